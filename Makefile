@@ -1,0 +1,42 @@
+# Everything runs from a bare Debian 12 or 13 as root; what is missing is installed, and said, first.
+#   LAB=container  system tests in a systemd-nspawn container (default)
+#   LAB=vm         system tests in a virtual machine
+#   LAB=host       system tests right here, on a machine booted with systemd
+
+LAB ?= container
+export LAB
+
+PREPARE := tests/lab/prepare
+CHECK := /usr/bin/python3 tests/lab/check
+
+help:  ## this list
+	@sed -n 's/^\([a-z]*\):.*##/make \1:/p' $(MAKEFILE_LIST)
+
+test:  ## everything: unit tests, system tests in the vm, system tests
+	@$(PREPARE) $(if $(filter host,$(LAB)),host,container vm)
+	@$(CHECK) test
+
+unit:  ## unit tests, on this machine's Python
+	@$(PREPARE)
+	@$(CHECK) unit
+
+system:  ## system tests in $(LAB)
+	@$(PREPARE) $(if $(filter vm,$(LAB)),container vm,$(LAB))
+	@$(CHECK) system
+
+vm:  ## system tests that need a kernel of their own
+	@$(PREPARE) container vm
+	@$(CHECK) vm
+
+lint:  ## ruff and mypy
+	@$(PREPARE)
+	@$(CHECK) lint
+
+demo:  ## a real dataflow under systemd, from start to stop
+	@$(PREPARE) $(if $(filter vm,$(LAB)),container vm,container)
+	@tests/lab/lab run -- tests/demo
+
+clean:  ## remove the images and venvs, and what killed runs left behind
+	@tests/lab/lab clean
+
+.PHONY: help test unit system vm lint demo clean

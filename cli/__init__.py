@@ -1,0 +1,1 @@
+"""The doractl command: one file per verb, no decision in any of them."""

@@ -1,0 +1,29 @@
+"""doractl dora: the stock dora command against one dataflow."""
+
+import click
+
+from dora_systemd.bus import Bus
+from dora_systemd.cli.parameters import current_scope, scope_options
+from dora_systemd.managercells import read_cells, select_cell
+from dora_systemd.managernode import exec_dora
+
+_EPILOG = """\b
+Examples:
+  doractl dora robot -- topic echo camera/image
+  doractl dora robot -- node list
+"""
+
+
+@click.command("dora", epilog=_EPILOG, context_settings={"ignore_unknown_options": True})
+@click.argument("selector")
+@click.argument("arguments", nargs=-1, type=click.UNPROCESSED, metavar="-- ARGUMENT...")
+@scope_options
+def command(selector: str, arguments: tuple[str, ...]) -> None:
+    """Run dora ARGUMENT... against the coordinator of the dataflow SELECTOR.
+
+    Only root and the user that the dataflow runs as may. Read logs with doractl logs: dora logs
+    knows nothing of them here.
+    """
+    scope = current_scope()
+    bus = Bus(scope)
+    exec_dora(scope, bus, select_cell(read_cells(bus), selector), arguments)

@@ -1,0 +1,29 @@
+"""doractl list: the dataflows of a manager, or the nodes of one of them."""
+
+import click
+
+from dora_systemd.cli.listing import print_dataflows
+from dora_systemd.cli.parameters import current_scope, output_option, scope_options
+from dora_systemd.cli.quick import ListRequest
+
+_EPILOG = """\b
+Examples:
+  doractl list                all that run
+  doractl list --all          also those that failed or ended
+  doractl list robot          the nodes of one
+  doractl list -o json
+"""
+
+
+@click.command("list", epilog=_EPILOG)
+@click.argument("selector", required=False)
+@click.option("-a", "--all", "want_all", is_flag=True, help="Failed and ended dataflows too.")
+@output_option
+@scope_options
+def command(selector: str | None, want_all: bool, output: str) -> int:
+    """List dataflows; with a SELECTOR, one dataflow and its nodes.
+
+    CPU% is in percent of one processor. The exit status for a SELECTOR is 3 unless that dataflow
+    runs, as with systemctl status.
+    """
+    return print_dataflows(ListRequest(selector, want_all, output, current_scope().is_user))

@@ -1,0 +1,53 @@
+"""What `doractl list` prints; without click, see main."""
+
+import json
+
+from dora_systemd.bus import Bus
+from dora_systemd.cli.quick import ListRequest
+from dora_systemd.errors import ExitCode
+from dora_systemd.managercells import read_cells
+from dora_systemd.managerlist import dataflow_row, find_row
+from dora_systemd.scope import Scope, scope_of
+from dora_systemd.statuswords import (
+    DataflowRow,
+    format_dataflow,
+    format_dataflows,
+    is_up_word,
+    row_values,
+)
+
+
+def print_dataflows(request: ListRequest) -> int:
+    """Print what is asked for; NOT_RUNNING if a single dataflow was asked for and is not up."""
+    scope = scope_of(request.is_user)
+    bus = Bus(scope)
+    if request.selector is None:
+        _print_all(_rows(bus, scope, request.want_all), request)
+        return ExitCode.OK
+    row = find_row(bus, scope, request.selector)
+    print(json.dumps(row_values(row), indent=2) if is_json(request) else format_dataflow(row))
+    return ExitCode.OK if is_up_word(row) else ExitCode.NOT_RUNNING
+
+
+def is_json(request: ListRequest) -> bool:
+    """Whether JSON was asked for."""
+    return request.output == "json"
+
+
+def _rows(bus: Bus, scope: Scope, want_all: bool) -> list[DataflowRow]:
+    rows = [dataflow_row(bus, scope, cell) for cell in read_cells(bus)]
+    if not want_all:
+        return [row for row in rows if is_up_word(row)]
+    # The journal is read only for those that systemd has forgotten.
+    from dora_systemd.managerended import ended_rows
+
+    return [*rows, *ended_rows(scope, rows)]
+
+
+def _print_all(rows: list[DataflowRow], request: ListRequest) -> None:
+    if is_json(request):
+        print(json.dumps([row_values(row) for row in rows], indent=2))
+    elif rows:
+        print(format_dataflows(rows))
+    else:
+        print("No dataflow." if request.want_all else "No dataflow is running.")

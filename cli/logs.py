@@ -1,0 +1,150 @@
+"""doractl logs: what the nodes of a dataflow wrote, out of the journal."""
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import click
+
+from dora_systemd.cli.parameters import current_scope, scope_options
+from dora_systemd.errors import ExitCode
+from dora_systemd.journalread import JournalReader, check_readable
+from dora_systemd.logquery import OUTPUTS, LogQuery, parse_level
+from dora_systemd.logterminal import TerminalLines
+from dora_systemd.managerlogs import LogRequest, find_query, pass_logs, read_logs
+
+_EPILOG = """\b
+Examples:
+  doractl logs robot                          all there is, in a pager
+  doractl logs robot --node camera --follow   what one node writes, from now on
+  doractl logs robot --tail 100 --level warn  the last 100 warnings and errors
+  doractl logs robot --run PREVIOUS --events  what happened to the run before this one
+  journalctl -t robot/camera                  the same records, with systemd's own tool
+"""
+
+
+@click.command("logs", epilog=_EPILOG)
+@click.argument("selector", default="")
+@click.option(
+    "-n",
+    "--node",
+    "nodes",
+    multiple=True,
+    metavar="NODE",
+    help="Only this node; a pattern as in the shell, may be repeated.",
+)
+@click.option(
+    "--all-nodes", is_flag=True, hidden=True, help="All nodes: the default, known from dora."
+)
+@click.option(
+    "-f",
+    "--follow",
+    "is_follow",
+    is_flag=True,
+    help="Wait for new lines; begins with the last 10 unless --tail or --since says more.",
+)
+@click.option("--tail", type=click.IntRange(min=0), metavar="N", help="Only the last N lines.")
+@click.option(
+    "--since",
+    default="",
+    metavar="TIME",
+    help='From this time on: "10 min ago", "2026-11-20 18:00", 5m, see systemd.time(7).',
+)
+@click.option("--until", default="", metavar="TIME", help="Up to this time.")
+@click.option(
+    "--level",
+    default="",
+    metavar="LEVEL",
+    help="This level and above: error, warn, info, debug, trace.",
+)
+@click.option(
+    "-g",
+    "--grep",
+    default="",
+    metavar="PATTERN",
+    help="Only messages that match; case matters if PATTERN has capitals.",
+)
+@click.option(
+    "--run",
+    default="ALL",
+    show_default=True,
+    metavar="RUN",
+    help="CURRENT, PREVIOUS, ALL or the id of a run (DORA_RUN).",
+)
+@click.option(
+    "--events", "is_events", is_flag=True, help="Only what happened to the dataflow and its nodes."
+)
+@click.option("-r", "--reverse", "is_reverse", is_flag=True, help="Newest lines first.")
+@click.option(
+    "-a",
+    "--all",
+    "want_unprintable",
+    is_flag=True,
+    help="Print messages with control characters as they are.",
+)
+@click.option(
+    "-o",
+    "--output",
+    type=click.Choice(OUTPUTS),
+    default="short",
+    show_default=True,
+    help="Form of the output, as journalctl has them.",
+)
+@click.option("--no-pager", is_flag=True, help="Do not use a pager.")
+@scope_options
+def command(selector: str, nodes: tuple[str, ...], run: str, no_pager: bool, **options: Any) -> int:
+    """Print what the nodes of a dataflow wrote, and what happened to them.
+
+    Without SELECTOR: of all dataflows. It may have ended long ago.
+    """
+    options.pop("all_nodes")
+    options["level"] = parse_level(options["level"]) if options["level"] else ""
+    scope = current_scope()
+    check_readable(scope)
+    journal = JournalReader()
+    query = find_query(journal, LogRequest(selector, nodes, run, LogQuery(scope, **options)))
+    if not sys.stdout.isatty():
+        return _exit_status(pass_logs(query, sys.stdout.fileno()))
+    lines = None
+    if query.output.startswith("short"):
+        known = query.nodes or (journal.known_nodes(query.name) if query.name else ())
+        lines = TerminalLines([*known, query.name], want_dataflow=not query.name)
+    chunks = read_logs(query, lines)
+    if not (no_pager or query.is_follow):
+        _page(chunks)
+    else:
+        _write(chunks, sys.stdout.fileno())
+    return ExitCode.OK
+
+
+def _exit_status(status: int) -> int:
+    """journalctl's own: 1 if --grep found nothing; killed by SIGPIPE counts as in a shell."""
+    return status if status >= 0 else 128 - status
+
+
+def _write(chunks: Iterator[bytes], fd: int) -> None:
+    for chunk in chunks:
+        rest = memoryview(chunk)
+        while rest:
+            rest = rest[os.write(fd, rest) :]
+
+
+def _page(chunks: Iterator[bytes]) -> None:
+    """Through the pager that journalctl(1) would use, with the options that it would give it."""
+    names = (os.environ.get(name, "") for name in ("DORACTL_PAGER", "SYSTEMD_PAGER", "PAGER"))
+    pager = next(filter(None, names), "less")
+    if not shutil.which(pager.split()[0]) or pager == "cat":
+        _write(chunks, sys.stdout.fileno())
+        return
+    environment = {"LESS": "FRSXMK", **os.environ}
+    with subprocess.Popen(pager, shell=True, stdin=subprocess.PIPE, env=environment) as child:
+        assert child.stdin
+        try:
+            _write(chunks, child.stdin.fileno())
+        except BrokenPipeError:
+            pass  # left before the end
+        finally:
+            child.stdin.close()

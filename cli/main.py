@@ -1,0 +1,72 @@
+"""The command doractl: where it begins, and the one place where its errors are printed."""
+
+import io
+import os
+import sys
+
+from dora_systemd import __version__
+from dora_systemd.cli.quick import parse_quick_list
+from dora_systemd.errors import DoraSystemdError, ExitCode
+
+
+def main() -> None:
+    """Run doractl and end the process with its exit status, see ExitCode."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # Names of files need not be in the terminal's encoding.
+        sys.stdout.reconfigure(errors="backslashreplace")
+    sys.exit(run(sys.argv[1:]))
+
+
+def run(arguments: list[str]) -> int:
+    """Run doractl and return its exit status; errors have been printed, in two lines."""
+    try:
+        status = _dispatch(arguments)
+        if sys.stdout:
+            sys.stdout.flush()
+    except DoraSystemdError as error:
+        return _report(error)
+    except BrokenPipeError:
+        # Whoever read our output has gone.
+        _give_up_output()
+        return _SIGPIPE_STATUS
+    except OSError as error:
+        _give_up_output()
+        return _report(DoraSystemdError(f"cannot go on: {error.strerror}", error.filename or ""))
+    except KeyboardInterrupt:
+        return ExitCode.INTERRUPTED
+    return status
+
+
+_SIGPIPE_STATUS = 128 + 13
+
+
+def _give_up_output() -> None:
+    """Nothing that is still buffered may be written at exit, where it would fail again."""
+    if sys.stdout:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _dispatch(arguments: list[str]) -> int:
+    """What is asked for again and again runs without click, which takes longer than the rest."""
+    if arguments == ["--version"]:
+        print(f"doractl {__version__}")
+        return ExitCode.OK
+    request = parse_quick_list(arguments)
+    if request is not None:
+        from dora_systemd.cli.listing import print_dataflows
+
+        return print_dataflows(request)
+    from dora_systemd.cli.group import run_verb
+
+    return run_verb(arguments)
+
+
+def _report(error: DoraSystemdError) -> int:
+    print(f"doractl: {error.message}", file=sys.stderr)
+    if error.hint:
+        print(f"hint: {error.hint}", file=sys.stderr)
+    return error.code
+
+
+if __name__ == "__main__":
+    main()

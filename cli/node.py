@@ -1,0 +1,44 @@
+"""doractl node: restart or stop single nodes."""
+
+import click
+
+from dora_systemd.bus import Bus
+from dora_systemd.cli.parameters import current_scope, scope_options
+from dora_systemd.managercells import Cell, read_cells, select_cell
+from dora_systemd.managernode import restart_node, stop_node
+
+_EPILOG = """\b
+Examples:
+  doractl node restart robot camera
+  doractl node stop robot plot
+"""
+
+
+@click.group("node", epilog=_EPILOG)
+@scope_options
+def command() -> None:
+    """Restart or stop a single node of a running dataflow."""
+
+
+@command.command("restart", epilog=_EPILOG)
+@click.argument("selector")
+@click.argument("node")
+@scope_options
+def restart(selector: str, node: str) -> None:
+    """Restart NODE of the dataflow SELECTOR; the other nodes run on."""
+    restart_node(current_scope(), _cell(selector), node)
+    click.echo(f"Node restarting: {node}")
+
+
+@command.command("stop", epilog=_EPILOG)
+@click.argument("selector")
+@click.argument("node")
+@scope_options
+def stop(selector: str, node: str) -> None:
+    """Stop NODE of the dataflow SELECTOR for good; its neighbours see their input closed."""
+    stop_node(current_scope(), _cell(selector), node)
+    click.echo(f"Node stopping: {node}")
+
+
+def _cell(selector: str) -> Cell:
+    return select_cell(read_cells(Bus(current_scope())), selector)

@@ -1,0 +1,88 @@
+"""Options and arguments that several verbs have in common."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
+
+import click
+
+from dora_systemd.errors import ExitCode
+from dora_systemd.managerstop import Outcome
+from dora_systemd.scope import Scope, scope_of
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+_SCOPE_KEY = "dora_systemd.is_user"
+
+
+def scope_options(function: F) -> F:
+    """`--system` and `--user`, which stand before or after the verb; the last one wins."""
+    for flag, is_user, text in (
+        ("--user", True, "Dataflows of the calling user (default unless root)."),
+        ("--system", False, "Dataflows of the system (default for root)."),
+    ):
+        function = click.option(
+            flag,
+            # A name of its own: one of the settings is called "user".
+            f"scope_{flag.strip('-')}",
+            is_flag=True,
+            expose_value=False,
+            callback=_remember(is_user),
+            help=text,
+        )(function)
+    return function
+
+
+def current_scope() -> Scope:
+    """The scope that the command line asks for."""
+    return scope_of(click.get_current_context().meta.get(_SCOPE_KEY))
+
+
+def output_option(function: F) -> F:
+    """`-o table|json`."""
+    option = click.option(
+        "-o",
+        "--output",
+        type=click.Choice(["table", "json"]),
+        default="table",
+        show_default=True,
+        help="A table for people, or JSON for programs.",
+    )
+    return option(function)
+
+
+def print_json(value: Any) -> None:
+    """`value` as JSON, indented."""
+    import json
+
+    click.echo(json.dumps(value, indent=2))
+
+
+def _remember(is_user: bool) -> Callable[[click.Context, click.Parameter, bool], None]:
+    def callback(ctx: click.Context, param: click.Parameter, value: bool) -> None:
+        del param
+        if value:
+            ctx.meta[_SCOPE_KEY] = is_user
+
+    return callback
+
+
+def print_outcomes(outcomes: Sequence[Outcome]) -> int:
+    """One line for each dataflow; the exit status is FAILURE if any has a problem."""
+    for one in outcomes:
+        if one.problem:
+            click.echo(f"doractl: {one.problem}", err=True)
+        else:
+            click.echo(one.text)
+    return ExitCode.FAILURE if any(one.problem for one in outcomes) else ExitCode.OK
+
+
+def print_warnings(warnings: Sequence[str]) -> None:
+    """One line each, on standard error."""
+    for warning in warnings:
+        click.echo(f"doractl: {warning}", err=True)
+
+
+def name_option(function: F) -> F:
+    """`--name NAME`, for what starts a dataflow."""
+    text = "Name of the dataflow; default: that of its file, or of the directory of a dataflow.yml."
+    return click.option("--name", metavar="NAME", help=text)(function)

@@ -1,0 +1,41 @@
+"""doractl restart: end dataflows and start them again."""
+
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+import click
+
+from dora_systemd.bus import Bus
+from dora_systemd.cli.parameters import current_scope, print_outcomes, scope_options
+from dora_systemd.cli.stageline import StageLine
+from dora_systemd.managercells import read_cells, select_cell
+from dora_systemd.managerstop import restart_cells
+
+_EPILOG = """\b
+Examples:
+  doractl restart robot
+  doractl restart robot vision
+"""
+
+
+@click.command("restart", epilog=_EPILOG)
+@click.argument("selectors", nargs=-1, required=True, metavar="SELECTOR...")
+@scope_options
+def command(selectors: tuple[str, ...]) -> int:
+    """Restart dataflows and wait until all their nodes are ready again.
+
+    Name, UUID and settings stay; the descriptor is read anew. A dataflow that has failed is
+    started again.
+    """
+    bus = Bus(current_scope())
+    cells = read_cells(bus)
+    chosen = dict.fromkeys(select_cell(cells, one) for one in selectors)
+    with StageLine(sys.stderr) as stage:
+        outcomes = restart_cells(bus, list(chosen), lambda changes: _show(stage, changes))
+    return print_outcomes(outcomes)
+
+
+def _show(stage: StageLine, changes: Mapping[str, Any]) -> None:
+    if changes.get("StatusText"):
+        stage(changes["StatusText"])

@@ -1,0 +1,60 @@
+"""doractl run: a dataflow in the foreground."""
+
+import os
+import sys
+import time
+from contextlib import closing
+from typing import Any
+
+import click
+
+from dora_systemd.bus import Bus
+from dora_systemd.cli.parameters import current_scope, name_option, print_warnings, scope_options
+from dora_systemd.cli.settingoptions import setting_options
+from dora_systemd.cli.stageline import StageLine
+from dora_systemd.logterminal import TerminalLines
+from dora_systemd.managerlogs import FollowedLog
+from dora_systemd.managerplan import DEFAULT_FILE, StartRequest, make_plan, request_name
+from dora_systemd.managerrun import attached_properties, follow_unit, life_line
+from dora_systemd.managerstart import require_free_name, start_plan
+from dora_systemd.managerunit import plan_properties
+from dora_systemd.names import unit_name
+
+_EPILOG = """\b
+Examples:
+  doractl run                          ./dataflow.yml
+  doractl run dataflow.yml --name robot --env MODEL=yolov8n.pt
+"""
+_MICROSECOND_NS = 1000
+
+
+@click.command("run", epilog=_EPILOG)
+@click.argument("dataflow", default=DEFAULT_FILE, metavar="[FILE]")
+@name_option
+@setting_options
+@scope_options
+def command(dataflow: str, name: str | None, **flags: Any) -> int:
+    """Run the dataflow in FILE and print its logs until it ends.
+
+    Ctrl+C stops it gracefully, a second Ctrl+C kills it. It ends with this command, however that
+    ends. The exit status is that of the dataflow: 0 when all nodes ended well.
+    """
+    scope = current_scope()
+    request = StartRequest(dataflow, name, flags, os.environ, attached=True)
+    bus = Bus(scope)
+    require_free_name(bus, unit_name(request_name(request)))
+    plan = make_plan(scope, request)
+    properties, warnings = plan_properties(plan, bus.version())
+    print_warnings(warnings)
+    options = plan.options
+    terminal = TerminalLines((), want_colors=sys.stdout.isatty())
+    since = time.time_ns() // _MICROSECOND_NS
+    followed = FollowedLog(scope, options.name, options.uuid, since, _write, terminal)
+    with life_line() as pipe, closing(followed) as logs, StageLine(sys.stderr) as stage:
+        start_plan(bus, plan, [*properties, *attached_properties(pipe)], stage, wait=False)
+        return follow_unit(bus, plan.unit, logs, stage)
+
+
+def _write(data: bytes) -> None:
+    sys.stdout.buffer.write(data)
+    sys.stdout.buffer.flush()

@@ -1,0 +1,35 @@
+"""The options of `start` and `run`: one for each setting that has a flag, made from its table."""
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import click
+
+from dora_systemd.settingkinds import Setting
+from dora_systemd.settingtable import SETTINGS
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def setting_options(function: F) -> F:
+    """All flags of the settings. Their raw values arrive as keyword arguments by setting name."""
+    for setting in reversed(SETTINGS):
+        if setting.flags:
+            function = _option(setting)(function)
+    return function
+
+
+def _option(setting: Setting[Any]) -> Callable[[F], F]:
+    flags = setting.flags
+    if setting.kind.is_flag:
+        long = flags[0].removeprefix("--")
+        spelled = (f"--{long}/--no-{long}", *flags[1:])
+        return click.option(*spelled, setting.name, default=None, help=setting.help)
+    return click.option(
+        *flags,
+        setting.name,
+        metavar=setting.metavar or "TEXT",
+        multiple=setting.kind.is_repeatable,
+        default=None,
+        help=setting.help,
+    )

@@ -1,0 +1,32 @@
+"""doractl show: the unit of a dataflow as text."""
+
+import click
+
+from dora_systemd.bus import Bus
+from dora_systemd.cli.parameters import current_scope, output_option, print_json, scope_options
+from dora_systemd.managercells import read_cells, select_cell
+from dora_systemd.managershow import format_unit_files, unit_files
+
+_EPILOG = """\b
+Examples:
+  doractl show robot
+  doractl show robot -o json
+"""
+
+
+@click.command("show", epilog=_EPILOG)
+@click.argument("selector")
+@output_option
+@scope_options
+def command(selector: str, output: str) -> None:
+    """Print the unit of a dataflow, each file below a comment with its path.
+
+    Environment variables are printed as well, with their values.
+    """
+    bus = Bus(current_scope())
+    cell = select_cell(read_cells(bus), selector)
+    files = unit_files(bus, cell)
+    if output == "json":
+        print_json({"unit": cell.unit, "name": cell.name, "uuid": cell.uuid, "files": files})
+    else:
+        click.echo(format_unit_files(files), nl=False)

@@ -1,0 +1,37 @@
+"""One line on a terminal that is rewritten while something is waited for; none in a pipe."""
+
+import shutil
+from types import TracebackType
+from typing import TextIO
+
+_BACK_AND_CLEAR = "\r\x1b[K"
+
+
+class StageLine:
+    """Shows the text it is called with, until the end of the `with` block wipes it away."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self._is_terminal = stream.isatty()
+
+    def __call__(self, text: str) -> None:
+        if self._is_terminal:
+            columns = shutil.get_terminal_size().columns
+            shown = "".join(char for char in text if char.isprintable())[: columns - 1]
+            self._write(f"{_BACK_AND_CLEAR}{shown}")
+
+    def __enter__(self) -> "StageLine":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if self._is_terminal:
+            self._write(_BACK_AND_CLEAR)
+
+    def _write(self, text: str) -> None:
+        self._stream.write(text)
+        self._stream.flush()

@@ -1,0 +1,60 @@
+"""doractl stop: end dataflows."""
+
+import click
+
+from dora_systemd.bus import Bus
+from dora_systemd.cli.parameters import current_scope, print_outcomes, scope_options
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.managercells import Cell, matching_cells, not_found, read_cells, select_cell
+from dora_systemd.managerstop import stop_cells
+from dora_systemd.scope import Scope
+
+_EPILOG = """\b
+Examples:
+  doractl stop robot
+  doractl stop 550e8400 vision
+  doractl stop --all
+"""
+
+
+@click.command("stop", epilog=_EPILOG)
+@click.argument("selectors", nargs=-1, metavar="SELECTOR...")
+@click.option("-a", "--all", "want_all", is_flag=True, help="All dataflows that run.")
+@scope_options
+def command(selectors: tuple[str, ...], want_all: bool) -> int:
+    """Stop dataflows and wait until they have ended.
+
+    Nodes are told to stop; what is left after the grace duration that the dataflow was started
+    with is killed. Several dataflows stop at the same time.
+    """
+    if bool(selectors) == want_all:
+        raise DoraSystemdError(
+            "cannot tell what to stop", "doractl stop NAME, or doractl stop --all", ExitCode.USAGE
+        )
+    scope = current_scope()
+    bus = Bus(scope)
+    cells = read_cells(bus)
+    if want_all:
+        chosen = [cell for cell in cells if cell.is_up]
+        if not chosen:
+            click.echo("No dataflow is running.")
+        return print_outcomes(stop_cells(bus, chosen))
+    _print_ended(scope, [one for one in selectors if not matching_cells(cells, one)], cells)
+    chosen = [cell for one in selectors for cell in _cells(cells, one)]
+    return print_outcomes(stop_cells(bus, list(dict.fromkeys(chosen))))
+
+
+def _print_ended(scope: Scope, selectors: list[str], cells: list[Cell]) -> None:
+    """Say which ones have ended long ago; raise DoraSystemdError for the others."""
+    for selector in selectors:
+        # Only the journal knows; it is not read for dataflows that systemd knows.
+        from dora_systemd.managerended import select_ended
+
+        row = select_ended(scope, selector)
+        if row is None:
+            raise not_found(selector, [cell.name for cell in cells])
+        click.echo(f"Dataflow not running: {row.uuid} ({row.name} {row.status.lower()})")
+
+
+def _cells(cells: list[Cell], selector: str) -> list[Cell]:
+    return [select_cell(cells, selector)] if matching_cells(cells, selector) else []

@@ -1,0 +1,25 @@
+"""doractl version: what takes part, and in which version."""
+
+import click
+
+from dora_systemd.cli.parameters import current_scope, output_option, print_json, scope_options
+from dora_systemd.managerversion import read_versions
+
+_EPILOG = """\b
+Examples:
+  doractl version
+  doractl version -o json
+"""
+
+
+@click.command("version", epilog=_EPILOG)
+@output_option
+@scope_options
+def command(output: str) -> None:
+    """Print the versions of doractl, Python, systemd and dora."""
+    versions = read_versions(current_scope())
+    if output == "json":
+        print_json(versions)
+        return
+    for name, version in versions.items():
+        click.echo(f"{name:<8} {version or 'not found'}")

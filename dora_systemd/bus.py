@@ -1,0 +1,251 @@
+"""systemd over D-Bus: the only module that talks to it, and the only one that imports pystemd.
+
+The interfaces are those of org.freedesktop.systemd1(5). Only pystemd's low level is used, on a
+connection that is told every signature: nothing is introspected, and no XML is parsed.
+"""
+
+import select
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cache
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from dora_systemd.buserrors import connection_error, explained
+from dora_systemd.busprotocol import JOB_DONE, Observer, Property, UnitState
+from dora_systemd.buswire import decoded, encoded
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.scope import Scope
+
+SERVICE = b"org.freedesktop.systemd1"
+ROOT = b"/org/freedesktop/systemd1"
+MANAGER = b"org.freedesktop.systemd1.Manager"
+UNIT = b"org.freedesktop.systemd1.Unit"
+UNIT_SERVICE = b"org.freedesktop.systemd1.Service"
+PROPERTIES = b"org.freedesktop.DBus.Properties"
+
+SYSTEM_BUS = Path("/run/dbus/system_bus_socket")
+
+_IDLE_SECONDS = 1.0
+_UNIT_PROPERTIES = frozenset(
+    (
+        *("ActiveState", "SubState", "LoadState", "FragmentPath", "DropInPaths", "Transient"),
+        *("ActiveEnterTimestamp", "ActiveEnterTimestampMonotonic", "InactiveEnterTimestamp"),
+        *("InactiveExitTimestamp", "InactiveExitTimestampMonotonic", "InvocationID", "Job"),
+        *("StateChangeTimestamp", "Description", "UnitFileState", "NeedDaemonReload"),
+    )
+)
+
+
+class Bus:
+    """A connection to the manager of `scope`: the Manager of busprotocol, which documents it."""
+
+    def __init__(self, scope: Scope) -> None:
+        self.scope = scope
+        self._bus = _connect(scope)
+        self._matches: dict[bytes, Callable[..., None]] = {}
+
+    def list_units(self, pattern: str) -> list[UnitState]:
+        rows = self._call(
+            "list units", ROOT, MANAGER, "ListUnitsByPatterns", ("as", []), ("as", [pattern])
+        )
+        return [UnitState(row[0], row[2], row[3], row[4]) for row in rows or ()]
+
+    def read(self, unit: str, names: Sequence[str]) -> dict[str, Any]:
+        return {name: self._read_one(unit, name) for name in names}
+
+    def start_transient(
+        self, unit: str, properties: Sequence[Property], observer: Observer | None, wait: bool
+    ) -> str:
+        self._listen(unit)
+        typed = [(name, (signature, value)) for name, signature, value in properties]
+        arguments: tuple[tuple[str, Any], ...] = (
+            ("s", unit),
+            ("s", "fail"),
+            ("a(sv)", typed),
+            ("a(sa(sv))", []),
+        )
+        job = self._call(f"start {unit}", ROOT, MANAGER, "StartTransientUnit", *arguments)
+        return self._wait_for_jobs({job: unit}, observer)[unit] if wait else JOB_DONE
+
+    def run_jobs(
+        self, method: str, units: Sequence[str], observer: Observer | None = None
+    ) -> dict[str, str]:
+        jobs = {self.queue_job(method, unit): unit for unit in units}
+        return self._wait_for_jobs(jobs, observer)
+
+    def queue_job(self, method: str, unit: str) -> str:
+        self._listen(unit)
+        action = f"{method.removesuffix('Unit').lower()} {unit}"
+        job: str = self._call(action, ROOT, MANAGER, method, ("s", unit), ("s", "replace"))
+        return job
+
+    def kill(self, unit: str, signal: int, whom: str = "all") -> None:
+        arguments = (("s", unit), ("s", whom), ("i", signal))
+        self._call(f"kill {unit}", ROOT, MANAGER, "KillUnit", *arguments)
+
+    def reset_failed(self, unit: str) -> None:
+        self._call(f"reset {unit}", ROOT, MANAGER, "ResetFailedUnit", ("s", unit))
+
+    def set_properties(self, unit: str, properties: Sequence[Property], runtime: bool) -> None:
+        typed = [(name, (signature, value)) for name, signature, value in properties]
+        arguments = (("s", unit), ("b", runtime), ("a(sv)", typed))
+        self._call(f"change {unit}", ROOT, MANAGER, "SetUnitProperties", *arguments)
+
+    def wait_until(
+        self, unit: str, is_done: Callable[[Mapping[str, Any]], bool], seconds: float
+    ) -> bool:
+        deadline = time.monotonic() + seconds
+        while (left := deadline - time.monotonic()) > 0:
+            if any(is_done(change) for change in self.changes(unit)):
+                return True
+            self._sleep(min(left, _IDLE_SECONDS))
+        return False
+
+    def changes(self, unit: str) -> list[Mapping[str, Any]]:
+        self._listen(unit)
+        return [body[1] for member, body in self._signals() if member == "PropertiesChanged"]
+
+    def version(self) -> str:
+        text: str = self._get("read systemd's version", ROOT, MANAGER, "Version")
+        return text
+
+    def fileno(self) -> int:
+        number: int = self._bus.get_fd()
+        return number
+
+    def _read_one(self, unit: str, name: str) -> Any:
+        interface = UNIT if name in _UNIT_PROPERTIES else UNIT_SERVICE
+        return self._get(f"read {name} of {unit}", _unit_path(unit), interface, name)
+
+    def _get(self, action: str, path: bytes, interface: bytes, name: str) -> Any:
+        return self._call(action, path, PROPERTIES, "Get", ("s", interface.decode()), ("s", name))
+
+    def _call(
+        self, action: str, path: bytes, interface: bytes, method: str, *arguments: tuple[str, Any]
+    ) -> Any:
+        words = [word for signature, value in arguments for word in encoded(signature, value)]
+        with explained(action, self.scope):
+            reply = self._bus.call_method(SERVICE, path, interface, method.encode(), words)
+        return decoded(reply.body)
+
+    def _listen(self, unit: str) -> None:
+        """Hear the end of jobs and the changed properties of `unit` from now on."""
+        path = _unit_path(unit)
+        if not self._matches:
+            self._call("listen to systemd", ROOT, MANAGER, "Subscribe")
+            self._match(ROOT, MANAGER, b"JobRemoved")
+        if path not in self._matches:
+            self._match(path, PROPERTIES, b"PropertiesChanged")
+
+    def _match(self, path: bytes, interface: bytes, member: bytes) -> None:
+        # pystemd keeps only a bare pointer to the callback, and needs a function of its own each
+        # time. It does nothing: process() returns every message as well.
+        def ignore(_message: Any, error: Any = None, userdata: Any = None) -> None:
+            del error, userdata
+
+        self._matches[path] = ignore
+        with explained("listen to systemd", self.scope):
+            self._bus.match_signal(None, path, interface, member, ignore)
+
+    def _signals(self) -> Iterator[tuple[str, Any]]:
+        """Member and body of what has arrived.
+
+        process() says nothing about steps that brought no message, hence the few empty tries.
+        """
+        empty = 0
+        while empty < 3:
+            with explained("hear from systemd", self.scope):
+                message = self._bus.process()
+                if message.is_empty():
+                    empty += 1
+                    continue
+                member = _member(message)
+                message.process_reply(False)
+            yield member, decoded(message.body)
+
+    def _wait_for_jobs(self, jobs: dict[str, str], observer: Observer | None) -> dict[str, str]:
+        """The results by unit. `jobs`: object paths of queued jobs and their units."""
+        results: dict[str, str] = {}
+        while len(results) < len(jobs):
+            heard = False
+            for member, body in self._signals():
+                heard = True
+                if member == "JobRemoved" and body[1] in jobs:
+                    results[jobs[body[1]]] = body[3]
+                if member == "PropertiesChanged" and observer:
+                    observer(body[1])
+            # A signal can be lost with a restart of the message bus: the units are asked too.
+            if not heard and not self._sleep(_IDLE_SECONDS):
+                left = [unit for unit in jobs.values() if unit not in results]
+                results |= {unit: word for unit in left if (word := self._job_result(unit))}
+        return results
+
+    def _job_result(self, unit: str) -> str:
+        if self._read_one(unit, "Job")[0]:
+            return ""
+        active = self._read_one(unit, "ActiveState")
+        return JOB_DONE if active in ("active", "inactive") else "failed"
+
+    def _sleep(self, seconds: float) -> bool:
+        poll = select.poll()
+        poll.register(self.fileno(), select.POLLIN)
+        return bool(poll.poll(seconds * 1000))
+
+
+def _connect(scope: Scope) -> Any:
+    address = _address(scope)
+    library = _dbuslib()
+    with connection_error(scope):
+        # A manager's private socket takes no part in the bus: there is nobody to say hello to.
+        bus = library.DBusAddress(
+            f"unix:path={address}".encode(), peer_to_peer=address.endswith("/private")
+        )
+        bus.open()
+    return bus
+
+
+def _address(scope: Scope) -> str:
+    """The message bus, else the manager's private socket: a user may have no bus of his own."""
+    bus = scope.runtime_root / "bus" if scope.is_user else SYSTEM_BUS
+    private = scope.runtime_root / "systemd" / "private"
+    return str(private) if not bus.exists() and private.exists() else str(bus)
+
+
+@cache
+def _dbuslib() -> ModuleType:
+    """pystemd.dbuslib without pystemd/__init__.py.
+
+    That imports lxml and the signatures of all unit properties, which takes longer than the whole
+    of `doractl list`. A package that holds nothing but its path stands in while the import runs.
+    """
+    if "pystemd" in sys.modules:
+        return import_module("pystemd.dbuslib")
+    spec = find_spec("pystemd")
+    if spec is None:
+        hint = "install python3-pystemd, or run pip install dora-systemd again"
+        raise DoraSystemdError("cannot find the Python module pystemd", hint, ExitCode.NO_SYSTEMD)
+    package = ModuleType("pystemd")
+    package.__path__ = list(spec.submodule_search_locations or ())
+    sys.modules["pystemd"] = package
+    try:
+        return import_module("pystemd.dbuslib")
+    finally:
+        del sys.modules["pystemd"]
+
+
+def _unit_path(unit: str) -> bytes:
+    """The object path of a unit, escaped as sd_bus_path_encode(3) does."""
+    escaped = (c if c.isascii() and c.isalnum() else f"_{ord(c):02x}" for c in unit)
+    return ROOT + b"/unit/" + "".join(escaped).encode()
+
+
+def _member(message: Any) -> str:
+    for interface, member in ((MANAGER, b"JobRemoved"), (PROPERTIES, b"PropertiesChanged")):
+        if message.is_signal(interface, member):
+            return member.decode()
+    return ""

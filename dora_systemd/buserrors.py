@@ -1,0 +1,99 @@
+"""What went wrong on D-Bus, in words."""
+
+import os
+import pwd
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.scope import Scope
+
+_REASONS = {
+    "AccessDenied": ("permission denied", ExitCode.NO_PERMISSION),
+    "InteractiveAuthorizationRequired": ("permission denied", ExitCode.NO_PERMISSION),
+    "AuthFailed": ("permission denied", ExitCode.NO_PERMISSION),
+    "UnitExists": ("a unit of that name is there already", ExitCode.NAME_IN_USE),
+    "NoSuchUnit": ("there is no such unit", ExitCode.NOT_FOUND),
+    "ConnectionRefused": ("systemd does not answer", ExitCode.NO_SYSTEMD),
+    "Disconnected": ("systemd hung up", ExitCode.NO_SYSTEMD),
+    "NoReply": ("systemd does not answer", ExitCode.NO_SYSTEMD),
+    "Timeout": ("systemd does not answer", ExitCode.NO_SYSTEMD),
+    "TimedOut": ("systemd does not answer", ExitCode.NO_SYSTEMD),
+    "ServiceUnknown": ("systemd is not on the message bus", ExitCode.NO_SYSTEMD),
+    "NameHasNoOwner": ("systemd is not on the message bus", ExitCode.NO_SYSTEMD),
+}
+
+
+@contextmanager
+def explained(action: str, scope: Scope) -> Iterator[None]:
+    """Turn pystemd's errors into DoraSystemdError "cannot `action`: reason"."""
+    try:
+        yield
+    except Exception as error:
+        if not _is_bus_error(error):
+            raise
+        raise bus_error(action, scope, error_name(error), _message(error)) from error
+
+
+def bus_error(action: str, scope: Scope, name: str, message: str) -> DoraSystemdError:
+    """The error of a D-Bus error name (last part) and the text that came with it."""
+    reason, code = _REASONS.get(name, (message or name, ExitCode.FAILURE))
+    hint = _HINTS.get(code, "")
+    if code is ExitCode.NO_PERMISSION and scope.is_user:
+        hint = ""
+    return DoraSystemdError(f"cannot {action}: {reason}", hint, code)
+
+
+_HINTS = {
+    ExitCode.NO_PERMISSION: "use sudo, or --user for a dataflow of your own",
+    ExitCode.NOT_FOUND: "doractl list --all shows what there is",
+    ExitCode.NAME_IN_USE: "doractl list shows it; stop it, or choose another --name",
+    ExitCode.NO_SYSTEMD: "see systemctl is-system-running",
+}
+
+
+@contextmanager
+def connection_error(scope: Scope) -> Iterator[None]:
+    """Say why a manager cannot be reached at all, and what helps."""
+    try:
+        yield
+    except Exception as error:
+        if not _is_bus_error(error):
+            raise
+        manager = "systemd of this user" if scope.is_user else "systemd"
+        reason = os.strerror(-getattr(error, "errno", 0))
+        message = f"cannot reach the {manager}" if scope.is_user else f"cannot reach {manager}"
+        raise DoraSystemdError(
+            f"{message}: {reason}", _connection_hint(scope), ExitCode.NO_SYSTEMD
+        ) from error
+
+
+def _connection_hint(scope: Scope) -> str:
+    if not Path("/run/systemd/system").is_dir():
+        return "this machine was not booted with systemd"
+    if not scope.is_user:
+        return "see systemctl is-system-running"
+    try:
+        user = pwd.getpwuid(scope.uid).pw_name
+    except KeyError:
+        user = str(scope.uid)
+    return f"log in as {user}, or let the manager run without: loginctl enable-linger {user}"
+
+
+def error_name(error: Exception) -> str:
+    """The last part of the D-Bus name; pystemd makes a class of the names that it knows."""
+    name = getattr(error, "err_name", "")
+    text = name.decode(errors="replace") if isinstance(name, bytes) else str(name)
+    return text.rpartition(".")[2] or type(error).__name__.removeprefix("DBus").removesuffix(
+        "Error"
+    )
+
+
+def _message(error: Exception) -> str:
+    text = getattr(error, "err_message", "")
+    return text.decode(errors="replace") if isinstance(text, bytes) else str(text)
+
+
+def _is_bus_error(error: Exception) -> bool:
+    return any(kind.__name__ == "DBusBaseError" for kind in type(error).__mro__)

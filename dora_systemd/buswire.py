@@ -1,0 +1,61 @@
+"""Values to and from the form in which pystemd's call_method() takes and gives them."""
+
+import os
+from typing import Any
+
+from dora_systemd.errors import DoraSystemdError, ExitCode
+
+_CLOSE = (-1, None)
+"""pystemd's mark for the end of a container."""
+
+
+def encoded(signature: str, value: Any) -> list[tuple[int, Any]]:
+    """`value` as the sequence of basic types and containers that call_method() takes.
+
+    A variant's value is a pair: its own signature and its value.
+    """
+    kind = signature[0]
+    if kind == "a":
+        items = [word for one in value for word in encoded(signature[1:], one)]
+        return [(ord("a"), signature[1:].encode()), *items, _CLOSE]
+    if kind == "(":
+        pairs = zip(_split(signature[1:-1]), value, strict=True)
+        items = [word for inner, one in pairs for word in encoded(inner, one)]
+        return [(ord("r"), signature[1:-1].encode()), *items, _CLOSE]
+    if kind == "v":
+        return [(ord("v"), value[0].encode()), *encoded(*value), _CLOSE]
+    return [(ord(kind), _text(value) if kind in "sog" else value)]
+
+
+def _text(value: str) -> bytes:
+    """UTF-8 without NUL, which would end the string silently in C: D-Bus knows no other text."""
+    try:
+        encoded_text = value.encode()
+    except UnicodeEncodeError:
+        encoded_text = b"\0"
+    if b"\0" in encoded_text:
+        hint = "write it as UTF-8 without NUL characters"
+        raise DoraSystemdError(f"cannot send {value!r} to systemd", hint, ExitCode.USAGE)
+    return encoded_text
+
+
+def _split(signature: str) -> list[str]:
+    """The complete types of a signature: "sasb" gives s, as, b."""
+    types, current, depth = [], "", 0
+    for char in signature:
+        current += char
+        depth += (char == "(") - (char == ")")
+        if char != "a" and depth == 0:
+            types.append(current)
+            current = ""
+    return types
+
+
+def decoded(value: Any) -> Any:
+    if isinstance(value, bytes):
+        return os.fsdecode(value)
+    if isinstance(value, dict):
+        return {decoded(key): decoded(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [decoded(one) for one in value]
+    return value

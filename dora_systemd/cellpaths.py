@@ -1,0 +1,53 @@
+"""The files of one cell: what lies where in the RuntimeDirectory of its unit."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class CellPaths:
+    """The RuntimeDirectory `root` (mode 0700, see RuntimeDirectory= in systemd.exec(5)) by name."""
+
+    root: Path
+
+    @property
+    def status(self) -> Path:
+        """The live node table, replaced atomically by the runner."""
+        return self.root / "status.json"
+
+    @property
+    def control(self) -> Path:
+        """Port and token of the cell's coordinator, mode 0600."""
+        return self.root / "control.json"
+
+    @property
+    def coordinator(self) -> Path:
+        """Working directory of the coordinator, which writes its token and its log there."""
+        return self.root / "coordinator"
+
+    @property
+    def daemon(self) -> Path:
+        """Working directory of the daemon."""
+        return self.root / "daemon"
+
+    @property
+    def work(self) -> Path:
+        """Dora's working directory of the dataflow: its `out/` lands here, not in the project."""
+        return self.root / "work"
+
+    @property
+    def io(self) -> Path:
+        """The directory of the nodes' output pipes."""
+        return self.root / "io"
+
+    def node_stdout(self, node: str) -> Path:
+        """The FIFO that is the standard output of `node`."""
+        return self.io / f"{node}.out"
+
+    def node_stderr(self, node: str) -> Path:
+        """The FIFO that is the standard error of `node`."""
+        return self.io / f"{node}.err"
+
+    def node_pid(self, node: str) -> Path:
+        """Where the launcher of `node` notes its pid, before anything else it does."""
+        return self.io / f"{node}.pid"

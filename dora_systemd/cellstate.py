@@ -1,0 +1,83 @@
+"""What the runner knows of its cell, and what it can do: the values of dora_systemd.lifecycle."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum, IntEnum
+
+from dora_systemd.status import NodeStatus
+
+
+class RunnerExit(IntEnum):
+    """Exit status of the runner, so what systemd shows as ExecMainStatus; see sysexits(3head)."""
+
+    OK = 0
+    FAILED = 1
+    ENGINE_LOST = 69
+    BAD_DATAFLOW = 78
+
+
+class State(Enum):
+    """Where a cell is in its life."""
+
+    BOOTING = "booting"
+    JOINING = "joining"
+    STARTING = "starting"
+    WAITING = "waiting"
+    RUNNING = "running"
+    STOPPING = "stopping"
+    CLOSING = "closing"
+    LEAVING = "leaving"
+    ENDED = "ended"
+
+
+class Do(Enum):
+    """Actions of the runner that need nothing but the cell."""
+
+    START_DAEMON = "start the daemon"
+    SEND_START = "send the descriptor"
+    SUBSCRIBE = "subscribe to the life events of the run"
+    OPEN_PIPES = "let the launchers go on"
+    ASK_SPAWN = "ask whether all nodes could be executed"
+    ASK_RESULT = "ask how the run ended"
+    ASK_STOP = "ask dora to stop the run"
+    DISMISS_DAEMON = "tell the daemon to end"
+    EXIT = "kill what is left and exit"
+
+
+@dataclass(frozen=True)
+class Record:
+    """Action: write a life event of dora_systemd.events. node: "" for the dataflow."""
+
+    event: str
+    node: str = ""
+    details: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Deadline:
+    """Action: DeadlinePassed comes in `after` µs, unless the state has changed; None: never."""
+
+    after: int | None
+
+
+Action = Do | Record | Deadline
+
+
+@dataclass(frozen=True)
+class Cell:
+    """All that the runner knows of its cell.
+
+    grace: µs. run: dora's id of the run, or "". nodes: the live table. started_us, ready_us:
+    CLOCK_REALTIME µs. stop_by: who asked to stop, or "". failure: why the cell fails, or "".
+    exit: what the runner will exit with.
+    """
+
+    grace: int
+    started_us: int
+    nodes: Mapping[str, NodeStatus]
+    state: State = State.BOOTING
+    run: str = ""
+    ready_us: int = 0
+    stop_by: str = ""
+    failure: str = ""
+    exit: RunnerExit = RunnerExit.OK

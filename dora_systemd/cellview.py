@@ -1,0 +1,102 @@
+"""What a cell shows of itself: STATUS= of its unit and the table in status.json."""
+
+from collections.abc import Mapping
+
+from dora_systemd.cellstate import Cell, State
+from dora_systemd.status import CellStatus, CpuSample, NodeStatus
+
+_STAGES = {
+    State.BOOTING: "starting",
+    State.JOINING: "starting",
+    State.STARTING: "starting",
+    State.WAITING: "waiting",
+    State.STOPPING: "stopping",
+    State.CLOSING: "stopping",
+    State.LEAVING: "stopping",
+    State.ENDED: "ended",
+}
+_FIXED = {
+    State.BOOTING: "starting the dora coordinator",
+    State.JOINING: "starting the dora daemon",
+    State.STARTING: "starting the nodes",
+    State.CLOSING: "asking dora how the dataflow ended",
+    State.LEAVING: "stopping the dora daemon",
+}
+_NAMED = 5
+"""How many nodes a status line names."""
+
+
+def format_status(cell: Cell) -> str:
+    """One line for STATUS=, see sd_notify(3)."""
+    if cell.failure:
+        return f"failed: {cell.failure}"
+    if cell.state in _FIXED:
+        return _FIXED[cell.state]
+    if cell.state is State.ENDED:
+        return "stopped" if cell.stop_by else "finished"
+    if cell.state is State.STOPPING:
+        return f"stopping, {_plural(_count(cell, 'starting', 'ready', 'running'))} left"
+    return _format_waiting(cell) if cell.state is State.WAITING else _format_running(cell)
+
+
+def _format_waiting(cell: Cell) -> str:
+    waiting = [ident for ident, node in cell.nodes.items() if node.state == "starting"]
+    text = f"{_count(cell, 'ready', 'dynamic')}/{len(cell.nodes)} nodes ready"
+    return f"{text}, waiting for {_names(waiting)}" if waiting else text
+
+
+def _format_running(cell: Cell) -> str:
+    parts = [f"{_count(cell, 'running', 'ready', 'dynamic')}/{len(cell.nodes)} nodes running"]
+    for state in ("starting", "restarting", "finished", "failed"):
+        nodes = {ident: node for ident, node in cell.nodes.items() if node.state == state}
+        if nodes:
+            parts.append(f"{state}: {_names([_with_exit(*one) for one in nodes.items()])}")
+    return "; ".join(parts)
+
+
+def _with_exit(ident: str, node: NodeStatus) -> str:
+    return f"{ident} ({node.exit})" if node.exit else ident
+
+
+def _names(texts: list[str]) -> str:
+    more = len(texts) - _NAMED
+    return ", ".join(texts[:_NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
+def _plural(count: int) -> str:
+    return f"{count} node" if count == 1 else f"{count} nodes"
+
+
+def _count(cell: Cell, *states: str) -> int:
+    return sum(node.state in states for node in cell.nodes.values())
+
+
+def stage(cell: Cell) -> str:
+    """One of dora_systemd.status.STAGES."""
+    if cell.state is State.RUNNING:
+        return "degraded" if _count(cell, "failed") else "running"
+    return _STAGES[cell.state]
+
+
+def cell_status(cell: Cell, uuid: str, samples: tuple[CpuSample, ...]) -> CellStatus:
+    """The table that status.json holds."""
+    return CellStatus(
+        uuid=uuid,
+        run=cell.run,
+        stage=stage(cell),
+        text=format_status(cell),
+        started_us=cell.started_us,
+        ready_us=cell.ready_us,
+        nodes=dict(cell.nodes),
+        samples=samples,
+    )
+
+
+def initial_nodes(kinds: Mapping[str, str], at_us: int) -> dict[str, NodeStatus]:
+    """The table before anything happened. kinds: node id -> how dora starts it."""
+    return {
+        ident: NodeStatus(
+            state="dynamic" if kind == "dynamic" else "starting", kind=kind, since_us=at_us
+        )
+        for ident, kind in kinds.items()
+    }

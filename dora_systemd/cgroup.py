@@ -1,0 +1,191 @@
+"""The cgroup tree: numbers read from it, and what the runner does in its own delegated part.
+
+Everything here follows the kernel's "Control Group v2" document. A group is named as systemd and
+/proc/PID/cgroup name it: by its path from the root of the hierarchy, "/dora.slice/dora-x.service".
+"""
+
+import contextlib
+import errno
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+from dora_systemd.errors import DoraSystemdError, ExitCode
+
+NODE_PREFIX = "node-"
+MOUNTS = (Path("/sys/fs/cgroup"), Path("/sys/fs/cgroup/unified"))
+UNLIMITED = 2**64 - 1
+"""What systemd's properties say where cgroup files say "max", see systemd.resource-control(5)."""
+
+_ABSENT = (errno.ENOENT, errno.ENODEV, errno.EOPNOTSUPP, errno.ENOTSUP)
+
+
+@dataclass(frozen=True)
+class Usage:
+    """What one group uses. CPU in µs since the group was made, memory in bytes, None: not known.
+
+    memory_max is UNLIMITED where there is no limit.
+    """
+
+    cpu_us: int
+    memory: int | None = None
+    memory_peak: int | None = None
+    memory_max: int | None = None
+
+
+@cache
+def mount_point() -> Path:
+    """Where the cgroup2 hierarchy is mounted; hybrid systems have it one level deeper.
+
+    Raises DoraSystemdError (NO_SYSTEMD) when there is none.
+    """
+    for place in MOUNTS:
+        if (place / "cgroup.procs").exists():
+            return place
+    raise DoraSystemdError(
+        "cannot find the cgroup v2 hierarchy below /sys/fs/cgroup",
+        "dora-systemd needs Linux with cgroup v2, as systemd 252 and newer set it up",
+        ExitCode.NO_SYSTEMD,
+    )
+
+
+def group_path(group: str) -> Path:
+    """The directory of `group` ("/a/b", as systemd's ControlGroup= property gives it)."""
+    return mount_point() / group.lstrip("/")
+
+
+def own_group() -> str:
+    """The group of this process: the "0::" line of /proc/self/cgroup, see cgroups(7)."""
+    for line in Path("/proc/self/cgroup").read_text().splitlines():
+        if line.startswith("0::"):
+            return line[3:]
+    return "/"
+
+
+def node_groups(path: Path) -> dict[str, Path]:
+    """Directories of the node groups below a unit's `path`, by node id."""
+    with contextlib.suppress(OSError):
+        return {
+            one.name.removeprefix(NODE_PREFIX): one
+            for one in sorted(path.iterdir())
+            if one.name.startswith(NODE_PREFIX) and one.is_dir()
+        }
+    return {}
+
+
+def read_usage(path: Path) -> Usage:
+    """CPU and memory of one group with all below it; zero for a group that has just gone.
+
+    Without a memory controller the memory is the sum of the processes' resident sets.
+    """
+    current = _read_number(path / "memory.current")
+    return Usage(
+        cpu_us=read_cpu_us(path),
+        memory=sum(map(_resident_bytes, pids(path))) if current is None else current,
+        memory_peak=_read_number(path / "memory.peak"),
+        memory_max=_read_number(path / "memory.max"),
+    )
+
+
+def read_cpu_us(path: Path) -> int:
+    """CPU time of a group in µs: usage_usec of cpu.stat, there even without a cpu controller."""
+    for line in _read_text(path / "cpu.stat").splitlines():
+        key, _, value = line.partition(" ")
+        if key == "usage_usec":
+            return int(value)
+    return 0
+
+
+def pids(path: Path) -> list[int]:
+    """The processes of a group and of all groups below it."""
+    return [int(pid) for one in _tree(path) for pid in _read_text(one / "cgroup.procs").split()]
+
+
+def is_populated(path: Path) -> bool:
+    """Whether any process is in the group or below it."""
+    return "populated 1" in _read_text(path / "cgroup.events").splitlines()
+
+
+def make_group(path: Path) -> None:
+    """Make one group; one that is there already is fine. Raises OSError."""
+    path.mkdir(exist_ok=True)
+
+
+def remove_group(path: Path) -> None:
+    """Remove a group that has no process; one that is gone or still busy is left as it is."""
+    with contextlib.suppress(OSError):
+        path.rmdir()
+
+
+def enable_controllers(path: Path) -> None:
+    """Give the groups below `path` every controller that `path` itself has been given.
+
+    What the kernel does not offer (no controllers at all, in some containers) is passed over.
+    """
+    for name in _read_text(path / "cgroup.controllers").split():
+        _write(path / "cgroup.subtree_control", f"+{name}")
+
+
+def move_process(path: Path, pid: int) -> None:
+    """Move process `pid` (0: this one) into the group. Raises OSError."""
+    control = os.open(path / "cgroup.procs", os.O_WRONLY | os.O_CLOEXEC)
+    try:
+        os.write(control, str(pid).encode())
+    finally:
+        os.close(control)
+
+
+def kill_group(path: Path) -> None:
+    """SIGKILL to everything in the group and below it at once; nothing can fork away.
+
+    cgroup.kill exists since Linux 5.14; before, every process gets its signal by pid.
+    """
+    if not _write(path / "cgroup.kill", "1"):
+        for pid in pids(path):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, 9)
+
+
+def _tree(path: Path) -> Iterator[Path]:
+    yield path
+    with contextlib.suppress(OSError):
+        for entry in os.scandir(path):
+            if entry.is_dir(follow_symlinks=False):
+                yield from _tree(Path(entry.path))
+
+
+def _write(path: Path, text: str) -> bool:
+    """Write to a control file; False where the kernel has no such file or controller."""
+    try:
+        control = os.open(path, os.O_WRONLY | os.O_CLOEXEC)
+        try:
+            os.write(control, text.encode())
+        finally:
+            os.close(control)
+    except OSError as error:
+        if error.errno in _ABSENT:
+            return False
+        raise
+    return True
+
+
+def _read_text(path: Path) -> str:
+    # A group may vanish between any two looks at it: that is the same as an empty one.
+    with contextlib.suppress(OSError):
+        return path.read_text()
+    return ""
+
+
+def _read_number(path: Path) -> int | None:
+    text = _read_text(path).strip()
+    if not text:
+        return None
+    return UNLIMITED if text == "max" else int(text)
+
+
+def _resident_bytes(pid: int) -> int:
+    """The second number of /proc/PID/statm, see proc_pid_statm(5); in pages there."""
+    numbers = _read_text(Path(f"/proc/{pid}/statm")).split()
+    return int(numbers[1]) * os.sysconf("SC_PAGE_SIZE") if len(numbers) > 1 else 0

@@ -1,0 +1,199 @@
+"""The nodes of a descriptor, as far as we read them; the whole is in the module dataflow."""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.values import quoted, shown
+
+MAX_NODE_ID = 200
+"""Characters of an id: "node-ID" names a cgroup and "ID.out" a pipe, and names end at 255 bytes."""
+
+_NODE_ID = re.compile(r"(?!\.)[A-Za-z0-9_.-]+")
+_RESERVED_IDS = frozenset({"dora"})
+_BACKOFF_KEYS = ("max_restarts", "restart_delay", "max_restart_delay", "restart_window")
+
+
+class NodeKind(StrEnum):
+    """What dora starts for a node; the names are those of the live node table."""
+
+    PYTHON = "python"
+    EXECUTABLE = "executable"
+    SHELL = "shell"
+    DYNAMIC = "dynamic"
+    URL = "url"
+    OPERATOR = "operator"
+    ROS2 = "ros2"
+    MODULE = "module"
+    HUB = "hub"
+
+
+_KEY_KINDS = {
+    "operator": NodeKind.OPERATOR,
+    "operators": NodeKind.OPERATOR,
+    "ros2": NodeKind.ROS2,
+    "module": NodeKind.MODULE,
+    "hub": NodeKind.HUB,
+}
+_PATH_KINDS = {"dynamic": NodeKind.DYNAMIC, "shell": NodeKind.SHELL}
+UNEXPANDED = frozenset({NodeKind.MODULE, NodeKind.HUB})
+"""Kinds that `dora expand` replaces: their outputs are declared elsewhere."""
+
+
+@dataclass(frozen=True)
+class Input:
+    """One input: its name as an error shows it, and its source, NODE/OUTPUT or dora's own."""
+
+    name: str
+    source: str
+
+
+@dataclass(frozen=True)
+class Node:
+    """One node of a descriptor.
+
+    path, args: as written, "" where there are none.
+    env: its own variables, values as YAML has them.
+    inputs, outputs: those of its operators too, outputs of one of several as "operator/output".
+    restart_policy: "never", "on-failure" or "always"; "" where the descriptor says nothing.
+    backoff: the other restart keys that are set, such as restart_delay.
+    build, git: the command and the repository that `dora build` uses, or "".
+    keeps_output: whether dora itself reads its output (`send_stdout_as`, `send_logs_as`).
+    working_directory: of `deploy:`, or "".
+    raw: the whole mapping.
+    """
+
+    id: str
+    kind: NodeKind
+    path: str
+    args: str
+    env: Mapping[str, object]
+    inputs: tuple[Input, ...]
+    outputs: frozenset[str]
+    restart_policy: str
+    backoff: Mapping[str, object]
+    build: str
+    git: str
+    keeps_output: bool
+    working_directory: str
+    raw: Mapping[str, object] = field(repr=False)
+
+
+def parse_node(node: object, place: int, source: str) -> Node:
+    """The node that stands at `place` (from 0) of the list; raises as parse_dataflow does."""
+    if not isinstance(node, dict):
+        hint = "a node is a mapping with at least 'id' and 'path'"
+        raise dataflow_refusal(source, f"node {place + 1} is {described(node)}", hint)
+    node_id = _parse_id(node.get("id"), place, source)
+    what = f"node {node_id}"
+    return Node(
+        id=node_id,
+        kind=_kind_of(node, source, what),
+        path=text_of(node.get("path")),
+        args=text_of(node.get("args")),
+        env=mapping_of(node.get("env"), source, f"{what}: 'env'"),
+        inputs=tuple(_inputs(node, source, what)),
+        outputs=frozenset(_outputs(node, source, what)),
+        restart_policy=text_of(node.get("restart_policy")),
+        backoff={key: node[key] for key in _BACKOFF_KEYS if node.get(key) is not None},
+        build=text_of(node.get("build")),
+        git=text_of(node.get("git")),
+        keeps_output=any(node.get(key) is not None for key in ("send_stdout_as", "send_logs_as")),
+        working_directory=text_of(mapping_of(node.get("deploy"), source, what).get("working_dir")),
+        raw=node,
+    )
+
+
+def _parse_id(node_id: object, place: int, source: str) -> str:
+    what = f"node {place + 1}"
+    if node_id is None:
+        raise dataflow_refusal(source, f"{what} has no id", "give every node an 'id'")
+    if not isinstance(node_id, str):
+        hint = f'in quotes it is text: id: "{node_id}"'
+        raise dataflow_refusal(source, f"the id of {what} is {described(node_id)}", hint)
+    hint = "an id is letters, digits, '_', '-' and '.', and begins with no '.'"
+    if not _NODE_ID.fullmatch(node_id):
+        raise dataflow_refusal(source, f"{what} has the id {quoted(node_id)}", hint)
+    if node_id in _RESERVED_IDS:
+        hint = "'dora' stands for dora's own sources, such as dora/timer"
+        raise dataflow_refusal(source, f"{what} has the id {quoted(node_id)}", hint)
+    if len(node_id) > MAX_NODE_ID:
+        hint = f"an id has at most {MAX_NODE_ID} characters: it names a cgroup"
+        raise dataflow_refusal(source, f"{what} has the id {quoted(node_id)}", hint)
+    return node_id
+
+
+def _kind_of(node: Mapping[str, object], source: str, what: str) -> NodeKind:
+    for key, kind in _KEY_KINDS.items():
+        if node.get(key) is not None:
+            return kind
+    path = text_of(node.get("path"))
+    if not path:
+        hint = "a node needs one of path, operator, operators, ros2, module and hub"
+        raise dataflow_refusal(source, f"{what} has no path", hint)
+    if path in _PATH_KINDS:
+        return _PATH_KINDS[path]
+    if path.startswith(("http://", "https://")):
+        return NodeKind.URL
+    return NodeKind.PYTHON if path.endswith(".py") else NodeKind.EXECUTABLE
+
+
+def _operators(
+    node: Mapping[str, object], source: str, what: str
+) -> Iterator[tuple[str, Mapping[str, object]]]:
+    """The parts of a node that have inputs and outputs, with the prefix of these."""
+    yield "", node
+    yield "", mapping_of(node.get("operator"), source, f"{what}: 'operator'")
+    for operator in _sequence(node.get("operators"), source, f"{what}: 'operators'"):
+        part = mapping_of(operator, source, f"{what}: an operator")
+        yield f"{text_of(part.get('id'))}/", part
+
+
+def _inputs(node: Mapping[str, object], source: str, what: str) -> Iterator[Input]:
+    for prefix, part in _operators(node, source, what):
+        inputs = mapping_of(part.get("inputs"), source, f"{what}: 'inputs'")
+        for name, value in inputs.items():
+            origin = value.get("source") if isinstance(value, dict) else value
+            yield Input(prefix + name, text_of(origin))
+
+
+def _outputs(node: Mapping[str, object], source: str, what: str) -> Iterator[str]:
+    for prefix, part in _operators(node, source, what):
+        for output in _sequence(part.get("outputs"), source, f"{what}: 'outputs'"):
+            yield prefix + text_of(output)
+
+
+def text_of(value: object) -> str:
+    """Text as dora reads it: it takes numbers and booleans for text where it expects that."""
+    if value is None or isinstance(value, dict | list):
+        return ""
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def mapping_of(value: object, source: str, what: str) -> Mapping[str, object]:
+    """A mapping, empty where nothing is written; raises for all else, naming it `what`."""
+    if value is not None and not isinstance(value, dict):
+        hint = "write a mapping, KEY: VALUE"
+        raise dataflow_refusal(source, f"{what} is {described(value)}", hint)
+    return value or {}
+
+
+def _sequence(value: object, source: str, what: str) -> Sequence[object]:
+    if value is not None and not isinstance(value, list):
+        raise dataflow_refusal(source, f"{what} is {described(value)}", "write a list")
+    return value or ()
+
+
+def described(value: object) -> str:
+    """What `value` is, in words of YAML."""
+    if isinstance(value, str):
+        return f"the text {quoted(value)}"
+    words = {dict: "a mapping", list: "a list", bool: "true or false", type(None): "nothing"}
+    return words.get(type(value), "a number")
+
+
+def dataflow_refusal(source: str, reason: str, hint: str) -> DoraSystemdError:
+    """The error (BAD_INPUT) that says why the descriptor `source` cannot be used."""
+    return DoraSystemdError(f"cannot use {shown(source)}: {reason}", hint, ExitCode.BAD_INPUT)

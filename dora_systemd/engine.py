@@ -1,0 +1,130 @@
+"""The dora coordinator and the dora daemon of one cell, as child processes."""
+
+import asyncio
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+MANAGER_VARIABLES = frozenset(
+    {
+        "NOTIFY_SOCKET",
+        "JOURNAL_STREAM",
+        "INVOCATION_ID",
+        "SYSTEMD_EXEC_PID",
+        "MANAGERPID",
+        "MANAGERPIDFDID",
+        "WATCHDOG_PID",
+        "WATCHDOG_USEC",
+        "FDSTORE",
+        "LISTEN_FDS",
+        "LISTEN_FDNAMES",
+        "LISTEN_PID",
+        "LISTEN_PIDFDID",
+        "RUNTIME_DIRECTORY",
+        "MEMORY_PRESSURE_WATCH",
+        "MEMORY_PRESSURE_WRITE",
+    }
+)
+"""What systemd means for the runner alone, see "Environment Variables Set or Propagated by the
+Service Manager" in systemd.exec(5). A node that speaks sd_notify must not speak for the cell."""
+
+
+def node_environment(environment: Mapping[str, str]) -> dict[str, str]:
+    """The runner's environment without what is systemd's."""
+    return {key: text for key, text in environment.items() if key not in MANAGER_VARIABLES}
+
+
+def coordinator_command(dora: str) -> list[str]:
+    """A coordinator on a free loopback port, with a token of its own making, storing nothing."""
+    flags = ("--interface", "127.0.0.1", "--port", "0", "--store", "memory", "--auth")
+    return [dora, "coordinator", *flags]
+
+
+def coordinator_environment(environment: Mapping[str, str], directory: Path) -> dict[str, str]:
+    """It writes its token to $XDG_CONFIG_HOME too: never over the one of the user's own dora."""
+    own = {"XDG_CONFIG_HOME": str(directory), "TMPDIR": str(directory), "RUST_BACKTRACE": "0"}
+    return {**environment, **own, "NO_COLOR": "1"}
+
+
+def daemon_command(dora: str, port: int, local_listen_port: int) -> list[str]:
+    """A daemon that finds its coordinator and nobody else: cells must not discover each other."""
+    ports = ("--coordinator-addr", "127.0.0.1", "--coordinator-port", str(port))
+    return [
+        dora,
+        "daemon",
+        *ports,
+        "--local-listen-port",
+        str(local_listen_port),
+        "--zenoh-no-multicast",
+    ]
+
+
+def free_port() -> int:
+    """A TCP port of the loopback interface that nobody listens on now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@dataclass(frozen=True)
+class Child:
+    """One running child. output: the read end of its stdout and stderr."""
+
+    label: str
+    popen: "subprocess.Popen[bytes]"
+    pidfd: int
+    output: int
+
+    def send_signal(self, number: signal.Signals) -> None:
+        """Signal it, and never another process that got its pid."""
+        with contextlib.suppress(ProcessLookupError):
+            signal.pidfd_send_signal(self.pidfd, number)
+
+
+def spawn(
+    label: str, command: Sequence[str], environment: Mapping[str, str], directory: Path
+) -> Child:
+    """Start a child; its output can be read from Child.output. Raises OSError."""
+    reading, writing = os.pipe2(os.O_CLOEXEC)
+    try:
+        popen = subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=writing,
+            stderr=writing,
+            env=environment,
+            cwd=directory,
+        )
+    except OSError:
+        os.close(reading)
+        raise
+    finally:
+        os.close(writing)
+    return Child(label, popen, os.pidfd_open(popen.pid), reading)
+
+
+def watch(
+    loop: asyncio.AbstractEventLoop, child: Child, on_exit: Callable[[str, str], None]
+) -> None:
+    """Call on_exit(label, how) once, when the child has ended."""
+
+    def ended() -> None:
+        loop.remove_reader(child.pidfd)
+        on_exit(child.label, format_exit(child.popen.wait()))
+
+    loop.add_reader(child.pidfd, ended)
+
+
+def format_exit(status: int) -> str:
+    """A status of subprocess as systemd would say it: "exit code 1", "signal SIGKILL"."""
+    if status >= 0:
+        return f"exit code {status}"
+    try:
+        return f"signal {signal.Signals(-status).name}"
+    except ValueError:
+        return f"signal {-status}"

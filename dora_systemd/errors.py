@@ -1,0 +1,34 @@
+"""The one error class, and what the exit status of doractl and of the runner means."""
+
+from enum import IntEnum
+
+
+class ExitCode(IntEnum):
+    """Exit status of doractl, as doractl(1) lists it; 3 and 4 are those of systemctl(1)."""
+
+    OK = 0
+    FAILURE = 1
+    USAGE = 2
+    NOT_RUNNING = 3
+    NOT_FOUND = 4
+    BAD_INPUT = 5
+    NAME_IN_USE = 6
+    NO_SYSTEMD = 7
+    NO_PERMISSION = 8
+    NO_DORA = 9
+    INTERRUPTED = 130
+
+
+class DoraSystemdError(Exception):
+    """Something the user asked for that cannot be done.
+
+    message: one line that starts with "cannot" and names the file, key or unit.
+    hint: what to do about it, or "".
+    code: the exit status of the command that ends with it.
+    """
+
+    def __init__(self, message: str, hint: str = "", code: ExitCode = ExitCode.FAILURE) -> None:
+        super().__init__(message)
+        self.message = " ".join(message.split())
+        self.hint = " ".join(hint.split())
+        self.code = code

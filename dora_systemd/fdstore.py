@@ -1,0 +1,40 @@
+"""systemd's file descriptor store: what outlives the runner.
+
+While systemd holds a pipe open, what is in it stays there. See FDSTORE=1 in sd_notify(3) and
+FileDescriptorStoreMax= in systemd.service(5).
+"""
+
+import contextlib
+import os
+import socket
+
+NAME = "dora-log"
+_FIRST = 3  # SD_LISTEN_FDS_START, see sd_listen_fds(3)
+
+
+def store(fd: int) -> None:
+    """Have systemd keep `fd` open too; without systemd, or a store, nothing happens."""
+    _send(f"FDSTORE=1\nFDNAME={NAME}\nFDPOLL=0", [fd])
+
+
+def forget_inherited() -> None:
+    """Close what an earlier life of this process left in the store, and take it out of it."""
+    if os.environ.pop("LISTEN_PID", "") != str(os.getpid()):
+        return
+    names = os.environ.pop("LISTEN_FDNAMES", "").split(":")
+    count = int(os.environ.pop("LISTEN_FDS", "0"))
+    for fd, name in zip(range(_FIRST, _FIRST + count), names, strict=False):
+        if name == NAME:
+            os.close(fd)
+    if NAME in names:
+        _send(f"FDSTOREREMOVE=1\nFDNAME={NAME}", [])
+
+
+def _send(text: str, fds: list[int]) -> None:
+    path = os.environ.get("NOTIFY_SOCKET", "")
+    if not path:
+        return
+    address = "\0" + path[1:] if path.startswith("@") else path
+    with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sock:
+        sock.connect(address)
+        socket.send_fds(sock, [text.encode()], fds)

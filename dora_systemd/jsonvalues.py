@@ -1,0 +1,71 @@
+"""Is a loaded document JSON of a bearable size? Asked without walking all of a huge one."""
+
+import math
+from collections.abc import Iterator
+
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.values import shown
+
+MAX_DEPTH = 64
+"""Levels of nesting: no dataflow needs more, and Python's own recursion ends at some hundreds."""
+
+_MAX_NUMBER = 2**64
+
+
+def check_json(document: object, source: str, max_bytes: int) -> None:
+    """Raises DoraSystemdError (BAD_INPUT) unless `document` is a JSON value of at most `max_bytes`.
+
+    An anchor of YAML that explodes, or one that holds itself, is one small object in memory and
+    without end when written out: the walk stops as soon as the limit is passed.
+    """
+    size = 0
+    waiting = [(document, 1)]
+    while waiting:
+        value, depth = waiting.pop()
+        size += _size(value, source)
+        if size > max_bytes:
+            hint = f"{max_bytes // 1024} KiB is the most; look for anchors that repeat much"
+            raise _refusal(source, "it is too large once its anchors are written out", hint)
+        if depth > MAX_DEPTH:
+            raise _refusal(source, f"it is nested more than {MAX_DEPTH} levels deep", "flatten it")
+        waiting += [(child, depth + 1) for child in _children(value, source)]
+
+
+def _size(value: object, source: str) -> int:
+    """Bytes of `value` as JSON without its children; at least 1, so that every walk ends."""
+    if isinstance(value, str):
+        return _text_size(value, source)
+    if value is None or isinstance(value, dict | list):
+        return 4
+    if isinstance(value, bool | int) and abs(value) < _MAX_NUMBER:
+        return 20
+    if isinstance(value, float) and math.isfinite(value):
+        return 20
+    if isinstance(value, int | float):
+        raise _refusal(source, "a number in it is too large for JSON", "write it as text")
+    kind = type(value).__name__
+    raise _refusal(source, f"a value in it is of type {kind}", "write plain text or a number")
+
+
+def _text_size(value: str, source: str) -> int:
+    try:
+        return len(value.encode()) + 4
+    except UnicodeEncodeError as error:
+        hint = "save the file as UTF-8"
+        raise _refusal(source, "a text in it is not Unicode", hint) from error
+
+
+def _children(value: object, source: str) -> Iterator[object]:
+    if isinstance(value, dict):
+        for key, child in value.items():
+            if not isinstance(key, str):
+                kind = f"a key in it is {type(key).__name__}, not text"
+                raise _refusal(source, kind, "put the key in quotes")
+            yield key
+            yield child
+    elif isinstance(value, list):
+        yield from value
+
+
+def _refusal(source: str, reason: str, hint: str) -> DoraSystemdError:
+    return DoraSystemdError(f"cannot use {shown(source)}: {reason}", hint, ExitCode.BAD_INPUT)

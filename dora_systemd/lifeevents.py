@@ -1,0 +1,146 @@
+"""What can happen to a cell: the events of the runner's state machine. Time arrives inside them."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class Event:
+    """Base of all. at_us: CLOCK_REALTIME µs at which the runner learned of it."""
+
+    at_us: int
+
+
+@dataclass(frozen=True)
+class CoordinatorListening(Event):
+    """The coordinator printed its port and wrote its token."""
+
+
+@dataclass(frozen=True)
+class DaemonConnected(Event):
+    """The coordinator says that its daemon has registered, and the descriptor is expanded."""
+
+
+@dataclass(frozen=True)
+class RunStarted(Event):
+    """The coordinator accepted the descriptor. run: dora's own id of this run."""
+
+    run: str
+
+
+@dataclass(frozen=True)
+class Subscribed(Event):
+    """From here on life events of the run arrive."""
+
+
+@dataclass(frozen=True)
+class Refused(Event):
+    """The dataflow could not be started. reason: one line."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class NodeSpawned(Event):
+    """Dora executed a node for the first time or again."""
+
+    node: str
+    pid: int
+
+
+@dataclass(frozen=True)
+class NodeReady(Event):
+    """The node has connected to dora."""
+
+    node: str
+
+
+@dataclass(frozen=True)
+class AllReady(Event):
+    """Dora opened its start barrier: messages flow."""
+
+
+@dataclass(frozen=True)
+class NodeExited(Event):
+    """A process of the node ended.
+
+    exit: "" for success, else "exit code 1" or "signal SIGKILL".
+    will_restart: dora is going to execute it again.
+    is_stale: the process that ended had already been replaced by one that lives.
+    """
+
+    node: str
+    exit: str
+    will_restart: bool
+    is_stale: bool = False
+
+
+@dataclass(frozen=True)
+class NodeCascaded(Event):
+    """Dora ended the node because `by` failed before it was ready."""
+
+    node: str
+    by: str
+
+
+@dataclass(frozen=True)
+class RunFinished(Event):
+    """Dora says that no node of the run is left."""
+
+
+@dataclass(frozen=True)
+class ResultKnown(Event):
+    """Dora's verdict on an ended run. results: node id -> "" or why it failed; empty: unknown."""
+
+    results: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class ChildExited(Event):
+    """The coordinator or the daemon is gone. child: which of the two. exit: how."""
+
+    child: str
+    exit: str
+
+
+@dataclass(frozen=True)
+class ConnectionLost(Event):
+    """The coordinator closed a control connection that we did not close."""
+
+
+@dataclass(frozen=True)
+class StopAsked(Event):
+    """SIGTERM, SIGINT or, when attached, the end of standard input. by: which of them."""
+
+    by: str
+
+
+@dataclass(frozen=True)
+class StopAnswered(Event):
+    """Dora's reply to our Stop: every node has ended."""
+
+
+@dataclass(frozen=True)
+class DeadlinePassed(Event):
+    """What the current state waits for took too long."""
+
+
+EVENTS: tuple[type[Event], ...] = (
+    CoordinatorListening,
+    DaemonConnected,
+    RunStarted,
+    Subscribed,
+    Refused,
+    NodeSpawned,
+    NodeReady,
+    AllReady,
+    NodeExited,
+    NodeCascaded,
+    RunFinished,
+    ResultKnown,
+    ChildExited,
+    ConnectionLost,
+    StopAsked,
+    StopAnswered,
+    DeadlinePassed,
+)

@@ -1,0 +1,87 @@
+"""One journal entry as bytes: the native protocol's fields, names made legal.
+
+The same form is read back from `journalctl -o export`.
+https://systemd.io/JOURNAL_NATIVE_PROTOCOL/ and systemd.journal-fields(7)
+"""
+
+import re
+from collections.abc import Iterable, Mapping
+
+MAX_NAME = 64
+_ILLEGAL = re.compile(r"[^A-Z0-9_]+")
+
+Value = str | bytes | int
+
+
+def legal_name(name: str, prefix: str = "") -> str:
+    """The journal field name for `name`: upper case, [A-Z0-9_], at most 64 characters.
+
+    journald drops fields whose name starts with an underscore (they are its own) or a digit.
+    """
+    legal = _ILLEGAL.sub("_", name.upper())
+    if prefix:
+        return (prefix + legal)[:MAX_NAME]
+    legal = legal.lstrip("_")
+    if not legal or legal[0].isdigit():
+        legal = "X_" + legal
+    return legal[:MAX_NAME]
+
+
+def encode_field(name: str, value: Value) -> bytes:
+    """One field; a value with a newline takes the form with a 64-bit little-endian length."""
+    data = value if isinstance(value, bytes) else str(value).encode("utf-8", "surrogateescape")
+    key = name.encode("ascii")
+    if b"\n" in data:
+        return key + b"\n" + len(data).to_bytes(8, "little") + data + b"\n"
+    return key + b"=" + data + b"\n"
+
+
+def encode_entry(fields: Mapping[str, Value] | Iterable[tuple[str, Value]]) -> bytes:
+    """A whole entry, ready for one datagram to /run/systemd/journal/socket."""
+    pairs = fields.items() if isinstance(fields, Mapping) else fields
+    return b"".join(encode_field(name, value) for name, value in pairs)
+
+
+class ExportReader:
+    """Entries out of the Journal Export Format, fed with bytes as they come.
+
+    https://systemd.io/JOURNAL_EXPORT_FORMATS/#journal-export-format
+    """
+
+    def __init__(self) -> None:
+        self._data = b""
+        self._entry: dict[str, bytes] = {}
+
+    def feed(self, data: bytes) -> list[dict[str, bytes]]:
+        """The entries that are complete with `data`; of a repeated field the last one counts."""
+        self._data += data
+        entries = []
+        position = 0
+        while (end := self._data.find(b"\n", position)) >= 0:
+            if end == position:
+                if self._entry:
+                    entries.append(self._entry)
+                self._entry = {}
+                position = end + 1
+                continue
+            after = self._field(position, end)
+            if after is None:
+                break
+            position = after
+        self._data = self._data[position:]
+        return entries
+
+    def _field(self, start: int, end: int) -> int | None:
+        """Take the field that starts at `start`; where the next one starts, None if it is cut."""
+        name, equals, value = self._data[start:end].partition(b"=")
+        after = end + 1
+        if not equals:
+            if len(self._data) < end + 9:
+                return None
+            first = end + 9
+            last = first + int.from_bytes(self._data[end + 1 : first], "little")
+            if len(self._data) < last + 1:
+                return None
+            value, after = self._data[first:last], last + 1
+        self._entry[name.decode("ascii", "replace")] = value
+        return after

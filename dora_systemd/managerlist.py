@@ -1,0 +1,122 @@
+"""`doractl list`: what runs and what it uses, from systemd, the cgroups and the node table.
+
+Nothing of ours has to be alive for it: the node table is only read.
+"""
+
+import time
+from pathlib import Path
+from typing import Any
+
+from dora_systemd import cgroup
+from dora_systemd.busprotocol import Manager
+from dora_systemd.cellpaths import CellPaths
+from dora_systemd.cgroup import Usage
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.managercells import Cell, matching_cells, read_cells, select_cell
+from dora_systemd.scope import Scope
+from dora_systemd.status import CellStatus, CpuSample, NodeStatus, cpu_percent
+from dora_systemd.statuswords import DataflowRow, NodeRow, status_word
+
+_PROPERTIES = (
+    "ControlGroup",
+    "NRestarts",
+    "StatusText",
+    "ActiveEnterTimestampMonotonic",
+    "InactiveExitTimestampMonotonic",
+    "ActiveEnterTimestamp",
+)
+_MICROSECOND_NS = 1000
+
+
+def dataflow_row(manager: Manager, scope: Scope, cell: Cell) -> DataflowRow:
+    """All that `list` knows of one dataflow."""
+    unit = manager.read(cell.unit, _PROPERTIES)
+    status = read_status(scope, cell) if cell.is_up else CellStatus()
+    word = status_word(cell.state.active, cell.state.sub, status.stage)
+    facts = {
+        "uuid": cell.uuid,
+        "name": cell.name,
+        "unit": cell.unit,
+        "status": word,
+        "dataflow": cell.options.dataflow,
+        "text": unit["StatusText"],
+        "restarts": unit["NRestarts"] + status.node_restarts,
+    }
+    if not cell.is_up or not unit["ControlGroup"]:
+        return DataflowRow(**facts)
+    return DataflowRow(**facts, **_life(unit), **_usage(unit, status))
+
+
+def find_row(manager: Manager, scope: Scope, selector: str) -> DataflowRow:
+    """All that is known of the dataflow that `selector` means, ended ones in the journal too.
+
+    Raises DoraSystemdError as select_cell does.
+    """
+    cells = read_cells(manager)
+    if not matching_cells(cells, selector):
+        from dora_systemd.managerended import select_ended
+
+        row = select_ended(scope, selector)
+        if row is not None:
+            return row
+    return dataflow_row(manager, scope, select_cell(cells, selector))
+
+
+def read_status(scope: Scope, cell: Cell) -> CellStatus:
+    """The runner's node table; an empty one where it is missing or another user's."""
+    try:
+        text = CellPaths(scope.cell_directory(cell.name)).status.read_text()
+        return CellStatus.from_json(text)
+    except (OSError, UnicodeDecodeError, DoraSystemdError):
+        return CellStatus()
+
+
+def _life(unit: dict[str, Any]) -> dict[str, Any]:
+    """Times of the present run; the monotonic ones do not care when the clock is set."""
+    since = unit["ActiveEnterTimestampMonotonic"]
+    if since < unit["InactiveExitTimestampMonotonic"]:
+        return {"uptime": _monotonic_us() - unit["InactiveExitTimestampMonotonic"]}
+    return {"uptime": _monotonic_us() - since, "started": unit["ActiveEnterTimestamp"]}
+
+
+def _usage(unit: dict[str, Any], status: CellStatus) -> dict[str, Any]:
+    path = cgroup.group_path(unit["ControlGroup"])
+    groups = cgroup.node_groups(path)
+    use = {node: cgroup.read_usage(group) for node, group in groups.items()}
+    whole = cgroup.read_usage(path)
+    now = CpuSample(_monotonic_us(), _cpu_by_group(whole, use))
+    samples = status.samples or (CpuSample(unit["InactiveExitTimestampMonotonic"]),)
+    names = status.nodes or dict.fromkeys(groups)
+    return {
+        "cpu_percent": cpu_percent(samples, now),
+        "memory": whole.memory,
+        "memory_peak": whole.memory_peak,
+        "nodes_total": len(names),
+        "nodes_alive": status.alive_count if status.nodes else _populated(groups),
+        "nodes": tuple(
+            _node_row(node, status.nodes.get(node), use.get(node), cpu_percent(samples, now, node))
+            for node in names
+        ),
+    }
+
+
+def _cpu_by_group(whole: Usage, use: dict[str, Usage]) -> dict[str, int]:
+    return {"": whole.cpu_us, **{node: one.cpu_us for node, one in use.items()}}
+
+
+def _populated(groups: dict[str, Path]) -> int:
+    return sum(map(cgroup.is_populated, groups.values()))
+
+
+def _node_row(node: str, status: NodeStatus | None, use: Usage | None, cpu: float) -> NodeRow:
+    row = NodeRow(node, status.state if status else "unknown")
+    if status:
+        row = NodeRow(node, status.state, status.pid, restarts=status.restarts, exit=status.exit)
+    if use is None:
+        return row
+    facts = {**vars(row), "memory": use.memory, "memory_peak": use.memory_peak}
+    return NodeRow(**{**facts, "cpu_percent": cpu})
+
+
+def _monotonic_us() -> int:
+    return time.clock_gettime_ns(time.CLOCK_MONOTONIC) // _MICROSECOND_NS

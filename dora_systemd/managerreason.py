@@ -1,0 +1,53 @@
+"""Why a unit did not start or did not last, in words, from what systemd remembers of it."""
+
+import signal
+from typing import Any
+
+from dora_systemd.busprotocol import Manager
+
+_PROPERTIES = ("Result", "StatusText", "ExecMainCode", "ExecMainStatus")
+_CLD_EXITED = 1
+"""ExecMainCode of a process that ended by itself, see waitid(2)."""
+
+_RUNNERS_VERDICT = "failed: "
+"""How STATUS= begins once the runner knows why a dataflow failed."""
+
+_WORDS = {
+    "protocol": "its runner ended without a word",
+    "timeout": "it did not end in time and was killed",
+    "watchdog": "its runner hung and was killed by the watchdog",
+    "oom-kill": "it ran out of memory",
+    "start-limit-hit": "it was started too often",
+    "resources": "systemd could not set it up",
+    "exec-condition": "a condition was not met",
+}
+
+
+def failure_reason(manager: Manager, unit: str) -> str:
+    """One line about the end of `unit`: the runner's own last words, else systemd's result."""
+    facts = manager.read(unit, _PROPERTIES)
+    special = _WORDS.get(facts["Result"], "")
+    last_words = str(facts["StatusText"]).removeprefix(_RUNNERS_VERDICT)
+    if not last_words:
+        return special or _exit_words(facts)
+    # A verdict of the runner says more than its exit status.
+    is_verdict = last_words != facts["StatusText"]
+    cause = special or ("" if is_verdict else _exit_words(facts))
+    return f"{last_words} ({cause})" if cause else last_words
+
+
+def _exit_words(unit: dict[str, Any]) -> str:
+    status = unit["ExecMainStatus"]
+    if unit["ExecMainCode"] == _CLD_EXITED:
+        return f"exit code {status}"
+    if status:
+        return f"signal {signal_name(status)}"
+    return "ended" if unit["Result"] == "success" else str(unit["Result"])
+
+
+def signal_name(number: int) -> str:
+    """ "SIGKILL" for 9."""
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return str(number)

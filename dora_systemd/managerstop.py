@@ -1,0 +1,55 @@
+"""`doractl stop` and `doractl restart`: jobs of systemd, for several dataflows at once."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from dora_systemd.busprotocol import JOB_DONE, Manager, Observer
+from dora_systemd.managercells import Cell
+from dora_systemd.managerreason import failure_reason
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one dataflow: `problem` is "" when it is as was asked for."""
+
+    cell: Cell
+    text: str
+    problem: str = ""
+
+
+def stop_cells(manager: Manager, cells: Sequence[Cell]) -> list[Outcome]:
+    """Stop dataflows, all at the same time, and wait until the last one has ended.
+
+    Each has its own grace duration, after which systemd kills what is left of it.
+    """
+    up = [cell.unit for cell in cells if cell.is_up]
+    results = manager.run_jobs("StopUnit", up) if up else {}
+    return [_stop_outcome(manager, cell, results.get(cell.unit)) for cell in cells]
+
+
+def restart_cells(
+    manager: Manager, cells: Sequence[Cell], observer: Observer | None = None
+) -> list[Outcome]:
+    """Stop and start dataflows, all at the same time, and wait until their nodes are ready."""
+    results = manager.run_jobs("RestartUnit", [cell.unit for cell in cells], observer)
+    return [_restart_outcome(manager, cell, results[cell.unit]) for cell in cells]
+
+
+def _stop_outcome(manager: Manager, cell: Cell, result: str | None) -> Outcome:
+    if result is None:
+        ended = "has failed" if cell.state.active == "failed" else "does not run"
+        return Outcome(cell, f"Dataflow not running: {cell.uuid} ({cell.name} {ended})")
+    if result != JOB_DONE:
+        return Outcome(cell, "", f"cannot stop {cell.unit}: the job was {result}")
+    state = manager.read(cell.unit, ["ActiveState", "Result"])
+    note = ""
+    if state["ActiveState"] == "failed":
+        note = f": {failure_reason(manager, cell.unit)}"
+    return Outcome(cell, f"Dataflow stopped: {cell.uuid} ({cell.name}){note}")
+
+
+def _restart_outcome(manager: Manager, cell: Cell, result: str) -> Outcome:
+    if result == JOB_DONE:
+        return Outcome(cell, f"Dataflow restarted: {cell.uuid} ({cell.name})")
+    reason = failure_reason(manager, cell.unit)
+    return Outcome(cell, "", f"cannot restart {cell.unit}: {reason}")

@@ -1,0 +1,35 @@
+"""The unit of a plan: its properties for systemd, and the same as text for people."""
+
+import sys
+
+from dora_systemd.compat import MIN_VERSION, drop_unsupported
+from dora_systemd.managerplan import Plan
+from dora_systemd.process import version_numbers
+from dora_systemd.properties import UnitContext, format_unit, unit_properties
+from dora_systemd.propertykinds import Property
+
+
+def plan_properties(plan: Plan, version: str) -> tuple[list[Property], tuple[str, ...]]:
+    """All properties of the unit that systemd `version` takes, and warnings about the others.
+
+    Raises DoraSystemdError.
+    """
+    number = next(iter(version_numbers(version)), MIN_VERSION)
+    properties, warnings = drop_unsupported(_properties(plan), number)
+    return list(properties.values()), warnings
+
+
+def format_plan(plan: Plan) -> str:
+    """The unit as the text of a unit file, with its name and what it is made from on top."""
+    head = f"# {plan.unit}\n# source: {plan.options.dataflow}\n"
+    return head + format_unit(_properties(plan))
+
+
+def _properties(plan: Plan) -> dict[str, Property]:
+    context = UnitContext(
+        python=sys.executable,
+        is_user=plan.scope.is_user,
+        user=None if plan.user is None else plan.user.pw_name,
+        environment=plan.environment,
+    )
+    return dict(unit_properties(plan.options, context, plan.settings))

@@ -1,0 +1,103 @@
+"""The live table of nodes: what each life event makes of it. Values in, values out."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from dora_systemd import lifeevents as life
+from dora_systemd.status import NodeStatus
+
+Nodes = Mapping[str, NodeStatus]
+RecordParts = tuple[str, str, Mapping[str, str]]
+"""Name, node and details of the life event that goes to the journal."""
+
+_WITH_PROCESS = frozenset({"starting", "ready", "running"})
+
+
+def has_process(nodes: Nodes) -> bool:
+    """Whether dora still has a process of any node, as far as the events tell."""
+    return any(node.state in _WITH_PROCESS for node in nodes.values())
+
+
+def all_ready(nodes: Nodes, at_us: int) -> Nodes:
+    """The table when dora opened its start barrier."""
+    return {
+        ident: replace(node, state="running", since_us=at_us) if node.state == "ready" else node
+        for ident, node in nodes.items()
+    }
+
+
+def update(
+    nodes: Nodes, event: life.Event, *, is_stopping: bool
+) -> tuple[Nodes, RecordParts | None]:
+    """The table after a node's event, and what the journal is to say about it."""
+    match event:
+        case life.NodeSpawned():
+            return _spawned(nodes, event)
+        case life.NodeReady():
+            state = "running" if _is_running(nodes) else "ready"
+            return _set(nodes, event.node, event.at_us, state=state), ("node-ready", event.node, {})
+        case life.NodeExited():
+            return _exited(nodes, event, is_stopping)
+        case life.NodeCascaded():
+            exit = f"node {event.by} failed before the start"
+            return _set(nodes, event.node, event.at_us, state="failed", exit=exit), None
+    return nodes, None
+
+
+def _is_running(nodes: Nodes) -> bool:
+    return any(node.state == "running" for node in nodes.values())
+
+
+def _set(nodes: Nodes, ident: str, at_us: int, **changes: str | int) -> Nodes:
+    old = nodes.get(ident, NodeStatus())
+    if changes.get("state") != old.state:
+        changes["since_us"] = at_us
+    return {**nodes, ident: replace(old, **changes)}  # type: ignore[arg-type]
+
+
+def _spawned(nodes: Nodes, event: life.NodeSpawned) -> tuple[Nodes, RecordParts | None]:
+    old = nodes.get(event.node, NodeStatus())
+    nodes = _set(nodes, event.node, event.at_us, state="starting", pid=event.pid, exit="")
+    if old.state != "restarting":
+        return nodes, None
+    return nodes, ("node-restarted", event.node, {"restarts": str(old.restarts)})
+
+
+def _exited(
+    nodes: Nodes, event: life.NodeExited, is_stopping: bool
+) -> tuple[Nodes, RecordParts | None]:
+    old = nodes.get(event.node, NodeStatus())
+    details = {"exit": event.exit} if event.exit else {}
+    name = "node-crashed" if event.exit and not is_stopping else "node-exited"
+    if event.is_stale and not event.will_restart:
+        return nodes, None  # it was replaced: its successor is what counts
+    if event.is_stale:  # dora said so only after it had executed the next one
+        nodes = {**nodes, event.node: replace(old, restarts=old.restarts + 1)}
+        return nodes, (name, event.node, details)
+    nodes = _set(
+        nodes,
+        event.node,
+        event.at_us,
+        state=_state_after(event, is_stopping),
+        pid=0,
+        exit=event.exit,
+        restarts=old.restarts + int(event.will_restart and not is_stopping),
+    )
+    return nodes, (name, event.node, details)
+
+
+def _state_after(event: life.NodeExited, is_stopping: bool) -> str:
+    if is_stopping:
+        return "stopped"
+    if event.will_restart:
+        return "restarting"
+    return "failed" if event.exit else "finished"
+
+
+def apply_results(nodes: Nodes, results: Mapping[str, str], at_us: int) -> Nodes:
+    """The table with dora's verdict: it knows causes that no event tells."""
+    for ident, how in results.items():
+        if ident in nodes and (how or nodes[ident].state not in ("failed", "stopped")):
+            state = "failed" if how else "finished"
+            nodes = _set(nodes, ident, at_us, state=state, exit=how, pid=0)
+    return nodes

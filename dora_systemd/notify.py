@@ -1,0 +1,23 @@
+"""What the runner tells its manager: sd_notify(3)."""
+
+from systemd.daemon import notify
+
+
+def send_ready() -> None:
+    """READY=1: the start job is done."""
+    notify("READY=1")
+
+
+def send_status(text: str) -> None:
+    """STATUS=: one line for `systemctl status`."""
+    notify(f"STATUS={' '.join(text.split())}")
+
+
+def send_stopping() -> None:
+    """STOPPING=1: the end has begun."""
+    notify("STOPPING=1")
+
+
+def send_alive() -> None:
+    """WATCHDOG=1: see WatchdogSec= in systemd.service(5)."""
+    notify("WATCHDOG=1")

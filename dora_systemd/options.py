@@ -1,0 +1,151 @@
+"""What a runner is told to run, and the command line that stores it in ExecStart= of the unit.
+
+There is no registry: `list` learns UUID and path of a dataflow from this command line. So this
+module imports nothing that costs time.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import parse_name, parse_uuid
+from dora_systemd.values import (
+    SECOND,
+    format_bool,
+    format_duration,
+    parse_bool,
+    parse_duration,
+    quoted,
+)
+
+RUNNER_MODULE = "dora_systemd.runner"
+
+_PYTHON_FLAGS = ("-E", "-P", "-m", RUNNER_MODULE)
+"""Without the environment's PYTHON* and without the working directory on sys.path: modules of the
+project can never stand in for the runner's."""
+
+_TEXTS = ("working-directory", "dora", "venv")
+_FLAGS = ("uv", "debug", "allow-shell-nodes", "attached")
+_REQUIRED = ("name", "uuid", "working-directory", "dora")
+
+
+@dataclass(frozen=True)
+class RunnerOptions:
+    """Everything that one runner needs to know; fixed for the life of its unit.
+
+    name, uuid: of the dataflow.
+    dataflow: absolute path of the descriptor.
+    working_directory: absolute; where relative node paths are and where the nodes run.
+    dora: absolute path of the dora executable.
+    venv: absolute path of the nodes' virtual environment, or None for the interpreter on PATH.
+    uv: run Python nodes by uv, as `dora start --uv`.
+    debug: let topics be inspected, as `dora start --debug`.
+    allow_shell_nodes: let nodes with `path: shell` run.
+    grace: µs that a node has to end by itself once it was told to stop.
+    attached: the end of standard input means stop (`doractl run`).
+    exit_when_nodes_finish: overrides the descriptor's key of that name, unless None.
+    env_keys: names of the variables that win over the descriptor's own `env:`.
+    """
+
+    name: str
+    uuid: str
+    dataflow: str
+    working_directory: str
+    dora: str
+    venv: str | None = None
+    uv: bool = False
+    debug: bool = False
+    allow_shell_nodes: bool = False
+    grace: int = 10 * SECOND
+    attached: bool = False
+    exit_when_nodes_finish: bool | None = None
+    env_keys: tuple[str, ...] = ()
+
+
+def format_runner_argv(options: RunnerOptions) -> list[str]:
+    """The arguments of `python3 -m dora_systemd.runner`, one readable GNU option each."""
+    pairs = [
+        ("name", options.name),
+        ("uuid", options.uuid),
+        ("working-directory", options.working_directory),
+        ("dora", options.dora),
+        ("grace-duration", format_duration(options.grace)),
+    ]
+    if options.venv is not None:
+        pairs.append(("venv", options.venv))
+    if options.exit_when_nodes_finish is not None:
+        pairs.append(("exit-when-nodes-finish", format_bool(options.exit_when_nodes_finish)))
+    pairs += [("env-key", key) for key in options.env_keys]
+    flags = [f"--{flag}" for flag in _FLAGS if getattr(options, flag.replace("-", "_"))]
+    return [f"--{key}={value}" for key, value in pairs] + flags + [options.dataflow]
+
+
+def parse_runner_argv(argv: Sequence[str]) -> RunnerOptions:
+    """The exact inverse of format_runner_argv.
+
+    Raises DoraSystemdError (USAGE) on an unknown, repeated or missing option and on a bad value.
+    """
+    dataflow, given = argv[-1] if argv else "", argv[:-1]
+    if not dataflow.startswith("/"):
+        raise _refusal(f"no absolute path of a dataflow in {quoted(' '.join(argv))}")
+    values: dict[str, str] = {}
+    env_keys: list[str] = []
+    for argument in given:
+        key, value = _split(argument)
+        if key == "env-key":
+            env_keys.append(value)
+        elif key in values:
+            raise _refusal(f"--{key} is given twice")
+        else:
+            values[key] = value
+    return _options(dataflow, values, tuple(env_keys))
+
+
+def runner_command(python: str, options: RunnerOptions) -> list[str]:
+    """ExecStart= of the unit: `python` is the absolute path of the interpreter of dora-systemd."""
+    return [python, *_PYTHON_FLAGS, *format_runner_argv(options)]
+
+
+def options_from_command(command: Sequence[str]) -> RunnerOptions:
+    """The options in the ExecStart= that runner_command made; DoraSystemdError for any other."""
+    if RUNNER_MODULE not in command:
+        raise _refusal(f"{quoted(' '.join(command))} is no runner of dora-systemd")
+    return parse_runner_argv(command[list(command).index(RUNNER_MODULE) + 1 :])
+
+
+def _split(argument: str) -> tuple[str, str]:
+    key, equals, value = argument.removeprefix("--").partition("=")
+    known = (*_REQUIRED, *_TEXTS, "grace-duration", "exit-when-nodes-finish", "env-key")
+    expected = known if equals else _FLAGS
+    if not argument.startswith("--") or key not in expected:
+        raise _refusal(f"unknown argument {quoted(argument)}")
+    return key, value
+
+
+def _options(dataflow: str, values: dict[str, str], env_keys: tuple[str, ...]) -> RunnerOptions:
+    missing = [f"--{key}" for key in _REQUIRED if key not in values]
+    if missing:
+        raise _refusal(f"{' and '.join(missing)} missing")
+    exits = values.get("exit-when-nodes-finish")
+    return RunnerOptions(
+        name=parse_name(values["name"]),
+        uuid=parse_uuid(values["uuid"]),
+        dataflow=dataflow,
+        env_keys=env_keys,
+        grace=parse_duration(values.get("grace-duration", "10s")),
+        exit_when_nodes_finish=None if exits is None else parse_bool(exits),
+        working_directory=values["working-directory"],
+        dora=values["dora"],
+        venv=values.get("venv"),
+        uv="uv" in values,
+        debug="debug" in values,
+        allow_shell_nodes="allow-shell-nodes" in values,
+        attached="attached" in values,
+    )
+
+
+def _refusal(reason: str) -> DoraSystemdError:
+    hint = "the runner is started by doractl, not by hand"
+    return DoraSystemdError(
+        f"cannot read the runner's command line: {reason}", hint, ExitCode.USAGE
+    )

@@ -1,0 +1,288 @@
+"""The nodes' output pipes, read into the journal.
+
+Nothing is ever dropped: when journald does not take an entry, the entries of the chunk just read
+wait in memory (at most CHUNK bytes of a pipe), the pipe is not read, and the node itself blocks
+in writing once its pipe is full. fifo(7), pipe(7)
+"""
+
+import asyncio
+import contextlib
+import fcntl
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from dora_systemd.cellpaths import CellPaths
+from dora_systemd.events import event_fields
+from dora_systemd.logfields import Value, encode_entry
+from dora_systemd.logqueue import Journal, LogQueue
+from dora_systemd.logs import LineEncoder, LineSplitter, Origin, dora_log_fields
+
+# A burst of this size does not slow its node. At the end of the cell journald has to take what is
+# in all pipes, 20,000 short lines each, before the unit may end.
+PIPE_SIZE = 1 << 18
+# What is read of one pipe before the others get their turn: about 1 ms of lines.
+CHUNK = 1 << 13
+# A pipe that gives more bytes than this in so many seconds is a flood: it yields to the others.
+FLOOD_BYTES = 1 << 14
+FLOOD_SECONDS = 0.1
+# Children that a dead node left behind may go on writing: drain() must still end.
+DRAIN_LIMIT = 4 * PIPE_SIZE
+
+
+@dataclass(frozen=True)
+class CellIdentity:
+    """The dataflow that all records of a cell belong to."""
+
+    name: str
+    uuid: str
+
+
+@dataclass
+class _Pipe:
+    fd: int
+    stream: str
+    encoder: LineEncoder
+    splitter: LineSplitter = field(default_factory=LineSplitter)
+    since: float = 0.0
+    taken: int = 0
+
+    def is_flood(self, size: int, now: float) -> bool:
+        """Whether the pipe, which has just given `size` bytes, floods; `now` in seconds."""
+        if now - self.since > FLOOD_SECONDS:
+            self.since, self.taken = now, 0
+        self.taken += size
+        return self.taken > FLOOD_BYTES
+
+
+@dataclass
+class _Source:
+    """A node and its pipes."""
+
+    origin: Origin
+    pipes: list[_Pipe] = field(default_factory=list)
+    # Bytes that drain() took since journald last had everything.
+    drained: int = 0
+
+
+class LogPipes:
+    """The output of all nodes of a cell, and the cell's life events, into the journal.
+
+    journal: where entries go. identity: whose entries they are. keep: is given each descriptor
+    whose content shall outlive this process. All methods belong to the thread of `loop` and
+    return at once.
+    """
+
+    def __init__(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        journal: Journal,
+        identity: CellIdentity,
+        keep: Callable[[int], object] | None = None,
+    ) -> None:
+        self._loop = loop
+        self._keep = keep
+        self._journal = journal
+        self._queue = LogQueue(loop, journal, self._pause, self._resume)
+        self._origin = Origin(identity.name, identity.uuid)
+        self._paths: dict[str, CellPaths] = {}
+        self._sources: dict[str, _Source] = {}
+        self._outputs: dict[int, LineSplitter] = {}
+        self._muted: frozenset[str] = frozenset()
+
+    def make(self, node_id: str, paths: CellPaths) -> None:
+        """Create the two FIFOs of a node, mode 0600; the directory must exist. Raises OSError."""
+        for path in _fifos(node_id, paths).values():
+            with contextlib.suppress(FileNotFoundError):
+                path.unlink()
+            os.mkfifo(path, 0o600)
+        self._paths[node_id] = paths
+
+    def open(self, node_id: str) -> None:
+        """Begin to read a node's FIFOs: who waits to open one for writing goes on. OSError."""
+        for stream, path in _fifos(node_id, self._paths[node_id]).items():
+            # Read and write: no end of file between two lives of the node.
+            fd = os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
+            with contextlib.suppress(OSError):  # above the user's limit the default must do
+                fcntl.fcntl(fd, fcntl.F_SETPIPE_SZ, PIPE_SIZE)
+            if self._keep is not None:
+                self._keep(fd)
+            self.adopt(node_id, stream, fd)
+
+    def adopt(self, node_id: str, stream: str, fd: int) -> None:
+        """Begin to read `fd`, a pipe that is open already, as "stdout" or "stderr" of a node."""
+        source = self._source(node_id)
+        os.set_blocking(fd, False)
+        pipe = _Pipe(fd, stream, LineEncoder(source.origin, stream))
+        source.pipes.append(pipe)
+        if not self._queue.waiting(node_id):
+            self._loop.add_reader(fd, self._read_pipe, node_id, pipe)
+
+    def set_pid(self, node_id: str, pid: int) -> None:
+        """The node's lines come from process `pid` from now on; 0: from its next one."""
+        self._renew(self._source(node_id), pid=pid)
+
+    def _learn_pid(self, source: _Source) -> None:
+        """Dora tells the pid tens of milliseconds after the launcher has noted it."""
+        node_id = source.origin.node
+        if node_id in self._paths:
+            with contextlib.suppress(OSError, ValueError):
+                self._renew(source, pid=int(self._paths[node_id].node_pid(node_id).read_text()))
+
+    def set_run(self, run_id: str) -> None:
+        """All lines and events belong to dora's run `run_id` from now on."""
+        self._origin = replace(self._origin, run=run_id)
+        for source in self._sources.values():
+            self._renew(source, run=run_id)
+
+    def _renew(self, source: _Source, **changes: Any) -> None:
+        source.origin = replace(source.origin, **changes)
+        for pipe in source.pipes:
+            pipe.encoder = LineEncoder(source.origin, pipe.stream)
+
+    def drain(self, node_id: str) -> None:
+        """Take all that is in a node's pipes now, and an unterminated line, before what follows.
+
+        For a node that has ended: its last words then come before the event that says so.
+        """
+        source = self._source(node_id)
+        for pipe in source.pipes:
+            # A full pipe again, and journald has not come back: the lines are safe where they are.
+            while source.drained < DRAIN_LIMIT and (data := _read(pipe.fd)):
+                source.drained += len(data)
+                self._put(node_id, pipe, data, is_flood=True)
+            self._put(node_id, pipe, b"", is_flood=False)
+        if not self._queue.waiting(node_id):
+            source.drained = 0
+
+    def write_event(self, name: str, node: str | None = None, **details: Value) -> None:
+        """Write life event `name` (see dora_systemd.events), after all lines put before it."""
+        origin = self._source(node).origin if node else self._origin
+        fields = event_fields(name, dataflow=origin.name, node=origin.node, **details)
+        if node:
+            self._queue.put_record(node, self._entry(fields, node))
+        else:
+            self._queue.put_event(self._entry(fields, node))
+
+    def write_fields(self, fields: dict[str, Value], node: str) -> None:
+        """Write a node's line that came another way than by a pipe; nothing bounds how many wait.
+
+        Who writes them looks at is_busy() before it reads on.
+        """
+        self._queue.put(node, partial(list, [self._entry(fields, node)]))
+
+    def _entry(self, fields: dict[str, Value], node: str | None) -> bytes:
+        origin = self._source(node).origin if node else self._origin
+        return encode_entry({**origin.fields(), **fields})
+
+    def is_busy(self, node: str) -> bool:
+        """Whether journald has not taken the node's records so far: what can wait should."""
+        return self._queue.waiting(node) > 0
+
+    def add_output(self, label: str, fd: int, on_line: Callable[[str], None] | None = None) -> None:
+        """Read what coordinator or daemon prints; warnings and errors become records of `label`.
+
+        on_line is given every line as it is, without its newline. Reading ends with the pipe;
+        `fd` is closed then.
+        """
+        os.set_blocking(fd, False)
+        self._outputs[fd] = LineSplitter()
+        self._loop.add_reader(fd, self._read_output, label, fd, on_line)
+
+    def mute(self, *labels: str) -> None:
+        """Make no more records of what these children print."""
+        self._muted |= frozenset(labels)
+
+    def settle(self, seconds: float = 6.0) -> None:
+        """Drain all pipes and block until journald has taken it all, at most `seconds`."""
+        for node_id in self._sources:
+            self.drain(node_id)
+        deadline = time.monotonic() + seconds
+        while not self._queue.is_empty and time.monotonic() < deadline:
+            self._journal.wait_ready(deadline - time.monotonic())
+            self._queue.flush()
+
+    def close(self, seconds: float = 6.0) -> None:
+        """Drain all pipes, wait up to `seconds` until journald has taken it all, and close.
+
+        Lines that it has not taken by then are counted in a last event, lines-lost, if it can be
+        written at all.
+        """
+        self.settle(seconds)
+        if lost := self._queue.give_up():
+            self.write_event("lines-lost", count=lost, reason="journald did not take them")
+        for source in self._sources.values():
+            for pipe in source.pipes:
+                self._loop.remove_reader(pipe.fd)
+                os.close(pipe.fd)
+            source.pipes.clear()
+        for fd in list(self._outputs):
+            self._end_output(fd)
+
+    def _source(self, node_id: str) -> _Source:
+        if node_id not in self._sources:
+            self._sources[node_id] = _Source(replace(self._origin, node=node_id))
+        return self._sources[node_id]
+
+    def _pause(self, node_id: str) -> None:
+        for pipe in self._source(node_id).pipes:
+            self._loop.remove_reader(pipe.fd)
+
+    def _resume(self, node_id: str) -> None:
+        source = self._source(node_id)
+        source.drained = 0
+        for pipe in source.pipes:
+            self._loop.add_reader(pipe.fd, self._read_pipe, node_id, pipe)
+        if lost := self._queue.take_lost():
+            self.write_event("lines-lost", count=lost, reason="journald was away for too long")
+
+    def _read_pipe(self, node_id: str, pipe: _Pipe) -> None:
+        data = _read(pipe.fd)
+        is_flood = pipe.is_flood(len(data), self._loop.time())
+        if data:
+            source = self._source(node_id)
+            if not source.origin.pid:
+                self._learn_pid(source)
+            self._put(node_id, pipe, data, is_flood)
+
+    def _put(self, node_id: str, pipe: _Pipe, data: bytes, is_flood: bool) -> None:
+        self._queue.put(node_id, partial(_entries, pipe.splitter, pipe.encoder, data), is_flood)
+
+    def _read_output(self, label: str, fd: int, on_line: Callable[[str], None] | None) -> None:
+        try:
+            data = os.read(fd, CHUNK)
+        except BlockingIOError:
+            return
+        lines = self._outputs[fd].feed(data) if data else self._outputs[fd].flush()
+        for line in lines:
+            if label not in self._muted and (fields := dora_log_fields(line)):
+                self._queue.put_record(label, self._entry(fields, label))
+            if on_line is not None:
+                on_line(line.decode("utf-8", "replace"))
+        if not data:
+            self._end_output(fd)
+
+    def _end_output(self, fd: int) -> None:
+        self._loop.remove_reader(fd)
+        del self._outputs[fd]
+        os.close(fd)
+
+
+def _entries(splitter: LineSplitter, encoder: LineEncoder, data: bytes) -> list[bytes]:
+    """The entries of the lines that `data` completes; no data: of the line that nothing will."""
+    return list(map(encoder.entry, splitter.feed(data) if data else splitter.flush()))
+
+
+def _fifos(node_id: str, paths: CellPaths) -> dict[str, Path]:
+    return {"stdout": paths.node_stdout(node_id), "stderr": paths.node_stderr(node_id)}
+
+
+def _read(fd: int) -> bytes:
+    try:
+        return os.read(fd, CHUNK)
+    except BlockingIOError:
+        return b""

@@ -1,0 +1,66 @@
+"""From a descriptor on disk to what is sent to dora: the same for doractl, which refuses a bad one
+before there is a unit, and for the runner, which does it at every start."""
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dora_systemd import files, process
+from dora_systemd.buildsession import BuildSession, parse_session, session_path
+from dora_systemd.dataflow import Dataflow, parse_dataflow
+from dora_systemd.dataflownodes import UNEXPANDED
+from dora_systemd.doraerrors import parse_dora_error
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.launch import LaunchPlan, launch_descriptor
+from dora_systemd.options import RunnerOptions
+
+PACKAGE = Path(__file__).parent
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A dataflow that can be started.
+
+    dataflow: with its modules expanded. descriptor: what is sent to dora.
+    """
+
+    dataflow: Dataflow
+    plan: LaunchPlan
+    descriptor: Mapping[str, Any]
+
+
+def prepare(options: RunnerOptions, environment: Mapping[str, str]) -> Prepared:
+    """Read the dataflow of `options` and rewrite it. environment: of the nodes.
+
+    Raises DoraSystemdError when it cannot be read or a node of it cannot be run.
+    """
+    dataflow = _load_dataflow(options)
+    plan = LaunchPlan(
+        options,
+        str(PACKAGE / "launcher.sh"),
+        environment.get("PATH") or os.defpath,
+        os.path.exists,
+        _load_session(options),
+    )
+    return Prepared(dataflow, plan, launch_descriptor(dataflow, plan))
+
+
+def _load_dataflow(options: RunnerOptions) -> Dataflow:
+    path = Path(options.dataflow)
+    dataflow = parse_dataflow(files.read_yaml(path), str(path))
+    if not any(node.kind in UNEXPANDED for node in dataflow.nodes):
+        return dataflow
+    done = process.run_dora(options.dora, ["expand", str(path)], directory=str(path.parent))
+    if done.status != 0:
+        reason = parse_dora_error(done.stderr)
+        raise DoraSystemdError(f"cannot expand {path}: {reason}", "", ExitCode.BAD_INPUT)
+    return parse_dataflow(files.parse_yaml(done.stdout, path), str(path))
+
+
+def _load_session(options: RunnerOptions) -> BuildSession:
+    path = Path(session_path(options.dataflow))
+    if not path.exists():
+        return BuildSession()
+    return parse_session(files.read_yaml(path, allow_empty=True))

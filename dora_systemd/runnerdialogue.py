@@ -1,0 +1,170 @@
+"""What the runner asks dora and hears from it: the actions of dora_systemd.lifecycle."""
+
+import asyncio
+from collections.abc import Callable, Coroutine, Mapping
+from typing import Any
+
+from dora_systemd import engine, notify, protocol
+from dora_systemd import lifeevents as life
+from dora_systemd.cellstate import Do, RunnerExit, State
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.lifecycle import stop_timeout
+from dora_systemd.options import RunnerOptions
+from dora_systemd.pipes import LogPipes
+from dora_systemd.runnerengine import Engine
+from dora_systemd.runnernodes import Nodes
+from dora_systemd.runnerpump import Pump, now_us
+from dora_systemd.values import SECOND
+
+_LISTENING = "Listening on port "
+_SETTLE_SECONDS = 0.02
+"""`systemctl kill` signals all of the cell at once: let our own signal be heard before the news
+that a child died of it."""
+_AGAIN_SECONDS = 0.02
+_LONG_SECONDS = 3600.0 * 24 * 365
+
+
+class Dialogue:
+    """Carries out each Do; every answer becomes an event of the pump."""
+
+    def __init__(
+        self, options: RunnerOptions, pump: Pump, dora: Engine, nodes: Nodes, pipes: LogPipes
+    ) -> None:
+        self._options = options
+        self._pump = pump
+        self._engine = dora
+        self._nodes = nodes
+        self._pipes = pipes
+        self._loop = asyncio.get_running_loop()
+        self._tasks: set[asyncio.Task[None]] = set()
+        self.end: asyncio.Future[RunnerExit] = self._loop.create_future()
+
+    def actions(
+        self, descriptor: Mapping[str, Any], variables: Mapping[str, str]
+    ) -> dict[Do, Callable[[], None]]:
+        """What each Do does. variables: what the daemon's environment has besides the nodes'."""
+        return {
+            Do.START_DAEMON: lambda: self._start_daemon(variables),
+            Do.SEND_START: lambda: self.spawn(self._send_start(descriptor)),
+            Do.SUBSCRIBE: lambda: self.spawn(self._subscribe()),
+            Do.OPEN_PIPES: lambda: self._nodes.listen(self._pump.cell.run),
+            Do.ASK_SPAWN: lambda: self.spawn(self._ask_spawn()),
+            Do.ASK_RESULT: lambda: self.spawn(self._ask_result()),
+            Do.ASK_STOP: lambda: self.spawn(self._ask_stop()),
+            Do.DISMISS_DAEMON: self._dismiss_daemon,
+            Do.EXIT: lambda: self.end.set_result(self._pump.cell.exit),
+        }
+
+    def spawn(self, work: Coroutine[Any, Any, None]) -> None:
+        """Run `work` beside all else; what it cannot do ends the cell."""
+        task = self._loop.create_task(self._guard(work))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _guard(self, work: Coroutine[Any, Any, None]) -> None:
+        try:
+            await work
+        except DoraSystemdError as error:
+            # While a child is dying, its end says more than what its connection suffers.
+            await asyncio.sleep(_SETTLE_SECONDS)
+            self._pump.push(life.Refused(now_us(), error.message))
+
+    def cancel(self) -> None:
+        """Give up all that is still asked."""
+        for task in self._tasks:
+            task.cancel()
+
+    def watch(self, child: engine.Child, on_line: Callable[[str], None] | None = None) -> None:
+        """Read a child's output and hear of its end."""
+        self._pipes.add_output(child.label, child.output, on_line)
+        engine.watch(self._loop, child, self._child_exited)
+
+    def _child_exited(self, label: str, how: str) -> None:
+        event = life.ChildExited(now_us(), label, how)
+        self._loop.call_later(_SETTLE_SECONDS, self._pump.push, event)
+
+    def read_coordinator(self, line: str) -> None:
+        """A line that the coordinator printed: one of them tells its port."""
+        if line.startswith(_LISTENING) and self._pump.cell.state is State.BOOTING:
+            self._engine.set_port(int(line.removeprefix(_LISTENING)))
+            self._pump.push(life.CoordinatorListening(now_us()))
+
+    def _start_daemon(self, variables: Mapping[str, str]) -> None:
+        self.watch(self._engine.start_daemon(variables))
+        self.spawn(self._wait_joined())
+
+    async def _wait_joined(self) -> None:
+        await self._engine.wait_joined()
+        self._pump.push(life.DaemonConnected(now_us()))
+
+    async def _send_start(self, descriptor: Mapping[str, Any]) -> None:
+        run = await self._engine.start_run(descriptor, self._options.name)
+        self._pipes.set_run(run)
+        self._pump.push(life.RunStarted(now_us(), run))
+
+    async def _subscribe(self) -> None:
+        def subscribed() -> None:
+            self._pump.push(life.Subscribed(now_us()))
+
+        await self._engine.read_events(self._pump.cell.run, subscribed, self._hear)
+        await asyncio.sleep(_SETTLE_SECONDS)
+        self._pump.push(life.ConnectionLost(now_us()))
+
+    def _hear(self, record: protocol.LogRecord) -> None:
+        event = protocol.parse_life_event(record, now_us())
+        if isinstance(event, life.NodeSpawned):
+            self._nodes.adopt(event.node, event.pid)
+        if isinstance(event, life.NodeExited):
+            node = self._pump.cell.nodes.get(event.node)
+            is_stale = node is not None and self._nodes.has_process(event.node, node.pid)
+            event = protocol.with_staleness(event, is_stale)
+        if event is not None:
+            self._pump.push(event)
+        if isinstance(event, life.NodeExited) and not event.is_stale:
+            self._nodes.forget(event.node)
+
+    async def _ask_spawn(self) -> None:
+        params = protocol.wait_spawn_params(self._pump.cell.run)
+        reply = await self._engine.ask_apart(params, _LONG_SECONDS)
+        if reply.error:
+            self._pump.push(life.Refused(now_us(), protocol.first_line(reply.error)))
+
+    async def _ask_result(self) -> None:
+        while True:
+            reply = await self._engine.ask(protocol.check_params(self._pump.cell.run))
+            results = protocol.parse_results(reply)
+            if results is not None:
+                return self._pump.push(life.ResultKnown(now_us(), results))
+            if self._pump.cell.state is not State.CLOSING:
+                return None  # it runs: that was the question
+            await asyncio.sleep(_AGAIN_SECONDS)
+
+    async def _ask_stop(self) -> None:
+        cell = self._pump.cell
+        seconds = stop_timeout(cell.grace) / SECOND
+        # A refusal means that nothing of the run is left; a Stop without an answer is known to
+        # happen, and the deadline of the state is for that.
+        await self._engine.ask_apart(protocol.stop_params(cell.run, cell.grace), seconds)
+        self._pump.push(life.StopAnswered(now_us()))
+
+    def _dismiss_daemon(self) -> None:
+        # What the two say about each other's end is no news.
+        self._pipes.mute("coordinator", "daemon")
+        if not self._engine.dismiss_daemon():
+            self._pump.push(life.ChildExited(now_us(), "daemon", "earlier"))
+
+    async def feed_watchdog(self, seconds: float) -> None:
+        """Every `seconds`: WATCHDOG=1, but only if coordinator and daemon have just answered.
+
+        While it stops, systemd's TimeoutStopSec= is what bounds it.
+        """
+        while True:
+            await asyncio.sleep(seconds)
+            if self._pump.cell.state is not State.RUNNING or await self._engine.is_joined():
+                notify.send_alive()
+
+    async def take_samples(self, seconds: float) -> None:
+        """Every `seconds`: CPU time used so far."""
+        while True:
+            self._pump.sample()
+            await asyncio.sleep(seconds)

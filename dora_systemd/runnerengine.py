@@ -1,0 +1,122 @@
+"""The runner's side of dora: its two children and the connections to the coordinator."""
+
+import asyncio
+import json
+import signal
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from dora_systemd import control, engine, files, protocol
+from dora_systemd.cellpaths import CellPaths
+from dora_systemd.errors import DoraSystemdError
+
+POLL_SECONDS = 0.002
+"""Between two questions whether the daemon has registered: dora tells it by no event."""
+
+OnRecord = Callable[[protocol.LogRecord], None]
+
+
+class Engine:
+    """Coordinator and daemon of a cell, and how they are asked.
+
+    environment: of the nodes, without what is systemd's.
+    """
+
+    def __init__(self, dora: str, paths: CellPaths, environment: Mapping[str, str]) -> None:
+        self._dora = dora
+        self._paths = paths
+        self._environment = dict(environment)
+        self._children: dict[str, engine.Child] = {}
+        self._requests: control.Connection | None = None
+        self._lock = asyncio.Lock()
+        self._port = 0
+        self._token = ""
+
+    def start_coordinator(self) -> engine.Child:
+        """Start the coordinator; it prints its port. Raises OSError."""
+        environment = engine.coordinator_environment(self._environment, self._paths.coordinator)
+        command = engine.coordinator_command(self._dora)
+        return self._spawn("coordinator", command, environment, self._paths.coordinator)
+
+    def set_port(self, port: int) -> None:
+        """The coordinator listens on `port`; its token is in its directory by now. OSError."""
+        self._port = port
+        self._token = (self._paths.coordinator / ".dora-token").read_text().strip()
+
+    def start_daemon(self, added: Mapping[str, str]) -> engine.Child:
+        """Start the daemon with `added` variables, and say where the cell is reached. OSError."""
+        listen = engine.free_port()
+        access = {"port": self._port, "token": self._token, "local_listen_port": listen}
+        files.write_atomic(self._paths.control, json.dumps(access), 0o600)
+        environment = {**self._environment, **added, "DORA_AUTH_TOKEN": self._token}
+        command = engine.daemon_command(self._dora, self._port, listen)
+        return self._spawn("daemon", command, environment, self._paths.daemon)
+
+    def _spawn(
+        self, label: str, command: list[str], environment: dict[str, str], directory: Path
+    ) -> engine.Child:
+        self._children[label] = engine.spawn(label, command, environment, directory)
+        return self._children[label]
+
+    async def wait_joined(self) -> None:
+        """Return once the daemon has registered with the coordinator."""
+        self._requests = await self.connect()
+        while not await self.is_joined():
+            await asyncio.sleep(POLL_SECONDS)
+
+    async def is_joined(self) -> bool:
+        """Whether coordinator and daemon answer. Raises DoraSystemdError when they do not."""
+        reply = await self.ask(protocol.DAEMON_CONNECTED)
+        return bool(protocol.result_of(reply, "DaemonConnected"))
+
+    async def ask(self, params: protocol.Params) -> protocol.Reply:
+        """One request that dora answers at once."""
+        assert self._requests is not None
+        async with self._lock:
+            return await self._requests.request(params)
+
+    async def ask_apart(self, params: protocol.Params, seconds: float) -> protocol.Reply:
+        """One request that may take long, on its own connection: each one answers in turn."""
+        connection = await self.connect()
+        try:
+            return await connection.request(params, seconds)
+        finally:
+            await connection.close()
+
+    async def connect(self) -> control.Connection:
+        """A new connection."""
+        return await control.Connection.open(self._port, self._token)
+
+    async def start_run(self, descriptor: Mapping[str, Any], name: str) -> str:
+        """Send the descriptor; dora's id of the run. Raises DoraSystemdError."""
+        params = protocol.start_params(descriptor, name, str(self._paths.work))
+        reply = await self.ask(params)
+        return str(protocol.result_of(reply, "DataflowStartTriggered")["uuid"])
+
+    async def read_events(
+        self, run: str, on_start: Callable[[], None], on_record: OnRecord
+    ) -> None:
+        """Subscribe to the events of a run, tell on_start, and give them on until the end."""
+        connection = await self.connect()
+        reply = await connection.request(protocol.subscribe_params(run))
+        if reply.error:
+            raise DoraSystemdError(f"cannot read events of dora: {reply.error}")
+        on_start()
+        await connection.read_events(on_record)
+
+    def dismiss_daemon(self) -> bool:
+        """Let the daemon end in good order; False when it already has."""
+        daemon = self._children.get("daemon")
+        if daemon is None or daemon.popen.returncode is not None:
+            return False
+        # SIGTERM would kill it where it stands; on SIGINT it cleans up, in half the time that
+        # the protocol's Destroy takes.
+        daemon.send_signal(signal.SIGINT)
+        return True
+
+    def kill(self) -> None:
+        """SIGKILL to what is left of the two, and reap."""
+        for child in self._children.values():
+            child.send_signal(signal.SIGKILL)
+            child.popen.wait()

@@ -1,0 +1,138 @@
+"""The runner's side of the nodes: their groups and their output."""
+
+import asyncio
+import contextlib
+import os
+from collections.abc import Iterable, Mapping
+from functools import partial
+from pathlib import Path
+
+from dora_systemd import cgroup
+from dora_systemd.cellpaths import CellPaths
+from dora_systemd.dataflow import Dataflow
+from dora_systemd.dataflownodes import NodeKind
+from dora_systemd.jsonl import JsonlTail
+from dora_systemd.launch import has_pipes, is_launched
+from dora_systemd.pipes import LogPipes
+from dora_systemd.status import WHOLE_CELL, CpuSample
+
+SUPERVISOR = "supervisor"
+
+
+def enter_supervisor() -> Path:
+    """The cgroup directory of the unit, with this process in its group `supervisor`.
+
+    DelegateSubgroup= puts it there; systemd before 254 does not have that. Raises OSError.
+    """
+    own = cgroup.group_path(cgroup.own_group())
+    if own.name == SUPERVISOR:
+        return own.parent
+    cgroup.make_group(own / SUPERVISOR)
+    cgroup.move_process(own / SUPERVISOR, 0)
+    return own
+
+
+class Nodes:
+    """The node groups below `unit`, the cgroup directory of the unit, and the nodes' pipes."""
+
+    def __init__(self, unit: Path, paths: CellPaths, pipes: LogPipes) -> None:
+        self._unit = unit
+        self._paths = paths
+        self._pipes = pipes
+        self._piped: list[str] = []
+        self._launched: frozenset[str] = frozenset()
+        self._tails: dict[str, JsonlTail | None] = {}
+
+    def prepare(self, dataflow: Dataflow) -> None:
+        """Make a group for every node and pipes for those that have them. Raises OSError."""
+        cgroup.enable_controllers(self._unit)
+        self._launched = frozenset(node.id for node in dataflow.nodes if is_launched(node))
+        for node in dataflow.nodes:
+            cgroup.make_group(self._group(node.id))
+            if has_pipes(node):
+                self._pipes.make(node.id, self._paths)
+                self._piped.append(node.id)
+            elif node.kind is not NodeKind.DYNAMIC:
+                self._tails[node.id] = None
+
+    def _group(self, node: str) -> Path:
+        return self._unit / f"{cgroup.NODE_PREFIX}{node}"
+
+    def listen(self, run: str) -> None:
+        """Begin to read what the nodes of `run` say: launchers that wait for a reader go on."""
+        for node in self._piped:
+            self._pipes.open(node)
+        loop = asyncio.get_running_loop()
+        for node in self._tails:
+            path = self._paths.work / "out" / run / f"log_{node}.jsonl"
+            put = partial(self._pipes.write_fields, node=node)
+            tail = JsonlTail(loop, path, put, partial(self._pipes.is_busy, node))
+            self._tails[node] = tail
+            tail.start()
+
+    def adopt(self, node: str, pid: int) -> None:
+        """Dora has executed `node`: name its lines, and move it if the launcher has not."""
+        self._pipes.set_pid(node, pid)
+        if node not in self._launched:
+            for process in _with_descendants(pid):
+                with contextlib.suppress(OSError):  # it may be gone already
+                    cgroup.move_process(self._group(node), process)
+
+    def forget(self, node: str) -> None:
+        """The node's process has ended: what it says next comes from another one."""
+        self._pipes.set_pid(node, 0)
+
+    def has_process(self, node: str, pid: int) -> bool:
+        """Whether `pid` lives and is one of the node's. Zombies do not count."""
+        return pid in cgroup.pids(self._group(node))
+
+    def kill(self) -> None:
+        """End every node at once, and take its last words from the pipes."""
+        for group in cgroup.node_groups(self._unit).values():
+            cgroup.kill_group(group)
+        self.drain((*self._piped, *self._tails))
+
+    def close(self) -> None:
+        """End every node, and stop to listen."""
+        self.kill()
+        for tail in self._tails.values():
+            if tail is not None:
+                tail.close()
+
+    def drain(self, nodes: Iterable[str]) -> None:
+        """Write what `nodes` have said so far before whatever is written next."""
+        for node in nodes:
+            if node in self._piped:
+                self._pipes.drain(node)
+            elif (tail := self._tails.get(node)) is not None:
+                tail.drain()
+
+    def sample(self, now_us: int) -> CpuSample:
+        """CPU time used so far by the cell and by each node."""
+        groups: Mapping[str, Path] = cgroup.node_groups(self._unit)
+        used = {node: cgroup.read_cpu_us(path) for node, path in groups.items()}
+        return CpuSample(now_us, {WHOLE_CELL: cgroup.read_cpu_us(self._unit), **used})
+
+
+def _with_descendants(pid: int) -> list[int]:
+    found = [pid]
+    for known in found:
+        for task in Path(f"/proc/{known}/task").glob("*/children"):
+            with contextlib.suppress(OSError):
+                found += map(int, task.read_text().split())
+    return found
+
+
+async def wait_eof(fd: int) -> None:
+    """Return at the end of file of `fd`, whatever comes before it."""
+    loop = asyncio.get_running_loop()
+    done = asyncio.Event()
+
+    def read() -> None:
+        with contextlib.suppress(BlockingIOError):
+            if not os.read(fd, 4096):
+                loop.remove_reader(fd)
+                done.set()
+
+    loop.add_reader(fd, read)
+    await done.wait()

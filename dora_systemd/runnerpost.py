@@ -1,0 +1,89 @@
+"""What is left to say when the runner was killed: `python3 -m dora_systemd.runnerpost NAME UUID`.
+
+ExecStopPost= of the unit. The runner's death leaves lines in the nodes' pipes, which systemd
+keeps open for us (dora_systemd.fdstore), and no event says how the dataflow ended. After a runner
+that ended by itself there is nothing to do. It always ends with status 0: the unit's result is
+that of the runner.
+"""
+
+import contextlib
+import os
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+STREAMS = {".out": "stdout", ".err": "stderr"}
+
+
+def main(argv: list[str]) -> int:
+    """Kill the nodes, write what they said last, and the event dataflow-failed."""
+    reason, directory = killed_by(os.environ), os.environ.get("RUNTIME_DIRECTORY", "")
+    if not reason or len(argv) != 2 or not directory:
+        return 0
+    with contextlib.suppress(OSError):
+        kill_nodes()
+    write_last_words(argv[0], argv[1], Path(directory), reason)
+    return 0
+
+
+def killed_by(environ: Mapping[str, str]) -> str:
+    """What ended the runner, "" if it ended by itself: EXIT_CODE in systemd.exec(5)."""
+    if environ.get("EXIT_CODE", "") not in ("killed", "dumped"):
+        return ""
+    if environ.get("SERVICE_RESULT") == "watchdog":
+        return "its runner hung and was ended by the watchdog"
+    return f"its runner was ended by signal SIG{environ.get('EXIT_STATUS', '')}"
+
+
+def write_last_words(
+    name: str, uuid: str, directory: Path, reason: str, journal_socket: str = ""
+) -> None:
+    """Write what is in the pipes below `directory`, and that the dataflow failed.
+
+    journal_socket: another one than journald's, for tests.
+    """
+    # Nearly always there is nothing to do: only then these imports cost their time.
+    import asyncio
+
+    from dora_systemd.cellpaths import CellPaths
+    from dora_systemd.errors import DoraSystemdError
+    from dora_systemd.journal import JOURNAL_SOCKET, JournalSocket
+    from dora_systemd.pipes import CellIdentity, LogPipes
+    from dora_systemd.status import CellStatus
+
+    paths = CellPaths(directory)
+    loop = asyncio.new_event_loop()
+    journal = JournalSocket(journal_socket or JOURNAL_SOCKET)
+    pipes = LogPipes(loop, journal, CellIdentity(name, uuid))
+    with contextlib.suppress(OSError, DoraSystemdError):
+        status = CellStatus.from_json(paths.status.read_text())
+        pipes.set_run(status.run)
+        for node, state in status.nodes.items():
+            pipes.set_pid(node, state.pid)
+    with contextlib.suppress(OSError):
+        for path in sorted(paths.io.iterdir()):
+            if path.suffix in STREAMS:
+                fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+                pipes.adopt(path.stem, STREAMS[path.suffix], fd)
+                pipes.drain(path.stem)
+    pipes.write_event("dataflow-failed", reason=reason)
+    pipes.close()
+    journal.close()
+    loop.close()
+
+
+def kill_nodes() -> None:
+    """End every node of this unit: with KillMode=mixed they outlive the runner until now."""
+    from dora_systemd import cgroup
+
+    unit = cgroup.group_path(cgroup.own_group())
+    while unit.suffix != ".service" and unit != unit.parent:
+        unit = unit.parent
+    for group in cgroup.node_groups(unit).values():
+        cgroup.kill_group(group)
+        while cgroup.is_populated(group):
+            os.sched_yield()
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,116 @@
+"""The runner's event pump: events in, the table of dora_systemd.lifecycle, actions out."""
+
+import asyncio
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+
+from dora_systemd import files, notify
+from dora_systemd import lifeevents as life
+from dora_systemd.cellpaths import CellPaths
+from dora_systemd.cellstate import Action, Cell, Deadline, Do, Record, State
+from dora_systemd.cellview import cell_status, format_status
+from dora_systemd.events import END_EVENTS
+from dora_systemd.lifecycle import step
+from dora_systemd.pipes import LogPipes
+from dora_systemd.runnernodes import Nodes
+from dora_systemd.status import CpuSample, add_sample
+from dora_systemd.values import SECOND
+
+
+def now_us() -> int:
+    """CLOCK_REALTIME in µs."""
+    return time.time_ns() // 1000
+
+
+class Pump:
+    """Holds the cell, moves it by events, and shows what it has become.
+
+    uuid: of the dataflow. What Do means is given by connect(), before the first event.
+    """
+
+    def __init__(
+        self, cell: Cell, uuid: str, paths: CellPaths, nodes: Nodes, pipes: LogPipes
+    ) -> None:
+        self.cell = cell
+        self._uuid = uuid
+        self._paths = paths
+        self._nodes = nodes
+        self._pipes = pipes
+        self._loop = asyncio.get_running_loop()
+        self._actions: Mapping[Do, Callable[[], None]] = {}
+        self._queue: deque[life.Event] = deque()
+        self._deadline: asyncio.TimerHandle | None = None
+        self._samples: tuple[CpuSample, ...] = ()
+        self._text = ""
+        self._is_ready = False
+
+    def connect(self, actions: Mapping[Do, Callable[[], None]]) -> None:
+        """Say what each Do does."""
+        self._actions = actions
+        self._publish()
+
+    def push(self, event: life.Event) -> None:
+        """Take one event through the table, then those that its actions cause."""
+        self._queue.append(event)
+        if len(self._queue) > 1:
+            return  # caused by an action: the loop below takes it when that event is done
+        while self._queue:
+            self._take(self._queue[0])
+            self._queue.popleft()
+
+    def _take(self, event: life.Event) -> None:
+        before = self.cell
+        self.cell, actions = step(before, event)
+        if self.cell is not before:
+            self._publish()
+        for action in actions:
+            self._perform(action)
+
+    def _perform(self, action: Action) -> None:
+        match action:
+            case Do():
+                self._actions[action]()
+            case Record():
+                self._record(action)
+            case Deadline():
+                self._set_deadline(action.after)
+
+    def _record(self, record: Record) -> None:
+        if record.event in END_EVENTS:
+            self._nodes.kill()  # no word of theirs after the last of ours
+        elif record.node:
+            self._nodes.drain([record.node])
+        elif record.event == "dataflow-stopping":
+            notify.send_stopping()
+        self._pipes.write_event(record.event, record.node or None, **record.details)
+
+    def _set_deadline(self, after: int | None) -> None:
+        if self._deadline is not None:
+            self._deadline.cancel()
+        self._deadline = None
+        if after is not None:
+            self._deadline = self._loop.call_later(
+                after / SECOND, lambda: self.push(life.DeadlinePassed(now_us()))
+            )
+
+    def _publish(self) -> None:
+        text = format_status(self.cell)
+        if text != self._text:
+            self._text = text
+            notify.send_status(text)
+        # The table first: who waited for READY=1 may read it at once.
+        self._write_table()
+        if self.cell.state is State.RUNNING and not self._is_ready:
+            self._is_ready = True
+            notify.send_ready()
+
+    def sample(self) -> None:
+        """Note CPU time used so far, so that `list` can tell CPU% without waiting."""
+        sample = self._nodes.sample(time.monotonic_ns() // 1000)
+        self._samples = add_sample(self._samples, sample)
+        self._write_table()
+
+    def _write_table(self) -> None:
+        table = cell_status(self.cell, self._uuid, self._samples)
+        files.write_atomic(self._paths.status, table.to_json(), 0o600)

@@ -1,0 +1,35 @@
+"""System scope or user scope: which manager, which directories."""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+RUNTIME_NAME = "dora-systemd"
+
+
+@dataclass(frozen=True)
+class Scope:
+    """One systemd manager: the system's, or the one of user `uid`."""
+
+    is_user: bool
+    uid: int
+
+    @property
+    def runtime_root(self) -> Path:
+        """Where the manager puts RuntimeDirectory=, see systemd.exec(5)."""
+        return Path(f"/run/user/{self.uid}") if self.is_user else Path("/run")
+
+    def cell_directory(self, name: str) -> Path:
+        """The RuntimeDirectory of the unit of dataflow `name`."""
+        return self.runtime_root / RUNTIME_NAME / name
+
+    @property
+    def flag(self) -> str:
+        """The option that selects this scope in systemctl, journalctl and doractl."""
+        return "--user" if self.is_user else "--system"
+
+
+def scope_of(is_user: bool | None) -> Scope:
+    """The scope asked for, by default the system's for root and the user's otherwise."""
+    uid = os.getuid()
+    return Scope(is_user=uid != 0 if is_user is None else is_user, uid=uid)

@@ -1,0 +1,128 @@
+"""The settings of a dataflow, one declaration each.
+
+Flags, settings-file keys, environment variables and manual entries derive from this table or are
+checked against it. A new setting is one more assignment.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+from dora_systemd.settingkinds import (
+    BOOL,
+    DURATION,
+    ENVIRONMENT,
+    PATH,
+    PATHS,
+    PROGRAM,
+    PROPERTIES,
+    TEXT,
+    Setting,
+)
+from dora_systemd.values import SECOND
+
+ENV = Setting[Mapping[str, str]](
+    "env",
+    ENVIRONMENT,
+    {},
+    "Environment variable of all nodes.",
+    flags=("--env",),
+    metavar="KEY=VALUE",
+)
+ENV_FILE = Setting[tuple[str, ...]](
+    "env_file",
+    PATHS,
+    (),
+    "File with environment variables, as EnvironmentFile= in systemd.exec(5).",
+    flags=("--env-file",),
+    metavar="FILE",
+)
+VENV = Setting[str | None](
+    "venv",
+    PATH,
+    None,
+    "Virtual environment whose Python runs the nodes.",
+    flags=("--venv",),
+    variable="DORA_VENV",
+    metavar="DIR",
+)
+UV = Setting[bool](
+    "uv",
+    BOOL,
+    False,
+    "Run Python nodes by uv, as dora start --uv does.",
+    flags=("--uv",),
+    variable="DORA_UV",
+)
+DEBUG = Setting[bool](
+    "debug",
+    BOOL,
+    False,
+    "Let topics be inspected, as dora start --debug does.",
+    flags=("--debug",),
+    variable="DORA_DEBUG",
+)
+WORKING_DIRECTORY = Setting[str | None](
+    "working_directory",
+    PATH,
+    None,
+    "Where relative node paths are and the nodes run; default: beside the dataflow file.",
+    flags=("--working-directory",),
+    variable="DORA_WORKING_DIRECTORY",
+    metavar="DIR",
+)
+GRACE_DURATION = Setting[int](
+    "grace_duration",
+    DURATION,
+    10 * SECOND,
+    "How long a node may take to end by itself when it is told to stop.",
+    flags=("--grace-duration",),
+    variable="DORA_GRACE_DURATION",
+    metavar="TIME",
+)
+PROPERTY = Setting[tuple[str, ...]](
+    "property",
+    PROPERTIES,
+    (),
+    "Property of the unit, as systemd-run(1) takes it.",
+    flags=("--property", "-p"),
+    metavar="KEY=VALUE",
+)
+USER = Setting[str | None](
+    "user",
+    TEXT,
+    None,
+    "User that the nodes run as; default: the owner of the dataflow file, or dora for root's.",
+    flags=("--uid",),
+    variable="DORA_UID",
+    metavar="USER",
+)
+ALLOW_SHELL_NODES = Setting[bool](
+    "allow_shell_nodes",
+    BOOL,
+    False,
+    "Let nodes with the path 'shell' run.",
+    flags=("--allow-shell-nodes",),
+    variable="DORA_ALLOW_SHELL_NODES",
+)
+EXIT_WHEN_NODES_FINISH = Setting[bool | None](
+    "exit_when_nodes_finish",
+    BOOL,
+    None,
+    "End the dataflow when its nodes have finished; default: what the dataflow says.",
+    flags=("--exit-when-nodes-finish",),
+    variable="DORA_EXIT_WHEN_NODES_FINISH",
+)
+DORA = Setting[str](
+    "dora",
+    PROGRAM,
+    "dora",
+    "The dora program to run.",
+    flags=("--dora",),
+    variable="DORA_PROGRAM",
+    metavar="FILE",
+)
+
+# All of the above, in that order, so that a setting is declared in one place only.
+SETTINGS: tuple[Setting[Any], ...] = tuple(
+    value for value in list(globals().values()) if isinstance(value, Setting)
+)

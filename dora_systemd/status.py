@@ -1,0 +1,154 @@
+"""The live table of one cell: what its runner writes to status.json and what `list` reads there."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, field, fields
+from typing import Any
+
+from dora_systemd.errors import DoraSystemdError, ExitCode
+
+STAGES = ("starting", "waiting", "running", "degraded", "stopping", "ended")
+NODE_STATES = (
+    "starting",
+    "ready",
+    "running",
+    "restarting",
+    "finished",
+    "failed",
+    "stopped",
+    "dynamic",
+)
+ALIVE_NODE_STATES = frozenset({"ready", "running", "dynamic"})
+WHOLE_CELL = ""
+"""The key of a CPU sample that stands for the unit's whole cgroup."""
+SAMPLES_KEPT = 2
+SHORTEST_WINDOW_US = 1_000_000
+
+
+@dataclass(frozen=True)
+class NodeStatus:
+    """One node as the runner sees it.
+
+    state: one of NODE_STATES. pid: 0 when no process is known. restarts: how often dora restarted
+    it in this run. since_us: CLOCK_REALTIME µs of the last change of state. exit: "" or a text such
+    as "exit code 1" or "signal SIGKILL". kind: how dora starts it (python, executable, shell, uv,
+    operator, ros2, dynamic, url).
+    """
+
+    state: str = "starting"
+    pid: int = 0
+    restarts: int = 0
+    since_us: int = 0
+    exit: str = ""
+    kind: str = ""
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether it counts as one of the "2/3 nodes" that are there."""
+        return self.state in ALIVE_NODE_STATES
+
+
+@dataclass(frozen=True)
+class CpuSample:
+    """CPU time used up to the moment `at_us` (CLOCK_MONOTONIC µs), in µs, by node id.
+
+    The key WHOLE_CELL is the unit's whole cgroup.
+    """
+
+    at_us: int
+    cpu_us: Mapping[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class CellStatus:
+    """What status.json holds.
+
+    run: dora's own id of this run, or "". stage: one of STAGES. text: the unit's STATUS=.
+    started_us, ready_us: CLOCK_REALTIME µs, 0 when that has not happened.
+    samples: the last SAMPLES_KEPT CPU samples, oldest first.
+    """
+
+    uuid: str = ""
+    run: str = ""
+    stage: str = "starting"
+    text: str = ""
+    started_us: int = 0
+    ready_us: int = 0
+    nodes: Mapping[str, NodeStatus] = field(default_factory=dict)
+    samples: tuple[CpuSample, ...] = ()
+
+    @property
+    def alive_count(self) -> int:
+        """How many nodes are there, dynamic ones included."""
+        return sum(node.is_alive for node in self.nodes.values())
+
+    @property
+    def node_restarts(self) -> int:
+        """Restarts of all nodes in this run, by dora."""
+        return sum(node.restarts for node in self.nodes.values())
+
+    def to_json(self) -> str:
+        """The text of status.json."""
+        values = {**vars(self), "nodes": {key: vars(node) for key, node in self.nodes.items()}}
+        values["samples"] = [
+            {"at_us": sample.at_us, "cpu_us": dict(sample.cpu_us)} for sample in self.samples
+        ]
+        return json.dumps(values)
+
+    @classmethod
+    def from_json(cls, text: str) -> "CellStatus":
+        """Inverse of to_json. Unknown keys are left aside: the runner may be a newer version.
+
+        Raises DoraSystemdError when the text is not such a table at all.
+        """
+        try:
+            return _parse_cell(json.loads(text))
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            raise DoraSystemdError(
+                f"cannot read the node table of a dataflow: {error}",
+                "it was written by another version of dora-systemd, or damaged",
+                ExitCode.FAILURE,
+            ) from error
+
+
+def add_sample(samples: tuple[CpuSample, ...], sample: CpuSample) -> tuple[CpuSample, ...]:
+    """`samples` with a newer one, the oldest dropped."""
+    return (*samples, sample)[-SAMPLES_KEPT:]
+
+
+def cpu_percent(samples: tuple[CpuSample, ...], now: CpuSample, key: str = WHOLE_CELL) -> float:
+    """CPU use of `key` up to `now` in percent of one processor, as top(1) counts.
+
+    The window begins at the newest sample that is at least a second old. A key that a sample lacks
+    had used nothing then; a count that went down belongs to a new group.
+    """
+    old_enough = [s for s in samples if now.at_us - s.at_us >= SHORTEST_WINDOW_US]
+    base = old_enough[-1] if old_enough else next(iter(samples), CpuSample(0))
+    window = now.at_us - base.at_us
+    used = now.cpu_us.get(key, 0) - base.cpu_us.get(key, 0)
+    return max(100.0 * used / window, 0.0) if window > 0 else 0.0
+
+
+def _parse_cell(raw: Any) -> CellStatus:
+    known = _known(CellStatus, raw)
+    nodes = {
+        str(key): NodeStatus(**_known(NodeStatus, node))
+        for key, node in known.pop("nodes", {}).items()
+    }
+    samples = tuple(_parse_sample(one) for one in known.pop("samples", ()))
+    return CellStatus(**known, nodes=nodes, samples=samples)
+
+
+def _parse_sample(raw: Any) -> CpuSample:
+    usage = {str(key): int(value) for key, value in raw.get("cpu_us", {}).items()}
+    return CpuSample(int(raw["at_us"]), usage)
+
+
+def _known(kind: type[Any], raw: Any) -> dict[str, Any]:
+    scalars = {one.name: type(one.default) for one in fields(kind) if one.default is not MISSING}
+    names = {one.name for one in fields(kind)}
+    return {
+        key: scalars[key](value) if scalars.get(key) in (int, str) else value
+        for key, value in raw.items()
+        if key in names
+    }

@@ -1,0 +1,16 @@
+"""What somebody may have meant by a word that we do not know."""
+
+from collections.abc import Iterable
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """A hint with up to three of the `known` words that are like `word`, or ""."""
+    # Only somebody who made a mistake pays for this import.
+    import difflib
+
+    by_lower = {one.lower().replace("-", "_"): one for one in known}
+    wanted = word[:100].lower().replace("-", "_")
+    if wanted in by_lower:
+        return f"did you mean {by_lower[wanted]}?"
+    near = [by_lower[one] for one in difflib.get_close_matches(wanted, by_lower, n=3)]
+    return f"did you mean {' or '.join(near)}?" if near else ""

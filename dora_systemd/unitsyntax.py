@@ -1,0 +1,78 @@
+"""The text of unit files: words, quotes, escapes and specifiers, as in systemd.syntax(7)."""
+
+import re
+
+SPACE = " \t\n\r"
+
+_ESCAPES = {
+    **{"a": "\a", "b": "\b", "f": "\f", "n": "\n", "r": "\r", "t": "\t", "v": "\v", "s": " "},
+    **{"\\": "\\", '"': '"', "'": "'"},
+}
+_NUMERIC = re.compile(r"x([0-9a-fA-F]{2})|u([0-9a-fA-F]{4})|U([0-9a-fA-F]{8})|([0-7]{3})")
+_PLAIN_WORD = re.compile(r"[A-Za-z0-9_@%=:,./+~^!?*\[\]-]+")
+_NEEDS_ESCAPE = re.compile(r'[\\"\x00-\x1f\x7f]')
+
+
+def split_words(text: str, separators: str = SPACE) -> list[str]:
+    """The words of `text`, quotes and C escapes resolved, split at any of `separators`.
+
+    Raises ValueError for an unfinished quote or escape. Adjacent blanks count as one separator;
+    any other separator keeps the empty words around it.
+    """
+    words: list[str] = []
+    word: str | None = None
+    quote, place = "", 0
+    while place < len(text):
+        char, length = text[place], 1
+        if char == "\\":
+            char, length = _unescaped(text, place)
+            word = (word or "") + char
+        elif quote:
+            word = (word or "") + (char if char != quote else "")
+            quote = "" if char == quote else quote
+        elif char in "\"'":
+            word, quote = word or "", char
+        elif char in separators:
+            words += [] if word is None and char in SPACE else [word or ""]
+            # "a:" has an empty word at its end, "a " has none.
+            word = None if char in SPACE else ""
+        else:
+            word = (word or "") + char
+        place += length
+    if quote:
+        raise ValueError("a quote is not closed")
+    return words + ([] if word is None else [word])
+
+
+def escape_specifiers(text: str) -> str:
+    """`text` with % doubled, or systemd.unit(5) would take what follows it for a specifier."""
+    return text.replace("%", "%%")
+
+
+def quote_word(text: str) -> str:
+    """`text` as one word of a list in a unit file, quoted and escaped where it needs that."""
+    escaped = escape_specifiers(text)
+    if _PLAIN_WORD.fullmatch(escaped):
+        return escaped
+    return '"' + _NEEDS_ESCAPE.sub(_escaped, escaped) + '"'
+
+
+def _unescaped(text: str, place: int) -> tuple[str, int]:
+    """The character that the escape at `place` stands for, and how long the escape is."""
+    letter = text[place + 1 : place + 2]
+    if not letter:
+        raise ValueError("a backslash ends it")
+    match = _NUMERIC.match(text, place + 1)
+    if match:
+        digits = match[1] or match[2] or match[3]
+        code = int(digits, 16) if digits else int(match[4], 8)
+        if not 0 < code < 0x110000 or 0xD800 <= code < 0xE000:
+            raise ValueError("an escape stands for no character")
+        return chr(code), 1 + len(match[0])
+    # Without a meaning of its own an escaped character stands for itself, as in paths.
+    return _ESCAPES.get(letter, letter), 2
+
+
+def _escaped(match: re.Match[str]) -> str:
+    char = match[0]
+    return {"\n": "\\n", "\t": "\\t", "\\": "\\\\", '"': '\\"'}.get(char, f"\\x{ord(char):02x}")

@@ -1,0 +1,169 @@
+"""Sizes, durations, CPU shares and booleans: text to value and back, as systemd spells them.
+
+Every `parse_` function raises DoraSystemdError (ExitCode.USAGE) on anything it does not know. The
+message names the text, the hint alone says what was expected: whoever knows the key or the file
+says so in a message of its own and keeps the hint.
+"""
+
+import re
+
+from dora_systemd.errors import DoraSystemdError, ExitCode
+
+INFINITY = 2**64 - 1
+"""What "infinity" is on D-Bus: UINT64_MAX, for sizes, durations and CPU shares alike."""
+
+SECOND = 1_000_000
+"""Microseconds of a second."""
+
+_SIZE = re.compile(r"([0-9]+)(?:\.([0-9]+))?\s*([KMGTPE]?)B?")
+_SIZE_FACTORS = {suffix: 1024**power for power, suffix in enumerate(" KMGTPE") if power} | {"": 1}
+_SIZE_HINT = "write bytes, or a number with K, M, G or T (powers of 1024) such as 512M; or infinity"
+
+_MINUTE, _HOUR, _DAY = 60 * SECOND, 3600 * SECOND, 86400 * SECOND
+_DURATION_UNITS = {
+    **dict.fromkeys(("usec", "us", "µs", "μs"), 1),
+    **dict.fromkeys(("msec", "ms"), 1000),
+    **dict.fromkeys(("seconds", "second", "sec", "s", ""), SECOND),
+    **dict.fromkeys(("minutes", "minute", "min", "m"), _MINUTE),
+    **dict.fromkeys(("hours", "hour", "hr", "h"), _HOUR),
+    **dict.fromkeys(("days", "day", "d"), _DAY),
+    **dict.fromkeys(("weeks", "week", "w"), 7 * _DAY),
+    **dict.fromkeys(("months", "month", "M"), 2_629_800 * SECOND),
+    **dict.fromkeys(("years", "year", "y"), 31_557_600 * SECOND),
+}
+_DURATION_NAMES = (("d", _DAY), ("h", _HOUR), ("min", _MINUTE), ("s", SECOND), ("ms", 1000))
+_SPAN = re.compile(r"\s*([0-9]+)(?:\.([0-9]+))?\s*([a-zA-Zµμ]*)")
+_DURATION_HINT = "write seconds, or a time span such as 500ms, 10s or 1min 30s; or infinity"
+
+_CPU = re.compile(r"([0-9]+)(?:\.([0-9]+))?(%?)")
+_CPU_STEP = 100
+_CPU_HINT = "write cores such as 1.5, or a share of one core such as 150%; or infinity"
+
+_BOOLEANS = {
+    **dict.fromkeys(("1", "yes", "y", "true", "t", "on"), True),
+    **dict.fromkeys(("0", "no", "n", "false", "f", "off"), False),
+}
+
+# Longer numbers overflow 64 bits anyway, and Python refuses to convert very long ones.
+_MAX_DIGITS = 40
+_MAX_SHOWN = 60
+
+
+def quoted(text: str) -> str:
+    """`text` for a message: in quotes, on one line, odd characters escaped, 60 at most."""
+    cut = text if len(text) <= _MAX_SHOWN else text[: _MAX_SHOWN - 3] + "..."
+    return repr(cut)
+
+
+def shown(text: str) -> str:
+    """`text` for a message, without quotes as long as it is plain: for paths and names of files."""
+    return text if text.isprintable() and text.strip() == text and text else quoted(text)
+
+
+def parse_size(text: str) -> int:
+    """Bytes; K, M, G, T, P and E are powers of 1024 as in systemd.resource-control(5)."""
+    if text.strip() == "infinity":
+        return INFINITY
+    match = _SIZE.fullmatch(text.strip())
+    size = _scaled(match[1], match[2], _SIZE_FACTORS[match[3]]) if match else None
+    if size is None:
+        raise _refusal("size", text, _SIZE_HINT)
+    return size
+
+
+def format_size(size: int) -> str:
+    """The shortest exact text of `size` bytes: parse_size gives the same number back."""
+    if size == INFINITY:
+        return "infinity"
+    for suffix in "EPTGMK":
+        if size and size % _SIZE_FACTORS[suffix] == 0:
+            return f"{size // _SIZE_FACTORS[suffix]}{suffix}"
+    return str(size)
+
+
+def format_rounded_size(size: int) -> str:
+    """`size` bytes for a table: three digits and a letter, such as 256M or 1.5G."""
+    if size == INFINITY:
+        return "infinity"
+    for suffix in "EPTGMK":
+        amount = size / _SIZE_FACTORS[suffix]
+        if amount >= 1:
+            digits = f"{amount:.1f}" if amount < 9.95 else f"{amount:.0f}"
+            return digits.removesuffix(".0") + suffix
+    return f"{size}B"
+
+
+def parse_duration(text: str) -> int:
+    """Microseconds; units and their sums as in systemd.time(7), a bare number is seconds."""
+    if text.strip() == "infinity":
+        return INFINITY
+    spans, end = [], 0
+    while match := _SPAN.match(text, end):
+        factor = _DURATION_UNITS.get(match[3])
+        spans.append(None if factor is None else _scaled(match[1], match[2], factor))
+        end = match.end()
+    known = [span for span in spans if span is not None]
+    if text[end:].strip() or not known or len(known) < len(spans) or sum(known) >= INFINITY:
+        raise _refusal("duration", text, _DURATION_HINT)
+    return sum(known)
+
+
+def format_duration(duration: int) -> str:
+    """The exact text of `duration` µs, such as "1min 30s": parse_duration gives the number back."""
+    if duration in (0, INFINITY):
+        return "infinity" if duration else "0"
+    parts, rest = [], duration
+    for unit, factor in (*_DURATION_NAMES, ("us", 1)):
+        count, rest = divmod(rest, factor)
+        parts += [f"{count}{unit}"] * (count > 0)
+    return " ".join(parts)
+
+
+def parse_cpu(text: str) -> int:
+    """Microseconds of CPU time per second, from cores ("2.0") or a share of one core ("150%").
+
+    The result is more than nothing and a multiple of 0.01 % of a core, the step of CPUQuota= in
+    systemd.resource-control(5).
+    """
+    if text.strip() == "infinity":
+        return INFINITY
+    match = _CPU.fullmatch(text.strip())
+    one = SECOND // 100 if match and match[3] else SECOND
+    share = _scaled(match[1], match[2], one) if match else None
+    if share is None or share < _CPU_STEP:
+        raise _refusal("CPU share", text, _CPU_HINT)
+    return share - share % _CPU_STEP
+
+
+def format_cpu(share: int) -> str:
+    """`share` µs of CPU per second as CPUQuota= takes it: "150%", two decimals at most."""
+    if share == INFINITY:
+        return "infinity"
+    whole, hundredths = divmod(share // _CPU_STEP, 100)
+    return f"{whole}.{hundredths:02}".rstrip("0").rstrip(".") + "%"
+
+
+def parse_bool(text: str) -> bool:
+    """True or False, from the words of systemd.syntax(7): yes, true, on, 1 and their opposites."""
+    value = _BOOLEANS.get(text.strip().lower())
+    if value is None:
+        raise _refusal("boolean", text, "write yes or no")
+    return value
+
+
+def format_bool(value: bool) -> str:
+    """ "yes" or "no"."""
+    return "yes" if value else "no"
+
+
+def _scaled(whole: str, fraction: str | None, factor: int) -> int | None:
+    """`whole.fraction` times `factor`, cut to an integer; None if it does not fit 64 bits."""
+    digits = fraction or ""
+    if len(whole) + len(digits) > _MAX_DIGITS:
+        return None
+    value = int(whole + digits) * factor // 10 ** len(digits)
+    return value if value < INFINITY else None
+
+
+def _refusal(what: str, text: str, hint: str) -> DoraSystemdError:
+    return DoraSystemdError(f"cannot read {quoted(text)} as a {what}", hint, ExitCode.USAGE)

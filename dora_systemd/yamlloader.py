@@ -1,0 +1,68 @@
+"""YAML as dora reads it. Imported by `files` alone, and only when there is YAML to read.
+
+PyYAML follows YAML 1.1: `on` would be true, `010` eight, `1:30` ninety, `2024-01-01` a date. dora's
+reader follows the core schema of YAML 1.2 (chapter 10.3), and so does this one, or a node would
+get other values from us than from dora.
+"""
+
+import re
+from collections.abc import Callable, Hashable
+from typing import Any
+
+import yaml
+
+_BASE: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_TAG = "tag:yaml.org,2002:"
+_BASES = {"0x": 16, "0o": 8, "0b": 2}
+_CORE = (
+    ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
+    ("bool", r"true|True|TRUE|false|False|FALSE", list("tTfF")),
+    ("int", r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+|0b[01]+", list("-+0123456789")),
+    (
+        "float",
+        r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)",
+        list("-+.0123456789"),
+    ),
+)
+
+
+class _Loader(_BASE):  # type: ignore[misc]
+    """The core schema, no merge keys, and no key twice in one mapping."""
+
+    yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012
+
+    def flatten_mapping(self, node: Any) -> None:
+        """dora knows no `<<`, and merging anchors of anchors grows without limit."""
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Hashable, Any]:
+        """The mapping of `node`; raises a ConstructorError with the line of a repeated key."""
+        seen: set[Hashable] = set()
+        for key_node, _ in node.value if isinstance(node, yaml.MappingNode) else ():
+            key = self.construct_object(key_node, deep=True)
+            if isinstance(key, Hashable) and key in seen:
+                problem = f"the key {key_node.value!r} is there twice"
+                raise yaml.constructor.ConstructorError(None, None, problem, key_node.start_mark)
+            seen |= {key} if isinstance(key, Hashable) else set()
+        mapping: dict[Hashable, Any] = super().construct_mapping(node, deep)
+        return mapping
+
+
+def loader_class() -> Any:
+    """The loader class for yaml.load(), on libyaml where PyYAML was built with it."""
+    for tag, pattern, first in _CORE:
+        _Loader.add_implicit_resolver(_TAG + tag, re.compile(f"(?:{pattern})$"), first)
+    for tag, construct in _constructors().items():
+        _Loader.add_constructor(_TAG + tag, construct)
+    return _Loader
+
+
+def _constructors() -> dict[str, Callable[[Any, Any], Any]]:
+    return {
+        "int": lambda loader, node: _integer(loader.construct_scalar(node)),
+        "bool": lambda loader, node: loader.construct_scalar(node).lower() == "true",
+    }
+
+
+def _integer(text: str) -> int:
+    base = _BASES.get(text[:2])
+    return int(text[2:], base) if base else int(text)

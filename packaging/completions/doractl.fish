@@ -1,0 +1,21 @@
+# fish completion for doractl(1). doractl itself says what fits: it knows its options and what runs.
+
+function __doractl_complete
+    set -l words (commandline --current-process --tokenize --cut-at-cursor)
+    set -lx COMP_WORDS "$words"
+    set -lx COMP_CWORD (commandline --current-token --cut-at-cursor)
+    set -lx _DORACTL_COMPLETE fish_complete
+    for line in (doractl 2>/dev/null)
+        set -l parts (string split --max 1 , -- $line)
+        switch $parts[1]
+            case plain
+                echo $parts[2]
+            case file
+                __fish_complete_path $COMP_CWORD
+            case dir
+                __fish_complete_directories $COMP_CWORD
+        end
+    end
+end
+
+complete --no-files --command doractl --arguments '(__doractl_complete)'

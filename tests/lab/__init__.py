@@ -1,0 +1,1 @@
+"""The test lab: a booted Debian with dora and the checkout, as a container or as a machine."""

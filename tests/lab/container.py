@@ -1,0 +1,116 @@
+"""LAB=container: systemd-nspawn boots the tree; commands enter it with nsenter."""
+
+import os
+import select
+import shutil
+import socket
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from lab import cgroup, image
+from lab.cache import find_cache
+from lab.errors import LabError
+from lab.options import Options
+from lab.process import die_with_parent, need_tools, read_last_line
+from lab.runs import Run, note, remove_cgroup
+from lab.service import service_command
+from lab.terminal import is_terminal, kept_terminal
+
+BOOT_SECONDS = 60.0
+# dora's shared memory needs mlock(), which nspawn forbids otherwise.
+CAPABILITIES = "CAP_IPC_LOCK"
+
+
+@dataclass(frozen=True)
+class Container:
+    leader: int
+    supervisor: Path  # nspawn's own cgroup, beside the payload's
+
+
+def run_in_container(run: Run, tree: Path, options: Options) -> int:
+    need_tools("systemd-nspawn")
+    if len(options.commands) > 1:
+        raise LabError("reboot a container", "LAB=vm")
+    source = run.directory / "src"
+    source.mkdir(mode=0o755)
+    image.copy_checkout(source)
+    with started_container(run, tree, options.out) as container, kept_terminal():
+        return subprocess.run(enter_command(container, options), check=False).returncode
+
+
+@contextmanager
+def started_container(run: Run, tree: Path, out: Path | None) -> Iterator[Container]:
+    hide_traces(run)
+    enter, path = cgroup.enter_command(run.name)
+    note(run, "cgroup", path)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ready:
+        ready.bind(str(run.directory / "notify"))
+        nspawn = start_nspawn(run, [*enter, *nspawn_command(run, tree, out)])
+        try:
+            yield Container(wait_ready(ready, nspawn, run), path / "supervisor")
+        finally:
+            remove_cgroup(path)
+            nspawn.kill()
+            nspawn.wait()
+
+
+def hide_traces(run: Run) -> None:
+    """nspawn leaves directories and mounts here when it is killed; they end with our namespace."""
+    place = Path("/run/systemd/nspawn")
+    place.mkdir(parents=True, exist_ok=True)
+    subprocess.run(["mount", "-t", "tmpfs", run.name, str(place)], check=True)
+
+
+def start_nspawn(run: Run, command: list[str]) -> subprocess.Popen[bytes]:
+    extra = {
+        "SYSTEMD_NSPAWN_UNIFIED_HIERARCHY": "1",
+        "SYSTEMD_NSPAWN_LOCK": "0",  # the tree is only read, by many at once
+        "NOTIFY_SOCKET": str(run.directory / "notify"),
+    }
+    with (run.directory / "log").open("wb") as log:
+        return subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            env={"PATH": image.CLEAN_PATH, "TMPDIR": str(run.directory), **extra},
+            start_new_session=True,  # Ctrl+C is for the command; the lab ends the container
+        )
+
+
+def nspawn_command(run: Run, tree: Path, out: Path | None) -> list[str]:
+    return die_with_parent([
+        "systemd-nspawn", "--register=no", "--keep-unit", "--quiet", "--boot",
+        f"--directory={tree}", "--volatile=overlay", f"--machine={run.name}", "--hostname=lab",
+        "--private-network", "--resolv-conf=off", "--timezone=off", "--link-journal=no",
+        f"--capability={CAPABILITIES}", "--console=pipe", "--notify-ready=yes",
+        f"--bind={run.directory / 'src'}:/src", *([f"--bind={out}:/out"] if out else []),
+    ])  # fmt: skip
+
+
+def wait_ready(ready: socket.socket, nspawn: subprocess.Popen[bytes], run: Run) -> int:
+    """nspawn tells the leader's pid when it forks it, and READY=1 when that has booted."""
+    leader = 0
+    ended = os.pidfd_open(nspawn.pid)
+    told = ready.fileno()
+    try:
+        while select.select([told, ended], [], [], BOOT_SECONDS)[0] == [told]:
+            message = ready.recv(4096).decode().splitlines()
+            fields = dict(line.partition("=")[::2] for line in message)
+            leader = int(fields.get("X_NSPAWN_LEADER_PID", leader))
+            if "READY" in fields and leader:
+                return leader
+    finally:
+        os.close(ended)
+    kept = shutil.copy(run.directory / "log", find_cache() / "boot.log")
+    raise LabError(f"boot the container: {read_last_line(run.directory / 'log')}", f"see {kept}")
+
+
+def enter_command(container: Container, options: Options) -> list[str]:
+    """In the run's cgroup as well: whatever ends that ends this too, before it can complain."""
+    join = cgroup.join_command(container.supervisor)
+    nsenter = ["nsenter", f"--target={container.leader}", "--all", "--"]
+    return [*join, *nsenter, *service_command(options.commands[0], options, is_terminal())]

@@ -1,0 +1,58 @@
+"""What the image is made of; the key of each layer is a hash of this."""
+
+import hashlib
+import json
+import tomllib
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).resolve().parent
+CHECKOUT = HERE.parents[1]
+
+SUITE = "trixie"
+
+# Debian's own build of everything Debian has: the product uses those in its package.
+PACKAGES = [
+    "systemd", "systemd-sysv", "libpam-systemd", "dbus", "dbus-user-session", "polkitd",
+    "python3", "python3-venv", "python3-setuptools", "python3-pystemd", "python3-systemd",
+    "python3-pydantic", "python3-click", "python3-yaml", "python3-watchfiles",
+    "python3-websockets", "python3-rich", "bash-completion", "ca-certificates", "curl", "git",
+    "iproute2", "kmod", "less", "lsof", "make", "man-db", "mandoc", "psmisc", "procps", "socat",
+    "strace", "udev",
+]  # fmt: skip
+
+PYPI = [
+    "dora-rs-cli==1.1.0", "dora-rs==1.1.0", "pyarrow", "numpy", "uv", "pytest",
+    "pytest-timeout", "hypothesis",
+]  # fmt: skip
+
+KERNEL = "linux-image-cloud-amd64"
+
+# What `pip install --editable` reads of the checkout, apart from the code it points at.
+PROJECT_TABLES = ("build-system", "project")
+SYSUSERS = CHECKOUT / "units/templates/dora-systemd.sysusers"
+
+
+def digest(*parts: object) -> str:
+    text = json.dumps(parts, sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def read_part(path: Path) -> str:
+    return path.read_text(encoding="utf-8") if path.is_file() else ""
+
+
+def base_key() -> str:
+    return digest(SUITE, PACKAGES, PYPI, read_part(HERE / "setup.sh"))
+
+
+def project_key(pyproject: str, sysusers: str) -> str:
+    """Settings of linters and pytest change often and do not change the image."""
+    tables: dict[str, Any] = tomllib.loads(pyproject)
+    wanted = {name: tables.get(name) for name in PROJECT_TABLES}
+    setuptools = tables.get("tool", {}).get("setuptools")
+    return digest(base_key(), wanted, setuptools, sysusers, read_part(HERE / "image.py"))
+
+
+def tree_key() -> str:
+    return project_key(read_part(CHECKOUT / "pyproject.toml"), read_part(SYSUSERS))

@@ -1,0 +1,83 @@
+"""The verbs of the lab."""
+
+import signal
+import sys
+from collections.abc import Sequence
+
+from lab import cgroup
+from lab.cache import find_cache, remove_layer
+from lab.container import run_in_container
+from lab.errors import LabError
+from lab.image import ensure_tree
+from lab.machine import ensure_machine, run_in_machine
+from lab.options import Options, parse_options
+from lab.process import need_root
+from lab.runs import Guard, clean_dead_runs, close_run, open_run, opened_door
+
+# As in docker and timeout: the lab's own failure is told apart from the command's.
+LAB_FAILED = 125
+
+
+def main(arguments: Sequence[str]) -> int:
+    try:
+        options = parse_options(arguments)
+        need_root()
+        prepare()
+        return VERBS[options.verb](options)
+    except LabError as error:
+        print(error, file=sys.stderr)
+        return LAB_FAILED
+    except SystemExit as ended:  # argparse, and end_orderly()
+        return ended.code if isinstance(ended.code, int) else LAB_FAILED
+
+
+def prepare() -> None:
+    cgroup.enter_namespace()
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, end_orderly)
+
+
+def run_command(options: Options) -> int:
+    layer = ENSURE[options.form](find_cache())
+    run = open_run()
+    with Guard():
+        try:
+            return RUN[options.form](run, layer, options)
+        finally:
+            close_run(run)
+
+
+def end_orderly(number: int, _frame: object) -> None:
+    raise SystemExit(128 + number)
+
+
+def build(options: Options) -> int:
+    ENSURE[options.form](find_cache())
+    return 0
+
+
+def sweep(_options: Options) -> int:
+    """Cleans up after a killed run; started by its guard."""
+    with opened_door():
+        clean_dead_runs()
+    return 0
+
+
+def clean(options: Options) -> int:
+    sweep(options)
+    for path in find_cache().iterdir():
+        if path.is_dir():
+            remove_layer(path)
+    return 0
+
+
+ENSURE = {"container": ensure_tree, "vm": ensure_machine}
+RUN = {"container": run_in_container, "vm": run_in_machine}
+VERBS = {
+    "run": run_command,
+    "shell": run_command,
+    "build": build,
+    "clean": clean,
+    "sweep": sweep,
+}

@@ -1,0 +1,110 @@
+"""The command line of the lab as a value."""
+
+import argparse
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from lab.errors import LabError
+
+FORMS = ("container", "vm")
+
+REBOOT = "--reboot--"
+
+EPILOG = """\
+environment:
+  LAB=container     a systemd-nspawn container (default): starts in half a second;
+                    systemd accepts limits there but cannot enforce them
+  LAB=vm            a virtual machine with its own kernel and cgroup v2 controllers
+  LAB_OUT=DIR       this directory is /out inside
+  DORA_LAB_CACHE    where images are kept (default: ~/.cache/dora-systemd-lab)
+  LAB_MIRROR        another Debian mirror for building the image
+
+The command runs as root in a private copy of the checkout, /src; what it writes
+there is gone afterwards. Inside, LAB names the form. The exit status is the
+command's, 128+N if signal N killed it, 125 if the lab itself failed.
+With LAB=vm, CMD1 --reboot-- CMD2 restarts the machine in between, if CMD1 succeeds.
+"""
+
+
+@dataclass(frozen=True)
+class Options:
+    verb: str
+    form: str
+    # More than one only in a machine, which is rebooted between them.
+    commands: tuple[tuple[str, ...], ...] = ()
+    env: tuple[tuple[str, str], ...] = ()
+    out: Path | None = None
+
+
+def parse_options(arguments: Sequence[str], environ: Mapping[str, str] = os.environ) -> Options:
+    given = build_parser().parse_args(arguments)
+    return Options(
+        verb=given.verb,
+        form=parse_form(environ.get("LAB") or FORMS[0]),
+        commands=parse_commands(given.verb, getattr(given, "command", [])),
+        env=tuple(parse_variable(text, environ) for text in getattr(given, "env", [])),
+        out=parse_out(environ.get("LAB_OUT", "")),
+    )
+
+
+def build_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="lab",
+        description="Run a command under a booted systemd, with dora and this checkout.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
+    run = verbs.add_parser("run", help="run a command in a fresh system: run [--env K[=V]] -- CMD")
+    shell = verbs.add_parser("shell", help="a root shell in a fresh system")
+    verbs.add_parser("build", help="build what is missing of the image")
+    verbs.add_parser("clean", help="remove all images and what killed runs left behind")
+    verbs.add_parser("sweep")  # no help: for the lab itself
+    for verb in (run, shell):
+        verb.add_argument(
+            "--env",
+            action="append",
+            default=[],
+            metavar="NAME[=VALUE]",
+            help="set a variable for the command; without a value, the caller's",
+        )
+    run.add_argument("command", nargs=argparse.REMAINDER, metavar="CMD")
+    return parser
+
+
+def parse_form(text: str) -> str:
+    if text not in FORMS:
+        raise LabError(f"use LAB={text}", f"one of {', '.join(FORMS)}")
+    return text
+
+
+def parse_commands(verb: str, words: Sequence[str]) -> tuple[tuple[str, ...], ...]:
+    if verb == "shell":
+        return (("/bin/bash", "--login"),)
+    commands: list[list[str]] = [[]]
+    for word in words[1:] if words[:1] == ["--"] else words:
+        if word == REBOOT:
+            commands.append([])
+        else:
+            commands[-1].append(word)
+    if verb == "run" and not all(commands):
+        raise LabError("run nothing", "lab run -- CMD")
+    return tuple(tuple(command) for command in commands)
+
+
+def parse_variable(text: str, environ: Mapping[str, str]) -> tuple[str, str]:
+    name, separator, value = text.partition("=")
+    if not name.isidentifier() or not name.isascii():
+        raise LabError(f"pass the variable {name!r}", "--env NAME or --env NAME=VALUE")
+    return name, value if separator else environ.get(name, "")
+
+
+def parse_out(text: str) -> Path | None:
+    if not text:
+        return None
+    path = Path(text).absolute()
+    if not path.is_dir():
+        raise LabError(f"use LAB_OUT={text}", "an existing directory")
+    return path

@@ -1,0 +1,139 @@
+"""The steps of `make test` and its parts, one after the other; the first failure ends them."""
+
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from lab.cache import find_cache
+from lab.definition import CHECKOUT
+from lab.errors import LabError, say
+from lab.venv import ensure_venv, venv_environment, write_package
+
+LAB_PYTHON = (3, 13)
+# pytest's last line: "=== 3 passed, 1 skipped in 0.12s ==="
+SUMMARY = re.compile(r"=+ (\d+ .* in [\d.:s ()]+) =+")
+
+
+@dataclass(frozen=True)
+class Step:
+    name: str
+    command: Sequence[str]
+    env: dict[str, str]
+    cwd: Path = CHECKOUT
+
+
+def main(arguments: Sequence[str]) -> int:
+    form = os.environ.get("LAB") or "container"
+    try:
+        plan = PLANS[arguments[0]]
+        os.environ["LAB"] = form
+        return run_steps(plan(form))
+    except LabError as error:
+        print(error, file=sys.stderr)
+        return 125
+    except KeyboardInterrupt:
+        return 130
+
+
+def run_steps(steps: Sequence[Step]) -> int:
+    results: list[str] = []
+    for step in steps:
+        if step is steps[-1] and results:
+            say("so far: " + "; ".join(results))
+        say(f"--- {step.name} ---")
+        status, summary = run_step(step)
+        results.append(f"{step.name}: {summary}")
+        if status:
+            return status
+    return 0
+
+
+def run_step(step: Step) -> tuple[int, str]:
+    summary = "done"
+    with subprocess.Popen(
+        step.command,
+        env=step.env,
+        cwd=step.cwd,
+        stdout=subprocess.PIPE,
+        text=True,
+        errors="replace",
+    ) as process:
+        assert process.stdout
+        for line in process.stdout:
+            print(line, end="", flush=True)
+            summary = read_summary(line) or summary
+    return process.returncode, summary
+
+
+def read_summary(line: str) -> str:
+    found = SUMMARY.fullmatch(line.strip())
+    return found[1] if found else ""
+
+
+def plan_test(form: str) -> list[Step]:
+    if form == "host":
+        return [*plan_unit(form), *plan_system(form)]
+    inside = [] if sys.version_info[:2] == LAB_PYTHON else [unit_in_lab()]
+    return [*plan_unit(form), *inside, *plan_lab(form), *plan_vm(form), *plan_system(form)]
+
+
+def plan_unit(_form: str) -> list[Step]:
+    venv = ensure_venv(find_cache())
+    command = ["python", "-m", "pytest", "tests/unit"]
+    version = ".".join(map(str, sys.version_info[:2]))
+    return [Step(f"unit tests, Python {version}", command, venv_environment(venv))]
+
+
+def unit_in_lab() -> Step:
+    version = ".".join(map(str, LAB_PYTHON))
+    return lab_step(f"unit tests, Python {version}", "container", ["tests/unit"])
+
+
+def plan_lab(_form: str) -> list[Step]:
+    command = ["python", "-m", "pytest", "tests/lab"]
+    return [Step("tests of the lab", command, venv_environment(ensure_venv(find_cache())))]
+
+
+def plan_vm(_form: str) -> list[Step]:
+    return [lab_step("system tests that need limits, vm", "vm", ["tests/system", "-m", "vm"])]
+
+
+def plan_system(form: str) -> list[Step]:
+    arguments = ["tests/system", "-m", "not vm"]
+    if form != "host":
+        return [lab_step(f"system tests, {form}", form, arguments)]
+    if not Path("/run/systemd/system").is_dir():
+        raise LabError("use LAB=host", "systemd is not running here; LAB=container brings its own")
+    venv = ensure_venv(find_cache(), for_system_tests=True)
+    command = ["python", "-m", "pytest", *arguments]
+    return [Step("system tests, this machine", command, venv_environment(venv))]
+
+
+def lab_step(name: str, form: str, arguments: Sequence[str]) -> Step:
+    command = ["tests/lab/lab", "run", "--", "pytest", *arguments]
+    return Step(name, command, {**os.environ, "LAB": form})
+
+
+def plan_lint(_form: str) -> list[Step]:
+    venv = ensure_venv(find_cache())
+    env = venv_environment(venv)
+    config = f"--config-file={CHECKOUT / 'pyproject.toml'}"
+    sources = ["dora_systemd", "lab"]
+    return [
+        Step("ruff", ["ruff", "check", "."], env),
+        Step("mypy", ["mypy", config, *sources], env, write_package(venv)),
+    ]
+
+
+PLANS: dict[str, Callable[[str], list[Step]]] = {
+    "test": plan_test,
+    "unit": plan_unit,
+    "system": plan_system,
+    "lab": plan_lab,
+    "vm": plan_vm,
+    "lint": plan_lint,
+}

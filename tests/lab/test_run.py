@@ -1,0 +1,117 @@
+"""`lab run` from the outside: needs root, and the images (built if they are missing)."""
+
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+LAB = Path(__file__).with_name("lab")
+RUNS = Path("/run/dora-systemd-lab")
+
+
+@pytest.fixture(params=["container", "vm"])
+def env(request: pytest.FixtureRequest) -> Iterator[dict[str, str]]:
+    yield {**os.environ, "LAB": request.param}
+    assert_nothing_left()
+
+
+def lab(env: dict[str, str], *arguments: str, given: bytes = b"") -> tuple[int, bytes, bytes]:
+    done = subprocess.run([LAB, *arguments], env=env, input=given, capture_output=True, check=False)
+    return done.returncode, done.stdout, done.stderr
+
+
+def own_runs() -> set[str]:
+    return {path.name for path in RUNS.glob("lab-*")}
+
+
+def assert_nothing_left() -> None:
+    """No run of a dead lab; those of other people at the same time have a living one."""
+    for _ in range(50):
+        subprocess.run([LAB, "sweep"], check=True)
+        mounts = Path("/proc/mounts").read_text()
+        if not any(name in mounts for name in own_runs()):
+            return
+        time.sleep(0.1)
+    raise AssertionError("mounts are left over")
+
+
+@pytest.mark.parametrize(
+    ("script", "status"), [("exit 3", 3), ("kill -KILL $$", 137), ("kill -TERM $$", 143)]
+)
+def test_exit_status(env: dict[str, str], script: str, status: int) -> None:
+    assert lab(env, "run", "--", "sh", "-c", script) == (status, b"", b"")
+
+
+def test_streams_are_separate(env: dict[str, str]) -> None:
+    given = bytes(range(256)) * 1000
+    done = lab(env, "run", "--", "sh", "-c", "cat; echo e >&2", given=given)
+    assert done == (0, given, b"e\n")
+
+
+def test_words_and_variables_arrive_unchanged(env: dict[str, str]) -> None:
+    value = "a $HOME \"b\" 'c' %n\n${X} \\ é"
+    script = 'import os, sys; print(ascii(os.environ["V"])); print(ascii(sys.argv[1]))'
+    _, out, _ = lab(env, "run", "--env", f"V={value}", "--", "python3", "-c", script, value)
+    assert out.decode().splitlines() == [ascii(value), ascii(value)]
+
+
+def test_untracked_files_are_there_and_nothing_comes_back(env: dict[str, str]) -> None:
+    untracked = LAB.with_name(f"untracked-{os.getpid()}")
+    untracked.write_text("here")
+    try:
+        name = f"tests/lab/{untracked.name}"
+        status, out, _ = lab(env, "run", "--", "sh", "-c", f"cat {name}; echo changed > {name}")
+        assert (status, out) == (0, b"here")
+        assert untracked.read_text() == "here"
+    finally:
+        untracked.unlink()
+
+
+def test_out_directory(env: dict[str, str], tmp_path: Path) -> None:
+    lab({**env, "LAB_OUT": str(tmp_path)}, "run", "--", "sh", "-c", "echo result > /out/file")
+    assert (tmp_path / "file").read_text() == "result\n"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_ended_from_outside(env: dict[str, str], number: signal.Signals) -> None:
+    before = own_runs()
+    command = [str(LAB), "run", "--", "sh", "-c", "echo up; sleep 1000"]
+    with subprocess.Popen(command, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as run:
+        assert run.stdout and run.stdout.readline() == b"up\n"
+        mine = own_runs() - before
+        run.send_signal(number)
+        status = run.wait(timeout=20)
+    assert status == (-9 if number is signal.SIGKILL else 128 + number)
+    deadline = time.monotonic() + 20
+    while mine & own_runs() and time.monotonic() < deadline:
+        time.sleep(0.1)
+    # Others may have started one between the two looks; theirs end too, but not in our time.
+    assert len(mine & own_runs()) < len(mine)
+
+
+def test_random_numbers_differ(env: dict[str, str]) -> None:
+    script = "cat /proc/sys/kernel/random/uuid; python3 -c 'import uuid; print(uuid.uuid4())'"
+    first, second = (lab(env, "run", "--", "sh", "-c", script)[1].split() for _ in range(2))
+    assert len({*first, *second}) == 4
+
+
+def test_reboot_between_commands() -> None:
+    env = {**os.environ, "LAB": "vm"}
+    script = "cat /proc/sys/kernel/random/boot_id; ls /var/tmp/kept; touch /var/tmp/kept"
+    one = ("sh", "-c", f"{script}; true")
+    status, out, _ = lab(env, "run", "--", *one, "--reboot--", *one)
+    lines = out.decode().splitlines()
+    assert status == 0
+    assert len(lines) == 3
+    assert lines[0] != lines[1]
+    assert lines[2] == "/var/tmp/kept"
+
+
+def test_errors_are_one_line() -> None:
+    status, out, err = lab({**os.environ, "LAB": "container"}, "run", "a", "--reboot--", "b")
+    assert (status, out) == (125, b"")
+    assert err == b"lab: cannot reboot a container (hint: LAB=vm)\n"

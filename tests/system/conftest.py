@@ -1,0 +1,65 @@
+"""After every system test: no process is left over, and no unexpected warning in the journal."""
+
+import json
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.system.cells import Cell, Project, dora_processes, run, wait_for
+
+ALLOWED_ALWAYS = (
+    # What zenoh says in nodes that start before their peers, or outlive them by milliseconds.
+    "Scouting delay elapsed before start conditions are met",
+    "Unable to find transport for link event",
+    "Unable to connect to any locator",
+    # Dora's node library, when a loaded machine is slower than a timer.
+    "Discarding event for input",
+    # A container whose root may not raise limits: nodes lock 8 MiB of shared memory or more.
+    "Unable to create POSIX shm segment",
+    # Dora's daemon starts a dataflow's timers before it has noted the dataflow.
+    "Timer event for unknown dataflow",
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    here = Path(__file__).parent
+    for item in items:
+        if here in item.path.parents:
+            item.add_marker(pytest.mark.system)
+
+
+@pytest.fixture
+def project() -> Iterator[Project]:
+    root = Path(tempfile.mkdtemp(prefix="flow-", dir="/var/tmp"))
+    root.chmod(0o755)
+    yield Project(root / "project")
+    shutil.rmtree(root)
+
+
+@pytest.fixture
+def cell(request: pytest.FixtureRequest) -> Iterator[Cell]:
+    name = request.node.name.removeprefix("test_").replace("[", "-").replace("]", "")
+    cell = Cell("".join(c if c.isalnum() else "-" for c in name).strip("-")[:60])
+    cursor = _cursor()
+    yield cell
+    cell.end()
+    wait_for("no process is left", lambda: not dora_processes())
+    expected = [m for mark in request.node.iter_markers("warns") for m in mark.args]
+    unexpected = [w for w in _warnings(cursor) if not any(e in w for e in expected)]
+    assert not unexpected, "unexpected warnings:\n" + "\n".join(unexpected)
+
+
+def _cursor() -> str:
+    done = run("journalctl", "-n", "0", "--show-cursor")
+    return done.stdout.rpartition("-- cursor: ")[2].strip()
+
+
+def _warnings(cursor: str) -> list[str]:
+    command = ("journalctl", "-o", "json", "--priority", "warning", f"--after-cursor={cursor}")
+    records = [json.loads(line) for line in run(*command, check=False).stdout.splitlines()]
+    ours = [r for r in records if "dora-" in r.get("_SYSTEMD_UNIT", "") + r.get("UNIT", "")]
+    lines = [f"{r.get('SYSLOG_IDENTIFIER')}: {r.get('MESSAGE')}" for r in ours]
+    return [line for line in lines if not any(allowed in line for allowed in ALLOWED_ALWAYS)]

@@ -1,0 +1,159 @@
+"""Every kind of node: in its own group, heard by the journal, in the project's directory."""
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+from tests.system.cells import Cell, Project, command_line, run, wait_for
+
+TICK = "inputs: {tick: dora/timer/millis/50}"
+SPEAKER = """
+import os
+from dora import Node
+node = Node()
+print("cwd", os.getcwd(), flush=True)
+for event in node:
+    if event["type"] == "INPUT":
+        print("tick", flush=True)
+"""
+
+
+def check(cell: Cell, node: str, directory: Path | str) -> None:
+    """The node runs in its group and its lines arrive, with the directory it is in."""
+    wait_for(f"{node} speaks", lambda: "tick" in cell.messages(node))
+    pids = cell.pids(f"node-{node}")
+    assert cell.status.nodes[node].pid in pids
+    assert not [pid for pid in cell.pids("supervisor") if node in " ".join(command_line(pid))]
+    assert f"cwd {directory}" in cell.messages(node)
+
+
+def flow_of(project: Project, node: str) -> Path:
+    """A dataflow of one node."""
+    return project.write("dataflow.yml", f"nodes:\n  - {{id: one, {TICK}, {node}}}\n")
+
+
+def test_python_in_a_venv(cell: Cell, project: Project) -> None:
+    project.write("speaker.py", SPEAKER + "\n    import sys; print('prefix', sys.prefix)\n")
+    venv = project.root / ".venv"
+    run("python3", "-m", "venv", "--system-site-packages", "--without-pip", str(venv))
+    found = run("python3", "-c", "import dora; print(dora.__path__[0])").stdout.strip()
+    site = next((venv / "lib").iterdir()) / "site-packages"
+    (site / "lab.pth").write_text(f"{Path(found).parent}\n")
+    cell.start(flow_of(project, "path: speaker.py"))
+    check(cell, "one", project.root)
+    wait_for("it told", lambda: f"prefix {venv}" in cell.messages("one"))
+
+
+def test_executable(cell: Cell, project: Project) -> None:
+    path = project.write("speaker", "#!/usr/bin/env python3\n" + SPEAKER)
+    path.chmod(0o755)
+    cell.start(flow_of(project, "path: speaker, args: '-x \"a b\"'"))
+    check(cell, "one", project.root)
+    words = command_line(cell.status.nodes["one"].pid)
+    assert list(words[-3:-1]) == ["-x", "a b"]
+
+
+def test_shell(cell: Cell, project: Project) -> None:
+    project.write("speaker.py", SPEAKER)
+    flow = flow_of(project, "path: shell, args: 'echo hello >&2; exec python3 -u speaker.py'")
+    refused = cell.start(flow, check=False)
+    assert refused.returncode == 5
+    assert "--allow-shell-nodes" in refused.stderr
+    assert cell.show("LoadState") == "not-found"
+    cell.start(flow, "--allow-shell-nodes")
+    check(cell, "one", project.root)
+    assert "hello" in cell.messages("one")
+
+
+def test_uv(cell: Cell, project: Project) -> None:
+    project.write("speaker.py", SPEAKER)
+    cell.start(flow_of(project, "path: speaker.py"), "--uv", "--env", "UV_OFFLINE=1",
+               "--env", "UV_CACHE_DIR=/tmp/uv")  # fmt: skip
+    assert cell.status.nodes["one"].kind == "uv"
+    check(cell, "one", project.root)
+
+
+def test_module(cell: Cell, project: Project) -> None:
+    project.write("speaker.py", SPEAKER)
+    project.write(
+        "inner.yml",
+        "module:\n  name: inner\n  inputs: [tick]\n  outputs: []\n"
+        "nodes:\n  - {id: one, path: speaker.py, inputs: {tick: _mod/tick}}\n",
+    )
+    flow = project.write("dataflow.yml", f"nodes:\n  - {{id: m, module: inner.yml, {TICK}}}\n")
+    cell.start(flow)
+    check(cell, "m.one", project.root)
+
+
+def test_operator(cell: Cell, project: Project) -> None:
+    project.write(
+        "op.py",
+        "import os\nfrom dora import DoraStatus\n"
+        "class Operator:\n"
+        "    def __init__(self):\n        print('cwd', os.getcwd(), flush=True)\n"
+        "    def on_event(self, event, send_output):\n"
+        "        if event['type'] == 'INPUT':\n            print('tick', flush=True)\n"
+        "        return DoraStatus.CONTINUE\n",
+    )
+    flow = project.write(
+        "dataflow.yml", f"nodes:\n  - id: one\n    operator: {{python: op.py, {TICK}}}\n"
+    )
+    cell.start(flow)
+    check(cell, "one", project.root)
+    assert cell.status.nodes["one"].kind == "operator"
+
+
+def test_output_that_dora_itself_sends_on(cell: Cell, project: Project) -> None:
+    project.write("speaker.py", SPEAKER)
+    project.write(
+        "listener.py",
+        "from dora import Node\nfor event in Node():\n"
+        "    if event['type'] == 'INPUT':\n        print('heard', event['value'], flush=True)\n",
+    )
+    flow = project.write(
+        "dataflow.yml",
+        f"nodes:\n  - {{id: one, path: speaker.py, {TICK}, send_stdout_as: out, outputs: [out]}}\n"
+        "  - {id: two, path: listener.py, inputs: {words: {source: one/out, queue_size: 1000}}}\n",
+    )
+    cell.start(flow)
+    check(cell, "one", project.root)
+    wait_for("it was sent on", lambda: any("tick" in line for line in cell.messages("two")))
+
+
+@pytest.mark.warns("failed to receive finished signal")
+def test_dynamic(cell: Cell, project: Project) -> None:
+    """The runner waits for nobody who comes from outside; who comes finds the cell."""
+    project.write("speaker.py", SPEAKER)
+    flow = project.write(
+        "dataflow.yml",
+        f"nodes:\n  - {{id: one, path: speaker.py, {TICK}}}\n"
+        f"  - {{id: guest, path: dynamic, {TICK}}}\n",
+    )
+    cell.start(flow)
+    assert cell.status.nodes["guest"].state == "dynamic"
+    assert cell.show("StatusText") == "2/2 nodes running"
+    port = json.loads(cell.paths.control.read_text())["local_listen_port"]
+    guest = "from dora import Node\nnode = Node('guest')\nprint(node.next()['type'])\n"
+    environment = {**os.environ, "DORA_DAEMON_LOCAL_LISTEN_PORT": str(port)}
+    said = run("python3", "-c", guest, env=environment, cwd=project.root).stdout
+    assert "INPUT" in said
+
+
+def test_built_from_git(cell: Cell, project: Project) -> None:
+    origin = project.root / "origin"
+    project.write("origin/speaker.py", SPEAKER)
+    git = ("git", "-C", str(origin), "-c", "user.email=a@example.org", "-c", "user.name=a")
+    run("git", "init", "--quiet", str(origin))
+    run(*git, "add", ".")
+    run(*git, "commit", "--quiet", "--message", "one")
+    flow = flow_of(project, f"path: speaker.py, git: 'file://{origin}', build: 'true'")
+    unbuilt = cell.start(flow, check=False)
+    assert unbuilt.returncode == 5
+    assert "dora build" in unbuilt.stderr
+    run("dora", "build", "--local", str(flow), cwd=project.root)
+    run("chmod", "-R", "a+rX", str(project.root))
+    cell.start(flow)
+    clone = next((project.root / "git").rglob("speaker.py")).parent
+    check(cell, "one", clone)

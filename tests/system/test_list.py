@@ -1,0 +1,141 @@
+"""doractl list: what runs, what it uses, what ran before."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+from typing import Any
+
+import pytest
+
+from dora_systemd.errors import ExitCode
+from tests.system.cells import Cell, Project, is_alive, run, wait_for
+
+
+def listed(cell: Cell, *words: str) -> dict[str, dict[str, Any]]:
+    """Rows of `list -o json` by name."""
+    rows = json.loads(cell.doractl("list", "-o", "json", *words).stdout)
+    return {row["name"]: row for row in rows}
+
+
+def test_no_dataflow() -> None:
+    done = run("doractl", "list")
+    assert (done.stdout, done.stderr) == ("No dataflow is running.\n", "")
+    assert json.loads(run("doractl", "list", "-o", "json").stdout) == []
+
+
+def test_table(cell: Cell, project: Project) -> None:
+    cell.start(project.three_nodes())
+    header, row = cell.doractl("list").stdout.splitlines()
+    assert header.split() == [
+        "UUID",
+        "NAME",
+        "STATUS",
+        "UPTIME",
+        "NODES",
+        "CPU%",
+        "MEM",
+        "RESTARTS",
+    ]
+    fields = row.split()
+    assert fields[0] in cell.show("ExecStart")
+    assert len(fields[0]) == 8
+    assert fields[1:3] == [cell.name, "Running"]
+    assert re.fullmatch(r"00:00:\d\d", fields[3])
+    assert fields[4] == "3/3"
+    assert float(fields[5]) > 0
+    assert fields[6].endswith("M")
+    assert fields[7] == "0"
+
+
+def test_one_dataflow(cell: Cell, project: Project) -> None:
+    flow = project.three_nodes()
+    cell.start(flow)
+    shown = cell.doractl("list", cell.name).stdout
+    for part in (f"Unit:     {cell.unit}", f"File:     {flow}", "Status:   Running (3/3 nodes"):
+        assert part in shown
+    row = json.loads(cell.doractl("status", cell.name, "-o", "json").stdout)
+    nodes = {node["node"]: node for node in row["nodes"]}
+    assert list(nodes) == ["source", "doubler", "sink"]
+    for name, node in nodes.items():
+        assert cell.pids(f"node-{name}") == [node["pid"]]
+        assert node["memory_bytes"] > 1 << 20
+        assert node["state"] == "running"
+
+
+def test_selectors(cell: Cell, project: Project) -> None:
+    uuid = json.loads(cell.start(project.three_nodes(), "-o", "json").stdout)["uuid"]
+    for selector in (cell.name, cell.unit, uuid, uuid[:8], uuid.upper()):
+        assert f"Dataflow: {uuid}" in cell.doractl("list", selector).stdout
+
+
+def test_it_needs_nothing_of_ours_alive(cell: Cell, project: Project) -> None:
+    cell.start(project.three_nodes())
+    pids = list(cell.all_pids())
+    for pid in pids:
+        os.kill(pid, signal.SIGSTOP)
+    try:
+        assert listed(cell)[cell.name]["nodes_alive"] == 3
+    finally:
+        for pid in pids:
+            os.kill(pid, signal.SIGCONT)
+
+
+def test_without_the_node_table(cell: Cell, project: Project) -> None:
+    """What another user sees: the directory of the cell is closed."""
+    cell.start(project.three_nodes())
+    command = ("su", "bob", "-s", "/bin/sh", "-c", "exec doractl --system list -o json")
+    (row,) = json.loads(run(*command).stdout)
+    assert (row["name"], row["nodes_alive"], row["nodes_total"]) == (cell.name, 3, 3)
+    assert row["memory_bytes"] > 1 << 20
+
+
+@pytest.mark.warns("code=killed", "Failed with result", "status=69")
+def test_restarts_are_counted_and_the_uuid_stays(cell: Cell, project: Project) -> None:
+    words = ("--property", "Restart=on-failure", "--property", "RestartSec=100ms", "-o", "json")
+    started = json.loads(cell.start(project.three_nodes(), *words).stdout)
+    runner = cell.supervisor_pid("runner")
+    os.kill(runner, signal.SIGKILL)
+    wait_for("it is back", lambda: cell.show("NRestarts") == "1" and not is_alive(runner))
+    wait_for("it runs", lambda: listed(cell).get(cell.name, {}).get("status") == "Running")
+    row = listed(cell)[cell.name]
+    assert (row["uuid"], row["restarts"]) == (started["uuid"], 1)
+
+
+def test_ended_dataflows(cell: Cell, project: Project) -> None:
+    started = json.loads(cell.start(project.three_nodes(), "-o", "json").stdout)
+    cell.doractl("stop", cell.name)
+    assert cell.name not in listed(cell)
+    row = listed(cell, "--all")[cell.name]
+    assert (row["status"], row["uuid"]) == ("Stopped", started["uuid"])
+    assert row["ended_us"] > 0
+    for selector in (cell.name, started["uuid"][:8]):
+        done = cell.doractl("list", selector, check=False)
+        assert done.returncode == ExitCode.NOT_RUNNING
+        assert "Status:   Stopped" in done.stdout
+
+
+def test_unknown_selector(cell: Cell, project: Project) -> None:
+    cell.start(project.three_nodes())
+    done = cell.doractl("list", cell.name[:-1], check=False)
+    assert done.returncode == ExitCode.NOT_FOUND
+    assert f"did you mean {cell.name}" in done.stderr
+
+
+def test_a_user_has_dataflows_of_his_own(cell: Cell, project: Project) -> None:
+    cell.start(project.three_nodes())
+
+    def as_alice(*words: str) -> "subprocess.CompletedProcess[str]":
+        return run("su", "alice", "-s", "/bin/sh", "-c", f"exec doractl {' '.join(words)}")
+
+    flow = project.root / "dataflow.yml"
+    as_alice("start", str(flow), "--name", "hers")
+    try:
+        (row,) = json.loads(as_alice("list", "-o", "json").stdout)
+        assert (row["name"], row["nodes_alive"], row["status"]) == ("hers", 3, "Running")
+        assert "hers" not in listed(cell)
+        done = run("su", "bob", "-s", "/bin/sh", "-c", "exec doractl list")
+        assert done.stdout == "No dataflow is running.\n"
+    finally:
+        as_alice("stop", "--all")

@@ -1,0 +1,187 @@
+"""doractl logs with a real journal."""
+
+import os
+import pty
+import re
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.events import EVENTS
+from tests.system.cells import Cell, Project, run, wait_for
+
+TALK = """
+import sys
+from dora import Node
+node = Node()
+for i in range(5):
+    print("line", i, flush=True)
+print("on stderr", file=sys.stderr, flush=True)
+node.log("error", "a bad thing")
+node.log("debug", "a detail")
+node.log("trace", "a tiny detail")
+for event in node:
+    if event["type"] == "INPUT":
+        print("tick", flush=True)
+"""
+FLOW = """
+nodes:
+  - {id: cam-left, path: talk.py, inputs: {tick: dora/timer/millis/100}}
+  - {id: cam-right, path: talk.py, inputs: {tick: dora/timer/millis/100}}
+"""
+
+pytestmark = pytest.mark.warns("a bad thing")
+
+
+@pytest.fixture
+def talking(cell: Cell, project: Project) -> Iterator[Cell]:
+    project.write("talk.py", TALK)
+    cell.start(project.write("dataflow.yml", FLOW))
+    for node in ("cam-left", "cam-right"):
+        wait_for("ticks", lambda node=node: "tick" in cell.messages(node))  # type: ignore[misc]
+    run("journalctl", "--sync")
+    yield cell
+
+
+def logs(cell: Cell, *arguments: str, check: bool = True) -> list[str]:
+    return cell.doractl("logs", *arguments, check=check).stdout.splitlines()
+
+
+def messages(cell: Cell, *arguments: str) -> list[str]:
+    return logs(cell, cell.name, "-o", "cat", *arguments)
+
+
+def test_what_is_shown(talking: Cell) -> None:
+    left = messages(talking, "--node", "cam-left")
+    assert [line for line in left if line.startswith("line")] == [f"line {i}" for i in range(5)]
+    both = messages(talking, "--node", "cam-*", "--grep", "^line 3$")
+    assert both == ["line 3", "line 3"]
+    assert "a bad thing" in messages(talking, "--level", "error")
+    assert "on stderr" not in messages(talking, "--level", "warn")
+    assert "a detail" in messages(talking, "--level", "debug")
+    assert "a tiny detail" not in messages(talking, "--level", "debug")
+    assert "a tiny detail" in messages(talking, "--level", "trace")
+    assert len(messages(talking, "--tail", "3")) == 3
+    assert messages(talking, "--since", "1h")
+    assert not messages(talking, "--until", "1 hour ago")
+    first, *_, last = messages(talking, "--events")
+    assert first == f"Dataflow {talking.name} is starting"
+    assert last == f"Dataflow {talking.name} runs, all nodes are ready"
+    assert messages(talking, "--events", "--reverse")[-1] == first
+
+
+def test_journalctl_shows_the_same(talking: Cell) -> None:
+    talking.systemctl("stop")
+    run("journalctl", "--sync")
+    ours = logs(talking, talking.name, "--node", "cam-left")
+    assert run("journalctl", "-q", "-t", f"{talking.name}/cam-left").stdout.splitlines() == ours
+    fields = (f"_SYSTEMD_UNIT={talking.unit}", "DORA_NODE=cam-left")
+    assert run("journalctl", "-q", *fields).stdout.splitlines() == ours
+
+
+def test_runs_and_selectors(talking: Cell) -> None:
+    uuid = talking.journal("DORA_EVENT=dataflow-started")[0]["DORA_DATAFLOW"]
+    first_run = talking.journal("DORA_EVENT=dataflow-started")[0]["DORA_RUN"]
+    talking.systemctl("restart")
+    talking.systemctl("stop")
+    starting = f"Dataflow {talking.name} is starting"
+    assert messages(talking, "--events").count(starting) == 2
+    for which in ("CURRENT", "PREVIOUS"):
+        assert messages(talking, "--events", "--run", which).count(starting) == 1
+    previous = messages(talking, "--run", "PREVIOUS")
+    assert messages(talking, "--run", first_run) == [text for text in previous if text != starting]
+    everything = messages(talking)
+    for selector in (uuid, uuid[:13], talking.unit):
+        assert logs(talking, selector, "-o", "cat") == everything
+    assert logs(talking, "-o", "cat", "--tail", "3") == everything[-3:]
+
+
+def test_follow(talking: Cell) -> None:
+    command = ["doractl", talking.scope.flag, "logs", talking.name, "-f", "-o", "cat"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as child:
+        assert child.stdout
+        lines = [child.stdout.readline() for _ in range(20)]
+        talking.systemctl("restart")
+        while "is starting" not in (line := child.stdout.readline()):
+            assert line
+        child.terminate()
+    assert lines.count("tick\n") > 5
+
+
+def test_terminal(talking: Cell) -> None:
+    """Aligned and coloured; the pager is not asked for."""
+    master, slave = pty.openpty()
+    command = ["doractl", talking.scope.flag, "logs", talking.name, "--no-pager", "--tail", "40"]
+    child = subprocess.Popen(command, stdout=slave)
+    os.close(slave)
+    data = b""
+    try:
+        while chunk := os.read(master, 65536):
+            data += chunk
+    except OSError:
+        pass  # how a terminal ends
+    assert child.wait() == 0
+    os.close(master)
+    lines = data.decode().splitlines()
+    assert len({re.sub(r"^.*(\x1b\[\d+m)cam.*$", r"\1", line) for line in lines if "cam-" in line})
+    plain = [re.sub(r"\x1b\[[0-9;:]*m", "", line) for line in lines]
+    places = {line.index("tick") for line in plain if line.endswith(" tick")}
+    assert len(places) == 1
+
+
+def test_pager(talking: Cell, tmp_path: Path) -> None:
+    seen = tmp_path / "seen"
+    environment = {**os.environ, "PAGER": f"tee {seen}", "TERM": "xterm"}
+    done = subprocess.run(
+        ["script", "-qec", f"doractl logs {talking.name} --tail 5", "/dev/null"],
+        env=environment,
+        capture_output=True,
+        timeout=30,
+        check=True,
+    )
+    assert len(seen.read_text().splitlines()) == 5
+    assert done.stdout
+
+
+BAD_INPUT = [
+    (["{name}", "--node", "cam"], 4, "cannot find a node 'cam'", "cam-left, cam-right"),
+    (["{name}x"], 4, "cannot find a dataflow", "did you mean"),
+    (["{name}", "--since", "foo"], 2, "cannot read the time: foo", "systemd.time(7)"),
+    (["{name}", "--level", "loud"], 2, "cannot use 'loud' as a level", "error, warn"),
+    (["{name}", "--grep", "("], 2, "cannot use the pattern", ""),
+    (["{name}", "--run", "PREVIOUS"], 4, "cannot find the previous run", "--run ALL"),
+    (["--node", "cam-left"], 2, "cannot select nodes of all dataflows", ""),
+    (["{name}", "-o", "yaml"], 2, "cannot read the command line", ""),
+    (["{name}", "--tail", "-1"], 2, "cannot read the command line", ""),
+]
+
+
+def test_bad_input(talking: Cell) -> None:
+    for arguments, code, problem, hint in BAD_INPUT:
+        words = [word.format(name=talking.name) for word in arguments]
+        done = talking.doractl("logs", *words, check=False)
+        assert (done.returncode, done.stdout) == (code, "")
+        first, *rest = done.stderr.splitlines()
+        assert first.startswith(f"doractl: {problem}")
+        assert len(rest) <= 1
+        assert hint in done.stderr
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="becomes another user")
+def test_journal_unreadable(talking: Cell) -> None:
+    words = ["setpriv", "--reuid=65534", "--regid=65534", "--clear-groups"]
+    done = run(*words, "doractl", "--system", "logs", talking.name, check=False)
+    assert done.returncode == 8
+    assert "cannot read the system's journal" in done.stderr
+    assert "systemd-journal" in done.stderr
+
+
+def test_no_entries(talking: Cell) -> None:
+    done = talking.doractl("logs", talking.name, "--grep", "never said", check=False)
+    assert "No entries" in done.stdout
+    assert not done.stderr
+    names = {record["DORA_EVENT"] for record in talking.journal() if "DORA_EVENT" in record}
+    assert names
+    assert names <= set(EVENTS)

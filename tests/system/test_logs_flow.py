@@ -1,0 +1,228 @@
+"""Every line of every node is in the journal: once, in order, whatever happens meanwhile.
+
+DORA_LOG_LINES says how many lines the floods have: 1000000 for the full measure.
+"""
+
+import os
+import re
+import signal
+from pathlib import Path
+
+import pytest
+
+from tests.system.cells import Cell, Project, run, wait_for
+
+LINES = int(os.environ.get("DORA_LOG_LINES", "30000"))
+OURS = re.compile(r"\d{8} flood$|last \d{8}$|half a line$")
+# How zenoh's warnings begin when a node has gone before another one has found it.
+ZENOH = "Unable to"
+LOST = ("is lost", "failed", "Failed", "exited", "connection error", "disconnected", "killed")
+
+FLOOD = f"""
+import sys
+from dora import Node
+node = Node()
+for first in range(0, {LINES}, 500):
+    sys.stdout.write("".join("%08d flood\\n" % i for i in range(first, min(first + 500, {LINES}))))
+sys.stdout.flush()
+"""
+# Floods until it is stopped, and tells then what its last line was.
+ENDLESS = """
+import os, sys, threading
+from dora import Node
+node, stop = Node(), threading.Event()
+def flood():
+    number = 0
+    while not stop.is_set():
+        sys.stdout.write("".join("%08d flood\\n" % i for i in range(number, number + 500)))
+        number += 500
+    sys.stdout.write("last %08d\\n" % (number - 1))
+    sys.stdout.flush()
+thread = threading.Thread(target=flood)
+thread.start()
+for event in node:
+    if event["type"] == "STOP":
+        break
+stop.set()
+thread.join()
+"""
+
+
+def printed(cell: Cell, node: str, *matches: str) -> list[str]:
+    """What a node printed, quickly: there may be a million lines."""
+    run("journalctl", "--sync")
+    where = (f"_SYSTEMD_UNIT={cell.unit}", f"DORA_NODE={node}", "DORA_STREAM=stdout")
+    lines = run("journalctl", "-q", "-o", "cat", *where, *matches).stdout.splitlines()
+    return [line for line in lines if OURS.match(line)]
+
+
+def numbered(count: int) -> list[str]:
+    return [f"{number:08d} flood" for number in range(count)]
+
+
+def flow(project: Project, code: str, *nodes: str) -> Path:
+    project.write("flood.py", code)
+    ids = "\n".join(f"  - {{id: {node}, path: flood.py}}" for node in nodes)
+    return project.write("dataflow.yml", f"nodes:\n{ids}\n")
+
+
+def wait_end(cell: Cell) -> None:
+    wait_for("the dataflow ends", lambda: cell.is_gone, 60 + LINES / 5000)
+
+
+@pytest.mark.warns(ZENOH)
+@pytest.mark.parametrize("count", [1, 8])
+def test_flood(cell: Cell, project: Project, count: int) -> None:
+    nodes = [f"n{number}" for number in range(count)]
+    cell.start(flow(project, FLOOD.replace(str(LINES), str(LINES // count)), *nodes))
+    wait_end(cell)
+    for node in nodes:
+        assert printed(cell, node) == numbered(LINES // count)
+
+
+def test_restart_keeps_the_last_line(cell: Cell, project: Project) -> None:
+    cell.start(flow(project, ENDLESS, "n"), "--grace-duration", "20s")
+    for _ in range(2):
+        wait_for("a flood", lambda: len(printed(cell, "n")) > 2000)
+        cell.systemctl("restart")
+    cell.systemctl("stop")
+    runs = {record["DORA_RUN"] for record in cell.journal("DORA_EVENT=node-ready")}
+    assert len(runs) == 3
+    for one in runs:
+        *lines, last = printed(cell, "n", f"DORA_RUN={one}")
+        assert lines == numbered(len(lines))
+        assert last == f"last {len(lines) - 1:08d}"
+
+
+@pytest.mark.warns("Journal", "systemd-journald")
+def test_journald_restarted_in_the_middle(cell: Cell, project: Project) -> None:
+    cell.start(flow(project, FLOOD, "n"))
+    run("systemctl", "restart", "systemd-journald.service")
+    wait_end(cell)
+    assert printed(cell, "n") == numbered(LINES)
+
+
+@pytest.mark.warns(*LOST)
+def test_coordinator_killed_in_the_middle(cell: Cell, project: Project) -> None:
+    cell.start(flow(project, ENDLESS, "n"))
+    wait_for("a flood", lambda: len(printed(cell, "n")) > 2000)
+    os.kill(cell.supervisor_pid("coordinator"), signal.SIGKILL)
+    wait_end(cell)
+    lines = [line for line in printed(cell, "n") if line.endswith(" flood")]
+    assert lines == numbered(len(lines))
+    assert cell.events()[-1] == ("dataflow-failed", "")
+
+
+@pytest.mark.warns("crashed", "exited", "Traceback", "failed", "Failed")
+def test_last_words_come_before_the_crash(cell: Cell, project: Project) -> None:
+    code = (
+        "import sys, time\nfrom dora import Node\nnode = Node()\n"
+        "for event in node:\n"
+        "    print('half a line', end='', flush=True)\n"
+        "    raise ValueError('the last words')\n"
+    )
+    project.write("bad.py", code)
+    flow = "nodes: [{id: bad, path: bad.py, inputs: {tick: dora/timer/millis/100}}]"
+    cell.start(project.write("dataflow.yml", flow))
+    wait_end(cell)
+    records = [record for record in cell.journal() if record.get("DORA_NODE") == "bad"]
+    texts = [record["MESSAGE"] for record in records]
+    words, crash = (
+        texts.index("ValueError: the last words"),
+        [record.get("DORA_EVENT") for record in records].index("node-crashed"),
+    )
+    assert words < crash
+    assert texts.index("half a line") < crash
+    assert records[texts.index("half a line")]["DORA_CUT"] == "1"
+    assert records[crash]["DORA_EXIT"] == "exit code 1"
+    assert records[crash]["DORA_RUN"] == records[words]["DORA_RUN"]
+
+
+ODD = r"""
+import sys
+from dora import Node
+node = Node()
+node.log("warn", "hello\nsecond", target="my.target", fields={"shot no": "7"})
+out = sys.stdout.buffer
+out.write(b"binary \x00\xff\x1b[31m\n" + b"x" * (1 << 20) + b"\n" + b"y" * (3 << 20) + b"\n")
+out.write("ünïcode\r\n".encode() + b"\n")
+out.flush()
+print("on stderr", file=sys.stderr, flush=True)
+"""
+
+
+@pytest.mark.warns("hello")
+def test_odd_lines(cell: Cell, project: Project) -> None:
+    cell.start(flow(project, ODD, "odd"))
+    wait_end(cell)
+    records = [r for r in cell.journal("DORA_NODE=odd") if "DORA_STREAM" in r]
+    log, binary, big, *pieces, text, empty = [r for r in records if r["DORA_STREAM"] == "stdout"]
+    assert (log["MESSAGE"], log["PRIORITY"], log["DORA_LEVEL"]) == ("hello\nsecond", "4", "warn")
+    assert (log["DORA_TARGET"], log["DORA_FIELD_SHOT_NO"]) == ("my.target", "7")
+    assert bytes(binary["MESSAGE"]) == b"binary \x00\xff\x1b[31m"
+    assert big["MESSAGE"] == "x" * (1 << 20)
+    assert "DORA_CUT" not in big
+    assert [len(piece["MESSAGE"]) for piece in pieces] == [1 << 20] * 3
+    assert [piece.get("DORA_CUT") for piece in pieces] == ["1", "1", None]
+    assert (text["MESSAGE"], text["PRIORITY"]) == ("ünïcode", "6")
+    assert empty["MESSAGE"] == ""
+    (stderr,) = [r for r in records if r["DORA_STREAM"] == "stderr"]
+    assert (stderr["MESSAGE"], stderr["PRIORITY"]) == ("on stderr", "5")
+    assert stderr["SYSLOG_IDENTIFIER"] == f"{cell.name}/odd"
+    assert int(stderr["DORA_NODE_PID"]) > 1
+
+
+def test_catalog(tmp_path: Path) -> None:
+    """systemd reads our explanations, and journalctl -x shows them."""
+    source = Path(__file__).parents[2] / "units/templates/dora-systemd.catalog"
+    target = Path("/usr/lib/systemd/catalog/dora-systemd.catalog")
+    if os.getuid():
+        pytest.skip("the catalog is the system's")
+    was_there = target.exists()
+    target.write_bytes(source.read_bytes())
+    try:
+        done = run("journalctl", "--update-catalog")
+        assert not done.stderr
+        listed = run("journalctl", "--list-catalog").stdout
+        assert listed.count("dora-systemd: ") == 16
+    finally:
+        if not was_there:
+            target.unlink()
+        run("journalctl", "--update-catalog")
+    del tmp_path
+
+
+LATE = """
+import os, time
+from dora import Node
+node = Node()
+while not os.path.exists("/run/logs-late"):
+    time.sleep(0.01)
+for number in range(1000):
+    print("%08d flood" % number, flush=True)
+print("half a line", end="", flush=True)
+open("/run/logs-late-done/done", "w").close()
+time.sleep(100)
+"""
+
+
+@pytest.mark.warns(*LOST)
+@pytest.mark.skipif(os.getuid() != 0, reason="writes below /run")
+def test_runner_killed_with_lines_in_the_pipes(cell: Cell, project: Project) -> None:
+    go, done = Path("/run/logs-late"), Path("/run/logs-late-done")
+    done.mkdir(exist_ok=True)
+    done.chmod(0o777)
+    cell.start(flow(project, LATE, "n"))
+    runner = cell.supervisor_pid("runner")
+    os.kill(runner, signal.SIGSTOP)
+    try:
+        go.touch()
+        wait_for("the node has written", lambda: (done / "done").exists())
+    finally:
+        go.unlink()
+        os.kill(runner, signal.SIGKILL)
+    wait_end(cell)
+    assert printed(cell, "n") == [*numbered(1000), "half a line"]
+    assert cell.events()[-1] == ("dataflow-failed", "")
+    assert any("SIGKILL" in record.get("DORA_REASON", "") for record in cell.journal())
+    (done / "done").unlink()

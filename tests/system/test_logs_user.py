@@ -1,0 +1,41 @@
+"""In user scope journald's rate limit cannot be lifted: what it takes away is counted."""
+
+import json
+import os
+import pwd
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.system.cells import run, wait_for
+
+ROOT = Path(__file__).parents[2]
+LINES = 60_000
+
+
+@pytest.fixture
+def user() -> str:
+    if os.getuid():
+        pytest.skip("asks another user's manager")
+    try:
+        name = pwd.getpwuid(1000).pw_name
+    except KeyError:
+        pytest.skip("there is no user")
+    run("loginctl", "enable-linger", name)
+    wait_for("the user's manager", lambda: Path("/run/user/1000/bus").exists())
+    return name
+
+
+def test_loss_is_counted(user: str) -> None:
+    unit = ["systemd-run", "--user", f"--machine={user}@.host", "--quiet", "--wait", "--pipe"]
+    unit += ["--slice=dora.slice", f"--working-directory={ROOT}"]
+    pump = [sys.executable, "-m", "tests.system.logpump", "--lines", str(LINES)]
+    uuid = json.loads(run(*unit, *pump).stdout)["uuid"]
+    run("journalctl", "--sync")
+    match = f"DORA_DATAFLOW={uuid}"
+    stored = run("journalctl", "-q", "-o", "cat", match, "DORA_STREAM=stdout").stdout.count("\n")
+    as_user = ["setpriv", "--reuid=1000", "--regid=1000", "--init-groups"]
+    found = run(*as_user, "journalctl", "-q", "-o", "json", match, "DORA_EVENT=lines-lost").stdout
+    lost = [int(json.loads(line)["DORA_COUNT"]) for line in found.splitlines()]
+    assert sum(lost) == LINES - stored

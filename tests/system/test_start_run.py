@@ -1,0 +1,82 @@
+"""doractl run: a dataflow that lives no longer than its terminal."""
+
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from tests.system.cells import Cell, Project, is_alive, wait_for
+
+TICK = "inputs: {tick: dora/timer/millis/50}"
+STUBBORN = """
+import signal, time
+from dora import Node
+node = Node()
+signal.signal(signal.SIGTERM, signal.SIG_IGN)
+print("stubborn", flush=True)
+while True:
+    time.sleep(1)
+"""
+EXITS = """
+import sys
+from dora import Node
+node = Node()
+print("bye", flush=True)
+sys.exit(int(sys.argv[1]))
+"""
+
+
+def run_attached(cell: Cell, flow: Path) -> "subprocess.Popen[str]":
+    command = ("doractl", "run", str(flow), "--name", cell.name)
+    child = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    wait_for("it runs", lambda: cell.show("ActiveState") == "active")
+    return child
+
+
+def test_run_ends_with_ctrl_c(cell: Cell, project: Project) -> None:
+    child = run_attached(cell, project.three_nodes())
+    wait_for("it prints", lambda: cell.messages("sink"))
+    child.send_signal(signal.SIGINT)
+    out, err = child.communicate(timeout=30)
+    assert (child.returncode, err) == (0, "")
+    assert "got [0]" in out
+    assert "stopped" in out.splitlines()[-1]
+    assert cell.is_gone
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM, signal.SIGHUP])
+def test_run_takes_the_dataflow_with_it(cell: Cell, project: Project, how: signal.Signals) -> None:
+    child = run_attached(cell, project.three_nodes())
+    pids = cell.all_pids()
+    child.send_signal(how)
+    child.communicate(timeout=30)
+    wait_for("it has ended", lambda: cell.is_gone)
+    assert not [pid for pid in pids if is_alive(pid)]
+    assert ("dataflow-stopped", "") in cell.events()
+
+
+@pytest.mark.warns("code=killed", "Failed with result 'signal'", "Killing process")
+def test_second_ctrl_c_kills(cell: Cell, project: Project) -> None:
+    project.write("stubborn.py", STUBBORN)
+    flow = project.write("dataflow.yml", f"nodes: [{{id: one, path: stubborn.py, {TICK}}}]")
+    child = run_attached(cell, flow)
+    child.send_signal(signal.SIGINT)
+    wait_for("it stops", lambda: cell.show("ActiveState") == "deactivating")
+    child.send_signal(signal.SIGINT)
+    child.communicate(timeout=5)
+    assert child.returncode == 128 + signal.SIGKILL
+    assert cell.is_gone
+
+
+@pytest.mark.warns("exit code 3", "ExitCode(3)", "Failed with result 'exit-code'")
+@pytest.mark.parametrize(("status", "expected"), [(0, 0), (3, 1)])
+def test_exit_status_of_run(cell: Cell, project: Project, status: int, expected: int) -> None:
+    project.write("exits.py", EXITS)
+    flow = project.write("dataflow.yml", f"nodes: [{{id: one, path: exits.py, args: '{status}'}}]")
+    done = cell.doractl("run", str(flow), "--name", cell.name, check=False)
+    assert done.returncode == expected
+    assert "bye" in done.stdout
+    wait_for("nothing is left of it", lambda: cell.show("LoadState") == "not-found")

@@ -1,0 +1,144 @@
+"""doractl stop, restart, node, show and dora against real dataflows."""
+
+import json
+import time
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.errors import ExitCode
+from tests.system.cells import Cell, Project, is_alive, run, wait_for
+
+DEAF = """
+import os, signal, time
+from dora import Node
+node = Node()
+signal.signal(signal.SIGTERM, signal.SIG_IGN)
+if os.fork() == 0 and os.fork() == 0:
+    os.setsid()
+print("deaf", flush=True)
+while True:
+    time.sleep(1)
+"""
+
+
+def test_stop(cell: Cell, project: Project) -> None:
+    started = json.loads(cell.start(project.three_nodes(), "-o", "json").stdout)
+    pids = cell.all_pids()
+    done = cell.doractl("stop", cell.name)
+    assert done.stdout == f"Dataflow stopped: {started['uuid']} ({cell.name})\n"
+    assert not [pid for pid in pids if is_alive(pid)]
+    again = cell.doractl("stop", cell.name)
+    assert again.stdout == f"Dataflow not running: {started['uuid']} ({cell.name} stopped)\n"
+
+
+def test_stop_what_is_not_there() -> None:
+    done = run("doractl", "stop", "nothing-of-that-name", check=False)
+    assert done.returncode == ExitCode.NOT_FOUND
+    assert done.stderr.startswith("doractl: cannot find a dataflow 'nothing-of-that-name'\nhint: ")
+
+
+def test_stop_all(cell: Cell, project: Project) -> None:
+    flow = project.three_nodes()
+    others = [Cell(f"{cell.name}-{n}") for n in (1, 2)]
+    for one in (cell, *others):
+        one.start(flow)
+    done = cell.doractl("stop", "--all")
+    assert done.stdout.count("Dataflow stopped: ") == 3
+    assert all(one.is_gone for one in (cell, *others))
+    assert cell.doractl("stop", "--all").stdout == "No dataflow is running.\n"
+
+
+@pytest.mark.warns("not stopping within the 1.5s", "process was killed on drop", "Signal(9)")
+def test_stop_ends_in_time_whatever_the_nodes_do(cell: Cell, project: Project) -> None:
+    project.write("deaf.py", DEAF)
+    tick = "inputs: {tick: dora/timer/millis/50}"
+    flow = project.write("dataflow.yml", f"nodes: [{{id: one, path: deaf.py, {tick}}}]")
+    cell.start(flow, "--grace-duration", "1s")
+    wait_for("it is deaf", lambda: "deaf" in cell.messages("one"))
+    pids = cell.all_pids()
+    begin = time.monotonic()
+    cell.doractl("stop", cell.name)
+    assert time.monotonic() - begin < 1.5 + 10
+    assert not [pid for pid in pids if is_alive(pid)]
+
+
+def test_restart_keeps_name_and_uuid(cell: Cell, project: Project) -> None:
+    started = json.loads(cell.start(project.three_nodes(), "-o", "json").stdout)
+    pids = cell.all_pids()
+    done = cell.doractl("restart", cell.name)
+    assert done.stdout == f"Dataflow restarted: {started['uuid']} ({cell.name})\n"
+    assert not [pid for pid in pids if is_alive(pid)]
+    assert started["uuid"] in cell.show("ExecStart")
+    cell.wait_exchanging()
+
+
+@pytest.mark.warns("failed to receive reply from daemon", "Signal(15)")
+def test_restart_of_one_node(cell: Cell, project: Project) -> None:
+    cell.start(project.three_nodes())
+    before = {node: status.pid for node, status in cell.status.nodes.items()}
+    cell.doractl("node", "restart", cell.name, "doubler")
+    wait_for("it is replaced", lambda: cell.status.nodes["doubler"].pid != before["doubler"])
+    wait_for("the old one has gone", lambda: not is_alive(before["doubler"]))
+    after = cell.status.nodes
+    assert [after[node].pid for node in ("source", "sink")] == [before["source"], before["sink"]]
+    cell.wait_exchanging()
+
+
+def test_stop_of_one_node(cell: Cell, project: Project) -> None:
+    cell.start(project.three_nodes())
+    cell.doractl("node", "stop", cell.name, "sink")
+    wait_for("it has gone", lambda: not cell.pids("node-sink"))
+    assert cell.show("ActiveState") == "active"
+
+
+def test_unknown_node(cell: Cell, project: Project) -> None:
+    cell.start(project.three_nodes())
+    done = cell.doractl("node", "stop", cell.name, "sinc", check=False)
+    assert done.returncode == ExitCode.NOT_FOUND
+    assert "did you mean sink" in done.stderr
+
+
+def test_others_cannot_speak_to_the_coordinator(cell: Cell, project: Project) -> None:
+    cell.start(project.three_nodes())
+    for words in ("node stop NAME sink", "dora NAME -- node list"):
+        command = f"exec doractl --system {words.replace('NAME', cell.name)}"
+        done = run("su", "bob", "-s", "/bin/sh", "-c", command, check=False)
+        assert done.returncode == ExitCode.NO_PERMISSION, done.stderr
+        assert len(done.stderr.splitlines()) == 2
+    assert len(cell.pids("node-sink")) == 1
+
+
+def test_others_cannot_stop_it(cell: Cell, project: Project) -> None:
+    cell.start(project.three_nodes())
+    command = f"exec doractl --system stop {cell.name}"
+    done = run("su", "bob", "-s", "/bin/sh", "-c", command, check=False)
+    assert done.returncode == ExitCode.NO_PERMISSION
+    assert "sudo" in done.stderr
+    assert cell.show("ActiveState") == "active"
+
+
+def test_stock_dora(cell: Cell, project: Project) -> None:
+    cell.start(project.three_nodes(), "--debug")
+    shown = cell.doractl("dora", cell.name, "--", "node", "list").stdout
+    assert "doubler" in shown
+    topic = ("dora", cell.name, "--", "topic", "echo", "--count", "1", "source/number")
+    done = cell.doractl(*topic, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "number" in done.stdout
+
+
+def test_show_is_what_systemctl_cat_prints(cell: Cell, project: Project) -> None:
+    cell.start(project.three_nodes())
+    shown = cell.doractl("show", cell.name).stdout
+    assert shown.strip() == cell.systemctl("cat", "--no-pager").strip()
+    files = json.loads(cell.doractl("show", cell.name, "-o", "json").stdout)["files"]
+    assert [Path(path).name for path in files] == [cell.unit]
+
+
+def test_verbs_that_need_a_running_dataflow(cell: Cell, project: Project) -> None:
+    flow = project.write("dataflow.yml", "nodes: [{id: never, path: sleep, args: '100'}]")
+    cell.start(flow, "--no-wait")
+    cell.doractl("stop", cell.name)
+    for words in (["show", cell.name], ["restart", cell.name], ["dora", cell.name, "--", "list"]):
+        assert cell.doractl(*words, check=False).returncode == ExitCode.NOT_FOUND

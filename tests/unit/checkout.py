@@ -1,0 +1,33 @@
+"""Where the sources are, and the package as it is when it is installed."""
+
+from pathlib import Path
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+
+
+def module_paths() -> dict[str, Path]:
+    """Every module of ours by name without "dora_systemd.", such as "values" and "cli.list"."""
+    own = {path.stem: path for path in (CHECKOUT / "dora_systemd").glob("*.py")}
+    verbs = {f"cli.{path.stem}": path for path in (CHECKOUT / "cli").glob("*.py")}
+    return {name: path for name, path in (own | verbs).items() if not name.endswith("__init__")}
+
+
+def linked_package(place: Path) -> Path:
+    """`place` with the packages where their names say they are, by links.
+
+    `dora_systemd.cli` is the directory `cli` only for setuptools and what it has installed.
+    """
+    package = place / "dora_systemd"
+    package.mkdir(parents=True, exist_ok=True)
+    wanted = {path.name: path for path in (CHECKOUT / "dora_systemd").iterdir()}
+    wanted["cli"] = CHECKOUT / "cli"
+    for link in package.iterdir():
+        if link.name not in wanted:
+            link.unlink()
+    for name, path in wanted.items():
+        if not (package / name).is_symlink():
+            (package / name).symlink_to(path)
+    for name, path in {"tests": CHECKOUT / "tests", "lab": CHECKOUT / "tests/lab"}.items():
+        if not (place / name).is_symlink():
+            (place / name).symlink_to(path)
+    return place

@@ -1,0 +1,166 @@
+"""D-Bus without a bus: how values are sent, and what its errors become."""
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dora_systemd import bus, buserrors
+from dora_systemd.buswire import decoded, encoded
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.scope import Scope
+from tests.unit.fake_manager import ScopeIn
+
+SYSTEM = Scope(is_user=False, uid=0)
+USER = Scope(is_user=True, uid=1000)
+CLOSE = (-1, None)
+
+
+def test_basic_types() -> None:
+    assert encoded("s", "ä") == [(ord("s"), "ä".encode())]
+    assert encoded("b", True) == [(ord("b"), True)]
+    assert encoded("t", 2**64 - 1) == [(ord("t"), 2**64 - 1)]
+
+
+def test_containers() -> None:
+    assert encoded("a(sasb)", [("/bin/x", ["x", "y"], False)]) == [
+        (ord("a"), b"(sasb)"),
+        (ord("r"), b"sasb"),
+        (ord("s"), b"/bin/x"),
+        (ord("a"), b"s"),
+        (ord("s"), b"x"),
+        (ord("s"), b"y"),
+        CLOSE,
+        (ord("b"), False),
+        CLOSE,
+        CLOSE,
+    ]
+
+
+def test_variant() -> None:
+    assert encoded("v", ("as", [])) == [(ord("v"), b"as"), (ord("a"), b"s"), CLOSE, CLOSE]
+
+
+def test_nested_structs() -> None:
+    assert encoded("(i(ss)a(st))", (1, ("a", "b"), [])) == [
+        (ord("r"), b"i(ss)a(st)"),
+        (ord("i"), 1),
+        (ord("r"), b"ss"),
+        (ord("s"), b"a"),
+        (ord("s"), b"b"),
+        CLOSE,
+        (ord("a"), b"(st)"),
+        CLOSE,
+        CLOSE,
+    ]
+
+
+def test_a_struct_of_the_wrong_length_is_a_mistake_of_ours() -> None:
+    with pytest.raises(ValueError, match="zip"):
+        encoded("(ss)", ("a",))
+
+
+@pytest.mark.parametrize("text", ["a\0b", "\udcff", "\0"])
+def test_what_is_no_text_for_d_bus(text: str) -> None:
+    with pytest.raises(DoraSystemdError) as caught:
+        encoded("s", text)
+    assert caught.value.code is ExitCode.USAGE
+
+
+@given(st.lists(st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]))))
+def test_text_survives_the_way_there_and_back(texts: list[str]) -> None:
+    sent = [value for kind, value in encoded("as", texts) if kind == ord("s")]
+    assert decoded(sent) == texts
+
+
+def test_answers_are_decoded_at_every_depth() -> None:
+    assert decoded([(b"a", 1, {b"k": [b"v"]}), True]) == [["a", 1, {"k": ["v"]}], True]
+
+
+def test_object_paths() -> None:
+    path = bus._unit_path("dora-a_b.c.service")
+    assert path == b"/org/freedesktop/systemd1/unit/dora_2da_5fb_2ec_2eservice"
+
+
+@given(st.from_regex(r"[A-Za-z0-9._-]+", fullmatch=True))
+def test_object_paths_are_those_of_sd_bus(name: str) -> None:
+    library: Any = bus._dbuslib()
+    expected = library.path_encode(b"/org/freedesktop/systemd1/unit", f"x{name}".encode())
+    assert bus._unit_path(f"x{name}") == expected
+
+
+@pytest.mark.parametrize(
+    ("name", "scope", "code", "words"),
+    [
+        ("AccessDenied", SYSTEM, ExitCode.NO_PERMISSION, "permission denied"),
+        ("InteractiveAuthorizationRequired", SYSTEM, ExitCode.NO_PERMISSION, "permission denied"),
+        ("UnitExists", USER, ExitCode.NAME_IN_USE, "there already"),
+        ("NoSuchUnit", USER, ExitCode.NOT_FOUND, "no such unit"),
+        ("NoReply", USER, ExitCode.NO_SYSTEMD, "does not answer"),
+        ("InvalidArgs", USER, ExitCode.FAILURE, "its own words"),
+    ],
+)
+def test_errors(name: str, scope: Scope, code: ExitCode, words: str) -> None:
+    error = buserrors.bus_error("start dora-x.service", scope, name, "its own words")
+    assert error.message.startswith("cannot start dora-x.service: ")
+    assert words in error.message
+    assert error.code is code
+
+
+def test_sudo_is_no_hint_for_a_user_manager() -> None:
+    assert "sudo" in buserrors.bus_error("x", SYSTEM, "AccessDenied", "").hint
+    assert "sudo" not in buserrors.bus_error("x", USER, "AccessDenied", "").hint
+
+
+def test_names_of_pystemds_errors() -> None:
+    class DBusBaseError(Exception):
+        err_name: bytes | str = b"org.freedesktop.systemd1.UnitExists"
+        err_message = b"told so"
+
+    class DBusAccessDeniedError(DBusBaseError):
+        err_name = ""
+
+    assert buserrors.error_name(DBusBaseError()) == "UnitExists"
+    assert buserrors.error_name(DBusAccessDeniedError()) == "AccessDenied"
+    with (
+        pytest.raises(DoraSystemdError, match="cannot do it: a unit"),
+        buserrors.explained("do it", SYSTEM),
+    ):
+        raise DBusBaseError
+
+
+def test_other_errors_pass() -> None:
+    with pytest.raises(ZeroDivisionError), buserrors.explained("do it", SYSTEM):
+        raise ZeroDivisionError
+
+
+def test_no_manager(tmp_path: Path) -> None:
+    with pytest.raises(DoraSystemdError) as caught:
+        bus.Bus(ScopeIn(is_user=True, uid=1000, root=tmp_path))
+    assert caught.value.code is ExitCode.NO_SYSTEMD
+    assert caught.value.message.startswith("cannot reach the systemd of this user")
+    assert caught.value.hint
+
+
+def test_private_socket_where_a_user_has_no_bus(tmp_path: Path) -> None:
+    scope = ScopeIn(is_user=True, uid=1000, root=tmp_path)
+    assert bus._address(scope) == str(tmp_path / "bus")
+    (tmp_path / "systemd").mkdir()
+    (tmp_path / "systemd" / "private").touch()
+    assert bus._address(scope) == str(tmp_path / "systemd" / "private")
+    (tmp_path / "bus").touch()
+    assert bus._address(scope) == str(tmp_path / "bus")
+
+
+def test_pystemd_is_loaded_without_lxml_and_stays_usable() -> None:
+    script = (
+        "import sys; from dora_systemd import bus; bus._dbuslib()\n"
+        "assert 'lxml' not in sys.modules and 'pystemd' not in sys.modules\n"
+        "import pystemd; from pystemd.dbuslib import DBus\n"
+        "assert pystemd.SDUnit and DBus is bus._dbuslib().DBus\n"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True)

@@ -1,0 +1,260 @@
+"""The command line of doractl, without a systemd behind it."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import click
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from dora_systemd import __version__
+from dora_systemd.cli import listing, main
+from dora_systemd.cli.group import ALIASES, VERBS, doractl
+from dora_systemd.cli.parameters import current_scope
+from dora_systemd.cli.quick import LIST_VERBS, ListRequest, parse_quick_list
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.scope import scope_of
+
+SHORT_LIVED = ("pydantic", "websockets", "watchfiles", "lxml", "rich")
+"""What verbs that are called again and again must not load."""
+
+
+@pytest.fixture
+def requests(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[ListRequest]]:
+    """Lists nothing, and keeps what was asked for."""
+    asked: list[ListRequest] = []
+    module: Any = import_module("dora_systemd.cli.list")
+
+    def print_dataflows(request: ListRequest) -> int:
+        asked.append(request)
+        return ExitCode.OK
+
+    monkeypatch.setattr(listing, "print_dataflows", print_dataflows)
+    monkeypatch.setattr(module, "print_dataflows", print_dataflows)
+    return asked
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main.run(["--version"]) == 0
+    assert capsys.readouterr().out == f"doractl {__version__}\n"
+    assert main.run(["--user", "--version"]) == 0
+    assert capsys.readouterr().out == f"doractl {__version__}\n"
+
+
+def test_bare_doractl_prints_help(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main.run([]) == 0
+    shown = capsys.readouterr().out
+    assert "Usage: doractl" in shown
+    for name, verb in VERBS.items():
+        assert name in shown
+        assert verb.summary in shown
+
+
+@pytest.mark.parametrize("name", [*VERBS, *ALIASES])
+@pytest.mark.parametrize("flag", ["-h", "--help"])
+def test_every_verb_has_help_with_examples(
+    name: str, flag: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main.run([name, flag]) == 0
+    shown = capsys.readouterr().out
+    assert "Examples:" in shown
+    assert f"doractl {ALIASES.get(name, name)}" in shown
+
+
+def options_of(command: click.Command) -> Iterator[click.Option]:
+    if isinstance(command, click.Group):
+        for one in command.commands.values():
+            yield from options_of(one)
+    yield from (one for one in command.params if isinstance(one, click.Option))
+
+
+@pytest.mark.parametrize("name", VERBS)
+def test_every_option_says_what_it_does(name: str) -> None:
+    command = doractl.get_command(click.Context(doractl), name)
+    assert command is not None
+    for option in options_of(command):
+        assert option.help, option.name
+        assert option.help.endswith("."), option.name
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message", "hint"),
+    [
+        (["strat"], "cannot understand the verb 'strat'", "did you mean doractl start?"),
+        (["qqq"], "cannot understand the verb 'qqq'", "doractl --help lists the verbs"),
+        (["list", "--oll"], "cannot read the command line: no such option", "did you mean --all?"),
+        (["stop"], "cannot tell what to stop", "doractl stop NAME, or doractl stop --all"),
+        (["stop", "x", "--all"], "cannot tell what to stop", ""),
+        (["show"], "cannot read the command line: missing argument", "see doractl show --help"),
+        (["list", "a", "b"], "cannot read the command line: got unexpected extra", ""),
+        (["list", "-o", "xml"], "cannot read the command line: invalid value", ""),
+    ],
+)
+def test_wrong_command_lines(
+    arguments: list[str], message: str, hint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main.run(arguments) == ExitCode.USAGE
+    out, err = capsys.readouterr()
+    lines = err.splitlines()
+    assert out == ""
+    assert len(lines) == 2
+    assert lines[0].startswith(f"doractl: {message}")
+    assert lines[1].startswith(f"hint: {hint}")
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--user", "x"], ["x", "--user"], ["--system", "x", "--user"]]
+)
+def test_scope_before_and_after_the_verb(arguments: list[str]) -> None:
+    from dora_systemd.cli.group import VerbGroup
+    from dora_systemd.cli.parameters import scope_options
+
+    seen = []
+
+    @click.command("x")
+    @scope_options
+    def verb() -> None:
+        seen.append(current_scope())
+
+    class OneVerb(VerbGroup):
+        def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command:
+            del ctx, cmd_name
+            return verb
+
+    @click.group(cls=OneVerb)
+    @scope_options
+    def group() -> None:
+        pass
+
+    group.main(arguments, standalone_mode=False)
+    assert seen == [scope_of(True)]
+
+
+words = st.lists(
+    st.sampled_from(
+        ["-a", "--all", "--user", "--system", "-o", "json", "table", "--output", "--output=json"]
+    )
+    | st.sampled_from(["-o=json", "-ojson", "robot", "", "--", "-h", "--al", "x", "-", "-oa"]),
+    max_size=5,
+)
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@given(verb=st.sampled_from(LIST_VERBS), rest=words)
+def test_the_quick_way_to_list_means_what_click_means(
+    requests: list[ListRequest], verb: str, rest: list[str]
+) -> None:
+    quick = parse_quick_list([verb, *rest])
+    if quick is None:
+        return
+    requests.clear()
+    assert doractl.main([verb, *rest], standalone_mode=False) == ExitCode.OK
+    (by_click,) = requests
+    assert by_click == quick._replace(is_user=scope_of(quick.is_user).is_user)
+
+
+@pytest.mark.parametrize("verb", LIST_VERBS)
+def test_list_by_all_its_names(verb: str, requests: list[ListRequest]) -> None:
+    assert main.run([verb, "robot", "-o", "json"]) == 0
+    assert main.run(["--user", verb]) == 0
+    assert requests == [ListRequest("robot", output="json"), ListRequest(is_user=True)]
+
+
+@pytest.mark.parametrize(
+    ("error", "status"),
+    [
+        (DoraSystemdError("cannot do it", "do that", ExitCode.NAME_IN_USE), ExitCode.NAME_IN_USE),
+        (KeyboardInterrupt(), ExitCode.INTERRUPTED),
+    ],
+)
+def test_exit_status_of_errors(
+    error: BaseException,
+    status: int,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def fail(_request: ListRequest) -> int:
+        raise error
+
+    monkeypatch.setattr(listing, "print_dataflows", fail)
+    assert main.run(["list"]) == status
+    expected = "doractl: cannot do it\nhint: do that\n" if status != 130 else ""
+    assert capsys.readouterr().err == expected
+
+
+def test_a_reader_that_went_away_is_no_error() -> None:
+    read, write = os.pipe()
+    os.close(read)
+    command = [sys.executable, "-m", "dora_systemd.cli.main", "--help"]
+    done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, check=False)
+    os.close(write)
+    assert done.returncode == 141
+    assert done.stderr == b""
+
+
+@pytest.mark.parametrize("module", ["listing", "list", "stop", "restart", "show", "logs"])
+def test_light_verbs_stay_light(module: str) -> None:
+    script = (
+        f"import sys, dora_systemd.cli.{module}\n"
+        f"print(*[m for m in {SHORT_LIVED} if m in sys.modules])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == []
+
+
+def test_list_does_without_click() -> None:
+    script = (
+        "import sys, dora_systemd.cli.main, dora_systemd.cli.listing\n"
+        "print(*[m for m in ('click', 'asyncio', 'subprocess') if m in sys.modules])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == []
+
+
+@pytest.mark.parametrize(
+    ("redirection", "status", "said"),
+    [
+        (">/dev/full", 1, "doractl: cannot go on: No space left on device\n"),
+        (">&-", 0, ""),
+        ("2>&- >&-", 0, ""),
+    ],
+)
+@pytest.mark.parametrize("verb", ["--help", "--version"])
+def test_output_that_cannot_be_written(redirection: str, status: int, said: str, verb: str) -> None:
+    shell = f"{sys.executable} -m dora_systemd.cli.main {verb} {redirection}"
+    done = subprocess.run(["/bin/sh", "-c", shell], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr, done.stdout) == (status, said, "")
+
+
+flags = st.sampled_from(
+    ["--name", "--env", "--env-file", "--property", "--venv", "--dora", "--uid", "--grace-duration"]
+)
+anything = st.text(st.characters(exclude_characters="\0"), max_size=20)
+
+
+@settings(deadline=None, max_examples=200)
+@given(file=anything, options=st.lists(st.tuples(flags, anything), max_size=3))
+def test_any_command_line_of_start_is_answered(file: str, options: list[tuple[str, str]]) -> None:
+    words = [f"{flag}={text}" for flag, text in options]
+    status = main.run(["--user", "start", "--dry-run", *words, "--", file or "x"])
+    assert status in set(ExitCode)
+    assert status != ExitCode.OK
+
+
+def test_names_of_files_in_any_encoding(tmp_path: Path) -> None:
+    flow = os.fsencode(tmp_path / "flow-") + b"\xff.yml"
+    command = [sys.executable, "-m", "dora_systemd.cli.main", "start", "--dry-run", "--user", flow]
+    done = subprocess.run(command, capture_output=True, check=False)
+    assert done.returncode == ExitCode.BAD_INPUT
+    assert done.stderr.startswith(b"doractl: cannot read ")
+    assert len(done.stderr.splitlines()) == 2

@@ -1,0 +1,47 @@
+"""What coordinator and daemon are started with."""
+
+import os
+from pathlib import Path
+
+from dora_systemd import engine
+
+
+def test_what_is_systemds_stays_with_the_runner() -> None:
+    given = {"NOTIFY_SOCKET": "/x", "WATCHDOG_USEC": "1", "PATH": "/bin", "MODEL": "yolo"}
+    assert engine.node_environment(given) == {"PATH": "/bin", "MODEL": "yolo"}
+
+
+def test_everything_listens_on_loopback_and_with_a_token() -> None:
+    coordinator = engine.coordinator_command("/dora")
+    assert coordinator[coordinator.index("--interface") + 1] == "127.0.0.1"
+    assert "--auth" in coordinator
+    daemon = engine.daemon_command("/dora", 1, 2)
+    assert "--zenoh-no-multicast" in daemon
+    assert daemon[daemon.index("--coordinator-addr") + 1] == "127.0.0.1"
+
+
+def test_the_users_own_token_is_not_overwritten() -> None:
+    made = engine.coordinator_environment({"HOME": "/h", "XDG_CONFIG_HOME": "/h/c"}, Path("/run/c"))
+    assert made["XDG_CONFIG_HOME"] == made["TMPDIR"] == "/run/c"
+
+
+def test_children_and_their_ends(tmp_path: Path) -> None:
+    child = engine.spawn("x", ["/bin/sh", "-c", "echo out; echo err >&2; exit 3"], {}, tmp_path)
+    with os.fdopen(child.output) as output:
+        assert output.read() == "out\nerr\n"
+    assert engine.format_exit(child.popen.wait()) == "exit code 3"
+    assert engine.format_exit(-9) == "signal SIGKILL"
+    assert engine.format_exit(-200) == "signal 200"
+
+
+def test_a_program_that_is_not_there(tmp_path: Path) -> None:
+    try:
+        engine.spawn("x", ["/nonexistent"], {}, tmp_path)
+    except OSError as error:
+        assert error.errno == 2
+    else:
+        raise AssertionError
+
+
+def test_a_free_port_is_free() -> None:
+    assert 0 < engine.free_port() < 65536

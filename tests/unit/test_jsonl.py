@@ -1,0 +1,175 @@
+"""dora's own log file: complete over append, rotation and truncation."""
+
+import asyncio
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dora_systemd.jsonl import JsonlTail
+from dora_systemd.logs import jsonl_fields
+
+
+class Dora:
+    """Writes the file as dora's daemon does."""
+
+    def __init__(self, directory: Path) -> None:
+        self.path = directory / "log_a.jsonl"
+        self.count = 0
+
+    def write(self, lines: int = 1) -> None:
+        with self.path.open("a") as file:
+            for _ in range(lines):
+                record = {"ts": "t", "level": "stdout", "stream": "stdout", "msg": str(self.count)}
+                file.write(json.dumps(record) + "\n")
+                self.count += 1
+
+    def rotate(self, keep: int) -> None:
+        if not self.path.exists():
+            return
+        for number in range(keep, 0, -1):
+            newer = self.path.with_name(f"log_a.{number - 1}.jsonl") if number > 1 else self.path
+            if newer.exists():
+                newer.rename(self.path.with_name(f"log_a.{number}.jsonl"))
+
+
+@pytest.fixture
+def loop() -> Iterator[asyncio.AbstractEventLoop]:
+    loop = asyncio.new_event_loop()
+    yield loop
+    loop.close()
+
+
+def tail(loop: asyncio.AbstractEventLoop, dora: Dora) -> tuple[JsonlTail, list[str]]:
+    found: list[str] = []
+    return JsonlTail(loop, dora.path, lambda fields: found.append(str(fields["MESSAGE"]))), found
+
+
+def numbers(count: int) -> list[str]:
+    return [str(number) for number in range(count)]
+
+
+def test_appended(loop: asyncio.AbstractEventLoop, tmp_path: Path) -> None:
+    dora = Dora(tmp_path)
+    follower, found = tail(loop, dora)
+    follower.drain()
+    for _ in range(3):
+        dora.write(2)
+        follower.drain()
+    assert found == numbers(6)
+    follower.close()
+
+
+def test_many_lines(loop: asyncio.AbstractEventLoop, tmp_path: Path) -> None:
+    dora = Dora(tmp_path)
+    dora.write(10_000)
+    follower, found = tail(loop, dora)
+    follower.close()
+    assert found == numbers(10_000)
+
+
+def test_truncated_by_dora_1_0(loop: asyncio.AbstractEventLoop, tmp_path: Path) -> None:
+    dora = Dora(tmp_path)
+    follower, found = tail(loop, dora)
+    dora.write(3)
+    follower.drain()
+    dora.path.write_text("")
+    dora.write(1)
+    follower.close()
+    assert found == numbers(4)
+
+
+STEPS = st.lists(st.sampled_from(["write", "rotate", "look"]), max_size=30)
+
+
+@given(STEPS)
+def test_rotated(tmp_path_factory: pytest.TempPathFactory, steps: list[str]) -> None:
+    loop = asyncio.new_event_loop()
+    dora = Dora(tmp_path_factory.mktemp("out"))
+    follower, found = tail(loop, dora)
+    for step in steps:
+        if step == "write":
+            dora.write(3)
+        elif step == "rotate":
+            dora.rotate(keep=40)
+        else:
+            follower.drain()
+    follower.close()
+    loop.close()
+    assert found == numbers(dora.count)
+    assert follower.lost_files == 0
+
+
+def test_deleted_before_it_was_read(loop: asyncio.AbstractEventLoop, tmp_path: Path) -> None:
+    dora = Dora(tmp_path)
+    follower, found = tail(loop, dora)
+    dora.write()
+    follower.drain()
+    for _ in range(3):
+        dora.write()
+        dora.rotate(keep=1)
+    dora.write()
+    follower.close()
+    assert found == ["0", "1", "3", "4"]
+    assert follower.lost_files == 1
+
+
+def test_waits_while_the_journal_is_busy(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        dora = Dora(tmp_path)
+        dora.write(3)
+        found: list[object] = []
+        busy = [True]
+        loop = asyncio.get_running_loop()
+        follower = JsonlTail(loop, dora.path, found.append, lambda: busy[0])
+        follower.start()
+        await asyncio.sleep(0.12)
+        assert not found
+        busy[0] = False
+        await asyncio.sleep(0.12)
+        assert len(found) == 3
+        follower.close()
+
+    asyncio.run(scenario())
+
+
+def test_fields_of_a_raw_line() -> None:
+    line = (
+        b'{"ts":"T","level":"stdout","node":"b","stream":"stderr","msg":"err",'
+        b'"target":null,"fields":null}'
+    )
+    assert jsonl_fields(line) == {
+        "PRIORITY": 5,
+        "DORA_TIMESTAMP": "T",
+        "DORA_STREAM": "stderr",
+        "MESSAGE": "err",
+    }
+
+
+def test_fields_of_a_structured_line() -> None:
+    line = (
+        b'{"ts":"T","level":"warn","node":"b","stream":"stdout","msg":"m",'
+        b'"target":"my.t","fields":{"a":"1"}}'
+    )
+    assert jsonl_fields(line) == {
+        "PRIORITY": 4,
+        "DORA_LEVEL": "warn",
+        "DORA_TIMESTAMP": "T",
+        "DORA_TARGET": "my.t",
+        "DORA_FIELD_A": "1",
+        "DORA_STREAM": "stdout",
+        "MESSAGE": "m",
+    }
+
+
+def test_line_that_dora_cut() -> None:
+    line = b'{"ts":"T","level":"stdout","stream":"stdout","msg":"xx... [truncated]"}'
+    assert jsonl_fields(line)["DORA_CUT"] == 1
+
+
+@pytest.mark.parametrize("line", [b"", b"{", b"[]", b"{}", b'{"stream":1,"level":2}', b"\xff"])
+def test_broken_line_is_kept_as_it_is(line: bytes) -> None:
+    assert jsonl_fields(line) == {"PRIORITY": 6, "MESSAGE": line}

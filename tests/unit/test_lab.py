@@ -1,0 +1,131 @@
+"""The parts of the test lab that need neither root nor an image."""
+
+import io
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from lab import cache, definition, initrd, qemu, wire
+from lab.errors import LabError
+from lab.options import parse_options
+from lab.steps import read_summary
+
+PYPROJECT = '[project]\nname = "x"\n[tool.ruff]\nline-length = 100\n'
+
+
+def test_options_of_run() -> None:
+    options = parse_options(["run", "--env", "A=1=2", "--env", "B", "--", "x", "--env"], {"B": "b"})
+    assert options.form == "container"
+    assert options.commands == (("x", "--env"),)
+    assert options.env == (("A", "1=2"), ("B", "b"))
+
+
+def test_the_dashes_are_optional() -> None:
+    assert parse_options(["run", "ls", "-l"], {}).commands == (("ls", "-l"),)
+
+
+def test_only_the_first_dashes_are_the_labs() -> None:
+    assert parse_options(["run", "--", "x", "--", "y"], {}).commands == (("x", "--", "y"),)
+
+
+def test_commands_around_a_reboot() -> None:
+    options = parse_options(["run", "--", "a", "b", "--reboot--", "c"], {"LAB": "vm"})
+    assert options.form == "vm"
+    assert options.commands == (("a", "b"), ("c",))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "environ", "message"),
+    [
+        (["run"], {}, "lab: cannot run nothing (hint: lab run -- CMD)"),
+        (["run", "a", "--reboot--"], {}, "lab: cannot run nothing (hint: lab run -- CMD)"),
+        (["run", "x"], {"LAB": "moon"}, "lab: cannot use LAB=moon (hint: one of container, vm)"),
+        (
+            ["run", "x"],
+            {"LAB_OUT": "/no/such"},
+            "lab: cannot use LAB_OUT=/no/such (hint: an existing directory)",
+        ),
+        (
+            ["run", "--env", "1=2", "x"],
+            {},
+            "lab: cannot pass the variable '1' (hint: --env NAME or --env NAME=VALUE)",
+        ),
+    ],
+)
+def test_refused(arguments: list[str], environ: dict[str, str], message: str) -> None:
+    with pytest.raises(LabError) as caught:
+        parse_options(arguments, environ)
+    assert str(caught.value) == message
+
+
+def test_key_ignores_linters_and_sees_dependencies() -> None:
+    key = definition.project_key(PYPROJECT, "")
+    assert key == definition.project_key(PYPROJECT.replace("100", "80"), "")
+    assert key != definition.project_key(PYPROJECT.replace('"x"', '"y"'), "")
+    assert key != definition.project_key(PYPROJECT, "u dora -")
+
+
+def test_interrupted_build_is_not_a_finished_one(tmp_path: Path) -> None:
+    def build_half(path: Path) -> None:
+        (path / "half").touch()
+        raise LabError("go on")
+
+    with pytest.raises(LabError):
+        cache.ensure(tmp_path, cache.Layer("tree", "k", build_half))
+    whole = cache.ensure(tmp_path, cache.Layer("tree", "k", lambda path: (path / "whole").touch()))
+    assert [path.name for path in whole.iterdir()] == ["whole"]
+    assert not list(tmp_path.glob("*.tmp"))
+
+
+def test_old_layers_are_removed_unless_in_use(tmp_path: Path) -> None:
+    for key in "abcd":
+        cache.ensure(tmp_path, cache.Layer("tree", key, lambda _: None))
+    # ensure() holds each against removal for as long as this process lives.
+    assert len([path for path in tmp_path.iterdir() if path.is_dir()]) == 4
+    old = tmp_path / "tree-old"
+    old.mkdir()
+    cache.remove_layer(old)
+    assert not old.exists()
+
+
+def test_frames_survive_any_split() -> None:
+    stream = io.BytesIO(wire.pack_frame(b"O", b"x" * 100_000) + wire.pack_frame(b"X", b"0"))
+    assert wire.read_frame(lambda count: stream.read(min(count, 7))) == (b"O", b"x" * 100_000)
+    assert wire.read_frame(stream.read) == (b"X", b"0")
+    with pytest.raises(EOFError):
+        wire.read_frame(stream.read)
+
+
+def test_initrd_members_are_aligned() -> None:
+    entry = initrd.format_entry("init", 0o100755, b"12345")
+    assert entry.startswith(b"070701")
+    assert len(entry) % 4 == 0
+    assert b"init\0" in entry
+
+
+@pytest.mark.parametrize(
+    ("version", "is_old"),
+    [
+        ("QEMU emulator version 7.2.22 (Debian 1:7.2)", True),
+        ("QEMU emulator version 10.0.2 (Debian 1:10)", False),
+        ("no idea", True),
+    ],
+)
+def test_old_emulators_get_the_workaround(version: str, is_old: bool) -> None:
+    assert ("clearcpuid=cx16" in qemu.kernel_options(version)) is is_old
+
+
+@pytest.mark.parametrize(
+    ("line", "summary"),
+    [
+        ("===== 3 passed, 1 skipped in 0.12s =====", "3 passed, 1 skipped in 0.12s"),
+        ("=== 120 passed in 75.31s (0:01:15) ===", "120 passed in 75.31s (0:01:15)"),
+        ("tests/unit/test_lab.py ....", ""),
+        ("2 cats in a box", ""),
+    ],
+)
+def test_summary_of_pytest(line: str, summary: str) -> None:
+    assert read_summary(line) == summary

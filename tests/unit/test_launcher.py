@@ -1,0 +1,111 @@
+"""launcher.sh and what stands in for python and uv: real shell scripts, with a pretended cgroup."""
+
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+
+import dora_systemd
+
+PACKAGE = Path(dora_systemd.__file__).parent
+LIBEXEC = str(PACKAGE / "libexec")
+
+
+@pytest.fixture
+def environment(tmp_path: Path) -> dict[str, str]:
+    """What the runner gives the daemon, for a cell with the nodes `one` and `kept`."""
+    for part in ("io", "node-one", "node-kept", "project"):
+        (tmp_path / part).mkdir()
+    return {
+        "PATH": f"{LIBEXEC}:/usr/bin:/bin",
+        "DORA_QUIET": "1",
+        "RUST_BACKTRACE": "0",
+        "MODEL": "yolo",
+        "DORA_SYSTEMD_UNSET": "DORA_QUIET RUST_BACKTRACE",
+        "DORA_SYSTEMD_CELL": str(tmp_path),
+        "DORA_SYSTEMD_GROUP": str(tmp_path),
+        "DORA_SYSTEMD_LIBEXEC": LIBEXEC,
+        "DORA_SYSTEMD_DIRECTORY": str(tmp_path / "project"),
+        "DORA_SYSTEMD_PYTHON": "/bin/echo",
+        "DORA_SYSTEMD_KEEP": "kept other",
+    }
+
+
+def launch(environment: dict[str, str], *words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        words, env=environment, capture_output=True, text=True, check=False, timeout=10
+    )
+
+
+def launcher(environment: dict[str, str], *words: str) -> subprocess.CompletedProcess[str]:
+    return launch(environment, "/bin/sh", str(PACKAGE / "launcher.sh"), *words)
+
+
+def test_the_node_gets_group_pipes_directory_and_environment(
+    environment: dict[str, str], tmp_path: Path
+) -> None:
+    script = "echo $$ $PWD; echo warn >&2; env"
+    done = launcher(environment, "one", str(tmp_path / "project"), "pipe", "/bin/sh", "-c", script)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    said = (tmp_path / "io/one.out").read_text().splitlines()
+    pid = (tmp_path / "io/one.pid").read_text().strip()
+    assert said[0] == f"{pid} {tmp_path / 'project'}"
+    assert (tmp_path / "io/one.err").read_text() == "warn\n"
+    assert (tmp_path / "node-one/cgroup.procs").read_text() == "0\n"
+    assert "MODEL=yolo" in said
+    assert "PATH=/usr/bin:/bin" in said
+    assert not [line for line in said if line.startswith(("DORA_", "RUST_"))]
+
+
+def test_output_that_dora_reads_is_left_alone(environment: dict[str, str], tmp_path: Path) -> None:
+    done = launcher(environment, "kept", str(tmp_path), "keep", "/bin/echo", "a b", "$x")
+    assert done.stdout == "a b $x\n"
+    assert not (tmp_path / "io/kept.out").exists()
+
+
+def test_a_command_that_is_not_there_says_so_in_the_nodes_own_log(
+    environment: dict[str, str], tmp_path: Path
+) -> None:
+    done = launcher(environment, "one", str(tmp_path), "pipe", "/nonexistent")
+    assert done.returncode == 127
+    assert "/nonexistent" in (tmp_path / "io/one.err").read_text()
+
+
+def test_a_directory_that_is_gone_and_a_group_that_is_gone(
+    environment: dict[str, str], tmp_path: Path
+) -> None:
+    assert launcher(environment, "one", "/nonexistent", "pipe", "true").returncode != 0
+    done = launcher(environment, "unknown", str(tmp_path), "keep", "/bin/echo", "ran")
+    assert done.returncode != 0
+    assert "ran" not in done.stdout
+
+
+@pytest.mark.parametrize("node", ["one", "kept"])
+def test_operators_are_recognised(environment: dict[str, str], tmp_path: Path, node: str) -> None:
+    words = ("-uc", f"import dora; dora.start_runtime() # {node}")
+    done = launch(environment, f"{LIBEXEC}/python", *words)
+    output = done.stdout if node == "kept" else (tmp_path / "io/one.out").read_text()
+    assert output == " ".join(words) + "\n"
+    assert (tmp_path / f"node-{node}/cgroup.procs").exists()
+
+
+def test_other_uses_of_python_go_to_the_real_one(environment: dict[str, str]) -> None:
+    assert launch(environment, f"{LIBEXEC}/python", "-c", "x").stdout == "-c x\n"
+    assert launch(environment, f"{LIBEXEC}/python").stdout == "\n"
+
+
+def test_uv_finds_our_python_and_is_uv_otherwise(
+    environment: dict[str, str], tmp_path: Path
+) -> None:
+    uv = tmp_path / "uv"
+    uv.write_text('#!/bin/sh\necho real "$@"\n')
+    uv.chmod(0o755)
+    environment["PATH"] = f"{LIBEXEC}:{tmp_path}:/usr/bin:/bin"
+    assert launch(environment, f"{LIBEXEC}/uv", "python", "find").stdout == f"{LIBEXEC}/python\n"
+    assert launch(environment, f"{LIBEXEC}/uv", "run", "x").stdout == "real run x\n"
+
+
+def test_the_scripts_are_executable() -> None:
+    for name in ("python", "uv"):
+        assert os.access(f"{LIBEXEC}/{name}", os.X_OK)

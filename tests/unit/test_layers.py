@@ -1,0 +1,221 @@
+"""The table of layers: who may import whom. Every module is in it; a new file is one line.
+
+Imports go down only. The groups of a layer do not import each other, but for the words and the
+decisions, which are one group each. Nothing imports in a circle.
+"""
+
+import ast
+import graphlib
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.unit.checkout import linked_package, module_paths
+
+WORDS = {
+    "words": [
+        "errors",
+        "values",
+        "names",
+        "scope",
+        "cellpaths",
+    ],
+}
+DECISIONS = {
+    "decisions": [
+        "buildsession",
+        "busprotocol",
+        "cellstate",
+        "cellview",
+        "compat",
+        "dataflow",
+        "dataflownodes",
+        "doraerrors",
+        "environment",
+        "events",
+        "jsonvalues",
+        "launch",
+        "lifecycle",
+        "lifeevents",
+        "logfields",
+        "logquery",
+        "logs",
+        "logterminal",
+        "nodetable",
+        "options",
+        "properties",
+        "propertykinds",
+        "propertylists",
+        "propertynumbers",
+        "propertyset",
+        "propertystructs",
+        "propertytable",
+        "protocol",
+        "settingkinds",
+        "settings",
+        "settingschema",
+        "settingtable",
+        "status",
+        "statuswords",
+        "suggestions",
+        "unitsyntax",
+    ],
+}
+ADAPTERS = {
+    "bus": ["bus", "buserrors", "buswire"],
+    "cgroup": ["cgroup"],
+    "control": ["control"],
+    "engine": ["engine"],
+    "files": ["files", "yamlloader"],
+    "journal": ["journal"],
+    "journalread": ["journalread"],
+    "jsonl": ["jsonl"],
+    "notify": ["notify"],
+    "pipes": ["pipes", "logqueue"],
+    "process": ["process"],
+}
+SHARED = {
+    "preparation": ["preparation"],
+}
+"""What both use cases do with several adapters."""
+USE_CASES = {
+    "manager": [
+        "manageraccount",
+        "managercells",
+        "managerended",
+        "managerlist",
+        "managerlogs",
+        "managernode",
+        "managerplan",
+        "managerreason",
+        "managerrun",
+        "managersettings",
+        "managershow",
+        "managerstart",
+        "managerstop",
+        "managerunit",
+        "managerversion",
+        "managerwords",
+    ],
+    "runner": [
+        "runner",
+        "runnerdialogue",
+        "runnerengine",
+        "runnernodes",
+        "runnerpump",
+    ],
+}
+CLI = {"cli": sorted(name for name in module_paths() if name.startswith("cli."))}
+
+LAYERS = [WORDS, DECISIONS, ADAPTERS, SHARED, USE_CASES, CLI]
+
+PLACES = {
+    module: (depth, group)
+    for depth, layer in enumerate(LAYERS)
+    for group, modules in layer.items()
+    for module in modules
+}
+
+ONLY_IMPORTERS = {
+    "click": {name for name in module_paths() if name.startswith("cli.")},
+    "pydantic": {"settingschema"},
+    "pystemd": {"bus", "buserrors"},
+    "systemd": {"journal", "journalread", "notify"},
+    "websockets": {"control"},
+    "yaml": {"files", "yamlloader"},
+    "watchfiles": {"watch"},
+}
+"""Packages of others, and the modules of ours that may import them."""
+
+IMPURE = {
+    *("asyncio", "glob", "io", "os", "random", "secrets", "select", "shutil", "socket"),
+    *("subprocess", "tempfile", "threading"),
+}
+"""What no decision needs: input, output, chance."""
+
+CLOCKS = {"time", "time_ns", "monotonic", "monotonic_ns", "sleep", "now", "utcnow", "today"}
+
+NOT_IN_SHORT_LIVED_VERBS = {"pydantic", "websockets", "watchfiles", "asyncio"}
+
+
+def imports(name: str) -> tuple[set[str], set[str]]:
+    """The modules of ours that a module imports anywhere in it, and the packages of others."""
+    own, others = set(), set()
+    for node in ast.walk(ast.parse(module_paths()[name].read_text())):
+        if isinstance(node, ast.ImportFrom):
+            targets = {f"{node.module}.{alias.name}" for alias in node.names}
+            targets = {one for one in targets if one.removeprefix("dora_systemd.") in PLACES}
+            imported = targets or {node.module or ""}
+        elif isinstance(node, ast.Import):
+            imported = {alias.name for alias in node.names}
+        else:
+            continue
+        own |= {one.removeprefix("dora_systemd.") for one in imported if "dora_systemd." in one}
+        others |= {one.partition(".")[0] for one in imported if "dora_systemd" not in one}
+    return own, others
+
+
+def test_every_module_is_in_the_table() -> None:
+    missing = module_paths().keys() - PLACES.keys()
+    gone = PLACES.keys() - module_paths().keys()
+    assert not missing, f"add to the table of layers: {sorted(missing)}"
+    assert not gone, f"take out of the table of layers: {sorted(gone)}"
+
+
+@pytest.mark.parametrize("name", sorted(module_paths().keys() & PLACES.keys()))
+def test_imports_go_down(name: str) -> None:
+    depth, group = PLACES[name]
+    wrong = [
+        target
+        for target in imports(name)[0]
+        if target in PLACES
+        and (
+            PLACES[target][0] > depth or (PLACES[target][0] == depth and PLACES[target][1] != group)
+        )
+    ]
+    assert not wrong, f"{name} of {group} must not import {', '.join(sorted(wrong))}"
+
+
+def test_nothing_imports_in_a_circle() -> None:
+    graph = {name: imports(name)[0] & PLACES.keys() for name in PLACES}
+    list(graphlib.TopologicalSorter(graph).static_order())
+
+
+@pytest.mark.parametrize("name", sorted(module_paths()))
+def test_each_outside_thing_has_one_importer(name: str) -> None:
+    foreign = {one for one in imports(name)[1] if name not in ONLY_IMPORTERS.get(one, {name})}
+    assert not foreign, f"{name} must not import {', '.join(sorted(foreign))}"
+
+
+@pytest.mark.parametrize("name", sorted(DECISIONS["decisions"]))
+def test_decisions_are_pure(name: str) -> None:
+    tree = ast.parse(module_paths()[name].read_text())
+    impure = imports(name)[1] & IMPURE
+    clocks = {
+        node.attr
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Attribute)
+        and node.attr in CLOCKS
+        and isinstance(node.value, ast.Name)
+        and node.value.id in ("time", "datetime", "date")
+    }
+    assert not impure | clocks, f"{name} uses {', '.join(sorted(impure | clocks))}"
+
+
+@pytest.mark.parametrize("verb", ["list", "stop", "logs"])
+def test_short_lived_verbs_load_little(verb: str, tmp_path: Path) -> None:
+    code = f"import sys, dora_systemd.cli.main, dora_systemd.cli.{verb}; print(*sys.modules)"
+    environment = {**os.environ, "PYTHONPATH": str(linked_package(tmp_path))}
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", code],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert not done.returncode, done.stderr
+    loaded = {module.partition(".")[0] for module in done.stdout.split()}
+    assert not loaded & NOT_IN_SHORT_LIVED_VERBS

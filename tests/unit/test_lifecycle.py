@@ -1,0 +1,208 @@
+"""The runner's state machine: every pair of state and event, and whole lives as tables."""
+
+from dataclasses import replace
+
+import pytest
+
+from dora_systemd import lifeevents as life
+from dora_systemd.cellstate import Cell, Deadline, Do, Record, RunnerExit, State
+from dora_systemd.lifecycle import ENGINE_TIMEOUT, TABLE, step, stop_timeout
+from dora_systemd.status import NodeStatus
+from dora_systemd.values import SECOND
+
+SAMPLES: dict[type[life.Event], tuple[life.Event, ...]] = {
+    life.CoordinatorListening: (life.CoordinatorListening(1),),
+    life.DaemonConnected: (life.DaemonConnected(1),),
+    life.RunStarted: (life.RunStarted(1, "run"),),
+    life.Subscribed: (life.Subscribed(1),),
+    life.Refused: (life.Refused(1, "no"),),
+    life.NodeSpawned: (life.NodeSpawned(1, "a", 7), life.NodeSpawned(1, "unknown", 7)),
+    life.NodeReady: (life.NodeReady(1, "a"), life.NodeReady(1, "unknown")),
+    life.AllReady: (life.AllReady(1),),
+    life.NodeExited: (
+        life.NodeExited(1, "a", "", False),
+        life.NodeExited(1, "a", "exit code 1", False),
+        life.NodeExited(1, "a", "signal SIGKILL", True),
+        life.NodeExited(1, "a", "", False, is_stale=True),
+        life.NodeExited(1, "unknown", "", True, is_stale=True),
+    ),
+    life.NodeCascaded: (life.NodeCascaded(1, "a", "b"),),
+    life.RunFinished: (life.RunFinished(1),),
+    life.ResultKnown: (life.ResultKnown(1), life.ResultKnown(1, {"a": "", "b": "exit code 1"})),
+    life.ChildExited: (
+        life.ChildExited(1, "daemon", "signal SIGKILL"),
+        life.ChildExited(1, "coordinator", "exit code 1"),
+    ),
+    life.ConnectionLost: (life.ConnectionLost(1),),
+    life.StopAsked: (life.StopAsked(1, "SIGTERM"),),
+    life.StopAnswered: (life.StopAnswered(1),),
+    life.DeadlinePassed: (life.DeadlinePassed(1),),
+}
+
+
+def cell(state: State = State.BOOTING, **changes: object) -> Cell:
+    nodes = {"a": NodeStatus("running", 7), "b": NodeStatus("running", 8)}
+    return replace(Cell(10 * SECOND, 0, nodes, state), **changes)  # type: ignore[arg-type]
+
+
+def test_the_table_is_total() -> None:
+    assert set(TABLE) == set(State)
+    for row in TABLE.values():
+        assert set(row) == set(life.EVENTS) == set(SAMPLES)
+
+
+@pytest.mark.parametrize("state", State)
+@pytest.mark.parametrize("kind", life.EVENTS, ids=lambda kind: kind.__name__)
+def test_every_pair(state: State, kind: type[life.Event]) -> None:
+    for event in SAMPLES[kind]:
+        after, actions = step(cell(state), event)
+        assert (Do.EXIT in actions) == (after.state is State.ENDED and state is not State.ENDED)
+        if after.state is not state:
+            deadlines = [one for one in actions if isinstance(one, Deadline)]
+            assert len(deadlines) == 1, "every change of state sets or clears the deadline"
+        if state is State.ENDED:
+            assert (after, actions) == (cell(state), ())
+
+
+@pytest.mark.parametrize("state", [s for s in State if s is not State.ENDED])
+def test_each_state_ends_when_it_is_told_to_and_nothing_answers(state: State) -> None:
+    now = cell(state)
+    for event in (life.StopAsked(1, "SIGTERM"), *[life.DeadlinePassed(2)] * 3):
+        now = step(now, event)[0]
+    assert now.state is State.ENDED
+    if state not in (State.CLOSING,):
+        assert now.exit is RunnerExit.OK
+
+
+def live(*events: life.Event, nodes: tuple[str, ...] = ("a", "b")) -> tuple[Cell, list[object]]:
+    now, done = Cell(2 * SECOND, 0, {n: NodeStatus() for n in nodes}), []
+    for event in events:
+        now, actions = step(now, event)
+        done += [action for action in actions if not isinstance(action, Deadline)]
+    return now, done
+
+
+START = (
+    life.CoordinatorListening(1),
+    life.DaemonConnected(2),
+    life.RunStarted(3, "run"),
+    life.Subscribed(4),
+)
+READY = (
+    *START,
+    life.NodeSpawned(5, "a", 7),
+    life.NodeSpawned(5, "b", 8),
+    life.NodeReady(6, "a"),
+    life.NodeReady(7, "b"),
+    life.AllReady(8),
+)
+ASKED = [
+    Do.START_DAEMON,
+    Do.SEND_START,
+    Do.SUBSCRIBE,
+    Do.OPEN_PIPES,
+    Do.ASK_SPAWN,
+    Do.ASK_RESULT,
+]
+
+
+def test_history_ready() -> None:
+    now, done = live(*READY)
+    assert now.state is State.RUNNING
+    assert now.ready_us == 8
+    assert [one for one in done if isinstance(one, Do)] == ASKED
+    assert done[-1] == Record("dataflow-started")
+    assert [node.state for node in now.nodes.values()] == ["running", "running"]
+
+
+def test_history_stop() -> None:
+    now, done = live(
+        *READY,
+        life.StopAsked(9, "SIGTERM"),
+        life.NodeExited(10, "a", "", False),
+        life.NodeExited(10, "b", "signal SIGTERM", False),
+        life.ChildExited(11, "daemon", "exit code 0"),
+    )
+    assert now.exit is RunnerExit.OK
+    ends = done[done.index(Record("dataflow-stopping", "", {"by": "SIGTERM"})) :]
+    assert [one for one in ends if isinstance(one, Do)] == [
+        Do.ASK_STOP,
+        Do.DISMISS_DAEMON,
+        Do.EXIT,
+    ]
+    assert Record("dataflow-stopped") in ends
+    assert not [one for one in ends if isinstance(one, Record) and one.event == "node-crashed"]
+
+
+def test_history_finish() -> None:
+    now, done = live(
+        *READY,
+        life.NodeExited(9, "a", "", False),
+        life.NodeExited(9, "b", "", False),
+        life.RunFinished(10),
+        life.ResultKnown(11, {"a": "", "b": ""}),
+        life.ChildExited(12, "daemon", "exit code 0"),
+    )
+    assert now.exit is RunnerExit.OK
+    assert done[-2:] == [Record("dataflow-finished"), Do.EXIT]
+
+
+def test_history_failed_before_ready() -> None:
+    now, done = live(
+        *START,
+        life.NodeExited(9, "a", "exit code 1", False),
+        life.NodeCascaded(9, "b", "a"),
+        life.RunFinished(10),
+        life.ResultKnown(11, {"a": "exit code 1", "b": "exit code 1 because node a failed"}),
+        life.ChildExited(12, "daemon", "exit code 0"),
+    )
+    assert now.exit is RunnerExit.FAILED
+    assert Record("node-crashed", "a", {"exit": "exit code 1"}) in done
+    assert now.failure.startswith("node a: exit code 1")
+
+
+def test_the_barrier_opens_although_a_node_has_failed() -> None:
+    failed = (*START, life.NodeExited(5, "a", "exit code 1", False), life.NodeReady(6, "b"))
+    now, done = live(*failed, life.AllReady(7))
+    assert now.state is State.WAITING
+    assert Record("dataflow-started") not in done
+    now, actions = step(now, life.DeadlinePassed(8))
+    assert now.state is State.RUNNING
+    assert Record("dataflow-started") in actions
+
+
+def test_an_empty_result_is_unknown_and_not_success() -> None:
+    now, _ = live(*READY, life.RunFinished(10), life.ResultKnown(11))
+    assert now.exit is RunnerExit.ENGINE_LOST
+
+
+def test_stop_does_not_wait_for_a_node_in_its_restart_delay() -> None:
+    now, done = live(
+        *READY,
+        life.NodeExited(9, "a", "", False),
+        life.NodeExited(9, "b", "exit code 1", True),
+        life.StopAsked(10, "SIGTERM"),
+    )
+    assert now.state is State.LEAVING
+    assert Do.ASK_STOP not in done
+
+
+def test_stop_timeout_covers_what_dora_takes_to_kill() -> None:
+    assert stop_timeout(10 * SECOND) == 17 * SECOND
+    _, actions = step(cell(State.RUNNING), life.StopAsked(1, "x"))
+    assert Deadline(17 * SECOND) in actions
+    assert ENGINE_TIMEOUT == 30 * SECOND
+
+
+def test_crash_restart_and_stale_exits() -> None:
+    now, done = live(*READY, life.NodeExited(9, "a", "exit code 3", True))
+    assert now.nodes["a"].state == "restarting"
+    now, actions = step(now, life.NodeSpawned(10, "a", 70))
+    assert actions == (Record("node-restarted", "a", {"restarts": "1"}),)
+    now, _ = step(now, life.NodeExited(11, "a", "signal SIGKILL", False, is_stale=True))
+    assert (now.nodes["a"].pid, now.nodes["a"].state) == (70, "starting")
+    now, _ = step(now, life.NodeReady(12, "a"))
+    assert (now.nodes["a"].state, now.nodes["a"].restarts) == ("running", 1)
+    now, _ = step(now, life.NodeExited(13, "a", "signal SIGKILL", True, is_stale=True))
+    assert (now.nodes["a"].pid, now.nodes["a"].restarts) == (70, 2)
+    assert Record("node-crashed", "a", {"exit": "exit code 3"}) in done

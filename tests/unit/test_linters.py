@@ -1,0 +1,97 @@
+"""The tree is clean: ruff, mypy, short modules, short functions, documented interfaces."""
+
+import ast
+import os
+import statistics
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.unit.checkout import CHECKOUT, linked_package, module_paths
+
+MAX_LINES = 300
+MEDIAN_LINES = 10
+
+Function = ast.FunctionDef | ast.AsyncFunctionDef
+
+
+def run(command: list[str], directory: Path, environment: dict[str, str]) -> None:
+    """Run a linter; its output is the whole of the failure."""
+    done = subprocess.run(
+        [sys.executable, "-m", *command],
+        cwd=directory,
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if done.returncode:
+        pytest.fail(f"{' '.join(command)}\n{done.stdout}{done.stderr}", pytrace=False)
+
+
+def cache_directory(config: pytest.Config, name: str) -> Path:
+    """A directory that stays from run to run: linters are slow without their caches."""
+    return config.cache.mkdir(name) if config.cache else CHECKOUT / ".pytest_cache" / name
+
+
+def test_ruff(pytestconfig: pytest.Config) -> None:
+    cache = str(cache_directory(pytestconfig, "ruff"))
+    run(["ruff", "check", "--output-format=concise", "."], CHECKOUT, {"RUFF_CACHE_DIR": cache})
+
+
+def test_mypy(pytestconfig: pytest.Config) -> None:
+    place = linked_package(cache_directory(pytestconfig, "package"))
+    cache = str(cache_directory(pytestconfig, "mypy"))
+    config = f"--config-file={CHECKOUT / 'pyproject.toml'}"
+    sources = ["dora_systemd", "tests/unit", "tests/system"]
+    run(["mypy", config, *sources], place, {"MYPY_CACHE_DIR": cache})
+
+
+@pytest.mark.parametrize("name", sorted(module_paths()))
+def test_modules_are_short(name: str) -> None:
+    count = len(module_paths()[name].read_text().splitlines())
+    assert count < MAX_LINES, f"{name} has {count} lines: split it"
+
+
+def functions() -> Iterator[tuple[str, Function]]:
+    for name, path in module_paths().items():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, Function):
+                yield f"{name}.{node.name}", node
+
+
+def body_lines(function: Function) -> int:
+    """Lines of a function without its docstring."""
+    first = function.body[0]
+    is_text = isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant)
+    document = (first.end_lineno or 0) - first.lineno + 1 if is_text else 0
+    return (function.end_lineno or 0) - function.lineno + 1 - document
+
+
+def test_functions_are_short() -> None:
+    lengths = {name: body_lines(function) for name, function in functions()}
+    median = statistics.median(lengths.values())
+    longest = sorted(lengths.items(), key=lambda item: -item[1])[:10]
+    assert median < MEDIAN_LINES, f"median {median} lines, the longest are {longest}"
+
+
+@pytest.mark.parametrize("name", sorted(module_paths()))
+def test_modules_are_documented(name: str) -> None:
+    """Modules, and what of them other modules may use."""
+    tree = ast.parse(module_paths()[name].read_text())
+    public = [
+        node
+        for node in tree.body
+        if isinstance(node, Function | ast.ClassDef) and not node.name.startswith("_")
+    ]
+    bare = [node.name for node in public if not ast.get_docstring(node)]
+    assert ast.get_docstring(tree), f"{name} has no docstring"
+    assert not bare, f"no docstring in {name}: {', '.join(bare)}"
+
+
+def test_no_drawers_for_everything() -> None:
+    stems = {name.rpartition(".")[2] for name in module_paths()}
+    assert not stems & {"util", "utils", "helper", "helpers", "misc", "common"}

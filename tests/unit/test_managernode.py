@@ -1,0 +1,125 @@
+"""What is asked of a coordinator, and who may ask."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dora_systemd import managernode
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.managercells import Cell, read_cells
+from dora_systemd.protocol import Reply
+from dora_systemd.scope import Scope
+from dora_systemd.status import CellStatus, NodeStatus
+from tests.unit.fake_manager import FakeManager, ScopeIn, options
+
+
+@pytest.fixture
+def scope(tmp_path: Path) -> Scope:
+    return ScopeIn(is_user=True, uid=1000, root=tmp_path)
+
+
+class FakeCoordinator:
+    """Answers every request with `reply`, Info with a descriptor of one node."""
+
+    def __init__(self, restart_policy: str | None) -> None:
+        self.requests: list[Mapping[str, Any]] = []
+        self.node: dict[str, Any] = {"id": "camera", "path": "x"}
+        self.others = [{"id": "plot", "inputs": {"image": {"source": "camera/image"}}}]
+        if restart_policy:
+            self.node["restart_policy"] = restart_policy
+        self.error = ""
+
+    def __call__(self, scope: Scope, cell: Cell, params: Mapping[str, Any]) -> Reply:
+        assert (scope.is_user, cell.name) == (True, "robot")
+        self.requests.append(params)
+        info = {"DataflowInfo": {"descriptor": {"nodes": [self.node, *self.others]}}}
+        return Reply("", info if "Info" in params else {}, self.error)
+
+
+@pytest.fixture
+def cell(scope: Scope) -> Cell:
+    directory = scope.cell_directory("robot")
+    directory.mkdir(parents=True)
+    access = {"port": 4711, "token": "secret", "local_listen_port": 4712}
+    (directory / "control.json").write_text(json.dumps(access))
+    status = CellStatus(run="run-1", nodes={"camera": NodeStatus("running")})
+    (directory / "status.json").write_text(status.to_json())
+    return make_cell("active")
+
+
+def make_cell(active: str) -> Cell:
+    manager = FakeManager()
+    manager.add(options(), active=active)
+    return read_cells(manager)[0]
+
+
+@pytest.mark.parametrize(
+    ("policy", "method"),
+    [
+        (None, "ReplaceNode"),
+        ("never", "ReplaceNode"),
+        ("on-failure", "RestartNode"),
+        ("always", "RestartNode"),
+    ],
+)
+def test_restart(scope: Scope, cell: Cell, policy: str | None, method: str) -> None:
+    fake = FakeCoordinator(policy)
+    managernode.restart_node(scope, cell, "camera", fake)
+    ((asked, params),) = fake.requests[-1].items()
+    assert asked == method
+    assert params["dataflow_id"] == "run-1"
+
+
+def test_restart_of_a_node_that_nobody_reads(scope: Scope, cell: Cell) -> None:
+    fake = FakeCoordinator(None)
+    fake.others = [{"id": "plot", "inputs": {"image": "camera2/image"}}]
+    managernode.restart_node(scope, cell, "camera", fake)
+    assert list(fake.requests[-1]) == ["RestartNode"]
+
+
+def test_stop(scope: Scope, cell: Cell) -> None:
+    fake = FakeCoordinator(None)
+    managernode.stop_node(scope, cell, "camera", fake)
+    assert fake.requests == [
+        {"StopNode": {"dataflow_id": "run-1", "node_id": "camera", "grace_duration": None}}
+    ]
+
+
+def test_unknown_node(scope: Scope, cell: Cell) -> None:
+    with pytest.raises(DoraSystemdError, match="cannot find a node 'camer'") as caught:
+        managernode.stop_node(scope, cell, "camer")
+    assert caught.value.hint == "did you mean camera?"
+    assert caught.value.code is ExitCode.NOT_FOUND
+
+
+def test_what_dora_refuses(scope: Scope, cell: Cell) -> None:
+    fake = FakeCoordinator(None)
+    fake.error = "not found in running dataflow"
+    with pytest.raises(DoraSystemdError, match="not found in running dataflow"):
+        managernode.stop_node(scope, cell, "camera", fake)
+
+
+def test_dataflow_that_does_not_run(scope: Scope) -> None:
+    with pytest.raises(DoraSystemdError) as caught:
+        managernode.read_coordinator(scope, make_cell("failed"))
+    assert caught.value.code is ExitCode.NOT_RUNNING
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"port": 1}'])
+def test_damaged_access(scope: Scope, cell: Cell, text: str) -> None:
+    (scope.cell_directory("robot") / "control.json").write_text(text)
+    with pytest.raises(DoraSystemdError) as caught:
+        managernode.read_coordinator(scope, cell)
+    assert caught.value.code is ExitCode.NOT_RUNNING
+
+
+def test_environment_of_the_dora_command(scope: Scope, cell: Cell) -> None:
+    assert managernode.dora_environment(managernode.read_coordinator(scope, cell)) == {
+        "DORA_COORDINATOR_ADDR": "127.0.0.1",
+        "DORA_COORDINATOR_PORT": "4711",
+        "DORA_AUTH_TOKEN": "secret",
+        "DORA_DAEMON_LOCAL_LISTEN_PORT": "4712",
+    }

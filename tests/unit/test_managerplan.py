@@ -1,0 +1,186 @@
+"""From a request to a checked plan, with a dora of three lines."""
+
+import os
+import pwd
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.manageraccount import check_access, choose_user
+from dora_systemd.managerplan import Plan, StartRequest, make_plan, request_name
+from dora_systemd.managersettings import read_settings, settings_files
+from dora_systemd.scope import Scope
+from dora_systemd.settingtable import UV
+
+USER = Scope(is_user=True, uid=os.getuid())
+SYSTEM = Scope(is_user=False, uid=os.getuid())
+FLOW = "nodes: [{id: a, path: a.py, inputs: {t: dora/timer/millis/100}}]\n"
+DORA = """#!/bin/sh
+case $1 in
+    --version) echo dora-cli 1.1.0;;
+    validate) grep -q refused "$2" && { echo "[ERROR]"; echo "it is refused" >&2; exit 1; };;
+esac
+exit 0
+"""
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Path:
+    (tmp_path / "robot.yml").write_text(FLOW)
+    (tmp_path / "a.py").write_text("")
+    make_program(tmp_path / "bin" / "dora", DORA)
+    return tmp_path
+
+
+def make_program(path: Path, text: str = "#!/bin/sh\n") -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    path.chmod(0o755)
+
+
+def plan_of(project: Path, environment: dict[str, str] | None = None, **flags: Any) -> Plan:
+    variables = {"PATH": f"{project}/bin:/usr/bin:/bin", **(environment or {})}
+    return make_plan(USER, StartRequest(str(project / "robot.yml"), None, flags, variables))
+
+
+def test_a_plain_plan(project: Path) -> None:
+    plan = plan_of(project)
+    options = plan.options
+    assert (plan.unit, options.name) == ("dora-robot.service", "robot")
+    assert options.dataflow == str(project / "robot.yml")
+    assert options.working_directory == str(project)
+    assert options.dora == str(project / "bin" / "dora")
+    assert options.venv is None
+    assert plan.user is None
+    assert plan.environment["PATH"].startswith(f"{project}/bin:")
+
+
+def test_every_plan_has_a_uuid_of_its_own(project: Path) -> None:
+    assert plan_of(project).options.uuid != plan_of(project).options.uuid
+
+
+def test_interpreter(project: Path) -> None:
+    """--venv, else VIRTUAL_ENV, else .venv beside the dataflow."""
+    places = [project / name for name in ("flag", "variable", ".venv")]
+    for place in places:
+        make_program(place / "bin" / "python")
+    flag, variable, beside = map(str, places)
+    assert plan_of(project).options.venv == beside
+    plan = plan_of(project, {"VIRTUAL_ENV": variable})
+    assert plan.options.venv == variable
+    assert plan.environment["VIRTUAL_ENV"] == variable
+    assert plan.environment["PATH"].startswith(f"{variable}/bin:")
+    assert plan_of(project, {"VIRTUAL_ENV": variable}, venv=flag).options.venv == flag
+    assert plan_of(project, {"VIRTUAL_ENV": "/nowhere"}).options.venv == beside
+
+
+def test_environment(project: Path) -> None:
+    (project / "one").write_text("A=1\nB=1\nC=1\n")
+    (project / "two").write_text("B=2\nC=2\n")
+    files = (str(project / "one"), str(project / "two"))
+    plan = plan_of(project, env_file=files, env=("C=3",))
+    assert plan.options.env_keys == ("A", "B", "C")
+    assert {key: plan.environment[key] for key in "ABC"} == {"A": "1", "B": "2", "C": "3"}
+
+
+@pytest.mark.parametrize(
+    ("flags", "code", "words"),
+    [
+        ({"venv": "/nowhere"}, ExitCode.BAD_INPUT, "no bin/python"),
+        ({"working_directory": "/nowhere"}, ExitCode.BAD_INPUT, "no directory"),
+        ({"dora": "/nowhere"}, ExitCode.NO_DORA, "/nowhere"),
+        ({"user": "root"}, ExitCode.USAGE, "--user"),
+        ({"env": ("X",)}, ExitCode.USAGE, "'X'"),
+        ({"env_file": ("/nowhere",)}, ExitCode.BAD_INPUT, "/nowhere"),
+    ],
+)
+def test_what_is_refused(project: Path, flags: dict[str, Any], code: ExitCode, words: str) -> None:
+    with pytest.raises(DoraSystemdError) as caught:
+        plan_of(project, **flags)
+    assert caught.value.code is code
+    assert words in caught.value.message
+    assert caught.value.hint
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [("# refused\n" + FLOW, "it is refused"), (FLOW.replace("a.py", "b.py"), "b.py")],
+)
+def test_what_dora_or_the_path_check_refuses(project: Path, text: str, words: str) -> None:
+    (project / "robot.yml").write_text(text)
+    with pytest.raises(DoraSystemdError) as caught:
+        plan_of(project)
+    assert caught.value.code is ExitCode.BAD_INPUT
+    assert words in caught.value.message
+
+
+def test_names() -> None:
+    assert request_name(StartRequest("/x/my flow.yml")) == "my-flow"
+    assert request_name(StartRequest("/x/y.yml", "robot")) == "robot"
+    with pytest.raises(DoraSystemdError):
+        request_name(StartRequest("/x/y.yml", "../robot"))
+
+
+def test_settings_files(tmp_path: Path) -> None:
+    flow = tmp_path / "robot.yml"
+    home = {"HOME": "/home/alice"}
+    beside, user, system = settings_files(flow, home)
+    assert beside == tmp_path / "robot.systemd.yml"
+    assert user == Path("/home/alice/.config/dora-systemd/config.yml")
+    assert system == Path("/etc/dora-systemd/config.yml")
+    config = settings_files(flow, {**home, "XDG_CONFIG_HOME": "/c"})[1]
+    assert config == Path("/c/dora-systemd/config.yml")
+    assert settings_files(flow, {}) == [beside, system]
+
+
+def test_settings_beside_the_dataflow(project: Path) -> None:
+    (project / "robot.systemd.yml").write_text("uv: yes\n")
+    assert read_settings(USER, project / "robot.yml", {}, {})[UV] is True
+    assert read_settings(USER, project / "robot.yml", {"uv": False}, {})[UV] is False
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="gives files to somebody else")
+@pytest.mark.parametrize("text", ["user: root\n", "property: {Nice: 5}\n"])
+def test_whom_to_believe(project: Path, text: str) -> None:
+    beside = project / "robot.systemd.yml"
+    beside.write_text(text)
+    read_settings(SYSTEM, project / "robot.yml", {}, {})
+    os.chown(beside, 65534, 65534)
+    read_settings(USER, project / "robot.yml", {}, {})
+    with pytest.raises(DoraSystemdError) as caught:
+        read_settings(SYSTEM, project / "robot.yml", {}, {})
+    assert caught.value.code is ExitCode.NO_PERMISSION
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="gives files to somebody else")
+def test_the_owner_of_the_dataflow_runs_it(project: Path) -> None:
+    flow = project / "robot.yml"
+    os.chown(flow, 65534, 65534)
+    user = choose_user(SYSTEM, None, flow)
+    assert user is not None
+    assert user.pw_uid == 65534
+    os.chown(flow, 4_000_000, 0)
+    with pytest.raises(DoraSystemdError, match="has no name"):
+        choose_user(SYSTEM, None, flow)
+
+
+def test_a_user_that_is_asked_for(project: Path) -> None:
+    for wanted in ("root", "0"):
+        assert choose_user(SYSTEM, wanted, project) == pwd.getpwuid(0)
+    for wanted in ("nobody-of-that-name", "9" * 30, "-1"):
+        with pytest.raises(DoraSystemdError, match="cannot find a user"):
+            choose_user(SYSTEM, wanted, project)
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="becomes somebody else")
+def test_what_a_user_can_reach(project: Path) -> None:
+    closed = project / "closed dir"
+    closed.mkdir(mode=0o700)
+    nobody = pwd.getpwuid(65534)
+    check_access(nobody, ["/etc/passwd"], ["/bin/sh", "/"])
+    with pytest.raises(DoraSystemdError) as caught:
+        check_access(nobody, ["/etc/passwd"], ["/bin/sh", str(closed)])
+    assert caught.value.message.endswith(f"who cannot reach {closed}")
+    check_access(None, [], [str(closed)])

@@ -1,0 +1,125 @@
+"""The start of a plan: names, stages, failures, what is printed."""
+
+from typing import Any
+
+import pytest
+
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.managerplan import Plan
+from dora_systemd.managerstart import Started, format_started, require_free_name, start_plan
+from dora_systemd.managerunit import format_plan, plan_properties
+from dora_systemd.scope import Scope
+from dora_systemd.settings import resolve_settings
+from tests.unit.fake_manager import UUID, FakeManager, options
+
+UNIT = "dora-robot.service"
+
+
+def make_plan(**flags: object) -> Plan:
+    scope = Scope(is_user=True, uid=1000)
+    settings = resolve_settings(flags, {}, [])
+    return Plan(scope, options(), settings, None, {"PATH": "/bin"})
+
+
+def test_a_free_name() -> None:
+    manager = FakeManager()
+    require_free_name(manager, UNIT)
+    assert manager.calls == []
+
+
+@pytest.mark.parametrize("state", ["active", "activating", "deactivating", "reloading"])
+def test_a_name_in_use(state: str) -> None:
+    manager = FakeManager()
+    manager.add(options(), active=state, InactiveExitTimestamp=1_700_000_000_000_000)
+    with pytest.raises(DoraSystemdError) as caught:
+        require_free_name(manager, UNIT)
+    assert caught.value.code is ExitCode.NAME_IN_USE
+    for part in (UUID, "/srv/robot.yml", "since 2023-11-1"):
+        assert part in caught.value.message
+    assert manager.calls == []
+
+
+def test_a_failed_one_is_forgotten() -> None:
+    manager = FakeManager()
+    manager.add(options(), active="failed")
+    require_free_name(manager, UNIT)
+    assert manager.calls == [("reset", UNIT)]
+
+
+@pytest.mark.parametrize("facts", [{"ExecStart": []}, {"Transient": False}])
+def test_a_unit_that_is_not_ours_to_replace(facts: dict[str, Any]) -> None:
+    manager = FakeManager()
+    manager.add(options(), active="failed", **facts)
+    with pytest.raises(DoraSystemdError, match="there already") as caught:
+        require_free_name(manager, UNIT)
+    assert caught.value.code is ExitCode.NAME_IN_USE
+    assert manager.calls == []
+
+
+def test_stages_are_told_while_it_starts() -> None:
+    manager = FakeManager()
+    manager.stages = ["0/3 nodes ready", "", "3/3 nodes ready"]
+    told: list[str] = []
+    started = start_plan(manager, make_plan(), [], told.append, wait=True)
+    assert told == ["0/3 nodes ready", "3/3 nodes ready"]
+    assert started == Started(UUID, "robot", UNIT, is_ready=True)
+
+
+@pytest.mark.parametrize(
+    ("result", "facts", "reason"),
+    [
+        ("failed", {"StatusText": "failed: node a: exit code 1"}, "node a: exit code 1"),
+        ("canceled", {}, "it was stopped while it started"),
+        ("dependency", {}, "a unit that it needs failed"),
+        ("done", {"ActiveState": "failed", "StatusText": "failed: gone"}, "gone"),
+    ],
+)
+def test_a_start_that_fails(result: str, facts: dict[str, Any], reason: str) -> None:
+    manager = FakeManager()
+    manager.add(options(), active="inactive")
+    manager.job_results[UNIT] = result
+    manager.after_job[UNIT] = facts
+    with pytest.raises(DoraSystemdError) as caught:
+        start_plan(manager, make_plan(), [], None, wait=True)
+    assert caught.value.message == f"cannot start robot: {reason}"
+    assert caught.value.code is ExitCode.FAILURE
+
+
+def test_what_start_prints() -> None:
+    assert format_started(Started("u", "robot", UNIT, is_ready=True)) == (
+        "Dataflow started: u\n"
+        "Name: robot\n"
+        "Unit: dora-robot.service\n"
+        "\n"
+        "Use 'doractl stop robot' to stop\n"
+        "Use 'doractl list' to view status\n"
+        "Use 'doractl logs robot' to view logs"
+    )
+    assert format_started(Started("u", "robot", UNIT, is_ready=False)).startswith(
+        "Dataflow starting: u\n"
+    )
+
+
+def test_properties_for_an_older_systemd() -> None:
+    plan = make_plan(property=("RestartMode=direct",))
+    names = [name for name, _, _ in plan_properties(plan, "257.13-1")[0]]
+    assert "DelegateSubgroup" in names
+    properties, warnings = plan_properties(plan, "252.39-1~deb12u1")
+    assert "DelegateSubgroup" not in [name for name, _, _ in properties]
+    assert len(warnings) == 1
+    assert "RestartMode" in warnings[0]
+
+
+def test_plan_as_text() -> None:
+    text = format_plan(make_plan())
+    assert text.startswith(f"# {UNIT}\n# source: /srv/robot.yml\n[Unit]\n")
+    assert "Environment=PATH=/bin\n" in text
+
+
+def test_fake_and_real_manager_have_the_same_methods() -> None:
+    from dora_systemd.bus import Bus
+    from dora_systemd.busprotocol import Manager
+
+    wanted = {name for name in vars(Manager) if not name.startswith("_")}
+    assert wanted <= vars(Bus).keys()
+    assert wanted <= vars(FakeManager).keys()

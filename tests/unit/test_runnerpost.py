@@ -1,0 +1,68 @@
+"""What is said when the runner was killed."""
+
+import os
+import socket
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.runnerpost import killed_by, main, write_last_words
+
+UUID = "550e8400-e29b-41d4-a716-446655440000"
+
+
+@pytest.mark.parametrize(
+    ("code", "status", "result", "reason"),
+    [
+        ("killed", "KILL", "signal", "its runner was ended by signal SIGKILL"),
+        ("dumped", "ABRT", "watchdog", "its runner hung and was ended by the watchdog"),
+        ("exited", "0", "success", ""),
+        ("exited", "1", "exit-code", ""),
+        ("", "", "", ""),
+    ],
+)
+def test_only_a_killed_runner_has_last_words(
+    code: str, status: str, result: str, reason: str
+) -> None:
+    environ = {"EXIT_CODE": code, "EXIT_STATUS": status, "SERVICE_RESULT": result}
+    assert killed_by(environ) == reason
+
+
+def test_by_hand() -> None:
+    assert main([]) == 0
+    assert main(["robot", UUID]) == 0
+
+
+def last_words(directory: Path) -> list[bytes]:
+    """The entries that are written for a runner that ran in `directory`."""
+    path = directory / "socket"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as server:
+        server.bind(str(path))
+        write_last_words("robot", UUID, directory, "killed", str(path))
+        entries = []
+        while True:
+            try:
+                entries.append(server.recv(10_000))
+            except BlockingIOError:
+                return entries
+
+
+def test_last_words(tmp_path: Path) -> None:
+    (tmp_path / "io").mkdir()
+    fifo = tmp_path / "io" / "m1.inner.out"
+    os.mkfifo(fifo)
+    kept = os.open(fifo, os.O_RDWR)  # as systemd's store does
+    os.write(kept, b"one\ntw")
+    (tmp_path / "status.json").write_text("not a table")
+    first, second, event = last_words(tmp_path)
+    os.close(kept)
+    assert b"MESSAGE=one\n" in first
+    assert b"DORA_NODE=m1.inner\n" in first
+    assert b"MESSAGE=tw\n" in second
+    assert b"DORA_CUT=1\n" in second
+    assert b"MESSAGE=Dataflow robot failed: killed\n" in event
+
+
+def test_runtime_directory_is_empty(tmp_path: Path) -> None:
+    (event,) = last_words(tmp_path)
+    assert b"DORA_EVENT=dataflow-failed\n" in event

@@ -1,0 +1,117 @@
+"""The node table in JSON, CPU percentages from its samples."""
+
+import json
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.status import (
+    NODE_STATES,
+    STAGES,
+    CellStatus,
+    CpuSample,
+    NodeStatus,
+    add_sample,
+    cpu_percent,
+)
+
+counts = st.integers(0, 2**63)
+nodes = st.builds(
+    NodeStatus, st.sampled_from(NODE_STATES), counts, counts, counts, st.text(), st.text()
+)
+samples = st.builds(CpuSample, counts, st.dictionaries(st.text(), counts))
+cells = st.builds(
+    CellStatus,
+    *(st.text(), st.text(), st.sampled_from(STAGES), st.text(), counts, counts),
+    st.dictionaries(st.text(), nodes),
+    st.lists(samples, max_size=2).map(tuple),
+)
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.text(),
+    lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
+)
+
+
+@given(cells)
+def test_json_and_back(cell: CellStatus) -> None:
+    assert CellStatus.from_json(cell.to_json()) == cell
+
+
+def test_keys_of_a_newer_runner_are_left_aside() -> None:
+    raw = json.loads(CellStatus(uuid="u", nodes={"a": NodeStatus()}).to_json())
+    raw["mood"] = "fine"
+    raw["nodes"]["a"]["colour"] = "red"
+    assert CellStatus.from_json(json.dumps(raw)).nodes["a"] == NodeStatus()
+
+
+def test_missing_keys_have_defaults() -> None:
+    assert CellStatus.from_json("{}") == CellStatus()
+
+
+@given(json_values)
+def test_any_json_is_a_table_or_an_error(value: Any) -> None:
+    for text in (json.dumps(value), json.dumps({"nodes": value}), json.dumps({"samples": value})):
+        try:
+            CellStatus.from_json(text)
+        except DoraSystemdError as error:
+            assert error.message.startswith("cannot")
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "3", '{"nodes": []}', '{"nodes": {"a": 1}}'])
+def test_no_table(text: str) -> None:
+    with pytest.raises(DoraSystemdError):
+        CellStatus.from_json(text)
+
+
+def test_counts() -> None:
+    table = {
+        "a": NodeStatus("running", restarts=2),
+        "b": NodeStatus("failed", restarts=1),
+        "c": NodeStatus("dynamic"),
+    }
+    cell = CellStatus(nodes=table)
+    assert cell.alive_count == 2
+    assert cell.node_restarts == 3
+
+
+def test_only_the_last_samples_are_kept() -> None:
+    one, two, three = (CpuSample(at) for at in (1, 2, 3))
+    assert add_sample(add_sample(add_sample((), one), two), three) == (two, three)
+
+
+SECOND = 1_000_000
+
+
+@pytest.mark.parametrize(
+    ("base", "now", "percent"),
+    [
+        ((), CpuSample(10 * SECOND, {"": 5 * SECOND}), 50.0),
+        ((CpuSample(0, {"": 0}),), CpuSample(SECOND, {"": SECOND // 4}), 25.0),
+        # The newest sample that is old enough.
+        (
+            (CpuSample(0, {"": 0}), CpuSample(5 * SECOND, {"": SECOND})),
+            CpuSample(7 * SECOND, {"": 3 * SECOND}),
+            100.0,
+        ),
+        # A sample of this moment tells nothing.
+        (
+            (CpuSample(0, {"": 0}), CpuSample(5 * SECOND, {"": 5 * SECOND})),
+            CpuSample(5 * SECOND + 10, {"": 5 * SECOND}),
+            pytest.approx(100.0, rel=0.01),
+        ),
+        # The group was made anew.
+        ((CpuSample(0, {"": SECOND}),), CpuSample(SECOND, {"": 0}), 0.0),
+        # The clock stood still.
+        ((CpuSample(SECOND, {"": 0}),), CpuSample(SECOND, {"": SECOND}), 0.0),
+    ],
+)
+def test_cpu_percent(base: tuple[CpuSample, ...], now: CpuSample, percent: float) -> None:
+    assert cpu_percent(base, now) == percent
+
+
+def test_a_node_that_came_later_had_used_nothing() -> None:
+    base = (CpuSample(0, {"": SECOND}),)
+    assert cpu_percent(base, CpuSample(SECOND, {"late": SECOND}), "late") == 100.0
