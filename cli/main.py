@@ -48,6 +48,11 @@ def _give_up_output() -> None:
 
 def _dispatch(arguments: list[str]) -> int:
     """What is asked for again and again runs without click, which takes longer than the rest."""
+    # A shell that wants to complete a line calls us without any argument.
+    if not arguments and (instruction := os.environ.get("_DORACTL_COMPLETE")):
+        from dora_systemd.cli.completion import complete
+
+        return complete(instruction)
     if arguments == ["--version"]:
         print(f"doractl {__version__}")
         return ExitCode.OK

@@ -52,6 +52,7 @@ def _split(signature: str) -> list[str]:
 
 
 def decoded(value: Any) -> Any:
+    """A body that pystemd gave, with text instead of bytes and lists instead of tuples."""
     if isinstance(value, bytes):
         return os.fsdecode(value)
     if isinstance(value, dict):

@@ -11,6 +11,11 @@ class CellPaths:
     root: Path
 
     @property
+    def is_of_user(self) -> bool:
+        """Whether it belongs to a unit of a user's manager: below XDG_RUNTIME_DIR."""
+        return self.root.is_relative_to("/run/user")
+
+    @property
     def status(self) -> Path:
         """The live node table, replaced atomically by the runner."""
         return self.root / "status.json"

@@ -9,6 +9,8 @@ import fcntl
 import os
 import select
 import socket
+import sys
+import termios
 import time
 from collections.abc import Callable
 
@@ -19,6 +21,7 @@ JOURNAL_SOCKET = "/run/systemd/journal/socket"
 BULK_BUFFER = 1 << 14
 EXPRESS_BUFFER = 1 << 20
 RETRY_SECONDS = 0.05
+UNREAD_SECONDS = 0.002
 
 _FULL = {errno.EAGAIN}
 _TOO_BIG = {errno.EMSGSIZE, errno.ENOBUFS}
@@ -66,6 +69,16 @@ class JournalSocket:
         for channel in (self._express, self._bulk):
             if channel.refused:
                 channel.wait_ready(seconds)
+
+    def wait_read(self, seconds: float) -> None:
+        """Block until journald has read all that was sent, at most `seconds`: before exiting.
+
+        It learns the unit of an entry from its sender's pid, and not from a process that is gone.
+        """
+        deadline = time.monotonic() + seconds
+        while time.monotonic() < deadline and (self._express.unread or self._bulk.unread):
+            time.sleep(UNREAD_SECONDS)
+        time.sleep(UNREAD_SECONDS)  # for the entry that it has just read
 
     def close(self) -> None:
         """Close the sockets and forget the callbacks."""
@@ -139,6 +152,13 @@ class _Channel:
         finally:
             os.close(fd)
         return True
+
+    @property
+    def unread(self) -> int:
+        """Bytes that are still in the socket's queue: SIOCOUTQ in unix(7) and tcp(7)."""
+        if self._socket is None:
+            return 0
+        return int.from_bytes(fcntl.ioctl(self._socket, termios.TIOCOUTQ, bytes(4)), sys.byteorder)
 
     def call_when_ready(
         self, loop: asyncio.AbstractEventLoop, callback: Callable[[], None]

@@ -52,10 +52,12 @@ class JsonlTail:
         has_more = not self._is_busy() and self._read_chunk()
         self._timer = self._loop.call_later(0 if has_more else POLL_SECONDS, self.start)
 
-    def drain(self) -> None:
-        """Take all that is there now: before the event that the node has ended."""
+    def drain(self) -> bool:
+        """Take all that is there now; whether there was anything."""
+        has_any = False
         while self._read_chunk():
-            pass
+            has_any = True
+        return has_any
 
     def close(self) -> None:
         """Take what is there and stop to look."""

@@ -43,6 +43,8 @@ class _Lane:
     # The entries of the item whose turn it is, last one first.
     entries: list[bytes] = field(default_factory=list)
     is_flood: bool = False
+    # How many of the items are records, see put_record.
+    records: int = 0
 
     @property
     def waiting(self) -> int:
@@ -94,10 +96,12 @@ class LogQueue:
 
     def put_record(self, node: str, entry: bytes) -> None:
         """The same for an entry that no pipe holds back: above MAX_RECORDS it is only counted."""
-        if self.waiting(node) >= MAX_RECORDS:
+        lane = self._lanes.setdefault(node, _Lane())
+        if lane.records >= MAX_RECORDS:
             self._lost += 1
-        else:
-            self.put(node, lambda: [entry])
+            return
+        lane.records += 1
+        self.put(node, lambda: [entry])
 
     def put_event(self, entry: bytes) -> None:
         """Send an entry after all that were put before it, of whatever node."""
@@ -155,6 +159,7 @@ class LogQueue:
                 if not send(entries[-1]):
                     return False
                 entries.pop()
+        lane.records = 0
         return True
 
     def _emptied(self, node: str) -> None:

@@ -23,6 +23,15 @@ _WORDS = {
 }
 
 
+def job_reason(manager: Manager, unit: str, result: str) -> str:
+    """Why a job that starts `unit` did not end well; `result`: JobRemoved's word."""
+    if result == "canceled":
+        return "it was stopped while it started"
+    if result == "dependency":
+        return "a unit that it needs failed"
+    return failure_reason(manager, unit)
+
+
 def failure_reason(manager: Manager, unit: str) -> str:
     """One line about the end of `unit`: the runner's own last words, else systemd's result."""
     facts = manager.read(unit, _PROPERTIES)

@@ -9,7 +9,7 @@ from dora_systemd.busprotocol import JOB_DONE, Manager, Property
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.managercells import Cell, read_cell
 from dora_systemd.managerplan import Plan
-from dora_systemd.managerreason import failure_reason
+from dora_systemd.managerreason import job_reason
 from dora_systemd.scope import Scope
 from dora_systemd.statuswords import local_time
 
@@ -131,11 +131,6 @@ def _has_failed(manager: Manager, unit: str) -> bool:
 def _start_failure(
     manager: Manager, scope: Scope, unit: str, name: str, result: str
 ) -> DoraSystemdError:
-    if result == "canceled":
-        reason = "it was stopped while it started"
-    elif result == "dependency":
-        reason = "a unit that it needs failed"
-    else:
-        reason = failure_reason(manager, unit)
+    reason = job_reason(manager, unit, result)
     hint = f"doractl logs {name}, or systemctl {scope.flag} status {unit}"
     return DoraSystemdError(f"cannot start {name}: {reason}", hint, ExitCode.FAILURE)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from dora_systemd.busprotocol import JOB_DONE, Manager, Observer
 from dora_systemd.managercells import Cell
-from dora_systemd.managerreason import failure_reason
+from dora_systemd.managerreason import failure_reason, job_reason
 
 
 @dataclass(frozen=True)
@@ -51,5 +51,5 @@ def _stop_outcome(manager: Manager, cell: Cell, result: str | None) -> Outcome:
 def _restart_outcome(manager: Manager, cell: Cell, result: str) -> Outcome:
     if result == JOB_DONE:
         return Outcome(cell, f"Dataflow restarted: {cell.uuid} ({cell.name})")
-    reason = failure_reason(manager, cell.unit)
+    reason = job_reason(manager, cell.unit, result)
     return Outcome(cell, "", f"cannot restart {cell.unit}: {reason}")

@@ -19,6 +19,7 @@ from dora_systemd.values import (
 )
 
 RUNNER_MODULE = "dora_systemd.runner"
+POST_MODULE = "dora_systemd.runnerpost"
 
 _PYTHON_FLAGS = ("-E", "-P", "-m", RUNNER_MODULE)
 """Without the environment's PYTHON* and without the working directory on sys.path: modules of the
@@ -104,6 +105,11 @@ def parse_runner_argv(argv: Sequence[str]) -> RunnerOptions:
 def runner_command(python: str, options: RunnerOptions) -> list[str]:
     """ExecStart= of the unit: `python` is the absolute path of the interpreter of dora-systemd."""
     return [python, *_PYTHON_FLAGS, *format_runner_argv(options)]
+
+
+def post_command(python: str, options: RunnerOptions) -> list[str]:
+    """ExecStopPost= of the unit: what is left to say when the runner was killed."""
+    return [python, *_PYTHON_FLAGS[:-1], POST_MODULE, options.name, options.uuid]
 
 
 def options_from_command(command: Sequence[str]) -> RunnerOptions:

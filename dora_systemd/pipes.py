@@ -7,7 +7,6 @@ in writing once its pipe is full. fifo(7), pipe(7)
 
 import asyncio
 import contextlib
-import fcntl
 import os
 import time
 from collections.abc import Callable
@@ -22,9 +21,9 @@ from dora_systemd.logfields import Value, encode_entry
 from dora_systemd.logqueue import Journal, LogQueue
 from dora_systemd.logs import LineEncoder, LineSplitter, Origin, dora_log_fields
 
-# A burst of this size does not slow its node. At the end of the cell journald has to take what is
-# in all pipes, 20,000 short lines each, before the unit may end.
-PIPE_SIZE = 1 << 18
+# Linux's default, and enough: in a bigger pipe bursts pass faster, but at the end of the cell
+# journald has to take what is in all pipes before the unit may end. See pipe(7).
+PIPE_SIZE = 1 << 16
 # What is read of one pipe before the others get their turn: about 1 ms of lines.
 CHUNK = 1 << 13
 # A pipe that gives more bytes than this in so many seconds is a flood: it yields to the others.
@@ -107,8 +106,6 @@ class LogPipes:
         for stream, path in _fifos(node_id, self._paths[node_id]).items():
             # Read and write: no end of file between two lives of the node.
             fd = os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
-            with contextlib.suppress(OSError):  # above the user's limit the default must do
-                fcntl.fcntl(fd, fcntl.F_SETPIPE_SZ, PIPE_SIZE)
             if self._keep is not None:
                 self._keep(fd)
             self.adopt(node_id, stream, fd)
@@ -197,7 +194,7 @@ class LogPipes:
         """Make no more records of what these children print."""
         self._muted |= frozenset(labels)
 
-    def settle(self, seconds: float = 6.0) -> None:
+    def settle(self, seconds: float = 7.0) -> None:
         """Drain all pipes and block until journald has taken it all, at most `seconds`."""
         for node_id in self._sources:
             self.drain(node_id)
@@ -206,7 +203,16 @@ class LogPipes:
             self._journal.wait_ready(deadline - time.monotonic())
             self._queue.flush()
 
-    def close(self, seconds: float = 6.0) -> None:
+    async def wait_empty(self, seconds: float) -> None:
+        """Return when journald has taken all that was put so far, or after `seconds`.
+
+        Unlike settle() and close() it lets the loop run, so that the watchdog is fed meanwhile.
+        """
+        deadline = time.monotonic() + seconds
+        while not self._queue.is_empty and time.monotonic() < deadline:
+            await asyncio.sleep(0.01)
+
+    def close(self, seconds: float = 7.0) -> None:
         """Drain all pipes, wait up to `seconds` until journald has taken it all, and close.
 
         Lines that it has not taken by then are counted in a last event, lines-lost, if it can be

@@ -10,7 +10,7 @@ from typing import Any
 from dora_systemd.environment import checked_variable, environment_entries
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import SLICE
-from dora_systemd.options import RunnerOptions, runner_command
+from dora_systemd.options import RunnerOptions, post_command, runner_command
 from dora_systemd.propertykinds import Property
 from dora_systemd.propertyset import (
     Properties,
@@ -93,10 +93,14 @@ def service_properties(options: RunnerOptions, context: UnitContext) -> dict[str
     "no-env-expand" is ":" in a unit file: a "$" in a path is a "$".
     """
     argv = tuple(runner_command(context.python, options))
+    post = tuple(post_command(context.python, options))
     return typed(
         Type="notify",
         NotifyAccess="main",
         ExecStart=((argv[0], argv, ("no-env-expand",)),),
+        ExecStopPost=((post[0], post, ("ignore-failure", "no-env-expand")),),
+        # Two pipes a node: what is in them is kept when the runner is killed.
+        FileDescriptorStoreMax=4096,
         Restart="no",
         # Never the project: its modules must not be found before the runner's.
         WorkingDirectory="/",
@@ -174,7 +178,9 @@ def log_properties(options: RunnerOptions, context: UnitContext) -> dict[str, Pr
         return common
     fields = (f"DORA_DATAFLOW={options.uuid}", f"DORA_DATAFLOW_NAME={options.name}")
     extra = tuple(field.encode() for field in fields)
-    return common | typed(LogExtraFields=extra, LogRateLimitIntervalSec=0)
+    # No limit: systemd 257 does not pass 0 on to journald, which then applies its own.
+    limits = typed(LogRateLimitIntervalSec=SECOND, LogRateLimitBurst=500_000_000)
+    return common | typed(LogExtraFields=extra) | limits
 
 
 def settings_properties(settings: Settings) -> dict[str, Property]:

@@ -10,7 +10,7 @@ import sys
 from functools import partial
 from pathlib import Path
 
-from dora_systemd import engine, notify
+from dora_systemd import engine, fdstore, notify
 from dora_systemd import lifeevents as life
 from dora_systemd.cellpaths import CellPaths
 from dora_systemd.cellstate import Cell, RunnerExit
@@ -23,10 +23,15 @@ from dora_systemd.pipes import CellIdentity, LogPipes
 from dora_systemd.preparation import PACKAGE, Prepared, prepare
 from dora_systemd.runnerdialogue import Dialogue
 from dora_systemd.runnerengine import Engine
+from dora_systemd.runnerloss import losses_of_user
 from dora_systemd.runnernodes import Nodes, enter_supervisor, wait_eof
 from dora_systemd.runnerpump import Pump, now_us
 
 SAMPLE_SECONDS = 5.0
+JOURNAL_SECONDS = 1.0
+STOP_SECONDS = 7.0
+BACKLOG_SECONDS = 60.0
+"""How long journald may take for what the nodes have left to say, when nobody waits."""
 
 
 def daemon_variables(prepared: Prepared, paths: CellPaths, unit: Path) -> dict[str, str]:
@@ -63,8 +68,13 @@ async def run_cell(options: RunnerOptions, paths: CellPaths) -> RunnerExit:
     environment = engine.node_environment(os.environ)
     dora = Engine(options.dora, paths, environment)
     coordinator = dora.start_coordinator()  # it boots while we read
-    pipes = LogPipes(loop, JournalSocket(), CellIdentity(options.name, options.uuid))
+    journal = JournalSocket()
+    identity = CellIdentity(options.name, options.uuid)
+    # While systemd holds the pipes too, what is in them outlives a kill of this process.
+    fdstore.forget_inherited()
+    pipes = LogPipes(loop, journal, identity, fdstore.store)
     nodes = Nodes(unit, paths, pipes)
+    losses = losses_of_user(journal, pipes) if paths.is_of_user else None
     try:
         pipes.write_event("dataflow-starting")
         prepared = prepare(options, environment)
@@ -75,19 +85,26 @@ async def run_cell(options: RunnerOptions, paths: CellPaths) -> RunnerExit:
         dialogue = Dialogue(options, pump, dora, nodes, pipes)
         pump.connect(dialogue.actions(prepared.descriptor, daemon_variables(prepared, paths, unit)))
         listen(loop, options, pump, dialogue)
+        if losses is not None:
+            dialogue.spawn(losses.run())
         dialogue.watch(coordinator, dialogue.read_coordinator)
         try:
             return await dialogue.end
         finally:
+            nodes.close()
+            # The loop runs on, so the watchdog is fed; a stop has systemd's clock against it.
+            await pipes.wait_empty(BACKLOG_SECONDS if not pump.cell.stop_by else STOP_SECONDS)
+            if losses is not None:
+                await losses.finish()
             dialogue.cancel()
     except DoraSystemdError as error:
         notify.send_status(f"failed: {error.message}")
         pipes.write_event("dataflow-failed", reason=error.message)
         raise
     finally:
-        nodes.close()
         dora.kill()
         pipes.close()
+        journal.wait_read(JOURNAL_SECONDS)
 
 
 def listen(

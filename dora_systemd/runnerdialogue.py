@@ -21,6 +21,7 @@ _SETTLE_SECONDS = 0.02
 """`systemctl kill` signals all of the cell at once: let our own signal be heard before the news
 that a child died of it."""
 _AGAIN_SECONDS = 0.02
+_QUIET_SECONDS = 0.1
 _LONG_SECONDS = 3600.0 * 24 * 365
 
 
@@ -150,6 +151,11 @@ class Dialogue:
     def _dismiss_daemon(self) -> None:
         # What the two say about each other's end is no news.
         self._pipes.mute("coordinator", "daemon")
+        self.spawn(self._dismiss_when_quiet())
+
+    async def _dismiss_when_quiet(self) -> None:
+        # The daemon writes what its nodes said last after the news that they have ended.
+        await self._nodes.wait_quiet(_QUIET_SECONDS)
         if not self._engine.dismiss_daemon():
             self._pump.push(life.ChildExited(now_us(), "daemon", "earlier"))
 

@@ -6,7 +6,13 @@ compared with what is there.
 """
 
 import asyncio
+import time
 from collections.abc import Callable
+
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.journal import JournalSocket
+from dora_systemd.pipes import LogPipes
+from dora_systemd.scope import scope_of
 
 CHECK_SECONDS = 30.0
 """RateLimitIntervalSec= of journald by default."""
@@ -75,3 +81,18 @@ class LossWatch:
             self._report(lost - self._lost)
             self._lost = lost
         self._is_open = lost > self._lost
+
+
+def losses_of_user(journal: JournalSocket, pipes: LogPipes) -> LossWatch | None:
+    """The watch over what this user's services share, or None if the user cannot read a journal."""
+    from dora_systemd.journalread import JournalReader, check_readable
+
+    def report(count: int) -> None:
+        pipes.write_event("lines-lost", count=count, reason="rate limit of journald")
+
+    try:
+        check_readable(scope_of(True))
+    except DoraSystemdError:
+        return None
+    reader = JournalReader()
+    return LossWatch(lambda: journal.sent, reader.count_own, report, lambda: time.time_ns() // 1000)

@@ -95,9 +95,14 @@ class Nodes:
     def close(self) -> None:
         """End every node, and stop to listen."""
         self.kill()
-        for tail in self._tails.values():
-            if tail is not None:
-                tail.close()
+        for node, tail in self._tails.items():
+            if tail is None:
+                continue
+            tail.close()
+            if tail.lost_files:
+                reason = f"dora deleted {tail.lost_files} of its log files before they were read"
+                self._pipes.write_event("lines-lost", node, count="Some", reason=reason)
+        self._tails.clear()
 
     def drain(self, nodes: Iterable[str]) -> None:
         """Write what `nodes` have said so far before whatever is written next."""
@@ -106,6 +111,12 @@ class Nodes:
                 self._pipes.drain(node)
             elif (tail := self._tails.get(node)) is not None:
                 tail.drain()
+
+    async def wait_quiet(self, seconds: float) -> None:
+        """Return when dora has written nothing more about its nodes' output for `seconds`."""
+        tails = [tail for tail in self._tails.values() if tail is not None]
+        while sum(tail.drain() for tail in tails):
+            await asyncio.sleep(seconds)
 
     def sample(self, now_us: int) -> CpuSample:
         """CPU time used so far by the cell and by each node."""

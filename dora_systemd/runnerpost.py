@@ -30,6 +30,8 @@ def killed_by(environ: Mapping[str, str]) -> str:
     """What ended the runner, "" if it ended by itself: EXIT_CODE in systemd.exec(5)."""
     if environ.get("EXIT_CODE", "") not in ("killed", "dumped"):
         return ""
+    if environ.get("SERVICE_RESULT") == "success":
+        return ""  # SIGTERM before it could listen to it: stopped as soon as it was started
     if environ.get("SERVICE_RESULT") == "watchdog":
         return "its runner hung and was ended by the watchdog"
     return f"its runner was ended by signal SIG{environ.get('EXIT_STATUS', '')}"
@@ -68,6 +70,7 @@ def write_last_words(
                 pipes.drain(path.stem)
     pipes.write_event("dataflow-failed", reason=reason)
     pipes.close()
+    journal.wait_read(1.0)
     journal.close()
     loop.close()
 

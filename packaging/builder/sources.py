@@ -5,6 +5,7 @@ import shutil
 import subprocess
 from collections.abc import Iterable
 from dataclasses import dataclass
+from email.utils import parsedate_to_datetime
 from pathlib import Path
 
 from lab import definition
@@ -60,11 +61,19 @@ def read_changelog(source: Source) -> str:
     return first.partition("(")[2].partition(")")[0]
 
 
+def read_date(source: Source) -> float:
+    """When the newest version was made, the same as SOURCE_DATE_EPOCH of its build."""
+    lines = (source.debian / "changelog").read_text(encoding="utf-8").splitlines()
+    last = next(line for line in lines if line.startswith(" -- "))
+    return parsedate_to_datetime(last.partition("  ")[2]).timestamp()
+
+
 def stage(source: Source, place: Path, wheels: Path) -> Path:
     """The unpacked source package below `place`, and what it needs beside it."""
     version = read_changelog(source)
     tree = place / f"{source.name}-{version.rpartition('-')[0] or version}"
     tree.mkdir()
+    date = read_date(source)
     if source.name == "dora-systemd":
         copy_files(CHECKOUT, tree, list_checkout())
         shutil.rmtree(tree / "packaging/debian")
@@ -73,10 +82,10 @@ def stage(source: Source, place: Path, wheels: Path) -> Path:
     debian = source.debian.relative_to(CHECKOUT)
     names = [path.relative_to(debian) for path in list_checkout() if path.is_relative_to(debian)]
     if source.name != "dora-systemd":
-        settle(tree)
+        settle(tree, date)
         pack_original(tree, version)
     copy_files(source.debian, tree / "debian", names)
-    settle(tree)
+    settle(tree, date)
     return tree
 
 
@@ -98,12 +107,12 @@ def copy_files(origin: Path, target: Path, names: Iterable[Path | str]) -> None:
         shutil.copy(origin / name, path)
 
 
-def settle(tree: Path) -> None:
+def settle(tree: Path, date: float) -> None:
     """Modes and times that do not depend on who made the checkout, and when."""
     for path in [tree, *tree.rglob("*")]:
         is_program = path.is_dir() or path.stat().st_mode & 0o100
         path.chmod(0o755 if is_program else 0o644)
-        os.utime(path, (0, 0))
+        os.utime(path, (date, date))
 
 
 def pack_original(tree: Path, version: str) -> None:

@@ -46,15 +46,18 @@ def started_container(run: Run, tree: Path, out: Path | None) -> Iterator[Contai
     hide_traces(run)
     enter, path = cgroup.enter_command(run.name)
     note(run, "cgroup", path)
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ready:
-        ready.bind(str(run.directory / "notify"))
-        nspawn = start_nspawn(run, [*enter, *nspawn_command(run, tree, out)])
-        try:
-            yield Container(wait_ready(ready, nspawn, run), path / "supervisor")
-        finally:
-            remove_cgroup(path)
-            nspawn.kill()
-            nspawn.wait()
+    ready = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    ready.bind(str(run.directory / "notify"))
+    nspawn = start_nspawn(run, [*enter, *nspawn_command(run, tree, out)])
+    try:
+        # Closed then: in a socket that nobody reads nspawn would wait, and PID 1 for nspawn.
+        with ready:
+            leader = wait_ready(ready, nspawn, run)
+        yield Container(leader, path / "supervisor")
+    finally:
+        remove_cgroup(path)
+        nspawn.kill()
+        nspawn.wait()
 
 
 def hide_traces(run: Run) -> None:

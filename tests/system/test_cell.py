@@ -241,3 +241,43 @@ def test_two_users_cannot_reach_each_other(cell: Cell, project: Project) -> None
     listed = run("runuser", "-u", "bob", "--", "dora", "list", check=False, env=environment)
     assert listed.returncode != 0
     assert "401" in listed.stderr
+
+
+def test_values_of_env_reach_the_node_and_not_the_journal(cell: Cell, project: Project) -> None:
+    """Dora's coordinator prints the whole descriptor at INFO."""
+    project.write(
+        "node.py",
+        "import os\nfrom dora import Node\nnode = Node()\n"
+        "print('length', len(os.environ['SECRET']), flush=True)\nfor event in node: pass\n",
+    )
+    flow = project.write(
+        "dataflow.yml",
+        "nodes:\n  - {id: one, path: node.py, env: {SECRET: hunter2-hunter2},"
+        " inputs: {tick: dora/timer/millis/100}}\n",
+    )
+    cell.start(flow)
+    wait_for("the node has it", lambda: "length 15" in cell.messages("one"))
+    cell.systemctl("stop")
+    assert "hunter2" not in json.dumps(cell.journal())
+
+
+def test_everything_listens_on_loopback_and_nothing_by_udp(cell: Cell, project: Project) -> None:
+    """With multicast two cells would find each other."""
+    cell.start(project.three_nodes())
+    pids = {f"pid={pid}," for pid in cell.all_pids()}
+    tcp = run("ss", "-Hltnp").stdout.splitlines()
+    ours = [line.split()[3] for line in tcp if any(pid in line for pid in pids)]
+    assert ours
+    assert not [address for address in ours if not address.startswith("127.0.0.1:")]
+    udp = run("ss", "-Hlunp").stdout.splitlines()
+    assert not [line for line in udp if any(pid in line for pid in pids)]
+
+
+def test_output_files_of_dora_die_with_the_unit(cell: Cell, project: Project) -> None:
+    cell.start(project.three_nodes())
+    assert (cell.paths.work / "out" / cell.status.run).is_dir()
+    assert not (project.root / "out").exists()
+    # DORA_QUIET=1: dora's own copy of what the nodes print stays empty.
+    cell.wait_exchanging()
+    copies = list((cell.paths.work / "out" / cell.status.run).glob("log_*.jsonl"))
+    assert sum(path.stat().st_size for path in copies) == 0

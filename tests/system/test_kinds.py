@@ -34,13 +34,18 @@ def flow_of(project: Project, node: str) -> Path:
     return project.write("dataflow.yml", f"nodes:\n  - {{id: one, {TICK}, {node}}}\n")
 
 
-def test_python_in_a_venv(cell: Cell, project: Project) -> None:
-    project.write("speaker.py", SPEAKER + "\n    import sys; print('prefix', sys.prefix)\n")
-    venv = project.root / ".venv"
-    run("python3", "-m", "venv", "--system-site-packages", "--without-pip", str(venv))
+def make_venv(venv: Path) -> None:
+    """A virtual environment that finds the dora of this one."""
+    run("python3", "-m", "venv", "--without-pip", str(venv))
     found = run("python3", "-c", "import dora; print(dora.__path__[0])").stdout.strip()
     site = next((venv / "lib").iterdir()) / "site-packages"
     (site / "lab.pth").write_text(f"{Path(found).parent}\n")
+
+
+def test_python_in_a_venv(cell: Cell, project: Project) -> None:
+    project.write("speaker.py", SPEAKER + "\n    import sys; print('prefix', sys.prefix)\n")
+    venv = project.root / ".venv"
+    make_venv(venv)
     cell.start(flow_of(project, "path: speaker.py"))
     check(cell, "one", project.root)
     wait_for("it told", lambda: f"prefix {venv}" in cell.messages("one"))
@@ -157,3 +162,21 @@ def test_built_from_git(cell: Cell, project: Project) -> None:
     cell.start(flow)
     clone = next((project.root / "git").rglob("speaker.py")).parent
     check(cell, "one", clone)
+
+
+def test_built_with_uv(cell: Cell, project: Project) -> None:
+    """The session as `dora build --uv` of dora 1.1 writes it; to run that needs the network."""
+    project.write("speaker.py", SPEAKER + "        import sys; print('prefix', sys.prefix)\n")
+    flow = flow_of(project, "path: speaker.py, build: 'true'")
+    env = project.root / ".dora" / "python-envs" / "one"
+    make_venv(env)
+    project.write(
+        "out/dataflow.dora-session.yaml",
+        "build_id: 01a1fb98-c7b4-7b75-b0dd-6baa317c6e37\n"
+        "session_id: 01a1fb98-c586-7345-bc00-1872b359d994\ngit_sources: {}\nlocal_build:\n"
+        f"  node_working_dirs:\n    one: {project.root}\n"
+        f"  python_env_dirs:\n    one: {env}\n  confined_nodes: []\n",
+    )
+    cell.start(flow, "--uv")
+    check(cell, "one", project.root)
+    wait_for("it told", lambda: f"prefix {env}" in cell.messages("one"))

@@ -91,7 +91,10 @@ def test_without_the_node_table(cell: Cell, project: Project) -> None:
     assert row["memory_bytes"] > 1 << 20
 
 
-@pytest.mark.warns("code=killed", "Failed with result", "status=69")
+@pytest.mark.warns(
+    *("code=killed", "Failed with result", "status=69", "its runner was ended"),
+    "server disconnected unexpectedly",
+)
 def test_restarts_are_counted_and_the_uuid_stays(cell: Cell, project: Project) -> None:
     words = ("--property", "Restart=on-failure", "--property", "RestartSec=100ms", "-o", "json")
     started = json.loads(cell.start(project.three_nodes(), *words).stdout)

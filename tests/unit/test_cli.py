@@ -26,7 +26,7 @@ SHORT_LIVED = ("pydantic", "websockets", "watchfiles", "lxml", "rich")
 
 
 @pytest.fixture
-def requests(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[ListRequest]]:
+def requests(monkeypatch: pytest.MonkeyPatch) -> list[ListRequest]:
     """Lists nothing, and keeps what was asked for."""
     asked: list[ListRequest] = []
     module: Any = import_module("dora_systemd.cli.list")
@@ -253,7 +253,8 @@ def test_any_command_line_of_start_is_answered(file: str, options: list[tuple[st
 
 def test_names_of_files_in_any_encoding(tmp_path: Path) -> None:
     flow = os.fsencode(tmp_path / "flow-") + b"\xff.yml"
-    command = [sys.executable, "-m", "dora_systemd.cli.main", "start", "--dry-run", "--user", flow]
+    words = ("-m", "dora_systemd.cli.main", "start", "--dry-run", "--user")
+    command = [os.fsencode(sys.executable), *map(os.fsencode, words), flow]
     done = subprocess.run(command, capture_output=True, check=False)
     assert done.returncode == ExitCode.BAD_INPUT
     assert done.stderr.startswith(b"doractl: cannot read ")

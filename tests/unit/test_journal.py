@@ -4,6 +4,8 @@ import array
 import asyncio
 import os
 import socket
+import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -168,3 +170,16 @@ def test_wait_ready(journal: JournalSocket, journald: Journald) -> None:
     journald.stop()
     assert not journal.send(b"A=1\n")
     journal.wait_ready(0.05)
+
+
+def test_waits_until_what_was_sent_is_read(journal: JournalSocket, journald: Journald) -> None:
+    for entry in (b"MESSAGE=a\n", b"MESSAGE=b\n"):
+        journal.send(entry)
+    begun = time.monotonic()
+    journal.wait_read(0.1)
+    assert time.monotonic() - begun >= 0.1
+    reader = threading.Timer(0.05, journald.all)
+    reader.start()
+    journal.wait_read(10)
+    assert time.monotonic() - begun < 5
+    reader.join()

@@ -171,5 +171,6 @@ def test_sessions() -> None:
     assert str(session_path("/p/flow.yml")) == "/p/out/flow.dora-session.yaml"
     build = {"node_working_dirs": {"a": "/c"}, "python_env_dirs": {"a": "/e"}}
     assert parse_session({"local_build": build}) == BuildSession({"a": "/c"}, {"a": "/e"})
-    for odd in (None, [], {}, {"local_build": None}, {"local_build": {"node_working_dirs": 3}}):
-        assert parse_session(odd) == BuildSession()
+    odd: list[object] = [None, [], {}, {"local_build": None}]
+    for one in (*odd, {"local_build": {"node_working_dirs": 3}}):
+        assert parse_session(one) == BuildSession()

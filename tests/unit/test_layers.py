@@ -69,6 +69,7 @@ ADAPTERS = {
     "cgroup": ["cgroup"],
     "control": ["control"],
     "engine": ["engine"],
+    "fdstore": ["fdstore"],
     "files": ["files", "yamlloader"],
     "journal": ["journal"],
     "journalread": ["journalread"],
@@ -104,7 +105,9 @@ USE_CASES = {
         "runner",
         "runnerdialogue",
         "runnerengine",
+        "runnerloss",
         "runnernodes",
+        "runnerpost",
         "runnerpump",
     ],
 }

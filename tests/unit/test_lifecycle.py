@@ -74,8 +74,11 @@ def test_each_state_ends_when_it_is_told_to_and_nothing_answers(state: State) ->
         assert now.exit is RunnerExit.OK
 
 
-def live(*events: life.Event, nodes: tuple[str, ...] = ("a", "b")) -> tuple[Cell, list[object]]:
-    now, done = Cell(2 * SECOND, 0, {n: NodeStatus() for n in nodes}), []
+def live(
+    *events: life.Event, nodes: tuple[str, ...] = ("a", "b")
+) -> tuple[Cell, list[Do | Record]]:
+    now = Cell(2 * SECOND, 0, {n: NodeStatus() for n in nodes})
+    done: list[Do | Record] = []
     for event in events:
         now, actions = step(now, event)
         done += [action for action in actions if not isinstance(action, Deadline)]

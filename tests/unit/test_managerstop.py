@@ -1,5 +1,7 @@
 """stop, restart and the reasons that systemd remembers."""
 
+from typing import Any
+
 import pytest
 
 from dora_systemd.managercells import read_cells
@@ -83,7 +85,7 @@ def test_restart_that_fails() -> None:
         ),
     ],
 )
-def test_reasons(facts: dict[str, object], reason: str) -> None:
+def test_reasons(facts: dict[str, Any], reason: str) -> None:
     manager = FakeManager()
     manager.add(options(), **facts)
     assert failure_reason(manager, UNIT) == reason

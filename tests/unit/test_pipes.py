@@ -157,6 +157,21 @@ def test_quiet_node_passes_a_flood(tmp_path: Path) -> None:
     run(tmp_path, scenario)
 
 
+def test_wait_until_journald_has_taken_all(tmp_path: Path) -> None:
+    async def scenario(cell: Cell) -> None:
+        cell.node("a")
+        cell.write(cell.paths.node_stdout("a"), b"x\n" * 5000)
+        cell.pipes.drain("a")
+        await cell.pipes.wait_empty(0.05)
+        assert cell.pipes.is_busy("a")
+        reader = asyncio.create_task(cell.messages(5000))
+        await cell.pipes.wait_empty(10)
+        assert not cell.pipes.is_busy("a")
+        assert len(await reader) == 5000
+
+    run(tmp_path, scenario)
+
+
 def test_journald_restarted(tmp_path: Path) -> None:
     async def scenario(cell: Cell) -> None:
         cell.node("a")

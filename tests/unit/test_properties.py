@@ -36,6 +36,9 @@ NotifyAccess=main
 ExecStart=:/usr/bin/python3 -E -P -m dora_systemd.runner --name=robot --uuid={UUID} \
 --working-directory=/srv/robot --dora=/usr/bin/dora --grace-duration=10s \
 --venv=/srv/robot/.venv /srv/robot/robot.yml
+ExecStopPost=-:/usr/bin/python3 -E -P -m dora_systemd.runnerpost robot \
+550e8400-e29b-41d4-a716-446655440000
+FileDescriptorStoreMax=4096
 Restart=no
 WorkingDirectory=/
 TimeoutStartSec=infinity
@@ -62,7 +65,8 @@ StandardError=journal
 SyslogIdentifier=robot
 LogExtraFields=DORA_DATAFLOW={UUID}
 LogExtraFields=DORA_DATAFLOW_NAME=robot
-LogRateLimitIntervalSec=0
+LogRateLimitIntervalSec=1s
+LogRateLimitBurst=500000000
 """
 
 
@@ -81,7 +85,9 @@ def test_the_whole_unit() -> None:
 
 def test_a_unit_of_a_user() -> None:
     properties = unit(context=USER)
-    assert set(unit()) - set(properties) == {"User", "LogExtraFields", "LogRateLimitIntervalSec"}
+    assert set(unit()) - set(properties) == {
+        *("User", "LogExtraFields", "LogRateLimitIntervalSec", "LogRateLimitBurst")
+    }
 
 
 def test_no_user_but_the_caller_in_user_scope() -> None:

@@ -1,0 +1,124 @@
+"""What the shells are told at the Tab key, as far as no systemd is needed for it."""
+
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import click
+import pytest
+
+from dora_systemd.cli import completion, main
+from dora_systemd.cli.completion import TYPES, VARIABLE, Live
+from dora_systemd.cli.group import VERBS, doractl
+from dora_systemd.errors import DoraSystemdError
+from tests.unit.checkout import CHECKOUT
+
+SCRIPTS = {"bash": "doractl", "zsh": "_doractl", "fish": "doractl.fish"}
+
+Complete = Callable[..., list[str]]
+
+
+@pytest.fixture
+def complete(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Complete:
+    def ask(words: str, shell: str = "bash") -> list[str]:
+        monkeypatch.setenv(VARIABLE, f"{shell}_complete")
+        monkeypatch.setenv("COMP_WORDS", words)
+        monkeypatch.setenv("COMP_CWORD", str(len(words.split(" ")) - 1))
+        main.run([])
+        out, err = capsys.readouterr()
+        assert err == ""
+        return list(filter(None, out.split("\n")))
+
+    return ask
+
+
+@pytest.fixture
+def running(monkeypatch: pytest.MonkeyPatch) -> None:
+    names = Live(lambda _ctx, _incomplete: ["robot", "rover", "vision"])
+    monkeypatch.setitem(completion.TYPES, "selector", names)
+    monkeypatch.setitem(completion.TYPES, "selectors", names)
+
+
+def test_verbs(complete: Complete) -> None:
+    assert complete("doractl ") == [f"plain,{name}" for name in VERBS]
+    assert complete("doractl st", "zsh") == [
+        *("plain", "start", VERBS["start"].summary),
+        *("plain", "stop", VERBS["stop"].summary),
+    ]
+    assert complete("doractl node ") == ["plain,restart", "plain,stop"]
+
+
+@pytest.mark.usefixtures("running")
+@pytest.mark.parametrize("verb", ["stop", "show", "list", "ps", "node restart", "stop --user"])
+def test_dataflows(verb: str, complete: Complete) -> None:
+    assert complete(f"doractl {verb} ro") == ["plain,robot", "plain,rover"]
+
+
+@pytest.mark.parametrize(
+    ("words", "answer"),
+    [
+        ("doractl --us", ["plain,--user"]),
+        ("doractl logs --le", ["plain,--level"]),
+        ("doractl logs --level w", ["plain,warn"]),
+        ("doractl list -o j", ["plain,json"]),
+        ("doractl start data", ["file,data"]),
+        ("doractl start --venv .v", ["dir,.v"]),
+        ("doractl nonsense x", []),
+        ("doractl logs --nonsense", []),
+    ],
+)
+def test_words(words: str, answer: list[str], complete: Complete) -> None:
+    assert complete(words) == answer
+
+
+def test_what_cannot_be_found_out_is_no_error(
+    complete: Complete, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(_ctx: click.Context, _incomplete: str) -> list[str]:
+        raise DoraSystemdError("cannot reach systemd")
+
+    monkeypatch.setitem(TYPES, "selector", Live(fail))
+    assert complete("doractl show ") == []
+
+
+def test_the_table_has_no_parameter_that_is_gone() -> None:
+    commands = [doractl.get_command(click.Context(doractl), name) for name in VERBS]
+    members = [one for command in commands for one in getattr(command, "commands", {}).values()]
+    names = {param.name for command in (*commands, *members) if command for param in command.params}
+    assert TYPES.keys() <= names
+
+
+@pytest.mark.parametrize("shell", SCRIPTS)
+def test_scripts_are_readable_for_their_shells(shell: str) -> None:
+    script = CHECKOUT / "packaging/completions" / SCRIPTS[shell]
+    assert f"{VARIABLE}" in script.read_text()
+    assert f"{shell}_complete" in script.read_text()
+    if not shutil.which(shell):
+        pytest.skip(f"no {shell} here")
+    done = subprocess.run([shell, "-n", str(script)], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+BASH = """
+source {script}
+COMP_WORDS=(doractl stop {word}); COMP_CWORD=2
+_doractl
+printf '%s\\n' "${{COMPREPLY[@]}}"
+"""
+
+
+def test_bash_takes_the_answer(tmp_path: Path) -> None:
+    """A value is one word, whatever characters are in it."""
+    fake = tmp_path / "doractl"
+    fake.write_text('#!/bin/sh\necho "plain,$COMP_WORDS|$COMP_CWORD"\necho "plain,a b"\n')
+    fake.chmod(0o755)
+    script = BASH.format(script=CHECKOUT / "packaging/completions/doractl", word="ro")
+    done = subprocess.run(
+        ["bash", "-c", script],
+        env={"PATH": f"{tmp_path}:/usr/bin:/bin"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout == "doractl stop ro|2\na b\n"
