@@ -19,6 +19,9 @@ ALLOWED_ALWAYS = (
     # Dora, when a loaded machine (or one that is emulated) is slow.
     "Discarding event for input",
     "ms for handling event",
+    # Dora's daemon and a node, one of which has just been ended.
+    "closing node connection after I/O error",
+    "server disconnected unexpectedly",
     # A container whose root may not raise limits: nodes lock 8 MiB of shared memory or more.
     "Unable to create POSIX shm segment",
     # Dora's daemon starts a dataflow's timers before it has noted the dataflow.
