@@ -34,7 +34,16 @@ def run(arguments: list[str]) -> int:
         return _report(DoraSystemdError(f"cannot go on: {error.strerror}", error.filename or ""))
     except KeyboardInterrupt:
         return ExitCode.INTERRUPTED
+    except Exception as error:
+        if "DORACTL_DEBUG" in os.environ:
+            raise
+        return _report(_mistake_of_ours(error))
     return status
+
+
+def _mistake_of_ours(error: Exception) -> DoraSystemdError:
+    what = f"cannot go on: a mistake in doractl, {type(error).__name__}: {error}"
+    return DoraSystemdError(what, "please report it; DORACTL_DEBUG=1 shows where it happened")
 
 
 _SIGPIPE_STATUS = 128 + 13

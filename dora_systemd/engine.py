@@ -10,34 +10,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-MANAGER_VARIABLES = frozenset(
-    {
-        "NOTIFY_SOCKET",
-        "JOURNAL_STREAM",
-        "INVOCATION_ID",
-        "SYSTEMD_EXEC_PID",
-        "MANAGERPID",
-        "MANAGERPIDFDID",
-        "WATCHDOG_PID",
-        "WATCHDOG_USEC",
-        "FDSTORE",
-        "LISTEN_FDS",
-        "LISTEN_FDNAMES",
-        "LISTEN_PID",
-        "LISTEN_PIDFDID",
-        "RUNTIME_DIRECTORY",
-        "MEMORY_PRESSURE_WATCH",
-        "MEMORY_PRESSURE_WRITE",
-    }
-)
-"""What systemd means for the runner alone, see "Environment Variables Set or Propagated by the
-Service Manager" in systemd.exec(5). A node that speaks sd_notify must not speak for the cell."""
-
-
-def node_environment(environment: Mapping[str, str]) -> dict[str, str]:
-    """The runner's environment without what is systemd's."""
-    return {key: text for key, text in environment.items() if key not in MANAGER_VARIABLES}
-
 
 def coordinator_command(dora: str) -> list[str]:
     """A coordinator on a free loopback port, with a token of its own making, storing nothing."""

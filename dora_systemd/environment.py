@@ -11,18 +11,25 @@ MAX_ENTRY = 128 * 1024 - 1
 
 _KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _CONTROL = re.compile(r"[\x00-\x08\x0a-\x1f\x7f]")
-_SYSTEMD_KEYS = frozenset(
+MANAGER_VARIABLES = frozenset(
     {
-        *("NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC", "INVOCATION_ID", "JOURNAL_STREAM"),
-        *("LISTEN_PID", "LISTEN_FDS", "LISTEN_FDNAMES", "MAINPID", "MANAGERPID"),
-        *("RUNTIME_DIRECTORY", "SYSTEMD_EXEC_PID", "FDSTORE"),
+        *("NOTIFY_SOCKET", "JOURNAL_STREAM", "INVOCATION_ID", "SYSTEMD_EXEC_PID", "MAINPID"),
+        *("MANAGERPID", "MANAGERPIDFDID", "WATCHDOG_PID", "WATCHDOG_USEC", "RUNTIME_DIRECTORY"),
+        *("LISTEN_FDS", "LISTEN_FDNAMES", "LISTEN_PID", "LISTEN_PIDFDID", "FDSTORE"),
+        *("MEMORY_PRESSURE_WATCH", "MEMORY_PRESSURE_WRITE"),
     }
 )
-"""Environment= would win over what the manager itself sets (systemd.exec(5)): a NOTIFY_SOCKET from
-a flag would let the start job wait for ever."""
+"""What systemd means for the runner alone, see systemd.exec(5). A node that speaks sd_notify must
+not speak for the cell; and Environment= would win over what the manager itself sets: a
+NOTIFY_SOCKET from a flag would let the start job wait for ever."""
 
 # One word of an environment file: quoted parts, escaped characters and plain ones, in any order.
 _QUOTED = re.compile(r"""'(?P<single>[^']*)'|"(?P<double>(?:[^"\\]|\\.)*)"|\\(?P<char>.)""", re.S)
+
+
+def node_environment(environment: Mapping[str, str]) -> dict[str, str]:
+    """The runner's environment without what is systemd's."""
+    return {key: text for key, text in environment.items() if key not in MANAGER_VARIABLES}
 
 
 def parse_assignment(text: str) -> tuple[str, str]:
@@ -42,7 +49,7 @@ def checked_variable(key: str, value: str) -> tuple[str, str]:
     """`key` and `value` unchanged; raises as parse_assignment does. The value is never shown."""
     if not _KEY.fullmatch(key):
         raise _refusal(key, "a name is letters, digits and '_', and begins with no digit")
-    if key in _SYSTEMD_KEYS:
+    if key in MANAGER_VARIABLES:
         raise _refusal(key, "systemd sets this one itself")
     if _CONTROL.search(value) or not _is_unicode(value):
         raise _refusal(key, "a value is one line of text without control characters")

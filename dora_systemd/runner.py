@@ -10,11 +10,12 @@ import sys
 from functools import partial
 from pathlib import Path
 
-from dora_systemd import engine, fdstore, notify
+from dora_systemd import fdstore, notify
 from dora_systemd import lifeevents as life
 from dora_systemd.cellpaths import CellPaths
 from dora_systemd.cellstate import Cell, RunnerExit
 from dora_systemd.cellview import initial_nodes
+from dora_systemd.environment import node_environment
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.journal import JournalSocket
 from dora_systemd.launch import has_pipes, kinds, python_of
@@ -65,7 +66,7 @@ async def run_cell(options: RunnerOptions, paths: CellPaths) -> RunnerExit:
     loop = asyncio.get_running_loop()
     unit = enter_supervisor()
     make_directories(paths)
-    environment = engine.node_environment(os.environ)
+    environment = node_environment(os.environ)
     dora = Engine(options.dora, paths, environment)
     coordinator = dora.start_coordinator()  # it boots while we read
     journal = JournalSocket()

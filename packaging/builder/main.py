@@ -68,20 +68,22 @@ def build_source(
     source: Source, place: Path, room: Path, wheels: Path, is_once: bool
 ) -> list[Path]:
     """Build one source package, with all that must hold for it."""
-    first = build(source, place / f"{source.name}-first", room, wheels, 0)
+    staged = place / source.name
+    staged.mkdir()
+    tree = stage(source, staged, wheels)  # once: somebody may be editing
+    first = build(source, tree, place / f"{source.name}-first", room, 0)
     with Stage(f"lintian {source.name}"):
         for changes in sorted(first.glob("*.changes")):
             run_in_room(room, first, [*LINTIAN, changes.name])
     if not is_once:
-        second = build(source, place / f"{source.name}-second-and-longer", room, wheels, 1)
+        second = build(source, tree, place / f"{source.name}-second-and-longer", room, 1)
         compare_builds(first, second)
     return sorted(first.glob("*.deb"))
 
 
-def build(source: Source, place: Path, room: Path, wheels: Path, variation: int) -> Path:
-    """One build, in a directory of its own."""
-    place.mkdir()
-    tree = stage(source, place, wheels)
+def build(source: Source, tree: Path, place: Path, room: Path, variation: int) -> Path:
+    """One build of the staged source, in a directory of its own."""
+    shutil.copytree(tree.parent, place)
     with Stage(f"build {source.name}, {'first' if not variation else 'second'} time"):
         for command in commands(source):
             script = f'umask {UMASKS[variation]}; cd "$1"; shift; exec "$@"'

@@ -259,3 +259,19 @@ def test_names_of_files_in_any_encoding(tmp_path: Path) -> None:
     assert done.returncode == ExitCode.BAD_INPUT
     assert done.stderr.startswith(b"doractl: cannot read ")
     assert len(done.stderr.splitlines()) == 2
+
+
+def test_a_mistake_of_ours_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(_: list[str]) -> int:
+        raise TypeError("oh")
+
+    monkeypatch.setattr(main, "_dispatch", fail)
+    assert main.run(["list"]) == 1
+    said = capsys.readouterr().err.splitlines()
+    assert said[0] == "doractl: cannot go on: a mistake in doractl, TypeError: oh"
+    assert "DORACTL_DEBUG" in said[1]
+    monkeypatch.setenv("DORACTL_DEBUG", "1")
+    with pytest.raises(TypeError):
+        main.run(["list"])

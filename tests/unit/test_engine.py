@@ -4,11 +4,12 @@ import os
 from pathlib import Path
 
 from dora_systemd import engine
+from dora_systemd.environment import node_environment
 
 
 def test_what_is_systemds_stays_with_the_runner() -> None:
     given = {"NOTIFY_SOCKET": "/x", "WATCHDOG_USEC": "1", "PATH": "/bin", "MODEL": "yolo"}
-    assert engine.node_environment(given) == {"PATH": "/bin", "MODEL": "yolo"}
+    assert node_environment(given) == {"PATH": "/bin", "MODEL": "yolo"}
 
 
 def test_everything_listens_on_loopback_and_with_a_token() -> None:
