@@ -50,6 +50,14 @@ def test_mypy(pytestconfig: pytest.Config) -> None:
     run(["mypy", config, *sources], place, {"MYPY_CACHE_DIR": cache})
 
 
+def test_mypy_of_the_builder(pytestconfig: pytest.Config, tmp_path: Path) -> None:
+    for name, target in (("builder", "packaging/builder"), ("lab", "tests/lab")):
+        (tmp_path / name).symlink_to(CHECKOUT / target)
+    cache = str(cache_directory(pytestconfig, "mypy-builder"))
+    config = f"--config-file={CHECKOUT / 'pyproject.toml'}"
+    run(["mypy", config, "builder"], tmp_path, {"MYPY_CACHE_DIR": cache})
+
+
 @pytest.mark.parametrize("name", sorted(module_paths()))
 def test_modules_are_short(name: str) -> None:
     count = len(module_paths()[name].read_text().splitlines())

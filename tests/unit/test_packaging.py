@@ -1,9 +1,7 @@
-"""The Debian packages agree with the project and with themselves; how they are built is typed."""
+"""The Debian packages agree with the project and with themselves."""
 
-import os
 import re
 import subprocess
-import sys
 import tomllib
 from pathlib import Path
 
@@ -89,20 +87,3 @@ def test_maintainer_scripts(debian: Path) -> None:
         assert "#DEBHELPER#" in text
         assert not re.search(r"\b(start|enable|restart)\b", re.sub("#.*", "", text)), path
         subprocess.run(["sh", "-n", str(path)], check=True)
-
-
-def test_mypy_of_the_builder(pytestconfig: pytest.Config, tmp_path: Path) -> None:
-    for name, target in (("builder", PACKAGING / "builder"), ("lab", CHECKOUT / "tests/lab")):
-        (tmp_path / name).symlink_to(target)
-    cache = pytestconfig.cache.mkdir("mypy-builder") if pytestconfig.cache else tmp_path / "cache"
-    config = f"--config-file={CHECKOUT / 'pyproject.toml'}"
-    done = subprocess.run(
-        [sys.executable, "-m", "mypy", config, "builder"],
-        cwd=tmp_path,
-        env={**os.environ, "MYPY_CACHE_DIR": str(cache)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if done.returncode:
-        pytest.fail(f"{done.stdout}{done.stderr}", pytrace=False)
