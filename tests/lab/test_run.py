@@ -76,11 +76,22 @@ def test_out_directory(env: dict[str, str], tmp_path: Path) -> None:
     assert (tmp_path / "file").read_text() == "result\n"
 
 
+def _listen() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_ended_from_outside(env: dict[str, str], number: signal.Signals) -> None:
+    """SIGINT by default: who runs the tests in the background of a shell hands it on ignored."""
     before = own_runs()
     command = [str(LAB), "run", "--", "sh", "-c", "echo up; sleep 1000"]
-    with subprocess.Popen(command, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as run:
+    with subprocess.Popen(
+        command,
+        env=env,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        preexec_fn=_listen,
+    ) as run:
         assert run.stdout and run.stdout.readline() == b"up\n"
         mine = own_runs() - before
         run.send_signal(number)
