@@ -16,20 +16,15 @@ _SCOPE_KEY = "dora_systemd.is_user"
 
 def scope_options(function: F) -> F:
     """`--system` and `--user`, which stand before or after the verb; the last one wins."""
-    for flag, is_user, text in (
-        ("--user", True, "Dataflows of the calling user (default unless root)."),
-        ("--system", False, "Dataflows of the system (default for root)."),
-    ):
-        function = click.option(
-            flag,
-            # A name of its own: one of the settings is called "user".
-            f"scope_{flag.strip('-')}",
-            is_flag=True,
-            expose_value=False,
-            callback=_remember(is_user),
-            help=text,
-        )(function)
-    return function
+    return click.option(
+        # A name of its own: one of the settings is called "user".
+        "--user/--system",
+        "wants_user",
+        default=None,
+        expose_value=False,
+        callback=_remember,
+        help="Dataflows of the calling user (default unless root), or of the system.",
+    )(function)
 
 
 def current_scope() -> Scope:
@@ -57,13 +52,10 @@ def print_json(value: Any) -> None:
     click.echo(json.dumps(value, indent=2))
 
 
-def _remember(is_user: bool) -> Callable[[click.Context, click.Parameter, bool], None]:
-    def callback(ctx: click.Context, param: click.Parameter, value: bool) -> None:
-        del param
-        if value:
-            ctx.meta[_SCOPE_KEY] = is_user
-
-    return callback
+def _remember(ctx: click.Context, param: click.Parameter, value: bool | None) -> None:
+    del param
+    if value is not None:
+        ctx.meta[_SCOPE_KEY] = value
 
 
 def print_outcomes(outcomes: Sequence[Outcome]) -> int:
