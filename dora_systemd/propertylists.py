@@ -98,11 +98,19 @@ def _format_conditions(value: Sequence[Condition]) -> Sequence[str]:
     )
 
 
+def _parse_search_path(text: str) -> tuple[str, ...]:
+    paths = tuple(path for word in parse_words(text) for path in word.split(":") if path)
+    # Quotes in a path would have to be quoted again in the unit; nobody has such a directory.
+    if any(not path.startswith("/") or set(path) & set("\"'\\ \t\n") for path in paths):
+        raise ValueError(text)
+    return paths
+
+
 WORDS = PropertyKind("as", "words separated by blanks", parse_words, format_words)
 SEARCH_PATH = PropertyKind(
     "as",
     "absolute paths with colons between them",
-    lambda text: tuple(path for word in parse_words(text) for path in word.split(":") if path),
+    _parse_search_path,
     lambda value: [escape_specifiers(":".join(value))],
 )
 ENVIRONMENT = PropertyKind(
