@@ -20,6 +20,8 @@ from dora_systemd.scope import Scope
 PERSISTENT = Path("/var/log/journal")
 VOLATILE = Path("/run/log/journal")
 _JOIN = "join the group systemd-journal or adm (usermod -aG) and log in again"
+_NOTICE = "to turn off this notice."
+"""How the hint to users who see their own records only ends."""
 
 _LIFE_EVENTS = ("starting", "started", "stopping", "finished", "stopped", "failed")
 _LIFE_FIELDS = ("DORA_DATAFLOW", "DORA_DATAFLOW_NAME", "DORA_EVENT", "DORA_EXIT", "DORA_REASON")
@@ -75,7 +77,7 @@ def end_journalctl(child: "subprocess.Popen[bytes]") -> int:
     """
     complaint = child.stderr.read().decode("utf-8", "replace").strip() if child.stderr else ""
     status = child.wait()
-    if status and complaint:
+    if status and complaint and not complaint.endswith(_NOTICE):
         raise _complaint_error(complaint.splitlines()[-1])
     return status
 

@@ -47,6 +47,12 @@ def test_complaints(journalctl: Path, complaint: str, message: str, code: ExitCo
     assert (caught.value.message, caught.value.code) == (message, code)
 
 
+def test_a_notice_is_no_complaint(journalctl: Path) -> None:
+    notice = "      Pass -q to turn off this notice."
+    play(journalctl, f"echo 'Hint: only your own' >&2; echo '{notice}' >&2; exit 1")
+    assert JournalReader().known_names() == []
+
+
 def test_no_journalctl(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(DoraSystemdError) as caught:
