@@ -135,13 +135,16 @@ def plan_vm(_form: str) -> list[Step]:
 
 
 def plan_system(form: str) -> list[Step]:
-    arguments = ["tests/system", "-m", "not vm"]
+    here = " and not lab" if form == "host" else ""
+    arguments = ["tests/system", "-m", f"not vm{here}"]
     if form == "container":
         return two_halves(arguments)
     if form != "host":
         return [lab_step(f"system tests, {form}", form, arguments)]
     if not Path("/run/systemd/system").is_dir():
         raise LabError("use LAB=host", "systemd is not running here; LAB=container brings its own")
+    if os.geteuid() == 0:
+        raise LabError("use LAB=host as root", "its tests run in user scope: be a user, not root")
     venv = ensure_venv(find_cache(), for_system_tests=True)
     command = ["python", "-m", "pytest", *arguments]
     return [Step("system tests, this machine", command, venv_environment(venv))]

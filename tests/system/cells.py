@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 from dora_systemd import cgroup
 from dora_systemd.cellpaths import CellPaths
+from dora_systemd.journal import JournalSocket
 from dora_systemd.scope import Scope, scope_of
 from dora_systemd.status import CellStatus
 
@@ -75,6 +76,19 @@ def run(*command: str, check: bool = True, **options: Any) -> subprocess.Complet
         f"{' '.join(command)}: {done.returncode}\n{done.stdout}{done.stderr}"
     )
     return done
+
+
+def sync_journal() -> None:
+    """Return when everything that was sent to journald can be read."""
+    if os.geteuid() == 0:
+        run("journalctl", "--sync")
+        return
+    # Others may not ask journald; what comes through its socket is handled in order.
+    mark = f"MESSAGE=sync {time.monotonic_ns()}"
+    journal = JournalSocket()
+    journal.send(mark.encode() + b"\n")
+    journal.close()
+    wait_for("journald", lambda: run("journalctl", "-q", "-o", "cat", mark).stdout)
 
 
 class Project:

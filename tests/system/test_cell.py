@@ -229,8 +229,10 @@ def test_read_only_project(cell: Cell, project: Project) -> None:
         "sink.py",
         "source.py",
     ]
+    project.root.chmod(0o755)
 
 
+@pytest.mark.lab
 @pytest.mark.warns("invalid or missing auth token")
 def test_two_users_cannot_reach_each_other(cell: Cell, project: Project) -> None:
     cell.start(project.three_nodes(), "--uid", "alice")

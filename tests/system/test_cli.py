@@ -4,6 +4,8 @@ import json
 import subprocess
 import sys
 
+import pytest
+
 from dora_systemd.errors import ExitCode
 from tests.system.cells import Cell, Project, run
 
@@ -19,12 +21,14 @@ def test_version() -> None:
     assert versions["dora"].startswith("1.")
 
 
+@pytest.mark.lab
 def test_scope_before_and_after_the_verb() -> None:
     for words in ("--system list", "list --system", "--user list --system"):
         assert as_user("alice", words).returncode == 0
     assert as_user("alice", "list").returncode == 0
 
 
+@pytest.mark.lab
 def test_no_user_manager() -> None:
     for words in (["list"], ["--user", "stop", "x"], ["start", "--user", "/nowhere.yml"]):
         done = run("doractl", "--user", *words, check=False)
@@ -33,6 +37,7 @@ def test_no_user_manager() -> None:
         assert "enable-linger root" in done.stderr
 
 
+@pytest.mark.lab
 def test_system_scope_is_roots(project: Project) -> None:
     flow = project.three_nodes()
     done = as_user("alice", f"--system start {flow} --name hers")

@@ -1,13 +1,12 @@
 """What the lab promises to every other system test."""
 
-import os
 import subprocess
 import time
 from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.skipif(os.environ.get("LAB") == "host", reason="this is no lab")
+pytestmark = pytest.mark.lab
 
 BURN = "import time\nstart = time.monotonic()\nwhile time.monotonic() - start < 3: pass"
 

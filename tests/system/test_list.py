@@ -82,6 +82,7 @@ def test_it_needs_nothing_of_ours_alive(cell: Cell, project: Project) -> None:
             os.kill(pid, signal.SIGCONT)
 
 
+@pytest.mark.lab
 def test_without_the_node_table(cell: Cell, project: Project) -> None:
     """What another user sees: the directory of the cell is closed."""
     cell.start(project.three_nodes())
@@ -126,6 +127,7 @@ def test_unknown_selector(cell: Cell, project: Project) -> None:
     assert f"did you mean {cell.name}" in done.stderr
 
 
+@pytest.mark.lab
 def test_a_user_has_dataflows_of_his_own(cell: Cell, project: Project) -> None:
     cell.start(project.three_nodes())
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.events import EVENTS
-from tests.system.cells import Cell, Project, run, wait_for
+from tests.system.cells import Cell, Project, run, sync_journal, wait_for
 
 TALK = """
 import sys
@@ -41,7 +41,7 @@ def talking(cell: Cell, project: Project) -> Iterator[Cell]:
     cell.start(project.write("dataflow.yml", FLOW))
     for node in ("cam-left", "cam-right"):
         wait_for("ticks", lambda node=node: "tick" in cell.messages(node))  # type: ignore[misc]
-    run("journalctl", "--sync")
+    sync_journal()
     yield cell
 
 
@@ -74,10 +74,11 @@ def test_what_is_shown(talking: Cell) -> None:
 
 def test_journalctl_shows_the_same(talking: Cell) -> None:
     talking.systemctl("stop")
-    run("journalctl", "--sync")
+    sync_journal()
     ours = logs(talking, talking.name, "--node", "cam-left")
     assert run("journalctl", "-q", "-t", f"{talking.name}/cam-left").stdout.splitlines() == ours
-    fields = (f"_SYSTEMD_UNIT={talking.unit}", "DORA_NODE=cam-left")
+    unit = "_SYSTEMD_USER_UNIT" if talking.scope.is_user else "_SYSTEMD_UNIT"
+    fields = (f"{unit}={talking.unit}", "DORA_NODE=cam-left")
     assert run("journalctl", "-q", *fields).stdout.splitlines() == ours
 
 
@@ -169,7 +170,7 @@ def test_bad_input(talking: Cell) -> None:
         assert hint in done.stderr
 
 
-@pytest.mark.skipif(os.getuid() != 0, reason="becomes another user")
+@pytest.mark.lab
 def test_journal_unreadable(talking: Cell) -> None:
     words = ["setpriv", "--reuid=65534", "--regid=65534", "--clear-groups"]
     done = run(*words, "doractl", "--system", "logs", talking.name, check=False)

@@ -71,6 +71,7 @@ def wait_end(cell: Cell) -> None:
     wait_for("the dataflow ends", lambda: cell.is_gone, 60 + LINES / 5000)
 
 
+@pytest.mark.lab
 @pytest.mark.warns(ZENOH)
 @pytest.mark.parametrize("count", [1, 8])
 def test_flood(cell: Cell, project: Project, count: int) -> None:
@@ -81,6 +82,7 @@ def test_flood(cell: Cell, project: Project, count: int) -> None:
         assert printed(cell, node) == numbered(LINES // count)
 
 
+@pytest.mark.lab
 def test_restart_keeps_the_last_line(cell: Cell, project: Project) -> None:
     cell.start(flow(project, ENDLESS, "n"), "--grace-duration", "20s")
     for _ in range(2):
@@ -95,6 +97,7 @@ def test_restart_keeps_the_last_line(cell: Cell, project: Project) -> None:
         assert last == f"last {len(lines) - 1:08d}"
 
 
+@pytest.mark.lab
 @pytest.mark.warns("Journal", "systemd-journald")
 def test_journald_restarted_in_the_middle(cell: Cell, project: Project) -> None:
     cell.start(flow(project, FLOOD, "n"))
@@ -103,6 +106,7 @@ def test_journald_restarted_in_the_middle(cell: Cell, project: Project) -> None:
     assert printed(cell, "n") == numbered(LINES)
 
 
+@pytest.mark.lab
 @pytest.mark.warns(*LOST)
 def test_coordinator_killed_in_the_middle(cell: Cell, project: Project) -> None:
     cell.start(flow(project, ENDLESS, "n"))
@@ -173,12 +177,11 @@ def test_odd_lines(cell: Cell, project: Project) -> None:
     assert int(stderr["DORA_NODE_PID"]) > 1
 
 
+@pytest.mark.lab
 def test_catalog(tmp_path: Path) -> None:
     """systemd reads our explanations, and journalctl -x shows them."""
     source = Path(__file__).parents[2] / "units/templates/dora-systemd.catalog"
     target = Path("/usr/lib/systemd/catalog/dora-systemd.catalog")
-    if os.getuid():
-        pytest.skip("the catalog is the system's")
     was_there = target.exists()
     target.write_bytes(source.read_bytes())
     try:
@@ -208,7 +211,7 @@ time.sleep(100)
 
 
 @pytest.mark.warns(*LOST)
-@pytest.mark.skipif(os.getuid() != 0, reason="writes below /run")
+@pytest.mark.lab
 def test_runner_killed_with_lines_in_the_pipes(cell: Cell, project: Project) -> None:
     go, done = Path("/run/logs-late"), Path("/run/logs-late-done")
     done.mkdir(exist_ok=True)
@@ -229,6 +232,7 @@ def test_runner_killed_with_lines_in_the_pipes(cell: Cell, project: Project) -> 
     (done / "done").unlink()
 
 
+@pytest.mark.lab
 @pytest.mark.warns(ZENOH)
 def test_flood_of_a_node_whose_output_dora_reads(cell: Cell, project: Project) -> None:
     project.write("flood.py", FLOOD)

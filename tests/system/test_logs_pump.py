@@ -3,7 +3,6 @@
 import json
 import os
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +14,8 @@ ROOT = Path(__file__).parents[2]
 SLACK = int(os.environ.get("DORA_LOG_SLACK", "1"))
 
 
-@pytest.fixture(autouse=True)
-def system_scope() -> Iterator[None]:
-    if os.getuid():
-        pytest.skip("LogRateLimitIntervalSec= works in system scope only")
-    yield
+# LogRateLimitIntervalSec= works in system scope only.
+pytestmark = pytest.mark.lab
 
 
 def pump(*arguments: str) -> dict[str, Any]:

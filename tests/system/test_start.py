@@ -121,6 +121,7 @@ def test_a_failed_name_is_replaced_and_its_logs_stay(cell: Cell, project: Projec
     wait_for("its words are kept", lambda: "bye" in cell.messages("one"))
 
 
+@pytest.mark.lab
 def test_a_foreign_unit_is_left_alone(cell: Cell, project: Project) -> None:
     run("systemd-run", "--quiet", f"--unit={cell.unit}", "sleep", "100")
     done = cell.start(project.three_nodes(), check=False)
@@ -128,6 +129,7 @@ def test_a_foreign_unit_is_left_alone(cell: Cell, project: Project) -> None:
     assert cell.show("ActiveState") == "active"
 
 
+@pytest.mark.lab
 def test_the_owner_of_the_file_runs_it(cell: Cell, project: Project) -> None:
     flow = project.three_nodes()
     shutil.chown(flow, "alice")
@@ -137,12 +139,14 @@ def test_the_owner_of_the_file_runs_it(cell: Cell, project: Project) -> None:
     assert uids == {pwd.getpwnam("alice").pw_uid}
 
 
+@pytest.mark.lab
 def test_root_only_when_asked_for(cell: Cell, project: Project) -> None:
     flow = project.three_nodes()
     assert "User=dora\n" in cell.start(flow, "--dry-run").stdout
     assert "User=root\n" in cell.start(flow, "--dry-run", "--uid", "root").stdout
 
 
+@pytest.mark.lab
 def test_a_file_of_somebody_else_cannot_choose_root(cell: Cell, project: Project) -> None:
     flow = project.three_nodes()
     beside = project.write("dataflow.systemd.yml", "user: root\n")
@@ -153,6 +157,7 @@ def test_a_file_of_somebody_else_cannot_choose_root(cell: Cell, project: Project
     assert "User=root\n" in cell.start(flow, "--dry-run").stdout
 
 
+@pytest.mark.lab
 def test_a_directory_that_the_user_cannot_enter(cell: Cell, project: Project) -> None:
     flow = project.three_nodes()
     project.root.chmod(0o700)

@@ -99,6 +99,7 @@ def test_unknown_node(cell: Cell, project: Project) -> None:
     assert "did you mean sink" in done.stderr
 
 
+@pytest.mark.lab
 def test_others_cannot_speak_to_the_coordinator(cell: Cell, project: Project) -> None:
     cell.start(project.three_nodes())
     for words in ("node stop NAME sink", "dora NAME -- node list"):
@@ -109,6 +110,7 @@ def test_others_cannot_speak_to_the_coordinator(cell: Cell, project: Project) ->
     assert len(cell.pids("node-sink")) == 1
 
 
+@pytest.mark.lab
 def test_others_cannot_stop_it(cell: Cell, project: Project) -> None:
     cell.start(project.three_nodes())
     command = f"exec doractl --system stop {cell.name}"
