@@ -62,6 +62,11 @@ EVENTS = {
         WARNING,
         "{count} log lines of dataflow {dataflow} are lost",
     ),
+    "lines-suppressed": EventKind(
+        "c1c721542288459ebe040a240a583d9d",
+        WARNING,
+        "{count} log lines of node {node} are beyond its limit of {limit}",
+    ),
 }
 
 # An end of the dataflow: each life of it ends with one of these, unless the runner was killed.

@@ -13,6 +13,7 @@ from dora_systemd.doraerrors import parse_dora_error
 from dora_systemd.environment import parse_environment_file, unit_environment
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.files import read_text, read_yaml
+from dora_systemd.lograteplan import check_rates, log_rates
 from dora_systemd.manageraccount import account_of, check_access, choose_user
 from dora_systemd.managersettings import read_settings
 from dora_systemd.names import name_from_path, parse_name, unit_name
@@ -102,6 +103,7 @@ def make_plan(scope: Scope, request: StartRequest) -> Plan:
         attached=request.attached,
         exit_when_nodes_finish=settings[EXIT_WHEN_NODES_FINISH],
         env_keys=tuple(variables),
+        log_rates=log_rates(settings),
     )
     environment = unit_environment(search_path, venv, variables)
     plan = Plan(scope, options, settings, user, environment)
@@ -133,7 +135,8 @@ def _check_plan(plan: Plan) -> None:
             ExitCode.BAD_INPUT,
         )
     # dora validate accepts paths that are not there, and other things that no node can run with.
-    prepare(options, plan.environment)
+    prepared = prepare(options, plan.environment)
+    check_rates(plan.settings, [node.id for node in prepared.dataflow.nodes])
 
 
 def _directory(settings: Settings, dataflow: Path) -> str:

@@ -5,9 +5,10 @@ module imports nothing that costs time.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.lograte import RateLimits, format_rates, parse_rates
 from dora_systemd.names import parse_name, parse_uuid
 from dora_systemd.values import (
     SECOND,
@@ -27,6 +28,7 @@ project can never stand in for the runner's."""
 
 _TEXTS = ("working-directory", "dora", "venv")
 _FLAGS = ("uv", "debug", "allow-shell-nodes", "attached")
+_REPEATED = ("env-key", "log-rate-limit")
 _REQUIRED = ("name", "uuid", "working-directory", "dora")
 
 
@@ -46,6 +48,7 @@ class RunnerOptions:
     attached: the end of standard input means stop (`doractl run`).
     exit_when_nodes_finish: overrides the descriptor's key of that name, unless None.
     env_keys: names of the variables that win over the descriptor's own `env:`.
+    log_rates: how many lines of which node are kept, see dora_systemd.lograte.
     """
 
     name: str
@@ -61,6 +64,7 @@ class RunnerOptions:
     attached: bool = False
     exit_when_nodes_finish: bool | None = None
     env_keys: tuple[str, ...] = ()
+    log_rates: RateLimits = field(default_factory=dict)
 
 
 def format_runner_argv(options: RunnerOptions) -> list[str]:
@@ -77,6 +81,7 @@ def format_runner_argv(options: RunnerOptions) -> list[str]:
     if options.exit_when_nodes_finish is not None:
         pairs.append(("exit-when-nodes-finish", format_bool(options.exit_when_nodes_finish)))
     pairs += [("env-key", key) for key in options.env_keys]
+    pairs += [("log-rate-limit", text) for text in format_rates(options.log_rates)]
     flags = [f"--{flag}" for flag in _FLAGS if getattr(options, flag.replace("-", "_"))]
     return [f"--{key}={value}" for key, value in pairs] + flags + [options.dataflow]
 
@@ -90,16 +95,16 @@ def parse_runner_argv(argv: Sequence[str]) -> RunnerOptions:
     if not dataflow.startswith("/"):
         raise _refusal(f"no absolute path of a dataflow in {quoted(' '.join(argv))}")
     values: dict[str, str] = {}
-    env_keys: list[str] = []
+    lists: dict[str, list[str]] = {key: [] for key in _REPEATED}
     for argument in given:
         key, value = _split(argument)
-        if key == "env-key":
-            env_keys.append(value)
+        if key in lists:
+            lists[key].append(value)
         elif key in values:
             raise _refusal(f"--{key} is given twice")
         else:
             values[key] = value
-    return _options(dataflow, values, tuple(env_keys))
+    return _options(dataflow, values, lists)
 
 
 def runner_command(python: str, options: RunnerOptions) -> list[str]:
@@ -121,14 +126,14 @@ def options_from_command(command: Sequence[str]) -> RunnerOptions:
 
 def _split(argument: str) -> tuple[str, str]:
     key, equals, value = argument.removeprefix("--").partition("=")
-    known = (*_REQUIRED, *_TEXTS, "grace-duration", "exit-when-nodes-finish", "env-key")
+    known = (*_REQUIRED, *_TEXTS, "grace-duration", "exit-when-nodes-finish", *_REPEATED)
     expected = known if equals else _FLAGS
     if not argument.startswith("--") or key not in expected:
         raise _refusal(f"unknown argument {quoted(argument)}")
     return key, value
 
 
-def _options(dataflow: str, values: dict[str, str], env_keys: tuple[str, ...]) -> RunnerOptions:
+def _options(dataflow: str, values: dict[str, str], lists: dict[str, list[str]]) -> RunnerOptions:
     missing = [f"--{key}" for key in _REQUIRED if key not in values]
     if missing:
         raise _refusal(f"{' and '.join(missing)} missing")
@@ -137,7 +142,8 @@ def _options(dataflow: str, values: dict[str, str], env_keys: tuple[str, ...]) -
         name=parse_name(values["name"]),
         uuid=parse_uuid(values["uuid"]),
         dataflow=dataflow,
-        env_keys=env_keys,
+        env_keys=tuple(lists["env-key"]),
+        log_rates=parse_rates(lists["log-rate-limit"]),
         grace=parse_duration(values.get("grace-duration", "10s")),
         exit_when_nodes_finish=None if exits is None else parse_bool(exits),
         working_directory=values["working-directory"],

@@ -1,8 +1,8 @@
 """The nodes' output pipes, read into the journal.
 
-Nothing is ever dropped: when journald does not take an entry, the entries of the chunk just read
-wait in memory (at most CHUNK bytes of a pipe), the pipe is not read, and the node itself blocks
-in writing once its pipe is full. fifo(7), pipe(7)
+Nothing is ever dropped, unless the node has a limit: when journald does not take an entry, the
+entries of the chunk just read wait in memory (at most CHUNK bytes of a pipe), the pipe is not
+read, and the node itself blocks in writing once its pipe is full. fifo(7), pipe(7)
 """
 
 import asyncio
@@ -10,25 +10,16 @@ import contextlib
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from functools import partial
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass, replace
 
 from dora_systemd.cellpaths import CellPaths
 from dora_systemd.events import event_fields
 from dora_systemd.logfields import Value, encode_entry
 from dora_systemd.logqueue import Journal, LogQueue
+from dora_systemd.lograte import LineLimiter, RateLimit, format_rate
 from dora_systemd.logs import LineEncoder, LineSplitter, Origin, dora_log_fields
+from dora_systemd.pipesource import CHUNK, PIPE_SIZE, Pipe, Source, fifos
 
-# Linux's default, and enough: in a bigger pipe bursts pass faster, but at the end of the cell
-# journald has to take what is in all pipes before the unit may end. See pipe(7).
-PIPE_SIZE = 1 << 16
-# What is read of one pipe before the others get their turn: about 1 ms of lines.
-CHUNK = 1 << 13
-# A pipe that gives more bytes than this in so many seconds is a flood: it yields to the others.
-FLOOD_BYTES = 1 << 14
-FLOOD_SECONDS = 0.1
 # Children that a dead node left behind may go on writing: drain() must still end.
 DRAIN_LIMIT = 4 * PIPE_SIZE
 
@@ -39,33 +30,6 @@ class CellIdentity:
 
     name: str
     uuid: str
-
-
-@dataclass
-class _Pipe:
-    fd: int
-    stream: str
-    encoder: LineEncoder
-    splitter: LineSplitter = field(default_factory=LineSplitter)
-    since: float = 0.0
-    taken: int = 0
-
-    def is_flood(self, size: int, now: float) -> bool:
-        """Whether the pipe, which has just given `size` bytes, floods; `now` in seconds."""
-        if now - self.since > FLOOD_SECONDS:
-            self.since, self.taken = now, 0
-        self.taken += size
-        return self.taken > FLOOD_BYTES
-
-
-@dataclass
-class _Source:
-    """A node and its pipes."""
-
-    origin: Origin
-    pipes: list[_Pipe] = field(default_factory=list)
-    # Bytes that drain() took since journald last had everything.
-    drained: int = 0
 
 
 class LogPipes:
@@ -89,21 +53,25 @@ class LogPipes:
         self._queue = LogQueue(loop, journal, self._pause, self._resume)
         self._origin = Origin(identity.name, identity.uuid)
         self._paths: dict[str, CellPaths] = {}
-        self._sources: dict[str, _Source] = {}
+        self._sources: dict[str, Source] = {}
         self._outputs: dict[int, LineSplitter] = {}
         self._muted: frozenset[str] = frozenset()
 
     def make(self, node_id: str, paths: CellPaths) -> None:
         """Create the two FIFOs of a node, mode 0600; the directory must exist. Raises OSError."""
-        for path in _fifos(node_id, paths).values():
+        for path in fifos(node_id, paths).values():
             with contextlib.suppress(FileNotFoundError):
                 path.unlink()
             os.mkfifo(path, 0o600)
         self._paths[node_id] = paths
 
+    def limit(self, node_id: str, limit: RateLimit) -> None:
+        """Keep only so many of a node's lines from now on; an event counts the others."""
+        self._source(node_id).limiter = LineLimiter(limit)
+
     def open(self, node_id: str) -> None:
         """Begin to read a node's FIFOs: who waits to open one for writing goes on. OSError."""
-        for stream, path in _fifos(node_id, self._paths[node_id]).items():
+        for stream, path in fifos(node_id, self._paths[node_id]).items():
             # Read and write: no end of file between two lives of the node.
             fd = os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
             if self._keep is not None:
@@ -114,32 +82,27 @@ class LogPipes:
         """Begin to read `fd`, a pipe that is open already, as "stdout" or "stderr" of a node."""
         source = self._source(node_id)
         os.set_blocking(fd, False)
-        pipe = _Pipe(fd, stream, LineEncoder(source.origin, stream))
+        pipe = Pipe(fd, stream, LineEncoder(source.origin, stream))
         source.pipes.append(pipe)
         if not self._queue.waiting(node_id):
             self._loop.add_reader(fd, self._read_pipe, node_id, pipe)
 
     def set_pid(self, node_id: str, pid: int) -> None:
         """The node's lines come from process `pid` from now on; 0: from its next one."""
-        self._renew(self._source(node_id), pid=pid)
+        self._source(node_id).renew(pid=pid)
 
-    def _learn_pid(self, source: _Source) -> None:
+    def _learn_pid(self, source: Source) -> None:
         """Dora tells the pid tens of milliseconds after the launcher has noted it."""
         node_id = source.origin.node
         if node_id in self._paths:
             with contextlib.suppress(OSError, ValueError):
-                self._renew(source, pid=int(self._paths[node_id].node_pid(node_id).read_text()))
+                source.renew(pid=int(self._paths[node_id].node_pid(node_id).read_text()))
 
     def set_run(self, run_id: str) -> None:
         """All lines and events belong to dora's run `run_id` from now on."""
         self._origin = replace(self._origin, run=run_id)
         for source in self._sources.values():
-            self._renew(source, run=run_id)
-
-    def _renew(self, source: _Source, **changes: Any) -> None:
-        source.origin = replace(source.origin, **changes)
-        for pipe in source.pipes:
-            pipe.encoder = LineEncoder(source.origin, pipe.stream)
+            source.renew(run=run_id)
 
     def drain(self, node_id: str) -> None:
         """Take all that is in a node's pipes now, and an unterminated line, before what follows.
@@ -149,10 +112,11 @@ class LogPipes:
         source = self._source(node_id)
         for pipe in source.pipes:
             # A full pipe again, and journald has not come back: the lines are safe where they are.
-            while source.drained < DRAIN_LIMIT and (data := _read(pipe.fd)):
+            while source.drained < DRAIN_LIMIT and (data := pipe.read()):
                 source.drained += len(data)
                 self._put(node_id, pipe, data, is_flood=True)
             self._put(node_id, pipe, b"", is_flood=False)
+        self._tell_suppressed(node_id)
         if not self._queue.waiting(node_id):
             source.drained = 0
 
@@ -170,7 +134,11 @@ class LogPipes:
 
         Who writes them looks at is_busy() before it reads on.
         """
-        self._queue.put(node, partial(list, [self._entry(fields, node)]))
+        source, stream = self._source(node), str(fields.get("DORA_STREAM", "stdout"))
+        if source.admit(stream, 1, self._loop.time()):
+            entry = self._entry(fields, node)
+            self._queue.put(node, lambda: [entry])
+        self._watch_limit(source, stream)
 
     def _entry(self, fields: dict[str, Value], node: str | None) -> bytes:
         origin = self._source(node).origin if node else self._origin
@@ -229,9 +197,9 @@ class LogPipes:
         for fd in list(self._outputs):
             self._end_output(fd)
 
-    def _source(self, node_id: str) -> _Source:
+    def _source(self, node_id: str) -> Source:
         if node_id not in self._sources:
-            self._sources[node_id] = _Source(replace(self._origin, node=node_id))
+            self._sources[node_id] = Source(replace(self._origin, node=node_id))
         return self._sources[node_id]
 
     def _pause(self, node_id: str) -> None:
@@ -246,8 +214,8 @@ class LogPipes:
         if lost := self._queue.take_lost():
             self.write_event("lines-lost", count=lost, reason="journald was away for too long")
 
-    def _read_pipe(self, node_id: str, pipe: _Pipe) -> None:
-        data = _read(pipe.fd)
+    def _read_pipe(self, node_id: str, pipe: Pipe) -> None:
+        data = pipe.read()
         is_flood = pipe.is_flood(len(data), self._loop.time())
         if data:
             source = self._source(node_id)
@@ -255,8 +223,28 @@ class LogPipes:
                 self._learn_pid(source)
             self._put(node_id, pipe, data, is_flood)
 
-    def _put(self, node_id: str, pipe: _Pipe, data: bytes, is_flood: bool) -> None:
-        self._queue.put(node_id, partial(_entries, pipe.splitter, pipe.encoder, data), is_flood)
+    def _put(self, node_id: str, pipe: Pipe, data: bytes, is_flood: bool) -> None:
+        source = self._source(node_id)
+        make_entries = source.entries(pipe, data, self._loop.time())
+        self._queue.put(node_id, make_entries, is_flood)
+        self._watch_limit(source, pipe.stream)
+
+    def _watch_limit(self, source: Source, stream: str) -> None:
+        """See that what is suppressed from now on is told at the end of the stream's window."""
+        limiter = source.limiter
+        if limiter is not None and limiter.suppressed and source.report is None:
+            tell = self._tell_suppressed
+            source.report = self._loop.call_at(limiter.end(stream), tell, source.origin.node)
+
+    def _tell_suppressed(self, node_id: str) -> None:
+        source = self._source(node_id)
+        limiter = source.limiter
+        if source.report is not None:
+            source.report.cancel()
+            source.report = None
+        if limiter is not None and (count := limiter.take_suppressed()):
+            limit = format_rate(limiter.limit)
+            self.write_event("lines-suppressed", node_id, count=count, limit=limit)
 
     def _read_output(self, label: str, fd: int, on_line: Callable[[str], None] | None) -> None:
         try:
@@ -276,19 +264,3 @@ class LogPipes:
         self._loop.remove_reader(fd)
         del self._outputs[fd]
         os.close(fd)
-
-
-def _entries(splitter: LineSplitter, encoder: LineEncoder, data: bytes) -> list[bytes]:
-    """The entries of the lines that `data` completes; no data: of the line that nothing will."""
-    return list(map(encoder.entry, splitter.feed(data) if data else splitter.flush()))
-
-
-def _fifos(node_id: str, paths: CellPaths) -> dict[str, Path]:
-    return {"stdout": paths.node_stdout(node_id), "stderr": paths.node_stderr(node_id)}
-
-
-def _read(fd: int) -> bytes:
-    try:
-        return os.read(fd, CHUNK)
-    except BlockingIOError:
-        return b""

@@ -13,6 +13,7 @@ from dora_systemd.dataflow import Dataflow
 from dora_systemd.dataflownodes import NodeKind
 from dora_systemd.jsonl import JsonlTail
 from dora_systemd.launch import has_pipes, is_launched
+from dora_systemd.lograte import RateLimits, rate_of
 from dora_systemd.pipes import LogPipes
 from dora_systemd.status import WHOLE_CELL, CpuSample
 
@@ -43,12 +44,17 @@ class Nodes:
         self._launched: frozenset[str] = frozenset()
         self._tails: dict[str, JsonlTail | None] = {}
 
-    def prepare(self, dataflow: Dataflow) -> None:
-        """Make a group for every node and pipes for those that have them. Raises OSError."""
+    def prepare(self, dataflow: Dataflow, rates: RateLimits) -> None:
+        """Make a group for every node and pipes for those that have them. Raises OSError.
+
+        rates: how many lines of each node are kept.
+        """
         cgroup.enable_controllers(self._unit)
         self._launched = frozenset(node.id for node in dataflow.nodes if is_launched(node))
         for node in dataflow.nodes:
             cgroup.make_group(self._group(node.id))
+            if limit := rate_of(rates, node.id):
+                self._pipes.limit(node.id, limit)
             if has_pipes(node):
                 self._pipes.make(node.id, self._paths)
                 self._piped.append(node.id)
@@ -99,6 +105,7 @@ class Nodes:
             if tail is None:
                 continue
             tail.close()
+            self._pipes.drain(node)  # what the limit took of the very last lines
             if tail.lost_files:
                 reason = f"dora deleted {tail.lost_files} of its log files before they were read"
                 self._pipes.write_event("lines-lost", node, count="Some", reason=reason)
@@ -107,10 +114,9 @@ class Nodes:
     def drain(self, nodes: Iterable[str]) -> None:
         """Write what `nodes` have said so far before whatever is written next."""
         for node in nodes:
-            if node in self._piped:
-                self._pipes.drain(node)
-            elif (tail := self._tails.get(node)) is not None:
+            if (tail := self._tails.get(node)) is not None:
                 tail.drain()
+            self._pipes.drain(node)
 
     async def wait_quiet(self, seconds: float) -> None:
         """Return when dora has written nothing more about its nodes' output for `seconds`."""

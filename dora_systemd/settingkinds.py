@@ -7,6 +7,7 @@ from typing import Any, Generic, TypeVar
 
 from dora_systemd.environment import checked_variable, environment_entries, parse_assignment
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.lograte import RateLimits, format_rates, parse_rates
 from dora_systemd.values import (
     format_bool,
     format_duration,
@@ -159,4 +160,12 @@ PROPERTIES = Kind[tuple[str, ...]](
     list,
     is_repeatable=True,
     merge=lambda lower, higher: lower + higher,
+)
+LINE_RATES = Kind[RateLimits](
+    str | list[str],
+    "LINES/TIME such as 1000/1s",
+    lambda value, _: parse_rates(map(scalar_text, _texts(value))),
+    format_rates,
+    is_repeatable=True,
+    merge=lambda lower, higher: {**lower, **higher},
 )

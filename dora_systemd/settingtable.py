@@ -7,10 +7,12 @@ checked against it. A new setting is one more assignment.
 from collections.abc import Mapping
 from typing import Any
 
+from dora_systemd.lograte import RateLimits
 from dora_systemd.settingkinds import (
     BOOL,
     DURATION,
     ENVIRONMENT,
+    LINE_RATES,
     PATH,
     PATHS,
     PROGRAM,
@@ -120,6 +122,16 @@ DORA = Setting[str](
     flags=("--dora",),
     variable="DORA_PROGRAM",
     metavar="FILE",
+)
+LOG_RATE_LIMIT = Setting[RateLimits](
+    "log_rate_limit",
+    LINE_RATES,
+    {},
+    "Lines per time of each node, or of NODE, that are kept; what is beyond that is counted.",
+    flags=("--log-rate-limit",),
+    variable="DORA_LOG_RATE_LIMIT",
+    metavar="[NODE=]LINES/TIME",
+    per_node=True,
 )
 
 # All of the above, in that order, so that a setting is declared in one place only.

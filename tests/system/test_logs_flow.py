@@ -188,7 +188,7 @@ def test_catalog(tmp_path: Path) -> None:
         done = run("journalctl", "--update-catalog")
         assert not done.stderr
         listed = run("journalctl", "--list-catalog").stdout
-        assert listed.count("dora-systemd: ") == 16
+        assert listed.count("dora-systemd: ") == 17
     finally:
         if not was_there:
             target.unlink()
@@ -230,6 +230,34 @@ def test_runner_killed_with_lines_in_the_pipes(cell: Cell, project: Project) -> 
     assert cell.events()[-1] == ("dataflow-failed", "")
     assert any("SIGKILL" in record.get("DORA_REASON", "") for record in cell.journal())
     (done / "done").unlink()
+
+
+def suppressed(cell: Cell, node: str) -> int:
+    """How many lines of a node its limit took, as the events tell."""
+    matches = ("DORA_EVENT=lines-suppressed", f"DORA_NODE={node}")
+    return sum(int(record["DORA_COUNT"]) for record in cell.journal(*matches))
+
+
+@pytest.mark.lab
+@pytest.mark.warns(ZENOH, "beyond its limit")
+def test_limits_of_nodes(cell: Cell, project: Project) -> None:
+    """What a limit takes is counted to the line, whichever way the lines come."""
+    project.write("flood.py", FLOOD)
+    by_dora = "{id: by-dora, path: flood.py, send_stdout_as: text, outputs: [text]}"
+    nodes = f"[{{id: few, path: flood.py}}, {{id: all, path: flood.py}}, {by_dora}]"
+    flow = project.write("dataflow.yml", f"nodes: {nodes}")
+    limits = "nodes: {few: {log_rate_limit: 500/1s}, all: {log_rate_limit: infinity}}"
+    project.write("dataflow.systemd.yml", limits)
+    cell.start(flow, "--log-rate-limit", "1/1h", "--log-rate-limit", "by-dora=700/200ms")
+    wait_end(cell)
+    assert printed(cell, "all") == numbered(LINES)
+    for node, least in (("few", 500), ("by-dora", 700)):
+        lines = printed(cell, node)
+        assert lines[:least] == numbered(least)
+        assert lines == sorted(set(lines))
+        assert suppressed(cell, node) == LINES - len(lines) > 0
+        kinds = [r.get("DORA_EVENT", "line") for r in cell.journal(f"DORA_NODE={node}")]
+        assert kinds.index("node-exited") == len(kinds) - 1
 
 
 @pytest.mark.lab

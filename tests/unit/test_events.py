@@ -27,7 +27,14 @@ def test_catalog_entry_says_what_and_what_to_do(name: str) -> None:
     assert "Defined-By: dora-systemd" in entry
     assert len(entry.split("\n\n")) >= 3, "a paragraph on what it means, one on what to do"
     for field in re.findall(r"@(\w+)@", entry):
-        assert field in {"DORA_DATAFLOW_NAME", "DORA_NODE", "DORA_EXIT", "DORA_COUNT", "UNIT"}
+        assert field in {
+            "DORA_DATAFLOW_NAME",
+            "DORA_NODE",
+            "DORA_EXIT",
+            "DORA_COUNT",
+            "DORA_LIMIT",
+            "UNIT",
+        }
 
 
 def test_message_ids_are_unique_uuids() -> None:

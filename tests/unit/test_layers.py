@@ -42,6 +42,8 @@ DECISIONS = {
         "lifeevents",
         "logfields",
         "logquery",
+        "lograte",
+        "lograteplan",
         "logs",
         "logterminal",
         "nodetable",
@@ -75,7 +77,7 @@ ADAPTERS = {
     "journalread": ["journalread"],
     "jsonl": ["jsonl"],
     "notify": ["notify"],
-    "pipes": ["pipes", "logqueue"],
+    "pipes": ["pipes", "pipesource", "logqueue"],
     "process": ["process"],
 }
 SHARED = {

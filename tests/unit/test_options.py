@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dora_systemd.errors import DoraSystemdError
+from dora_systemd.lograte import ALL_NODES, SHORTEST, RateLimit
 from dora_systemd.options import (
     RunnerOptions,
     format_runner_argv,
@@ -16,12 +17,15 @@ from dora_systemd.options import (
     parse_runner_argv,
     runner_command,
 )
+from dora_systemd.values import INFINITY
 
 UUID = "550e8400-e29b-41d4-a716-446655440000"
 OPTIONS = RunnerOptions("robot", UUID, "/srv/robot.yml", "/srv", "/usr/bin/dora")
 
 texts = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]))
 paths = texts.map(lambda text: "/" + text)
+nodes = st.just(ALL_NODES) | st.from_regex(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,20}", fullmatch=True)
+rates = st.builds(RateLimit, st.integers(1, 10**18 - 1), st.integers(SHORTEST, INFINITY - 1))
 options = st.builds(
     RunnerOptions,
     name=st.from_regex(r"[a-z][a-z0-9_-]{0,20}", fullmatch=True).filter(lambda n: n != "gateway"),
@@ -37,6 +41,7 @@ options = st.builds(
     attached=st.booleans(),
     exit_when_nodes_finish=st.none() | st.booleans(),
     env_keys=st.lists(texts).map(tuple),
+    log_rates=st.dictionaries(nodes, st.none() | rates),
 )
 
 

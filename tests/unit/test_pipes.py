@@ -12,7 +12,9 @@ import pytest
 
 from dora_systemd.cellpaths import CellPaths
 from dora_systemd.journal import JournalSocket
+from dora_systemd.lograte import RateLimit
 from dora_systemd.pipes import CellIdentity, LogPipes
+from dora_systemd.values import SECOND
 
 IDENTITY = CellIdentity("robot", "550e8400-e29b-41d4-a716-446655440000")
 
@@ -118,6 +120,35 @@ def test_last_words_come_before_the_event(tmp_path: Path) -> None:
         assert entries[2]["DORA_NODE"] == "a"
         assert entries[2]["DORA_EXIT"] == "exit code 1"
         assert entries[3]["SYSLOG_IDENTIFIER"] == "robot"
+
+    run(tmp_path, scenario)
+
+
+def test_what_a_limit_takes_is_counted(tmp_path: Path) -> None:
+    async def scenario(cell: Cell) -> None:
+        cell.node("a")
+        cell.pipes.limit("a", RateLimit(2, SECOND // 10))
+        path = cell.paths.node_stdout("a")
+        cell.write(path, b"1\n2\n3\n4\n")
+        assert await cell.messages(3) == [
+            "1",
+            "2",
+            "2 log lines of node a are beyond its limit of 2/100ms",
+        ]
+        cell.write(path, b"5\n6\n7\n8")
+        cell.write(cell.paths.node_stderr("a"), b"the last words")
+        cell.pipes.drain("a")
+        cell.pipes.write_fields({"MESSAGE": "from dora's file", "DORA_STREAM": "stdout"}, "a")
+        cell.pipes.drain("a")
+        cell.pipes.write_event("node-exited", "a")
+        entries = cell.received()
+        assert sorted(entry["MESSAGE"] for entry in entries[:3]) == ["5", "6", "the last words"]
+        suppressed, more, exited = entries[3:]
+        assert (suppressed["DORA_COUNT"], suppressed["DORA_NODE"]) == ("2", "a")
+        assert more["DORA_COUNT"] == "1"
+        assert suppressed["DORA_EVENT"] == "lines-suppressed"
+        assert suppressed["DORA_LIMIT"] == "2/100ms"
+        assert exited["MESSAGE"] == "Node a exited"
 
     run(tmp_path, scenario)
 

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.lograte import RateLimit
 from dora_systemd.settingkinds import DURATION, TEXT, Setting
 from dora_systemd.settings import DEFAULT_SOURCE, Settings, check_document, resolve_settings
 from dora_systemd.settingtable import (
@@ -203,6 +204,9 @@ def test_values_and_back(data: st.DataObject) -> None:
         "env_file": st.lists(texts).map(tuple),
         "property": st.lists(texts).map(tuple),
         "grace_duration": st.integers(0, 2**64 - 1),
+        "log_rate_limit": st.dictionaries(
+            st.sampled_from(["", "cam"]), st.none() | st.just(RateLimit(5, SECOND))
+        ),
     }
     for setting in SETTINGS:
         strategy = st.booleans() if setting.kind.is_flag else examples.get(setting.name, texts)
@@ -257,4 +261,4 @@ def test_bad_settings_of_nodes(document: object, message: str) -> None:
 
 def test_nodes_need_settings_per_node() -> None:
     with pytest.raises(DoraSystemdError, match="unknown key 'nodes'"):
-        check_document(BESIDE, {"nodes": {}})
+        check_document(BESIDE, {"nodes": {}}, [UV])

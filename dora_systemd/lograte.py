@@ -1,0 +1,133 @@
+"""How many lines a node may write in how much time, and what is beyond that. Pure: no clock.
+
+Off unless somebody asks for it: a limit of ours takes lines away, however exactly it counts them.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.values import INFINITY, SECOND, format_duration, parse_duration, quoted
+
+SHORTEST = SECOND // 10
+"""µs. A window that takes lines away is reported at its end: not more than ten times a second."""
+
+_HINT = "write LINES/TIME such as 1000/1s, with at least one line and 100ms; or infinity"
+
+ALL_NODES = ""
+
+
+@dataclass(frozen=True)
+class RateLimit:
+    """`lines` of each of a node's streams in `interval` µs."""
+
+    lines: int
+    interval: int
+
+
+RateLimits = Mapping[str, RateLimit | None]
+"""By node, ALL_NODES for those that are not named; None: no limit."""
+
+
+def parse_rate(text: str) -> RateLimit | None:
+    """The limit "1000/1s", None for "infinity"; raises DoraSystemdError (USAGE)."""
+    if text.strip() == "infinity":
+        return None
+    lines, slash, time = (part.strip() for part in text.partition("/"))
+    if not (slash and lines.isascii() and lines.isdigit() and len(lines) < 19 and int(lines)):
+        raise _refusal(text)
+    try:
+        interval = parse_duration(time)
+    except DoraSystemdError as error:
+        raise _refusal(text) from error
+    if not SHORTEST <= interval < INFINITY:
+        raise _refusal(text)
+    return RateLimit(int(lines), interval)
+
+
+def format_rate(limit: RateLimit | None) -> str:
+    """The text that parse_rate gives `limit` for."""
+    if limit is None:
+        return "infinity"
+    return f"{limit.lines}/{format_duration(limit.interval)}"
+
+
+def parse_rates(texts: Iterable[str]) -> dict[str, RateLimit | None]:
+    """Limits by node from "1000/1s" and "NODE=100/1s"; raises DoraSystemdError (USAGE)."""
+    parts = (text.rpartition("=")[::2] for text in texts)
+    return {node.strip(): parse_rate(limit) for node, limit in parts}
+
+
+def format_rates(limits: RateLimits) -> list[str]:
+    """The texts that parse_rates gives `limits` for."""
+    return [
+        f"{node}={format_rate(limit)}" if node else format_rate(limit)
+        for node, limit in limits.items()
+    ]
+
+
+def rate_of(limits: RateLimits, node: str) -> RateLimit | None:
+    """The limit of one node, None if there is none."""
+    return limits[node] if node in limits else limits.get(ALL_NODES)
+
+
+def merge_rates(nodes: Mapping[str, RateLimits], given: RateLimits) -> RateLimits:
+    """The limits of `given`, and below them those that a settings file has for single nodes.
+
+    Raises DoraSystemdError (BAD_INPUT) for one that names a node again.
+    """
+    limits: dict[str, RateLimit | None] = {}
+    for node, own in nodes.items():
+        for name, limit in own.items():
+            if name:
+                text = f"{name}={format_rate(limit)}"
+                message = f"cannot use {quoted(text)} as log_rate_limit of node {node}"
+                raise DoraSystemdError(message, _HINT, ExitCode.BAD_INPUT)
+            limits[node] = limit
+    return {**limits, **given}
+
+
+@dataclass
+class _Window:
+    end: float
+    left: int
+
+
+@dataclass
+class LineLimiter:
+    """Counts the lines of one node.
+
+    Each stream has a window of its own: a flood on standard output does not take a traceback on
+    standard error away. A window begins with a stream's first line after the one before it.
+
+    suppressed: how many lines were refused since take_suppressed().
+    """
+
+    limit: RateLimit
+    suppressed: int = 0
+    _windows: dict[str, _Window] = field(default_factory=dict)
+
+    def admit(self, stream: str, count: int, now: float) -> int:
+        """How many of the `count` lines that have come at `now`, in seconds, may pass."""
+        window = self._windows.get(stream)
+        if window is None or now >= window.end:
+            window = _Window(now + self.limit.interval / SECOND, self.limit.lines)
+            self._windows[stream] = window
+        passed = min(count, window.left)
+        window.left -= passed
+        self.suppressed += count - passed
+        return passed
+
+    def end(self, stream: str) -> float:
+        """When the window of a stream that has written is over, in seconds."""
+        return self._windows[stream].end
+
+    def take_suppressed(self) -> int:
+        """How many lines were refused since the last call."""
+        count, self.suppressed = self.suppressed, 0
+        return count
+
+
+def _refusal(text: str) -> DoraSystemdError:
+    message = f"cannot read {quoted(text)} as a rate of lines"
+    return DoraSystemdError(message, _HINT, ExitCode.USAGE)

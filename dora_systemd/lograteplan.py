@@ -1,0 +1,30 @@
+"""The limits on log lines that the settings of a dataflow ask for."""
+
+from collections.abc import Sequence
+
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.lograte import ALL_NODES, RateLimits, merge_rates
+from dora_systemd.settings import Settings
+from dora_systemd.settingtable import LOG_RATE_LIMIT
+from dora_systemd.suggestions import did_you_mean
+from dora_systemd.values import quoted
+
+
+def log_rates(settings: Settings) -> RateLimits:
+    """Those that were given by name or for all, below them those of `nodes:` in files.
+
+    Raises DoraSystemdError (BAD_INPUT).
+    """
+    name = LOG_RATE_LIMIT.name
+    nodes = {node: values[name] for node, values in settings.nodes.items() if name in values}
+    return merge_rates(nodes, settings[LOG_RATE_LIMIT])
+
+
+def check_rates(settings: Settings, nodes: Sequence[str]) -> None:
+    """Raise DoraSystemdError (USAGE) for a limit of a node that is none of `nodes`."""
+    for node in settings[LOG_RATE_LIMIT]:
+        if node != ALL_NODES and node not in nodes:
+            source = settings.source(LOG_RATE_LIMIT)
+            message = f"cannot limit the lines of node {quoted(node)}: there is none ({source})"
+            hint = did_you_mean(node, nodes) or f"there are {', '.join(nodes)}"
+            raise DoraSystemdError(message, hint, ExitCode.USAGE)
