@@ -44,7 +44,7 @@ def command(dataflow: str, name: str | None, **flags: Any) -> int:
     bus = Bus(scope)
     require_free_name(bus, unit_name(request_name(request)))
     plan = make_plan(scope, request)
-    properties, warnings = plan_properties(plan, bus.version())
+    properties, warnings = plan_properties(plan, bus)
     print_warnings(warnings)
     options = plan.options
     terminal = TerminalLines((), want_colors=sys.stdout.isatty())

@@ -28,6 +28,7 @@ Examples:
   doractl start                                    ./dataflow.yml
   doractl start dataflow.yml --name robot
   doractl start dataflow.yml --env MODEL=yolov8n.pt --venv .venv
+  doractl start dataflow.yml --memory-limit 4G --node-limit detector:memory=1G,cpu=1.5
   doractl start dataflow.yml --property Restart=on-failure
   doractl start dataflow.yml --dry-run
 """
@@ -57,7 +58,7 @@ def command(
     bus = Bus(scope)
     require_free_name(bus, unit_name(request_name(request)))
     plan = make_plan(scope, request)
-    properties, warnings = plan_properties(plan, bus.version())
+    properties, warnings = plan_properties(plan, bus)
     print_warnings(warnings)
     try:
         with StageLine(sys.stderr) as stage:

@@ -110,6 +110,13 @@ class Bus:
         self._listen(unit)
         return [body[1] for member, body in self._signals() if member == "PropertiesChanged"]
 
+    def control_group(self) -> str:
+        group: str = self._get("read systemd's cgroup", ROOT, MANAGER, "ControlGroup")
+        return group
+
+    def reload(self) -> None:
+        self._call("reload systemd", ROOT, MANAGER, "Reload")
+
     def version(self) -> str:
         text: str = self._get("read systemd's version", ROOT, MANAGER, "Version")
         return text

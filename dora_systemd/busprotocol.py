@@ -65,5 +65,11 @@ class Manager(Protocol):
     ) -> bool:
         """Wait for a change of the unit's properties after which `is_done`; False: too late."""
 
+    def control_group(self) -> str:
+        """The manager's own cgroup, below which its units are; "" is the root."""
+
+    def reload(self) -> None:
+        """Have the files of all units read again, as `systemctl daemon-reload`."""
+
     def version(self) -> str:
         """The systemd version, as in "257.13-1"."""

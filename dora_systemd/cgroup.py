@@ -13,6 +13,7 @@ from functools import cache
 from pathlib import Path
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.limits import NodeLimits
 
 NODE_PREFIX = "node-"
 MOUNTS = (Path("/sys/fs/cgroup"), Path("/sys/fs/cgroup/unified"))
@@ -119,13 +120,39 @@ def remove_group(path: Path) -> None:
         path.rmdir()
 
 
+def read_controllers(path: Path) -> frozenset[str]:
+    """The controllers that a group has been given, which it can give to those below it."""
+    return frozenset(_read_text(path / "cgroup.controllers").split())
+
+
 def enable_controllers(path: Path) -> None:
     """Give the groups below `path` every controller that `path` itself has been given.
 
     What the kernel does not offer (no controllers at all, in some containers) is passed over.
     """
-    for name in _read_text(path / "cgroup.controllers").split():
+    for name in sorted(read_controllers(path)):
         _write(path / "cgroup.subtree_control", f"+{name}")
+
+
+def kill_as_one(path: Path) -> None:
+    """Have the kernel kill all of a group when one of its processes uses too much memory."""
+    _write(path / "memory.oom.group", "1")
+
+
+def limit_group(path: Path, limits: NodeLimits) -> None:
+    """Limit a node's group. Raises DoraSystemdError for a limit that does not take hold."""
+    for file, text in limits.files().items():
+        try:
+            is_limited = _write(path / file, text)
+            reason = f"its group has no {file}"
+        except OSError as error:
+            is_limited, reason = False, f"{error.strerror} ({file}: {text})"
+        if not is_limited:
+            raise DoraSystemdError(
+                f"cannot limit the node {limits.node}: {reason}",
+                "the kernel, or the container, does not give that to this dataflow",
+                ExitCode.NO_SYSTEMD,
+            )
 
 
 def move_process(path: Path, pid: int) -> None:

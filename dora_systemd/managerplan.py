@@ -13,6 +13,7 @@ from dora_systemd.doraerrors import parse_dora_error
 from dora_systemd.environment import parse_environment_file, unit_environment
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.files import read_text, read_yaml
+from dora_systemd.limitchecks import settings_node_limits
 from dora_systemd.lograteplan import check_rates, log_rates
 from dora_systemd.manageraccount import account_of, check_access, choose_user
 from dora_systemd.managersettings import read_settings
@@ -104,6 +105,7 @@ def make_plan(scope: Scope, request: StartRequest) -> Plan:
         exit_when_nodes_finish=settings[EXIT_WHEN_NODES_FINISH],
         env_keys=tuple(variables),
         log_rates=log_rates(settings),
+        node_limits=settings_node_limits(settings),
     )
     environment = unit_environment(search_path, venv, variables)
     plan = Plan(scope, options, settings, user, environment)

@@ -11,8 +11,9 @@ from dora_systemd.settingtable import SETTINGS
 
 SYSTEM_FILE = Path("/etc/dora-systemd/config.yml")
 USER_FILE = Path("dora-systemd/config.yml")
-_ROOT_ONLY = ("user", "property")
-"""Keys with which whoever wrote a settings file could have commands run as root."""
+_ROOT_ONLY = ("user", "property", "nice", "realtime")
+"""Keys with which whoever wrote a settings file could have commands run as root, or get more of the
+machine than root gave him."""
 
 
 def settings_files(dataflow: Path, environment: Mapping[str, str]) -> list[Path]:

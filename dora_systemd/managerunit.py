@@ -2,21 +2,24 @@
 
 import sys
 
+from dora_systemd.busprotocol import Manager
 from dora_systemd.compat import MIN_VERSION, drop_unsupported
+from dora_systemd.managerlimits import check_limits
 from dora_systemd.managerplan import Plan
 from dora_systemd.process import version_numbers
 from dora_systemd.properties import UnitContext, format_unit, unit_properties
 from dora_systemd.propertykinds import Property
 
 
-def plan_properties(plan: Plan, version: str) -> tuple[list[Property], tuple[str, ...]]:
-    """All properties of the unit that systemd `version` takes, and warnings about the others.
+def plan_properties(plan: Plan, manager: Manager) -> tuple[list[Property], tuple[str, ...]]:
+    """All properties of the unit that this systemd takes, and warnings.
 
-    Raises DoraSystemdError.
+    They are about the properties that it does not take and limits beyond the machine's own. Raises
+    DoraSystemdError.
     """
-    number = next(iter(version_numbers(version)), MIN_VERSION)
+    number = next(iter(version_numbers(manager.version())), MIN_VERSION)
     properties, warnings = drop_unsupported(_properties(plan), number)
-    return list(properties.values()), warnings
+    return list(properties.values()), (*warnings, *check_limits(manager, plan, properties))
 
 
 def format_plan(plan: Plan) -> str:

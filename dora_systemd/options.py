@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.limits import NodeLimits, format_node_limits, parse_node_limits
 from dora_systemd.lograte import RateLimits, format_rates, parse_rates
 from dora_systemd.names import parse_name, parse_uuid
 from dora_systemd.values import (
@@ -28,7 +29,7 @@ project can never stand in for the runner's."""
 
 _TEXTS = ("working-directory", "dora", "venv")
 _FLAGS = ("uv", "debug", "allow-shell-nodes", "attached")
-_REPEATED = ("env-key", "log-rate-limit")
+_REPEATED = ("env-key", "log-rate-limit", "node-limit")
 _REQUIRED = ("name", "uuid", "working-directory", "dora")
 
 
@@ -49,6 +50,7 @@ class RunnerOptions:
     exit_when_nodes_finish: overrides the descriptor's key of that name, unless None.
     env_keys: names of the variables that win over the descriptor's own `env:`.
     log_rates: how many lines of which node are kept, see dora_systemd.lograte.
+    node_limits: limits of single nodes.
     """
 
     name: str
@@ -64,7 +66,8 @@ class RunnerOptions:
     attached: bool = False
     exit_when_nodes_finish: bool | None = None
     env_keys: tuple[str, ...] = ()
-    log_rates: RateLimits = field(default_factory=dict)
+    log_rates: RateLimits = field(default_factory=dict, hash=False)
+    node_limits: tuple[NodeLimits, ...] = ()
 
 
 def format_runner_argv(options: RunnerOptions) -> list[str]:
@@ -82,6 +85,7 @@ def format_runner_argv(options: RunnerOptions) -> list[str]:
         pairs.append(("exit-when-nodes-finish", format_bool(options.exit_when_nodes_finish)))
     pairs += [("env-key", key) for key in options.env_keys]
     pairs += [("log-rate-limit", text) for text in format_rates(options.log_rates)]
+    pairs += [("node-limit", format_node_limits(one)) for one in options.node_limits]
     flags = [f"--{flag}" for flag in _FLAGS if getattr(options, flag.replace("-", "_"))]
     return [f"--{key}={value}" for key, value in pairs] + flags + [options.dataflow]
 
@@ -144,6 +148,7 @@ def _options(dataflow: str, values: dict[str, str], lists: dict[str, list[str]])
         dataflow=dataflow,
         env_keys=tuple(lists["env-key"]),
         log_rates=parse_rates(lists["log-rate-limit"]),
+        node_limits=tuple(map(parse_node_limits, lists["node-limit"])),
         grace=parse_duration(values.get("grace-duration", "10s")),
         exit_when_nodes_finish=None if exits is None else parse_bool(exits),
         working_directory=values["working-directory"],

@@ -10,10 +10,11 @@ from typing import Any
 from dora_systemd import files, process
 from dora_systemd.buildsession import BuildSession, parse_session, session_path
 from dora_systemd.dataflow import Dataflow, parse_dataflow
-from dora_systemd.dataflownodes import UNEXPANDED
+from dora_systemd.dataflownodes import UNEXPANDED, NodeKind
 from dora_systemd.doraerrors import parse_dora_error
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.launch import LaunchPlan, launch_descriptor
+from dora_systemd.limits import check_nodes
 from dora_systemd.options import RunnerOptions
 
 PACKAGE = Path(__file__).parent
@@ -36,7 +37,10 @@ def prepare(options: RunnerOptions, environment: Mapping[str, str]) -> Prepared:
 
     Raises DoraSystemdError when it cannot be read or a node of it cannot be run.
     """
-    dataflow = _load_dataflow(options)
+    dataflow = load_dataflow(options)
+    ids = [node.id for node in dataflow.nodes]
+    dynamic = [node.id for node in dataflow.nodes if node.kind is NodeKind.DYNAMIC]
+    check_nodes(options.node_limits, ids, dynamic)
     plan = LaunchPlan(
         options,
         str(PACKAGE / "launcher.sh"),
@@ -47,7 +51,8 @@ def prepare(options: RunnerOptions, environment: Mapping[str, str]) -> Prepared:
     return Prepared(dataflow, plan, launch_descriptor(dataflow, plan))
 
 
-def _load_dataflow(options: RunnerOptions) -> Dataflow:
+def load_dataflow(options: RunnerOptions) -> Dataflow:
+    """The dataflow of `options`, its modules expanded. Raises DoraSystemdError."""
     path = Path(options.dataflow)
     dataflow = parse_dataflow(files.read_yaml(path), str(path))
     if not any(node.kind in UNEXPANDED for node in dataflow.nodes):

@@ -9,6 +9,7 @@ from typing import Any
 
 from dora_systemd.environment import checked_variable, environment_entries
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.limitsettings import REALTIME
 from dora_systemd.names import SLICE
 from dora_systemd.options import RunnerOptions, post_command, runner_command
 from dora_systemd.propertykinds import Property
@@ -65,6 +66,7 @@ def unit_properties(
         **user_properties(context),
         **log_properties(options, context),
     }
+    own |= realtime_properties(settings)
     properties = with_properties(own, settings_properties(settings))
     for assignment in settings[PROPERTY]:
         properties = with_properties(properties, _given_property(assignment, settings))
@@ -191,8 +193,21 @@ def settings_properties(settings: Settings) -> dict[str, Property]:
         if setting.property and value != setting.default:
             texts = setting.kind.format(value)
             for text in texts:
-                properties |= parse_property(f"{setting.property}={text}")
+                given = parse_property(f"{setting.property}={text}")
+                properties = with_properties(properties, given)
     return properties
+
+
+def realtime_properties(settings: Settings) -> dict[str, Property]:
+    """CPUSchedulingPolicy= and its priority, see systemd.exec(5) and sched(7)."""
+    given = settings[REALTIME]
+    if given is None:
+        return {}
+    policy, _, priority = given.partition(":")
+    return {
+        **parse_property(f"CPUSchedulingPolicy={policy}"),
+        **parse_property(f"CPUSchedulingPriority={priority}"),
+    }
 
 
 def _given_property(assignment: str, settings: Settings) -> dict[str, Property]:

@@ -79,7 +79,7 @@ async def run_cell(options: RunnerOptions, paths: CellPaths) -> RunnerExit:
     try:
         pipes.write_event("dataflow-starting")
         prepared = prepare(options, environment)
-        nodes.prepare(prepared.dataflow, options.log_rates)
+        nodes.prepare(prepared.dataflow, options.log_rates, options.node_limits)
         table = initial_nodes(kinds(prepared.dataflow, prepared.plan), started_us)
         cell = Cell(options.grace, started_us, table)
         pump = Pump(cell, options.uuid, paths, nodes, pipes)

@@ -13,6 +13,7 @@ from dora_systemd.dataflow import Dataflow
 from dora_systemd.dataflownodes import NodeKind
 from dora_systemd.jsonl import JsonlTail
 from dora_systemd.launch import has_pipes, is_launched
+from dora_systemd.limits import NodeLimits
 from dora_systemd.lograte import RateLimits, rate_of
 from dora_systemd.pipes import LogPipes
 from dora_systemd.status import WHOLE_CELL, CpuSample
@@ -44,10 +45,11 @@ class Nodes:
         self._launched: frozenset[str] = frozenset()
         self._tails: dict[str, JsonlTail | None] = {}
 
-    def prepare(self, dataflow: Dataflow, rates: RateLimits) -> None:
-        """Make a group for every node and pipes for those that have them. Raises OSError.
+    def prepare(self, dataflow: Dataflow, rates: RateLimits, limits: Iterable[NodeLimits]) -> None:
+        """Make a group for every node, with its limits, and pipes for those that have them.
 
-        rates: how many lines of each node are kept.
+        rates: how many lines of each node are kept. Raises OSError, and DoraSystemdError for a
+        limit that does not take hold.
         """
         cgroup.enable_controllers(self._unit)
         self._launched = frozenset(node.id for node in dataflow.nodes if is_launched(node))
@@ -55,11 +57,15 @@ class Nodes:
             cgroup.make_group(self._group(node.id))
             if limit := rate_of(rates, node.id):
                 self._pipes.limit(node.id, limit)
+            cgroup.kill_as_one(self._group(node.id))
             if has_pipes(node):
                 self._pipes.make(node.id, self._paths)
                 self._piped.append(node.id)
             elif node.kind is not NodeKind.DYNAMIC:
                 self._tails[node.id] = None
+
+        for one in limits:
+            cgroup.limit_group(self._group(one.node), one)
 
     def _group(self, node: str) -> Path:
         return self._unit / f"{cgroup.NODE_PREFIX}{node}"

@@ -7,6 +7,7 @@ checked against it. A new setting is one more assignment.
 from collections.abc import Mapping
 from typing import Any
 
+from dora_systemd.limitsettings import LIMIT_SETTINGS
 from dora_systemd.lograte import RateLimits
 from dora_systemd.settingkinds import (
     BOOL,
@@ -134,7 +135,9 @@ LOG_RATE_LIMIT = Setting[RateLimits](
     per_node=True,
 )
 
-# All of the above, in that order, so that a setting is declared in one place only.
-SETTINGS: tuple[Setting[Any], ...] = tuple(
-    value for value in list(globals().values()) if isinstance(value, Setting)
+# All of the above, in that order, so that a setting is declared in one place only, and then those
+# of the module limitsettings.
+SETTINGS: tuple[Setting[Any], ...] = (
+    *(value for value in list(globals().values()) if isinstance(value, Setting)),
+    *LIMIT_SETTINGS,
 )

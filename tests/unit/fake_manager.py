@@ -44,6 +44,7 @@ class FakeManager:
         self.job_results: dict[str, str] = {}
         self.stages: list[str] = []
         self.after_job: dict[str, dict[str, Any]] = {}
+        self.systemd = "257.13-1"
 
     def add(self, runner: RunnerOptions, active: str = "active", **facts: Any) -> str:
         """A unit of ours in state `active`."""
@@ -128,8 +129,14 @@ class FakeManager:
         del seconds
         return is_done(self.units.get(unit, {}))
 
+    def control_group(self) -> str:
+        return ""
+
+    def reload(self) -> None:
+        self.calls.append(("reload",))
+
     def version(self) -> str:
-        return "257.13-1"
+        return self.systemd
 
     def _tell(self, observer: Observer | None) -> None:
         for stage in self.stages:

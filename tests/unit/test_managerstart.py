@@ -102,9 +102,11 @@ def test_what_start_prints() -> None:
 
 def test_properties_for_an_older_systemd() -> None:
     plan = make_plan(property=("RestartMode=direct",))
-    names = [name for name, _, _ in plan_properties(plan, "257.13-1")[0]]
+    manager = FakeManager()
+    names = [name for name, _, _ in plan_properties(plan, manager)[0]]
     assert "DelegateSubgroup" in names
-    properties, warnings = plan_properties(plan, "252.39-1~deb12u1")
+    manager.systemd = "252.39-1~deb12u1"
+    properties, warnings = plan_properties(plan, manager)
     assert "DelegateSubgroup" not in [name for name, _, _ in properties]
     assert len(warnings) == 1
     assert "RestartMode" in warnings[0]

@@ -18,6 +18,7 @@ from dora_systemd.options import (
     runner_command,
 )
 from dora_systemd.values import INFINITY
+from tests.unit.limit_values import limits_of_a_node
 
 UUID = "550e8400-e29b-41d4-a716-446655440000"
 OPTIONS = RunnerOptions("robot", UUID, "/srv/robot.yml", "/srv", "/usr/bin/dora")
@@ -42,6 +43,7 @@ options = st.builds(
     exit_when_nodes_finish=st.none() | st.booleans(),
     env_keys=st.lists(texts).map(tuple),
     log_rates=st.dictionaries(nodes, st.none() | rates),
+    node_limits=st.lists(limits_of_a_node()).map(tuple),
 )
 
 
@@ -57,6 +59,7 @@ def test_arguments_and_back(given_options: RunnerOptions) -> None:
     assert parse_runner_argv(format_runner_argv(given_options)) == given_options
     command = runner_command("/usr/bin/python3", given_options)
     assert options_from_command(command) == given_options
+    assert hash(given_options), "doractl stop and restart take each dataflow once"
 
 
 @given(st.lists(st.text() | st.sampled_from(format_runner_argv(OPTIONS))))

@@ -26,6 +26,7 @@ from dora_systemd.settingtable import (
     WORKING_DIRECTORY,
 )
 from dora_systemd.values import SECOND
+from tests.unit.limit_values import LIMIT_VALUES
 
 BESIDE = "/srv/robot.systemd.yml"
 HOME = "/home/me/.config/dora-systemd/config.yml"
@@ -207,6 +208,7 @@ def test_values_and_back(data: st.DataObject) -> None:
         "log_rate_limit": st.dictionaries(
             st.sampled_from(["", "cam"]), st.none() | st.just(RateLimit(5, SECOND))
         ),
+        **LIMIT_VALUES,
     }
     for setting in SETTINGS:
         strategy = st.booleans() if setting.kind.is_flag else examples.get(setting.name, texts)
@@ -260,5 +262,7 @@ def test_bad_settings_of_nodes(document: object, message: str) -> None:
 
 
 def test_nodes_need_settings_per_node() -> None:
+    table = [setting for setting in SETTINGS if not setting.per_node]
     with pytest.raises(DoraSystemdError, match="unknown key 'nodes'"):
         check_document(BESIDE, {"nodes": {}}, [UV])
+        check_document(BESIDE, {"nodes": {}}, table)

@@ -1,0 +1,213 @@
+"""Limits of resources: what can be limited for a node, how it is written, and where it takes hold.
+
+The control files are those of the kernel's "Control Group v2" document. The runner's command line
+holds limits of nodes, so this module imports nothing that costs time.
+"""
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.suggestions import did_you_mean
+from dora_systemd.values import (
+    INFINITY,
+    SECOND,
+    format_cpu,
+    format_size,
+    parse_cpu,
+    parse_size,
+    quoted,
+)
+
+SMALLEST_MEMORY = 1024 * 1024
+"""Bytes. Less is a forgotten letter: no program runs in it."""
+
+SMALLEST_CPU = SECOND // 100
+"""µs of CPU per second."""
+
+HIGHEST_WEIGHT = 10_000
+
+_PERIOD = 100_000
+"""µs: the kernel's own period of cpu.max."""
+
+_NUMBER = re.compile(r"[0-9]{1,18}")
+
+
+def parse_memory(text: str) -> int:
+    """Bytes of memory, 1M at least; INFINITY for no limit. Raises DoraSystemdError (USAGE)."""
+    size = parse_size(text)
+    if size < SMALLEST_MEMORY:
+        hint = "write at least 1M, such as 512M or 4G; or infinity for no limit"
+        raise _refusal(f"{quoted(text)} as a limit of memory", hint)
+    return size
+
+
+def parse_share(text: str) -> int:
+    """µs of CPU per second, a hundredth of a core at least. Raises DoraSystemdError (USAGE)."""
+    share = parse_cpu(text)
+    if share < SMALLEST_CPU:
+        hint = "write at least 0.01 cores, such as 1.5; or infinity for no limit"
+        raise _refusal(f"{quoted(text)} as a limit of CPU time", hint)
+    return share
+
+
+def parse_tasks(text: str) -> int:
+    """A number of processes and threads, or INFINITY. Raises DoraSystemdError (USAGE)."""
+    if text.strip() == "infinity":
+        return INFINITY
+    return _parse_number(text, 1, 2**32 - 1, "a number of tasks", "write at least 1; or infinity")
+
+
+def parse_weight(text: str) -> int:
+    """A share in relation to others, from 1 to 10000. Raises DoraSystemdError (USAGE)."""
+    hint = f"write a number from 1 to {HIGHEST_WEIGHT}; 100 is everyone's"
+    return _parse_number(text, 1, HIGHEST_WEIGHT, "a weight", hint)
+
+
+def _parse_number(text: str, lowest: int, highest: int, what: str, hint: str) -> int:
+    if not _NUMBER.fullmatch(text.strip()) or not lowest <= int(text) <= highest:
+        raise _refusal(f"{quoted(text)} as {what}", hint)
+    return int(text)
+
+
+def format_number(value: int) -> str:
+    """A number of tasks or a weight, or "infinity"."""
+    return "infinity" if value == INFINITY else str(value)
+
+
+def _plain_file(value: int) -> str:
+    return "max" if value == INFINITY else str(value)
+
+
+def _quota_file(share: int) -> str:
+    """cpu.max: quota and period in µs."""
+    return f"{'max' if share == INFINITY else share * _PERIOD // SECOND} {_PERIOD}"
+
+
+def _weight_file(weight: int) -> str:
+    return f"default {weight}"
+
+
+@dataclass(frozen=True)
+class Limit:
+    """Something that can be limited, for a dataflow and for a node.
+
+    word: its name in `--node-limit NODE:WORD=VALUE`. key: of the setting, in settings files.
+    property: of the unit, see systemd.resource-control(5). controller, file: of cgroup v2.
+    parse, format: text to value and back. file_text: what is written to the file.
+    """
+
+    word: str
+    key: str
+    property: str
+    controller: str
+    file: str
+    parse: Callable[[str], int]
+    format: Callable[[int], str]
+    file_text: Callable[[int], str]
+
+
+def _memory(word: str, key: str, unit_property: str, file: str) -> Limit:
+    # Of swap none at all makes sense, unlike of memory.
+    parse = parse_size if word == "swap" else parse_memory
+    return Limit(word, key, unit_property, "memory", file, parse, format_size, _plain_file)
+
+
+LIMITS: tuple[Limit, ...] = (
+    Limit(
+        *("cpu", "cpu_limit", "CPUQuota", "cpu", "cpu.max"),
+        *(parse_share, format_cpu, _quota_file),
+    ),
+    _memory("memory", "memory_limit", "MemoryMax", "memory.max"),
+    _memory("memory-high", "memory_high", "MemoryHigh", "memory.high"),
+    _memory("swap", "swap_limit", "MemorySwapMax", "memory.swap.max"),
+    Limit(
+        *("tasks", "tasks_limit", "TasksMax", "pids", "pids.max"),
+        *(parse_tasks, format_number, _plain_file),
+    ),
+    Limit(
+        *("cpu-weight", "cpu_weight", "CPUWeight", "cpu", "cpu.weight"),
+        *(parse_weight, format_number, _plain_file),
+    ),
+    Limit(
+        *("io-weight", "io_weight", "IOWeight", "io", "io.weight"),
+        *(parse_weight, format_number, _weight_file),
+    ),
+)
+BY_WORD: Mapping[str, Limit] = {limit.word: limit for limit in LIMITS}
+BY_KEY: Mapping[str, Limit] = {limit.key: limit for limit in LIMITS}
+
+
+class NodeLimits(NamedTuple):
+    """The limits of one node: pairs of a word of LIMITS and its value, in the order of LIMITS."""
+
+    node: str
+    limits: tuple[tuple[str, int], ...]
+
+    def files(self) -> dict[str, str]:
+        """What is to be written to which control file of the node's group."""
+        return {BY_WORD[word].file: BY_WORD[word].file_text(value) for word, value in self.limits}
+
+    def controllers(self) -> dict[str, str]:
+        """The controllers that are needed, each with the file that one of the limits is in."""
+        return {BY_WORD[word].controller: BY_WORD[word].file for word, _ in self.limits}
+
+
+def node_limits(node: str, limits: Mapping[str, int]) -> NodeLimits:
+    """The limits of `node`, by word."""
+    return NodeLimits(node, tuple((word, limits[word]) for word in BY_WORD if word in limits))
+
+
+def parse_node_limits(text: str) -> NodeLimits:
+    """The limits in NODE:WORD=VALUE,WORD=VALUE. Raises DoraSystemdError (USAGE)."""
+    node, colon, assignments = text.rpartition(":")
+    if not colon or not node or not assignments:
+        raise _refusal(f"{quoted(text)} as limits of a node", "write NODE:memory=1G,cpu=1.5")
+    limits: dict[str, int] = {}
+    for assignment in assignments.split(","):
+        word, _, value = assignment.partition("=")
+        if word not in BY_WORD:
+            hint = did_you_mean(word, BY_WORD) or f"there are {', '.join(BY_WORD)}"
+            raise _refusal(f"{quoted(assignment)} as a limit of the node {quoted(node)}", hint)
+        if word in limits:
+            raise _refusal(f"{quoted(text)}: {word} is given twice", "leave one of them out")
+        limits[word] = BY_WORD[word].parse(value)
+    return node_limits(node, limits)
+
+
+def format_node_limits(limits: NodeLimits) -> str:
+    """The exact inverse of parse_node_limits."""
+    pairs = (f"{word}={BY_WORD[word].format(value)}" for word, value in limits.limits)
+    return f"{limits.node}:{','.join(pairs)}"
+
+
+def merge_node_limits(*sources: Iterable[NodeLimits]) -> tuple[NodeLimits, ...]:
+    """The limits of several sources, each one more important than those before it."""
+    merged: dict[str, dict[str, int]] = {}
+    for source in sources:
+        for one in source:
+            merged.setdefault(one.node, {}).update(one.limits)
+    return tuple(node_limits(node, limits) for node, limits in merged.items() if limits)
+
+
+def check_nodes(limits: Iterable[NodeLimits], nodes: Iterable[str], dynamic: Iterable[str]) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) for limits of a node that is not there or out of reach.
+
+    nodes: all ids. dynamic: those that nobody starts, whose processes are anywhere.
+    """
+    known, free = list(nodes), frozenset(dynamic)
+    for one in limits:
+        message = f"cannot limit the node {quoted(one.node)}"
+        if one.node not in known:
+            hint = did_you_mean(one.node, known) or f"there are {', '.join(known)}"
+            raise DoraSystemdError(f"{message}: it is not there", hint, ExitCode.BAD_INPUT)
+        if one.node in free:
+            hint = "limit what it is started with"
+            reason = "it is dynamic, so it does not run inside the dataflow's unit"
+            raise DoraSystemdError(f"{message}: {reason}", hint, ExitCode.BAD_INPUT)
+
+
+def _refusal(what: str, hint: str) -> DoraSystemdError:
+    return DoraSystemdError(f"cannot use {what}", hint, ExitCode.USAGE)

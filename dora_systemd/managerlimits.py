@@ -1,0 +1,35 @@
+"""Whether the limits of a dataflow can be kept on this machine."""
+
+from pathlib import Path
+
+from dora_systemd import cgroup
+from dora_systemd.busprotocol import Manager
+from dora_systemd.limitchecks import check_controllers, needed_controllers, size_warnings
+from dora_systemd.limits import BY_KEY
+from dora_systemd.limitsettings import DEVICE
+from dora_systemd.machine import read_machine
+from dora_systemd.managerplan import Plan
+from dora_systemd.propertyset import Properties
+
+
+def check_limits(manager: Manager, plan: Plan, properties: Properties) -> tuple[str, ...]:
+    """Warnings about limits that go too far, and about devices that are not there.
+
+    Raises DoraSystemdError (NO_SYSTEMD) for a limit that nothing would hold up.
+    """
+    nodes = plan.options.node_limits
+    needed = needed_controllers(properties, nodes)
+    if needed:
+        available = cgroup.read_controllers(cgroup.group_path(manager.control_group()))
+        check_controllers(needed, available, plan.scope.is_user)
+    values = {limit.word: plan.settings.values[key] for key, limit in BY_KEY.items()}
+    return (*size_warnings(values, nodes, read_machine()), *_missing_devices(plan))
+
+
+def _missing_devices(plan: Plan) -> list[str]:
+    paths = (device.partition(" ")[0] for device in plan.settings[DEVICE])
+    return [
+        f"there is no device {path}"
+        for path in paths
+        if path.startswith("/") and not Path(path).exists()
+    ]

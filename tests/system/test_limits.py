@@ -1,0 +1,69 @@
+"""Limits that nothing would hold up are refused; the lab's container has no controllers."""
+
+import os
+
+from dora_systemd.cgroup import mount_point, read_controllers
+from dora_systemd.errors import ExitCode
+from tests.system.cells import Cell, Project
+from tests.system.refusals import Refusal, check_refusals
+
+BAD_LIMITS = (
+    *("--memory-limit=0", "--memory-limit=-1", "--memory-limit=4 gigs", "--memory-limit=4"),
+    *("--cpu-limit=0", "--cpu-limit=-2", "--cpu-limit=two", "--tasks-limit=0"),
+    *("--cpu-weight=0", "--io-weight=10001", "--nice=20", "--realtime=0", "--device=video0"),
+    *("--node-limit=sink", "--node-limit=sink:memory=0", "--node-limit=sink:mem=1G"),
+    *("--node-limit=sink:cpu=-1", "--node-limit=:cpu=1"),
+)
+
+
+def test_bad_limits(cell: Cell, project: Project) -> None:
+    flow = str(project.three_nodes())
+    refusals = [Refusal([flow, limit], ExitCode.USAGE, limit.split("=")[0]) for limit in BAD_LIMITS]
+    there = "there are source, doubler, sink"
+    refusals.append(Refusal([flow, "--node-limit=x:cpu=1"], ExitCode.BAD_INPUT, there))
+    refusals.append(Refusal([flow, "--node-limit=Sink:cpu=1"], ExitCode.BAD_INPUT, "mean sink?"))
+    check_refusals(cell, project, refusals)
+
+
+def test_bad_limits_in_the_settings_file(cell: Cell, project: Project) -> None:
+    flow = str(project.three_nodes())
+    for text, words in (
+        ("memory_limit: 0", "memory_limit in"),
+        ("nodes: {sink: {memory_limit: 4 gigs}}", "nodes.sink.memory_limit in"),
+        ("nodes: {snik: {memory_limit: 1G}}", "did you mean sink?"),
+        ("nodes: {sink: {nice: 5}}", "unknown key 'nice'"),
+        ("nodes: {sink: {memory: 1G}}", "did you mean memory_"),
+    ):
+        project.write("dataflow.systemd.yml", text)
+        check_refusals(cell, project, [Refusal([flow], ExitCode.BAD_INPUT, words)])
+
+
+def test_limits_without_controllers(cell: Cell, project: Project) -> None:
+    """Never pretend: neither for the dataflow nor for a node, nor by a property."""
+    missing = {"cpu", "memory", "pids", "io"} - read_controllers(mount_point())
+    flow = str(project.three_nodes())
+    flags = {
+        "memory": ("--memory-limit=1G", "--node-limit=sink:memory=1G", "--property=MemoryHigh=1G"),
+        "cpu": ("--cpu-limit=1", "--cpu-weight=50"),
+        "pids": ("--tasks-limit=100",),
+        "io": ("--io-weight=50", "--node-limit=sink:io-weight=50"),
+    }
+    words = "this systemd has no cgroup controller"
+    check_refusals(
+        cell,
+        project,
+        [
+            Refusal([flow, flag], ExitCode.NO_SYSTEMD, f"{words} '{controller}'")
+            for controller in missing
+            for flag in flags[controller]
+        ],
+    )
+
+
+def test_nice_and_devices(cell: Cell, project: Project) -> None:
+    done = cell.start(project.three_nodes(), "--device=/dev/video99:r", "--nice=3")
+    assert "doractl: there is no device /dev/video99" in done.stderr
+    assert "DeviceAllow=/dev/video99 r" in cell.doractl("show", cell.name).stdout
+    cell.wait_exchanging()
+    (pid,) = cell.pids("node-sink")
+    assert os.getpriority(os.PRIO_PROCESS, pid) == 3
