@@ -20,6 +20,7 @@ _EPILOG = """\b
 Examples:
   doractl logs robot                          all there is, in a pager
   doractl logs robot --node camera --follow   what one node writes, from now on
+  doractl logs robot --until-end -o json      all until it ends, for a program
   doractl logs robot --tail 100 --level warn  the last 100 warnings and errors
   doractl logs robot --run PREVIOUS --events  what happened to the run before this one
   journalctl -t robot/camera                  the same records, with systemd's own tool
@@ -45,6 +46,11 @@ Examples:
     "is_follow",
     is_flag=True,
     help="Wait for new lines; begins with the last 10 unless --tail or --since says more.",
+)
+@click.option(
+    "--until-end",
+    is_flag=True,
+    help="Follow until the dataflow has ended; a restart is no end.",
 )
 @click.option("--tail", type=click.IntRange(min=0), metavar="N", help="Only the last N lines.")
 @click.option(
@@ -95,7 +101,14 @@ Examples:
 )
 @click.option("--no-pager", is_flag=True, help="Do not use a pager.")
 @scope_options
-def command(selector: str, nodes: tuple[str, ...], run: str, no_pager: bool, **options: Any) -> int:
+def command(
+    selector: str,
+    nodes: tuple[str, ...],
+    run: str,
+    no_pager: bool,
+    until_end: bool,
+    **options: Any,
+) -> int:
     """Print what the nodes of a dataflow wrote, and what happened to them.
 
     Without SELECTOR: of all dataflows. It may have ended long ago.
@@ -104,19 +117,31 @@ def command(selector: str, nodes: tuple[str, ...], run: str, no_pager: bool, **o
     options["level"] = parse_level(options["level"]) if options["level"] else ""
     scope = current_scope()
     check_readable(scope)
+    if until_end:
+        # What this way of reading logs needs is no business of the others.
+        from dora_systemd.managerfollow import check_until_end, follow_to_end
+
+        check_until_end(selector, options["is_reverse"])
     journal = JournalReader()
     query = find_query(journal, LogRequest(selector, nodes, run, LogQuery(scope, **options)))
-    if not sys.stdout.isatty():
-        return _exit_status(pass_logs(query, sys.stdout.fileno()))
     lines = None
-    if query.output.startswith("short"):
+    if sys.stdout.isatty() and query.output.startswith("short"):
         known = query.nodes or (journal.known_nodes(query.name) if query.name else ())
         lines = TerminalLines([*known, query.name], want_dataflow=not query.name)
-    chunks = read_logs(query, lines)
-    if not (no_pager or query.is_follow):
-        _page(chunks)
-    else:
-        _write(chunks, sys.stdout.fileno())
+    if until_end:
+        follow_to_end(query, lambda step: _print(step, lines))
+        return ExitCode.OK
+    if no_pager or query.is_follow or not sys.stdout.isatty():
+        return _exit_status(_print(query, lines))
+    _page(read_logs(query, lines))
+    return ExitCode.OK
+
+
+def _print(query: LogQuery, lines: TerminalLines | None) -> int:
+    """Print the records of a query, rewritten for a terminal or as journalctl does."""
+    if not sys.stdout.isatty():
+        return pass_logs(query, sys.stdout.fileno())
+    _write(read_logs(query, lines), sys.stdout.fileno())
     return ExitCode.OK
 
 

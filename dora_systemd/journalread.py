@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.logquery import scope_matches
+from dora_systemd.logquery import journal_timestamp, scope_matches
 from dora_systemd.scope import Scope
 
 PERSISTENT = Path("/var/log/journal")
@@ -122,7 +122,7 @@ class JournalReader:
     def count_own(self, since_us: int, until_us: int) -> int:
         """How many records of this very process there are; CLOCK_REALTIME, µs, both included."""
         times = (("since", since_us), ("until", until_us))
-        options = [f"--{name}=@{us // 1_000_000}.{us % 1_000_000:06d}" for name, us in times]
+        options = [f"--{name}={journal_timestamp(us)}" for name, us in times]
         options += ["--quiet", "--boot", "--output=cat", "--output-fields=_PID"]
         with open_journalctl([*options, "--", f"_PID={os.getpid()}"]) as child:
             assert child.stdout

@@ -32,6 +32,7 @@ class LogQuery:
     invocation: of systemd, one life of the unit. run: dora's id of one run.
     since, until: as in systemd.time(7), or a bare duration, which means so long ago.
     tail: the last so many records.
+    cursor_file: begin behind the record that it names, write the last one's place there.
     """
 
     scope: Scope
@@ -50,6 +51,7 @@ class LogQuery:
     is_reverse: bool = False
     want_unprintable: bool = False
     output: str = "short"
+    cursor_file: str = ""
 
 
 def parse_level(text: str) -> str:
@@ -66,6 +68,11 @@ def journal_time(text: str) -> str:
     number = text.rstrip("abcdefghijklmnopqrstuvwxyz")
     is_duration = number.replace(".", "", 1).isdigit() and text[len(number) :] in _UNITS
     return f"-{text}" if is_duration else text
+
+
+def journal_timestamp(us: int) -> str:
+    """A CLOCK_REALTIME in µs as journalctl takes it."""
+    return f"@{us // 1_000_000}.{us % 1_000_000:06d}"
 
 
 def scope_matches(scope: Scope, name: str = "") -> list[str]:
@@ -118,13 +125,14 @@ def _with_level(base: list[str], level: str) -> list[str]:
 def query_arguments(query: LogQuery) -> list[str]:
     """The arguments of journalctl for a query."""
     options = [f"--output={query.output}"]
-    if query.output not in ("short", "short-precise"):
+    if query.output not in ("short", "short-precise") or query.cursor_file:
         options.append("--quiet")  # no line between two boots
     for option, value in (
         ("--since", journal_time(query.since)),
         ("--until", journal_time(query.until)),
         ("--grep", query.grep),
         ("--lines", "" if query.tail is None else str(query.tail)),
+        ("--cursor-file", query.cursor_file),
     ):
         if value:
             options.append(f"{option}={value}")

@@ -18,6 +18,7 @@ from dora_systemd.logquery import (
     UNIT_ENDS,
     LogQuery,
     end_matches,
+    journal_timestamp,
     query_arguments,
     query_matches,
 )
@@ -179,7 +180,7 @@ class FollowedLog:
         terminal: TerminalLines,
     ) -> None:
         query = LogQuery(scope, name=name, uuid=uuid)
-        since = f"--since=@{since_us // 1_000_000}.{since_us % 1_000_000:06d}"
+        since = f"--since={journal_timestamp(since_us)}"
         options = ["--follow", "--quiet", "--output=export", f"--output-fields={_FIELDS}", since]
         matches = [*query_matches(query), "+", *end_matches(scope, name)]
         self.has_ended = False

@@ -1,5 +1,6 @@
 """doractl logs with a real journal."""
 
+import json
 import os
 import pty
 import re
@@ -111,6 +112,38 @@ def test_follow(talking: Cell) -> None:
     assert lines.count("tick\n") > 5
 
 
+UNTIL_END = ["--until-end", "--tail", "1", "--grep", "is starting|finished|stopped|^tick"]
+
+
+def test_follow_until_the_end(talking: Cell) -> None:
+    """A restart is no end, and every line is there once, the last one too."""
+    command = ["doractl", talking.scope.flag, "logs", talking.name, "-o", "json", *UNTIL_END]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as child:
+        assert child.stdout
+        lines = [child.stdout.readline()]
+        talking.systemctl("restart")
+        while "is starting" not in lines[-1]:
+            lines.append(child.stdout.readline())
+            assert lines[-1]
+        talking.systemctl("stop")
+        lines += child.stdout.readlines()
+        assert child.wait() == 0
+    seen = [json.loads(line) for line in lines]
+    assert seen[-1]["DORA_EVENT"] == "dataflow-stopped"
+    since = ("--since", f"@{int(seen[0]['__REALTIME_TIMESTAMP']) / 1e6:.6f}")
+    again = logs(talking, talking.name, "-o", "json", *UNTIL_END[-2:], *since)
+    cursors = [json.loads(line)["__CURSOR"] for line in again]
+    assert [one["__CURSOR"] for one in seen] == cursors[cursors.index(seen[0]["__CURSOR"]) :]
+
+
+def test_until_the_end_of_what_does_not_run(talking: Cell) -> None:
+    talking.systemctl("stop")
+    run("journalctl", "--sync")
+    shown = messages(talking, "--until-end", "--tail", "3")
+    assert shown == messages(talking, "--tail", "3")
+    assert messages(talking, "--until-end") == messages(talking, "--tail", "10")
+
+
 def test_terminal(talking: Cell) -> None:
     """Aligned and coloured; the pager is not asked for."""
     master, slave = pty.openpty()
@@ -153,6 +186,8 @@ BAD_INPUT = [
     (["{name}", "--level", "loud"], 2, "cannot use 'loud' as a level", "error, warn"),
     (["{name}", "--grep", "("], 2, "cannot use the pattern", ""),
     (["{name}", "--run", "PREVIOUS"], 4, "cannot find the previous run", "--run ALL"),
+    (["--until-end"], 2, "cannot wait for the end of all dataflows", "doractl logs NAME"),
+    (["{name}", "-r", "--until-end"], 2, "cannot follow with the newest", "--reverse"),
     (["--node", "cam-left"], 2, "cannot select nodes of all dataflows", ""),
     (["{name}", "-o", "yaml"], 2, "cannot read the command line", ""),
     (["{name}", "--tail", "-1"], 2, "cannot read the command line", ""),

@@ -94,6 +94,7 @@ USE_CASES = {
         "managercells",
         "managerended",
         "managerlimits",
+        "managerfollow",
         "managerlist",
         "managerlogs",
         "managernode",
