@@ -13,7 +13,18 @@ LAB = Path(__file__).with_name("lab")
 RUNS = Path("/run/dora-systemd-lab")
 
 
-@pytest.fixture(params=["container", "vm"])
+FORMS = ["container", "vm"]
+
+
+@pytest.fixture(scope="session", autouse=True)
+def images(request: pytest.FixtureRequest) -> None:
+    """Build what is missing, in sight of who waits: what the lab says then is no test's output."""
+    with request.config.pluginmanager.getplugin("capturemanager").global_and_fixture_disabled():
+        for form in FORMS:
+            subprocess.run([LAB, "build"], env={**os.environ, "LAB": form}, check=True)
+
+
+@pytest.fixture(params=FORMS)
 def env(request: pytest.FixtureRequest) -> Iterator[dict[str, str]]:
     yield {**os.environ, "LAB": request.param}
     assert_nothing_left()
