@@ -20,11 +20,10 @@ def log_rates(settings: Settings) -> RateLimits:
     return merge_rates(nodes, settings[LOG_RATE_LIMIT])
 
 
-def check_rates(settings: Settings, nodes: Sequence[str]) -> None:
-    """Raise DoraSystemdError (USAGE) for a limit of a node that is none of `nodes`."""
-    for node in settings[LOG_RATE_LIMIT]:
+def check_rates(limits: RateLimits, nodes: Sequence[str]) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) for a limit of a node that is none of `nodes`."""
+    for node in limits:
         if node != ALL_NODES and node not in nodes:
-            source = settings.source(LOG_RATE_LIMIT)
-            message = f"cannot limit the lines of node {quoted(node)}: there is none ({source})"
+            message = f"cannot limit the lines of the node {quoted(node)}: it is not there"
             hint = did_you_mean(node, nodes) or f"there are {', '.join(nodes)}"
-            raise DoraSystemdError(message, hint, ExitCode.USAGE)
+            raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)

@@ -138,7 +138,7 @@ def _check_plan(plan: Plan) -> None:
         )
     # dora validate accepts paths that are not there, and other things that no node can run with.
     prepared = prepare(options, plan.environment)
-    check_rates(plan.settings, [node.id for node in prepared.dataflow.nodes])
+    check_rates(options.log_rates, [node.id for node in prepared.dataflow.nodes])
 
 
 def _directory(settings: Settings, dataflow: Path) -> str:

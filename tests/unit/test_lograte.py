@@ -90,15 +90,15 @@ def test_a_node_in_a_file_cannot_name_another() -> None:
     assert merge_rates({}, {}) == {}
 
 
-def test_a_flag_must_name_a_node_that_is_there() -> None:
-    given_settings = settings(("1/1s", "camra=1/1s"))
+def test_a_limit_must_name_a_node_that_is_there() -> None:
+    limits = parse_rates(("1/1s", "camra=1/1s"))
     with pytest.raises(DoraSystemdError, match=r"^cannot limit the lines .*'camra'") as caught:
-        check_rates(given_settings, ["camera", "lidar"])
+        check_rates(limits, ["camera", "lidar"])
     assert caught.value.hint == "did you mean camera?"
     with pytest.raises(DoraSystemdError) as caught:
-        check_rates(given_settings, ["one", "two"])
+        check_rates(limits, ["one", "two"])
     assert caught.value.hint == "there are one, two"
-    check_rates(given_settings, ["camra"])
+    check_rates(limits, ["camra"])
 
 
 def test_window() -> None:
