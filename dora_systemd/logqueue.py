@@ -15,6 +15,8 @@ from typing import Protocol
 MAX_RECORDS = 20_000
 
 MakeEntries = Callable[[], list[bytes]]
+Note = Callable[[int], object]
+"""Is told how many entries of an item wait, when some of them or all have been taken."""
 
 
 class Journal(Protocol):
@@ -35,13 +37,18 @@ class Journal(Protocol):
         """Block until then, at most `seconds`."""
 
 
+def _ignore(left: int) -> None:
+    """For what nobody asks about."""
+
+
 @dataclass
 class _Lane:
     """The entries of one node that journald has not taken yet."""
 
-    items: deque[MakeEntries] = field(default_factory=deque)
+    items: deque[tuple[MakeEntries, Note]] = field(default_factory=deque)
     # The entries of the item whose turn it is, last one first.
     entries: list[bytes] = field(default_factory=list)
+    note: Note = _ignore
     is_flood: bool = False
     # How many of the items are records, see put_record.
     records: int = 0
@@ -82,11 +89,13 @@ class LogQueue:
         self._turn = 0
         self._lost = 0
 
-    def put(self, node: str, make_entries: MakeEntries, is_flood: bool = False) -> None:
+    def put(
+        self, node: str, make_entries: MakeEntries, is_flood: bool = False, note: Note = _ignore
+    ) -> None:
         """Send the entries of a node after its earlier ones, now or as soon as possible."""
         lane = self._lanes.setdefault(node, _Lane())
         was_waiting = lane.waiting
-        lane.items.append(make_entries)
+        lane.items.append((make_entries, note))
         if was_waiting:
             return
         lane.is_flood = is_flood
@@ -139,7 +148,9 @@ class LogQueue:
         """Forget what waits; how many entries that were, with those counted before."""
         waiting = len(self._events)
         for lane in self._lanes.values():
-            waiting += len(lane.entries) + sum(len(make_entries()) for make_entries in lane.items)
+            waiting += len(lane.entries) + sum(
+                len(make_entries()) for make_entries, _ in lane.items
+            )
         self._lanes.clear()
         self._events.clear()
         return waiting + self.take_lost()
@@ -154,11 +165,14 @@ class LogQueue:
         entries, items = lane.entries, lane.items
         while entries or items:
             if not entries:
-                entries += reversed(items.popleft()())
+                make_entries, lane.note = items.popleft()
+                entries += reversed(make_entries())
             while entries:
                 if not send(entries[-1]):
+                    lane.note(len(entries))
                     return False
                 entries.pop()
+            lane.note(0)
         lane.records = 0
         return True
 

@@ -54,6 +54,11 @@ class LineSplitter:
             lines = [line if type(line) is Piece else line.removesuffix(b"\r") for line in lines]
         return lines
 
+    @property
+    def rest(self) -> bytes:
+        """What came after the last newline."""
+        return self._rest
+
     def _cut(self, line: bytes) -> list[bytes]:
         cuts = range(0, max(len(line), 1), self.limit)
         pieces: list[bytes] = [Piece(line[cut : cut + self.limit]) for cut in cuts]

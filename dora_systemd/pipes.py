@@ -11,9 +11,11 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from dora_systemd.cellpaths import CellPaths
 from dora_systemd.events import event_fields
+from dora_systemd.heldlines import HeldLines, read_held
 from dora_systemd.logfields import Value, encode_entry
 from dora_systemd.logqueue import Journal, LogQueue
 from dora_systemd.lograte import LineLimiter, RateLimit, format_rate
@@ -76,16 +78,29 @@ class LogPipes:
             fd = os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
             if self._keep is not None:
                 self._keep(fd)
-            self.adopt(node_id, stream, fd)
+            self.adopt(node_id, stream, fd, HeldLines(path))
 
-    def adopt(self, node_id: str, stream: str, fd: int) -> None:
-        """Begin to read `fd`, a pipe that is open already, as "stdout" or "stderr" of a node."""
+    def adopt(self, node_id: str, stream: str, fd: int, held: HeldLines | None = None) -> None:
+        """Begin to read `fd`, a pipe that is open already, as "stdout" or "stderr" of a node.
+
+        held: where to note what has been read of it and is not in the journal.
+        """
         source = self._source(node_id)
         os.set_blocking(fd, False)
-        pipe = Pipe(fd, stream, LineEncoder(source.origin, stream))
+        pipe = Pipe(fd, stream, LineEncoder(source.origin, stream), held=held)
         source.pipes.append(pipe)
         if not self._queue.waiting(node_id):
             self._loop.add_reader(fd, self._read_pipe, node_id, pipe)
+
+    def replay(self, node_id: str, path: Path) -> None:
+        """Write what another process had read of the FIFO at `path`, and could not write any more.
+
+        It comes before what is in the pipe, which was adopted last.
+        """
+        pipe = self._source(node_id).pipes[-1]
+        data, done = read_held(path)
+        lines = pipe.lines(data)[done:] if data else []
+        self._queue.put(node_id, lambda: list(map(pipe.encoder.entry, lines)))
 
     def set_pid(self, node_id: str, pid: int) -> None:
         """The node's lines come from process `pid` from now on; 0: from its next one."""
@@ -192,7 +207,7 @@ class LogPipes:
         for source in self._sources.values():
             for pipe in source.pipes:
                 self._loop.remove_reader(pipe.fd)
-                os.close(pipe.fd)
+                pipe.close()
             source.pipes.clear()
         for fd in list(self._outputs):
             self._end_output(fd)
@@ -225,8 +240,8 @@ class LogPipes:
 
     def _put(self, node_id: str, pipe: Pipe, data: bytes, is_flood: bool) -> None:
         source = self._source(node_id)
-        make_entries = source.entries(pipe, data, self._loop.time())
-        self._queue.put(node_id, make_entries, is_flood)
+        batch = source.batch(pipe, data, self._loop.time())
+        self._queue.put(node_id, batch.entries, is_flood, batch.note)
         self._watch_limit(source, pipe.stream)
 
     def _watch_limit(self, source: Source, stream: str) -> None:

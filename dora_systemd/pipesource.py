@@ -2,13 +2,12 @@
 
 import asyncio
 import os
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from dora_systemd.cellpaths import CellPaths
+from dora_systemd.heldlines import HeldLines
 from dora_systemd.lograte import LineLimiter
 from dora_systemd.logs import LineEncoder, LineSplitter, Origin
 
@@ -32,6 +31,12 @@ class Pipe:
     splitter: LineSplitter = field(default_factory=LineSplitter)
     since: float = 0.0
     taken: int = 0
+    # Where what is on its way is noted; how many batches that is, and lines of earlier ones.
+    held: HeldLines | None = None
+    batches: int = 0
+    noted: int = 0
+    # Whether the last line has not ended.
+    is_open: bool = False
 
     def read(self) -> bytes:
         """What is in the pipe, CHUNK bytes at most."""
@@ -39,6 +44,12 @@ class Pipe:
             return os.read(self.fd, CHUNK)
         except BlockingIOError:
             return b""
+
+    def close(self) -> None:
+        """Close it, and what is noted of it."""
+        os.close(self.fd)
+        if self.held is not None:
+            self.held.close()
 
     def is_flood(self, size: int, now: float) -> bool:
         """Whether the pipe, which has just given `size` bytes, floods; `now` in seconds."""
@@ -50,6 +61,32 @@ class Pipe:
     def lines(self, data: bytes) -> list[bytes]:
         """The lines that `data` completes; no data: the line that nothing will."""
         return self.splitter.feed(data) if data else self.splitter.flush()
+
+    def take(self, data: bytes) -> None:
+        """Note `data` as on its way, in a batch that is to come; none: nothing ends the line."""
+        self.batches += 1
+        if not data and self.is_open:
+            data = b"\n"
+        if data:
+            self.is_open = data[-1:] != b"\n"
+            if self.held is not None:
+                self.held.add(data)
+
+    def note_part(self, lines: int) -> None:
+        """Journald has so many lines of the batch whose turn it is."""
+        if self.held is not None:
+            self.held.sent(self.noted + lines)
+
+    def note_all(self, lines: int) -> None:
+        """Journald has all of it, which is `lines`."""
+        self.batches -= 1
+        self.noted += lines
+        if self.batches:
+            self.note_part(0)
+            return
+        self.noted = 0
+        if self.held is not None:
+            self.held.restart(self.splitter.rest)
 
 
 @dataclass
@@ -70,28 +107,50 @@ class Source:
         for pipe in self.pipes:
             pipe.encoder = LineEncoder(self.origin, pipe.stream)
 
-    def entries(self, pipe: Pipe, data: bytes, now: float) -> Callable[[], list[bytes]]:
-        """What makes the journal entries of the lines that `data` of `pipe` completes.
-
-        `now` in seconds. They are made late, because what waits for journald should be small.
-        """
+    def batch(self, pipe: Pipe, data: bytes, now: float) -> "LineBatch":
+        """The entries of the lines that `data` of `pipe` completes; `now` in seconds."""
+        pipe.take(data)
         if self.limiter is None:
-            return partial(_entries_of_data, pipe, pipe.encoder, data)
+            return LineBatch(pipe, data)
         lines = pipe.lines(data)
-        passed = self.admit(pipe.stream, len(lines), now)
-        return partial(_entries_of_lines, pipe.encoder, lines[:passed])
+        return LineBatch(pipe, data, lines, self.admit(pipe.stream, len(lines), now))
 
     def admit(self, stream: str, count: int, now: float) -> int:
         """How many of `count` lines that have come at `now`, in seconds, may pass."""
         return count if self.limiter is None else self.limiter.admit(stream, count, now)
 
 
-def _entries_of_data(pipe: Pipe, encoder: LineEncoder, data: bytes) -> list[bytes]:
-    return _entries_of_lines(encoder, pipe.lines(data))
+class LineBatch:
+    """Entries on their way. They are made late, because what waits for journald should be small.
 
+    data: what was read of `pipe`. lines, passed: of a node with a limit, whose lines had to be
+    looked at already: those of `data`, and how many of them are sent.
+    """
 
-def _entries_of_lines(encoder: LineEncoder, lines: list[bytes]) -> list[bytes]:
-    return list(map(encoder.entry, lines))
+    def __init__(
+        self, pipe: Pipe, data: bytes, lines: list[bytes] | None = None, passed: int = 0
+    ) -> None:
+        self._pipe = pipe
+        self._encoder = pipe.encoder
+        self._data = data
+        self._lines = lines
+        self._passed = passed
+        self._count = 0
+
+    def entries(self) -> list[bytes]:
+        """Make them."""
+        lines = self._pipe.lines(self._data) if self._lines is None else self._lines
+        self._count = len(lines)
+        if self._lines is None:
+            self._passed = self._count
+        return list(map(self._encoder.entry, lines[: self._passed]))
+
+    def note(self, left: int) -> None:
+        """Journald has taken all but the last `left` entries."""
+        if left:
+            self._pipe.note_part(self._passed - left)
+        else:
+            self._pipe.note_all(self._count)
 
 
 def fifos(node_id: str, paths: CellPaths) -> dict[str, Path]:

@@ -67,6 +67,7 @@ def write_last_words(
             if path.suffix in STREAMS:
                 fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
                 pipes.adopt(path.stem, STREAMS[path.suffix], fd)
+                pipes.replay(path.stem, path)
                 pipes.drain(path.stem)
     pipes.write_event("dataflow-failed", reason=reason)
     pipes.close()

@@ -232,6 +232,22 @@ def test_runner_killed_with_lines_in_the_pipes(cell: Cell, project: Project) -> 
     (done / "done").unlink()
 
 
+@pytest.mark.lab
+@pytest.mark.warns(*LOST, ZENOH)
+def test_runner_killed_in_a_flood(cell: Cell, project: Project) -> None:
+    """What it had read and not written is not lost either."""
+    cell.start(flow(project, ENDLESS, "n1", "n2"))
+    for node in ("n1", "n2"):
+        wait_for("a flood", lambda node=node: len(printed(cell, node)) > 2000)  # type: ignore[misc]
+    os.kill(cell.supervisor_pid("runner"), signal.SIGKILL)
+    wait_end(cell)
+    for node in ("n1", "n2"):
+        lines = [line for line in printed(cell, node) if line.endswith(" flood")]
+        assert sorted(set(lines)) == numbered(int(lines[-1].split()[0]) + 1)
+        # The kill may fall between a line and the note that it was written.
+        assert len(lines) - len(set(lines)) <= 20
+
+
 def suppressed(cell: Cell, node: str) -> int:
     """How many lines of a node its limit took, as the events tell."""
     matches = ("DORA_EVENT=lines-suppressed", f"DORA_NODE={node}")

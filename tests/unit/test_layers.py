@@ -81,7 +81,7 @@ ADAPTERS = {
     "jsonl": ["jsonl"],
     "machine": ["machine"],
     "notify": ["notify"],
-    "pipes": ["pipes", "pipesource", "logqueue"],
+    "pipes": ["pipes", "pipesource", "heldlines", "logqueue"],
     "process": ["process"],
 }
 SHARED = {
