@@ -53,6 +53,10 @@ class CellPaths:
         """The FIFO that is the standard error of `node`."""
         return self.io / f"{node}.err"
 
+    def node_place(self, node: str) -> Path:
+        """How far dora's own log file of `node` is in the journal."""
+        return self.io / f"{node}.place"
+
     def node_pid(self, node: str) -> Path:
         """Where the launcher of `node` notes its pid, before anything else it does."""
         return self.io / f"{node}.pid"

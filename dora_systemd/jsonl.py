@@ -6,6 +6,7 @@ read twice or passed over as long as dora keeps one file more than was written b
 """
 
 import asyncio
+import contextlib
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -20,6 +21,8 @@ MAX_ROTATED = 1000
 # A line of at most 1 MiB grows up to sixfold when it is escaped.
 LINE_LIMIT = 8 << 20
 
+PLACE_SUFFIX = ".place"
+
 Put = Callable[[dict[str, Value]], None]
 
 
@@ -28,6 +31,7 @@ class JsonlTail:
 
     path: log_<node>.jsonl, which may not exist yet. put: takes the journal fields of each line.
     is_busy: while it says so nothing is read, the lines stay in the file.
+    place: where to note how far the journal has the lines; see resume_tail().
     lost_files: how often dora deleted a rotated file before it was read.
     """
 
@@ -37,6 +41,7 @@ class JsonlTail:
         path: Path,
         put: Put,
         is_busy: Callable[[], bool] = lambda: False,
+        place: Path | None = None,
     ) -> None:
         self.path = path
         self.lost_files = 0
@@ -46,10 +51,13 @@ class JsonlTail:
         self._lines = LineSplitter(LINE_LIMIT)
         self._fd = -1
         self._timer: asyncio.TimerHandle | None = None
+        self._place = _Place(place, path) if place is not None else None
 
     def start(self) -> None:
         """Begin to look, every POLL_SECONDS."""
+        self._note_place()
         has_more = not self._is_busy() and self._read_chunk()
+        self._note_place()
         self._timer = self._loop.call_later(0 if has_more else POLL_SECONDS, self.start)
 
     def drain(self) -> bool:
@@ -67,6 +75,26 @@ class JsonlTail:
         for line in self._lines.flush():
             self._put(jsonl_fields(line))
         self._shut()
+        if self._place is not None:
+            self._place.close()
+
+    @property
+    def loss(self) -> str:
+        """Why lines are lost, "" if none are. How many nobody knows: dora does not count them."""
+        if not self.lost_files:
+            return ""
+        return f"dora deleted {self.lost_files} of its log files before they were read"
+
+    def resume(self, inode: int, offset: int) -> None:
+        """Begin with byte `offset` of the file `inode`, if it is still there."""
+        for path in self._chain():
+            if _inode(path) == inode and self._open(path):
+                os.lseek(self._fd, offset, os.SEEK_SET)
+
+    def _note_place(self) -> None:
+        if self._place is not None and self._fd >= 0 and not self._is_busy():
+            offset = os.lseek(self._fd, 0, os.SEEK_CUR) - len(self._lines.rest)
+            self._place.note(os.fstat(self._fd).st_ino, offset)
 
     def _read_chunk(self) -> bool:
         """Read on, in the next file if this one is at its end; whether there was anything."""
@@ -126,6 +154,38 @@ class JsonlTail:
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
+
+
+class _Place:
+    """Inode and offset in a file that outlives this process, with the path of what they are in."""
+
+    def __init__(self, path: Path, log: Path) -> None:
+        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
+        self._log = log
+        self._noted = (0, -1)
+
+    def note(self, inode: int, offset: int) -> None:
+        if self._noted != (inode, offset):
+            self._noted = (inode, offset)
+            with contextlib.suppress(OSError):
+                # One call and always of one length: there is no half of it.
+                os.pwrite(self._fd, b"%020d %020d %s" % (inode, offset, bytes(self._log)), 0)
+
+    def close(self) -> None:
+        os.close(self._fd)
+
+
+def resume_tail(loop: asyncio.AbstractEventLoop, place: Path, put: Put) -> JsonlTail | None:
+    """What follows the file that another process followed, from the place that it noted.
+
+    None if it had read nothing.
+    """
+    words = place.read_bytes().split(b" ", 2)
+    if len(words) != 3:
+        return None
+    tail = JsonlTail(loop, Path(os.fsdecode(words[2])), put)
+    tail.resume(int(words[0]), int(words[1]))
+    return tail
 
 
 def _inode(path: Path) -> int:

@@ -78,7 +78,8 @@ class Nodes:
         for node in self._tails:
             path = self._paths.work / "out" / run / f"log_{node}.jsonl"
             put = partial(self._pipes.write_fields, node=node)
-            tail = JsonlTail(loop, path, put, partial(self._pipes.is_busy, node))
+            is_busy = partial(self._pipes.is_busy, node)
+            tail = JsonlTail(loop, path, put, is_busy, self._paths.node_place(node))
             self._tails[node] = tail
             tail.start()
 
@@ -112,9 +113,8 @@ class Nodes:
                 continue
             tail.close()
             self._pipes.drain(node)  # what the limit took of the very last lines
-            if tail.lost_files:
-                reason = f"dora deleted {tail.lost_files} of its log files before they were read"
-                self._pipes.write_event("lines-lost", node, count="Some", reason=reason)
+            if tail.loss:
+                self._pipes.write_event("lines-lost", node, count="Some", reason=tail.loss)
         self._tails.clear()
 
     def drain(self, nodes: Iterable[str]) -> None:

@@ -9,9 +9,19 @@ that of the runner.
 import contextlib
 import os
 import sys
+import time
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+if TYPE_CHECKING:
+    from asyncio import AbstractEventLoop
+
+    from dora_systemd.pipes import LogPipes
+
+QUIET_SECONDS = 0.1
+DAEMON_SECONDS = 5.0
 STREAMS = {".out": "stdout", ".err": "stderr"}
 
 
@@ -69,11 +79,34 @@ def write_last_words(
                 pipes.adopt(path.stem, STREAMS[path.suffix], fd)
                 pipes.replay(path.stem, path)
                 pipes.drain(path.stem)
+        read_logs_of_dora(loop, pipes, paths.io)
     pipes.write_event("dataflow-failed", reason=reason)
     pipes.close()
     journal.wait_read(1.0)
     journal.close()
     loop.close()
+
+
+def read_logs_of_dora(loop: "AbstractEventLoop", pipes: "LogPipes", io: Path) -> None:
+    """Write what dora's own log files have more than the runner has read.
+
+    The daemon may still live, and writes what the nodes said last. Raises OSError.
+    """
+    from dora_systemd.jsonl import PLACE_SUFFIX, resume_tail
+
+    places = [path for path in sorted(io.iterdir()) if path.suffix == PLACE_SUFFIX]
+    found = {
+        path.stem: resume_tail(loop, path, partial(pipes.write_fields, node=path.stem))
+        for path in places
+    }
+    tails = {node: tail for node, tail in found.items() if tail is not None}
+    deadline = time.monotonic() + DAEMON_SECONDS
+    while sum(tail.drain() for tail in tails.values()) and time.monotonic() < deadline:
+        time.sleep(QUIET_SECONDS)
+    for node, tail in tails.items():
+        tail.close()
+        if tail.loss:
+            pipes.write_event("lines-lost", node, count="Some", reason=tail.loss)
 
 
 def kill_nodes() -> None:

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dora_systemd.jsonl import JsonlTail
+from dora_systemd.jsonl import JsonlTail, resume_tail
+from dora_systemd.logfields import Value
 from dora_systemd.logs import jsonl_fields
 
 
@@ -71,6 +72,44 @@ def test_many_lines(loop: asyncio.AbstractEventLoop, tmp_path: Path) -> None:
     assert found == numbers(10_000)
 
 
+def test_a_kill_and_who_comes_after(loop: asyncio.AbstractEventLoop, tmp_path: Path) -> None:
+    """The place that is noted is that of what the journal has, over rotations too."""
+    dora, place = Dora(tmp_path), tmp_path / "a.place"
+    busy: list[int] = []
+    found: list[str] = []
+
+    def put(fields: dict[str, Value]) -> None:
+        found.append(str(fields["MESSAGE"]))
+
+    first = JsonlTail(loop, dora.path, put, lambda: bool(busy), place)
+    first.start()
+    assert resume_tail(loop, place, put) is None
+    dora.write(5)
+    first.start()
+    with dora.path.open("a") as file:
+        file.write('{"ts": "t", "level": "stdout", ')
+    first.start()
+    assert found == numbers(5)
+    with dora.path.open("a") as file:
+        file.write('"stream": "stdout", "msg": "5"}\n')
+    dora.count = 6
+    dora.rotate(2)
+    dora.write(4)
+    second = resume_tail(loop, place, put)
+    assert second is not None
+    second.close()
+    assert found == numbers(10)
+    busy.append(1)  # what was read but not taken stays behind the place
+    first.drain()
+    first.start()
+    found.clear()
+    third = resume_tail(loop, place, put)
+    assert third is not None
+    third.close()
+    assert found == numbers(10)[5:]
+    first.close()
+
+
 def test_truncated_by_dora_1_0(loop: asyncio.AbstractEventLoop, tmp_path: Path) -> None:
     dora = Dora(tmp_path)
     follower, found = tail(loop, dora)
@@ -101,6 +140,7 @@ def test_rotated(tmp_path_factory: pytest.TempPathFactory, steps: list[str]) -> 
     loop.close()
     assert found == numbers(dora.count)
     assert follower.lost_files == 0
+    assert follower.loss == ""
 
 
 def test_deleted_before_it_was_read(loop: asyncio.AbstractEventLoop, tmp_path: Path) -> None:
@@ -114,7 +154,7 @@ def test_deleted_before_it_was_read(loop: asyncio.AbstractEventLoop, tmp_path: P
     dora.write()
     follower.close()
     assert found == ["0", "1", "3", "4"]
-    assert follower.lost_files == 1
+    assert follower.loss == "dora deleted 1 of its log files before they were read"
 
 
 def test_waits_while_the_journal_is_busy(tmp_path: Path) -> None:
