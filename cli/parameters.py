@@ -1,13 +1,16 @@
 """Options and arguments that several verbs have in common."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
 from dora_systemd.errors import ExitCode
-from dora_systemd.managerstop import Outcome
 from dora_systemd.scope import Scope, scope_of
+
+if TYPE_CHECKING:
+    # Verbs that print no outcomes need not wait for it.
+    from dora_systemd.managerstop import Outcome
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -58,7 +61,7 @@ def _remember(ctx: click.Context, param: click.Parameter, value: bool | None) ->
         ctx.meta[_SCOPE_KEY] = value
 
 
-def print_outcomes(outcomes: Sequence[Outcome]) -> int:
+def print_outcomes(outcomes: "Sequence[Outcome]") -> int:
     """One line for each dataflow; the exit status is FAILURE if any has a problem."""
     for one in outcomes:
         if one.problem:
