@@ -25,6 +25,7 @@ VERBS = {
     "stop": Verb("stop", "Stop dataflows."),
     "restart": Verb("restart", "Restart dataflows."),
     "node": Verb("node", "Restart or stop a single node."),
+    "set": Verb("set", "Change limits of a dataflow that runs."),
     "show": Verb("show", "Print the unit of a dataflow."),
     "dora": Verb("dora", "Run the dora command against one dataflow."),
     "version": Verb("version", "Print the versions of all that takes part."),

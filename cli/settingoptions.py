@@ -1,10 +1,11 @@
 """The options of `start` and `run`: one for each setting that has a flag, made from its table."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import click
 
+from dora_systemd.limitsettings import LIVE_SETTINGS
 from dora_systemd.settingkinds import Setting
 from dora_systemd.settingtable import SETTINGS
 
@@ -13,7 +14,16 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 def setting_options(function: F) -> F:
     """All flags of the settings. Their raw values arrive as keyword arguments by setting name."""
-    for setting in reversed(SETTINGS):
+    return _options(SETTINGS, function)
+
+
+def live_options(function: F) -> F:
+    """The flags of those that can be changed while a dataflow runs."""
+    return _options(LIVE_SETTINGS, function)
+
+
+def _options(settings: Sequence[Setting[Any]], function: F) -> F:
+    for setting in reversed(settings):
         if setting.flags:
             function = _option(setting)(function)
     return function

@@ -7,6 +7,7 @@ Everything here follows the kernel's "Control Group v2" document. A group is nam
 import contextlib
 import errno
 import os
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -14,6 +15,9 @@ from pathlib import Path
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.limits import NodeLimits
+from dora_systemd.oom import OomCounts
+from dora_systemd.pressure import Load
+from dora_systemd.values import SECOND
 
 NODE_PREFIX = "node-"
 MOUNTS = (Path("/sys/fs/cgroup"), Path("/sys/fs/cgroup/unified"))
@@ -27,13 +31,16 @@ _ABSENT = (errno.ENOENT, errno.ENODEV, errno.EOPNOTSUPP, errno.ENOTSUP)
 class Usage:
     """What one group uses. CPU in µs since the group was made, memory in bytes, None: not known.
 
-    memory_max is UNLIMITED where there is no limit.
+    memory_max is UNLIMITED where there is no limit; cpu_max, in µs per second, too. throttling:
+    periods in which the group wanted to run, and those in which it had to wait for its cpu.max.
     """
 
     cpu_us: int
     memory: int | None = None
     memory_peak: int | None = None
     memory_max: int | None = None
+    cpu_max: int | None = None
+    throttling: tuple[int, int] = (0, 0)
 
 
 @cache
@@ -82,21 +89,55 @@ def read_usage(path: Path) -> Usage:
     Without a memory controller the memory is the sum of the processes' resident sets.
     """
     current = _read_number(path / "memory.current")
+    cpu = read_cpu(path)
     return Usage(
-        cpu_us=read_cpu_us(path),
+        cpu_us=cpu.cpu_us,
         memory=sum(map(_resident_bytes, pids(path))) if current is None else current,
         memory_peak=_read_number(path / "memory.peak"),
         memory_max=_read_number(path / "memory.max"),
+        cpu_max=_read_share(path / "cpu.max"),
+        throttling=cpu.throttling,
     )
 
 
-def read_cpu_us(path: Path) -> int:
-    """CPU time of a group in µs: usage_usec of cpu.stat, there even without a cpu controller."""
-    for line in _read_text(path / "cpu.stat").splitlines():
-        key, _, value = line.partition(" ")
-        if key == "usage_usec":
-            return int(value)
-    return 0
+def read_oom(path: Path) -> OomCounts:
+    """How often the kernel has killed in a group, and how often its own limit was the reason."""
+    return OomCounts(
+        read_numbers(path / "memory.events").get("oom_kill", 0),
+        read_numbers(path / "memory.events.local").get("oom", 0),
+    )
+
+
+def read_load(path: Path) -> Load:
+    """How close a group is to its limit of memory; its throttling is for the caller to say.
+
+    What counts is what the kernel cannot drop: it fills every group up with files it has read.
+    """
+    limits = [_read_number(path / name) for name in ("memory.max", "memory.high")]
+    limit = min((one for one in limits if one is not None), default=UNLIMITED)
+    if limit == UNLIMITED:
+        return Load()
+    stat = read_numbers(path / "memory.stat")
+    return Load(stat.get("anon", 0) + stat.get("shmem", 0), limit, _read_stalled(path))
+
+
+def _read_stalled(path: Path) -> float:
+    """avg10 of "some" in memory.pressure, see the kernel's "PSI" document; 0 where it is off."""
+    match = re.search(r"^some avg10=([0-9.]+)", _read_text(path / "memory.pressure"))
+    return float(match[1]) if match else 0.0
+
+
+def read_cpu(path: Path) -> Usage:
+    """CPU time and throttling of a group alone; there even without a cpu controller."""
+    numbers = read_numbers(path / "cpu.stat")
+    throttling = numbers.get("nr_periods", 0), numbers.get("nr_throttled", 0)
+    return Usage(numbers.get("usage_usec", 0), throttling=throttling)
+
+
+def read_numbers(path: Path) -> dict[str, int]:
+    """The numbers of a control file with one KEY NUMBER in a line; {} where there is none."""
+    pairs = (line.partition(" ") for line in _read_text(path).splitlines())
+    return {key: int(value) for key, _, value in pairs}
 
 
 def pids(path: Path) -> list[int]:
@@ -147,7 +188,7 @@ def limit_group(path: Path, limits: NodeLimits) -> None:
             reason = f"its group has no {file}"
         except OSError as error:
             is_limited, reason = False, f"{error.strerror} ({file}: {text})"
-        if not is_limited:
+        if not is_limited and not text.startswith("max"):
             raise DoraSystemdError(
                 f"cannot limit the node {limits.node}: {reason}",
                 "the kernel, or the container, does not give that to this dataflow",
@@ -210,6 +251,14 @@ def _read_number(path: Path) -> int | None:
     if not text:
         return None
     return UNLIMITED if text == "max" else int(text)
+
+
+def _read_share(path: Path) -> int | None:
+    """cpu.max as µs per second."""
+    quota, _, period = _read_text(path).strip().partition(" ")
+    if not period:
+        return None
+    return UNLIMITED if quota == "max" else int(quota) * SECOND // int(period)
 
 
 def _resident_bytes(pid: int) -> int:

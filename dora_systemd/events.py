@@ -45,7 +45,16 @@ EVENTS = {
         "436622a1703a4db68ed8a1aac4ddc336", WARNING, "Node {node} is being restarted by dora"
     ),
     "node-oom": EventKind(
-        "1e5f89981faf4b0ba7cd69e0b844f9a3", ERR, "Node {node} was killed by its memory limit"
+        "1e5f89981faf4b0ba7cd69e0b844f9a3", ERR, "Node {node} was killed for want of memory"
+    ),
+    "dataflow-oom": EventKind(
+        "074b91207b234b46973343bb14a637a9", ERR, "Dataflow {dataflow} has used up its memory limit"
+    ),
+    "memory-pressure": EventKind(
+        "df01123a855d446d8a751cc3e2f99656", WARNING, "Memory gets short in dataflow {dataflow}"
+    ),
+    "cpu-throttled": EventKind(
+        "1c40798a51c14a89a416ed625e0afc1a", NOTICE, "CPU time gets short in dataflow {dataflow}"
     ),
     "node-hung": EventKind("6bb24464fee34a848c077fc1b20c1802", ERR, "Node {node} hangs"),
     "coordinator-lost": EventKind(

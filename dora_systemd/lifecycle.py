@@ -12,6 +12,7 @@ from dataclasses import replace
 from dora_systemd import lifeevents as life
 from dora_systemd import nodetable as table
 from dora_systemd.cellstate import Action, Cell, Deadline, Do, Record, RunnerExit, State
+from dora_systemd.oom import Owner
 from dora_systemd.values import SECOND
 
 Step = tuple[Cell, tuple[Action, ...]]
@@ -106,7 +107,16 @@ def _engine_deadline(cell: Cell, event: life.Event) -> Step:
 def _node_event(cell: Cell, event: life.Event) -> Step:
     nodes, record = table.update(cell.nodes, event, is_stopping=bool(cell.stop_by))
     actions = () if record is None else (Record(*record),)
-    return replace(cell, nodes=nodes), actions
+    return replace(cell, nodes=nodes), (*_oom_of_all(event), *actions)
+
+
+def _oom_of_all(event: life.Event) -> tuple[Action, ...]:
+    """What there is to say about the dataflow when its own limit has killed a node."""
+    if not isinstance(event, life.NodeExited) or event.oom is None:
+        return ()
+    if event.oom.owner is not Owner.DATAFLOW:
+        return ()
+    return (Record("dataflow-oom", "", event.oom.dataflow_details()),)
 
 
 def _stop_early(cell: Cell, event: life.Event) -> Step:

@@ -3,6 +3,8 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from dora_systemd.oom import Oom
+
 
 @dataclass(frozen=True)
 class Event:
@@ -67,12 +69,14 @@ class NodeExited(Event):
     exit: "" for success, else "exit code 1" or "signal SIGKILL".
     will_restart: dora is going to execute it again.
     is_stale: the process that ended had already been replaced by one that lives.
+    oom: what the kernel killed it for, if it was for want of memory.
     """
 
     node: str
     exit: str
     will_restart: bool
     is_stale: bool = False
+    oom: Oom | None = None
 
 
 @dataclass(frozen=True)

@@ -57,8 +57,9 @@ def needed_controllers(properties: Properties, nodes: Iterable[NodeLimits]) -> d
         if slot in _CONTROLLERS and one.value != INFINITY
     }
     for one in nodes:
-        for word, _ in one.limits:
-            needed.setdefault(BY_WORD[word].controller, f"{word} of the node {one.node}")
+        for word, value in one.limits:
+            if value != INFINITY:
+                needed.setdefault(BY_WORD[word].controller, f"{word} of the node {one.node}")
     return needed
 
 
@@ -90,6 +91,26 @@ def size_warnings(
         found += _too_large(f"the node {one.node}", of_node, machine)
         found += _above_whole(one.node, of_node, own)
     return tuple(found)
+
+
+def use_warnings(
+    limits: Mapping[str, int | None],
+    nodes: Iterable[NodeLimits],
+    whole: int | None,
+    held: Mapping[str, int | None],
+) -> tuple[str, ...]:
+    """One warning for each limit of memory that is less than what is in use now.
+
+    limits: of the dataflow, by word. whole, held: bytes in use by it and by each node.
+    """
+    pairs = [("the dataflow", limits.get("memory"), whole)]
+    pairs += [(f"the node {n.node}", dict(n.limits).get("memory"), held.get(n.node)) for n in nodes]
+    return tuple(
+        f"the limit memory={_shown('memory', limit)} of {whose} is less than it uses now: "
+        f"{_shown('memory', used)}; something may be killed"
+        for whose, limit, used in pairs
+        if limit is not None and used is not None and limit < used
+    )
 
 
 def _too_large(whose: str, limits: Mapping[str, int], machine: Machine) -> Iterator[str]:

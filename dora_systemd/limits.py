@@ -192,6 +192,20 @@ def merge_node_limits(*sources: Iterable[NodeLimits]) -> tuple[NodeLimits, ...]:
     return tuple(node_limits(node, limits) for node, limits in merged.items() if limits)
 
 
+CHANGES_VARIABLE = "DORA_SYSTEMD_NODE_LIMITS"
+"""With which `doractl set` tells the next runner what has been changed, in Environment=."""
+
+
+def parse_changes(text: str) -> tuple[NodeLimits, ...]:
+    """What is in CHANGES_VARIABLE. Raises DoraSystemdError (USAGE)."""
+    return tuple(map(parse_node_limits, text.split()))
+
+
+def format_changes(limits: Iterable[NodeLimits]) -> str:
+    """The inverse of parse_changes: the ids of nodes have no blanks."""
+    return " ".join(map(format_node_limits, limits))
+
+
 def check_nodes(limits: Iterable[NodeLimits], nodes: Iterable[str], dynamic: Iterable[str]) -> None:
     """Raise DoraSystemdError (BAD_INPUT) for limits of a node that is not there or out of reach.
 

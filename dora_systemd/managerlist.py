@@ -14,8 +14,16 @@ from dora_systemd.cgroup import Usage
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.managercells import Cell, matching_cells, read_cells, select_cell
 from dora_systemd.scope import Scope
-from dora_systemd.status import CellStatus, CpuSample, NodeStatus, cpu_percent
+from dora_systemd.status import (
+    WHOLE_CELL,
+    CellStatus,
+    CpuSample,
+    NodeStatus,
+    cpu_percent,
+    throttled_percent,
+)
 from dora_systemd.statuswords import DataflowRow, NodeRow, status_word
+from dora_systemd.values import SECOND
 
 _PROPERTIES = (
     "ControlGroup",
@@ -84,38 +92,57 @@ def _usage(unit: dict[str, Any], status: CellStatus) -> dict[str, Any]:
     groups = cgroup.node_groups(path)
     use = {node: cgroup.read_usage(group) for node, group in groups.items()}
     whole = cgroup.read_usage(path)
-    now = CpuSample(_monotonic_us(), _cpu_by_group(whole, use))
+    everyone = {WHOLE_CELL: whole, **use}
+    now = CpuSample(
+        _monotonic_us(),
+        {key: one.cpu_us for key, one in everyone.items()},
+        {key: one.throttling for key, one in everyone.items()},
+    )
     samples = status.samples or (CpuSample(unit["InactiveExitTimestampMonotonic"]),)
     names = status.nodes or dict.fromkeys(groups)
     return {
-        "cpu_percent": cpu_percent(samples, now),
-        "memory": whole.memory,
-        "memory_peak": whole.memory_peak,
+        **_numbers(whole, samples, now, WHOLE_CELL),
         "nodes_total": len(names),
         "nodes_alive": status.alive_count if status.nodes else _populated(groups),
         "nodes": tuple(
-            _node_row(node, status.nodes.get(node), use.get(node), cpu_percent(samples, now, node))
+            _node_row(
+                node,
+                status.nodes.get(node),
+                _numbers(use[node], samples, now, node) if node in use else {},
+            )
             for node in names
         ),
     }
 
 
-def _cpu_by_group(whole: Usage, use: dict[str, Usage]) -> dict[str, int]:
-    return {"": whole.cpu_us, **{node: one.cpu_us for node, one in use.items()}}
+def _numbers(
+    use: Usage, samples: tuple[CpuSample, ...], now: CpuSample, key: str
+) -> dict[str, Any]:
+    """What a group uses and may use, as rows have it."""
+    share = _limit(use.cpu_max)
+    return {
+        "cpu_percent": cpu_percent(samples, now, key),
+        "cpu_limit": None if share is None else 100 * share / SECOND,
+        "throttled": None if share is None else throttled_percent(samples, now, key),
+        "memory": use.memory,
+        "memory_peak": use.memory_peak,
+        "memory_limit": _limit(use.memory_max),
+    }
+
+
+def _limit(value: int | None) -> int | None:
+    return None if value == cgroup.UNLIMITED else value
 
 
 def _populated(groups: dict[str, Path]) -> int:
     return sum(map(cgroup.is_populated, groups.values()))
 
 
-def _node_row(node: str, status: NodeStatus | None, use: Usage | None, cpu: float) -> NodeRow:
-    row = NodeRow(node, status.state if status else "unknown")
-    if status:
-        row = NodeRow(node, status.state, status.pid, restarts=status.restarts, exit=status.exit)
-    if use is None:
-        return row
-    facts = {**vars(row), "memory": use.memory, "memory_peak": use.memory_peak}
-    return NodeRow(**{**facts, "cpu_percent": cpu})
+def _node_row(node: str, status: NodeStatus | None, numbers: dict[str, Any]) -> NodeRow:
+    if status is None:
+        return NodeRow(node, "unknown", **numbers)
+    facts = {"pid": status.pid, "restarts": status.restarts, "exit": status.exit}
+    return NodeRow(node, status.state, **facts, **numbers)  # type: ignore[arg-type]
 
 
 def _monotonic_us() -> int:

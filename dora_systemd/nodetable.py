@@ -57,7 +57,7 @@ def _set(nodes: Nodes, ident: str, at_us: int, **changes: str | int) -> Nodes:
 
 def _spawned(nodes: Nodes, event: life.NodeSpawned) -> tuple[Nodes, RecordParts | None]:
     old = nodes.get(event.node, NodeStatus())
-    nodes = _set(nodes, event.node, event.at_us, state="starting", pid=event.pid, exit="")
+    nodes = _set(nodes, event.node, event.at_us, state="starting", pid=event.pid)
     if old.state != "restarting":
         return nodes, None
     return nodes, ("node-restarted", event.node, {"restarts": str(old.restarts)})
@@ -67,8 +67,7 @@ def _exited(
     nodes: Nodes, event: life.NodeExited, is_stopping: bool
 ) -> tuple[Nodes, RecordParts | None]:
     old = nodes.get(event.node, NodeStatus())
-    details = {"exit": event.exit} if event.exit else {}
-    name = "node-crashed" if event.exit and not is_stopping else "node-exited"
+    name, details = _words_of(event, is_stopping)
     if event.is_stale and not event.will_restart:
         return nodes, None  # it was replaced: its successor is what counts
     if event.is_stale:  # dora said so only after it had executed the next one
@@ -84,6 +83,14 @@ def _exited(
         restarts=old.restarts + int(event.will_restart and not is_stopping),
     )
     return nodes, (name, event.node, details)
+
+
+def _words_of(event: life.NodeExited, is_stopping: bool) -> tuple[str, Mapping[str, str]]:
+    """Name and details of what the journal says about the end of a node."""
+    if event.oom is not None:
+        return "node-oom", event.oom.node_details()
+    name = "node-crashed" if event.exit and not is_stopping else "node-exited"
+    return name, {"exit": event.exit} if event.exit else {}
 
 
 def _state_after(event: life.NodeExited, is_stopping: bool) -> str:

@@ -14,6 +14,7 @@ from uuid import uuid4
 
 from dora_systemd import lifeevents as life
 from dora_systemd.errors import DoraSystemdError
+from dora_systemd.oom import Oom
 from dora_systemd.values import SECOND
 
 Params = str | Mapping[str, Any]
@@ -230,6 +231,10 @@ def _exit_text(kind: str, number: str | None) -> str:
     return f"exit code {number}" if kind == "ExitCode" and number else "unknown exit status"
 
 
-def with_staleness(event: life.NodeExited, is_stale: bool) -> life.NodeExited:
-    """The event with what only the runner can tell: whether the node's process lives on."""
-    return replace(event, is_stale=is_stale)
+def with_facts(event: life.NodeExited, is_stale: bool, oom: Oom | None) -> life.NodeExited:
+    """The event with what only the runner can tell.
+
+    is_stale: whether the node's process lives on. oom: the want of memory that ended it.
+    """
+    how = event.exit if oom is None or not event.exit else oom.text
+    return replace(event, exit=how, is_stale=is_stale, oom=oom if event.exit else None)

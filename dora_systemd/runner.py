@@ -7,6 +7,8 @@ import asyncio
 import os
 import signal
 import sys
+from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -19,6 +21,7 @@ from dora_systemd.environment import node_environment
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.journal import JournalSocket
 from dora_systemd.launch import has_pipes, kinds, python_of
+from dora_systemd.limits import CHANGES_VARIABLE, merge_node_limits, parse_changes
 from dora_systemd.options import RunnerOptions, parse_runner_argv
 from dora_systemd.pipes import CellIdentity, LogPipes
 from dora_systemd.preparation import PACKAGE, Prepared, prepare
@@ -122,6 +125,12 @@ def listen(
         dialogue.spawn(stop_at_eof(pump))
 
 
+def with_changes(options: RunnerOptions, environment: Mapping[str, str]) -> RunnerOptions:
+    """The options with what `doractl set` has changed since the unit was made."""
+    changes = parse_changes(environment.get(CHANGES_VARIABLE, ""))
+    return replace(options, node_limits=merge_node_limits(options.node_limits, changes))
+
+
 def stop(pump: Pump, by: str) -> None:
     """Ask the cell to stop."""
     pump.push(life.StopAsked(now_us(), by))
@@ -136,7 +145,7 @@ async def stop_at_eof(pump: Pump) -> None:
 def main(argv: list[str]) -> int:
     """Run the cell that `argv` describes; the exit status."""
     try:
-        options = parse_runner_argv(argv)
+        options = with_changes(parse_runner_argv(argv), os.environ)
         directory = os.environ.get("RUNTIME_DIRECTORY")
         if not directory:
             hint = "it is started by systemd: use `doractl start`"

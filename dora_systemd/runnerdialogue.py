@@ -81,7 +81,8 @@ class Dialogue:
         engine.watch(self._loop, child, self._child_exited)
 
     def _child_exited(self, label: str, how: str) -> None:
-        event = life.ChildExited(now_us(), label, how)
+        oom = self._nodes.find_oom_of_dora()
+        event = life.ChildExited(now_us(), label, how if oom is None else oom.text)
         self._loop.call_later(_SETTLE_SECONDS, self._pump.push, event)
 
     def read_coordinator(self, line: str) -> None:
@@ -118,7 +119,7 @@ class Dialogue:
         if isinstance(event, life.NodeExited):
             node = self._pump.cell.nodes.get(event.node)
             is_stale = node is not None and self._nodes.has_process(event.node, node.pid)
-            event = protocol.with_staleness(event, is_stale)
+            event = protocol.with_facts(event, is_stale, self._nodes.find_oom(event.node))
         if event is not None:
             self._pump.push(event)
         if isinstance(event, life.NodeExited) and not event.is_stale:

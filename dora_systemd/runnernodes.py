@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 
@@ -15,7 +15,9 @@ from dora_systemd.jsonl import JsonlTail
 from dora_systemd.launch import has_pipes, is_launched
 from dora_systemd.limits import NodeLimits
 from dora_systemd.lograte import RateLimits, rate_of
+from dora_systemd.oom import Oom
 from dora_systemd.pipes import LogPipes
+from dora_systemd.runnerresources import Resources
 from dora_systemd.status import WHOLE_CELL, CpuSample
 
 SUPERVISOR = "supervisor"
@@ -44,6 +46,7 @@ class Nodes:
         self._piped: list[str] = []
         self._launched: frozenset[str] = frozenset()
         self._tails: dict[str, JsonlTail | None] = {}
+        self.resources = Resources(unit)
 
     def prepare(self, dataflow: Dataflow, rates: RateLimits, limits: Iterable[NodeLimits]) -> None:
         """Make a group for every node, with its limits, and pipes for those that have them.
@@ -99,6 +102,14 @@ class Nodes:
         """Whether `pid` lives and is one of the node's. Zombies do not count."""
         return pid in cgroup.pids(self._group(node))
 
+    def find_oom(self, node: str) -> Oom | None:
+        """What the kernel has just killed `node` for, if it was for want of memory."""
+        return self.resources.explain(self._group(node))
+
+    def find_oom_of_dora(self) -> Oom | None:
+        """The same for dora's coordinator and daemon."""
+        return self.resources.explain(self._unit / SUPERVISOR)
+
     def kill(self) -> None:
         """End every node at once, and take its last words from the pipes."""
         for group in cgroup.node_groups(self._unit).values():
@@ -132,9 +143,13 @@ class Nodes:
 
     def sample(self, now_us: int) -> CpuSample:
         """CPU time used so far by the cell and by each node."""
-        groups: Mapping[str, Path] = cgroup.node_groups(self._unit)
-        used = {node: cgroup.read_cpu_us(path) for node, path in groups.items()}
-        return CpuSample(now_us, {WHOLE_CELL: cgroup.read_cpu_us(self._unit), **used})
+        groups = {WHOLE_CELL: self._unit, **cgroup.node_groups(self._unit)}
+        use = {key: cgroup.read_cpu(path) for key, path in groups.items()}
+        return CpuSample(
+            now_us,
+            {key: one.cpu_us for key, one in use.items()},
+            {key: one.throttling for key, one in use.items() if any(one.throttling)},
+        )
 
 
 def _with_descendants(pid: int) -> list[int]:

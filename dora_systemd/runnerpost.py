@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 QUIET_SECONDS = 0.1
 DAEMON_SECONDS = 5.0
+SUPERVISOR = "supervisor"
 STREAMS = {".out": "stdout", ".err": "stderr"}
 
 
@@ -30,8 +31,11 @@ def main(argv: list[str]) -> int:
     reason, directory = killed_by(os.environ), os.environ.get("RUNTIME_DIRECTORY", "")
     if not reason or len(argv) != 2 or not directory:
         return 0
+    unit = unit_group()
+    if is_out_of_memory(unit):
+        reason = "its runner was killed for want of memory"
     with contextlib.suppress(OSError):
-        kill_nodes()
+        kill_nodes(unit)
     write_last_words(argv[0], argv[1], Path(directory), reason)
     return 0
 
@@ -109,13 +113,27 @@ def read_logs_of_dora(loop: "AbstractEventLoop", pipes: "LogPipes", io: Path) ->
             pipes.write_event("lines-lost", node, count="Some", reason=tail.loss)
 
 
-def kill_nodes() -> None:
-    """End every node of this unit: with KillMode=mixed they outlive the runner until now."""
+def unit_group() -> Path:
+    """The cgroup directory of this unit."""
     from dora_systemd import cgroup
 
     unit = cgroup.group_path(cgroup.own_group())
     while unit.suffix != ".service" and unit != unit.parent:
         unit = unit.parent
+    return unit
+
+
+def is_out_of_memory(unit: Path) -> bool:
+    """Whether the kernel has killed something beside the runner, or the runner, for memory."""
+    from dora_systemd import cgroup
+
+    return cgroup.read_oom(unit / SUPERVISOR).kills > 0
+
+
+def kill_nodes(unit: Path) -> None:
+    """End every node of this unit: with KillMode=mixed they outlive the runner until now."""
+    from dora_systemd import cgroup
+
     for group in cgroup.node_groups(unit).values():
         cgroup.kill_group(group)
         while cgroup.is_populated(group):

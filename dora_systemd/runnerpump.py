@@ -106,8 +106,14 @@ class Pump:
             notify.send_ready()
 
     def sample(self) -> None:
-        """Note CPU time used so far, so that `list` can tell CPU% without waiting."""
+        """Note CPU time used so far, so that `list` can tell CPU% without waiting.
+
+        Says so when CPU time or memory gets short, once the nodes run.
+        """
         sample = self._nodes.sample(time.monotonic_ns() // 1000)
+        if self.cell.state is State.RUNNING:
+            for record in self._nodes.resources.look(self._samples, sample):
+                self._record(record)
         self._samples = add_sample(self._samples, sample)
         self._write_table()
 

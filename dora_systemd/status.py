@@ -30,9 +30,9 @@ class NodeStatus:
     """One node as the runner sees it.
 
     state: one of NODE_STATES. pid: 0 when no process is known. restarts: how often dora restarted
-    it in this run. since_us: CLOCK_REALTIME µs of the last change of state. exit: "" or a text such
-    as "exit code 1" or "signal SIGKILL". kind: how dora starts it (python, executable, shell, uv,
-    operator, ros2, dynamic, url).
+    it in this run. since_us: CLOCK_REALTIME µs of the last change of state. exit: how its last
+    process ended, "" or a text such as "exit code 1" or "signal SIGKILL". kind: how dora
+    starts it (python, executable, shell, uv, operator, ros2, dynamic, url).
     """
 
     state: str = "starting"
@@ -52,11 +52,13 @@ class NodeStatus:
 class CpuSample:
     """CPU time used up to the moment `at_us` (CLOCK_MONOTONIC µs), in µs, by node id.
 
+    throttling: periods in which the node wanted to run and in which it had to wait for its limit.
     The key WHOLE_CELL is the unit's whole cgroup.
     """
 
     at_us: int
     cpu_us: Mapping[str, int] = field(default_factory=dict)
+    throttling: Mapping[str, tuple[int, int]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,8 @@ class CellStatus:
         """The text of status.json."""
         values = {**vars(self), "nodes": {key: vars(node) for key, node in self.nodes.items()}}
         values["samples"] = [
-            {"at_us": sample.at_us, "cpu_us": dict(sample.cpu_us)} for sample in self.samples
+            {**vars(sample), "cpu_us": dict(sample.cpu_us), "throttling": dict(sample.throttling)}
+            for sample in self.samples
         ]
         return json.dumps(values)
 
@@ -122,11 +125,28 @@ def cpu_percent(samples: tuple[CpuSample, ...], now: CpuSample, key: str = WHOLE
     The window begins at the newest sample that is at least a second old. A key that a sample lacks
     had used nothing then; a count that went down belongs to a new group.
     """
-    old_enough = [s for s in samples if now.at_us - s.at_us >= SHORTEST_WINDOW_US]
-    base = old_enough[-1] if old_enough else next(iter(samples), CpuSample(0))
+    base = _window_start(samples, now)
     window = now.at_us - base.at_us
     used = now.cpu_us.get(key, 0) - base.cpu_us.get(key, 0)
     return max(100.0 * used / window, 0.0) if window > 0 else 0.0
+
+
+def throttled_percent(
+    samples: tuple[CpuSample, ...], now: CpuSample, key: str = WHOLE_CELL
+) -> float:
+    """Of the time in which `key` wanted to run, the share in which its CPU limit made it wait.
+
+    The window is that of cpu_percent.
+    """
+    old_periods, old_throttled = _window_start(samples, now).throttling.get(key, (0, 0))
+    periods, throttled = now.throttling.get(key, (0, 0))
+    wanted = periods - old_periods
+    return 100.0 * (throttled - old_throttled) / wanted if wanted > 0 else 0.0
+
+
+def _window_start(samples: tuple[CpuSample, ...], now: CpuSample) -> CpuSample:
+    old_enough = [s for s in samples if now.at_us - s.at_us >= SHORTEST_WINDOW_US]
+    return old_enough[-1] if old_enough else next(iter(samples), CpuSample(0))
 
 
 def _parse_cell(raw: Any) -> CellStatus:
@@ -141,7 +161,10 @@ def _parse_cell(raw: Any) -> CellStatus:
 
 def _parse_sample(raw: Any) -> CpuSample:
     usage = {str(key): int(value) for key, value in raw.get("cpu_us", {}).items()}
-    return CpuSample(int(raw["at_us"]), usage)
+    throttling = {
+        str(key): (int(one), int(two)) for key, (one, two) in raw.get("throttling", {}).items()
+    }
+    return CpuSample(int(raw["at_us"]), usage, throttling)
 
 
 def _known(kind: type[Any], raw: Any) -> dict[str, Any]:

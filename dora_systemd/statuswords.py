@@ -32,7 +32,8 @@ SHORTEST_PREFIX = 8
 class NodeRow:
     """One line of `list SELECTOR`. Sizes in bytes, cpu in percent of one processor, None: unknown.
 
-    limit: the group's own memory limit in bytes, or None.
+    cpu_limit, memory_limit: the group's own, or None. throttled: the percentage of the time in
+    which it had to wait for its CPU limit, None without one.
     """
 
     node: str
@@ -43,11 +44,17 @@ class NodeRow:
     memory_peak: int | None = None
     restarts: int | None = None
     exit: str = ""
+    cpu_limit: float | None = None
+    memory_limit: int | None = None
+    throttled: float | None = None
 
 
 @dataclass(frozen=True)
 class DataflowRow:
-    """One line of `list`. uptime in µs; started, ended in CLOCK_REALTIME µs, 0: not known."""
+    """One line of `list`. uptime in µs; started, ended in CLOCK_REALTIME µs, 0: not known.
+
+    The numbers are those of NodeRow, for the whole dataflow.
+    """
 
     uuid: str
     name: str
@@ -63,6 +70,9 @@ class DataflowRow:
     cpu_percent: float | None = None
     memory: int | None = None
     memory_peak: int | None = None
+    cpu_limit: float | None = None
+    memory_limit: int | None = None
+    throttled: float | None = None
     restarts: int | None = None
     nodes: tuple[NodeRow, ...] = field(default=())
 
@@ -95,9 +105,10 @@ def format_percent(percent: float | None) -> str:
     return UNKNOWN if percent is None else f"{percent:.1f}"
 
 
-def format_memory(size: int | None) -> str:
-    """Bytes for a table, as in "256M"."""
-    return UNKNOWN if size is None else format_rounded_size(size)
+def format_memory(size: int | None, limit: int | None = None) -> str:
+    """Bytes for a table, as in "256M", or "256M/4G" where there is a limit."""
+    text = UNKNOWN if size is None else format_rounded_size(size)
+    return text if limit is None else f"{text}/{format_rounded_size(limit)}"
 
 
 def format_count(count: int | None) -> str:
@@ -116,7 +127,7 @@ def _prefix(uuid: str, others: Sequence[str]) -> str:
     return uuid[: next(free, len(uuid))]
 
 
-_RIGHT_ALIGNED = frozenset({"CPU%", "MEM", "PEAK", "RESTARTS", "PID", "UPTIME"})
+_RIGHT_ALIGNED = frozenset({"CPU%", "THROTTLED%", "MEM", "PEAK", "RESTARTS", "PID", "UPTIME"})
 
 
 def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -151,30 +162,35 @@ def _dataflow_cells(row: DataflowRow, prefix: str) -> tuple[str, ...]:
         format_uptime(row.uptime),
         f"{row.nodes_alive}/{row.nodes_total}" if row.nodes_total else UNKNOWN,
         format_percent(row.cpu_percent),
-        format_memory(row.memory),
+        format_memory(row.memory, row.memory_limit),
         format_count(row.restarts),
     )
-
-
-_NODE_HEADER = ("NODE", "STATE", "PID", "CPU%", "MEM", "PEAK", "RESTARTS", "EXIT")
 
 
 def format_nodes(rows: Sequence[NodeRow]) -> str:
-    """The node table of `doractl list SELECTOR`."""
-    return format_table(_NODE_HEADER, [_node_cells(row) for row in rows])
+    """The node table of `doractl list SELECTOR`; THROTTLED% is there if any node has a limit."""
+    cells = [_node_cells(row) for row in rows]
+    is_limited = any(row.cpu_limit is not None for row in rows)
+    header = [title for title in cells[0] if is_limited or title != _THROTTLED]
+    return format_table(header, [[row[title] for title in header] for row in cells])
 
 
-def _node_cells(row: NodeRow) -> tuple[str, ...]:
-    return (
-        row.node,
-        row.state.capitalize(),
-        str(row.pid) if row.pid else UNKNOWN,
-        format_percent(row.cpu_percent),
-        format_memory(row.memory),
-        format_memory(row.memory_peak),
-        format_count(row.restarts),
-        row.exit or UNKNOWN,
-    )
+_THROTTLED = "THROTTLED%"
+
+
+def _node_cells(row: NodeRow) -> dict[str, str]:
+    cpu = format_percent(row.cpu_percent)
+    return {
+        "NODE": row.node,
+        "STATE": row.state.capitalize(),
+        "PID": str(row.pid) if row.pid else UNKNOWN,
+        "CPU%": cpu if row.cpu_limit is None else f"{cpu}/{row.cpu_limit:g}",
+        _THROTTLED: format_percent(row.throttled),
+        "MEM": format_memory(row.memory, row.memory_limit),
+        "PEAK": format_memory(row.memory_peak),
+        "RESTARTS": format_count(row.restarts),
+        "EXIT": row.exit or UNKNOWN,
+    }
 
 
 def format_dataflow(row: DataflowRow) -> str:
@@ -188,7 +204,7 @@ def format_dataflow(row: DataflowRow) -> str:
         ("Uptime", format_uptime(row.uptime)),
         ("Started", local_time(row.started)),
         ("Ended", local_time(row.ended) if row.ended else ""),
-        ("CPU", UNKNOWN if row.cpu_percent is None else f"{row.cpu_percent:.1f}%"),
+        ("CPU", _cpu_words(row)),
         ("Memory", _memory_words(row)),
         ("Restarts", format_count(row.restarts)),
     )
@@ -196,8 +212,17 @@ def format_dataflow(row: DataflowRow) -> str:
     return "\n".join([*lines, "", format_nodes(row.nodes)] if row.nodes else lines)
 
 
+def _cpu_words(row: DataflowRow) -> str:
+    now = UNKNOWN if row.cpu_percent is None else f"{row.cpu_percent:.1f}%"
+    if row.cpu_limit is None:
+        return now
+    return f"{now} of {row.cpu_limit:g}%, throttled {format_percent(row.throttled)}% of the time"
+
+
 def _memory_words(row: DataflowRow) -> str:
     now = format_memory(row.memory)
+    if row.memory_limit is not None:
+        now = f"{now} of {format_memory(row.memory_limit)}"
     return now if row.memory_peak is None else f"{now} (peak {format_memory(row.memory_peak)})"
 
 
@@ -228,4 +253,7 @@ _JSON_KEYS = {
     "ended": "ended_us",
     "memory": "memory_bytes",
     "memory_peak": "memory_peak_bytes",
+    "memory_limit": "memory_limit_bytes",
+    "cpu_limit": "cpu_limit_percent",
+    "throttled": "throttled_percent",
 }

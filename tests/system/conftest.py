@@ -19,6 +19,9 @@ ALLOWED_ALWAYS = (
     # Dora, when a loaded machine (or one that is emulated) is slow.
     "Discarding event for input",
     "ms for handling event",
+    "Didn't receive final reply for query",
+    "for unknown Query",
+    "for unknown Request",
     # Dora's daemon and a node, one of which has just been ended.
     "closing node connection after I/O error",
     "server disconnected unexpectedly",

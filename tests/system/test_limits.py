@@ -1,11 +1,14 @@
 """Limits that nothing would hold up are refused; the lab's container has no controllers."""
 
 import os
+from pathlib import Path
 
 from dora_systemd.cgroup import mount_point, read_controllers
 from dora_systemd.errors import ExitCode
 from tests.system.cells import Cell, Project
 from tests.system.refusals import Refusal, check_refusals
+
+MOUNT = mount_point()
 
 BAD_LIMITS = (
     *("--memory-limit=0", "--memory-limit=-1", "--memory-limit=4 gigs", "--memory-limit=4"),
@@ -40,7 +43,7 @@ def test_bad_limits_in_the_settings_file(cell: Cell, project: Project) -> None:
 
 def test_limits_without_controllers(cell: Cell, project: Project) -> None:
     """Never pretend: neither for the dataflow nor for a node, nor by a property."""
-    missing = {"cpu", "memory", "pids", "io"} - read_controllers(mount_point())
+    missing = {"cpu", "memory", "pids", "io"} - read_controllers(MOUNT)
     flow = str(project.three_nodes())
     flags = {
         "memory": ("--memory-limit=1G", "--node-limit=sink:memory=1G", "--property=MemoryHigh=1G"),
@@ -67,3 +70,46 @@ def test_nice_and_devices(cell: Cell, project: Project) -> None:
     cell.wait_exchanging()
     (pid,) = cell.pids("node-sink")
     assert os.getpriority(os.PRIO_PROCESS, pid) == 3
+
+
+BAD_CHANGES = {
+    (): ExitCode.USAGE,
+    ("--memory-limit=0",): ExitCode.USAGE,
+    ("--memory-limit=4 gigs",): ExitCode.USAGE,
+    ("--nice=5",): ExitCode.USAGE,
+    ("--node-limit=sink",): ExitCode.USAGE,
+    ("--node-limit=x:cpu=infinity",): ExitCode.BAD_INPUT,
+    ("--node-limit=sink:cpu=infinity", "--node-limit=Sink:cpu=infinity"): ExitCode.BAD_INPUT,
+}
+
+
+def test_bad_changes(cell: Cell, project: Project) -> None:
+    cell.start(project.three_nodes())
+    before = cell.doractl("show", cell.name).stdout
+    for flags, code in BAD_CHANGES.items():
+        done = cell.doractl("set", cell.name, *flags, check=False)
+        assert (done.returncode, done.stdout) == (code, ""), (flags, done.stderr)
+        assert len(done.stderr.splitlines()) == 2, done.stderr
+    assert cell.doractl("set", "x" + cell.name, "--cpu-limit=1", check=False).returncode == (
+        ExitCode.NOT_FOUND
+    )
+    missing = {"memory": "--memory-limit=1G", "cpu": "--cpu-limit=1"}.items()
+    for flag in (f for controller, f in missing if controller not in read_controllers(MOUNT)):
+        done = cell.doractl("set", cell.name, flag, check=False)
+        assert done.returncode == ExitCode.NO_SYSTEMD, done.stderr
+    assert cell.doractl("show", cell.name).stdout == before
+
+
+def test_changes_are_remembered_while_the_dataflow_is_there(cell: Cell, project: Project) -> None:
+    """Lifting what is not limited needs no controller: the way there and back can be seen."""
+    cell.start(project.three_nodes())
+    cell.doractl("set", cell.unit, "--node-limit=sink:cpu=infinity", "--tasks-limit=infinity")
+    (run, unit) = cell.status.run, cell.doractl("show", cell.name).stdout
+    assert "DORA_SYSTEMD_NODE_LIMITS=sink:cpu=infinity" in unit
+    cell.doractl("restart", cell.name)
+    assert cell.status.run != run
+    assert cell.doractl("show", cell.name).stdout == unit
+    (pid,) = cell.pids("node-sink")
+    assert b"DORA_SYSTEMD_NODE_LIMITS" not in Path(f"/proc/{pid}/environ").read_bytes()
+    cell.doractl("stop", cell.name)
+    assert not list(Path("/run/systemd").glob(f"*/{cell.unit}*"))

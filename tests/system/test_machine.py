@@ -1,8 +1,16 @@
 """What only a kernel with cgroup controllers can show."""
 
+import json
+import re
+import time
+from pathlib import Path
+from typing import Any
+
 import pytest
 
-from tests.system.cells import Cell, Project, run, wait_for
+from dora_systemd.cgroup import read_cpu
+from dora_systemd.errors import ExitCode
+from tests.system.cells import Cell, Project, is_alive, run, wait_for
 
 pytestmark = pytest.mark.vm
 
@@ -13,6 +21,12 @@ node, hoard = Node(), []
 for event in node:
     if event["type"] == "INPUT":
         hoard.append(bytearray(16 << 20))
+"""
+
+
+CHILD = """
+import subprocess
+subprocess.Popen(["sleep", "1000"])
 """
 
 
@@ -41,7 +55,176 @@ def test_a_limit_of_the_unit_kills_the_leaking_node_alone(cell: Cell, project: P
     project.write("sink.py", LEAK)
     cell.start(flow, "--property", "MemoryMax=700M", "--property", "MemorySwapMax=0")
     wait_for("it is degraded", lambda: cell.status.stage == "degraded", 300)
-    assert cell.status.nodes["sink"].exit == "signal SIGKILL"
+    assert re.fullmatch(
+        r"out of memory: peak \S+M, limit of the dataflow 700M", cell.status.nodes["sink"].exit
+    )
     assert cell.status.nodes["source"].state == "running"
+    (whole,) = cell.journal("DORA_EVENT=dataflow-oom")
+    assert whole["DORA_MOST"] == "sink"
+    assert int(whole["DORA_HELD"]) > 300 << 20
+    assert ("node-oom", "sink") in cell.events()
+    assert "out of memory" in cell.show("StatusText")
     events = run("cat", str(cell.group / "node-sink" / "memory.events")).stdout
     assert "oom_kill 1" in events
+
+
+@pytest.mark.warns("oom", "OOM", "killed", "node exited with error", "restart", "Failed", "Memory")
+def test_a_node_over_its_limit_is_killed_alone(cell: Cell, project: Project) -> None:
+    """With all its processes, named with its peak and its limit, and restarted by its policy."""
+    flow = project.three_nodes()
+    project.write("sink.py", CHILD + LEAK)
+    flow.write_text(flow.read_text() + "    restart_policy: on-failure\n    restart_delay: 2\n")
+    cell.start(flow, "--node-limit=sink:memory=300M,swap=0")
+    before = cell.pids("node-source") + cell.pids("node-doubler")
+    (event,) = wait_for("it is out of memory", lambda: cell.journal("DORA_EVENT=node-oom"), 300)
+    assert (event["DORA_NODE"], event["DORA_OWNER"]) == ("sink", "node")
+    assert int(event["DORA_LIMIT"]) == 300 << 20
+    assert 0 <= int(event["DORA_LIMIT"]) - int(event["DORA_PEAK"]) < 16 << 20
+    assert str(event["MESSAGE"]).endswith("out of memory: peak 300M, limit 300M")
+    wait_for("it was restarted", lambda: cell.status.nodes["sink"].restarts, 60)
+    assert all(is_alive(pid) for pid in before)
+    assert cell.pids("node-source") + cell.pids("node-doubler") == before
+    cell.wait_exchanging("source")
+    assert "out of memory: peak 300M, limit 300M" in cell.doractl("list", cell.name).stdout
+    assert not [one for one in cell.events() if one[0] == "dataflow-oom"]
+
+
+HOARD = """
+from dora import Node
+from pathlib import Path
+node, hoard = Node(), []
+group = Path("/sys/fs/cgroup") / Path("/proc/self/cgroup").read_text().strip()[4:]
+limit = int((group / "memory.max").read_text())
+def held():
+    return int((group / "memory.stat").read_text().split()[1])
+while held() < 0.93 * limit:
+    hoard.append(b"x" * (1 << 20))
+print("full", flush=True)
+for event in node:
+    pass
+"""
+
+
+@pytest.mark.warns("Memory gets short")
+def test_memory_that_gets_short_is_reported_once(cell: Cell, project: Project) -> None:
+    flow = project.three_nodes()
+    project.write("sink.py", HOARD)
+    cell.start(flow, "--node-limit=sink:memory=300M,swap=0")
+    wait_for("it is full", lambda: cell.messages("sink"), 60)
+    (event,) = wait_for("it is told", lambda: cell.journal("DORA_EVENT=memory-pressure"), 60)
+    assert (event["DORA_NODE"], int(event["DORA_LIMIT"])) == ("sink", 300 << 20)
+    samples = cell.status.samples
+    wait_for("two more looks", lambda: not any(one in cell.status.samples for one in samples), 60)
+    assert len(cell.journal("DORA_EVENT=memory-pressure")) == 1
+
+
+LIMITED = "sink:memory=300M,memory-high=infinity,swap=0,cpu=1.5,tasks=64,cpu-weight=50,io-weight=20"
+
+
+def test_limits_are_what_the_kernel_holds_up(cell: Cell, project: Project) -> None:
+    flow = project.three_nodes()
+    project.write("dataflow.systemd.yml", "nodes: {source: {memory_limit: 1G}}\nmemory_high: 2G\n")
+    cell.start(flow, "--memory-limit=1500M", "--cpu-limit=1.5", f"--node-limit={LIMITED}")
+    assert control(cell, ".", "memory.max") == str(1500 << 20)
+    assert control(cell, ".", "memory.high") == str(2 << 30)
+    assert control(cell, ".", "cpu.max") == "150000 100000"
+    assert control(cell, ".", "pids.max") == "max"
+    files = {"memory.max": str(300 << 20), "memory.swap.max": "0", "memory.high": "max"}
+    files |= {"cpu.max": "150000 100000", "pids.max": "64", "cpu.weight": "50"}
+    files |= {"io.weight": "default 20", "memory.oom.group": "1"}
+    assert {name: control(cell, "node-sink", name) for name in files} == files
+    assert control(cell, "node-source", "memory.max") == str(1 << 30)
+    assert control(cell, "node-doubler", "memory.max") == "max"
+    assert "--node-limit=sink:cpu=150%%,memory=300M," in cell.doractl("show", cell.name).stdout
+    cell.wait_exchanging()
+    row = listed(cell)
+    assert (row["memory_limit_bytes"], row["cpu_limit_percent"]) == (1500 << 20, 150)
+    assert [one["memory_limit_bytes"] for one in row["nodes"]] == [1 << 30, None, 300 << 20]
+    assert "/1.5G" in cell.doractl("list").stdout
+
+
+def test_limits_change_live_and_are_remembered(cell: Cell, project: Project) -> None:
+    flow = project.three_nodes()
+    cell.start(flow, "--node-limit=sink:memory=1G,cpu-weight=30")
+    changes = ("--memory-limit=1500M", "--node-limit=source:tasks=77")
+    done = cell.doractl(
+        "set", cell.status.uuid[:8], *changes, "--node-limit=sink:cpu=0.8,memory=600M"
+    )
+    assert done.stderr == ""
+    changed = [str(1500 << 20), str(600 << 20), "80000 100000", "30", "77"]
+    assert held(cell) == changed
+    text = cell.doractl("show", cell.name).stdout
+    assert "MemoryMax=1572864000" in text
+    assert "sink:cpu=80%%,memory=600M" in text
+    bad = cell.doractl("set", cell.unit, "--memory-limit=2G", "--node-limit=x:cpu=1", check=False)
+    assert bad.returncode == ExitCode.BAD_INPUT
+    assert held(cell) == changed
+    cell.doractl("restart", cell.name)
+    assert held(cell) == changed
+    lifted = "sink:cpu=infinity,memory=infinity"
+    cell.doractl("set", cell.name, "--memory-limit=infinity", f"--node-limit={lifted}")
+    assert held(cell) == ["max", "max", "max 100000", "30", "77"]
+    cell.wait_exchanging()
+    cell.doractl("stop", cell.name)
+    assert not list(Path("/run/systemd").glob(f"*/{cell.unit}*")), "nothing is left of it"
+
+
+def held(cell: Cell) -> list[str]:
+    """Limits that the kernel holds up."""
+    return [
+        control(cell, ".", "memory.max"),
+        *(control(cell, "node-sink", name) for name in ("memory.max", "cpu.max", "cpu.weight")),
+        control(cell, "node-source", "pids.max"),
+    ]
+
+
+def control(cell: Cell, group: str, name: str) -> str:
+    """A control file of a group of the cell."""
+    return (cell.group / group / name).read_text().strip()
+
+
+SPIN = """
+from dora import Node
+node = Node()
+node.next()
+print("spinning", flush=True)
+while True:
+    pass
+"""
+
+
+@pytest.mark.warns("grace period", "killed on drop", "node exited with error")
+def test_a_busy_node_has_its_share(cell: Cell, project: Project) -> None:
+    flow = project.three_nodes()
+    project.write("sink.py", SPIN)
+    cell.start(flow, "--node-limit=sink:cpu=0.4", "--grace-duration=1s")
+    wait_for("it spins", lambda: cell.messages("sink"), 60)
+    shares: list[float] = []
+
+    def is_held() -> bool:
+        """Never more than its share; and no less, when the host lets the machine run."""
+        shares.append(cpu_share(cell.group / "node-sink", 5))
+        assert shares[-1] <= 0.4 * 1.05, shares
+        return shares[-1] >= 0.4 * 0.95
+
+    wait_for("it has its share", is_held, 60)
+    (row,) = [one for one in listed(cell)["nodes"] if one["node"] == "sink"]
+    assert row["cpu_limit_percent"] == 40
+    assert row["throttled_percent"] > 80
+    (event,) = wait_for("it is told", lambda: cell.journal("DORA_EVENT=cpu-throttled"), 60)
+    assert event["DORA_NODE"] == "sink"
+    assert abs(row["cpu_percent"] - 40) < 5
+    assert "THROTTLED%" in cell.doractl("list", cell.name).stdout
+
+
+def cpu_share(group: Path, seconds: float) -> float:
+    """How many processors a group uses: what is measured is a rate, hence the sleep."""
+    used, began = read_cpu(group).cpu_us, time.monotonic()
+    time.sleep(seconds)
+    return (read_cpu(group).cpu_us - used) / (time.monotonic() - began) / 1_000_000
+
+
+def listed(cell: Cell) -> dict[str, Any]:
+    """What `doractl list` knows of the cell."""
+    row: dict[str, Any] = json.loads(cell.doractl("list", cell.name, "-o", "json").stdout)
+    return row

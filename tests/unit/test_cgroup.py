@@ -6,6 +6,8 @@ from pathlib import Path
 import pytest
 
 from dora_systemd import cgroup
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.limits import parse_node_limits
 
 
 @pytest.fixture
@@ -15,7 +17,7 @@ def unit(tmp_path: Path) -> Path:
         (group / name).mkdir(parents=True)
         (group / name / "cgroup.procs").write_text("")
     (group / "cgroup.procs").write_text("")
-    (group / "cpu.stat").write_text("usage_usec 1500\nuser_usec 1000\nsystem_usec 500\n")
+    (group / "cpu.stat").write_text("usage_usec 1500\nnr_periods 10\nnr_throttled 3\n")
     return group
 
 
@@ -28,9 +30,12 @@ def test_node_groups(unit: Path) -> None:
 
 
 def test_usage_with_a_memory_controller(unit: Path) -> None:
+    (unit / "cpu.max").write_text("150000 100000\n")
     for name, text in (("current", "4096\n"), ("peak", "8192\n"), ("max", "max\n")):
         (unit / f"memory.{name}").write_text(text)
-    assert cgroup.read_usage(unit) == cgroup.Usage(1500, 4096, 8192, cgroup.UNLIMITED)
+    assert cgroup.read_usage(unit) == cgroup.Usage(
+        1500, 4096, 8192, cgroup.UNLIMITED, 1_500_000, (10, 3)
+    )
 
 
 def test_usage_without_a_memory_controller(unit: Path) -> None:
@@ -39,6 +44,23 @@ def test_usage_without_a_memory_controller(unit: Path) -> None:
     assert usage.memory is not None
     assert usage.memory > 1024**2
     assert usage.memory_peak is None
+
+
+def test_limits_of_a_node(unit: Path) -> None:
+    group = unit / "node-camera"
+    for name in ("memory.max", "cpu.max", "memory.oom.group"):
+        (group / name).write_text("")
+    cgroup.kill_as_one(group)
+    cgroup.limit_group(group, parse_node_limits("camera:memory=1G,cpu=infinity"))
+    assert (group / "memory.oom.group").read_text() == "1"
+    assert (group / "memory.max").read_text() == str(1 << 30)
+    assert (group / "cpu.max").read_text() == "max 100000"
+
+
+def test_a_limit_that_nothing_holds_up_is_an_error(unit: Path) -> None:
+    with pytest.raises(DoraSystemdError) as caught:
+        cgroup.limit_group(unit / "node-camera", parse_node_limits("camera:tasks=5"))
+    assert caught.value.message == "cannot limit the node camera: its group has no pids.max"
 
 
 def test_usage_of_a_group_that_has_gone(tmp_path: Path) -> None:

@@ -33,6 +33,7 @@ def test_catalog_entry_says_what_and_what_to_do(name: str) -> None:
             "DORA_EXIT",
             "DORA_COUNT",
             "DORA_LIMIT",
+            "DORA_MOST",
             "UNIT",
         }
 

@@ -50,7 +50,9 @@ DECISIONS = {
         "logs",
         "logterminal",
         "nodetable",
+        "oom",
         "options",
+        "pressure",
         "properties",
         "propertykinds",
         "propertylists",
@@ -101,6 +103,7 @@ USE_CASES = {
         "managerplan",
         "managerreason",
         "managerrun",
+        "managerset",
         "managersettings",
         "managershow",
         "managerstart",
@@ -117,6 +120,7 @@ USE_CASES = {
         "runnernodes",
         "runnerpost",
         "runnerpump",
+        "runnerresources",
     ],
 }
 CLI = {"cli": sorted(name for name in module_paths() if name.startswith("cli."))}

@@ -16,13 +16,19 @@ from dora_systemd.status import (
     NodeStatus,
     add_sample,
     cpu_percent,
+    throttled_percent,
 )
 
 counts = st.integers(0, 2**63)
 nodes = st.builds(
     NodeStatus, st.sampled_from(NODE_STATES), counts, counts, counts, st.text(), st.text()
 )
-samples = st.builds(CpuSample, counts, st.dictionaries(st.text(), counts))
+samples = st.builds(
+    CpuSample,
+    counts,
+    st.dictionaries(st.text(), counts),
+    st.dictionaries(st.text(), st.tuples(counts, counts)),
+)
 cells = st.builds(
     CellStatus,
     *(st.text(), st.text(), st.sampled_from(STAGES), st.text(), counts, counts),
@@ -75,6 +81,15 @@ def test_counts() -> None:
     cell = CellStatus(nodes=table)
     assert cell.alive_count == 2
     assert cell.node_restarts == 3
+
+
+def test_throttled_percent() -> None:
+    """Of the periods in which the node wanted to run, those in which it had to wait."""
+    old = (CpuSample(0, {}, {"a": (100, 90)}),)
+    assert throttled_percent(old, CpuSample(5 * SECOND, {}, {"a": (150, 110)}), "a") == 40.0
+    assert throttled_percent(old, CpuSample(5 * SECOND, {}, {"a": (100, 90)}), "a") == 0.0
+    assert throttled_percent((), CpuSample(5 * SECOND, {}, {"a": (10, 1)}), "a") == 10.0
+    assert throttled_percent(old, CpuSample(5 * SECOND), "b") == 0.0
 
 
 def test_only_the_last_samples_are_kept() -> None:

@@ -1,5 +1,7 @@
 """Words and whole tables of `doractl list`."""
 
+from dataclasses import replace
+
 import pytest
 
 from dora_systemd.statuswords import (
@@ -114,6 +116,35 @@ def test_one_dataflow() -> None:
         "camera    Running   42   5.0  128M  200M         0  -\n"
         "detector  Failed     -     -     -     -         3  exit code 1"
     )
+
+
+LIMITED = replace(
+    ROWS[0],
+    memory_limit=4 << 30,
+    memory_peak=300 << 20,
+    cpu_limit=200.0,
+    throttled=12.0,
+    nodes=(
+        replace(ROWS[0].nodes[0], memory_limit=1 << 30, cpu_limit=150.0, throttled=31.25),
+        ROWS[0].nodes[1],
+    ),
+)
+
+
+def test_limits_stand_beside_what_is_used() -> None:
+    assert format_dataflows([LIMITED]).splitlines()[1].split()[6:] == ["256M/4G", "0"]
+    lines = format_dataflow(LIMITED).splitlines()
+    assert "CPU:      12.5% of 200%, throttled 12.0% of the time" in lines
+    assert "Memory:   256M of 4G (peak 300M)" in lines
+    assert lines[-3:] == [
+        "NODE      STATE    PID     CPU%  THROTTLED%      MEM  PEAK  RESTARTS  EXIT",
+        "camera    Running   42  5.0/150        31.2  128M/1G  200M         0  -",
+        "detector  Failed     -        -           -        -     -         3  exit code 1",
+    ]
+    values = row_values(LIMITED)
+    assert (values["memory_limit_bytes"], values["cpu_limit_percent"]) == (4 << 30, 200.0)
+    assert values["nodes"][0]["throttled_percent"] == 31.25
+    assert values["nodes"][1]["memory_limit_bytes"] is None
 
 
 def test_one_dataflow_without_nodes() -> None:

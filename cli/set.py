@@ -1,0 +1,35 @@
+"""doractl set: other limits for a dataflow that runs."""
+
+from typing import Any
+
+import click
+
+from dora_systemd.bus import Bus
+from dora_systemd.cli.parameters import current_scope, print_warnings, scope_options
+from dora_systemd.cli.settingoptions import live_options
+from dora_systemd.managercells import read_cells, select_cell
+from dora_systemd.managerset import set_limits
+
+_EPILOG = """\b
+Examples:
+  doractl set robot --memory-limit 6G
+  doractl set robot --node-limit detector:memory=2G,cpu=1.5
+  doractl set robot --cpu-limit infinity
+"""
+
+
+@click.command("set", epilog=_EPILOG)
+@click.argument("selector")
+@live_options
+@scope_options
+def command(selector: str, **flags: Any) -> None:
+    """Change limits of a dataflow while it runs.
+
+    They hold at once and stay over restarts, until the dataflow is stopped. Infinity lifts a
+    limit. Nothing is changed if anything is wrong.
+    """
+    scope = current_scope()
+    bus = Bus(scope)
+    cell = select_cell(read_cells(bus), selector)
+    print_warnings(set_limits(bus, scope, cell, flags))
+    click.echo(f"Limits changed: {cell.uuid} ({cell.name})")

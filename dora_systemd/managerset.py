@@ -1,0 +1,115 @@
+"""`doractl set`: limits of a dataflow and of its nodes, changed while it runs and remembered.
+
+systemd keeps the dataflow's own, as with `systemctl set-property`. The nodes' are in a drop-in of
+ours beside the unit's file; that of a transient unit goes with it.
+"""
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from dora_systemd import cgroup
+from dora_systemd.busprotocol import Manager
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.files import write_atomic
+from dora_systemd.limitchecks import (
+    check_controllers,
+    needed_controllers,
+    size_warnings,
+    use_warnings,
+)
+from dora_systemd.limits import (
+    BY_KEY,
+    CHANGES_VARIABLE,
+    NodeLimits,
+    check_nodes,
+    format_changes,
+    merge_node_limits,
+    parse_changes,
+)
+from dora_systemd.limitsettings import LIVE_SETTINGS, NODE_LIMIT
+from dora_systemd.machine import read_machine
+from dora_systemd.managercells import Cell
+from dora_systemd.managerlist import read_status
+from dora_systemd.preparation import load_dataflow
+from dora_systemd.properties import format_unit, settings_properties, typed
+from dora_systemd.scope import Scope
+from dora_systemd.settings import Settings, resolve_settings
+
+DROP_IN = "60-node-limits.conf"
+_PROPERTIES = ("ControlGroup", "Environment", "FragmentPath", "Transient")
+
+
+def set_limits(
+    manager: Manager, scope: Scope, cell: Cell, flags: Mapping[str, object]
+) -> tuple[str, ...]:
+    """Change limits of a dataflow; warnings. flags: raw values by name of LIVE_SETTINGS.
+
+    Raises DoraSystemdError; as long as anything is wrong, nothing is changed.
+    """
+    settings = resolve_settings(flags, {}, (), LIVE_SETTINGS)
+    properties, nodes = settings_properties(settings), settings[NODE_LIMIT]
+    if not properties and not nodes:
+        hint = "see doractl set --help"
+        message = f"cannot change the limits of {cell.name}: none is given"
+        raise DoraSystemdError(message, hint, ExitCode.USAGE)
+    if not scope.is_user and os.geteuid() != 0:
+        message = f"cannot change the limits of {cell.name}: permission denied"
+        raise DoraSystemdError(message, "use sudo", ExitCode.NO_PERMISSION)
+    _check_nodes(scope, cell, nodes)
+    if needed := needed_controllers(properties, nodes):
+        available = cgroup.read_controllers(cgroup.group_path(manager.control_group()))
+        check_controllers(needed, available, scope.is_user)
+    unit = manager.read(cell.unit, _PROPERTIES)
+    warnings = _warnings(settings, nodes, unit)
+    if properties:
+        manager.set_properties(cell.unit, list(properties.values()), bool(unit["Transient"]))
+    if nodes:
+        _remember(manager, cell, unit, nodes)
+        _limit_groups(unit, nodes)
+    return warnings
+
+
+def _check_nodes(scope: Scope, cell: Cell, limits: tuple[NodeLimits, ...]) -> None:
+    if not limits:
+        return
+    kinds = {node: one.kind for node, one in read_status(scope, cell).nodes.items()}
+    if not kinds:
+        kinds = {node.id: str(node.kind) for node in load_dataflow(cell.options).nodes}
+    check_nodes(limits, kinds, [node for node, kind in kinds.items() if kind == "dynamic"])
+
+
+def _warnings(
+    settings: Settings, nodes: tuple[NodeLimits, ...], unit: Mapping[str, Any]
+) -> tuple[str, ...]:
+    values = {limit.word: settings.values[key] for key, limit in BY_KEY.items()}
+    warnings = size_warnings(values, nodes, read_machine())
+    if not unit["ControlGroup"]:
+        return warnings
+    path = cgroup.group_path(unit["ControlGroup"])
+    held = {node: cgroup.read_usage(one).memory for node, one in cgroup.node_groups(path).items()}
+    return (*warnings, *use_warnings(values, nodes, cgroup.read_usage(path).memory, held))
+
+
+def _remember(
+    manager: Manager, cell: Cell, unit: Mapping[str, Any], nodes: tuple[NodeLimits, ...]
+) -> None:
+    """Write the drop-in, and have systemd read it: the next start of the runner is told of it."""
+    before = dict(entry.split("=", 1) for entry in unit["Environment"] or ())
+    changes = merge_node_limits(parse_changes(before.get(CHANGES_VARIABLE, "")), nodes)
+    text = format_unit(typed(Environment=(f"{CHANGES_VARIABLE}={format_changes(changes)}",)))
+    path = Path(unit["FragmentPath"]).parent / f"{cell.unit}.d" / DROP_IN
+    try:
+        path.parent.mkdir(mode=0o755, exist_ok=True)
+    except OSError as error:
+        raise DoraSystemdError(f"cannot make {path.parent}: {error.strerror}") from error
+    write_atomic(path, f"# Written by doractl set.\n{text}")
+    manager.reload()
+
+
+def _limit_groups(unit: Mapping[str, Any], nodes: tuple[NodeLimits, ...]) -> None:
+    if unit["ControlGroup"]:
+        groups = cgroup.node_groups(cgroup.group_path(unit["ControlGroup"]))
+        for one in nodes:
+            cgroup.limit_group(groups[one.node], one)

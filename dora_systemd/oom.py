@@ -1,0 +1,87 @@
+"""Who ran out of memory when the kernel has killed a node: the node, the dataflow or the machine.
+
+The counters are those of memory.events and memory.events.local in the kernel's "Control Group v2"
+document.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+
+from dora_systemd.values import format_rounded_size
+
+
+class Owner(Enum):
+    """Whose memory was used up."""
+
+    NODE = "node"
+    DATAFLOW = "dataflow"
+    MACHINE = "machine"
+
+
+@dataclass(frozen=True)
+class OomCounts:
+    """Counters of one group, which only grow.
+
+    kills: processes in it or below it that the kernel has killed for want of memory. refusals: how
+    often the limit of this group itself left no memory.
+    """
+
+    kills: int = 0
+    refusals: int = 0
+
+
+@dataclass(frozen=True)
+class Oom:
+    """A node that was killed for want of memory. Sizes in bytes.
+
+    peak: the most that the node ever held. limit: of the owner, 0 for the machine. most: the node
+    that held most, and how much that was.
+    """
+
+    owner: Owner
+    peak: int
+    limit: int = 0
+    most: str = ""
+    most_held: int = 0
+
+    @property
+    def text(self) -> str:
+        """How the node ended, for the table of nodes."""
+        peak, limit = format_rounded_size(self.peak), format_rounded_size(self.limit)
+        if self.owner is Owner.NODE:
+            return f"out of memory: peak {peak}, limit {limit}"
+        if self.owner is Owner.DATAFLOW:
+            return f"out of memory: peak {peak}, limit of the dataflow {limit}"
+        return f"out of memory: peak {peak}, the machine had none left"
+
+    def node_details(self) -> dict[str, str]:
+        """Details of the event node-oom."""
+        details = {"exit": self.text, "peak": str(self.peak), "owner": self.owner.value}
+        return {**details, "limit": str(self.limit)} if self.limit else details
+
+    def dataflow_details(self) -> dict[str, str]:
+        """Details of the event dataflow-oom."""
+        held, limit = format_rounded_size(self.most_held), format_rounded_size(self.limit)
+        return {
+            "reason": f"of {limit} the node {self.most} held most, {held}",
+            "limit": str(self.limit),
+            "most": self.most,
+            "held": str(self.most_held),
+        }
+
+
+def find_owner(
+    node: tuple[OomCounts, OomCounts], unit: tuple[OomCounts, OomCounts]
+) -> Owner | None:
+    """Whose memory was used up between two looks at node and unit; None: nothing was killed."""
+    if node[1].kills <= node[0].kills:
+        return None
+    if node[1].refusals > node[0].refusals:
+        return Owner.NODE
+    return Owner.DATAFLOW if unit[1].refusals > unit[0].refusals else Owner.MACHINE
+
+
+def largest(held: Mapping[str, int]) -> tuple[str, int]:
+    """The node that holds most memory, and how much; "" where there is none."""
+    return max(held.items(), key=lambda item: item[1], default=("", 0))
