@@ -26,7 +26,10 @@ VERBS = {
     "restart": Verb("restart", "Restart dataflows."),
     "node": Verb("node", "Restart or stop a single node."),
     "set": Verb("set", "Change limits of a dataflow that runs."),
+    "enable": Verb("enable", "Start dataflows at every boot."),
+    "disable": Verb("disable", "No longer start dataflows at boot."),
     "show": Verb("show", "Print the unit of a dataflow."),
+    "export": Verb("export", "Print a unit file that needs nothing of doractl."),
     "dora": Verb("dora", "Run the dora command against one dataflow."),
     "version": Verb("version", "Print the versions of all that takes part."),
 }

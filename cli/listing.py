@@ -5,8 +5,7 @@ import json
 from dora_systemd.bus import Bus
 from dora_systemd.cli.quick import ListRequest
 from dora_systemd.errors import ExitCode
-from dora_systemd.managercells import read_cells
-from dora_systemd.managerlist import dataflow_row, find_row
+from dora_systemd.managerlist import find_row, read_rows
 from dora_systemd.scope import Scope, scope_of
 from dora_systemd.statuswords import (
     DataflowRow,
@@ -35,7 +34,7 @@ def is_json(request: ListRequest) -> bool:
 
 
 def _rows(bus: Bus, scope: Scope, want_all: bool) -> list[DataflowRow]:
-    rows = [dataflow_row(bus, scope, cell) for cell in read_cells(bus)]
+    rows = read_rows(bus, scope)
     if not want_all:
         return [row for row in rows if is_up_word(row)]
     # The journal is read only for those that systemd has forgotten.

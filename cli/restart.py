@@ -9,7 +9,7 @@ import click
 from dora_systemd.bus import Bus
 from dora_systemd.cli.parameters import current_scope, print_outcomes, scope_options
 from dora_systemd.cli.stageline import StageLine
-from dora_systemd.managercells import read_cells, select_cell
+from dora_systemd.managercells import find_cell
 from dora_systemd.managerstop import restart_cells
 
 _EPILOG = """\b
@@ -29,8 +29,7 @@ def command(selectors: tuple[str, ...]) -> int:
     started again.
     """
     bus = Bus(current_scope())
-    cells = read_cells(bus)
-    chosen = dict.fromkeys(select_cell(cells, one) for one in selectors)
+    chosen = dict.fromkeys(find_cell(bus, one) for one in selectors)
     with StageLine(sys.stderr) as stage:
         outcomes = restart_cells(bus, list(chosen), lambda changes: _show(stage, changes))
     return print_outcomes(outcomes)

@@ -13,10 +13,11 @@ from dora_systemd.cli.parameters import current_scope, name_option, print_warnin
 from dora_systemd.cli.settingoptions import setting_options
 from dora_systemd.cli.stageline import StageLine
 from dora_systemd.logterminal import TerminalLines
+from dora_systemd.managerclaim import refuse_unit_file, require_free_name
 from dora_systemd.managerlogs import FollowedLog
 from dora_systemd.managerplan import DEFAULT_FILE, StartRequest, make_plan, request_name
 from dora_systemd.managerrun import attached_properties, follow_unit, life_line
-from dora_systemd.managerstart import require_free_name, start_plan
+from dora_systemd.managerstart import start_plan
 from dora_systemd.managerunit import plan_properties
 from dora_systemd.names import unit_name
 
@@ -42,7 +43,7 @@ def command(dataflow: str, name: str | None, **flags: Any) -> int:
     scope = current_scope()
     request = StartRequest(dataflow, name, flags, os.environ, attached=True)
     bus = Bus(scope)
-    require_free_name(bus, unit_name(request_name(request)))
+    refuse_unit_file(require_free_name(bus, scope, unit_name(request_name(request))))
     plan = make_plan(scope, request)
     properties, warnings = plan_properties(plan, bus)
     print_warnings(warnings)
@@ -51,7 +52,7 @@ def command(dataflow: str, name: str | None, **flags: Any) -> int:
     since = time.time_ns() // _MICROSECOND_NS
     followed = FollowedLog(scope, options.name, options.uuid, since, _write, terminal)
     with life_line() as pipe, closing(followed) as logs, StageLine(sys.stderr) as stage:
-        start_plan(bus, plan, [*properties, *attached_properties(pipe)], stage, wait=False)
+        start_plan(bus, plan, [*properties.values(), *attached_properties(pipe)], stage, wait=False)
         return follow_unit(bus, plan.unit, logs, stage)
 
 

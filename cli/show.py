@@ -4,7 +4,7 @@ import click
 
 from dora_systemd.bus import Bus
 from dora_systemd.cli.parameters import current_scope, output_option, print_json, scope_options
-from dora_systemd.managercells import read_cells, select_cell
+from dora_systemd.managercells import find_cell
 from dora_systemd.managershow import format_unit_files, unit_files
 
 _EPILOG = """\b
@@ -24,7 +24,7 @@ def command(selector: str, output: str) -> None:
     Environment variables are printed as well, with their values.
     """
     bus = Bus(current_scope())
-    cell = select_cell(read_cells(bus), selector)
+    cell = find_cell(bus, selector)
     files = unit_files(bus, cell)
     if output == "json":
         print_json({"unit": cell.unit, "name": cell.name, "uuid": cell.uuid, "files": files})

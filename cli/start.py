@@ -18,10 +18,13 @@ from dora_systemd.cli.parameters import (
 from dora_systemd.cli.settingoptions import setting_options
 from dora_systemd.cli.stageline import StageLine
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.managerclaim import place_unit_file, require_free_name, with_known_uuid
+from dora_systemd.managerlinger import ensure_linger
 from dora_systemd.managerplan import DEFAULT_FILE, Plan, StartRequest, make_plan, request_name
-from dora_systemd.managerstart import format_started, require_free_name, start_plan
+from dora_systemd.managerstart import Started, format_started, start_plan, start_unit_file
 from dora_systemd.managerunit import format_plan, plan_properties
 from dora_systemd.names import unit_name
+from dora_systemd.propertyset import Properties
 
 _EPILOG = """\b
 Examples:
@@ -30,6 +33,7 @@ Examples:
   doractl start dataflow.yml --env MODEL=yolov8n.pt --venv .venv
   doractl start dataflow.yml --memory-limit 4G --node-limit detector:memory=1G,cpu=1.5
   doractl start dataflow.yml --property Restart=on-failure
+  doractl start dataflow.yml --enable              now and at every boot
   doractl start dataflow.yml --dry-run
 """
 
@@ -39,16 +43,24 @@ Examples:
 @name_option
 @setting_options
 @click.option("--no-wait", is_flag=True, help="Do not wait until the nodes are ready.")
+@click.option("--enable", "want_boot", is_flag=True, help="Start it at every boot as well.")
 @click.option("--dry-run", is_flag=True, help="Print the unit and start nothing.")
 @output_option
 @scope_options
 def command(
-    dataflow: str, name: str | None, no_wait: bool, dry_run: bool, output: str, **flags: Any
+    dataflow: str,
+    name: str | None,
+    no_wait: bool,
+    want_boot: bool,
+    dry_run: bool,
+    output: str,
+    **flags: Any,
 ) -> None:
     """Start the dataflow in FILE as the service dora-NAME.service.
 
     Ends when all nodes are ready, or fails with the reason. The name must be free; a dataflow of
-    that name that has failed is replaced, its logs stay.
+    that name that has failed is replaced, its logs stay. One that is enabled is started as it is
+    if its settings are the same; --enable replaces it.
     """
     scope = current_scope()
     request = StartRequest(dataflow, name, flags, os.environ)
@@ -56,21 +68,30 @@ def command(
         print(format_plan(make_plan(scope, request)), end="")
         return
     bus = Bus(scope)
-    require_free_name(bus, unit_name(request_name(request)))
-    plan = make_plan(scope, request)
+    boot = require_free_name(bus, scope, unit_name(request_name(request)))
+    plan = with_known_uuid(make_plan(scope, request), boot)
     properties, warnings = plan_properties(plan, bus)
     print_warnings(warnings)
-    try:
-        with StageLine(sys.stderr) as stage:
-            started = start_plan(bus, plan, properties, stage, not no_wait)
-    except DoraSystemdError as error:
-        if error.code is ExitCode.FAILURE:
-            _print_last_words(plan)
-        raise
+    has_file = place_unit_file(bus, plan, properties, boot, want_boot)
+    print_warnings([note for note in [ensure_linger(scope) if want_boot else ""] if note])
+    started = _start(bus, plan, None if has_file else properties, not no_wait)
     if output == "json":
         print_json({**vars(started), "dataflow": plan.options.dataflow})
     else:
         click.echo(format_started(started))
+
+
+def _start(bus: Bus, plan: Plan, properties: Properties | None, wait: bool) -> Started:
+    """Start a transient unit of these properties, or without them the unit file."""
+    try:
+        with StageLine(sys.stderr) as stage:
+            if properties is None:
+                return start_unit_file(bus, plan, stage, wait)
+            return start_plan(bus, plan, list(properties.values()), stage, wait)
+    except DoraSystemdError as error:
+        if error.code is ExitCode.FAILURE:
+            _print_last_words(plan)
+        raise
 
 
 def _print_last_words(plan: Plan) -> None:

@@ -38,10 +38,10 @@ def command(selectors: tuple[str, ...], want_all: bool) -> int:
         chosen = [cell for cell in cells if cell.is_up]
         if not chosen:
             click.echo("No dataflow is running.")
-        return print_outcomes(stop_cells(bus, chosen))
+        return print_outcomes(stop_cells(bus, scope, chosen))
     _print_ended(scope, [one for one in selectors if not matching_cells(cells, one)], cells)
     chosen = [cell for one in selectors for cell in _cells(cells, one)]
-    return print_outcomes(stop_cells(bus, list(dict.fromkeys(chosen))))
+    return print_outcomes(stop_cells(bus, scope, list(dict.fromkeys(chosen))))
 
 
 def _print_ended(scope: Scope, selectors: list[str], cells: list[Cell]) -> None:

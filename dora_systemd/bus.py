@@ -36,7 +36,7 @@ _UNIT_PROPERTIES = frozenset(
         *("ActiveState", "SubState", "LoadState", "FragmentPath", "DropInPaths", "Transient"),
         *("ActiveEnterTimestamp", "ActiveEnterTimestampMonotonic", "InactiveEnterTimestamp"),
         *("InactiveExitTimestamp", "InactiveExitTimestampMonotonic", "InvocationID", "Job"),
-        *("StateChangeTimestamp", "Description", "UnitFileState", "NeedDaemonReload"),
+        *("StateChangeTimestamp", "Description", "UnitFileState", "NeedDaemonReload", "WantedBy"),
     )
 )
 
@@ -116,6 +116,19 @@ class Bus:
 
     def reload(self) -> None:
         self._call("reload systemd", ROOT, MANAGER, "Reload")
+
+    def unit_path(self) -> list[str]:
+        paths: list[str] = self._get("read where units are", ROOT, MANAGER, "UnitPath")
+        return paths
+
+    def enable_unit_files(self, names: Sequence[str]) -> bool:
+        arguments = (("as", names), ("b", False), ("b", True))
+        reply = self._call(f"enable {names[0]}", ROOT, MANAGER, "EnableUnitFiles", *arguments)
+        return bool(reply[0])
+
+    def disable_unit_files(self, units: Sequence[str]) -> None:
+        arguments = (("as", units), ("b", False))
+        self._call(f"disable {units[0]}", ROOT, MANAGER, "DisableUnitFiles", *arguments)
 
     def version(self) -> str:
         text: str = self._get("read systemd's version", ROOT, MANAGER, "Version")

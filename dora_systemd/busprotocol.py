@@ -71,5 +71,14 @@ class Manager(Protocol):
     def reload(self) -> None:
         """Have the files of all units read again, as `systemctl daemon-reload`."""
 
+    def unit_path(self) -> list[str]:
+        """The directories of unit files, the most important first, as `systemctl show` has it."""
+
+    def enable_unit_files(self, names: Sequence[str]) -> bool:
+        """Link units or files as their [Install] sections say; whether they have one."""
+
+    def disable_unit_files(self, units: Sequence[str]) -> None:
+        """Remove all links to these units."""
+
     def version(self) -> str:
         """The systemd version, as in "257.13-1"."""

@@ -32,6 +32,14 @@ _REASONS = {
     errno.EPERM: ("permission denied", "let the calling user read it"),
 }
 
+_WRITE_HINTS = {
+    errno.EACCES: "use sudo, or choose a place that is yours",
+    errno.EPERM: "use sudo, or choose a place that is yours",
+    errno.EROFS: "the file system is mounted read-only",
+    errno.ENOSPC: "the disk is full, see df",
+    errno.EDQUOT: "the quota is used up, see quota",
+}
+
 
 def read_text(path: Path) -> str:
     """The text of the regular file `path`, at most MAX_BYTES of UTF-8.
@@ -88,11 +96,13 @@ def read_json(path: Path) -> Any:
         raise _refusal(path, "it is not JSON", "") from error
 
 
-def write_atomic(path: Path, data: str | bytes, mode: int = 0o644) -> None:
+def write_atomic(
+    path: Path, data: str | bytes, mode: int = 0o644, is_durable: bool = False
+) -> None:
     """Replaces `path` by `data` in one step: readers see the old file or the new one, whole.
 
-    `mode` holds from the first byte on, whatever the umask. Nothing is left behind on failure,
-    which raises DoraSystemdError.
+    `mode` holds from the first byte on, whatever the umask. is_durable: the same is true after a
+    power cut. Nothing is left behind on failure, which raises DoraSystemdError.
     """
     content = data.encode() if isinstance(data, str) else data
     temporary = ""
@@ -101,11 +111,17 @@ def write_atomic(path: Path, data: str | bytes, mode: int = 0o644) -> None:
         with os.fdopen(descriptor, "wb") as file:
             os.fchmod(file.fileno(), mode)
             file.write(content)
+            if is_durable:
+                file.flush()
+                os.fsync(file.fileno())
         Path(temporary).replace(path)
     except OSError as error:
         with contextlib.suppress(OSError):
             Path(temporary).unlink()
-        raise DoraSystemdError(f"cannot write {shown(str(path))}: {error.strerror}") from error
+        is_refused = error.errno in (errno.EACCES, errno.EPERM, errno.EROFS)
+        code = ExitCode.NO_PERMISSION if is_refused else ExitCode.FAILURE
+        message = f"cannot write {shown(str(path))}: {error.strerror}"
+        raise DoraSystemdError(message, _WRITE_HINTS.get(error.errno or 0, ""), code) from error
 
 
 def _read_bytes(path: Path) -> bytes:

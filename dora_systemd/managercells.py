@@ -6,7 +6,14 @@ from typing import Any
 
 from dora_systemd.busprotocol import Manager, UnitState
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.names import UNIT_PREFIX, UNIT_SUFFIX, is_uuid_prefix, name_from_unit
+from dora_systemd.names import (
+    UNIT_PREFIX,
+    UNIT_SUFFIX,
+    is_uuid_prefix,
+    name_from_unit,
+    parse_name,
+    unit_name,
+)
 from dora_systemd.options import RunnerOptions, options_from_command
 from dora_systemd.values import quoted
 
@@ -58,6 +65,17 @@ def read_cell(manager: Manager, unit: str) -> Cell | None:
     return _cell(manager, found)
 
 
+def find_cell(manager: Manager, selector: str) -> Cell:
+    """As select_cell, also for a dataflow that has a unit file and that systemd has not loaded."""
+    cells = read_cells(manager)
+    if not matching_cells(cells, selector):
+        unit = _named_unit(selector)
+        cell = read_cell(manager, unit) if unit else None
+        if cell is not None:
+            return cell
+    return select_cell(cells, selector)
+
+
 def select_cell(cells: Sequence[Cell], selector: str) -> Cell:
     """The one dataflow that `selector` (name, unit, UUID, beginning of a UUID) means.
 
@@ -97,6 +115,14 @@ def not_found(selector: str, names: Sequence[str]) -> DoraSystemdError:
         hint = "no dataflow is there; doractl list --all shows ended ones too"
     message = f"cannot find a dataflow {quoted(selector)}"
     return DoraSystemdError(message, hint, ExitCode.NOT_FOUND)
+
+
+def _named_unit(selector: str) -> str:
+    """The unit that `selector` would name, "" for what can be no name."""
+    try:
+        return selector if name_from_unit(selector) else unit_name(parse_name(selector))
+    except DoraSystemdError:
+        return ""
 
 
 def _cell(manager: Manager, state: UnitState) -> Cell | None:

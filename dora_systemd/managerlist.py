@@ -4,6 +4,8 @@ Nothing of ours has to be alive for it: the node table is only read.
 """
 
 import time
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ from dora_systemd.cellpaths import CellPaths
 from dora_systemd.cgroup import Usage
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.managercells import Cell, matching_cells, read_cells, select_cell
+from dora_systemd.managerenabled import enabled_units
 from dora_systemd.scope import Scope
 from dora_systemd.status import (
     WHOLE_CELL,
@@ -55,6 +58,18 @@ def dataflow_row(manager: Manager, scope: Scope, cell: Cell) -> DataflowRow:
     return DataflowRow(**facts, **_life(unit), **_usage(unit, status))
 
 
+def read_rows(manager: Manager, scope: Scope) -> list[DataflowRow]:
+    """All dataflows that systemd knows."""
+    rows = [dataflow_row(manager, scope, cell) for cell in read_cells(manager)]
+    return mark_enabled(manager, scope, rows) if rows else []
+
+
+def mark_enabled(manager: Manager, scope: Scope, rows: Sequence[DataflowRow]) -> list[DataflowRow]:
+    """The rows, with a mark on those that a boot starts."""
+    enabled = enabled_units(manager, scope)
+    return [replace(row, enabled=row.unit in enabled) for row in rows]
+
+
 def find_row(manager: Manager, scope: Scope, selector: str) -> DataflowRow:
     """All that is known of the dataflow that `selector` means, ended ones in the journal too.
 
@@ -67,7 +82,8 @@ def find_row(manager: Manager, scope: Scope, selector: str) -> DataflowRow:
         row = select_ended(scope, selector)
         if row is not None:
             return row
-    return dataflow_row(manager, scope, select_cell(cells, selector))
+    row = dataflow_row(manager, scope, select_cell(cells, selector))
+    return mark_enabled(manager, scope, [row])[0]
 
 
 def read_status(scope: Scope, cell: Cell) -> CellStatus:

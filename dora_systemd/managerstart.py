@@ -1,23 +1,17 @@
 """`doractl start`: a checked plan becomes a transient unit, and its start is waited for."""
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from dora_systemd.busprotocol import JOB_DONE, Manager, Property
+from dora_systemd.busprotocol import JOB_DONE, Manager, Observer, Property
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.managercells import Cell, read_cell
 from dora_systemd.managerplan import Plan
 from dora_systemd.managerreason import job_reason
 from dora_systemd.scope import Scope
-from dora_systemd.statuswords import local_time
 
 StageObserver = Callable[[str], None]
 """Is told the unit's STATUS= while its start is waited for."""
-
-_FORGET_SECONDS = 2.0
-_RETRY_SECONDS = 0.02
 
 
 @dataclass(frozen=True)
@@ -30,27 +24,6 @@ class Started:
     is_ready: bool
 
 
-def require_free_name(manager: Manager, unit: str) -> None:
-    """Make sure that `unit` can be made: a failed or ended dataflow of that name is forgotten.
-
-    Raises DoraSystemdError (NAME_IN_USE), which says what runs there.
-    """
-    cell = read_cell(manager, unit)
-    if cell is not None and cell.is_up:
-        raise _in_use(manager, cell)
-    state = manager.read(unit, ["LoadState", "Transient"])
-    if state["LoadState"] == "not-found":
-        return
-    if cell is None or not state["Transient"]:
-        raise DoraSystemdError(
-            f"cannot start {unit}: a unit of that name is there already",
-            f"see systemctl cat {unit}; choose another --name",
-            ExitCode.NAME_IN_USE,
-        )
-    manager.reset_failed(unit)
-    _wait_until_forgotten(manager, unit)
-
-
 def start_plan(
     manager: Manager,
     plan: Plan,
@@ -58,17 +31,46 @@ def start_plan(
     on_stage: StageObserver | None,
     wait: bool,
 ) -> Started:
-    """Start the unit of a plan and wait until its nodes are ready, unless told not to.
+    """Start the transient unit of a plan and wait until its nodes are ready, unless told not to.
 
     Raises DoraSystemdError when the start fails, with the reason; the unit is left as failed then.
     """
+    return _started(
+        manager,
+        plan,
+        lambda observe: manager.start_transient(plan.unit, properties, observe, wait),
+        on_stage,
+        wait,
+    )
 
+
+def start_unit_file(
+    manager: Manager, plan: Plan, on_stage: StageObserver | None, wait: bool
+) -> Started:
+    """The same for a plan whose unit is a file that systemd has read."""
+
+    def start(observe: Observer) -> str:
+        if wait:
+            return manager.run_jobs("StartUnit", [plan.unit], observe)[plan.unit]
+        manager.queue_job("StartUnit", plan.unit)
+        return JOB_DONE
+
+    return _started(manager, plan, start, on_stage, wait)
+
+
+def _started(
+    manager: Manager,
+    plan: Plan,
+    start: Callable[[Observer], str],
+    on_stage: StageObserver | None,
+    wait: bool,
+) -> Started:
     def observe(changes: Mapping[str, Any]) -> None:
         if on_stage and changes.get("StatusText"):
             on_stage(changes["StatusText"])
 
     try:
-        result = manager.start_transient(plan.unit, properties, observe, wait)
+        result = start(observe)
     except KeyboardInterrupt as error:
         raise _interruption(plan.options.name) from error
     if result == JOB_DONE and wait and _has_failed(manager, plan.unit):
@@ -93,29 +95,6 @@ def format_started(started: Started) -> str:
             f"Use 'doractl logs {name}' to view logs",
         )
     )
-
-
-def _in_use(manager: Manager, cell: Cell) -> DoraSystemdError:
-    since = manager.read(cell.unit, ["InactiveExitTimestamp"])["InactiveExitTimestamp"]
-    return DoraSystemdError(
-        f"cannot start {cell.name}: dataflow {cell.uuid} of that name runs since "
-        f"{local_time(since)} from {cell.options.dataflow}",
-        f"doractl stop {cell.name}, or choose another --name",
-        ExitCode.NAME_IN_USE,
-    )
-
-
-def _wait_until_forgotten(manager: Manager, unit: str) -> None:
-    """systemd unloads a unit some time after nothing holds it any more."""
-    deadline = time.monotonic() + _FORGET_SECONDS
-    while manager.read(unit, ["LoadState"])["LoadState"] != "not-found":
-        if time.monotonic() > deadline:
-            raise DoraSystemdError(
-                f"cannot start {unit}: systemd still holds the failed one",
-                f"systemctl list-dependencies --reverse {unit}",
-                ExitCode.NAME_IN_USE,
-            )
-        time.sleep(_RETRY_SECONDS)
 
 
 def _interruption(name: str) -> DoraSystemdError:

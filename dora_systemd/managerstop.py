@@ -5,7 +5,9 @@ from dataclasses import dataclass
 
 from dora_systemd.busprotocol import JOB_DONE, Manager, Observer
 from dora_systemd.managercells import Cell
+from dora_systemd.managerenabled import enabled_units
 from dora_systemd.managerreason import failure_reason, job_reason
+from dora_systemd.scope import Scope
 
 
 @dataclass(frozen=True)
@@ -17,14 +19,28 @@ class Outcome:
     problem: str = ""
 
 
-def stop_cells(manager: Manager, cells: Sequence[Cell]) -> list[Outcome]:
+def stop_cells(manager: Manager, scope: Scope, cells: Sequence[Cell]) -> list[Outcome]:
     """Stop dataflows, all at the same time, and wait until the last one has ended.
 
     Each has its own grace duration, after which systemd kills what is left of it.
     """
     up = [cell.unit for cell in cells if cell.is_up]
     results = manager.run_jobs("StopUnit", up) if up else {}
-    return [_stop_outcome(manager, cell, results.get(cell.unit)) for cell in cells]
+    outcomes = [_stop_outcome(manager, cell, results.get(cell.unit)) for cell in cells]
+    _release_enabled(manager, scope, up)
+    return outcomes
+
+
+def _release_enabled(manager: Manager, scope: Scope, units: Sequence[str]) -> None:
+    """What was enabled while it ran is that unit file from its next start on."""
+    for unit in sorted(enabled_units(manager, scope).intersection(units)):
+        state = manager.read(unit, ["Transient", "ActiveState"])
+        if state["Transient"] and state["ActiveState"] == "inactive":
+            from dora_systemd.managerenable import read_boot_unit, release_transient
+
+            boot = read_boot_unit(manager, scope, unit)
+            if boot.is_enabled:
+                release_transient(manager, boot)
 
 
 def restart_cells(

@@ -11,15 +11,15 @@ from dora_systemd.properties import UnitContext, format_unit, unit_properties
 from dora_systemd.propertykinds import Property
 
 
-def plan_properties(plan: Plan, manager: Manager) -> tuple[list[Property], tuple[str, ...]]:
-    """All properties of the unit that this systemd takes, and warnings.
+def plan_properties(plan: Plan, manager: Manager) -> tuple[dict[str, Property], tuple[str, ...]]:
+    """All properties of the unit that this systemd takes, by slot, and warnings.
 
     They are about the properties that it does not take and limits beyond the machine's own. Raises
     DoraSystemdError.
     """
     number = next(iter(version_numbers(manager.version())), MIN_VERSION)
     properties, warnings = drop_unsupported(_properties(plan), number)
-    return list(properties.values()), (*warnings, *check_limits(manager, plan, properties))
+    return properties, (*warnings, *check_limits(manager, plan, properties))
 
 
 def format_plan(plan: Plan) -> str:

@@ -53,10 +53,19 @@ def parse_property(assignment: str) -> dict[str, Property]:
     keys = _DOUBLE_KEYS.get(key, (key,))
     for one in keys:
         _check_key(one)
+    return {slot: one for each in keys for slot, one in parse_line(each, text).items()}
+
+
+def parse_line(key: str, text: str) -> dict[str, Property]:
+    """The properties that the line KEY=TEXT of one of our own unit files sets, by slot.
+
+    The text has no specifiers. Raises KeyError for a key that is not in the table, DoraSystemdError
+    (USAGE) for a bad value.
+    """
     if key in RLIMITS:
         soft, hard = _split_limit(text)
         return {**_parse_one(f"{key}Soft", soft), **_parse_one(key, hard)}
-    return {slot: one for each in keys for slot, one in _parse_one(each, text).items()}
+    return _parse_one(key, text)
 
 
 def with_properties(properties: Properties, changes: Properties) -> dict[str, Property]:

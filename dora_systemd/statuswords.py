@@ -54,6 +54,7 @@ class DataflowRow:
     """One line of `list`. uptime in µs; started, ended in CLOCK_REALTIME µs, 0: not known.
 
     The numbers are those of NodeRow, for the whole dataflow.
+    enabled: whether a boot starts it.
     """
 
     uuid: str
@@ -75,6 +76,7 @@ class DataflowRow:
     throttled: float | None = None
     restarts: int | None = None
     nodes: tuple[NodeRow, ...] = field(default=())
+    enabled: bool = False
 
 
 def status_word(active: str, sub: str, stage: str = "") -> str:
@@ -145,7 +147,7 @@ def _line(header: Sequence[str], cells: Sequence[str], widths: Sequence[int]) ->
     return "  ".join(aligned).rstrip()
 
 
-_HEADER = ("UUID", "NAME", "STATUS", "UPTIME", "NODES", "CPU%", "MEM", "RESTARTS")
+_HEADER = ("UUID", "NAME", "STATUS", "UPTIME", "NODES", "CPU%", "MEM", "RESTARTS", "BOOT")
 
 
 def format_dataflows(rows: Sequence[DataflowRow]) -> str:
@@ -164,6 +166,7 @@ def _dataflow_cells(row: DataflowRow, prefix: str) -> tuple[str, ...]:
         format_percent(row.cpu_percent),
         format_memory(row.memory, row.memory_limit),
         format_count(row.restarts),
+        "yes" if row.enabled else UNKNOWN,
     )
 
 
@@ -207,6 +210,7 @@ def format_dataflow(row: DataflowRow) -> str:
         ("CPU", _cpu_words(row)),
         ("Memory", _memory_words(row)),
         ("Restarts", format_count(row.restarts)),
+        ("At boot", "started" if row.enabled else ""),
     )
     lines = [f"{title + ':':<10}{text}" for title, text in facts if text]
     return "\n".join([*lines, "", format_nodes(row.nodes)] if row.nodes else lines)

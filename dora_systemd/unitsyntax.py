@@ -9,6 +9,9 @@ _ESCAPES = {
     **{"\\": "\\", '"': '"', "'": "'"},
 }
 _NUMERIC = re.compile(r"x([0-9a-fA-F]{2})|u([0-9a-fA-F]{4})|U([0-9a-fA-F]{8})|([0-7]{3})")
+# Behind a pair of backslashes there is no escape.
+_BYTES = re.compile(r"\\\\|(?:\\[23][0-7]{2}|\\x[89a-fA-F][0-9a-fA-F])+")
+_BYTE = re.compile(r"\\x(..)|\\(...)")
 _PLAIN_WORD = re.compile(r"[A-Za-z0-9_@%=:,./+~^!?*\[\]-]+")
 _NEEDS_ESCAPE = re.compile(r'[\\"\x00-\x1f\x7f]')
 
@@ -21,6 +24,7 @@ def split_words(text: str, separators: str = SPACE) -> list[str]:
     """
     words: list[str] = []
     word: str | None = None
+    text = _BYTES.sub(_characters, text)
     quote, place = "", 0
     while place < len(text):
         char, length = text[place], 1
@@ -55,6 +59,18 @@ def quote_word(text: str) -> str:
     if _PLAIN_WORD.fullmatch(escaped):
         return escaped
     return '"' + _NEEDS_ESCAPE.sub(_escaped, escaped) + '"'
+
+
+def _characters(match: re.Match[str]) -> str:
+    """Escapes of single bytes as the UTF-8 that they are: how systemd writes all but ASCII."""
+    pairs = _BYTE.findall(match[0])
+    data = bytes(
+        int(hexadecimal, 16) if hexadecimal else int(octal, 8) for hexadecimal, octal in pairs
+    )
+    try:
+        return data.decode() or match[0]
+    except UnicodeDecodeError:
+        return match[0]
 
 
 def _unescaped(text: str, place: int) -> tuple[str, int]:

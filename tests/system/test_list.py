@@ -37,6 +37,7 @@ def test_table(cell: Cell, project: Project) -> None:
         "CPU%",
         "MEM",
         "RESTARTS",
+        "BOOT",
     ]
     fields = row.split()
     assert fields[0] in cell.show("ExecStart")
@@ -46,7 +47,7 @@ def test_table(cell: Cell, project: Project) -> None:
     assert fields[4] == "3/3"
     assert float(fields[5]) > 0
     assert fields[6].endswith("M")
-    assert fields[7] == "0"
+    assert fields[7:] == ["0", "-"]
 
 
 def test_one_dataflow(cell: Cell, project: Project) -> None:

@@ -45,6 +45,7 @@ class FakeManager:
         self.stages: list[str] = []
         self.after_job: dict[str, dict[str, Any]] = {}
         self.systemd = "257.13-1"
+        self.etc = Path("/nowhere/etc")
 
     def add(self, runner: RunnerOptions, active: str = "active", **facts: Any) -> str:
         """A unit of ours in state `active`."""
@@ -55,6 +56,7 @@ class FakeManager:
             "ActiveState": active,
             "SubState": "running",
             "Transient": True,
+            "FragmentPath": f"/run/systemd/transient/{unit}",
             "ExecStart": [[command[0], command, False, 0, 0, 0, 0, 0, 0, 0]],
             "ControlGroup": "",
             "NRestarts": 0,
@@ -134,6 +136,25 @@ class FakeManager:
 
     def reload(self) -> None:
         self.calls.append(("reload",))
+
+    def unit_path(self) -> list[str]:
+        return [f"{self.etc}/systemd/{kind}" for kind in ("system", "user")]
+
+    def enable_unit_files(self, names: Sequence[str]) -> bool:
+        self.calls.append(("enable", *names))
+        for name in names:
+            wants = self.etc / "systemd/system/dora.target.wants"
+            wants.mkdir(parents=True, exist_ok=True)
+            link = wants / Path(name).name
+            link.unlink(missing_ok=True)
+            link.symlink_to(self.etc / "systemd/system" / link.name)
+        return True
+
+    def disable_unit_files(self, units: Sequence[str]) -> None:
+        self.calls.append(("disable", *units))
+        for unit in units:
+            for link in self.etc.glob(f"systemd/*/*.wants/{unit}"):
+                link.unlink()
 
     def version(self) -> str:
         return self.systemd

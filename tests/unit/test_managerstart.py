@@ -6,7 +6,7 @@ import pytest
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.managerplan import Plan
-from dora_systemd.managerstart import Started, format_started, require_free_name, start_plan
+from dora_systemd.managerstart import Started, format_started, start_plan
 from dora_systemd.managerunit import format_plan, plan_properties
 from dora_systemd.scope import Scope
 from dora_systemd.settings import resolve_settings
@@ -19,41 +19,6 @@ def make_plan(**flags: object) -> Plan:
     scope = Scope(is_user=True, uid=1000)
     settings = resolve_settings(flags, {}, [])
     return Plan(scope, options(), settings, None, {"PATH": "/bin"})
-
-
-def test_a_free_name() -> None:
-    manager = FakeManager()
-    require_free_name(manager, UNIT)
-    assert manager.calls == []
-
-
-@pytest.mark.parametrize("state", ["active", "activating", "deactivating", "reloading"])
-def test_a_name_in_use(state: str) -> None:
-    manager = FakeManager()
-    manager.add(options(), active=state, InactiveExitTimestamp=1_700_000_000_000_000)
-    with pytest.raises(DoraSystemdError) as caught:
-        require_free_name(manager, UNIT)
-    assert caught.value.code is ExitCode.NAME_IN_USE
-    for part in (UUID, "/srv/robot.yml", "since 2023-11-1"):
-        assert part in caught.value.message
-    assert manager.calls == []
-
-
-def test_a_failed_one_is_forgotten() -> None:
-    manager = FakeManager()
-    manager.add(options(), active="failed")
-    require_free_name(manager, UNIT)
-    assert manager.calls == [("reset", UNIT)]
-
-
-@pytest.mark.parametrize("facts", [{"ExecStart": []}, {"Transient": False}])
-def test_a_unit_that_is_not_ours_to_replace(facts: dict[str, Any]) -> None:
-    manager = FakeManager()
-    manager.add(options(), active="failed", **facts)
-    with pytest.raises(DoraSystemdError, match="there already") as caught:
-        require_free_name(manager, UNIT)
-    assert caught.value.code is ExitCode.NAME_IN_USE
-    assert manager.calls == []
 
 
 def test_stages_are_told_while_it_starts() -> None:
@@ -103,11 +68,11 @@ def test_what_start_prints() -> None:
 def test_properties_for_an_older_systemd() -> None:
     plan = make_plan(property=("RestartMode=direct",))
     manager = FakeManager()
-    names = [name for name, _, _ in plan_properties(plan, manager)[0]]
+    names = [one.name for one in plan_properties(plan, manager)[0].values()]
     assert "DelegateSubgroup" in names
     manager.systemd = "252.39-1~deb12u1"
     properties, warnings = plan_properties(plan, manager)
-    assert "DelegateSubgroup" not in [name for name, _, _ in properties]
+    assert "DelegateSubgroup" not in [one.name for one in properties.values()]
     assert len(warnings) == 1
     assert "RestartMode" in warnings[0]
 

@@ -7,15 +7,18 @@ import pytest
 from dora_systemd.managercells import read_cells
 from dora_systemd.managerreason import failure_reason
 from dora_systemd.managerstop import restart_cells, stop_cells
+from dora_systemd.scope import Scope
 from tests.unit.fake_manager import UUID, FakeManager, options
 
 UNIT = "dora-robot.service"
+
+SCOPE = Scope(is_user=False, uid=0)
 
 
 def test_stop() -> None:
     manager = FakeManager()
     manager.add(options())
-    (outcome,) = stop_cells(manager, read_cells(manager))
+    (outcome,) = stop_cells(manager, SCOPE, read_cells(manager))
     assert outcome.text == f"Dataflow stopped: {UUID} (robot)"
     assert manager.calls == [("StopUnit", UNIT)]
 
@@ -25,7 +28,7 @@ def test_several_stop_in_one_call() -> None:
     for name in ("a", "b", "c"):
         manager.add(options(name))
     manager.units["dora-b.service"]["ActiveState"] = "failed"
-    outcomes = stop_cells(manager, read_cells(manager))
+    outcomes = stop_cells(manager, SCOPE, read_cells(manager))
     assert manager.calls == [("StopUnit", "dora-a.service", "dora-c.service")]
     assert [one.problem for one in outcomes] == ["", "", ""]
     assert outcomes[1].text == f"Dataflow not running: {UUID} (b has failed)"
@@ -35,7 +38,7 @@ def test_stop_that_had_to_kill_says_so() -> None:
     manager = FakeManager()
     manager.add(options())
     manager.after_job[UNIT] = {"ActiveState": "failed", "Result": "timeout"}
-    (outcome,) = stop_cells(manager, read_cells(manager))
+    (outcome,) = stop_cells(manager, SCOPE, read_cells(manager))
     assert outcome.text.endswith("(robot): it did not end in time and was killed")
     assert outcome.problem == ""
 
@@ -44,7 +47,7 @@ def test_stop_that_was_cancelled() -> None:
     manager = FakeManager()
     manager.add(options())
     manager.job_results[UNIT] = "canceled"
-    (outcome,) = stop_cells(manager, read_cells(manager))
+    (outcome,) = stop_cells(manager, SCOPE, read_cells(manager))
     assert outcome.problem == f"cannot stop {UNIT}: the job was canceled"
 
 

@@ -86,6 +86,7 @@ ROWS = (
             NodeRow("camera", "running", 42, 5.0, 128 * 1024**2, 200 * 1024**2, 0),
             NodeRow("detector", "failed", 0, restarts=3, exit="exit code 1"),
         ),
+        enabled=True,
     ),
     DataflowRow(uuid=B, name="a-longer-name", unit="u", status="Failed", restarts=12),
 )
@@ -93,9 +94,9 @@ ROWS = (
 
 def test_table_of_dataflows() -> None:
     assert format_dataflows(ROWS) == (
-        "UUID      NAME           STATUS     UPTIME  NODES  CPU%   MEM  RESTARTS\n"
-        "550e8400  robot          Running  00:05:32  2/2    12.5  256M         0\n"
-        "550e8401  a-longer-name  Failed          -  -         -     -        12"
+        "UUID      NAME           STATUS     UPTIME  NODES  CPU%   MEM  RESTARTS  BOOT\n"
+        "550e8400  robot          Running  00:05:32  2/2    12.5  256M         0  yes\n"
+        "550e8401  a-longer-name  Failed          -  -         -     -        12  -"
     )
 
 
@@ -111,6 +112,7 @@ def test_one_dataflow() -> None:
         "CPU:      12.5%\n"
         "Memory:   256M\n"
         "Restarts: 0\n"
+        "At boot:  started\n"
         "\n"
         "NODE      STATE    PID  CPU%   MEM  PEAK  RESTARTS  EXIT\n"
         "camera    Running   42   5.0  128M  200M         0  -\n"
@@ -132,7 +134,7 @@ LIMITED = replace(
 
 
 def test_limits_stand_beside_what_is_used() -> None:
-    assert format_dataflows([LIMITED]).splitlines()[1].split()[6:] == ["256M/4G", "0"]
+    assert format_dataflows([LIMITED]).splitlines()[1].split()[6:] == ["256M/4G", "0", "yes"]
     lines = format_dataflow(LIMITED).splitlines()
     assert "CPU:      12.5% of 200%, throttled 12.0% of the time" in lines
     assert "Memory:   256M of 4G (peak 300M)" in lines

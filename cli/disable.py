@@ -1,0 +1,28 @@
+"""doractl disable: a dataflow that no boot starts any more."""
+
+import click
+
+from dora_systemd.bus import Bus
+from dora_systemd.cli.parameters import current_scope, scope_options
+from dora_systemd.managercells import find_cell
+from dora_systemd.managerenable import disable_cell
+
+_EPILOG = """\b
+Examples:
+  doractl disable robot
+"""
+
+
+@click.command("disable", epilog=_EPILOG)
+@click.argument("selectors", nargs=-1, required=True, metavar="SELECTOR...")
+@scope_options
+def command(selectors: tuple[str, ...]) -> None:
+    """No longer have dataflows started at boot; those that run go on until they end.
+
+    Takes away what enable has made. That a dataflow is not enabled is no error.
+    """
+    scope = current_scope()
+    bus = Bus(scope)
+    for cell in dict.fromkeys(find_cell(bus, one) for one in selectors):
+        done = disable_cell(bus, scope, cell)
+        click.echo(f"Dataflow {'disabled' if done else 'not enabled'}: {cell.uuid} ({cell.name})")

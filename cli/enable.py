@@ -1,0 +1,35 @@
+"""doractl enable: a dataflow that every boot starts."""
+
+import click
+
+from dora_systemd.bus import Bus
+from dora_systemd.cli.parameters import current_scope, print_warnings, scope_options
+from dora_systemd.managercells import find_cell
+from dora_systemd.managerenable import enable_cell
+from dora_systemd.managerlinger import ensure_linger
+
+_EPILOG = """\b
+Examples:
+  doractl enable robot
+  doractl enable robot vision
+"""
+
+
+@click.command("enable", epilog=_EPILOG)
+@click.argument("selectors", nargs=-1, required=True, metavar="SELECTOR...")
+@scope_options
+def command(selectors: tuple[str, ...]) -> None:
+    """Have dataflows started at every boot, as they run now.
+
+    UUID and settings stay, and what runs goes on. The unit becomes a file that systemctl edits,
+    shows and disables like any other.
+    """
+    scope = current_scope()
+    bus = Bus(scope)
+    cells = dict.fromkeys(find_cell(bus, one) for one in selectors)
+    for cell in cells:
+        boot, is_news = enable_cell(bus, scope, cell)
+        already = "" if is_news else " already"
+        click.echo(f"Dataflow{already} enabled: {cell.uuid} ({cell.name})")
+        click.echo(f"Unit file: {boot.path}")
+    print_warnings([note for note in [ensure_linger(scope)] if note])

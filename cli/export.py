@@ -1,0 +1,28 @@
+"""doractl export: the unit of a dataflow as a file for systemd alone."""
+
+import click
+
+from dora_systemd.bus import Bus
+from dora_systemd.cli.parameters import current_scope, scope_options
+from dora_systemd.managercells import find_cell
+from dora_systemd.managerexport import export_cell
+
+_EPILOG = """\b
+Examples:
+  doractl export robot
+  doractl export robot > /etc/systemd/system/dora-robot.service
+"""
+
+
+@click.command("export", epilog=_EPILOG)
+@click.argument("selector")
+@scope_options
+def command(selector: str) -> None:
+    """Print the unit of a dataflow as one unit file, with its drop-ins in it.
+
+    Put it where unit files are and systemctl enable does the rest: of dora-systemd it needs only
+    the runner. Environment variables are printed as well, with their values.
+    """
+    scope = current_scope()
+    bus = Bus(scope)
+    click.echo(export_cell(bus, scope, find_cell(bus, selector)), nl=False)

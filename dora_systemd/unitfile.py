@@ -1,0 +1,138 @@
+"""Unit files that outlive a run: their text, whose they are, and where they belong.
+
+The text is that of systemd.unit(5), made from what `properties` gives or from what systemd itself
+wrote for a transient unit: both say the same of the same dataflow.
+"""
+
+import posixpath
+import re
+from collections.abc import Iterator, Mapping, Sequence
+
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.options import RunnerOptions, options_from_command
+from dora_systemd.propertykinds import Property
+from dora_systemd.propertyset import parse_line, with_properties
+from dora_systemd.propertytable import TABLE
+
+BOOT_TARGET = "dora.target"
+"""Starts the enabled dataflows at boot where it is set up; nothing waits for it."""
+
+HEADER = "# Written by doractl(1). To change something: systemctl edit, see dora-systemd(7).\n"
+
+_SECTION = re.compile(r"\[([^\]]+)\]")
+_SPECIFIER = re.compile(r"%[a-zA-Z]")
+_ORDERS = ("After=default.target", "After=multi-user.target")
+_MOUNTABLE = re.compile(r"[^\x00-\x1f\x7f\"'\\]+")
+
+
+def plain_target(is_user: bool) -> str:
+    """The target that every boot (or every start of a user's manager) reaches."""
+    return "default.target" if is_user else "multi-user.target"
+
+
+def persistent_unit(
+    texts: Sequence[str], options: RunnerOptions, is_user: bool, target: str
+) -> str:
+    """One unit file that says what `texts` (a fragment and its drop-ins) say, hung below `target`.
+
+    A plain target is not kept waiting for the dataflow: it comes first.
+    """
+    sections = _sections(texts)
+    unit = sections.setdefault("Unit", [])
+    boot = [] if target == BOOT_TARGET else [f"After={target}"]
+    boot += [] if is_user else _mounts(options)
+    unit += [line for line in boot if line not in unit]
+    sections["Install"] = [f"WantedBy={target}"]
+    return _format(sections)
+
+
+def without_install(text: str) -> str:
+    """The same unit as a file that nothing starts by itself."""
+    return _format(_sections([text]))
+
+
+def runner_of(text: str) -> RunnerOptions | None:
+    """What the runner is told in the unit file `text`; None for a file that is none of ours."""
+    lines = _sections([text]).get("Service", ())
+    commands = [line.partition("=")[2] for line in lines if re.match(r"ExecStart\s*=\s*\S", line)]
+    if len(commands) != 1:
+        return None
+    kind = TABLE["ExecStart"].choices[0][1]
+    try:
+        ((_, argv, _),) = kind.parse(commands[0])
+        return options_from_command([word.replace("%%", "%") for word in argv])
+    except (DoraSystemdError, ValueError):
+        return None
+
+
+def says_the_same(text: str, other: str) -> bool:
+    """Whether two unit files start the same dataflow in the same way, whichever target starts it.
+
+    False as well where one of them holds what only its admin can have written there.
+    """
+    first = _properties(text)
+    return first is not None and first == _properties(other)
+
+
+def _properties(text: str) -> dict[str, Property] | None:
+    sections = _sections([text])
+    properties: dict[str, Property] = {}
+    for line in (line for lines in sections.values() for line in lines):
+        key, _, value = line.partition("=")
+        if line in _ORDERS:
+            continue
+        if _SPECIFIER.search(value.replace("%%", "")):
+            return None
+        try:
+            change = parse_line(key, value.replace("%%", "%"))
+        except (KeyError, DoraSystemdError):
+            return None
+        properties = with_properties(properties, change)
+    return properties
+
+
+def _mounts(options: RunnerOptions) -> list[str]:
+    """What has to be mounted first. Paths that this line cannot hold are mounted by then, or not.
+
+    systemd.unit(5) knows quotes there, but no escapes.
+    """
+    paths = (posixpath.dirname(options.dataflow), options.working_directory)
+    clean = dict.fromkeys(posixpath.normpath(path).replace("%", "%%") for path in paths)
+    words = [f'"{path}"' if " " in path else path for path in clean if _MOUNTABLE.fullmatch(path)]
+    return [f"RequiresMountsFor={' '.join(words)}"] if words else []
+
+
+def _format(sections: Mapping[str, Sequence[str]]) -> str:
+    parts = ["\n".join((f"[{name}]", *lines)) for name, lines in sections.items() if lines]
+    return HEADER + "\n\n".join(parts) + "\n"
+
+
+def _sections(texts: Sequence[str]) -> dict[str, list[str]]:
+    """The lines of all texts by section, without comments; what is for another file is left out."""
+    sections: dict[str, list[str]] = {"Unit": [], "Service": []}
+    for text in texts:
+        name = ""
+        for line in _logical_lines(text):
+            heading = _SECTION.fullmatch(line)
+            if heading:
+                name = heading[1]
+            elif name and name != "Install":
+                sections.setdefault(name, []).append(line)
+    return sections
+
+
+def _logical_lines(text: str) -> Iterator[str]:
+    """Lines without comments; those that end in a backslash are joined to the next."""
+    pending = ""
+    # Not splitlines: only a newline ends a line here.
+    for raw in text.split("\n"):
+        line = raw.strip(" \t\r")
+        if (not line and not pending) or line.startswith(("#", ";")):
+            continue
+        if line.endswith("\\"):
+            pending += line[:-1] + " "
+            continue
+        yield pending + line
+        pending = ""
+    if pending:
+        yield pending.rstrip()

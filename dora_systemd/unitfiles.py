@@ -1,0 +1,68 @@
+"""Unit files on disk: read, written so that a power cut leaves the old one or the new one."""
+
+import errno
+import stat
+from pathlib import Path
+
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.files import read_text, write_atomic
+
+_REFUSED = {errno.EACCES, errno.EPERM, errno.EROFS}
+
+
+def read_unit_file(path: Path) -> str | None:
+    """The text of `path`, None where nothing is.
+
+    Raises DoraSystemdError: NAME_IN_USE for a link (as systemctl mask makes) or anything else that
+    is no regular file, BAD_INPUT for what cannot be read.
+    """
+    try:
+        mode = path.lstat().st_mode
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise _failure("read", path, error) from error
+    if not stat.S_ISREG(mode):
+        raise foreign_file(path)
+    return read_text(path)
+
+
+def write_unit_file(path: Path, text: str) -> None:
+    """Put `text` at `path` and onto the disk; missing directories are made.
+
+    Raises DoraSystemdError; then all is as it was.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _failure("write", path, error) from error
+    write_atomic(path, text, is_durable=True)
+
+
+def remove_unit_file(path: Path) -> None:
+    """Take `path` away, if it is there. Raises DoraSystemdError."""
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise _failure("remove", path, error) from error
+
+
+def wanted_units(directory: Path) -> frozenset[str]:
+    """The units that the targets of `directory` start: the links in its .wants directories."""
+    return frozenset(path.name for path in directory.glob("*.wants/dora-*.service"))
+
+
+def foreign_file(path: Path) -> DoraSystemdError:
+    """The error for a file in our place that somebody else has put there."""
+    return DoraSystemdError(
+        f"cannot use {path}: it is there already and not doractl's",
+        "look at it, and choose another --name or move it away",
+        ExitCode.NAME_IN_USE,
+    )
+
+
+def _failure(what: str, path: Path, error: OSError) -> DoraSystemdError:
+    is_refused = error.errno in _REFUSED
+    hint = "use sudo, or --user for a dataflow of your own" if is_refused else ""
+    code = ExitCode.NO_PERMISSION if is_refused else ExitCode.FAILURE
+    return DoraSystemdError(f"cannot {what} {path}: {error.strerror}", hint, code)

@@ -1,0 +1,262 @@
+"""doractl enable, disable and export: unit files that systemd itself reads."""
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from dora_systemd.bus import Bus
+from dora_systemd.errors import ExitCode
+from dora_systemd.options import RunnerOptions, options_from_command
+from dora_systemd.properties import UnitContext, format_unit, unit_properties
+from dora_systemd.settings import resolve_settings
+from dora_systemd.unitfile import persistent_unit
+from tests.system.cells import Cell, Project, run, wait_for
+
+# They write to /etc, or would make the user linger.
+pytestmark = pytest.mark.lab
+
+ETC = Path("/etc/systemd/system")
+TEMPLATES = Path(__file__).parents[2] / "units/templates"
+NASTY = r"""x "y" 'z' $HOME ${A} %h %% é \ \n \x41 # ;"""
+
+
+@pytest.fixture
+def boots(cell: Cell) -> Iterator[Cell]:
+    """A cell whose unit files go with it."""
+    yield cell
+    cell.doractl("disable", cell.name, check=False)
+    cell.end()
+    for path in ETC.glob(f"*.wants/{cell.unit}"):
+        path.unlink()
+    for root in (ETC, Path("/run/systemd/system")):
+        (root / cell.unit).unlink(missing_ok=True)
+        shutil.rmtree(root / f"{cell.unit}.d", ignore_errors=True)
+    run("systemctl", "daemon-reload")
+
+
+@pytest.fixture
+def target() -> Iterator[None]:
+    """dora.target, as the package has it."""
+    link = ETC / "multi-user.target.wants/dora.target"
+    shutil.copy(TEMPLATES / "dora.target", ETC)
+    link.symlink_to(ETC / "dora.target")
+    run("systemctl", "daemon-reload")
+    run("systemctl", "start", "dora.target")
+    yield
+    run("systemctl", "stop", "dora.target")
+    link.unlink()
+    (ETC / "dora.target").unlink()
+    run("systemctl", "daemon-reload")
+
+
+def facts(cell: Cell) -> tuple[str, str]:
+    """Where the unit comes from, and whether it would start at boot."""
+    return cell.show("FragmentPath"), cell.show("UnitFileState")
+
+
+def variables(cell: Cell) -> list[str]:
+    found: list[str] = Bus(cell.scope).read(cell.unit, ["Environment"])["Environment"]
+    return found
+
+
+def uuid_of(cell: Cell) -> str:
+    rows = json.loads(cell.doractl("list", "--all", "-o", "json").stdout)
+    (row,) = [row for row in rows if row["name"] == cell.name]
+    return str(row["uuid"])
+
+
+def test_exported_units_need_nothing_of_us(boots: Cell, project: Project) -> None:
+    boots.start(project.three_nodes(), "--env", f"SECRET={NASTY}", "--property", "Nice=5")
+    before = variables(boots), uuid_of(boots)
+    text = boots.doractl("export", boots.name).stdout
+    boots.end()
+    path = ETC / boots.unit
+    path.write_text(text)
+    assert run("systemd-analyze", "verify", str(path)).stderr == ""
+    boots.systemctl("enable", "--now")
+    assert facts(boots) == (str(path), "enabled")
+    assert (variables(boots), uuid_of(boots)) == before
+    assert f"SECRET={NASTY}" in before[0]
+    boots.wait_exchanging()
+    # enable and disable take it for what it is.
+    assert "already enabled" in boots.doractl("enable", boots.name).stdout
+
+
+@pytest.mark.usefixtures("target")
+def test_a_running_dataflow_is_enabled_and_runs_on(boots: Cell, project: Project) -> None:
+    boots.start(project.three_nodes(), "--env", f"SECRET={NASTY}")
+    pids, before = boots.all_pids(), (variables(boots), uuid_of(boots))
+    done = boots.doractl("enable", boots.name)
+    path = ETC / boots.unit
+    assert done.stdout == (f"Dataflow enabled: {before[1]} ({boots.name})\nUnit file: {path}\n")
+    assert boots.all_pids() == pids
+    assert (ETC / "dora.target.wants" / boots.unit).is_symlink()
+    assert run("systemd-analyze", "verify", str(path)).stderr == ""
+    header, row = boots.doractl("list").stdout.splitlines()
+    assert (header.split()[-1], row.split()[-1]) == ("BOOT", "yes")
+    # With its own tools: systemd has no reason to hold the transient unit.
+    boots.systemctl("stop")
+    boots.systemctl("start")
+    assert facts(boots) == (str(path), "enabled")
+    assert (variables(boots), uuid_of(boots)) == before
+    boots.wait_exchanging()
+
+
+@pytest.mark.usefixtures("target")
+def test_a_reload_in_between_changes_nothing(boots: Cell, project: Project) -> None:
+    """The target holds the transient unit then; doractl has it forgotten."""
+    flow = project.three_nodes()
+    boots.start(flow)
+    uuid = uuid_of(boots)
+    boots.doractl("enable", boots.name)
+    pids = boots.all_pids()
+    run("systemctl", "daemon-reload")
+    assert boots.all_pids() == pids
+    boots.doractl("stop", boots.name)
+    assert facts(boots) == (str(ETC / boots.unit), "enabled")
+    row = json.loads(boots.doractl("list", "--all", "-o", "json").stdout)[0]
+    assert (row["status"], row["enabled"], row["uuid"]) == ("Stopped", True, uuid)
+    assert boots.doractl("list", boots.name, check=False).returncode == ExitCode.NOT_RUNNING
+    # The same again is the enabled one.
+    assert f"Dataflow started: {uuid}\n" in boots.start(flow).stdout
+    assert facts(boots) == (str(ETC / boots.unit), "enabled")
+
+
+def test_start_and_enable(boots: Cell, project: Project) -> None:
+    flow = project.three_nodes()
+    first = boots.start(flow, "--enable", "--env", "A=1").stdout
+    assert facts(boots) == (str(ETC / boots.unit), "enabled")
+    assert boots.show("WantedBy") == "multi-user.target"
+    uuid = uuid_of(boots)
+    assert uuid in first
+    boots.doractl("stop", boots.name)
+    refused = boots.start(flow, check=False)
+    assert refused.returncode == ExitCode.NAME_IN_USE
+    assert "enabled with other settings" in refused.stderr
+    assert uuid in boots.start(flow, "--enable", "--env", "A=2").stdout
+    assert "A=2" in variables(boots)
+
+
+def test_drop_ins_work(boots: Cell, project: Project) -> None:
+    boots.start(project.three_nodes(), "--enable")
+    run("systemctl", "edit", "--stdin", boots.unit, input="[Service]\nNice=7\n")
+    boots.doractl("restart", boots.name)
+    assert boots.show("Nice") == "7"
+    assert "Nice=7" in boots.systemctl("cat")
+    assert "\nNice=7\n" in boots.doractl("export", boots.name).stdout
+    shutil.rmtree(ETC / f"{boots.unit}.d")
+
+
+def test_disabled_while_it_runs(boots: Cell, project: Project) -> None:
+    boots.start(project.three_nodes(), "--enable")
+    pids = boots.all_pids()
+    assert "Dataflow disabled: " in boots.doractl("disable", boots.name).stdout
+    assert boots.all_pids() == pids
+    assert not (ETC / boots.unit).exists()
+    assert boots.show("KillMode") == "mixed"
+    assert not json.loads(boots.doractl("list", "-o", "json").stdout)[0]["enabled"]
+    again = boots.doractl("disable", boots.name)
+    assert (again.returncode, again.stdout.split(":")[0]) == (0, "Dataflow not enabled")
+    boots.doractl("stop", boots.name)
+    boots.start(project.root / "dataflow.yml")
+    assert boots.show("Transient") == "yes"
+
+
+def test_enabled_and_disabled_again_while_it_runs(boots: Cell, project: Project) -> None:
+    boots.start(project.three_nodes())
+    boots.doractl("enable", boots.name)
+    assert "already enabled" in boots.doractl("enable", boots.name).stdout
+    boots.doractl("disable", boots.name)
+    boots.doractl("stop", boots.name)
+    assert not list(ETC.rglob(boots.unit))
+    assert boots.show("LoadState") == "not-found"
+
+
+@pytest.mark.parametrize("verb", ["enable", "disable", "export"])
+def test_unknown_dataflows(verb: str) -> None:
+    for name in ("nobody", "no/body", "gateway", ""):
+        done = run("doractl", verb, name, check=False)
+        assert (done.returncode, done.stdout) == (ExitCode.NOT_FOUND, "")
+        assert len(done.stderr.splitlines()) == 2
+
+
+def test_a_foreign_unit_file_stays(boots: Cell, project: Project) -> None:
+    flow = project.three_nodes()
+    boots.start(flow)
+    path = ETC / boots.unit
+    path.write_text("[Service]\nExecStart=/bin/true\n")
+    done = boots.doractl("enable", boots.name, check=False)
+    assert done.returncode == ExitCode.NAME_IN_USE
+    assert done.stderr.startswith(f"doractl: cannot use {path}: it is there already")
+    boots.end()
+    assert boots.start(flow, "--enable", check=False).returncode == ExitCode.NAME_IN_USE
+    assert path.read_text() == "[Service]\nExecStart=/bin/true\n"
+
+
+def test_a_full_etc(boots: Cell, project: Project) -> None:
+    """One clear line, and nothing is left behind."""
+    boots.start(project.three_nodes())
+    run("mount", "-t", "tmpfs", "-o", "size=4k,mode=755", "tmpfs", str(ETC))
+    try:
+        (ETC / "fill").write_bytes(b"x" * 4096)
+        done = boots.doractl("enable", boots.name, check=False)
+        assert [path.name for path in ETC.iterdir()] == ["fill"]
+    finally:
+        run("umount", str(ETC))
+    assert done.returncode == ExitCode.FAILURE
+    assert done.stderr.splitlines()[0] == (
+        f"doractl: cannot write {ETC / boots.unit}: No space left on device"
+    )
+    boots.wait_exchanging()
+
+
+def test_users_may_not(boots: Cell, project: Project) -> None:
+    boots.start(project.three_nodes())
+    command = ("runuser", "-u", "alice", "--", "doractl", "--system", "enable", boots.name)
+    done = run(*command, check=False)
+    assert done.returncode == ExitCode.NO_PERMISSION
+    assert "use sudo" in done.stderr
+
+
+@pytest.mark.warns("no such file", "exit", "Failed", "failed", "cannot")
+def test_a_dataflow_file_that_is_gone(boots: Cell, project: Project) -> None:
+    """The boot goes on: the target does not wait, and does not need it."""
+    flow = project.three_nodes()
+    boots.start(flow, "--enable")
+    boots.doractl("stop", boots.name)
+    flow.unlink()
+    boots.systemctl("start", check=False)
+    wait_for("it has failed", lambda: boots.show("ActiveState") == "failed")
+    assert boots.show("ExecMainStatus") == "78"
+    assert str(flow) in boots.show("StatusText")
+    row = json.loads(boots.doractl("list", "--all", "-o", "json").stdout)[0]
+    assert (row["status"], row["enabled"]) == ("Failed", True)
+
+
+values = st.text(st.characters(exclude_categories=["Cc", "Cs"]), max_size=40)
+paths = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]), max_size=20)
+
+
+@settings(
+    deadline=None, max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(texts=st.lists(values, max_size=30), path=paths)
+def test_systemd_reads_what_was_meant(boots: Cell, texts: list[str], path: str) -> None:
+    """Quotes, backslashes, "%" and "$" in secrets and in paths."""
+    name, environment = boots.name, {f"V{place}": text for place, text in enumerate(texts)}
+    uuid = "550e8400-e29b-41d4-a716-446655440000"
+    told = RunnerOptions(name, uuid, f"/{path}", "/srv", "/usr/bin/dora")
+    context = UnitContext("/usr/bin/python3", False, "dora", environment)
+    unit = format_unit(unit_properties(told, context, resolve_settings({}, {}, [])))
+    (ETC / boots.unit).write_text(persistent_unit([unit], told, False, "dora.target"))
+    bus = Bus(boots.scope)
+    bus.reload()
+    found = bus.read(boots.unit, ["LoadState", "Environment", "ExecStart"])
+    assert found["LoadState"] == "loaded"
+    assert found["Environment"] == [f"{key}={text}" for key, text in environment.items()]
+    assert options_from_command(found["ExecStart"][0][1]) == told
