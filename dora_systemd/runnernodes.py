@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import os
+import resource
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
@@ -75,6 +76,7 @@ class Nodes:
 
     def listen(self, run: str) -> None:
         """Begin to read what the nodes of `run` say: launchers that wait for a reader go on."""
+        raise_file_limit()
         for node in self._piped:
             self._pipes.open(node)
         loop = asyncio.get_running_loop()
@@ -150,6 +152,15 @@ class Nodes:
             {key: one.cpu_us for key, one in use.items()},
             {key: one.throttling for key, one in use.items() if any(one.throttling)},
         )
+
+
+def raise_file_limit() -> None:
+    """Let this process have as many open files as it may: it needs four for each node.
+
+    Not before coordinator and daemon run: they and the nodes keep the limit that the unit has.
+    """
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
 
 
 def _with_descendants(pid: int) -> list[int]:
