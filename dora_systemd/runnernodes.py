@@ -157,7 +157,7 @@ class Nodes:
 def raise_file_limit() -> None:
     """Let this process have as many open files as it may: it needs four for each node.
 
-    Not before coordinator and daemon run: they and the nodes keep the limit that the unit has.
+    Not before coordinator and daemon run: theirs is dora's business, the daemon raises its own.
     """
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
