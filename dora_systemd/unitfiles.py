@@ -1,5 +1,6 @@
 """Unit files on disk: read, written so that a power cut leaves the old one or the new one."""
 
+import contextlib
 import errno
 import stat
 from pathlib import Path
@@ -25,6 +26,22 @@ def read_unit_file(path: Path) -> str | None:
     if not stat.S_ISREG(mode):
         raise foreign_file(path)
     return read_text(path)
+
+
+def write_link(path: Path, target: str) -> None:
+    """Make the symbolic link `path`, unless it is there. Raises DoraSystemdError."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if not path.is_symlink():
+            path.symlink_to(target)
+    except OSError as error:
+        raise _failure("write", path, error) from error
+
+
+def remove_empty(directory: Path) -> None:
+    """Take a directory away if nothing is in it."""
+    with contextlib.suppress(OSError):
+        directory.rmdir()
 
 
 def write_unit_file(path: Path, text: str) -> None:
@@ -56,7 +73,7 @@ def foreign_file(path: Path) -> DoraSystemdError:
     """The error for a file in our place that somebody else has put there."""
     return DoraSystemdError(
         f"cannot use {path}: it is there already and not doractl's",
-        "look at it, and choose another --name or move it away",
+        "look at it; then move it away, or take another name",
         ExitCode.NAME_IN_USE,
     )
 

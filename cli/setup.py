@@ -1,0 +1,58 @@
+"""doractl setup: what a pip install does not put in place."""
+
+import click
+
+from dora_systemd.bus import Bus
+from dora_systemd.cli.parameters import current_scope, print_warnings, scope_options
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.managersetup import (
+    packaged_unit,
+    plan_setup,
+    put_in_place,
+    refuse_if_needed,
+    take_away,
+    tell_systemd,
+)
+from dora_systemd.scope import Scope
+
+_EPILOG = """\b
+Examples:
+  doractl setup
+  doractl setup --user
+  doractl setup --remove
+"""
+
+
+@click.command("setup", epilog=_EPILOG)
+@click.option("--remove", "want_removal", is_flag=True, help="Take all of it away again.")
+@scope_options
+def command(want_removal: bool) -> None:
+    """Put dora.slice, dora.target, catalog, completions and manuals in place after pip install.
+
+    Below /usr/local for the system, below ~/.local/share for a user; the Debian package has it all
+    already. A file there that is not ours is refused and not touched.
+    """
+    scope = current_scope()
+    if not want_removal and (packaged := packaged_unit(scope)):
+        click.echo(f"A package has put everything in place: {packaged}")
+        return
+    steps = plan_setup(scope)
+    if want_removal:
+        _check_use(scope)
+    changed = take_away(steps) if want_removal else put_in_place(steps)
+    word = "Removed" if want_removal else "Installed"
+    for path in changed:
+        click.echo(f"{word}: {path}")
+    if changed:
+        print_warnings(tell_systemd(Bus, scope))
+    else:
+        click.echo("Nothing to remove." if want_removal else "Everything is in place.")
+
+
+def _check_use(scope: Scope) -> None:
+    """Nothing is in use where there is no systemd to ask."""
+    try:
+        refuse_if_needed(Bus(scope), scope)
+    except DoraSystemdError as error:
+        if error.code is not ExitCode.NO_SYSTEMD:
+            raise
