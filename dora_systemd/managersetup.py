@@ -10,11 +10,12 @@ from pathlib import Path
 from dora_systemd.busprotocol import Manager
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.files import read_text
-from dora_systemd.managerenabled import enabled_units
+from dora_systemd.managerenabled import own_directories
 from dora_systemd.names import name_from_unit
 from dora_systemd.process import run_command
 from dora_systemd.scope import Scope
 from dora_systemd.setupfiles import PACKAGED_UNIT, SYSTEM_ROOT, SetupFile, is_ours, setup_files
+from dora_systemd.unitfile import BOOT_TARGET
 from dora_systemd.unitfiles import (
     foreign_file,
     read_unit_file,
@@ -81,7 +82,11 @@ def data_root(scope: Scope) -> Path:
     given = os.environ.get("XDG_DATA_HOME", "")
     if given.startswith("/"):
         return Path(given)
-    return Path("~/.local/share").expanduser()
+    try:
+        return Path.home() / ".local/share"
+    except RuntimeError as error:
+        hint = "set HOME, or XDG_DATA_HOME"
+        raise DoraSystemdError("cannot find your home directory", hint) from error
 
 
 def packaged_unit(scope: Scope) -> str:
@@ -92,7 +97,8 @@ def packaged_unit(scope: Scope) -> str:
 
 def refuse_if_needed(manager: Manager, scope: Scope) -> None:
     """Raise DoraSystemdError while a boot starts dataflows by way of dora.target."""
-    names = sorted(filter(None, map(name_from_unit, enabled_units(manager, scope))))
+    links = own_directories(manager, scope)[0].glob(f"{BOOT_TARGET}.wants/*")
+    names = sorted(filter(None, (name_from_unit(link.name) for link in links)))
     if names:
         raise DoraSystemdError(
             f"cannot remove dora.target: a boot starts {', '.join(names)} with it",

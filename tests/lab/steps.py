@@ -131,7 +131,15 @@ def plan_lab(_form: str) -> list[Step]:
 
 
 def plan_vm(_form: str) -> list[Step]:
-    return [lab_step("system tests that need limits, vm", "vm", ["tests/system", "-m", "vm"])]
+    limits = lab_step("system tests that need limits, vm", "vm", ["tests/system", "-m", "vm"])
+    return [limits, reboot_step()]
+
+
+def reboot_step() -> Step:
+    """One machine for both: what is enabled before the reboot is looked for behind it."""
+    first, second = (["pytest", f"tests/boot/test_{when}.py"] for when in ("before", "after"))
+    command = ["tests/lab/lab", "run", "--", *first, "--reboot--", *second]
+    return Step("a reboot, vm", command, {**os.environ, "LAB": "vm"})
 
 
 def plan_system(form: str) -> list[Step]:

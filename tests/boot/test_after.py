@@ -1,0 +1,37 @@
+"""After the reboot: they are back, with their UUIDs; one without its file has failed alone."""
+
+import json
+from functools import partial
+
+from dora_systemd.bus import Bus
+from dora_systemd.scope import scope_of
+from tests.boot.flows import ALICE, NOTES, ROOT, listed
+from tests.system.cells import run, wait_for
+
+
+def status(caller: tuple[str, ...], name: str) -> str:
+    return str(listed(caller)[name]["status"])
+
+
+def is_running(caller: tuple[str, ...], name: str) -> bool:
+    return status(caller, name) == "Running"
+
+
+def test_they_are_back() -> None:
+    notes = json.loads(NOTES.read_text())
+    active = ("is-active", "multi-user.target")
+    wait_for("the boot", lambda: not run("systemctl", *active, check=False).returncode, 240)
+    for caller, name in ((ROOT, "begun"), (ROOT, "running"), (ALICE, "mine")):
+        wait_for(name, partial(is_running, caller, name), 240)
+        assert listed(caller)[name]["uuid"] == notes[name]
+    found = Bus(scope_of(None)).read("dora-begun.service", ["Environment"])["Environment"]
+    assert "A=x $B %h" in found
+
+
+def test_one_without_its_file_has_failed() -> None:
+    """The boot has gone on, and the status says which file."""
+    wait_for("its failure", lambda: status(ROOT, "gone") == "Failed", 240)
+    row = listed(ROOT)["gone"]
+    assert "/srv/gone/dataflow.yml" in row["text"]
+    shown = run("systemctl", "is-active", "multi-user.target", "dora.target").stdout.split()
+    assert shown == ["active", "active"]

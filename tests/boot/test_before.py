@@ -1,0 +1,41 @@
+"""Before the reboot: dataflows of the system and of a user become part of the boot."""
+
+import json
+import shutil
+from pathlib import Path
+
+from tests.boot.flows import ALICE, NOTES, ROOT, listed
+from tests.system.cells import run, wait_for
+
+NODE = """
+from dora import Node
+for event in Node():
+    pass
+"""
+FLOW = "nodes: [{id: only, path: node.py, inputs: {tick: dora/timer/millis/200}}]\n"
+
+
+def flow(directory: Path) -> str:
+    directory.mkdir(parents=True)
+    (directory / "node.py").write_text(NODE)
+    path = directory / "dataflow.yml"
+    path.write_text(FLOW)
+    return str(path)
+
+
+def test_enable() -> None:
+    run("doractl", "setup")
+    begun = flow(Path("/srv/begun"))
+    run("doractl", "start", begun, "--enable", "--no-wait", "--env", "A=x $B %h")
+    run("doractl", "start", flow(Path("/srv/running")))
+    run("doractl", "enable", "running")
+    gone = flow(Path("/srv/gone"))
+    run("doractl", "start", gone, "--enable", "--no-wait")
+    user = flow(Path("/home/alice/mine"))
+    wait_for("alice's manager", lambda: Path("/run/user/1000/bus").exists(), 120)
+    shutil.chown("/home/alice/mine", "alice")
+    run(*ALICE, "doractl", "start", user, "--enable")
+    notes = {name: row["uuid"] for who in (ROOT, ALICE) for name, row in listed(who).items()}
+    assert notes.keys() == {"begun", "running", "gone", "mine"}
+    Path(gone).unlink()
+    NOTES.write_text(json.dumps(notes))
