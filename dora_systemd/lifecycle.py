@@ -87,7 +87,9 @@ def _fail(cell: Cell, reason: str, code: RunnerExit) -> Step:
 
 def _child_exited(cell: Cell, event: life.Event) -> Step:
     assert isinstance(event, life.ChildExited)
-    return _lose(cell, event.child, f"the dora {event.child} is gone ({event.exit})", event.exit)
+    reason = f"the dora {event.child} is gone ({event.exit})"
+    cell, actions = _lose(cell, event.child, reason, event.exit)
+    return cell, (*_oom_of_all(event), *actions)
 
 
 def _connection_lost(cell: Cell, event: life.Event) -> Step:
@@ -111,8 +113,8 @@ def _node_event(cell: Cell, event: life.Event) -> Step:
 
 
 def _oom_of_all(event: life.Event) -> tuple[Action, ...]:
-    """What there is to say about the dataflow when its own limit has killed a node."""
-    if not isinstance(event, life.NodeExited) or event.oom is None:
+    """What there is to say about the dataflow when its own limit has killed something of it."""
+    if not isinstance(event, life.NodeExited | life.ChildExited) or event.oom is None:
         return ()
     if event.oom.owner is not Owner.DATAFLOW:
         return ()
@@ -164,11 +166,15 @@ def _result(cell: Cell, event: life.Event) -> Step:
     cell = replace(cell, nodes=table.apply_results(cell.nodes, event.results, event.at_us))
     if not event.results:
         return _fail(cell, "dora lost the dataflow", RunnerExit.ENGINE_LOST)
-    failed = {node: how for node, how in event.results.items() if how}
+    failed = {node: _known_exit(cell, node, how) for node, how in event.results.items() if how}
     if failed:
         reason = ", ".join(f"node {node}: {how}" for node, how in failed.items())
         cell = replace(cell, failure=reason, exit=RunnerExit.FAILED)
     return _leave(cell)
+
+
+def _known_exit(cell: Cell, node: str, how: str) -> str:
+    return cell.nodes[node].exit if node in cell.nodes else how
 
 
 def _stop_while_closing(cell: Cell, event: life.Event) -> Step:

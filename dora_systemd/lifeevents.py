@@ -101,10 +101,11 @@ class ResultKnown(Event):
 
 @dataclass(frozen=True)
 class ChildExited(Event):
-    """The coordinator or the daemon is gone. child: which of the two. exit: how."""
+    """The coordinator or the daemon is gone. child: which of the two. exit: how. oom: as above."""
 
     child: str
     exit: str
+    oom: Oom | None = None
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from dora_systemd import cgroup
 from dora_systemd.busprotocol import Manager
 from dora_systemd.limitchecks import check_controllers, needed_controllers, size_warnings
 from dora_systemd.limits import BY_KEY
-from dora_systemd.limitsettings import DEVICE
+from dora_systemd.limitsettings import DEVICE, NICE
 from dora_systemd.machine import read_machine
 from dora_systemd.managerplan import Plan
 from dora_systemd.propertyset import Properties
@@ -23,7 +23,19 @@ def check_limits(manager: Manager, plan: Plan, properties: Properties) -> tuple[
         available = cgroup.read_controllers(cgroup.group_path(manager.control_group()))
         check_controllers(needed, available, plan.scope.is_user)
     values = {limit.word: plan.settings.values[key] for key, limit in BY_KEY.items()}
-    return (*size_warnings(values, nodes, read_machine()), *_missing_devices(plan))
+    sizes = size_warnings(values, nodes, read_machine())
+    return (*sizes, *_missing_devices(plan), *_powerless(plan))
+
+
+def _powerless(plan: Plan) -> list[str]:
+    """What a user's manager takes and cannot do."""
+    if not plan.scope.is_user:
+        return []
+    nice = plan.settings[NICE]
+    warnings = ["devices cannot be closed in user scope"] if plan.settings[DEVICE] else []
+    if nice is not None and nice < 0:
+        warnings.append(f"the nice value {nice} needs LimitNICE= of the user's manager")
+    return warnings
 
 
 def _missing_devices(plan: Plan) -> list[str]:

@@ -12,6 +12,12 @@ _CLD_EXITED = 1
 _RUNNERS_VERDICT = "failed: "
 """How STATUS= begins once the runner knows why a dataflow failed."""
 
+_REFUSED = {
+    201: "the nice value was refused",
+    214: "realtime scheduling was refused, see LimitRTPRIO= in systemd.exec(5)",
+}
+"""What systemd could not do before the runner: exit statuses of systemd.exec(5)."""
+
 _WORDS = {
     "protocol": "its runner ended without a word",
     "timeout": "it did not end in time and was killed",
@@ -48,7 +54,8 @@ def failure_reason(manager: Manager, unit: str) -> str:
 def _exit_words(unit: dict[str, Any]) -> str:
     status = unit["ExecMainStatus"]
     if unit["ExecMainCode"] == _CLD_EXITED:
-        return f"exit code {status}"
+        refused = _REFUSED.get(status)
+        return f"{refused} (exit code {status})" if refused else f"exit code {status}"
     if status:
         return f"signal {signal_name(status)}"
     return "ended" if unit["Result"] == "success" else str(unit["Result"])

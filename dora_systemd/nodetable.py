@@ -10,6 +10,7 @@ Nodes = Mapping[str, NodeStatus]
 RecordParts = tuple[str, str, Mapping[str, str]]
 """Name, node and details of the life event that goes to the journal."""
 
+KILLED = "signal SIGKILL"
 _WITH_PROCESS = frozenset({"starting", "ready", "running"})
 
 
@@ -106,5 +107,7 @@ def apply_results(nodes: Nodes, results: Mapping[str, str], at_us: int) -> Nodes
     for ident, how in results.items():
         if ident in nodes and (how or nodes[ident].state not in ("failed", "stopped")):
             state = "failed" if how else "finished"
-            nodes = _set(nodes, ident, at_us, state=state, exit=how, pid=0)
+            # Of a kill for want of memory dora knows no more than the signal.
+            words = (nodes[ident].exit or how) if how == KILLED else how
+            nodes = _set(nodes, ident, at_us, state=state, exit=words, pid=0)
     return nodes

@@ -7,7 +7,6 @@ was well for a while in between and the last report is old enough, so nothing fl
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from dora_systemd.cellstate import Record
 from dora_systemd.status import WHOLE_CELL
 from dora_systemd.values import SECOND, format_rounded_size
 
@@ -54,23 +53,26 @@ class Alarm:
     reported_us: int = 0
 
 
+Report = tuple[str, str, Mapping[str, str]]
+"""Event, node (WHOLE_CELL: the dataflow) and details."""
+
 Alarms = Mapping[tuple[str, str], Alarm]
 """By node (WHOLE_CELL: the dataflow) and event."""
 
 
-def look(alarms: Alarms, loads: Mapping[str, Load], now_us: int) -> tuple[Alarms, list[Record]]:
+def look(alarms: Alarms, loads: Mapping[str, Load], now_us: int) -> tuple[Alarms, list[Report]]:
     """The alarms after one look at all groups, and what is to be reported."""
     after = dict(alarms)  # who is without a limit for a while has been reported all the same
-    records = []
+    reports = []
     for key, load in loads.items():
         for event, is_bad, is_good in _judged(load):
             old = after.get((key, event), Alarm())
             new = _counted(old, is_bad, is_good)
             if _is_due(new, event, now_us):
                 new = replace(new, is_on=True, reported_us=now_us)
-                records.append(_record(event, key, load))
+                reports.append(_report(event, key, load))
             after[key, event] = new
-    return after, records
+    return after, reports
 
 
 def _judged(load: Load) -> list[tuple[str, bool, bool]]:
@@ -96,12 +98,12 @@ def _is_due(alarm: Alarm, event: str, now_us: int) -> bool:
     return not alarm.is_on and is_quiet and alarm.bad >= BAD_LOOKS[event]
 
 
-def _record(event: str, key: str, load: Load) -> Record:
+def _report(event: str, key: str, load: Load) -> Report:
     whose = "its nodes together" if key == WHOLE_CELL else f"node {key}"
     if event == CPU:
         share = f"{load.throttled or 0.0:.0f}"
         reason = f"{whose} had to wait for the limit {share}% of the time"
-        return Record(event, key, {"reason": reason, "throttled": share})
+        return (event, key, {"reason": reason, "throttled": share})
     held, limit = format_rounded_size(load.held), format_rounded_size(load.limit or 0)
     stalled = f"{load.stalled:.0f}"
     reason = (
@@ -110,4 +112,4 @@ def _record(event: str, key: str, load: Load) -> Record:
         else f"{whose} holds {held} of {limit}"
     )
     details = {"held": str(load.held), "limit": str(load.limit), "stalled": stalled}
-    return Record(event, key, {"reason": f"{reason}, waiting {stalled}% of the time", **details})
+    return (event, key, {"reason": f"{reason}, waiting {stalled}% of the time", **details})

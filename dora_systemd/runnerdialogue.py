@@ -82,7 +82,7 @@ class Dialogue:
 
     def _child_exited(self, label: str, how: str) -> None:
         oom = self._nodes.find_oom_of_dora()
-        event = life.ChildExited(now_us(), label, how if oom is None else oom.text)
+        event = life.ChildExited(now_us(), label, how if oom is None else oom.text, oom)
         self._loop.call_later(_SETTLE_SECONDS, self._pump.push, event)
 
     def read_coordinator(self, line: str) -> None:

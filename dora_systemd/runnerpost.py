@@ -32,8 +32,7 @@ def main(argv: list[str]) -> int:
     if not reason or len(argv) != 2 or not directory:
         return 0
     unit = unit_group()
-    if is_out_of_memory(unit):
-        reason = "its runner was killed for want of memory"
+    reason = out_of_memory(unit) or reason
     with contextlib.suppress(OSError):
         kill_nodes(unit)
     write_last_words(argv[0], argv[1], Path(directory), reason)
@@ -123,11 +122,18 @@ def unit_group() -> Path:
     return unit
 
 
-def is_out_of_memory(unit: Path) -> bool:
-    """Whether the kernel has killed something beside the runner, or the runner, for memory."""
+def out_of_memory(unit: Path) -> str:
+    """What there is to say if the kernel has killed the runner for want of memory, else ""."""
     from dora_systemd import cgroup
+    from dora_systemd.oom import largest
+    from dora_systemd.values import format_rounded_size
 
-    return cgroup.read_oom(unit / SUPERVISOR).kills > 0
+    if not cgroup.read_oom(unit / SUPERVISOR).kills:
+        return ""
+    groups = cgroup.node_groups(unit)
+    node, held = largest({key: cgroup.read_usage(one).memory or 0 for key, one in groups.items()})
+    most = f"; the node {node} held most, {format_rounded_size(held)}" if node else ""
+    return f"its runner was killed for want of memory{most}"
 
 
 def kill_nodes(unit: Path) -> None:

@@ -44,8 +44,8 @@ class Resources:
         """What is to be said about limits that come close. samples: those before `now`."""
         groups = {WHOLE_CELL: self._unit, **cgroup.node_groups(self._unit)}
         loads = {key: _load(path, key, samples, now) for key, path in groups.items()}
-        self._alarms, records = look(self._alarms, loads, now.at_us)
-        return records
+        self._alarms, reports = look(self._alarms, loads, now.at_us)
+        return [Record(*one) for one in reports]
 
 
 def _load(path: Path, key: str, samples: tuple[CpuSample, ...], now: CpuSample) -> Load:

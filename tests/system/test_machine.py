@@ -1,6 +1,7 @@
 """What only a kernel with cgroup controllers can show."""
 
 import json
+import os
 import re
 import time
 from pathlib import Path
@@ -24,6 +25,8 @@ for event in node:
 """
 
 
+# In an emulated machine three nodes take all the CPU time there is.
+ALONE = "nodes: [{id: sink, path: sink.py, inputs: {t: dora/timer/millis/100}}]"
 CHILD = """
 import subprocess
 subprocess.Popen(["sleep", "1000"])
@@ -185,6 +188,32 @@ def control(cell: Cell, group: str, name: str) -> str:
     return (cell.group / group / name).read_text().strip()
 
 
+LOOK = """
+from dora import Node
+import os
+node = Node()
+for device in ("/dev/fuse", "/dev/kmsg", "/dev/null"):
+    try:
+        os.close(os.open(device, os.O_RDWR))
+        print(device, "is open", flush=True)
+    except PermissionError:
+        print(device, "is closed", flush=True)
+for event in node:
+    pass
+"""
+
+
+def test_devices_and_realtime(cell: Cell, project: Project) -> None:
+    flow = project.write("dataflow.yml", ALONE)
+    project.write("sink.py", LOOK)
+    cell.start(flow, "--uid=root", "--device=/dev/fuse", "--realtime=fifo:20")
+    seen = wait_for("it looked", lambda: cell.messages("sink")[2:] and cell.messages("sink"), 60)
+    assert seen == ["/dev/fuse is open", "/dev/kmsg is closed", "/dev/null is open"]
+    (pid,) = cell.pids("node-sink")
+    assert os.sched_getscheduler(pid) == os.SCHED_FIFO
+    assert os.sched_getparam(pid).sched_priority == 20
+
+
 SPIN = """
 from dora import Node
 node = Node()
@@ -197,10 +226,7 @@ while True:
 
 @pytest.mark.warns("grace period", "killed on drop", "node exited with error")
 def test_a_busy_node_has_its_share(cell: Cell, project: Project) -> None:
-    # Alone: in an emulated machine three nodes take all there is.
-    flow = project.write(
-        "dataflow.yml", "nodes: [{id: sink, path: sink.py, inputs: {t: dora/timer/millis/100}}]"
-    )
+    flow = project.write("dataflow.yml", ALONE)
     project.write("sink.py", SPIN)
     cell.start(flow, "--node-limit=sink:cpu=0.4", "--grace-duration=1s")
     wait_for("it spins", lambda: cell.messages("sink"), 60)

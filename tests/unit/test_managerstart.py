@@ -77,6 +77,17 @@ def test_properties_for_an_older_systemd() -> None:
     assert "RestartMode" in warnings[0]
 
 
+def test_warnings_about_limits() -> None:
+    plan = make_plan(device=("/dev/null", "/dev/nowhere"), nice="-5", realtime="20")
+    properties, warnings = plan_properties(plan, FakeManager())
+    assert warnings == (
+        "there is no device /dev/nowhere",
+        "devices cannot be closed in user scope",
+        "the nice value -5 needs LimitNICE= of the user's manager",
+    )
+    assert properties["CPUSchedulingPriority"].value == 20
+
+
 def test_plan_as_text() -> None:
     text = format_plan(make_plan())
     assert text.startswith(f"# {UNIT}\n# source: /srv/robot.yml\n[Unit]\n")

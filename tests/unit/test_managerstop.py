@@ -70,6 +70,10 @@ def test_restart_that_fails() -> None:
     ("facts", "reason"),
     [
         ({"Result": "exit-code", "ExecMainStatus": 78}, "exit code 78"),
+        (
+            {"Result": "exit-code", "ExecMainStatus": 214},
+            "realtime scheduling was refused, see LimitRTPRIO= in systemd.exec(5) (exit code 214)",
+        ),
         ({"Result": "signal", "ExecMainCode": 2, "ExecMainStatus": 9}, "signal SIGKILL"),
         ({"Result": "signal", "ExecMainCode": 2, "ExecMainStatus": 99}, "signal 99"),
         (

@@ -75,6 +75,26 @@ def test_the_dataflow_at_its_limit() -> None:
     ]
 
 
+def test_the_dataflow_without_its_daemon() -> None:
+    oom = Oom(Owner.DATAFLOW, 19 * MIB, 700 * MIB, "b", 500 * MIB)
+    cell = Cell(0, 0, {"b": NodeStatus("running", 8)}, State.RUNNING)
+    after, actions = step(cell, life.ChildExited(5, "daemon", oom.text, oom))
+    said = [one for one in actions if isinstance(one, Record)]
+    assert [one.event for one in said] == ["dataflow-oom", "daemon-lost", "dataflow-failed"]
+    assert after.failure == (
+        "the dora daemon is gone (out of memory: peak 19M, limit of the dataflow 700M)"
+    )
+
+
+def test_doras_verdict_does_not_hide_it() -> None:
+    oom = Oom(Owner.NODE, 64 * MIB, 64 * MIB)
+    after = records(oom)[0]
+    after = step(after, life.RunFinished(6))[0]
+    after = step(after, life.ResultKnown(7, {"a": "signal SIGKILL", "b": "exit code 1"}))[0]
+    assert after.failure == f"node a: {oom.text}, node b: exit code 1"
+    assert after.nodes["a"].exit == oom.text
+
+
 def test_a_node_that_ended_well_did_not_want_memory() -> None:
     event = with_facts(life.NodeExited(5, "a", "", False), False, Oom(Owner.NODE, 1, 1))
     assert (event.exit, event.oom) == ("", None)

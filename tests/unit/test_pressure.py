@@ -5,8 +5,17 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dora_systemd.cellstate import Record
-from dora_systemd.pressure import BAD_LOOKS, CPU, GOOD_LOOKS, MEMORY, QUIET, Alarms, Load, look
+from dora_systemd.pressure import (
+    BAD_LOOKS,
+    CPU,
+    GOOD_LOOKS,
+    MEMORY,
+    QUIET,
+    Alarms,
+    Load,
+    Report,
+    look,
+)
 from dora_systemd.values import SECOND
 
 STEP = 5 * SECOND
@@ -19,35 +28,35 @@ WAITING = Load(throttled=99.0)
 FLOWING = Load(throttled=1.0)
 
 
-def live(*loads: Load, key: str = "a") -> list[tuple[int, Record]]:
-    """The records of one group that is looked at every 5 s, each with the number of its look."""
+def live(*loads: Load, key: str = "a") -> list[tuple[int, Report]]:
+    """The reports about one group that is looked at every 5 s, each with the number of its look."""
     alarms: Alarms = {}
     found = []
     for number, load in enumerate(loads):
-        alarms, records = look(alarms, {key: load}, STEP * (number + 1))
-        found += [(number, record) for record in records]
+        alarms, reports = look(alarms, {key: load}, STEP * (number + 1))
+        found += [(number, report) for report in reports]
     return found
 
 
 def test_memory_is_reported_at_once_and_once() -> None:
-    ((number, record),) = live(WELL, FULL, FULL, FULL, BETWEEN, FULL)
-    assert (number, record.event, record.node) == (1, MEMORY, "a")
-    assert record.details["reason"] == "node a holds 950M of 1G, waiting 0% of the time"
-    ((_, record),) = live(STALLED)
-    assert record.details["stalled"] == "40"
+    ((number, report),) = live(WELL, FULL, FULL, FULL, BETWEEN, FULL)
+    assert (number, *report[:2]) == (1, MEMORY, "a")
+    assert report[2]["reason"] == "node a holds 950M of 1G, waiting 0% of the time"
+    ((_, report),) = live(STALLED)
+    assert report[2]["stalled"] == "40"
 
 
 def test_the_dataflow_has_no_node() -> None:
-    ((_, record),) = live(FULL, key="")
-    assert record.node == ""
-    assert record.details["reason"].startswith("its nodes together hold 950M")
+    ((_, report),) = live(FULL, key="")
+    assert report[1] == ""
+    assert report[2]["reason"].startswith("its nodes together hold 950M")
 
 
 def test_cpu_is_reported_when_it_lasts() -> None:
     assert live(*[WAITING] * (BAD_LOOKS[CPU] - 1), FLOWING, WAITING) == []
-    ((number, record),) = live(*[WAITING] * 20)
-    assert (number, record.event) == (BAD_LOOKS[CPU] - 1, CPU)
-    assert record.details["reason"] == "node a had to wait for the limit 99% of the time"
+    ((number, report),) = live(*[WAITING] * 20)
+    assert (number, report[0]) == (BAD_LOOKS[CPU] - 1, CPU)
+    assert report[2]["reason"] == "node a had to wait for the limit 99% of the time"
 
 
 def test_without_a_limit_nothing_is_short() -> None:
@@ -67,6 +76,6 @@ def test_again_after_it_was_well_for_a_while() -> None:
 @given(st.lists(st.sampled_from([FULL, STALLED, WELL, BETWEEN, WAITING, FLOWING]), max_size=400))
 def test_reports_of_one_kind_are_far_apart(loads: list[Load]) -> None:
     for event in (MEMORY, CPU):
-        numbers = [number for number, record in live(*loads) if record.event == event]
+        numbers = [number for number, report in live(*loads) if report[0] == event]
         gaps = [b - a for a, b in pairwise(numbers)]
         assert all(gap * STEP >= QUIET for gap in gaps)

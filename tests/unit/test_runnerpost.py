@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from dora_systemd.runnerpost import killed_by, main, write_last_words
+from dora_systemd.runnerpost import killed_by, main, out_of_memory, write_last_words
 
 UUID = "550e8400-e29b-41d4-a716-446655440000"
 
@@ -26,6 +26,17 @@ def test_only_a_killed_runner_has_last_words(
 ) -> None:
     environ = {"EXIT_CODE": code, "EXIT_STATUS": status, "SERVICE_RESULT": result}
     assert killed_by(environ) == reason
+
+
+def test_a_runner_that_was_killed_for_want_of_memory(tmp_path: Path) -> None:
+    for name, held in (("supervisor", 1), ("node-a", 300), ("node-b", 500)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "memory.current").write_text(str(held << 20))
+    assert out_of_memory(tmp_path) == ""
+    (tmp_path / "supervisor/memory.events").write_text("oom_kill 1\n")
+    assert out_of_memory(tmp_path) == (
+        "its runner was killed for want of memory; the node b held most, 500M"
+    )
 
 
 def test_by_hand() -> None:
