@@ -25,8 +25,8 @@ Examples:
 def command(selector: str, **flags: Any) -> None:
     """Change limits of a dataflow while it runs.
 
-    They hold at once and stay over restarts, until the dataflow is stopped. Infinity lifts a
-    limit. Nothing is changed if anything is wrong.
+    They hold at once and stay over restarts, until the dataflow is stopped; those of an enabled
+    one until it is disabled. Infinity lifts a limit. Nothing is changed if anything is wrong.
     """
     scope = current_scope()
     bus = Bus(scope)

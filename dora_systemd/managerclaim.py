@@ -20,7 +20,7 @@ from dora_systemd.propertyset import Properties
 from dora_systemd.scope import Scope
 from dora_systemd.statuswords import local_time
 from dora_systemd.unitfile import persistent_unit, says_the_same
-from dora_systemd.unitfiles import remove_unit_file
+from dora_systemd.unitfiles import remove_changes, remove_unit_file
 
 
 def require_free_name(manager: Manager, scope: Scope, unit: str) -> BootUnit:
@@ -76,6 +76,7 @@ def place_unit_file(
     text = persistent_unit([format_unit(properties)], plan.options, scope.is_user, target)
     if want_boot:
         install_unit_file(manager, boot, text)
+        remove_changes(boot.path)
         remove_unit_file(boot.runtime)
         manager.reload()
         return True

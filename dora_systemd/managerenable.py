@@ -24,8 +24,10 @@ from dora_systemd.unitfile import (
     without_install,
 )
 from dora_systemd.unitfiles import (
+    changed_files,
     foreign_file,
     read_unit_file,
+    remove_changes,
     remove_unit_file,
     wanted_units,
     write_unit_file,
@@ -135,9 +137,11 @@ def disable_cell(manager: Manager, scope: Scope, cell: Cell) -> bool:
     facts = manager.read(cell.unit, ["FragmentPath", "ActiveState"])
     is_in_use = facts["FragmentPath"] == str(boot.path) and facts["ActiveState"] != "inactive"
     if boot.text is not None and is_in_use:
-        write_unit_file(boot.runtime, without_install(boot.text))
+        changes = [read_unit_file(path) or "" for path in changed_files(boot.path)]
+        write_unit_file(boot.runtime, without_install("\n".join([boot.text, *changes])))
     manager.disable_unit_files([cell.unit])
     remove_unit_file(boot.path)
+    remove_changes(boot.path)
     manager.reload()
     return True
 
@@ -145,8 +149,9 @@ def disable_cell(manager: Manager, scope: Scope, cell: Cell) -> bool:
 def drop_unit_files(manager: Manager, boot: BootUnit) -> None:
     """Take away unit files that no boot uses: of a dataflow that was disabled, and does not run."""
     if boot.text is not None or boot.runtime.exists():
-        remove_unit_file(boot.path)
-        remove_unit_file(boot.runtime)
+        for path in (boot.path, boot.runtime):
+            remove_unit_file(path)
+            remove_changes(path)
         manager.reload()
 
 

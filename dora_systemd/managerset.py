@@ -1,7 +1,7 @@
 """`doractl set`: limits of a dataflow and of its nodes, changed while it runs and remembered.
 
 systemd keeps the dataflow's own, as with `systemctl set-property`. The nodes' are in a drop-in of
-ours beside the unit's file; that of a transient unit goes with it.
+ours beside systemd's: those of a transient unit go with it, those of a unit file when that goes.
 """
 
 import os
@@ -12,7 +12,6 @@ from typing import Any
 from dora_systemd import cgroup
 from dora_systemd.busprotocol import Manager
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.files import write_atomic
 from dora_systemd.limitchecks import (
     check_controllers,
     needed_controllers,
@@ -31,13 +30,14 @@ from dora_systemd.limits import (
 from dora_systemd.limitsettings import LIVE_SETTINGS, NODE_LIMIT
 from dora_systemd.machine import read_machine
 from dora_systemd.managercells import Cell
+from dora_systemd.managerenabled import enabled_units
 from dora_systemd.managerlist import read_status
 from dora_systemd.preparation import load_dataflow
 from dora_systemd.properties import format_unit, settings_properties, typed
 from dora_systemd.scope import Scope
 from dora_systemd.settings import Settings, resolve_settings
+from dora_systemd.unitfiles import NODE_LIMITS_FILE, drop_in_directory, write_unit_file
 
-DROP_IN = "60-node-limits.conf"
 _PROPERTIES = ("ControlGroup", "Environment", "FragmentPath", "Transient")
 
 
@@ -63,12 +63,24 @@ def set_limits(
         check_controllers(needed, available, scope.is_user)
     unit = manager.read(cell.unit, _PROPERTIES)
     warnings = _warnings(settings, nodes, unit)
+    # systemd keeps those of a transient unit beside it, whatever it is told.
+    is_fleeting = Path(unit["FragmentPath"]).is_relative_to("/run")
     if properties:
-        manager.set_properties(cell.unit, list(properties.values()), bool(unit["Transient"]))
+        manager.set_properties(cell.unit, list(properties.values()), is_fleeting)
     if nodes:
-        _remember(manager, cell, unit, nodes)
+        _remember(manager, unit, nodes)
         _limit_groups(unit, nodes)
-    return warnings
+    return (*warnings, *_unit_file_warnings(manager, scope, cell, unit))
+
+
+def _unit_file_warnings(
+    manager: Manager, scope: Scope, cell: Cell, unit: Mapping[str, Any]
+) -> list[str]:
+    """A dataflow that was enabled while it ran has a unit file beside its transient unit."""
+    if not unit["Transient"] or cell.unit not in enabled_units(manager, scope):
+        return []
+    name = cell.name
+    return [f"the next boot has the old limits, unless you disable {name} and enable it again"]
 
 
 def _check_nodes(scope: Scope, cell: Cell, limits: tuple[NodeLimits, ...]) -> None:
@@ -92,19 +104,13 @@ def _warnings(
     return (*warnings, *use_warnings(values, nodes, cgroup.read_usage(path).memory, held))
 
 
-def _remember(
-    manager: Manager, cell: Cell, unit: Mapping[str, Any], nodes: tuple[NodeLimits, ...]
-) -> None:
+def _remember(manager: Manager, unit: Mapping[str, Any], nodes: tuple[NodeLimits, ...]) -> None:
     """Write the drop-in, and have systemd read it: the next start of the runner is told of it."""
     before = dict(entry.split("=", 1) for entry in unit["Environment"] or ())
     changes = merge_node_limits(parse_changes(before.get(CHANGES_VARIABLE, "")), nodes)
     text = format_unit(typed(Environment=(f"{CHANGES_VARIABLE}={format_changes(changes)}",)))
-    path = Path(unit["FragmentPath"]).parent / f"{cell.unit}.d" / DROP_IN
-    try:
-        path.parent.mkdir(mode=0o755, exist_ok=True)
-    except OSError as error:
-        raise DoraSystemdError(f"cannot make {path.parent}: {error.strerror}") from error
-    write_atomic(path, f"# Written by doractl set.\n{text}")
+    directory = drop_in_directory(Path(unit["FragmentPath"]), bool(unit["Transient"]))
+    write_unit_file(directory / NODE_LIMITS_FILE, f"# Written by doractl set.\n{text}")
     manager.reload()
 
 

@@ -64,6 +64,33 @@ def remove_unit_file(path: Path) -> None:
         raise _failure("remove", path, error) from error
 
 
+NODE_LIMITS_FILE = "60-node-limits.conf"
+_CHANGES = ("50-*.conf", NODE_LIMITS_FILE)
+"""systemd's own drop-ins for changed properties, and ours for limits of nodes."""
+
+
+def drop_in_directory(fragment: Path, is_transient: bool) -> Path:
+    """Where drop-ins for what was changed belong: those of a transient unit go with it."""
+    place = fragment.parent
+    if not is_transient:
+        place = place.with_name(f"{place.name}.control")
+    return place / f"{fragment.name}.d"
+
+
+def changed_files(fragment: Path) -> list[Path]:
+    """The drop-ins with which `doractl set` or systemctl set-property has changed a unit file."""
+    place = drop_in_directory(fragment, is_transient=False)
+    return sorted(path for pattern in _CHANGES for path in place.glob(pattern))
+
+
+def remove_changes(fragment: Path) -> None:
+    """Take these drop-ins away. Raises DoraSystemdError."""
+    for path in changed_files(fragment):
+        remove_unit_file(path)
+    with contextlib.suppress(OSError):  # there may be others, or none
+        drop_in_directory(fragment, is_transient=False).rmdir()
+
+
 def wanted_units(directory: Path) -> frozenset[str]:
     """The units that the targets of `directory` start: the links in its .wants directories."""
     return frozenset(path.name for path in directory.glob("*.wants/dora-*.service"))

@@ -128,7 +128,7 @@ LIMITED = (
 
 
 def test_limits_are_what_the_kernel_holds_up(cell: Cell, project: Project) -> None:
-    flow = project.three_nodes()
+    flow = slow_flow(project)
     project.write("dataflow.systemd.yml", "nodes: {source: {memory_limit: 1G}}\nmemory_high: 2G\n")
     cell.start(flow, "--memory-limit=1500M", "--cpu-limit=1.5", f"--node-limit={LIMITED}")
     assert control(cell, ".", "memory.max") == str(1500 << 20)
@@ -149,7 +149,7 @@ def test_limits_are_what_the_kernel_holds_up(cell: Cell, project: Project) -> No
 
 
 def test_limits_change_live_and_are_remembered(cell: Cell, project: Project) -> None:
-    flow = project.three_nodes()
+    flow = slow_flow(project)
     cell.start(flow, "--node-limit=sink:memory=1G,cpu-weight=30")
     changes = ("--memory-limit=1500M", "--node-limit=source:tasks=77")
     done = cell.doractl(
@@ -172,6 +172,34 @@ def test_limits_change_live_and_are_remembered(cell: Cell, project: Project) -> 
     cell.wait_exchanging()
     cell.doractl("stop", cell.name)
     assert not list(Path("/run/systemd").glob(f"*/{cell.unit}*")), "nothing is left of it"
+
+
+def test_changes_of_an_enabled_dataflow_stay_until_it_is_disabled(
+    cell: Cell, project: Project
+) -> None:
+    cell.start(slow_flow(project), "--enable", "--memory-limit=1G")
+    cell.doractl("set", cell.name, "--memory-limit=1500M", "--node-limit=sink:memory=600M")
+    changed = [str(1500 << 20), str(600 << 20)]
+    assert held(cell)[:2] == changed
+    assert "MemoryMax=1572864000" in cell.doractl("show", cell.name).stdout
+    cell.doractl("stop", cell.name)
+    cell.systemctl("start")
+    assert held(cell)[:2] == changed
+    cell.doractl("disable", cell.name)
+    assert held(cell)[:2] == changed
+    cell.doractl("restart", cell.name)
+    assert held(cell)[:2] == changed
+    cell.doractl("stop", cell.name)
+    assert not list(Path("/").glob(f"[er][tu][cn]/systemd/system.control/{cell.unit}*"))
+    cell.start(project.root / "dataflow.yml")
+    assert held(cell)[:2] == ["max", "max"]
+
+
+def slow_flow(project: Project) -> Path:
+    """Three nodes with so few messages that an emulated and limited machine keeps up."""
+    flow = project.three_nodes()
+    flow.write_text(flow.read_text().replace("millis/20", "millis/500"))
+    return flow
 
 
 def held(cell: Cell) -> list[str]:

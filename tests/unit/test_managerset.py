@@ -8,8 +8,9 @@ import pytest
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.limits import parse_node_limits
 from dora_systemd.managercells import Cell, read_cell
-from dora_systemd.managerset import DROP_IN, set_limits
+from dora_systemd.managerset import set_limits
 from dora_systemd.status import CellStatus, NodeStatus
+from dora_systemd.unitfiles import NODE_LIMITS_FILE, changed_files, remove_changes
 from dora_systemd.values import INFINITY
 from tests.unit.fake_manager import FakeManager, ScopeIn, options
 
@@ -21,6 +22,7 @@ class Place:
     """One dataflow with its cgroup, its unit's files and its node table, all below `root`."""
 
     def __init__(self, root: Path) -> None:
+        self.root = root
         self.scope = ScopeIn(is_user=True, uid=1000, root=root / "run")
         self.group = root / "cgroup/unit/node-camera"
         self.group.mkdir(parents=True)
@@ -52,7 +54,7 @@ class Place:
 
     @property
     def drop_in(self) -> Path:
-        return self.units / "dora-robot.service.d" / DROP_IN
+        return self.units / "dora-robot.service.d" / NODE_LIMITS_FILE
 
     def set(self, **flags: Any) -> tuple[str, ...]:
         return set_limits(self.manager, self.scope, self.cell, flags)
@@ -67,7 +69,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Place:
 def test_limits_of_the_dataflow(place: Place) -> None:
     assert place.set(memory_limit="6M", cpu_limit="infinity") == ()
     properties = [("CPUQuotaPerSecUSec", "t", INFINITY), ("MemoryMax", "t", 6 << 20)]
-    assert place.manager.calls == [("set", place.unit, properties, True)]
+    assert place.manager.calls == [("set", place.unit, properties, False)]
     assert not place.drop_in.exists()
 
 
@@ -80,6 +82,17 @@ def test_limits_of_a_node_hold_now_and_later(place: Place) -> None:
         "[Service]",
         "Environment=DORA_SYSTEMD_NODE_LIMITS=camera:cpu=150%%,memory=2M",
     ]
+
+
+def test_a_unit_file_keeps_its_changes_until_it_goes(place: Place) -> None:
+    place.manager.units[place.unit]["Transient"] = False
+    place.set(node_limit=("camera:memory=2M",))
+    fragment = place.units / "dora-robot.service"
+    (drop_in,) = changed_files(fragment)
+    assert drop_in == place.root / "units.control/dora-robot.service.d" / NODE_LIMITS_FILE
+    remove_changes(fragment)
+    assert not drop_in.parent.exists()
+    remove_changes(fragment)
 
 
 def test_changes_add_up(place: Place) -> None:
