@@ -55,6 +55,12 @@ def drop_unsupported(
     return kept, warnings
 
 
+def lacking(systemd_version: int) -> list[str]:
+    """Names on D-Bus of the properties that this systemd does not know."""
+    later = (names for version, names in _ADDED.items() if version > systemd_version)
+    return [name for names in later for name in names]
+
+
 def _since(one: Property) -> int:
     """The first version of systemd that takes this property."""
     return _SINCE.get(one.name.removesuffix("Scale"), MIN_VERSION)

@@ -33,9 +33,11 @@ DECISIONS = {
         "compat",
         "dataflow",
         "dataflownodes",
+        "diagnosis",
         "doraerrors",
         "environment",
         "events",
+        "findings",
         "jsonvalues",
         "launch",
         "lifecycle",
@@ -88,6 +90,7 @@ ADAPTERS = {
     "notify": ["notify"],
     "pipes": ["pipes", "pipesource", "heldlines", "logqueue"],
     "process": ["process"],
+    "proctable": ["proctable"],
 }
 SHARED = {
     "preparation": ["preparation"],
@@ -98,6 +101,7 @@ USE_CASES = {
         "manageraccount",
         "managercells",
         "managerclaim",
+        "managerdoctor",
         "managerenable",
         "managerenabled",
         "managerended",

@@ -1,0 +1,32 @@
+"""doractl doctor: what on this machine hinders dataflows, and what helps."""
+
+import click
+
+from dora_systemd.bus import Bus
+from dora_systemd.cli.parameters import current_scope, output_option, print_json, scope_options
+from dora_systemd.errors import ExitCode
+from dora_systemd.findings import finding_values, format_findings, has_problem
+from dora_systemd.managerdoctor import examine
+
+_EPILOG = """\b
+Examples:
+  doractl doctor
+  doractl --user doctor -o json
+"""
+
+
+@click.command("doctor", epilog=_EPILOG)
+@output_option
+@scope_options
+def command(output: str) -> int:
+    """Look at everything that dataflows need, and say what helps where something is amiss.
+
+    Changes nothing. The exit status is 1 if a problem keeps dataflows from working; notes and
+    warnings do not count.
+    """
+    findings = examine(Bus, current_scope())
+    if output == "json":
+        print_json([finding_values(one) for one in findings])
+    else:
+        click.echo(format_findings(findings))
+    return ExitCode.FAILURE if has_problem(findings) else ExitCode.OK

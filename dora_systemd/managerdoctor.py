@@ -1,0 +1,215 @@
+"""`doractl doctor`: looks at everything that a dataflow needs; every check is one function.
+
+Without systemd the checks that ask it are left out: there is nothing to ask.
+"""
+
+import os
+import pwd
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from dora_systemd import cgroup, journalread
+from dora_systemd.busprotocol import Manager
+from dora_systemd.diagnosis import (
+    DORA_PORTS,
+    judge_controllers,
+    judge_port,
+    judge_processes,
+    judge_rate,
+    judge_systemd,
+)
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.files import read_yaml
+from dora_systemd.findings import Finding, State
+from dora_systemd.manageraccount import DEFAULT_USER
+from dora_systemd.managerenable import boot_target
+from dora_systemd.managerenabled import enabled_units, own_directories
+from dora_systemd.managerlinger import is_lingering, linger_command
+from dora_systemd.managersettings import settings_files
+from dora_systemd.names import unit_name
+from dora_systemd.process import (
+    RECOMMENDED_DORA,
+    dora_version,
+    find_dora,
+    run_command,
+    version_numbers,
+)
+from dora_systemd.proctable import listening_sockets, read_processes, socket_owners
+from dora_systemd.scope import RUNTIME_NAME, Scope
+from dora_systemd.unitfile import BOOT_TARGET, runner_of
+from dora_systemd.unitfiles import read_unit_file
+
+_SECONDS = 20.0
+_DOWN = ("inactive", "failed")
+
+
+def examine(reach: Callable[[Scope], Manager], scope: Scope) -> list[Finding]:
+    """All findings. reach: opens the connection to systemd."""
+    try:
+        manager = reach(scope)
+        version = manager.version()
+    except DoraSystemdError as error:
+        found = [Finding("systemd", State.PROBLEM, error.message, error.hint)]
+    else:
+        found = [judge_systemd(version)]
+        found += [one for check in _WITH_SYSTEMD for one in _guarded(check, manager, scope)]
+    return found + [one for check in _WITHOUT for one in check(scope)]
+
+
+def _guarded(
+    check: Callable[[Manager, Scope], Iterator[Finding]], manager: Manager, scope: Scope
+) -> list[Finding]:
+    """What a check finds; one that cannot be done is a finding itself."""
+    topic = check.__name__.removeprefix("_")
+    try:
+        return list(check(manager, scope))
+    except DoraSystemdError as error:
+        return [Finding(topic, State.WARNING, error.message, error.hint)]
+
+
+def _controllers(manager: Manager, scope: Scope) -> Iterator[Finding]:
+    group = cgroup.group_path(manager.control_group())
+    yield judge_controllers(cgroup.read_controllers(group), scope.is_user)
+
+
+def _linger(manager: Manager, scope: Scope) -> Iterator[Finding]:
+    del manager
+    if not scope.is_user:
+        return
+    if is_lingering(scope):
+        yield Finding("linger", State.OK, "dataflows run on after logout and start at boot")
+    else:
+        text = "dataflows end when you log out, and none starts at boot"
+        yield Finding("linger", State.WARNING, text, f"as root: {linger_command(scope)}")
+
+
+def _boot(manager: Manager, scope: Scope) -> Iterator[Finding]:
+    if boot_target(manager, scope) == BOOT_TARGET:
+        yield Finding("boot", State.OK, f"{BOOT_TARGET} starts what is enabled")
+    else:
+        text = f"{BOOT_TARGET} is not set up; dataflows can be enabled without it"
+        yield Finding("boot", State.NOTE, text, f"doractl {scope.flag} setup")
+    directory = own_directories(manager, scope)[0]
+    for unit in sorted(enabled_units(manager, scope)):
+        yield from _enabled(directory / unit)
+
+
+def _enabled(path: Path) -> Iterator[Finding]:
+    """Whether what a boot starts can be started."""
+    try:
+        text = read_unit_file(path)
+    except DoraSystemdError as error:
+        yield Finding("boot", State.WARNING, error.message, error.hint)
+        return
+    options = runner_of(text or "")
+    if text is None or options is None:
+        broken = "is gone" if text is None else "starts no dataflow"
+        remedy = f"systemctl disable {path.name}"
+        yield Finding("boot", State.WARNING, f"{path} is enabled and {broken}", remedy)
+    elif not Path(options.dataflow).exists():
+        text = f"{options.name} is enabled, but {options.dataflow} is not there"
+        yield Finding("boot", State.WARNING, text, f"doractl disable {options.name}")
+
+
+def _leftovers(manager: Manager, scope: Scope) -> Iterator[Finding]:
+    left = [path for path in _cell_directories(scope) if _is_down(manager, unit_name(path.name))]
+    for path in left:
+        text = f"{path} belongs to no dataflow that runs"
+        yield Finding("left over", State.WARNING, text, f"rm -r {path}")
+    groups = [path for path in _unit_groups(manager) if _is_down(manager, path.name)]
+    for path in groups:
+        text = f"processes are left in {path}"
+        yield Finding("left over", State.WARNING, text, f"as root: echo 1 > {path}/cgroup.kill")
+    if not left and not groups:
+        yield Finding("left over", State.OK, "nothing of dataflows that have ended")
+
+
+def _cell_directories(scope: Scope) -> list[Path]:
+    try:
+        return sorted((scope.runtime_root / RUNTIME_NAME).iterdir())
+    except OSError:
+        return []
+
+
+def _unit_groups(manager: Manager) -> list[Path]:
+    top = cgroup.group_path(manager.control_group()) / "dora.slice"
+    return [path for path in sorted(top.glob("dora-*.service")) if cgroup.is_populated(path)]
+
+
+def _is_down(manager: Manager, unit: str) -> bool:
+    return manager.read(unit, ["ActiveState"])["ActiveState"] in _DOWN
+
+
+def _journal(scope: Scope) -> Iterator[Finding]:
+    try:
+        journalread.check_readable(scope)
+    except DoraSystemdError as error:
+        yield Finding("journal", State.WARNING, error.message, error.hint)
+    if journalread.is_volatile():
+        text, remedy = "it is in memory and gone after a reboot", "as root: mkdir /var/log/journal"
+        remedy += " and systemctl restart systemd-journald"
+        yield Finding("journal", State.WARNING, text, remedy)
+    else:
+        yield Finding("journal", State.OK, "it outlives a reboot")
+    command = ("systemd-analyze", "--no-pager", "cat-config", "systemd/journald.conf")
+    try:
+        config = run_command(command, _SECONDS).stdout
+    except DoraSystemdError as error:
+        yield Finding("log rate", State.NOTE, error.message)
+    else:
+        yield judge_rate(config, scope.is_user)
+
+
+def _dora(scope: Scope) -> Iterator[Finding]:
+    del scope
+    path = os.environ.get("PATH", os.defpath)
+    try:
+        dora = find_dora(None, os.environ.get("VIRTUAL_ENV"), path)
+        version = dora_version(dora)
+    except DoraSystemdError as error:
+        yield Finding("dora", State.PROBLEM, error.message, error.hint)
+        return
+    if version_numbers(version) < RECOMMENDED_DORA:
+        remedy = "pip install --upgrade dora-rs-cli"
+        yield Finding("dora", State.NOTE, f"{dora} is {version}, older than recommended", remedy)
+    else:
+        yield Finding("dora", State.OK, f"{dora}, version {version}")
+
+
+def _user(scope: Scope) -> Iterator[Finding]:
+    if scope.is_user:
+        return
+    try:
+        pwd.getpwnam(DEFAULT_USER)
+    except KeyError:
+        text = f"there is no user {DEFAULT_USER} to run the dataflows of root's files"
+        yield Finding("user", State.NOTE, text, "doractl setup, or start them with --uid")
+    else:
+        yield Finding("user", State.OK, f"{DEFAULT_USER} runs the dataflows of root's files")
+
+
+def _settings(scope: Scope) -> Iterator[Finding]:
+    """The files that count for every dataflow; the one beside a dataflow is for start to check."""
+    del scope
+    for path in settings_files(Path("/dataflow.yml"), os.environ)[1:]:
+        if path.exists():
+            try:
+                read_yaml(path, allow_empty=True)
+            except DoraSystemdError as error:
+                yield Finding("settings", State.PROBLEM, error.message, error.hint)
+            else:
+                yield Finding("settings", State.OK, f"{path} can be read")
+
+
+def _processes(scope: Scope) -> Iterator[Finding]:
+    del scope
+    processes = read_processes()
+    for port in DORA_PORTS:
+        sockets = listening_sockets(port)
+        owners = socket_owners(sockets) if sockets else frozenset()
+        yield judge_port(port, [one for one in processes if one.pid in owners], bool(sockets))
+    yield from judge_processes(processes)
+
+
+_WITH_SYSTEMD = (_controllers, _linger, _boot, _leftovers)
+_WITHOUT = (_journal, _dora, _user, _settings, _processes)
