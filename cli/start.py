@@ -19,6 +19,7 @@ from dora_systemd.cli.settingoptions import setting_options
 from dora_systemd.cli.stageline import StageLine
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.managerclaim import place_unit_file, require_free_name, with_known_uuid
+from dora_systemd.managerenable import boot_target
 from dora_systemd.managerlinger import ensure_linger
 from dora_systemd.managerplan import DEFAULT_FILE, Plan, StartRequest, make_plan, request_name
 from dora_systemd.managerstart import Started, format_started, start_plan, start_unit_file
@@ -65,7 +66,8 @@ def command(
     scope = current_scope()
     request = StartRequest(dataflow, name, flags, os.environ)
     if dry_run:
-        print(format_plan(make_plan(scope, request)), end="")
+        target = boot_target(Bus(scope), scope) if want_boot else None
+        print(format_plan(make_plan(scope, request), target), end="")
         return
     bus = Bus(scope)
     boot = require_free_name(bus, scope, unit_name(request_name(request)))

@@ -9,6 +9,7 @@ from dora_systemd.managerplan import Plan
 from dora_systemd.process import version_numbers
 from dora_systemd.properties import UnitContext, format_unit, unit_properties
 from dora_systemd.propertykinds import Property
+from dora_systemd.unitfile import persistent_unit
 
 
 def plan_properties(plan: Plan, manager: Manager) -> tuple[dict[str, Property], tuple[str, ...]]:
@@ -22,10 +23,16 @@ def plan_properties(plan: Plan, manager: Manager) -> tuple[dict[str, Property], 
     return properties, (*warnings, *check_limits(manager, plan, properties))
 
 
-def format_plan(plan: Plan) -> str:
-    """The unit as the text of a unit file, with its name and what it is made from on top."""
+def format_plan(plan: Plan, target: str | None = None) -> str:
+    """The unit as the text of a unit file, with its name and what it is made from on top.
+
+    target: what would start it at boot.
+    """
     head = f"# {plan.unit}\n# source: {plan.options.dataflow}\n"
-    return head + format_unit(_properties(plan))
+    text = format_unit(_properties(plan))
+    if target is not None:
+        text = persistent_unit([text], plan.options, plan.scope.is_user, target)
+    return head + text
 
 
 def _properties(plan: Plan) -> dict[str, Property]:

@@ -1,6 +1,8 @@
 """doractl enable, disable and export: unit files that systemd itself reads."""
 
 import json
+import os
+import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -140,6 +142,58 @@ def test_start_and_enable(boots: Cell, project: Project) -> None:
     assert "enabled with other settings" in refused.stderr
     assert uuid in boots.start(flow, "--enable", "--env", "A=2").stdout
     assert "A=2" in variables(boots)
+
+
+def test_what_a_dry_run_shows_is_what_is_written(boots: Cell, project: Project) -> None:
+    flow = project.three_nodes()
+    shown = boots.start(flow, "--enable", "--dry-run").stdout
+    assert not (ETC / boots.unit).exists()
+    boots.start(flow, "--enable")
+    uuid, written = uuid_of(boots), (ETC / boots.unit).read_text()
+    assert re.sub(r"[0-9a-f-]{36}", uuid, shown).endswith(written)
+    assert run("systemd-analyze", "verify", str(ETC / boots.unit)).stderr == ""
+
+
+@pytest.fixture
+def leaving() -> Iterator[tuple[str, ...]]:
+    """How a command is run as a user whose manager ends when he logs out."""
+    run("loginctl", "disable-linger", "bob")
+    runtime = "XDG_RUNTIME_DIR=/run/user/1001"
+    session = (
+        "systemd-run",
+        "--quiet",
+        "--pipe",
+        "--wait",
+        "-p",
+        "PAMName=login",
+        "-p",
+        "User=bob",
+    )
+    yield (*session, f"--setenv=PATH={os.environ['PATH']}", f"--setenv={runtime}")
+    run("loginctl", "enable-linger", "bob")
+    wait_for("his manager", lambda: Path("/run/user/1001/bus").exists())
+
+
+def test_a_user_lingers_from_then_on(leaving: tuple[str, ...], project: Project) -> None:
+    flow = project.three_nodes()
+    start = (*leaving, "doractl", "start", str(flow), "--name", "leaving")
+    done = run(
+        *leaving, "sh", "-c", f"doractl start {flow} --name leaving && doractl enable leaving"
+    )
+    assert "Dataflow enabled: " in done.stdout
+    assert (
+        done.stderr
+        == "doractl: lingering is now on for bob: dataflows start at boot, not at login\n"
+    )
+    assert run("loginctl", "show-user", "-p", "Linger", "--value", "bob").stdout == "yes\n"
+    # The session that he started it in has ended, and nothing was said to lose.
+    assert run(*start, check=False).returncode == ExitCode.NAME_IN_USE
+    path = Path("/home/bob/.config/systemd/user/dora-leaving.service")
+    assert path.read_text().endswith("\n[Install]\nWantedBy=default.target\n")
+    run(*leaving, "doractl", "stop", "leaving")
+    assert run(*leaving, "systemctl", "--user", "is-enabled", path.name).stdout == "enabled\n"
+    run(*leaving, "doractl", "disable", "leaving")
+    assert not path.exists()
 
 
 def test_drop_ins_work(boots: Cell, project: Project) -> None:

@@ -92,6 +92,8 @@ def test_plan_as_text() -> None:
     text = format_plan(make_plan())
     assert text.startswith(f"# {UNIT}\n# source: /srv/robot.yml\n[Unit]\n")
     assert "Environment=PATH=/bin\n" in text
+    assert "[Install]" not in text
+    assert format_plan(make_plan(), "dora.target").endswith("\n[Install]\nWantedBy=dora.target\n")
 
 
 def test_fake_and_real_manager_have_the_same_methods() -> None:
