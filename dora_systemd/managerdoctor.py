@@ -40,6 +40,7 @@ from dora_systemd.unitfile import BOOT_TARGET, runner_of
 from dora_systemd.unitfiles import read_unit_file
 
 _SECONDS = 20.0
+_BROKEN = ("bad-setting", "error")
 _DOWN = ("inactive", "failed")
 
 
@@ -92,6 +93,14 @@ def _boot(manager: Manager, scope: Scope) -> Iterator[Finding]:
     directory = own_directories(manager, scope)[0]
     for unit in sorted(enabled_units(manager, scope)):
         yield from _enabled(directory / unit)
+
+
+def _units(manager: Manager, scope: Scope) -> Iterator[Finding]:
+    for one in manager.list_units("dora-*.service"):
+        if one.load in _BROKEN:
+            text = f"{one.unit} cannot be loaded: {one.load}"
+            remedy = f"systemd-analyze {scope.flag} verify {one.unit}"
+            yield Finding("units", State.WARNING, text, remedy)
 
 
 def _enabled(path: Path) -> Iterator[Finding]:
@@ -211,5 +220,5 @@ def _processes(scope: Scope) -> Iterator[Finding]:
     yield from judge_processes(processes)
 
 
-_WITH_SYSTEMD = (_controllers, _linger, _boot, _leftovers)
+_WITH_SYSTEMD = (_controllers, _linger, _boot, _units, _leftovers)
 _WITHOUT = (_journal, _dora, _user, _settings, _processes)

@@ -1,9 +1,11 @@
 """`doractl stop` and `doractl restart`: jobs of systemd, for several dataflows at once."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 from dora_systemd.busprotocol import JOB_DONE, Manager, Observer
+from dora_systemd.errors import DoraSystemdError
 from dora_systemd.managercells import Cell
 from dora_systemd.managerenabled import enabled_units
 from dora_systemd.managerreason import failure_reason, job_reason
@@ -38,9 +40,11 @@ def _release_enabled(manager: Manager, scope: Scope, units: Sequence[str]) -> No
         if state["Transient"] and state["ActiveState"] == "inactive":
             from dora_systemd.managerenable import read_boot_unit, release_transient
 
-            boot = read_boot_unit(manager, scope, unit)
-            if boot.is_enabled:
-                release_transient(manager, boot)
+            # One that something else holds says the same as its file.
+            with suppress(DoraSystemdError):
+                boot = read_boot_unit(manager, scope, unit)
+                if boot.is_enabled:
+                    release_transient(manager, boot)
 
 
 def restart_cells(

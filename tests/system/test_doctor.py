@@ -100,6 +100,32 @@ def test_leftovers() -> None:
     assert left["remedy"] == f"rm -r {directory}"
 
 
+@pytest.mark.warns("dora-broken.service")
+def test_a_broken_unit(cell: Cell, project: Project) -> None:
+    """It hinders nobody else."""
+    etc = Path("/etc/systemd/system")
+    path = etc / "dora-broken.service"
+    link = etc / "multi-user.target.wants" / path.name
+    path.write_text("[Service]\nnonsense\n")
+    link.symlink_to(path)
+    run("systemctl", "daemon-reload")
+    try:
+        cell.start(project.three_nodes())
+        assert [row["name"] for row in json.loads(run("doractl", "list", "-o", "json").stdout)] == [
+            cell.name
+        ]
+        assert "dora-broken.service cannot be loaded" in of("units", findings())[0]["text"]
+        assert of("boot", findings())[-1]["state"] == "warning"
+        refused = run(
+            "doractl", "start", str(project.root / "dataflow.yml"), "--name", "broken", check=False
+        )
+        assert refused.returncode == ExitCode.NAME_IN_USE
+    finally:
+        path.unlink()
+        link.unlink()
+        run("systemctl", "daemon-reload")
+
+
 def test_a_half_written_settings_file() -> None:
     path = Path("/etc/dora-systemd/config.yml")
     path.parent.mkdir(exist_ok=True)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
@@ -75,10 +76,10 @@ class FakeManager:
         return unit
 
     def list_units(self, pattern: str) -> list[UnitState]:
-        del pattern
         return [
             UnitState(unit, facts["LoadState"], facts["ActiveState"], facts["SubState"])
             for unit, facts in self.units.items()
+            if fnmatch(unit, pattern)
         ]
 
     def read(self, unit: str, names: Sequence[str]) -> dict[str, Any]:

@@ -112,6 +112,12 @@ def test_a_half_written_settings_file(
     assert finding.text.startswith(f"cannot read {path}: line ")
 
 
+def test_a_broken_unit(manager: FakeManager, scope: Scope) -> None:
+    manager.add(options(), active="inactive", LoadState="bad-setting")
+    finding = found(manager, scope)["units"]
+    assert finding.text == "dora-robot.service cannot be loaded: bad-setting"
+
+
 def test_dora(manager: FakeManager, scope: Scope, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(managerdoctor, "dora_version", lambda _dora: "1.0.1")
     assert found(manager, scope)["dora"].state is State.NOTE
