@@ -28,6 +28,15 @@ def test_they_are_back() -> None:
     assert "A=x $B %h" in found
 
 
+def test_the_boot_waits_for_none_of_them() -> None:
+    """One that never gets ready starts for ever, on a machine that is up."""
+    wait_for("its start", lambda: status(ROOT, "never") == "Starting", 240)
+    jobs = run("systemctl", "list-jobs", "--no-legend").stdout.splitlines()
+    waiting = [line.split()[1] for line in jobs]
+    assert "dora-never.service" in waiting
+    assert not [unit for unit in waiting if unit.endswith(".target")]
+
+
 def test_one_without_its_file_has_failed() -> None:
     """The boot has gone on, and the status says which file."""
     wait_for("its failure", lambda: status(ROOT, "gone") == "Failed", 240)

@@ -12,14 +12,15 @@ from dora import Node
 for event in Node():
     pass
 """
+NEVER_READY = "nodes: [{id: only, path: sleep, args: '100000'}]\n"
 FLOW = "nodes: [{id: only, path: node.py, inputs: {tick: dora/timer/millis/200}}]\n"
 
 
-def flow(directory: Path) -> str:
+def flow(directory: Path, text: str = FLOW) -> str:
     directory.mkdir(parents=True)
     (directory / "node.py").write_text(NODE)
     path = directory / "dataflow.yml"
-    path.write_text(FLOW)
+    path.write_text(text)
     return str(path)
 
 
@@ -31,11 +32,13 @@ def test_enable() -> None:
     run("doractl", "enable", "running")
     gone = flow(Path("/srv/gone"))
     run("doractl", "start", gone, "--enable", "--no-wait")
+    never = flow(Path("/srv/never"), NEVER_READY)
+    run("doractl", "start", never, "--enable", "--no-wait")
     user = flow(Path("/home/alice/mine"))
     wait_for("alice's manager", lambda: Path("/run/user/1000/bus").exists(), 120)
     shutil.chown("/home/alice/mine", "alice")
     run(*ALICE, "doractl", "start", user, "--enable")
     notes = {name: row["uuid"] for who in (ROOT, ALICE) for name, row in listed(who).items()}
-    assert notes.keys() == {"begun", "running", "gone", "mine"}
+    assert notes.keys() == {"begun", "running", "gone", "never", "mine"}
     Path(gone).unlink()
     NOTES.write_text(json.dumps(notes))
