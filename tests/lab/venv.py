@@ -65,7 +65,7 @@ def write_skeleton(venv: Path) -> Path:
     """The checkout by links, so that setuptools does not write its egg-info into the checkout."""
     skeleton = venv / "checkout"
     skeleton.mkdir()
-    for name in ("pyproject.toml", "README.md", "dora_systemd", "cli", "units"):
+    for name in ("pyproject.toml", "README.md", "dora_systemd", "cli", "units", "packaging"):
         (skeleton / name).symlink_to(definition.CHECKOUT / name)
     return skeleton
 
