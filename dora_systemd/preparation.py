@@ -3,7 +3,7 @@ before there is a unit, and for the runner, which does it at every start."""
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,12 @@ from dora_systemd.dataflownodes import UNEXPANDED, NodeKind
 from dora_systemd.doraerrors import parse_dora_error
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.launch import LaunchPlan, launch_descriptor
-from dora_systemd.limits import check_nodes
+from dora_systemd.limits import (
+    CHANGES_VARIABLE,
+    check_nodes,
+    merge_node_limits,
+    parse_changes,
+)
 from dora_systemd.options import RunnerOptions
 
 PACKAGE = Path(__file__).parent
@@ -49,6 +54,12 @@ def prepare(options: RunnerOptions, environment: Mapping[str, str]) -> Prepared:
         _load_session(options),
     )
     return Prepared(dataflow, plan, launch_descriptor(dataflow, plan))
+
+
+def with_changes(options: RunnerOptions, environment: Mapping[str, str]) -> RunnerOptions:
+    """The options with what `doractl set` has changed since the unit was made."""
+    changes = parse_changes(environment.get(CHANGES_VARIABLE, ""))
+    return replace(options, node_limits=merge_node_limits(options.node_limits, changes))
 
 
 def load_dataflow(options: RunnerOptions) -> Dataflow:

@@ -7,8 +7,6 @@ import asyncio
 import os
 import signal
 import sys
-from collections.abc import Mapping
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -21,10 +19,9 @@ from dora_systemd.environment import node_environment
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.journal import JournalSocket
 from dora_systemd.launch import has_pipes, kinds, python_of
-from dora_systemd.limits import CHANGES_VARIABLE, merge_node_limits, parse_changes
 from dora_systemd.options import RunnerOptions, parse_runner_argv
 from dora_systemd.pipes import CellIdentity, LogPipes
-from dora_systemd.preparation import PACKAGE, Prepared, prepare
+from dora_systemd.preparation import PACKAGE, Prepared, prepare, with_changes
 from dora_systemd.runnerdialogue import Dialogue
 from dora_systemd.runnerengine import Engine
 from dora_systemd.runnerloss import losses_of_user
@@ -123,12 +120,6 @@ def listen(
         dialogue.spawn(dialogue.feed_watchdog(seconds))
     if options.attached:
         dialogue.spawn(stop_at_eof(pump))
-
-
-def with_changes(options: RunnerOptions, environment: Mapping[str, str]) -> RunnerOptions:
-    """The options with what `doractl set` has changed since the unit was made."""
-    changes = parse_changes(environment.get(CHANGES_VARIABLE, ""))
-    return replace(options, node_limits=merge_node_limits(options.node_limits, changes))
 
 
 def stop(pump: Pump, by: str) -> None:

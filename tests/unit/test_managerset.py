@@ -144,7 +144,7 @@ def test_root_is_needed_for_others(place: Place, monkeypatch: pytest.MonkeyPatch
 
 def test_the_runner_is_told() -> None:
     from dora_systemd.environment import node_environment
-    from dora_systemd.runner import with_changes
+    from dora_systemd.preparation import with_changes
 
     before = options(node_limits=(parse_node_limits("camera:cpu=1,memory=1G"),))
     variables = {"DORA_SYSTEMD_NODE_LIMITS": "camera:memory=2G ui:tasks=9"}
