@@ -24,6 +24,7 @@ VERBS = {
     "logs": Verb("logs", "Print what the nodes of a dataflow wrote."),
     "stop": Verb("stop", "Stop dataflows."),
     "restart": Verb("restart", "Restart dataflows."),
+    "reset": Verb("reset", "Forget failures, and count restarts anew."),
     "node": Verb("node", "Restart or stop a single node."),
     "set": Verb("set", "Change limits of a dataflow that runs."),
     "enable": Verb("enable", "Start dataflows at every boot."),

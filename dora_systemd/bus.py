@@ -37,6 +37,7 @@ _UNIT_PROPERTIES = frozenset(
         *("ActiveEnterTimestamp", "ActiveEnterTimestampMonotonic", "InactiveEnterTimestamp"),
         *("InactiveExitTimestamp", "InactiveExitTimestampMonotonic", "InvocationID", "Job"),
         *("StateChangeTimestamp", "Description", "UnitFileState", "NeedDaemonReload", "WantedBy"),
+        *("StateChangeTimestampMonotonic", "StartLimitBurst", "StartLimitIntervalUSec"),
     )
 )
 
@@ -90,6 +91,9 @@ class Bus:
 
     def reset_failed(self, unit: str) -> None:
         self._call(f"reset {unit}", ROOT, MANAGER, "ResetFailedUnit", ("s", unit))
+
+    def hold(self, unit: str) -> None:
+        self._call(f"hold {unit}", ROOT, MANAGER, "RefUnit", ("s", unit))
 
     def set_properties(self, unit: str, properties: Sequence[Property], runtime: bool) -> None:
         typed = [(name, (signature, value)) for name, signature, value in properties]

@@ -65,6 +65,9 @@ class Manager(Protocol):
     ) -> bool:
         """Wait for a change of the unit's properties after which `is_done`; False: too late."""
 
+    def hold(self, unit: str) -> None:
+        """Keep systemd from forgetting the unit, until this client leaves the bus."""
+
     def control_group(self) -> str:
         """The manager's own cgroup, below which its units are; "" is the root."""
 

@@ -13,6 +13,7 @@ class RunnerExit(IntEnum):
     OK = 0
     FAILED = 1
     ENGINE_LOST = 69
+    NODES_FAILED = 70
     BAD_DATAFLOW = 78
 
 

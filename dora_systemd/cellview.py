@@ -1,6 +1,7 @@
 """What a cell shows of itself: STATUS= of its unit and the table in status.json."""
 
 from collections.abc import Mapping
+from typing import Any
 
 from dora_systemd.cellstate import Cell, State
 from dora_systemd.status import CellStatus, CpuSample, NodeStatus
@@ -92,11 +93,21 @@ def cell_status(cell: Cell, uuid: str, samples: tuple[CpuSample, ...]) -> CellSt
     )
 
 
-def initial_nodes(kinds: Mapping[str, str], at_us: int) -> dict[str, NodeStatus]:
-    """The table before anything happened. kinds: node id -> how dora starts it."""
+def initial_nodes(
+    kinds: Mapping[str, str], descriptor: Mapping[str, Any], at_us: int
+) -> dict[str, NodeStatus]:
+    """The table before anything happened.
+
+    kinds: node id -> how dora starts it. descriptor: what dora is sent.
+    """
+    raw = {node["id"]: node for node in descriptor["nodes"]}
     return {
         ident: NodeStatus(
-            state="dynamic" if kind == "dynamic" else "starting", kind=kind, since_us=at_us
+            state="dynamic" if kind == "dynamic" else "starting",
+            kind=kind,
+            since_us=at_us,
+            policy=raw[ident].get("restart_policy") or "never",
+            max_restarts=int(raw[ident].get("max_restarts") or 0),
         )
         for ident, kind in kinds.items()
     }

@@ -157,6 +157,11 @@ class JournalReader:
                 break
         return list(found.values())
 
+    def starts(self, scope: Scope, uuid: str, limit: int) -> list[int]:
+        """When the newest lives of a dataflow began, CLOCK_REALTIME µs, newest first."""
+        matches = [*scope_matches(scope), f"DORA_DATAFLOW={uuid}", "DORA_EVENT=dataflow-starting"]
+        return [int(one["__REALTIME_TIMESTAMP"]) for one in self.newest(matches, limit)]
+
     def invocations(self, scope: Scope, name: str, uuid: str) -> Iterator[str]:
         """systemd's ids of the lives of a dataflow's unit, newest first."""
         matches = [*scope_matches(scope, name), "DORA_EVENT=dataflow-starting"]

@@ -15,14 +15,11 @@ from dora_systemd.dataflow import Dataflow
 from dora_systemd.dataflownodes import Node, NodeKind
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.options import RunnerOptions
-from dora_systemd.values import quoted
+from dora_systemd.restarts import DEFAULT
+from dora_systemd.values import SECOND, quoted
 
 LAUNCHED = frozenset({NodeKind.PYTHON, NodeKind.EXECUTABLE, NodeKind.SHELL})
 _PROGRAM_KEYS = ("path", "args", "build", "git", "branch", "tag", "rev")
-MIN_RESTART_DELAY = 0.5
-"""Seconds. Dora's default is none: a node that cannot start was restarted 37 times a second."""
-MAX_RESTART_DELAY = 30.0
-"""Seconds. Dora doubles the delay without end unless it is told where to stop."""
 _JSONL_BOUNDS = {"max_log_size": "16MB", "max_rotated_files": 1}
 """What dora's own log files of one node may take of the RuntimeDirectory, which is memory."""
 
@@ -81,7 +78,7 @@ def _kind(node: Node, plan: LaunchPlan) -> str:
 
 
 def _launch_node(node: Node, source: str, plan: LaunchPlan) -> dict[str, Any]:
-    raw = {**node.raw, **_restart_bounds(node)}
+    raw = {**node.raw, **_restart_keys(node, plan.options)}
     if node.keeps_output or not (is_launched(node) or node.kind is NodeKind.OPERATOR):
         raw = {**_JSONL_BOUNDS, **{key: value for key, value in raw.items() if value is not None}}
     if node.kind is NodeKind.OPERATOR:
@@ -97,12 +94,25 @@ def _launch_node(node: Node, source: str, plan: LaunchPlan) -> dict[str, Any]:
     return {**kept, "path": "/bin/sh", "args": shlex.join(words)}
 
 
+def _restart_keys(node: Node, options: RunnerOptions) -> dict[str, Any]:
+    """What the node's restarts become: the settings' word for it, its own, or the dataflow's."""
+    for ident, policy in options.node_restarts:
+        if ident == node.id:
+            return policy.dora_keys()
+    if node.restart_policy:
+        return _restart_bounds(node)
+    # Of nodes made of operators, and those that others start, dora restarts none.
+    is_restarted = node.kind not in (NodeKind.OPERATOR, NodeKind.DYNAMIC)
+    return options.restart.dora_keys() if is_restarted and options.restart.policy != "no" else {}
+
+
 def _restart_bounds(node: Node) -> dict[str, Any]:
     """Bounds for the delays of a node that dora restarts, where the descriptor has none."""
     if node.restart_policy not in ("on-failure", "always"):
         return {}
-    delay = max(_seconds(node, "restart_delay", MIN_RESTART_DELAY), MIN_RESTART_DELAY)
-    longest = max(_seconds(node, "max_restart_delay", MAX_RESTART_DELAY), delay)
+    shortest, longest = DEFAULT.delay / SECOND, DEFAULT.max_delay / SECOND
+    delay = max(_seconds(node, "restart_delay", shortest), shortest)
+    longest = max(_seconds(node, "max_restart_delay", longest), delay)
     return {"restart_delay": delay, "max_restart_delay": longest}
 
 

@@ -13,7 +13,7 @@ from dora_systemd import lifeevents as life
 from dora_systemd import nodetable as table
 from dora_systemd.cellstate import Action, Cell, Deadline, Do, Record, RunnerExit, State
 from dora_systemd.oom import Owner
-from dora_systemd.values import SECOND
+from dora_systemd.values import SECOND, format_duration
 
 Step = tuple[Cell, tuple[Action, ...]]
 Handler = Callable[[Cell, life.Event], Step]
@@ -21,6 +21,7 @@ Handler = Callable[[Cell, life.Event], Step]
 ENGINE_TIMEOUT = 30 * SECOND
 """What dora itself allows its parts to answer each other."""
 LEAVE_TIMEOUT = 2 * SECOND
+_NOT_READY = ("starting", "restarting")
 CASCADE_TIMEOUT = 5 * SECOND
 """Dora ends a dataflow within milliseconds when a node failed before it was ready."""
 
@@ -73,6 +74,17 @@ def _barrier_opened(cell: Cell, event: life.Event) -> Step:
 def _run(cell: Cell, event: life.Event) -> Step:
     cell = replace(cell, nodes=table.all_ready(cell.nodes, event.at_us), ready_us=event.at_us)
     return _to(cell, State.RUNNING, Record("dataflow-started"))
+
+
+def _start_timed_out(cell: Cell, event: life.Event) -> Step:
+    assert isinstance(event, life.StartTimedOut)
+    late = [ident for ident, node in cell.nodes.items() if node.state in _NOT_READY]
+    reason = f"{_nodes(late)} not ready within {format_duration(event.after)}"
+    return _fail(cell, reason, RunnerExit.FAILED)
+
+
+def _nodes(idents: list[str]) -> str:
+    return f"node {idents[0]} was" if len(idents) == 1 else f"nodes {', '.join(idents)} were"
 
 
 def _refused(cell: Cell, event: life.Event) -> Step:
@@ -167,9 +179,11 @@ def _result(cell: Cell, event: life.Event) -> Step:
     if not event.results:
         return _fail(cell, "dora lost the dataflow", RunnerExit.ENGINE_LOST)
     failed = {node: _known_exit(cell, node, how) for node, how in event.results.items() if how}
-    if failed:
-        reason = ", ".join(f"node {node}: {how}" for node, how in failed.items())
-        cell = replace(cell, failure=reason, exit=RunnerExit.FAILED)
+    spent = table.spent(cell.nodes)
+    if failed or spent:
+        reason = ", ".join(f"node {node}: {how}" for node, how in {**failed, **spent}.items())
+        code = RunnerExit.NODES_FAILED if spent else RunnerExit.FAILED
+        cell = replace(cell, failure=reason, exit=code)
     return _leave(cell)
 
 
@@ -204,7 +218,7 @@ def _row(**handlers: Handler) -> dict[type[life.Event], Handler]:
 
 
 _NODES: dict[str, Handler] = dict.fromkeys(
-    ("NodeSpawned", "NodeReady", "NodeExited", "NodeCascaded"), _node_event
+    ("NodeSpawned", "NodeReady", "NodeExited", "NodeCascaded", "NodeHung"), _node_event
 )
 _NODES_STOPPING: dict[str, Handler] = dict.fromkeys(_NODES, _node_event_stopping)
 _LOST: dict[str, Handler] = {
@@ -214,6 +228,7 @@ _LOST: dict[str, Handler] = {
 }
 _EARLY: dict[str, Handler] = {
     **_LOST,
+    "StartTimedOut": _start_timed_out,
     "StopAsked": _stop_early,
     "DeadlinePassed": _engine_deadline,
 }
@@ -243,7 +258,12 @@ TABLE: Mapping[State, Mapping[type[life.Event], Handler]] = {
     State.BOOTING: _row(**_EARLY, CoordinatorListening=_listening),
     State.JOINING: _row(**_EARLY, DaemonConnected=_joined),
     State.STARTING: _row(**_EARLY, RunStarted=_started, Subscribed=_subscribed),
-    State.WAITING: _row(**_ALIVE, AllReady=_barrier_opened, DeadlinePassed=_run),
+    State.WAITING: _row(
+        **_ALIVE,
+        AllReady=_barrier_opened,
+        DeadlinePassed=_run,
+        StartTimedOut=_start_timed_out,
+    ),
     State.RUNNING: _row(**_ALIVE),
     State.STOPPING: _row(**_STOPPING),
     State.CLOSING: _row(

@@ -88,6 +88,21 @@ class NodeCascaded(Event):
 
 
 @dataclass(frozen=True)
+class NodeHung(Event):
+    """Dora's health check ends the node. reason: such as "unresponsive for 5322ms"."""
+
+    node: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class StartTimedOut(Event):
+    """The nodes had `after` µs to be ready."""
+
+    after: int
+
+
+@dataclass(frozen=True)
 class RunFinished(Event):
     """Dora says that no node of the run is left."""
 
@@ -141,6 +156,8 @@ EVENTS: tuple[type[Event], ...] = (
     AllReady,
     NodeExited,
     NodeCascaded,
+    NodeHung,
+    StartTimedOut,
     RunFinished,
     ResultKnown,
     ChildExited,

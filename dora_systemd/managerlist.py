@@ -14,6 +14,7 @@ from dora_systemd.busprotocol import Manager
 from dora_systemd.cellpaths import CellPaths
 from dora_systemd.cgroup import Usage
 from dora_systemd.errors import DoraSystemdError
+from dora_systemd.managerbudget import restart_budget
 from dora_systemd.managercells import Cell, matching_cells, read_cells, select_cell
 from dora_systemd.managerenabled import enabled_units
 from dora_systemd.scope import Scope
@@ -82,7 +83,9 @@ def find_row(manager: Manager, scope: Scope, selector: str) -> DataflowRow:
         row = select_ended(scope, selector)
         if row is not None:
             return row
-    row = dataflow_row(manager, scope, select_cell(cells, selector))
+    cell = select_cell(cells, selector)
+    row = dataflow_row(manager, scope, cell)
+    row = replace(row, restart_budget=restart_budget(manager, scope, cell))
     return mark_enabled(manager, scope, [row])[0]
 
 
@@ -157,7 +160,12 @@ def _populated(groups: dict[str, Path]) -> int:
 def _node_row(node: str, status: NodeStatus | None, numbers: dict[str, Any]) -> NodeRow:
     if status is None:
         return NodeRow(node, "unknown", **numbers)
-    facts = {"pid": status.pid, "restarts": status.restarts, "exit": status.exit}
+    facts = {
+        "pid": status.pid,
+        "restarts": status.restarts,
+        "max_restarts": status.max_restarts or None,
+        "exit": status.exit,
+    }
     return NodeRow(node, status.state, **facts, **numbers)  # type: ignore[arg-type]
 
 

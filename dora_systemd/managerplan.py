@@ -21,6 +21,8 @@ from dora_systemd.names import name_from_path, parse_name, unit_name
 from dora_systemd.options import RunnerOptions
 from dora_systemd.preparation import prepare
 from dora_systemd.process import dora_version, find_dora, run_dora
+from dora_systemd.restartplan import node_policies, restart_policy
+from dora_systemd.restartsettings import START_TIMEOUT
 from dora_systemd.scope import Scope
 from dora_systemd.settings import Settings
 from dora_systemd.settingtable import (
@@ -106,6 +108,9 @@ def make_plan(scope: Scope, request: StartRequest) -> Plan:
         env_keys=tuple(variables),
         log_rates=log_rates(settings),
         node_limits=settings_node_limits(settings),
+        restart=restart_policy(settings),
+        node_restarts=node_policies(settings),
+        start_timeout=settings[START_TIMEOUT],
     )
     environment = unit_environment(search_path, venv, variables)
     plan = Plan(scope, options, settings, user, environment)

@@ -50,7 +50,13 @@ def _release_enabled(manager: Manager, scope: Scope, units: Sequence[str]) -> No
 def restart_cells(
     manager: Manager, cells: Sequence[Cell], observer: Observer | None = None
 ) -> list[Outcome]:
-    """Stop and start dataflows, all at the same time, and wait until their nodes are ready."""
+    """Stop and start dataflows, all at the same time, and wait until their nodes are ready.
+
+    Who asks for a restart begins anew: it counts for none of those that systemd may do itself.
+    """
+    for cell in cells:
+        manager.hold(cell.unit)  # a failed transient unit would be gone with its failure
+        manager.reset_failed(cell.unit)
     results = manager.run_jobs("RestartUnit", [cell.unit for cell in cells], observer)
     return [_restart_outcome(manager, cell, results[cell.unit]) for cell in cells]
 

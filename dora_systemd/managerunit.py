@@ -9,6 +9,7 @@ from dora_systemd.managerplan import Plan
 from dora_systemd.process import version_numbers
 from dora_systemd.properties import UnitContext, format_unit, unit_properties
 from dora_systemd.propertykinds import Property
+from dora_systemd.restartplan import restart_warnings
 from dora_systemd.unitfile import persistent_unit
 
 
@@ -20,6 +21,7 @@ def plan_properties(plan: Plan, manager: Manager) -> tuple[dict[str, Property], 
     """
     number = next(iter(version_numbers(manager.version())), MIN_VERSION)
     properties, warnings = drop_unsupported(_properties(plan), number)
+    warnings = (*warnings, *restart_warnings(plan.settings))
     return properties, (*warnings, *check_limits(manager, plan, properties))
 
 

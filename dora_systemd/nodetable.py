@@ -42,6 +42,8 @@ def update(
         case life.NodeCascaded():
             exit = f"node {event.by} failed before the start"
             return _set(nodes, event.node, event.at_us, state="failed", exit=exit), None
+        case life.NodeHung():
+            return _hung(nodes, event)
     return nodes, None
 
 
@@ -56,6 +58,13 @@ def _set(nodes: Nodes, ident: str, at_us: int, **changes: str | int) -> Nodes:
     return {**nodes, ident: replace(old, **changes)}  # type: ignore[arg-type]
 
 
+def _hung(nodes: Nodes, event: life.NodeHung) -> tuple[Nodes, RecordParts | None]:
+    if event.node not in nodes:
+        return nodes, None
+    nodes = {**nodes, event.node: replace(nodes[event.node], hung=event.reason)}
+    return nodes, ("node-hung", event.node, {"reason": event.reason})
+
+
 def _spawned(nodes: Nodes, event: life.NodeSpawned) -> tuple[Nodes, RecordParts | None]:
     old = nodes.get(event.node, NodeStatus())
     nodes = _set(nodes, event.node, event.at_us, state="starting", pid=event.pid)
@@ -68,6 +77,8 @@ def _exited(
     nodes: Nodes, event: life.NodeExited, is_stopping: bool
 ) -> tuple[Nodes, RecordParts | None]:
     old = nodes.get(event.node, NodeStatus())
+    if old.hung and event.exit:  # the signal that ended it says nothing
+        event = replace(event, exit=f"hung, {old.hung}")
     name, details = _words_of(event, is_stopping)
     if event.is_stale and not event.will_restart:
         return nodes, None  # it was replaced: its successor is what counts
@@ -81,6 +92,7 @@ def _exited(
         state=_state_after(event, is_stopping),
         pid=0,
         exit=event.exit,
+        hung="",
         restarts=old.restarts + int(event.will_restart and not is_stopping),
     )
     return nodes, (name, event.node, details)
@@ -100,6 +112,27 @@ def _state_after(event: life.NodeExited, is_stopping: bool) -> str:
     if event.will_restart:
         return "restarting"
     return "failed" if event.exit else "finished"
+
+
+def spent(nodes: Nodes) -> dict[str, str]:
+    """Nodes that are gone for good although dora restarts them: their restarts are used up."""
+    return {
+        ident: f"{node.exit or 'ended'} after {_restarts(node.restarts)}"
+        for ident, node in nodes.items()
+        if _is_spent(node)
+    }
+
+
+def _is_spent(node: NodeStatus) -> bool:
+    is_cascaded = node.exit.startswith("node ") or " because node " in node.exit
+    if node.state == "failed":
+        return node.policy != "never" and not is_cascaded
+    is_used_up = 0 < node.max_restarts <= node.restarts
+    return node.state == "finished" and node.policy == "always" and is_used_up
+
+
+def _restarts(count: int) -> str:
+    return "1 restart" if count == 1 else f"{count} restarts"
 
 
 def apply_results(nodes: Nodes, results: Mapping[str, str], at_us: int) -> Nodes:

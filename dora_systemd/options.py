@@ -11,7 +11,9 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.limits import NodeLimits, format_node_limits, parse_node_limits
 from dora_systemd.lograte import RateLimits, format_rates, parse_rates
 from dora_systemd.names import parse_name, parse_uuid
+from dora_systemd.restarts import DEFAULT, RestartPolicy, format_policy, parse_policy
 from dora_systemd.values import (
+    INFINITY,
     SECOND,
     format_bool,
     format_duration,
@@ -27,9 +29,9 @@ _PYTHON_FLAGS = ("-E", "-P", "-m", RUNNER_MODULE)
 """Without the environment's PYTHON* and without the working directory on sys.path: modules of the
 project can never stand in for the runner's."""
 
-_TEXTS = ("working-directory", "dora", "venv")
+_TEXTS = ("working-directory", "dora", "venv", "restart", "start-timeout")
 _FLAGS = ("uv", "debug", "allow-shell-nodes", "attached")
-_REPEATED = ("env-key", "log-rate-limit", "node-limit")
+_REPEATED = ("env-key", "log-rate-limit", "node-limit", "node-restart")
 _REQUIRED = ("name", "uuid", "working-directory", "dora")
 
 
@@ -51,6 +53,9 @@ class RunnerOptions:
     env_keys: names of the variables that win over the descriptor's own `env:`.
     log_rates: how many lines of which node are kept, see dora_systemd.lograte.
     node_limits: limits of single nodes.
+    restart: policy of nodes for which the descriptor has none.
+    node_restarts: policies of single nodes.
+    start_timeout: µs in which all nodes have to be ready, or INFINITY.
     """
 
     name: str
@@ -68,6 +73,9 @@ class RunnerOptions:
     env_keys: tuple[str, ...] = ()
     log_rates: RateLimits = field(default_factory=dict, hash=False)
     node_limits: tuple[NodeLimits, ...] = ()
+    restart: RestartPolicy = DEFAULT
+    node_restarts: tuple[tuple[str, RestartPolicy], ...] = ()
+    start_timeout: int = INFINITY
 
 
 def format_runner_argv(options: RunnerOptions) -> list[str]:
@@ -83,9 +91,16 @@ def format_runner_argv(options: RunnerOptions) -> list[str]:
         pairs.append(("venv", options.venv))
     if options.exit_when_nodes_finish is not None:
         pairs.append(("exit-when-nodes-finish", format_bool(options.exit_when_nodes_finish)))
+    if options.restart != DEFAULT:
+        pairs.append(("restart", format_policy(options.restart)))
+    if options.start_timeout != INFINITY:
+        pairs.append(("start-timeout", format_duration(options.start_timeout)))
     pairs += [("env-key", key) for key in options.env_keys]
     pairs += [("log-rate-limit", text) for text in format_rates(options.log_rates)]
     pairs += [("node-limit", format_node_limits(one)) for one in options.node_limits]
+    pairs += [
+        ("node-restart", f"{node}:{format_policy(one)}") for node, one in options.node_restarts
+    ]
     flags = [f"--{flag}" for flag in _FLAGS if getattr(options, flag.replace("-", "_"))]
     return [f"--{key}={value}" for key, value in pairs] + flags + [options.dataflow]
 
@@ -149,6 +164,9 @@ def _options(dataflow: str, values: dict[str, str], lists: dict[str, list[str]])
         env_keys=tuple(lists["env-key"]),
         log_rates=parse_rates(lists["log-rate-limit"]),
         node_limits=tuple(map(parse_node_limits, lists["node-limit"])),
+        restart=parse_policy(values["restart"]) if "restart" in values else DEFAULT,
+        node_restarts=tuple(map(_node_restart, lists["node-restart"])),
+        start_timeout=parse_duration(values.get("start-timeout", "infinity")),
         grace=parse_duration(values.get("grace-duration", "10s")),
         exit_when_nodes_finish=None if exits is None else parse_bool(exits),
         working_directory=values["working-directory"],
@@ -159,6 +177,12 @@ def _options(dataflow: str, values: dict[str, str], lists: dict[str, list[str]])
         allow_shell_nodes="allow-shell-nodes" in values,
         attached="attached" in values,
     )
+
+
+def _node_restart(text: str) -> tuple[str, RestartPolicy]:
+    # Times have no colon, ids of nodes may have one.
+    node, _, policy = text.rpartition(":")
+    return node, parse_policy(policy)
 
 
 def _refusal(reason: str) -> DoraSystemdError:

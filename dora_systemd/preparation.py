@@ -21,6 +21,7 @@ from dora_systemd.limits import (
     parse_changes,
 )
 from dora_systemd.options import RunnerOptions
+from dora_systemd.restarts import check_restart_nodes
 
 PACKAGE = Path(__file__).parent
 
@@ -46,6 +47,7 @@ def prepare(options: RunnerOptions, environment: Mapping[str, str]) -> Prepared:
     ids = [node.id for node in dataflow.nodes]
     dynamic = [node.id for node in dataflow.nodes if node.kind is NodeKind.DYNAMIC]
     check_nodes(options.node_limits, ids, dynamic)
+    check_restart_nodes(options.node_restarts, ids)
     plan = LaunchPlan(
         options,
         str(PACKAGE / "launcher.sh"),

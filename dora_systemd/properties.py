@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from dora_systemd.cellstate import RunnerExit
 from dora_systemd.environment import checked_variable, environment_entries
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.limitsettings import REALTIME
@@ -29,6 +30,9 @@ STOP_MARGIN = 10 * SECOND
 """What TimeoutStopSec= allows beyond 1.5 grace durations, dora's own last resort."""
 
 WATCHDOG = 30 * SECOND
+
+START_MARGIN = 10 * SECOND
+"""What TimeoutStartSec= allows beyond --start-timeout, which is the runner's."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +63,7 @@ def unit_properties(
         **identity_properties(options),
         **service_properties(options, context),
         **stop_properties(options),
+        **restart_properties(options),
         **cgroup_properties(),
         **memory_lock_properties(),
         **directory_properties(options),
@@ -96,6 +101,9 @@ def service_properties(options: RunnerOptions, context: UnitContext) -> dict[str
     """
     argv = tuple(runner_command(context.python, options))
     post = tuple(post_command(context.python, options))
+    # The runner names the nodes that are late; systemd ends one that cannot even do that.
+    is_endless = options.start_timeout == INFINITY
+    start_timeout = INFINITY if is_endless else options.start_timeout + START_MARGIN
     return typed(
         Type="notify",
         NotifyAccess="main",
@@ -103,10 +111,9 @@ def service_properties(options: RunnerOptions, context: UnitContext) -> dict[str
         ExecStopPost=((post[0], post, ("ignore-failure", "no-env-expand")),),
         # Two pipes a node: what is in them is kept when the runner is killed.
         FileDescriptorStoreMax=4096,
-        Restart="no",
         # Never the project: its modules must not be found before the runner's.
         WorkingDirectory="/",
-        TimeoutStartSec=INFINITY,
+        TimeoutStartSec=start_timeout,
         WatchdogSec=WATCHDOG,
         # One node out of memory is not the end of the others; the runner says what happened.
         OOMPolicy="continue",
@@ -121,6 +128,31 @@ def stop_properties(options: RunnerOptions) -> dict[str, Property]:
     is_endless = options.grace == INFINITY
     timeout = INFINITY if is_endless else options.grace * 3 // 2 + STOP_MARGIN
     return typed(KillMode="mixed", TimeoutStopSec=timeout)
+
+
+def restart_properties(options: RunnerOptions) -> dict[str, Property]:
+    """What systemd starts again, see systemd.service(5) and StartLimitBurst= in systemd.unit(5).
+
+    The first start counts as one: "3 restarts" are four starts.
+    """
+    policy = options.restart
+    # Of nodes that dora gave up, and of a bad dataflow, another start makes nothing better. Who
+    # runs it attached wants its end to be the end.
+    final = (RunnerExit.NODES_FAILED, RunnerExit.BAD_DATAFLOW, *([0] if options.attached else []))
+    common = typed(RestartPreventExitStatus=(tuple(sorted(map(int, final))), ()))
+    if policy.policy == "no":
+        return common | typed(Restart="no")
+    is_endless = policy.max_restarts == INFINITY
+    growth = {"RestartSteps": policy.steps(), "RestartMaxDelaySec": policy.max_delay}
+    if policy.steps() < 1:
+        growth = {}
+    return common | typed(
+        Restart=policy.policy,
+        RestartSec=policy.delay,
+        **growth,
+        StartLimitIntervalSec=0 if is_endless else policy.window,
+        StartLimitBurst=1 if is_endless else policy.max_restarts + 1,
+    )
 
 
 def cgroup_properties() -> dict[str, Property]:

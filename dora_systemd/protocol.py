@@ -231,6 +231,15 @@ def _exit_text(kind: str, number: str | None) -> str:
     return f"exit code {number}" if kind == "ExitCode" and number else "unknown exit status"
 
 
+_UNRESPONSIVE = re.compile(r"node `([^`]+)` (unresponsive for \d+ms \(timeout: [^)]*\)), killing")
+
+
+def parse_daemon_line(line: str, at_us: int) -> life.Event | None:
+    """What a line that the daemon printed says about a node; dora tells hangs nowhere else."""
+    match = _UNRESPONSIVE.search(line)
+    return life.NodeHung(at_us, match[1], match[2]) if match else None
+
+
 def with_facts(event: life.NodeExited, is_stale: bool, oom: Oom | None) -> life.NodeExited:
     """The event with what only the runner can tell.
 

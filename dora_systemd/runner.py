@@ -27,6 +27,7 @@ from dora_systemd.runnerengine import Engine
 from dora_systemd.runnerloss import losses_of_user
 from dora_systemd.runnernodes import Nodes, enter_supervisor, wait_eof
 from dora_systemd.runnerpump import Pump, now_us
+from dora_systemd.values import INFINITY, SECOND
 
 SAMPLE_SECONDS = 5.0
 JOURNAL_SECONDS = 1.0
@@ -80,7 +81,9 @@ async def run_cell(options: RunnerOptions, paths: CellPaths) -> RunnerExit:
         pipes.write_event("dataflow-starting")
         prepared = prepare(options, environment)
         nodes.prepare(prepared.dataflow, options.log_rates, options.node_limits)
-        table = initial_nodes(kinds(prepared.dataflow, prepared.plan), started_us)
+        table = initial_nodes(
+            kinds(prepared.dataflow, prepared.plan), prepared.descriptor, started_us
+        )
         cell = Cell(options.grace, started_us, table)
         pump = Pump(cell, options.uuid, paths, nodes, pipes)
         dialogue = Dialogue(options, pump, dora, nodes, pipes)
@@ -118,6 +121,9 @@ def listen(
     if "WATCHDOG_USEC" in os.environ:
         seconds = int(os.environ["WATCHDOG_USEC"]) / 1_000_000 / 3
         dialogue.spawn(dialogue.feed_watchdog(seconds))
+    if options.start_timeout != INFINITY:
+        late = life.StartTimedOut(now_us(), options.start_timeout)
+        loop.call_later(options.start_timeout / SECOND, pump.push, late)
     if options.attached:
         dialogue.spawn(stop_at_eof(pump))
 

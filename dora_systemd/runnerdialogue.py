@@ -92,8 +92,13 @@ class Dialogue:
             self._pump.push(life.CoordinatorListening(now_us()))
 
     def _start_daemon(self, variables: Mapping[str, str]) -> None:
-        self.watch(self._engine.start_daemon(variables))
+        self.watch(self._engine.start_daemon(variables), self._read_daemon)
         self.spawn(self._wait_joined())
+
+    def _read_daemon(self, line: str) -> None:
+        event = protocol.parse_daemon_line(line, now_us())
+        if event is not None:
+            self._pump.push(event)
 
     async def _wait_joined(self) -> None:
         await self._engine.wait_joined()

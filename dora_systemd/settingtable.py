@@ -9,6 +9,7 @@ from typing import Any
 
 from dora_systemd.limitsettings import LIMIT_SETTINGS
 from dora_systemd.lograte import RateLimits
+from dora_systemd.restartsettings import RESTART_SETTINGS
 from dora_systemd.settingkinds import (
     BOOL,
     DURATION,
@@ -136,8 +137,9 @@ LOG_RATE_LIMIT = Setting[RateLimits](
 )
 
 # All of the above, in that order, so that a setting is declared in one place only, and then those
-# of the module limitsettings.
+# of other modules.
 SETTINGS: tuple[Setting[Any], ...] = (
     *(value for value in list(globals().values()) if isinstance(value, Setting)),
     *LIMIT_SETTINGS,
+    *RESTART_SETTINGS,
 )

@@ -32,7 +32,9 @@ class NodeStatus:
     state: one of NODE_STATES. pid: 0 when no process is known. restarts: how often dora restarted
     it in this run. since_us: CLOCK_REALTIME µs of the last change of state. exit: how its last
     process ended, "" or a text such as "exit code 1" or "signal SIGKILL". kind: how dora
-    starts it (python, executable, shell, uv, operator, ros2, dynamic, url).
+    starts it (python, executable, shell, uv, operator, ros2, dynamic, url). policy: dora's word
+    for what it restarts, "never" where it says none. max_restarts: how often in one window, 0
+    without limit. hung: what dora's health check said of the process before it ended it, or "".
     """
 
     state: str = "starting"
@@ -41,6 +43,9 @@ class NodeStatus:
     since_us: int = 0
     exit: str = ""
     kind: str = ""
+    policy: str = "never"
+    max_restarts: int = 0
+    hung: str = ""
 
     @property
     def is_alive(self) -> bool:

@@ -1,10 +1,11 @@
 """What systemd and the runner say about a dataflow, in the words and tables of `doractl list`."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from dora_systemd.restarts import budget_words
 from dora_systemd.values import SECOND, format_rounded_size
 
 STARTING, RUNNING, DEGRADED = "Starting", "Running", "Degraded"
@@ -43,6 +44,7 @@ class NodeRow:
     memory: int | None = None
     memory_peak: int | None = None
     restarts: int | None = None
+    max_restarts: int | None = None
     exit: str = ""
     cpu_limit: float | None = None
     memory_limit: int | None = None
@@ -75,6 +77,7 @@ class DataflowRow:
     memory_limit: int | None = None
     throttled: float | None = None
     restarts: int | None = None
+    restart_budget: Mapping[str, int | None] | None = None
     nodes: tuple[NodeRow, ...] = field(default=())
     enabled: bool = False
 
@@ -191,9 +194,14 @@ def _node_cells(row: NodeRow) -> dict[str, str]:
         _THROTTLED: format_percent(row.throttled),
         "MEM": format_memory(row.memory, row.memory_limit),
         "PEAK": format_memory(row.memory_peak),
-        "RESTARTS": format_count(row.restarts),
+        "RESTARTS": _restarts_of(row),
         "EXIT": row.exit or UNKNOWN,
     }
+
+
+def _restarts_of(row: NodeRow) -> str:
+    used = format_count(row.restarts)
+    return f"{used}/{row.max_restarts}" if row.max_restarts else used
 
 
 def format_dataflow(row: DataflowRow) -> str:
@@ -210,6 +218,7 @@ def format_dataflow(row: DataflowRow) -> str:
         ("CPU", _cpu_words(row)),
         ("Memory", _memory_words(row)),
         ("Restarts", format_count(row.restarts)),
+        ("Budget", budget_words(row.restart_budget) if row.restart_budget else ""),
         ("At boot", "started" if row.enabled else ""),
     )
     lines = [f"{title + ':':<10}{text}" for title, text in facts if text]

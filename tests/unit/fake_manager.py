@@ -44,6 +44,7 @@ class FakeManager:
         self.calls: list[tuple[Any, ...]] = []
         self.job_results: dict[str, str] = {}
         self.stages: list[str] = []
+        self.held: set[str] = set()
         self.after_job: dict[str, dict[str, Any]] = {}
         self.systemd = "257.13-1"
         self.etc = Path("/nowhere/etc")
@@ -61,6 +62,9 @@ class FakeManager:
             "ExecStart": [[command[0], command, False, 0, 0, 0, 0, 0, 0, 0]],
             "ControlGroup": "",
             "NRestarts": 0,
+            "Restart": "no",
+            "StartLimitBurst": 5,
+            "StartLimitIntervalUSec": 10_000_000,
             "StatusText": "",
             "Result": "success",
             "ExecMainCode": 1,
@@ -114,7 +118,12 @@ class FakeManager:
         if unit not in self.units:
             raise DoraSystemdError(f"cannot reset {unit}", "", ExitCode.NOT_FOUND)
         self.calls.append(("reset", unit))
-        del self.units[unit]
+        self.units[unit]["NRestarts"] = 0
+        if unit not in self.held and self.units[unit]["ActiveState"] != "active":
+            del self.units[unit]
+
+    def hold(self, unit: str) -> None:
+        self.held.add(unit)
 
     def set_properties(self, unit: str, properties: Sequence[Property], runtime: bool) -> None:
         self.calls.append(("set", unit, list(properties), runtime))

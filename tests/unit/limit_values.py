@@ -30,6 +30,17 @@ def limits_of_a_node(draw: st.DrawFn, ids: st.SearchStrategy[str] = IDS) -> Node
     return node_limits(draw(ids), {word: draw(BY_NAME[word]) for word in words})
 
 
+_TIME = st.integers(1, 10**12)
+_DELAY = st.integers(500_000, 10**12)
+RESTART_VALUES: dict[str, st.SearchStrategy[Any]] = {
+    "restart_policy": st.sampled_from(["no", "on-failure", "always"]),
+    "max_restarts": st.integers(1, 1_000_000) | st.just(INFINITY),
+    "restart_window": _TIME,
+    "restart_delay": _DELAY,
+    "max_restart_delay": _DELAY,
+    "start_timeout": _TIME,
+}
+
 LIMIT_VALUES: dict[str, st.SearchStrategy[Any]] = {
     "cpu_limit": CPU,
     "memory_limit": MEMORY,

@@ -45,7 +45,10 @@ def test_stages_and_table() -> None:
     assert stage(cell(State.RUNNING, a="running")) == "running"
     assert stage(cell(State.RUNNING, a="failed")) == "degraded"
     assert stage(cell(State.ENDED)) == "ended"
-    nodes = initial_nodes({"a": "python", "b": "dynamic"}, 5)
+    raw = [{"id": "a", "restart_policy": "always", "max_restarts": 3}, {"id": "b"}]
+    nodes = initial_nodes({"a": "python", "b": "dynamic"}, {"nodes": raw}, 5)
     assert [node.state for node in nodes.values()] == ["starting", "dynamic"]
+    assert [node.policy for node in nodes.values()] == ["always", "never"]
+    assert [node.max_restarts for node in nodes.values()] == [3, 0]
     table = cell_status(Cell(0, 3, nodes), "uuid", ())
     assert CellStatus.from_json(table.to_json()) == table

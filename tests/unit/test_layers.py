@@ -63,6 +63,9 @@ DECISIONS = {
         "propertystructs",
         "propertytable",
         "protocol",
+        "restartplan",
+        "restarts",
+        "restartsettings",
         "settingkinds",
         "settings",
         "settingschema",
@@ -99,6 +102,7 @@ SHARED = {
 USE_CASES = {
     "manager": [
         "manageraccount",
+        "managerbudget",
         "managercells",
         "managerclaim",
         "managerdoctor",
@@ -114,6 +118,7 @@ USE_CASES = {
         "managernode",
         "managerplan",
         "managerreason",
+        "managerreset",
         "managerrun",
         "managerset",
         "managersettings",

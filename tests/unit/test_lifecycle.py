@@ -27,6 +27,8 @@ SAMPLES: dict[type[life.Event], tuple[life.Event, ...]] = {
         life.NodeExited(1, "unknown", "", True, is_stale=True),
     ),
     life.NodeCascaded: (life.NodeCascaded(1, "a", "b"),),
+    life.NodeHung: (life.NodeHung(1, "a", "unresponsive"), life.NodeHung(1, "unknown", "")),
+    life.StartTimedOut: (life.StartTimedOut(1, 1_000_000),),
     life.RunFinished: (life.RunFinished(1),),
     life.ResultKnown: (life.ResultKnown(1), life.ResultKnown(1, {"a": "", "b": "exit code 1"})),
     life.ChildExited: (

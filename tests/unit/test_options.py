@@ -17,6 +17,7 @@ from dora_systemd.options import (
     parse_runner_argv,
     runner_command,
 )
+from dora_systemd.restarts import POLICIES, RestartPolicy
 from dora_systemd.values import INFINITY
 from tests.unit.limit_values import limits_of_a_node
 
@@ -27,6 +28,15 @@ texts = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]
 paths = texts.map(lambda text: "/" + text)
 nodes = st.just(ALL_NODES) | st.from_regex(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,20}", fullmatch=True)
 rates = st.builds(RateLimit, st.integers(1, 10**18 - 1), st.integers(SHORTEST, INFINITY - 1))
+times = st.integers(1, 10**12)
+policies = st.builds(
+    RestartPolicy,
+    st.sampled_from(POLICIES),
+    st.integers(1, 1_000_000) | st.just(INFINITY),
+    times | st.just(INFINITY),
+    times,
+    times,
+)
 options = st.builds(
     RunnerOptions,
     name=st.from_regex(r"[a-z][a-z0-9_-]{0,20}", fullmatch=True).filter(lambda n: n != "gateway"),
@@ -44,6 +54,9 @@ options = st.builds(
     env_keys=st.lists(texts).map(tuple),
     log_rates=st.dictionaries(nodes, st.none() | rates),
     node_limits=st.lists(limits_of_a_node()).map(tuple),
+    restart=policies,
+    node_restarts=st.lists(st.tuples(st.text(min_size=1), policies)).map(tuple),
+    start_timeout=st.integers(min_value=1, max_value=10**12) | st.just(INFINITY),
 )
 
 

@@ -39,13 +39,14 @@ ExecStart=:/usr/bin/python3 -E -P -m dora_systemd.runner --name=robot --uuid={UU
 ExecStopPost=-:/usr/bin/python3 -E -P -m dora_systemd.runnerpost robot \
 550e8400-e29b-41d4-a716-446655440000
 FileDescriptorStoreMax=4096
-Restart=no
 WorkingDirectory=/
 TimeoutStartSec=infinity
 WatchdogSec=30s
 OOMPolicy=continue
 KillMode=mixed
 TimeoutStopSec=25s
+RestartPreventExitStatus=70 78
+Restart=no
 Delegate=yes
 DelegateSubgroup=supervisor
 CPUAccounting=yes

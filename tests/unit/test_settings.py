@@ -26,7 +26,7 @@ from dora_systemd.settingtable import (
     WORKING_DIRECTORY,
 )
 from dora_systemd.values import SECOND
-from tests.unit.limit_values import LIMIT_VALUES
+from tests.unit.limit_values import LIMIT_VALUES, RESTART_VALUES
 
 BESIDE = "/srv/robot.systemd.yml"
 HOME = "/home/me/.config/dora-systemd/config.yml"
@@ -209,6 +209,7 @@ def test_values_and_back(data: st.DataObject) -> None:
             st.sampled_from(["", "cam"]), st.none() | st.just(RateLimit(5, SECOND))
         ),
         **LIMIT_VALUES,
+        **RESTART_VALUES,
     }
     for setting in SETTINGS:
         strategy = st.booleans() if setting.kind.is_flag else examples.get(setting.name, texts)

@@ -1,0 +1,39 @@
+"""doractl reset: count restarts anew."""
+
+import click
+
+from dora_systemd.bus import Bus
+from dora_systemd.cli.parameters import current_scope, print_outcomes, scope_options
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.managercells import read_cells, select_cell
+from dora_systemd.managerreset import reset_cells
+
+_EPILOG = """\b
+Examples:
+  doractl reset robot
+  doractl reset --all
+"""
+
+
+@click.command("reset", epilog=_EPILOG)
+@click.argument("selectors", nargs=-1, metavar="SELECTOR...")
+@click.option("-a", "--all", "want_all", is_flag=True, help="All dataflows that systemd knows.")
+@scope_options
+def command(selectors: tuple[str, ...], want_all: bool) -> int:
+    """Forget the failure of dataflows, and the restarts that they have used up.
+
+    As systemctl reset-failed: what runs goes on, and may be restarted by systemd as often as at
+    the beginning. The restarts of single nodes are dora's; doractl restart begins those anew.
+    """
+    if bool(selectors) == want_all:
+        raise DoraSystemdError(
+            "cannot tell what to reset",
+            "doractl reset NAME, or doractl reset --all",
+            ExitCode.USAGE,
+        )
+    bus = Bus(current_scope())
+    cells = read_cells(bus)
+    chosen = cells if want_all else [select_cell(cells, one) for one in selectors]
+    if want_all and not chosen:
+        click.echo("No dataflow.")
+    return print_outcomes(reset_cells(bus, list(dict.fromkeys(chosen))))

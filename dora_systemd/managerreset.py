@@ -1,0 +1,24 @@
+"""`doractl reset`: systemd forgets failures and counts restarts anew."""
+
+from collections.abc import Sequence
+
+from dora_systemd.busprotocol import Manager
+from dora_systemd.managercells import Cell
+from dora_systemd.managerstop import Outcome
+
+_FACTS = ("NRestarts",)
+
+
+def reset_cells(manager: Manager, cells: Sequence[Cell]) -> list[Outcome]:
+    """Clear the restarts used up by each dataflow, and its failure; what runs goes on running.
+
+    A failed unit that nothing else holds is gone from systemd then, its logs stay.
+    """
+    return [_reset(manager, cell) for cell in cells]
+
+
+def _reset(manager: Manager, cell: Cell) -> Outcome:
+    used = manager.read(cell.unit, _FACTS)["NRestarts"]
+    manager.reset_failed(cell.unit)
+    words = "1 restart" if used == 1 else f"{used} restarts"
+    return Outcome(cell, f"Dataflow reset: {cell.uuid} ({cell.name}, {words} forgotten)")

@@ -1,0 +1,163 @@
+"""Restart policies: what starts again, how often, how soon; and how systemd and dora are told.
+
+One owner for each kind of failure: of a node dora, of the dataflow as a whole systemd. Both get the
+same policy. See systemd.service(5), systemd.unit(5) and dora's descriptor.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.suggestions import did_you_mean
+from dora_systemd.values import (
+    INFINITY,
+    SECOND,
+    format_duration,
+    parse_duration,
+    quoted,
+)
+
+POLICIES = ("no", "on-failure", "always")
+_DORA_POLICIES = {"no": "never", "on-failure": "on-failure", "always": "always"}
+
+MIN_DELAY = SECOND // 2
+"""µs. Dora's default is none: a node that cannot start was restarted 37 times a second."""
+
+MAX_RESTARTS = 1_000_000
+
+
+class RestartPolicy(NamedTuple):
+    """What starts again by itself, and how. Times in µs.
+
+    policy: one of POLICIES. max_restarts: in one window, or INFINITY. delay: before the first one;
+    it doubles with each, up to max_delay.
+    """
+
+    policy: str = "no"
+    max_restarts: int = 5
+    window: int = 600 * SECOND
+    delay: int = MIN_DELAY
+    max_delay: int = 30 * SECOND
+
+    def dora_keys(self) -> dict[str, Any]:
+        """The keys of a node in dora's descriptor; 0 is no limit there, and times are seconds."""
+        if self.policy == "no":
+            return {"restart_policy": "never"}
+        is_endless = self.max_restarts == INFINITY
+        window = {} if self.window == INFINITY else {"restart_window": self.window / SECOND}
+        return {
+            "restart_policy": _DORA_POLICIES[self.policy],
+            "max_restarts": 0 if is_endless else self.max_restarts,
+            "restart_delay": self.delay / SECOND,
+            "max_restart_delay": self.max_delay / SECOND,
+            **window,
+        }
+
+    def steps(self) -> int:
+        """RestartSteps=: so many doublings lead from delay to max_delay; 0 is no growth."""
+        return (self.max_delay // max(self.delay, 1)).bit_length() - 1
+
+
+DEFAULT = RestartPolicy()
+
+_KEYS = ("policy", "max", "window", "delay", "max-delay")
+
+
+def format_policy(policy: RestartPolicy) -> str:
+    """The policy as the runner's command line has it: `on-failure,max=5,window=10min,...`."""
+    maximum = "infinity" if policy.max_restarts == INFINITY else str(policy.max_restarts)
+    times = (format_duration(one) for one in (policy.window, policy.delay, policy.max_delay))
+    pairs = zip(_KEYS[1:], (maximum, *times), strict=True)
+    return ",".join([policy.policy, *(f"{key}={text}" for key, text in pairs)])
+
+
+def parse_policy(text: str) -> RestartPolicy:
+    """The exact inverse of format_policy. Raises DoraSystemdError (USAGE)."""
+    word, *pairs = text.split(",")
+    given = dict(pair.split("=", 1) for pair in pairs if "=" in pair)
+    if word not in POLICIES or set(given) != set(_KEYS[1:]):
+        message = f"cannot use {quoted(text)} as restart policy"
+        raise DoraSystemdError(message, f"there are {', '.join(POLICIES)}", ExitCode.USAGE)
+    return RestartPolicy(
+        word,
+        parse_count(given["max"]),
+        *(parse_duration(given[key]) for key in ("window", "delay", "max-delay")),
+    )
+
+
+def parse_count(text: str) -> int:
+    """A number of restarts, or INFINITY. Raises DoraSystemdError (USAGE)."""
+    if text.strip() == "infinity":
+        return INFINITY
+    if not text.strip().isdecimal() or not 1 <= int(text) <= MAX_RESTARTS:
+        raise DoraSystemdError(
+            f"cannot use {quoted(text)} as a number of restarts",
+            "write 1 or more, or infinity; for none use --restart-policy no",
+            ExitCode.USAGE,
+        )
+    return int(text)
+
+
+def parse_delay(text: str) -> int:
+    """µs before a restart, MIN_DELAY at least. Raises DoraSystemdError (USAGE)."""
+    delay = parse_duration(text)
+    if not MIN_DELAY <= delay < INFINITY:
+        message = f"cannot use {quoted(text)} as the delay of a restart"
+        hint = f"write {format_duration(MIN_DELAY)} or more: crash loops cost the machine its time"
+        raise DoraSystemdError(message, hint, ExitCode.USAGE)
+    return delay
+
+
+def with_values(base: RestartPolicy, values: Mapping[str, Any]) -> RestartPolicy:
+    """`base` with some of its fields changed; the longest delay is never below the first."""
+    changed = base._replace(**values)
+    return changed._replace(max_delay=max(changed.max_delay, changed.delay))
+
+
+def check_restart_nodes(
+    policies: Iterable[tuple[str, RestartPolicy]], nodes: Sequence[str]
+) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) for the policy of a node that is not in `nodes`."""
+    for node, _ in policies:
+        if node not in nodes:
+            hint = did_you_mean(node, nodes) or f"there are {', '.join(nodes)}"
+            message = f"cannot set the restart policy of the node {quoted(node)}: it is not there"
+            raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+
+
+def budget_words(budget: Mapping[str, int | None]) -> str:
+    """As "3/5 restarts used, next try in 40s, resets in 8min"; times to the second."""
+    parts = [f"{budget['used']}/{budget['max']} restarts used"]
+    for key, words in (("next_us", "next try in"), ("resets_us", "resets in")):
+        left = budget[key]
+        if left is not None:
+            parts.append(f"{words} {format_duration(-(-left // SECOND) * SECOND)}")
+    return ", ".join(parts)
+
+
+class Budget(NamedTuple):
+    """What is left of the restarts of a unit. used: in this window. resets_in: µs, or None."""
+
+    used: int
+    resets_in: int | None
+
+
+def unit_budget(
+    starts: Sequence[int], max_restarts: int, window: int, now: int, counted: int
+) -> Budget:
+    """How much of StartLimitBurst= is used up, as systemd counts it.
+
+    starts: CLOCK_REALTIME µs of the starts of the unit, oldest first. counted: NRestarts=, which
+    `doractl reset` clears. systemd's window begins with a start and lasts `window` µs; the next
+    start after its end begins another one.
+    """
+    begin, used = None, 0
+    for start in starts:
+        if begin is None or start - begin >= window:
+            begin, used = start, 0
+        else:
+            used += 1
+    if begin is None or now - begin >= window:
+        return Budget(0, None)
+    used = min(used, counted, max_restarts)
+    return Budget(used, begin + window - now if used else None)

@@ -1,0 +1,175 @@
+"""Restart policies with real dora and systemd: one owner for each failure, and a visible budget."""
+
+import json
+import os
+import signal
+
+import pytest
+
+from dora_systemd.errors import ExitCode
+from dora_systemd.values import SECOND
+from tests.system.cells import Cell, Project, is_alive, wait_for
+
+CRASHING = """
+import sys
+from dora import Node
+node = Node()
+for event in node:
+    if event["type"] == "INPUT":
+        print("I crash", flush=True)
+        sys.exit(3)
+"""
+CRASH = "nodes: [{id: bad, path: bad.py, inputs: {tick: dora/timer/millis/50}}]"
+FINISHING = "from dora import Node\nnode = Node()\nprint('done', flush=True)\n"
+LATE = "import time\ntime.sleep(1000)\n"
+HANGING = """
+import time
+from dora import Node
+node = Node()
+for event in node:
+    print("I hang", flush=True)
+    time.sleep(1000)
+"""
+ON_FAILURE = ("--restart-policy", "on-failure")
+CRASHES = ("crashed", "exit code 3", "ExitCode(3)", "restarted", "after failure", "Failed with")
+KILLED = (
+    *("code=killed", "Failed with result", "status=69", "is lost", "failed: ", "was ended"),
+    *("disconnected", "start-limit", "too quickly", "exited", "Failed to start", "outputs done"),
+)
+
+
+def listed(cell: Cell) -> dict[str, object]:
+    row: dict[str, object] = json.loads(cell.doractl("list", cell.name, "-o", "json",
+                                                     check=False).stdout)  # fmt: skip
+    return row
+
+
+def kill(cell: Cell, what: str) -> int:
+    pid = cell.supervisor_pid(what)
+    os.kill(pid, signal.SIGKILL)
+    wait_for("it is dead", lambda: not is_alive(pid))
+    return pid
+
+
+@pytest.mark.warns(*CRASHES)
+def test_three_restarts_are_three(cell: Cell, project: Project) -> None:
+    """The crashes of a node are dora's alone: systemd does not begin again after the last one."""
+    project.write("bad.py", CRASHING)
+    words = ("--max-restarts", "3", "--max-restart-delay", "500ms")
+    cell.start(project.write("flow.yml", CRASH), *ON_FAILURE, *words)
+    wait_for("it has failed", lambda: cell.show("ActiveState") == "failed")
+    assert cell.messages("bad").count("I crash") == 4
+    assert [event for event, _ in cell.events()].count("node-restarted") == 3
+    assert (cell.show("NRestarts"), cell.show("ExecMainStatus")) == ("0", "70")
+    assert "node bad: exit code 3 after 3 restarts" in cell.show("StatusText")
+
+
+@pytest.mark.warns(*CRASHES)
+def test_what_the_dataflow_says_of_a_node_holds(cell: Cell, project: Project) -> None:
+    flow = project.three_nodes()
+    project.write("bad.py", CRASHING)
+    bad = "\n  - {id: bad, path: bad.py, restart_policy: never, inputs: {n: source/number}}\n"
+    flow.write_text(flow.read_text().rstrip() + bad)
+    project.write("dataflow.systemd.yml", "nodes: {sink: {max_restarts: 7}}")
+    cell.start(flow, *ON_FAILURE, check=False)
+    wait_for("it is degraded", lambda: cell.status.stage == "degraded")
+    assert cell.status.nodes["bad"].restarts == 0
+    nodes = {one["node"]: one for one in listed(cell)["nodes"]}  # type: ignore[attr-defined]
+    assert nodes["sink"]["max_restarts"] == 7
+    assert nodes["source"]["max_restarts"] == 5
+    assert nodes["bad"]["max_restarts"] is None
+    assert "0/7" in cell.doractl("list", cell.name).stdout
+
+
+@pytest.mark.warns(*KILLED)
+def test_the_budget_is_seen_used_up_and_reset(cell: Cell, project: Project) -> None:
+    words = ("--max-restarts", "1", "--restart-window", "5min")
+    cell.start(project.three_nodes(), *ON_FAILURE, *words)
+    assert listed(cell)["restart_budget"] == {
+        "used": 0,
+        "max": 1,
+        "next_us": None,
+        "resets_us": None,
+    }
+    old = kill(cell, "daemon")
+    wait_for("it is back", lambda: cell.show("ActiveState") == "active" and not is_alive(old))
+    cell.wait_exchanging()
+    budget = listed(cell)["restart_budget"]
+    assert isinstance(budget, dict)
+    assert (budget["used"], budget["max"]) == (1, 1)
+    assert 0 < budget["resets_us"] <= 300 * SECOND
+    assert "Budget:   1/1 restarts used, resets in " in cell.doractl("list", cell.name).stdout
+
+    done = cell.doractl("reset", cell.name)
+    assert done.stdout.endswith(f"({cell.name}, 1 restart forgotten)\n")
+    assert cell.show("ActiveState") == "active"
+    # The start of what runs is forgotten, too: there is one restart more.
+    for restarts in ("1", "2"):
+        kill(cell, "runner")
+        wait_for("it is back", lambda number=restarts: cell.show("NRestarts") == number)  # type: ignore[misc]
+        wait_for("it is up", lambda: cell.show("ActiveState") == "active")
+    kill(cell, "runner")
+    wait_for("it is given up", lambda: cell.show("ActiveState") == "failed")
+    assert listed(cell)["status"] == "Failed"
+
+    # Who restarts it by hand begins anew.
+    assert cell.doractl("restart", cell.name).returncode == 0
+    assert cell.show("NRestarts") == "0"
+
+
+def test_always_restarts_what_ended_by_itself(cell: Cell, project: Project) -> None:
+    project.write("short.py", FINISHING)
+    flow = project.write("flow.yml", "nodes: [{id: short, path: short.py, restart_policy: never}]")
+    cell.start(flow, "--restart-policy", "always", check=False)
+    wait_for("it begins again", lambda: cell.messages("short").count("done") > 1)
+    cell.doractl("stop", cell.name)
+    assert cell.show("ActiveState") == "inactive"
+    assert listed(cell)["status"] in ("Stopped", "Finished")
+
+
+@pytest.mark.warns("not ready within", "Failed with result", "exited", "failed", "Failed to start")
+def test_start_timeout_names_the_late(cell: Cell, project: Project) -> None:
+    flow = project.three_nodes()
+    project.write("late.py", LATE)
+    flow.write_text(flow.read_text().rstrip() + "\n  - {id: late, path: late.py}\n")
+    done = cell.start(flow, "--start-timeout", "3s", check=False)
+    assert done.returncode == ExitCode.FAILURE
+    assert "node late was not ready within 3s" in done.stderr
+    assert cell.show("ActiveState") == "failed"
+
+
+@pytest.mark.warns("hang", "unresponsive", "crashed", "SIGKILL", "Signal(9)", "restarted", "after")
+def test_a_hang_is_called_one(cell: Cell, project: Project) -> None:
+    project.write("hang.py", HANGING)
+    project.write("source.py", project.three_nodes().with_name("source.py").read_text())
+    text = (
+        "health_check_interval: 0.5\nnodes:\n"
+        "  - {id: source, path: source.py, inputs: {t: dora/timer/millis/50}, outputs: [number]}\n"
+        "  - {id: hang, path: hang.py, health_check_timeout: 1.0,"
+        " inputs: {n: {source: source/number, queue_size: 1000}}}\n"
+    )
+    cell.start(project.write("flow.yml", text), *ON_FAILURE)
+    wait_for("it is found out", lambda: ("node-hung", "hang") in cell.events(), 60)
+    wait_for("it is restarted", lambda: ("node-restarted", "hang") in cell.events())
+    (crash, *_) = [one for one in cell.journal() if one.get("DORA_EVENT") == "node-crashed"]
+    assert crash["DORA_EXIT"].startswith("hung, unresponsive for ")
+
+
+@pytest.mark.warns(*KILLED, "watchdog", "Watchdog", "Killing process", "SIGABRT", "core-dump")
+def test_watchdog_restarts_a_runner_that_hangs(cell: Cell, project: Project) -> None:
+    cell.start(project.three_nodes(), *ON_FAILURE, "--property", "WatchdogSec=2s")
+    runner = cell.supervisor_pid("runner")
+    os.kill(runner, signal.SIGSTOP)
+    wait_for("it is replaced", lambda: cell.show("NRestarts") == "1" and not is_alive(runner), 60)
+    wait_for("it is up", lambda: cell.show("ActiveState") == "active")
+    cell.wait_exchanging()
+
+
+def test_unknown_node(cell: Cell, project: Project) -> None:
+    flow = project.three_nodes()
+    project.write("dataflow.systemd.yml", "nodes: {sinc: {restart_policy: always}}")
+    done = cell.start(flow, check=False)
+    assert done.returncode == ExitCode.BAD_INPUT
+    assert "the node 'sinc': it is not there" in done.stderr
+    assert "did you mean sink" in done.stderr
+    assert cell.show("LoadState") == "not-found"

@@ -1,0 +1,52 @@
+"""doractl reset, and what is left of restarts."""
+
+import pytest
+
+from dora_systemd import managerbudget
+from dora_systemd.managerbudget import restart_budget
+from dora_systemd.managercells import read_cells
+from dora_systemd.managerreset import reset_cells
+from dora_systemd.values import SECOND
+from tests.unit.fake_manager import UUID, FakeManager, ScopeIn, options
+
+UNIT = "dora-robot.service"
+
+
+def test_reset_of_what_runs() -> None:
+    manager = FakeManager()
+    manager.add(options(), NRestarts=3)
+    (outcome,) = reset_cells(manager, read_cells(manager))
+    assert outcome.text == f"Dataflow reset: {UUID} (robot, 3 restarts forgotten)"
+    assert manager.calls == [("reset", UNIT)]
+    (again,) = reset_cells(manager, read_cells(manager))
+    assert again.text.endswith("(robot, 0 restarts forgotten)")
+
+
+def test_no_budget_without_policy() -> None:
+    manager = FakeManager()
+    manager.add(options())
+    (cell,) = read_cells(manager)
+    assert restart_budget(manager, ScopeIn(True, 1000), cell) is None
+
+
+def test_budget(monkeypatch: pytest.MonkeyPatch) -> None:
+    manager = FakeManager()
+    facts = {"Restart": "on-failure", "StartLimitBurst": 4, "StartLimitIntervalUSec": 60 * SECOND}
+    manager.add(
+        options(),
+        active="activating",
+        SubState="auto-restart",
+        NRestarts=1,
+        RestartUSec=SECOND,
+        RestartUSecNext=2 * SECOND,
+        StateChangeTimestampMonotonic=0,
+        **facts,
+    )
+    (cell,) = read_cells(manager)
+    monkeypatch.setattr(managerbudget, "_starts", lambda *_: [])
+    assert restart_budget(manager, ScopeIn(True, 1000), cell) == {
+        "used": 0,
+        "max": 3,
+        "next_us": 0,
+        "resets_us": None,
+    }
