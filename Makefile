@@ -39,4 +39,8 @@ demo:  ## a real dataflow under systemd, from start to stop
 clean:  ## remove the images and venvs, and what killed runs left behind
 	@tests/lab/lab clean
 
-.PHONY: help test unit system vm lint demo clean
+deb:  ## the Debian packages, built twice and checked, into dist/
+	@$(PREPARE) container
+	@packaging/build
+
+.PHONY: help test unit system vm lint demo clean deb

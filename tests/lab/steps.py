@@ -108,7 +108,8 @@ def plan_test(form: str) -> list[Step]:
     if form == "host":
         return [*plan_unit(form), *plan_system(form)]
     inside = [] if sys.version_info[:2] == LAB_PYTHON else [unit_in_lab()]
-    return [*plan_unit(form), *inside, *plan_lab(form), *plan_vm(form), *plan_system(form)]
+    own = [*plan_unit(form), *inside, *plan_lab(form), *plan_vm(form)]
+    return [*own, *plan_packages(form), *plan_system(form)]
 
 
 def plan_unit(_form: str) -> list[Step]:
@@ -140,6 +141,12 @@ def reboot_step() -> Step:
     first, second = (["pytest", f"tests/boot/test_{when}.py"] for when in ("before", "after"))
     command = ["tests/lab/lab", "run", "--", *first, "--reboot--", *second]
     return Step("a reboot, vm", command, {**os.environ, "LAB": "vm"})
+
+
+def plan_packages(_form: str) -> list[Step]:
+    """The real .deb files, as a user installs them."""
+    build = Step("Debian packages", ["packaging/build"], dict(os.environ))
+    return [build, lab_step("tests of the Debian packages", "container", ["tests/deb"])]
 
 
 def plan_system(form: str) -> list[Step]:
@@ -187,5 +194,6 @@ PLANS: dict[str, Callable[[str], list[Step]]] = {
     "system": plan_system,
     "lab": plan_lab,
     "vm": plan_vm,
+    "packages": plan_packages,
     "lint": plan_lint,
 }

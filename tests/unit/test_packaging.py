@@ -87,3 +87,11 @@ def test_maintainer_scripts(debian: Path) -> None:
         assert "#DEBHELPER#" in text
         assert not re.search(r"\b(start|enable|restart)\b", re.sub("#.*", "", text)), path
         subprocess.run(["sh", "-n", str(path)], check=True)
+
+
+def test_upgrades_restart_nothing() -> None:
+    """debhelper would: a restart of dora.slice is one of every dataflow."""
+    rules = (DEBIANS[0] / "rules").read_text()
+    assert re.search(
+        r"^override_dh_installsystemd override_dh_installsystemduser:\n\n", rules, re.M
+    )

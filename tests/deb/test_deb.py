@@ -1,0 +1,185 @@
+"""The Debian packages: installed, used, installed again, removed and purged, in this order.
+
+Needs what `make deb` makes, in dist/, or the packages themselves with autopkgtest.
+"""
+
+import json
+import pwd
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.deb import packages
+from tests.deb.packages import sh
+from tests.system.cells import dora_processes, wait_for
+
+USERS = ("root", "alice")
+ALICE = "XDG_RUNTIME_DIR=/run/user/$(id -u)"
+MANUALS = ("doractl.1", "dora-systemd.yml.5", "dora-systemd.7", "dora.1")
+COMPLETIONS = (
+    "/usr/share/bash-completion/completions/doractl",
+    "/usr/share/zsh/vendor-completions/_doractl",
+    "/usr/share/fish/vendor_completions.d/doractl.fish",
+)
+COMPLETE = """
+bash -c '
+. /usr/share/bash-completion/bash_completion
+_comp_load doractl 2>/dev/null || _completion_loader doractl || :
+COMP_WORDS=(doractl node restart robot ""); COMP_CWORD=4; COMP_LINE="${COMP_WORDS[*]}"
+_doractl; echo "${COMPREPLY[@]}"'
+"""
+
+
+@pytest.fixture(scope="module")
+def before() -> set[str]:
+    """The disk before the packages came; autopkgtest has installed them, the lab made a user."""
+    if packages.AUTOPKGTEST:
+        packages.apt("purge", "--yes", *packages.PACKAGES)
+    sh("userdel dora 2>/dev/null || :")
+    return packages.files()
+
+
+@pytest.fixture(scope="module")
+def flows() -> Iterator[dict[str, Path]]:
+    """The robot of each user."""
+    with packages.robot("root") as roots, packages.robot("alice") as hers:
+        yield {"root": roots, "alice": hers}
+        for user in USERS:
+            sh("command -v doractl >/dev/null && doractl stop --all || :", user)
+
+
+def main_pid(user: str) -> str:
+    flag = "--system" if user == "root" else "--user"
+    script = f"{ALICE} systemctl {flag} show --value --property=MainPID dora-robot"
+    return sh(script, user).stdout.strip()
+
+
+def lines(user: str, node: str) -> list[str]:
+    return sh(f"doractl logs robot --node {node} -o cat", user, check=False).stdout.splitlines()
+
+
+def wait_for_plot(user: str, seen: int = 0) -> None:
+    wait_for(f"{user}'s robot plots", lambda: len(lines(user, "plot")) > seen, 120)
+
+
+def start(flows: dict[str, Path]) -> None:
+    for user, flow in flows.items():
+        sh(f"doractl start {flow} --name robot", user)
+
+
+def test_install(before: set[str]) -> None:
+    listening, running = packages.listeners(), packages.services()
+    packages.install()
+    assert packages.listeners() == listening, "the package opens no port"
+    assert packages.services() == running, "the package starts no service"
+    assert not dora_processes()
+    assert sh("command -v doractl; command -v dora").stdout.split() == [
+        "/usr/bin/doractl",
+        "/usr/bin/dora",
+    ]
+    assert pwd.getpwnam("dora").pw_shell == "/usr/sbin/nologin"
+    assert not any("dist-packages/dora_cli" in path for path in packages.files() - before)
+
+
+def test_versions_of_what_is_installed() -> None:
+    versions = json.loads(sh("doractl version -o json").stdout)
+    assert versions["dora"] == "1.1.0"
+    assert versions["doractl"] == sh("dpkg-query -Wf '${Version}' dora-systemd").stdout
+
+
+def test_units() -> None:
+    for flags in ("--system", "--user"):
+        user = "root" if flags == "--system" else "alice"
+        show = f"{ALICE} systemctl {flags} show --value -p FragmentPath -p LoadState"
+        kind = flags.removeprefix("--")
+        for unit in ("dora.slice", "dora.target"):
+            words = sh(f"{show} {unit}", user).stdout.split()
+            assert sorted(words) == [f"/usr/lib/systemd/{kind}/{unit}", "loaded"]
+    sh("systemd-analyze verify --man=yes dora.slice dora.target")
+    sh(f"{ALICE} systemd-analyze verify --user --man=yes dora.slice dora.target", "alice")
+    assert "dora.target" in sh("systemctl list-dependencies --plain multi-user.target").stdout
+
+
+def test_catalog() -> None:
+    listed = sh("journalctl --list-catalog c8e3833d172d44c5a32de08c980c4d67").stdout
+    assert "runs" in listed
+
+
+@pytest.mark.parametrize("page", MANUALS)
+def test_manuals(page: str) -> None:
+    name, _, section = page.rpartition(".")
+    path = sh(f"man --where {section} {name}").stdout.strip()
+    assert path.startswith("/usr/share/man/")
+    assert sh(f"man --warnings {section} {name}").stderr == ""
+    lint = sh(f"mandoc -T lint -W style {path} 2>/dev/null || :").stdout.splitlines()
+    assert [line for line in lint if "referenced manual not found" not in line] == []
+
+
+def test_both_users_start_the_robot(flows: dict[str, Path]) -> None:
+    start(flows)
+    for user in USERS:
+        (row,) = json.loads(sh("doractl list -o json", user).stdout)
+        assert (row["name"], row["status"], row["nodes_alive"]) == ("robot", "Running", 3)
+        wait_for_plot(user)
+    assert "dora-robot.service" in sh("systemctl status dora.slice --no-pager").stdout
+    assert "dora-robot.service" in sh(f"{ALICE} systemctl --user status dora.slice", "alice").stdout
+
+
+def test_only_what_is_installed_runs() -> None:
+    for user in USERS:
+        owner = "dora" if user == "root" else "alice"
+        pid = main_pid(user)
+        assert sh(f"stat -c %U /proc/{pid}").stdout.strip() == owner
+        words = sh(f"tr '\\0' ' ' </proc/{pid}/cmdline").stdout
+        assert words.startswith("/usr/bin/python3 ")
+        assert "--dora=/usr/bin/dora" in words.replace("--dora ", "--dora=")
+    where = sh("python3 -c 'import dora_systemd; print(dora_systemd.__file__)'").stdout
+    assert where.startswith("/usr/lib/python3/dist-packages/")
+
+
+@pytest.mark.parametrize("path", COMPLETIONS)
+def test_completions_are_there(path: str) -> None:
+    assert Path(path).stat().st_mode & 0o777 == 0o644
+
+
+def test_bash_completes_nodes_that_run() -> None:
+    for user in USERS:
+        assert sh(COMPLETE, user).stdout.split() == ["camera", "detector", "plot"]
+
+
+def test_reinstall_keeps_dataflows_running() -> None:
+    pids = {user: main_pid(user) for user in USERS}
+    packages.install()
+    assert {user: main_pid(user) for user in USERS} == pids
+    for user in USERS:
+        wait_for_plot(user, len(lines(user, "plot")))
+
+
+def test_stop_and_start_after_that(flows: dict[str, Path]) -> None:
+    for user in USERS:
+        assert "Dataflow stopped:" in sh("doractl stop robot", user).stdout
+    wait_for("nothing runs", lambda: not dora_processes())
+    start(flows)
+
+
+def test_remove_stops_dataflows_and_leaves_configuration(before: set[str]) -> None:
+    config = Path("/etc/dora-systemd/config.yml")
+    config.write_text("grace_duration: 5s\n")
+    packages.apt("remove", "--yes", *packages.PACKAGES)
+    assert not dora_processes()
+    assert "dora-" not in sh("systemctl list-units --all --plain --no-legend 'dora-*'").stdout
+    assert left(before) == {str(config.parent), str(config)}
+
+
+def test_purge_leaves_nothing(before: set[str]) -> None:
+    packages.apt("purge", "--yes", *packages.PACKAGES)
+    assert left(before) == set()
+    names = [entry.pw_name for entry in pwd.getpwall()]
+    assert "dora" not in names
+    assert Path("/etc/passwd").stat().st_mode & 0o777 == 0o644
+
+
+def left(before: set[str]) -> set[str]:
+    """What is on the disk now and was not; the robots of the tests are elsewhere."""
+    return packages.files() - before
