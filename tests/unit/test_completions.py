@@ -1,6 +1,5 @@
 """What the shells are told at the Tab key, as far as no systemd is needed for it."""
 
-import shutil
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +12,7 @@ from dora_systemd.cli.completion import TYPES, VARIABLE, Live
 from dora_systemd.cli.group import VERBS, doractl
 from dora_systemd.errors import DoraSystemdError
 from tests.unit.checkout import CHECKOUT
+from tests.unit.tools import require
 
 SCRIPTS = {"bash": "doractl", "zsh": "_doractl", "fish": "doractl.fish"}
 
@@ -94,8 +94,7 @@ def test_scripts_are_readable_for_their_shells(shell: str) -> None:
     script = CHECKOUT / "packaging/completions" / SCRIPTS[shell]
     assert f"{VARIABLE}" in script.read_text()
     assert f"{shell}_complete" in script.read_text()
-    if not shutil.which(shell):
-        pytest.skip(f"no {shell} here")
+    require(shell)
     done = subprocess.run([shell, "-n", str(script)], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
 

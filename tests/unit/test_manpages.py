@@ -1,8 +1,6 @@
 """The manuals say what the code does: options, settings, exit statuses, events."""
 
-import os
 import re
-import shutil
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -17,6 +15,7 @@ from dora_systemd.managersettings import SYSTEM_FILE
 from dora_systemd.settingkinds import Setting
 from dora_systemd.settingtable import SETTINGS
 from tests.unit.checkout import CHECKOUT
+from tests.unit.tools import require
 
 MAN = CHECKOUT / "packaging/man"
 PAGES = sorted(MAN.iterdir())
@@ -120,13 +119,6 @@ def events_text() -> str:
 def test_files() -> None:
     for page in ("doractl.1", "dora-systemd.yml.5"):
         assert str(SYSTEM_FILE) in sections(page)["FILES"]
-
-
-def require(tool: str) -> None:
-    """Skips where the tool is missing; in the lab (see its README) it must be there."""
-    if not shutil.which(tool):
-        assert "LAB" not in os.environ, f"the lab has no {tool}"
-        pytest.skip(f"no {tool} here; the lab has it")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

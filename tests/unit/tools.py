@@ -1,0 +1,18 @@
+"""Programs that some unit tests ask for a second opinion, and that not every machine has."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from tests.unit.checkout import CHECKOUT
+
+# Where the lab has its copy of the checkout; `make test` runs the unit tests there too.
+IN_LAB = CHECKOUT == Path("/src")
+
+
+def require(tool: str) -> None:
+    """Skips where the tool is missing; in the lab it must be there."""
+    if not shutil.which(tool):
+        assert not IN_LAB, f"the lab has no {tool}"
+        pytest.skip(f"no {tool} here; the lab has it")
