@@ -1,14 +1,13 @@
 """Programs that some unit tests ask for a second opinion, and that not every machine has."""
 
 import shutil
-from pathlib import Path
 
 import pytest
 
 from tests.unit.checkout import CHECKOUT
 
 # Where the lab has its copy of the checkout; `make test` runs the unit tests there too.
-IN_LAB = CHECKOUT == Path("/src")
+IN_LAB = str(CHECKOUT) == "/src"
 
 
 def require(tool: str) -> None:
