@@ -34,6 +34,7 @@ Examples:
   doractl start dataflow.yml --env MODEL=yolov8n.pt --venv .venv
   doractl start dataflow.yml --memory-limit 4G --node-limit detector:memory=1G,cpu=1.5
   doractl start dataflow.yml --restart-policy on-failure --max-restarts 3
+  doractl start dataflow.yml --credential token=/etc/robot/token
   doractl start dataflow.yml --enable              now and at every boot
   doractl start dataflow.yml --dry-run
 """

@@ -24,6 +24,9 @@ MANAGER_VARIABLES = frozenset(
 not speak for the cell; and Environment= would win over what the manager itself sets: a
 NOTIFY_SOCKET from a flag would let the start job wait for ever."""
 
+_RESERVED = MANAGER_VARIABLES | {"CREDENTIALS_DIRECTORY"}
+"""What only systemd sets; the last one is for the nodes, who find their secrets by it."""
+
 # One word of an environment file: quoted parts, escaped characters and plain ones, in any order.
 _QUOTED = re.compile(r"""'(?P<single>[^']*)'|"(?P<double>(?:[^"\\]|\\.)*)"|\\(?P<char>.)""", re.S)
 
@@ -50,7 +53,7 @@ def checked_variable(key: str, value: str) -> tuple[str, str]:
     """`key` and `value` unchanged; raises as parse_assignment does. The value is never shown."""
     if not _KEY.fullmatch(key):
         raise _refusal(key, "a name is letters, digits and '_', and begins with no digit")
-    if key in MANAGER_VARIABLES:
+    if key in _RESERVED:
         raise _refusal(key, "systemd sets this one itself")
     if _CONTROL.search(value) or not _is_unicode(value):
         raise _refusal(key, "a value is one line of text without control characters")

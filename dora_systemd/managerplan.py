@@ -16,6 +16,7 @@ from dora_systemd.files import read_text, read_yaml
 from dora_systemd.limitchecks import settings_node_limits
 from dora_systemd.lograteplan import check_rates, log_rates
 from dora_systemd.manageraccount import account_of, check_access, choose_user
+from dora_systemd.managercredentials import check_credentials, credential_files
 from dora_systemd.managersettings import read_settings
 from dora_systemd.names import name_from_path, parse_name, unit_name
 from dora_systemd.options import RunnerOptions
@@ -125,6 +126,7 @@ def _check_plan(plan: Plan) -> None:
         [options.dataflow, __file__],
         [options.working_directory, options.dora, sys.executable],
     )
+    check_credentials(plan.scope, credential_files(plan.settings))
     account = account_of(plan.user)
     dora_version(options.dora, account)
     done = run_dora(

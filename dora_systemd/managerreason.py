@@ -14,6 +14,7 @@ _RUNNERS_VERDICT = "failed: "
 
 _REFUSED = {
     201: "the nice value was refused",
+    243: "a credential could not be read",
     214: "realtime scheduling was refused, see LimitRTPRIO= in systemd.exec(5)",
 }
 """What systemd could not do before the runner: exit statuses of systemd.exec(5)."""

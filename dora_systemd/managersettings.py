@@ -11,9 +11,9 @@ from dora_systemd.settingtable import SETTINGS
 
 SYSTEM_FILE = Path("/etc/dora-systemd/config.yml")
 USER_FILE = Path("dora-systemd/config.yml")
-_ROOT_ONLY = ("user", "property", "nice", "realtime")
-"""Keys with which whoever wrote a settings file could have commands run as root, or get more of the
-machine than root gave him."""
+_ROOT_ONLY = ("user", "property", "nice", "realtime", "credentials")
+"""Keys with which whoever wrote a settings file could have commands run as root, read what only
+root may read, or get more of the machine than root gave him."""
 
 
 def settings_files(dataflow: Path, environment: Mapping[str, str]) -> list[Path]:
@@ -49,4 +49,4 @@ def _check_trust(path: Path, document: object) -> None:
 
 
 def _flag(key: str) -> str:
-    return "uid" if key == "user" else key
+    return {"user": "uid", "credentials": "credential"}.get(key, key)

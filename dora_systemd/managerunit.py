@@ -4,6 +4,7 @@ import sys
 
 from dora_systemd.busprotocol import Manager
 from dora_systemd.compat import MIN_VERSION, drop_unsupported
+from dora_systemd.managercredentials import credential_files
 from dora_systemd.managerlimits import check_limits
 from dora_systemd.managerplan import Plan
 from dora_systemd.process import version_numbers
@@ -43,5 +44,6 @@ def _properties(plan: Plan) -> dict[str, Property]:
         is_user=plan.scope.is_user,
         user=None if plan.user is None else plan.user.pw_name,
         environment=plan.environment,
+        credentials=credential_files(plan.settings),
     )
     return dict(unit_properties(plan.options, context, plan.settings))

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from dora_systemd.cellstate import RunnerExit
+from dora_systemd.credentials import credential_properties
 from dora_systemd.environment import checked_variable, environment_entries
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.limitsettings import REALTIME
@@ -43,12 +44,14 @@ class UnitContext:
     is_user: whether the unit is one of a user's manager.
     user: User= in system scope; None runs everything as root.
     environment: all of Environment=, see unit_environment.
+    credentials: absolute path by name.
     """
 
     python: str
     is_user: bool
     user: str | None = None
     environment: Mapping[str, str] = field(default_factory=dict)
+    credentials: Mapping[str, str] = field(default_factory=dict)
 
 
 def unit_properties(
@@ -68,6 +71,7 @@ def unit_properties(
         **memory_lock_properties(),
         **directory_properties(options),
         **environment_properties(context),
+        **credential_properties(context.credentials),
         **user_properties(context),
         **log_properties(options, context),
     }

@@ -7,6 +7,7 @@ checked against it. A new setting is one more assignment.
 from collections.abc import Mapping
 from typing import Any
 
+from dora_systemd.credentials import CREDENTIAL_SETTINGS
 from dora_systemd.limitsettings import LIMIT_SETTINGS
 from dora_systemd.lograte import RateLimits
 from dora_systemd.restartsettings import RESTART_SETTINGS
@@ -142,4 +143,5 @@ SETTINGS: tuple[Setting[Any], ...] = (
     *(value for value in list(globals().values()) if isinstance(value, Setting)),
     *LIMIT_SETTINGS,
     *RESTART_SETTINGS,
+    *CREDENTIAL_SETTINGS,
 )

@@ -142,7 +142,9 @@ def test_settings_beside_the_dataflow(project: Path) -> None:
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="gives files to somebody else")
-@pytest.mark.parametrize("text", ["user: root\n", "property: {Nice: 5}\n"])
+@pytest.mark.parametrize(
+    "text", ["user: root\n", "property: {Nice: 5}\n", "credentials: {a: /etc/shadow}\n"]
+)
 def test_whom_to_believe(project: Path, text: str) -> None:
     beside = project / "robot.systemd.yml"
     beside.write_text(text)

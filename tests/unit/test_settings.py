@@ -208,6 +208,9 @@ def test_values_and_back(data: st.DataObject) -> None:
         "log_rate_limit": st.dictionaries(
             st.sampled_from(["", "cam"]), st.none() | st.just(RateLimit(5, SECOND))
         ),
+        "credentials": st.dictionaries(
+            st.from_regex(r"[a-z.]{3,9}", fullmatch=True), texts.filter(lambda x: x[-1] != "\\")
+        ),
         **LIMIT_VALUES,
         **RESTART_VALUES,
     }

@@ -1,0 +1,61 @@
+"""The files that credentials are read from: checked before systemd has to read them."""
+
+import os
+import stat
+from collections.abc import Mapping
+from pathlib import Path
+
+from dora_systemd.credentials import CREDENTIALS, MAX_SIZE
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.scope import Scope
+from dora_systemd.settings import Settings
+from dora_systemd.values import shown
+
+
+def credential_files(settings: Settings) -> dict[str, str]:
+    """The absolute path of each credential by its name, as systemd wants it, without ".."."""
+    return {name: _absolute(file) for name, file in settings[CREDENTIALS].items()}
+
+
+def check_credentials(scope: Scope, files: Mapping[str, str]) -> None:
+    """Raise DoraSystemdError for the first file that systemd could not read, and for too much.
+
+    In system scope root reads them, whoever calls: what others cannot see is not judged here.
+    """
+    is_reader = scope.is_user or os.geteuid() == 0
+    total = 0
+    for name, file in files.items():
+        try:
+            total += _checked_size(name, file)
+        except PermissionError as error:
+            if is_reader:
+                reason, hint = "permission denied", "let the calling user read it"
+                raise _refusal(name, file, reason, hint, ExitCode.NO_PERMISSION) from error
+        except OSError as error:
+            reason, hint = "there is no such file", "give the path of a file that has the secret"
+            raise _refusal(name, file, reason, hint) from error
+        if total > MAX_SIZE:
+            reason, hint = "it is too large", "all credentials together have at most 1 MiB"
+            raise _refusal(name, file, reason, hint)
+
+
+def _absolute(file: str) -> str:
+    path = Path(file).absolute()
+    return str(path.resolve() if ".." in path.parts else path)
+
+
+def _checked_size(name: str, file: str) -> int:
+    status = Path(file).stat()
+    if stat.S_ISDIR(status.st_mode):
+        raise _refusal(name, file, "it is a directory", "give each file in it a name")
+    if not stat.S_ISREG(status.st_mode):
+        raise _refusal(name, file, "it is not a regular file", "give a file")
+    if not os.access(file, os.R_OK):
+        raise PermissionError
+    return status.st_size
+
+
+def _refusal(
+    name: str, file: str, reason: str, hint: str, code: ExitCode = ExitCode.BAD_INPUT
+) -> DoraSystemdError:
+    return DoraSystemdError(f"cannot use {shown(file)} as credential {name}: {reason}", hint, code)
