@@ -21,6 +21,9 @@ from dora_systemd.names import is_uuid_prefix
 
 VARIABLE = "_DORACTL_COMPLETE"
 
+_OF_THE_PAST = ("logs", "why")
+"""Verbs that find dataflows which only the journal knows."""
+
 _RUNNING_ONLY = ("stop", "dora")
 """Verbs that have nothing to do with a dataflow that has failed."""
 
@@ -50,7 +53,7 @@ def dataflow_names(ctx: click.Context, incomplete: str) -> list[str]:
     verb = ctx.command.name or ""
     cells = [cell for cell in read_cells(_bus()) if cell.is_up or verb not in _RUNNING_ONLY]
     names = [cell.name for cell in cells] + (
-        JournalReader().known_names() if verb == "logs" else []
+        JournalReader().known_names() if verb in _OF_THE_PAST else []
     )
     if is_uuid_prefix(incomplete) and not any(name.startswith(incomplete) for name in names):
         return [cell.uuid for cell in cells]

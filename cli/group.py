@@ -22,6 +22,7 @@ VERBS = {
     "run": Verb("run", "Run a dataflow in the foreground."),
     "list": Verb("list", "List dataflows, or the nodes of one."),
     "logs": Verb("logs", "Print what the nodes of a dataflow wrote."),
+    "why": Verb("why", "Say what became of a dataflow, and why."),
     "stop": Verb("stop", "Stop dataflows."),
     "restart": Verb("restart", "Restart dataflows."),
     "reset": Verb("reset", "Forget failures, and count restarts anew."),

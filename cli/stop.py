@@ -5,6 +5,7 @@ import click
 from dora_systemd.bus import Bus
 from dora_systemd.cli.parameters import current_scope, print_outcomes, scope_options
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.managerask import note_stop
 from dora_systemd.managercells import Cell, matching_cells, not_found, read_cells, select_cell
 from dora_systemd.managerstop import stop_cells
 from dora_systemd.scope import Scope
@@ -38,10 +39,15 @@ def command(selectors: tuple[str, ...], want_all: bool) -> int:
         chosen = [cell for cell in cells if cell.is_up]
         if not chosen:
             click.echo("No dataflow is running.")
-        return print_outcomes(stop_cells(bus, scope, chosen))
+        return _stop(bus, scope, chosen)
     _print_ended(scope, [one for one in selectors if not matching_cells(cells, one)], cells)
     chosen = [cell for one in selectors for cell in _cells(cells, one)]
-    return print_outcomes(stop_cells(bus, scope, list(dict.fromkeys(chosen))))
+    return _stop(bus, scope, list(dict.fromkeys(chosen)))
+
+
+def _stop(bus: Bus, scope: Scope, cells: list[Cell]) -> int:
+    note_stop(cells)
+    return print_outcomes(stop_cells(bus, scope, cells))
 
 
 def _print_ended(scope: Scope, selectors: list[str], cells: list[Cell]) -> None:

@@ -4,7 +4,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum, IntEnum
 
+from dora_systemd.causes import Cause
 from dora_systemd.status import NodeStatus
+from dora_systemd.wiring import Downstream
 
 
 class RunnerExit(IntEnum):
@@ -70,7 +72,8 @@ class Cell:
 
     grace: µs. run: dora's id of the run, or "". nodes: the live table. started_us, ready_us:
     CLOCK_REALTIME µs. stop_by: who asked to stop, or "". failure: why the cell fails, or "".
-    exit: what the runner will exit with.
+    exit: what the runner will exit with. cause, culprits: of the failure, and the nodes that it is
+    about. downstream: who gets nothing any more when a node is gone.
     """
 
     grace: int
@@ -82,3 +85,6 @@ class Cell:
     stop_by: str = ""
     failure: str = ""
     exit: RunnerExit = RunnerExit.OK
+    cause: Cause = Cause.NONE
+    culprits: tuple[str, ...] = ()
+    downstream: Downstream = field(default_factory=dict)

@@ -29,6 +29,9 @@ EVENTS = {
     "dataflow-stopping": EventKind(
         "822b051bbbe24788bf93c0952aafa491", INFO, "Dataflow {dataflow} is stopping"
     ),
+    "stop-asked": EventKind(
+        "958c39b63a3d47cd9dd585937d57d927", INFO, "Dataflow {dataflow} is told to stop by {by}"
+    ),
     "dataflow-finished": EventKind(
         "61a9895e49214871ae2381a42f2a1968", NOTICE, "Dataflow {dataflow} finished"
     ),

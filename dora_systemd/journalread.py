@@ -136,10 +136,21 @@ class JournalReader:
             return str(record.get("DORA_DATAFLOW_NAME", ""))
         return ""
 
-    def newest(self, matches: Sequence[str], limit: int | None) -> Iterator[dict[str, Any]]:
-        """The records that fit, newest first, as journalctl's JSON has them."""
-        lines = [] if limit is None else [f"--lines={limit}"]
-        arguments = ["--output=json", "--reverse", "--quiet", *lines, "--", *matches]
+    def newest(
+        self,
+        matches: Sequence[str],
+        limit: int | None,
+        until_us: int = 0,
+        is_whole: bool = False,
+    ) -> Iterator[dict[str, Any]]:
+        """The records that fit, newest first, as journalctl's JSON has them.
+
+        until_us: CLOCK_REALTIME µs of the newest one, 0 for now. is_whole: long fields, too.
+        """
+        options = [] if limit is None else [f"--lines={limit}"]
+        options += [f"--until={journal_timestamp(until_us)}"] if until_us else []
+        options += ["--all"] if is_whole else []
+        arguments = ["--output=json", "--reverse", "--quiet", *options, "--", *matches]
         with open_journalctl(arguments) as child:
             assert child.stdout
             for line in child.stdout:

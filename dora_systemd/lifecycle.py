@@ -6,14 +6,16 @@
 Every pair of state and event has an entry in TABLE; tests/unit/test_lifecycle.py takes them all.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 
 from dora_systemd import lifeevents as life
 from dora_systemd import nodetable as table
+from dora_systemd.causes import Cause
 from dora_systemd.cellstate import Action, Cell, Deadline, Do, Record, RunnerExit, State
 from dora_systemd.oom import Owner
 from dora_systemd.values import SECOND, format_duration
+from dora_systemd.wiring import with_downstream
 
 Step = tuple[Cell, tuple[Action, ...]]
 Handler = Callable[[Cell, life.Event], Step]
@@ -80,6 +82,7 @@ def _start_timed_out(cell: Cell, event: life.Event) -> Step:
     assert isinstance(event, life.StartTimedOut)
     late = [ident for ident, node in cell.nodes.items() if node.state in _NOT_READY]
     reason = f"{_nodes(late)} not ready within {format_duration(event.after)}"
+    cell = _because(cell, Cause.START_TIMEOUT, late)
     return _fail(cell, reason, RunnerExit.FAILED)
 
 
@@ -89,12 +92,18 @@ def _nodes(idents: list[str]) -> str:
 
 def _refused(cell: Cell, event: life.Event) -> Step:
     assert isinstance(event, life.Refused)
-    return _fail(cell, event.reason, RunnerExit.FAILED)
+    return _fail(_because(cell, Cause.REFUSED), event.reason, RunnerExit.FAILED)
+
+
+def _because(cell: Cell, cause: Cause, nodes: Iterable[str] = ()) -> Cell:
+    return replace(cell, cause=cause, culprits=tuple(nodes))
 
 
 def _fail(cell: Cell, reason: str, code: RunnerExit) -> Step:
     cell = replace(cell, failure=reason, exit=code)
-    return _to(cell, State.ENDED, Record("dataflow-failed", "", {"reason": reason}), Do.EXIT)
+    details = {"reason": reason, "cause": str(cell.cause), "nodes": " ".join(cell.culprits)}
+    known = {key: text for key, text in details.items() if text}
+    return _to(cell, State.ENDED, Record("dataflow-failed", "", known), Do.EXIT)
 
 
 def _child_exited(cell: Cell, event: life.Event) -> Step:
@@ -109,18 +118,19 @@ def _connection_lost(cell: Cell, event: life.Event) -> Step:
 
 
 def _lose(cell: Cell, child: str, reason: str, how: str) -> Step:
+    cell = _because(cell, Cause(f"{child}-lost"))
     cell, actions = _fail(cell, reason, RunnerExit.ENGINE_LOST)
     return cell, (Record(f"{child}-lost", "", {"exit": how} if how else {}), *actions)
 
 
 def _engine_deadline(cell: Cell, event: life.Event) -> Step:
     reason = f"dora did not answer within {ENGINE_TIMEOUT // SECOND} s while {cell.state.value}"
-    return _fail(cell, reason, RunnerExit.ENGINE_LOST)
+    return _fail(_because(cell, Cause.NO_ANSWER), reason, RunnerExit.ENGINE_LOST)
 
 
 def _node_event(cell: Cell, event: life.Event) -> Step:
     nodes, record = table.update(cell.nodes, event, is_stopping=bool(cell.stop_by))
-    actions = () if record is None else (Record(*record),)
+    actions = () if record is None else (Record(*with_downstream(record, cell.downstream)),)
     return replace(cell, nodes=nodes), (*_oom_of_all(event), *actions)
 
 
@@ -177,12 +187,14 @@ def _result(cell: Cell, event: life.Event) -> Step:
     assert isinstance(event, life.ResultKnown)
     cell = replace(cell, nodes=table.apply_results(cell.nodes, event.results, event.at_us))
     if not event.results:
-        return _fail(cell, "dora lost the dataflow", RunnerExit.ENGINE_LOST)
+        lost = _because(cell, Cause.NO_ANSWER)
+        return _fail(lost, "dora lost the dataflow", RunnerExit.ENGINE_LOST)
     failed = {node: _known_exit(cell, node, how) for node, how in event.results.items() if how}
     spent = table.spent(cell.nodes)
     if failed or spent:
         reason = ", ".join(f"node {node}: {how}" for node, how in {**failed, **spent}.items())
         code = RunnerExit.NODES_FAILED if spent else RunnerExit.FAILED
+        cell = _because(cell, Cause.NODE_FAILED, {**failed, **spent})
         cell = replace(cell, failure=reason, exit=code)
     return _leave(cell)
 

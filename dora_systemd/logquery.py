@@ -113,6 +113,17 @@ def end_matches(scope: Scope, name: str) -> list[str]:
     return [*who, *(f"MESSAGE_ID={message_id}" for message_id in UNIT_ENDS)]
 
 
+def story_matches(scope: Scope, name: str, uuid: str) -> list[str]:
+    """What happened to a dataflow: our life events, what systemd says of its unit, who asked."""
+    own = [*scope_matches(scope, name), f"DORA_DATAFLOW={uuid}"]
+    events = [f"MESSAGE_ID={kind.message_id}" for kind in EVENTS.values()]
+    unit = unit_name(name)
+    who = f"_UID={scope.uid}" if scope.is_user else "_UID=0"
+    systemd = [f"USER_UNIT={unit}", who] if scope.is_user else [f"UNIT={unit}", "_PID=1"]
+    asked = [f"DORA_DATAFLOW={uuid}", "DORA_EVENT=stop-asked", who]
+    return [*own, *events, "+", *systemd, "+", *asked]
+
+
 def _with_level(base: list[str], level: str) -> list[str]:
     if level in ("", "trace", "stdout"):
         return base

@@ -111,5 +111,5 @@ def _start_failure(
     manager: Manager, scope: Scope, unit: str, name: str, result: str
 ) -> DoraSystemdError:
     reason = job_reason(manager, unit, result)
-    hint = f"doractl logs {name}, or systemctl {scope.flag} status {unit}"
+    hint = f"doractl {scope.flag} why {name} tells more"
     return DoraSystemdError(f"cannot start {name}: {reason}", hint, ExitCode.FAILURE)

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from dora_systemd import fdstore, notify
 from dora_systemd import lifeevents as life
+from dora_systemd.causes import Cause
 from dora_systemd.cellpaths import CellPaths
 from dora_systemd.cellstate import Cell, RunnerExit
 from dora_systemd.cellview import initial_nodes
@@ -28,6 +29,7 @@ from dora_systemd.runnerloss import losses_of_user
 from dora_systemd.runnernodes import Nodes, enter_supervisor, wait_eof
 from dora_systemd.runnerpump import Pump, now_us
 from dora_systemd.values import INFINITY, SECOND
+from dora_systemd.wiring import downstream_of
 
 SAMPLE_SECONDS = 5.0
 JOURNAL_SECONDS = 1.0
@@ -84,7 +86,8 @@ async def run_cell(options: RunnerOptions, paths: CellPaths) -> RunnerExit:
         table = initial_nodes(
             kinds(prepared.dataflow, prepared.plan), prepared.descriptor, started_us
         )
-        cell = Cell(options.grace, started_us, table)
+        fed = downstream_of(prepared.dataflow)
+        cell = Cell(options.grace, started_us, table, downstream=fed)
         pump = Pump(cell, options.uuid, paths, nodes, pipes)
         dialogue = Dialogue(options, pump, dora, nodes, pipes)
         pump.connect(dialogue.actions(prepared.descriptor, daemon_variables(prepared, paths, unit)))
@@ -103,7 +106,7 @@ async def run_cell(options: RunnerOptions, paths: CellPaths) -> RunnerExit:
             dialogue.cancel()
     except DoraSystemdError as error:
         notify.send_status(f"failed: {error.message}")
-        pipes.write_event("dataflow-failed", reason=error.message)
+        pipes.write_event("dataflow-failed", reason=error.message, cause=Cause.BAD_DATAFLOW)
         raise
     finally:
         dora.kill()

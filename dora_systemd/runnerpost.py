@@ -15,6 +15,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dora_systemd.causes import Cause
+
 if TYPE_CHECKING:
     from asyncio import AbstractEventLoop
 
@@ -32,10 +34,12 @@ def main(argv: list[str]) -> int:
     if not reason or len(argv) != 2 or not directory:
         return 0
     unit = unit_group()
-    reason = out_of_memory(unit) or reason
+    cause, memory = killed_cause(os.environ), out_of_memory(unit)
+    if memory:
+        cause, reason = Cause.OUT_OF_MEMORY, memory
     with contextlib.suppress(OSError):
         kill_nodes(unit)
-    write_last_words(argv[0], argv[1], Path(directory), reason)
+    write_last_words(argv[0], argv[1], Path(directory), reason, cause=cause)
     return 0
 
 
@@ -47,11 +51,19 @@ def killed_by(environ: Mapping[str, str]) -> str:
         return ""  # SIGTERM before it could listen to it: stopped as soon as it was started
     if environ.get("SERVICE_RESULT") == "watchdog":
         return "its runner hung and was ended by the watchdog"
+    if environ.get("SERVICE_RESULT") == "timeout":
+        return "it did not start or stop in time and was killed"
     return f"its runner was ended by signal SIG{environ.get('EXIT_STATUS', '')}"
 
 
+def killed_cause(environ: Mapping[str, str]) -> Cause:
+    """What DORA_CAUSE says about a runner that was killed."""
+    causes = {"watchdog": Cause.WATCHDOG, "timeout": Cause.TIMEOUT}
+    return causes.get(environ.get("SERVICE_RESULT", ""), Cause.RUNNER_KILLED)
+
+
 def write_last_words(
-    name: str, uuid: str, directory: Path, reason: str, journal_socket: str = ""
+    name: str, uuid: str, directory: Path, reason: str, journal_socket: str = "", cause: str = ""
 ) -> None:
     """Write what is in the pipes below `directory`, and that the dataflow failed.
 
@@ -83,7 +95,7 @@ def write_last_words(
                 pipes.replay(path.stem, path)
                 pipes.drain(path.stem)
         read_logs_of_dora(loop, pipes, paths.io)
-    pipes.write_event("dataflow-failed", reason=reason)
+    pipes.write_event("dataflow-failed", reason=reason, cause=cause)
     pipes.close()
     journal.wait_read(1.0)
     journal.close()

@@ -30,6 +30,7 @@ def test_catalog_entry_says_what_and_what_to_do(name: str) -> None:
         assert field in {
             "DORA_DATAFLOW_NAME",
             "DORA_NODE",
+            "DORA_BY",
             "DORA_EXIT",
             "DORA_COUNT",
             "DORA_LIMIT",

@@ -29,6 +29,7 @@ DECISIONS = {
         "buildsession",
         "busprotocol",
         "cellstate",
+        "causes",
         "cellview",
         "compat",
         "credentials",
@@ -43,6 +44,7 @@ DECISIONS = {
         "launch",
         "lifecycle",
         "lifeevents",
+        "lifestory",
         "limitchecks",
         "limits",
         "limitsettings",
@@ -55,6 +57,8 @@ DECISIONS = {
         "nodetable",
         "oom",
         "options",
+        "postmortem",
+        "postmortemtext",
         "pressure",
         "properties",
         "propertykinds",
@@ -78,6 +82,7 @@ DECISIONS = {
         "unitfile",
         "unitplaces",
         "unitsyntax",
+        "wiring",
     ],
 }
 ADAPTERS = {
@@ -87,7 +92,7 @@ ADAPTERS = {
     "engine": ["engine"],
     "fdstore": ["fdstore"],
     "files": ["files", "unitfiles", "yamlloader"],
-    "journal": ["journal"],
+    "journal": ["journal", "journalnote"],
     "journalread": ["journalread"],
     "jsonl": ["jsonl"],
     "machine": ["machine"],
@@ -103,6 +108,7 @@ SHARED = {
 USE_CASES = {
     "manager": [
         "manageraccount",
+        "managerask",
         "managerbudget",
         "managercells",
         "managerclaim",
@@ -130,6 +136,7 @@ USE_CASES = {
         "managerstop",
         "managerunit",
         "managerversion",
+        "managerwhy",
         "managerwords",
     ],
     "runner": [
@@ -240,7 +247,7 @@ def test_decisions_are_pure(name: str) -> None:
     assert not impure | clocks, f"{name} uses {', '.join(sorted(impure | clocks))}"
 
 
-@pytest.mark.parametrize("verb", ["list", "stop", "logs"])
+@pytest.mark.parametrize("verb", ["list", "stop", "logs", "why"])
 def test_short_lived_verbs_load_little(verb: str, tmp_path: Path) -> None:
     code = f"import sys, dora_systemd.cli.main, dora_systemd.cli.{verb}; print(*sys.modules)"
     environment = {**os.environ, "PYTHONPATH": str(linked_package(tmp_path))}

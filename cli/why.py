@@ -1,0 +1,42 @@
+"""doractl why: what became of a dataflow, and why, in one screen."""
+
+import shutil
+import sys
+
+import click
+
+from dora_systemd.bus import Bus
+from dora_systemd.cli.parameters import current_scope, output_option, print_json, scope_options
+from dora_systemd.errors import ExitCode
+from dora_systemd.journalread import JournalReader, check_readable
+from dora_systemd.managerwhy import explain
+from dora_systemd.postmortemtext import format_report, report_values
+
+_EPILOG = """\b
+Examples:
+  doractl why robot             what ended it, which node, when, what to do
+  doractl why robot -o json     the same for a program
+  doractl why 44f30e60          one that ended long ago, by its UUID
+"""
+
+
+@click.command("why", epilog=_EPILOG)
+@click.argument("selector")
+@output_option
+@scope_options
+def command(selector: str, output: str) -> int:
+    """Say what became of a dataflow, and why: what ended, when, which node, what to do.
+
+    It may run, have failed, been stopped, or be known to the journal only. Nothing is changed.
+    """
+    scope = current_scope()
+    check_readable(scope)
+    report = explain(Bus(scope), scope, selector, JournalReader())
+    if output == "json":
+        print_json(report_values(report))
+        return ExitCode.OK
+    is_terminal = sys.stdout.isatty()
+    width = shutil.get_terminal_size().columns if is_terminal else None
+    # Bytes of nodes are replaced before they get here; colours only where they are seen.
+    print(format_report(report, width, want_colors=is_terminal))
+    return ExitCode.OK

@@ -1,0 +1,27 @@
+"""Why a dataflow has ended: the words of DORA_CAUSE in the journal and of `doractl why`."""
+
+from enum import StrEnum
+
+
+class Cause(StrEnum):
+    """One reason for an end; those up to OUT_OF_MEMORY are in the event dataflow-failed."""
+
+    NODE_FAILED = "node-failed"
+    START_TIMEOUT = "start-timeout"
+    REFUSED = "refused"
+    BAD_DATAFLOW = "bad-dataflow"
+    DAEMON_LOST = "daemon-lost"
+    COORDINATOR_LOST = "coordinator-lost"
+    NO_ANSWER = "no-answer"
+    RUNNER_KILLED = "runner-killed"
+    WATCHDOG = "watchdog"
+    TIMEOUT = "timeout"
+    OUT_OF_MEMORY = "out-of-memory"
+
+    NODE_HUNG = "node-hung"
+    NODE_OUT_OF_MEMORY = "node-out-of-memory"
+    UNIT_FAILED = "unit-failed"
+    NO_END = "no-end"
+    STOPPED = "stopped"
+    FINISHED = "finished"
+    NONE = ""

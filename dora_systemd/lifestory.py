@@ -1,0 +1,146 @@
+"""What the journal has about the lives of one dataflow: our life events, and systemd's records.
+
+Records are journalctl's JSON; each field may be missing, or be anything. One life is one
+invocation of the unit, see INVOCATION_ID in systemd.journal-fields(7).
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+# https://github.com/systemd/systemd/blob/main/src/systemd/sd-messages.h
+UNIT_MESSAGES = {
+    "7d4958e842da4a758f6c1cdc7b36dcc5": "unit-starting",
+    "39f53479d3a045ac8e11786248231fbf": "unit-started",
+    "de5b426a63be47a7b6ac3eaac82e2f6f": "unit-stopping",
+    "9d1aaa27d60140bd96365438aad20286": "unit-stopped",
+    "7ad2d189f7e94e70a38c781354912448": "unit-succeeded",
+    "d9b373ed55a64feb8242e02dbe79a49c": "unit-failed",
+    "98e322203f7a4ed290d09fe03c09fe15": "process-exited",
+    "5eb03494b6584870a536b337290809b3": "unit-restart",
+}
+"""What systemd itself says about a unit: SD_MESSAGE_UNIT_* by MESSAGE_ID."""
+
+SHUTDOWN_MESSAGE = "98268866d1d54a499c4e98921d93bc40"
+"""SD_MESSAGE_SHUTDOWN, by systemd-logind."""
+
+START_LIMIT_FUNCTION = "unit_test_start_limit"
+"""CODE_FUNC of systemd's "Start request repeated too quickly.", which has no MESSAGE_ID."""
+
+_SYSTEMD_FIELDS = ("EXIT_CODE", "EXIT_STATUS", "COMMAND", "UNIT_RESULT", "N_RESTARTS")
+
+
+@dataclass(frozen=True)
+class Happening:
+    """One record. at_us: CLOCK_REALTIME µs. name: DORA_EVENT, or one of UNIT_MESSAGES.
+
+    details: DORA_* without that prefix, and systemd's own fields, in lower case.
+    """
+
+    name: str
+    at_us: int = 0
+    node: str = ""
+    text: str = ""
+    invocation: str = ""
+    boot: str = ""
+    details: Mapping[str, str] = field(default_factory=dict)
+
+    def detail(self, key: str) -> str:
+        """A detail, "" where it is not recorded."""
+        return self.details.get(key, "")
+
+
+@dataclass(frozen=True)
+class Life:
+    """One invocation of the unit, or of what is known about it; oldest first."""
+
+    happenings: tuple[Happening, ...] = ()
+
+    def all(self, *names: str) -> list[Happening]:
+        """The happenings of these names."""
+        return [one for one in self.happenings if one.name in names]
+
+    def last(self, *names: str) -> Happening | None:
+        """The last one of these names."""
+        return next(reversed(self.all(*names)), None)
+
+    def first(self, *names: str) -> Happening | None:
+        """The first one of these names."""
+        return next(iter(self.all(*names)), None)
+
+    @property
+    def began_us(self) -> int:
+        """CLOCK_REALTIME µs of the first record, 0 without any."""
+        return self.happenings[0].at_us if self.happenings else 0
+
+    @property
+    def ended_us(self) -> int:
+        """CLOCK_REALTIME µs of the last record, 0 without any."""
+        return self.happenings[-1].at_us if self.happenings else 0
+
+    @property
+    def boot(self) -> str:
+        """The id of the boot in which it ended, or ""."""
+        return next((one.boot for one in reversed(self.happenings) if one.boot), "")
+
+    @property
+    def invocation(self) -> str:
+        """systemd's id of this life, or ""."""
+        return next((one.invocation for one in self.happenings if one.invocation), "")
+
+
+def plain_text(value: Any) -> str:
+    """The value of a journal field: bytes come as numbers, a repeated field as a list."""
+    if isinstance(value, list):
+        if value and all(isinstance(one, int) and 0 <= one < 256 for one in value):
+            return bytes(value).decode("utf-8", "replace")
+        return plain_text(value[-1]) if value else ""
+    return "" if value is None else str(value)
+
+
+def parse_happening(record: Mapping[str, Any]) -> Happening | None:
+    """The happening that a record is, or None for any other record."""
+    texts = {str(key): plain_text(value) for key, value in record.items()}
+    name = texts.get("DORA_EVENT") or UNIT_MESSAGES.get(texts.get("MESSAGE_ID", ""), "")
+    if texts.get("CODE_FUNC") == START_LIMIT_FUNCTION:
+        name = "start-limit"
+    if not name:
+        return None
+    own = {k[5:].lower(): text for k, text in texts.items() if k.startswith("DORA_")}
+    systemd = {key.lower(): texts[key] for key in _SYSTEMD_FIELDS if key in texts}
+    keys = ("_SYSTEMD_INVOCATION_ID", "INVOCATION_ID", "USER_INVOCATION_ID")
+    ids = keys if "DORA_EVENT" in texts else keys[1:]
+    return Happening(
+        name,
+        _number(texts.get("__REALTIME_TIMESTAMP", "")),
+        texts.get("DORA_NODE", ""),
+        texts.get("MESSAGE", ""),
+        next((texts[key] for key in ids if texts.get(key)), ""),
+        texts.get("_BOOT_ID", ""),
+        {**systemd, **own},
+    )
+
+
+def _number(text: str) -> int:
+    return int(text) if text.isascii() and text.isdigit() else 0
+
+
+def find_lives(happenings: Iterable[Happening]) -> list[Life]:
+    """The lives that happenings, oldest first, tell of; those of no unit belong to the one then."""
+    found: dict[str, list[Happening]] = {}
+    current = ""
+    for one in happenings:
+        if one.invocation and one.name != "stop-asked":
+            current = one.invocation
+        found.setdefault(current, []).append(one)
+    return [Life(tuple(life)) for life in found.values()]
+
+
+def with_restarts(lives: Sequence[Life]) -> list[Life]:
+    """The last life, and those before it that systemd itself made lead to it."""
+    chain = list(lives[-1:])
+    for life in reversed(lives[:-1]):
+        if life.last("unit-restart") is None:
+            break
+        chain.insert(0, life)
+    return chain

@@ -1,0 +1,30 @@
+"""Who asks for the end of a dataflow: systemd notes that it was asked, and not by whom."""
+
+import os
+import pwd
+from collections.abc import Iterable, Mapping
+
+from dora_systemd.events import event_fields
+from dora_systemd.journalnote import send_note
+from dora_systemd.logfields import encode_entry
+from dora_systemd.managercells import Cell
+
+
+def note_stop(cells: Iterable[Cell]) -> None:
+    """Write the event stop-asked for those dataflows that run."""
+    by = f"{caller(os.getuid(), os.environ)} (doractl stop)"
+    for cell in cells:
+        if cell.is_up:
+            fields = event_fields("stop-asked", dataflow=cell.name, by=by)
+            own = {"DORA_DATAFLOW": cell.uuid, "DORA_DATAFLOW_NAME": cell.name}
+            send_note(encode_entry({**fields, **own, "SYSLOG_IDENTIFIER": "doractl"}))
+
+
+def caller(uid: int, environ: Mapping[str, str]) -> str:
+    """A user's name; root by sudo(8) is told with the one who called it."""
+    try:
+        name = pwd.getpwuid(uid).pw_name
+    except KeyError:
+        name = f"the user {uid}"
+    behind = environ.get("SUDO_USER", "")
+    return f"{name}, by sudo of {behind}" if uid == 0 and behind not in ("", "root") else name

@@ -1,0 +1,247 @@
+"""The verdict of `doractl why` as one screen of text, or as values for JSON."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from dora_systemd.causes import Cause
+from dora_systemd.lifestory import Happening
+from dora_systemd.postmortem import Restart, Verdict
+from dora_systemd.restarts import budget_words
+from dora_systemd.statuswords import RESTARTING, UNKNOWN, local_time
+from dora_systemd.values import SECOND, format_duration, format_rounded_size
+
+_TOLD = ("event", "node", "nodes", "dataflow", "dataflow_name", "downstream", "cause", "reason")
+"""Details of an event that have a key of their own in JSON."""
+
+LINES = 20
+"""How many of the last lines are shown."""
+_TIMELINE = 7
+_TITLE_WIDTH = 10
+_RED, _GREEN, _BOLD, _PLAIN = "\x1b[31m", "\x1b[32m", "\x1b[1m", "\x1b[0m"
+
+_REMEDIES = {
+    Cause.NODE_FAILED: "mend {node} (its last words are above), then: doractl restart {name}",
+    Cause.NODE_HUNG: "find out what {node} waited for; health_check_timeout: in its YAML",
+    Cause.NODE_OUT_OF_MEMORY: "look for a leak in {node}, or: "
+    "doractl set {name} --node-limit {node}:memory=SIZE",
+    Cause.START_TIMEOUT: "see why {node} does not call Node(), or give it a longer --start-timeout",
+    Cause.REFUSED: "mend {file}; dora validate checks it",
+    Cause.BAD_DATAFLOW: "mend {file}, then: doractl restart {name}",
+    Cause.DAEMON_LOST: "doractl restart {name}; --restart-policy on-failure does it by itself",
+    Cause.COORDINATOR_LOST: "doractl restart {name}; --restart-policy on-failure does it by itself",
+    Cause.NO_ANSWER: "doractl restart {name}; was the machine overloaded?",
+    Cause.RUNNER_KILLED: "doractl restart {name}; --restart-policy on-failure does it by itself",
+    Cause.WATCHDOG: "doractl restart {name}; was the machine overloaded?",
+    Cause.OUT_OF_MEMORY: "limit single nodes (--node-limit NODE:memory=SIZE), so that one is named",
+    Cause.UNIT_FAILED: "systemctl {flag} status {unit} shows what systemd did",
+    Cause.TIMEOUT: "start it with a longer --start-timeout or --grace-duration",
+    Cause.NO_END: "doractl start {file}; doractl enable {name} brings it back after a reboot",
+}
+_GIVEN_UP = "systemd has given it up: doractl restart {name} counts its restarts anew"
+_WAITING = "systemd starts it again by itself; doractl stop {name} keeps it from that"
+_GONE_FOR_GOOD = "{node} stays away: doractl restart {name} makes the dataflow whole again"
+
+
+@dataclass(frozen=True)
+class Subject:
+    """Whom a verdict is about. file: its descriptor, "" where that is not known any more."""
+
+    uuid: str
+    name: str
+    unit: str
+    flag: str
+    file: str = ""
+    is_loaded: bool = False
+
+
+@dataclass(frozen=True)
+class Word:
+    """One line that a node wrote; at_us: CLOCK_REALTIME µs."""
+
+    at_us: int
+    node: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Report:
+    """All that `doractl why` says. words: the last lines, of verdict.node or of all nodes."""
+
+    subject: Subject
+    verdict: Verdict
+    words: tuple[Word, ...] = ()
+    budget: Mapping[str, int | None] | None = None
+
+
+def remedies(report: Report) -> list[str]:
+    """What to do, each in one line."""
+    verdict, subject = report.verdict, report.subject
+    texts = [_REMEDIES.get(verdict.cause, "")]
+    if verdict.cause is Cause.NODE_FAILED and verdict.is_up:
+        texts = [_GONE_FOR_GOOD] if verdict.status != RESTARTING else texts
+    if verdict.is_given_up:
+        texts.append(_GIVEN_UP)
+    elif verdict.status == RESTARTING:
+        texts.append(_WAITING)
+    values = {
+        "name": subject.name,
+        "node": verdict.node or "the node",
+        "file": subject.file or "FILE",
+        "unit": subject.unit,
+        "flag": subject.flag,
+    }
+    filled = [text.format(**values) for text in texts if text]
+    if subject.is_loaded:
+        return filled
+    again = f"doractl start {values['file']} --name {subject.name}"
+    return [text.replace(f"doractl restart {subject.name}", again) for text in filled]
+
+
+def format_report(report: Report, width: int | None = None, want_colors: bool = False) -> str:
+    """The report as at most 45 lines, each cut at `width` characters if that is given."""
+    blocks = [_head(report), _timeline(report), _words(report), _todo(report)]
+    lines = "\n\n".join("\n".join(block) for block in blocks if block).split("\n")
+    cut = [line if width is None else _cut(line, width) for line in lines]
+    return "\n".join(_colored(cut, report.verdict)) if want_colors else "\n".join(cut)
+
+
+def _cut(line: str, width: int) -> str:
+    return line if len(line) <= width else line[: max(width - 1, 0)] + "…"
+
+
+def _colored(lines: list[str], verdict: Verdict) -> list[str]:
+    color = _RED if verdict.is_failure else _GREEN
+    titles = [f"{_BOLD}{one}{_PLAIN}" if one.endswith(":") else one for one in lines[1:]]
+    return [f"{color}{_BOLD}{lines[0]}{_PLAIN}", *titles]
+
+
+def _head(report: Report) -> list[str]:
+    verdict, subject = report.verdict, report.subject
+    facts = {
+        "Why" if verdict.cause else "Now": verdict.summary,
+        "When": _when(verdict),
+        "Memory": _memory_words(verdict.details),
+        "Starved": ", ".join(verdict.starved),
+        "Restarts": _restart_words(verdict.restarts),
+        "Budget": _budget_words(report),
+        "Unit": f"{subject.unit} ({subject.uuid})",
+        "File": subject.file,
+    }
+    title = f"{subject.name}: {verdict.status}"
+    rows = [f"  {key + ':':<{_TITLE_WIDTH}}{text}" for key, text in facts.items() if text]
+    return [_printable(one) for one in (title, *rows)]
+
+
+def _budget_words(report: Report) -> str:
+    """What is left of systemd's restarts, as long as there may be one."""
+    budget = report.budget
+    return budget_words(budget) if budget and (budget["used"] or report.verdict.is_up) else ""
+
+
+def _when(verdict: Verdict) -> str:
+    since = f"began {local_time(verdict.began_us)}" if verdict.began_us else ""
+    if not verdict.at_us:
+        return since
+    lasted = verdict.at_us - verdict.began_us
+    words = f", {_span(lasted)} after it began" if verdict.began_us and lasted >= 0 else ""
+    return f"{local_time(verdict.at_us)}{words}"
+
+
+def _span(duration: int) -> str:
+    """µs in the roughness that helps: seconds from the second on."""
+    unit = SECOND if duration >= SECOND else 1000
+    return format_duration(duration // unit * unit)
+
+
+def _memory_words(details: Mapping[str, str]) -> str:
+    sizes = [
+        f"{words} {format_rounded_size(int(details[key]))}"
+        for key, words in (("peak", "peak"), ("limit", "limit"), ("held", "held"))
+        if details.get(key, "").isdigit() and details.get(key) != "0"
+    ]
+    owner = {"dataflow": " of the dataflow", "machine": "; the machine had none left"}
+    return ", ".join(sizes) + owner.get(details.get("owner", ""), "") if sizes else ""
+
+
+def _restart_words(restarts: Sequence[Restart]) -> str:
+    """As "detector 3 (exit code 1), all of it 1 (the dora daemon is gone)"."""
+    groups: dict[tuple[str, str], int] = {}
+    for one in restarts:
+        key = (one.node or "all of it", one.reason)
+        groups[key] = groups.get(key, 0) + 1
+    return ", ".join(f"{who} {count} ({why})" for (who, why), count in groups.items())
+
+
+def _timeline(report: Report) -> list[str]:
+    news = report.verdict.timeline
+    if not news:
+        return []
+    shown = list(news)
+    if len(news) > _TIMELINE:
+        shown = [*news[:2], None, *news[2 - _TIMELINE :]]  # type: ignore[list-item]
+    left = len(news) - _TIMELINE
+    lines = [f"  ... {left} more ..." if one is None else _news(one) for one in shown]
+    return ["What happened:", *lines]
+
+
+def _news(one: Happening) -> str:
+    return f"  {_clock(one.at_us)}  {_printable(one.text or one.name)}"
+
+
+def _clock(moment: int) -> str:
+    return local_time(moment)[5:] if moment else UNKNOWN
+
+
+def _words(report: Report) -> list[str]:
+    if not report.words:
+        return []
+    node = report.verdict.node
+    count = "line" if len(report.words) == 1 else f"{len(report.words)} lines"
+    title = f"The last {count} of {node or 'its nodes'}:"
+    return [title, *(f"  {_clock(one.at_us)[6:]}  {_line(one, node)}" for one in report.words)]
+
+
+def _line(word: Word, node: str) -> str:
+    text = _printable(word.text)
+    return text if node else f"{word.node}: {text}"
+
+
+def _todo(report: Report) -> list[str]:
+    found = remedies(report)
+    return ["What to do:", *(f"  {_printable(one)}" for one in found)] if found else []
+
+
+def _printable(text: str) -> str:
+    """What a node wrote must not command the terminal."""
+    return "".join(c if c.isprintable() else " " if c in "\n\t" else "�" for c in text)
+
+
+def report_values(report: Report) -> dict[str, Any]:
+    """The report for JSON: exact numbers, their units in the keys."""
+    verdict, subject = report.verdict, report.subject
+    return {
+        "uuid": subject.uuid,
+        "name": subject.name,
+        "unit": subject.unit,
+        "dataflow": subject.file or None,
+        "status": verdict.status,
+        "is_failure": verdict.is_failure,
+        "cause": str(verdict.cause) or None,
+        "summary": verdict.summary,
+        "node": verdict.node or None,
+        "at_us": verdict.at_us or None,
+        "began_us": verdict.began_us or None,
+        "stopped_by": verdict.stopped_by or None,
+        "given_up": verdict.is_given_up,
+        "details": {k: text for k, text in verdict.details.items() if k not in _TOLD},
+        "starved": list(verdict.starved),
+        "restarts": [vars(one) for one in verdict.restarts],
+        "restart_budget": report.budget,
+        "timeline": [
+            {"at_us": one.at_us, "event": one.name, "node": one.node or None, "text": one.text}
+            for one in verdict.timeline
+        ],
+        "last_lines": [vars(one) for one in report.words],
+        "remedies": remedies(report),
+    }
