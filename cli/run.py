@@ -25,6 +25,7 @@ _EPILOG = """\b
 Examples:
   doractl run                          ./dataflow.yml
   doractl run dataflow.yml --name robot --env MODEL=yolov8n.pt
+  doractl run dataflow.yml --hot-reload
 """
 _MICROSECOND_NS = 1000
 

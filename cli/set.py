@@ -8,6 +8,7 @@ from dora_systemd.bus import Bus
 from dora_systemd.cli.parameters import current_scope, print_warnings, scope_options
 from dora_systemd.cli.settingoptions import live_options
 from dora_systemd.managercells import read_cells, select_cell
+from dora_systemd.managerreload import switch_hot_reload
 from dora_systemd.managerset import set_limits
 
 _EPILOG = """\b
@@ -15,15 +16,17 @@ Examples:
   doractl set robot --memory-limit 6G
   doractl set robot --node-limit detector:memory=2G,cpu=1.5
   doractl set robot --cpu-limit infinity
+  doractl set robot --hot-reload on
 """
 
 
 @click.command("set", epilog=_EPILOG)
 @click.argument("selector")
 @live_options
+@click.option("--hot-reload", type=click.Choice(["on", "off"]), help="Watch its files, or not.")
 @scope_options
-def command(selector: str, **flags: Any) -> None:
-    """Change limits of a dataflow while it runs.
+def command(selector: str, hot_reload: str | None, **flags: Any) -> None:
+    """Change limits of a dataflow, or hot reload, while it runs.
 
     They hold at once and stay over restarts, until the dataflow is stopped; those of an enabled
     one until it is disabled. Infinity lifts a limit. Nothing is changed if anything is wrong.
@@ -31,5 +34,9 @@ def command(selector: str, **flags: Any) -> None:
     scope = current_scope()
     bus = Bus(scope)
     cell = select_cell(read_cells(bus), selector)
-    print_warnings(set_limits(bus, scope, cell, flags))
-    click.echo(f"Limits changed: {cell.uuid} ({cell.name})")
+    if hot_reload is None or any(value not in (None, ()) for value in flags.values()):
+        print_warnings(set_limits(bus, scope, cell, flags))
+        click.echo(f"Limits changed: {cell.uuid} ({cell.name})")
+    if hot_reload is not None:
+        switch_hot_reload(bus, scope, cell, hot_reload == "on")
+        click.echo(f"Hot reload {hot_reload}: {cell.uuid} ({cell.name})")

@@ -24,6 +24,7 @@ from dora_systemd.managerlinger import ensure_linger
 from dora_systemd.managerplan import DEFAULT_FILE, Plan, StartRequest, make_plan, request_name
 from dora_systemd.managerstart import Started, format_started, start_plan, start_unit_file
 from dora_systemd.managerunit import format_plan, plan_properties
+from dora_systemd.managerwatch import watched_patterns
 from dora_systemd.names import unit_name
 from dora_systemd.propertyset import Properties
 
@@ -35,6 +36,7 @@ Examples:
   doractl start dataflow.yml --memory-limit 4G --node-limit detector:memory=1G,cpu=1.5
   doractl start dataflow.yml --restart-policy on-failure --max-restarts 3
   doractl start dataflow.yml --credential token=/etc/robot/token
+  doractl start dataflow.yml --hot-reload --watch "*.py,config/*"
   doractl start dataflow.yml --enable              now and at every boot
   doractl start dataflow.yml --dry-run
 """
@@ -81,7 +83,7 @@ def command(
     if output == "json":
         print_json({**vars(started), "dataflow": plan.options.dataflow})
     else:
-        click.echo(format_started(started))
+        click.echo(format_started(started, watched_patterns(plan)))
 
 
 def _start(bus: Bus, plan: Plan, properties: Properties | None, wait: bool) -> Started:

@@ -26,6 +26,11 @@ class CellPaths:
         return self.root / "control.json"
 
     @property
+    def socket(self) -> Path:
+        """Where the runner answers doractl."""
+        return self.root / "runner.sock"
+
+    @property
     def coordinator(self) -> Path:
         """Working directory of the coordinator, which writes its token and its log there."""
         return self.root / "coordinator"

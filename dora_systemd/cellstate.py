@@ -74,6 +74,9 @@ class Cell:
     CLOCK_REALTIME µs. stop_by: who asked to stop, or "". failure: why the cell fails, or "".
     exit: what the runner will exit with. cause, culprits: of the failure, and the nodes that it is
     about. downstream: who gets nothing any more when a node is gone.
+    is_again: whether a reload has started it again in place.
+    is_trial: whether the version before can come back. reload: whether it ends to be started again.
+    notice: what the last reload has left to say.
     """
 
     grace: int
@@ -88,3 +91,7 @@ class Cell:
     cause: Cause = Cause.NONE
     culprits: tuple[str, ...] = ()
     downstream: Downstream = field(default_factory=dict)
+    is_again: bool = False
+    is_trial: bool = False
+    reload: bool = False
+    notice: str = ""

@@ -4,7 +4,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from dora_systemd.cellstate import Cell, State
-from dora_systemd.status import CellStatus, CpuSample, NodeStatus
+from dora_systemd.restarts import HELD_SECONDS
+from dora_systemd.status import HELD, CellStatus, CpuSample, NodeStatus
 
 _STAGES = {
     State.BOOTING: "starting",
@@ -42,16 +43,20 @@ def format_status(cell: Cell) -> str:
 
 def _format_waiting(cell: Cell) -> str:
     waiting = [ident for ident, node in cell.nodes.items() if node.state == "starting"]
+    failed = [_with_exit(*one) for one in cell.nodes.items() if one[1].state == "failed"]
     text = f"{_count(cell, 'ready', 'dynamic')}/{len(cell.nodes)} nodes ready"
-    return f"{text}, waiting for {_names(waiting)}" if waiting else text
+    text = f"{text}, waiting for {_names(waiting)}" if waiting else text
+    return f"{text}; failed: {_names(failed)}" if failed else text
 
 
 def _format_running(cell: Cell) -> str:
     parts = [f"{_count(cell, 'running', 'ready', 'dynamic')}/{len(cell.nodes)} nodes running"]
-    for state in ("starting", "restarting", "finished", "failed"):
+    for state in ("starting", "restarting", "reloading", "finished", "failed"):
         nodes = {ident: node for ident, node in cell.nodes.items() if node.state == state}
         if nodes:
             parts.append(f"{state}: {_names([_with_exit(*one) for one in nodes.items()])}")
+    if cell.notice:
+        parts.append(cell.notice)
     return "; ".join(parts)
 
 
@@ -93,6 +98,12 @@ def cell_status(cell: Cell, uuid: str, samples: tuple[CpuSample, ...]) -> CellSt
     )
 
 
+def _policy(raw: Mapping[str, Any]) -> str:
+    if raw.get("restart_delay") == HELD_SECONDS:
+        return HELD
+    return raw.get("restart_policy") or "never"
+
+
 def initial_nodes(
     kinds: Mapping[str, str], descriptor: Mapping[str, Any], at_us: int
 ) -> dict[str, NodeStatus]:
@@ -106,7 +117,7 @@ def initial_nodes(
             state="dynamic" if kind == "dynamic" else "starting",
             kind=kind,
             since_us=at_us,
-            policy=raw[ident].get("restart_policy") or "never",
+            policy=_policy(raw[ident]),
             max_restarts=int(raw[ident].get("max_restarts") or 0),
         )
         for ident, kind in kinds.items()

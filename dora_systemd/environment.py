@@ -4,6 +4,7 @@ import re
 from collections.abc import Mapping
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.hotreload import CHANGE_VARIABLE
 from dora_systemd.limits import CHANGES_VARIABLE
 from dora_systemd.values import quoted, shown
 
@@ -17,7 +18,7 @@ MANAGER_VARIABLES = frozenset(
         *("NOTIFY_SOCKET", "JOURNAL_STREAM", "INVOCATION_ID", "SYSTEMD_EXEC_PID", "MAINPID"),
         *("MANAGERPID", "MANAGERPIDFDID", "WATCHDOG_PID", "WATCHDOG_USEC", "RUNTIME_DIRECTORY"),
         *("LISTEN_FDS", "LISTEN_FDNAMES", "LISTEN_PID", "LISTEN_PIDFDID", "FDSTORE"),
-        *("MEMORY_PRESSURE_WATCH", "MEMORY_PRESSURE_WRITE", CHANGES_VARIABLE),
+        *("MEMORY_PRESSURE_WATCH", "MEMORY_PRESSURE_WRITE", CHANGES_VARIABLE, CHANGE_VARIABLE),
     }
 )
 """What systemd means for the runner alone, see systemd.exec(5). A node that speaks sd_notify must

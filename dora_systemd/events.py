@@ -69,6 +69,11 @@ EVENTS = {
     "reloaded": EventKind(
         "6ddc74129bfd4d61bd13747edb506634", NOTICE, "Dataflow {dataflow} was reloaded"
     ),
+    "files-changed": EventKind("902dc080ec514a37b5dfa7ecceb95347", INFO, "File changed: {files}"),
+    "node-reloaded": EventKind("4c9f8decbcc94dfbb46948d6c865191d", NOTICE, "Node {node} was {how}"),
+    "reload-failed": EventKind(
+        "47ac7b36b7204f468199e716c9176175", WARNING, "Dataflow {dataflow} was not reloaded"
+    ),
     "lines-lost": EventKind(
         "d880d0e56bbe4318ac5ac2afbb8cb42f",
         WARNING,

@@ -57,6 +57,7 @@ class HeldLines:
     def close(self) -> None:
         """Close the file; what is in it stays."""
         os.close(self._fd)
+        self._fd = -1  # what is noted from now on must not land in another file
 
 
 def held_path(pipe: Path) -> Path:

@@ -5,7 +5,7 @@ launcher. Kinds that dora has to start itself are left as they are.
 """
 
 import shlex
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import PurePath
 from typing import Any
@@ -15,11 +15,13 @@ from dora_systemd.dataflow import Dataflow
 from dora_systemd.dataflownodes import Node, NodeKind
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.options import RunnerOptions
-from dora_systemd.restarts import DEFAULT
+from dora_systemd.restarts import DEFAULT, HELD_KEYS
 from dora_systemd.values import SECOND, quoted
 
 LAUNCHED = frozenset({NodeKind.PYTHON, NodeKind.EXECUTABLE, NodeKind.SHELL})
 _PROGRAM_KEYS = ("path", "args", "build", "git", "branch", "tag", "rev")
+DEFAULT_OPERATOR = "op"
+"""dora's id of the operator of a node that has one only."""
 _JSONL_BOUNDS = {"max_log_size": "16MB", "max_rotated_files": 1}
 """What dora's own log files of one node may take of the RuntimeDirectory, which is memory."""
 
@@ -79,6 +81,8 @@ def _kind(node: Node, plan: LaunchPlan) -> str:
 
 def _launch_node(node: Node, source: str, plan: LaunchPlan) -> dict[str, Any]:
     raw = {**node.raw, **_restart_keys(node, plan.options)}
+    if plan.options.hot_reload and raw.get("restart_policy", "never") == "never":
+        raw |= HELD_KEYS if is_launched(node) else {}
     if node.keeps_output or not (is_launched(node) or node.kind is NodeKind.OPERATOR):
         raw = {**_JSONL_BOUNDS, **{key: value for key, value in raw.items() if value is not None}}
     if node.kind is NodeKind.OPERATOR:
@@ -147,6 +151,23 @@ def _split(node: Node, source: str) -> list[str]:
         return shlex.split(node.args)
     except ValueError as error:
         raise _refusal(source, node, f"its args: {error}", "quote args as in a shell") from error
+
+
+def sources(dataflow: Dataflow, plan: LaunchPlan) -> dict[str, dict[str, str]]:
+    """The files that each node is started from, absolute, by the operator's id or ""."""
+    return {node.id: dict(_node_sources(node, dataflow.source, plan)) for node in dataflow.nodes}
+
+
+def _node_sources(node: Node, source: str, plan: LaunchPlan) -> Iterator[tuple[str, str]]:
+    if node.kind in (NodeKind.PYTHON, NodeKind.EXECUTABLE):
+        yield "", _find(node, _directory(node, source, plan), source, plan)
+    if node.kind is NodeKind.OPERATOR:
+        raw = _with_absolute_operators(dict(node.raw), plan.options.working_directory)
+        for operator in (raw.get("operator"), *(raw.get("operators") or ())):
+            python = operator.get("python") if isinstance(operator, Mapping) else None
+            file = python.get("source") if isinstance(python, Mapping) else python
+            if isinstance(file, str):
+                yield str(operator.get("id") or DEFAULT_OPERATOR), file
 
 
 def _find(node: Node, directory: str, source: str, plan: LaunchPlan) -> str:

@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from dora_systemd.oom import Oom
+from dora_systemd.status import NodeStatus
+from dora_systemd.wiring import Downstream
 
 
 @dataclass(frozen=True)
@@ -141,6 +143,48 @@ class StopAnswered(Event):
 
 
 @dataclass(frozen=True)
+class NodeReloading(Event):
+    """The node is about to be ended, and another one to be started in its place.
+
+    status: what that one is before anything happened, or None when there is none.
+    """
+
+    node: str
+    status: NodeStatus | None = None
+
+
+@dataclass(frozen=True)
+class NodeAdded(Event):
+    """The node is new in the descriptor. status: how it is, before anything of it happened."""
+
+    node: str
+    status: NodeStatus
+
+
+@dataclass(frozen=True)
+class NodeRemoved(Event):
+    """The node is no longer in the descriptor, and its process has ended."""
+
+    node: str
+
+
+@dataclass(frozen=True)
+class ReloadNoted(Event):
+    """What came of the last reload. notice: what to say about it as long as it holds, or "".
+
+    downstream: who gets nothing any more when a node is gone, if that is another now.
+    """
+
+    notice: str
+    downstream: Downstream | None = None
+
+
+@dataclass(frozen=True)
+class ReloadAsked(Event):
+    """The dataflow as a whole has to start again."""
+
+
+@dataclass(frozen=True)
 class DeadlinePassed(Event):
     """What the current state waits for took too long."""
 
@@ -164,5 +208,10 @@ EVENTS: tuple[type[Event], ...] = (
     ConnectionLost,
     StopAsked,
     StopAnswered,
+    NodeReloading,
+    NodeAdded,
+    NodeRemoved,
+    ReloadNoted,
+    ReloadAsked,
     DeadlinePassed,
 )

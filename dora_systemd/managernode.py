@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
@@ -11,15 +11,15 @@ from dora_systemd.cellpaths import CellPaths
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.managercells import Cell, not_found
 from dora_systemd.managerlist import read_status
-from dora_systemd.protocol import Reply
+from dora_systemd.protocol import Params, Reply, node_params, replace_params
 from dora_systemd.scope import Scope
 from dora_systemd.status import CellStatus
-from dora_systemd.values import quoted
+from dora_systemd.values import SECOND, quoted
 
-_OVERLAP = {"secs": 1, "nanos": 0}
-"""How long a node and its replacement run at the same time, as dora writes durations."""
+_OVERLAP = SECOND
+"""µs for which a node and its replacement run at the same time, at most."""
 
-Ask = Callable[[Scope, Cell, Mapping[str, Any]], Reply]
+Ask = Callable[[Scope, Cell, Params], Reply]
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def require_running(cell: Cell) -> None:
         )
 
 
-def ask_coordinator(scope: Scope, cell: Cell, params: Mapping[str, Any]) -> Reply:
+def ask_coordinator(scope: Scope, cell: Cell, params: Params) -> Reply:
     """One request to the cell's coordinator, and its answer. Raises DoraSystemdError."""
     # WebSockets are slow to import, and no other verb needs them.
     from dora_systemd import control
@@ -86,17 +86,16 @@ def restart_node(scope: Scope, cell: Cell, node: str, ask: Ask = ask_coordinator
     definition = next((one for one in nodes if one.get("id") == node), {})
     is_replaceable = definition.get("restart_policy", "never") == "never"
     if is_replaceable and _has_consumers(nodes, node):
-        replacement = {"dataflow_id": status.run, "node": definition, "grace_duration": _OVERLAP}
-        params: dict[str, Any] = {"ReplaceNode": replacement}
+        params = replace_params(status.run, definition, _OVERLAP)
     else:
-        params = _node_request("RestartNode", status, node)
+        params = node_params("RestartNode", status.run, node)
     _answer(cell, ask(scope, cell, params))
 
 
 def stop_node(scope: Scope, cell: Cell, node: str, ask: Ask = ask_coordinator) -> None:
     """End one node for good; its neighbours see their input closed."""
     status = _checked_status(scope, cell, node)
-    _answer(cell, ask(scope, cell, _node_request("StopNode", status, node)))
+    _answer(cell, ask(scope, cell, node_params("StopNode", status.run, node)))
 
 
 def exec_dora(scope: Scope, manager: Manager, cell: Cell, arguments: Sequence[str]) -> NoReturn:
@@ -154,10 +153,6 @@ def _has_consumers(nodes: Sequence[dict[str, Any]], node: str) -> bool:
     """Whether any other node has an input from this one, in one of the many forms of inputs."""
     source = json.dumps(f"{node}/")[:-1]
     return any(source in json.dumps(one) for one in nodes if one.get("id") != node)
-
-
-def _node_request(method: str, status: CellStatus, node: str) -> dict[str, Any]:
-    return {method: {"dataflow_id": status.run, "node_id": node, "grace_duration": None}}
 
 
 def _answer(cell: Cell, reply: Reply) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from dora_systemd.names import name_from_path, parse_name, unit_name
 from dora_systemd.options import RunnerOptions
 from dora_systemd.preparation import prepare
 from dora_systemd.process import dora_version, find_dora, run_dora
+from dora_systemd.reloadplan import check_reload_nodes, hot_reload
 from dora_systemd.restartplan import node_policies, restart_policy
 from dora_systemd.restartsettings import START_TIMEOUT
 from dora_systemd.scope import Scope
@@ -93,11 +94,12 @@ def make_plan(scope: Scope, request: StartRequest) -> Plan:
     venv = _find_venv(settings, path, request.environment)
     search_path = request.environment.get("PATH") or os.defpath
     variables = _variables(settings)
+    directory = _directory(settings, path)
     options = RunnerOptions(
         name=name,
         uuid=str(uuid.uuid4()),
         dataflow=str(path),
-        working_directory=_directory(settings, path),
+        working_directory=directory,
         dora=find_dora(_given_dora(settings), venv, search_path),
         venv=venv,
         uv=settings[UV],
@@ -112,6 +114,7 @@ def make_plan(scope: Scope, request: StartRequest) -> Plan:
         restart=restart_policy(settings),
         node_restarts=node_policies(settings),
         start_timeout=settings[START_TIMEOUT],
+        reload=hot_reload(settings, directory),
     )
     environment = unit_environment(search_path, venv, variables)
     plan = Plan(scope, options, settings, user, environment)
@@ -145,7 +148,9 @@ def _check_plan(plan: Plan) -> None:
         )
     # dora validate accepts paths that are not there, and other things that no node can run with.
     prepared = prepare(options, plan.environment)
-    check_rates(options.log_rates, [node.id for node in prepared.dataflow.nodes])
+    ids = [node.id for node in prepared.dataflow.nodes]
+    check_rates(options.log_rates, ids)
+    check_reload_nodes(options.reload, ids)
 
 
 def _directory(settings: Settings, dataflow: Path) -> str:

@@ -80,19 +80,25 @@ def _started(
     return Started(plan.options.uuid, plan.options.name, plan.unit, is_ready=wait)
 
 
-def format_started(started: Started) -> str:
-    """What `doractl start` prints, in the manner of dora's own start."""
+def format_started(started: Started, watched: Sequence[str] = ()) -> str:
+    """What `doractl start` prints, in the manner of dora's own start.
+
+    watched: patterns of the files that mean a reload, none without hot reload.
+    """
     done = "started" if started.is_ready else "starting"
     name = started.name
+    more = " (hot-reload enabled)" if watched else ""
+    watching = ("", "Watching for changes...", *(f"  - {one}" for one in watched))
     return "\n".join(
         (
-            f"Dataflow {done}: {started.uuid}",
+            f"Dataflow {done}: {started.uuid}{more}",
             f"Name: {name}",
             f"Unit: {started.unit}",
             "",
             f"Use 'doractl stop {name}' to stop",
             "Use 'doractl list' to view status",
             f"Use 'doractl logs {name}' to view logs",
+            *(watching if watched else ()),
         )
     )
 

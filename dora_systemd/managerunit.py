@@ -7,9 +7,11 @@ from dora_systemd.compat import MIN_VERSION, drop_unsupported
 from dora_systemd.managercredentials import credential_files
 from dora_systemd.managerlimits import check_limits
 from dora_systemd.managerplan import Plan
+from dora_systemd.managerwatch import watch_warnings
 from dora_systemd.process import version_numbers
 from dora_systemd.properties import UnitContext, format_unit, unit_properties
 from dora_systemd.propertykinds import Property
+from dora_systemd.reloadplan import reload_warnings
 from dora_systemd.restartplan import restart_warnings
 from dora_systemd.unitfile import persistent_unit
 
@@ -22,7 +24,8 @@ def plan_properties(plan: Plan, manager: Manager) -> tuple[dict[str, Property], 
     """
     number = next(iter(version_numbers(manager.version())), MIN_VERSION)
     properties, warnings = drop_unsupported(_properties(plan), number)
-    warnings = (*warnings, *restart_warnings(plan.settings))
+    warnings = (*warnings, *restart_warnings(plan.settings), *reload_warnings(plan.settings))
+    warnings = (*warnings, *watch_warnings(plan))
     return properties, (*warnings, *check_limits(manager, plan, properties))
 
 

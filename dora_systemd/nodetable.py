@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from dora_systemd import lifeevents as life
-from dora_systemd.status import NodeStatus
+from dora_systemd.status import HELD, NodeStatus
 
 Nodes = Mapping[str, NodeStatus]
 RecordParts = tuple[str, str, Mapping[str, str]]
@@ -16,7 +16,10 @@ _WITH_PROCESS = frozenset({"starting", "ready", "running"})
 
 def has_process(nodes: Nodes) -> bool:
     """Whether dora still has a process of any node, as far as the events tell."""
-    return any(node.state in _WITH_PROCESS for node in nodes.values())
+    return any(
+        node.state in _WITH_PROCESS or (node.state == "reloading" and node.pid)
+        for node in nodes.values()
+    )
 
 
 def all_ready(nodes: Nodes, at_us: int) -> Nodes:
@@ -47,6 +50,18 @@ def update(
     return nodes, None
 
 
+def reshape(nodes: Nodes, event: life.Event) -> Nodes:
+    """The table while a reload changes which nodes there are."""
+    match event:
+        case life.NodeReloading():
+            return _reloading(nodes, event)
+        case life.NodeAdded():
+            return {**nodes, event.node: event.status}
+        case life.NodeRemoved():
+            return {ident: node for ident, node in nodes.items() if ident != event.node}
+    return nodes
+
+
 def _is_running(nodes: Nodes) -> bool:
     return any(node.state == "running" for node in nodes.values())
 
@@ -56,6 +71,13 @@ def _set(nodes: Nodes, ident: str, at_us: int, **changes: str | int) -> Nodes:
     if changes.get("state") != old.state:
         changes["since_us"] = at_us
     return {**nodes, ident: replace(old, **changes)}  # type: ignore[arg-type]
+
+
+def _reloading(nodes: Nodes, event: life.NodeReloading) -> Nodes:
+    """Its successor has restarts of its own."""
+    old = nodes.get(event.node, NodeStatus())
+    status = replace(event.status or old, state="reloading", pid=old.pid, since_us=event.at_us)
+    return {**nodes, event.node: status}
 
 
 def _hung(nodes: Nodes, event: life.NodeHung) -> tuple[Nodes, RecordParts | None]:
@@ -77,6 +99,12 @@ def _exited(
     nodes: Nodes, event: life.NodeExited, is_stopping: bool
 ) -> tuple[Nodes, RecordParts | None]:
     old = nodes.get(event.node, NodeStatus())
+    if old.state == "reloading" and not is_stopping and not event.is_stale:
+        nodes = {**nodes, event.node: replace(old, pid=0)}
+        return nodes, ("node-exited", event.node, {"exit": event.exit} if event.exit else {})
+    if event.will_restart and old.policy == HELD:
+        # Not by itself: dora has been told to wait, so that a reload can start it again.
+        event = replace(event, will_restart=False)
     if old.hung and event.exit:  # the signal that ended it says nothing
         event = replace(event, exit=f"hung, {old.hung}")
     name, details = _words_of(event, is_stopping)
@@ -126,7 +154,7 @@ def spent(nodes: Nodes) -> dict[str, str]:
 def _is_spent(node: NodeStatus) -> bool:
     is_cascaded = node.exit.startswith("node ") or " because node " in node.exit
     if node.state == "failed":
-        return node.policy != "never" and not is_cascaded
+        return node.policy not in ("never", HELD) and not is_cascaded
     is_used_up = 0 < node.max_restarts <= node.restarts
     return node.state == "finished" and node.policy == "always" and is_used_up
 

@@ -1,5 +1,7 @@
 """What the runner tells its manager: sd_notify(3)."""
 
+import time
+
 from systemd.daemon import notify
 
 
@@ -11,6 +13,11 @@ def send_ready() -> None:
 def send_status(text: str) -> None:
     """STATUS=: one line for `systemctl status`."""
     notify(f"STATUS={' '.join(text.split())}")
+
+
+def send_reloading() -> None:
+    """RELOADING=1: until READY=1 comes again."""
+    notify(f"RELOADING=1\nMONOTONIC_USEC={time.monotonic_ns() // 1000}")
 
 
 def send_stopping() -> None:

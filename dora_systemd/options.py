@@ -8,6 +8,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.hotreload import (
+    ARGUMENTS,
+    DEFAULT_RELOAD,
+    HotReload,
+    format_reload,
+    parse_reload,
+)
 from dora_systemd.limits import NodeLimits, format_node_limits, parse_node_limits
 from dora_systemd.lograte import RateLimits, format_rates, parse_rates
 from dora_systemd.names import parse_name, parse_uuid
@@ -24,14 +31,15 @@ from dora_systemd.values import (
 
 RUNNER_MODULE = "dora_systemd.runner"
 POST_MODULE = "dora_systemd.runnerpost"
+RELOAD_MODULE = "dora_systemd.runnerask"
 
 _PYTHON_FLAGS = ("-E", "-P", "-m", RUNNER_MODULE)
 """Without the environment's PYTHON* and without the working directory on sys.path: modules of the
 project can never stand in for the runner's."""
 
 _TEXTS = ("working-directory", "dora", "venv", "restart", "start-timeout")
-_FLAGS = ("uv", "debug", "allow-shell-nodes", "attached")
-_REPEATED = ("env-key", "log-rate-limit", "node-limit", "node-restart")
+_FLAGS = ("uv", "debug", "allow-shell-nodes", "attached", "hot-reload")
+_REPEATED = ("env-key", "log-rate-limit", "node-limit", "node-restart", *ARGUMENTS)
 _REQUIRED = ("name", "uuid", "working-directory", "dora")
 
 
@@ -56,6 +64,7 @@ class RunnerOptions:
     restart: policy of nodes for which the descriptor has none.
     node_restarts: policies of single nodes.
     start_timeout: µs in which all nodes have to be ready, or INFINITY.
+    reload: which files mean a reload, and how nodes are replaced.
     """
 
     name: str
@@ -76,6 +85,12 @@ class RunnerOptions:
     restart: RestartPolicy = DEFAULT
     node_restarts: tuple[tuple[str, RestartPolicy], ...] = ()
     start_timeout: int = INFINITY
+    reload: HotReload = DEFAULT_RELOAD
+
+    @property
+    def hot_reload(self) -> bool:
+        """Whether files are watched."""
+        return self.reload.is_on
 
 
 def format_runner_argv(options: RunnerOptions) -> list[str]:
@@ -101,6 +116,7 @@ def format_runner_argv(options: RunnerOptions) -> list[str]:
     pairs += [
         ("node-restart", f"{node}:{format_policy(one)}") for node, one in options.node_restarts
     ]
+    pairs += format_reload(options.reload)
     flags = [f"--{flag}" for flag in _FLAGS if getattr(options, flag.replace("-", "_"))]
     return [f"--{key}={value}" for key, value in pairs] + flags + [options.dataflow]
 
@@ -134,6 +150,11 @@ def runner_command(python: str, options: RunnerOptions) -> list[str]:
 def post_command(python: str, options: RunnerOptions) -> list[str]:
     """ExecStopPost= of the unit: what is left to say when the runner was killed."""
     return [python, *_PYTHON_FLAGS[:-1], POST_MODULE, options.name, options.uuid]
+
+
+def reload_command(python: str) -> list[str]:
+    """ExecReload= of the unit: what `systemctl reload` runs."""
+    return [python, *_PYTHON_FLAGS[:-1], RELOAD_MODULE]
 
 
 def options_from_command(command: Sequence[str]) -> RunnerOptions:
@@ -176,6 +197,7 @@ def _options(dataflow: str, values: dict[str, str], lists: dict[str, list[str]])
         debug="debug" in values,
         allow_shell_nodes="allow-shell-nodes" in values,
         attached="attached" in values,
+        reload=parse_reload("hot-reload" in values, lists),
     )
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from dora_systemd.cellpaths import CellPaths
 from dora_systemd.events import event_fields
-from dora_systemd.heldlines import HeldLines, read_held
+from dora_systemd.heldlines import HeldLines, held_path, read_held
 from dora_systemd.logfields import Value, encode_entry
 from dora_systemd.logqueue import Journal, LogQueue
 from dora_systemd.lograte import LineLimiter, RateLimit, format_rate
@@ -60,7 +60,9 @@ class LogPipes:
         self._muted: frozenset[str] = frozenset()
 
     def make(self, node_id: str, paths: CellPaths) -> None:
-        """Create the two FIFOs of a node, mode 0600; the directory must exist. Raises OSError."""
+        """Create the two FIFOs of a node, mode 0600, unless it has them already. Raises OSError."""
+        if node_id in self._paths:
+            return
         for path in fifos(node_id, paths).values():
             with contextlib.suppress(FileNotFoundError):
                 path.unlink()
@@ -73,12 +75,26 @@ class LogPipes:
 
     def open(self, node_id: str) -> None:
         """Begin to read a node's FIFOs: who waits to open one for writing goes on. OSError."""
+        if self._source(node_id).pipes:
+            return
         for stream, path in fifos(node_id, self._paths[node_id]).items():
             # Read and write: no end of file between two lives of the node.
             fd = os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
             if self._keep is not None:
                 self._keep(fd)
             self.adopt(node_id, stream, fd, HeldLines(path))
+
+    def forget(self, node_id: str) -> None:
+        """The node is gone for good: take its last words, close its pipes and remove them."""
+        self.drain(node_id)
+        source = self._sources.pop(node_id)
+        for pipe in source.pipes:
+            self._loop.remove_reader(pipe.fd)
+            pipe.close()
+        if node_id in self._paths:
+            for path in fifos(node_id, self._paths.pop(node_id)).values():
+                path.unlink(missing_ok=True)
+                held_path(path).unlink(missing_ok=True)
 
     def adopt(self, node_id: str, stream: str, fd: int, held: HeldLines | None = None) -> None:
         """Begin to read `fd`, a pipe that is open already, as "stdout" or "stderr" of a node.
@@ -174,8 +190,8 @@ class LogPipes:
         self._loop.add_reader(fd, self._read_output, label, fd, on_line)
 
     def mute(self, *labels: str) -> None:
-        """Make no more records of what these children print."""
-        self._muted |= frozenset(labels)
+        """Make no more records of what these children print, but of all others."""
+        self._muted = frozenset(labels)
 
     def settle(self, seconds: float = 7.0) -> None:
         """Drain all pipes and block until journald has taken it all, at most `seconds`."""

@@ -13,6 +13,7 @@ from dora_systemd.dataflow import Dataflow, parse_dataflow
 from dora_systemd.dataflownodes import UNEXPANDED, NodeKind
 from dora_systemd.doraerrors import parse_dora_error
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.hotreload import CHANGE_VARIABLE
 from dora_systemd.launch import LaunchPlan, launch_descriptor
 from dora_systemd.limits import (
     CHANGES_VARIABLE,
@@ -22,6 +23,7 @@ from dora_systemd.limits import (
 )
 from dora_systemd.options import RunnerOptions
 from dora_systemd.restarts import check_restart_nodes
+from dora_systemd.values import format_bool, parse_bool
 
 PACKAGE = Path(__file__).parent
 
@@ -61,7 +63,9 @@ def prepare(options: RunnerOptions, environment: Mapping[str, str]) -> Prepared:
 def with_changes(options: RunnerOptions, environment: Mapping[str, str]) -> RunnerOptions:
     """The options with what `doractl set` has changed since the unit was made."""
     changes = parse_changes(environment.get(CHANGES_VARIABLE, ""))
-    return replace(options, node_limits=merge_node_limits(options.node_limits, changes))
+    limits = merge_node_limits(options.node_limits, changes)
+    is_on = parse_bool(environment.get(CHANGE_VARIABLE) or format_bool(options.hot_reload))
+    return replace(options, node_limits=limits, reload=options.reload._replace(is_on=is_on))
 
 
 def load_dataflow(options: RunnerOptions) -> Dataflow:

@@ -13,7 +13,7 @@ from dora_systemd.environment import checked_variable, environment_entries
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.limitsettings import REALTIME
 from dora_systemd.names import SLICE
-from dora_systemd.options import RunnerOptions, post_command, runner_command
+from dora_systemd.options import RunnerOptions, post_command, reload_command, runner_command
 from dora_systemd.propertykinds import Property
 from dora_systemd.propertyset import (
     Properties,
@@ -105,6 +105,7 @@ def service_properties(options: RunnerOptions, context: UnitContext) -> dict[str
     """
     argv = tuple(runner_command(context.python, options))
     post = tuple(post_command(context.python, options))
+    reload = tuple(reload_command(context.python))
     # The runner names the nodes that are late; systemd ends one that cannot even do that.
     is_endless = options.start_timeout == INFINITY
     start_timeout = INFINITY if is_endless else options.start_timeout + START_MARGIN
@@ -113,6 +114,7 @@ def service_properties(options: RunnerOptions, context: UnitContext) -> dict[str
         NotifyAccess="main",
         ExecStart=((argv[0], argv, ("no-env-expand",)),),
         ExecStopPost=((post[0], post, ("ignore-failure", "no-env-expand")),),
+        ExecReload=((reload[0], reload, ("no-env-expand",)),),
         # Two pipes a node: what is in them is kept when the runner is killed.
         FileDescriptorStoreMax=4096,
         # Never the project: its modules must not be found before the runner's.

@@ -131,6 +131,29 @@ def check_params(run: str) -> Params:
     return {"Check": {"dataflow_uuid": run}}
 
 
+def node_params(method: str, run: str, node: str, grace: int | None = None) -> Params:
+    """RestartNode, StopNode or RemoveNode. grace: µs as above; None: dora's own."""
+    limit = None if grace is None else duration(grace)
+    return {method: {"dataflow_id": run, "node_id": node, "grace_duration": limit}}
+
+
+def replace_params(run: str, definition: Mapping[str, Any], grace: int) -> Params:
+    """Start `definition` in place of the node of that id, which then has `grace` µs to end."""
+    return {
+        "ReplaceNode": {"dataflow_id": run, "node": definition, "grace_duration": duration(grace)}
+    }
+
+
+def add_params(run: str, definition: Mapping[str, Any]) -> Params:
+    """Add a node to a dataflow that runs."""
+    return {"AddNode": {"dataflow_id": run, "node": definition}}
+
+
+def reload_params(run: str, node: str, operator: str) -> Params:
+    """Have a Python operator read its file again."""
+    return {"Reload": {"dataflow_id": run, "node_id": node, "operator_id": operator}}
+
+
 DAEMON_CONNECTED: Params = "DaemonConnected"
 HELLO: Params = {"Hello": {"dora_version": "1.0.0"}}
 

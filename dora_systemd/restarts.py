@@ -60,6 +60,15 @@ class RestartPolicy(NamedTuple):
 
 DEFAULT = RestartPolicy()
 
+HELD_SECONDS = 30 * 24 * 3600.0
+HELD_KEYS: Mapping[str, Any] = {
+    "restart_policy": "on-failure",
+    "restart_delay": HELD_SECONDS,
+    "max_restart_delay": HELD_SECONDS,
+}
+"""A node that fails, and waits: dora starts a new one in its place at any time, but none in the
+place of one that it has given up."""
+
 _KEYS = ("policy", "max", "window", "delay", "max-delay")
 
 

@@ -7,6 +7,7 @@ import asyncio
 import os
 import signal
 import sys
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from dora_systemd import fdstore, notify
 from dora_systemd import lifeevents as life
 from dora_systemd.causes import Cause
 from dora_systemd.cellpaths import CellPaths
-from dora_systemd.cellstate import Cell, RunnerExit
+from dora_systemd.cellstate import Cell, RunnerExit, State
 from dora_systemd.cellview import initial_nodes
 from dora_systemd.environment import node_environment
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -23,11 +24,15 @@ from dora_systemd.launch import has_pipes, kinds, python_of
 from dora_systemd.options import RunnerOptions, parse_runner_argv
 from dora_systemd.pipes import CellIdentity, LogPipes
 from dora_systemd.preparation import PACKAGE, Prepared, prepare, with_changes
+from dora_systemd.runnerapply import Run
 from dora_systemd.runnerdialogue import Dialogue
 from dora_systemd.runnerengine import Engine
-from dora_systemd.runnerloss import losses_of_user
+from dora_systemd.runnerloss import LossWatch, losses_of_user
 from dora_systemd.runnernodes import Nodes, enter_supervisor, wait_eof
 from dora_systemd.runnerpump import Pump, now_us
+from dora_systemd.runnerreload import Reloader
+from dora_systemd.runnersocket import serve
+from dora_systemd.runnerswap import READY_SECONDS, Swapper
 from dora_systemd.values import INFINITY, SECOND
 from dora_systemd.wiring import downstream_of
 
@@ -64,54 +69,115 @@ def make_directories(paths: CellPaths) -> None:
 
 
 async def run_cell(options: RunnerOptions, paths: CellPaths) -> RunnerExit:
-    """Live the life of one cell."""
-    started_us = now_us()
+    """Live the life of one cell: one run of the dataflow after the other, until it has to end."""
     loop = asyncio.get_running_loop()
     unit = enter_supervisor()
     make_directories(paths)
-    environment = node_environment(os.environ)
-    dora = Engine(options.dora, paths, environment)
-    coordinator = dora.start_coordinator()  # it boots while we read
     journal = JournalSocket()
-    identity = CellIdentity(options.name, options.uuid)
     # While systemd holds the pipes too, what is in them outlives a kill of this process.
     fdstore.forget_inherited()
-    pipes = LogPipes(loop, journal, identity, fdstore.store)
+    pipes = LogPipes(loop, journal, CellIdentity(options.name, options.uuid), fdstore.store)
+    environment = node_environment(os.environ)
     nodes = Nodes(unit, paths, pipes)
+    cell = Runs(options, paths, unit, environment, pipes, nodes, Reloader(options, environment))
     losses = losses_of_user(journal, pipes) if paths.is_of_user else None
     try:
         pipes.write_event("dataflow-starting")
-        prepared = prepare(options, environment)
-        nodes.prepare(prepared.dataflow, options.log_rates, options.node_limits)
-        table = initial_nodes(
-            kinds(prepared.dataflow, prepared.plan), prepared.descriptor, started_us
-        )
-        fed = downstream_of(prepared.dataflow)
-        cell = Cell(options.grace, started_us, table, downstream=fed)
-        pump = Pump(cell, options.uuid, paths, nodes, pipes)
-        dialogue = Dialogue(options, pump, dora, nodes, pipes)
-        pump.connect(dialogue.actions(prepared.descriptor, daemon_variables(prepared, paths, unit)))
-        listen(loop, options, pump, dialogue)
-        if losses is not None:
-            dialogue.spawn(losses.run())
-        dialogue.watch(coordinator, dialogue.read_coordinator)
-        try:
-            return await dialogue.end
-        finally:
-            nodes.close()
-            # The loop runs on, so the watchdog is fed; a stop has systemd's clock against it.
-            await pipes.wait_empty(BACKLOG_SECONDS if not pump.cell.stop_by else STOP_SECONDS)
-            if losses is not None:
-                await losses.finish()
-            dialogue.cancel()
+        return await live(cell, losses)
     except DoraSystemdError as error:
         notify.send_status(f"failed: {error.message}")
         pipes.write_event("dataflow-failed", reason=error.message, cause=Cause.BAD_DATAFLOW)
         raise
     finally:
-        dora.kill()
         pipes.close()
         journal.wait_read(JOURNAL_SECONDS)
+
+
+@dataclass(frozen=True)
+class Runs:
+    """What all runs of the dataflow share. unit: cgroup directory. environment: of the nodes."""
+
+    options: RunnerOptions
+    paths: CellPaths
+    unit: Path
+    environment: dict[str, str]
+    pipes: LogPipes
+    nodes: Nodes
+    reloader: Reloader
+
+
+async def live(cell: Runs, losses: LossWatch | None) -> RunnerExit:
+    """Run the dataflow, and again as long as reloads ask for it."""
+    beside = [asyncio.create_task(cell.reloader.work())]
+    beside.append(asyncio.create_task(serve(cell.paths.socket, cell.reloader.answer)))
+    if losses is not None:
+        beside.append(asyncio.create_task(losses.run()))
+    try:
+        last = await run_once(cell, is_again=False)
+        while goes_on(cell, last):
+            notify.send_reloading()
+            last = await run_once(cell, is_again=True)
+        if losses is not None:
+            await losses.finish()
+        return last.exit
+    finally:
+        cell.reloader.close()
+        for task in beside:
+            task.cancel()
+
+
+def goes_on(cell: Runs, last: Cell) -> bool:
+    """Whether another run follows: asked for, or the one before what has just failed."""
+    if last.reload:
+        return True
+    if not last.is_trial or last.ready_us or last.stop_by:
+        cell.reloader.go_back(last.failure or "it was stopped")
+        return False
+    return cell.reloader.go_back(last.failure)
+
+
+async def run_once(cell: Runs, is_again: bool) -> Cell:
+    """One run of the dataflow, with a dora of its own; how it ended. Raises DoraSystemdError."""
+    started_us, options, reloader = now_us(), cell.options, cell.reloader
+    dora = Engine(options.dora, cell.paths, cell.environment)
+    try:
+        coordinator = dora.start_coordinator()  # it boots while we read
+        prepared = reloader.current or prepare(options, cell.environment)
+        cell.nodes.prepare(prepared.dataflow, options.log_rates, options.node_limits)
+        table = initial_nodes(
+            kinds(prepared.dataflow, prepared.plan), prepared.descriptor, started_us
+        )
+        first = Cell(options.grace, started_us, table, is_again=is_again, notice=reloader.notice)
+        fed = downstream_of(prepared.dataflow)
+        first = replace(first, is_trial=reloader.before is not None, downstream=fed)
+        pump = Pump(first, options.uuid, cell.paths, cell.nodes, cell.pipes)
+        dialogue = Dialogue(options, pump, dora, cell.nodes, cell.pipes)
+        variables = daemon_variables(prepared, cell.paths, cell.unit)
+        pump.connect(dialogue.actions(prepared.descriptor, variables))
+        cell.pipes.mute()
+        listen(asyncio.get_running_loop(), options, pump, dialogue)
+        dialogue.watch(coordinator, dialogue.read_coordinator)
+        reloader.begin(Run(pump, cell.nodes, cell.pipes, Swapper(pump, dora)), prepared)
+        dialogue.spawn(tell_started(pump, reloader))
+        try:
+            await dialogue.end
+        finally:
+            reloader.end()
+            cell.nodes.close()
+            if not pump.cell.reload:
+                # The loop runs on and the watchdog is fed; a stop has systemd's clock against it.
+                seconds = STOP_SECONDS if pump.cell.stop_by else BACKLOG_SECONDS
+                await cell.pipes.wait_empty(seconds)
+            dialogue.cancel()
+        return pump.cell
+    finally:
+        dora.kill()
+
+
+async def tell_started(pump: Pump, reloader: Reloader) -> None:
+    """A run that has started once is no trial any more."""
+    if await pump.wait(lambda cell: cell.state is State.RUNNING, None):
+        reloader.has_started()
 
 
 def listen(
@@ -124,9 +190,12 @@ def listen(
     if "WATCHDOG_USEC" in os.environ:
         seconds = int(os.environ["WATCHDOG_USEC"]) / 1_000_000 / 3
         dialogue.spawn(dialogue.feed_watchdog(seconds))
-    if options.start_timeout != INFINITY:
-        late = life.StartTimedOut(now_us(), options.start_timeout)
-        loop.call_later(options.start_timeout / SECOND, pump.push, late)
+    timeout = options.start_timeout
+    if pump.cell.is_trial:
+        timeout = min(timeout, round(READY_SECONDS * SECOND))
+    if timeout != INFINITY:
+        late = life.StartTimedOut(now_us(), timeout)
+        loop.call_later(timeout / SECOND, pump.push, late)
     if options.attached:
         dialogue.spawn(stop_at_eof(pump))
 

@@ -8,7 +8,7 @@ from dora_systemd import engine, notify, protocol
 from dora_systemd import lifeevents as life
 from dora_systemd.cellstate import Do, RunnerExit, State
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.lifecycle import stop_timeout
+from dora_systemd.lifehandlers import stop_timeout
 from dora_systemd.options import RunnerOptions
 from dora_systemd.pipes import LogPipes
 from dora_systemd.runnerengine import Engine

@@ -11,7 +11,7 @@ from pathlib import Path
 from dora_systemd import cgroup
 from dora_systemd.cellpaths import CellPaths
 from dora_systemd.dataflow import Dataflow
-from dora_systemd.dataflownodes import NodeKind
+from dora_systemd.dataflownodes import Node, NodeKind
 from dora_systemd.jsonl import JsonlTail
 from dora_systemd.launch import has_pipes, is_launched
 from dora_systemd.limits import NodeLimits
@@ -44,32 +44,59 @@ class Nodes:
         self._unit = unit
         self._paths = paths
         self._pipes = pipes
-        self._piped: list[str] = []
-        self._launched: frozenset[str] = frozenset()
+        self._piped: set[str] = set()
+        self._launched: set[str] = set()
         self._tails: dict[str, JsonlTail | None] = {}
         self.resources = Resources(unit)
 
     def prepare(self, dataflow: Dataflow, rates: RateLimits, limits: Iterable[NodeLimits]) -> None:
         """Make a group for every node, with its limits, and pipes for those that have them.
 
-        rates: how many lines of each node are kept. Raises OSError, and DoraSystemdError for a
-        limit that does not take hold.
+        What there is of nodes that are no longer in the dataflow goes. rates: how many lines of
+        each node are kept. Raises OSError, and DoraSystemdError for a limit that does not take
+        hold.
         """
         cgroup.enable_controllers(self._unit)
-        self._launched = frozenset(node.id for node in dataflow.nodes if is_launched(node))
+        piped = {node.id for node in dataflow.nodes if has_pipes(node)}
+        gone = {*cgroup.node_groups(self._unit)} - {node.id for node in dataflow.nodes}
+        for ident in gone | (self._piped - piped):
+            self.remove(ident)
+        self._launched.clear()
         for node in dataflow.nodes:
-            cgroup.make_group(self._group(node.id))
-            if limit := rate_of(rates, node.id):
-                self._pipes.limit(node.id, limit)
-            cgroup.kill_as_one(self._group(node.id))
-            if has_pipes(node):
-                self._pipes.make(node.id, self._paths)
-                self._piped.append(node.id)
-            elif node.kind is not NodeKind.DYNAMIC:
-                self._tails[node.id] = None
-
+            self._make(node, rates)
         for one in limits:
             cgroup.limit_group(self._group(one.node), one)
+
+    def _make(self, node: Node, rates: RateLimits) -> None:
+        cgroup.make_group(self._group(node.id))
+        if limit := rate_of(rates, node.id):
+            self._pipes.limit(node.id, limit)
+        cgroup.kill_as_one(self._group(node.id))
+        if is_launched(node):
+            self._launched.add(node.id)
+        if has_pipes(node):
+            self._pipes.make(node.id, self._paths)
+            self._piped.add(node.id)
+        elif node.kind is not NodeKind.DYNAMIC:
+            self._tails[node.id] = None
+
+    def add(self, node: Node, rates: RateLimits, limits: Iterable[NodeLimits]) -> None:
+        """The same for one node of a dataflow that runs; it has pipes. Raises as prepare() does."""
+        self._make(node, rates)
+        for one in limits:
+            if one.node == node.id:
+                cgroup.limit_group(self._group(node.id), one)
+        self._pipes.open(node.id)
+
+    def remove(self, node: str) -> None:
+        """The node has ended and does not come back. Raises OSError."""
+        cgroup.kill_group(self._group(node))
+        if node in self._piped:
+            self._pipes.forget(node)
+        self._piped.discard(node)
+        self._launched.discard(node)
+        with contextlib.suppress(OSError):  # what is dying holds it for a moment
+            cgroup.remove_group(self._group(node))
 
     def _group(self, node: str) -> Path:
         return self._unit / f"{cgroup.NODE_PREFIX}{node}"
@@ -101,8 +128,11 @@ class Nodes:
         self._pipes.set_pid(node, 0)
 
     def has_process(self, node: str, pid: int) -> bool:
-        """Whether `pid` lives and is one of the node's. Zombies do not count."""
-        return pid in cgroup.pids(self._group(node))
+        """Whether `pid` lives and is one of the node's. Zombies do not count.
+
+        Until its launcher has moved it, it is where the daemon is.
+        """
+        return any(pid in cgroup.pids(one) for one in (self._group(node), self._unit / SUPERVISOR))
 
     def find_oom(self, node: str) -> Oom | None:
         """What the kernel has just killed `node` for, if it was for want of memory."""

@@ -1,6 +1,7 @@
 """The runner's event pump: events in, the table of dora_systemd.lifecycle, actions out."""
 
 import asyncio
+import contextlib
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -44,6 +45,7 @@ class Pump:
         self._samples: tuple[CpuSample, ...] = ()
         self._text = ""
         self._is_ready = False
+        self._waiting: list[tuple[Callable[[Cell], bool], asyncio.Future[None]]] = []
 
     def connect(self, actions: Mapping[Do, Callable[[], None]]) -> None:
         """Say what each Do does."""
@@ -64,6 +66,7 @@ class Pump:
         self.cell, actions = step(before, event)
         if self.cell is not before:
             self._publish()
+            self._tell_waiting()
         for action in actions:
             self._perform(action)
 
@@ -84,6 +87,22 @@ class Pump:
         elif record.event == "dataflow-stopping":
             notify.send_stopping()
         self._pipes.write_event(record.event, record.node or None, **record.details)
+
+    async def wait(self, is_so: Callable[[Cell], bool], seconds: float | None) -> bool:
+        """Return True as soon as `is_so` holds of the cell, or False after so many seconds."""
+        if is_so(self.cell):
+            return True
+        future: asyncio.Future[None] = self._loop.create_future()
+        self._waiting.append((is_so, future))
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(future, seconds)
+        return is_so(self.cell)
+
+    def _tell_waiting(self) -> None:
+        for is_so, future in self._waiting:
+            if not future.done() and is_so(self.cell):
+                future.set_result(None)
+        self._waiting = [one for one in self._waiting if not one[1].done()]
 
     def _set_deadline(self, after: int | None) -> None:
         if self._deadline is not None:

@@ -10,6 +10,7 @@ from typing import Any
 from dora_systemd.credentials import CREDENTIAL_SETTINGS
 from dora_systemd.limitsettings import LIMIT_SETTINGS
 from dora_systemd.lograte import RateLimits
+from dora_systemd.reloadsettings import RELOAD_SETTINGS
 from dora_systemd.restartsettings import RESTART_SETTINGS
 from dora_systemd.settingkinds import (
     BOOL,
@@ -144,4 +145,5 @@ SETTINGS: tuple[Setting[Any], ...] = (
     *LIMIT_SETTINGS,
     *RESTART_SETTINGS,
     *CREDENTIAL_SETTINGS,
+    *RELOAD_SETTINGS,
 )

@@ -13,11 +13,14 @@ NODE_STATES = (
     "ready",
     "running",
     "restarting",
+    "reloading",
     "finished",
     "failed",
     "stopped",
     "dynamic",
 )
+HELD = "held"
+"""Policy of a node that, when it has failed, waits for a reload."""
 ALIVE_NODE_STATES = frozenset({"ready", "running", "dynamic"})
 WHOLE_CELL = ""
 """The key of a CPU sample that stands for the unit's whole cgroup."""
@@ -33,8 +36,9 @@ class NodeStatus:
     it in this run. since_us: CLOCK_REALTIME µs of the last change of state. exit: how its last
     process ended, "" or a text such as "exit code 1" or "signal SIGKILL". kind: how dora
     starts it (python, executable, shell, uv, operator, ros2, dynamic, url). policy: dora's word
-    for what it restarts, "never" where it says none. max_restarts: how often in one window, 0
-    without limit. hung: what dora's health check said of the process before it ended it, or "".
+    for what it restarts, "never" where it says none, or HELD. max_restarts: how often in one
+    window, 0 without limit. hung: what dora's health check said of the process before it ended it,
+    or "".
     """
 
     state: str = "starting"

@@ -65,7 +65,8 @@ def remove_unit_file(path: Path) -> None:
 
 
 NODE_LIMITS_FILE = "60-node-limits.conf"
-_CHANGES = ("50-*.conf", NODE_LIMITS_FILE)
+HOT_RELOAD_FILE = "60-hot-reload.conf"
+_CHANGES = ("50-*.conf", NODE_LIMITS_FILE, HOT_RELOAD_FILE)
 """systemd's own drop-ins for changed properties, and ours for limits of nodes."""
 
 

@@ -61,7 +61,8 @@ def project() -> Iterator[Project]:
 
 
 @pytest.fixture
-def cell(request: pytest.FixtureRequest) -> Iterator[Cell]:
+def cell(request: pytest.FixtureRequest, project: Project) -> Iterator[Cell]:
+    del project  # it outlives the cell, as files of a dataflow do
     name = request.node.name.removeprefix("test_").replace("[", "-").replace("]", "")
     cell = Cell("".join(c if c.isalnum() else "-" for c in name).strip("-")[:60])
     cursor = _cursor()

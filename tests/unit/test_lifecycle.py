@@ -6,8 +6,9 @@ import pytest
 
 from dora_systemd import lifeevents as life
 from dora_systemd.cellstate import Cell, Deadline, Do, Record, RunnerExit, State
-from dora_systemd.lifecycle import ENGINE_TIMEOUT, TABLE, step, stop_timeout
-from dora_systemd.status import NodeStatus
+from dora_systemd.lifecycle import TABLE, step
+from dora_systemd.lifehandlers import ENGINE_TIMEOUT, stop_timeout
+from dora_systemd.status import HELD, NodeStatus
 from dora_systemd.values import SECOND
 
 SAMPLES: dict[type[life.Event], tuple[life.Event, ...]] = {
@@ -38,6 +39,11 @@ SAMPLES: dict[type[life.Event], tuple[life.Event, ...]] = {
     life.ConnectionLost: (life.ConnectionLost(1),),
     life.StopAsked: (life.StopAsked(1, "SIGTERM"),),
     life.StopAnswered: (life.StopAnswered(1),),
+    life.NodeReloading: (life.NodeReloading(1, "a"),),
+    life.NodeAdded: (life.NodeAdded(1, "c", NodeStatus()),),
+    life.NodeRemoved: (life.NodeRemoved(1, "a"), life.NodeRemoved(1, "unknown")),
+    life.ReloadNoted: (life.ReloadNoted(1, "a.py: line 3: invalid syntax"),),
+    life.ReloadAsked: (life.ReloadAsked(1),),
     life.DeadlinePassed: (life.DeadlinePassed(1),),
 }
 
@@ -211,3 +217,74 @@ def test_crash_restart_and_stale_exits() -> None:
     now, _ = step(now, life.NodeExited(13, "a", "signal SIGKILL", True, is_stale=True))
     assert (now.nodes["a"].pid, now.nodes["a"].restarts) == (70, 2)
     assert Record("node-crashed", "a", {"exit": "exit code 3"}) in done
+
+
+def lives(now: Cell, *events: life.Event) -> tuple[Cell, list[object]]:
+    done: list[object] = []
+    for event in events:
+        now, actions = step(now, event)
+        done += [one for one in actions if not isinstance(one, Deadline)]
+    return now, done
+
+
+def test_a_reload_of_the_whole_ends_without_a_word() -> None:
+    after, done = lives(
+        cell(State.RUNNING),
+        life.ReloadAsked(1),
+        life.NodeExited(2, "a", "", False),
+        life.NodeExited(3, "b", "", False),
+        life.ChildExited(4, "daemon", "exit code 0"),
+    )
+    assert after.state is State.ENDED
+    assert (after.reload, after.exit, after.failure) == (True, RunnerExit.OK, "")
+    names = [one.event for one in done if isinstance(one, Record)]
+    assert names == ["node-exited", "node-exited"]
+
+
+def test_a_stop_is_stronger_than_a_reload() -> None:
+    after, done = lives(
+        cell(State.RUNNING),
+        life.ReloadAsked(1),
+        life.StopAsked(2, "SIGTERM"),
+        life.StopAnswered(3),
+        life.ChildExited(4, "daemon", "exit code 0"),
+    )
+    assert (after.state, after.reload, after.stop_by) == (State.ENDED, False, "SIGTERM")
+    assert [one.event for one in done if isinstance(one, Record)] == [
+        "dataflow-stopping",
+        "dataflow-stopped",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("changes", "ends", "word"),
+    [
+        ({}, True, "dataflow-failed"),
+        ({"is_again": True}, False, ""),
+    ],
+)
+def test_a_held_node_that_fails_before_the_start(
+    changes: dict[str, bool], ends: bool, word: str
+) -> None:
+    nodes = {"a": NodeStatus("starting", 7, policy=HELD), "b": NodeStatus("ready", 8)}
+    now = cell(State.WAITING, nodes=nodes, **changes)
+    after, done = lives(now, life.NodeExited(1, "a", "exit code 1", True))
+    assert (after.state is State.ENDED) == ends
+    names = [one.event for one in done if isinstance(one, Record)]
+    assert names == ["node-crashed", *([word] if word else [])]
+
+
+def test_a_trial_that_fails_ends_in_good_order() -> None:
+    nodes = {"a": NodeStatus("starting", 7, policy=HELD), "b": NodeStatus("ready", 8)}
+    now = cell(State.WAITING, nodes=nodes, is_again=True, is_trial=True)
+    after, done = lives(
+        now,
+        life.NodeExited(1, "a", "exit code 1", True),
+        life.NodeExited(2, "b", "", False),
+        life.ChildExited(3, "daemon", "exit code 0"),
+    )
+    assert Do.ASK_STOP in done
+    assert after.state is State.ENDED
+    assert after.failure == "node a: exit code 1 before it was ready"
+    names = [one.event for one in done if isinstance(one, Record)]
+    assert names == ["node-crashed", "node-exited", "reload-failed"]

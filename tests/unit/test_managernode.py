@@ -10,7 +10,7 @@ import pytest
 from dora_systemd import managernode
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.managercells import Cell, read_cells
-from dora_systemd.protocol import Reply
+from dora_systemd.protocol import Params, Reply
 from dora_systemd.scope import Scope
 from dora_systemd.status import CellStatus, NodeStatus
 from tests.unit.fake_manager import FakeManager, ScopeIn, options
@@ -32,7 +32,8 @@ class FakeCoordinator:
             self.node["restart_policy"] = restart_policy
         self.error = ""
 
-    def __call__(self, scope: Scope, cell: Cell, params: Mapping[str, Any]) -> Reply:
+    def __call__(self, scope: Scope, cell: Cell, params: Params) -> Reply:
+        assert not isinstance(params, str)
         assert (scope.is_user, cell.name) == (True, "robot")
         self.requests.append(params)
         info = {"DataflowInfo": {"descriptor": {"nodes": [self.node, *self.others]}}}

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dora_systemd.errors import DoraSystemdError
+from dora_systemd.hotreload import REPLACE_WORDS, HotReload
 from dora_systemd.lograte import ALL_NODES, SHORTEST, RateLimit
 from dora_systemd.options import (
     RunnerOptions,
@@ -26,7 +27,8 @@ OPTIONS = RunnerOptions("robot", UUID, "/srv/robot.yml", "/srv", "/usr/bin/dora"
 
 texts = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]))
 paths = texts.map(lambda text: "/" + text)
-nodes = st.just(ALL_NODES) | st.from_regex(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,20}", fullmatch=True)
+idents = st.from_regex(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,20}", fullmatch=True)
+nodes = st.just(ALL_NODES) | idents
 rates = st.builds(RateLimit, st.integers(1, 10**18 - 1), st.integers(SHORTEST, INFINITY - 1))
 times = st.integers(1, 10**12)
 policies = st.builds(
@@ -57,6 +59,14 @@ options = st.builds(
     restart=policies,
     node_restarts=st.lists(st.tuples(st.text(min_size=1), policies)).map(tuple),
     start_timeout=st.integers(min_value=1, max_value=10**12) | st.just(INFINITY),
+    reload=st.builds(
+        HotReload,
+        st.booleans(),
+        st.lists(texts).map(tuple),
+        st.lists(texts).map(tuple),
+        st.lists(st.tuples(idents, texts)).map(tuple),
+        st.lists(st.tuples(st.just("") | idents, st.sampled_from(REPLACE_WORDS))).map(tuple),
+    ),
 )
 
 

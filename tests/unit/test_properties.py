@@ -38,6 +38,7 @@ ExecStart=:/usr/bin/python3 -E -P -m dora_systemd.runner --name=robot --uuid={UU
 --venv=/srv/robot/.venv /srv/robot/robot.yml
 ExecStopPost=-:/usr/bin/python3 -E -P -m dora_systemd.runnerpost robot \
 550e8400-e29b-41d4-a716-446655440000
+ExecReload=:/usr/bin/python3 -E -P -m dora_systemd.runnerask
 FileDescriptorStoreMax=4096
 WorkingDirectory=/
 TimeoutStartSec=infinity

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.hotreload import REPLACE_WORDS
 from dora_systemd.lograte import RateLimit
 from dora_systemd.settingkinds import DURATION, TEXT, Setting
 from dora_systemd.settings import DEFAULT_SOURCE, Settings, check_document, resolve_settings
@@ -213,6 +214,9 @@ def test_values_and_back(data: st.DataObject) -> None:
         ),
         **LIMIT_VALUES,
         **RESTART_VALUES,
+        "watch": st.just(("*.py", "config/*")),
+        "ignore": st.just(("draft_*",)),
+        "replace": st.sampled_from(REPLACE_WORDS),
     }
     for setting in SETTINGS:
         strategy = st.booleans() if setting.kind.is_flag else examples.get(setting.name, texts)

@@ -1,0 +1,58 @@
+"""`doractl reload`, and `doractl set --hot-reload`: requests to the runner of a dataflow."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from dora_systemd.busprotocol import Manager
+from dora_systemd.cellpaths import CellPaths
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.hotreload import CHANGE_VARIABLE
+from dora_systemd.managercells import Cell, not_found
+from dora_systemd.managerlist import read_status
+from dora_systemd.managernode import require_running
+from dora_systemd.properties import format_unit, typed
+from dora_systemd.runnersocket import ask
+from dora_systemd.scope import Scope
+from dora_systemd.unitfiles import HOT_RELOAD_FILE, drop_in_directory, write_unit_file
+from dora_systemd.values import format_bool, quoted
+
+Ask = Callable[[Path, Mapping[str, Any]], dict[str, Any]]
+
+
+def reload_cell(scope: Scope, cell: Cell, node: str | None, ask: Ask = ask) -> list[str]:
+    """What was done, in words: nothing if no file has changed and no node is named.
+
+    Raises DoraSystemdError; then the old version runs on.
+    """
+    require_running(cell)
+    if node is not None:
+        _require_node(scope, cell, node)
+    return list(ask(_socket(scope, cell), {"verb": "reload", "node": node})["done"])
+
+
+def switch_hot_reload(
+    manager: Manager, scope: Scope, cell: Cell, is_on: bool, ask: Ask = ask
+) -> None:
+    """Watch the files of a dataflow from now on, or no longer; also after a restart of its unit.
+
+    Raises DoraSystemdError.
+    """
+    require_running(cell)
+    unit = manager.read(cell.unit, ("FragmentPath", "Transient"))
+    ask(_socket(scope, cell), {"verb": "hot-reload", "on": is_on})
+    text = format_unit(typed(Environment=(f"{CHANGE_VARIABLE}={format_bool(is_on)}",)))
+    directory = drop_in_directory(Path(unit["FragmentPath"]), bool(unit["Transient"]))
+    write_unit_file(directory / HOT_RELOAD_FILE, f"# Written by doractl set.\n{text}")
+    manager.reload()
+
+
+def _socket(scope: Scope, cell: Cell) -> Path:
+    return CellPaths(scope.cell_directory(cell.name)).socket
+
+
+def _require_node(scope: Scope, cell: Cell, node: str) -> None:
+    nodes = list(read_status(scope, cell).nodes)
+    if node not in nodes:
+        message = f"cannot find a node {quoted(node)} in the dataflow {cell.name}"
+        raise DoraSystemdError(message, not_found(node, nodes).hint, ExitCode.NOT_FOUND)

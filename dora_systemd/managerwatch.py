@@ -1,0 +1,30 @@
+"""What `doractl start --hot-reload` says about the files that are going to be watched."""
+
+from collections.abc import Iterator
+
+from dora_systemd.managerplan import Plan
+from dora_systemd.values import quoted
+
+
+def watched_patterns(plan: Plan) -> tuple[str, ...]:
+    """The patterns of the files that mean a reload, none if hot reload is off."""
+    from dora_systemd.watchrules import DEFAULT_WATCH
+
+    if not plan.options.hot_reload:
+        return ()
+    return plan.options.reload.watch or DEFAULT_WATCH
+
+
+def watch_warnings(plan: Plan) -> Iterator[str]:
+    """One for each pattern that was given and fits no file."""
+    if not plan.options.hot_reload or not plan.options.reload.watch:
+        return
+    # Only who gives patterns pays for a walk through the files.
+    from dora_systemd.watch import read_gitignores, watched_files
+    from dora_systemd.watchrules import WatchRules, unmatched_patterns
+
+    given, root = plan.options.reload, plan.options.working_directory
+    rules = WatchRules(root, given.watch, given.ignore, read_gitignores(root))
+    found = [path for path, _ in watched_files(rules)]
+    for pattern in unmatched_patterns(rules, found):
+        yield f"no file below {root} fits --watch {quoted(pattern)}"

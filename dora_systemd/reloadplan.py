@@ -1,0 +1,53 @@
+"""From settings to what the runner is told about reloads."""
+
+from collections.abc import Iterator, Sequence
+
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.hotreload import HotReload
+from dora_systemd.reloadsettings import HOT_RELOAD, IGNORE, RELOAD_SETTINGS, REPLACE, WATCH
+from dora_systemd.settings import DEFAULT_SOURCE, Settings
+from dora_systemd.suggestions import did_you_mean
+from dora_systemd.values import quoted
+from dora_systemd.watchrules import relative_patterns
+
+
+def hot_reload(settings: Settings, root: str) -> HotReload:
+    """The settings of reloads; patterns are relative to `root`, the working directory.
+
+    Raises DoraSystemdError (USAGE) for an absolute pattern outside of it.
+    """
+    watch, ignore = settings[WATCH], settings[IGNORE]
+    given = {node: one.get(WATCH.name, ()) for node, one in settings.nodes.items()}
+    return HotReload(
+        settings[HOT_RELOAD],
+        relative_patterns(watch, root),
+        relative_patterns(ignore, root),
+        tuple((node, one) for node in given for one in relative_patterns(given[node], root)),
+        tuple(_replace_words(settings)),
+    )
+
+
+def _replace_words(settings: Settings) -> Iterator[tuple[str, str]]:
+    if settings.source(REPLACE) != DEFAULT_SOURCE:
+        yield "", settings[REPLACE]
+    for node, given in settings.nodes.items():
+        if REPLACE.name in given:
+            yield node, given[REPLACE.name]
+
+
+def check_reload_nodes(reload: HotReload, nodes: Sequence[str]) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) for a node that is none of `nodes`."""
+    for node in (*dict(reload.node_watch), *filter(None, dict(reload.replace))):
+        if node not in nodes:
+            message = f"cannot watch files of the node {quoted(node)}: it is not there"
+            hint = did_you_mean(node, nodes) or f"there are {', '.join(nodes)}"
+            raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+
+
+def reload_warnings(settings: Settings) -> Iterator[str]:
+    """One for each setting of hot reload that is given although it is off."""
+    if settings[HOT_RELOAD]:
+        return
+    for setting in RELOAD_SETTINGS:
+        if setting not in (HOT_RELOAD, REPLACE) and settings.source(setting) != DEFAULT_SOURCE:
+            yield f"{setting.flags[0]} does nothing without {HOT_RELOAD.flags[0]}"

@@ -1,0 +1,28 @@
+"""What `systemctl reload` runs in the unit: it has the runner reload what has changed.
+
+ExecReload= in systemd.service(5): its exit status says whether the reload is good.
+"""
+
+import os
+import sys
+from pathlib import Path
+
+from dora_systemd.cellpaths import CellPaths
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.runnersocket import ask
+
+
+def main() -> int:
+    """Ask the runner of this unit; 0, or the exit status of doractl for what went wrong."""
+    directory = os.environ.get("RUNTIME_DIRECTORY", "")
+    try:
+        done = ask(CellPaths(Path(directory)).socket, {"verb": "reload"})["done"]
+    except DoraSystemdError as error:
+        print(error.message, file=sys.stderr)
+        return error.code
+    print("\n".join(done) or "Nothing has changed")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

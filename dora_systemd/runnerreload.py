@@ -1,0 +1,235 @@
+"""Reloads: the runner watches files, decides what they mean, and has dora take it over.
+
+It outlives the runs of the dataflow: when only all of it can follow a change, the run ends and the
+next one begins, in the same unit and with the same process.
+"""
+
+import asyncio
+import time
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+from pathlib import PurePath
+from typing import Any
+
+from dora_systemd import lifeevents as life
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.options import RunnerOptions
+from dora_systemd.preparation import Prepared
+from dora_systemd.reloadsteps import How, Step
+from dora_systemd.runnerapply import Applier, Run
+from dora_systemd.runnerpump import now_us
+from dora_systemd.runnersources import Change, Sources, watch_rules
+from dora_systemd.runnerswap import NotReady
+from dora_systemd.values import quoted
+from dora_systemd.watch import changed_files
+from dora_systemd.wiring import downstream_of
+
+PAUSE_SECONDS = 1.0
+"""Between the beginnings of two reloads."""
+
+Answer = dict[str, Any]
+
+
+class Reloader:
+    """All that reloads need. options: of the runner. environment: of the nodes.
+
+    current: what runs. before: what ran before a reload of the whole dataflow that has yet to show
+    that it works, or None. notice: what the last reload has left to say.
+    """
+
+    def __init__(self, options: RunnerOptions, environment: Mapping[str, str]) -> None:
+        self._options = options
+        self._environment = environment
+        self._sources = Sources(options, environment)
+        self._lock = asyncio.Lock()
+        self._changed: set[str] = set()
+        self._wake = asyncio.Event()
+        self._begun = asyncio.Event()
+        self._watcher: asyncio.Task[None] | None = None
+        self._run: Run | None = None
+        self._outcome: asyncio.Future[str] | None = None
+        self._stamps: dict[str, int] = {}
+        self.current: Prepared | None = None
+        self.before: Prepared | None = None
+        self.notice = ""
+
+    def begin(self, run: Run, prepared: Prepared) -> None:
+        """A run of the dataflow begins."""
+        self._run, self.current = run, prepared
+        self._stamps = self._sources.stamps(prepared)
+        self._begun.set()
+
+    def end(self) -> None:
+        """The run has ended."""
+        self._run = None
+        self._begun.clear()
+
+    def has_started(self) -> None:
+        """All nodes of the run are ready: what it replaced is history."""
+        self.before = None
+        self._settle("")
+
+    def go_back(self, reason: str) -> bool:
+        """A run failed before it had started: whether the version before can run instead."""
+        self._settle(reason)
+        if self.before is None:
+            return False
+        self.current, self.before = self.before, None
+        self.notice = f"not reloaded: {reason}"
+        return True
+
+    def _settle(self, outcome: str) -> None:
+        if self._outcome is not None and not self._outcome.done():
+            self._outcome.set_result(outcome)
+
+    async def work(self) -> None:
+        """Reload what has changed, again and again."""
+        self._watch(self._options.hot_reload)
+        while True:
+            await self._wake.wait()
+            await self._begun.wait()
+            self._wake.clear()
+            changed, self._changed = self._changed, set()
+            pause = asyncio.create_task(asyncio.sleep(PAUSE_SECONDS))
+            try:
+                await self._reload(changed)
+            except DoraSystemdError as error:
+                self._refuse(error)
+            await pause
+
+    def _watch(self, is_on: bool) -> None:
+        if self._watcher is not None:
+            self._watcher.cancel()
+        self._watcher = asyncio.create_task(self._collect()) if is_on else None
+
+    async def _collect(self) -> None:
+        rules = await asyncio.to_thread(watch_rules, self._options)
+        try:
+            async for files in changed_files(rules):
+                self._changed |= files
+                self._wake.set()
+        except DoraSystemdError as error:
+            self._refuse(error)
+
+    def _refuse(self, error: DoraSystemdError) -> None:
+        """The old one runs on: say so where the operator looks."""
+        self.notice = f"not reloaded: {error.message.removeprefix('cannot use ')}"
+        if self._run is not None:
+            self._run.pump.push(life.ReloadNoted(now_us(), self.notice))
+            hint = f" ({error.hint})" if error.hint else ""
+            self._run.pipes.write_event("reload-failed", reason=error.message + hint)
+
+    async def _reload(self, changed: Collection[str], node: str = "") -> list[str]:
+        """What was done about the files `changed`, and about `node` in any case."""
+        async with self._lock:
+            run, current = self._run, self.current
+            if run is None or current is None:
+                hint = "wait until it has started"
+                raise DoraSystemdError("cannot reload: no node runs", hint, ExitCode.NOT_RUNNING)
+            change = await asyncio.to_thread(self._sources.look, current, changed)
+            change = _with_node(change, node, self._options.dataflow)
+            if not change.is_empty:
+                run.pipes.write_event("files-changed", files=", ".join(_names(change, changed)))
+            done = await self._apply(run, change) if not change.is_empty else []
+            self._stamps |= await asyncio.to_thread(self._sources.stamps, change.prepared)
+        self.notice = ""
+        if self._run is not None and (done or self._run.pump.cell.notice):
+            fed = downstream_of(change.prepared.dataflow)
+            self._run.pump.push(life.ReloadNoted(now_us(), "", fed))
+        return done
+
+    async def _apply(self, run: Run, change: Change) -> list[str]:
+        applier = Applier(run, change, self._options)
+        reason = change.whole or applier.obstacle()
+        if not reason:
+            try:
+                await applier.apply()
+                self.current = change.prepared
+                return applier.done
+            except NotReady as error:
+                raise await self._undo(applier, change, error) from error
+            except DoraSystemdError as error:
+                reason = error.message
+        return await self._restart(run, change, reason)
+
+    async def _undo(self, applier: Applier, change: Change, error: NotReady) -> DoraSystemdError:
+        """Bring back the descriptor before; of a program there is no version before."""
+        if change.prepared is self.current:
+            return DoraSystemdError(f"cannot use what was saved: {error}")
+        assert self.current is not None
+        await applier.undo(self.current)
+        message = f"cannot use {self._options.dataflow}: {error}; the version before runs again"
+        return DoraSystemdError(message)
+
+    async def _restart(self, run: Run, change: Change, reason: str) -> list[str]:
+        """End this run, and have the next one begin with what is new."""
+        begun = time.monotonic()
+        self.before = self.current if change.prepared is not self.current else None
+        self.current = change.prepared
+        self._outcome = asyncio.get_running_loop().create_future()
+        run.pump.push(life.ReloadAsked(now_us()))
+        if failure := await self._outcome:
+            raise DoraSystemdError(f"cannot use {self._options.dataflow}: {failure}")
+        took = f"{time.monotonic() - begun:.2f}s"
+        words = f"{reason}; ready after {took}"
+        run.pipes.write_event("reloaded", reason=words, file=", ".join(_files(change)))
+        return [f"the dataflow was reloaded: {words}"]
+
+    async def answer(self, request: Mapping[str, Any]) -> Answer:
+        """A request of doractl: {"verb": "reload"} or {"verb": "hot-reload", "on": true}.
+
+        Raises DoraSystemdError.
+        """
+        if request.get("verb") == "hot-reload":
+            return await self._switch(bool(request.get("on")))
+        if request.get("verb") != "reload":
+            raise DoraSystemdError(f"cannot do {quoted(str(request))}", "", ExitCode.USAGE)
+        node = str(request.get("node") or "")
+        changed = [] if node else await asyncio.to_thread(self._changed_since)
+        try:
+            return {"done": await self._reload(changed, node)}
+        except DoraSystemdError as error:
+            self._refuse(error)
+            raise
+
+    def _changed_since(self) -> list[str]:
+        if self.current is None:
+            return []
+        now = self._sources.stamps(self.current)
+        return [path for path, stamp in now.items() if self._stamps.get(path) != stamp]
+
+    async def _switch(self, is_on: bool) -> Answer:
+        async with self._lock:
+            reload = self._options.reload._replace(is_on=is_on)
+            self._options = replace(self._options, reload=reload)
+            self._sources = Sources(self._options, self._environment)
+            # Only how nodes that fail are treated differs: each gets it with its next reload.
+            self.current = await asyncio.to_thread(self._sources.prepare)
+            self._watch(is_on)
+        return {"done": []}
+
+    def close(self) -> None:
+        """Watch no more."""
+        if self._watcher is not None:
+            self._watcher.cancel()
+
+
+def _with_node(change: Change, node: str, dataflow: str) -> Change:
+    """The change, with `node` reloaded whatever has changed."""
+    if not node or any(step.node == node for step in change.steps):
+        return change
+    operators = change.operators.get(node, {})
+    steps = [Step(How.OPERATOR, node, file) for name, file in operators.items() if name]
+    if not steps:
+        steps = [Step(How.SWAP, node, operators.get("", dataflow))]
+    return replace(change, steps=(*change.steps, *steps))
+
+
+def _files(change: Change) -> list[str]:
+    return list(dict.fromkeys(step.file for step in change.steps))
+
+
+def _names(change: Change, changed: Collection[str]) -> list[str]:
+    """The last parts of those files that mean anything; all of them if it is the whole dataflow."""
+    found = _files(change) if change.steps else sorted(changed)
+    return [PurePath(path).name for path in found]

@@ -1,0 +1,144 @@
+"""The runner's look at the files of its dataflow: what has changed, and what that means."""
+
+import json
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from dora_systemd import process
+from dora_systemd.dataflownodes import NodeKind
+from dora_systemd.doraerrors import parse_dora_error
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.hotreload import HotReload
+from dora_systemd.launch import kinds, sources
+from dora_systemd.options import RunnerOptions
+from dora_systemd.preparation import Prepared, prepare
+from dora_systemd.pythonimports import program_files, syntax_error
+from dora_systemd.reload import Difference, NodeSources, difference, touched
+from dora_systemd.reloadsteps import How, Step, plan_steps
+from dora_systemd.watch import change_time, read_gitignores
+from dora_systemd.watchrules import DEFAULT_WATCH, WatchRules
+
+
+@dataclass(frozen=True)
+class Change:
+    """What changed files mean. whole: why the dataflow as a whole has to start again, or ""."""
+
+    prepared: Prepared
+    steps: tuple[Step, ...] = ()
+    whole: str = ""
+    operators: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing has to be done."""
+        return not self.steps and not self.whole
+
+
+def watch_rules(options: RunnerOptions) -> WatchRules:
+    """Which files of the dataflow mean a reload."""
+    root, given = options.working_directory, options.reload
+    dataflow = options.dataflow
+    watched = given.watch or DEFAULT_WATCH
+    return WatchRules(root, watched, given.ignore, read_gitignores(root), frozenset({dataflow}))
+
+
+class Sources:
+    """Looks at files, for a runner with these options. environment: of the nodes."""
+
+    def __init__(self, options: RunnerOptions, environment: Mapping[str, str]) -> None:
+        self._options = options
+        self._environment = environment
+
+    def look(self, current: Prepared, changed: Iterable[str]) -> Change:
+        """What the files `changed` mean for what runs, which is `current`.
+
+        It takes its time: not for the thread of the loop. Raises DoraSystemdError when a file
+        cannot be used as it is now; then nothing should be changed.
+        """
+        # What is gone cannot be loaded; it may come back in a moment, as in a git checkout.
+        paths = frozenset(path for path in changed if change_time(path))
+        dataflow = self._options.dataflow
+        prepared = self.prepare() if dataflow in paths else current
+        found = touched(paths, dataflow, self._nodes(prepared))
+        check_programs(found.nodes.values())
+        difference_ = (
+            difference(current.descriptor, prepared.descriptor)
+            if found.descriptor
+            else Difference()
+        )
+        how = kinds(prepared.dataflow, prepared.plan)
+        steps = plan_steps(found, difference_, how, dataflow)
+        operators = sources(prepared.dataflow, prepared.plan)
+        whole = difference_.whole or _stubborn(steps, operators)
+        return Change(prepared, steps, whole, operators)
+
+    def prepare(self) -> Prepared:
+        """Read the dataflow again, as at a start. Raises DoraSystemdError."""
+        options = self._options
+        prepared = prepare(options, self._environment)
+        environment = {**os.environ, **self._environment}
+        command = ["validate", options.dataflow]
+        done = process.run_dora(options.dora, command, environment, options.working_directory)
+        if done.status:
+            reason = parse_dora_error(done.stderr) or parse_dora_error(done.stdout)
+            message = f"cannot use {options.dataflow}: {reason or 'dora refuses it'}"
+            raise DoraSystemdError(message, "", ExitCode.BAD_INPUT)
+        return prepared
+
+    def stamps(self, current: Prepared) -> dict[str, int]:
+        """When each file that the dataflow is made of was changed, in ns; 0: it is not there."""
+        nodes = self._nodes(current).values()
+        paths = {self._options.dataflow, *(path for node in nodes for path in node.files)}
+        return {path: change_time(path) for path in paths}
+
+    def _nodes(self, prepared: Prepared) -> dict[str, NodeSources]:
+        own = sources(prepared.dataflow, prepared.plan)
+        rules: HotReload = self._options.reload
+        root = self._options.working_directory
+        found = {}
+        for node in prepared.dataflow.nodes:
+            patterns = rules.watched_by(node.id)
+            found[node.id] = NodeSources(
+                self._files(own[node.id].values(), node.kind),
+                json.dumps(node.raw, default=str),
+                WatchRules(root, patterns) if patterns else None,
+            )
+        return found
+
+    def _files(self, scripts: Iterable[str], kind: NodeKind) -> frozenset[str]:
+        if kind not in (NodeKind.PYTHON, NodeKind.OPERATOR):
+            return frozenset(scripts)
+        root = self._options.working_directory
+        path = self._environment.get("PYTHONPATH", "")
+        places = [*filter(None, path.split(":")), root, f"{root}/src"]
+        every = (program_files(one, _read, places) for one in scripts)
+        return frozenset().union(*every)
+
+
+def _stubborn(steps: Iterable[Step], operators: Mapping[str, Mapping[str, str]]) -> str:
+    """Why dora cannot take over what changed of an operator; it reads the operator's file only."""
+    for step in steps:
+        if step.how is How.OPERATOR and step.file not in operators[step.node].values():
+            return f"the operators of the node {step.node} import {Path(step.file).name}"
+    return ""
+
+
+def check_programs(paths: Iterable[str]) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) for one that cannot be read, or does not compile."""
+    for path in paths:
+        try:
+            text = Path(path).read_text(errors="replace")
+        except OSError as error:
+            message = f"cannot use {path}: {error.strerror}"
+            raise DoraSystemdError(message, "", ExitCode.BAD_INPUT) from error
+        if path.endswith(".py") and (reason := syntax_error(path, text)):
+            raise DoraSystemdError(f"cannot use {path}: {reason}", "", ExitCode.BAD_INPUT)
+
+
+def _read(path: str) -> str | None:
+    try:
+        return Path(path).read_text(errors="replace")
+    except OSError:
+        return None

@@ -1,0 +1,134 @@
+"""Which files of a project mean a reload when they change.
+
+Patterns are those of gitignore(5): `*.py` is any file of that kind, `config/*` all that is in the
+directory config of the top.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import PurePath
+from typing import TYPE_CHECKING
+
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.values import quoted
+
+if TYPE_CHECKING:
+    from pathspec import GitIgnoreSpec
+
+DEFAULT_WATCH = (
+    *("*.py", "*.yml", "*.yaml"),
+    *("*.toml", "*.json", "*.ini", "*.cfg", "*.conf", ".env"),
+)
+"""Programs, dataflows and configuration, as the reference page of dora says."""
+
+ALWAYS_IGNORED = (
+    # Version control, environments, caches and what builds make.
+    *(".git/", ".hg/", ".svn/", "__pycache__/", "venv/", ".venv/", ".dora/", "node_modules/"),
+    *("site-packages/", ".tox/", ".nox/", ".*_cache/", ".hypothesis/", "*.egg-info/"),
+    *("build/", "dist/", "target/", "out/"),
+    # Logs, temporary files, and what editors write beside the file that is being edited.
+    *("*.log", "*.jsonl", "log/", "logs/", "tmp/", "*.tmp", "*.temp", "*.part", "*.bak", "*~"),
+    *(".#*", "#*#", "*.sw?", "4913", "*.pyc"),
+    # Data.
+    *("data/", "*.csv", "*.parquet", "*.arrow", "*.npy", "*.npz", "*.pt", "*.onnx"),
+)
+
+
+@dataclass(frozen=True)
+class WatchRules:
+    """The rules of one dataflow.
+
+    root: absolute directory that patterns are relative to. watched: patterns of files.
+    ignored: patterns that win. gitignores: by directory relative to root, lines of .gitignore.
+    files: absolute paths that are watched in any case.
+    """
+
+    root: str
+    watched: tuple[str, ...] = DEFAULT_WATCH
+    ignored: tuple[str, ...] = ()
+    gitignores: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    files: frozenset[str] = frozenset()
+
+    def has(self, path: str) -> bool:
+        """Whether a change of the file `path`, absolute, means a reload."""
+        relative = self._relative(path)
+        return path in self.files or (
+            bool(relative) and not self.is_ignored(path) and self._watched(relative)
+        )
+
+    def has_directory(self, path: str) -> bool:
+        """Whether there may be such files in the directory `path`, absolute."""
+        return path == self.root or not self.is_ignored(f"{path}/")
+
+    def is_ignored(self, path: str) -> bool:
+        """Whether `path`, absolute, is left alone; one that ends in / is a directory."""
+        relative = self._relative(path)
+        return not relative or self._ignores(relative) or self._gitignores(relative)
+
+    def _relative(self, path: str) -> str:
+        """The path below root as patterns see it; "" for what is not below it."""
+        prefix = self.root.rstrip("/") + "/"
+        return path.removeprefix(prefix) if path.startswith(prefix) else ""
+
+    def _watched(self, relative: str) -> bool:
+        return _spec(self.watched).match_file(relative)
+
+    def _ignores(self, relative: str) -> bool:
+        return _spec((*ALWAYS_IGNORED, *self.ignored)).match_file(relative)
+
+    def _gitignores(self, relative: str) -> bool:
+        for directory, lines in self.gitignores.items():
+            prefix = f"{directory}/" if directory else ""
+            if relative.startswith(prefix) and _spec(lines).match_file(relative[len(prefix) :]):
+                return True
+        return False
+
+
+_SPECS: dict[tuple[str, ...], "GitIgnoreSpec"] = {}
+
+
+def _spec(patterns: tuple[str, ...]) -> "GitIgnoreSpec":
+    # Compiled once; imported only where something is watched.
+    if patterns not in _SPECS:
+        from pathspec import GitIgnoreSpec
+
+        _SPECS[patterns] = GitIgnoreSpec.from_lines(patterns)
+    return _SPECS[patterns]
+
+
+def parse_patterns(texts: Iterable[str]) -> tuple[str, ...]:
+    """The patterns in comma lists. Raises DoraSystemdError (USAGE)."""
+    patterns = [one.strip() for text in texts for one in text.split(",") if one.strip()]
+    for pattern in patterns:
+        if not pattern.isprintable() or ".." in PurePath(pattern).parts or pattern == "!":
+            hint = "write patterns as in gitignore(5), such as *.py or config/*"
+            raise DoraSystemdError(f"cannot watch {quoted(pattern)}", hint, ExitCode.USAGE)
+    return tuple(patterns)
+
+
+def relative_patterns(patterns: Iterable[str], root: str) -> tuple[str, ...]:
+    """Patterns as seen from `root`; an absolute path has to be in it.
+
+    Raises DoraSystemdError (USAGE) for one that is not.
+    """
+    return tuple(_relative_pattern(pattern, root.rstrip("/")) for pattern in patterns)
+
+
+def _relative_pattern(pattern: str, root: str) -> str:
+    if not pattern.startswith("/"):
+        return pattern
+    if not pattern.startswith(f"{root}/"):
+        hint = "watched files are in the working directory; see --working-directory"
+        message = f"cannot watch {quoted(pattern)}: it is outside of {root}"
+        raise DoraSystemdError(message, hint, ExitCode.USAGE)
+    return pattern.removeprefix(root)
+
+
+def unmatched_patterns(rules: WatchRules, paths: Iterable[str]) -> tuple[str, ...]:
+    """Those patterns of `rules` that fit none of `paths`, for a warning that names them."""
+    known = [path for path in paths if not rules.is_ignored(path)]
+    return tuple(
+        pattern
+        for pattern in rules.watched
+        if not any(WatchRules(rules.root, (pattern,)).has(path) for path in known)
+    )
