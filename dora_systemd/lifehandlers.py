@@ -140,7 +140,9 @@ def engine_deadline(cell: Cell, event: life.Event) -> Step:
 
 def node_event(cell: Cell, event: life.Event) -> Step:
     """Something happened to a node."""
-    nodes, record = table.update(cell.nodes, event, is_stopping=_is_stopping(cell))
+    is_open = cell.ready_us > 0
+    stops = _is_stopping(cell)
+    nodes, record = table.update(cell.nodes, event, is_stopping=stops, is_open=is_open)
     actions = () if record is None else (Record(*with_downstream(record, cell.downstream)),)
     return replace(cell, nodes=nodes), (*_oom_of_all(event), *actions)
 

@@ -31,14 +31,17 @@ def all_ready(nodes: Nodes, at_us: int) -> Nodes:
 
 
 def update(
-    nodes: Nodes, event: life.Event, *, is_stopping: bool
+    nodes: Nodes, event: life.Event, *, is_stopping: bool, is_open: bool
 ) -> tuple[Nodes, RecordParts | None]:
-    """The table after a node's event, and what the journal is to say about it."""
+    """The table after a node's event, and what the journal is to say about it.
+
+    is_open: dora's start barrier is, so a node that is ready runs, even if it is the only one.
+    """
     match event:
         case life.NodeSpawned():
             return _spawned(nodes, event)
         case life.NodeReady():
-            state = "running" if _is_running(nodes) else "ready"
+            state = "running" if is_open else "ready"
             return _set(nodes, event.node, event.at_us, state=state), ("node-ready", event.node, {})
         case life.NodeExited():
             return _exited(nodes, event, is_stopping)
@@ -60,10 +63,6 @@ def reshape(nodes: Nodes, event: life.Event) -> Nodes:
         case life.NodeRemoved():
             return {ident: node for ident, node in nodes.items() if ident != event.node}
     return nodes
-
-
-def _is_running(nodes: Nodes) -> bool:
-    return any(node.state == "running" for node in nodes.values())
 
 
 def _set(nodes: Nodes, ident: str, at_us: int, **changes: str | int) -> Nodes:

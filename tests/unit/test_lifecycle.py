@@ -288,3 +288,10 @@ def test_a_trial_that_fails_ends_in_good_order() -> None:
     assert after.failure == "node a: exit code 1 before it was ready"
     names = [one.event for one in done if isinstance(one, Record)]
     assert names == ["node-crashed", "node-exited", "reload-failed"]
+
+
+def test_nodes_that_all_crashed_at_once_run_again() -> None:
+    crashes = [life.NodeExited(9, node, "signal SIGKILL", True) for node in ("a", "b")]
+    again = [life.NodeSpawned(10, "a", 70), life.NodeSpawned(10, "b", 80)]
+    now, _ = live(*READY, *crashes, *again, life.NodeReady(11, "a"), life.NodeReady(12, "b"))
+    assert [node.state for node in now.nodes.values()] == ["running", "running"]

@@ -14,7 +14,7 @@ def updated(nodes: dict[str, NodeStatus], *events: life.Event) -> list[str]:
     found = []
     table = dict(nodes)
     for event in events:
-        after, record = update(table, event, is_stopping=False)
+        after, record = update(table, event, is_stopping=False, is_open=True)
         table = dict(reshape(after, event))
         found.append(f"{table['a'].state} {record[0] if record else ''}".strip())
     return found
@@ -28,7 +28,7 @@ def test_a_swap_is_no_crash_and_no_restart() -> None:
         life.NodeExited(2, "a", "", True),
         life.NodeSpawned(3, "a", 8),
         life.NodeReady(4, "a"),
-    ) == ["reloading", "reloading node-exited", "starting", "ready node-ready"]
+    ) == ["reloading", "reloading node-exited", "starting", "running node-ready"]
 
 
 def test_the_old_one_may_end_after_its_successor_has_begun() -> None:
@@ -38,11 +38,13 @@ def test_the_old_one_may_end_after_its_successor_has_begun() -> None:
         life.NodeSpawned(2, "a", 8),
         life.NodeExited(3, "a", "signal SIGTERM", False, is_stale=True),
         life.NodeReady(4, "a"),
-    ) == ["reloading", "starting", "starting", "ready node-ready"]
+    ) == ["reloading", "starting", "starting", "running node-ready"]
 
 
 def test_a_node_that_is_held_fails_and_is_not_restarted() -> None:
-    nodes, record = update(RUNNING, life.NodeExited(1, "a", "exit code 1", True), is_stopping=False)
+    nodes, record = update(
+        RUNNING, life.NodeExited(1, "a", "exit code 1", True), is_stopping=False, is_open=True
+    )
     assert record is not None
     assert (nodes["a"].state, nodes["a"].restarts, record[0]) == ("failed", 2, "node-crashed")
 
