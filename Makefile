@@ -28,6 +28,10 @@ vm:  ## system tests that need a kernel of their own
 	@$(PREPARE) container vm
 	@$(CHECK) vm
 
+faults:  ## every fault of tests/system/faults, ROUNDS=n times
+	@$(PREPARE) $(if $(filter vm,$(LAB)),container vm,container)
+	@ROUNDS=$(ROUNDS) $(CHECK) faults
+
 lint:  ## ruff and mypy
 	@$(PREPARE)
 	@$(CHECK) lint
@@ -43,4 +47,4 @@ deb:  ## the Debian packages, built twice and checked, into dist/
 	@$(PREPARE) container
 	@packaging/build
 
-.PHONY: help test unit system vm lint demo clean deb
+.PHONY: help test unit system vm faults lint demo clean deb

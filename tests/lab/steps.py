@@ -16,6 +16,7 @@ from lab.errors import LabError, say
 from lab.venv import ensure_venv, venv_environment, write_package
 
 LAB_PYTHON = (3, 13)
+FAULTS = "tests/system/faults"
 # pytest's last line: "=== 3 passed, 1 skipped in 0.12s ==="
 SUMMARY = re.compile(r"=+ (\d+ .* in [\d.:s ()]+) =+")
 
@@ -153,7 +154,7 @@ def plan_system(form: str) -> list[Step]:
     here = " and not lab" if form == "host" else ""
     arguments = ["tests/system", "-m", f"not vm{here}"]
     if form == "container":
-        return two_halves(arguments)
+        return [*plan_faults(form), *two_halves([*arguments, f"--ignore={FAULTS}"])]
     if form != "host":
         return [lab_step(f"system tests, {form}", form, arguments)]
     if not Path("/run/systemd/system").is_dir():
@@ -163,6 +164,15 @@ def plan_system(form: str) -> list[Step]:
     venv = ensure_venv(find_cache(), for_system_tests=True)
     command = ["python", "-m", "pytest", *arguments]
     return [Step("system tests, this machine", command, venv_environment(venv))]
+
+
+def plan_faults(form: str) -> list[Step]:
+    """Every fault as often as ROUNDS says; a machine of its own, and nothing beside it."""
+    rounds = os.environ.get("ROUNDS") or "1"
+    marks = "vm" if form == "vm" else "not vm"
+    command = ["tests/lab/lab", "run", "--env", f"FAULT_ROUNDS={rounds}", "--", "pytest"]
+    env = {**os.environ, "LAB": form}
+    return [Step(f"faults, {form}", [*command, FAULTS, "-m", marks], env)]
 
 
 def two_halves(arguments: Sequence[str]) -> list[Step]:
@@ -192,6 +202,7 @@ PLANS: dict[str, Callable[[str], list[Step]]] = {
     "test": plan_test,
     "unit": plan_unit,
     "system": plan_system,
+    "faults": plan_faults,
     "lab": plan_lab,
     "vm": plan_vm,
     "packages": plan_packages,

@@ -1,0 +1,113 @@
+"""The faults: how each comes about, under which flags, what becomes of the dataflow, how soon."""
+
+import signal
+from dataclasses import dataclass
+
+from tests.system.faults import apply
+from tests.system.faults.apply import Apply
+from tests.system.faults.checks import Outcome
+from tests.system.faults.scene import health
+
+ON_FAILURE = ("--restart-policy", "on-failure")
+ALWAYS = ("--restart-policy", "always")
+WATCHED = (*ON_FAILURE, "--property", "WatchdogSec=2s")
+SHORT_GRACE = (*ON_FAILURE, "--grace-duration", "1s")
+
+LOST = (
+    *("code=killed", "Failed with result", "status=69", "is lost", "failed: ", "was ended"),
+    *(
+        "disconnected",
+        "exited",
+        "connection error",
+        "outputs done",
+        "outputs on drop",
+        "channel closed",
+    ),
+)
+CRASHED = (
+    *("crashed", "node exited with error", "exit code", "signal", "restarted", "after failure"),
+    *("node has no daemon event stream", "zenoh teardown timed out"),
+)
+HUNG = (*LOST, "atchdog", "Killing process", "SIGABRT", "core-dump", "dumped")
+UNRESPONSIVE = (*CRASHED, "hang", "unresponsive", "SIGKILL", "Signal(9)")
+KILLED = ("grace period", "killed on drop", "node exited with error")
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One line of the table.
+
+    seconds: within which the outcome is there. cause: what the journal says, and `list` of a
+    dataflow that has failed. warns: what the journal of the unit may warn of. more: what all nodes
+    have more in the dataflow file. repeats: lines that may be in the journal twice.
+    vm: needs controllers, or a kernel of its own.
+    """
+
+    name: str
+    apply: Apply
+    outcome: Outcome
+    seconds: float
+    cause: str = ""
+    flags: tuple[str, ...] = ON_FAILURE
+    warns: tuple[str, ...] = ()
+    more: str = ""
+    repeats: int = 0
+    vm: bool = False
+
+
+KILL, TERM, STOP = signal.SIGKILL, signal.SIGTERM, signal.SIGSTOP
+UNAFFECTED, DORA, SYSTEMD = Outcome.UNAFFECTED, Outcome.DORA, Outcome.SYSTEMD
+ENDED, FAILED = Outcome.ENDED, Outcome.FAILED
+
+PARTS = (
+    Fault(
+        "kill-runner", apply.part("runner", KILL), SYSTEMD, 12, "SIGKILL", warns=LOST, repeats=20
+    ),
+    Fault("term-runner", apply.part("runner", TERM), ENDED, 5),
+    Fault(
+        *("stop-runner", apply.part("runner", STOP), SYSTEMD, 15, "hung", WATCHED, HUNG),
+        repeats=20,
+    ),
+    Fault("kill-coordinator", apply.part("coordinator", KILL), SYSTEMD, 12, "SIGKILL", warns=LOST),
+    Fault("term-coordinator", apply.part("coordinator", TERM), SYSTEMD, 12, "SIGTERM", warns=LOST),
+    Fault("stop-coordinator", apply.part("coordinator", STOP), SYSTEMD, 15, "", WATCHED, HUNG),
+    Fault("kill-daemon", apply.part("daemon", KILL), SYSTEMD, 12, "SIGKILL", warns=LOST),
+    Fault("term-daemon", apply.part("daemon", TERM), SYSTEMD, 12, "SIGTERM", warns=LOST),
+)
+NODES = (
+    Fault("kill-node", apply.nodes(KILL, "doubler"), DORA, 12, "SIGKILL", warns=CRASHED),
+    Fault("term-node", apply.nodes(TERM, "doubler"), DORA, 12, "SIGTERM", warns=CRASHED),
+    Fault(
+        *("stop-node", apply.nodes(STOP, "doubler"), DORA, 20, "hangs"),
+        warns=UNRESPONSIVE,
+        more=health(2),
+    ),
+    Fault("kill-nodes", apply.all_nodes(KILL), DORA, 12, "SIGKILL", warns=CRASHED),
+    Fault("term-nodes", apply.all_nodes(TERM), DORA, 12, "SIGTERM", warns=CRASHED),
+    Fault(
+        *("stop-nodes", apply.all_nodes(STOP), DORA, 20, "hangs"),
+        warns=UNRESPONSIVE,
+        more=health(2),
+    ),
+    Fault("node-exits-0", apply.death("source", "exit0"), ENDED, 8, "finished"),
+    Fault("node-exits-0-always", apply.death("sink", "exit0"), DORA, 12, "", ALWAYS, CRASHED),
+    Fault("node-exits-1", apply.death("sink", "exit1"), DORA, 12, "exit code 1", warns=CRASHED),
+    Fault("node-aborts", apply.death("sink", "abort"), DORA, 12, "SIGABRT", warns=CRASHED),
+    Fault("node-leaves-child", apply.death("sink", "leave-child"), DORA, 12, warns=CRASHED),
+    Fault("node-daemonises", apply.death("sink", "daemonise"), DORA, 12, warns=CRASHED),
+    Fault("node-ignores-stop", apply.stubborn, ENDED, 8, "", SHORT_GRACE, KILLED),
+    Fault(
+        *("node-spins", apply.order("sink", "spin"), DORA, 20, "hangs"),
+        warns=UNRESPONSIVE,
+        more=health(2),
+    ),
+    Fault("node-floods", apply.order("sink", "flood"), UNAFFECTED, 30),
+)
+MACHINE = (
+    Fault("journald-restarts", apply.restarted("systemd-journald.service"), UNAFFECTED, 5),
+    Fault("daemon-reexec", apply.command("systemctl", "daemon-reexec"), UNAFFECTED, 5),
+    Fault("daemon-reload", apply.command("systemctl", "daemon-reload"), UNAFFECTED, 5),
+    Fault("kill-all", apply.kill_unit, SYSTEMD, 12, "SIGKILL", warns=LOST, repeats=20),
+)
+
+TABLE = (*PARTS, *NODES, *MACHINE)
