@@ -18,6 +18,7 @@ from dora_systemd.cli.parameters import current_scope
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.journalread import JournalReader
 from dora_systemd.names import is_uuid_prefix
+from dora_systemd.sandbox import LEVELS, NETWORKS
 
 VARIABLE = "_DORACTL_COMPLETE"
 
@@ -89,6 +90,9 @@ TYPES: dict[str, Any] = {
     "env_file": click.File(),
     "venv": click.Path(file_okay=False),
     "working_directory": click.Path(file_okay=False),
+    "writable": click.Path(),
+    "sandbox": click.Choice(LEVELS),
+    "network": click.Choice(NETWORKS),
 }
 
 

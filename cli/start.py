@@ -37,6 +37,7 @@ Examples:
   doractl start dataflow.yml --restart-policy on-failure --max-restarts 3
   doractl start dataflow.yml --credential token=/etc/robot/token
   doractl start dataflow.yml --hot-reload --watch "*.py,config/*"
+  doractl start dataflow.yml --device /dev/video0 --writable /srv/recordings
   doractl start dataflow.yml --enable              now and at every boot
   doractl start dataflow.yml --dry-run
 """

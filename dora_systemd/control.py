@@ -125,7 +125,10 @@ def _reading(control: Path) -> "Iterator[None]":
 
 
 def _unreachable(port: int, error: Exception) -> DoraSystemdError:
-    hint = "see `doractl list`; a dataflow that starts or stops has no coordinator for a moment"
+    hint = (
+        "see `doractl list`; a dataflow that starts or stops has no coordinator for a moment, "
+        "and one with a private network none that can be reached from here"
+    )
     return DoraSystemdError(
         f"cannot reach the dora coordinator on port {port}: {error or type(error).__name__}", hint
     )

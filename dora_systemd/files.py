@@ -41,6 +41,12 @@ _WRITE_HINTS = {
 }
 
 
+def absolute_path(text: str) -> str:
+    """The path as systemd wants it: absolute and without "..", links before which are followed."""
+    path = Path(text).absolute()
+    return "/" + str(path.resolve() if ".." in path.parts else path).lstrip("/")
+
+
 def read_text(path: Path) -> str:
     """The text of the regular file `path`, at most MAX_BYTES of UTF-8.
 

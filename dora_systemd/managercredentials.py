@@ -7,14 +7,15 @@ from pathlib import Path
 
 from dora_systemd.credentials import CREDENTIALS, MAX_SIZE
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.files import absolute_path
 from dora_systemd.scope import Scope
 from dora_systemd.settings import Settings
 from dora_systemd.values import shown
 
 
 def credential_files(settings: Settings) -> dict[str, str]:
-    """The absolute path of each credential by its name, as systemd wants it, without ".."."""
-    return {name: _absolute(file) for name, file in settings[CREDENTIALS].items()}
+    """The absolute path of each credential by its name."""
+    return {name: absolute_path(file) for name, file in settings[CREDENTIALS].items()}
 
 
 def check_credentials(scope: Scope, files: Mapping[str, str]) -> None:
@@ -37,11 +38,6 @@ def check_credentials(scope: Scope, files: Mapping[str, str]) -> None:
         if total > MAX_SIZE:
             reason, hint = "it is too large", "all credentials together have at most 1 MiB"
             raise _refusal(name, file, reason, hint)
-
-
-def _absolute(file: str) -> str:
-    path = Path(file).absolute()
-    return str(path.resolve() if ".." in path.parts else path)
 
 
 def _checked_size(name: str, file: str) -> int:

@@ -5,7 +5,7 @@ import pwd
 import sys
 import uuid
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from dora_systemd.dataflow import parse_dataflow
@@ -17,14 +17,16 @@ from dora_systemd.limitchecks import settings_node_limits
 from dora_systemd.lograteplan import check_rates, log_rates
 from dora_systemd.manageraccount import account_of, check_access, choose_user
 from dora_systemd.managercredentials import check_credentials, credential_files
+from dora_systemd.managersandbox import make_sandbox
 from dora_systemd.managersettings import read_settings
 from dora_systemd.names import name_from_path, parse_name, unit_name
 from dora_systemd.options import RunnerOptions
-from dora_systemd.preparation import prepare
+from dora_systemd.preparation import Prepared, prepare
 from dora_systemd.process import dora_version, find_dora, run_dora
 from dora_systemd.reloadplan import check_reload_nodes, hot_reload
 from dora_systemd.restartplan import node_policies, restart_policy
 from dora_systemd.restartsettings import START_TIMEOUT
+from dora_systemd.sandbox import Sandbox
 from dora_systemd.scope import Scope
 from dora_systemd.settings import Settings
 from dora_systemd.settingtable import (
@@ -70,6 +72,7 @@ class Plan:
     settings: Settings
     user: pwd.struct_passwd | None
     environment: Mapping[str, str]
+    sandbox: Sandbox = field(default_factory=Sandbox)
 
     @property
     def unit(self) -> str:
@@ -118,11 +121,11 @@ def make_plan(scope: Scope, request: StartRequest) -> Plan:
     )
     environment = unit_environment(search_path, venv, variables)
     plan = Plan(scope, options, settings, user, environment)
-    _check_plan(plan)
-    return plan
+    sandbox = make_sandbox(scope, settings, user, _check_plan(plan))
+    return replace(plan, sandbox=sandbox)
 
 
-def _check_plan(plan: Plan) -> None:
+def _check_plan(plan: Plan) -> Prepared:
     options = plan.options
     check_access(
         plan.user,
@@ -151,6 +154,7 @@ def _check_plan(plan: Plan) -> None:
     ids = [node.id for node in prepared.dataflow.nodes]
     check_rates(options.log_rates, ids)
     check_reload_nodes(options.reload, ids)
+    return prepared
 
 
 def _directory(settings: Settings, dataflow: Path) -> str:

@@ -7,6 +7,7 @@ from dora_systemd.compat import MIN_VERSION, drop_unsupported
 from dora_systemd.managercredentials import credential_files
 from dora_systemd.managerlimits import check_limits
 from dora_systemd.managerplan import Plan
+from dora_systemd.managersandbox import sandbox_warnings
 from dora_systemd.managerwatch import watch_warnings
 from dora_systemd.process import version_numbers
 from dora_systemd.properties import UnitContext, format_unit, unit_properties
@@ -25,7 +26,7 @@ def plan_properties(plan: Plan, manager: Manager) -> tuple[dict[str, Property], 
     number = next(iter(version_numbers(manager.version())), MIN_VERSION)
     properties, warnings = drop_unsupported(_properties(plan), number)
     warnings = (*warnings, *restart_warnings(plan.settings), *reload_warnings(plan.settings))
-    warnings = (*warnings, *watch_warnings(plan))
+    warnings = (*warnings, *watch_warnings(plan), *sandbox_warnings(plan.sandbox))
     return properties, (*warnings, *check_limits(manager, plan, properties))
 
 
@@ -48,5 +49,6 @@ def _properties(plan: Plan) -> dict[str, Property]:
         user=None if plan.user is None else plan.user.pw_name,
         environment=plan.environment,
         credentials=credential_files(plan.settings),
+        sandbox=plan.sandbox,
     )
     return dict(unit_properties(plan.options, context, plan.settings))

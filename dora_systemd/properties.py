@@ -22,6 +22,7 @@ from dora_systemd.propertyset import (
     with_properties,
 )
 from dora_systemd.propertytable import TABLE
+from dora_systemd.sandbox import Sandbox, sandbox_properties
 from dora_systemd.scope import RUNTIME_NAME
 from dora_systemd.settings import Settings
 from dora_systemd.settingtable import PROPERTY
@@ -45,6 +46,7 @@ class UnitContext:
     user: User= in system scope; None runs everything as root.
     environment: all of Environment=, see unit_environment.
     credentials: absolute path by name.
+    sandbox: what the dataflow is kept from; None for nothing.
     """
 
     python: str
@@ -52,6 +54,7 @@ class UnitContext:
     user: str | None = None
     environment: Mapping[str, str] = field(default_factory=dict)
     credentials: Mapping[str, str] = field(default_factory=dict)
+    sandbox: Sandbox | None = None
 
 
 def unit_properties(
@@ -74,8 +77,9 @@ def unit_properties(
         **credential_properties(context.credentials),
         **user_properties(context),
         **log_properties(options, context),
+        **(sandbox_properties(context.sandbox) if context.sandbox else {}),
+        **realtime_properties(settings),
     }
-    own |= realtime_properties(settings)
     properties = with_properties(own, settings_properties(settings))
     for assignment in settings[PROPERTY]:
         properties = with_properties(properties, _given_property(assignment, settings))

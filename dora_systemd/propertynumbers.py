@@ -114,7 +114,8 @@ def _parse_namespaces(text: str) -> int:
     if text.strip() in ("yes", "true", "on", "1"):
         return 0
     everything = sum(_NAMESPACES.values())
-    if text.strip() in ("no", "false", "off", "0"):
+    # An empty line of a unit file resets it.
+    if text.strip() in ("", "no", "false", "off", "0"):
         return everything
     return _mask_parser(_NAMESPACES, everything)(text)
 
@@ -162,5 +163,7 @@ NUMA_POLICY = named_kind(
 )
 MOUNT_FLAGS = named_kind("t", {"": 0, "shared": 1 << 20, "slave": 1 << 19, "private": 1 << 18})
 ERROR_NUMBER = named_kind(
-    "i", {name: number for number, name in sorted(errno.errorcode.items())} | {"kill": 0x7FFFFFFE}
+    "i",
+    {name: number for number, name in sorted(errno.errorcode.items())} | {"kill": 0x7FFFFFFE},
+    is_open=True,
 )

@@ -12,6 +12,7 @@ from dora_systemd.limitsettings import LIMIT_SETTINGS
 from dora_systemd.lograte import RateLimits
 from dora_systemd.reloadsettings import RELOAD_SETTINGS
 from dora_systemd.restartsettings import RESTART_SETTINGS
+from dora_systemd.sandboxsettings import SANDBOX_SETTINGS
 from dora_systemd.settingkinds import (
     BOOL,
     DURATION,
@@ -145,5 +146,6 @@ SETTINGS: tuple[Setting[Any], ...] = (
     *LIMIT_SETTINGS,
     *RESTART_SETTINGS,
     *CREDENTIAL_SETTINGS,
+    *SANDBOX_SETTINGS,
     *RELOAD_SETTINGS,
 )

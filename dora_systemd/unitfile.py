@@ -88,7 +88,12 @@ def _properties(text: str) -> dict[str, Property] | None:
         except (KeyError, DoraSystemdError):
             return None
         properties = with_properties(properties, change)
-    return properties
+    return {slot: _ordered(one) for slot, one in properties.items()}
+
+
+def _ordered(one: Property) -> Property:
+    """The property, networks in one order: systemd keeps those as a set."""
+    return one._replace(value=tuple(sorted(one.value))) if one.signature == "a(iayu)" else one
 
 
 def _mounts(options: RunnerOptions) -> list[str]:

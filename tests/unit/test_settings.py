@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.hotreload import REPLACE_WORDS
 from dora_systemd.lograte import RateLimit
+from dora_systemd.sandbox import LEVELS, NETWORKS
 from dora_systemd.settingkinds import DURATION, TEXT, Setting
 from dora_systemd.settings import DEFAULT_SOURCE, Settings, check_document, resolve_settings
 from dora_systemd.settingtable import (
@@ -209,6 +210,9 @@ def test_values_and_back(data: st.DataObject) -> None:
         "log_rate_limit": st.dictionaries(
             st.sampled_from(["", "cam"]), st.none() | st.just(RateLimit(5, SECOND))
         ),
+        "sandbox": st.sampled_from(LEVELS),
+        "network": st.sampled_from(NETWORKS),
+        "writable": st.lists(texts).map(tuple),
         "credentials": st.dictionaries(
             st.from_regex(r"[a-z.]{3,9}", fullmatch=True), texts.filter(lambda x: x[-1] != "\\")
         ),

@@ -153,3 +153,11 @@ def test_directories() -> None:
     assert unit_directories(USER, True, "/run/user/1000") == UnitDirectories(USER[0], USER[2])
     with pytest.raises(DoraSystemdError, match="systemd/user"):
         unit_directories(SYSTEM, True, "/run/user/1000")
+
+
+def test_networks_in_another_order_are_the_same() -> None:
+    head = "[Service]\n"
+    ours = f"{head}IPAddressDeny=0.0.0.0/0 ::/0\nSystemCallErrorNumber=EPERM\n"
+    systemds = f"{head}IPAddressDeny=\nIPAddressDeny=::/0\nIPAddressDeny=0.0.0.0/0\n"
+    assert says_the_same(ours, f"{systemds}SystemCallErrorNumber=1\n")
+    assert not says_the_same(ours, f"{head}IPAddressDeny=::/0\nSystemCallErrorNumber=1\n")

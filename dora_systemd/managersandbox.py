@@ -1,0 +1,96 @@
+"""The sandbox of a plan: which paths have to stay open, and what a scope cannot keep."""
+
+import pwd
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.files import absolute_path
+from dora_systemd.launch import python_of
+from dora_systemd.limitsettings import DEVICE, REALTIME
+from dora_systemd.options import RunnerOptions
+from dora_systemd.preparation import PACKAGE, Prepared
+from dora_systemd.sandbox import Sandbox
+from dora_systemd.sandboxsettings import NETWORK, SANDBOX, WRITABLE
+from dora_systemd.scope import Scope
+from dora_systemd.settings import Settings
+from dora_systemd.settingtable import PROPERTY
+from dora_systemd.values import shown
+
+_UV_PLACES = (".cache/uv", ".local/share/uv")
+"""What uv writes below the home directory, see `uv cache dir` and `uv python dir`."""
+
+
+def make_sandbox(
+    scope: Scope, settings: Settings, user: pwd.struct_passwd | None, prepared: Prepared
+) -> Sandbox:
+    """The sandbox that the settings ask for. Raises DoraSystemdError for a path that is not there.
+
+    user: of the nodes, None in user scope.
+    """
+    given = [_checked(path) for path in settings[WRITABLE]]
+    is_named = any(one.partition("=")[0] == "DeviceAllow" for one in settings[PROPERTY])
+    return Sandbox(
+        level=settings[SANDBOX],
+        network=settings[NETWORK],
+        is_user=scope.is_user,
+        is_root=user is not None and user.pw_uid == 0,
+        has_devices=bool(settings[DEVICE]) or is_named,
+        is_realtime=settings[REALTIME] is not None,
+        needed=tuple(dict.fromkeys(_existing(_needed(prepared)))),
+        writable=(*given, *_existing(_written_by_uv(prepared.plan.options, user))),
+    )
+
+
+def sandbox_warnings(sandbox: Sandbox) -> Iterator[str]:
+    """What a user's manager takes and cannot keep."""
+    if not sandbox.is_user:
+        return
+    if sandbox.level == "strict":
+        yield "the sandbox protects no files in user scope, strict or not"
+    if sandbox.network == "loopback":
+        yield "the network cannot be limited to the loopback interface in user scope"
+    if sandbox.network == "private":
+        yield "a private network in user scope needs user namespaces, see systemd.exec(5)"
+
+
+def _checked(path: str) -> str:
+    absolute = absolute_path(path)
+    if not Path(absolute).exists():
+        raise DoraSystemdError(
+            f"cannot let the nodes write {shown(absolute)}: it is not there",
+            f"mkdir -p {absolute}, or correct --writable",
+            ExitCode.BAD_INPUT,
+        )
+    return absolute
+
+
+def _existing(paths: Iterator[Path]) -> Iterator[str]:
+    yield from (absolute_path(str(path)) for path in paths if path.exists())
+
+
+def _needed(prepared: Prepared) -> Iterator[Path]:
+    """Where the dataflow, its programs and their interpreters are, and we ourselves."""
+    options = prepared.plan.options
+    yield Path(options.dataflow).parent
+    yield Path(options.working_directory)
+    yield from (Path(sys.prefix), Path(sys.base_prefix), PACKAGE.parent)
+    for program in (options.dora, python_of(prepared.plan)):
+        # A virtual environment has links to the Python that it is made from.
+        yield from (_prefix(Path(program)), _prefix(Path(program).resolve()))
+    for node in prepared.dataflow.nodes:
+        yield from (Path(one) for one in (node.working_directory,) if one.startswith("/"))
+        yield from (Path(one).parent for one in (node.path,) if one.startswith("/"))
+    session = prepared.plan.session
+    yield from map(Path, (*session.directories.values(), *session.envs.values()))
+
+
+def _prefix(program: Path) -> Path:
+    return program.parent.parent if program.parent.name == "bin" else program.parent
+
+
+def _written_by_uv(options: RunnerOptions, user: pwd.struct_passwd | None) -> Iterator[Path]:
+    if options.uv and user is not None:
+        yield Path(options.working_directory)
+        yield from (Path(user.pw_dir, place) for place in _UV_PLACES)

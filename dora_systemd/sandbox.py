@@ -1,0 +1,161 @@
+"""What a dataflow is kept from: a level and a few choices become unit properties.
+
+Every property is one of systemd.exec(5) or systemd.resource-control(5). What each costs is in the
+table SANDBOX of dora-systemd(7).
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from dora_systemd.propertykinds import Property
+from dora_systemd.propertyset import parse_property, with_properties
+from dora_systemd.propertystructs import MS_REC
+from dora_systemd.values import format_bool
+
+LEVELS = ("none", "default", "strict")
+NETWORKS = ("host", "loopback", "private")
+
+DEFAULT_LEVEL = "default"
+DEFAULT_NETWORK = "host"
+
+# Filters of system calls and flags of processes: the kernel lets every user set them.
+_CALLS = (
+    "NoNewPrivileges=yes",
+    # To make the one that is left needs a capability that nodes do not have. systemd 257 writes a
+    # transient unit with none left as an empty line, which it reads back as all.
+    "RestrictNamespaces=uts",
+    "RestrictSUIDSGID=yes",
+    "LockPersonality=yes",
+    "SystemCallArchitectures=native",
+    "SystemCallFilter=@system-service",
+    "SystemCallErrorNumber=EPERM",
+    "RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6 AF_NETLINK",
+)
+# What is done with mounts, capabilities and BPF needs the system's manager. A user's manager would
+# need user namespaces, and would fail where the kernel or a container does not let it have them.
+_FILES = (
+    "ProtectSystem=strict",
+    "ProtectKernelTunables=yes",
+    "ProtectKernelModules=yes",
+    "ProtectKernelLogs=yes",
+    "ProtectClock=yes",
+    "ProtectHostname=yes",
+    "ProtectProc=invisible",
+)
+# No ProtectControlGroups=: the runner makes a group for each node.
+_STRICT_CALLS = ("MemoryDenyWriteExecute=yes", "UMask=0077", "SystemCallFilter=~@privileged")
+_STRICT_FILES = ("ProcSubset=pid", "PrivateIPC=yes")
+
+_TEMPORARY = ("/tmp", "/var/tmp")
+_HOMES = ("/home", "/root", "/run/user")
+
+
+@dataclass(frozen=True)
+class Sandbox:
+    """The choices.
+
+    level: one of LEVELS. network: one of NETWORKS. is_user: of a user's manager.
+    is_root: the nodes run as root. has_devices: some are allowed by name.
+    is_realtime: the nodes are scheduled so.
+    needed: absolute paths that are read, such as the project. writable: those that are written.
+    """
+
+    level: str = DEFAULT_LEVEL
+    network: str = DEFAULT_NETWORK
+    is_user: bool = False
+    is_root: bool = False
+    has_devices: bool = False
+    is_realtime: bool = False
+    needed: Sequence[str] = ()
+    writable: Sequence[str] = ()
+
+
+def sandbox_properties(sandbox: Sandbox) -> dict[str, Property]:
+    """The properties by key of the unit file."""
+    properties: dict[str, Property] = {}
+    for assignment in _assignments(sandbox):
+        properties = with_properties(properties, parse_property(assignment))
+    return properties | _path_properties(sandbox)
+
+
+def _assignments(sandbox: Sandbox) -> list[str]:
+    found = _network(sandbox)
+    if sandbox.level == "none":
+        return found
+    is_strict = sandbox.level == "strict"
+    found += _CALLS
+    found += _STRICT_CALLS if is_strict else ()
+    if not sandbox.is_realtime:
+        # A process of a realtime dataflow may order its own threads.
+        found += ["RestrictRealtime=yes"]
+        found += ["SystemCallFilter=~@resources"] if is_strict else []
+    if not sandbox.is_user:
+        found += [*_FILES, _devices(sandbox), *_privileges(sandbox)]
+        found += _STRICT_FILES if is_strict else ()
+    return found
+
+
+def _network(sandbox: Sandbox) -> list[str]:
+    if sandbox.network == "private":
+        return ["PrivateNetwork=yes"]
+    if sandbox.network == "loopback" and not sandbox.is_user:
+        return ["IPAddressDeny=any", "IPAddressAllow=localhost"]
+    return []
+
+
+def _devices(sandbox: Sandbox) -> str:
+    # PrivateDevices= hides all but /dev/null and its like, also those that are allowed.
+    return "DevicePolicy=closed" if sandbox.has_devices else "PrivateDevices=yes"
+
+
+def _privileges(sandbox: Sandbox) -> list[str]:
+    if sandbox.is_root:
+        # Who asks for root wants every file; in a user namespace it would be root of its own only.
+        return ["CapabilityBoundingSet=CAP_DAC_OVERRIDE CAP_DAC_READ_SEARCH"]
+    users = ["PrivateUsers=yes"] if sandbox.level == "strict" else []
+    return ["CapabilityBoundingSet=", *users]
+
+
+def _path_properties(sandbox: Sandbox) -> dict[str, Property]:
+    """What is hidden and what stays: private directories, and mounts of what is needed in them."""
+    if sandbox.level == "none" or sandbox.is_user:
+        return {}
+    hides_tmp = _can_hide(_TEMPORARY, sandbox)
+    hides_home = sandbox.level == "strict" and _can_hide(_HOMES, sandbox)
+    hidden = (*(_TEMPORARY if hides_tmp else ()), *(_HOMES if hides_home else ()))
+    # Without temporary directories of their own the nodes write to the machine's.
+    shared = () if hides_tmp else _TEMPORARY
+    bound = [path for path in sandbox.writable if _is_below(path, hidden)]
+    written = [path for path in sandbox.writable if path not in bound]
+    read = [path for path in sandbox.needed if _is_below(path, hidden)]
+    return {
+        **parse_property(f"ProtectHome={'tmpfs' if hides_home else 'read-only'}"),
+        **parse_property(f"PrivateTmp={format_bool(hides_tmp)}"),
+        **_words("ReadWritePaths", (*shared, *written)),
+        **_binds("BindPaths", bound),
+        **_binds("BindReadOnlyPaths", [path for path in read if not _is_below(path, bound)]),
+    }
+
+
+def _can_hide(places: Iterable[str], sandbox: Sandbox) -> bool:
+    """Whether nobody wants a whole place, and all that is needed in it can be mounted."""
+    paths = (*sandbox.needed, *sandbox.writable)
+    wants_whole = any(_is_below(place, paths) for place in places)
+    # A bind mount cannot be written with colons.
+    return not wants_whole and not any(":" in one and _is_below(one, places) for one in paths)
+
+
+def _is_below(path: str, places: Iterable[str]) -> bool:
+    """Whether `path` is one of `places` or in one of them."""
+    return any(f"{path}/".startswith(f"{place.rstrip('/')}/") for place in places)
+
+
+def _words(key: str, paths: Iterable[str]) -> dict[str, Property]:
+    words = tuple(dict.fromkeys(paths))
+    return {key: Property(key, "as", words)} if words else {}
+
+
+def _binds(key: str, paths: Sequence[str]) -> dict[str, Property]:
+    outer = [one for one in dict.fromkeys(paths) if not _is_below(one, {*paths} - {one})]
+    binds = tuple((path, path, False, MS_REC) for path in outer)
+    return {key: Property(key, "a(ssbt)", binds)} if binds else {}

@@ -1,0 +1,272 @@
+"""The sandbox on a real system: its score, what nodes can still do, and what they cannot."""
+
+import json
+import os
+import pwd
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.errors import ExitCode
+from dora_systemd.scope import Scope
+from tests.system.cells import Cell, Project, run, wait_for
+from tests.system.refusals import Refusal, check_refusals
+
+pytestmark = pytest.mark.lab
+
+LEVELS = ("none", "default", "strict")
+HIGHEST = 2.0
+"""What `systemd-analyze security` may say of a unit that nobody has configured."""
+
+PROBE = """
+import errno, json, os, socket
+from dora import Node
+
+def write(path):
+    with open(path, "w") as file:
+        file.write("x")
+
+def send(address):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.sendto(b"x", (address, 9))
+
+def read(path):
+    open(path, "rb").close()
+
+def tried(text):
+    verb, _, what = text.partition(":")
+    try:
+        globals()[verb](what)
+    except OSError as error:
+        return errno.errorcode[error.errno]
+    return "ok"
+
+node = Node()
+print("tried", json.dumps({one: tried(one) for one in os.environ["PROBE"].split()}), flush=True)
+for event in node:
+    pass
+"""
+FLOW = "nodes: [{id: probe, path: probe.py, inputs: {t: dora/timer/millis/100}}]\n"
+
+
+def probe(cell: Cell, project: Project, *flags: str, tries: list[str]) -> list[str]:
+    """What comes of each try of a node."""
+    project.write("probe.py", PROBE)
+    flow = project.write("dataflow.yml", FLOW)
+    cell.start(flow, "--env", f"PROBE={' '.join(tries)}", *flags)
+    (line,) = wait_for("the node tries", lambda: cell.messages("probe"))
+    found = json.loads(line.partition(" ")[2])
+    return [found[one] for one in tries]
+
+
+@pytest.fixture
+def place() -> Iterator[Path]:
+    """A directory outside of the project that everyone may write."""
+    path = Path("/srv/recordings")
+    path.mkdir()
+    path.chmod(0o777)
+    yield path
+    shutil.rmtree(path)
+
+
+def exposure(cell: Cell) -> float:
+    """The score of the unit, as systemd-analyze prints it."""
+    user = ["--user"] if cell.scope.is_user else []
+    words = ("systemd-analyze", *user, "security", "--no-pager", cell.unit)
+    last = run(*words).stdout.splitlines()[-1]
+    return float(last.partition(": ")[2].split()[0])
+
+
+def test_exposure(cell: Cell, project: Project, capsys: pytest.CaptureFixture[str]) -> None:
+    found = {}
+    for level in LEVELS:
+        flags = [] if level == "default" else ["--sandbox", level]
+        cell.start(project.three_nodes(), *flags)
+        found[level] = exposure(cell)
+        rows = run("systemd-analyze", "security", "--json=short", "--no-pager", cell.unit).stdout
+        weak = [row["json_field"] for row in json.loads(rows) if row.get("exposure")]
+        assert "NoNewPrivileges" not in weak or level == "none"
+        cell.end()
+    with capsys.disabled():
+        print(f" exposure: {found} ", end="")
+    assert found["strict"] < found["default"] <= HIGHEST < found["none"]
+
+
+def test_exposure_with_a_device_and_in_a_home(cell: Cell, project: Project) -> None:
+    cell.start(project.three_nodes(), "--device", "/dev/null")
+    assert exposure(cell) <= HIGHEST
+
+
+@pytest.mark.warns("is being restarted by dora", "dropping event because")
+@pytest.mark.parametrize("level", LEVELS)
+def test_a_dataflow_in_each_level(cell: Cell, project: Project, level: str) -> None:
+    cell.start(project.three_nodes(), "--sandbox", level)
+    cell.wait_exchanging()
+    assert set(cell.status.nodes) == {"source", "doubler", "sink"}
+    (before,) = cell.pids("node-sink")
+    cell.doractl("node", "restart", cell.name, "sink")
+    wait_for("another sink", lambda: cell.pids("node-sink") not in ([before], []))
+    assert "doubler" in cell.doractl("dora", cell.name, "--", "node", "list").stdout
+    cell.doractl("restart", cell.name)
+    cell.wait_exchanging()
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_user_scope(project: Project, level: str) -> None:
+    alice = pwd.getpwnam("alice")
+    runtime = f"/run/user/{alice.pw_uid}"
+    wait_for("her manager", lambda: Path(runtime, "bus").exists())
+    hers = Cell(f"hers-{level}", Scope(is_user=True, uid=alice.pw_uid))
+    become = ("runuser", "-u", "alice", "--", "env", f"XDG_RUNTIME_DIR={runtime}", "doractl")
+    start = ("start", str(project.three_nodes()), "--name", hers.name, "--sandbox", level)
+    try:
+        done = run(*become, *start)
+        assert ("protects no files in user scope" in done.stderr) == (level == "strict")
+        match = ("journalctl", "-q", "-o", "cat", f"DORA_DATAFLOW_NAME={hers.name}")
+        wait_for("messages", lambda: "got [4]" in run(*match, "DORA_NODE=sink").stdout)
+        row = json.loads(run(*become, "list", hers.name, "-o", "json").stdout)
+        (pid,) = [one["pid"] for one in row["nodes"] if one["node"] == "sink"]
+        status = Path(f"/proc/{pid}/status").read_text()
+        assert ("NoNewPrivs:\t1" in status) == (level != "none")
+    finally:
+        run(*become, "stop", hers.name)
+
+
+def test_files(cell: Cell, project: Project, place: Path) -> None:
+    project.root.chmod(0o777)
+    host = Path("/tmp/of-the-host")
+    host.touch()
+    tries = [f"write:{project.root}/x", f"write:{place}/x", "write:/tmp/y", f"read:{host}"]
+    tries += ["write:/dev/shm/dora-systemd-test", f"read:{project.root}/probe.py"]
+    try:
+        found = probe(cell, project, tries=tries)
+    finally:
+        host.unlink()
+        Path("/dev/shm/dora-systemd-test").unlink(missing_ok=True)
+    assert found == ["EROFS", "EROFS", "ok", "ENOENT", "ok", "ok"]
+    assert not Path("/tmp/y").exists()
+
+
+@pytest.mark.parametrize("level", ["default", "strict"])
+def test_writable(cell: Cell, project: Project, place: Path, level: str) -> None:
+    (project.root / "out").mkdir()
+    (project.root / "out").chmod(0o777)
+    project.root.chmod(0o777)
+    flags = ["--sandbox", level, "--writable", str(place), "--writable", f"{project.root}/out"]
+    tries = [f"write:{place}/x", f"write:{project.root}/out/x", f"write:{project.root}/x"]
+    assert probe(cell, project, *flags, tries=tries) == ["ok", "ok", "EROFS"]
+    assert (place / "x").read_text() == (project.root / "out" / "x").read_text() == "x"
+
+
+def test_none_writes_everywhere(cell: Cell, project: Project, place: Path) -> None:
+    assert probe(cell, project, "--sandbox", "none", tries=[f"write:{place}/x"]) == ["ok"]
+
+
+def test_a_property_has_the_last_word(cell: Cell, project: Project, place: Path) -> None:
+    flags = ["--property", "ProtectSystem=no"]
+    assert probe(cell, project, *flags, tries=[f"write:{place}/x"]) == ["ok"]
+
+
+@pytest.mark.parametrize("level", ["default", "strict"])
+@pytest.mark.parametrize(("home", "user"), [("/home/alice", "alice"), ("/root", "root")])
+def test_projects_in_a_home(cell: Cell, home: str, user: str, level: str) -> None:
+    """A home that only its owner may enter."""
+    owner = pwd.getpwnam(user)
+    mode = Path(home).stat().st_mode
+    Path(home).chmod(0o700)
+    mine = Project(Path(home) / "project")
+    other = Path(home) / "secret"
+    other.touch()
+    try:
+        for path in (mine.root, mine.write("probe.py", ""), mine.write("dataflow.yml", ""), other):
+            os.chown(path, owner.pw_uid, owner.pw_gid)
+        flags = ["--sandbox", level, "--uid", user]
+        tries = [f"read:{home}/project/probe.py", f"write:{home}/project/x", f"read:{other}"]
+        found = probe(cell, mine, *flags, tries=tries)
+        assert found == ["ok", "EROFS", "ENOENT" if level == "strict" else "ok"]
+    finally:
+        cell.end()
+        shutil.rmtree(mine.root)
+        other.unlink()
+        Path(home).chmod(mode)
+
+
+def test_a_private_network(cell: Cell, project: Project) -> None:
+    cell.start(project.three_nodes(), "--network", "private")
+    cell.wait_exchanging()
+    (pid,) = cell.pids("node-sink")
+    assert Path(f"/proc/{pid}/ns/net").readlink() != Path("/proc/self/ns/net").readlink()
+    done = cell.doractl("node", "restart", cell.name, "sink", check=False)
+    assert "private network" in done.stderr
+
+
+def test_a_unit_file_is_the_same(cell: Cell, project: Project, place: Path) -> None:
+    flags = ["--sandbox", "strict", "--writable", str(place), "--device", "/dev/null"]
+    flow = project.three_nodes()
+    cell.start(flow, *flags, "--enable")
+    try:
+        cell.wait_exchanging()
+        before = exposure(cell)
+        cell.doractl("stop", cell.name)
+        # Started from its file: the settings are the same.
+        cell.start(flow, *flags)
+        assert cell.show("FragmentPath").startswith("/etc/")
+        cell.wait_exchanging()
+        assert exposure(cell) == before
+    finally:
+        cell.end()
+        cell.doractl("disable", cell.name)
+
+
+@pytest.fixture
+def device() -> Iterator[Path]:
+    """A device that no policy opens by itself."""
+    there = [Path(one) for one in ("/dev/net/tun", "/dev/fuse", "/dev/loop-control")]
+    path = next(one for one in there if one.exists())
+    mode = path.stat().st_mode
+    path.chmod(0o666)
+    yield path
+    path.chmod(mode)
+
+
+@pytest.mark.vm
+def test_devices(cell: Cell, project: Project, device: Path) -> None:
+    for flags, expected in (
+        ([], "ENOENT"),
+        (["--device", "/dev/null"], "EPERM"),
+        (["--device", str(device)], "ok"),
+        (["--sandbox", "none"], "ok"),
+    ):
+        assert probe(cell, project, *flags, tries=[f"read:{device}"]) == [expected], flags
+        cell.end()
+        run("journalctl", "--rotate", "--vacuum-time=1s")
+
+
+@pytest.mark.vm
+def test_the_loopback_alone(cell: Cell, project: Project) -> None:
+    run("ip", "link", "add", "sandbox0", "type", "dummy")
+    try:
+        run("ip", "address", "add", "10.99.0.1/24", "dev", "sandbox0")
+        run("ip", "link", "set", "sandbox0", "up")
+        tries = ["send:10.99.0.1", "send:10.99.0.2", "send:127.0.0.1"]
+        found = probe(cell, project, "--network", "loopback", tries=tries)
+        assert found == ["EPERM", "EPERM", "ok"]
+    finally:
+        run("ip", "link", "delete", "sandbox0")
+
+
+def test_what_is_refused(cell: Cell, project: Project) -> None:
+    flow = str(project.three_nodes())
+    check_refusals(
+        cell,
+        project,
+        [
+            Refusal([flow, "--sandbox=strikt"], ExitCode.USAGE, "did you mean strict?"),
+            Refusal([flow, "--network=lan"], ExitCode.USAGE, "host, loopback, private"),
+            Refusal([flow, "--writable=/nowhere"], ExitCode.BAD_INPUT, "mkdir -p /nowhere"),
+        ],
+    )
+    project.write("dataflow.systemd.yml", "sandbox: 5\n")
+    check_refusals(cell, project, [Refusal([flow], ExitCode.BAD_INPUT, "none, default or strict")])
