@@ -76,7 +76,7 @@ class Scene:
         shutil.copy(Path(__file__).with_name("node.py"), self.project.root)
         text = FLOW.format(tick=200 if IS_VM else 10, more=more)
         flow = self.project.write("dataflow.yml", text)
-        self.cell.start(flow, "--env", self.mark, *flags)
+        self.cell.start(flow, "--env", self.mark, "--writable", str(self.notes), *flags)
         wait_for("load", lambda: min(self.counts().get(role, 0) for role in ROLES) > 20, 120)
         self.before = self.state()
 
