@@ -45,6 +45,7 @@ Examples:
   doractl start dataflow.yml --name robot
   doractl list
   doractl logs robot --node camera --follow
+  doractl why robot
   doractl stop robot
 """
 

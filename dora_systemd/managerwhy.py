@@ -14,11 +14,12 @@ from dora_systemd.managercells import Cell, find_cell, matching_cells, read_cell
 from dora_systemd.managerended import select_ended
 from dora_systemd.managerlist import read_status
 from dora_systemd.names import unit_name
-from dora_systemd.postmortem import Facts, Verdict, examine
+from dora_systemd.postmortem import examine
 from dora_systemd.postmortemtext import LINES, Report, Subject, Word
 from dora_systemd.scope import Scope
 from dora_systemd.status import CellStatus
 from dora_systemd.statuswords import status_word
+from dora_systemd.verdict import Facts, Verdict
 
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 _MOST_RECORDS = 1000
@@ -114,7 +115,7 @@ def _last_words(
     journal: JournalReader, scope: Scope, subject: Subject, verdict: Verdict
 ) -> tuple[Word, ...]:
     """The last lines of the node that began it, before it ended; of all nodes where none did."""
-    if not verdict.is_failure or not verdict.invocation:
+    if not (verdict.is_failure or verdict.node) or not verdict.invocation:
         return ()
     matches = [
         *scope_matches(scope, subject.name),

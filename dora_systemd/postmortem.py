@@ -3,8 +3,9 @@
 Where nothing is recorded, the verdict says so; it never guesses.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 from dora_systemd.causes import Cause
 from dora_systemd.lifestory import Happening, Life, with_restarts
@@ -15,6 +16,7 @@ from dora_systemd.statuswords import (
     STOPPED,
     UP_WORDS,
 )
+from dora_systemd.verdict import Facts, Restart, Verdict
 
 _CRASHES = ("node-crashed", "node-oom")
 _LOSSES = {"daemon-lost": Cause.DAEMON_LOST, "coordinator-lost": Cause.COORDINATOR_LOST}
@@ -25,68 +27,9 @@ _RESULTS = {
     "watchdog": (Cause.WATCHDOG, "its runner hung and was ended by the watchdog"),
     "oom-kill": (Cause.OUT_OF_MEMORY, "it ran out of memory"),
 }
+_STATUS = re.compile(r"status=(\S+)")
 NO_END = "its end is not on record: it was killed, or the machine went down"
 UNKNOWN_PERSON = "a request to systemd, which does not note whose"
-
-
-@dataclass(frozen=True)
-class Facts:
-    """What systemd and the runner know of a dataflow now, beside what the journal has.
-
-    status: a word of `list`. text: STATUS=. failed: nodes that are gone for good, restarting:
-    those that wait. result, exit_words: of the unit, in words. now_boot: the id of this boot.
-    """
-
-    status: str = ""
-    text: str = ""
-    failed: Mapping[str, str] = field(default_factory=dict)
-    restarting: tuple[str, ...] = ()
-    now_boot: str = ""
-
-
-@dataclass(frozen=True)
-class Restart:
-    """One restart. owner: "dora" of a node, "systemd" of the whole. reason: what made it."""
-
-    at_us: int
-    owner: str
-    node: str
-    reason: str
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """What became of a dataflow.
-
-    status: a word of `list`. summary: what ended and how. node: the one that began it, or "".
-    at_us: when that was, began_us: when that life began; CLOCK_REALTIME µs, 0: not known.
-    invocation: systemd's id of that life. details: what else is known of the end.
-    is_given_up: systemd's limit of starts is used up. starved: nodes downstream.
-    """
-
-    status: str
-    cause: Cause = Cause.NONE
-    summary: str = ""
-    node: str = ""
-    at_us: int = 0
-    began_us: int = 0
-    invocation: str = ""
-    stopped_by: str = ""
-    is_given_up: bool = False
-    details: Mapping[str, str] = field(default_factory=dict)
-    starved: tuple[str, ...] = ()
-    restarts: tuple[Restart, ...] = ()
-    timeline: tuple[Happening, ...] = ()
-
-    @property
-    def is_up(self) -> bool:
-        """Whether it runs, or is on its way."""
-        return self.status in UP_WORDS
-
-    @property
-    def is_failure(self) -> bool:
-        """Whether something went wrong that was not mended by itself."""
-        return self.status in (FAILED, RESTARTING) or (self.is_up and bool(self.node))
 
 
 @dataclass(frozen=True)
@@ -98,6 +41,7 @@ class _Finding:
     at: Happening | None = None
     node: str = ""
     by: str = ""
+    is_passing: bool = False
 
 
 def examine(lives: Sequence[Life], facts: Facts, shutdowns: Sequence[int] = ()) -> Verdict:
@@ -124,6 +68,7 @@ def examine(lives: Sequence[Life], facts: Facts, shutdowns: Sequence[int] = ()) 
         life.invocation,
         found.by,
         life.last("start-limit") is not None,
+        found.is_passing,
         found.at.details if found.at else {},
         _starved(found, life),
         tuple(restarts_of(chain)),
@@ -149,7 +94,7 @@ def _present(life: Life, facts: Facts) -> _Finding:
         return _crash(gone[0])
     waiting = [one for one in final_crashes(life) if one.node in facts.restarting]
     if waiting:
-        return _crash(waiting[-1])
+        return replace(_crash(waiting[-1]), is_passing=True)
     return _Finding(Cause.NONE, facts.text)
 
 
@@ -225,10 +170,11 @@ def _unit_failure(life: Life, end: Happening) -> _Finding:
 
 
 def _exit_words(exit: Happening) -> str:
-    status, code = exit.detail("exit_status"), exit.detail("exit_code")
-    if code == "exited":
-        return f"its runner could not work (exit code {status})"
-    return f"its runner was ended by signal {status or 'unknown'}"
+    status = exit.detail("exit_status") or "unknown"
+    if exit.detail("exit_code") != "exited":
+        return f"its runner was ended by signal {status}"
+    named = _STATUS.search(exit.text)  # as "217/USER"
+    return f"systemd could not start its runner: exit code {named[1] if named else status}"
 
 
 def _without_end(life: Life, facts: Facts) -> _Finding:

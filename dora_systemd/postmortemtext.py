@@ -6,10 +6,10 @@ from typing import Any
 
 from dora_systemd.causes import Cause
 from dora_systemd.lifestory import Happening
-from dora_systemd.postmortem import Restart, Verdict
 from dora_systemd.restarts import budget_words
 from dora_systemd.statuswords import RESTARTING, UNKNOWN, local_time
 from dora_systemd.values import SECOND, format_duration, format_rounded_size
+from dora_systemd.verdict import Restart, Verdict
 
 _TOLD = ("event", "node", "nodes", "dataflow", "dataflow_name", "downstream", "cause", "reason")
 """Details of an event that have a key of their own in JSON."""
@@ -21,12 +21,12 @@ _TITLE_WIDTH = 10
 _RED, _GREEN, _BOLD, _PLAIN = "\x1b[31m", "\x1b[32m", "\x1b[1m", "\x1b[0m"
 
 _REMEDIES = {
-    Cause.NODE_FAILED: "mend {node} (its last words are above), then: doractl restart {name}",
+    Cause.NODE_FAILED: "mend {node}, then: doractl restart {name}",
     Cause.NODE_HUNG: "find out what {node} waited for; health_check_timeout: in its YAML",
     Cause.NODE_OUT_OF_MEMORY: "look for a leak in {node}, or: "
     "doractl set {name} --node-limit {node}:memory=SIZE",
     Cause.START_TIMEOUT: "see why {node} does not call Node(), or give it a longer --start-timeout",
-    Cause.REFUSED: "mend {file}; dora validate checks it",
+    Cause.REFUSED: "mend {file}, then: doractl restart {name}",
     Cause.BAD_DATAFLOW: "mend {file}, then: doractl restart {name}",
     Cause.DAEMON_LOST: "doractl restart {name}; --restart-policy on-failure does it by itself",
     Cause.COORDINATOR_LOST: "doractl restart {name}; --restart-policy on-failure does it by itself",
@@ -38,9 +38,22 @@ _REMEDIES = {
     Cause.TIMEOUT: "start it with a longer --start-timeout or --grace-duration",
     Cause.NO_END: "doractl start {file}; doractl enable {name} brings it back after a reboot",
 }
+_MEMORY_REMEDIES = {
+    "dataflow": "doractl set {name} --memory-limit SIZE, or limit single nodes (--node-limit)",
+    "machine": "the machine is short of memory: limit single nodes (--node-limit NODE:memory=SIZE)",
+}
+"""By whose memory was used up, where that is not the node's."""
+_SIGNAL_REMEDIES = {
+    "SIGKILL": "find out who killed {node}: journalctl -k, or somebody's kill -9",
+    **dict.fromkeys(
+        ("SIGSEGV", "SIGABRT", "SIGBUS", "SIGILL", "SIGFPE"),
+        "mend {node}; where it was: coredumpctl info {pid}",
+    ),
+}
 _GIVEN_UP = "systemd has given it up: doractl restart {name} counts its restarts anew"
 _WAITING = "systemd starts it again by itself; doractl stop {name} keeps it from that"
-_GONE_FOR_GOOD = "{node} stays away: doractl restart {name} makes the dataflow whole again"
+_AGAIN = "nothing: dora starts {node} again by itself"
+_AWAY = "{node} stays away until doractl restart {name}; the others run on"
 
 
 @dataclass(frozen=True)
@@ -77,9 +90,11 @@ class Report:
 def remedies(report: Report) -> list[str]:
     """What to do, each in one line."""
     verdict, subject = report.verdict, report.subject
-    texts = [_REMEDIES.get(verdict.cause, "")]
-    if verdict.cause is Cause.NODE_FAILED and verdict.is_up:
-        texts = [_GONE_FOR_GOOD] if verdict.status != RESTARTING else texts
+    texts = [_remedy(verdict)]
+    if verdict.is_passing:
+        texts = [_AGAIN]
+    elif verdict.node and verdict.is_up and verdict.status != RESTARTING:
+        texts.append(_AWAY)
     if verdict.is_given_up:
         texts.append(_GIVEN_UP)
     elif verdict.status == RESTARTING:
@@ -90,12 +105,23 @@ def remedies(report: Report) -> list[str]:
         "file": subject.file or "FILE",
         "unit": subject.unit,
         "flag": subject.flag,
+        "pid": verdict.details.get("node_pid", "PID"),
     }
     filled = [text.format(**values) for text in texts if text]
     if subject.is_loaded:
         return filled
     again = f"doractl start {values['file']} --name {subject.name}"
     return [text.replace(f"doractl restart {subject.name}", again) for text in filled]
+
+
+def _remedy(verdict: Verdict) -> str:
+    if verdict.cause is Cause.NODE_OUT_OF_MEMORY:
+        owner = verdict.details.get("owner", "")
+        return _MEMORY_REMEDIES.get(owner, _REMEDIES[verdict.cause])
+    signal = verdict.details.get("exit", "").removeprefix("signal ")
+    if verdict.cause is Cause.NODE_FAILED and signal in _SIGNAL_REMEDIES:
+        return _SIGNAL_REMEDIES[signal]
+    return _REMEDIES.get(verdict.cause, "")
 
 
 def format_report(report: Report, width: int | None = None, want_colors: bool = False) -> str:
@@ -198,7 +224,8 @@ def _words(report: Report) -> list[str]:
         return []
     node = report.verdict.node
     count = "line" if len(report.words) == 1 else f"{len(report.words)} lines"
-    title = f"The last {count} of {node or 'its nodes'}:"
+    every = f"doractl logs {report.subject.name}" + (f" --node {node}" if node else "")
+    title = f"The last {count} of {node or 'its nodes'} (all: {every}):"
     return [title, *(f"  {_clock(one.at_us)[6:]}  {_line(one, node)}" for one in report.words)]
 
 

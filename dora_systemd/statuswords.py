@@ -204,6 +204,9 @@ def _restarts_of(row: NodeRow) -> str:
     return f"{used}/{row.max_restarts}" if row.max_restarts else used
 
 
+_WITH_REASON = (FAILED, DEGRADED, RESTARTING)
+
+
 def format_dataflow(row: DataflowRow) -> str:
     """`doractl list SELECTOR`: the dataflow line by line, then the table of its nodes."""
     facts = (
@@ -220,6 +223,7 @@ def format_dataflow(row: DataflowRow) -> str:
         ("Restarts", format_count(row.restarts)),
         ("Budget", budget_words(row.restart_budget) if row.restart_budget else ""),
         ("At boot", "started" if row.enabled else ""),
+        ("Reason", f"doractl why {row.name}" if row.status in _WITH_REASON else ""),
     )
     lines = [f"{title + ':':<10}{text}" for title, text in facts if text]
     return "\n".join([*lines, "", format_nodes(row.nodes)] if row.nodes else lines)

@@ -2,6 +2,7 @@
 
 import json
 from functools import partial
+from typing import Any
 
 from dora_systemd.bus import Bus
 from dora_systemd.scope import scope_of
@@ -44,3 +45,20 @@ def test_one_without_its_file_has_failed() -> None:
     assert "/srv/gone/dataflow.yml" in row["text"]
     shown = run("systemctl", "is-active", "multi-user.target", "dora.target").stdout.split()
     assert shown == ["active", "active"]
+
+
+def why(name: str) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(run("doractl", "why", name, "-o", "json").stdout)
+    return found
+
+
+def test_what_was_before_the_reboot_is_explained() -> None:
+    """systemd knows neither of them any more, the journal does."""
+    assert not listed(ROOT).keys() & {"broken", "passing"}
+    broken = why("broken")
+    assert (broken["status"], broken["cause"]) == ("Failed", "node-failed")
+    assert broken["summary"] == "node only: exit code 3"
+    assert [one["text"] for one in broken["last_lines"]] == ["no camera there"]
+    passing = why("passing")
+    assert (passing["status"], passing["is_failure"]) == ("Stopped", False)
+    assert passing["stopped_by"] == "the shutdown of the machine"

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from functools import partial
 from pathlib import Path
 
 from tests.boot.flows import ALICE, NOTES, ROOT, listed
@@ -16,9 +17,14 @@ NEVER_READY = "nodes: [{id: only, path: sleep, args: '100000'}]\n"
 FLOW = "nodes: [{id: only, path: node.py, inputs: {tick: dora/timer/millis/200}}]\n"
 
 
-def flow(directory: Path, text: str = FLOW) -> str:
+BROKEN = (
+    'from dora import Node\nNode()\nprint("no camera there", flush=True)\nraise SystemExit(3)\n'
+)
+
+
+def flow(directory: Path, text: str = FLOW, node: str = NODE) -> str:
     directory.mkdir(parents=True)
-    (directory / "node.py").write_text(NODE)
+    (directory / "node.py").write_text(node)
     path = directory / "dataflow.yml"
     path.write_text(text)
     return str(path)
@@ -34,6 +40,11 @@ def test_enable() -> None:
     run("doractl", "start", gone, "--enable", "--no-wait")
     never = flow(Path("/srv/never"), NEVER_READY)
     run("doractl", "start", never, "--enable", "--no-wait")
+    run("doractl", "start", flow(Path("/srv/passing")))
+    # Whether its start is called a success depends on how soon it ends.
+    run("doractl", "start", flow(Path("/srv/broken"), node=BROKEN), check=False)
+    is_failed = partial(run, "systemctl", "is-failed", "dora-broken", check=False)
+    wait_for("its failure", lambda: not is_failed().returncode, 120)
     user = flow(Path("/home/alice/mine"))
     wait_for("alice's manager", lambda: Path("/run/user/1000/bus").exists(), 120)
     shutil.chown("/home/alice/mine", "alice")

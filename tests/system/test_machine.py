@@ -70,6 +70,15 @@ def test_a_limit_of_the_unit_kills_the_leaking_node_alone(cell: Cell, project: P
     assert "out of memory" in cell.show("StatusText")
     events = run("cat", str(cell.group / "node-sink" / "memory.events")).stdout
     assert "oom_group_kill 1" in events
+    found = why(cell)
+    assert (found["status"], found["cause"], found["node"]) == (
+        *("Degraded", "node-out-of-memory"),
+        "sink",
+    )
+    assert (found["details"]["owner"], found["details"]["limit"]) == ("dataflow", str(700 << 20))
+    text = cell.doractl("why", cell.name).stdout
+    assert re.search(r"\n  Memory: +peak \S+M, limit 700M of the dataflow\n", text), text
+    assert f"doractl set {cell.name} --memory-limit" in text
 
 
 @pytest.mark.warns("oom", "OOM", "killed", "node exited with error", "restart", "Failed", "Memory")
@@ -90,6 +99,8 @@ def test_a_node_over_its_limit_is_killed_alone(cell: Cell, project: Project) -> 
     assert cell.pids("node-source") + cell.pids("node-doubler") == before
     cell.wait_exchanging("source")
     assert "out of memory: peak 300M, limit 300M" in cell.doractl("list", cell.name).stdout
+    (restart,) = why(cell)["restarts"][:1]
+    assert (restart["node"], restart["reason"]) == ("sink", "out of memory: peak 300M, limit 300M")
     assert not [one for one in cell.events() if one[0] == "dataflow-oom"]
 
 
@@ -281,6 +292,12 @@ def cpu_share(group: Path, seconds: float) -> float:
     used, began = read_cpu(group).cpu_us, time.monotonic()
     time.sleep(seconds)
     return (read_cpu(group).cpu_us - used) / (time.monotonic() - began) / 1_000_000
+
+
+def why(cell: Cell) -> dict[str, Any]:
+    """What `doractl why` knows of the cell."""
+    found: dict[str, Any] = json.loads(cell.doractl("why", cell.name, "-o", "json").stdout)
+    return found
 
 
 def listed(cell: Cell) -> dict[str, Any]:

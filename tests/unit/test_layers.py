@@ -91,6 +91,7 @@ DECISIONS = {
         "unitfile",
         "unitplaces",
         "unitsyntax",
+        "verdict",
         "wiring",
         "watchrules",
     ],

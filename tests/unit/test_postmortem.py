@@ -17,8 +17,9 @@ from dora_systemd.lifestory import (
     parse_happening,
     plain_text,
 )
-from dora_systemd.postmortem import UNKNOWN_PERSON, Facts, Verdict, examine
+from dora_systemd.postmortem import UNKNOWN_PERSON, examine
 from dora_systemd.postmortemtext import Report, Subject, Word, format_report, report_values
+from dora_systemd.verdict import Facts, Verdict
 
 Record = Mapping[str, Any]
 IDS = {name: message_id for message_id, name in UNIT_MESSAGES.items()}
@@ -107,9 +108,10 @@ CASES: dict[str, tuple[tuple[Record, ...], str, Cause, str, str]] = {
         *("Failed", Cause.WATCHDOG, "", "its runner hung"),
     ),
     "systemd could not begin": (
-        (unit("process-exited", EXIT_CODE="exited", EXIT_STATUS="217"),
+        (unit("process-exited", EXIT_CODE="exited", MESSAGE="status=217/USER"),
          unit("unit-failed", UNIT_RESULT="exit-code")),
-        *("Failed", Cause.UNIT_FAILED, "", "its runner could not work (exit code 217)"),
+        *("Failed", Cause.UNIT_FAILED, ""),
+        "systemd could not start its runner: exit code 217/USER",
     ),
     "systemd lost patience": (
         (*RUNS, unit("unit-failed", UNIT_RESULT="timeout")),
@@ -217,6 +219,10 @@ def test_running_degraded_and_restarting() -> None:
     verdict = judge(*RUNS, CRASH, facts=gone)
     assert (verdict.status, verdict.node, verdict.is_failure) == ("Degraded", "camera", True)
     assert "camera stays away" in format_report(Report(SUBJECT, verdict))
+    waiting = Facts("Running", "1/2", restarting=("camera",))
+    verdict = judge(*RUNS, CRASH, facts=waiting)
+    assert (verdict.node, verdict.is_passing, verdict.is_failure) == ("camera", True, False)
+    assert "dora starts camera again by itself" in format_report(Report(SUBJECT, verdict))
     facts = Facts("Restarting")
     verdict = judge(*RUNS, failed("daemon-lost", "gone"), unit("unit-restart"), facts=facts)
     assert (verdict.status, verdict.summary) == ("Restarting", "gone")
@@ -244,6 +250,29 @@ def test_values_of_fields() -> None:
     assert plain_text(None) == plain_text([]) == ""
     assert parse_happening({"MESSAGE": "a line"}) is None
     assert parse_happening({"MESSAGE_ID": SHUTDOWN_MESSAGE}) is None
+
+
+@pytest.mark.parametrize(
+    ("exit", "owner", "words"),
+    [
+        ("signal SIGSEGV", "", "coredumpctl info 7"),
+        ("signal SIGKILL", "", "journalctl -k"),
+        ("out of memory: x", "dataflow", "doractl set robot --memory-limit SIZE"),
+        ("out of memory: x", "machine", "the machine is short of memory"),
+        ("exit code 1", "", "mend camera"),
+    ],
+)
+def test_remedies(exit: str, owner: str, words: str) -> None:
+    name = "node-oom" if owner else "node-crashed"
+    crash = event(name, "camera", exit=exit, owner=owner, node_pid="7")
+    text = format_report(Report(SUBJECT, judge(*RUNS, crash, NODE_FAILED)))
+    assert words in text.partition("What to do:")[2]
+
+
+def test_one_that_is_gone_is_started_anew() -> None:
+    gone = Subject(UUID, "robot", "dora-robot.service", "--user")
+    text = format_report(Report(gone, judge(*RUNS, CRASH, NODE_FAILED)))
+    assert "mend camera, then: doractl start FILE --name robot" in text
 
 
 SEVERAL = [record for records, *_ in CASES.values() for record in records]

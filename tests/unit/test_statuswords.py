@@ -150,7 +150,7 @@ def test_limits_stand_beside_what_is_used() -> None:
 
 
 def test_one_dataflow_without_nodes() -> None:
-    assert format_dataflow(ROWS[1]).endswith("Restarts: 12")
+    assert format_dataflow(ROWS[1]).endswith("Restarts: 12\nReason:   doractl why a-longer-name")
 
 
 def test_json_has_units_in_its_keys() -> None:
