@@ -27,6 +27,7 @@ SHUTDOWN_MESSAGE = "98268866d1d54a499c4e98921d93bc40"
 START_LIMIT_FUNCTION = "unit_test_start_limit"
 """CODE_FUNC of systemd's "Start request repeated too quickly.", which has no MESSAGE_ID."""
 
+_BEGINNINGS = ("unit-starting", "dataflow-starting")
 _SYSTEMD_FIELDS = ("EXIT_CODE", "EXIT_STATUS", "COMMAND", "UNIT_RESULT", "N_RESTARTS")
 
 
@@ -70,13 +71,9 @@ class Life:
 
     @property
     def began_us(self) -> int:
-        """CLOCK_REALTIME µs of the first record, 0 without any."""
-        return self.happenings[0].at_us if self.happenings else 0
-
-    @property
-    def ended_us(self) -> int:
-        """CLOCK_REALTIME µs of the last record, 0 without any."""
-        return self.happenings[-1].at_us if self.happenings else 0
+        """CLOCK_REALTIME µs of its beginning, 0 where that is not among the records."""
+        begin = self.first(*_BEGINNINGS)
+        return begin.at_us if begin else 0
 
     @property
     def boot(self) -> str:

@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from itertools import islice
 from pathlib import Path
 
+from dora_systemd import nodetable
 from dora_systemd.busprotocol import Manager
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.journalread import JournalReader, is_volatile
@@ -73,11 +74,11 @@ def _subject(scope: Scope, cell: Cell) -> Subject:
 
 def _facts(manager: Manager, scope: Scope, cell: Cell) -> Facts:
     status = read_status(scope, cell) if cell.is_up else CellStatus()
-    nodes = status.nodes.items()
+    nodes, spent = status.nodes.items(), nodetable.spent(status.nodes)
     return Facts(
         status_word(cell.state.active, cell.state.sub, status.stage),
         str(manager.read(cell.unit, ["StatusText"])["StatusText"]),
-        {key: node.exit for key, node in nodes if node.state == "failed"},
+        {key: spent.get(key, node.exit) for key, node in nodes if node.state == "failed"},
         tuple(key for key, node in nodes if node.state == "restarting"),
         _now_boot(),
     )

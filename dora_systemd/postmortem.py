@@ -62,6 +62,7 @@ def examine(lives: Sequence[Life], facts: Facts, shutdowns: Sequence[int] = ()) 
         status,
         found.cause,
         found.summary,
+        facts.text if status in UP_WORDS else "",
         found.node,
         found.at.at_us if found.at else 0,
         life.began_us,
@@ -91,11 +92,13 @@ def _present(life: Life, facts: Facts) -> _Finding:
     """How a dataflow that runs is: what has gone for good, else what was restarted last."""
     gone = [one for one in final_crashes(life) if one.node in facts.failed]
     if gone:
-        return _crash(gone[0])
+        # The table of nodes has counted their restarts.
+        first, how = gone[0].node, facts.failed[gone[0].node]
+        return replace(_crash(gone[0]), summary=f"node {first}: {how}")
     waiting = [one for one in final_crashes(life) if one.node in facts.restarting]
     if waiting:
         return replace(_crash(waiting[-1]), is_passing=True)
-    return _Finding(Cause.NONE, facts.text)
+    return _Finding(Cause.NONE, "")
 
 
 def final_crashes(life: Life) -> list[Happening]:

@@ -138,14 +138,19 @@ def _cut(line: str, width: int) -> str:
 
 def _colored(lines: list[str], verdict: Verdict) -> list[str]:
     color = _RED if verdict.is_failure else _GREEN
-    titles = [f"{_BOLD}{one}{_PLAIN}" if one.endswith(":") else one for one in lines[1:]]
+    titles = [f"{_BOLD}{one}{_PLAIN}" if _is_title(one) else one for one in lines[1:]]
     return [f"{color}{_BOLD}{lines[0]}{_PLAIN}", *titles]
+
+
+def _is_title(line: str) -> bool:
+    return line.endswith(":") and not line.startswith(" ")
 
 
 def _head(report: Report) -> list[str]:
     verdict, subject = report.verdict, report.subject
     facts = {
-        "Why" if verdict.cause else "Now": verdict.summary,
+        "Why": verdict.summary,
+        "Now": verdict.now,
         "When": _when(verdict),
         "Memory": _memory_words(verdict.details),
         "Starved": ", ".join(verdict.starved),
@@ -162,7 +167,8 @@ def _head(report: Report) -> list[str]:
 def _budget_words(report: Report) -> str:
     """What is left of systemd's restarts, as long as there may be one."""
     budget = report.budget
-    return budget_words(budget) if budget and (budget["used"] or report.verdict.is_up) else ""
+    is_due = budget and (budget["used"] or report.verdict.status == RESTARTING)
+    return budget_words(budget) if budget and is_due else ""
 
 
 def _when(verdict: Verdict) -> str:
@@ -255,7 +261,8 @@ def report_values(report: Report) -> dict[str, Any]:
         "status": verdict.status,
         "is_failure": verdict.is_failure,
         "cause": str(verdict.cause) or None,
-        "summary": verdict.summary,
+        "summary": verdict.summary or None,
+        "now": verdict.now or None,
         "node": verdict.node or None,
         "at_us": verdict.at_us or None,
         "began_us": verdict.began_us or None,

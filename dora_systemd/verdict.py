@@ -37,7 +37,8 @@ class Restart:
 class Verdict:
     """What became of a dataflow.
 
-    status: a word of `list`. summary: what ended and how. node: the one that began it, or "".
+    status: a word of `list`. summary: what ended and how. now: STATUS= of one that is up.
+    node: the one that began it, or "".
     at_us: when that was, began_us: when that life began; CLOCK_REALTIME µs, 0: not known.
     invocation: systemd's id of that life. details: what else is known of the end.
     is_given_up: systemd's limit of starts is used up. is_passing: dora starts the node again by
@@ -47,6 +48,7 @@ class Verdict:
     status: str
     cause: Cause = Cause.NONE
     summary: str = ""
+    now: str = ""
     node: str = ""
     at_us: int = 0
     began_us: int = 0

@@ -295,3 +295,36 @@ def test_nodes_that_all_crashed_at_once_run_again() -> None:
     again = [life.NodeSpawned(10, "a", 70), life.NodeSpawned(10, "b", 80)]
     now, _ = live(*READY, *crashes, *again, life.NodeReady(11, "a"), life.NodeReady(12, "b"))
     assert [node.state for node in now.nodes.values()] == ["running", "running"]
+
+
+@pytest.mark.parametrize(
+    ("events", "cause", "nodes"),
+    [
+        ((life.Refused(9, "no"),), "refused", ""),
+        ((life.StartTimedOut(9, SECOND),), "start-timeout", "a b"),
+        ((life.ChildExited(9, "daemon", "signal SIGKILL"),), "daemon-lost", ""),
+        ((life.ConnectionLost(9),), "coordinator-lost", ""),
+    ],
+)
+def test_a_failure_names_its_cause(events: tuple[life.Event, ...], cause: str, nodes: str) -> None:
+    _, done = live(*START, *events)
+    (failure,) = [one for one in done if isinstance(one, Record) and one.event == "dataflow-failed"]
+    assert (failure.details["cause"], failure.details.get("nodes", "")) == (cause, nodes)
+
+
+def test_a_failed_node_names_itself_and_whom_it_starves() -> None:
+    now, _ = live(*READY)
+    now = replace(now, downstream={"a": ("b",)})
+    said: list[Record] = []
+    for event in (
+        life.NodeExited(9, "a", "exit code 1", False),
+        life.NodeExited(9, "b", "", False),
+        life.RunFinished(10),
+        life.ResultKnown(11, {"a": "exit code 1", "b": ""}),
+        life.ChildExited(12, "daemon", "exit code 0"),
+    ):
+        now, actions = step(now, event)
+        said += [one for one in actions if isinstance(one, Record)]
+    crash, _, failure = said
+    assert crash.details == {"exit": "exit code 1", "downstream": "b"}
+    assert (failure.details["cause"], failure.details["nodes"]) == ("node-failed", "a")

@@ -213,12 +213,14 @@ def test_restarts_of_the_whole_and_the_limit_of_them() -> None:
 def test_running_degraded_and_restarting() -> None:
     again = (CRASH, event("node-restarted", "camera"))
     verdict = judge(*RUNS, *again, facts=Facts("Running", "2/2 nodes running"))
-    assert (verdict.summary, verdict.node, verdict.is_failure) == ("2/2 nodes running", "", False)
+    assert (verdict.now, verdict.node, verdict.is_failure) == ("2/2 nodes running", "", False)
     assert [(one.node, one.reason) for one in verdict.restarts] == [("camera", "exit code 1")]
-    gone = Facts("Degraded", "1/2", {"camera": "exit code 1"})
+    gone = Facts("Degraded", "1/2", {"camera": "exit code 1 after 2 restarts"})
     verdict = judge(*RUNS, CRASH, facts=gone)
     assert (verdict.status, verdict.node, verdict.is_failure) == ("Degraded", "camera", True)
-    assert "camera stays away" in format_report(Report(SUBJECT, verdict))
+    text = format_report(Report(SUBJECT, verdict))
+    assert "Why:      node camera: exit code 1 after 2 restarts\n  Now:      1/2\n" in text
+    assert "camera stays away" in text
     waiting = Facts("Running", "1/2", restarting=("camera",))
     verdict = judge(*RUNS, CRASH, facts=waiting)
     assert (verdict.node, verdict.is_passing, verdict.is_failure) == ("camera", True, False)

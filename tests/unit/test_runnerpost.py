@@ -6,26 +6,28 @@ from pathlib import Path
 
 import pytest
 
-from dora_systemd.runnerpost import killed_by, main, out_of_memory, write_last_words
+from dora_systemd.runnerpost import killed_by, killed_cause, main, out_of_memory, write_last_words
 
 UUID = "550e8400-e29b-41d4-a716-446655440000"
 
 
 @pytest.mark.parametrize(
-    ("code", "status", "result", "reason"),
+    ("code", "status", "result", "reason", "cause"),
     [
-        ("killed", "KILL", "signal", "its runner was ended by signal SIGKILL"),
-        ("dumped", "ABRT", "watchdog", "its runner hung and was ended by the watchdog"),
-        ("exited", "0", "success", ""),
-        ("exited", "1", "exit-code", ""),
-        ("", "", "", ""),
+        ("killed", "KILL", "signal", "its runner was ended by signal SIGKILL", "runner-killed"),
+        ("dumped", "ABRT", "watchdog", "its runner hung and was ended by the watchdog", "watchdog"),
+        ("killed", "KILL", "timeout", "it did not start or stop in time and was killed", "timeout"),
+        ("exited", "0", "success", "", "runner-killed"),
+        ("exited", "1", "exit-code", "", "runner-killed"),
+        ("", "", "", "", "runner-killed"),
     ],
 )
 def test_only_a_killed_runner_has_last_words(
-    code: str, status: str, result: str, reason: str
+    code: str, status: str, result: str, reason: str, cause: str
 ) -> None:
     environ = {"EXIT_CODE": code, "EXIT_STATUS": status, "SERVICE_RESULT": result}
     assert killed_by(environ) == reason
+    assert killed_cause(environ) == cause
 
 
 def test_a_runner_that_was_killed_for_want_of_memory(tmp_path: Path) -> None:
