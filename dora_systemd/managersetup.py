@@ -28,7 +28,7 @@ from dora_systemd.unitfiles import (
 _PACKAGE = Path(__file__).parent
 _CHECKOUT = {"templates": "units/templates", "completions": "packaging/completions"}
 _SECONDS = 60.0
-_STANDARD = ("lib", "share", "man", "local")
+_STANDARD = ("etc", "lib", "share", "man", "local")
 """Directories that every machine has."""
 
 

@@ -1,13 +1,13 @@
 """What `doractl setup` puts where: the files that the Debian package has, for a pip install.
 
-System-wide they go where systemd, bash and man look for what the admin has installed; for a user
-below the user's own data directory, see file-hierarchy(7).
+System-wide they go where systemd, man and the shells look for what the admin has installed; for a
+user below the user's own data directory, see file-hierarchy(7).
 """
 
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-SYSTEM_ROOT = "/usr/local"
+SYSTEM_ROOT = "/"
 PACKAGED_UNIT = "/usr/lib/systemd/system/dora.slice"
 """There if a package has put everything in place."""
 
@@ -30,6 +30,9 @@ _UNITS = ("dora.slice", "dora.target")
 _BASH = SetupFile(("completions", "doractl"), "share/bash-completion/completions/doractl")
 _ZSH = SetupFile(("completions", "_doractl"), "share/zsh/site-functions/_doractl")
 _FISH = SetupFile(("completions", "doractl.fish"), "share/fish/vendor_completions.d/doractl.fish")
+_LOCAL = "usr/local"
+# Below /usr/local fish looks only where XDG_DATA_DIRS says so, which nothing sets on a server.
+_FISH_OF_ALL = _FISH._replace(place="etc/fish/completions/doractl.fish")
 _SYSTEM_ONLY = (
     SetupFile(("templates", "dora-systemd.catalog"), "lib/systemd/catalog/dora-systemd.catalog"),
     SetupFile(("templates", "dora-systemd.sysusers"), "lib/sysusers.d/dora-systemd.conf"),
@@ -39,15 +42,16 @@ _SYSTEM_ONLY = (
 
 def setup_files(is_user: bool, manuals: Iterable[str]) -> list[SetupFile]:
     """All files of one scope. manuals: names of the manual pages that there are."""
-    common = [_BASH, _FISH]
+    common = [_BASH]
     common += [SetupFile(("man", one), f"share/man/man{one[-1]}/{one}") for one in sorted(manuals)]
     if is_user:
-        files = [*_units("share/systemd/user", "default.target"), *common]
+        files = [*_units("share/systemd/user", "default.target"), *common, _FISH]
         # All of a user's are below one directory, which is called share itself.
         return [one._replace(place=one.place.removeprefix("share/")) for one in files]
     users = _units("lib/systemd/user", "default.target")
     system = _units("lib/systemd/system", "multi-user.target")
-    return [*system, *users, *_SYSTEM_ONLY, *common]
+    local = [*system, *users, *_SYSTEM_ONLY, *common]
+    return [*(one._replace(place=f"{_LOCAL}/{one.place}") for one in local), _FISH_OF_ALL]
 
 
 def is_ours(text: str) -> bool:

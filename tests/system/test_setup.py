@@ -8,19 +8,20 @@ import pytest
 from dora_systemd.errors import ExitCode
 from tests.system.cells import Cell, Project, run
 
-# Writes below /usr/local.
+# Writes below /usr/local and to /etc/fish.
 pytestmark = pytest.mark.lab
 
 LOCAL = Path("/usr/local")
+PLACES = (LOCAL, Path("/etc/fish"))
 
 
 def files() -> set[Path]:
-    return {path for path in LOCAL.rglob("*") if not path.is_dir()}
+    return {path for place in PLACES for path in place.rglob("*") if not path.is_dir()}
 
 
 @pytest.fixture
 def removed() -> Iterator[set[Path]]:
-    """What is below /usr/local before and after."""
+    """What is there before and after."""
     before = files()
     yield before
     run("doractl", "setup", "--remove", check=False)

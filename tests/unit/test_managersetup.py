@@ -44,14 +44,14 @@ def test_put_in_place_and_taken_away(scope: Scope, tmp_path: Path) -> None:
     assert sorted(take_away(plan_setup(scope, tmp_path))) == sorted(written)
     assert tree(tmp_path) == before
     left = {path.name for path in tmp_path.rglob("*") if path.is_dir()}
-    assert left <= {"lib", "share", "man"}
+    assert left <= {"etc", "usr", "local", "lib", "share", "man"}
     assert take_away(plan_setup(scope, tmp_path)) == []
 
 
 def test_the_links_lead_to_the_target(tmp_path: Path) -> None:
     put_in_place(plan_setup(SYSTEM, tmp_path))
     for place in ("system/multi-user.target.wants", "user/default.target.wants"):
-        link = tmp_path / "lib/systemd" / place / "dora.target"
+        link = tmp_path / "usr/local/lib/systemd" / place / "dora.target"
         assert link.resolve() == (link.parent.parent / "dora.target").resolve()
         assert link.exists()
 
@@ -71,9 +71,9 @@ def test_everything_of_the_project_has_a_place() -> None:
 
 @pytest.mark.parametrize("is_link", [False, True])
 def test_foreign_files_stay(is_link: bool, tmp_path: Path) -> None:
-    path = tmp_path / "lib/systemd/system/dora.slice"
+    path = tmp_path / "usr/local/lib/systemd/system/dora.slice"
     if is_link:
-        path = tmp_path / "lib/systemd/system/multi-user.target.wants/dora.target"
+        path = tmp_path / "usr/local/lib/systemd/system/multi-user.target.wants/dora.target"
     path.parent.mkdir(parents=True)
     path.write_text("[Slice]\n")
     with pytest.raises(DoraSystemdError, match="there already") as caught:
@@ -83,7 +83,7 @@ def test_foreign_files_stay(is_link: bool, tmp_path: Path) -> None:
 
 
 def test_an_older_version_is_replaced(tmp_path: Path) -> None:
-    path = tmp_path / "lib/systemd/system/dora.slice"
+    path = tmp_path / "usr/local/lib/systemd/system/dora.slice"
     path.parent.mkdir(parents=True)
     path.write_text("# of dora-systemd 0.0\n[Slice]\n")
     assert path in put_in_place(plan_setup(SYSTEM, tmp_path))
