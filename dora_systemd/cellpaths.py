@@ -31,6 +31,11 @@ class CellPaths:
         return self.root / "runner.sock"
 
     @property
+    def settings(self) -> Path:
+        """The version of the dataflow's settings file that is in use."""
+        return self.root / "settings.yml"
+
+    @property
     def coordinator(self) -> Path:
         """Working directory of the coordinator, which writes its token and its log there."""
         return self.root / "coordinator"

@@ -31,6 +31,7 @@ from dora_systemd.runnerloss import LossWatch, losses_of_user
 from dora_systemd.runnernodes import Nodes, enter_supervisor, wait_eof
 from dora_systemd.runnerpump import Pump, now_us
 from dora_systemd.runnerreload import Reloader
+from dora_systemd.runnersettings import SettingsFile, settings_path
 from dora_systemd.runnersocket import serve
 from dora_systemd.runnerswap import READY_SECONDS, Swapper
 from dora_systemd.values import INFINITY, SECOND
@@ -79,7 +80,9 @@ async def run_cell(options: RunnerOptions, paths: CellPaths) -> RunnerExit:
     pipes = LogPipes(loop, journal, CellIdentity(options.name, options.uuid), fdstore.store)
     environment = node_environment(os.environ)
     nodes = Nodes(unit, paths, pipes)
-    cell = Runs(options, paths, unit, environment, pipes, nodes, Reloader(options, environment))
+    settings = SettingsFile(settings_path(options), paths.settings)
+    reloader = Reloader(options, environment, settings)
+    cell = Runs(paths, unit, environment, pipes, nodes, reloader)
     losses = losses_of_user(journal, pipes) if paths.is_of_user else None
     try:
         pipes.write_event("dataflow-starting")
@@ -97,7 +100,6 @@ async def run_cell(options: RunnerOptions, paths: CellPaths) -> RunnerExit:
 class Runs:
     """What all runs of the dataflow share. unit: cgroup directory. environment: of the nodes."""
 
-    options: RunnerOptions
     paths: CellPaths
     unit: Path
     environment: dict[str, str]
@@ -138,7 +140,7 @@ def goes_on(cell: Runs, last: Cell) -> bool:
 
 async def run_once(cell: Runs, is_again: bool) -> Cell:
     """One run of the dataflow, with a dora of its own; how it ended. Raises DoraSystemdError."""
-    started_us, options, reloader = now_us(), cell.options, cell.reloader
+    started_us, options, reloader = now_us(), cell.reloader.options, cell.reloader
     dora = Engine(options.dora, cell.paths, cell.environment)
     try:
         coordinator = dora.start_coordinator()  # it boots while we read

@@ -64,8 +64,7 @@ class Nodes:
         self._launched.clear()
         for node in dataflow.nodes:
             self._make(node, rates)
-        for one in limits:
-            cgroup.limit_group(self._group(one.node), one)
+        self.limit(limits)
 
     def _make(self, node: Node, rates: RateLimits) -> None:
         cgroup.make_group(self._group(node.id))
@@ -83,10 +82,13 @@ class Nodes:
     def add(self, node: Node, rates: RateLimits, limits: Iterable[NodeLimits]) -> None:
         """The same for one node of a dataflow that runs; it has pipes. Raises as prepare() does."""
         self._make(node, rates)
-        for one in limits:
-            if one.node == node.id:
-                cgroup.limit_group(self._group(node.id), one)
+        self.limit(one for one in limits if one.node == node.id)
         self._pipes.open(node.id)
+
+    def limit(self, limits: Iterable[NodeLimits]) -> None:
+        """Other limits for nodes that run. Raises DoraSystemdError for one that does not hold."""
+        for one in limits:
+            cgroup.limit_group(self._group(one.node), one)
 
     def remove(self, node: str) -> None:
         """The node has ended and does not come back. Raises OSError."""

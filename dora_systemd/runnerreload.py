@@ -13,15 +13,17 @@ from typing import Any
 
 from dora_systemd import lifeevents as life
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.limits import check_nodes, merge_node_limits
 from dora_systemd.options import RunnerOptions
 from dora_systemd.preparation import Prepared
 from dora_systemd.reloadsteps import How, Step
 from dora_systemd.runnerapply import Applier, Run
 from dora_systemd.runnerpump import now_us
+from dora_systemd.runnersettings import SettingsFile
 from dora_systemd.runnersources import Change, Sources, watch_rules
 from dora_systemd.runnerswap import NotReady
 from dora_systemd.values import quoted
-from dora_systemd.watch import changed_files
+from dora_systemd.watch import change_time, changed_files
 from dora_systemd.wiring import downstream_of
 
 PAUSE_SECONDS = 1.0
@@ -31,14 +33,18 @@ Answer = dict[str, Any]
 
 
 class Reloader:
-    """All that reloads need. options: of the runner. environment: of the nodes.
+    """All that reloads need. options: of the runner. environment: of the nodes. settings: the
+    settings file beside the dataflow.
 
     current: what runs. before: what ran before a reload of the whole dataflow that has yet to show
     that it works, or None. notice: what the last reload has left to say.
     """
 
-    def __init__(self, options: RunnerOptions, environment: Mapping[str, str]) -> None:
-        self._options = options
+    def __init__(
+        self, options: RunnerOptions, environment: Mapping[str, str], settings: SettingsFile
+    ) -> None:
+        self.options = options
+        self._settings = settings
         self._environment = environment
         self._sources = Sources(options, environment)
         self._lock = asyncio.Lock()
@@ -57,6 +63,7 @@ class Reloader:
         """A run of the dataflow begins."""
         self._run, self.current = run, prepared
         self._stamps = self._sources.stamps(prepared)
+        self._stamps[self._settings.path] = change_time(self._settings.path)
         self._begun.set()
 
     def end(self) -> None:
@@ -84,7 +91,8 @@ class Reloader:
 
     async def work(self) -> None:
         """Reload what has changed, again and again."""
-        self._watch(self._options.hot_reload)
+        self._settings.keep()
+        self._watch(self.options.hot_reload)
         while True:
             await self._wake.wait()
             await self._begun.wait()
@@ -95,6 +103,10 @@ class Reloader:
                 await self._reload(changed)
             except DoraSystemdError as error:
                 self._refuse(error)
+            except Exception as error:
+                # Whatever it is: what runs goes on, and the next save has another chance.
+                what = f"cannot reload: {type(error).__name__}: {error}"
+                self._refuse(DoraSystemdError(what, "please report it"))
             await pause
 
     def _watch(self, is_on: bool) -> None:
@@ -103,7 +115,7 @@ class Reloader:
         self._watcher = asyncio.create_task(self._collect()) if is_on else None
 
     async def _collect(self) -> None:
-        rules = await asyncio.to_thread(watch_rules, self._options)
+        rules = await asyncio.to_thread(watch_rules, self.options)
         try:
             async for files in changed_files(rules):
                 self._changed |= files
@@ -126,20 +138,40 @@ class Reloader:
             if run is None or current is None:
                 hint = "wait until it has started"
                 raise DoraSystemdError("cannot reload: no node runs", hint, ExitCode.NOT_RUNNING)
+            done = await self._take_settings(run) if self._settings.path in changed else []
+            changed = [path for path in changed if path != self._settings.path]
             change = await asyncio.to_thread(self._sources.look, current, changed)
-            change = _with_node(change, node, self._options.dataflow)
+            change = _with_node(change, node, self.options.dataflow)
             if not change.is_empty:
                 run.pipes.write_event("files-changed", files=", ".join(_names(change, changed)))
-            done = await self._apply(run, change) if not change.is_empty else []
+                done += await self._apply(run, change)
             self._stamps |= await asyncio.to_thread(self._sources.stamps, change.prepared)
+            self._stamps[self._settings.path] = change_time(self._settings.path)
         self.notice = ""
         if self._run is not None and (done or self._run.pump.cell.notice):
             fed = downstream_of(change.prepared.dataflow)
             self._run.pump.push(life.ReloadNoted(now_us(), "", fed))
         return done
 
+    async def _take_settings(self, run: Run) -> list[str]:
+        """Other limits of nodes hold at once; what else has changed waits for the next start."""
+        change = await asyncio.to_thread(self._settings.change)
+        check_nodes(change.limits, run.pump.cell.nodes, ())
+        run.nodes.limit(change.limits)
+        self._settings.keep()
+        merged = merge_node_limits(self.options.node_limits, change.limits)
+        self.options = replace(self.options, node_limits=merged)
+        name = PurePath(self._settings.path).name
+        for one in change.limits:
+            run.pipes.write_event("node-reloaded", one.node, how="limited anew", reason=name)
+        if change.others:
+            keys = ", ".join(change.others)
+            reason = f"{name}: {keys}: only doractl stop and start take that over"
+            run.pipes.write_event("reload-failed", reason=reason)
+        return [f"the node {one.node} was limited anew: {name}" for one in change.limits]
+
     async def _apply(self, run: Run, change: Change) -> list[str]:
-        applier = Applier(run, change, self._options)
+        applier = Applier(run, change, self.options)
         reason = change.whole or applier.obstacle()
         if not reason:
             try:
@@ -158,7 +190,7 @@ class Reloader:
             return DoraSystemdError(f"cannot use what was saved: {error}")
         assert self.current is not None
         await applier.undo(self.current)
-        message = f"cannot use {self._options.dataflow}: {error}; the version before runs again"
+        message = f"cannot use {self.options.dataflow}: {error}; the version before runs again"
         return DoraSystemdError(message)
 
     async def _restart(self, run: Run, change: Change, reason: str) -> list[str]:
@@ -169,7 +201,7 @@ class Reloader:
         self._outcome = asyncio.get_running_loop().create_future()
         run.pump.push(life.ReloadAsked(now_us()))
         if failure := await self._outcome:
-            raise DoraSystemdError(f"cannot use {self._options.dataflow}: {failure}")
+            raise DoraSystemdError(f"cannot use {self.options.dataflow}: {failure}")
         took = f"{time.monotonic() - begun:.2f}s"
         words = f"{reason}; ready after {took}"
         run.pipes.write_event("reloaded", reason=words, file=", ".join(_files(change)))
@@ -196,13 +228,14 @@ class Reloader:
         if self.current is None:
             return []
         now = self._sources.stamps(self.current)
+        now[self._settings.path] = change_time(self._settings.path)
         return [path for path, stamp in now.items() if self._stamps.get(path) != stamp]
 
     async def _switch(self, is_on: bool) -> Answer:
         async with self._lock:
-            reload = self._options.reload._replace(is_on=is_on)
-            self._options = replace(self._options, reload=reload)
-            self._sources = Sources(self._options, self._environment)
+            reload = self.options.reload._replace(is_on=is_on)
+            self.options = replace(self.options, reload=reload)
+            self._sources = Sources(self.options, self._environment)
             # Only how nodes that fail are treated differs: each gets it with its next reload.
             self.current = await asyncio.to_thread(self._sources.prepare)
             self._watch(is_on)

@@ -17,6 +17,7 @@ from dora_systemd.preparation import Prepared, prepare
 from dora_systemd.pythonimports import program_files, syntax_error
 from dora_systemd.reload import Difference, NodeSources, difference, touched
 from dora_systemd.reloadsteps import How, Step, plan_steps
+from dora_systemd.runnersettings import settings_path
 from dora_systemd.watch import change_time, read_gitignores
 from dora_systemd.watchrules import DEFAULT_WATCH, WatchRules
 
@@ -39,9 +40,9 @@ class Change:
 def watch_rules(options: RunnerOptions) -> WatchRules:
     """Which files of the dataflow mean a reload."""
     root, given = options.working_directory, options.reload
-    dataflow = options.dataflow
+    own = frozenset({options.dataflow, settings_path(options)})
     watched = given.watch or DEFAULT_WATCH
-    return WatchRules(root, watched, given.ignore, read_gitignores(root), frozenset({dataflow}))
+    return WatchRules(root, watched, given.ignore, read_gitignores(root), own)
 
 
 class Sources:

@@ -11,7 +11,7 @@ from dora_systemd.watchrules import WatchRules
 
 DEBOUNCE_MS = 400
 """Changes that follow each other faster belong together, up to this time."""
-_STEP_MS = 50
+_STEP_MS = 100
 _GONE_SECONDS = 0.25
 
 

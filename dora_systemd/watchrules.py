@@ -53,7 +53,7 @@ class WatchRules:
         """Whether a change of the file `path`, absolute, means a reload."""
         relative = self._relative(path)
         return path in self.files or (
-            bool(relative) and not self.is_ignored(path) and self._watched(relative)
+            bool(relative) and self._watched(relative) and not self.is_ignored(path)
         )
 
     def has_directory(self, path: str) -> bool:

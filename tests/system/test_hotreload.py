@@ -10,6 +10,8 @@ from dora_systemd.errors import ExitCode
 from tests.system.cells import DOUBLER, SINK, THREE_NODES, Cell, Project, wait_for
 
 HOT = "--hot-reload"
+SLOW_SECONDS = 150.0
+"""A child that imports pydantic takes its time where the processor is emulated."""
 SHARED = "FACTOR = 2\n"
 USES_SHARED = DOUBLER.replace("from dora", "import shared\nfrom dora").replace(
     "2 * event", "shared.FACTOR * event"
@@ -38,9 +40,9 @@ def reloads(cell: Cell) -> list[dict[str, str]]:
     return [one for one in cell.journal() if one.get("DORA_EVENT") == "node-reloaded"]
 
 
-def wait_reloads(cell: Cell, count: int) -> list[dict[str, str]]:
+def wait_reloads(cell: Cell, count: int, seconds: float = 30.0) -> list[dict[str, str]]:
     return wait_for(
-        f"reload {count}", lambda: found if len(found := reloads(cell)) >= count else []
+        f"reload {count}", lambda: found if len(found := reloads(cell)) >= count else [], seconds
     )
 
 
@@ -349,3 +351,26 @@ def test_a_first_start_that_fails_is_a_failed_start(cell: Cell, project: Project
     done = cell.start(flow, HOT, check=False)
     assert done.returncode == ExitCode.FAILURE
     assert "exit code 1" in done.stderr
+
+
+@pytest.mark.vm
+@pytest.mark.warns(NOT_RELOADED)
+def test_a_settings_file(cell: Cell, project: Project) -> None:
+    """Limits of nodes hold at once, and over a reload of the whole; the rest is named."""
+    flow = project.three_nodes()
+    cell.start(flow, HOT)
+    before = pids(cell)
+    settings = project.write("dataflow.systemd.yml", "nodes: {sink: {memory_limit: 1G}}")
+    (record,) = wait_reloads(cell, 1, SLOW_SECONDS)
+    assert record["MESSAGE"] == "Node sink was limited anew: dataflow.systemd.yml"
+    assert (cell.group / "node-sink/memory.max").read_text() == f"{1 << 30}\n"
+    save(flow, "env: {COLOR: blue}\n" + THREE_NODES)
+    wait_for("it is reloaded", lambda: ("reloaded", "") in cell.events())
+    assert (cell.group / "node-sink/memory.max").read_text() == f"{1 << 30}\n"
+    save(settings, "env: {A: b}\nnodes: {sink: {memory_limit: lots}}")
+    wait_for("it is refused", lambda: len(failures(cell)) >= 1, SLOW_SECONDS)
+    save(settings, "env: {A: b}\n")
+    wait_for("it is named", lambda: len(failures(cell)) >= 2, SLOW_SECONDS)
+    assert "dataflow.systemd.yml: env: only doractl stop and start" in failures(cell)[-1]
+    assert (cell.group / "node-sink/memory.max").read_text() == "max\n"
+    assert pids(cell).keys() == before.keys()
