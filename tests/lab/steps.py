@@ -109,8 +109,10 @@ def plan_test(form: str) -> list[Step]:
     if form == "host":
         return [*plan_unit(form), *plan_system(form)]
     inside = [] if sys.version_info[:2] == LAB_PYTHON else [unit_in_lab()]
-    own = [*plan_unit(form), *inside, *plan_lab(form), *plan_vm(form)]
-    return [*own, *plan_packages(form), *plan_system(form)]
+    own = [*plan_unit(form), *inside, *plan_lab(form)]
+    build, *tests = plan_packages(form)
+    # The machine is emulated by one processor; the packages can be built by the other.
+    return [*own, replace(build, with_next=True), *plan_vm(form), *tests, *plan_system(form)]
 
 
 def plan_unit(_form: str) -> list[Step]:
