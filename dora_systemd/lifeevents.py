@@ -127,7 +127,10 @@ class ChildExited(Event):
 
 @dataclass(frozen=True)
 class ConnectionLost(Event):
-    """The coordinator closed a control connection that we did not close."""
+    """The coordinator closed a control connection that we did not close, or `child` is silent."""
+
+    child: str = "coordinator"
+    reason: str = "the dora coordinator closed the control connection"
 
 
 @dataclass(frozen=True)

@@ -123,7 +123,8 @@ def child_exited(cell: Cell, event: life.Event) -> Step:
 
 def connection_lost(cell: Cell, event: life.Event) -> Step:
     """The same, learned another way."""
-    return _lose(cell, "coordinator", "the dora coordinator closed the control connection", "")
+    assert isinstance(event, life.ConnectionLost)
+    return _lose(cell, event.child, event.reason, "")
 
 
 def _lose(cell: Cell, child: str, reason: str, how: str) -> Step:

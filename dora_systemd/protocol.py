@@ -15,7 +15,7 @@ from uuid import uuid4
 from dora_systemd import lifeevents as life
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.oom import Oom
-from dora_systemd.values import SECOND
+from dora_systemd.values import INFINITY, SECOND
 
 Params = str | Mapping[str, Any]
 
@@ -155,7 +155,20 @@ def reload_params(run: str, node: str, operator: str) -> Params:
 
 
 DAEMON_CONNECTED: Params = "DaemonConnected"
+CONNECTED_DAEMONS: Params = "ConnectedMachines"
 HELLO: Params = {"Hello": {"dora_version": "1.0.0"}}
+
+
+def parse_heartbeat(reply: Reply) -> int:
+    """µs since the coordinator last heard of its daemon, as CONNECTED_DAEMONS is answered.
+
+    INFINITY when it has none any more, 0 when the answer does not tell.
+    """
+    daemons = _mapping(reply.result).get("ConnectedDaemons")
+    if not isinstance(daemons, list):
+        return 0
+    ages = (_mapping(one).get("last_heartbeat_ago_ms") or 0 for one in daemons)
+    return min((int(age) * 1000 for age in ages), default=INFINITY)
 
 
 def parse_results(reply: Reply) -> dict[str, str] | None:

@@ -166,14 +166,18 @@ class Dialogue:
             self._pump.push(life.ChildExited(now_us(), "daemon", "earlier"))
 
     async def feed_watchdog(self, seconds: float) -> None:
-        """Every `seconds`: WATCHDOG=1, but only if coordinator and daemon have just answered.
+        """Every `seconds`: WATCHDOG=1, and see that neither coordinator nor daemon hangs.
 
         While it stops, systemd's TimeoutStopSec= is what bounds it.
         """
         while True:
             await asyncio.sleep(seconds)
-            if self._pump.cell.state is not State.RUNNING or await self._engine.is_joined():
-                notify.send_alive()
+            if self._pump.cell.state is State.RUNNING:
+                silent = await self._engine.find_silent(1.5 * seconds)
+                if silent and self._pump.cell.state is State.RUNNING:
+                    reason = f"the dora {silent} does not answer any more"
+                    self._pump.push(life.ConnectionLost(now_us(), silent, reason))
+            notify.send_alive()
 
     async def take_samples(self, seconds: float) -> None:
         """Every `seconds`: CPU time used so far."""

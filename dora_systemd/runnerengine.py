@@ -10,9 +10,13 @@ from typing import Any
 from dora_systemd import control, engine, files, protocol
 from dora_systemd.cellpaths import CellPaths
 from dora_systemd.errors import DoraSystemdError
+from dora_systemd.values import SECOND
 
 POLL_SECONDS = 0.002
 """Between two questions whether the daemon has registered: dora tells it by no event."""
+
+SILENCE = 20
+"""Seconds without a word of the daemon after which it hangs; it sends a heartbeat every 5."""
 
 OnRecord = Callable[[protocol.LogRecord], None]
 
@@ -66,9 +70,22 @@ class Engine:
             await asyncio.sleep(POLL_SECONDS)
 
     async def is_joined(self) -> bool:
-        """Whether coordinator and daemon answer. Raises DoraSystemdError when they do not."""
+        """Whether the daemon has registered. Raises DoraSystemdError without an answer."""
         reply = await self.ask(protocol.DAEMON_CONNECTED)
         return bool(protocol.result_of(reply, "DaemonConnected"))
+
+    async def find_silent(self, seconds: float) -> str:
+        """The one of the two that hangs, or "": they were heard of just now.
+
+        seconds: how long the coordinator may take to answer. It does not ask the daemon: that would
+        keep it from answering anybody else for 30 s.
+        """
+        try:
+            async with asyncio.timeout(seconds):
+                reply = await self.ask(protocol.CONNECTED_DAEMONS)
+        except TimeoutError:
+            return "coordinator"
+        return "" if protocol.parse_heartbeat(reply) <= SILENCE * SECOND else "daemon"
 
     async def ask(self, params: protocol.Params) -> protocol.Reply:
         """One request that dora answers at once."""

@@ -10,6 +10,7 @@ from dora_systemd import lifeevents as life
 from dora_systemd import protocol
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.protocol import LogRecord, Reply
+from dora_systemd.values import INFINITY
 
 RUN = "01a1fb9e-9464-7aee-adce-79cf1bfc2b24"
 
@@ -136,3 +137,17 @@ def test_no_reply_breaks_the_results(frame: object) -> None:
     reply = protocol.parse_frame(json.dumps(frame))
     assert isinstance(reply, Reply)
     protocol.parse_results(reply)
+
+
+@pytest.mark.parametrize(
+    ("result", "age"),
+    [
+        ({"ConnectedDaemons": [{"last_heartbeat_ago_ms": 2302}]}, 2_302_000),
+        ({"ConnectedDaemons": [{"daemon_id": {}}]}, 0),
+        ({"ConnectedDaemons": []}, INFINITY),
+        ({"ConnectedMachines": ["a"]}, 0),
+        (None, 0),
+    ],
+)
+def test_heartbeat(result: object, age: int) -> None:
+    assert protocol.parse_heartbeat(Reply("1", result, "")) == age
