@@ -13,6 +13,7 @@ class Cause(StrEnum):
     DAEMON_LOST = "daemon-lost"
     COORDINATOR_LOST = "coordinator-lost"
     NO_ANSWER = "no-answer"
+    DIRECTORY_LOST = "directory-lost"
     RUNNER_KILLED = "runner-killed"
     WATCHDOG = "watchdog"
     TIMEOUT = "timeout"

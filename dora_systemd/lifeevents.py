@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from dora_systemd.causes import Cause
 from dora_systemd.oom import Oom
 from dora_systemd.status import NodeStatus
 from dora_systemd.wiring import Downstream
@@ -39,9 +40,10 @@ class Subscribed(Event):
 
 @dataclass(frozen=True)
 class Refused(Event):
-    """The dataflow could not be started. reason: one line."""
+    """The dataflow could not be started, or cannot go on. reason: one line."""
 
     reason: str
+    cause: Cause = Cause.REFUSED
 
 
 @dataclass(frozen=True)

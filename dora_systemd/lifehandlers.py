@@ -98,7 +98,7 @@ def _nodes(idents: list[str]) -> str:
 def refused(cell: Cell, event: life.Event) -> Step:
     """Dora does not want it, or does not understand us."""
     assert isinstance(event, life.Refused)
-    return _fail(_because(cell, Cause.REFUSED), event.reason, RunnerExit.FAILED)
+    return _fail(_because(cell, event.cause), event.reason, RunnerExit.FAILED)
 
 
 def _because(cell: Cell, cause: Cause, nodes: Iterable[str] = ()) -> Cell:

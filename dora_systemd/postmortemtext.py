@@ -31,6 +31,7 @@ _REMEDIES = {
     Cause.DAEMON_LOST: "doractl restart {name}; --restart-policy on-failure does it by itself",
     Cause.COORDINATOR_LOST: "doractl restart {name}; --restart-policy on-failure does it by itself",
     Cause.NO_ANSWER: "doractl restart {name}; was the machine overloaded?",
+    Cause.DIRECTORY_LOST: "doractl restart {name}; nobody but systemd may tidy up there",
     Cause.RUNNER_KILLED: "doractl restart {name}; --restart-policy on-failure does it by itself",
     Cause.WATCHDOG: "doractl restart {name}; was the machine overloaded?",
     Cause.OUT_OF_MEMORY: "limit single nodes (--node-limit NODE:memory=SIZE), so that one is named",

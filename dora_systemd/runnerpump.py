@@ -2,15 +2,18 @@
 
 import asyncio
 import contextlib
+import sys
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
 
 from dora_systemd import files, notify
 from dora_systemd import lifeevents as life
+from dora_systemd.causes import Cause
 from dora_systemd.cellpaths import CellPaths
 from dora_systemd.cellstate import Action, Cell, Deadline, Do, Record, State
 from dora_systemd.cellview import cell_status, format_status
+from dora_systemd.errors import DoraSystemdError
 from dora_systemd.events import END_EVENTS
 from dora_systemd.lifecycle import step
 from dora_systemd.pipes import LogPipes
@@ -45,6 +48,7 @@ class Pump:
         self._samples: tuple[CpuSample, ...] = ()
         self._text = ""
         self._is_ready = False
+        self._is_unwritten = False
         self._waiting: list[tuple[Callable[[Cell], bool], asyncio.Future[None]]] = []
 
     def connect(self, actions: Mapping[Do, Callable[[], None]]) -> None:
@@ -138,4 +142,22 @@ class Pump:
 
     def _write_table(self) -> None:
         table = cell_status(self.cell, self._uuid, self._samples)
-        files.write_atomic(self._paths.status, table.to_json(), 0o600)
+        try:
+            files.write_atomic(self._paths.status, table.to_json(), 0o600)
+        except DoraSystemdError as error:
+            # Nothing that happens may be lost for it: it is only for `list`.
+            self._report_unwritten(error)
+
+    def _report_unwritten(self, error: DoraSystemdError) -> None:
+        """Say once that the table is old; without its directory the cell cannot go on.
+
+        The pipes of the nodes are there: dora could start none of them again.
+        """
+        if self._is_unwritten:
+            return
+        self._is_unwritten = True
+        print(f"<4>{error.message}", file=sys.stderr, flush=True)
+        if not self._paths.root.exists():
+            reason = f"its directory {self._paths.root} is gone"
+            lost = life.Refused(now_us(), reason, Cause.DIRECTORY_LOST)
+            self._loop.call_soon(self.push, lost)
