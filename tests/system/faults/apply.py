@@ -1,6 +1,8 @@
 """How each fault is brought about. Each function returns when the fault has truly happened."""
 
+import errno
 import os
+import shutil
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -105,3 +107,52 @@ def stubborn(scene: Scene) -> None:
     (mask,) = [line.split()[1] for line in status if line.startswith("SigIgn")]
     assert int(mask, 16) & ignored
     scene.cell.systemctl("stop", "--no-block")
+
+
+def reexec_in_start(scene: Scene) -> None:
+    """systemd executes itself anew while it starts the dataflow again."""
+    part("daemon", signal.SIGKILL)(scene)
+    wait_for("it starts", lambda: scene.cell.show("SubState") == "start")
+    run("systemctl", "daemon-reexec")
+
+
+def delete_directory(scene: Scene) -> None:
+    """The RuntimeDirectory is deleted."""
+    shutil.rmtree(scene.cell.paths.root)
+    assert not scene.cell.paths.root.exists()
+
+
+def mount_project(scene: Scene) -> None:
+    """Give the project a file system of its own."""
+    scene.mount(scene.project.root, "1M")
+
+
+def read_only_project(scene: Scene) -> None:
+    """The project cannot be written any more, and a node has to be started again."""
+    run("mount", "-o", "remount,ro", str(scene.project.root))
+    try:
+        (scene.project.root / "new").touch()
+    except OSError as error:
+        assert error.errno == errno.EROFS
+    else:
+        raise AssertionError("it can be written")
+    nodes(signal.SIGKILL, "doubler")(scene)
+
+
+def fill_out(scene: Scene) -> None:
+    """There is no room where dora writes its own logs, and a node has to be started again."""
+    out = scene.cell.paths.work / "out"
+    logs = sorted(out.glob("*/log_*.jsonl"))
+    assert logs
+    scene.mount(out, "64k")
+    for log in logs:
+        log.parent.mkdir(exist_ok=True)
+        log.touch()
+    run("chown", "--recursive", f"--reference={scene.cell.paths.work}", str(out))
+    try:
+        (out / "big").write_bytes(bytes(1 << 20))
+    except OSError as error:
+        assert error.errno == errno.ENOSPC
+    else:
+        raise AssertionError("there is room")
+    nodes(signal.SIGKILL, "doubler")(scene)

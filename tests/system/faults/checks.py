@@ -45,6 +45,8 @@ def check_systemd(scene: Scene) -> bool:
 
 def is_exchanging(scene: Scene) -> bool:
     """Whether the dataflow runs as a whole and every node has printed since the fault."""
+    if not scene.cell.paths.status.exists():
+        return False
     nodes = scene.cell.status.nodes
     if any(nodes[role].state != "running" for role in ROLES):
         return False

@@ -50,16 +50,35 @@ class State:
 class Scene:
     """A cell with three nodes that print numbered lines and note how many.
 
-    before: the state when the fault is applied.
+    before: the state when the fault is applied. mounts: what is to be unmounted at the end.
     """
 
     cell: Cell
     project: Project
     before: State = field(init=False)
+    mounts: list[Path] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.notes.mkdir(parents=True, exist_ok=True)
         self.notes.chmod(0o777)
+
+    def __enter__(self) -> "Scene":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.mounts:
+            self.cell.end()
+        self.unmount()
+
+    def mount(self, place: Path, size: str) -> None:
+        """Put a small file system of its own at `place`."""
+        run("mount", "-t", "tmpfs", "-o", f"size={size},mode=755", "tmpfs", str(place))
+        self.mounts.append(place)
+
+    def unmount(self) -> None:
+        """Take away all of these."""
+        while self.mounts:
+            run("umount", "--lazy", str(self.mounts.pop()))
 
     @property
     def notes(self) -> Path:

@@ -28,7 +28,7 @@ CRASHED = (
     *("crashed", "node exited with error", "exit code", "signal", "restarted", "after failure"),
     *("node has no daemon event stream", "zenoh teardown timed out"),
 )
-HUNG = (*LOST, "atchdog", "Killing process", "SIGABRT", "core-dump", "dumped")
+HUNG = (*LOST, "no heartbeat", "atchdog", "Killing process", "SIGABRT", "core-dump", "dumped")
 UNRESPONSIVE = (*CRASHED, "hang", "unresponsive", "SIGKILL", "Signal(9)")
 KILLED = ("grace period", "killed on drop", "node exited with error")
 
@@ -40,7 +40,7 @@ class Fault:
     seconds: within which the outcome is there. cause: what the journal says, and `list` of a
     dataflow that has failed. warns: what the journal of the unit may warn of. more: what all nodes
     have more in the dataflow file. repeats: lines that may be in the journal twice.
-    vm: needs controllers, or a kernel of its own.
+    vm: needs controllers, or a kernel of its own. prepare: what is done before the start.
     """
 
     name: str
@@ -53,6 +53,7 @@ class Fault:
     more: str = ""
     repeats: int = 0
     vm: bool = False
+    prepare: Apply | None = None
 
 
 KILL, TERM, STOP = signal.SIGKILL, signal.SIGTERM, signal.SIGSTOP
@@ -70,8 +71,15 @@ PARTS = (
     ),
     Fault("kill-coordinator", apply.part("coordinator", KILL), SYSTEMD, 12, "SIGKILL", warns=LOST),
     Fault("term-coordinator", apply.part("coordinator", TERM), SYSTEMD, 12, "SIGTERM", warns=LOST),
-    Fault("stop-coordinator", apply.part("coordinator", STOP), SYSTEMD, 15, "", WATCHED, HUNG),
+    Fault(
+        *("stop-coordinator", apply.part("coordinator", STOP), SYSTEMD, 15, "does not answer"),
+        *(WATCHED, HUNG),
+    ),
     Fault("kill-daemon", apply.part("daemon", KILL), SYSTEMD, 12, "SIGKILL", warns=LOST),
+    Fault(
+        *("stop-daemon", apply.part("daemon", STOP), SYSTEMD, 40, "does not answer"),
+        *(WATCHED, HUNG),
+    ),
     Fault("term-daemon", apply.part("daemon", TERM), SYSTEMD, 12, "SIGTERM", warns=LOST),
 )
 NODES = (
@@ -107,6 +115,21 @@ MACHINE = (
     Fault("journald-restarts", apply.restarted("systemd-journald.service"), UNAFFECTED, 5),
     Fault("daemon-reexec", apply.command("systemctl", "daemon-reexec"), UNAFFECTED, 5),
     Fault("daemon-reload", apply.command("systemctl", "daemon-reload"), UNAFFECTED, 5),
+    Fault("reexec-in-start", apply.reexec_in_start, SYSTEMD, 15, "SIGKILL", warns=LOST),
+    Fault(
+        "directory-deleted",
+        apply.delete_directory,
+        SYSTEMD,
+        20,
+        "is gone",
+        warns=(*LOST, "cannot write"),
+    ),
+    Fault(
+        *("project-read-only", apply.read_only_project, DORA, 12, "SIGKILL"),
+        warns=CRASHED,
+        prepare=apply.mount_project,
+    ),
+    Fault("disk-full", apply.fill_out, DORA, 12, "SIGKILL", warns=CRASHED),
     Fault("kill-all", apply.kill_unit, SYSTEMD, 12, "SIGKILL", warns=LOST, repeats=20),
 )
 

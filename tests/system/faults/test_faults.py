@@ -10,7 +10,15 @@ from tests.system.faults.table import Fault
 
 
 def test_fault(fault: Fault, cell: Cell, project: Project, recoveries: Recoveries) -> None:
-    scene = Scene(cell, project)
+    with Scene(cell, project) as scene:
+        check_fault(scene, fault, recoveries)
+
+
+def check_fault(scene: Scene, fault: Fault, recoveries: Recoveries) -> None:
+    """Apply the fault, and look at everything that must hold then."""
+    cell = scene.cell
+    if fault.prepare is not None:
+        fault.prepare(scene)
     scene.start(fault.flags, fault.more)
     group = cell.group
 
@@ -21,6 +29,7 @@ def test_fault(fault: Fault, cell: Cell, project: Project, recoveries: Recoverie
 
     checks.check_nothing_is_outside(scene)
     checks.check_list(scene, fault.outcome, fault.cause)
+    scene.unmount()
     cell.end()
     checks.check_nothing_is_left(scene, group)
     checks.check_lines(scene, fault.repeats)
