@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from dora_systemd.errors import ExitCode
 from dora_systemd.events import EVENTS
 from tests.system.cells import Cell, Project, run, sync_journal, wait_for
 
@@ -221,3 +222,21 @@ def test_no_entries(talking: Cell) -> None:
     names = {record["DORA_EVENT"] for record in talking.journal() if "DORA_EVENT" in record}
     assert names
     assert names <= set(EVENTS)
+
+
+@pytest.mark.lab
+@pytest.mark.parametrize("scope", ["--system", "--user"])
+def test_a_journal_in_memory_that_is_closed(scope: str) -> None:
+    """Without /var/log/journal there are no files of users, and the system's is not theirs."""
+    script = """
+    mount -t tmpfs tmpfs /var/log/journal
+    mount -t tmpfs tmpfs /run/log
+    install -d -m 0750 /run/log/journal/machine
+    touch /run/log/journal/machine/system.journal
+    exec setpriv --reuid alice --regid alice --init-groups \\
+        env XDG_RUNTIME_DIR=/run/user/1000 doractl "$1" logs robot
+    """
+    done = run("unshare", "--mount", "sh", "-ec", script, "sh", scope, check=False)
+    assert done.returncode == ExitCode.NO_PERMISSION
+    assert done.stderr.startswith("doractl: cannot read the ")
+    assert "systemd-journal" in done.stderr
