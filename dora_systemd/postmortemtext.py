@@ -7,6 +7,7 @@ from typing import Any
 from dora_systemd.causes import Cause
 from dora_systemd.lifestory import Happening
 from dora_systemd.restarts import budget_words
+from dora_systemd.sandboxsigns import sandbox_remedy
 from dora_systemd.statuswords import RESTARTING, UNKNOWN, local_time
 from dora_systemd.values import SECOND, format_duration, format_rounded_size
 from dora_systemd.verdict import Restart, Verdict
@@ -96,6 +97,7 @@ def remedies(report: Report) -> list[str]:
         texts = [_AGAIN]
     elif verdict.node and verdict.is_up and verdict.status != RESTARTING:
         texts.append(_AWAY)
+    hint = sandbox_remedy(one.text for one in report.words) if verdict.node else ""
     if verdict.is_given_up:
         texts.append(_GIVEN_UP)
     elif verdict.status == RESTARTING:
@@ -108,7 +110,7 @@ def remedies(report: Report) -> list[str]:
         "flag": subject.flag,
         "pid": verdict.details.get("node_pid", "PID"),
     }
-    filled = [text.format(**values) for text in texts if text]
+    filled = [*([hint] if hint else []), *(text.format(**values) for text in texts if text)]
     if subject.is_loaded:
         return filled
     again = f"doractl start {values['file']} --name {subject.name}"

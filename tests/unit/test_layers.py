@@ -80,6 +80,7 @@ DECISIONS = {
         "restartsettings",
         "sandbox",
         "sandboxsettings",
+        "sandboxsigns",
         "settingkinds",
         "settings",
         "settingschange",

@@ -19,6 +19,7 @@ from dora_systemd.properties import UnitContext, format_unit, unit_properties
 from dora_systemd.propertyset import parse_line, with_properties
 from dora_systemd.propertytable import TABLE
 from dora_systemd.sandbox import LEVELS, NETWORKS, Sandbox, sandbox_properties
+from dora_systemd.sandboxsigns import sandbox_remedy
 from dora_systemd.scope import Scope
 from dora_systemd.settings import resolve_settings
 from tests.unit.fake_manager import options
@@ -223,3 +224,24 @@ def test_absolute_paths(tmp_path: Path) -> None:
     assert absolute_path("//usr//bin/") == "/usr/bin"
     assert absolute_path(f"{tmp_path}/link") == f"{tmp_path}/link"
     assert absolute_path(f"{tmp_path}/link/../bin") == "/usr/bin"
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("OSError: [Errno 30] Read-only file system: '/srv/x'", "--writable PATH"),
+        (
+            'Os { code: 30, kind: ReadOnlyFilesystem, message: "Read-only file system" }',
+            "--writable",
+        ),
+        ("FileNotFoundError: [Errno 2] No such file or directory: '/dev/video0'", "--device"),
+        ("FileNotFoundError: [Errno 2] No such file or directory: '/tmp/map'", "--writable /tmp"),
+        ("PermissionError: [Errno 1] Operation not permitted", "--sandbox none"),
+        ("OSError: [Errno 97] Address family not supported by protocol", "--sandbox none"),
+        ("FileNotFoundError: [Errno 2] No such file or directory: 'model.pt'", ""),
+        ("", ""),
+    ],
+)
+def test_signs_of_the_sandbox(line: str, words: str) -> None:
+    found = sandbox_remedy(["Traceback (most recent call last):", line])
+    assert (words in found) if words else found == ""
