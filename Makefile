@@ -32,6 +32,10 @@ faults:  ## every fault of tests/system/faults, ROUNDS=n times
 	@$(PREPARE) $(if $(filter vm,$(LAB)),container vm,container)
 	@ROUNDS=$(ROUNDS) $(CHECK) faults
 
+bench:  ## what supervision costs, against named rivals; ROUNDS=n
+	@$(PREPARE) container
+	@tests/lab/lab run -- python -m benchmarks.logs $(or $(ROUNDS),5)
+
 lint:  ## ruff and mypy
 	@$(PREPARE)
 	@$(CHECK) lint
@@ -47,4 +51,4 @@ deb:  ## the Debian packages, built twice and checked, into dist/
 	@$(PREPARE) container
 	@packaging/build
 
-.PHONY: help test unit system vm faults lint demo clean deb
+.PHONY: help test unit system vm faults bench lint demo clean deb

@@ -27,7 +27,8 @@ def linked_package(place: Path) -> Path:
     for name, path in wanted.items():
         if not (package / name).is_symlink():
             (package / name).symlink_to(path)
-    for name, path in {"tests": CHECKOUT / "tests", "lab": CHECKOUT / "tests/lab"}.items():
+    others = {"tests": "tests", "lab": "tests/lab", "benchmarks": "benchmarks"}
+    for name, path in {name: CHECKOUT / path for name, path in others.items()}.items():
         if not (place / name).is_symlink():
             (place / name).symlink_to(path)
     return place

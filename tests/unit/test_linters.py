@@ -46,7 +46,7 @@ def test_mypy(pytestconfig: pytest.Config) -> None:
     place = linked_package(cache_directory(pytestconfig, "package"))
     cache = str(cache_directory(pytestconfig, "mypy"))
     config = f"--config-file={CHECKOUT / 'pyproject.toml'}"
-    sources = ["dora_systemd", "tests/unit", "tests/system", "tests/boot"]
+    sources = ["dora_systemd", "benchmarks", "tests/unit", "tests/system", "tests/boot"]
     run(["mypy", config, *sources], place, {"MYPY_CACHE_DIR": cache})
 
 

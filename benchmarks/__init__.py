@@ -1,0 +1,1 @@
+"""What supervision costs, beside what users would take instead: see README.md here."""
