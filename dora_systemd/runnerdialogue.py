@@ -125,6 +125,8 @@ class Dialogue:
             node = self._pump.cell.nodes.get(event.node)
             is_stale = node is not None and self._nodes.has_process(event.node, node.pid)
             event = protocol.with_facts(event, is_stale, self._nodes.find_oom(event.node))
+            if node is not None and event.exit and event.will_restart and not is_stale:
+                self._nodes.clear(event.node, node.pid)
         if event is not None:
             self._pump.push(event)
         if isinstance(event, life.NodeExited) and not event.is_stale:

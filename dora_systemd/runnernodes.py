@@ -125,6 +125,17 @@ class Nodes:
                 with contextlib.suppress(OSError):  # it may be gone already
                     cgroup.move_process(self._group(node), process)
 
+    def clear(self, node: str, pid: int) -> None:
+        """Kill what `pid`, which crashed, has left of the node, before dora executes the next one.
+
+        It would count against the limits of the next one, and may hold what that needs.
+        """
+        if node not in self._launched:
+            return
+        with contextlib.suppress(OSError, ValueError):
+            if int(self._paths.node_pid(node).read_text()) == pid:  # the next one is not there yet
+                cgroup.kill_group(self._group(node))
+
     def forget(self, node: str) -> None:
         """The node's process has ended: what it says next comes from another one."""
         self._pipes.set_pid(node, 0)

@@ -85,7 +85,8 @@ def check_list(scene: Scene, outcome: Outcome, cause: str) -> None:
         assert row["status"] == "Running"
         for node in row["nodes"]:
             assert node["state"] == "running"
-            assert node["pid"] in scene.cell.pids(f"node-{node['node']}")
+            # Nor is anything there that an earlier life of it has left behind.
+            assert scene.cell.pids(f"node-{node['node']}") == [node["pid"]]
 
 
 def check_cause(scene: Scene, cause: str) -> None:
