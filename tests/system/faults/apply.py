@@ -4,9 +4,11 @@ import errno
 import os
 import shutil
 import signal
+import time
 from collections.abc import Callable
 from pathlib import Path
 
+from dora_systemd.cgroup import read_numbers
 from tests.system.cells import is_alive, run, wait_for
 from tests.system.faults.scene import ROLES, Scene
 
@@ -156,3 +158,22 @@ def fill_out(scene: Scene) -> None:
     else:
         raise AssertionError("there is room")
     nodes(signal.SIGKILL, "doubler")(scene)
+
+
+def fork_bomb(scene: Scene) -> None:
+    """A node forks as often as its limit of tasks lets it, and fails."""
+    death("sink", "fork-bomb")(scene)
+    events = read_numbers(scene.cell.group / "node-sink" / "pids.events")
+    assert events["max"] > 0
+
+
+def clock(seconds: int) -> Apply:
+    """The clock of the machine is set forward or back."""
+
+    def apply(scene: Scene) -> None:
+        del scene
+        before = time.time() - time.monotonic()
+        run("date", f"--set=@{time.time() + seconds:.3f}")
+        assert abs(time.time() - time.monotonic() - before - seconds) < 60
+
+    return apply

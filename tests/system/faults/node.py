@@ -77,6 +77,17 @@ def spin(lines: Lines) -> None:
         pass
 
 
+def fork_bomb(lines: Lines) -> None:
+    """Fork until the kernel does not want it any more, and fail."""
+    lines.write()
+    try:
+        while True:
+            if os.fork() == 0:
+                time.sleep(1000)
+    except BlockingIOError:
+        os._exit(1)
+
+
 def flood(lines: Lines) -> None:
     """Fill stdout."""
     for _ in range(FLOOD // 50):
@@ -92,6 +103,7 @@ ORDERS: dict[str, Callable[[Lines], object]] = {
     "ignore": ignore_everything,
     "spin": spin,
     "flood": flood,
+    "fork-bomb": fork_bomb,
 }
 
 

@@ -133,4 +133,13 @@ MACHINE = (
     Fault("kill-all", apply.kill_unit, SYSTEMD, 12, "SIGKILL", warns=LOST, repeats=20),
 )
 
-TABLE = (*PARTS, *NODES, *MACHINE)
+OWN_KERNEL = (
+    Fault(
+        *("node-fork-bombs", apply.fork_bomb, DORA, 120, "exit code 1"),
+        *((*ON_FAILURE, "--node-limit=sink:tasks=100"), CRASHED),
+        vm=True,
+    ),
+    Fault("clock-forward", apply.clock(3600), UNAFFECTED, 60, vm=True),
+)
+
+TABLE = (*PARTS, *NODES, *MACHINE, *OWN_KERNEL)
