@@ -74,7 +74,16 @@ def examine(lives: Sequence[Life], facts: Facts, shutdowns: Sequence[int] = ()) 
         _starved(found, life),
         tuple(restarts_of(chain)),
         tuple(one for each in chain for one in each.happenings if _is_news(one)),
+        *_before(lives[: -len(chain)] if chain else (), facts, shutdowns),
     )
+
+
+def _before(lives: Sequence[Life], facts: Facts, shutdowns: Sequence[int]) -> tuple[str, int]:
+    """How the life ended that somebody, or a boot, began anew."""
+    if not lives:
+        return "", 0
+    end = _end(lives[-1], facts, shutdowns)
+    return end.summary, end.at.at_us if end.at else 0
 
 
 def ended_word(life: Life, known: str = "") -> str:

@@ -159,6 +159,7 @@ def _head(report: Report) -> list[str]:
         "Starved": ", ".join(verdict.starved),
         "Restarts": _restart_words(verdict.restarts),
         "Budget": _budget_words(report),
+        "Before": f"{verdict.before} ({local_time(verdict.before_us)})" if verdict.before else "",
         "Unit": f"{subject.unit} ({subject.uuid})",
         "File": subject.file,
     }
@@ -193,7 +194,7 @@ def _memory_words(details: Mapping[str, str]) -> str:
     sizes = [
         f"{words} {format_rounded_size(int(details[key]))}"
         for key, words in (("peak", "peak"), ("limit", "limit"), ("held", "held"))
-        if details.get(key, "").isdigit() and details.get(key) != "0"
+        if details.get(key, "").isdecimal() and details.get(key) != "0"
     ]
     owner = {"dataflow": " of the dataflow", "machine": "; the machine had none left"}
     return ", ".join(sizes) + owner.get(details.get("owner", ""), "") if sizes else ""
@@ -275,6 +276,9 @@ def report_values(report: Report) -> dict[str, Any]:
         "starved": list(verdict.starved),
         "restarts": [vars(one) for one in verdict.restarts],
         "restart_budget": report.budget,
+        "before": {"summary": verdict.before, "at_us": verdict.before_us or None}
+        if verdict.before
+        else None,
         "timeline": [
             {"at_us": one.at_us, "event": one.name, "node": one.node or None, "text": one.text}
             for one in verdict.timeline

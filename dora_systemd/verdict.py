@@ -42,7 +42,7 @@ class Verdict:
     at_us: when that was, began_us: when that life began; CLOCK_REALTIME µs, 0: not known.
     invocation: systemd's id of that life. details: what else is known of the end.
     is_given_up: systemd's limit of starts is used up. is_passing: dora starts the node again by
-    itself. starved: nodes downstream.
+    itself. starved: nodes downstream. before: how the life before these ended, and when.
     """
 
     status: str
@@ -60,6 +60,8 @@ class Verdict:
     starved: tuple[str, ...] = ()
     restarts: tuple[Restart, ...] = ()
     timeline: tuple[Happening, ...] = ()
+    before: str = ""
+    before_us: int = 0
 
     @property
     def is_up(self) -> bool:

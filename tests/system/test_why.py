@@ -72,6 +72,11 @@ def test_a_node_that_crashed_for_good(cell: Cell, project: Project) -> None:
     assert f"doractl restart {cell.name}" in found["remedies"][0]
     # Nobody has changed anything by asking.
     assert verdict(cell) == found
+    project.write("bad.py", TAKER)
+    cell.doractl("restart", cell.name)
+    again = verdict(cell)
+    assert (again["status"], again["cause"]) == ("Running", None)
+    assert again["before"] == {"summary": found["summary"], "at_us": found["at_us"]}
 
 
 @pytest.mark.warns(*CRASHES)
@@ -129,6 +134,16 @@ def test_systemd_restarts_it_and_gives_it_up(cell: Cell, project: Project) -> No
     found = verdict(cell)
     assert (found["cause"], found["given_up"]) == ("daemon-lost", True)
     assert "systemd has given it up" in found["remedies"][-1]
+
+
+@pytest.mark.warns(*KILLED, "watchdog", "Watchdog", "Killing process", "SIGABRT", "core-dump")
+def test_a_runner_that_hung(cell: Cell, project: Project) -> None:
+    cell.start(project.three_nodes(), "--property", "WatchdogSec=2s")
+    os.kill(cell.supervisor_pid("runner"), signal.SIGSTOP)
+    wait_for("it has failed", lambda: cell.show("ActiveState") == "failed", 60)
+    found = verdict(cell)
+    assert (found["cause"], found["is_failure"]) == ("watchdog", True)
+    assert found["summary"] == "its runner hung and was ended by the watchdog"
 
 
 @pytest.mark.warns("not ready within", "Failed with result", "exited", "failed", "Failed to start")

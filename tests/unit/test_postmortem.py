@@ -178,6 +178,12 @@ def test_memory() -> None:
     assert "doractl set robot --node-limit camera:memory=SIZE" in text
 
 
+def test_memory_that_is_no_number() -> None:
+    crash = {**OOM, "DORA_PEAK": "²", "DORA_LIMIT": "many"}
+    text = format_report(Report(SUBJECT, judge(*RUNS, crash, NODE_FAILED)))
+    assert "Memory:" not in text
+
+
 def test_power_cut() -> None:
     verdict = judge(*RUNS, facts=Facts(now_boot="another"))
     assert verdict.cause is Cause.NO_END
@@ -205,7 +211,8 @@ def test_restarts_of_the_whole_and_the_limit_of_them() -> None:
     assert verdict.is_given_up
     assert (verdict.summary, verdict.invocation) == ("gone again", "2")
     text = format_report(Report(SUBJECT, verdict))
-    assert "another matter" not in text
+    assert (verdict.before, verdict.before_us) == ("another matter", 2)
+    assert "Before:   another matter (" in text
     assert "Restarts: all of it 1 (gone)" in text
     assert "systemd has given it up" in text
 
