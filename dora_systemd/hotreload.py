@@ -6,6 +6,8 @@ It is part of the runner's command line, which `list` reads: nothing here costs 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+from dora_systemd.limits import NodeLimits
+
 START_FIRST = "start-first"
 REPLACE_WORDS = ("stop-first", START_FIRST)
 
@@ -39,6 +41,16 @@ class HotReload(NamedTuple):
 
 
 DEFAULT_RELOAD = HotReload()
+
+
+class SettingsChange(NamedTuple):
+    """What has changed in a settings file.
+
+    limits: those of nodes. others: keys that take effect with the next start.
+    """
+
+    limits: tuple[NodeLimits, ...]
+    others: tuple[str, ...]
 
 
 def format_reload(reload: HotReload) -> list[tuple[str, str]]:

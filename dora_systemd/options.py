@@ -148,8 +148,12 @@ def runner_command(python: str, options: RunnerOptions) -> list[str]:
 
 
 def post_command(python: str, options: RunnerOptions) -> list[str]:
-    """ExecStopPost= of the unit: what is left to say when the runner was killed."""
-    return [python, *_PYTHON_FLAGS[:-1], POST_MODULE, options.name, options.uuid]
+    """ExecStopPost= of the unit: what is left to say when the runner was killed.
+
+    After a runner that ended by itself no Python is started, which a restart would wait for.
+    """
+    command = [python, *_PYTHON_FLAGS[:-1], POST_MODULE, options.name, options.uuid]
+    return ["/bin/sh", "-c", 'test "$EXIT_CODE" = exited || exec "$@"', "sh", *command]
 
 
 def reload_command(python: str) -> list[str]:

@@ -159,7 +159,8 @@ async def run_once(cell: Runs, is_again: bool) -> Cell:
         cell.pipes.mute()
         listen(asyncio.get_running_loop(), options, pump, dialogue)
         dialogue.watch(coordinator, dialogue.read_coordinator)
-        reloader.begin(Run(pump, cell.nodes, cell.pipes, Swapper(pump, dora)), prepared)
+        run = Run(pump, cell.nodes, cell.pipes, Swapper(pump, dora))
+        reloader.begin(run, prepared, started_us * 1000)
         dialogue.spawn(tell_started(pump, reloader))
         try:
             await dialogue.end

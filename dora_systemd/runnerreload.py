@@ -54,16 +54,16 @@ class Reloader:
         self._watcher: asyncio.Task[None] | None = None
         self._run: Run | None = None
         self._outcome: asyncio.Future[str] | None = None
-        self._stamps: dict[str, int] = {}
+        # What of the dataflow has been read when: all of it at the beginning, then file by file.
+        self._read_ns = 0
+        self._taken: dict[str, int] = {}
         self.current: Prepared | None = None
         self.before: Prepared | None = None
         self.notice = ""
 
-    def begin(self, run: Run, prepared: Prepared) -> None:
-        """A run of the dataflow begins."""
-        self._run, self.current = run, prepared
-        self._stamps = self._sources.stamps(prepared)
-        self._stamps[self._settings.path] = change_time(self._settings.path)
+    def begin(self, run: Run, prepared: Prepared, read_ns: int) -> None:
+        """A run of the dataflow begins. read_ns: since when its files are read, CLOCK_REALTIME."""
+        self._run, self.current, self._read_ns = run, prepared, read_ns
         self._begun.set()
 
     def end(self) -> None:
@@ -138,6 +138,7 @@ class Reloader:
             if run is None or current is None:
                 hint = "wait until it has started"
                 raise DoraSystemdError("cannot reload: no node runs", hint, ExitCode.NOT_RUNNING)
+            taken = {path: change_time(path) for path in changed}
             done = await self._take_settings(run) if self._settings.path in changed else []
             changed = [path for path in changed if path != self._settings.path]
             change = await asyncio.to_thread(self._sources.look, current, changed)
@@ -145,8 +146,7 @@ class Reloader:
             if not change.is_empty:
                 run.pipes.write_event("files-changed", files=", ".join(_names(change, changed)))
                 done += await self._apply(run, change)
-            self._stamps |= await asyncio.to_thread(self._sources.stamps, change.prepared)
-            self._stamps[self._settings.path] = change_time(self._settings.path)
+            self._taken |= taken
         self.notice = ""
         if self._run is not None and (done or self._run.pump.cell.notice):
             fed = downstream_of(change.prepared.dataflow)
@@ -227,9 +227,10 @@ class Reloader:
     def _changed_since(self) -> list[str]:
         if self.current is None:
             return []
-        now = self._sources.stamps(self.current)
-        now[self._settings.path] = change_time(self._settings.path)
-        return [path for path, stamp in now.items() if self._stamps.get(path) != stamp]
+        paths = {self._settings.path, *self._sources.files(self.current)}
+        now = {path: change_time(path) for path in paths}
+        taken = self._taken
+        return [path for path, at in now.items() if at > self._read_ns and taken.get(path) != at]
 
     async def _switch(self, is_on: bool) -> Answer:
         async with self._lock:

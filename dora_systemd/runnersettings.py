@@ -11,9 +11,9 @@ from pathlib import Path
 
 from dora_systemd import process
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.hotreload import SettingsChange
 from dora_systemd.limits import format_node_limits, parse_node_limits
 from dora_systemd.options import RunnerOptions
-from dora_systemd.settingschange import SettingsChange
 
 _SECONDS = 120.0
 

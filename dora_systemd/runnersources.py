@@ -88,11 +88,10 @@ class Sources:
             raise DoraSystemdError(message, "", ExitCode.BAD_INPUT)
         return prepared
 
-    def stamps(self, current: Prepared) -> dict[str, int]:
-        """When each file that the dataflow is made of was changed, in ns; 0: it is not there."""
+    def files(self, current: Prepared) -> set[str]:
+        """The files that the dataflow is made of, absolute."""
         nodes = self._nodes(current).values()
-        paths = {self._options.dataflow, *(path for node in nodes for path in node.files)}
-        return {path: change_time(path) for path in paths}
+        return {self._options.dataflow, *(path for node in nodes for path in node.files)}
 
     def _nodes(self, prepared: Prepared) -> dict[str, NodeSources]:
         own = sources(prepared.dataflow, prepared.plan)

@@ -1,8 +1,9 @@
 """What is different between two versions of a settings file."""
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
+from dora_systemd.hotreload import SettingsChange
 from dora_systemd.limitchecks import settings_node_limits
 from dora_systemd.limits import BY_KEY, NodeLimits, node_limits
 from dora_systemd.limitsettings import NODE_LIMIT
@@ -10,13 +11,6 @@ from dora_systemd.settings import Settings
 from dora_systemd.values import INFINITY
 
 _USUAL_WEIGHT = 100
-
-
-class SettingsChange(NamedTuple):
-    """limits: of nodes, those that changed. others: keys that take effect with the next start."""
-
-    limits: tuple[NodeLimits, ...]
-    others: tuple[str, ...]
 
 
 def settings_change(before: Settings, after: Settings) -> SettingsChange:

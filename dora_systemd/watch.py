@@ -69,9 +69,9 @@ def read_gitignores(root: str) -> dict[str, tuple[str, ...]]:
 
 
 def change_time(path: str) -> int:
-    """When a file was changed last, in ns since the epoch; 0 when it is not there."""
+    """When a file was written or put in its place, in ns since the epoch; 0: it is not there."""
     try:
-        return Path(path).stat().st_mtime_ns
+        return Path(path).stat().st_ctime_ns
     except OSError:
         return 0
 

@@ -36,8 +36,8 @@ NotifyAccess=main
 ExecStart=:/usr/bin/python3 -E -P -m dora_systemd.runner --name=robot --uuid={UUID} \
 --working-directory=/srv/robot --dora=/usr/bin/dora --grace-duration=10s \
 --venv=/srv/robot/.venv /srv/robot/robot.yml
-ExecStopPost=-:/usr/bin/python3 -E -P -m dora_systemd.runnerpost robot \
-550e8400-e29b-41d4-a716-446655440000
+ExecStopPost=-:/bin/sh -c "test \\"$EXIT_CODE\\" = exited || exec \\"$@\\"" sh \
+/usr/bin/python3 -E -P -m dora_systemd.runnerpost robot 550e8400-e29b-41d4-a716-446655440000
 ExecReload=:/usr/bin/python3 -E -P -m dora_systemd.runnerask
 FileDescriptorStoreMax=4096
 WorkingDirectory=/

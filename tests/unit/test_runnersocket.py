@@ -23,7 +23,9 @@ def ask_server(path: Path, *requests: bytes | Mapping[str, Any]) -> list[Any]:
         while not path.exists():
             await asyncio.sleep(0)
         try:
-            return [await one_answer(path, request) for request in requests]
+            answers = [await one_answer(path, request) for request in requests]
+            assert path.stat().st_mode & 0o777 == 0o600
+            return answers
         finally:
             server.cancel()
 
@@ -52,7 +54,6 @@ def test_answers(tmp_path: Path) -> None:
     assert (bad.message, bad.hint, bad.code) == ("cannot do it", "do that", ExitCode.NOT_FOUND)
     assert b"cannot read the request" in garbage
     assert odd == b'{"done": [null]}\n'
-    assert path.stat().st_mode & 0o777 == 0o600
 
 
 def test_a_line_without_end_does_no_harm(tmp_path: Path) -> None:
