@@ -36,6 +36,10 @@ bench:  ## what supervision costs, against named rivals; ROUNDS=n
 	@$(PREPARE) container
 	@tests/lab/lab run -- python -m benchmarks.logs $(or $(ROUNDS),5)
 
+bookworm:  ## the checkout on Debian 12, with systemd 252, installed by pip
+	@$(PREPARE) container
+	@$(CHECK) bookworm
+
 lint:  ## ruff and mypy
 	@$(PREPARE)
 	@$(CHECK) lint
@@ -51,4 +55,4 @@ deb:  ## the Debian packages, built twice and checked, into dist/
 	@$(PREPARE) container
 	@packaging/build
 
-.PHONY: help test unit system vm faults bench lint demo clean deb
+.PHONY: help test unit system vm faults bench bookworm lint demo clean deb

@@ -5,9 +5,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from dora_systemd.busprotocol import JOB_DONE, Manager, Observer, Property
+from dora_systemd.compat import MIN_VERSION, transient_commands
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.managerplan import Plan
 from dora_systemd.managerreason import job_reason
+from dora_systemd.process import version_numbers
 from dora_systemd.scope import Scope
 
 StageObserver = Callable[[str], None]
@@ -35,10 +37,12 @@ def start_plan(
 
     Raises DoraSystemdError when the start fails, with the reason; the unit is left as failed then.
     """
+    number = next(iter(version_numbers(manager.version())), MIN_VERSION)
+    told = transient_commands(properties, number)
     return _started(
         manager,
         plan,
-        lambda observe: manager.start_transient(plan.unit, properties, observe, wait),
+        lambda observe: manager.start_transient(plan.unit, told, observe, wait),
         on_stage,
         wait,
     )

@@ -7,6 +7,7 @@ import selectors
 import shutil
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -97,7 +98,8 @@ def run_dora(
 def find_dora(given: str | None, venv: str | None, search_path: str) -> str:
     """Absolute path of the dora command: the one given, else of the venv, else on `search_path`.
 
-    Raises DoraSystemdError (NO_DORA).
+    Last comes that beside our own Python: pip has put both into one virtual environment, and what
+    is linked onto PATH is only doractl. Raises DoraSystemdError (NO_DORA).
     """
     if given is not None:
         found = shutil.which(given, path=search_path)
@@ -106,8 +108,8 @@ def find_dora(given: str | None, venv: str | None, search_path: str) -> str:
                 f"cannot run the dora command {given}", _INSTALL_HINT, ExitCode.NO_DORA
             )
         return str(Path(found).absolute())
-    places = [f"{venv}/bin"] if venv else []
-    found = shutil.which("dora", path=os.pathsep.join([*places, search_path]))
+    places = [*([f"{venv}/bin"] if venv else []), search_path, str(Path(sys.executable).parent)]
+    found = shutil.which("dora", path=os.pathsep.join(places))
     if found is None:
         raise DoraSystemdError("cannot find the dora command", _INSTALL_HINT, ExitCode.NO_DORA)
     return str(Path(found).absolute())

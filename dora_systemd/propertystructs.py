@@ -116,7 +116,9 @@ def _parse_bind(word: str) -> Bind:
 
 def _format_bind(bind: Bind) -> str:
     source, target, is_optional, flags = bind
-    return quote_word("-" * is_optional + f"{source}:{target}" + ("" if flags else ":norbind"))
+    # Each for itself: systemd takes a ":" within quotes for a part of the path.
+    paths = f"{quote_word('-' * is_optional + source)}:{quote_word(target)}"
+    return paths + ("" if flags else ":norbind")
 
 
 def _bandwidth(text: str) -> int:

@@ -26,6 +26,14 @@ PYPI = [
     "pytest-timeout", "hypothesis",
 ]  # fmt: skip
 
+# The oldest Debian that the product works on, with what README.md asks for there, and no more.
+OLD_SUITE = "bookworm"
+README_PACKAGES = ["python3-venv", "python3-pystemd", "python3-systemd"]
+OLD_PACKAGES = [
+    "systemd", "systemd-sysv", "libpam-systemd", "dbus", "dbus-user-session", "polkitd",
+    "ca-certificates", "iproute2", "procps", *README_PACKAGES,
+]  # fmt: skip
+
 KERNEL = "linux-image-cloud-amd64"
 
 # What `pip install --editable` reads of the checkout, apart from the code it points at.
@@ -40,6 +48,12 @@ def digest(*parts: object) -> str:
 
 def read_part(path: Path) -> str:
     return path.read_text(encoding="utf-8") if path.is_file() else ""
+
+
+def read_dependencies() -> list[str]:
+    """What pip installs with the product."""
+    project = tomllib.loads(read_part(CHECKOUT / "pyproject.toml"))["project"]
+    return list(project["dependencies"])
 
 
 def base_key() -> str:

@@ -43,14 +43,16 @@ def build_base(path: Path, log: Path) -> None:
         run_in_tree(path, ["sh", "/run/setup.sh"], log)
 
 
-def debian_command(path: Path, variant: str, packages: list[str]) -> list[str]:
+def debian_command(
+    path: Path, variant: str, packages: list[str], suite: str = definition.SUITE
+) -> list[str]:
     mirror = os.environ.get("LAB_MIRROR")
     return [
         "mmdebstrap", f"--variant={variant}", "--mode=root", "--format=directory",
         f"--include={','.join(packages)}",
         "--dpkgopt=path-exclude=/usr/share/doc/*",
         "--dpkgopt=path-exclude=/usr/share/locale/*",
-        definition.SUITE, str(path), *([mirror] if mirror else []),
+        suite, str(path), *([mirror] if mirror else []),
     ]  # fmt: skip
 
 

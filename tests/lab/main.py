@@ -5,6 +5,7 @@ import sys
 from collections.abc import Sequence
 
 from lab import cgroup
+from lab.bookworm import ensure_bookworm
 from lab.cache import find_cache, remove_layer
 from lab.container import run_in_container
 from lab.errors import LabError
@@ -72,8 +73,8 @@ def clean(options: Options) -> int:
     return 0
 
 
-ENSURE = {"container": ensure_tree, "vm": ensure_machine}
-RUN = {"container": run_in_container, "vm": run_in_machine}
+ENSURE = {"container": ensure_tree, "vm": ensure_machine, "bookworm": ensure_bookworm}
+RUN = {"container": run_in_container, "vm": run_in_machine, "bookworm": run_in_container}
 VERBS = {
     "run": run_command,
     "shell": run_command,

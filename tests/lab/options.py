@@ -8,7 +8,7 @@ from pathlib import Path
 
 from lab.errors import LabError
 
-FORMS = ("container", "vm")
+FORMS = ("container", "vm", "bookworm")
 
 REBOOT = "--reboot--"
 
@@ -17,6 +17,8 @@ environment:
   LAB=container     a systemd-nspawn container (default): starts in half a second;
                     systemd accepts limits there but cannot enforce them
   LAB=vm            a virtual machine with its own kernel and cgroup v2 controllers
+  LAB=bookworm      a container with Debian 12: systemd 252, Python 3.11, the checkout
+                    not installed, but all that pip needs to do so
   LAB_OUT=DIR       this directory is /out inside
   DORA_LAB_CACHE    where images are kept (default: ~/.cache/dora-systemd-lab)
   LAB_MIRROR        another Debian mirror for building the image

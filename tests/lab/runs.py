@@ -66,16 +66,21 @@ class Guard:
 
 def clean_dead_runs() -> None:
     for directory in RUNS.glob("lab-*"):
-        lock = try_lock(directory / "lock")
-        if lock is not None:
-            close_run(Run(directory, lock))
+        with suppress(FileNotFoundError):  # gone since we looked
+            lock = try_lock(directory / "lock")
+            if lock is not None:
+                close_run(Run(directory, lock))
+    for directory in RUNS.glob("gone-*"):
+        shutil.rmtree(directory, ignore_errors=True)
 
 
 def close_run(run: Run) -> None:
     for kind, remove in (("cgroup", remove_cgroup), ("disk", remove_disk)):
         for path in read_noted(run, kind):
             remove(path)
-    shutil.rmtree(run.directory)
+    # Without its lock file, which goes at some time, another lab would take it for a dead run.
+    gone = run.directory.rename(RUNS / f"gone-{run.name}")
+    shutil.rmtree(gone, ignore_errors=True)
     os.close(run.lock)
 
 

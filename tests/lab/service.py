@@ -19,7 +19,11 @@ def service_command(command: Sequence[str], options: Options, terminal: bool) ->
         "env", "SYSTEMD_ADJUST_TERMINAL_TITLE=0", "SYSTEMD_TINT_BACKGROUND=0",
         "systemd-run", "--quiet", "--wait", "--collect", "--pty" if terminal else "--pipe",
         "--unit=lab-command", "--working-directory=/src", "--service-type=exec",
-        "--expand-environment=no",
         *(f"--setenv={name}={value}" for name, value in (env | dict(options.env)).items()),
-        "--", "/bin/bash", "-c", KEEP_STATUS, "lab", *command,
+        "--", "/bin/bash", "-c", *map(escape, (KEEP_STATUS, "lab", *command)),
     ]  # fmt: skip
+
+
+def escape(word: str) -> str:
+    """What systemd makes `word` of. --expand-environment=no would be for systemd 254 and newer."""
+    return word.replace("$", "$$")

@@ -152,6 +152,11 @@ def plan_packages(_form: str) -> list[Step]:
     return [build, lab_step("tests of the Debian packages", "container", ["tests/deb"])]
 
 
+def plan_bookworm(_form: str) -> list[Step]:
+    """The oldest systemd that the product takes, and the checkout installed there by pip."""
+    return [lab_step("tests on Debian 12", "bookworm", ["tests/bookworm"])]
+
+
 def plan_system(form: str) -> list[Step]:
     here = " and not lab" if form == "host" else ""
     arguments = ["tests/system", "-m", f"not vm{here}"]
@@ -208,5 +213,6 @@ PLANS: dict[str, Callable[[str], list[Step]]] = {
     "lab": plan_lab,
     "vm": plan_vm,
     "packages": plan_packages,
+    "bookworm": plan_bookworm,
     "lint": plan_lint,
 }

@@ -2,7 +2,7 @@
 
 import pytest
 
-from dora_systemd.compat import drop_unsupported
+from dora_systemd.compat import drop_unsupported, transient_commands
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.propertykinds import Property
 from dora_systemd.propertyset import parse_property
@@ -53,3 +53,23 @@ def test_too_old_versions_are_refused(version: int) -> None:
         drop_unsupported({}, version)
     assert caught.value.code == ExitCode.NO_SYSTEMD
     assert "252" in caught.value.hint
+
+
+def test_command_lines_of_transient_units() -> None:
+    """Systemd 252 forgets ExecStartEx at a daemon-reload."""
+    told = [*properties("ExecStop=-:/bin/x a", "ExecStopPost=/bin/y b", "Nice=5").values()]
+    assert transient_commands(told, 257) == told
+    assert transient_commands(told, 252) == [
+        ("ExecStop", "a(sasb)", (("/bin/x", ("/bin/x", "a"), True),)),
+        ("ExecStopPost", "a(sasb)", (("/bin/y", ("/bin/y", "b"), False),)),
+        ("Nice", "i", 5),
+    ]
+
+
+@pytest.mark.parametrize("command", ["+/bin/x", "!/bin/x", "/bin/x $A", ":/srv/$x/y", "/bin/`x`"])
+def test_command_lines_that_an_older_systemd_would_not_keep(command: str) -> None:
+    told = [*properties(f"ExecStartPre={command}").values()]
+    assert transient_commands(told, 257) == told
+    with pytest.raises(DoraSystemdError, match=r"^cannot keep ExecStartPre=") as caught:
+        transient_commands(told, 252)
+    assert caught.value.code == ExitCode.USAGE

@@ -16,6 +16,11 @@ from lab.steps import read_summary
 PYPROJECT = '[project]\nname = "x"\n[tool.ruff]\nline-length = 100\n'
 
 
+def test_debian_12_gets_what_the_readme_asks_for() -> None:
+    readme = definition.read_part(definition.CHECKOUT / "README.md")
+    assert f"\napt install {' '.join(definition.README_PACKAGES)}\n" in readme
+
+
 def test_options_of_run() -> None:
     options = parse_options(["run", "--env", "A=1=2", "--env", "B", "--", "x", "--env"], {"B": "b"})
     assert options.form == "container"
@@ -42,7 +47,11 @@ def test_commands_around_a_reboot() -> None:
     [
         (["run"], {}, "lab: cannot run nothing (hint: lab run -- CMD)"),
         (["run", "a", "--reboot--"], {}, "lab: cannot run nothing (hint: lab run -- CMD)"),
-        (["run", "x"], {"LAB": "moon"}, "lab: cannot use LAB=moon (hint: one of container, vm)"),
+        (
+            ["run", "x"],
+            {"LAB": "moon"},
+            "lab: cannot use LAB=moon (hint: one of container, vm, bookworm)",
+        ),
         (
             ["run", "x"],
             {"LAB_OUT": "/no/such"},

@@ -63,8 +63,17 @@ def test_dora_given_wins_over_venv_and_path(tmp_path: Path) -> None:
     assert process.find_dora(None, None, search_path) == other
 
 
+def test_dora_beside_our_own_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As pip has installed both; PATH wins over it."""
+    own, other = (make_program(tmp_path / place / "dora", "") for place in ("own", "other"))
+    monkeypatch.setattr("sys.executable", str(tmp_path / "own/python3"))
+    assert process.find_dora(None, None, "/nowhere") == own
+    assert process.find_dora(None, None, str(tmp_path / "other")) == other
+
+
 @pytest.mark.parametrize("given_dora", [None, "/nowhere/dora"])
-def test_no_dora(given_dora: str | None) -> None:
+def test_no_dora(given_dora: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.executable", "/nowhere/python3")
     with pytest.raises(DoraSystemdError) as caught:
         process.find_dora(given_dora, None, "/nowhere")
     assert caught.value.code is ExitCode.NO_DORA

@@ -1,0 +1,226 @@
+"""Debian 12 with systemd 252: the checkout installed by pip, as README.md says, and used."""
+
+import json
+import pwd
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from subprocess import CompletedProcess
+from typing import Any
+
+import pytest
+
+from tests.system.cells import Project, dora_processes, run, wait_for
+
+CHECKOUT = Path(__file__).parents[2]
+VENV = "/opt/dora-systemd"
+LAB = "/opt/lab"
+"""The environment of the tests, which is that of the nodes too."""
+USERS = ("root", "alice")
+PATH = "/usr/sbin:/usr/bin:/sbin:/bin"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def installed() -> None:
+    """The last two of the README's commands; there is no network here."""
+    offline = ("--quiet", "--no-index", "--find-links=/opt/wheels")
+    run(f"{VENV}/bin/pip", "install", *offline, str(CHECKOUT))
+    setup = run(f"{VENV}/bin/doractl", "setup")
+    assert setup.stderr == ""
+
+
+@pytest.fixture
+def flow() -> Iterator[Path]:
+    root = Path(tempfile.mkdtemp(prefix="flow-", dir="/var/tmp"))
+    root.chmod(0o755)
+    yield Project(root / "project").three_nodes()
+    for user in USERS:
+        doractl(user, "disable", "robot", check=False)
+        doractl(user, "stop", "robot", check=False)
+    shutil.rmtree(root)
+    wait_for("no process is left", lambda: not dora_processes())
+
+
+def as_user(user: str, *words: str, check: bool = True) -> CompletedProcess[str]:
+    """A command of `user`, who has nothing but what Debian gives him."""
+    entry = pwd.getpwnam(user)
+    env = {"PATH": PATH, "LANG": "C.UTF-8", "HOME": entry.pw_dir}
+    env["XDG_RUNTIME_DIR"] = f"/run/user/{entry.pw_uid}"
+    if user == "root":
+        return run(*words, env=env, cwd="/", check=check)
+    switch = ("setpriv", f"--reuid={user}", f"--regid={user}", "--init-groups")
+    return run(*switch, *words, env=env, cwd="/", check=check)
+
+
+def doractl(user: str, *words: str, check: bool = True) -> CompletedProcess[str]:
+    return as_user(user, f"{VENV}/bin/doractl", *words, check=check)
+
+
+def start(user: str, flow: Path, *words: str) -> CompletedProcess[str]:
+    command = ("start", str(flow), "--name", "robot", "--venv", LAB, *words)
+    return doractl(user, *command)
+
+
+def systemctl(user: str, verb: str, *words: str) -> str:
+    scope = "--system" if user == "root" else "--user"
+    return as_user(user, "systemctl", scope, verb, "dora-robot.service", *words).stdout
+
+
+def show(user: str, name: str) -> str:
+    return systemctl(user, "show", "--value", "--property", name).strip()
+
+
+def row(user: str) -> dict[str, Any]:
+    (found,) = json.loads(doractl(user, "list", "-o", "json").stdout)
+    return dict(found)
+
+
+def lines(user: str, node: str) -> list[str]:
+    return doractl(user, "logs", "robot", "--node", node, "-o", "cat").stdout.splitlines()
+
+
+def group(user: str) -> Path:
+    return Path(f"/sys/fs/cgroup{show(user, 'ControlGroup')}")
+
+
+def warnings(cursor: str) -> list[str]:
+    """What systemd and we have warned of since then; dora's own warnings are not meant."""
+    command = ("journalctl", "-o", "json", "--priority=warning", f"--after-cursor={cursor}")
+    found = [json.loads(line) for line in run(*command).stdout.splitlines()]
+    ours = [one for one in found if "DORA_NODE" not in one]
+    return [str(one["MESSAGE"]) for one in ours if "dora" in str(one)]
+
+
+def cursor() -> str:
+    shown = run("journalctl", "-n", "0", "--show-cursor").stdout
+    return shown.rpartition("-- cursor: ")[2].strip()
+
+
+def test_this_is_the_oldest_systemd() -> None:
+    versions = json.loads(doractl("alice", "version", "-o", "json").stdout)
+    assert versions["systemd"].startswith("252")
+    assert versions["python"].startswith("3.11")
+    assert versions["dora"] == "1.1.0"
+
+
+@pytest.mark.parametrize("user", USERS)
+def test_doctor_says_what_it_lacks(user: str) -> None:
+    done = doractl(user, "doctor", "-o", "json")
+    found = {one["topic"]: one for one in json.loads(done.stdout)}
+    assert done.stderr == ""
+    assert found["systemd"]["state"] == "note"
+    for name in ("DelegateSubgroup", "RestartSteps", "PrivatePIDs"):
+        assert name in found["systemd"]["text"]
+    assert found["dora"]["text"] == f"{VENV}/bin/dora, version 1.1.0"
+
+
+def test_setup_is_understood() -> None:
+    units = [str(path) for path in Path("/usr/local/lib/systemd/system").glob("dora.*")]
+    assert len(units) == 2
+    assert run("systemd-analyze", "verify", "--man=no", *units).stderr == ""
+    assert "dora.target" in run("systemctl", "list-dependencies", "multi-user.target").stdout
+    assert pwd.getpwnam("dora").pw_shell == "/usr/sbin/nologin"
+
+
+@pytest.mark.parametrize("user", USERS)
+def test_a_life(user: str, flow: Path) -> None:
+    before = cursor()
+    assert start(user, flow).stderr == ""
+    shown = row(user)
+    assert (shown["name"], shown["status"], shown["nodes_alive"]) == ("robot", "Running", 3)
+    wait_for("the sink prints", lambda: len(lines(user, "sink")) > 2)
+    groups = {path.name for path in group(user).iterdir() if path.is_dir()}
+    assert groups == {"supervisor", "node-source", "node-doubler", "node-sink"}
+    assert "3/3 nodes running" in systemctl(user, "status", "--no-pager")
+    pid = (group(user) / "node-doubler/cgroup.procs").read_text()
+    doractl(user, "node", "restart", "robot", "doubler")
+    assert (group(user) / "node-doubler/cgroup.procs").read_text() != pid
+    assert "Dataflow stopped:" in doractl(user, "stop", "robot").stdout
+    wait_for("it is gone", lambda: not dora_processes())
+    assert warnings(before) == []
+
+
+@pytest.mark.parametrize("user", USERS)
+def test_what_is_left_out_is_named(user: str, flow: Path) -> None:
+    words = ("--restart-policy", "on-failure", "--property", "PrivatePIDs=yes")
+    said = start(user, flow, *words).stderr.splitlines()
+    assert said == [
+        f"doractl: {name}= is left out: systemd 252 lacks it, version {version} has it"
+        for name, version in (
+            ("RestartSteps", 254),
+            ("RestartMaxDelaySec", 254),
+            ("PrivatePIDs", 257),
+        )
+    ]
+    assert (show(user, "Restart"), show(user, "ActiveState")) == ("on-failure", "active")
+
+
+@pytest.mark.parametrize("user", USERS)
+def test_a_killed_daemon_is_followed_by_a_new_start(user: str, flow: Path) -> None:
+    start(user, flow, "--restart-policy", "on-failure")
+    uuid, runner = row(user)["uuid"], show(user, "MainPID")
+    pids = (group(user) / "supervisor/cgroup.procs").read_text().split()
+    (daemon,) = (pid for pid in pids if "daemon" in Path(f"/proc/{pid}/cmdline").read_text())
+    run("kill", "-KILL", daemon)
+    wait_for("another runner", lambda: show(user, "MainPID") not in ("0", runner))
+    wait_for("it runs", lambda: row(user)["status"] == "Running")
+    assert row(user)["uuid"] == uuid
+    assert show(user, "NRestarts") == "1"
+
+
+@pytest.mark.parametrize("user", USERS)
+def test_enabled_and_disabled(user: str, flow: Path) -> None:
+    start(user, flow)
+    uuid, pid = row(user)["uuid"], show(user, "MainPID")
+    assert doractl(user, "enable", "robot").stdout.startswith(f"Dataflow enabled: {uuid}")
+    assert show(user, "MainPID") == pid
+    unit = systemctl(user, "show", "--value", "--property=FragmentPath")
+    assert row(user)["enabled"], unit
+    systemctl(user, "stop")
+    before = cursor()
+    systemctl(user, "start")
+    wait_for("it runs", lambda: row(user)["status"] == "Running")
+    assert (row(user)["uuid"], show(user, "UnitFileState")) == (uuid, "enabled")
+    assert warnings(before) == [], "systemd 252 knows all that is in the file"
+    assert "Dataflow disabled:" in doractl(user, "disable", "robot").stdout
+    assert not row(user)["enabled"]
+
+
+@pytest.mark.parametrize("user", USERS)
+def test_a_reload_of_systemd_changes_nothing(user: str, flow: Path) -> None:
+    """As the installation of any package makes one."""
+    start(user, flow, "--restart-policy", "on-failure")
+    before, argv = row(user), show(user, "ExecStart")
+    scope = "--system" if user == "root" else "--user"
+    said = cursor()
+    as_user(user, "systemctl", scope, "daemon-reload")
+    assert row(user)["uuid"] == before["uuid"]
+    assert show(user, "ExecStart").partition(";")[0] == argv.partition(";")[0]
+    doractl(user, "restart", "robot")
+    assert row(user)["status"] == "Running"
+    assert warnings(said) == []
+
+
+def test_what_would_not_outlive_a_reload_is_refused(flow: Path) -> None:
+    """Such a path is for a later systemd, or for a unit file."""
+    place = flow.parent.rename(flow.parent.with_name("$HOME"))
+    command = ("start", str(place / flow.name), "--name", "robot", "--venv", LAB)
+    done = doractl("root", *command, check=False)
+    assert done.returncode == 2
+    assert "over a reload of systemd 252" in done.stderr
+    doractl("root", *command, "--enable")
+    assert row("root")["status"] == "Running"
+
+
+@pytest.mark.parametrize("user", USERS)
+def test_start_and_enable(user: str, flow: Path) -> None:
+    before = cursor()
+    assert start(user, flow, "--enable").stderr == ""
+    assert (row(user)["enabled"], row(user)["status"]) == (True, "Running")
+    assert warnings(before) == []
+
+
+def test_setup_is_taken_away() -> None:
+    run(f"{VENV}/bin/doractl", "setup", "--remove")
+    assert not list(Path("/usr/local").rglob("*dora*"))
