@@ -1,10 +1,12 @@
 """The Debian packages as a user of them meets them: installed, without this lab's dora."""
 
 import os
+import pwd
+import re
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -27,17 +29,38 @@ _NOT_OURS = ("/var/lib/dpkg", "/var/lib/apt", "/var/cache", "/var/log", "/var/tm
 def find_packages() -> list[Path]:
     """The .deb files of this machine: those of `make deb`, unless DORA_DEBS names others."""
     place = Path(os.environ.get("DORA_DEBS", CHECKOUT / "dist"))
+    if AUTOPKGTEST:
+        place = Path(os.environ["AUTOPKGTEST_TMP"])
+        run("apt-get", "download", *PACKAGES, cwd=place)
     own = run("dpkg", "--print-architecture").stdout.strip()
     found = [path for kind in ("all", own) for path in sorted(place.glob(f"dora-*_{kind}.deb"))]
     assert len(found) == len(PACKAGES), f"no packages in {place}: run make deb"
     return found
 
 
-def install() -> None:
-    """Install both packages, or install them again, as a user does."""
-    names = PACKAGES if AUTOPKGTEST else [str(path) for path in find_packages()]
+def build_previous(place: Path) -> list[Path]:
+    """The same packages as an earlier build would be, below `place`."""
+    built = place / "previous"
+    built.mkdir()
+    for path in find_packages():
+        tree = place / path.stem
+        run("dpkg-deb", "--raw-extract", str(path), str(tree))
+        control = tree / "DEBIAN/control"
+        text = control.read_text()
+        control.write_text(re.sub(r"^(Version: .*)$", r"\1~previous", text, flags=re.MULTILINE))
+        run("dpkg-deb", "--root-owner-group", "-Znone", "--build", str(tree), str(built))
+    return sorted(built.iterdir())
+
+
+def install(paths: Sequence[Path] = ()) -> None:
+    """Install these packages, or those of this build, as a user does; there or not there."""
     options = ("--yes", "--reinstall", "--allow-downgrades", "-o", "Dpkg::Use-Pty=0")
-    apt("install", *options, *names)
+    apt("install", *options, *map(str, paths or find_packages()))
+
+
+def version() -> str:
+    """That of the package dora-systemd which is installed."""
+    return sh("dpkg-query -Wf '${Version}' dora-systemd").stdout
 
 
 def apt(*arguments: str) -> None:
@@ -54,15 +77,17 @@ def apt(*arguments: str) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+def caller(user: str) -> tuple[str, ...]:
+    """The words before a command of `user`, who has nothing but what Debian gives him."""
+    home = pwd.getpwnam(user).pw_dir
+    plain = ("env", "--ignore-environment", "--chdir=/", f"PATH={PATH}", "LANG=C.UTF-8")
+    switch = ("setpriv", f"--reuid={user}", f"--regid={user}", "--init-groups")
+    return (*plain, f"HOME={home}", *(() if user == "root" else switch))
+
+
 def sh(script: str, user: str = "root", check: bool = True) -> subprocess.CompletedProcess[str]:
-    """A shell script as `user`, who has nothing but what Debian gives him."""
-    environment = {"PATH": PATH, "LANG": "C.UTF-8", "HOME": f"/home/{user}"}
-    if user == "root":
-        command: tuple[str, ...] = ("sh", "-euc", script)
-    else:
-        command = ("setpriv", f"--reuid={user}", f"--regid={user}", "--init-groups", "sh", "-euc")
-        command = (*command, script)
-    return run(*command, env=environment, cwd="/", check=check)
+    """A shell script as `user`."""
+    return run(*caller(user), "sh", "-euc", script, check=check)
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""The Debian packages: installed, used, installed again, removed and purged, in this order.
+"""The Debian packages: installed, used, upgraded, removed and purged, in this order.
 
 Needs what `make deb` makes, in dist/, or the packages themselves with autopkgtest.
 """
@@ -13,6 +13,7 @@ import pytest
 from tests.deb import packages
 from tests.deb.packages import sh
 from tests.system.cells import dora_processes, wait_for
+from tests.system.shells import SHELLS
 
 USERS = ("root", "alice")
 ALICE = "XDG_RUNTIME_DIR=/run/user/$(id -u)"
@@ -22,13 +23,6 @@ COMPLETIONS = (
     "/usr/share/zsh/vendor-completions/_doractl",
     "/usr/share/fish/vendor_completions.d/doractl.fish",
 )
-COMPLETE = """
-bash -c '
-. /usr/share/bash-completion/bash_completion
-_comp_load doractl 2>/dev/null || _completion_loader doractl || :
-COMP_WORDS=(doractl node restart robot ""); COMP_CWORD=4; COMP_LINE="${COMP_WORDS[*]}"
-_doractl; echo "${COMPREPLY[@]}"'
-"""
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +47,19 @@ def main_pid(user: str) -> str:
     flag = "--system" if user == "root" else "--user"
     script = f"{ALICE} systemctl {flag} show --value --property=MainPID dora-robot"
     return sh(script, user).stdout.strip()
+
+
+def all_pids(user: str) -> list[str]:
+    """Every process of the robot."""
+    flag = "--system" if user == "root" else "--user"
+    script = f"{ALICE} systemctl {flag} show --value --property=ControlGroup dora-robot"
+    group = Path(f"/sys/fs/cgroup{sh(script, user).stdout.strip()}")
+    return sorted(pid for path in group.rglob("cgroup.procs") for pid in path.read_text().split())
+
+
+def uuid(user: str) -> str:
+    (row,) = json.loads(sh("doractl list -o json", user).stdout)
+    return str(row["uuid"])
 
 
 def lines(user: str, node: str) -> list[str]:
@@ -85,7 +92,7 @@ def test_install(before: set[str]) -> None:
 def test_versions_of_what_is_installed() -> None:
     versions = json.loads(sh("doractl version -o json").stdout)
     assert versions["dora"] == "1.1.0"
-    assert versions["doractl"] == sh("dpkg-query -Wf '${Version}' dora-systemd").stdout
+    assert versions["doractl"] == packages.version()
 
 
 def test_units() -> None:
@@ -143,17 +150,29 @@ def test_completions_are_there(path: str) -> None:
     assert Path(path).stat().st_mode & 0o777 == 0o644
 
 
-def test_bash_completes_nodes_that_run() -> None:
+@pytest.mark.parametrize("user", USERS)
+@pytest.mark.parametrize("shell", SHELLS)
+def test_shells_complete_nodes_that_run(shell: str, user: str) -> None:
+    found = SHELLS[shell]("doractl node restart robot d", packages.caller(user))
+    assert found == ["detector"]
+
+
+def test_upgrade_keeps_dataflows_running(tmp_path: Path) -> None:
+    """What runs is not touched, and what is installed then works with it."""
+    this = packages.version()
+    packages.install(packages.build_previous(tmp_path))
+    assert packages.version() == f"{this}~previous"
     for user in USERS:
-        assert sh(COMPLETE, user).stdout.split() == ["camera", "detector", "plot"]
-
-
-def test_reinstall_keeps_dataflows_running() -> None:
-    pids = {user: main_pid(user) for user in USERS}
+        sh("doractl restart robot", user)
+    before = {user: (all_pids(user), uuid(user)) for user in USERS}
     packages.install()
-    assert {user: main_pid(user) for user in USERS} == pids
+    assert packages.version() == this
+    assert {user: (all_pids(user), uuid(user)) for user in USERS} == before
     for user in USERS:
         wait_for_plot(user, len(lines(user, "plot")))
+        sh("doractl node restart robot detector", user)
+        wait_for_plot(user, len(lines(user, "plot")))
+        assert main_pid(user) in before[user][0]
 
 
 def test_stop_and_start_after_that(flows: dict[str, Path]) -> None:

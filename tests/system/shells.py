@@ -23,17 +23,16 @@ printf '%s\\n' "${COMPREPLY[@]}"
 # A terminal of its own, in which somebody types. What is on the screen is hard to read, so the
 # widget writes down the line.
 _ZSH = """
+# What it has found in its directories: without that it looks for a second, each time.
+dump=/var/tmp/zsh-completions-$UID
 zmodload zsh/zpty
 zpty typed zsh -f -i
-zpty -w typed "autoload -Uz compinit && compinit -u -d $3"
+zpty -w typed "autoload -Uz compinit && compinit -u -d $dump"
 zpty -w typed 'note() { zle complete-word; print -r -- "$BUFFER" >'$2'; exit }'
 zpty -w typed "zle -N note; bindkey '^X' note"
 zpty -w -n typed "$1"$'\\x18'
 while zpty -r typed screen; do :; done
 """
-
-# What zsh has found in its directories; without it each shell takes a second to look again.
-_DUMP = "/var/tmp/zsh-completions"
 
 _FISH = "complete --do-complete $argv[1]"
 
@@ -49,7 +48,7 @@ def ask_zsh(line: str, caller: Sequence[str]) -> list[str]:
     with tempfile.TemporaryDirectory() as place:
         Path(place).chmod(0o777)
         noted = Path(place) / "line"
-        run(*caller, "zsh", "-f", "-c", _ZSH, "zsh", line, str(noted), _DUMP)
+        run(*caller, "zsh", "-f", "-c", _ZSH, "zsh", line, str(noted))
         completed = noted.read_text().removesuffix("\n")
     return [] if completed == line else [completed.split()[-1]]
 
