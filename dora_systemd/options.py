@@ -4,6 +4,7 @@ There is no registry: `list` learns UUID and path of a dataflow from this comman
 module imports nothing that costs time.
 """
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -150,10 +151,12 @@ def runner_command(python: str, options: RunnerOptions) -> list[str]:
 def post_command(python: str, options: RunnerOptions) -> list[str]:
     """ExecStopPost= of the unit: what is left to say when the runner was killed.
 
-    After a runner that ended by itself no Python is started, which a restart would wait for.
+    After a runner that ended by itself no Python is started, which a restart would wait for. There
+    is no "$" in it: systemd 252 would not keep that over a daemon-reload.
     """
     command = [python, *_PYTHON_FLAGS[:-1], POST_MODULE, options.name, options.uuid]
-    return ["/bin/sh", "-c", 'test "$EXIT_CODE" = exited || exec "$@"', "sh", *command]
+    script = f"printenv EXIT_CODE | grep -qx exited || exec {shlex.join(command)}"
+    return ["/bin/sh", "-c", script]
 
 
 def reload_command(python: str) -> list[str]:

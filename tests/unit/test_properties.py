@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dora_systemd.compat import MIN_VERSION, transient_commands
 from dora_systemd.environment import unit_environment
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.options import RunnerOptions, options_from_command
@@ -36,8 +37,8 @@ NotifyAccess=main
 ExecStart=:/usr/bin/python3 -E -P -m dora_systemd.runner --name=robot --uuid={UUID} \
 --working-directory=/srv/robot --dora=/usr/bin/dora --grace-duration=10s \
 --venv=/srv/robot/.venv /srv/robot/robot.yml
-ExecStopPost=-:/bin/sh -c "test \\"$EXIT_CODE\\" = exited || exec \\"$@\\"" sh \
-/usr/bin/python3 -E -P -m dora_systemd.runnerpost robot 550e8400-e29b-41d4-a716-446655440000
+ExecStopPost=-:/bin/sh -c "printenv EXIT_CODE | grep -qx exited || exec \
+/usr/bin/python3 -E -P -m dora_systemd.runnerpost robot 550e8400-e29b-41d4-a716-446655440000"
 ExecReload=:/usr/bin/python3 -E -P -m dora_systemd.runnerask
 FileDescriptorStoreMax=4096
 WorkingDirectory=/
@@ -96,6 +97,13 @@ def test_no_user_but_the_caller_in_user_scope() -> None:
     with pytest.raises(DoraSystemdError, match="user scope") as caught:
         unit(context=UnitContext("/usr/bin/python3", True, "dora"))
     assert caught.value.code == ExitCode.USAGE
+
+
+def test_debian_12_keeps_the_command_lines() -> None:
+    """None of them has a "$", which systemd 252 would lose at a daemon-reload."""
+    told = transient_commands(unit().values(), MIN_VERSION)
+    commands = [name for name, signature, _ in told if signature == "a(sasb)"]
+    assert commands == ["ExecStart", "ExecStopPost", "ExecReload"]
 
 
 def test_types_on_the_bus() -> None:
