@@ -140,10 +140,13 @@ def plan_vm(_form: str) -> list[Step]:
 
 
 def reboot_step() -> Step:
-    """One machine for both: what is enabled before the reboot is looked for behind it."""
-    first, second = (["pytest", f"tests/boot/test_{when}.py"] for when in ("before", "after"))
-    command = ["tests/lab/lab", "run", "--", *first, "--reboot--", *second]
-    return Step("a reboot, vm", command, {**os.environ, "LAB": "vm"})
+    """One machine for all: what is enabled is looked for behind a reboot and a power cut."""
+    stages = (("before",), ("after", "cut"), ("was_cut",))
+    command = ["tests/lab/lab", "run", "--"]
+    for place, stage in enumerate(stages):
+        command += ["--reboot--"] if place else []
+        command += ["pytest", *(f"tests/boot/test_{name}.py" for name in stage)]
+    return Step("a reboot and a power cut, vm", command, {**os.environ, "LAB": "vm"})
 
 
 def plan_packages(_form: str) -> list[Step]:
