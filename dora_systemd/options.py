@@ -4,9 +4,9 @@ There is no registry: `list` learns UUID and path of a dataflow from this comman
 module imports nothing that costs time.
 """
 
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import PurePath
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.hotreload import (
@@ -33,6 +33,7 @@ from dora_systemd.values import (
 RUNNER_MODULE = "dora_systemd.runner"
 POST_MODULE = "dora_systemd.runnerpost"
 RELOAD_MODULE = "dora_systemd.runnerask"
+_STOP_POST = str(PurePath(__file__).with_name("stoppost.sh"))
 
 _PYTHON_FLAGS = ("-E", "-P", "-m", RUNNER_MODULE)
 """Without the environment's PYTHON* and without the working directory on sys.path: modules of the
@@ -151,12 +152,10 @@ def runner_command(python: str, options: RunnerOptions) -> list[str]:
 def post_command(python: str, options: RunnerOptions) -> list[str]:
     """ExecStopPost= of the unit: what is left to say when the runner was killed.
 
-    After a runner that ended by itself no Python is started, which a restart would wait for. There
-    is no "$" in it: systemd 252 would not keep that over a daemon-reload.
+    After a runner that ended by itself no Python is started, which a restart would wait for.
     """
     command = [python, *_PYTHON_FLAGS[:-1], POST_MODULE, options.name, options.uuid]
-    script = f"printenv EXIT_CODE | grep -qx exited || exec {shlex.join(command)}"
-    return ["/bin/sh", "-c", script]
+    return ["/bin/sh", _STOP_POST, *command]
 
 
 def reload_command(python: str) -> list[str]:

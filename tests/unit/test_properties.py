@@ -17,6 +17,7 @@ from dora_systemd.settings import resolve_settings
 from dora_systemd.settingtable import SETTINGS
 from dora_systemd.unitsyntax import split_words
 from dora_systemd.values import INFINITY, SECOND, format_size, parse_size
+from tests.unit.checkout import CHECKOUT
 
 UUID = "550e8400-e29b-41d4-a716-446655440000"
 OPTIONS = RunnerOptions(
@@ -26,6 +27,7 @@ ENVIRONMENT = unit_environment("/usr/bin:/bin", "/srv/robot/.venv", {"MODEL": "a
 SYSTEM = UnitContext("/usr/bin/python3", False, "dora", ENVIRONMENT)
 USER = UnitContext("/usr/bin/python3", True, None, ENVIRONMENT)
 
+STOP_POST = CHECKOUT / "dora_systemd/stoppost.sh"
 UNIT = f"""\
 [Unit]
 Description=dora dataflow robot
@@ -37,8 +39,8 @@ NotifyAccess=main
 ExecStart=:/usr/bin/python3 -E -P -m dora_systemd.runner --name=robot --uuid={UUID} \
 --working-directory=/srv/robot --dora=/usr/bin/dora --grace-duration=10s \
 --venv=/srv/robot/.venv /srv/robot/robot.yml
-ExecStopPost=-:/bin/sh -c "printenv EXIT_CODE | grep -qx exited || exec \
-/usr/bin/python3 -E -P -m dora_systemd.runnerpost robot 550e8400-e29b-41d4-a716-446655440000"
+ExecStopPost=-:/bin/sh {STOP_POST} /usr/bin/python3 -E -P -m dora_systemd.runnerpost robot \
+550e8400-e29b-41d4-a716-446655440000
 ExecReload=:/usr/bin/python3 -E -P -m dora_systemd.runnerask
 FileDescriptorStoreMax=4096
 WorkingDirectory=/

@@ -2,11 +2,13 @@
 
 import os
 import socket
+import subprocess
 from pathlib import Path
 
 import pytest
 
 from dora_systemd.runnerpost import killed_by, killed_cause, main, out_of_memory, write_last_words
+from tests.unit.checkout import CHECKOUT
 
 UUID = "550e8400-e29b-41d4-a716-446655440000"
 
@@ -79,3 +81,12 @@ def test_last_words(tmp_path: Path) -> None:
 def test_runtime_directory_is_empty(tmp_path: Path) -> None:
     (event,) = last_words(tmp_path)
     assert b"DORA_EVENT=dataflow-failed\n" in event
+
+
+def test_no_python_is_started_after_a_runner_that_ended_by_itself() -> None:
+    script = ["/bin/sh", str(CHECKOUT / "dora_systemd/stoppost.sh"), "echo", "a  b"]
+    for ended, printed in (("exited", ""), ("killed", "a  b\n"), ("dumped", "a  b\n")):
+        done = subprocess.run(
+            script, env={"EXIT_CODE": ended}, capture_output=True, text=True, check=True
+        )
+        assert done.stdout == printed
