@@ -190,7 +190,7 @@ def test_a_failed_start_says_why(cell: Cell, project: Project) -> None:
     *words, message, hint = done.stderr.splitlines()
     assert "  one: ModuleNotFoundError: No module named 'nosuchmodule'" in words
     assert message == f"doractl: cannot start {cell.name}: node one: exit code 1"
-    assert hint.startswith(f"hint: doractl logs {cell.name}")
+    assert hint == f"hint: doractl {cell.scope.flag} why {cell.name} tells more"
 
 
 def test_ctrl_c_while_it_starts_ends_the_waiting_only(cell: Cell, project: Project) -> None:
