@@ -42,19 +42,23 @@ for event in node:
     if event["type"] == "INPUT":
         print("got", event["value"].to_pylist(), flush=True)
 """
-THREE_NODES = """
+# An emulated processor has little to spare for how often a test asks and how often a node sends.
+IS_EMULATED = os.environ.get("LAB") == "vm"
+TICK = f"dora/timer/millis/{250 if IS_EMULATED else 20}"
+POLL_SECONDS = 0.5 if IS_EMULATED else 0.02
+THREE_NODES = f"""
 nodes:
   - id: source
     path: source.py
-    inputs: {tick: dora/timer/millis/20}
+    inputs: {{tick: {TICK}}}
     outputs: [number]
   - id: doubler
     path: doubler.py
-    inputs: {number: {source: source/number, queue_size: 1000}}
+    inputs: {{number: {{source: source/number, queue_size: 1000}}}}
     outputs: [double]
   - id: sink
     path: sink.py
-    inputs: {double: {source: doubler/double, queue_size: 1000}}
+    inputs: {{double: {{source: doubler/double, queue_size: 1000}}}}
 """
 
 
@@ -63,7 +67,7 @@ def wait_for(what: str, condition: Callable[[], T], seconds: float = 30.0) -> T:
     deadline = time.monotonic() + seconds
     while not (value := condition()):
         assert time.monotonic() < deadline, f"not within {seconds} s: {what}"
-        time.sleep(0.02)
+        time.sleep(POLL_SECONDS)
     return value
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from dora_systemd.cgroup import read_cpu
 from dora_systemd.errors import ExitCode
-from tests.system.cells import Cell, Project, is_alive, run, wait_for
+from tests.system.cells import TICK, Cell, Project, is_alive, run, wait_for
 
 pytestmark = pytest.mark.vm
 
@@ -209,7 +209,7 @@ def test_changes_of_an_enabled_dataflow_stay_until_it_is_disabled(
 def slow_flow(project: Project) -> Path:
     """Three nodes with so few messages that an emulated and limited machine keeps up."""
     flow = project.three_nodes()
-    flow.write_text(flow.read_text().replace("millis/20", "millis/500"))
+    flow.write_text(flow.read_text().replace(TICK, "dora/timer/millis/500"))
     return flow
 
 

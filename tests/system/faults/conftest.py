@@ -2,13 +2,17 @@
 
 import os
 import statistics
+import time
 from collections import defaultdict
+from collections.abc import Iterator
 
 import pytest
 
 from dora_systemd.statuswords import format_table
+from tests.system.cells import run
 from tests.system.faults.table import TABLE, Fault
 
+CLOCK_SECONDS = 60
 ROUNDS = int(os.environ.get("FAULT_ROUNDS") or "1")
 
 
@@ -50,6 +54,15 @@ RECOVERIES = Recoveries()
 @pytest.fixture
 def recoveries() -> Recoveries:
     return RECOVERIES
+
+
+@pytest.fixture(autouse=True)
+def clock() -> Iterator[None]:
+    """What comes after a fault of the clock finds it as it was."""
+    offset = time.time() - time.monotonic()
+    yield
+    if abs(time.time() - time.monotonic() - offset) > CLOCK_SECONDS:
+        run("date", f"--set=@{time.monotonic() + offset:.3f}")
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
