@@ -374,3 +374,31 @@ def test_a_settings_file(cell: Cell, project: Project) -> None:
     assert "dataflow.systemd.yml: env: only doractl stop and start" in failures(cell)[-1]
     assert (cell.group / "node-sink/memory.max").read_text() == "max\n"
     assert pids(cell).keys() == before.keys()
+
+
+OPERATOR = """
+from dora import DoraStatus
+import pyarrow as pa
+class Operator:
+    def on_event(self, event, send_output):
+        if event["type"] == "INPUT":
+            send_output("double", pa.array([2 * event["value"][0].as_py()]))
+        return DoraStatus.CONTINUE
+"""
+
+
+def test_a_python_operator_reads_its_file_again(cell: Cell, project: Project) -> None:
+    """In place: the process stays, dora reloads the module."""
+    flow = project.three_nodes()
+    project.write("op.py", OPERATOR)
+    text = THREE_NODES.replace("path: doubler.py", "operator:\n      python: op.py")
+    text = text.replace("    inputs: {number", "      inputs: {number")
+    flow.write_text(text.replace("    outputs: [double]", "      outputs: [double]"))
+    cell.start(flow, HOT)
+    cell.wait_exchanging()
+    before = pids(cell)
+    save(project.root / "op.py", OPERATOR.replace("2 *", "-1 *"))
+    (record,) = wait_reloads(cell, 1)
+    assert "was reloaded in place: op.py" in record["MESSAGE"]
+    wait_for("the new code", lambda: cell.messages("sink")[-1].startswith("got [-"))
+    assert pids(cell) == before
