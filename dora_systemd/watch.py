@@ -106,6 +106,9 @@ async def _bursts(rules: WatchRules) -> AsyncIterator[frozenset[str]]:
                 ExitCode.FAILURE,
             ) from error
         raise DoraSystemdError(f"cannot watch {rules.root}: {error}") from error
+    except RuntimeError as error:  # watchfiles's own, when the kernel gives no inotify instance
+        hint = "more of them: sysctl fs.inotify.max_user_instances"
+        raise DoraSystemdError(f"cannot watch {rules.root}: {error}", hint) from error
 
 
 def _is_new_directory(path: str, rules: WatchRules) -> bool:
