@@ -11,7 +11,7 @@ from dora_systemd.launch import python_of
 from dora_systemd.limitsettings import DEVICE, REALTIME
 from dora_systemd.options import RunnerOptions
 from dora_systemd.preparation import PACKAGE, Prepared
-from dora_systemd.sandbox import Sandbox
+from dora_systemd.sandbox import Sandbox, odd_paths
 from dora_systemd.sandboxsettings import NETWORK, SANDBOX, WRITABLE
 from dora_systemd.scope import Scope
 from dora_systemd.settings import Settings
@@ -44,7 +44,9 @@ def make_sandbox(
 
 
 def sandbox_warnings(sandbox: Sandbox) -> Iterator[str]:
-    """What a user's manager takes and cannot keep."""
+    """What a user's manager takes and cannot keep, and what the name of a path keeps open."""
+    for path in odd_paths(sandbox):
+        yield f"the sandbox cannot hide what is around {shown(path)}, whose name no mount can have"
     if not sandbox.is_user:
         return
     if sandbox.level == "strict":

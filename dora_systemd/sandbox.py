@@ -4,6 +4,7 @@ Every property is one of systemd.exec(5) or systemd.resource-control(5). What ea
 table SANDBOX of dora-systemd(7).
 """
 
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -48,6 +49,7 @@ _STRICT_FILES = ("ProcSubset=pid", "PrivateIPC=yes")
 
 _TEMPORARY = ("/tmp", "/var/tmp")
 _HOMES = ("/home", "/root", "/run/user")
+_MOUNTABLE = re.compile(r"[^\s\x00-\x1f\x7f\"'\\:]+")
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,15 @@ def sandbox_properties(sandbox: Sandbox) -> dict[str, Property]:
     for assignment in _assignments(sandbox):
         properties = with_properties(properties, parse_property(assignment))
     return properties | _path_properties(sandbox)
+
+
+def odd_paths(sandbox: Sandbox) -> list[str]:
+    """The paths that keep whole places of the machine open: systemd cannot mount them alone."""
+    if sandbox.level == "none" or sandbox.is_user:
+        return []
+    places = (*_TEMPORARY, *(_HOMES if sandbox.level == "strict" else ()))
+    paths = _unmountable((*sandbox.needed, *sandbox.writable))
+    return [path for path in dict.fromkeys(paths) if _is_below(path, places)]
 
 
 def _assignments(sandbox: Sandbox) -> list[str]:
@@ -141,8 +152,15 @@ def _can_hide(places: Iterable[str], sandbox: Sandbox) -> bool:
     """Whether nobody wants a whole place, and all that is needed in it can be mounted."""
     paths = (*sandbox.needed, *sandbox.writable)
     wants_whole = any(_is_below(place, paths) for place in places)
-    # A bind mount cannot be written with colons.
-    return not wants_whole and not any(":" in one and _is_below(one, places) for one in paths)
+    return not wants_whole and not any(_is_below(one, places) for one in _unmountable(paths))
+
+
+def _unmountable(paths: Iterable[str]) -> list[str]:
+    """The paths that systemd 257 writes into a transient unit in a way that it reads otherwise.
+
+    The unit would be without that mount, or with another, from the next daemon-reload on.
+    """
+    return [path for path in paths if not _MOUNTABLE.fullmatch(path)]
 
 
 def _is_below(path: str, places: Iterable[str]) -> bool:

@@ -12,6 +12,7 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.options import RunnerOptions, options_from_command
 from dora_systemd.propertykinds import Property
 from dora_systemd.propertyset import parse_line, with_properties
+from dora_systemd.propertystructs import MS_REC
 from dora_systemd.propertytable import TABLE
 
 BOOT_TARGET = "dora.target"
@@ -23,6 +24,10 @@ _SECTION = re.compile(r"\[([^\]]+)\]")
 _SPECIFIER = re.compile(r"%[a-zA-Z]")
 _ORDERS = ("After=default.target", "After=multi-user.target")
 _MOUNTABLE = re.compile(r"[^\x00-\x1f\x7f\"'\\]+")
+_TRANSIENT = "# This is a transient unit file"
+# How systemd 257 writes a bind mount into such a file. It quotes nothing there, and would itself
+# read other paths from a line with blanks.
+_TRANSIENT_BIND = re.compile(r"(Bind(?:ReadOnly)?Paths)=(-?)(/[^:]*):(/[^:]*):(rbind|norbind)")
 
 
 def plain_target(is_user: bool) -> str:
@@ -122,8 +127,20 @@ def _sections(texts: Sequence[str]) -> dict[str, list[str]]:
             if heading:
                 name = heading[1]
             elif name and name != "Install":
-                sections.setdefault(name, []).append(line)
+                quoted = _quoted_bind(line) if text.startswith(_TRANSIENT) else line
+                sections.setdefault(name, []).append(quoted)
     return sections
+
+
+def _quoted_bind(line: str) -> str:
+    """The bind mount of a transient unit so that systemd reads what it has mounted."""
+    found = _TRANSIENT_BIND.fullmatch(line.replace("%%", "%"))
+    if not found:
+        return line
+    key, optional, source, target, option = found.groups()
+    bind = (source, target, bool(optional), MS_REC if option == "rbind" else 0)
+    (text,) = TABLE[key].choices[0][1].format((bind,))
+    return f"{key}={text}"
 
 
 def _logical_lines(text: str) -> Iterator[str]:

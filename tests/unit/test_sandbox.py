@@ -25,7 +25,18 @@ from dora_systemd.settings import resolve_settings
 from tests.unit.fake_manager import options
 
 places = st.sampled_from(
-    ["/", "/srv/x", "/tmp", "/tmp/x", "/var/tmp/x/y", "/home/x", "/home/x/p", "/root", "/tmp/a:b"]
+    [
+        "/",
+        "/srv/x",
+        "/tmp",
+        "/tmp/x",
+        "/var/tmp/x/y",
+        "/home/x",
+        "/home/x/p",
+        "/root",
+        "/tmp/a:b",
+        "/home/x/p q",
+    ]
 )
 sandboxes = st.builds(
     Sandbox,
@@ -122,6 +133,22 @@ def test_a_project_below_tmp_is_mounted() -> None:
     assert [one[0] for one in value(sandbox, "BindReadOnlyPaths")] == ["/tmp/p"]  # type: ignore
     assert [one[0] for one in value(sandbox, "BindPaths")] == ["/tmp/p/out"]  # type: ignore
     assert value(sandbox, "ReadWritePaths") == ("/srv/o",)
+
+
+@pytest.mark.parametrize("odd", ["a:b", "a b", "a\tb", "a\nb", 'a"b', "a'b", "a\\b"])
+def test_what_no_mount_can_be_called_keeps_its_place_open(odd: str) -> None:
+    """systemd 257 writes mounts of a transient unit unquoted: a reload would read others."""
+    below_tmp = Sandbox(needed=(f"/var/tmp/{odd}", "/srv"))
+    assert value(below_tmp, "PrivateTmp") is False
+    assert value(below_tmp, "BindReadOnlyPaths") is None
+    (warning,) = sandbox_warnings(below_tmp)
+    assert "cannot hide what is around" in warning
+    for path in (f"/srv/{odd}", f"/home/x/{odd}"):
+        assert value(Sandbox(needed=(path,)), "PrivateTmp") is True
+        assert not list(sandbox_warnings(Sandbox(needed=(path,))))
+    strict = Sandbox(level="strict", needed=(f"/home/x/{odd}",))
+    assert value(strict, "ProtectHome") == "read-only"
+    assert len(list(sandbox_warnings(strict))) == 1
 
 
 def test_tmp_itself_is_shared_when_asked_for() -> None:

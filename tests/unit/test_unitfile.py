@@ -136,6 +136,24 @@ def test_systemds_own_spelling() -> None:
     assert says_the_same(SYSTEMDS_OWN, OUR_OWN)
 
 
+@pytest.mark.parametrize(
+    ("line", "quoted"),
+    [
+        ("BindReadOnlyPaths=/a b:/a b:rbind", 'BindReadOnlyPaths="/a b":"/a b"'),
+        ("BindPaths=-/a b:/c  d:norbind", 'BindPaths="-/a b":"/c  d":norbind'),
+        ('BindPaths=/100%% "x" \\:/y:rbind', 'BindPaths="/100%% \\"x\\" \\\\":/y'),
+        ("BindPaths=/a:/b:norbind", "BindPaths=/a:/b:norbind"),
+        ("BindPaths=", "BindPaths="),
+    ],
+)
+def test_systemds_own_bind_mounts(line: str, quoted: str) -> None:
+    """It writes them as they are; what doractl has written is right as it is."""
+    assert f"\n{quoted}\n" in persistent_unit(
+        [f"{SYSTEMDS_OWN}\n[Service]\n{line}\n"], options(), False, "dora.target"
+    )
+    assert f"\n{line}\n" in persistent_unit([f"{OUR_OWN}{line}\n"], options(), False, "dora.target")
+
+
 @pytest.mark.parametrize("line", ["Nice=5", "User=%u", "Unheard=1", "Nice=x"])
 def test_edited_by_hand(line: str) -> None:
     assert not says_the_same(f"{OUR_OWN}{line}\n", OUR_OWN)
