@@ -6,7 +6,6 @@ connection that is told every signature: nothing is introspected, and no XML is 
 
 import select
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from importlib import import_module
@@ -99,16 +98,6 @@ class Bus:
         typed = [(name, (signature, value)) for name, signature, value in properties]
         arguments = (("s", unit), ("b", runtime), ("a(sv)", typed))
         self._call(f"change {unit}", ROOT, MANAGER, "SetUnitProperties", *arguments)
-
-    def wait_until(
-        self, unit: str, is_done: Callable[[Mapping[str, Any]], bool], seconds: float
-    ) -> bool:
-        deadline = time.monotonic() + seconds
-        while (left := deadline - time.monotonic()) > 0:
-            if any(is_done(change) for change in self.changes(unit)):
-                return True
-            self._sleep(min(left, _IDLE_SECONDS))
-        return False
 
     def changes(self, unit: str) -> list[Mapping[str, Any]]:
         self._listen(unit)

@@ -60,11 +60,6 @@ class Manager(Protocol):
     def changes(self, unit: str) -> list[Mapping[str, Any]]:
         """What has changed of a unit's properties since the last look; does not wait."""
 
-    def wait_until(
-        self, unit: str, is_done: Callable[[Mapping[str, Any]], bool], seconds: float
-    ) -> bool:
-        """Wait for a change of the unit's properties after which `is_done`; False: too late."""
-
     def hold(self, unit: str) -> None:
         """Keep systemd from forgetting the unit, until this client leaves the bus."""
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.propertykinds import Property
-from dora_systemd.settingkinds import PATH, Base, Kind, Setting, scalar_text
+from dora_systemd.settingkinds import PATH, Base, Kind, Setting, scalar_text, texts_of
 from dora_systemd.values import quoted
 
 MAX_SIZE = 1024 * 1024
@@ -19,8 +19,7 @@ def parse_credentials(value: Any, base: Base) -> Mapping[str, str]:
     """File by name, from a mapping or from texts NAME=FILE. Raises DoraSystemdError (USAGE)."""
     if isinstance(value, Mapping):
         return dict(_pair(scalar_text(name), file, base) for name, file in value.items())
-    many = value if isinstance(value, list | tuple) else [value]
-    return dict(_parse_one(scalar_text(one), base) for one in many)
+    return dict(_parse_one(scalar_text(one), base) for one in texts_of(value))
 
 
 def credential_properties(files: Mapping[str, str]) -> dict[str, Property]:

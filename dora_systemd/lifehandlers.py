@@ -171,11 +171,7 @@ def stop_early(cell: Cell, event: life.Event) -> Step:
 def stop(cell: Cell, event: life.Event) -> Step:
     """Dora ends the nodes, if there are any."""
     assert isinstance(event, life.StopAsked)
-    cell = replace(cell, stop_by=event.by)
-    if not table.has_process(cell.nodes):
-        return _leave(cell, _stopping(event))
-    after = stop_timeout(cell.grace)
-    return _to(cell, State.STOPPING, _stopping(event), Do.ASK_STOP, after=after)
+    return _wind_down(replace(cell, stop_by=event.by), _stopping(event))
 
 
 def _stopping(event: life.StopAsked) -> Record:
@@ -202,10 +198,13 @@ def leave_now(cell: Cell, event: life.Event) -> Step:
 
 def reload(cell: Cell, event: life.Event) -> Step:
     """End as for a stop, and without a word: who asked for it starts the next life."""
-    cell = replace(cell, reload=True)
+    return _wind_down(replace(cell, reload=True))
+
+
+def _wind_down(cell: Cell, *actions: Action) -> Step:
     if not table.has_process(cell.nodes):
-        return _leave(cell)
-    return _to(cell, State.STOPPING, Do.ASK_STOP, after=stop_timeout(cell.grace))
+        return _leave(cell, *actions)
+    return _to(cell, State.STOPPING, *actions, Do.ASK_STOP, after=stop_timeout(cell.grace))
 
 
 def stop_again(cell: Cell, event: life.Event) -> Step:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.suggestions import did_you_mean
+from dora_systemd.suggestions import did_you_mean, missing_node
 from dora_systemd.values import (
     INFINITY,
     SECOND,
@@ -213,14 +213,13 @@ def check_nodes(limits: Iterable[NodeLimits], nodes: Iterable[str], dynamic: Ite
     """
     known, free = list(nodes), frozenset(dynamic)
     for one in limits:
-        message = f"cannot limit the node {quoted(one.node)}"
         if one.node not in known:
-            hint = did_you_mean(one.node, known) or f"there are {', '.join(known)}"
-            raise DoraSystemdError(f"{message}: it is not there", hint, ExitCode.BAD_INPUT)
+            raise missing_node("cannot limit", one.node, known)
         if one.node in free:
             hint = "limit what it is started with"
             reason = "it is dynamic, so it does not run inside the dataflow's unit"
-            raise DoraSystemdError(f"{message}: {reason}", hint, ExitCode.BAD_INPUT)
+            message = f"cannot limit the node {quoted(one.node)}: {reason}"
+            raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
 
 
 def _refusal(what: str, hint: str) -> DoraSystemdError:

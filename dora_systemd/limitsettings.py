@@ -12,7 +12,7 @@ from dora_systemd.limits import (
     merge_node_limits,
     parse_node_limits,
 )
-from dora_systemd.settingkinds import Base, Kind, Setting, scalar_text
+from dora_systemd.settingkinds import Base, Kind, Setting, scalar_text, texts_of
 from dora_systemd.values import quoted
 
 _DEVICE = re.compile(r"(/dev/\S+?|(?:char|block)-\S+?)(?:[: ]([rwm]+))?")
@@ -60,7 +60,7 @@ def _limit_setting(key: str) -> Setting[int | None]:
 
 
 def _texts(value: Any) -> list[str]:
-    return [scalar_text(one) for one in (value if isinstance(value, list | tuple) else [value])]
+    return [scalar_text(one) for one in texts_of(value)]
 
 
 def _parse_nice(value: Any, base: Base) -> int:

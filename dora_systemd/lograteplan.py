@@ -2,12 +2,10 @@
 
 from collections.abc import Sequence
 
-from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.lograte import ALL_NODES, RateLimits, merge_rates
 from dora_systemd.settings import Settings
 from dora_systemd.settingtable import LOG_RATE_LIMIT
-from dora_systemd.suggestions import did_you_mean
-from dora_systemd.values import quoted
+from dora_systemd.suggestions import missing_node
 
 
 def log_rates(settings: Settings) -> RateLimits:
@@ -24,6 +22,4 @@ def check_rates(limits: RateLimits, nodes: Sequence[str]) -> None:
     """Raise DoraSystemdError (BAD_INPUT) for a limit of a node that is none of `nodes`."""
     for node in limits:
         if node != ALL_NODES and node not in nodes:
-            message = f"cannot limit the lines of the node {quoted(node)}: it is not there"
-            hint = did_you_mean(node, nodes) or f"there are {', '.join(nodes)}"
-            raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+            raise missing_node("cannot limit the lines of", node, nodes)

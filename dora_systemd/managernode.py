@@ -12,12 +12,10 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.managercells import Cell, not_found
 from dora_systemd.managerlist import read_status
 from dora_systemd.protocol import Params, Reply, node_params, replace_params
+from dora_systemd.reload import has_readers
 from dora_systemd.scope import Scope
 from dora_systemd.status import CellStatus
-from dora_systemd.values import SECOND, quoted
-
-_OVERLAP = SECOND
-"""µs for which a node and its replacement run at the same time, at most."""
+from dora_systemd.values import quoted
 
 Ask = Callable[[Scope, Cell, Params], Reply]
 
@@ -85,8 +83,8 @@ def restart_node(scope: Scope, cell: Cell, node: str, ask: Ask = ask_coordinator
     nodes: list[dict[str, Any]] = info["DataflowInfo"]["descriptor"]["nodes"]
     definition = next((one for one in nodes if one.get("id") == node), {})
     is_replaceable = definition.get("restart_policy", "never") == "never"
-    if is_replaceable and _has_consumers(nodes, node):
-        params = replace_params(status.run, definition, _OVERLAP)
+    if is_replaceable and has_readers(node, nodes):
+        params = replace_params(status.run, definition)
     else:
         params = node_params("RestartNode", status.run, node)
     _answer(cell, ask(scope, cell, params))
@@ -137,22 +135,19 @@ def _become(uid: int) -> None:
 
 def _checked_status(scope: Scope, cell: Cell, node: str) -> CellStatus:
     read_coordinator(scope, cell)
+    return require_node(scope, cell, node)
+
+
+def require_node(scope: Scope, cell: Cell, node: str) -> CellStatus:
+    """The live table that `node` is in. Raises DoraSystemdError (NOT_FOUND) if it is not."""
     status = read_status(scope, cell)
     if node not in status.nodes:
-        names = list(status.nodes)
-        error = not_found(node, names)
         raise DoraSystemdError(
             f"cannot find a node {quoted(node)} in the dataflow {cell.name}",
-            error.hint,
+            not_found(node, list(status.nodes)).hint,
             ExitCode.NOT_FOUND,
         )
     return status
-
-
-def _has_consumers(nodes: Sequence[dict[str, Any]], node: str) -> bool:
-    """Whether any other node has an input from this one, in one of the many forms of inputs."""
-    source = json.dumps(f"{node}/")[:-1]
-    return any(source in json.dumps(one) for one in nodes if one.get("id") != node)
 
 
 def _answer(cell: Cell, reply: Reply) -> dict[str, Any]:

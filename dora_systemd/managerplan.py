@@ -9,7 +9,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from dora_systemd.dataflow import parse_dataflow
-from dora_systemd.doraerrors import parse_dora_error
 from dora_systemd.environment import parse_environment_file, unit_environment
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.files import read_text, read_yaml
@@ -21,8 +20,8 @@ from dora_systemd.managersandbox import make_sandbox
 from dora_systemd.managersettings import read_settings
 from dora_systemd.names import name_from_path, parse_name, unit_name
 from dora_systemd.options import RunnerOptions
-from dora_systemd.preparation import Prepared, prepare
-from dora_systemd.process import dora_version, find_dora, run_dora
+from dora_systemd.preparation import Prepared, prepare, refusal_of_dora
+from dora_systemd.process import dora_version, find_dora
 from dora_systemd.reloadplan import check_reload_nodes, hot_reload
 from dora_systemd.restartplan import node_policies, restart_policy
 from dora_systemd.restartsettings import START_TIMEOUT
@@ -135,17 +134,9 @@ def _check_plan(plan: Plan) -> Prepared:
     check_credentials(plan.scope, credential_files(plan.settings))
     account = account_of(plan.user)
     dora_version(options.dora, account)
-    done = run_dora(
-        options.dora,
-        ["validate", options.dataflow],
-        {**os.environ, **plan.environment},
-        options.working_directory,
-        account,
-    )
-    if done.status:
-        reason = parse_dora_error(done.stderr) or parse_dora_error(done.stdout)
+    if reason := refusal_of_dora(options, plan.environment, account):
         raise DoraSystemdError(
-            f"cannot use {options.dataflow}: {reason or 'dora refuses it'}",
+            f"cannot use {options.dataflow}: {reason}",
             f"see {options.dora} validate {options.dataflow}",
             ExitCode.BAD_INPUT,
         )

@@ -6,16 +6,14 @@ from typing import Any
 
 from dora_systemd.busprotocol import Manager
 from dora_systemd.cellpaths import CellPaths
-from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.hotreload import CHANGE_VARIABLE
-from dora_systemd.managercells import Cell, not_found
-from dora_systemd.managerlist import read_status
-from dora_systemd.managernode import require_running
+from dora_systemd.managercells import Cell
+from dora_systemd.managernode import require_node, require_running
 from dora_systemd.properties import format_unit, typed
 from dora_systemd.runnersocket import ask
 from dora_systemd.scope import Scope
 from dora_systemd.unitfiles import HOT_RELOAD_FILE, drop_in_directory, write_unit_file
-from dora_systemd.values import format_bool, quoted
+from dora_systemd.values import format_bool
 
 Ask = Callable[[Path, Mapping[str, Any]], dict[str, Any]]
 
@@ -27,7 +25,7 @@ def reload_cell(scope: Scope, cell: Cell, node: str | None, ask: Ask = ask) -> l
     """
     require_running(cell)
     if node is not None:
-        _require_node(scope, cell, node)
+        require_node(scope, cell, node)
     return list(ask(_socket(scope, cell), {"verb": "reload", "node": node})["done"])
 
 
@@ -49,10 +47,3 @@ def switch_hot_reload(
 
 def _socket(scope: Scope, cell: Cell) -> Path:
     return CellPaths(scope.cell_directory(cell.name)).socket
-
-
-def _require_node(scope: Scope, cell: Cell, node: str) -> None:
-    nodes = list(read_status(scope, cell).nodes)
-    if node not in nodes:
-        message = f"cannot find a node {quoted(node)} in the dataflow {cell.name}"
-        raise DoraSystemdError(message, not_found(node, nodes).hint, ExitCode.NOT_FOUND)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.files import read_yaml
+from dora_systemd.names import settings_path
 from dora_systemd.scope import Scope
 from dora_systemd.settings import Settings, resolve_settings
 from dora_systemd.settingtable import SETTINGS
@@ -20,7 +21,7 @@ def settings_files(dataflow: Path, environment: Mapping[str, str]) -> list[Path]
     """The settings files that may exist, the most important first, see design."""
     home = environment.get("HOME", "")
     config = environment.get("XDG_CONFIG_HOME", "") or (f"{home}/.config" if home else "")
-    beside = dataflow.with_name(f"{dataflow.stem}.systemd.yml")
+    beside = Path(settings_path(str(dataflow)))
     user = [Path(config) / USER_FILE] if config.startswith("/") else []
     return [beside, *user, SYSTEM_FILE]
 

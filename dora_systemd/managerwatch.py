@@ -20,11 +20,10 @@ def watch_warnings(plan: Plan) -> Iterator[str]:
     if not plan.options.hot_reload or not plan.options.reload.watch:
         return
     # Only who gives patterns pays for a walk through the files.
-    from dora_systemd.watch import read_gitignores, watched_files
-    from dora_systemd.watchrules import WatchRules, unmatched_patterns
+    from dora_systemd.watch import watch_rules, watched_files
+    from dora_systemd.watchrules import unmatched_patterns
 
-    given, root = plan.options.reload, plan.options.working_directory
-    rules = WatchRules(root, given.watch, given.ignore, read_gitignores(root))
+    rules = watch_rules(plan.options)
     found = [path for path, _ in watched_files(rules)]
     for pattern in unmatched_patterns(rules, found):
-        yield f"no file below {root} fits --watch {quoted(pattern)}"
+        yield f"no file below {rules.root} fits --watch {quoted(pattern)}"

@@ -45,6 +45,12 @@ def parse_name(text: str) -> str:
 PLAIN_STEM = "dataflow"
 
 
+def settings_path(dataflow: str) -> str:
+    """The settings file beside a dataflow file, which may be missing."""
+    path = PurePath(dataflow)
+    return str(path.with_name(f"{path.stem}.systemd.yml"))
+
+
 def name_from_path(path: str) -> str:
     """The name that a dataflow file gives: its stem, every character a name lacks becoming "-".
 

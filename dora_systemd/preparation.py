@@ -81,6 +81,27 @@ def load_dataflow(options: RunnerOptions) -> Dataflow:
     return parse_dataflow(files.parse_yaml(done.stdout, path), str(path))
 
 
+def refusal_of_dora(
+    options: RunnerOptions,
+    environment: Mapping[str, str],
+    account: process.Account | None = None,
+) -> str:
+    """What `dora validate` says against the dataflow of `options`, or "".
+
+    environment: of the nodes. account: whom dora runs as, None for the caller.
+    """
+    done = process.run_dora(
+        options.dora,
+        ["validate", options.dataflow],
+        {**os.environ, **environment},
+        options.working_directory,
+        account,
+    )
+    if done.status == 0:
+        return ""
+    return parse_dora_error(done.stderr) or parse_dora_error(done.stdout) or "dora refuses it"
+
+
 def _load_session(options: RunnerOptions) -> BuildSession:
     path = Path(session_path(options.dataflow))
     if not path.exists():

@@ -137,11 +137,14 @@ def node_params(method: str, run: str, node: str, grace: int | None = None) -> P
     return {method: {"dataflow_id": run, "node_id": node, "grace_duration": limit}}
 
 
-def replace_params(run: str, definition: Mapping[str, Any], grace: int) -> Params:
-    """Start `definition` in place of the node of that id, which then has `grace` µs to end."""
-    return {
-        "ReplaceNode": {"dataflow_id": run, "node": definition, "grace_duration": duration(grace)}
-    }
+OVERLAP = SECOND
+"""µs for which a node and its replacement run at the same time, at most."""
+
+
+def replace_params(run: str, definition: Mapping[str, Any]) -> Params:
+    """Start `definition` in place of the node of that id, which then has OVERLAP to end."""
+    overlap = duration(OVERLAP)
+    return {"ReplaceNode": {"dataflow_id": run, "node": definition, "grace_duration": overlap}}
 
 
 def add_params(run: str, definition: Mapping[str, Any]) -> Params:

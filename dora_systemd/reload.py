@@ -99,7 +99,7 @@ def difference(old: Mapping[str, Any], new: Mapping[str, Any]) -> Difference:
     changed = [node for node in after if node in before and after[node] != before[node]]
     rewired = tuple(node for node in changed if _edges(before[node]) != _edges(after[node]))
     for node in rewired:
-        if _has_readers(node, before) or _has_readers(node, after):
+        if has_readers(node, before.values()) or has_readers(node, after.values()):
             return Difference(whole=f"inputs or outputs of the node {node} have changed")
     added = tuple(node for node in after if node not in before)
     for node in (*added, *changed):
@@ -113,6 +113,12 @@ def difference(old: Mapping[str, Any], new: Mapping[str, Any]) -> Difference:
     )
 
 
+def has_readers(node: str, nodes: Iterable[Mapping[str, Any]]) -> bool:
+    """Whether an input of another one of `nodes` names this one, in one of its many forms."""
+    source = json.dumps(f"{node}/")[:-1]
+    return any(source in json.dumps(one) for one in nodes if one.get("id") != node)
+
+
 def _without_nodes(descriptor: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in descriptor.items() if key != "nodes"}
 
@@ -123,12 +129,6 @@ def _edges(node: Mapping[str, Any]) -> list[Any]:
 
 def _has_operators(node: Mapping[str, Any]) -> bool:
     return bool(node.get("operator") or node.get("operators"))
-
-
-def _has_readers(node: str, nodes: Mapping[str, Mapping[str, Any]]) -> bool:
-    """Whether an input of another node names this one, in one of the many forms of inputs."""
-    source = json.dumps(f"{node}/")[:-1]
-    return any(source in json.dumps(one) for ident, one in nodes.items() if ident != node)
 
 
 def _by_id(nodes: Sequence[Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:

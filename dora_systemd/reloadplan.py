@@ -2,12 +2,10 @@
 
 from collections.abc import Iterator, Sequence
 
-from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.hotreload import HotReload
 from dora_systemd.reloadsettings import HOT_RELOAD, IGNORE, RELOAD_SETTINGS, REPLACE, WATCH
 from dora_systemd.settings import DEFAULT_SOURCE, Settings
-from dora_systemd.suggestions import did_you_mean
-from dora_systemd.values import quoted
+from dora_systemd.suggestions import missing_node
 from dora_systemd.watchrules import relative_patterns
 
 
@@ -39,9 +37,7 @@ def check_reload_nodes(reload: HotReload, nodes: Sequence[str]) -> None:
     """Raise DoraSystemdError (BAD_INPUT) for a node that is none of `nodes`."""
     for node in (*dict(reload.node_watch), *filter(None, dict(reload.replace))):
         if node not in nodes:
-            message = f"cannot watch files of the node {quoted(node)}: it is not there"
-            hint = did_you_mean(node, nodes) or f"there are {', '.join(nodes)}"
-            raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+            raise missing_node("cannot watch files of", node, nodes)
 
 
 def reload_warnings(settings: Settings) -> Iterator[str]:

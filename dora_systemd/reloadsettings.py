@@ -1,22 +1,17 @@
 """The settings of hot reload."""
 
-from collections.abc import Sequence
 from typing import Any
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.hotreload import REPLACE_WORDS
-from dora_systemd.settingkinds import BOOL, Base, Kind, Setting, scalar_text
+from dora_systemd.settingkinds import BOOL, Base, Kind, Setting, scalar_text, texts_of
 from dora_systemd.values import quoted
 from dora_systemd.watchrules import DEFAULT_WATCH, parse_patterns
 
 
-def _texts(value: Any) -> Sequence[Any]:
-    return value if isinstance(value, list | tuple) else [value]
-
-
 def _parse_patterns(value: Any, base: Base) -> tuple[str, ...]:
     del base
-    return parse_patterns(scalar_text(one) for one in _texts(value))
+    return parse_patterns(scalar_text(one) for one in texts_of(value))
 
 
 def _parse_replace(value: Any, base: Base) -> str:

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.suggestions import did_you_mean
+from dora_systemd.suggestions import missing_node
 from dora_systemd.values import (
     INFINITY,
     SECOND,
@@ -129,9 +129,7 @@ def check_restart_nodes(
     """Raise DoraSystemdError (BAD_INPUT) for the policy of a node that is not in `nodes`."""
     for node, _ in policies:
         if node not in nodes:
-            hint = did_you_mean(node, nodes) or f"there are {', '.join(nodes)}"
-            message = f"cannot set the restart policy of the node {quoted(node)}: it is not there"
-            raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+            raise missing_node("cannot set the restart policy of", node, nodes)
 
 
 def budget_words(budget: Mapping[str, int | None]) -> str:

@@ -21,6 +21,7 @@ from dora_systemd.environment import node_environment
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.journal import JournalSocket
 from dora_systemd.launch import has_pipes, kinds, python_of
+from dora_systemd.names import settings_path
 from dora_systemd.options import RunnerOptions, parse_runner_argv
 from dora_systemd.pipes import CellIdentity, LogPipes
 from dora_systemd.preparation import PACKAGE, Prepared, prepare, with_changes
@@ -31,7 +32,7 @@ from dora_systemd.runnerloss import LossWatch, losses_of_user
 from dora_systemd.runnernodes import Nodes, enter_supervisor, wait_eof
 from dora_systemd.runnerpump import Pump, now_us
 from dora_systemd.runnerreload import Reloader
-from dora_systemd.runnersettings import SettingsFile, settings_path
+from dora_systemd.runnersettings import SettingsFile
 from dora_systemd.runnersocket import serve
 from dora_systemd.runnerswap import READY_SECONDS, Swapper
 from dora_systemd.values import INFINITY, SECOND
@@ -80,7 +81,7 @@ async def run_cell(options: RunnerOptions, paths: CellPaths) -> RunnerExit:
     pipes = LogPipes(loop, journal, CellIdentity(options.name, options.uuid), fdstore.store)
     environment = node_environment(os.environ)
     nodes = Nodes(unit, paths, pipes)
-    settings = SettingsFile(settings_path(options), paths.settings)
+    settings = SettingsFile(settings_path(options.dataflow), paths.settings)
     reloader = Reloader(options, environment, settings)
     cell = Runs(paths, unit, environment, pipes, nodes, reloader)
     losses = losses_of_user(journal, pipes) if paths.is_of_user else None

@@ -20,10 +20,10 @@ from dora_systemd.reloadsteps import How, Step
 from dora_systemd.runnerapply import Applier, Run
 from dora_systemd.runnerpump import now_us
 from dora_systemd.runnersettings import SettingsFile
-from dora_systemd.runnersources import Change, Sources, watch_rules
+from dora_systemd.runnersources import Change, Sources
 from dora_systemd.runnerswap import NotReady
 from dora_systemd.values import quoted
-from dora_systemd.watch import change_time, changed_files
+from dora_systemd.watch import change_time, changed_files, watch_rules
 from dora_systemd.wiring import downstream_of
 
 PAUSE_SECONDS = 1.0

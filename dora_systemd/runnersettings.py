@@ -13,15 +13,8 @@ from dora_systemd import process
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.hotreload import SettingsChange
 from dora_systemd.limits import format_node_limits, parse_node_limits
-from dora_systemd.options import RunnerOptions
 
 _SECONDS = 120.0
-
-
-def settings_path(options: RunnerOptions) -> str:
-    """The settings file of the dataflow, which may be missing."""
-    dataflow = Path(options.dataflow)
-    return str(dataflow.with_name(f"{dataflow.stem}.systemd.yml"))
 
 
 class SettingsFile:

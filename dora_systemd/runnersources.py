@@ -1,25 +1,21 @@
 """The runner's look at the files of its dataflow: what has changed, and what that means."""
 
 import json
-import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from dora_systemd import process
 from dora_systemd.dataflownodes import NodeKind
-from dora_systemd.doraerrors import parse_dora_error
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.hotreload import HotReload
 from dora_systemd.launch import kinds, sources
 from dora_systemd.options import RunnerOptions
-from dora_systemd.preparation import Prepared, prepare
+from dora_systemd.preparation import Prepared, prepare, refusal_of_dora
 from dora_systemd.pythonimports import program_files, syntax_error
 from dora_systemd.reload import Difference, NodeSources, difference, touched
 from dora_systemd.reloadsteps import How, Step, plan_steps
-from dora_systemd.runnersettings import settings_path
-from dora_systemd.watch import change_time, read_gitignores
-from dora_systemd.watchrules import DEFAULT_WATCH, WatchRules
+from dora_systemd.watch import change_time
+from dora_systemd.watchrules import WatchRules
 
 
 @dataclass(frozen=True)
@@ -35,14 +31,6 @@ class Change:
     def is_empty(self) -> bool:
         """Whether nothing has to be done."""
         return not self.steps and not self.whole
-
-
-def watch_rules(options: RunnerOptions) -> WatchRules:
-    """Which files of the dataflow mean a reload."""
-    root, given = options.working_directory, options.reload
-    own = frozenset({options.dataflow, settings_path(options)})
-    watched = given.watch or DEFAULT_WATCH
-    return WatchRules(root, watched, given.ignore, read_gitignores(root), own)
 
 
 class Sources:
@@ -62,7 +50,8 @@ class Sources:
         paths = frozenset(path for path in changed if change_time(path))
         dataflow = self._options.dataflow
         prepared = self.prepare() if dataflow in paths else current
-        found = touched(paths, dataflow, self._nodes(prepared))
+        programs = sources(prepared.dataflow, prepared.plan)
+        found = touched(paths, dataflow, self._nodes(prepared, programs))
         check_programs(found.nodes.values())
         difference_ = (
             difference(current.descriptor, prepared.descriptor)
@@ -71,37 +60,33 @@ class Sources:
         )
         how = kinds(prepared.dataflow, prepared.plan)
         steps = plan_steps(found, difference_, how, dataflow)
-        operators = sources(prepared.dataflow, prepared.plan)
-        whole = difference_.whole or _stubborn(steps, operators)
-        return Change(prepared, steps, whole, operators)
+        whole = difference_.whole or _stubborn(steps, programs)
+        return Change(prepared, steps, whole, programs)
 
     def prepare(self) -> Prepared:
         """Read the dataflow again, as at a start. Raises DoraSystemdError."""
         options = self._options
         prepared = prepare(options, self._environment)
-        environment = {**os.environ, **self._environment}
-        command = ["validate", options.dataflow]
-        done = process.run_dora(options.dora, command, environment, options.working_directory)
-        if done.status:
-            reason = parse_dora_error(done.stderr) or parse_dora_error(done.stdout)
-            message = f"cannot use {options.dataflow}: {reason or 'dora refuses it'}"
+        if reason := refusal_of_dora(options, self._environment):
+            message = f"cannot use {options.dataflow}: {reason}"
             raise DoraSystemdError(message, "", ExitCode.BAD_INPUT)
         return prepared
 
     def files(self, current: Prepared) -> set[str]:
         """The files that the dataflow is made of, absolute."""
-        nodes = self._nodes(current).values()
+        nodes = self._nodes(current, sources(current.dataflow, current.plan)).values()
         return {self._options.dataflow, *(path for node in nodes for path in node.files)}
 
-    def _nodes(self, prepared: Prepared) -> dict[str, NodeSources]:
-        own = sources(prepared.dataflow, prepared.plan)
+    def _nodes(
+        self, prepared: Prepared, programs: Mapping[str, Mapping[str, str]]
+    ) -> dict[str, NodeSources]:
         rules: HotReload = self._options.reload
         root = self._options.working_directory
         found = {}
         for node in prepared.dataflow.nodes:
             patterns = rules.watched_by(node.id)
             found[node.id] = NodeSources(
-                self._files(own[node.id].values(), node.kind),
+                self._files(programs[node.id].values(), node.kind),
                 json.dumps(node.raw, default=str),
                 WatchRules(root, patterns) if patterns else None,
             )

@@ -19,9 +19,6 @@ from dora_systemd.runnerpump import Pump, now_us
 from dora_systemd.status import NodeStatus
 from dora_systemd.values import SECOND, format_duration
 
-OVERLAP = SECOND
-"""µs for which a node and its successor run at the same time, at most."""
-
 READY_SECONDS = 30.0
 """How long a reloaded node may take to be ready, before it counts as failed."""
 
@@ -50,7 +47,7 @@ class Swapper:
         self._push(life.NodeReloading(now_us(), node, _status(definition, kind)))
         if old.pid and not starts_first and _is_restartable(old):
             await self._end(node, "RestartNode")
-        await self._ask(protocol.replace_params(self._run, definition, OVERLAP))
+        await self._ask(protocol.replace_params(self._run, definition))
         await self._wait_ready(node)
 
     async def rewire(self, definition: Mapping[str, Any], kind: str) -> None:

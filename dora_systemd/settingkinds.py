@@ -92,19 +92,20 @@ def _parse_program(value: Scalar, base: Base) -> str:
     return _parse_path(text, base) if "/" in text else text
 
 
-def _texts(value: Any) -> Sequence[Any]:
+def texts_of(value: Any) -> Sequence[Any]:
+    """What a repeatable flag or a settings file gives: many values, or one that stands alone."""
     return value if isinstance(value, list | tuple) else [value]
 
 
 def _parse_paths(value: Any, base: Base) -> tuple[str, ...]:
-    return tuple(_parse_path(one, base) for one in _texts(value))
+    return tuple(_parse_path(one, base) for one in texts_of(value))
 
 
 def _parse_environment(value: Any, base: Base) -> Mapping[str, str]:
     del base
     if isinstance(value, Mapping):
         return dict(checked_variable(key, scalar_text(one)) for key, one in value.items())
-    return dict(parse_assignment(scalar_text(one)) for one in _texts(value))
+    return dict(parse_assignment(scalar_text(one)) for one in texts_of(value))
 
 
 def _parse_properties(value: Any, base: Base) -> tuple[str, ...]:
@@ -112,9 +113,9 @@ def _parse_properties(value: Any, base: Base) -> tuple[str, ...]:
     del base
     if isinstance(value, Mapping):
         return tuple(
-            f"{key}={_property_text(one)}" for key, many in value.items() for one in _texts(many)
+            f"{key}={_property_text(one)}" for key, many in value.items() for one in texts_of(many)
         )
-    return tuple(scalar_text(one) for one in _texts(value))
+    return tuple(scalar_text(one) for one in texts_of(value))
 
 
 def _property_text(value: Scalar) -> str:
@@ -164,7 +165,7 @@ PROPERTIES = Kind[tuple[str, ...]](
 LINE_RATES = Kind[RateLimits](
     str | list[str],
     "LINES/TIME such as 1000/1s",
-    lambda value, _: parse_rates(map(scalar_text, _texts(value))),
+    lambda value, _: parse_rates(map(scalar_text, texts_of(value))),
     format_rates,
     is_repeatable=True,
     merge=lambda lower, higher: {**lower, **higher},

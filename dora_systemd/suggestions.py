@@ -2,6 +2,20 @@
 
 from collections.abc import Iterable
 
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.values import quoted
+
+
+def missing_node(problem: str, node: str, nodes: Iterable[str]) -> DoraSystemdError:
+    """The error (BAD_INPUT) for a setting of a node that is none of `nodes`.
+
+    problem: such as "cannot limit", what stands before "the node".
+    """
+    known = list(nodes)
+    message = f"{problem} the node {quoted(node)}: it is not there"
+    hint = did_you_mean(node, known) or f"there are {', '.join(known)}"
+    return DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """A hint with up to three of the `known` words that are like `word`, or ""."""

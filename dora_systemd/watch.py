@@ -7,12 +7,22 @@ from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.watchrules import WatchRules
+from dora_systemd.names import settings_path
+from dora_systemd.options import RunnerOptions
+from dora_systemd.watchrules import DEFAULT_WATCH, WatchRules
 
 DEBOUNCE_MS = 400
 """Changes that follow each other faster belong together, up to this time."""
 _STEP_MS = 100
 _GONE_SECONDS = 0.25
+
+
+def watch_rules(options: RunnerOptions) -> WatchRules:
+    """Which files of a dataflow mean a reload; the .gitignore files are read now."""
+    root, given = options.working_directory, options.reload
+    own = frozenset({options.dataflow, settings_path(options.dataflow)})
+    watched = given.watch or DEFAULT_WATCH
+    return WatchRules(root, watched, given.ignore, read_gitignores(root), own)
 
 
 async def changed_files(rules: WatchRules) -> AsyncIterator[frozenset[str]]:
@@ -21,7 +31,8 @@ async def changed_files(rules: WatchRules) -> AsyncIterator[frozenset[str]]:
     Directories are watched, not files: editors save by renaming. What ignored directories hold
     costs nothing. Raises DoraSystemdError when the kernel gives no more watches.
     """
-    seen = dict(watched_files(rules))
+    # A large tree takes seconds to walk, and the loop of the runner feeds the watchdog.
+    seen = await asyncio.to_thread(_stamps, rules)
     while True:
         await _wait_root(rules.root)
         async for paths in _bursts(rules):
@@ -30,11 +41,15 @@ async def changed_files(rules: WatchRules) -> AsyncIterator[frozenset[str]]:
                 seen.update((path, change_time(path)) for path in files)
                 yield files
         # Directories came or went. What changed while they were not watched is found by its time.
-        now = dict(watched_files(rules))
+        now = await asyncio.to_thread(_stamps, rules)
         missed = frozenset(path for path in {*seen, *now} if seen.get(path) != now.get(path))
         seen = now
         if missed:
             yield missed
+
+
+def _stamps(rules: WatchRules) -> dict[str, int]:
+    return dict(watched_files(rules))
 
 
 def watched_files(rules: WatchRules) -> Iterator[tuple[str, int]]:
@@ -81,7 +96,7 @@ async def _bursts(rules: WatchRules) -> AsyncIterator[frozenset[str]]:
     # Only who asks for a reload pays for it.
     from watchfiles import Change, awatch
 
-    directories = watched_directories(rules)
+    directories = await asyncio.to_thread(watched_directories, rules)
     try:
         async for changes in awatch(
             *directories,

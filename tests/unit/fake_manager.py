@@ -1,6 +1,6 @@
 """A systemd of a few dicts: what the use cases of doractl are tested against."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
@@ -134,12 +134,6 @@ class FakeManager:
     def changes(self, unit: str) -> list[Mapping[str, Any]]:
         del unit
         return []
-
-    def wait_until(
-        self, unit: str, is_done: Callable[[Mapping[str, Any]], bool], seconds: float
-    ) -> bool:
-        del seconds
-        return is_done(self.units.get(unit, {}))
 
     def control_group(self) -> str:
         return ""
