@@ -21,6 +21,7 @@ VERBS = {
     "start": Verb("start", "Start a dataflow as a systemd service."),
     "run": Verb("run", "Run a dataflow in the foreground."),
     "list": Verb("list", "List dataflows, or the nodes of one."),
+    "top": Verb("top", "Show what dataflows and nodes use, live."),
     "logs": Verb("logs", "Print what the nodes of a dataflow wrote."),
     "why": Verb("why", "Say what became of a dataflow, and why."),
     "stop": Verb("stop", "Stop dataflows."),

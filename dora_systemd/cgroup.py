@@ -123,7 +123,7 @@ def read_load(path: Path) -> Load:
 
 def _read_stalled(path: Path) -> float:
     """avg10 of "some" in memory.pressure, see the kernel's "PSI" document; 0 where it is off."""
-    match = re.search(r"^some avg10=([0-9.]+)", _read_text(path / "memory.pressure"))
+    match = re.search(r"^some avg10=([0-9.]+)", read_text(path / "memory.pressure"))
     return float(match[1]) if match else 0.0
 
 
@@ -136,18 +136,18 @@ def read_cpu(path: Path) -> Usage:
 
 def read_numbers(path: Path) -> dict[str, int]:
     """The numbers of a control file with one KEY NUMBER in a line; {} where there is none."""
-    pairs = (line.partition(" ") for line in _read_text(path).splitlines())
+    pairs = (line.partition(" ") for line in read_text(path).splitlines())
     return {key: int(value) for key, _, value in pairs}
 
 
 def pids(path: Path) -> list[int]:
     """The processes of a group and of all groups below it."""
-    return [int(pid) for one in _tree(path) for pid in _read_text(one / "cgroup.procs").split()]
+    return [int(pid) for one in _tree(path) for pid in read_text(one / "cgroup.procs").split()]
 
 
 def is_populated(path: Path) -> bool:
     """Whether any process is in the group or below it."""
-    return "populated 1" in _read_text(path / "cgroup.events").splitlines()
+    return "populated 1" in read_text(path / "cgroup.events").splitlines()
 
 
 def make_group(path: Path) -> None:
@@ -163,7 +163,7 @@ def remove_group(path: Path) -> None:
 
 def read_controllers(path: Path) -> frozenset[str]:
     """The controllers that a group has been given, which it can give to those below it."""
-    return frozenset(_read_text(path / "cgroup.controllers").split())
+    return frozenset(read_text(path / "cgroup.controllers").split())
 
 
 def enable_controllers(path: Path) -> None:
@@ -239,7 +239,8 @@ def _write(path: Path, text: str) -> bool:
     return True
 
 
-def _read_text(path: Path) -> str:
+def read_text(path: Path) -> str:
+    """The text of a control file; "" where there is none, or no group any more."""
     # A group may vanish between any two looks at it: that is the same as an empty one.
     with contextlib.suppress(OSError):
         return path.read_text()
@@ -247,7 +248,7 @@ def _read_text(path: Path) -> str:
 
 
 def _read_number(path: Path) -> int | None:
-    text = _read_text(path).strip()
+    text = read_text(path).strip()
     if not text:
         return None
     return UNLIMITED if text == "max" else int(text)
@@ -255,7 +256,7 @@ def _read_number(path: Path) -> int | None:
 
 def _read_share(path: Path) -> int | None:
     """cpu.max as µs per second."""
-    quota, _, period = _read_text(path).strip().partition(" ")
+    quota, _, period = read_text(path).strip().partition(" ")
     if not period:
         return None
     return UNLIMITED if quota == "max" else int(quota) * SECOND // int(period)
@@ -263,5 +264,5 @@ def _read_share(path: Path) -> int | None:
 
 def _resident_bytes(pid: int) -> int:
     """The second number of /proc/PID/statm, see proc_pid_statm(5); in pages there."""
-    numbers = _read_text(Path(f"/proc/{pid}/statm")).split()
+    numbers = read_text(Path(f"/proc/{pid}/statm")).split()
     return int(numbers[1]) * os.sysconf("SC_PAGE_SIZE") if len(numbers) > 1 else 0

@@ -4,8 +4,8 @@ Nothing of ours has to be alive for it: the node table is only read.
 """
 
 import time
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,23 +40,67 @@ _PROPERTIES = (
 _MICROSECOND_NS = 1000
 
 
-def dataflow_row(manager: Manager, scope: Scope, cell: Cell) -> DataflowRow:
-    """All that `list` knows of one dataflow."""
+@dataclass(frozen=True)
+class Reading:
+    """One look at a dataflow: what systemd and its runner say, and what its groups have used.
+
+    unit: properties of its unit. groups, usage: by node, WHOLE_CELL is the unit's own; empty for a
+    dataflow that is not up. at_us: when, CLOCK_MONOTONIC.
+    """
+
+    cell: Cell
+    unit: Mapping[str, Any]
+    status: CellStatus = field(default_factory=CellStatus)
+    groups: Mapping[str, Path] = field(default_factory=dict)
+    usage: Mapping[str, Usage] = field(default_factory=dict)
+    at_us: int = 0
+
+    @property
+    def sample(self) -> CpuSample:
+        """What counts as CPU time and throttling of this look."""
+        return CpuSample(
+            self.at_us,
+            {key: one.cpu_us for key, one in self.usage.items()},
+            {key: one.throttling for key, one in self.usage.items()},
+        )
+
+
+def read_dataflow(manager: Manager, scope: Scope, cell: Cell) -> Reading:
+    """Look at one dataflow."""
     unit = manager.read(cell.unit, _PROPERTIES)
     status = read_status(scope, cell) if cell.is_up else CellStatus()
-    word = status_word(cell.state.active, cell.state.sub, status.stage)
+    if not cell.is_up or not unit["ControlGroup"]:
+        return Reading(cell, unit, status)
+    path = cgroup.group_path(unit["ControlGroup"])
+    groups = {WHOLE_CELL: path, **cgroup.node_groups(path)}
+    usage = {key: cgroup.read_usage(group) for key, group in groups.items()}
+    return Reading(cell, unit, status, groups, usage, _monotonic_us())
+
+
+def row_of(reading: Reading, before: Reading | None = None) -> DataflowRow:
+    """All that `list` knows of one dataflow.
+
+    before: an earlier look at the same run, where CPU and throttling begin; else the runner's own.
+    """
+    cell, unit, status = reading.cell, reading.unit, reading.status
     facts = {
         "uuid": cell.uuid,
         "name": cell.name,
         "unit": cell.unit,
-        "status": word,
+        "status": status_word(cell.state.active, cell.state.sub, status.stage),
         "dataflow": cell.options.dataflow,
         "text": unit["StatusText"],
         "restarts": unit["NRestarts"] + status.node_restarts,
     }
-    if not cell.is_up or not unit["ControlGroup"]:
+    if not reading.usage:
         return DataflowRow(**facts)
-    return DataflowRow(**facts, **_life(unit), **_usage(unit, status))
+    samples = (before.sample,) if before else status.samples
+    return DataflowRow(**facts, **_life(unit), **_usage(reading, samples))
+
+
+def dataflow_row(manager: Manager, scope: Scope, cell: Cell) -> DataflowRow:
+    """The line of one dataflow."""
+    return row_of(read_dataflow(manager, scope, cell))
 
 
 def read_rows(manager: Manager, scope: Scope) -> list[DataflowRow]:
@@ -98,7 +142,7 @@ def read_status(scope: Scope, cell: Cell) -> CellStatus:
         return CellStatus()
 
 
-def _life(unit: dict[str, Any]) -> dict[str, Any]:
+def _life(unit: Mapping[str, Any]) -> dict[str, Any]:
     """Times of the present run; the monotonic ones do not care when the clock is set."""
     since = unit["ActiveEnterTimestampMonotonic"]
     if since < unit["InactiveExitTimestampMonotonic"]:
@@ -106,21 +150,13 @@ def _life(unit: dict[str, Any]) -> dict[str, Any]:
     return {"uptime": _monotonic_us() - since, "started": unit["ActiveEnterTimestamp"]}
 
 
-def _usage(unit: dict[str, Any], status: CellStatus) -> dict[str, Any]:
-    path = cgroup.group_path(unit["ControlGroup"])
-    groups = cgroup.node_groups(path)
-    use = {node: cgroup.read_usage(group) for node, group in groups.items()}
-    whole = cgroup.read_usage(path)
-    everyone = {WHOLE_CELL: whole, **use}
-    now = CpuSample(
-        _monotonic_us(),
-        {key: one.cpu_us for key, one in everyone.items()},
-        {key: one.throttling for key, one in everyone.items()},
-    )
-    samples = status.samples or (CpuSample(unit["InactiveExitTimestampMonotonic"]),)
+def _usage(reading: Reading, known: tuple[CpuSample, ...]) -> dict[str, Any]:
+    status, use, now = reading.status, reading.usage, reading.sample
+    samples = known or (CpuSample(reading.unit["InactiveExitTimestampMonotonic"]),)
+    groups = {key: path for key, path in reading.groups.items() if key != WHOLE_CELL}
     names = status.nodes or dict.fromkeys(groups)
     return {
-        **_numbers(whole, samples, now, WHOLE_CELL),
+        **_numbers(use[WHOLE_CELL], samples, now, WHOLE_CELL),
         "nodes_total": len(names),
         "nodes_alive": status.alive_count if status.nodes else _populated(groups),
         "nodes": tuple(
@@ -165,6 +201,7 @@ def _node_row(node: str, status: NodeStatus | None, numbers: dict[str, Any]) -> 
         "restarts": status.restarts,
         "max_restarts": status.max_restarts or None,
         "exit": status.exit,
+        "since": status.since_us,
     }
     return NodeRow(node, status.state, **facts, **numbers)  # type: ignore[arg-type]
 

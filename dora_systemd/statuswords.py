@@ -34,7 +34,8 @@ class NodeRow:
     """One line of `list SELECTOR`. Sizes in bytes, cpu in percent of one processor, None: unknown.
 
     cpu_limit, memory_limit: the group's own, or None. throttled: the percentage of the time in
-    which it had to wait for its CPU limit, None without one.
+    which it had to wait for its CPU limit, None without one. since: of its last change of state,
+    CLOCK_REALTIME µs, 0: not known.
     """
 
     node: str
@@ -49,6 +50,7 @@ class NodeRow:
     cpu_limit: float | None = None
     memory_limit: int | None = None
     throttled: float | None = None
+    since: int = 0
 
 
 @dataclass(frozen=True)
@@ -267,6 +269,7 @@ def row_values(row: DataflowRow) -> dict[str, Any]:
 _JSON_KEYS = {
     "uptime": "uptime_us",
     "started": "started_us",
+    "since": "since_us",
     "ended": "ended_us",
     "memory": "memory_bytes",
     "memory_peak": "memory_peak_bytes",

@@ -89,7 +89,9 @@ DECISIONS = {
         "setupfiles",
         "status",
         "statuswords",
+        "strain",
         "suggestions",
+        "toptable",
         "unitfile",
         "unitplaces",
         "unitsyntax",
@@ -100,7 +102,7 @@ DECISIONS = {
 }
 ADAPTERS = {
     "bus": ["bus", "buserrors", "buswire"],
-    "cgroup": ["cgroup"],
+    "cgroup": ["cgroup", "cgroupstrain"],
     "control": ["control"],
     "engine": ["engine"],
     "fdstore": ["fdstore"],
@@ -151,6 +153,7 @@ USE_CASES = {
         "managershow",
         "managerstart",
         "managerstop",
+        "managertop",
         "managerunit",
         "managerversion",
         "managerwhy",

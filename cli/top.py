@@ -1,0 +1,104 @@
+"""doractl top: what dataflows and their nodes use, again and again."""
+
+import json
+import sys
+import time
+
+import click
+
+from dora_systemd.bus import Bus
+from dora_systemd.cli.parameters import current_scope, output_option, scope_options
+from dora_systemd.errors import ExitCode
+from dora_systemd.managertop import Top
+from dora_systemd.toptable import SORTS, Look, format_summary, format_top, look_values
+
+_EPILOG = """\b
+Examples:
+  doractl top                          all that run, until q
+  doractl top robot --sort memory      one dataflow, the largest nodes first
+  doractl top --once                   one reading, for a script or a report
+  doractl top -o json --interval 10    a JSON object every ten seconds
+"""
+
+_FIRST_SECONDS = 0.5
+"""Between the two looks that make one reading."""
+
+_KEYS = {sort[0]: sort for sort in SORTS}
+
+
+@click.command("top", epilog=_EPILOG)
+@click.argument("selectors", nargs=-1, metavar="[SELECTOR]...")
+@click.option(
+    "--interval",
+    type=click.FloatRange(min=0.1),
+    default=2.0,
+    show_default=True,
+    metavar="SECONDS",
+    help="Time from one reading to the next.",
+)
+@click.option(
+    "--sort",
+    type=click.Choice(SORTS),
+    default="cpu",
+    show_default=True,
+    help="What stands first: most CPU, most memory, or names from A to Z.",
+)
+@click.option("--once", "is_once", is_flag=True, help="Print one reading and exit.")
+@output_option
+@scope_options
+def command(
+    selectors: tuple[str, ...], interval: float, sort: str, is_once: bool, output: str
+) -> int:
+    """Show what dataflows and their nodes use, live; without SELECTOR, all that run.
+
+    On a terminal: q ends it, and c, m and n sort by CPU, memory and name. In a pipe one reading is
+    printed; JSON goes on, one object in a line for each reading.
+    """
+    scope = current_scope()
+    top = Top(Bus(scope), scope, selectors)
+    top.look()
+    is_terminal = sys.stdin.isatty() and sys.stdout.isatty()
+    try:
+        if output == "json":
+            _print_objects(top, interval, sort, is_once)
+        elif is_once or not is_terminal:
+            time.sleep(_FIRST_SECONDS)
+            print(format_top(top.look(), sort))
+        else:
+            _show(top, interval, sort)
+    except KeyboardInterrupt:
+        # The way to leave it, as in top(1).
+        pass
+    return ExitCode.OK
+
+
+def _print_objects(top: Top, interval: float, sort: str, is_once: bool) -> None:
+    time.sleep(_FIRST_SECONDS)
+    while True:
+        print(json.dumps(look_values(top.look(), sort)), flush=True)
+        if is_once:
+            return
+        time.sleep(interval)
+
+
+def _show(top: Top, interval: float, sort: str) -> None:
+    from dora_systemd.cli.screen import Screen
+
+    with Screen() as screen:
+        look, due = top.look(), time.monotonic() + _FIRST_SECONDS
+        while True:
+            table = format_top(look, sort).splitlines()
+            screen.show([_title(look, interval), "", *table], bold=[0, 2])
+            key = screen.wait_key(due - time.monotonic())
+            if key in ("q", "Q"):
+                return
+            sort = _KEYS.get(key, sort)
+            if time.monotonic() >= due:
+                look, due = top.look(), time.monotonic() + interval
+
+
+def _title(look: Look, interval: float) -> str:
+    return (
+        f"doractl top {time.strftime('%H:%M:%S')}, every {interval:g}s: {format_summary(look)}"
+        " (q ends, c m n sort)"
+    )

@@ -1,0 +1,38 @@
+"""What the processes of a group had to wait for, and what the kernel killed of them. Pure."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+RESOURCES = ("cpu", "memory", "io")
+WORTH_SHOWING = 1.0
+"""Percent of the time from which on a wait is shown to people."""
+
+
+@dataclass(frozen=True)
+class Strain:
+    """Counters of one group, which only grow, see the kernel's "Control Group v2" and "PSI".
+
+    stalled: by resource, the µs in which some of its processes waited for it, and those in which
+    all did; a resource that the kernel does not watch is not there. throttled: µs for which the
+    CPU limit held them. oom_kills: processes killed for want of memory.
+    """
+
+    stalled: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    throttled: int = 0
+    oom_kills: int = 0
+
+
+def waits(before: Strain, now: Strain, window: int) -> dict[str, float]:
+    """By resource, the percentage of `window` µs in which something waited for it."""
+    if window <= 0:
+        return {}
+    return {
+        resource: max(100.0 * (some - before.stalled.get(resource, (0, 0))[0]) / window, 0.0)
+        for resource, (some, _) in now.stalled.items()
+    }
+
+
+def format_waits(shares: Mapping[str, float]) -> str:
+    """Those that are worth a look, the longest first, as in "memory 12% io 3%"."""
+    worth = [(share, name) for name, share in shares.items() if share >= WORTH_SHOWING]
+    return " ".join(f"{name} {share:.0f}%" for share, name in sorted(worth, reverse=True))
