@@ -35,6 +35,7 @@ VERBS = {
     "show": Verb("show", "Print the unit of a dataflow."),
     "export": Verb("export", "Print a unit file that needs nothing of doractl."),
     "dora": Verb("dora", "Run the dora command against one dataflow."),
+    "up": Verb("up", "Open the port of the gateway to all dataflows."),
     "doctor": Verb("doctor", "Say what on this machine hinders dataflows."),
     "setup": Verb("setup", "Put slice, target and manuals in place after pip install."),
     "version": Verb("version", "Print the versions of all that takes part."),

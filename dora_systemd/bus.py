@@ -24,7 +24,11 @@ SERVICE = b"org.freedesktop.systemd1"
 ROOT = b"/org/freedesktop/systemd1"
 MANAGER = b"org.freedesktop.systemd1.Manager"
 UNIT = b"org.freedesktop.systemd1.Unit"
-UNIT_SERVICE = b"org.freedesktop.systemd1.Service"
+BY_TYPE = {
+    "service": b"org.freedesktop.systemd1.Service",
+    "socket": b"org.freedesktop.systemd1.Socket",
+    "slice": b"org.freedesktop.systemd1.Slice",
+}
 PROPERTIES = b"org.freedesktop.DBus.Properties"
 
 SYSTEM_BUS = Path("/run/dbus/system_bus_socket")
@@ -36,6 +40,7 @@ _UNIT_PROPERTIES = frozenset(
         *("ActiveEnterTimestamp", "ActiveEnterTimestampMonotonic", "InactiveEnterTimestamp"),
         *("InactiveExitTimestamp", "InactiveExitTimestampMonotonic", "InvocationID", "Job"),
         *("StateChangeTimestamp", "Description", "UnitFileState", "NeedDaemonReload", "WantedBy"),
+        *("RequiredBy",),
         *("StateChangeTimestampMonotonic", "StartLimitBurst", "StartLimitIntervalUSec"),
     )
 )
@@ -132,7 +137,8 @@ class Bus:
         return number
 
     def _read_one(self, unit: str, name: str) -> Any:
-        interface = UNIT if name in _UNIT_PROPERTIES else UNIT_SERVICE
+        own = BY_TYPE.get(unit.rpartition(".")[2], UNIT)
+        interface = UNIT if name in _UNIT_PROPERTIES else own
         return self._get(f"read {name} of {unit}", _unit_path(unit), interface, name)
 
     def _get(self, action: str, path: bytes, interface: bytes, name: str) -> Any:

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import takewhile
@@ -14,7 +15,14 @@ from dora_systemd.managerenabled import own_directories
 from dora_systemd.names import name_from_unit
 from dora_systemd.process import run_command
 from dora_systemd.scope import Scope
-from dora_systemd.setupfiles import PACKAGED_UNIT, SYSTEM_ROOT, SetupFile, is_ours, setup_files
+from dora_systemd.setupfiles import (
+    PACKAGED_UNIT,
+    SYSTEM_ROOT,
+    SetupFile,
+    is_ours,
+    setup_files,
+    with_interpreter,
+)
 from dora_systemd.unitfile import BOOT_TARGET
 from dora_systemd.unitfiles import (
     foreign_file,
@@ -135,11 +143,17 @@ def _step(file: SetupFile, path: Path) -> Step:
         present = read_unit_file(path)
         if present is not None and not is_ours(present):
             raise foreign_file(path)
-        return Step(file, path, read_text(_directory(file.source[0]) / file.source[1]), present)
+        return Step(file, path, text_of(file), present)
     link = str(path.readlink()) if path.is_symlink() else None
     if link not in (None, file.link) or (link is None and path.exists()):
         raise foreign_file(path)
     return Step(file, path, "", link)
+
+
+def text_of(file: SetupFile) -> str:
+    """What belongs into a file; units run the Python that this is."""
+    text = read_text(_directory(file.source[0]) / file.source[1])
+    return with_interpreter(text, sys.executable)
 
 
 def _directory(kind: str) -> Path:

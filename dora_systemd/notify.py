@@ -1,8 +1,9 @@
-"""What the runner tells its manager: sd_notify(3)."""
+"""What a main process tells its manager and is given by it: sd_notify(3), sd_listen_fds(3)."""
 
+import socket
 import time
 
-from systemd.daemon import notify
+from systemd.daemon import listen_fds, notify
 
 
 def send_ready() -> None:
@@ -28,3 +29,8 @@ def send_stopping() -> None:
 def send_alive() -> None:
     """WATCHDOG=1: see WatchdogSec= in systemd.service(5)."""
     notify("WATCHDOG=1")
+
+
+def activated_sockets() -> list[socket.socket]:
+    """The listening sockets that the manager has passed."""
+    return [socket.socket(fileno=number) for number in listen_fds()]

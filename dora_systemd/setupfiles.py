@@ -7,6 +7,8 @@ user below the user's own data directory, see file-hierarchy(7).
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
+from dora_systemd.unitsyntax import quote_word
+
 SYSTEM_ROOT = "/"
 PACKAGED_UNIT = "/usr/lib/systemd/system/dora.slice"
 """There if a package has put everything in place."""
@@ -26,7 +28,12 @@ class SetupFile(NamedTuple):
     link: str = ""
 
 
-_UNITS = ("dora.slice", "dora.target")
+_UNITS = ("dora.slice", "dora.target", "dora-gateway.socket", "dora-gateway.service")
+SANDBOX = SetupFile(
+    ("templates", "dora-gateway-sandbox.conf"), "dora-gateway.service.d/10-sandbox.conf"
+)
+"""What only the system's manager can do; its place is below the directory of units."""
+PACKAGED_PYTHON = "/usr/bin/python3"
 _BASH = SetupFile(("completions", "doractl"), "share/bash-completion/completions/doractl")
 _ZSH = SetupFile(("completions", "_doractl"), "share/zsh/site-functions/_doractl")
 _FISH = SetupFile(("completions", "doractl.fish"), "share/fish/vendor_completions.d/doractl.fish")
@@ -36,6 +43,7 @@ _FISH_OF_ALL = _FISH._replace(place="etc/fish/completions/doractl.fish")
 _SYSTEM_ONLY = (
     SetupFile(("templates", "dora-systemd.catalog"), "lib/systemd/catalog/dora-systemd.catalog"),
     SetupFile(("templates", "dora-systemd.sysusers"), "lib/sysusers.d/dora-systemd.conf"),
+    SANDBOX._replace(place=f"lib/systemd/system/{SANDBOX.place}"),
     _ZSH,
 )
 
@@ -52,6 +60,17 @@ def setup_files(is_user: bool, manuals: Iterable[str]) -> list[SetupFile]:
     system = _units("lib/systemd/system", "multi-user.target")
     local = [*system, *users, *_SYSTEM_ONLY, *common]
     return [*(one._replace(place=f"{_LOCAL}/{one.place}") for one in local), _FISH_OF_ALL]
+
+
+def gateway_files(is_user: bool) -> list[SetupFile]:
+    """What the gateway needs, with places below a directory of units."""
+    units = [SetupFile(("templates", unit), unit) for unit in _UNITS if "gateway" in unit]
+    return units if is_user else [*units, SANDBOX]
+
+
+def with_interpreter(text: str, python: str) -> str:
+    """A unit file of ours for another Python than that of the package."""
+    return text.replace(f"ExecStart={PACKAGED_PYTHON} ", f"ExecStart={quote_word(python)} ")
 
 
 def is_ours(text: str) -> bool:

@@ -22,6 +22,7 @@ WORDS = {
         "names",
         "scope",
         "cellpaths",
+        "gatewayplace",
     ],
 }
 DECISIONS = {
@@ -40,6 +41,9 @@ DECISIONS = {
         "environment",
         "events",
         "findings",
+        "gatewayaccess",
+        "gatewayport",
+        "gatewayrequest",
         "hotreload",
         "jsonvalues",
         "launch",
@@ -110,12 +114,14 @@ ADAPTERS = {
     "journal": ["journal", "journalnote"],
     "journalread": ["journalread"],
     "jsonl": ["jsonl"],
+    "loopback": ["loopback"],
     "machine": ["machine"],
     "notify": ["notify"],
     "pipes": ["pipes", "pipesource", "heldlines", "logqueue"],
     "process": ["process"],
     "proctable": ["proctable"],
     "runnersocket": ["runnersocket"],
+    "sockettable": ["sockettable"],
     "watch": ["watch"],
 }
 SHARED = {
@@ -155,6 +161,7 @@ USE_CASES = {
         "managerstop",
         "managertop",
         "managerunit",
+        "managerup",
         "managerversion",
         "managerwhy",
         "managerwatch",
@@ -177,9 +184,18 @@ USE_CASES = {
         "runnerswap",
     ],
 }
+GATEWAY = {
+    "gateway": [
+        "gateway",
+        "gatewayroutes",
+        "gatewayserver",
+    ],
+}
+"""It does for others what the manager does for doractl, and so stands above it. The runner is none
+of its business: they meet in systemd."""
 CLI = {"cli": sorted(name for name in module_paths() if name.startswith("cli."))}
 
-LAYERS = [WORDS, DECISIONS, ADAPTERS, SHARED, USE_CASES, CLI]
+LAYERS = [WORDS, DECISIONS, ADAPTERS, SHARED, USE_CASES, GATEWAY, CLI]
 
 PLACES = {
     module: (depth, group)
@@ -193,7 +209,7 @@ ONLY_IMPORTERS = {
     "pydantic": {"settingschema"},
     "pystemd": {"bus", "buserrors"},
     "systemd": {"journal", "journalread", "notify"},
-    "websockets": {"control"},
+    "websockets": {"control", "gatewayserver"},
     "yaml": {"files", "yamlloader"},
     "watchfiles": {"watch"},
 }
@@ -246,6 +262,12 @@ def test_imports_go_down(name: str) -> None:
         )
     ]
     assert not wrong, f"{name} of {group} must not import {', '.join(sorted(wrong))}"
+
+
+@pytest.mark.parametrize("name", [*GATEWAY["gateway"], *CLI["cli"]])
+def test_only_systemd_starts_runners_and_gateways(name: str) -> None:
+    apart = {*USE_CASES["runner"], *(GATEWAY["gateway"] if name in CLI["cli"] else ())}
+    assert not imports(name)[0] & apart
 
 
 def test_nothing_imports_in_a_circle() -> None:

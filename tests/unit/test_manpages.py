@@ -11,6 +11,7 @@ import pytest
 from dora_systemd.cli.group import VERBS, doractl
 from dora_systemd.errors import ExitCode
 from dora_systemd.events import EVENTS
+from dora_systemd.gatewayport import ADDRESS_VARIABLE, PORT_VARIABLE
 from dora_systemd.managersettings import SYSTEM_FILE
 from dora_systemd.settingkinds import Setting
 from dora_systemd.settingtable import SETTINGS
@@ -104,7 +105,8 @@ def test_entries_are_true(setting: Setting[Any]) -> None:
 def test_variables_of_the_command() -> None:
     text = sections("doractl.1")["ENVIRONMENT"]
     listed = re.findall(r"\b(DORA_[A-Z_]+)", text)
-    assert sorted(listed) == sorted(filter(None, (setting.variable for setting in SETTINGS)))
+    settings = filter(None, (setting.variable for setting in SETTINGS))
+    assert sorted(set(listed)) == sorted([*settings, PORT_VARIABLE, ADDRESS_VARIABLE])
 
 
 def test_events() -> None:

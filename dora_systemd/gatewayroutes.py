@@ -1,0 +1,19 @@
+"""What the gateway answers: one line for each path."""
+
+from dora_systemd.gatewayrequest import PLAIN, Answer, Get, Request, Talk
+
+HEALTH = "/health"
+
+
+async def answer_health(_request: Request) -> Answer:
+    """What dora's own coordinator says there."""
+    return Answer(200, PLAIN, b"ok")
+
+
+GET: dict[str, Get] = {
+    HEALTH: answer_health,
+}
+SOCKETS: dict[str, Talk] = {}
+
+OPEN_TO_ALL = frozenset({HEALTH})
+"""What every user of the machine may ask; it tells nothing."""

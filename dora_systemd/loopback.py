@@ -1,0 +1,40 @@
+"""TCP ports of 127.0.0.1: is one free, and does somebody answer there."""
+
+import contextlib
+import socket
+import time
+
+_HOST = "127.0.0.1"
+_RETRY_SECONDS = 0.05
+_CHUNK = 65536
+
+
+def port_error(port: int) -> int:
+    """Why nobody could listen there, as an errno; 0 if one could."""
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as trial:
+        # As systemd does it: what lingers of former connections is no hindrance.
+        trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            trial.bind((_HOST, port))
+            trial.listen(1)
+        except OSError as error:
+            return error.errno or 1
+    return 0
+
+
+def answers_health(port: int, seconds: float) -> bool:
+    """Whether GET /health is answered with 200 within that time."""
+    deadline = time.monotonic() + seconds
+    while (left := deadline - time.monotonic()) > 0:
+        with contextlib.suppress(OSError):
+            if _ask(port, left).startswith(b"HTTP/1.1 200 "):
+                return True
+        time.sleep(_RETRY_SECONDS)
+    return False
+
+
+def _ask(port: int, seconds: float) -> bytes:
+    with socket.create_connection((_HOST, port), timeout=seconds) as connection:
+        host = f"{_HOST}:{port}"
+        connection.sendall(f"GET /health HTTP/1.1\r\nHost: {host}\r\n\r\n".encode())
+        return connection.recv(_CHUNK)

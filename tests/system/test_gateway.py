@@ -1,0 +1,171 @@
+"""The gateway: doractl up, who may ask, and that nothing depends on it."""
+
+import os
+import signal
+import socket
+from collections.abc import Iterator
+
+import pytest
+
+from dora_systemd.errors import ExitCode
+from dora_systemd.gatewayplace import SERVICE_UNIT, SOCKET_UNIT
+from tests.system.cells import Cell, Project, run, wait_for
+from tests.system.gateways import Front
+
+# Speaks as several users, and opens the port.
+pytestmark = pytest.mark.lab
+
+UP = """\
+Starting dora daemon...
+  ✓ Coordinator started on port {port}
+  ✓ Daemon ready
+
+Daemon running at: http://localhost:{port}
+"""
+
+
+@pytest.fixture
+def front() -> Iterator[Front]:
+    """The system's, down."""
+    front = Front()
+    yield front
+    front.end()
+
+
+@pytest.fixture
+def alice() -> Iterator[Front]:
+    """Hers, down."""
+    front = Front("alice", 1000, 53291)
+    yield front
+    front.end()
+
+
+def test_up(front: Front) -> None:
+    assert front.doractl("up").stdout == UP.format(port=53290)
+    pid, token = front.pid, front.token
+    again = front.doractl("up")
+    assert again.stdout == "Daemon already running at: http://localhost:53290\n"
+    assert (front.pid, front.token) == (pid, token)
+    # To another port, and back.
+    front.port = 53292
+    assert front.up() == UP.format(port=53292)
+    assert front.get("/health") == (200, "ok")
+    assert front.token != token
+    assert front.doractl("up").stdout == "Daemon already running at: http://localhost:53292\n"
+    environment = {**os.environ, "DORA_COORDINATOR_ADDR": "localhost:53290"}
+    assert run("doractl", "up", env=environment).stdout == UP.format(port=53290)
+    assert "process" not in front.journal()
+
+
+def test_units_in_use_are_good(front: Front) -> None:
+    front.up()
+    paths = [front.show("FragmentPath", unit) for unit in (SOCKET_UNIT, SERVICE_UNIT)]
+    assert run("systemd-analyze", "verify", "--man=no", *paths).stderr == ""
+    shown = run("systemd-analyze", "security", "--no-pager", SERVICE_UNIT).stdout
+    assert float(shown.split("level for")[1].split()[1]) < 3.0
+    assert front.show("ControlGroup") == f"/dora.slice/{SERVICE_UNIT}"
+
+
+def test_who_may(front: Front, alice: Front) -> None:
+    front.up()
+    alice.up()
+    for one, others in ((front, ("alice", "bob")), (alice, ("bob",))):
+        for user in ("", one.user):
+            assert one.get("/nothing", user=user).status == 404
+        for user in others:
+            assert one.get("/health", user=user) == (200, "ok")
+            assert one.get("/nothing", user=user).status == 401
+            wrong = f"Authorization: Bearer {one.token[::-1]}"
+            assert one.get("/nothing", "-H", wrong, user=user).status == 401
+            right = f"Authorization: Bearer {one.token}"
+            assert one.get("/nothing", "-H", right, user=user).status == 404
+    secret = front.scope.runtime_root / "dora-systemd-gateway/token"
+    assert run("runuser", "-u", "alice", "cat", str(secret), check=False).stdout == ""
+
+
+def test_other_sites_are_kept_out(front: Front) -> None:
+    front.up()
+    for header in (
+        "Host: evil.example",
+        "Host: evil.example:53290",
+        "Host:",
+        "Origin: http://evil.example",
+        "Origin: null",
+        "Origin: http://localhost:53290",
+    ):
+        assert front.get("/health", "-H", header).status == 403, header
+    assert front.get("/health", "-H", "Origin: http://127.0.0.1:53290").status == 200
+
+
+def test_other_methods(front: Front) -> None:
+    front.up()
+    assert front.get("/health", "-X", "DELETE").status in (0, 405)
+    assert front.get("/health", "-d", "x").status in (0, 405)
+    assert front.get("/health").status == 200
+
+
+def test_a_port_in_use(front: Front, alice: Front) -> None:
+    with socket.socket() as one:
+        one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        one.bind(("127.0.0.1", 53290))
+        one.listen()
+        for who, words in ((front, f"process {os.getpid()} ("), (alice, "a process of root")):
+            done = who.doractl("up", check=False)
+            assert done.returncode == ExitCode.NAME_IN_USE
+            first, second = done.stderr.splitlines()
+            assert first.startswith("doractl: cannot open port 53290: it is in use by ")
+            assert words in first
+            for way in ("stop that process", "doractl up --port 53291", "doractl start"):
+                assert way in second
+    assert front.systemctl("list-units", "--all", "--plain", "--no-legend", "dora-g*") == ""
+
+
+@pytest.mark.parametrize(
+    "variable", ["DORA_COORDINATOR_ADDR=192.168.1.5", "DORA_DAEMON_PORT=nonsense"]
+)
+def test_wrong_variables(variable: str, front: Front) -> None:
+    done = run("env", variable, "doractl", "up", check=False)
+    assert (done.returncode, done.stdout) == (ExitCode.BAD_INPUT, "")
+    assert variable.partition("=")[0] in done.stderr
+    assert not front.pid
+
+
+@pytest.mark.warns("dora-gateway.service: Main process exited", "Failed with result 'signal'")
+def test_killed_again_and_again(front: Front, cell: Cell, project: Project) -> None:
+    """Dataflows do not notice, and the next connection finds a new one."""
+    cell.start(project.three_nodes())
+    front.up()
+    token, before = front.token, cell.all_pids()
+    for _ in range(15):
+        pid = wait_for("a gateway", lambda: front.get("/health").status == 200 and front.pid)
+        os.kill(pid, signal.SIGKILL)
+        wait_for("its end", lambda pid=pid: front.pid != pid)  # type: ignore[misc]
+    assert front.get("/health") == (200, "ok")
+    assert front.token == token
+    assert front.show("ActiveState", SOCKET_UNIT) == "active"
+    assert cell.all_pids() == before
+    cell.wait_exchanging()
+
+
+def test_it_rests_and_comes_back(front: Front) -> None:
+    front.up()
+    front.rest_after("1s")
+    assert front.get("/health").status == 200
+    front.wait_resting()
+    assert front.show("Result") == "success"
+    assert front.show("ActiveState", SOCKET_UNIT) == "active"
+    assert run("systemctl", "show", "-P", "MemoryCurrent", SERVICE_UNIT).stdout in (
+        "[not set]\n",
+        "0\n",
+    )
+    assert front.get("/health").status == 200
+    # A connection keeps it, for as long as it is open.
+    with socket.create_connection(("127.0.0.1", front.port)):
+        pid = front.pid
+        wait_for("time passes", lambda: front.get("/health").status == 200 and _age(pid) > 3)
+        assert front.pid == pid
+    front.wait_resting()
+
+
+def _age(pid: int) -> float:
+    return float(run("ps", "-o", "etimes=", "-p", str(pid)).stdout)

@@ -1,0 +1,73 @@
+"""Whose the other end of a connection is."""
+
+import os
+import socket
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.sockettable import Address, listener_uids, peer_uid
+
+HEAD = "  sl  local_address rem_address   st tx_queue rx_queue tr tm->when retrnsmt   uid  timeout"
+PEER, OWN = ("127.0.0.1", 40000), ("127.0.0.1", 53290)
+LINE = (
+    "  1: {peer} {own} {state} 00000000:00000000 00:00000000 00000000 {uid:5} 0 {inode} 1 0 20 4\n"
+)
+
+
+def table(path: Path, *lines: str) -> tuple[Path, ...]:
+    path.write_text(HEAD + "\n" + "".join(lines))
+    return (path,)
+
+
+def line(uid: int, inode: int, peer: str = "0100007F:9C40", own: str = "0100007F:D02A") -> str:
+    return LINE.format(peer=peer, own=own, state="01", uid=uid, inode=inode)
+
+
+def test_found_by_both_ends(tmp_path: Path) -> None:
+    others = line(7, 1, own="0100007F:D02B"), line(8, 2, peer="0100007F:9C41")
+    tables = table(tmp_path / "tcp", *others, line(1001, 3))
+    assert peer_uid(PEER, OWN, tables) == 1001
+    assert peer_uid(OWN, PEER, tables) is None
+
+
+def test_a_closed_socket_is_nobodys(tmp_path: Path) -> None:
+    """The kernel calls the owner of a socket that was closed root."""
+    assert peer_uid(PEER, OWN, table(tmp_path / "tcp", line(0, 0))) is None
+
+
+def test_a_socket_that_is_closed_meanwhile_is_nobodys(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    texts = iter([line(0, 5), *[line(0, 0)] * 10])
+    monkeypatch.setattr(Path, "read_text", lambda _: HEAD + "\n" + next(texts))
+    assert peer_uid(PEER, OWN, (tmp_path / "tcp",)) is None
+
+
+def test_without_a_table(tmp_path: Path) -> None:
+    assert peer_uid(PEER, OWN, (tmp_path / "none",)) is None
+    assert peer_uid(("nonsense", 1), OWN, (tmp_path / "none",)) is None
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
+def test_with_this_kernel(host: str) -> None:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family) as listener:
+        try:
+            listener.bind((host, 0))
+        except OSError:
+            pytest.skip(f"no {host} on this machine")
+        listener.listen()
+        with socket.create_connection(listener.getsockname()[:2]) as one:
+            peer, own = ends(one)
+            assert peer_uid(peer, own) == os.getuid()
+            assert os.getuid() in listener_uids(own[1])
+            other, _ = listener.accept()
+        # Closed by its process, but not by the other side: the kernel still has it.
+        assert peer_uid(peer, own) is None
+        other.close()
+
+
+def ends(connection: socket.socket) -> tuple[Address, Address]:
+    peer, own = connection.getsockname(), connection.getpeername()
+    return (peer[0], peer[1]), (own[0], own[1])
