@@ -25,7 +25,7 @@ VARIABLE = "_DORACTL_COMPLETE"
 _OF_THE_PAST = ("logs", "why")
 """Verbs that find dataflows which only the journal knows."""
 
-_RUNNING_ONLY = ("stop", "dora", "top")
+_RUNNING_ONLY = ("stop", "dora", "env", "top")
 """Verbs that have nothing to do with a dataflow that has failed."""
 
 

@@ -7,13 +7,8 @@ import click
 from dora_systemd.bus import Bus
 from dora_systemd.cli.parameters import current_scope, scope_options
 from dora_systemd.gatewayport import wanted_port
-from dora_systemd.managerup import (
-    check_answer,
-    check_machine,
-    open_port,
-    read_gateway,
-    start_boot_target,
-)
+from dora_systemd.managergateway import check_answer, read_gateway
+from dora_systemd.managerup import check_machine, open_port, start_boot_target
 
 _EPILOG = """\b
 Examples:

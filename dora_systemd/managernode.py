@@ -8,6 +8,7 @@ from typing import Any, NoReturn
 
 from dora_systemd.busprotocol import Manager
 from dora_systemd.cellpaths import CellPaths
+from dora_systemd.doraenv import coordinator_variables
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.managercells import Cell, not_found
 from dora_systemd.managerlist import read_status
@@ -113,12 +114,7 @@ def exec_dora(scope: Scope, manager: Manager, cell: Cell, arguments: Sequence[st
 
 def dora_environment(coordinator: Coordinator) -> dict[str, str]:
     """The variables with which the dora command finds a coordinator and its daemon."""
-    return {
-        "DORA_COORDINATOR_ADDR": "127.0.0.1",
-        "DORA_COORDINATOR_PORT": str(coordinator.port),
-        "DORA_AUTH_TOKEN": coordinator.token,
-        "DORA_DAEMON_LOCAL_LISTEN_PORT": str(coordinator.local_listen_port),
-    }
+    return coordinator_variables(coordinator.port, coordinator.token, coordinator.local_listen_port)
 
 
 def _become(uid: int) -> None:

@@ -4,7 +4,6 @@ import errno
 import pwd
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 from dora_systemd.busprotocol import JOB_DONE, Manager
@@ -12,10 +11,11 @@ from dora_systemd.diagnosis import Process
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.findings import State
 from dora_systemd.gatewayplace import ADDRESS, DEFAULT_PORT, SERVICE_UNIT, SOCKET_UNIT
-from dora_systemd.gatewayport import port_drop_in, port_of
-from dora_systemd.loopback import answers_health, port_error
+from dora_systemd.gatewayport import port_drop_in
+from dora_systemd.loopback import port_error
 from dora_systemd.managerdoctor import examine
 from dora_systemd.managerenabled import enabled_units, own_directories
+from dora_systemd.managergateway import read_gateway
 from dora_systemd.managersetup import text_of
 from dora_systemd.names import name_from_unit
 from dora_systemd.proctable import listening_sockets, read_processes, socket_owners
@@ -26,15 +26,6 @@ from dora_systemd.unitfile import BOOT_TARGET
 from dora_systemd.unitfiles import read_unit_file, remove_unit_file, write_unit_file
 
 PORT_FILE = f"{SOCKET_UNIT}.d/50-port.conf"
-_READY_SECONDS = 30.0
-
-
-@dataclass(frozen=True)
-class Gateway:
-    """What systemd knows of the gateway. port: None where no unit of it is there."""
-
-    is_up: bool
-    port: int | None
 
 
 def check_machine(reach: Callable[[Scope], Manager], scope: Scope) -> None:
@@ -44,15 +35,6 @@ def check_machine(reach: Callable[[Scope], Manager], scope: Scope) -> None:
             is_said = one.text.startswith("cannot ")
             message = one.text if is_said else f"cannot run dataflows here: {one.topic}: {one.text}"
             raise DoraSystemdError(message, one.remedy)
-
-
-def read_gateway(manager: Manager) -> Gateway:
-    """Whether the port is open, and which one it is."""
-    facts = manager.read(SOCKET_UNIT, ["LoadState", "ActiveState"])
-    if facts["LoadState"] != "loaded":
-        return Gateway(False, None)
-    port = port_of(manager.read(SOCKET_UNIT, ["Listen"])["Listen"])
-    return Gateway(facts["ActiveState"] == "active", port)
 
 
 def open_port(manager: Manager, scope: Scope, port: int | None) -> int:
@@ -81,15 +63,6 @@ def open_port(manager: Manager, scope: Scope, port: int | None) -> int:
             f"systemctl {scope.flag} status {SOCKET_UNIT}",
         )
     return opened
-
-
-def check_answer(scope: Scope, port: int) -> None:
-    """Return when the gateway answers. Raises DoraSystemdError when it does not."""
-    if not answers_health(port, _READY_SECONDS):
-        raise DoraSystemdError(
-            f"cannot get an answer from the gateway on port {port}",
-            f"journalctl {'--user-unit' if scope.is_user else '--unit'} {SERVICE_UNIT} -e",
-        )
 
 
 def start_boot_target(manager: Manager, scope: Scope) -> list[str]:

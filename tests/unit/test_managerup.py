@@ -11,11 +11,11 @@ from dora_systemd import managerup
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.findings import Finding, State
 from dora_systemd.gatewayplace import SERVICE_UNIT, SOCKET_UNIT
+from dora_systemd.managergateway import read_gateway
 from dora_systemd.managerup import (
     PORT_FILE,
     check_machine,
     open_port,
-    read_gateway,
     start_boot_target,
 )
 from dora_systemd.unitfile import BOOT_TARGET

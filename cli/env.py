@@ -1,0 +1,44 @@
+"""doractl env: point the stock dora command at the gateway, or at one dataflow."""
+
+import click
+
+from dora_systemd.bus import Bus
+from dora_systemd.cli.parameters import current_scope, scope_options
+from dora_systemd.doraenv import SHELLS, format_exports, format_unsets
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.managerenv import read_variables
+
+_EPILOG = """\b
+Examples:
+  eval "$(doractl env)"; dora list
+  eval "$(doractl env robot)"; dora node list
+  doractl env --shell fish | source
+  eval "$(doractl env --unset)"
+"""
+
+
+@click.command("env", epilog=_EPILOG)
+@click.argument("selector", required=False)
+@click.option(
+    "--shell",
+    type=click.Choice(list(SHELLS)),
+    default="sh",
+    show_default=True,
+    help="The shell that is to read it; sh is for bash and zsh, too.",
+)
+@click.option("--unset", "want_unset", is_flag=True, help="Print what takes it all back.")
+@scope_options
+def command(selector: str | None, shell: str, want_unset: bool) -> None:
+    """Print the variables with which a stock dora command finds the gateway.
+
+    With SELECTOR: the coordinator of that dataflow alone. The output has a token that is as good
+    as a password; it is for eval.
+    """
+    if want_unset and selector is not None:
+        hint = "leave the dataflow out: all variables are unset"
+        raise DoraSystemdError("cannot unset for one dataflow", hint, ExitCode.USAGE)
+    if want_unset:
+        click.echo(format_unsets(shell))
+        return
+    scope = current_scope()
+    click.echo(format_exports(shell, read_variables(Bus(scope), scope, selector)))
