@@ -32,9 +32,13 @@ faults:  ## every fault of tests/system/faults, ROUNDS=n times
 	@$(PREPARE) $(if $(filter vm,$(LAB)),container vm,container)
 	@ROUNDS=$(ROUNDS) $(CHECK) faults
 
-bench:  ## what supervision costs, against named rivals; ROUNDS=n
+BENCHMARKS := start stop recovery logs
+
+bench:  ## what supervision costs, against named rivals; WHAT="start ...", ROUNDS=n
 	@$(PREPARE) container
-	@tests/lab/lab run -- python -m benchmarks.logs $(or $(ROUNDS),5)
+	@for one in $(or $(WHAT),$(BENCHMARKS)); do LAB=rivals LAB_OUT=benchmarks/data \
+	    tests/lab/lab run -- python -m benchmarks.$$one $(ROUNDS) || exit; done
+	@/usr/bin/python3 -B -m benchmarks.report
 
 bookworm:  ## the checkout on Debian 12, with systemd 252, installed by pip
 	@$(PREPARE) container

@@ -1,24 +1,30 @@
-"""The log path: lines into the journal, and out of it. `python -m benchmarks.logs [ROUNDS]`.
+"""The log path: lines into the journal, and out of it.  `python -m benchmarks.logs [ROUNDS]`
 
 Rivals: a process that writes the same lines to journald itself, as fast as journald takes them,
-and journalctl.
+`dora run` with its output into a file, and journalctl.
 """
 
 import json
+import os
+import resource
 import statistics
+import subprocess
 import sys
-import tempfile
 import time
-from pathlib import Path
+from contextlib import suppress
+from functools import partial
 
-from benchmarks.rounds import Figure, alternate, report
+from benchmarks.contestants import ENVIRONMENT
+from benchmarks.flows import HOME, STAMP, clear_stamps, make_home, wait_stamps
+from benchmarks.rounds import OURS, Figure, alternate, keep
 from tests.system.cells import Cell, Project, run, sync_journal, wait_for
 
 LINES = 200_000
-FLOOD = f"""
+FLOOD = f"""{STAMP}
 import sys
-from dora import Node
 Node()
+if os.access("{HOME}/stamps", os.W_OK):
+    stamp("ready")
 lines = b"".join(b"%07d %s\\n" % (i, b"x" * 72) for i in range({LINES}))
 sys.stdout.buffer.write(lines)
 sys.stdout.flush()
@@ -44,6 +50,7 @@ for event in node:
         print(time.time_ns() // 1000, flush=True)
 """
 FLOW = "nodes: [{id: flood, path: flood.py}]"
+SILENT = "nodes: [{id: flood, path: silent.py}]"
 TICK = "{source: dora/timer/millis/20, queue_size: 100}"
 TWO = f"nodes: [{{id: quiet, path: quiet.py, inputs: {{tick: {TICK}}}}}, FLOOD]"
 NO_LIMIT = ("-p", "LogRateLimitIntervalSec=1s", "-p", "LogRateLimitBurst=500000000")
@@ -65,15 +72,20 @@ def per_second(found: list[int]) -> float:
 
 def ours_in(project: Project) -> float:
     """A node's lines, through its pipe and the runner."""
+    cell = life(project, FLOW)
+    return per_second(times(f"DORA_DATAFLOW_NAME={cell.name}", "DORA_STREAM=stdout"))
+
+
+def life(project: Project, flow: str) -> Cell:
+    """A dataflow that has ended by itself."""
     cell = Cell(f"bench-{time.time_ns()}")
-    cell.start(project.write("flow.yml", FLOW))
+    cell.start(project.write("flow.yml", flow))
     wait_for("it is over", lambda: cell.is_gone, 120)
-    found = times(f"DORA_DATAFLOW_NAME={cell.name}", "DORA_STREAM=stdout")
     cell.end()
-    return per_second(found)
+    return cell
 
 
-def rival_in(project: Project) -> float:
+def sender_in(project: Project) -> float:
     """The same lines from a service that speaks journald's protocol itself."""
     unit = f"sender-{time.time_ns()}.service"
     script = str(project.write("sender.py", SENDER))
@@ -81,21 +93,72 @@ def rival_in(project: Project) -> float:
     return per_second(times(f"_SYSTEMD_UNIT={unit}", "DORA_STREAM=stdout"))
 
 
+def dora_in(project: Project) -> float:
+    """The same lines through bare dora, into a file."""
+    clear_stamps()
+    dora_life(project, FLOW)
+    ended = time.monotonic()
+    (ready,) = wait_stamps("ready", 1)
+    found = (HOME / "dora-run.log").read_bytes().count(b"x" * 72)
+    assert found == LINES, f"{found} of {LINES} lines"
+    return LINES / (ended - ready.at)
+
+
+def dora_life(project: Project, flow: str) -> None:
+    """A dataflow in `dora run` that has ended by itself."""
+    command = ["dora", "run", str(project.write("flow.yml", flow))]
+    with (HOME / "dora-run.log").open("wb") as log:
+        environment = {**os.environ, **ENVIRONMENT}
+        subprocess.run(command, stdout=log, stderr=log, env=environment, check=True)
+
+
+def ours_cpu(project: Project) -> float:
+    """µs of a processor for a line, journald's work left out."""
+    return (ours_cpu_of(project, FLOW) - ours_cpu_of(project, SILENT)) / LINES
+
+
+def ours_cpu_of(project: Project, flow: str) -> float:
+    """µs that a unit has used in its life, from its cgroup as long as that is there."""
+    cell = Cell(f"bench-{time.time_ns()}")
+    cell.start(project.write("flow.yml", flow))
+    used, path = 0.0, cell.group / "cpu.stat"
+    with suppress(OSError):
+        while True:
+            used = float(path.read_text().split()[1])
+            time.sleep(0.005)
+    cell.end()
+    return used
+
+
+def dora_cpu(project: Project) -> float:
+    """µs of a processor for a line in bare dora, its terminal left out."""
+    return (dora_cpu_of(project, FLOW) - dora_cpu_of(project, SILENT)) / LINES
+
+
+def dora_cpu_of(project: Project, flow: str) -> float:
+    """µs that `dora run` and its nodes have used."""
+    before = children_cpu()
+    dora_life(project, flow)
+    return children_cpu() - before
+
+
+def children_cpu() -> float:
+    """µs of all processes that have been waited for."""
+    use = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return (use.ru_utime + use.ru_stime) * 1e6
+
+
 def reading(project: Project, output: str, rounds: int) -> Figure:
     """Printing what is in the journal."""
-    cell = Cell(f"read-{time.time_ns()}")
-    cell.start(project.write("flow.yml", FLOW))
-    wait_for("it is over", lambda: cell.is_gone, 120)
+    cell = life(project, FLOW)
     sync_journal()
     matches = (f"DORA_DATAFLOW_NAME={cell.name}", "_TRANSPORT=journal")
-    ours = ("doractl", "logs", cell.name, "-o", output, "--no-pager")
-    rival = ("journalctl", "-q", "-o", output, "--no-pager", *matches)
+    measures = {
+        OURS: partial(seconds, "doractl", "logs", cell.name, "-o", output, "--no-pager"),
+        "journalctl": partial(seconds, "journalctl", "-q", "-o", output, "--no-pager", *matches),
+    }
     what = f"`logs -o {output}` of {LINES:,} lines"
-    figure = alternate(
-        what, "s", lambda: seconds(*ours), "journalctl", lambda: seconds(*rival), rounds
-    )
-    cell.end()
-    return figure
+    return alternate(what, "s", measures, rounds, goal="≤ 1.25 × journalctl")
 
 
 def seconds(*command: str) -> float:
@@ -107,11 +170,11 @@ def seconds(*command: str) -> float:
 
 def quiet_line(project: Project, with_flood: bool) -> float:
     """ms from a line of a quiet node to journald, the median of some 200."""
-    flood = "{id: flood, path: endless.py}" if with_flood else ""
+    flood = ", {id: flood, path: endless.py}" if with_flood else ""
     endless = FLOOD.replace("sys.stdout.buffer", "while True: sys.stdout.buffer")
     project.write("endless.py", endless)
     cell = Cell(f"quiet-{time.time_ns()}")
-    cell.start(project.write("flow.yml", TWO.replace(", FLOOD", f", {flood}" if flood else "")))
+    cell.start(project.write("flow.yml", TWO.replace(", FLOOD", flood)))
     wait_for("200 lines", lambda: len(cell.messages("quiet")) > 200, 60)
     cell.end()
     found = cell.journal("DORA_NODE=quiet", "DORA_STREAM=stdout")
@@ -120,34 +183,27 @@ def quiet_line(project: Project, with_flood: bool) -> float:
     return statistics.median(late) / 1000
 
 
-def main(rounds: int) -> None:
-    """Measure and report."""
-    project = Project(Path(tempfile.mkdtemp(dir="/var/tmp")) / "bench")
-    project.root.parent.chmod(0o755)
+def measure(rounds: int, want_all: bool = True) -> list[Figure]:
+    """Lines in and out; beside a flood, and their cost, too, if all is wanted."""
+    project = make_home()
     project.write("flood.py", FLOOD)
+    project.write("silent.py", FLOOD.rpartition("lines =")[0])
     project.write("quiet.py", QUIET)
-    figures = [
-        alternate(
-            "lines a second into the journal, one node",
-            "lines/s",
-            lambda: ours_in(project),
-            "writes to journald itself",
-            lambda: rival_in(project),
-            rounds,
-        ),
-        reading(project, "short", rounds),
-        reading(project, "cat", rounds),
-        alternate(
-            "a quiet node's line beside a flood",
-            "ms",
-            lambda: quiet_line(project, True),
-            "without the flood",
-            lambda: quiet_line(project, False),
-            rounds,
-        ),
-    ]
-    report("logs", figures)
+    own = "writes to journald itself"
+    lines = {OURS: partial(ours_in, project), own: partial(sender_in, project)}
+    lines |= {"dora run": partial(dora_in, project)}
+    what, goal = "lines a second into the journal, one node", "≥ 60,000"
+    figures = [alternate(what, "lines/s", lines, rounds, goal=goal)]
+    figures.append(reading(project, "short", rounds))
+    if want_all:
+        figures.append(reading(project, "cat", rounds))
+        costs = {OURS: partial(ours_cpu, project), "dora run": partial(dora_cpu, project)}
+        figures.append(alternate("CPU for a line, node included", "µs", costs, rounds))
+        quiet = {OURS: partial(quiet_line, project, True)}
+        quiet |= {"without the flood": partial(quiet_line, project, False)}
+        figures.append(alternate("a quiet node's line beside a flood", "ms", quiet, rounds))
+    return figures
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 5)
+    keep("logs", measure, int(sys.argv[1]) if len(sys.argv) > 1 else 5)

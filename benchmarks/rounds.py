@@ -1,12 +1,17 @@
-"""Rounds: ours and a rival's in turns, on the same machine, so that only the ratio counts."""
+"""Rounds: ours and the rivals in turns, on the same machine, so that only the ratio counts."""
 
 import json
 import os
 import platform
 import statistics
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
+
+OURS = "doractl"
+"""The contestant that all others are compared with."""
 
 OUT = Path("/out")
 """Where `LAB_OUT=DIR tests/lab/lab run` takes files out of the lab."""
@@ -14,51 +19,117 @@ OUT = Path("/out")
 
 @dataclass(frozen=True)
 class Figure:
-    """One line of a table. ours, rival: all rounds, in `unit`, in the order they were measured."""
+    """One line of a table. values: of each contestant all rounds, in `unit`, in their order.
+
+    at: how many, or how large, where several figures make a curve.
+    """
 
     what: str
-    rival_name: str
     unit: str
-    ours: list[float]
-    rival: list[float]
+    values: dict[str, list[float]]
+    goal: str = ""
+    at: int | None = None
+
+    def median(self, name: str = OURS) -> float:
+        """Of all rounds of a contestant."""
+        return statistics.median(self.values[name])
+
+    def ratios(self, rival: str) -> list[float]:
+        """Ours to a rival's, round by round."""
+        pairs = zip(self.values[OURS], self.values[rival], strict=True)
+        return [ours / other for ours, other in pairs]
 
     @property
-    def ratios(self) -> list[float]:
-        """Of each round."""
-        return [one / other for one, other in zip(self.ours, self.rival, strict=True)]
+    def rivals(self) -> list[str]:
+        """All contestants but ours."""
+        return [name for name in self.values if name != OURS]
 
-    def line(self) -> str:
-        """The figure as a line of a Markdown table: medians, their ratio, its spread."""
-        ratio = statistics.median(self.ratios)
-        spread = f"{min(self.ratios):.2f} to {max(self.ratios):.2f}"
-        ours, rival = statistics.median(self.ours), statistics.median(self.rival)
-        values = f"{ours:,.4g} {self.unit} | {rival:,.4g} {self.unit}"
-        return f"| {self.what} | {values} ({self.rival_name}) | {ratio:.2f} | {spread} |"
+
+@dataclass(frozen=True)
+class Record:
+    """What a benchmark has measured, when, and where. load: before and after, of one minute."""
+
+    name: str
+    date: str
+    rounds: int
+    machine: dict[str, Any]
+    load: tuple[float, float]
+    figures: tuple[Figure, ...]
+
+
+Measure = Callable[[], float]
 
 
 def alternate(
-    what: str,
-    unit: str,
-    ours: Callable[[], float],
-    rival_name: str,
-    rival: Callable[[], float],
-    rounds: int,
+    what: str, unit: str, contestants: Mapping[str, Measure], rounds: int, **about: Any
 ) -> Figure:
-    """Measure both, one after the other, `rounds` times; who begins changes."""
-    found: dict[bool, list[float]] = {True: [], False: []}
+    """Measure all, one after the other, `rounds` times; each round begins with another one."""
+    values: dict[str, list[float]] = {name: [] for name in contestants}
+    names = list(contestants)
     for number in range(rounds):
-        for is_ours in (True, False) if number % 2 else (False, True):
-            found[is_ours].append((ours if is_ours else rival)())
-    return Figure(what, rival_name, unit, found[True], found[False])
+        first = number % len(names)
+        for name in (*names[first:], *names[:first]):
+            values[name].append(contestants[name]())
+    figure = Figure(what, unit, values, **about)
+    print(format_line(figure), flush=True)
+    return figure
 
 
-def report(name: str, figures: list[Figure]) -> None:
-    """Print a Markdown table, and keep all rounds as JSON where the lab takes it out."""
-    print("| what | ours | rival | ratio, median | spread |")
-    print("|---|---|---|---|---|")
-    for figure in figures:
-        print(figure.line())
-    machine = {"cores": os.cpu_count(), "machine": platform.machine(), "linux": platform.release()}
-    document = {"machine": machine, "figures": [asdict(one) for one in figures]}
+def format_line(figure: Figure) -> str:
+    """A figure for whoever watches: medians and ratios."""
+    of_rivals = (
+        f"{name} {figure.median(name):.4g} ({statistics.median(figure.ratios(name)):.2f})"
+        for name in figure.rivals
+    )
+    ours = f"{figure.what}: {OURS} {figure.median():.4g} {figure.unit}"
+    return "; ".join((ours, *of_rivals))
+
+
+def machine() -> dict[str, Any]:
+    """What the figures were measured on."""
+    fields = Path("/proc/cpuinfo").read_text().splitlines()
+    model = next((one.partition(":")[2].strip() for one in fields if "model name" in one), "")
+    pages = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return {
+        "processor": model or platform.machine(),
+        "cores": os.cpu_count(),
+        "memory_gib": round(pages / 2**30),
+        "linux": platform.release(),
+        "python": platform.python_version(),
+        "where": os.environ.get("LAB", "host"),
+    }
+
+
+def load() -> float:
+    """How many processes have wanted to run, on average, in the last minute."""
+    return round(os.getloadavg()[0], 2)
+
+
+def keep(name: str, measure: Callable[[int], Sequence[Figure]], rounds: int) -> None:
+    """Measure, and write all rounds as JSON to where the lab takes it out, else print them."""
+    before = load()
+    date = datetime.now(UTC).strftime("%Y-%m-%d %H:%M")
+    figures = tuple(measure(rounds))
+    record = Record(name, date, rounds, machine(), (before, load()), figures)
     if OUT.is_dir():
-        (OUT / f"{name}.json").write_text(json.dumps(document, indent=1))
+        (OUT / f"{name}.json").write_text(format_record(record))
+
+
+def format_record(record: Record) -> str:
+    """As JSON with a line for each contestant's rounds; five digits are more than there are."""
+    document = asdict(record)
+    figures = document.pop("figures")
+    for figure in figures:
+        for name, found in figure["values"].items():
+            figure["values"][name] = [float(f"{value:.5g}") for value in found]
+    head = json.dumps(document, indent=1).removesuffix("\n}")
+    lines = ",\n  ".join(json.dumps(figure) for figure in figures)
+    return f'{head},\n "figures": [\n  {lines}\n ]\n}}\n'
+
+
+def parse_record(text: str) -> Record:
+    """The exact inverse of format_record."""
+    document = json.loads(text)
+    figures = tuple(Figure(**figure) for figure in document.pop("figures"))
+    before, after = document.pop("load")
+    return Record(**document, load=(before, after), figures=figures)

@@ -13,6 +13,7 @@ from lab.image import ensure_tree
 from lab.machine import ensure_machine, run_in_machine
 from lab.options import Options, parse_options
 from lab.process import need_root
+from lab.rivals import ensure_rivals
 from lab.runs import Guard, clean_dead_runs, close_run, open_run, opened_door
 
 # As in docker and timeout: the lab's own failure is told apart from the command's.
@@ -73,8 +74,18 @@ def clean(options: Options) -> int:
     return 0
 
 
-ENSURE = {"container": ensure_tree, "vm": ensure_machine, "bookworm": ensure_bookworm}
-RUN = {"container": run_in_container, "vm": run_in_machine, "bookworm": run_in_container}
+ENSURE = {
+    "container": ensure_tree,
+    "vm": ensure_machine,
+    "bookworm": ensure_bookworm,
+    "rivals": ensure_rivals,
+}
+RUN = {
+    "container": run_in_container,
+    "vm": run_in_machine,
+    "bookworm": run_in_container,
+    "rivals": run_in_container,
+}
 VERBS = {
     "run": run_command,
     "shell": run_command,

@@ -1,0 +1,160 @@
+"""Writes the tables of both READMEs and the plots from data/*.json.  `python -m benchmarks.report`
+
+Nothing between its markers is typed by hand.
+"""
+
+import statistics
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from benchmarks.plots import bar_chart, line_chart
+from benchmarks.rounds import OURS, Figure, Record, parse_record
+
+HERE = Path(__file__).resolve().parent
+DATA = HERE / "data"
+FULL = HERE / "README.md"
+SHORT = HERE.parent / "README.md"
+BEGIN = "<!-- benchmarks: written by python -m benchmarks.report -->"
+END = "<!-- end of benchmarks -->"
+
+TITLES = {
+    "start": "Start",
+    "stop": "Stop and restart",
+    "recovery": "Recovery",
+    "startup": "The command itself",
+    "many": "Many dataflows",
+    "cost": "Memory and idle CPU",
+    "logs": "Log path",
+    "messages": "Messages",
+    "reload": "Hot reload",
+}
+"""The records in their order."""
+
+PLOTS = {"start": bar_chart, "many": line_chart}
+
+HIGHLIGHTS = (
+    ("start", "start to all of 2 nodes ready", "dora run"),
+    ("start", "start to all of 20 nodes ready", "dora run"),
+    ("stop", "stop until nothing is left", "supervisord"),
+    ("recovery", "kill -9 until messages flow again", "supervisord"),
+    ("startup", "`list` with no dataflow", "pm2"),
+    ("many", "`list` of 50", "pm2"),
+    ("cost", "private memory of the supervisor, per dataflow", "systemd-run dora run"),
+    ("logs", "lines a second into the journal, one node", "writes to journald itself"),
+    ("messages", "throughput of 4 MB messages", "dora run"),
+)
+"""Lines of the short table: record, figure, rival."""
+
+
+def read_records(directory: Path = DATA) -> dict[str, Record]:
+    """The stored ones, in the order of TITLES."""
+    paths = {name: directory / f"{name}.json" for name in TITLES}
+    return {name: parse_record(path.read_text()) for name, path in paths.items() if path.exists()}
+
+
+def format_number(value: float) -> str:
+    """Three digits, and no exponent."""
+    digits = 0 if abs(value) >= 100 else 1 if abs(value) >= 10 else 2
+    return f"{value:,.{digits}f}"
+
+
+def format_ratio(ratios: Sequence[float]) -> str:
+    """The median, and from where to where they go."""
+    middle, low, high = statistics.median(ratios), min(ratios), max(ratios)
+    spread = "" if len(ratios) == 1 else f", {low:.2f}–{high:.2f}"
+    return f"**{middle:.2f}**{spread}"
+
+
+def format_cell(figure: Figure, name: str) -> str:
+    """A contestant's median; with ours to it, if it is a rival."""
+    if name not in figure.values:
+        return "–"
+    value = f"{format_number(figure.median(name))} {figure.unit}".strip()
+    return value if name == OURS else f"{value} ({format_ratio(figure.ratios(name))})"
+
+
+def format_table(figures: Sequence[Figure]) -> str:
+    """Figures with the same rivals, or with fewer of them than the first one."""
+    names = [OURS, *figures[0].rivals]
+    lines = [("", *names, "goal"), ("---",) * (len(names) + 2)]
+    for figure in figures:
+        lines.append((figure.what, *(format_cell(figure, name) for name in names), figure.goal))
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def group_figures(figures: Iterable[Figure]) -> list[list[Figure]]:
+    """In their order, a new table wherever there is a rival that the one before does not have."""
+    tables: list[list[Figure]] = []
+    for figure in figures:
+        if tables and set(figure.rivals) <= set(tables[-1][0].rivals):
+            tables[-1].append(figure)
+        else:
+            tables.append([figure])
+    return tables
+
+
+def format_machine(record: Record) -> str:
+    """What it was measured on."""
+    about = record.machine
+    return (
+        f"{about['processor']}, {about['cores']} cores, {about['memory_gib']} GiB, "
+        f"Linux {about['linux']}, Python {about['python']}"
+    )
+
+
+def format_record(record: Record) -> str:
+    """One section."""
+    before, after = record.load
+    times = f"{record.rounds} rounds" if record.rounds > 1 else "1 round"
+    when = f"{record.date} UTC, {times}, load {before:.1f} before and {after:.1f} after."
+    tables = [format_table(one) for one in group_figures(record.figures)]
+    plot = [f"![{TITLES[record.name]}](data/{record.name}.svg)"] * (record.name in PLOTS)
+    return "\n\n".join((f"### {TITLES[record.name]}", when, *tables, *plot))
+
+
+def format_full(records: dict[str, Record]) -> str:
+    """All that was measured."""
+    machines = sorted({format_machine(record) for record in records.values()})
+    return "\n\n".join(
+        (f"Measured on: {'; '.join(machines)}.", *map(format_record, records.values()))
+    )
+
+
+def format_short(records: dict[str, Record]) -> str:
+    """The lines that README.md has."""
+    lines = ["| | doractl | beside | ratio, spread |", "|---|---|---|---|"]
+    for name, what, rival in HIGHLIGHTS:
+        figures = records[name].figures if name in records else ()
+        for figure in (one for one in figures if one.what == what and rival in one.values):
+            ours, theirs = (
+                f"{format_number(figure.median(n))} {figure.unit}" for n in (OURS, rival)
+            )
+            ratio = format_ratio(figure.ratios(rival))
+            lines.append(f"| {what} | {ours} | {rival}: {theirs} | {ratio} |")
+    return "\n".join(lines)
+
+
+def between_markers(document: str, text: str) -> str:
+    """The document with `text` where its markers are."""
+    head, _, rest = document.partition(BEGIN)
+    _, end, tail = rest.partition(END)
+    assert end, f"no {BEGIN} ... {END}"
+    return f"{head}{BEGIN}\n{text}\n{END}{tail}"
+
+
+def make_files(records: dict[str, Record]) -> dict[Path, str]:
+    """Every file that is written, and its text."""
+    files = {
+        FULL: between_markers(FULL.read_text(), format_full(records)),
+        SHORT: between_markers(SHORT.read_text(), format_short(records)),
+    }
+    for name, plot in PLOTS.items():
+        if name in records:
+            curves = [one for one in records[name].figures if one.at is not None]
+            files[DATA / f"{name}.svg"] = plot(TITLES[name], curves)
+    return files
+
+
+if __name__ == "__main__":
+    for path, text in make_files(read_records()).items():
+        path.write_text(text)
