@@ -24,6 +24,10 @@ system:  ## system tests in $(LAB)
 	@$(PREPARE) $(if $(filter vm,$(LAB)),container vm,$(LAB))
 	@$(CHECK) system
 
+quick:  ## the heart of the system tests, in less than two minutes
+	@$(PREPARE) container
+	@$(CHECK) quick
+
 vm:  ## system tests that need a kernel of their own
 	@$(PREPARE) container vm
 	@$(CHECK) vm
@@ -59,4 +63,4 @@ deb:  ## the Debian packages, built twice and checked, into dist/
 	@$(PREPARE) container
 	@packaging/build
 
-.PHONY: help test unit system vm faults bench bookworm lint demo clean deb
+.PHONY: help test unit system quick vm faults bench bookworm lint demo clean deb

@@ -17,6 +17,11 @@ from lab.venv import ensure_venv, venv_environment, write_package
 
 LAB_PYTHON = (3, 13)
 FAULTS = "tests/system/faults"
+# A dataflow as a service, from start to stop: what to run after every change.
+QUICK = (
+    ("cell", "start", "bus", "lab"),
+    ("stop", "list", "kinds", "start_refused", "start_run", "cli"),
+)
 # pytest's last line: "=== 3 passed, 1 skipped in 0.12s ==="
 SUMMARY = re.compile(r"=+ (\d+ .* in [\d.:s ()]+) =+")
 
@@ -185,6 +190,18 @@ def plan_faults(form: str) -> list[Step]:
     return [Step(f"faults, {form}", [*command, FAULTS, "-m", marks], env)]
 
 
+def plan_quick(_form: str) -> list[Step]:
+    """The heart of the system tests, two containers at the same time."""
+    first, second = (
+        quick_step([f"tests/system/test_{name}.py" for name in half]) for half in QUICK
+    )
+    return [replace(first, with_next=True), second]
+
+
+def quick_step(files: Sequence[str]) -> Step:
+    return lab_step("quick system tests", "container", [*files, "-m", "not vm"])
+
+
 def two_halves(arguments: Sequence[str]) -> list[Step]:
     """Two containers at the same time; a test that measures or floods has its half for itself."""
     first = lab_step("system tests, first half", "container", [*arguments, "--half=1"])
@@ -212,6 +229,7 @@ PLANS: dict[str, Callable[[str], list[Step]]] = {
     "test": plan_test,
     "unit": plan_unit,
     "system": plan_system,
+    "quick": plan_quick,
     "faults": plan_faults,
     "lab": plan_lab,
     "vm": plan_vm,

@@ -16,6 +16,7 @@ ALLOWED_ALWAYS = (
     "Unable to find transport for link event",
     "Unable to connect to any locator",
     "in response to an OpenSyn",
+    "Attempt to establish transport to itself",
     # Dora, when a loaded machine (or one that is emulated) is slow.
     "Discarding event for input",
     "ms for handling event",
