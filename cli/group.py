@@ -37,6 +37,7 @@ VERBS = {
     "dora": Verb("dora", "Run the dora command against one dataflow."),
     "up": Verb("up", "Open the port of the gateway to all dataflows."),
     "env": Verb("env", "Print what points a stock dora command at the gateway."),
+    "destroy": Verb("destroy", "Stop all dataflows and the gateway."),
     "doctor": Verb("doctor", "Say what on this machine hinders dataflows."),
     "setup": Verb("setup", "Put slice, target and manuals in place after pip install."),
     "version": Verb("version", "Print the versions of all that takes part."),

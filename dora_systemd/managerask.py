@@ -10,9 +10,9 @@ from dora_systemd.logfields import encode_entry
 from dora_systemd.managercells import Cell
 
 
-def note_stop(cells: Iterable[Cell]) -> None:
+def note_stop(cells: Iterable[Cell], command: str = "doractl stop") -> None:
     """Write the event stop-asked for those dataflows that run."""
-    by = f"{caller(os.getuid(), os.environ)} (doractl stop)"
+    by = f"{caller(os.getuid(), os.environ)} ({command})"
     for cell in cells:
         if cell.is_up:
             fields = event_fields("stop-asked", dataflow=cell.name, by=by)

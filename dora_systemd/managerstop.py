@@ -29,11 +29,11 @@ def stop_cells(manager: Manager, scope: Scope, cells: Sequence[Cell]) -> list[Ou
     up = [cell.unit for cell in cells if cell.is_up]
     results = manager.run_jobs("StopUnit", up) if up else {}
     outcomes = [_stop_outcome(manager, cell, results.get(cell.unit)) for cell in cells]
-    _release_enabled(manager, scope, up)
+    release_enabled(manager, scope, up)
     return outcomes
 
 
-def _release_enabled(manager: Manager, scope: Scope, units: Sequence[str]) -> None:
+def release_enabled(manager: Manager, scope: Scope, units: Sequence[str]) -> None:
     """What was enabled while it ran is that unit file from its next start on."""
     for unit in sorted(enabled_units(manager, scope).intersection(units)):
         state = manager.read(unit, ["Transient", "ActiveState"])

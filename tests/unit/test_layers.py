@@ -137,6 +137,7 @@ USE_CASES = {
         "managercells",
         "managerclaim",
         "managercredentials",
+        "managerdestroy",
         "managerdoctor",
         "managerenable",
         "managerenabled",

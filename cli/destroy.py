@@ -1,0 +1,79 @@
+"""doractl destroy: stop everything."""
+
+import click
+
+from dora_systemd.bus import Bus
+from dora_systemd.cli.parameters import current_scope, scope_options
+from dora_systemd.errors import ExitCode
+from dora_systemd.managerask import note_stop
+from dora_systemd.managerdestroy import (
+    processes_left,
+    running_cells,
+    stop_all,
+    stop_gateway,
+    stop_slice,
+)
+from dora_systemd.managerenabled import enabled_units
+from dora_systemd.managergateway import read_gateway
+from dora_systemd.names import name_from_unit
+from dora_systemd.scope import Scope
+
+_EPILOG = """\b
+Examples:
+  doractl destroy
+  doractl --user destroy --force
+"""
+
+
+@click.command("destroy", epilog=_EPILOG)
+@click.option("--force", is_flag=True, help="Kill the nodes, instead of telling them to stop.")
+@scope_options
+def command(force: bool) -> int:
+    """Stop all dataflows, the gateway and dora.slice, and look whether any process is left.
+
+    Only what is of this scope: the system's, or the calling user's. What is enabled stays enabled.
+    """
+    scope = current_scope()
+    bus = Bus(scope)
+    is_good = _stop_dataflows(bus, scope, force)
+    was_up = read_gateway(bus).is_up
+    if was_up:
+        click.echo("Shutting down daemon...")
+    stop_gateway(bus, scope)
+    others = stop_slice(bus)
+    if was_up:
+        click.echo("  ✓ Daemon stopped")
+    return ExitCode.OK if _print_left(bus, scope, others) and is_good else ExitCode.FAILURE
+
+
+def _stop_dataflows(bus: Bus, scope: Scope, force: bool) -> bool:
+    """Whether all have stopped."""
+    cells = running_cells(bus)
+    if not cells:
+        click.echo("No dataflow is running.")
+        return True
+    note_stop(cells, "doractl destroy")
+    click.echo("Stopping all dataflows...")
+    is_good = True
+    for ended in stop_all(bus, scope, force):
+        if ended.problem:
+            click.echo(f"doractl: {ended.problem}", err=True)
+        else:
+            click.echo(f"  ✓ {ended.name} stopped{f' ({ended.note})' if ended.note else ''}")
+        is_good = is_good and not ended.problem
+    return is_good
+
+
+def _print_left(bus: Bus, scope: Scope, others: list[str]) -> bool:
+    """Say what is left; whether nothing of ours is."""
+    if others:
+        click.echo(f"Left alone in dora.slice, not doractl's: {', '.join(others)}")
+    left = processes_left(bus, others)
+    for one in left:
+        click.echo(f"doractl: cannot end {one}", err=True)
+    if not left:
+        click.echo("Nothing is left: no process in dora.slice.")
+    names = sorted(filter(None, map(name_from_unit, enabled_units(bus, scope))))
+    if names:
+        click.echo(f"Still enabled: {', '.join(names)}; the next boot starts what is enabled.")
+    return not left
