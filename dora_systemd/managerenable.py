@@ -118,12 +118,18 @@ def install_unit_file(manager: Manager, boot: BootUnit, text: str) -> None:
     write_unit_file(boot.path, text)
     try:
         _link(manager, str(boot.path), boot.unit)
-    except DoraSystemdError:
+    except DoraSystemdError as error:
         if boot.text is None:
             remove_unit_file(boot.path)
         else:
             write_unit_file(boot.path, boot.text)
-        raise
+        raise _no_link(boot.unit) if error.code is ExitCode.NOT_FOUND else error from error
+
+
+def _no_link(unit: str) -> DoraSystemdError:
+    """What systemd calls a missing unit: it could not make the directory of the link."""
+    hint = f"is there room on the disk? see systemctl enable {unit}"
+    return DoraSystemdError(f"cannot enable {unit}: systemd made no link to it", hint)
 
 
 def disable_cell(manager: Manager, scope: Scope, cell: Cell) -> bool:

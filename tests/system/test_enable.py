@@ -6,6 +6,7 @@ import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -278,20 +279,91 @@ def test_a_foreign_unit_file_stays(boots: Cell, project: Project) -> None:
     assert path.read_text() == "[Service]\nExecStart=/bin/true\n"
 
 
-def test_a_full_etc(boots: Cell, project: Project) -> None:
+STRANGE = {
+    "foreign": "[Service]\nExecStart=/bin/true\n",
+    "no-unit": "hello [[[\n",
+    "empty": "",
+}
+
+
+@pytest.mark.warns(
+    *(f"dora-{name}.service" for name in ("no-unit", "empty", "half", "cut", "gone"))
+)
+def test_broken_and_foreign_unit_files(boots: Cell, project: Project) -> None:
+    """They are told from ours, none is touched, and nobody else is bothered."""
+    flow = project.three_nodes()
+    boots.start(flow)
+    exported = boots.doractl("export", boots.name).stdout
+    texts = {
+        **STRANGE,
+        "of-another": exported,
+        "half": exported.partition("NotifyAccess")[0],
+        "cut": exported.partition("--uuid")[0],
+    }
+    paths = {name: ETC / f"dora-{name}.service" for name in (*texts, "masked", "gone", "directory")}
+    for name, text in texts.items():
+        paths[name].write_text(text)
+    paths["masked"].symlink_to("/dev/null")
+    paths["gone"].symlink_to("/nowhere")
+    paths["directory"].mkdir()
+    before = list_directory(ETC)
+    run("systemctl", "daemon-reload")
+    try:
+        assert [row["name"] for row in rows_of(boots)] == [boots.name]
+        assert run("doractl", "doctor", check=False).stderr == ""
+        for name in paths:
+            refused(boots, ExitCode.NAME_IN_USE, "start", str(flow), "--enable", "--name", name)
+            refused(boots, ExitCode.NOT_FOUND, "enable", name)
+            refused(boots, ExitCode.NOT_FOUND, "disable", name)
+        assert list_directory(ETC) == before
+    finally:
+        for path in paths.values():
+            path.rmdir() if path.is_dir() else path.unlink()
+    boots.wait_exchanging()
+
+
+def refused(cell: Cell, code: ExitCode, *words: str) -> None:
+    """One line and a hint."""
+    done = cell.doractl(*words, check=False)
+    assert (done.returncode, done.stdout) == (code, ""), (words, done.stderr)
+    first, second = done.stderr.splitlines()
+    assert first.startswith("doractl: cannot ")
+    assert second.startswith("hint: ")
+
+
+def rows_of(cell: Cell) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = json.loads(cell.doractl("list", "-o", "json").stdout)
+    return rows
+
+
+def list_directory(place: Path) -> dict[str, str]:
+    """Every path below it, with what a file has in it."""
+    found = sorted(place.rglob("*"))
+    return {str(path): path.read_text() if path.is_file() else "" for path in found}
+
+
+@pytest.mark.parametrize(
+    "room", ["size=4k", "nr_inodes=3"], ids=["no-byte-left", "no-room-for-the-link"]
+)
+def test_a_full_etc(boots: Cell, project: Project, room: str) -> None:
     """One clear line, and nothing is left behind."""
-    boots.start(project.three_nodes())
-    run("mount", "-t", "tmpfs", "-o", "size=4k,mode=755", "tmpfs", str(ETC))
+    flow = project.three_nodes()
+    boots.start(flow)
+    run("mount", "-t", "tmpfs", "-o", f"{room},mode=755", "tmpfs", str(ETC))
     try:
         (ETC / "fill").write_bytes(b"x" * 4096)
         done = boots.doractl("enable", boots.name, check=False)
+        other = boots.doractl("start", str(flow), "--enable", "--name", "other", check=False)
         assert [path.name for path in ETC.iterdir()] == ["fill"]
     finally:
         run("umount", str(ETC))
-    assert done.returncode == ExitCode.FAILURE
-    assert done.stderr.splitlines()[0] == (
-        f"doractl: cannot write {ETC / boots.unit}: No space left on device"
-    )
+    for one, unit in ((done, boots.unit), (other, "dora-other.service")):
+        assert one.returncode == ExitCode.FAILURE
+        line = one.stderr.splitlines()[0]
+        assert line.startswith("doractl: cannot ")
+        assert unit in line
+        assert "No space left on device" in line or "systemd made no link" in line
+    assert [row["name"] for row in rows_of(boots)] == [boots.name]
     boots.wait_exchanging()
 
 

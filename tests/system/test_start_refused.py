@@ -1,6 +1,9 @@
 """What doractl start refuses: one line and a hint, the exit status, and nothing left behind."""
 
 import os
+from pathlib import Path
+
+import pytest
 
 from dora_systemd.errors import ExitCode
 from tests.system.cells import Cell, Project
@@ -101,3 +104,33 @@ def test_a_dora_that_is_too_old(cell: Cell, project: Project) -> None:
     old.chmod(0o755)
     words = [str(project.three_nodes()), f"--dora={old}"]
     check_refusals(cell, project, [Refusal(words, ExitCode.NO_DORA, "0.4.1")])
+
+
+HALF_WRITTEN = (
+    "memory_limit: [4G\n",
+    "memory_lim",
+    "env: {A: x, B",
+    'env_file: "/srv',
+    "nodes:\n  sin",
+)
+
+
+@pytest.mark.lab
+@pytest.mark.parametrize("place", ["beside", "of-the-machine"])
+def test_half_written_settings(cell: Cell, project: Project, place: str) -> None:
+    """Refused by name; what runs and is started again has its settings in its unit."""
+    flow = project.three_nodes()
+    cell.start(flow)
+    path = project.root / "dataflow.systemd.yml"
+    if place != "beside":
+        path = Path("/etc/dora-systemd/config.yml")
+    path.parent.mkdir(exist_ok=True)
+    try:
+        for text in HALF_WRITTEN:
+            path.write_text(text)
+            words = [str(flow), "--name", "other"]
+            check_refusals(cell, project, [Refusal(words, ExitCode.BAD_INPUT, str(path))])
+        cell.doractl("restart", cell.name)
+    finally:
+        path.unlink()
+    cell.wait_exchanging()
