@@ -9,7 +9,6 @@ import errno
 import os
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
@@ -17,30 +16,13 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.limits import NodeLimits
 from dora_systemd.oom import OomCounts
 from dora_systemd.pressure import Load
+from dora_systemd.usage import UNLIMITED, Usage
 from dora_systemd.values import SECOND
 
 NODE_PREFIX = "node-"
 MOUNTS = (Path("/sys/fs/cgroup"), Path("/sys/fs/cgroup/unified"))
-UNLIMITED = 2**64 - 1
-"""What systemd's properties say where cgroup files say "max", see systemd.resource-control(5)."""
 
 _ABSENT = (errno.ENOENT, errno.ENODEV, errno.EOPNOTSUPP, errno.ENOTSUP)
-
-
-@dataclass(frozen=True)
-class Usage:
-    """What one group uses. CPU in µs since the group was made, memory in bytes, None: not known.
-
-    memory_max is UNLIMITED where there is no limit; cpu_max, in µs per second, too. throttling:
-    periods in which the group wanted to run, and those in which it had to wait for its cpu.max.
-    """
-
-    cpu_us: int
-    memory: int | None = None
-    memory_peak: int | None = None
-    memory_max: int | None = None
-    cpu_max: int | None = None
-    throttling: tuple[int, int] = (0, 0)
 
 
 @cache

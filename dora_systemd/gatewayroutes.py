@@ -1,5 +1,8 @@
 """What the gateway answers: one line for each path."""
 
+from dora_systemd.gatewaylive import talk
+from dora_systemd.gatewaymetrics import answer_metrics
+from dora_systemd.gatewaypage import page_routes
 from dora_systemd.gatewayrequest import PLAIN, Answer, Get, Request, Talk
 
 HEALTH = "/health"
@@ -12,8 +15,12 @@ async def answer_health(_request: Request) -> Answer:
 
 GET: dict[str, Get] = {
     HEALTH: answer_health,
+    "/metrics": answer_metrics,
+    **page_routes(),
 }
-SOCKETS: dict[str, Talk] = {}
+SOCKETS: dict[str, Talk] = {
+    "/api/live": talk,
+}
 
 OPEN_TO_ALL = frozenset({HEALTH})
 """What every user of the machine may ask; it tells nothing."""

@@ -12,7 +12,6 @@ from typing import Any
 from dora_systemd import cgroup
 from dora_systemd.busprotocol import Manager
 from dora_systemd.cellpaths import CellPaths
-from dora_systemd.cgroup import Usage
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.managerbudget import restart_budget
 from dora_systemd.managercells import Cell, matching_cells, read_cells, select_cell
@@ -27,6 +26,7 @@ from dora_systemd.status import (
     throttled_percent,
 )
 from dora_systemd.statuswords import DataflowRow, NodeRow, status_word
+from dora_systemd.usage import UNLIMITED, Usage
 from dora_systemd.values import SECOND
 
 _PROPERTIES = (
@@ -186,7 +186,7 @@ def _numbers(
 
 
 def _limit(value: int | None) -> int | None:
-    return None if value == cgroup.UNLIMITED else value
+    return None if value == UNLIMITED else value
 
 
 def _populated(groups: dict[str, Path]) -> int:

@@ -4,13 +4,13 @@ import time
 from collections.abc import Mapping, Sequence
 
 from dora_systemd.busprotocol import Manager
-from dora_systemd.cgroupstrain import read_strain
 from dora_systemd.managercells import Cell, read_cells, select_cell
 from dora_systemd.managerlist import Reading, read_dataflow, row_of
 from dora_systemd.managernode import require_running
+from dora_systemd.managersnapshot import read_strains
 from dora_systemd.scope import Scope
-from dora_systemd.strain import Strain, waits
 from dora_systemd.toptable import Look, TopEntry
+from dora_systemd.usage import Strain, waits
 
 _Seen = tuple[Reading, Mapping[str, Strain]]
 
@@ -45,7 +45,7 @@ class Top:
 
     def _see(self, cell: Cell) -> _Seen:
         reading = read_dataflow(self._manager, self._scope, cell)
-        return reading, {key: read_strain(path) for key, path in reading.groups.items()}
+        return reading, read_strains(reading)
 
 
 def _entry(now: _Seen, before: _Seen | None) -> TopEntry:

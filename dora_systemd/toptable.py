@@ -16,7 +16,7 @@ from dora_systemd.statuswords import (
     format_uptime,
     row_values,
 )
-from dora_systemd.strain import format_waits
+from dora_systemd.usage import format_waits
 
 SORTS = ("cpu", "memory", "name")
 HEADER = ("NAME", "STATE", "UPTIME", "CPU%", "MEM", "PEAK", "RESTARTS", "WAITS FOR")

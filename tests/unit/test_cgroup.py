@@ -8,6 +8,7 @@ import pytest
 from dora_systemd import cgroup
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.limits import parse_node_limits
+from dora_systemd.usage import UNLIMITED, Usage
 
 
 @pytest.fixture
@@ -33,9 +34,7 @@ def test_usage_with_a_memory_controller(unit: Path) -> None:
     (unit / "cpu.max").write_text("150000 100000\n")
     for name, text in (("current", "4096\n"), ("peak", "8192\n"), ("max", "max\n")):
         (unit / f"memory.{name}").write_text(text)
-    assert cgroup.read_usage(unit) == cgroup.Usage(
-        1500, 4096, 8192, cgroup.UNLIMITED, 1_500_000, (10, 3)
-    )
+    assert cgroup.read_usage(unit) == Usage(1500, 4096, 8192, UNLIMITED, 1_500_000, (10, 3))
 
 
 def test_usage_without_a_memory_controller(unit: Path) -> None:
@@ -64,7 +63,7 @@ def test_a_limit_that_nothing_holds_up_is_an_error(unit: Path) -> None:
 
 
 def test_usage_of_a_group_that_has_gone(tmp_path: Path) -> None:
-    assert cgroup.read_usage(tmp_path / "gone") == cgroup.Usage(0, 0)
+    assert cgroup.read_usage(tmp_path / "gone") == Usage(0, 0)
 
 
 def test_pids_of_the_whole_tree(unit: Path) -> None:

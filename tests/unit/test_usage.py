@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.cgroupstrain import read_strain
-from dora_systemd.strain import Strain, format_waits, waits
+from dora_systemd.usage import Strain, format_waits, waits
 
 PSI = "some avg10=1.50 avg60=0.00 avg300=0.00 total=1500\n"
 FULL = "full avg10=0.00 avg60=0.00 avg300=0.00 total=700\n"

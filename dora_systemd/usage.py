@@ -1,11 +1,29 @@
-"""What the processes of a group had to wait for, and what the kernel killed of them. Pure."""
+"""What the processes of a group use, and what they had to wait for. Pure."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 RESOURCES = ("cpu", "memory", "io")
+UNLIMITED = 2**64 - 1
+"""What systemd's properties say where cgroup files say "max", see systemd.resource-control(5)."""
 WORTH_SHOWING = 1.0
 """Percent of the time from which on a wait is shown to people."""
+
+
+@dataclass(frozen=True)
+class Usage:
+    """What one group uses. CPU in µs since the group was made, memory in bytes, None: not known.
+
+    memory_max is UNLIMITED where there is no limit; cpu_max, in µs per second, too. throttling:
+    periods in which the group wanted to run, and those in which it had to wait for its cpu.max.
+    """
+
+    cpu_us: int
+    memory: int | None = None
+    memory_peak: int | None = None
+    memory_max: int | None = None
+    cpu_max: int | None = None
+    throttling: tuple[int, int] = (0, 0)
 
 
 @dataclass(frozen=True)

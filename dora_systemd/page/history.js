@@ -1,0 +1,66 @@
+// The last minutes of every dataflow and node. The gateway keeps none: what is a share of time is
+// computed here, from two snapshots.
+
+export const KEPT = 150;
+const WORTH = 5;
+
+const series = () => ({ cpu: [], memory: [], waits: {} });
+
+export class History {
+  constructor() {
+    this.last = new Map();
+    this.groups = new Map();
+  }
+
+  /** What is known of one group: its series, oldest first. */
+  of(uuid, node = "") {
+    return this.groups.get(`${uuid} ${node}`) ?? series();
+  }
+
+  /** Takes one snapshot in. */
+  add(dataflows) {
+    const seen = new Set();
+    for (const flow of dataflows) {
+      const before = this.last.get(flow.uuid);
+      for (const [node, counters] of Object.entries(flow.groups)) {
+        const key = `${flow.uuid} ${node}`;
+        const facts = node ? flow.nodes.find((one) => one.node === node) : flow;
+        seen.add(key);
+        this.#note(key, facts, counters, before?.groups[node], flow.at_us - (before?.at_us ?? 0));
+      }
+      this.last.set(flow.uuid, flow);
+    }
+    for (const key of this.groups.keys()) if (!seen.has(key)) this.groups.delete(key);
+  }
+
+  #note(key, facts, now, before, window) {
+    if (!facts) return;
+    const kept = this.groups.get(key) ?? series();
+    // A counter that went down belongs to another run.
+    const isSame = before && window > 0 && now.cpu_us >= before.cpu_us;
+    const share = (from, to) => (100 * Math.max(to - from, 0)) / window;
+    kept.cpu.push(isSame ? share(before.cpu_us, now.cpu_us) : facts.cpu_percent ?? 0);
+    kept.memory.push(facts.memory_bytes ?? 0);
+    kept.waits = isSame ? this.#waits(now, before, share) : {};
+    for (const list of [kept.cpu, kept.memory]) if (list.length > KEPT) list.shift();
+    this.groups.set(key, kept);
+  }
+
+  #waits(now, before, share) {
+    const found = Object.entries(now.stalled_us).map(([resource, us]) =>
+      [resource, share(before.stalled_us[resource] ?? 0, us)]);
+    const periods = now.periods - before.periods;
+    const throttled = now.throttled_periods - before.throttled_periods;
+    if (periods > 0 && throttled > 0) found.push(["its CPU limit", (100 * throttled) / periods]);
+    return Object.fromEntries(found.filter(([, amount]) => amount >= WORTH));
+  }
+}
+
+export const newest = (list) => (list.length ? list[list.length - 1] : null);
+
+/** "waits for memory 12 %, io 8 %", or nothing: only what is worth a look. */
+export function waitWords(waits) {
+  const sorted = Object.entries(waits).sort((a, b) => b[1] - a[1]);
+  const words = sorted.map(([resource, share]) => `${resource} ${share.toFixed(0)}\u00a0%`);
+  return words.length ? `waits for ${words.join(", ")}` : "";
+}

@@ -1,0 +1,56 @@
+// Numbers and states as people read them; the words are those of doractl list.
+
+const UNITS = ["B", "K", "M", "G", "T"];
+
+export function bytes(size) {
+  if (size == null) return "–";
+  let unit = 0;
+  while (size >= 1024 && unit < UNITS.length - 1) {
+    size /= 1024;
+    unit += 1;
+  }
+  const digits = size < 9.95 && unit > 0 ? 1 : 0;
+  return `${size.toFixed(digits).replace(/\.0$/, "")}\u00a0${UNITS[unit]}${unit ? "iB" : ""}`;
+}
+
+export const percent = (share) => (share == null ? "–" : `${share.toFixed(share < 99.95 ? 1 : 0)}\u00a0%`);
+
+const two = (number) => String(number).padStart(2, "0");
+
+export function uptime(us) {
+  if (us == null || us < 0) return "–";
+  const seconds = Math.floor(us / 1e6);
+  const days = Math.floor(seconds / 86400);
+  const clock = [Math.floor(seconds / 3600) % 24, Math.floor(seconds / 60) % 60, seconds % 60];
+  return `${days ? `${days}d ` : ""}${clock.map(two).join(":")}`;
+}
+
+export function clock(us) {
+  const date = new Date(us / 1000);
+  return [date.getHours(), date.getMinutes(), date.getSeconds()].map(two).join(":");
+}
+
+export const plural = (count, what) => `${count} ${what}${count === 1 ? "" : "s"}`;
+
+const TONES = {
+  running: "good", ready: "good", dynamic: "good", finished: "calm", stopped: "calm",
+  starting: "busy", stopping: "busy", restarting: "warn", reloading: "busy", degraded: "warn",
+  failed: "bad",
+};
+
+/** How a state looks: good, busy, warn, bad or calm. */
+export const tone = (state) => TONES[state.toLowerCase()] ?? "calm";
+
+export const titled = (state) => state.charAt(0).toUpperCase() + state.slice(1);
+
+const UP = ["Starting", "Running", "Degraded", "Stopping", "Restarting"];
+export const isUp = (dataflow) => UP.includes(dataflow.status);
+
+const TIMES = { millis: "ms", secs: "s", micros: "µs", nanos: "ns" };
+
+/** A source of dora's own, such as dora/timer/millis/20, in short. */
+export function sourceName(id) {
+  const [, kind, unit, amount] = id.split("/");
+  if (kind !== "timer" || !amount) return id.replace(/^dora\//, "");
+  return unit === "hz" ? `${amount} Hz` : `every ${amount} ${TIMES[unit] ?? unit}`;
+}

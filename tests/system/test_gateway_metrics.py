@@ -1,0 +1,54 @@
+"""What Prometheus gets from a real gateway of real dataflows."""
+
+import re
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from tests.system.cells import Cell, Project, wait_for
+from tests.system.gateways import Front
+
+# Opens the port of the system.
+pytestmark = pytest.mark.lab
+
+LINE = re.compile(r'(\w+)\{((?:\w+="[^"]*",?)*)\} (\S+)')
+
+
+@pytest.fixture
+def front() -> Iterator[Front]:
+    """The system's, up."""
+    front = Front()
+    front.up()
+    yield front
+    front.end()
+
+
+def scrape(front: Front) -> dict[tuple[str, ...], float]:
+    """All samples: by name and the values of the labels."""
+    status, text = front.get("/metrics")
+    assert status == 200, text
+    found = [LINE.fullmatch(line) for line in text.splitlines() if not line.startswith("#")]
+    assert found
+    return {(one[1], *re.findall(r'="([^"]*)"', one[2])): float(one[3]) for one in found if one}
+
+
+def test_a_dataflow(front: Front, cell: Cell, project: Project) -> None:
+    cell.start(project.three_nodes())
+    first = scrape(front)
+    name = cell.name
+    assert first["dora_dataflow_state", name, "running"] == 1
+    assert first["dora_dataflow_nodes_alive", name] == 3
+    assert abs(first["dora_dataflow_start_time_seconds", name] - time.time()) < 60
+    assert first["dora_node_state", name, "source", "running"] == 1
+    assert first["dora_node_memory_bytes", name, "sink"] > 1 << 20
+
+    def is_counting() -> bool:
+        key = ("dora_node_cpu_seconds_total", name, "source")
+        return scrape(front)[key] > first[key]
+
+    wait_for("CPU time is counted", is_counting)
+
+
+def test_nothing_runs(front: Front) -> None:
+    assert [key[0] for key in scrape(front)] == ["dora_systemd_build_info"]
