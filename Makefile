@@ -10,7 +10,7 @@ PREPARE := tests/lab/prepare
 CHECK := /usr/bin/python3 tests/lab/check
 
 help:  ## this list
-	@sed -n 's/^\([a-z]*\):.*##/make \1:/p' $(MAKEFILE_LIST)
+	@sed -n 's/^\([a-z-]*\):.*##/make \1:/p' $(MAKEFILE_LIST)
 
 test:  ## everything: unit tests, system tests in the vm, system tests
 	@$(PREPARE) $(if $(filter host,$(LAB)),host,container vm)
@@ -36,13 +36,17 @@ faults:  ## every fault of tests/system/faults, ROUNDS=n times
 	@$(PREPARE) $(if $(filter vm,$(LAB)),container vm,container)
 	@ROUNDS=$(ROUNDS) $(CHECK) faults
 
-BENCHMARKS := start stop recovery logs
+BENCHMARKS := start stop recovery startup many cost logs messages reload
 
 bench:  ## what supervision costs, against named rivals; WHAT="start ...", ROUNDS=n
 	@$(PREPARE) container
 	@for one in $(or $(WHAT),$(BENCHMARKS)); do LAB=rivals LAB_OUT=benchmarks/data \
 	    tests/lab/lab run -- python -m benchmarks.$$one $(ROUNDS) || exit; done
 	@/usr/bin/python3 -B -m benchmarks.report
+
+bench-quick:  ## a few benchmarks in 3 minutes, their ratios beside the stored ones; WHAT="start ..."
+	@$(PREPARE) container
+	@LAB=rivals tests/lab/lab run -- python -m benchmarks.quick $(WHAT)
 
 bookworm:  ## the checkout on Debian 12, with systemd 252, installed by pip
 	@$(PREPARE) container
@@ -63,4 +67,4 @@ deb:  ## the Debian packages, built twice and checked, into dist/
 	@$(PREPARE) container
 	@packaging/build
 
-.PHONY: help test unit system quick vm faults bench bookworm lint demo clean deb
+.PHONY: help test unit system quick vm faults bench bench-quick bookworm lint demo clean deb

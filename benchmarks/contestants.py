@@ -9,7 +9,7 @@ import signal
 import subprocess
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from benchmarks.flows import HOME, STAMPS
@@ -48,6 +48,14 @@ class Contestant(ABC):
     def main_pid(self) -> int:
         """Of the process whose loss is the loss of the dataflow."""
 
+    def daemon_pids(self) -> list[int]:
+        """Of what is there for the dataflow and is neither dora nor a node."""
+        return []
+
+    def dora_pids(self) -> list[int]:
+        """Of dora's own processes."""
+        return [self.main_pid()]
+
     def close(self) -> None:  # noqa: B027
         """Leave nothing behind."""
 
@@ -69,6 +77,12 @@ class Doractl(Contestant):
 
     def main_pid(self) -> int:
         return Cell(NAME).supervisor_pid("daemon")
+
+    def daemon_pids(self) -> list[int]:
+        return [Cell(NAME).supervisor_pid("runner")]
+
+    def dora_pids(self) -> list[int]:
+        return [Cell(NAME).supervisor_pid(one) for one in ("coordinator", "daemon")]
 
     def close(self) -> None:
         Cell(NAME).end()
@@ -101,13 +115,16 @@ class DoraUp(Contestant):
     """`dora up`, and the dataflow in that daemon."""
 
     name = "dora up, start"
+    pids: tuple[int, ...]
 
     def dora(self, *words: str) -> None:
         """One command."""
         run("dora", *words, env={**os.environ, **ENVIRONMENT}, cwd=HOME)
 
     def prepare(self) -> None:
+        before = processes_of_dora()
         self.dora("up")
+        self.pids = tuple(processes_of_dora() - before)
 
     def start(self) -> None:
         self.dora("start", str(self.flow), "--name", NAME, "--detach")
@@ -119,10 +136,17 @@ class DoraUp(Contestant):
         self.dora("restart", "--name", NAME)
 
     def main_pid(self) -> int:
-        return pid_of("dora", "daemon")
+        return next(pid for pid in self.pids if "daemon" in command_line(pid))
+
+    def dora_pids(self) -> list[int]:
+        return list(self.pids)
 
     def close(self) -> None:
-        self.dora("down")
+        run("dora", "down", "--force", env={**os.environ, **ENVIRONMENT}, check=False)
+        # On a loaded machine it gives up before they have ended.
+        for pid in self.pids:
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
 
 
 class SystemdRun(Contestant):
@@ -190,7 +214,8 @@ class Supervisord(Contestant):
     def control(self, *words: str) -> str:
         """One command, and what it printed."""
         config = HOME / "supervisord.conf"
-        return run(f"{RIVALS}/supervisorctl", "-c", str(config), *words).stdout
+        command = (f"{RIVALS}/supervisorctl", "-c", str(config), *words)
+        return run(*command, check=words[0] != "status").stdout
 
     def start(self) -> None:
         self.control("start", NAME)
@@ -203,6 +228,9 @@ class Supervisord(Contestant):
 
     def main_pid(self) -> int:
         return int(self.control("pid", NAME))
+
+    def daemon_pids(self) -> list[int]:
+        return [int((HOME / "supervisord.pid").read_text())]
 
     def close(self) -> None:
         self.control("shutdown")
@@ -261,6 +289,9 @@ class Circus(Contestant):
     def main_pid(self) -> int:
         return child_of(self.process.pid)
 
+    def daemon_pids(self) -> list[int]:
+        return [self.process.pid]
+
     def close(self) -> None:
         self.process.terminate()
         self.process.wait()
@@ -297,6 +328,9 @@ class Pm2(Contestant):
     def main_pid(self) -> int:
         return int(self.control("pid", NAME))
 
+    def daemon_pids(self) -> list[int]:
+        return [int((HOME / "pm2/pm2.pid").read_text())]
+
     def close(self) -> None:
         self.control("kill")
 
@@ -316,12 +350,10 @@ def prepared(kinds: tuple[type[Contestant], ...], flow: Path) -> Iterator[list[C
         yield contestants
 
 
-def pid_of(*words: str) -> int:
-    """The one process whose command line has these words."""
-    numbers = [int(path.name) for path in Path("/proc").glob("[0-9]*")]
-    found = [pid for pid in numbers if set(words) <= {Path(w).name for w in command_line(pid)}]
-    assert len(found) == 1, f"{words}: {found}"
-    return found[0]
+def processes_of_dora() -> set[int]:
+    """Coordinators and daemons, of whomever."""
+    pids = (int(path.name) for path in Path("/proc").glob("[0-9]*"))
+    return {pid for pid in pids if {"coordinator", "daemon"} & set(command_line(pid)[1:3])}
 
 
 def child_of(parent: int) -> int:

@@ -79,7 +79,7 @@ def clear_stamps() -> None:
 def read_stamps() -> list[Stamp]:
     """What was written so far, whole ones only."""
     found = []
-    for path in STAMPS.iterdir():
+    for path in STAMPS.glob("*-*"):
         what, _, pid = path.name.partition("-")
         if text := path.read_text():
             found.append(Stamp(what, int(pid), int(text) / 1e9))

@@ -39,7 +39,8 @@ HIGHLIGHTS = (
     ("recovery", "kill -9 until messages flow again", "supervisord"),
     ("startup", "`list` with no dataflow", "pm2"),
     ("many", "`list` of 50", "pm2"),
-    ("cost", "private memory of the supervisor, per dataflow", "systemd-run dora run"),
+    ("cost", "private memory, with dora's own processes", "dora up, start"),
+    ("cost", "CPU when idle, beside dora", "pm2"),
     ("logs", "lines a second into the journal, one node", "writes to journald itself"),
     ("messages", "throughput of 4 MB messages", "dora run"),
 )

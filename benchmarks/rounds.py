@@ -8,7 +8,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+T = TypeVar("T")
 
 OURS = "doractl"
 """The contestant that all others are compared with."""
@@ -60,17 +62,26 @@ class Record:
 Measure = Callable[[], float]
 
 
-def alternate(
-    what: str, unit: str, contestants: Mapping[str, Measure], rounds: int, **about: Any
-) -> Figure:
-    """Measure all, one after the other, `rounds` times; each round begins with another one."""
-    values: dict[str, list[float]] = {name: [] for name in contestants}
+def take_turns(contestants: Mapping[str, Callable[[], T]], rounds: int) -> dict[str, list[T]]:
+    """What each gives, `rounds` times, one after the other; each round begins with another one."""
+    values: dict[str, list[T]] = {name: [] for name in contestants}
     names = list(contestants)
     for number in range(rounds):
         first = number % len(names)
         for name in (*names[first:], *names[:first]):
             values[name].append(contestants[name]())
-    figure = Figure(what, unit, values, **about)
+    return values
+
+
+def alternate(
+    what: str, unit: str, contestants: Mapping[str, Measure], rounds: int, **about: Any
+) -> Figure:
+    """Measure all in turns."""
+    return shown(Figure(what, unit, take_turns(contestants, rounds), **about))
+
+
+def shown(figure: Figure) -> Figure:
+    """The figure, for whoever watches."""
     print(format_line(figure), flush=True)
     return figure
 

@@ -6,7 +6,9 @@ from functools import partial
 
 import pytest
 
+from benchmarks.messages import COUNT, SIZES, Message, name_of, results
 from benchmarks.plots import bar_chart, ceiling, line_chart
+from benchmarks.quick import compare
 from benchmarks.report import (
     BEGIN,
     END,
@@ -126,6 +128,41 @@ def test_charts_are_xml_with_every_name(chart: object) -> None:
     drawn = ET.fromstring(chart("a < b", [FIGURE, replace(FIGURE, at=5)]))
     words = [one.text for one in drawn.iter("{http://www.w3.org/2000/svg}text")]
     assert {"a < b, ms", "doractl", "dora run", "pm2", "2", "5"} <= set(words)
+
+
+def messages_of(size: int, delay_us: int, gap_us: int) -> list[Message]:
+    """The pattern for one size; those without pause come every gap_us."""
+    calm = [(size, 0, n * 10**7, n * 10**7 + delay_us * 1000) for n in range(COUNT)]
+    return calm + [(size, 1, 0, n * gap_us * 1000) for n in range(COUNT)]
+
+
+def test_latency_is_of_the_calm_messages_and_throughput_of_the_fast_ones() -> None:
+    messages = [one for size in SIZES for one in messages_of(size, 500, 100)]
+    found = results([(3, 0, 0, 10**12), *messages])
+    assert found["latency of 4 MB"] == 500
+    assert found["throughput of 0 B messages"] == pytest.approx(10_000)
+
+
+def test_a_few_messages_may_be_lost() -> None:
+    messages = [one for size in SIZES for one in messages_of(size, 500, 100)]
+    assert results(messages[10:])["latency of 0 B"] == 500
+    with pytest.raises(AssertionError, match="40 of 100 messages of 0 bytes"):
+        results(messages[60:])
+
+
+@pytest.mark.parametrize(
+    ("size", "written"), [(0, "0 B"), (512, "512 B"), (40_960, "41 kB"), (4_096_000, "4 MB")]
+)
+def test_sizes(size: int, written: str) -> None:
+    assert name_of(size) == written
+
+
+def test_quick_compares_ratios_not_times() -> None:
+    slower = {"doractl": [500.0], "dora run": [1000.0], "circus": [1.0]}
+    now = [replace(FIGURE, values=slower), replace(FIGURE, what="new")]
+    assert compare(now, [FIGURE]) == [
+        "start to all of 2 nodes ready, to dora run: 1.20 stored, 0.50 now, 0.42 ×"
+    ]
 
 
 def test_readme_and_plots_are_what_the_stored_data_say() -> None:
