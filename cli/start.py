@@ -18,15 +18,13 @@ from dora_systemd.cli.parameters import (
 from dora_systemd.cli.settingoptions import setting_options
 from dora_systemd.cli.stageline import StageLine
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.managerclaim import place_unit_file, require_free_name, with_known_uuid
 from dora_systemd.managerenable import boot_target
+from dora_systemd.managerlaunch import Claim, claim, start_claim
 from dora_systemd.managerlinger import ensure_linger
-from dora_systemd.managerplan import DEFAULT_FILE, Plan, StartRequest, make_plan, request_name
-from dora_systemd.managerstart import Started, format_started, start_plan, start_unit_file
-from dora_systemd.managerunit import format_plan, plan_properties
+from dora_systemd.managerplan import DEFAULT_FILE, Plan, StartRequest, make_plan
+from dora_systemd.managerstart import Started, format_started
+from dora_systemd.managerunit import format_plan
 from dora_systemd.managerwatch import watched_patterns
-from dora_systemd.names import unit_name
-from dora_systemd.propertyset import Properties
 
 _EPILOG = """\b
 Examples:
@@ -74,29 +72,23 @@ def command(
         print(format_plan(make_plan(scope, request), target), end="")
         return
     bus = Bus(scope)
-    boot = require_free_name(bus, scope, unit_name(request_name(request)))
-    plan = with_known_uuid(make_plan(scope, request), boot)
-    properties, warnings = plan_properties(plan, bus)
-    print_warnings(warnings)
-    has_file = place_unit_file(bus, plan, properties, boot, want_boot)
+    claimed = claim(bus, scope, request, want_boot)
+    print_warnings(claimed.warnings)
     print_warnings([note for note in [ensure_linger(scope) if want_boot else ""] if note])
-    started = _start(bus, plan, None if has_file else properties, not no_wait)
+    started = _start(bus, claimed, not no_wait)
     if output == "json":
-        print_json({**vars(started), "dataflow": plan.options.dataflow})
+        print_json({**vars(started), "dataflow": claimed.plan.options.dataflow})
     else:
-        click.echo(format_started(started, watched_patterns(plan)))
+        click.echo(format_started(started, watched_patterns(claimed.plan)))
 
 
-def _start(bus: Bus, plan: Plan, properties: Properties | None, wait: bool) -> Started:
-    """Start a transient unit of these properties, or without them the unit file."""
+def _start(bus: Bus, claimed: Claim, wait: bool) -> Started:
     try:
         with StageLine(sys.stderr) as stage:
-            if properties is None:
-                return start_unit_file(bus, plan, stage, wait)
-            return start_plan(bus, plan, list(properties.values()), stage, wait)
+            return start_claim(bus, claimed, stage, wait)
     except DoraSystemdError as error:
         if error.code is ExitCode.FAILURE:
-            _print_last_words(plan)
+            _print_last_words(claimed.plan)
         raise
 
 

@@ -2,7 +2,7 @@
 
 import asyncio
 import json
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -72,6 +72,16 @@ class Connection:
         async for text in self._socket:
             if isinstance(frame := parse_frame(text), LogRecord):
                 on_record(frame)
+
+    async def frames(self) -> AsyncIterator[str | bytes]:
+        """Every message as it comes, until the connection is closed by either side."""
+        from websockets.exceptions import ConnectionClosed
+
+        try:
+            while True:
+                yield await self._socket.recv()
+        except ConnectionClosed:
+            return
 
     async def close(self) -> None:
         """Close at once: the peer may be dead or hang."""

@@ -35,7 +35,7 @@ async def follow_lines(
     arguments = [f"--output-fields={LOG_FIELDS}", *query_arguments(query)]
     with open_journalctl(arguments) as child:
         assert child.stdout
-        async with _stream(child.stdout) as stream:
+        async with open_stream(child.stdout) as stream:
             async for lines in _batches(stream):
                 yield lines
         end_journalctl(child)
@@ -72,7 +72,8 @@ def _query(scope: Scope, message: PageMessage) -> LogQuery:
 
 
 @asynccontextmanager
-async def _stream(pipe: IO[bytes]) -> AsyncIterator[asyncio.StreamReader]:
+async def open_stream(pipe: IO[bytes]) -> AsyncIterator[asyncio.StreamReader]:
+    """What a child writes, for the event loop."""
     loop = asyncio.get_running_loop()
     stream = asyncio.StreamReader(_CHUNK, loop)
     protocol = asyncio.StreamReaderProtocol(stream, loop=loop)

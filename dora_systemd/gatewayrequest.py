@@ -1,6 +1,6 @@
 """What the gateway's routes are given and what they give back."""
 
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from collections.abc import AsyncIterable, AsyncIterator, Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -42,8 +42,8 @@ class Socket(Protocol):
     async def recv(self) -> str | bytes:
         """The next message."""
 
-    async def send(self, message: str | bytes) -> None:
-        """Send a message; waits while the other side is slow."""
+    async def send(self, message: str | bytes | AsyncIterable[str]) -> None:
+        """Send a message, whole or in parts; waits while the other side is slow."""
 
     async def close(self, code: int = 1000, reason: str = "") -> None:
         """Say goodbye."""

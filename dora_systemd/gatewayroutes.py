@@ -1,5 +1,6 @@
 """What the gateway answers: one line for each path."""
 
+from dora_systemd.gatewaycontrol import serve_control
 from dora_systemd.gatewaylive import talk
 from dora_systemd.gatewaymetrics import answer_metrics
 from dora_systemd.gatewaypage import page_routes
@@ -19,6 +20,7 @@ GET: dict[str, Get] = {
     **page_routes(),
 }
 SOCKETS: dict[str, Talk] = {
+    "/api/control": serve_control,
     "/api/live": talk,
 }
 

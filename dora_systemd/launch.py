@@ -19,7 +19,8 @@ from dora_systemd.restarts import DEFAULT, HELD_KEYS
 from dora_systemd.values import SECOND, quoted
 
 LAUNCHED = frozenset({NodeKind.PYTHON, NodeKind.EXECUTABLE, NodeKind.SHELL})
-_PROGRAM_KEYS = ("path", "args", "build", "git", "branch", "tag", "rev")
+PROGRAM_KEYS = ("path", "args", "build", "git", "branch", "tag", "rev")
+"""The keys of a node that say what it runs: dora is told something else."""
 DEFAULT_OPERATOR = "op"
 """dora's id of the operator of a node that has one only."""
 _JSONL_BOUNDS = {"max_log_size": "16MB", "max_rotated_files": 1}
@@ -92,7 +93,7 @@ def _launch_node(node: Node, source: str, plan: LaunchPlan) -> dict[str, Any]:
     output = "keep" if node.keeps_output else "pipe"
     directory = _directory(node, source, plan)
     words = [plan.launcher, node.id, directory, output, *_command(node, directory, source, plan)]
-    kept = {key: value for key, value in raw.items() if key not in _PROGRAM_KEYS}
+    kept = {key: value for key, value in raw.items() if key not in PROGRAM_KEYS}
     if isinstance(kept.get("deploy"), Mapping):
         kept["deploy"] = {**kept["deploy"], "working_dir": None}
     return {**kept, "path": "/bin/sh", "args": shlex.join(words)}

@@ -11,7 +11,7 @@ from dora_systemd.managercells import Cell
 
 
 def note_stop(cells: Iterable[Cell], command: str = "doractl stop") -> None:
-    """Write the event stop-asked for those dataflows that run."""
+    """Write the event stop-asked for those dataflows that run. command: by which it is asked."""
     by = f"{caller(os.getuid(), os.environ)} ({command})"
     for cell in cells:
         if cell.is_up:

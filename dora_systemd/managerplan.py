@@ -21,7 +21,7 @@ from dora_systemd.managersettings import read_settings
 from dora_systemd.names import name_from_path, parse_name, unit_name
 from dora_systemd.options import RunnerOptions
 from dora_systemd.preparation import Prepared, prepare, refusal_of_dora
-from dora_systemd.process import dora_version, find_dora
+from dora_systemd.process import Account, dora_version, find_dora
 from dora_systemd.reloadplan import check_reload_nodes, hot_reload
 from dora_systemd.restartplan import node_policies, restart_policy
 from dora_systemd.restartsettings import START_TIMEOUT
@@ -122,6 +122,20 @@ def make_plan(scope: Scope, request: StartRequest) -> Plan:
     plan = Plan(scope, options, settings, user, environment)
     sandbox = make_sandbox(scope, settings, user, _check_plan(plan))
     return replace(plan, sandbox=sandbox)
+
+
+def find_engine(
+    scope: Scope, path: Path, environment: Mapping[str, str]
+) -> tuple[str, Account | None]:
+    """The dora command that would run the dataflow at `path`, and as whom.
+
+    Raises DoraSystemdError.
+    """
+    settings = read_settings(scope, path, {}, environment)
+    venv = _find_venv(settings, path, environment)
+    search_path = environment.get("PATH") or os.defpath
+    account = account_of(choose_user(scope, settings[USER], path))
+    return find_dora(_given_dora(settings), venv, search_path), account
 
 
 def _check_plan(plan: Plan) -> Prepared:

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.system.cells import Cell, Project, dora_processes, run, wait_for
+from tests.system.gateways import Front
 
 ALLOWED_ALWAYS = (
     # What zenoh says in nodes that start before their peers, or outlive them by milliseconds.
@@ -73,6 +74,15 @@ def cell(request: pytest.FixtureRequest, project: Project) -> Iterator[Cell]:
     expected = [m for mark in request.node.iter_markers("warns") for m in mark.args]
     unexpected = [w for w in _warnings(cursor) if not any(e in w for e in expected)]
     assert not unexpected, "unexpected warnings:\n" + "\n".join(unexpected)
+
+
+@pytest.fixture
+def front() -> Iterator[Front]:
+    """The gateway of the system, up."""
+    front = Front()
+    front.up()
+    yield front
+    front.end()
 
 
 def _cursor() -> str:

@@ -2,7 +2,6 @@
 
 import re
 import time
-from collections.abc import Iterator
 
 import pytest
 
@@ -13,15 +12,6 @@ from tests.system.gateways import Front
 pytestmark = pytest.mark.lab
 
 LINE = re.compile(r'(\w+)\{((?:\w+="[^"]*",?)*)\} (\S+)')
-
-
-@pytest.fixture
-def front() -> Iterator[Front]:
-    """The system's, up."""
-    front = Front()
-    front.up()
-    yield front
-    front.end()
 
 
 def scrape(front: Front) -> dict[tuple[str, ...], float]:

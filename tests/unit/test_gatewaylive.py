@@ -2,7 +2,7 @@
 
 import asyncio
 import json
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterable, AsyncIterator, Awaitable, Callable
 from typing import Any
 
 import pytest
@@ -26,7 +26,8 @@ class Browser:
         self.got: list[dict[str, Any]] = []
         self.is_stuck = False
 
-    async def send(self, message: str | bytes) -> None:
+    async def send(self, message: str | bytes | AsyncIterable[str]) -> None:
+        assert isinstance(message, str)
         while self.is_stuck:
             await asyncio.sleep(1)
         self.got.append(json.loads(message))

@@ -1,0 +1,129 @@
+"""Start of dora's protocol: the file that was meant becomes a supervised unit, as by doractl."""
+
+import asyncio
+import os
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dora_systemd.buildsession import session_path
+from dora_systemd.bus import Bus
+from dora_systemd.doraerrors import parse_dora_error
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.files import parse_yaml, read_text, read_yaml
+from dora_systemd.gatewaycontrolframes import Request
+from dora_systemd.gatewaycontrolmatch import could_be, sent_flags
+from dora_systemd.gatewaycontrolstate import spawned
+from dora_systemd.gatewaycontroltalk import Talk
+from dora_systemd.managerlaunch import claim, start_claim
+from dora_systemd.managerplan import StartRequest, find_engine
+from dora_systemd.process import run_dora
+from dora_systemd.scope import Scope
+
+_SUFFIXES = (".yml", ".yaml")
+_MOST_FILES = 200
+_POLL_SECONDS = 0.1
+
+
+@dataclass(frozen=True)
+class Match:
+    """A file that gives what was sent, when it is started with these flags."""
+
+    path: Path
+    flags: Mapping[str, object]
+
+
+async def start(talk: Talk, request: Request) -> dict[str, Any]:
+    """Start: answered when systemd has been told to. Raises DoraSystemdError."""
+    began = time.time_ns() // 1000
+    uuid = await asyncio.to_thread(_start, talk.scope, request)
+    talk.started[uuid] = began
+    return {"DataflowStartTriggered": {"uuid": uuid}}
+
+
+async def wait_for_spawn(talk: Talk, request: Request) -> dict[str, Any]:
+    """WaitForSpawn: answered when all nodes are ready. Raises DoraSystemdError."""
+    while True:
+        answer = await asyncio.to_thread(spawned, talk.scope, request.dataflow)
+        if answer is not None:
+            return answer
+        await asyncio.sleep(_POLL_SECONDS)
+
+
+def _start(scope: Scope, request: Request) -> str:
+    if request.body.get("write_events_to") is not None:
+        hint = "unset DORA_WRITE_EVENTS_TO, or use dora run"
+        raise DoraSystemdError("cannot write the events of a supervised dataflow", hint)
+    name = request.body.get("name")
+    found = find_file(scope, request)
+    wanted = StartRequest(
+        str(found.path), name if isinstance(name, str) else None, found.flags, os.environ
+    )
+    bus = Bus(scope)
+    return start_claim(bus, claim(bus, scope, wanted), None, wait=False).uuid
+
+
+def find_file(scope: Scope, request: Request) -> Match:
+    """The one file that is meant. Raises DoraSystemdError when there is none, or several."""
+    directory, sent = Path(request.text("local_working_dir")), request.body.get("dataflow")
+    if not isinstance(sent, dict):
+        raise DoraSystemdError("cannot start: no dataflow was sent", "", ExitCode.BAD_INPUT)
+    files = [path for path in _files(directory) if could_be(_read(path), sent)]
+    found = [one for one in (_match(scope, path, request, sent) for path in files) if one]
+    if len(found) > 1:
+        session = request.body.get("session_id")
+        found = [one for one in found if _session(one.path) == session] or found
+    if len(found) == 1:
+        return found[0]
+    names = ", ".join(one.path.name for one in found)
+    reason = f"{names} fit it equally" if found else f"no file in {directory} holds it"
+    raise DoraSystemdError(
+        f"cannot tell which file this dataflow is from: {reason}",
+        "doractl start FILE takes the file itself",
+        ExitCode.BAD_INPUT,
+    )
+
+
+def _files(directory: Path) -> list[Path]:
+    if not directory.is_absolute():
+        raise DoraSystemdError(f"cannot start in {directory}: it is no absolute path")
+    try:
+        found = sorted(path for path in directory.iterdir() if path.suffix in _SUFFIXES)
+    except OSError as error:
+        raise DoraSystemdError(
+            f"cannot look for the dataflow in {directory}: {error.strerror}",
+            "doractl start FILE takes the file itself",
+            ExitCode.BAD_INPUT,
+        ) from error
+    return found[:_MOST_FILES]
+
+
+def _read(path: Path) -> object:
+    with suppress(DoraSystemdError):
+        return read_yaml(path)
+    return None
+
+
+def _match(scope: Scope, path: Path, request: Request, sent: Mapping[str, Any]) -> Match | None:
+    dora, account = find_engine(scope, path, os.environ)
+    done = run_dora(dora, ["expand", str(path)], directory=str(path.parent), account=account)
+    if done.status:
+        reason = parse_dora_error(done.stderr)
+        raise DoraSystemdError(f"cannot expand {path}: {reason}", "", ExitCode.BAD_INPUT)
+    expanded = parse_yaml(done.stdout, path)
+    if not isinstance(expanded, dict):
+        return None
+    has_variables = "$" in read_text(path)
+    flags = sent_flags(sent, expanded, bool(request.body.get("uv")), has_variables)
+    return None if flags is None else Match(path, flags)
+
+
+def _session(path: Path) -> object:
+    """The id that the dora command sends for this file."""
+    with suppress(DoraSystemdError):
+        document = read_yaml(Path(session_path(str(path))))
+        return document.get("session_id") if isinstance(document, dict) else None
+    return None
