@@ -48,6 +48,13 @@ def test_dependencies() -> None:
     assert f"systemd (>= {MIN_VERSION})" in control
     assert "dora-cli (>= 1.0)" in control
     assert "${python3:Depends}" in control
+    pyproject = tomllib.loads((CHECKOUT / "pyproject.toml").read_text())["project"]
+    assert f"X-Python3-Version: {pyproject['requires-python'].replace('>=', '>= ')}\n" in control
+    for needed in pyproject["dependencies"]:
+        # dh_python3 finds the packages, but leaves out which versions are enough.
+        name, _, version = needed.replace("py", "", needed.startswith("pyyaml")).partition(">=")
+        package = f"python3-{name.removesuffix('-python')}"
+        assert f"\n {package} (>= {version}),\n" in control
 
 
 def test_every_template_is_installed() -> None:
