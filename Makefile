@@ -67,4 +67,8 @@ deb:  ## the Debian packages, built twice and checked, into dist/
 	@$(PREPARE) container
 	@packaging/build
 
-.PHONY: help test unit system quick vm faults bench bench-quick bookworm lint demo clean deb
+autopkgtest:  ## debian/tests, by Debian's own autopkgtest, on what make deb has built
+	@$(PREPARE) $(if $(filter vm,$(LAB)),container vm,container)
+	@packaging/autopkgtest
+
+.PHONY: help test unit system quick vm faults bench bench-quick bookworm lint demo clean deb autopkgtest
