@@ -54,6 +54,11 @@ class Bus:
         self._bus = _connect(scope)
         self._matches: dict[bytes, Callable[..., None]] = {}
 
+    def __del__(self) -> None:
+        # pystemd keeps the connection, two descriptors, until it is told. A gateway has many.
+        if hasattr(self, "_bus"):
+            self._bus.close()
+
     def list_units(self, pattern: str) -> list[UnitState]:
         rows = self._call(
             "list units", ROOT, MANAGER, "ListUnitsByPatterns", ("as", []), ("as", [pattern])

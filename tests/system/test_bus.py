@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from dora_systemd import bus
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.scope import scope_of
 from tests.unit.fake_manager import ScopeIn
 
 
@@ -37,3 +38,11 @@ def test_pystemd_is_loaded_without_lxml_and_stays_usable() -> None:
         "assert pystemd.SDUnit and DBus is bus._dbuslib().DBus\n"
     )
     subprocess.run([sys.executable, "-c", script], check=True)
+
+
+def test_a_connection_ends_with_its_object() -> None:
+    """The gateway opens one for each reading."""
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    for _ in range(3):
+        bus.Bus(scope_of(None)).version()
+    assert len(list(Path("/proc/self/fd").iterdir())) == before
