@@ -2,6 +2,7 @@
 
 import time
 from contextlib import suppress
+from functools import lru_cache
 from typing import Any
 
 from dora_systemd.bus import Bus
@@ -29,14 +30,22 @@ from dora_systemd.statuswords import FAILED, FINISHED, DataflowRow, status_word
 
 _MOST_ENDED = 20
 """How many dataflows that have ended long ago dora list shows."""
-_SEEN_UP = ("active", "deactivating", "reloading", "refreshing")
+_FRESH_SECONDS = 5.0
+"""For which the journal's answer about ended dataflows is good, at most."""
+_SEEN_UP = ("active", "reloading", "refreshing")
+_ON_THE_WAY = ("activating", "deactivating")
 
 
 def list_dataflows(scope: Scope) -> dict[str, Any]:
     """What runs, what has failed, and what ended last."""
-    cells = read_cells(Bus(scope))
-    rows = [_row(cell) for cell in cells]
-    return dataflow_list([*rows, *ended_rows(scope, rows)[:_MOST_ENDED]])
+    rows = tuple(map(_row, read_cells(Bus(scope))))
+    return dataflow_list([*rows, *_ended(scope, rows, int(time.monotonic() / _FRESH_SECONDS))])
+
+
+@lru_cache(maxsize=1)
+def _ended(scope: Scope, rows: tuple[DataflowRow, ...], _period: int) -> tuple[DataflowRow, ...]:
+    """The newest that ended; the journal is not asked again while systemd says the same."""
+    return tuple(ended_rows(scope, rows)[:_MOST_ENDED])
 
 
 def _row(cell: Cell) -> DataflowRow:
@@ -114,7 +123,7 @@ def spawned(scope: Scope, uuid: str) -> dict[str, Any] | None:
     state = bus.read(cell.unit, ["ActiveState", "Job"])
     if state["ActiveState"] in _SEEN_UP:
         return {"DataflowSpawned": {"uuid": uuid}}
-    if state["ActiveState"] == "activating" or state["Job"][0]:
+    if state["ActiveState"] in _ON_THE_WAY or state["Job"][0]:
         return None
     if state["ActiveState"] != "failed":
         return _over(scope, uuid)

@@ -293,10 +293,13 @@ def test_settings_are_those_of_the_file(dora: Dora, places: Sequence[Project]) -
         Cell("place0").end()
 
 
-@pytest.mark.warns("node exited with error", "crashed", "failed", "Failed with result")
+@pytest.mark.warns(
+    *("node exited with error", "crashed", "failed", "Failed with result", "Failed to start")
+)
 def test_dataflows_that_end(dora: Dora, cell: Cell, places: Sequence[Project]) -> None:
     place = places[0]
-    for name, text in (("crasher", CRASHER), ("finisher", FINISHER)):
+    early = "raise SystemExit('no camera')"
+    for name, text in (("crasher", CRASHER), ("finisher", FINISHER), ("early", early)):
         place.write(f"{name}.py", text)
         place.write(f"{name}.yml", f"nodes: [{{id: only, path: {name}.py}}]\n")
         place.write(f"{name}.systemd.yml", (place.root / "dataflow.systemd.yml").read_text())
@@ -308,6 +311,9 @@ def test_dataflows_that_end(dora: Dora, cell: Cell, places: Sequence[Project]) -
     assert "Node `only` failed" in failed.stderr
     assert "no use" in failed.stderr
     assert dora("list", "--status", "failed", "--quiet").stdout
+    error = dora.refusal("start", str(place.root / "early.yml"), "--name", cell.name, "--detach")
+    assert f"cannot start {cell.name}: node only: exit code 1" in error
+    assert "no camera" in error
 
 
 def test_which_file_is_meant(dora: Dora, cell: Cell, places: Sequence[Project]) -> None:
@@ -371,3 +377,32 @@ def test_killed_while_logs_are_followed(dora: Dora, front: Front, three: list[Ce
     three[1].wait_exchanging()
     # The next command finds another gateway.
     assert sorted(uuids(dora)) == ["one", "three", "two"]
+
+
+def test_nothing_stays_behind(
+    dora: Dora, front: Front, cell: Cell, places: Sequence[Project]
+) -> None:
+    """Neither descriptors nor children of commands that went, nor units that it once held."""
+    flow = str(places[0].root / "dataflow.yml")
+    for _ in range(2):
+        dora("start", flow, "--name", cell.name, "--detach", "--debug")
+        dora("restart", cell.name)
+        dora("stop", cell.name)
+    dora("start", flow, "--name", cell.name, "--detach", "--debug")
+    pid, count = front.pid, _descriptors(front.pid)
+    for words, said in (
+        (("logs", cell.name, "--follow"), "got"),
+        (("topic", "echo", "-d", cell.name, "source/number"), "source/number"),
+    ) * 3:
+        with dora.running(*words) as child:
+            read_until(child, said)
+    for _ in range(5):
+        dora("node", "list")
+        dora("logs", cell.name, "--tail", "1")
+    wait_for("no child", lambda: not run("pgrep", "-P", str(pid), check=False).stdout)
+    wait_for("no descriptor", lambda: _descriptors(pid) <= count)
+    assert front.pid == pid
+
+
+def _descriptors(pid: int) -> int:
+    return len(list(Path(f"/proc/{pid}/fd").iterdir()))
