@@ -36,6 +36,10 @@ faults:  ## every fault of tests/system/faults, ROUNDS=n times
 	@$(PREPARE) $(if $(filter vm,$(LAB)),container vm,container)
 	@ROUNDS=$(ROUNDS) $(CHECK) faults
 
+browser:  ## the status page in headless Chromium; LAB_OUT=DIR keeps pictures of it
+	@$(PREPARE) container
+	@$(CHECK) browser
+
 BENCHMARKS := start stop recovery startup many cost logs messages reload
 
 bench:  ## what supervision costs, against named rivals; WHAT="start ...", ROUNDS=n
@@ -71,4 +75,4 @@ autopkgtest:  ## debian/tests, by Debian's own autopkgtest, on what make deb has
 	@$(PREPARE) $(if $(filter vm,$(LAB)),container vm,container)
 	@packaging/autopkgtest
 
-.PHONY: help test unit system quick vm faults bench bench-quick bookworm lint demo clean deb autopkgtest
+.PHONY: help test unit system quick vm faults browser bench bench-quick bookworm lint demo clean deb autopkgtest

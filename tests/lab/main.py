@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from lab import cgroup
 from lab.bookworm import ensure_bookworm
+from lab.browser import ensure_browser
 from lab.cache import find_cache, remove_layer
 from lab.container import run_in_container
 from lab.errors import LabError
@@ -79,12 +80,14 @@ ENSURE = {
     "vm": ensure_machine,
     "bookworm": ensure_bookworm,
     "rivals": ensure_rivals,
+    "browser": ensure_browser,
 }
 RUN = {
     "container": run_in_container,
     "vm": run_in_machine,
     "bookworm": run_in_container,
     "rivals": run_in_container,
+    "browser": run_in_container,
 }
 VERBS = {
     "run": run_command,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from lab.errors import LabError
 
-FORMS = ("container", "vm", "bookworm", "rivals")
+FORMS = ("container", "vm", "bookworm", "rivals", "browser")
 
 REBOOT = "--reboot--"
 
@@ -20,6 +20,7 @@ environment:
   LAB=bookworm      a container with Debian 12: systemd 252, Python 3.11, the checkout
                     not installed, but all that pip needs to do so
   LAB=rivals        the container with supervisord, circus and pm2, for benchmarks
+  LAB=browser       the container with Chromium, for the status page
   LAB_OUT=DIR       this directory is /out inside
   DORA_LAB_CACHE    where images are kept (default: ~/.cache/dora-systemd-lab)
   LAB_MIRROR        another Debian mirror for building the image

@@ -168,9 +168,10 @@ def plan_bookworm(_form: str) -> list[Step]:
 
 def plan_system(form: str) -> list[Step]:
     here = " and not lab" if form == "host" else ""
-    arguments = ["tests/system", "-m", f"not vm{here}"]
+    arguments = ["tests/system", "-m", f"not vm and not browser{here}"]
     if form == "container":
-        return [*plan_faults(form), *two_halves([*arguments, f"--ignore={FAULTS}"])]
+        halves = two_halves([*arguments, f"--ignore={FAULTS}"])
+        return [*plan_faults(form), *halves, *plan_browser(form)]
     if form != "host":
         return [lab_step(f"system tests, {form}", form, arguments)]
     if not Path("/run/systemd/system").is_dir():
@@ -180,6 +181,10 @@ def plan_system(form: str) -> list[Step]:
     venv = ensure_venv(find_cache(), for_system_tests=True)
     command = ["python", "-m", "pytest", *arguments]
     return [Step("system tests, this machine", command, venv_environment(venv))]
+
+
+def plan_browser(_form: str) -> list[Step]:
+    return [lab_step("status page in a browser", "browser", ["tests/system", "-m", "browser"])]
 
 
 def plan_faults(form: str) -> list[Step]:
@@ -236,5 +241,6 @@ PLANS: dict[str, Callable[[str], list[Step]]] = {
     "vm": plan_vm,
     "packages": plan_packages,
     "bookworm": plan_bookworm,
+    "browser": plan_browser,
     "lint": plan_lint,
 }

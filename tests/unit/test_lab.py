@@ -50,7 +50,7 @@ def test_commands_around_a_reboot() -> None:
         (
             ["run", "x"],
             {"LAB": "moon"},
-            "lab: cannot use LAB=moon (hint: one of container, vm, bookworm, rivals)",
+            "lab: cannot use LAB=moon (hint: one of container, vm, bookworm, rivals, browser)",
         ),
         (
             ["run", "x"],

@@ -1,0 +1,300 @@
+"""The status page of a real gateway, with real dataflows, in a real browser."""
+
+import json
+from collections.abc import Iterator
+
+import pytest
+
+from dora_systemd.gatewayplace import SERVICE_UNIT, SOCKET_UNIT
+from tests.system.cells import Cell, Project, run, wait_for
+from tests.system.chromium import Browser
+from tests.system.gateways import Front
+
+pytestmark = [pytest.mark.lab, pytest.mark.browser]
+
+HOSTILE = """
+from dora import Node
+node, count = Node(), 0
+for event in node:
+    if event["type"] == "INPUT" and count < 3:
+        print("<img src=x onerror=alert(1)>\\x1b[31mred\\x1b[0m &amp; \\x07bell", flush=True)
+        count += 1
+"""
+FLOOD = """
+from dora import Node
+count = 0
+for event in Node():
+    for _ in range(400):
+        print("line", count)
+        count += 1
+"""
+
+
+@pytest.fixture
+def front() -> Iterator[Front]:
+    """The system's, up."""
+    front = Front()
+    front.up()
+    yield front
+    front.end()
+
+
+@pytest.fixture
+def browser(front: Front, cell: Cell) -> Iterator[Browser]:
+    """At the page, in which nothing has gone wrong by the end."""
+    del cell  # it ends after the browser has looked at it
+    place = f"127.0.0.1:{front.port}/"
+    with Browser() as browser:
+        browser.open(f"http://{place}")
+        yield browser
+        own = (f"http://{place}", f"ws://{place}")
+        assert [url for url in browser.requests() if not url.startswith(own)] == []
+
+
+def node(name: str) -> str:
+    """The line of a node."""
+    return f"#detail .nodes li[data-node={name}]"
+
+
+def test_what_runs(browser: Browser, cell: Cell, project: Project) -> None:
+    browser.wait_text("#none", "doractl start")
+    cell.start(project.three_nodes())
+    browser.wait_text("#list .card", cell.name)
+    browser.wait_text("#detail h1", cell.name)
+    for name in ("source", "doubler", "sink"):
+        browser.wait_text(f"{node(name)} .badge", "Running")
+    assert "3 of 3" in browser.text("#detail dl")
+    assert str(project.root / "dataflow.yml") in browser.text("#detail dl")
+    # From the second snapshot on there is a line to draw.
+    browser.wait_js("document.querySelector('#detail .charts .line').getAttribute('d') !== ''")
+    assert "MiB" in browser.text("#detail .charts .memory .value")
+    drawn = "[...document.querySelectorAll('.graph {}')].map((e) => e.textContent)"
+    assert len(browser.wait_js(drawn.format(".box"))) == 3
+    assert set(browser.js(drawn.format(".edge title"))) == {
+        "dora/timer/millis/20 → source: tick",
+        "source → doubler: number",
+        "doubler → sink: double",
+    }
+    browser.wait_text(".lines", "got [")
+    assert browser.failures() == []
+
+
+def test_logs_of_one_node_follow(browser: Browser, cell: Cell, project: Project) -> None:
+    cell.start(project.three_nodes())
+    browser.wait_text(".lines", "sent 1")
+    browser.wait_js("document.querySelectorAll('.graph .box').length === 3")
+    browser.click(".graph [data-node=sink]")
+    browser.wait_js("document.querySelector('#log-node').value === 'sink'")
+    browser.wait_text(".lines", "got [")
+    last = "document.querySelector('.lines p:last-of-type .text').textContent"
+    before = browser.js(last)
+    browser.wait_js(f"{last} !== {json.dumps(before)}")
+    assert "sent" not in browser.text(".lines")
+    at_end = "((e) => e.scrollHeight - e.clientHeight - e.scrollTop < 30)"
+    assert browser.wait_js(f"{at_end}(document.querySelector('.lines'))")
+    # Who scrolls up is left in peace.
+    browser.js("document.querySelector('.lines').scrollTop = 0")
+    browser.wait_js("!document.querySelector('#log-follow').checked")
+    assert browser.failures() == []
+
+
+@pytest.mark.warns("server disconnected", "node_failure", "is being restarted")
+def test_buttons(browser: Browser, cell: Cell, project: Project) -> None:
+    cell.start(project.three_nodes())
+    browser.wait_text(f"{node('sink')} .badge", "Running")
+    (pid,) = cell.pids("node-sink")
+    # No means no.
+    browser.click(f"{node('sink')} .buttons button")
+    browser.wait_text("#question", f"Restart node sink of {cell.name}?")
+    browser.press("Escape")
+    browser.wait_js("!document.querySelector('#confirm').open")
+    browser.click(f"{node('sink')} .buttons button")
+    browser.wait_js("document.querySelector('#confirm').open")
+    browser.picture("confirm")
+    browser.click("#confirmed")
+    browser.wait_text("#said", "Node sink")
+    assert cell.pids("node-sink") != [pid] or wait_for(
+        "the node is another one", lambda: cell.pids("node-sink") not in ([pid], [])
+    )
+    since = cell.show("InvocationID")
+    browser.wait_js("!document.querySelector('#detail [data-action=restart]').disabled")
+    browser.click("#detail [data-action=restart]")
+    browser.click("#confirmed")
+    browser.wait_text("#said", "Dataflow restarted")
+    assert cell.show("InvocationID") != since
+    browser.wait_js("!document.querySelector('#detail [data-action=stop]').disabled")
+    browser.click("#detail [data-action=stop]")
+    browser.wait_text("#question", f"Stop {cell.name}?")
+    browser.click("#confirmed")
+    browser.wait_text("#said", "Dataflow stopped")
+    assert cell.is_gone
+    asked = [one["MESSAGE"] for one in cell_notes(cell)]
+    assert any("status page" in text for text in asked), asked
+    browser.wait_text("#none", "No dataflow is running")
+    assert browser.failures() == []
+
+
+def cell_notes(cell: Cell) -> list[dict[str, str]]:
+    """Who has asked for the end of the dataflow."""
+    command = (
+        "journalctl",
+        "-o",
+        "json",
+        f"DORA_DATAFLOW_NAME={cell.name}",
+        "DORA_EVENT=stop-asked",
+    )
+    return [json.loads(line) for line in run(*command).stdout.splitlines()]
+
+
+def test_by_keyboard(browser: Browser, cell: Cell, project: Project) -> None:
+    cell.start(project.three_nodes())
+    browser.wait_text(f"{node('sink')} .badge", "Running")
+    browser.wait_js("document.querySelectorAll('.graph .box').length === 3")
+    focused = (
+        "document.activeElement.getAttribute('aria-label') ?? document.activeElement.textContent"
+    )
+    seen = []
+    for _ in range(40):
+        browser.press("Tab")
+        seen.append(browser.js(focused))
+        if seen[-1] == "Stop sink":
+            break
+    assert {"Restart", "Stop", "source", "Stop source", "Stop sink"} <= set(seen), seen
+    assert any("sink, running" in one for one in seen), seen
+    browser.press("Enter", "\r")
+    browser.wait_text("#question", f"Stop node sink of {cell.name}?")
+    assert browser.js("document.activeElement.textContent") == "Cancel"
+    browser.press("Enter", "\r")
+    browser.wait_js("!document.querySelector('#confirm').open")
+    assert len(cell.pids("node-sink")) == 1
+
+
+def test_what_nodes_print_is_text(browser: Browser, cell: Cell, project: Project) -> None:
+    flow = project.three_nodes()
+    project.write("sink.py", HOSTILE)
+    cell.start(flow)
+    browser.wait_text(".lines", "<img src=x onerror=alert(1)>red &amp; \ufffdbell")
+    assert browser.js("document.querySelectorAll('.lines img').length") == 0
+    assert browser.failures() == []
+
+
+def test_a_flood_is_bounded(browser: Browser, cell: Cell, project: Project) -> None:
+    flow = project.three_nodes()
+    project.write("sink.py", FLOOD)
+    cell.start(flow)
+    browser.wait_text(".lines", "left out here", 60)
+    browser.wait_js("document.querySelectorAll('.lines p').length === 1000", 60)
+    # And the numbers go on meanwhile.
+    before = browser.text("#detail dl")
+    wait_for("the page lives", lambda: browser.text("#detail dl") != before)
+    assert browser.js("document.querySelectorAll('.lines p').length") == 1000
+
+
+@pytest.mark.warns("Failed with result", "code=killed")
+def test_disconnected_and_back(
+    browser: Browser, front: Front, cell: Cell, project: Project
+) -> None:
+    cell.start(project.three_nodes())
+    browser.wait_text("#link", "live")
+    front.systemctl("kill", "--signal=KILL", SERVICE_UNIT)
+    browser.wait_text("#link", "disconnected")
+    browser.wait_text("#link", "live")
+    browser.wait_text(".lines", "got [")
+    front.systemctl("stop", SOCKET_UNIT)
+    browser.wait_text("#link", "disconnected")
+    assert browser.js("document.querySelector('#detail [data-action=stop]').disabled")
+    front.systemctl("start", SOCKET_UNIT)
+    browser.click("#again")
+    browser.wait_text("#link", "live")
+
+
+CONTRAST = """
+(() => {
+  const parse = (text) => text.match(/[\\d.]+/g).map(Number);
+  const light = ([r, g, b]) => [r, g, b]
+    .map((c) => c / 255).map((c) => c <= .03928 ? c / 12.92 : ((c + .055) / 1.055) ** 2.4)
+    .reduce((sum, c, at) => sum + c * [.2126, .7152, .0722][at], 0);
+  const ground = (e) => {
+    for (; e; e = e.parentElement) {
+      const color = parse(getComputedStyle(e).backgroundColor);
+      if (color.length === 3 || color[3] > 0) return color;
+    }
+    return [255, 255, 255];
+  };
+  const bad = [];
+  for (const e of document.querySelectorAll('body *')) {
+    const own = [...e.childNodes].some((n) => n.nodeType === 3 && n.data.trim());
+    if (!own || !e.checkVisibility() || e.closest('svg, :disabled, option')) continue;
+    const [a, b] = [light(parse(getComputedStyle(e).color)), light(ground(e))];
+    const ratio = (Math.max(a, b) + .05) / (Math.min(a, b) + .05);
+    if (ratio < 4.5) bad.push([e.className, e.textContent.slice(0, 30), ratio.toFixed(2)]);
+  }
+  return bad;
+})()
+"""
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_looks(scheme: str, browser: Browser, cell: Cell, project: Project) -> None:
+    cell.start(project.three_nodes())
+    browser.prefer(scheme)
+    browser.wait_text(".lines", "got [")
+    browser.wait_js("document.querySelectorAll('.graph .box').length === 3")
+    assert browser.js(CONTRAST) == []
+    browser.picture(f"desktop-{scheme}", is_whole=True)
+    browser.resize(360, 740, is_phone=True)
+    wait = "document.documentElement.scrollWidth"
+    assert browser.wait_js(wait) == 360
+    assert browser.js(CONTRAST) == []
+    browser.picture(f"phone-{scheme}", is_whole=True)
+    # The way back to the list, and no sideways scrolling there.
+    browser.click(".return")
+    browser.wait_js("document.body.dataset.view === 'list'")
+    assert browser.js(wait) == 360
+    browser.picture(f"phone-list-{scheme}")
+    named = "[...document.querySelectorAll('button, select, input, a')]"
+    nameless = f"{named}.filter((e) => e.checkVisibility()).filter((e) =>"
+    nameless += " !(e.textContent.trim() || e.ariaLabel || e.labels?.length)).length"
+    assert browser.js(nameless) == 0
+    assert browser.failures() == []
+
+
+LAYOUT = """
+(async () => {
+  const { layOut } = await import("/page/layers.js");
+  const wrong = [];
+  let seed = 7;
+  const random = (below) => (seed = (seed * 48271) % 2147483647) % below;
+  for (let round = 0; round < 200; round += 1) {
+    const count = 1 + random(12);
+    const nodes = Array.from({ length: count }, (_, at) =>
+      ({ id: `n${at}`, length: 60 + random(90), breadth: 40 + random(30) }));
+    const edges = Array.from({ length: random(20) }, () =>
+      ({ from: `n${random(count)}`, to: `n${random(count + 1)}` }));
+    const plan = layOut(nodes, edges, 50);
+    const places = [...plan.places.values()];
+    for (const a of places) {
+      if (!(a.along >= 0 && a.across >= 0 && a.along <= plan.length && a.across <= plan.breadth)) {
+        wrong.push([round, a.id, "outside"]);
+      }
+      for (const b of places) {
+        if (a.id < b.id && Math.abs(a.along - b.along) < (a.length + b.length) / 2 - 1 &&
+            Math.abs(a.across - b.across) < (a.breadth + b.breadth) / 2 - 1) {
+          wrong.push([round, a.id, b.id]);
+        }
+      }
+    }
+    for (const [edge, way] of plan.ways) {
+      if (way[0].id !== edge.from || way.at(-1).id !== edge.to) wrong.push([round, edge]);
+      const steps = way.slice(1).map((place, at) => place.layer - way[at].layer);
+      if (steps.some((step) => step !== (plan.back.has(edge) ? -1 : 1))) wrong.push([round, "way"]);
+    }
+  }
+  return wrong;
+})()
+"""
+
+
+def test_no_two_nodes_in_one_place(browser: Browser) -> None:
+    """Two hundred graphs, with circles, loops and edges from nowhere."""
+    assert browser.js(LAYOUT) == []
