@@ -145,7 +145,7 @@ class Gateway:
         ends = (connection.remote_address, connection.local_address)
         if all(ends):
             peer, own = (tuple(end[:2]) for end in ends)
-            uid = await asyncio.to_thread(peer_uid, peer, own)
+            uid = peer_uid(peer, own)
             caller = Caller(uid, caller.hosts, caller.origins, caller.authorizations)
         return refuse_user(caller, os.getuid(), self._token)
 

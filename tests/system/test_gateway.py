@@ -10,6 +10,8 @@ import pytest
 from dora_systemd.errors import ExitCode
 from dora_systemd.gatewayplace import SERVICE_UNIT, SOCKET_UNIT
 from tests.system.cells import Cell, Project, run, wait_for
+from tests.system.gatewayfuzz import attack
+from tests.system.gatewayload import ask_steadily, read_use
 from tests.system.gateways import Front
 
 # Speaks as several users, and opens the port.
@@ -169,3 +171,50 @@ def test_it_rests_and_comes_back(front: Front) -> None:
 
 def _age(pid: int) -> float:
     return float(run("ps", "-o", "etimes=", "-p", str(pid)).stdout)
+
+
+def test_a_hundred_requests_a_second(front: Front) -> None:
+    """A short version; gatewayload runs for as long as one likes."""
+    front.up()
+    paths = ("/health", "/nothing")
+    ask_steadily(front.port, paths, 2)  # threads are made, modules loaded
+    pid, before = front.pid, read_use(front.pid)
+    load = ask_steadily(front.port, paths, 5)
+    assert load.answers == {"/health 200": 250, "/nothing 404": 250}
+    wait_for("connections end", lambda: read_use(pid).descriptors <= before.descriptors)
+    after = read_use(pid)
+    assert front.pid == pid
+    assert after.memory - before.memory < 1024 * 1024
+    assert after.threads == before.threads
+    assert "Traceback" not in front.journal()
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_nonsense(seed: int, front: Front) -> None:
+    front.up()
+    attack(front.port, 0, 50)
+    pid, before = front.pid, read_use(front.pid)
+    answers = attack(front.port, seed, 500)
+    assert answers["http 403"]
+    assert answers["http closed"]
+    assert not [one for one in answers if one.endswith(("500", "503", "504"))]
+    assert front.pid == pid
+    assert front.get("/health") == (200, "ok")
+    wait_for("connections end", lambda: read_use(pid).descriptors <= before.descriptors)
+    assert read_use(pid).memory - before.memory < 4 * 1024 * 1024
+    said = front.journal().splitlines()
+    assert not [line for line in said if "Traceback" in line or line.startswith("cannot ")]
+
+
+def test_many_who_say_nothing(front: Front) -> None:
+    """More connections than there may be: the gateway goes on, and is there when they have gone."""
+    front.up()
+    pid = front.pid
+    many = [socket.create_connection(("127.0.0.1", front.port)) for _ in range(400)]
+    wait_for("too many", lambda: read_use(pid).descriptors > 200)
+    for one in many:
+        one.close()
+    wait_for("an answer", lambda: front.get("/health").status == 200)
+    wait_for("connections end", lambda: read_use(pid).descriptors < 30)
+    assert front.pid == pid
+    assert "Traceback" not in front.journal()
