@@ -82,7 +82,10 @@ def exchange(port: int, pieces: Sequence[bytes], what: str = "") -> bytes:
         socket.create_connection(("127.0.0.1", port), timeout=PATIENCE) as connection,
         suppress(ConnectionError),  # it did not want to read all of that
     ):
-        for piece in pieces:
+        connection.sendall(pieces[0])
+        if b"Sec-WebSocket-Key" in pieces[0]:
+            received += connection.recv(65536)
+        for piece in pieces[1:]:
             connection.sendall(piece)
         connection.settimeout(_PAUSE)
         while time.monotonic() < deadline:
@@ -99,9 +102,9 @@ def exchange(port: int, pieces: Sequence[bytes], what: str = "") -> bytes:
 
 def _request(chance: random.Random, port: int) -> list[bytes]:
     shape = chance.random()
-    if shape < 0.15:
+    if shape < 0.1:
         return [chance.randbytes(chance.choice((1, 10, 100, 5000, 40000)))]
-    text = _damaged(chance, _head(chance, port)) if shape < 0.6 else _odd(chance, port)
+    text = _damaged(chance, _head(chance, port)) if shape < 0.4 else _odd(chance, port)
     cut = chance.randrange(len(text) + 1) if text and chance.random() < 0.2 else len(text)
     middle = chance.randrange(cut + 1)
     return [text[:middle], text[middle:cut]]
