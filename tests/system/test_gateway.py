@@ -191,12 +191,11 @@ def test_a_hundred_requests_a_second(front: Front) -> None:
     assert "Traceback" not in front.journal()
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_nonsense(seed: int, front: Front) -> None:
+def test_nonsense(front: Front) -> None:
     front.up()
     attack(front.port, 0, 300)  # the largest frames set what is kept
     pid, before = front.pid, read_use(front.pid)
-    answers = attack(front.port, seed, 300)
+    answers = attack(front.port, 1, 300)
     assert answers["http 403"]
     assert answers["http closed"]
     assert not [one for one in answers if one.endswith(("500", "503", "504"))]
