@@ -21,7 +21,7 @@ from dora_systemd.managersettings import read_settings
 from dora_systemd.names import name_from_path, parse_name, unit_name
 from dora_systemd.options import RunnerOptions
 from dora_systemd.preparation import Prepared, prepare, refusal_of_dora
-from dora_systemd.process import Account, dora_version, find_dora
+from dora_systemd.process import Account, Beside, dora_version, find_dora
 from dora_systemd.reloadplan import check_reload_nodes, hot_reload
 from dora_systemd.restartplan import node_policies, restart_policy
 from dora_systemd.restartsettings import START_TIMEOUT
@@ -139,23 +139,27 @@ def find_engine(
 
 
 def _check_plan(plan: Plan) -> Prepared:
-    options = plan.options
-    check_access(
-        plan.user,
-        [options.dataflow, __file__],
-        [options.working_directory, options.dora, sys.executable],
-    )
+    """Three programs are asked, and take longer than all else here: so all at the same time.
+
+    Whose answer comes first in the code is whose refusal counts.
+    """
+    options, account = plan.options, account_of(plan.user)
+    places = [options.working_directory, options.dora, sys.executable]
+    access = Beside(lambda: check_access(plan.user, [options.dataflow, __file__], places))
+    version = Beside(lambda: dora_version(options.dora, account))
+    refusal = Beside(lambda: refusal_of_dora(options, plan.environment, account))
+    preparation = Beside(lambda: prepare(options, plan.environment))
+    access.result()
     check_credentials(plan.scope, credential_files(plan.settings))
-    account = account_of(plan.user)
-    dora_version(options.dora, account)
-    if reason := refusal_of_dora(options, plan.environment, account):
+    version.result()
+    if reason := refusal.result():
         raise DoraSystemdError(
             f"cannot use {options.dataflow}: {reason}",
             f"see {options.dora} validate {options.dataflow}",
             ExitCode.BAD_INPUT,
         )
     # dora validate accepts paths that are not there, and other things that no node can run with.
-    prepared = prepare(options, plan.environment)
+    prepared = preparation.result()
     ids = [node.id for node in prepared.dataflow.nodes]
     check_rates(options.log_rates, ids)
     check_reload_nodes(options.reload, ids)

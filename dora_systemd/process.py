@@ -8,12 +8,16 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Generic, TypeVar, cast
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
+
+T = TypeVar("T")
 
 OLDEST_DORA = (1, 0)
 """Before 1.0 the control protocol was another one."""
@@ -80,6 +84,33 @@ def run_command(
                 os.killpg(child.pid, signal.SIGKILL)
             raise
         return Completed(child.wait(), *(one.decode(errors="replace") for one in streams))
+
+
+class Beside(Generic[T]):
+    """A call in a thread of its own, for those that wait for children.
+
+    No daemon thread: the child of one that nobody waits for any more is still waited for.
+    """
+
+    def __init__(self, call: Callable[[], T]) -> None:
+        self._call = call
+        self._result: T | None = None
+        self._error: Exception | None = None
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            self._result = self._call()
+        except Exception as error:
+            self._error = error
+
+    def result(self) -> T:
+        """What the call has returned, once it has. Raises what the call raised."""
+        self._thread.join()
+        if self._error is not None:
+            raise self._error
+        return cast(T, self._result)
 
 
 def run_dora(

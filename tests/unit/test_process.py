@@ -1,6 +1,7 @@
 """Children: their output, their time limit, and the dora command."""
 
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -103,3 +104,15 @@ def test_version(tmp_path: Path) -> None:
 def test_any_text_has_a_version_or_none(text: str) -> None:
     version = process.parse_dora_version(text)
     assert version is None or process.version_numbers(version)
+
+
+def test_calls_beside_each_other_take_the_time_of_one() -> None:
+    meeting = threading.Barrier(2, timeout=30)
+    calls = [process.Beside(meeting.wait) for _ in range(2)]
+    assert {call.result() for call in calls} == {0, 1}
+
+
+def test_call_beside_raises_where_its_result_is_wanted() -> None:
+    call = process.Beside(lambda: process.run_command(["/nowhere/x"], 1))
+    with pytest.raises(DoraSystemdError, match="cannot run /nowhere/x"):
+        call.result()
