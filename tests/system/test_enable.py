@@ -188,6 +188,7 @@ def leaving() -> Iterator[tuple[str, ...]]:
     runtime = "XDG_RUNTIME_DIR=/run/user/1001"
     session = (
         "systemd-run",
+        "--collect",
         "--quiet",
         "--pipe",
         "--wait",
