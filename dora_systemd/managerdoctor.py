@@ -12,6 +12,7 @@ from dora_systemd import cgroup, journalread
 from dora_systemd.busprotocol import Manager
 from dora_systemd.diagnosis import (
     DORA_PORTS,
+    Process,
     judge_controllers,
     judge_port,
     judge_processes,
@@ -24,6 +25,7 @@ from dora_systemd.findings import Finding, State
 from dora_systemd.manageraccount import DEFAULT_USER
 from dora_systemd.managerenable import boot_target
 from dora_systemd.managerenabled import enabled_units, own_directories
+from dora_systemd.managergateway import read_gateway
 from dora_systemd.managerlinger import is_lingering, linger_command
 from dora_systemd.managersettings import settings_files
 from dora_systemd.names import unit_name
@@ -93,6 +95,20 @@ def _boot(manager: Manager, scope: Scope) -> Iterator[Finding]:
     directory = own_directories(manager, scope)[0]
     for unit in sorted(enabled_units(manager, scope)):
         yield from _enabled(directory / unit)
+
+
+def _ports(manager: Manager, scope: Scope) -> Iterator[Finding]:
+    del scope
+    gateway = read_gateway(manager)
+    processes: list[Process] = []
+    for port in DORA_PORTS:
+        if gateway.is_up and gateway.port == port:
+            yield Finding(f"port {port}", State.OK, "the gateway to all dataflows, see doractl env")
+            continue
+        sockets = listening_sockets(port)
+        owners = socket_owners(sockets) if sockets else frozenset()
+        processes = processes or (read_processes() if owners else [])
+        yield judge_port(port, [one for one in processes if one.pid in owners], bool(sockets))
 
 
 def _units(manager: Manager, scope: Scope) -> Iterator[Finding]:
@@ -212,13 +228,8 @@ def _settings(scope: Scope) -> Iterator[Finding]:
 
 def _processes(scope: Scope) -> Iterator[Finding]:
     del scope
-    processes = read_processes()
-    for port in DORA_PORTS:
-        sockets = listening_sockets(port)
-        owners = socket_owners(sockets) if sockets else frozenset()
-        yield judge_port(port, [one for one in processes if one.pid in owners], bool(sockets))
-    yield from judge_processes(processes)
+    yield from judge_processes(read_processes())
 
 
-_WITH_SYSTEMD = (_controllers, _linger, _boot, _units, _leftovers)
+_WITH_SYSTEMD = (_controllers, _linger, _boot, _units, _leftovers, _ports)
 _WITHOUT = (_journal, _dora, _user, _settings, _processes)

@@ -6,6 +6,9 @@ import socket
 from collections.abc import Iterator
 
 import pytest
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+from websockets.typing import Origin
 
 from dora_systemd.errors import ExitCode
 from dora_systemd.gatewayplace import SERVICE_UNIT, SOCKET_UNIT
@@ -161,12 +164,25 @@ def test_it_rests_and_comes_back(front: Front) -> None:
         "0\n",
     )
     assert front.get("/health").status == 200
-    # A connection keeps it, for as long as it is open.
-    with socket.create_connection(("127.0.0.1", front.port)):
+    # What is open keeps it.
+    with connect(f"ws://127.0.0.1:{front.port}/api/live") as page:
         pid = front.pid
-        wait_for("time passes", lambda: front.get("/health").status == 200 and _age(pid) > 3)
+        page.recv()
+        wait_for("time passes", lambda: page.recv() and _age(pid) > 4)
         assert front.pid == pid
     front.wait_resting()
+
+
+def test_a_page_of_another_origin(front: Front) -> None:
+    """WebSockets are not covered by what browsers call the same origin policy."""
+    front.up()
+    for path in ("/api/live", "/api/control"):
+        url = f"ws://localhost:{front.port}{path}"
+        with pytest.raises(InvalidStatus) as caught:
+            connect(url, origin=Origin("http://evil.example"))
+        assert caught.value.response.status_code == 403
+        with connect(url, origin=Origin(f"http://localhost:{front.port}")):
+            pass
 
 
 def _age(pid: int) -> float:

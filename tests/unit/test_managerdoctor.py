@@ -8,6 +8,7 @@ import pytest
 from dora_systemd import cgroup, journalread, managerdoctor
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.findings import Finding, State
+from dora_systemd.gatewayplace import SOCKET_UNIT
 from dora_systemd.managerdoctor import examine
 from dora_systemd.process import Completed
 from dora_systemd.scope import Scope
@@ -55,6 +56,18 @@ def test_all_is_well(manager: FakeManager, scope: Scope) -> None:
         *("port 6013", "port 53290", "bare dora"),
     }
     assert not any(one.remedy for one in findings)
+
+
+def test_its_own_gateway_is_no_stranger(
+    manager: FakeManager, scope: Scope, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(managerdoctor, "listening_sockets", lambda _port: frozenset({"7"}))
+    monkeypatch.setattr(managerdoctor, "socket_owners", lambda _sockets: frozenset())
+    assert {"port 6013", "port 53290"} <= found(manager, scope).keys()
+    facts = {"LoadState": "loaded", "ActiveState": "active"}
+    manager.units[SOCKET_UNIT] = {**facts, "Listen": [["Stream", "127.0.0.1:53290"]]}
+    assert "port 53290" not in found(manager, scope)
+    assert "port 6013" in found(manager, scope)
 
 
 def test_without_systemd(manager: FakeManager, scope: Scope) -> None:
