@@ -189,6 +189,14 @@ def parse_results(reply: Reply) -> dict[str, str] | None:
     return {node: _failure(verdict) for node, verdict in sorted(nodes.items())}
 
 
+def parse_spawn_failure(reply: Reply) -> str:
+    """The reply to WaitForSpawn: "" or why a node could not be executed.
+
+    A run that dora does not know any more was executed and has ended: its life events tell how.
+    """
+    return "" if _ENDED_ALREADY.match(reply.error) else first_line(reply.error)
+
+
 def _mapping(value: Any) -> dict[str, Any]:
     return value if isinstance(value, dict) else {}
 
@@ -228,6 +236,7 @@ def first_line(text: str) -> str:
     return " ".join(head.split())
 
 
+_ENDED_ALREADY = re.compile(r"unknown dataflow\b")
 _SPAWNED = re.compile(r"spawned node with pid (\d+)")
 _EXITED = re.compile(
     r"handling node stop with exit status (\w+)(?:\((-?\d+)\))? \(restart: (true|false)"

@@ -135,8 +135,9 @@ class Dialogue:
     async def _ask_spawn(self) -> None:
         params = protocol.wait_spawn_params(self._pump.cell.run)
         reply = await self._engine.ask_apart(params, _LONG_SECONDS)
-        if reply.error:
-            self._pump.push(life.Refused(now_us(), protocol.first_line(reply.error)))
+        failure = protocol.parse_spawn_failure(reply)
+        if failure:
+            self._pump.push(life.Refused(now_us(), failure))
 
     async def _ask_result(self) -> None:
         while True:

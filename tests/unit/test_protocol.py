@@ -151,3 +151,17 @@ def test_no_reply_breaks_the_results(frame: object) -> None:
 )
 def test_heartbeat(result: object, age: int) -> None:
     assert protocol.parse_heartbeat(Reply("1", result, "")) == age
+
+
+@pytest.mark.parametrize(
+    ("error", "failure"),
+    [
+        ("", ""),
+        # On a slow machine a short run is over before dora is asked.
+        (f"unknown dataflow {RUN}", ""),
+        (f"unknown dataflow {RUN}\n\nLocation:\n    coordinator.rs:1", ""),
+        ("dataflow failed to start:\n  a: failed", "dataflow failed to start: a: failed"),
+    ],
+)
+def test_spawn_failures(error: str, failure: str) -> None:
+    assert protocol.parse_spawn_failure(Reply("1", None, error)) == failure
