@@ -6,6 +6,7 @@ and what would go around the supervisor is refused.
 """
 
 import asyncio
+import logging
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any
 
@@ -29,21 +30,44 @@ from dora_systemd.gatewayrequest import Request as HttpRequest
 from dora_systemd.gatewayrequest import Socket
 from dora_systemd.scope import Scope
 
+log = logging.getLogger(__name__)
+
 Handler = Callable[[Talk, Request], Awaitable[Result]]
 
+Task = asyncio.Task[None]
+
 _LOOPBACK = "127.0.0.1"
+_AT_ONCE = 8
+"""Requests of one connection that are answered at the same time."""
+_LONGEST = 500
 _BY_FILE = "change its file, then: doractl reload NAME"
 _OWN = "doractl dora NAME -- {} asks the coordinator of one dataflow"
 
 
 async def serve_control(socket: Socket, request: HttpRequest) -> None:
-    """Answer one dora command, request by request, until it goes."""
-    talk = Talk(socket, request.scope)
+    """Answer one dora command until it goes; what it has asked for then is still done.
+
+    One request does not wait for the one before it, which a coordinator's would: a start may take
+    long, and that nobody waits for it any more is seen by reading on.
+    """
+    talk, pending = Talk(socket, request.scope), set[Task]()
     try:
         async for message in socket:
-            await _answer(talk, message)
+            task = asyncio.ensure_future(_answer(talk, message))
+            pending.add(task)
+            task.add_done_callback(_forget)
+            task.add_done_callback(pending.discard)
+            if len(pending) >= _AT_ONCE:
+                await asyncio.wait(pending, return_when=asyncio.FIRST_COMPLETED)
     finally:
         await talk.end()
+        await asyncio.gather(*pending, return_exceptions=True)
+
+
+def _forget(task: Task) -> None:
+    """There is nobody any more to whom the error, of the connection, could be told."""
+    if not task.cancelled():
+        task.exception()
 
 
 async def _answer(talk: Talk, message: str | bytes) -> None:
@@ -69,6 +93,10 @@ async def _result(talk: Talk, request: Request) -> Result:
         return await handler(talk, request)
     except DoraSystemdError as error:
         return error_result(error)
+    except Exception as error:
+        # What is sent can be wrong in more ways than are checked; once gone, nobody gets this.
+        log.info("cannot answer %s: %s: %s", request.name, type(error).__name__, error)
+        return error_result(DoraSystemdError(f"cannot do {request.name}: {error}"[:_LONGEST]))
 
 
 async def _hello(_talk: Talk, request: Request) -> Result:

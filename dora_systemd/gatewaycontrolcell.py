@@ -23,8 +23,6 @@ from dora_systemd.managernode import require_running, restart_node
 from dora_systemd.protocol import Params, Reply
 from dora_systemd.scope import Scope
 
-_MOST_TOPICS = 16
-"""Subscriptions of one connection, as dora's own coordinator has it."""
 _GOING_AWAY = 1001
 
 
@@ -67,18 +65,16 @@ async def _describe_running(scope: Scope, uuid: str) -> dict[str, Any]:
 
 async def subscribe_topics(talk: Talk, request: Request) -> Result:
     """TopicSubscribe, on a connection to the dataflow of its own. Raises DoraSystemdError."""
-    if len(talk.topics) >= _MOST_TOPICS:
-        raise DoraSystemdError(f"cannot subscribe: {_MOST_TOPICS} at a time are enough")
     cell, run = await asyncio.to_thread(_running, talk.scope, request.dataflow)
     connection = await _open(talk.scope, cell)
     try:
         reply = await connection.request(renamed(request.params, cell.uuid, run))
         ident = _subscription(reply)
+        talk.after_reply(_pass_frames(talk, ident, connection))
     except BaseException:
         await connection.close()
         raise
     talk.topics[ident] = connection
-    talk.after_reply(_pass_frames(talk, ident, connection))
     return _answer(reply, run, cell.uuid)
 
 

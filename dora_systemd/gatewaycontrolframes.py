@@ -93,6 +93,8 @@ def parse_request(text: str | bytes) -> Request | Malformed:
         return Malformed(NO_ID, "cannot read a binary frame: requests are text")
     try:
         frame = json.loads(text)
+        # Half a surrogate pair is no text to anybody else: a coordinator would not answer at all.
+        json.dumps(frame, ensure_ascii=False).encode()
     except (ValueError, RecursionError) as error:
         return Malformed(NO_ID, f"cannot read the request: {error}"[:300])
     if not isinstance(frame, dict) or not isinstance(frame.get("id"), str):

@@ -17,7 +17,7 @@ from dora_systemd.files import parse_yaml, read_text, read_yaml
 from dora_systemd.gatewaycontrolframes import Request
 from dora_systemd.gatewaycontrolmatch import could_be, sent_flags
 from dora_systemd.gatewaycontrolstate import spawned
-from dora_systemd.gatewaycontroltalk import Talk
+from dora_systemd.gatewaycontroltalk import Result, Talk
 from dora_systemd.managerlaunch import claim, start_claim
 from dora_systemd.managerplan import StartRequest, find_engine
 from dora_systemd.process import run_dora
@@ -44,13 +44,13 @@ async def start(talk: Talk, request: Request) -> dict[str, Any]:
     return {"DataflowStartTriggered": {"uuid": uuid}}
 
 
-async def wait_for_spawn(talk: Talk, request: Request) -> dict[str, Any]:
+async def wait_for_spawn(talk: Talk, request: Request) -> Result:
     """WaitForSpawn: answered when all nodes are ready. Raises DoraSystemdError."""
-    while True:
-        answer = await asyncio.to_thread(spawned, talk.scope, request.dataflow)
-        if answer is not None:
-            return answer
+    while (answer := await asyncio.to_thread(spawned, talk.scope, request.dataflow)) is None:
+        if talk.is_over:
+            return None
         await asyncio.sleep(_POLL_SECONDS)
+    return answer
 
 
 def _start(scope: Scope, request: Request) -> str:

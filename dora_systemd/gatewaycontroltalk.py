@@ -18,6 +18,9 @@ Place = tuple[int, int]
 
 Task = Coroutine[Any, Any, None]
 
+_MOST_TASKS = 16
+"""As dora's own coordinator has it for topics; each log that is followed is a journalctl."""
+
 
 @dataclass
 class Talk:
@@ -26,6 +29,7 @@ class Talk:
     started: by UUID, when this connection has started a dataflow, CLOCK_REALTIME µs.
     places: by UUID and node, up to where its log has been sent.
     topics: by id of the subscription, the connection that they come from.
+    is_over: the other side has gone.
     """
 
     socket: Socket
@@ -33,11 +37,20 @@ class Talk:
     started: dict[str, int] = field(default_factory=dict)
     places: dict[str, dict[str, Place]] = field(default_factory=dict)
     topics: dict[str, Connection] = field(default_factory=dict)
+    is_over: bool = False
     _next: list[Task] = field(default_factory=list)
     _running: set["asyncio.Task[None]"] = field(default_factory=set)
 
     def after_reply(self, task: Task) -> None:
-        """Run `task` once the request at hand has been answered, as long as there is somebody."""
+        """Run `task` once the request at hand has been answered, as long as there is somebody.
+
+        Raises DoraSystemdError for one too many.
+        """
+        if len(self._running) >= _MOST_TASKS:
+            task.close()
+            raise DoraSystemdError(
+                f"cannot follow more: {_MOST_TASKS} on one connection are enough"
+            )
         self._next.append(task)
 
     def begin_tasks(self) -> None:
@@ -50,6 +63,7 @@ class Talk:
 
     async def end(self) -> None:
         """The other side has gone: end all that was done for it."""
+        self.is_over = True
         for one in self._next:
             one.close()
         tasks = list(self._running)

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -32,6 +33,15 @@ FINISHER = """
 from dora import Node
 node = Node()
 print("done", flush=True)
+"""
+HANGER = """
+import signal, time
+from dora import Node
+signal.signal(signal.SIGTERM, signal.SIG_IGN)
+node = Node()
+print("hanging", flush=True)
+while True:
+    time.sleep(1)
 """
 TALKER = """
 from dora import Node
@@ -273,6 +283,42 @@ def test_attached(dora: Dora, cell: Cell, places: Sequence[Project]) -> None:
         attached.send_signal(signal.SIGINT)
         assert attached.wait(30) == 0
     assert cell.is_gone
+
+
+def hanging(place: Project) -> str:
+    """A dataflow that does not end by itself, nor within the 15 s that it is given."""
+    place.write("hanger.py", HANGER)
+    place.write("hanger.systemd.yml", (place.root / "dataflow.systemd.yml").read_text())
+    return str(place.write("hanger.yml", "nodes: [{id: only, path: hanger.py}]\n"))
+
+
+@pytest.mark.warns("was killed due to not stopping", "killed on drop", "error: Signal(9)")
+def test_attached_and_impatient(dora: Dora, cell: Cell, places: Sequence[Project]) -> None:
+    """At the second Ctrl+C the command goes, without a word to anybody; the stop goes on."""
+    flow = hanging(places[0])
+    settings = places[0].root / "hanger.systemd.yml"
+    settings.write_text(settings.read_text() + "grace_duration: 2s\n")
+    with dora.running("start", flow, "--name", cell.name, "--attach") as attached:
+        read_until(attached, "all nodes are ready")
+        attached.send_signal(signal.SIGINT)
+        wait_for("it stops", lambda: cell.show("ActiveState") == "deactivating")
+        attached.send_signal(signal.SIGINT)
+        assert attached.wait(5) == 1
+    wait_for("it is gone", lambda: cell.is_gone)
+
+
+@pytest.mark.warns("Killing process", "Main process exited", "Failed with", "by signal SIGKILL")
+def test_by_force(dora: Dora, cell: Cell, places: Sequence[Project]) -> None:
+    flow = hanging(places[0])
+    for words in (("--force",), ("--grace-duration", "1s")):
+        dora("start", flow, "--name", cell.name, "--detach")
+        began = time.monotonic()
+        dora("restart", cell.name, *words)
+        done = dora("stop", cell.name, *words, check=False)
+        assert time.monotonic() - began < 14
+        assert cell.is_gone
+        # As with dora itself, one whose patience was at an end is told so.
+        assert done.returncode == ("--force" not in words), done
 
 
 @pytest.mark.usefixtures("cell")

@@ -90,6 +90,7 @@ def test_requests(params: Any, name: str, body: dict[str, str]) -> None:
         frame({}),
         frame({"Stop": {}, "List": {}}),
         frame({"Stop": "now"}),
+        frame({"Stop": {"name": "\ud800"}}),
         "[" * 100_000,
     ],
 )
