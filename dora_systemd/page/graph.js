@@ -89,8 +89,10 @@ export class Graph {
     const labels = [];
     for (const [edge, way] of plan.ways) {
       const isBack = plan.back.has(edge);
-      const points = isBack && way.length === 2 ? bent(way, at, isDown) : led(way, at, isDown);
-      arrows.push(svg("path", { d: curve(points, isDown), class: isBack ? "edge back" : "edge",
+      const isBent = isBack && way.length === 2;
+      const points = isBent ? bent(way, at, isDown) : led(way, at, isDown);
+      const d = isBent ? arc(points) : curve(points, isDown);
+      arrows.push(svg("path", { d, class: isBack ? "edge back" : "edge",
         "marker-end": "url(#arrow)" }, svg("title", {}, title(edge))));
       labels.push(edgeLabel(edge, points));
       for (const [x, y] of points) {
@@ -177,6 +179,11 @@ function bent(way, at, isDown) {
   const y = Math.max(from[1] + first.height / 2, to[1] + last.height / 2) + 26;
   return [[from[0], from[1] + first.height / 2], [(from[0] + to[0]) / 2, y],
     [to[0], to[1] + last.height / 2]];
+}
+
+/** One bow through the middle of three points. */
+function arc([[x0, y0], [x1, y1], [x2, y2]]) {
+  return `M${x0} ${y0}Q${2 * x1 - (x0 + x2) / 2} ${2 * y1 - (y0 + y2) / 2} ${x2} ${y2}`;
 }
 
 function curve(points, isDown) {

@@ -36,7 +36,7 @@ class Browser:
         port = wait_for("Chromium", lambda: told.read_text().split() if told.exists() else [])[0]
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list") as answer:
             pages = [one for one in json.load(answer) if one["type"] == "page"]
-        self._link = connect(pages[0]["webSocketDebuggerUrl"], max_size=None)
+        self._link = connect(pages[0]["webSocketDebuggerUrl"], max_size=None, ping_interval=None)
         self._count = 0
         self._events: list[dict[str, Any]] = []
         for part in ("Runtime", "Page", "Network", "Log"):
