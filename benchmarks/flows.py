@@ -6,6 +6,7 @@ is the same in all processes, so nothing has to be asked while the clock runs.
 
 import shutil
 import time
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -54,6 +55,7 @@ class Stamp(NamedTuple):
     at: float
 
 
+@cache
 def install_ours() -> None:
     """As users do: the lab's editable install imports through a finder, and compiles each time."""
     run("pip", "install", "--no-deps", "--no-build-isolation", "--quiet", str(CHECKOUT))
