@@ -425,6 +425,20 @@ def test_killed_while_logs_are_followed(dora: Dora, front: Front, three: list[Ce
     assert sorted(uuids(dora)) == ["one", "three", "two"]
 
 
+def test_one_that_is_enabled(dora: Dora, cell: Cell, places: Sequence[Project]) -> None:
+    """The unit file of one that was disabled while it ran is in the way of the next start."""
+    flow = places[0].root / "dataflow.yml"
+    uuid = json.loads(cell.start(flow, "--enable", "-o", "json").stdout)["uuid"]
+    dora("stop", cell.name)
+    dora("restart", cell.name)
+    assert uuids(dora) == {cell.name: uuid}
+    cell.doractl("disable", cell.name)
+    dora("stop", uuid)
+    dora("start", str(flow), "--name", cell.name, "--detach")
+    assert uuids(dora)[cell.name] != uuid
+    assert cell.show("FragmentPath").startswith("/run/systemd/transient/")
+
+
 def test_nothing_stays_behind(
     dora: Dora, front: Front, cell: Cell, places: Sequence[Project]
 ) -> None:
