@@ -116,8 +116,9 @@ def test_doctor_says_what_it_lacks(user: str) -> None:
 
 
 def test_setup_is_understood() -> None:
-    units = [str(path) for path in Path("/usr/local/lib/systemd/system").glob("dora.*")]
-    assert len(units) == 2
+    units = [str(path) for path in Path("/usr/local/lib/systemd/system").glob("dora*.*")]
+    units = [unit for unit in units if not unit.endswith(".d")]
+    assert len(units) == 4
     assert run("systemd-analyze", "verify", "--man=no", *units).stderr == ""
     assert "dora.target" in run("systemctl", "list-dependencies", "multi-user.target").stdout
     assert pwd.getpwnam("dora").pw_shell == "/usr/sbin/nologin"
@@ -224,3 +225,16 @@ def test_start_and_enable(user: str, flow: Path) -> None:
 def test_setup_is_taken_away() -> None:
     run(f"{VENV}/bin/doractl", "setup", "--remove")
     assert not list(Path("/usr/local").rglob("*dora*"))
+
+
+@pytest.mark.parametrize("user", USERS)
+def test_the_gateway(user: str, flow: Path) -> None:
+    start(user, flow)
+    assert "  ✓ Daemon ready\n" in doractl(user, "up").stdout
+    script = f'eval "$({VENV}/bin/doractl env)"; {VENV}/bin/dora list'
+    assert "robot" in as_user(user, "bash", "-c", script).stdout
+    done = doractl(user, "destroy")
+    assert "  ✓ robot stopped\n" in done.stdout
+    assert done.stdout.endswith("Nothing is left: no process in dora.slice.\n")
+    assert not Path("/run/dora-systemd-gateway").exists()
+    assert not Path("/run/user/1000/dora-systemd-gateway").exists()
