@@ -150,7 +150,9 @@ class Gateway:
         return refuse_user(caller, os.getuid(), self._token)
 
     async def _routed(self, raw: RawRequest) -> Answer | None:
-        path, wants_socket = _path(raw), "websocket" in raw.headers.get("Upgrade", "").lower()
+        # Any header may be there twice, which get() takes for an error.
+        upgrade = ",".join(raw.headers.get_all("Upgrade")).lower()
+        path, wants_socket = _path(raw), "websocket" in upgrade
         if getattr(raw, "method", "GET") != "GET":
             return text_answer(405, "the gateway takes GET only", Allow="GET")
         if path in SOCKETS:

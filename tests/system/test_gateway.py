@@ -106,6 +106,8 @@ def test_other_methods(front: Front) -> None:
     front.up()
     assert front.get("/health", "-X", "DELETE").status in (0, 405)
     assert front.get("/health", "-d", "x").status in (0, 405)
+    twice = ("-H", "Upgrade: x", "-H", "Upgrade: y")
+    assert front.get("/health", *twice).status == 200
     assert front.get("/health").status == 200
 
 
