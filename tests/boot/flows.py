@@ -4,11 +4,18 @@ import json
 from pathlib import Path
 from typing import Any
 
+from tests.deb import packages
 from tests.system.cells import run
 
 NOTES = Path("/var/lib/dora-systemd-boot.json")
-ALICE = ("runuser", "-u", "alice", "--", "env", "XDG_RUNTIME_DIR=/run/user/1000")
-ROOT = ()
+ALICE, ROOT = packages.caller("alice"), packages.caller("root")
+VENV = Path("/opt/boot")
+"""Of the nodes: it has their modules, but no dora command."""
+
+
+def doractl(*words: str) -> str:
+    """What the doractl that is installed says to root."""
+    return run(*ROOT, "doractl", *words).stdout
 
 
 def listed(caller: tuple[str, ...]) -> dict[str, dict[str, Any]]:

@@ -6,16 +6,16 @@ from typing import Any
 
 from dora_systemd.bus import Bus
 from dora_systemd.scope import scope_of
-from tests.boot.flows import ALICE, NOTES, ROOT, listed
+from tests.boot.flows import ALICE, NOTES, ROOT, doractl, listed
 from tests.system.cells import run, wait_for
 
+# Asked often, and much faster than doractl in an emulated machine.
+HERS = ("--user", "--machine=alice@")
 
-def status(caller: tuple[str, ...], name: str) -> str:
-    return str(listed(caller)[name]["status"])
 
-
-def is_running(caller: tuple[str, ...], name: str) -> bool:
-    return status(caller, name) == "Running"
+def is_state(name: str, state: str, *manager: str) -> bool:
+    """Whether systemd says so of a dataflow."""
+    return run("systemctl", *manager, "is-active", f"dora-{name}", check=False).stdout == state
 
 
 def they_are_back() -> None:
@@ -23,11 +23,15 @@ def they_are_back() -> None:
     notes = json.loads(NOTES.read_text())
     active = ("is-active", "multi-user.target")
     wait_for("the boot", lambda: not run("systemctl", *active, check=False).returncode, 240)
-    for caller, name in ((ROOT, "begun"), (ROOT, "running"), (ALICE, "mine")):
-        wait_for(name, partial(is_running, caller, name), 240)
-        assert listed(caller)[name]["uuid"] == notes[name]
-    found = Bus(scope_of(None)).read("dora-begun.service", ["Environment"])["Environment"]
-    assert "A=x $B %h" in found
+    for caller, manager, names in ((ROOT, (), ("begun", "running")), (ALICE, HERS, ("mine",))):
+        for name in names:
+            wait_for(name, partial(is_state, name, "active\n", *manager), 240)
+        rows = listed(caller)
+        found = {name: (rows[name]["status"], rows[name]["uuid"]) for name in names}
+        assert found == {name: ("Running", notes[name]) for name in names}
+    unit = Bus(scope_of(None)).read("dora-begun.service", ["Environment", "ExecStart"])
+    assert "A=x $B %h" in unit["Environment"]
+    assert {"/usr/bin/python3", "--dora=/usr/bin/dora"} <= set(unit["ExecStart"][0][1])
 
 
 def test_they_are_back() -> None:
@@ -36,7 +40,7 @@ def test_they_are_back() -> None:
 
 def test_the_boot_waits_for_none_of_them() -> None:
     """One that never gets ready starts for ever, on a machine that is up."""
-    wait_for("its start", lambda: status(ROOT, "never") == "Starting", 240)
+    wait_for("its start", lambda: is_state("never", "activating\n"), 240)
     jobs = run("systemctl", "list-jobs", "--no-legend").stdout.splitlines()
     waiting = [line.split()[1] for line in jobs]
     assert "dora-never.service" in waiting
@@ -45,15 +49,16 @@ def test_the_boot_waits_for_none_of_them() -> None:
 
 def test_one_without_its_file_has_failed() -> None:
     """The boot has gone on, and the status says which file."""
-    wait_for("its failure", lambda: status(ROOT, "gone") == "Failed", 240)
+    wait_for("its failure", lambda: is_state("gone", "failed\n"), 240)
     row = listed(ROOT)["gone"]
+    assert row["status"] == "Failed"
     assert "/srv/gone/dataflow.yml" in row["text"]
     shown = run("systemctl", "is-active", "multi-user.target", "dora.target").stdout.split()
     assert shown == ["active", "active"]
 
 
 def why(name: str) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads(run("doractl", "why", name, "-o", "json").stdout)
+    found: dict[str, Any] = json.loads(doractl("why", name, "-o", "json"))
     return found
 
 
@@ -65,5 +70,5 @@ def test_what_was_before_the_reboot_is_explained() -> None:
     assert broken["summary"] == "node only: exit code 3"
     assert [one["text"] for one in broken["last_lines"]] == ["no camera there"]
     passing = why("passing")
-    assert (passing["status"], passing["is_failure"]) == ("Stopped", False)
+    assert (passing["status"], passing["is_failure"]) == ("Stopped", False), passing
     assert passing["stopped_by"] == "the shutdown of the machine"

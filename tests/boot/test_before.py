@@ -1,11 +1,12 @@
-"""Before the reboot: dataflows of the system and of a user become part of the boot."""
+"""The packages, before the reboot: dataflows of the system and of a user are part of the boot."""
 
 import json
 import shutil
 from functools import partial
 from pathlib import Path
 
-from tests.boot.flows import ALICE, NOTES, ROOT, listed
+from tests.boot.flows import ALICE, NOTES, ROOT, VENV, doractl, listed
+from tests.deb import packages
 from tests.system.cells import run, wait_for
 
 NODE = """
@@ -14,7 +15,8 @@ for event in Node():
     pass
 """
 NEVER_READY = "nodes: [{id: only, path: sleep, args: '100000'}]\n"
-FLOW = "nodes: [{id: only, path: node.py, inputs: {tick: dora/timer/millis/200}}]\n"
+# Seldom: four of these share one emulated processor.
+FLOW = "nodes: [{id: only, path: node.py, inputs: {tick: dora/timer/secs/5}}]\n"
 BROKEN = """nodes: [{id: only, path: sh, args: "-c 'echo no camera there; exit 3'"}]\n"""
 
 
@@ -26,25 +28,31 @@ def flow(directory: Path, text: str = FLOW) -> str:
     return str(path)
 
 
+def start(*words: str) -> None:
+    doractl("start", "--venv", str(VENV), *words)
+
+
 def test_enable() -> None:
-    run("doractl", "setup")
+    before = sorted(packages.files())
+    packages.install()
+    packages.make_venv(VENV)
     begun = flow(Path("/srv/begun"))
-    run("doractl", "start", begun, "--enable", "--no-wait", "--env", "A=x $B %h")
-    run("doractl", "start", flow(Path("/srv/running")))
-    run("doractl", "enable", "running")
+    start(begun, "--enable", "--no-wait", "--env", "A=x $B %h")
+    start(flow(Path("/srv/running")))
+    doractl("enable", "running")
     gone = flow(Path("/srv/gone"))
-    run("doractl", "start", gone, "--enable", "--no-wait")
+    start(gone, "--enable", "--no-wait")
     never = flow(Path("/srv/never"), NEVER_READY)
-    run("doractl", "start", never, "--enable", "--no-wait")
-    run("doractl", "start", flow(Path("/srv/passing"), NEVER_READY), "--no-wait")
-    run("doractl", "start", flow(Path("/srv/broken"), BROKEN), "--no-wait")
+    start(never, "--enable", "--no-wait")
+    start(flow(Path("/srv/passing"), NEVER_READY), "--no-wait")
+    start(flow(Path("/srv/broken"), BROKEN), "--no-wait")
     is_failed = partial(run, "systemctl", "is-failed", "dora-broken", check=False)
     wait_for("its failure", lambda: not is_failed().returncode, 240)
     user = flow(Path("/home/alice/mine"))
     wait_for("alice's manager", lambda: Path("/run/user/1000/bus").exists(), 120)
     shutil.chown("/home/alice/mine", "alice")
-    run(*ALICE, "doractl", "start", user, "--enable")
+    run(*ALICE, "doractl", "start", user, "--enable", "--venv", str(VENV))
     notes = {name: row["uuid"] for who in (ROOT, ALICE) for name, row in listed(who).items()}
     assert notes.keys() == {"begun", "running", "gone", "never", "mine"}
     Path(gone).unlink()
-    NOTES.write_text(json.dumps(notes))
+    NOTES.write_text(json.dumps({**notes, "files": before}))

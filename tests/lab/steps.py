@@ -115,9 +115,7 @@ def plan_test(form: str) -> list[Step]:
         return [*plan_unit(form), *plan_system(form)]
     inside = [] if sys.version_info[:2] == LAB_PYTHON else [unit_in_lab()]
     own = [*plan_unit(form), *inside, *plan_lab(form)]
-    build, *tests = plan_packages(form)
-    # The machine is emulated by one processor; the packages can be built by the other.
-    return [*own, replace(build, with_next=True), *plan_vm(form), *tests, *plan_system(form)]
+    return [*own, *plan_vm(form), packages_step(), *plan_system(form)]
 
 
 def plan_unit(_form: str) -> list[Step]:
@@ -142,23 +140,31 @@ def plan_lab(_form: str) -> list[Step]:
 
 def plan_vm(_form: str) -> list[Step]:
     limits = lab_step("system tests that need limits, vm", "vm", ["tests/system", "-m", "vm"])
-    return [limits, reboot_step()]
+    # The machine is emulated by one processor; the packages can be built by the other.
+    return [replace(build_step(), with_next=True), limits, reboot_step()]
+
+
+def build_step() -> Step:
+    return Step("Debian packages", ["packaging/build"], dict(os.environ))
 
 
 def reboot_step() -> Step:
-    """One machine for all: what is enabled is looked for behind a reboot and a power cut."""
-    stages = (("before",), ("after", "cut"), ("was_cut",))
+    """One machine for all: the packages, a reboot and a power cut with them, and their end."""
+    stages = (("before",), ("after", "cut"), ("was_cut", "purge"))
     command = ["tests/lab/lab", "run", "--"]
     for place, stage in enumerate(stages):
         command += ["--reboot--"] if place else []
         command += ["pytest", *(f"tests/boot/test_{name}.py" for name in stage)]
-    return Step("a reboot and a power cut, vm", command, {**os.environ, "LAB": "vm"})
+    return Step("the packages, a reboot and a power cut, vm", command, {**os.environ, "LAB": "vm"})
 
 
 def plan_packages(_form: str) -> list[Step]:
     """The real .deb files, as a user installs them."""
-    build = Step("Debian packages", ["packaging/build"], dict(os.environ))
-    return [build, lab_step("tests of the Debian packages", "container", ["tests/deb"])]
+    return [build_step(), packages_step(), reboot_step()]
+
+
+def packages_step() -> Step:
+    return lab_step("tests of the Debian packages", "container", ["tests/deb"])
 
 
 def plan_bookworm(_form: str) -> list[Step]:
