@@ -35,12 +35,12 @@ PLOTS = {"start": bar_chart, "many": line_chart}
 HIGHLIGHTS = (
     ("start", "start to all of 2 nodes ready", "dora run"),
     ("start", "start to all of 20 nodes ready", "dora run"),
-    ("stop", "stop until nothing is left", "supervisord"),
-    ("recovery", "kill -9 until messages flow again", "supervisord"),
-    ("startup", "`list` with no dataflow", "pm2"),
-    ("many", "`list` of 50", "pm2"),
+    ("stop", "stop until nothing is left", "dora up, start"),
+    ("recovery", "kill -9 until messages flow again", "systemd-run dora run"),
+    ("startup", "`list` with no dataflow", "dora"),
+    ("many", "`list` of 50", "dora"),
     ("cost", "private memory, with dora's own processes", "dora up, start"),
-    ("cost", "CPU when idle, beside dora", "pm2"),
+    ("cost", "CPU when idle, beside dora", "supervisord"),
     ("logs", "lines a second into the journal, one node", "writes to journald itself"),
     ("messages", "throughput of 4 MB messages", "dora run"),
 )
