@@ -365,7 +365,7 @@ def test_a_settings_file(cell: Cell, project: Project) -> None:
     assert record["MESSAGE"] == "Node sink was limited anew: dataflow.systemd.yml"
     assert (cell.group / "node-sink/memory.max").read_text() == f"{1 << 30}\n"
     save(flow, "env: {COLOR: blue}\n" + THREE_NODES)
-    wait_for("it is reloaded", lambda: ("reloaded", "") in cell.events())
+    wait_for("it is reloaded", lambda: ("reloaded", "") in cell.events(), SLOW_SECONDS)
     assert (cell.group / "node-sink/memory.max").read_text() == f"{1 << 30}\n"
     save(settings, "env: {A: b}\nnodes: {sink: {memory_limit: lots}}")
     wait_for("it is refused", lambda: len(failures(cell)) >= 1, SLOW_SECONDS)
