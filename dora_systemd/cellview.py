@@ -5,7 +5,7 @@ from typing import Any
 
 from dora_systemd.cellstate import Cell, State
 from dora_systemd.restarts import HELD_SECONDS
-from dora_systemd.status import HELD, CellStatus, CpuSample, NodeStatus
+from dora_systemd.status import HELD, CellStatus, CpuSample, LineCount, NodeStatus
 
 _STAGES = {
     State.BOOTING: "starting",
@@ -84,7 +84,12 @@ def stage(cell: Cell) -> str:
     return _STAGES[cell.state]
 
 
-def cell_status(cell: Cell, uuid: str, samples: tuple[CpuSample, ...]) -> CellStatus:
+def cell_status(
+    cell: Cell,
+    uuid: str,
+    samples: tuple[CpuSample, ...],
+    lines: Mapping[str, LineCount],
+) -> CellStatus:
     """The table that status.json holds."""
     return CellStatus(
         uuid=uuid,
@@ -95,6 +100,7 @@ def cell_status(cell: Cell, uuid: str, samples: tuple[CpuSample, ...]) -> CellSt
         ready_us=cell.ready_us,
         nodes=dict(cell.nodes),
         samples=samples,
+        lines=lines,
     )
 
 

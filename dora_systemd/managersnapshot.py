@@ -19,7 +19,14 @@ def read_snapshot(manager: Manager, scope: Scope) -> list[Observed]:
 def observe(reading: Reading) -> Observed:
     """What a look at a dataflow shows of it, with what its groups had to wait for."""
     restarts = reading.unit["NRestarts"]
-    return Observed(row_of(reading), reading.at_us, restarts, reading.usage, read_strains(reading))
+    return Observed(
+        row_of(reading),
+        reading.at_us,
+        restarts,
+        reading.usage,
+        read_strains(reading),
+        reading.status.lines,
+    )
 
 
 def read_strains(reading: Reading) -> Mapping[str, Strain]:

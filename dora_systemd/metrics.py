@@ -85,6 +85,11 @@ NODE_START = Family("start_time_seconds", "gauge", "When it became ready, in Uni
 INFO = Family("info", "gauge", "UUID and unit of a dataflow; the value is always 1.")
 NODES = Family("nodes", "gauge", "Nodes that the dataflow has.")
 ALIVE = Family("nodes_alive", "gauge", "Nodes that are there.")
+LINES = Family("log_lines_total", "counter", "Lines that journald was given.")
+SUPPRESSED = Family(
+    "log_lines_suppressed_total", "counter", "Lines that log_rate_limit kept out of the journal."
+)
+LOST = Family("log_lines_lost_total", "counter", "Lines of its nodes that are not in the journal.")
 BUILD = Family("dora_systemd_build_info", "gauge", "Version of dora-systemd; always 1.")
 
 
@@ -108,6 +113,7 @@ def _dataflow_samples(observed: Sequence[Observed]) -> Iterator[tuple[Family, li
     yield START, [(own, o.row.started / SECOND) for own, o in labelled if o.row.started]
     yield NODES, [(own, one.row.nodes_total) for own, one in labelled if one.usage]
     yield ALIVE, [(own, one.row.nodes_alive) for own, one in labelled if one.usage]
+    yield LOST, [(own, o.lines[WHOLE_CELL].lost) for own, o in labelled if WHOLE_CELL in o.lines]
     yield from _group_samples([(own, one, WHOLE_CELL) for own, one in labelled])
 
 
@@ -122,6 +128,9 @@ def _node_samples(observed: Sequence[Observed]) -> Iterator[tuple[Family, list[S
     restarts = [(own, node.restarts) for own, _, node in places]
     yield RESTARTS, [(own, count) for own, count in restarts if count is not None]
     yield NODE_START, [(own, node.since / SECOND) for own, _, node in places if _is_there(node)]
+    counts = [(own, o.lines[node.node]) for own, o, node in places if node.node in o.lines]
+    yield LINES, [(own, count.written) for own, count in counts]
+    yield SUPPRESSED, [(own, count.suppressed) for own, count in counts]
     yield from _group_samples([(own, one, node.node) for own, one, node in places])
 
 

@@ -10,7 +10,7 @@ import contextlib
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from dora_systemd.cellpaths import CellPaths
@@ -21,43 +21,36 @@ from dora_systemd.logqueue import Journal, LogQueue
 from dora_systemd.lograte import LineLimiter, RateLimit, format_rate
 from dora_systemd.logs import LineEncoder, LineSplitter, Origin, dora_log_fields
 from dora_systemd.pipesource import CHUNK, PIPE_SIZE, Pipe, Source, fifos
+from dora_systemd.status import WHOLE_CELL, LineCount
 
 # Children that a dead node left behind may go on writing: drain() must still end.
 DRAIN_LIMIT = 4 * PIPE_SIZE
 
 
-@dataclass(frozen=True)
-class CellIdentity:
-    """The dataflow that all records of a cell belong to."""
-
-    name: str
-    uuid: str
-
-
 class LogPipes:
     """The output of all nodes of a cell, and the cell's life events, into the journal.
 
-    journal: where entries go. identity: whose entries they are. keep: is given each descriptor
-    whose content shall outlive this process. All methods belong to the thread of `loop` and
-    return at once.
+    journal: where entries go. origin: of what is of no node. keep: is given each descriptor whose
+    content shall outlive this process. All methods belong to `loop`'s thread and return at once.
     """
 
     def __init__(
         self,
         loop: asyncio.AbstractEventLoop,
         journal: Journal,
-        identity: CellIdentity,
+        origin: Origin,
         keep: Callable[[int], object] | None = None,
     ) -> None:
         self._loop = loop
         self._keep = keep
         self._journal = journal
         self._queue = LogQueue(loop, journal, self._pause, self._resume)
-        self._origin = Origin(identity.name, identity.uuid)
+        self._origin = origin
         self._paths: dict[str, CellPaths] = {}
         self._sources: dict[str, Source] = {}
         self._outputs: dict[int, LineSplitter] = {}
         self._muted: frozenset[str] = frozenset()
+        self._lost = 0
 
     def make(self, node_id: str, paths: CellPaths) -> None:
         """Create the two FIFOs of a node, mode 0600, unless it has them already. Raises OSError."""
@@ -154,6 +147,8 @@ class LogPipes:
     def write_event(self, name: str, node: str | None = None, **details: Value) -> None:
         """Write life event `name` (see dora_systemd.events), after all lines put before it."""
         origin = self._source(node).origin if node else self._origin
+        if name == "lines-lost" and isinstance(lost := details["count"], int):
+            self._lost += lost
         fields = event_fields(name, dataflow=origin.name, node=origin.node, **details)
         if node:
             self._queue.put_record(node, self._entry(fields, node))
@@ -167,6 +162,7 @@ class LogPipes:
         """
         source, stream = self._source(node), str(fields.get("DORA_STREAM", "stdout"))
         if source.admit(stream, 1, self._loop.time()):
+            source.written += 1
             entry = self._entry(fields, node)
             self._queue.put(node, lambda: [entry])
         self._watch_limit(source, stream)
@@ -174,6 +170,11 @@ class LogPipes:
     def _entry(self, fields: dict[str, Value], node: str | None) -> bytes:
         origin = self._source(node).origin if node else self._origin
         return encode_entry({**origin.fields(), **fields})
+
+    def line_counts(self) -> dict[str, LineCount]:
+        """What became of the lines so far, by node; of those that are lost nobody knows whose."""
+        whole = {WHOLE_CELL: LineCount(lost=self._lost)}
+        return whole | {node: source.line_count for node, source in self._sources.items()}
 
     def is_busy(self, node: str) -> bool:
         """Whether journald has not taken the node's records so far: what can wait should."""
@@ -274,6 +275,7 @@ class LogPipes:
             source.report.cancel()
             source.report = None
         if limiter is not None and (count := limiter.take_suppressed()):
+            source.suppressed += count
             limit = format_rate(limiter.limit)
             self.write_event("lines-suppressed", node_id, count=count, limit=limit)
 

@@ -10,6 +10,7 @@ from dora_systemd.cellpaths import CellPaths
 from dora_systemd.heldlines import HeldLines
 from dora_systemd.lograte import LineLimiter
 from dora_systemd.logs import LineEncoder, LineSplitter, Origin
+from dora_systemd.status import LineCount
 
 # Linux's default, and enough: in a bigger pipe bursts pass faster, but at the end of the cell
 # journald has to take what is in all pipes before the unit may end. See pipe(7).
@@ -37,6 +38,8 @@ class Pipe:
     noted: int = 0
     # Whether the last line has not ended.
     is_open: bool = False
+    # Lines that journald has taken.
+    written: int = 0
 
     def read(self) -> bytes:
         """What is in the pipe, CHUNK bytes at most."""
@@ -100,6 +103,15 @@ class Source:
     limiter: LineLimiter | None = None
     # When what the limiter took is told.
     report: asyncio.TimerHandle | None = None
+    # Lines that did not come by a pipe, and those that the limiter took and that were told.
+    written: int = 0
+    suppressed: int = 0
+
+    @property
+    def line_count(self) -> LineCount:
+        """What became of its lines so far."""
+        piped = sum(pipe.written for pipe in self.pipes)
+        return LineCount(self.written + piped, self.suppressed)
 
     def renew(self, **changes: Any) -> None:
         """Change the origin, of this node's next lines too."""
@@ -150,6 +162,7 @@ class LineBatch:
         if left:
             self._pipe.note_part(self._passed - left)
         else:
+            self._pipe.written += self._passed
             self._pipe.note_all(self._count)
 
 

@@ -21,9 +21,10 @@ from dora_systemd.environment import node_environment
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.journal import JournalSocket
 from dora_systemd.launch import has_pipes, kinds, python_of
+from dora_systemd.logs import Origin
 from dora_systemd.names import settings_path
 from dora_systemd.options import RunnerOptions, parse_runner_argv
-from dora_systemd.pipes import CellIdentity, LogPipes
+from dora_systemd.pipes import LogPipes
 from dora_systemd.preparation import PACKAGE, Prepared, prepare, with_changes
 from dora_systemd.runnerapply import Run
 from dora_systemd.runnerdialogue import Dialogue
@@ -78,7 +79,7 @@ async def run_cell(options: RunnerOptions, paths: CellPaths) -> RunnerExit:
     journal = JournalSocket()
     # While systemd holds the pipes too, what is in them outlives a kill of this process.
     fdstore.forget_inherited()
-    pipes = LogPipes(loop, journal, CellIdentity(options.name, options.uuid), fdstore.store)
+    pipes = LogPipes(loop, journal, Origin(options.name, options.uuid), fdstore.store)
     environment = node_environment(os.environ)
     nodes = Nodes(unit, paths, pipes)
     settings = SettingsFile(settings_path(options.dataflow), paths.settings)

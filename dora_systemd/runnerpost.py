@@ -75,13 +75,14 @@ def write_last_words(
     from dora_systemd.cellpaths import CellPaths
     from dora_systemd.errors import DoraSystemdError
     from dora_systemd.journal import JOURNAL_SOCKET, JournalSocket
-    from dora_systemd.pipes import CellIdentity, LogPipes
+    from dora_systemd.logs import Origin
+    from dora_systemd.pipes import LogPipes
     from dora_systemd.status import CellStatus
 
     paths = CellPaths(directory)
     loop = asyncio.new_event_loop()
     journal = JournalSocket(journal_socket or JOURNAL_SOCKET)
-    pipes = LogPipes(loop, journal, CellIdentity(name, uuid))
+    pipes = LogPipes(loop, journal, Origin(name, uuid))
     with contextlib.suppress(OSError, DoraSystemdError):
         status = CellStatus.from_json(paths.status.read_text())
         pipes.set_run(status.run)

@@ -141,7 +141,7 @@ class Pump:
         self._write_table()
 
     def _write_table(self) -> None:
-        table = cell_status(self.cell, self._uuid, self._samples)
+        table = cell_status(self.cell, self._uuid, self._samples, self._pipes.line_counts())
         try:
             files.write_atomic(self._paths.status, table.to_json(), 0o600)
         except DoraSystemdError as error:

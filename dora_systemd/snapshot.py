@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from dora_systemd.status import LineCount
 from dora_systemd.statuswords import DataflowRow, row_values
 from dora_systemd.usage import Strain, Usage
 
@@ -16,7 +17,7 @@ class Observed:
     """A dataflow. at_us: when its counters were read, CLOCK_MONOTONIC.
 
     row: its line in `list`. unit_restarts: how often systemd has started it again by itself.
-    usage, strains: by node, WHOLE_CELL is all of it; nothing for one that is not up.
+    usage, strains, lines: by node, WHOLE_CELL is all of it; nothing for one that is not up.
     """
 
     row: DataflowRow
@@ -24,6 +25,7 @@ class Observed:
     unit_restarts: int = 0
     usage: Mapping[str, Usage] = field(default_factory=dict)
     strains: Mapping[str, Strain] = field(default_factory=dict)
+    lines: Mapping[str, LineCount] = field(default_factory=dict)
 
 
 def observed_values(one: Observed) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields
-from typing import Any
+from typing import Any, NamedTuple
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
 
@@ -70,13 +70,22 @@ class CpuSample:
     throttling: Mapping[str, tuple[int, int]] = field(default_factory=dict)
 
 
+class LineCount(NamedTuple):
+    """Lines that journald was given, that a limit took away, and that are lost, since the start."""
+
+    written: int = 0
+    suppressed: int = 0
+    lost: int = 0
+
+
 @dataclass(frozen=True)
 class CellStatus:
     """What status.json holds.
 
     run: dora's own id of this run, or "". stage: one of STAGES. text: the unit's STATUS=.
     started_us, ready_us: CLOCK_REALTIME µs, 0 when that has not happened.
-    samples: the last SAMPLES_KEPT CPU samples, oldest first.
+    samples: the last SAMPLES_KEPT CPU samples, oldest first. lines: by node, and the lost ones of
+    WHOLE_CELL.
     """
 
     uuid: str = ""
@@ -87,6 +96,7 @@ class CellStatus:
     ready_us: int = 0
     nodes: Mapping[str, NodeStatus] = field(default_factory=dict)
     samples: tuple[CpuSample, ...] = ()
+    lines: Mapping[str, LineCount] = field(default_factory=dict)
 
     @property
     def alive_count(self) -> int:
@@ -165,7 +175,8 @@ def _parse_cell(raw: Any) -> CellStatus:
         for key, node in known.pop("nodes", {}).items()
     }
     samples = tuple(_parse_sample(one) for one in known.pop("samples", ()))
-    return CellStatus(**known, nodes=nodes, samples=samples)
+    lines = {str(key): LineCount(*map(int, one)) for key, one in known.pop("lines", {}).items()}
+    return CellStatus(**known, nodes=nodes, samples=samples, lines=lines)
 
 
 def _parse_sample(raw: Any) -> CpuSample:

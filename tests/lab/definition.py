@@ -16,7 +16,7 @@ PACKAGES = [
     "systemd", "systemd-sysv", "libpam-systemd", "dbus", "dbus-user-session", "polkitd",
     "python3", "python3-venv", "python3-setuptools", "python3-pystemd", "python3-systemd",
     "python3-pydantic", "python3-click", "python3-yaml", "python3-watchfiles",
-    "python3-websockets", "python3-rich", "python3-pathspec", "bash-completion",
+    "python3-websockets", "python3-pathspec", "bash-completion",
     "ca-certificates", "curl", "fish", "git", "iproute2", "kmod", "less", "lsof", "make", "man-db",
     "mandoc", "psmisc", "procps", "socat", "strace", "udev", "zsh",
 ]  # fmt: skip

@@ -45,7 +45,7 @@ OOMScoreAdjust=-1000
 
 # Once before the snapshot, so that no run pays for reading them from disk.
 WARM_UP = (
-    "import dora, pyarrow, numpy, pydantic, click, yaml, rich, websockets, watchfiles, pytest;"
+    "import dora, pyarrow, numpy, pydantic, click, yaml, websockets, watchfiles, pytest;"
     "import pystemd, systemd.journal, hypothesis"
 )
 

@@ -20,7 +20,8 @@ from pathlib import Path
 from dora_systemd.cellpaths import CellPaths
 from dora_systemd.journal import JOURNAL_SOCKET, JournalSocket
 from dora_systemd.journalread import JournalReader
-from dora_systemd.pipes import CellIdentity, LogPipes
+from dora_systemd.logs import Origin
+from dora_systemd.pipes import LogPipes
 from dora_systemd.runnerloss import LossWatch
 
 FLOOD = """
@@ -64,7 +65,7 @@ def watch_losses(journal: JournalSocket, pipes: LogPipes) -> LossWatch:
 
 
 async def pump(options: argparse.Namespace, paths: CellPaths) -> dict[str, object]:
-    identity = CellIdentity("pump", str(uuid.uuid4()))
+    identity = Origin("pump", str(uuid.uuid4()))
     journal = JournalSocket(options.socket)
     pipes = LogPipes(asyncio.get_running_loop(), journal, identity)
     codes = {f"n{i}": FLOOD.format(**vars(options)) for i in range(options.nodes)}

@@ -38,6 +38,9 @@ def test_a_dataflow(front: Front, cell: Cell, project: Project) -> None:
         return scrape(front)[key] > first[key]
 
     wait_for("CPU time is counted", is_counting)
+    lines = ("dora_node_log_lines_total", name, "source")
+    wait_for("lines are counted", lambda: scrape(front).get(lines, 0) > 0)
+    assert scrape(front)["dora_dataflow_log_lines_lost_total", name] == 0
 
 
 def test_nothing_runs(front: Front) -> None:

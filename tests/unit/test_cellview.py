@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from dora_systemd.cellstate import Cell, State
 from dora_systemd.cellview import cell_status, format_status, initial_nodes, stage
-from dora_systemd.status import CellStatus, NodeStatus
+from dora_systemd.status import CellStatus, LineCount, NodeStatus
 
 
 def cell(state: State, **states: str) -> Cell:
@@ -50,5 +50,5 @@ def test_stages_and_table() -> None:
     assert [node.state for node in nodes.values()] == ["starting", "dynamic"]
     assert [node.policy for node in nodes.values()] == ["always", "never"]
     assert [node.max_restarts for node in nodes.values()] == [3, 0]
-    table = cell_status(Cell(0, 3, nodes), "uuid", ())
+    table = cell_status(Cell(0, 3, nodes), "uuid", (), {"a": LineCount(3)})
     assert CellStatus.from_json(table.to_json()) == table

@@ -9,11 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dora_systemd.heldlines import HeldLines, held_path, read_held
-from dora_systemd.logs import LINE_LIMIT
-from dora_systemd.pipes import CellIdentity, LogPipes
+from dora_systemd.logs import LINE_LIMIT, Origin
+from dora_systemd.pipes import LogPipes
 from tests.unit.test_logqueue import SlowJournal
 
-IDENTITY = CellIdentity("robot", "550e8400-e29b-41d4-a716-446655440000")
+IDENTITY = Origin("robot", "550e8400-e29b-41d4-a716-446655440000")
 
 
 class Runner:

@@ -14,6 +14,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from dora_systemd.metrics import STATES, format_metrics
 from dora_systemd.snapshot import Observed
+from dora_systemd.status import LineCount
 from dora_systemd.statuswords import DataflowRow, NodeRow
 from dora_systemd.usage import UNLIMITED, Strain, Usage
 
@@ -39,6 +40,7 @@ ROBOT = Observed(
         "camera": Usage(1_000_000, 1024, None, UNLIMITED, UNLIMITED),
     },
     strains={"": Strain({"cpu": (1_500_000, 0), "memory": (20, 10)}, 250_000, 4)},
+    lines={"": LineCount(lost=7), "camera": LineCount(1000, 20)},
 )
 FAILED = Observed(DataflowRow("u", "old", "dora-old.service", "Failed"), unit_restarts=1)
 
@@ -92,6 +94,9 @@ def test_numbers_of_nodes() -> None:
     assert value(found, "dora_node_cpu_seconds_total", **own) == 1.0
     assert value(found, "dora_node_restarts_total", **own) == 3
     assert value(found, "dora_node_start_time_seconds", **own) == 1_700_000_001
+    assert value(found, "dora_node_log_lines_total", **own) == 1000
+    assert value(found, "dora_node_log_lines_suppressed_total", **own) == 20
+    assert value(found, "dora_dataflow_log_lines_lost_total", dataflow="robot") == 7
     # No limit is no number; what is not there has no time at which it became ready.
     assert "dora_node_memory_limit_bytes" not in found
     assert "dora_node_memory_peak_bytes" not in found

@@ -13,10 +13,12 @@ import pytest
 from dora_systemd.cellpaths import CellPaths
 from dora_systemd.journal import JournalSocket
 from dora_systemd.lograte import RateLimit
-from dora_systemd.pipes import CellIdentity, LogPipes
+from dora_systemd.logs import Origin
+from dora_systemd.pipes import LogPipes
+from dora_systemd.status import LineCount
 from dora_systemd.values import SECOND
 
-IDENTITY = CellIdentity("robot", "550e8400-e29b-41d4-a716-446655440000")
+IDENTITY = Origin("robot", "550e8400-e29b-41d4-a716-446655440000")
 
 
 class Cell:
@@ -148,6 +150,8 @@ def test_what_a_limit_takes_is_counted(tmp_path: Path) -> None:
         assert more["DORA_COUNT"] == "1"
         assert suppressed["DORA_EVENT"] == "lines-suppressed"
         assert suppressed["DORA_LIMIT"] == "2/100ms"
+        counts = cell.pipes.line_counts()
+        assert counts == {"a": LineCount(5, 5), "": LineCount()}
         assert exited["MESSAGE"] == "Node a exited"
 
     run(tmp_path, scenario)
