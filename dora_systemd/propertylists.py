@@ -35,8 +35,11 @@ def _parse_environment(text: str) -> tuple[str, ...]:
 
 
 def _parse_filter(text: str) -> tuple[bool, tuple[str, ...]]:
-    words = plain_text(text)
-    return not words.startswith("~"), parse_words(words.removeprefix("~"))
+    given = plain_text(text)
+    words = parse_words(given.removeprefix("~"))
+    if words and words[0].startswith("~"):
+        raise ValueError("only one ~ may stand in front")  # in quotes it would be read as the first
+    return not given.startswith("~"), words
 
 
 def _format_filter(value: tuple[bool, Sequence[str]]) -> Sequence[str]:

@@ -37,6 +37,7 @@ ALLOWED_ALWAYS = (
 FIRST_HALF = (
     *("test_cell", "test_kinds", "test_start", "test_start_refused", "test_logs_cli"),
     *("test_doctor", "test_enable", "test_hotreload", "test_limits", "test_setup"),
+    *("test_destroy", "test_gateway", "test_top"),
 )
 """Files of about half the time, which `make test` runs beside the others in a lab of their own."""
 

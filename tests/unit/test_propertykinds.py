@@ -192,6 +192,12 @@ def test_what_unit_files_cannot_say_is_a_comment() -> None:
     ]
 
 
+@pytest.mark.parametrize("text", ["''~", "~~lo", "~'~lo'"])
+def test_a_filter_is_turned_round_once(text: str) -> None:
+    with pytest.raises(DoraSystemdError, match="cannot set property RestrictNetworkInterfaces"):
+        parse_property(f"RestrictNetworkInterfaces={text}")
+
+
 plain = st.text(st.characters(exclude_categories=["Cs"]))
 
 
