@@ -44,7 +44,7 @@ class Pipe:
     def read(self) -> bytes:
         """What is in the pipe, CHUNK bytes at most."""
         try:
-            return os.read(self.fd, CHUNK)
+            return os.read(self.fd, CHUNK) if self.held is None else self.held.take(self.fd, CHUNK)
         except BlockingIOError:
             return b""
 
@@ -66,14 +66,14 @@ class Pipe:
         return self.splitter.feed(data) if data else self.splitter.flush()
 
     def take(self, data: bytes) -> None:
-        """Note `data` as on its way, in a batch that is to come; none: nothing ends the line."""
+        """A batch with `data`, just read, is to come; none: nothing ends the line."""
         self.batches += 1
-        if not data and self.is_open:
-            data = b"\n"
         if data:
             self.is_open = data[-1:] != b"\n"
+        elif self.is_open:
+            self.is_open = False
             if self.held is not None:
-                self.held.add(data)
+                self.held.add(b"\n")
 
     def note_part(self, lines: int) -> None:
         """Journald has so many lines of the batch whose turn it is."""
@@ -84,12 +84,12 @@ class Pipe:
         """Journald has all of it, which is `lines`."""
         self.batches -= 1
         self.noted += lines
-        if self.batches:
-            self.note_part(0)
+        if self.held is None:
             return
-        self.noted = 0
-        if self.held is not None:
-            self.held.restart(self.splitter.rest)
+        if self.batches or not self.held.restart(self.splitter.rest):
+            self.note_part(0)
+        else:
+            self.noted = 0
 
 
 @dataclass

@@ -112,11 +112,44 @@ def test_no_file_and_a_torn_one(tmp_path: Path) -> None:
     assert read_held(fifo) == (b"", 0)
 
 
+def test_a_kill_as_soon_as_it_is_read(tmp_path: Path) -> None:
+    fifo = tmp_path / "a.out"
+    os.mkfifo(fifo)
+    fd = os.open(fifo, os.O_RDWR | os.O_NONBLOCK)
+    os.write(fd, b"one\ntwo")
+    assert HeldLines(fifo).take(fd, 1000) == b"one\ntwo"
+    assert read_held(fifo) == (b"one\ntwo", 0)
+
+
+def test_the_file_does_not_grow(tmp_path: Path) -> None:
+    """Lines that end in the next chunk only, again and again."""
+    fifo = tmp_path / "a.out"
+    os.mkfifo(fifo)
+    journal = SlowJournal()
+    journal.room = 1 << 30
+    runner = Runner(fifo, journal)
+    runner.pipes.adopt("a", "stdout", runner.fd, HeldLines(fifo))
+    for _ in range(1000):
+        os.write(runner.fd, b"x" * 5000 + b"\n" + b"rest")
+        runner.turn()
+    assert held_path(fifo).stat().st_size < 2 * LINE_LIMIT
+    runner.kill()
+    assert len(messages(journal)) == 1000
+    assert replayed(fifo) == [b"rest"]
+    assert [path.name for path in tmp_path.iterdir() if path.suffix != ".out"] == ["a.out.held"]
+
+
 def test_a_full_disk_is_no_reason_to_stop(tmp_path: Path) -> None:
-    held = HeldLines(tmp_path / "a.out")
+    fifo = tmp_path / "a.out"
+    os.mkfifo(fifo)
+    fd = os.open(fifo, os.O_RDWR | os.O_NONBLOCK)
+    held = HeldLines(fifo)
     os.close(held._fd)
     held._fd = os.open("/dev/full", os.O_RDWR)
-    held.add(b"line\n")
+    os.write(fd, b"line\n")
+    assert held.take(fd, 100) == b"line\n"
+    held.add(b"\n")
     held.sent(1)
-    held.restart(b"rest")
+    assert held.restart(b"rest")
+    assert read_held(fifo) == (b"rest", 0)
     held.close()
