@@ -29,6 +29,8 @@ class Terminal:
     def __init__(self, script: str) -> None:
         self.pid, self.fd = pty.fork()
         if not self.pid:
+            for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTSTP):
+                signal.signal(number, signal.SIG_DFL)  # a shell's background job ignores some
             os.execve(sys.executable, [sys.executable, "-c", script], {**os.environ, "LINES": "8"})
         self.before = termios.tcgetattr(self.fd)
         self.seen = b""
