@@ -139,7 +139,7 @@ def test_follow_until_the_end(talking: Cell) -> None:
 
 def test_until_the_end_of_what_does_not_run(talking: Cell) -> None:
     talking.systemctl("stop")
-    run("journalctl", "--sync")
+    sync_journal()
     shown = messages(talking, "--until-end", "--tail", "3")
     assert shown == messages(talking, "--tail", "3")
     assert messages(talking, "--until-end") == messages(talking, "--tail", "10")
