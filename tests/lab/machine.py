@@ -182,7 +182,9 @@ def run_commands(guest: Guest, options: Options) -> int:
 def push_checkout(guest: Guest) -> None:
     """And the editable install of it: the snapshot is older than that and outlives it."""
     difference = ensure_tree(find_cache()) / DIFFERENCE
-    guest.request(["tar", "--extract", "--ignore-zeros", "--directory", "/"], resume=True)
+    # Its clock may be a second behind this one, and files of the checkout newer than that.
+    quiet = ["--ignore-zeros", "--warning=no-timestamp"]
+    guest.request(["tar", "--extract", *quiet, "--directory", "/"], resume=True)
     command = pack_command(definition.CHECKOUT, "--transform=flags=rhS;s,^\\.,src,")
     pack = subprocess.Popen(command, stdout=subprocess.PIPE)
     assert pack.stdout
