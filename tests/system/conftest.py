@@ -27,6 +27,7 @@ ALLOWED_ALWAYS = (
     # Dora's daemon and a node, one of which has just been ended.
     "closing node connection after I/O error",
     "server disconnected unexpectedly",
+    "failed to report outputs done to dora-daemon",
     # A container whose root may not raise limits: nodes lock 8 MiB of shared memory or more.
     "Unable to create POSIX shm segment",
     # Dora's daemon starts a dataflow's timers before it has noted the dataflow.

@@ -94,6 +94,7 @@ def test_restart_brings_the_dataflow_back(cell: Cell, project: Project, victim: 
     cell.wait_exchanging()
 
 
+@pytest.mark.warns("WS coordinator connection error")  # the signal goes to dora as well
 def test_systemctl_restart_and_kill(cell: Cell, project: Project) -> None:
     cell.start(project.three_nodes())
     old = cell.all_pids()
