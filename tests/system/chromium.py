@@ -29,7 +29,8 @@ class Browser:
     """Chromium with one page."""
 
     def __init__(self) -> None:
-        self._home = tempfile.TemporaryDirectory(prefix="chromium-")
+        # Its helpers may write for a moment longer than it lives.
+        self._home = tempfile.TemporaryDirectory(prefix="chromium-", ignore_cleanup_errors=True)
         command = [*COMMAND, f"--user-data-dir={self._home.name}", "about:blank"]
         self._process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
         told = Path(self._home.name, "DevToolsActivePort")
