@@ -60,6 +60,26 @@ class Contestant(ABC):
         """Leave nothing behind."""
 
 
+class Supervisor(Contestant):
+    """One whose command controls programs by their names."""
+
+    @abstractmethod
+    def control(self, *words: str) -> str:
+        """One command, and what it printed."""
+
+    def start(self) -> None:
+        self.control("start", NAME)
+
+    def stop(self) -> None:
+        self.control("stop", NAME)
+
+    def restart(self) -> None:
+        self.control("restart", NAME)
+
+    def main_pid(self) -> int:
+        return int(self.control("pid", NAME))
+
+
 class Doractl(Contestant):
     """Ours. The nodes write their stamps through the sandbox."""
 
@@ -196,7 +216,7 @@ autorestart=true
 """
 
 
-class Supervisord(Contestant):
+class Supervisord(Supervisor):
     """supervisord, with `dora run` as its program."""
 
     name = "supervisord"
@@ -217,18 +237,6 @@ class Supervisord(Contestant):
         command = (f"{RIVALS}/supervisorctl", "-c", str(config), *words)
         return run(*command, check=words[0] != "status").stdout
 
-    def start(self) -> None:
-        self.control("start", NAME)
-
-    def stop(self) -> None:
-        self.control("stop", NAME)
-
-    def restart(self) -> None:
-        self.control("restart", NAME)
-
-    def main_pid(self) -> int:
-        return int(self.control("pid", NAME))
-
     def daemon_pids(self) -> list[int]:
         return [int((HOME / "supervisord.pid").read_text())]
 
@@ -248,7 +256,7 @@ autostart = False
 """
 
 
-class Circus(Contestant):
+class Circus(Supervisor):
     """circusd, with `dora run` as its watcher."""
 
     name = "circus"
@@ -277,14 +285,8 @@ class Circus(Contestant):
         command = (f"{RIVALS}/circusctl", "--endpoint", endpoint, "--timeout", "60", *words)
         return run(*command, check=check).stdout
 
-    def start(self) -> None:
-        self.control("start", NAME)
-
     def stop(self) -> None:
         self.control("stop", NAME, "--waiting")
-
-    def restart(self) -> None:
-        self.control("restart", NAME)
 
     def main_pid(self) -> int:
         return child_of(self.process.pid)
@@ -297,7 +299,7 @@ class Circus(Contestant):
         self.process.wait()
 
 
-class Pm2(Contestant):
+class Pm2(Supervisor):
     """pm2, with `dora run` as its app."""
 
     name = "pm2"
@@ -315,18 +317,6 @@ class Pm2(Contestant):
     def arguments(self) -> tuple[str, ...]:
         """Of the app."""
         return ("--", "run", str(self.flow))
-
-    def start(self) -> None:
-        self.control("start", NAME)
-
-    def stop(self) -> None:
-        self.control("stop", NAME)
-
-    def restart(self) -> None:
-        self.control("restart", NAME)
-
-    def main_pid(self) -> int:
-        return int(self.control("pid", NAME))
 
     def daemon_pids(self) -> list[int]:
         return [int((HOME / "pm2/pm2.pid").read_text())]

@@ -6,7 +6,6 @@ Bare dora is not here: after the loss of its daemon nothing comes back.
 import os
 import signal
 import sys
-import time
 from functools import partial
 
 from benchmarks.contestants import (
@@ -18,22 +17,15 @@ from benchmarks.contestants import (
     SystemdRun,
     prepared,
 )
-from benchmarks.flows import clear_stamps, make_home, wait_gone, wait_stamps, write_flow
+from benchmarks.flows import make_home, write_flow
 from benchmarks.rounds import Figure, alternate, keep
-from benchmarks.stop import COUNT, is_running
+from benchmarks.stop import COUNT, is_running, resumed_ms
 
 
 def recovery_ms(contestant: Contestant) -> float:
     """Until the next nodes exchange messages; delays that supervisors wait first are within."""
     old = is_running(contestant)
-    clear_stamps()
-    lost = contestant.main_pid()
-    begun = time.monotonic()
-    os.kill(lost, signal.SIGKILL)
-    fresh = wait_stamps("input", COUNT - 1)
-    contestant.stop()
-    wait_gone([*old, *(stamp.pid for stamp in fresh)])
-    return (max(stamp.at for stamp in fresh) - begun) * 1000
+    return resumed_ms(contestant, old, partial(os.kill, contestant.main_pid(), signal.SIGKILL))
 
 
 def measure(rounds: int) -> list[Figure]:

@@ -2,6 +2,7 @@
 
 import sys
 import time
+from collections.abc import Callable, Sequence
 from functools import partial
 
 from benchmarks.contestants import ALL, Contestant, prepared
@@ -30,10 +31,14 @@ def stop_ms(contestant: Contestant) -> float:
 
 def restart_ms(contestant: Contestant) -> float:
     """Until the new nodes exchange messages."""
-    old = is_running(contestant)
+    return resumed_ms(contestant, is_running(contestant), contestant.restart)
+
+
+def resumed_ms(contestant: Contestant, old: Sequence[int], act: Callable[[], None]) -> float:
+    """From `act`, which ends the nodes `old`, until the next ones exchange messages."""
     clear_stamps()
     begun = time.monotonic()
-    contestant.restart()
+    act()
     fresh = wait_stamps("input", COUNT - 1)
     contestant.stop()
     wait_gone([*old, *(stamp.pid for stamp in fresh)])

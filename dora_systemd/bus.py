@@ -1,23 +1,17 @@
-"""systemd over D-Bus: the only module that talks to it, and the only one that imports pystemd.
+"""systemd over D-Bus: the only module that talks to it.
 
 The interfaces are those of org.freedesktop.systemd1(5). Only pystemd's low level is used, on a
 connection that is told every signature: nothing is introspected, and no XML is parsed.
 """
 
 import select
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import cache
-from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 from dora_systemd.buserrors import connection_error, explained
 from dora_systemd.busprotocol import JOB_DONE, Observer, Property, UnitState
 from dora_systemd.buswire import decoded, encoded
-from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 
 SERVICE = b"org.freedesktop.systemd1"
@@ -223,10 +217,12 @@ class Bus:
 
 def _connect(scope: Scope) -> Any:
     address = _address(scope)
-    library = _dbuslib()
+    # What only explains itself or asks for a version need not find pystemd.
+    from dora_systemd.buslibrary import dbuslib
+
     with connection_error(scope):
         # A manager's private socket takes no part in the bus: there is nobody to say hello to.
-        bus = library.DBusAddress(
+        bus = dbuslib.DBusAddress(
             f"unix:path={address}".encode(), peer_to_peer=address.endswith("/private")
         )
         bus.open()
@@ -238,28 +234,6 @@ def _address(scope: Scope) -> str:
     bus = scope.runtime_root / "bus" if scope.is_user else SYSTEM_BUS
     private = scope.runtime_root / "systemd" / "private"
     return str(private) if not bus.exists() and private.exists() else str(bus)
-
-
-@cache
-def _dbuslib() -> ModuleType:
-    """pystemd.dbuslib without pystemd/__init__.py.
-
-    That imports lxml and the signatures of all unit properties, which takes longer than the whole
-    of `doractl list`. A package that holds nothing but its path stands in while the import runs.
-    """
-    if "pystemd" in sys.modules:
-        return import_module("pystemd.dbuslib")
-    spec = find_spec("pystemd")
-    if spec is None:
-        hint = "install python3-pystemd, or run pip install dora-systemd again"
-        raise DoraSystemdError("cannot find the Python module pystemd", hint, ExitCode.NO_SYSTEMD)
-    package = ModuleType("pystemd")
-    package.__path__ = list(spec.submodule_search_locations or ())
-    sys.modules["pystemd"] = package
-    try:
-        return import_module("pystemd.dbuslib")
-    finally:
-        del sys.modules["pystemd"]
 
 
 def _unit_path(unit: str) -> bytes:

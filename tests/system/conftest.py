@@ -80,11 +80,24 @@ def cell(request: pytest.FixtureRequest, project: Project) -> Iterator[Cell]:
 
 @pytest.fixture
 def front() -> Iterator[Front]:
-    """The gateway of the system, up."""
+    """The gateway of the system, down."""
     front = Front()
-    front.up()
     yield front
     front.end()
+
+
+@pytest.fixture
+def alice() -> Iterator[Front]:
+    """The gateway of alice, down."""
+    front = Front("alice", 1000, 53291)
+    yield front
+    front.end()
+
+
+@pytest.fixture
+def gateway_up(front: Front) -> None:
+    """For modules whose tests all ask the system's gateway."""
+    front.up()
 
 
 def _cursor() -> str:

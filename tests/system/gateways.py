@@ -1,6 +1,7 @@
 """The gateway of one user or of the system, as the system tests see it."""
 
 import subprocess
+import time
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,6 +24,7 @@ class Front:
         self.user = user
         self.scope = Scope(is_user=uid != 0, uid=uid)
         self.port = port
+        self.begun = time.time()
 
     def command(self, *words: str) -> list[str]:
         """A command of this user."""
@@ -77,9 +79,10 @@ class Front:
         self.systemctl("stop", SERVICE_UNIT)
 
     def journal(self) -> str:
-        """What the gateway has written since it is up, from this boot on."""
+        """What the gateway has written in this test."""
         which = "--user-unit" if self.scope.is_user else "--unit"
-        return run("journalctl", "-q", "-o", "cat", which, SERVICE_UNIT).stdout
+        since = f"--since=@{self.begun:.6f}"
+        return run("journalctl", "-q", "-o", "cat", since, which, SERVICE_UNIT).stdout
 
     def wait_resting(self) -> None:
         """Return when the gateway has ended."""

@@ -3,22 +3,22 @@
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from dora_systemd import bus
+from dora_systemd.buslibrary import dbuslib
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import scope_of
+from tests.system.cells import run
 from tests.unit.fake_manager import ScopeIn
 
 
 @given(st.from_regex(r"[A-Za-z0-9._-]+", fullmatch=True))
 def test_object_paths_are_those_of_sd_bus(name: str) -> None:
-    library: Any = bus._dbuslib()
-    expected = library.path_encode(b"/org/freedesktop/systemd1/unit", f"x{name}".encode())
+    expected = dbuslib.path_encode(b"/org/freedesktop/systemd1/unit", f"x{name}".encode())
     assert bus._unit_path(f"x{name}") == expected
 
 
@@ -32,12 +32,27 @@ def test_no_manager(tmp_path: Path) -> None:
 
 def test_pystemd_is_loaded_without_lxml_and_stays_usable() -> None:
     script = (
-        "import sys; from dora_systemd import bus; bus._dbuslib()\n"
+        "import sys; from dora_systemd.buslibrary import dbuslib\n"
         "assert 'lxml' not in sys.modules and 'pystemd' not in sys.modules\n"
         "import pystemd; from pystemd.dbuslib import DBus\n"
-        "assert pystemd.SDUnit and DBus is bus._dbuslib().DBus\n"
+        "assert pystemd.SDUnit and DBus is dbuslib.DBus\n"
     )
     subprocess.run([sys.executable, "-c", script], check=True)
+
+
+def test_threads_load_pystemd_at_the_same_time() -> None:
+    """As requests do that reach a gateway which has just been started."""
+    script = (
+        "import sys, threading\n"
+        "from dora_systemd import bus; from dora_systemd.scope import scope_of\n"
+        "from concurrent.futures import ThreadPoolExecutor\n"
+        "sys.setswitchinterval(1e-6)\n"
+        "barrier = threading.Barrier(8)\n"
+        "ask = lambda _: (barrier.wait(), bus.Bus(scope_of(None)).version())[1]\n"
+        "with ThreadPoolExecutor(8) as pool: print(len(set(pool.map(ask, range(8)))))\n"
+    )
+    for _ in range(5):
+        assert run(sys.executable, "-c", script).stdout == "1\n"
 
 
 def test_a_connection_ends_with_its_object() -> None:

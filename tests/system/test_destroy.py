@@ -3,7 +3,6 @@
 import json
 import os
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -23,22 +22,6 @@ TICK = "inputs: {tick: dora/timer/millis/50}"
 UNREADY = "import time\nprint('started', flush=True)\ntime.sleep(1000)\n"
 FAILING = "import sys, dora\nnode = dora.Node()\nsys.exit(3)\n"
 SLICE = Path("/sys/fs/cgroup/dora.slice")
-
-
-@pytest.fixture
-def front() -> Iterator[Front]:
-    """The system's, down."""
-    front = Front()
-    yield front
-    front.end()
-
-
-@pytest.fixture
-def alice() -> Iterator[Front]:
-    """Hers, down."""
-    front = Front("alice", 1000, 53291)
-    yield front
-    front.end()
 
 
 def test_all_of_it(front: Front, cell: Cell, project: Project) -> None:

@@ -3,7 +3,6 @@
 import os
 import signal
 import socket
-from collections.abc import Iterator
 
 import pytest
 from websockets.exceptions import InvalidStatus
@@ -27,22 +26,6 @@ Starting dora daemon...
 
 Daemon running at: http://localhost:{port}
 """
-
-
-@pytest.fixture
-def front() -> Iterator[Front]:
-    """The system's, down."""
-    front = Front()
-    yield front
-    front.end()
-
-
-@pytest.fixture
-def alice() -> Iterator[Front]:
-    """Hers, down."""
-    front = Front("alice", 1000, 53291)
-    yield front
-    front.end()
 
 
 def test_up(front: Front) -> None:

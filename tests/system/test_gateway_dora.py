@@ -20,7 +20,7 @@ from tests.system.cells import Cell, Project, run, wait_for
 from tests.system.gateways import Front
 
 # Speaks as several users, and opens the port.
-pytestmark = pytest.mark.lab
+pytestmark = [pytest.mark.lab, pytest.mark.usefixtures("gateway_up")]
 
 CRASHER = """
 import sys, time
@@ -139,11 +139,13 @@ def three(dora: Dora, cell: Cell, places: Sequence[Project]) -> Iterator[list[Ce
     cells = [Cell(name) for name in ("one", "two", "three")]
     flows = [str(place.root / "dataflow.yml") for place in places]
     options = [("--name", one.name, "--detach", "--debug") for one in cells]
-    with ThreadPoolExecutor() as pool:
-        list(pool.map(lambda flow, words: dora("start", flow, *words), flows, options))
-    yield cells
-    for one in cells:
-        one.end()
+    try:
+        with ThreadPoolExecutor() as pool:
+            list(pool.map(lambda flow, words: dora("start", flow, *words), flows, options))
+        yield cells
+    finally:
+        for one in cells:
+            one.end()
 
 
 def uuids(dora: Dora) -> dict[str, str]:

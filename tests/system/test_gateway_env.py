@@ -1,7 +1,5 @@
 """doractl env, for the stock dora command."""
 
-from collections.abc import Iterator
-
 import pytest
 
 from dora_systemd.errors import ExitCode
@@ -9,14 +7,6 @@ from tests.system.cells import Cell, Project, run
 from tests.system.gateways import Front
 
 pytestmark = pytest.mark.lab
-
-
-@pytest.fixture
-def front() -> Iterator[Front]:
-    """The system's, down."""
-    front = Front()
-    yield front
-    front.end()
 
 
 def test_of_one_dataflow(cell: Cell, project: Project) -> None:

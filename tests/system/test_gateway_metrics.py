@@ -9,7 +9,7 @@ from tests.system.cells import Cell, Project, wait_for
 from tests.system.gateways import Front
 
 # Opens the port of the system.
-pytestmark = pytest.mark.lab
+pytestmark = [pytest.mark.lab, pytest.mark.usefixtures("gateway_up")]
 
 LINE = re.compile(r'(\w+)\{((?:\w+="[^"]*",?)*)\} (\S+)')
 

@@ -10,7 +10,7 @@ from tests.system.cells import Cell, Project, run, wait_for
 from tests.system.chromium import Browser
 from tests.system.gateways import Front
 
-pytestmark = [pytest.mark.lab, pytest.mark.browser]
+pytestmark = [pytest.mark.lab, pytest.mark.browser, pytest.mark.usefixtures("gateway_up")]
 
 HOSTILE = """
 from dora import Node
@@ -28,15 +28,6 @@ for event in Node():
         print("line", count)
         count += 1
 """
-
-
-@pytest.fixture
-def front() -> Iterator[Front]:
-    """The system's, up."""
-    front = Front()
-    front.up()
-    yield front
-    front.end()
 
 
 @pytest.fixture

@@ -112,7 +112,7 @@ DECISIONS = {
     ],
 }
 ADAPTERS = {
-    "bus": ["bus", "buserrors", "buswire"],
+    "bus": ["bus", "buserrors", "buslibrary", "buswire"],
     "cgroup": ["cgroup", "cgroupstrain"],
     "control": ["control"],
     "engine": ["engine"],

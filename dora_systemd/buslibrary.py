@@ -1,0 +1,32 @@
+"""pystemd.dbuslib without pystemd/__init__.py; the only module that imports pystemd.
+
+That imports lxml and the signatures of all unit properties, which takes longer than the whole of
+`doractl list`. A package that holds nothing but its path stands in while the import runs. This is
+a module, as Python runs one once and lets other threads wait: the gateway has many.
+"""
+
+import sys
+from importlib import import_module
+from importlib.util import find_spec
+from types import ModuleType
+
+from dora_systemd.errors import DoraSystemdError, ExitCode
+
+
+def _load() -> ModuleType:
+    if "pystemd" in sys.modules:
+        return import_module("pystemd.dbuslib")
+    spec = find_spec("pystemd")
+    if spec is None:
+        hint = "install python3-pystemd, or run pip install dora-systemd again"
+        raise DoraSystemdError("cannot find the Python module pystemd", hint, ExitCode.NO_SYSTEMD)
+    package = ModuleType("pystemd")
+    package.__path__ = list(spec.submodule_search_locations or ())
+    sys.modules["pystemd"] = package
+    try:
+        return import_module("pystemd.dbuslib")
+    finally:
+        del sys.modules["pystemd"]
+
+
+dbuslib = _load()
