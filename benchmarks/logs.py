@@ -11,12 +11,14 @@ import statistics
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 
 from benchmarks.contestants import ENVIRONMENT
 from benchmarks.flows import HOME, STAMP, clear_stamps, make_home, wait_stamps
 from benchmarks.rounds import OURS, Figure, alternate, keep
+from dora_systemd.cgroup import group_path
 from tests.system.cells import Cell, Project, run, sync_journal, wait_for
 
 LINES = 200_000
@@ -91,6 +93,20 @@ def sender_in(project: Project) -> float:
     script = str(project.write("sender.py", SENDER))
     run("systemd-run", "--quiet", "--wait", "-u", unit, *NO_LIMIT, "python3", script)
     return per_second(times(f"_SYSTEMD_UNIT={unit}", "DORA_STREAM=stdout"))
+
+
+def journald_busy(lines_in: Callable[[Project], float], project: Project) -> float:
+    """% of a processor that journald uses while the lines come: 100 is as fast as it can."""
+    before = journald_cpu()
+    span = LINES / lines_in(project)
+    return 100 * (journald_cpu() - before) / span
+
+
+def journald_cpu() -> float:
+    """Seconds that journald has used."""
+    group = run("systemctl", "show", "--value", "-p", "ControlGroup", "systemd-journald").stdout
+    text = (group_path(group.strip()) / "cpu.stat").read_text()
+    return float(text.split()[1]) / 1e6
 
 
 def dora_in(project: Project) -> float:
@@ -196,6 +212,10 @@ def measure(rounds: int, want_all: bool = True) -> list[Figure]:
     figures = [alternate(what, "lines/s", lines, rounds, goal=goal)]
     figures.append(reading(project, "short", rounds))
     if want_all:
+        busy = {OURS: partial(journald_busy, ours_in, project)}
+        busy |= {own: partial(journald_busy, sender_in, project)}
+        what = "journald's processor meanwhile: 100 % is all it can"
+        figures.append(alternate(what, "%", busy, rounds))
         figures.append(reading(project, "cat", rounds))
         costs = {OURS: partial(ours_cpu, project), "dora run": partial(dora_cpu, project)}
         figures.append(alternate("CPU for a line, node included", "µs", costs, rounds))
