@@ -1,9 +1,9 @@
-"""One WebSocket connection to the coordinator of a cell. The only importer of websockets."""
+"""One WebSocket connection to the coordinator of a cell."""
 
 import asyncio
 import json
 from collections.abc import AsyncIterator, Callable
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +13,7 @@ from dora_systemd.protocol import LogRecord, Params, Reply, encode_request, pars
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from websockets.asyncio.client import ClientConnection
+    from dora_systemd.websocket import WebSocket
 
 _OPTIONS: dict[str, Any] = {
     # A coordinator answers no ping while a request is pending; frames are as large as a descriptor;
@@ -23,12 +23,9 @@ _OPTIONS: dict[str, Any] = {
     "max_size": None,
     "proxy": None,
 }
+PATH = "/api/control"
 REQUEST_SECONDS = 35.0
 """Just above the 30 s after which the coordinator itself gives up on its daemon."""
-
-
-def _url(port: int) -> str:
-    return f"ws://127.0.0.1:{port}/api/control"
 
 
 def _headers(token: str) -> dict[str, str]:
@@ -38,23 +35,22 @@ def _headers(token: str) -> dict[str, str]:
 class Connection:
     """A connection for requests, answered one after the other, or for the events of one run."""
 
-    def __init__(self, socket: "ClientConnection") -> None:
+    def __init__(self, socket: "WebSocket") -> None:
         self._socket = socket
 
     @classmethod
     async def open(cls, port: int, token: str) -> "Connection":
         """Connect. Raises DoraSystemdError."""
-        from websockets.asyncio.client import connect
-        from websockets.exceptions import WebSocketException
+        from dora_systemd.websocket import WebSocket, WebSocketException
 
         try:
-            return cls(await connect(_url(port), additional_headers=_headers(token), **_OPTIONS))
-        except (OSError, WebSocketException, TimeoutError) as error:
+            return cls(await WebSocket.connect(port, PATH, _headers(token)))
+        except (OSError, WebSocketException) as error:
             raise _unreachable(port, error) from error
 
     async def request(self, params: Params, seconds: float = REQUEST_SECONDS) -> Reply:
         """Send a request and wait for its reply. Raises DoraSystemdError, also after `seconds`."""
-        from websockets.exceptions import ConnectionClosed
+        from dora_systemd.websocket import WebSocketException
 
         ident, text = encode_request(params)
         try:
@@ -64,28 +60,24 @@ class Connection:
                     frame = parse_frame(await self._socket.recv())
                     if isinstance(frame, Reply) and frame.id == ident:
                         return frame
-        except (ConnectionClosed, TimeoutError) as error:
+        except (OSError, WebSocketException) as error:
             raise _silent(params, error) from error
 
     async def read_events(self, on_record: Callable[[LogRecord], None]) -> None:
         """Give every event to on_record, until the connection is closed by either side."""
-        async for text in self._socket:
+        async for text in self.frames():
             if isinstance(frame := parse_frame(text), LogRecord):
                 on_record(frame)
 
     async def frames(self) -> AsyncIterator[str | bytes]:
         """Every message as it comes, until the connection is closed by either side."""
-        from websockets.exceptions import ConnectionClosed
-
-        try:
+        with suppress(OSError):
             while True:
                 yield await self._socket.recv()
-        except ConnectionClosed:
-            return
 
     async def close(self) -> None:
         """Close at once: the peer may be dead or hang."""
-        self._socket.transport.abort()
+        self._socket.abort()
 
 
 def request(control: Path, params: Params, seconds: float = REQUEST_SECONDS) -> Reply:
@@ -99,7 +91,9 @@ def request(control: Path, params: Params, seconds: float = REQUEST_SECONDS) -> 
     port, token = read_access(control)
     ident, text = encode_request(params)
     try:
-        with connect(_url(port), additional_headers=_headers(token), **_OPTIONS) as socket:
+        with connect(
+            f"ws://127.0.0.1:{port}{PATH}", additional_headers=_headers(token), **_OPTIONS
+        ) as socket:
             socket.send(text)
             while True:
                 frame = parse_frame(socket.recv(timeout=seconds))

@@ -1,6 +1,5 @@
 """The dora coordinator and the dora daemon of one cell, as child processes."""
 
-import asyncio
 import contextlib
 import os
 import signal
@@ -9,6 +8,10 @@ import subprocess
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import asyncio
 
 
 def coordinator_command(dora: str) -> list[str]:
@@ -81,7 +84,7 @@ def spawn(
 
 
 def watch(
-    loop: asyncio.AbstractEventLoop, child: Child, on_exit: Callable[[str, str], None]
+    loop: "asyncio.AbstractEventLoop", child: Child, on_exit: Callable[[str, str], None]
 ) -> None:
     """Call on_exit(label, how) once, when the child has ended."""
 

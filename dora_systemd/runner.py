@@ -1,236 +1,44 @@
 """The main process of a dataflow's unit: `python3 -m dora_systemd.runner`, started by systemd.
 
-Its exit status is dora_systemd.lifecycle.RunnerExit.
+Its exit status is dora_systemd.lifecycle.RunnerExit. Here is what comes before the rest of it is
+imported, which takes longer than dora's coordinator takes to listen.
 """
 
-import asyncio
+import contextlib
 import os
-import signal
 import sys
-from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from dora_systemd import fdstore, notify
-from dora_systemd import lifeevents as life
-from dora_systemd.causes import Cause
 from dora_systemd.cellpaths import CellPaths
-from dora_systemd.cellstate import Cell, RunnerExit, State
-from dora_systemd.cellview import initial_nodes
 from dora_systemd.environment import node_environment
-from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.journal import JournalSocket
-from dora_systemd.launch import has_pipes, kinds, python_of
-from dora_systemd.logs import Origin
-from dora_systemd.names import settings_path
-from dora_systemd.options import RunnerOptions, parse_runner_argv
-from dora_systemd.pipes import LogPipes
-from dora_systemd.preparation import PACKAGE, Prepared, prepare, with_changes
-from dora_systemd.runnerapply import Run
-from dora_systemd.runnerdialogue import Dialogue
-from dora_systemd.runnerengine import Engine
-from dora_systemd.runnerloss import LossWatch, losses_of_user
-from dora_systemd.runnernodes import Nodes, enter_supervisor, wait_eof
-from dora_systemd.runnerpump import Pump, now_us
-from dora_systemd.runnerreload import Reloader
-from dora_systemd.runnersettings import SettingsFile
-from dora_systemd.runnersocket import serve
-from dora_systemd.runnerswap import READY_SECONDS, Swapper
-from dora_systemd.values import INFINITY, SECOND
-from dora_systemd.wiring import downstream_of
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.options import parse_runner_argv
+from dora_systemd.runnerbegin import enter_supervisor, leave_out_openssl, start_coordinator
 
-SAMPLE_SECONDS = 5.0
-JOURNAL_SECONDS = 1.0
-STOP_SECONDS = 7.0
-BACKLOG_SECONDS = 60.0
-"""How long journald may take for what the nodes have left to say, when nobody waits."""
+if TYPE_CHECKING:
+    from dora_systemd.engine import Child
 
 
-def daemon_variables(prepared: Prepared, paths: CellPaths, unit: Path) -> dict[str, str]:
-    """What the daemon's environment has besides the nodes'; launcher.sh takes it out again."""
-    libexec = str(PACKAGE / "libexec")
-    own = {"DORA_QUIET": "1", "RUST_BACKTRACE": "0"}
-    added = {key: text for key, text in own.items() if key not in os.environ}
-    kept = [node.id for node in prepared.dataflow.nodes if not has_pipes(node)]
-    return {
-        **added,
-        "DORA_SYSTEMD_UNSET": " ".join(("DORA_QUIET", *added)),
-        "DORA_SYSTEMD_CELL": str(paths.root),
-        "DORA_SYSTEMD_GROUP": str(unit),
-        "DORA_SYSTEMD_LIBEXEC": libexec,
-        "DORA_SYSTEMD_DIRECTORY": prepared.plan.options.working_directory,
-        "DORA_SYSTEMD_PYTHON": python_of(prepared.plan),
-        "DORA_SYSTEMD_KEEP": " ".join(kept),
-        "PATH": f"{libexec}:{prepared.plan.search_path}",
-    }
-
-
-def make_directories(paths: CellPaths) -> None:
-    """The rooms of the RuntimeDirectory. Raises OSError."""
-    for path in (paths.coordinator, paths.daemon, paths.work, paths.io):
-        path.mkdir(mode=0o700, exist_ok=True)
-
-
-async def run_cell(options: RunnerOptions, paths: CellPaths) -> RunnerExit:
-    """Live the life of one cell: one run of the dataflow after the other, until it has to end."""
-    loop = asyncio.get_running_loop()
-    unit = enter_supervisor()
-    make_directories(paths)
-    journal = JournalSocket()
-    # While systemd holds the pipes too, what is in them outlives a kill of this process.
-    fdstore.forget_inherited()
-    pipes = LogPipes(loop, journal, Origin(options.name, options.uuid), fdstore.store)
-    environment = node_environment(os.environ)
-    nodes = Nodes(unit, paths, pipes)
-    settings = SettingsFile(settings_path(options.dataflow), paths.settings)
-    reloader = Reloader(options, environment, settings)
-    cell = Runs(paths, unit, environment, pipes, nodes, reloader)
-    losses = losses_of_user(journal, pipes) if paths.is_of_user else None
-    try:
-        pipes.write_event("dataflow-starting")
-        return await live(cell, losses)
-    except DoraSystemdError as error:
-        notify.send_status(f"failed: {error.message}")
-        pipes.write_event("dataflow-failed", reason=error.message, cause=Cause.BAD_DATAFLOW)
-        raise
-    finally:
-        pipes.close()
-        journal.wait_read(JOURNAL_SECONDS)
-
-
-@dataclass(frozen=True)
-class Runs:
-    """What all runs of the dataflow share. unit: cgroup directory. environment: of the nodes."""
-
-    paths: CellPaths
-    unit: Path
-    environment: dict[str, str]
-    pipes: LogPipes
-    nodes: Nodes
-    reloader: Reloader
-
-
-async def live(cell: Runs, losses: LossWatch | None) -> RunnerExit:
-    """Run the dataflow, and again as long as reloads ask for it."""
-    beside = [asyncio.create_task(cell.reloader.work())]
-    beside.append(asyncio.create_task(serve(cell.paths.socket, cell.reloader.answer)))
-    if losses is not None:
-        beside.append(asyncio.create_task(losses.run()))
-    try:
-        last = await run_once(cell, is_again=False)
-        while goes_on(cell, last):
-            notify.send_reloading()
-            last = await run_once(cell, is_again=True)
-        if losses is not None:
-            await losses.finish()
-        return last.exit
-    finally:
-        cell.reloader.close()
-        for task in beside:
-            task.cancel()
-
-
-def goes_on(cell: Runs, last: Cell) -> bool:
-    """Whether another run follows: asked for, or the one before what has just failed."""
-    if last.reload:
-        return True
-    if not last.is_trial or last.ready_us or last.stop_by:
-        cell.reloader.go_back(last.failure or "it was stopped")
-        return False
-    return cell.reloader.go_back(last.failure)
-
-
-async def run_once(cell: Runs, is_again: bool) -> Cell:
-    """One run of the dataflow, with a dora of its own; how it ended. Raises DoraSystemdError."""
-    started_us, options, reloader = now_us(), cell.reloader.options, cell.reloader
-    dora = Engine(options.dora, cell.paths, cell.environment)
-    try:
-        coordinator = dora.start_coordinator()  # it boots while we read
-        prepared = reloader.current or prepare(options, cell.environment)
-        cell.nodes.prepare(prepared.dataflow, options.log_rates, options.node_limits)
-        table = initial_nodes(
-            kinds(prepared.dataflow, prepared.plan), prepared.descriptor, started_us
-        )
-        first = Cell(options.grace, started_us, table, is_again=is_again, notice=reloader.notice)
-        fed = downstream_of(prepared.dataflow)
-        first = replace(first, is_trial=reloader.before is not None, downstream=fed)
-        pump = Pump(first, options.uuid, cell.paths, cell.nodes, cell.pipes)
-        dialogue = Dialogue(options, pump, dora, cell.nodes, cell.pipes)
-        variables = daemon_variables(prepared, cell.paths, cell.unit)
-        pump.connect(dialogue.actions(prepared.descriptor, variables))
-        cell.pipes.mute()
-        listen(asyncio.get_running_loop(), options, pump, dialogue)
-        dialogue.watch(coordinator, dialogue.read_coordinator)
-        run = Run(pump, cell.nodes, cell.pipes, Swapper(pump, dora))
-        reloader.begin(run, prepared, started_us * 1000)
-        dialogue.spawn(tell_started(pump, reloader))
-        try:
-            await dialogue.end
-        finally:
-            reloader.end()
-            cell.nodes.close()
-            if not pump.cell.reload:
-                # The loop runs on and the watchdog is fed; a stop has systemd's clock against it.
-                seconds = STOP_SECONDS if pump.cell.stop_by else BACKLOG_SECONDS
-                await cell.pipes.wait_empty(seconds)
-            dialogue.cancel()
-        return pump.cell
-    finally:
-        dora.kill()
-
-
-async def tell_started(pump: Pump, reloader: Reloader) -> None:
-    """A run that has started once is no trial any more."""
-    if await pump.wait(lambda cell: cell.state is State.RUNNING, None):
-        reloader.has_started()
-
-
-def listen(
-    loop: asyncio.AbstractEventLoop, options: RunnerOptions, pump: Pump, dialogue: Dialogue
-) -> None:
-    """Hear what asks the cell to stop, and do what is done from time to time."""
-    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-        loop.add_signal_handler(number, partial(stop, pump, number.name))
-    dialogue.spawn(dialogue.take_samples(SAMPLE_SECONDS))
-    if "WATCHDOG_USEC" in os.environ:
-        seconds = int(os.environ["WATCHDOG_USEC"]) / 1_000_000 / 3
-        dialogue.spawn(dialogue.feed_watchdog(seconds))
-    timeout = options.start_timeout
-    if pump.cell.is_trial:
-        timeout = min(timeout, round(READY_SECONDS * SECOND))
-    if timeout != INFINITY:
-        late = life.StartTimedOut(now_us(), timeout)
-        loop.call_later(timeout / SECOND, pump.push, late)
-    if options.attached:
-        dialogue.spawn(stop_at_eof(pump))
-
-
-def stop(pump: Pump, by: str) -> None:
-    """Ask the cell to stop."""
-    pump.push(life.StopAsked(now_us(), by))
-
-
-async def stop_at_eof(pump: Pump) -> None:
-    """Stop when who started the cell, attached, is gone."""
-    await wait_eof(sys.stdin.fileno())
-    stop(pump, "terminal")
+def begin(argv: list[str]) -> "Child | None":
+    """The coordinator of the first run. None where that is not possible: who needs it says why."""
+    directory = os.environ.get("RUNTIME_DIRECTORY")
+    if directory:
+        with contextlib.suppress(OSError, DoraSystemdError):
+            options = parse_runner_argv(argv)
+            enter_supervisor()
+            paths = CellPaths(Path(directory))
+            return start_coordinator(options.dora, paths, node_environment(os.environ))
+    return None
 
 
 def main(argv: list[str]) -> int:
     """Run the cell that `argv` describes; the exit status."""
-    try:
-        options = with_changes(parse_runner_argv(argv), os.environ)
-        directory = os.environ.get("RUNTIME_DIRECTORY")
-        if not directory:
-            hint = "it is started by systemd: use `doractl start`"
-            raise DoraSystemdError("cannot run without RUNTIME_DIRECTORY", hint, ExitCode.USAGE)
-        return asyncio.run(run_cell(options, CellPaths(Path(directory))))
-    except DoraSystemdError as error:
-        print(f"{error.message}\n{error.hint}".strip(), file=sys.stderr)
-        return RunnerExit.BAD_DATAFLOW
-    except OSError as error:
-        print(f"cannot run the dataflow: {error}", file=sys.stderr)
-        return RunnerExit.FAILED
+    coordinator = begin(argv)
+    leave_out_openssl()
+    from dora_systemd.runnercell import run
+
+    return run(argv, coordinator)
 
 
 if __name__ == "__main__":

@@ -4,12 +4,12 @@ import asyncio
 import json
 import signal
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any
 
 from dora_systemd import control, engine, files, protocol
 from dora_systemd.cellpaths import CellPaths
 from dora_systemd.errors import DoraSystemdError
+from dora_systemd.runnerbegin import start_coordinator
 from dora_systemd.values import SECOND
 
 POLL_SECONDS = 0.002
@@ -37,11 +37,11 @@ class Engine:
         self._port = 0
         self._token = ""
 
-    def start_coordinator(self) -> engine.Child:
-        """Start the coordinator; it prints its port. Raises OSError."""
-        environment = engine.coordinator_environment(self._environment, self._paths.coordinator)
-        command = engine.coordinator_command(self._dora)
-        return self._spawn("coordinator", command, environment, self._paths.coordinator)
+    def start_coordinator(self, early: engine.Child | None = None) -> engine.Child:
+        """Start the coordinator, unless `early` is there; it prints its port. Raises OSError."""
+        child = early or start_coordinator(self._dora, self._paths, self._environment)
+        self._children[child.label] = child
+        return child
 
     def set_port(self, port: int) -> None:
         """The coordinator listens on `port`; its token is in its directory by now. OSError."""
@@ -55,13 +55,9 @@ class Engine:
         files.write_atomic(self._paths.control, json.dumps(access), 0o600)
         environment = {**self._environment, **added, "DORA_AUTH_TOKEN": self._token}
         command = engine.daemon_command(self._dora, self._port, listen)
-        return self._spawn("daemon", command, environment, self._paths.daemon)
-
-    def _spawn(
-        self, label: str, command: list[str], environment: dict[str, str], directory: Path
-    ) -> engine.Child:
-        self._children[label] = engine.spawn(label, command, environment, directory)
-        return self._children[label]
+        daemon = engine.spawn("daemon", command, environment, self._paths.daemon)
+        self._children[daemon.label] = daemon
+        return daemon
 
     async def wait_joined(self) -> None:
         """Return once the daemon has registered with the coordinator."""

@@ -18,23 +18,9 @@ from dora_systemd.limits import NodeLimits
 from dora_systemd.lograte import RateLimits, rate_of
 from dora_systemd.oom import Oom
 from dora_systemd.pipes import LogPipes
+from dora_systemd.runnerbegin import SUPERVISOR
 from dora_systemd.runnerresources import Resources
 from dora_systemd.status import WHOLE_CELL, CpuSample
-
-SUPERVISOR = "supervisor"
-
-
-def enter_supervisor() -> Path:
-    """The cgroup directory of the unit, with this process in its group `supervisor`.
-
-    DelegateSubgroup= puts it there; systemd before 254 does not have that. Raises OSError.
-    """
-    own = cgroup.group_path(cgroup.own_group())
-    if own.name == SUPERVISOR:
-        return own.parent
-    cgroup.make_group(own / SUPERVISOR)
-    cgroup.move_process(own / SUPERVISOR, 0)
-    return own
 
 
 class Nodes:

@@ -18,6 +18,7 @@ from dora_systemd.options import RunnerOptions
 from dora_systemd.preparation import Prepared
 from dora_systemd.reloadsteps import How, Step
 from dora_systemd.runnerapply import Applier, Run
+from dora_systemd.runnerbegin import let_openssl_in
 from dora_systemd.runnerpump import now_us
 from dora_systemd.runnersettings import SettingsFile
 from dora_systemd.runnersources import Change, Sources
@@ -116,6 +117,7 @@ class Reloader:
 
     async def _collect(self) -> None:
         rules = await asyncio.to_thread(watch_rules, self.options)
+        let_openssl_in()  # watchfiles imports anyio, which imports ssl
         try:
             async for files in changed_files(rules):
                 self._changed |= files

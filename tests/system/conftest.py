@@ -78,17 +78,25 @@ def cell(request: pytest.FixtureRequest, project: Project) -> Iterator[Cell]:
     assert not unexpected, "unexpected warnings:\n" + "\n".join(unexpected)
 
 
+@pytest.fixture(scope="session")
+def reserved_ports() -> None:
+    """No connection of a dataflow may happen to take a gateway's port: see ip-sysctl, tcp(7)."""
+    Path("/proc/sys/net/ipv4/ip_local_reserved_ports").write_text("53290-53299")
+
+
 @pytest.fixture
-def front() -> Iterator[Front]:
+def front(reserved_ports: None) -> Iterator[Front]:
     """The gateway of the system, down."""
+    del reserved_ports
     front = Front()
     yield front
     front.end()
 
 
 @pytest.fixture
-def alice() -> Iterator[Front]:
+def alice(reserved_ports: None) -> Iterator[Front]:
     """The gateway of alice, down."""
+    del reserved_ports
     front = Front("alice", 1000, 53291)
     yield front
     front.end()

@@ -26,6 +26,14 @@ def test_status_shows_the_tree(cell: Cell, project: Project) -> None:
     cell.wait_exchanging()
 
 
+def test_the_runner_does_without_openssl(cell: Cell, project: Project) -> None:
+    """A fifth of its memory; nothing that it imports may bring it back."""
+    cell.start(project.three_nodes())
+    maps = Path(f"/proc/{cell.supervisor_pid('runner')}/maps").read_text()
+    assert "libsystemd" in maps
+    assert "libcrypto" not in maps
+
+
 def test_stop_is_clean_and_quick(cell: Cell, project: Project) -> None:
     cell.start(project.three_nodes())
     pids = cell.all_pids()

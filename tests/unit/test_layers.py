@@ -114,7 +114,7 @@ DECISIONS = {
 ADAPTERS = {
     "bus": ["bus", "buserrors", "buslibrary", "buswire"],
     "cgroup": ["cgroup", "cgroupstrain"],
-    "control": ["control"],
+    "control": ["control", "websocket"],
     "engine": ["engine"],
     "fdstore": ["fdstore"],
     "files": ["files", "unitfiles", "yamlloader"],
@@ -182,6 +182,8 @@ USE_CASES = {
     "runner": [
         "runner",
         "runnerapply",
+        "runnerbegin",
+        "runnercell",
         "runnerask",
         "runnerdialogue",
         "runnerengine",
@@ -233,7 +235,7 @@ ONLY_IMPORTERS = {
     "pydantic": {"settingschema"},
     "pystemd": {"bus", "buserrors"},
     "systemd": {"journal", "journalread", "notify"},
-    "websockets": {"control", "gatewayserver"},
+    "websockets": {"control", "websocket", "gatewayserver"},
     "yaml": {"files", "yamlloader"},
     "watchfiles": {"watch"},
 }

@@ -1,0 +1,108 @@
+"""A WebSocket client over asyncio's streams, for loopback. The protocol is that of websockets.
+
+Its own asyncio client imports OpenSSL and a proxy's ways, a fifth of the memory of a runner; what
+is used here is the layer below, which does no input and output itself:
+https://websockets.readthedocs.io/en/stable/howto/sansio.html
+"""
+
+import asyncio
+from collections import deque
+from collections.abc import Mapping
+
+from websockets.client import ClientProtocol
+from websockets.exceptions import WebSocketException
+from websockets.frames import Frame, Opcode
+from websockets.protocol import State
+from websockets.uri import parse_uri
+
+HOST = "127.0.0.1"
+OPEN_SECONDS = 10.0
+CHUNK = 1 << 16
+
+
+class WebSocket:
+    """One connection. Frames may be as large as a descriptor, so there is no limit."""
+
+    def __init__(
+        self,
+        protocol: ClientProtocol,
+        reader: asyncio.StreamReader,
+        writer: asyncio.StreamWriter,
+    ) -> None:
+        self._protocol = protocol
+        self._reader = reader
+        self._writer = writer
+        self._parts: list[Frame] = []
+        self._messages: deque[str | bytes] = deque()
+
+    @classmethod
+    async def connect(cls, port: int, path: str, headers: Mapping[str, str]) -> "WebSocket":
+        """Connect to `port` of this machine. Raises OSError, also without an answer in time, and
+        WebSocketException."""
+        async with asyncio.timeout(OPEN_SECONDS):
+            reader, writer = await asyncio.open_connection(HOST, port)
+            protocol = ClientProtocol(parse_uri(f"ws://{HOST}:{port}{path}"), max_size=None)
+            socket = cls(protocol, reader, writer)
+            try:
+                await socket._shake_hands(headers)
+            except BaseException:
+                socket.abort()
+                raise
+        return socket
+
+    async def _shake_hands(self, headers: Mapping[str, str]) -> None:
+        request = self._protocol.connect()
+        request.headers.update(headers)
+        self._protocol.send_request(request)
+        self._flush()
+        while self._protocol.state is State.CONNECTING:
+            if self._protocol.handshake_exc is not None:
+                raise self._protocol.handshake_exc
+            await self._receive()
+
+    async def send(self, text: str) -> None:
+        """Send a message. Raises OSError, and WebSocketException once it is closed."""
+        self._protocol.send_text(text.encode())
+        self._flush()
+        await self._writer.drain()
+
+    async def recv(self) -> str | bytes:
+        """The next message. Raises OSError, ConnectionError if it is closed by either side."""
+        while not self._messages:
+            if self._protocol.state is not State.OPEN:
+                raise ConnectionError("it closed the connection")
+            await self._receive()
+        return self._messages.popleft()
+
+    def abort(self) -> None:
+        """Close at once: the peer may be dead or hang."""
+        self._writer.transport.abort()
+
+    async def _receive(self) -> None:
+        data = await self._reader.read(CHUNK)
+        if data:
+            self._protocol.receive_data(data)
+        else:
+            self._protocol.receive_eof()
+        self._flush()  # what the protocol answers by itself, such as a pong
+        for event in self._protocol.events_received():
+            if isinstance(event, Frame):
+                self._take(event)
+
+    def _take(self, frame: Frame) -> None:
+        if frame.opcode not in (Opcode.TEXT, Opcode.BINARY, Opcode.CONT):
+            return
+        self._parts.append(frame)
+        if frame.fin:
+            data = b"".join(part.data for part in self._parts)
+            is_text = self._parts[0].opcode is Opcode.TEXT
+            self._messages.append(data.decode() if is_text else data)
+            self._parts.clear()
+
+    def _flush(self) -> None:
+        for data in self._protocol.data_to_send():
+            if data:
+                self._writer.write(data)
+
+
+__all__ = ["WebSocket", "WebSocketException"]
