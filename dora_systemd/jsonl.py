@@ -32,6 +32,7 @@ class JsonlTail:
     path: log_<node>.jsonl, which may not exist yet. put: takes the journal fields of each line.
     is_busy: while it says so nothing is read, the lines stay in the file.
     place: where to note how far the journal has the lines; see resume_tail().
+    watch: is told at each look how many bytes are there that were not read.
     lost_files: how often dora deleted a rotated file before it was read.
     """
 
@@ -42,12 +43,14 @@ class JsonlTail:
         put: Put,
         is_busy: Callable[[], bool] = lambda: False,
         place: Path | None = None,
+        watch: Callable[[int], None] = lambda _: None,
     ) -> None:
         self.path = path
         self.lost_files = 0
         self._loop = loop
         self._put = put
         self._is_busy = is_busy
+        self._watch = watch
         self._lines = LineSplitter(LINE_LIMIT)
         self._fd = -1
         self._timer: asyncio.TimerHandle | None = None
@@ -56,22 +59,24 @@ class JsonlTail:
     def start(self) -> None:
         """Begin to look, every POLL_SECONDS."""
         self._note_place()
-        has_more = not self._is_busy() and self._read_chunk()
+        has_more = not self._is_busy() and self._read_chunk() > 0
         self._note_place()
+        self._watch(self.backlog())
         self._timer = self._loop.call_later(0 if has_more else POLL_SECONDS, self.start)
 
     def drain(self) -> bool:
-        """Take all that is there now; whether there was anything."""
-        has_any = False
-        while self._read_chunk():
-            has_any = True
-        return has_any
+        """Take all that is there now, and no more of a flood; whether there was anything."""
+        left = whole = self.backlog()
+        while left > 0 and (size := self._read_chunk()):
+            left -= size
+        return left < whole
 
     def close(self) -> None:
         """Take what is there and stop to look."""
         if self._timer is not None:
             self._timer.cancel()
-        self.drain()
+        while self._read_chunk():
+            pass
         for line in self._lines.flush():
             self._put(jsonl_fields(line))
         self._shut()
@@ -85,6 +90,20 @@ class JsonlTail:
             return ""
         return f"dora deleted {self.lost_files} of its log files before they were read"
 
+    def backlog(self) -> int:
+        """How many bytes dora has written that were not read."""
+        own, total = None, 0
+        if self._fd >= 0:
+            own, place = os.fstat(self._fd), os.lseek(self._fd, 0, os.SEEK_CUR)
+            total = own.st_size - (place if place <= own.st_size else 0)
+        for path in self._chain():
+            with contextlib.suppress(OSError):
+                status = path.stat()
+                if own and status.st_ino == own.st_ino:
+                    break
+                total += status.st_size
+        return total
+
     def resume(self, inode: int, offset: int) -> None:
         """Begin with byte `offset` of the file `inode`, if it is still there."""
         for path in self._chain():
@@ -96,12 +115,12 @@ class JsonlTail:
             offset = os.lseek(self._fd, 0, os.SEEK_CUR) - len(self._lines.rest)
             self._place.note(os.fstat(self._fd).st_ino, offset)
 
-    def _read_chunk(self) -> bool:
-        """Read on, in the next file if this one is at its end; whether there was anything."""
+    def _read_chunk(self) -> int:
+        """Read on, in the next file if this one is at its end; how many bytes there were."""
         data = self._read() or (self._go_on() and self._read()) or b""
         for line in self._lines.feed(data):
             self._put(jsonl_fields(line))
-        return bool(data)
+        return len(data)
 
     def _read(self) -> bytes:
         if self._fd < 0:

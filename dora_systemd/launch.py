@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import PurePath
 from typing import Any
 
+from dora_systemd.backlog import with_bounds
 from dora_systemd.buildsession import BuildSession
 from dora_systemd.dataflow import Dataflow
 from dora_systemd.dataflownodes import Node, NodeKind
@@ -23,8 +24,6 @@ PROGRAM_KEYS = ("path", "args", "build", "git", "branch", "tag", "rev")
 """The keys of a node that say what it runs: dora is told something else."""
 DEFAULT_OPERATOR = "op"
 """dora's id of the operator of a node that has one only."""
-_JSONL_BOUNDS = {"max_log_size": "16MB", "max_rotated_files": 1}
-"""What dora's own log files of one node may take of the RuntimeDirectory, which is memory."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +84,7 @@ def _launch_node(node: Node, source: str, plan: LaunchPlan) -> dict[str, Any]:
     if plan.options.hot_reload and raw.get("restart_policy", "never") == "never":
         raw |= HELD_KEYS if is_launched(node) else {}
     if node.keeps_output or not (is_launched(node) or node.kind is NodeKind.OPERATOR):
-        raw = {**_JSONL_BOUNDS, **{key: value for key, value in raw.items() if value is not None}}
+        raw = with_bounds(raw)
     if node.kind is NodeKind.OPERATOR:
         return _with_absolute_operators(raw, plan.options.working_directory)
     if not is_launched(node):

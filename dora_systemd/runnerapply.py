@@ -64,7 +64,8 @@ class Applier:
         for step in self._change.steps:
             started = time.monotonic()
             self._begun.append(step)
-            await self._take(step, self._change.prepared)
+            with self._run.nodes.exchanging(step.node):
+                await self._take(step, self._change.prepared)
             self._tell(step, time.monotonic() - started)
 
     async def undo(self, before: Prepared) -> None:
@@ -72,7 +73,8 @@ class Applier:
         for step in reversed(self._begun):
             back = Step(_BACK.get(step.how, step.how), step.node, step.file)
             try:
-                await self._take(back, before)
+                with self._run.nodes.exchanging(step.node):
+                    await self._take(back, before)
             except NotReady:
                 continue  # as it was
 

@@ -150,6 +150,7 @@ class Dialogue:
             await asyncio.sleep(_AGAIN_SECONDS)
 
     async def _ask_stop(self) -> None:
+        self._nodes.let_go()
         cell = self._pump.cell
         seconds = stop_timeout(cell.grace) / SECOND
         # A refusal means that nothing of the run is left; a Stop without an answer is known to
@@ -158,6 +159,7 @@ class Dialogue:
         self._pump.push(life.StopAnswered(now_us()))
 
     def _dismiss_daemon(self) -> None:
+        self._nodes.let_go()
         # What the two say about each other's end is no news.
         self._pipes.mute("coordinator", "daemon")
         self.spawn(self._dismiss_when_quiet())

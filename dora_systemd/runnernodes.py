@@ -5,10 +5,12 @@ import contextlib
 import os
 import resource
 from collections.abc import Iterable
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
 
 from dora_systemd import cgroup
+from dora_systemd.backlog import marks_of
 from dora_systemd.cellpaths import CellPaths
 from dora_systemd.dataflow import Dataflow
 from dora_systemd.dataflownodes import Node, NodeKind
@@ -19,6 +21,7 @@ from dora_systemd.lograte import RateLimits, rate_of
 from dora_systemd.oom import Oom
 from dora_systemd.pipes import LogPipes
 from dora_systemd.runnerbegin import SUPERVISOR
+from dora_systemd.runnerhold import Hold
 from dora_systemd.runnerresources import Resources
 from dora_systemd.status import WHOLE_CELL, CpuSample
 
@@ -33,6 +36,7 @@ class Nodes:
         self._piped: set[str] = set()
         self._launched: set[str] = set()
         self._tails: dict[str, JsonlTail | None] = {}
+        self._holds: dict[str, Hold] = {}
         self.resources = Resources(unit)
 
     def prepare(self, dataflow: Dataflow, rates: RateLimits, limits: Iterable[NodeLimits]) -> None:
@@ -64,6 +68,7 @@ class Nodes:
             self._piped.add(node.id)
         elif node.kind is not NodeKind.DYNAMIC:
             self._tails[node.id] = None
+            self._holds[node.id] = Hold(self._group(node.id), marks_of(node.raw))
 
     def add(self, node: Node, rates: RateLimits, limits: Iterable[NodeLimits]) -> None:
         """The same for one node of a dataflow that runs; it has pipes. Raises as prepare() does."""
@@ -78,6 +83,8 @@ class Nodes:
 
     def remove(self, node: str) -> None:
         """The node has ended and does not come back. Raises OSError."""
+        if hold := self._holds.pop(node, None):
+            hold.end()
         cgroup.kill_group(self._group(node))
         if node in self._piped:
             self._pipes.forget(node)
@@ -99,7 +106,8 @@ class Nodes:
             path = self._paths.work / "out" / run / f"log_{node}.jsonl"
             put = partial(self._pipes.write_fields, node=node)
             is_busy = partial(self._pipes.is_busy, node)
-            tail = JsonlTail(loop, path, put, is_busy, self._paths.node_place(node))
+            place, watch = self._paths.node_place(node), self._holds[node].look
+            tail = JsonlTail(loop, path, put, is_busy, place, watch)
             self._tails[node] = tail
             tail.start()
 
@@ -121,6 +129,16 @@ class Nodes:
         with contextlib.suppress(OSError, ValueError):
             if int(self._paths.node_pid(node).read_text()) == pid:  # the next one is not there yet
                 cgroup.kill_group(self._group(node))
+
+    def let_go(self) -> None:
+        """The nodes are to end: from now on none of them waits for the journal."""
+        for hold in self._holds.values():
+            hold.end()
+
+    def exchanging(self, node: str) -> AbstractContextManager[None]:
+        """Meanwhile `node` does not wait for the journal, because it is to end."""
+        hold = self._holds.get(node)
+        return nullcontext() if hold is None else hold.paused()
 
     def forget(self, node: str) -> None:
         """The node's process has ended: what it says next comes from another one."""
@@ -157,6 +175,8 @@ class Nodes:
             self._pipes.drain(node)  # what the limit took of the very last lines
             if tail.loss:
                 self._pipes.write_event("lines-lost", node, count="Some", reason=tail.loss)
+        self.let_go()
+        self._holds.clear()
         self._tails.clear()
 
     def drain(self, nodes: Iterable[str]) -> None:

@@ -6,10 +6,14 @@ DORA_LOG_LINES says how many lines the floods have: 1000000 for the full measure
 import os
 import re
 import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
+from dora_systemd import cgroup
 from dora_systemd.events import EVENTS
 from tests.system.cells import Cell, Project, run, wait_for
 
@@ -237,9 +241,7 @@ def test_runner_killed_with_lines_in_the_pipes(cell: Cell, project: Project) -> 
 def test_runner_killed_in_a_flood(cell: Cell, project: Project) -> None:
     """What it had read and not written is not lost either."""
     project.write("flood.py", ENDLESS)
-    # Faster than dora's daemon and the runner, it would lose lines by the limit of dora's files.
-    project.write("paced.py", ENDLESS.replace("number += 250", "number += 250; stop.wait(0.05)"))
-    by_dora = "{id: n2, path: paced.py, send_stdout_as: text, outputs: [text]}"
+    by_dora = "{id: n2, path: flood.py, send_stdout_as: text, outputs: [text]}"
     cell.start(project.write("dataflow.yml", f"nodes: [{{id: n1, path: flood.py}}, {by_dora}]"))
     for node in ("n1", "n2"):
         wait_for("a flood", lambda node=node: len(printed(cell, node)) > 2000)  # type: ignore[misc]
@@ -288,3 +290,143 @@ def test_flood_of_a_node_whose_output_dora_reads(cell: Cell, project: Project) -
     cell.start(project.write("dataflow.yml", f"nodes: [{node}]"))
     wait_end(cell)
     assert printed(cell, "n") == numbered(LINES)
+
+
+# Floods as ENDLESS does, as soon as there is a file "go" beside it.
+WHEN_TOLD = ENDLESS.replace(
+    "    number = 0\n", "    number = 0\n    while not os.path.exists('go'): stop.wait(0.01)\n"
+).replace("stop.set()\n", "stop.set()\nopen('/run/logs-held/stopped', 'w').close()\n")
+
+
+@contextmanager
+def without_journald() -> Iterator[None]:
+    """It takes nothing: what it is sent waits, and soon all who send."""
+    show = ("systemctl", "show", "--value", "--property", "MainPID", "systemd-journald.service")
+    pid = int(run(*show).stdout)
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        os.kill(pid, signal.SIGCONT)
+
+
+def group_of(cell: Cell, node: str) -> Path:
+    return cgroup.group_path(cell.show("ControlGroup")) / f"node-{node}"
+
+
+def is_frozen(group: Path) -> bool:
+    return "frozen 1" in (group / "cgroup.events").read_text().splitlines()
+
+
+@pytest.fixture
+def held(project: Project) -> Iterator[Path]:
+    """A dataflow whose node n floods when it is told, and writes when it is told to stop."""
+    place = Path("/run/logs-held")
+    place.mkdir()
+    place.chmod(0o777)
+    project.write("flood.py", WHEN_TOLD)
+    # Without an input dora would not start it again.
+    keys = "inputs: {tick: dora/timer/secs/1}, send_stdout_as: text, outputs: [text]"
+    keys += ", restart_policy: on-failure"
+    yield project.write("dataflow.yml", f"nodes: [{{id: n, path: flood.py, {keys}}}]")
+    (place / "stopped").unlink(missing_ok=True)
+    place.rmdir()
+
+
+def assert_whole(cell: Cell) -> None:
+    *lines, last = printed(cell, "n")
+    assert lines == numbered(len(lines))
+    assert last == f"last {len(lines) - 1:08d}"
+
+
+@pytest.mark.lab
+def test_node_whose_output_dora_reads_waits_for_the_journal(
+    cell: Cell, project: Project, held: Path
+) -> None:
+    cell.start(held)
+    group = group_of(cell, "n")
+    with without_journald():
+        project.write("go", "")
+        wait_for("the node is held", lambda: is_frozen(group))
+        assert "Running" in cell.doractl("list").stdout
+    wait_for("a flood that goes on", lambda: len(printed(cell, "n")) > 60_000, 60)
+    cell.systemctl("stop")
+    assert_whole(cell)
+
+
+@pytest.mark.lab
+def test_stop_while_a_node_waits_for_the_journal(cell: Cell, project: Project, held: Path) -> None:
+    cell.start(held)
+    group = group_of(cell, "n")
+    with without_journald():
+        project.write("go", "")
+        wait_for("the node is held", lambda: is_frozen(group))
+        begun = time.monotonic()
+        cell.systemctl("stop", "--no-block")
+        stopped = Path("/run/logs-held/stopped")
+        wait_for("the node hears of it", stopped.exists, 5)
+    wait_end(cell)
+    assert time.monotonic() - begun < 10  # dora would have killed it after 15 s
+    assert cell.show("Result") == "success"
+    assert_whole(cell)
+
+
+@pytest.mark.lab
+def test_reload_while_a_node_waits_for_the_journal(
+    cell: Cell, project: Project, held: Path
+) -> None:
+    cell.start(held, "--hot-reload")
+    group = group_of(cell, "n")
+    with without_journald():
+        project.write("go", "")
+        wait_for("the node is held", lambda: is_frozen(group))
+        project.write("flood.py", WHEN_TOLD + "# changed\n")
+        wait_for("the old one ends", Path("/run/logs-held/stopped").exists, 5)
+        wait_for("the new one is held", lambda: is_frozen(group))
+    wait_for("it is told", lambda: cell.journal("DORA_EVENT=node-reloaded"))
+    cell.systemctl("stop")
+    lines = printed(cell, "n")
+    again = lines.index(numbered(1)[0], 1)
+    for life in (lines[:again], lines[again:]):
+        assert life == [*numbered(len(life) - 1), f"last {len(life) - 2:08d}"]
+
+
+@pytest.mark.lab
+@pytest.mark.warns("crashed", "exited", "restarted", *LOST)
+def test_node_that_dies_while_it_waits_for_the_journal(
+    cell: Cell, project: Project, held: Path
+) -> None:
+    cell.start(held)
+    group = group_of(cell, "n")
+    with without_journald():
+        project.write("go", "")
+        wait_for("the node is held", lambda: is_frozen(group))
+        os.kill(cell.status.nodes["n"].pid, signal.SIGKILL)
+        wait_for("it is gone", lambda: not (group / "cgroup.procs").read_text())
+    wait_for("it starts again", lambda: len(cell.journal("DORA_EVENT=node-ready")) == 2)
+    count = len(printed(cell, "n"))
+    wait_for("a flood that goes on", lambda: len(printed(cell, "n")) > count)
+    cell.systemctl("stop")
+    lines = printed(cell, "n")
+    again = lines.index(numbered(1)[0], 1)
+    assert lines[:again] == numbered(again)
+    assert lines[again:-1] == numbered(len(lines) - again - 1)
+
+
+@pytest.mark.lab
+@pytest.mark.warns(*LOST)
+def test_runner_killed_while_a_node_waits_for_the_journal(
+    cell: Cell, project: Project, held: Path
+) -> None:
+    cell.start(held)
+    group = group_of(cell, "n")
+    with without_journald():
+        project.write("go", "")
+        wait_for("the node is held", lambda: is_frozen(group))
+        os.kill(cell.supervisor_pid("runner"), signal.SIGKILL)
+    begun = time.monotonic()
+    wait_end(cell)
+    assert time.monotonic() - begun < 10
+    lines = list(dict.fromkeys(printed(cell, "n")))
+    assert lines == numbered(len(lines))
+    assert len(lines) > 5_000

@@ -157,6 +157,70 @@ def test_deleted_before_it_was_read(loop: asyncio.AbstractEventLoop, tmp_path: P
     assert follower.loss == "dora deleted 1 of its log files before they were read"
 
 
+def test_backlog_over_rotations(loop: asyncio.AbstractEventLoop, tmp_path: Path) -> None:
+    dora = Dora(tmp_path)
+    follower, found = tail(loop, dora)
+    assert follower.backlog() == 0
+    dora.write(3)
+    size = dora.path.stat().st_size
+    assert follower.backlog() == size
+    follower.drain()
+    assert follower.backlog() == 0
+    for _ in range(2):
+        dora.write(2)
+        dora.rotate(keep=2)
+    assert follower.backlog() == size // 3 * 4
+    dora.path.with_name("log_a.2.jsonl").unlink()
+    assert follower.backlog() == size // 3 * 4  # it is still open
+    follower.close()
+    assert found == numbers(7)
+
+
+def test_backlog_of_a_truncated_file(loop: asyncio.AbstractEventLoop, tmp_path: Path) -> None:
+    dora = Dora(tmp_path)
+    follower, found = tail(loop, dora)
+    dora.write(3)
+    follower.drain()
+    dora.path.write_text("")
+    dora.write(1)
+    assert follower.backlog() == dora.path.stat().st_size
+    follower.drain()
+    assert found == numbers(4)
+    follower.close()
+
+
+def test_drain_ends_while_dora_goes_on(loop: asyncio.AbstractEventLoop, tmp_path: Path) -> None:
+    dora = Dora(tmp_path)
+    found: list[str] = []
+
+    def put(fields: dict[str, Value]) -> None:
+        found.append(str(fields["MESSAGE"]))
+        dora.write()
+
+    follower = JsonlTail(loop, dora.path, put)
+    dora.write(3)
+    assert follower.drain()
+    assert found == numbers(3)
+    follower._put = lambda fields: found.append(str(fields["MESSAGE"]))
+    follower.close()
+    assert found == numbers(6)
+
+
+def test_watch_hears_of_the_backlog_while_the_journal_is_busy(
+    loop: asyncio.AbstractEventLoop, tmp_path: Path
+) -> None:
+    dora = Dora(tmp_path)
+    dora.write(3)
+    heard: list[int] = []
+    busy = [1]
+    follower = JsonlTail(loop, dora.path, lambda _: None, lambda: bool(busy), watch=heard.append)
+    follower.start()
+    busy.clear()
+    follower.start()
+    assert heard == [dora.path.stat().st_size, 0]
+    follower.close()
+
+
 def test_waits_while_the_journal_is_busy(tmp_path: Path) -> None:
     async def scenario() -> None:
         dora = Dora(tmp_path)

@@ -27,6 +27,7 @@ WORDS = {
 }
 DECISIONS = {
     "decisions": [
+        "backlog",
         "buildsession",
         "busprotocol",
         "cellstate",
@@ -187,6 +188,7 @@ USE_CASES = {
         "runnerask",
         "runnerdialogue",
         "runnerengine",
+        "runnerhold",
         "runnerloss",
         "runnernodes",
         "runnerpost",
