@@ -114,7 +114,7 @@ class Dialogue:
             self._pump.push(life.Subscribed(now_us()))
 
         await self._engine.read_events(self._pump.cell.run, subscribed, self._hear)
-        await asyncio.sleep(_SETTLE_SECONDS)
+        await asyncio.sleep(2 * _SETTLE_SECONDS)  # after the coordinator's own end, if it is that
         self._pump.push(life.ConnectionLost(now_us()))
 
     def _hear(self, record: protocol.LogRecord) -> None:
