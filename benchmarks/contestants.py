@@ -113,12 +113,14 @@ class DoraRun(Contestant):
 
     name = "dora run"
     process: subprocess.Popen[bytes] | None = None
+    user: str | None = None
 
     def start(self) -> None:
         log = (HOME / "dora-run.log").open("wb")
         command = ["dora", "run", str(self.flow)]
+        environment = {**os.environ, **ENVIRONMENT}
         self.process = subprocess.Popen(
-            command, stdout=log, stderr=log, env={**os.environ, **ENVIRONMENT}
+            command, stdout=log, stderr=log, env=environment, user=self.user, group=self.user
         )
 
     def stop(self) -> None:
@@ -129,6 +131,15 @@ class DoraRun(Contestant):
     def main_pid(self) -> int:
         assert self.process
         return self.process.pid
+
+
+class DoraRunOfUser(DoraRun):
+    """The same as the user whom ours runs as: root may lock more memory for large messages."""
+
+    user = "dora"
+
+    def prepare(self) -> None:
+        HOME.chmod(0o777)  # it writes its logs beside the dataflow
 
 
 class DoraUp(Contestant):

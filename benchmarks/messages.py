@@ -9,7 +9,7 @@ import statistics
 import sys
 from functools import partial
 
-from benchmarks.contestants import BARE, Contestant, prepared
+from benchmarks.contestants import Contestant, Doractl, DoraRunOfUser, prepared
 from benchmarks.flows import STAMP, STAMPS, clear_stamps, make_home, wait_gone, wait_stamps
 from benchmarks.rounds import Figure, keep, shown, take_turns
 
@@ -98,7 +98,7 @@ def measure(rounds: int) -> list[Figure]:
     project = make_home()
     project.write("sender.py", SENDER)
     project.write("receiver.py", RECEIVER)
-    with prepared(BARE[:2], project.write("messages.yml", YAML)) as contestants:
+    with prepared((Doractl, DoraRunOfUser), project.write("messages.yml", YAML)) as contestants:
         lives = take_turns({one.name: partial(life, one) for one in contestants}, rounds)
     figures = []
     for what in sorted(lives["doractl"][0], key=lambda what: what.split()[0]):

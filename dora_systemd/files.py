@@ -5,7 +5,6 @@ import errno
 import json
 import os
 import stat
-import tempfile
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -110,10 +109,12 @@ def write_atomic(
     `mode` holds from the first byte on, whatever the umask. is_durable: the same is true after a
     power cut. Nothing is left behind on failure, which raises DoraSystemdError.
     """
+    from tempfile import mkstemp  # imports every compressor, and most commands write nothing
+
     content = data.encode() if isinstance(data, str) else data
     temporary = ""
     try:
-        descriptor, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+        descriptor, temporary = mkstemp(prefix=f".{path.name}.", dir=path.parent)
         with os.fdopen(descriptor, "wb") as file:
             os.fchmod(file.fileno(), mode)
             file.write(content)

@@ -251,7 +251,7 @@ IMPURE = {
 
 CLOCKS = {"time", "time_ns", "monotonic", "monotonic_ns", "sleep", "now", "utcnow", "today"}
 
-NOT_IN_SHORT_LIVED_VERBS = {"pydantic", "websockets", "watchfiles", "asyncio"}
+NOT_IN_SHORT_LIVED_VERBS = {"tempfile", "pydantic", "websockets", "watchfiles", "asyncio"}
 
 
 def imports(name: str) -> tuple[set[str], set[str]]:
