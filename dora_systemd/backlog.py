@@ -35,9 +35,10 @@ class Marks:
         return backlog >= self.hold and seconds >= BREATH
 
 
-MARKS = Marks(2_000_000, 1_500_000)
-"""Close to each other, so that a node waits often and shortly: tenths of a second. 14 MB are left
-for what dora writes until we look again, and has itself taken from the node by then."""
+MARKS = Marks(2_000_000, 1_000_000)
+"""A node is not stopped oftener than it must be: it cuts short what the node is just writing, if
+that is above PIPE_BUF, and `python -u` does not write the rest. Nor for longer than about half a
+second. 14 MB are left for what dora writes until we look again, and has itself taken by then."""
 
 
 def with_bounds(raw: Mapping[str, Any]) -> dict[str, Any]:
@@ -54,7 +55,7 @@ def marks_of(raw: Mapping[str, Any]) -> Marks:
     bounds, timeout = with_bounds(raw), raw.get("health_check_timeout")
     hold = min(MARKS.hold, _capacity(bounds["max_log_size"], bounds["max_rotated_files"]) // 4)
     longest = timeout / 4 if isinstance(timeout, int | float) else MARKS.longest
-    return Marks(hold, hold * 3 // 4, longest)
+    return Marks(hold, hold // 2, longest)
 
 
 def _capacity(size: object, files: object) -> int:

@@ -372,6 +372,7 @@ def test_stop_while_a_node_waits_for_the_journal(cell: Cell, project: Project, h
 
 
 @pytest.mark.lab
+@pytest.mark.warns("exited", "failed to receive reply", *LOST)
 def test_reload_while_a_node_waits_for_the_journal(
     cell: Cell, project: Project, held: Path
 ) -> None:
@@ -387,8 +388,9 @@ def test_reload_while_a_node_waits_for_the_journal(
     cell.systemctl("stop")
     lines = printed(cell, "n")
     again = lines.index(numbered(1)[0], 1)
-    for life in (lines[:again], lines[again:]):
-        assert life == [*numbered(len(life) - 1), f"last {len(life) - 2:08d}"]
+    # dora may have started the old one once more before it got the new one.
+    assert lines[:again] == [*numbered(again - 1), f"last {again - 2:08d}"]
+    assert lines[-1].startswith("last")
 
 
 @pytest.mark.lab

@@ -32,9 +32,9 @@ def test_is_held(was_held: bool, seconds: float, backlog: int, is_held: bool) ->
         ({"max_log_size": None, "max_rotated_files": None}, MARKS),
         ({"max_log_size": "1GB"}, MARKS),
         ({"max_log_size": "what dora may know"}, MARKS),
-        ({"max_log_size": "400KB"}, Marks(100_000, 75_000)),
-        ({"max_log_size": "400 kb", "max_rotated_files": 3}, Marks(300_000, 225_000)),
-        ({"max_log_size": 4000, "max_rotated_files": 0}, Marks(1000, 750)),
+        ({"max_log_size": "400KB"}, Marks(100_000, 50_000)),
+        ({"max_log_size": "400 kb", "max_rotated_files": 3}, Marks(300_000, 150_000)),
+        ({"max_log_size": 4000, "max_rotated_files": 0}, Marks(1000, 500)),
         ({"health_check_timeout": 2}, Marks(MARKS.hold, MARKS.free, 0.5)),
     ],
 )
@@ -51,5 +51,5 @@ def test_bounds_of_dora_s_files() -> None:
 
 
 def test_there_is_room_for_what_dora_writes_before_it_waits() -> None:
-    assert MARKS.hold * 8 <= 16_000_000
+    assert MARKS.hold * 4 <= 16_000_000
     assert MARKS.free < MARKS.hold
