@@ -71,10 +71,17 @@ class Nodes:
             self._holds[node.id] = Hold(self._group(node.id), marks_of(node.raw))
 
     def add(self, node: Node, rates: RateLimits, limits: Iterable[NodeLimits]) -> None:
-        """The same for one node of a dataflow that runs; it has pipes. Raises as prepare() does."""
+        """The same for one node of a dataflow that runs. Raises as prepare() does.
+
+        One without pipes has been there before: dora's file of it goes on.
+        """
+        tail = self._tails.get(node.id)
         self._make(node, rates)
         self.limit(one for one in limits if one.node == node.id)
-        self._pipes.open(node.id)
+        if tail is not None:
+            self._tails[node.id] = tail
+        elif node.id in self._piped:
+            self._pipes.open(node.id)
 
     def limit(self, limits: Iterable[NodeLimits]) -> None:
         """Other limits for nodes that run. Raises DoraSystemdError for one that does not hold."""

@@ -1,11 +1,18 @@
 """The runner's side of the nodes."""
 
+import asyncio
 import resource
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
-from dora_systemd.runnernodes import raise_file_limit
+from dora_systemd.cellpaths import CellPaths
+from dora_systemd.dataflow import parse_dataflow
+from dora_systemd.logs import Origin
+from dora_systemd.pipes import LogPipes
+from dora_systemd.runnernodes import Nodes, raise_file_limit
+from tests.unit.test_logqueue import SlowJournal
 
 
 @pytest.fixture
@@ -21,3 +28,26 @@ def test_more_nodes_than_a_process_has_files() -> None:
     raise_file_limit()
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     assert soft == hard
+
+
+def test_a_node_that_dora_reads_is_removed_and_taken_back(tmp_path: Path) -> None:
+    raw = {"id": "a", "path": "a.py", "outputs": ["said"], "send_stdout_as": "said"}
+    dataflow = parse_dataflow({"nodes": [raw]}, "dataflow.yml")
+    journal = SlowJournal()
+    journal.make_room(100)
+    log = tmp_path / "work/out/run/log_a.jsonl"
+    log.parent.mkdir(parents=True)
+    (tmp_path / "io").mkdir()
+
+    async def live() -> None:
+        pipes = LogPipes(asyncio.get_running_loop(), journal, Origin("robot", "uuid"))
+        nodes = Nodes(tmp_path, CellPaths(tmp_path), pipes)
+        nodes.prepare(dataflow, {}, ())
+        nodes.listen("run")
+        nodes.remove("a")
+        nodes.add(dataflow.nodes[0], {}, ())
+        log.write_text("again\n")
+        nodes.close()
+
+    asyncio.run(live())
+    assert b"MESSAGE=again\n" in b"".join(journal.taken)
