@@ -102,8 +102,10 @@ class Scene:
     def order(self, role: str, what: str) -> None:
         """Have a node do something; return when it has begun."""
         order = self.notes / f"order.{role}.{what}"
-        order.touch()
-        order.chmod(0o666)
+        draft = self.notes / "draft"
+        draft.touch()
+        draft.chmod(0o666)
+        draft.rename(order)  # whole when the node sees it: it looks at any moment
         wait_for("it obeys", lambda: not order.exists())
 
     def lives(self, role: str) -> dict[str, int]:
