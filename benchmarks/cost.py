@@ -10,7 +10,7 @@ from benchmarks.flows import clear_stamps, make_home, wait_stamps
 from benchmarks.rounds import OURS, Figure, keep, shown
 
 SETTLE_SECONDS = 10.0
-WINDOW_SECONDS = 10.0
+WINDOW_SECONDS = 30.0
 OF_DAEMONS = "beside dora"
 OF_ALL = "with dora's own processes"
 

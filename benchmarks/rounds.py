@@ -1,6 +1,7 @@
 """Rounds: ours and the rivals in turns, on the same machine, so that only the ratio counts."""
 
 import json
+import math
 import os
 import platform
 import statistics
@@ -37,9 +38,9 @@ class Figure:
         return statistics.median(self.values[name])
 
     def ratios(self, rival: str) -> list[float]:
-        """Ours to a rival's, round by round."""
+        """Ours to a rival's, round by round; infinite where that is nothing."""
         pairs = zip(self.values[OURS], self.values[rival], strict=True)
-        return [ours / other for ours, other in pairs]
+        return [ours / other if other else math.inf for ours, other in pairs]
 
     @property
     def rivals(self) -> list[str]:
