@@ -21,7 +21,7 @@ def print_dataflows(request: ListRequest) -> int:
     scope = scope_of(request.is_user)
     bus = Bus(scope)
     if request.selector is None:
-        _print_all(_rows(bus, scope, request.want_all), request)
+        _print_all(_rows(bus, scope, request), request)
         return ExitCode.OK
     row = find_row(bus, scope, request.selector)
     print(json.dumps(row_values(row), indent=2) if is_json(request) else format_dataflow(row))
@@ -33,9 +33,9 @@ def is_json(request: ListRequest) -> bool:
     return request.output == "json"
 
 
-def _rows(bus: Bus, scope: Scope, want_all: bool) -> list[DataflowRow]:
-    rows = read_rows(bus, scope)
-    if not want_all:
+def _rows(bus: Bus, scope: Scope, request: ListRequest) -> list[DataflowRow]:
+    rows = read_rows(bus, scope, with_details=is_json(request))
+    if not request.want_all:
         return [row for row in rows if is_up_word(row)]
     # The journal is read only for those that systemd has forgotten.
     from dora_systemd.managerended import ended_rows

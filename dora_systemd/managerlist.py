@@ -32,11 +32,10 @@ from dora_systemd.values import SECOND
 _PROPERTIES = (
     "ControlGroup",
     "NRestarts",
-    "StatusText",
     "ActiveEnterTimestampMonotonic",
     "InactiveExitTimestampMonotonic",
-    "ActiveEnterTimestamp",
 )
+_DETAILS = ("StatusText", "ActiveEnterTimestamp")
 _MICROSECOND_NS = 1000
 
 
@@ -65,14 +64,16 @@ class Reading:
         )
 
 
-def read_dataflow(manager: Manager, scope: Scope, cell: Cell) -> Reading:
-    """Look at one dataflow."""
-    unit = manager.read(cell.unit, _PROPERTIES)
+def read_dataflow(manager: Manager, scope: Scope, cell: Cell, with_details: bool = True) -> Reading:
+    """Look at one dataflow; at more than the table of `list` has only if asked."""
+    unit = manager.read(cell.unit, (*_PROPERTIES, *(_DETAILS if with_details else ())))
     status = read_status(scope, cell) if cell.is_up else CellStatus()
     if not cell.is_up or not unit["ControlGroup"]:
         return Reading(cell, unit, status)
     path = cgroup.group_path(unit["ControlGroup"])
-    groups = {WHOLE_CELL: path, **cgroup.node_groups(path)}
+    # Without the runner's table the groups are all that is known of the nodes.
+    nodes = cgroup.node_groups(path) if with_details or not status.nodes else {}
+    groups = {WHOLE_CELL: path, **nodes}
     usage = {key: cgroup.read_usage(group) for key, group in groups.items()}
     return Reading(cell, unit, status, groups, usage, _monotonic_us())
 
@@ -89,7 +90,7 @@ def row_of(reading: Reading, before: Reading | None = None) -> DataflowRow:
         "unit": cell.unit,
         "status": status_word(cell.state.active, cell.state.sub, status.stage),
         "dataflow": cell.options.dataflow,
-        "text": unit["StatusText"],
+        "text": unit.get("StatusText", ""),
         "restarts": unit["NRestarts"] + status.node_restarts,
     }
     if not reading.usage:
@@ -98,14 +99,16 @@ def row_of(reading: Reading, before: Reading | None = None) -> DataflowRow:
     return DataflowRow(**facts, **_life(unit), **_usage(reading, samples))
 
 
-def dataflow_row(manager: Manager, scope: Scope, cell: Cell) -> DataflowRow:
+def dataflow_row(
+    manager: Manager, scope: Scope, cell: Cell, with_details: bool = True
+) -> DataflowRow:
     """The line of one dataflow."""
-    return row_of(read_dataflow(manager, scope, cell))
+    return row_of(read_dataflow(manager, scope, cell, with_details))
 
 
-def read_rows(manager: Manager, scope: Scope) -> list[DataflowRow]:
-    """All dataflows that systemd knows."""
-    rows = [dataflow_row(manager, scope, cell) for cell in read_cells(manager)]
+def read_rows(manager: Manager, scope: Scope, with_details: bool = True) -> list[DataflowRow]:
+    """All dataflows that systemd knows. with_details: for more than the table."""
+    rows = [dataflow_row(manager, scope, cell, with_details) for cell in read_cells(manager)]
     return mark_enabled(manager, scope, rows) if rows else []
 
 
@@ -147,7 +150,7 @@ def _life(unit: Mapping[str, Any]) -> dict[str, Any]:
     since = unit["ActiveEnterTimestampMonotonic"]
     if since < unit["InactiveExitTimestampMonotonic"]:
         return {"uptime": _monotonic_us() - unit["InactiveExitTimestampMonotonic"]}
-    return {"uptime": _monotonic_us() - since, "started": unit["ActiveEnterTimestamp"]}
+    return {"uptime": _monotonic_us() - since, "started": unit.get("ActiveEnterTimestamp", 0)}
 
 
 def _usage(reading: Reading, known: tuple[CpuSample, ...]) -> dict[str, Any]:
