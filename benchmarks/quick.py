@@ -14,9 +14,9 @@ from benchmarks.rounds import Figure
 PARTS: dict[str, Callable[[], list[Figure]]] = {
     "start": lambda: start.measure(3, (2,)),
     "stop": lambda: stop.measure(2),
-    "recovery": lambda: recovery.measure(2),
+    "recovery": lambda: recovery.measure(1),
     "startup": lambda: startup.measure(5),
-    "logs": lambda: logs.measure(2, want_all=False),
+    "logs": lambda: logs.measure(1, want_all=False),
 }
 
 
