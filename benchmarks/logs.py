@@ -12,13 +12,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from functools import partial
 
 from benchmarks.contestants import ENVIRONMENT
 from benchmarks.flows import HOME, STAMP, clear_stamps, make_home, wait_stamps
 from benchmarks.rounds import OURS, Figure, alternate, keep
-from dora_systemd.cgroup import group_path
+from dora_systemd.cgroup import group_path, read_cpu
 from tests.system.cells import Cell, Project, run, sync_journal, wait_for
 
 LINES = 200_000
@@ -105,8 +104,7 @@ def journald_busy(lines_in: Callable[[Project], float], project: Project) -> flo
 def journald_cpu() -> float:
     """Seconds that journald has used."""
     group = run("systemctl", "show", "--value", "-p", "ControlGroup", "systemd-journald").stdout
-    text = (group_path(group.strip()) / "cpu.stat").read_text()
-    return float(text.split()[1]) / 1e6
+    return read_cpu(group_path(group.strip())).cpu_us / 1e6
 
 
 def dora_in(project: Project) -> float:
@@ -137,11 +135,10 @@ def ours_cpu_of(project: Project, flow: str) -> float:
     """µs that a unit has used in its life, from its cgroup as long as that is there."""
     cell = Cell(f"bench-{time.time_ns()}")
     cell.start(project.write("flow.yml", flow))
-    used, path = 0.0, cell.group / "cpu.stat"
-    with suppress(OSError):
-        while True:
-            used = float(path.read_text().split()[1])
-            time.sleep(0.005)
+    used, group = 0, cell.group
+    while now := read_cpu(group).cpu_us:
+        used = now
+        time.sleep(0.005)
     cell.end()
     return used
 

@@ -20,6 +20,8 @@ from dora_systemd.usage import UNLIMITED, Usage
 from dora_systemd.values import SECOND
 
 NODE_PREFIX = "node-"
+SUPERVISOR = "supervisor"
+"""The group of the runner and of dora's own processes, below that of the unit."""
 MOUNTS = (Path("/sys/fs/cgroup"), Path("/sys/fs/cgroup/unified"))
 
 _ABSENT = (errno.ENOENT, errno.ENODEV, errno.EOPNOTSUPP, errno.ENOTSUP)

@@ -23,9 +23,12 @@ _OPTIONS: dict[str, Any] = {
     "max_size": None,
     "proxy": None,
 }
-PATH = "/api/control"
 REQUEST_SECONDS = 35.0
 """Just above the 30 s after which the coordinator itself gives up on its daemon."""
+
+
+def _url(port: int) -> str:
+    return f"ws://127.0.0.1:{port}/api/control"
 
 
 def _headers(token: str) -> dict[str, str]:
@@ -44,7 +47,7 @@ class Connection:
         from dora_systemd.websocket import WebSocket, WebSocketException
 
         try:
-            return cls(await WebSocket.connect(port, PATH, _headers(token)))
+            return cls(await WebSocket.connect(_url(port), _headers(token)))
         except (OSError, WebSocketException) as error:
             raise _unreachable(port, error) from error
 
@@ -91,9 +94,7 @@ def request(control: Path, params: Params, seconds: float = REQUEST_SECONDS) -> 
     port, token = read_access(control)
     ident, text = encode_request(params)
     try:
-        with connect(
-            f"ws://127.0.0.1:{port}{PATH}", additional_headers=_headers(token), **_OPTIONS
-        ) as socket:
+        with connect(_url(port), additional_headers=_headers(token), **_OPTIONS) as socket:
             socket.send(text)
             while True:
                 frame = parse_frame(socket.recv(timeout=seconds))

@@ -59,9 +59,10 @@ class JsonlTail:
     def start(self) -> None:
         """Begin to look, every POLL_SECONDS."""
         self._note_place()
-        has_more = not self._is_busy() and self._read_chunk() > 0
+        is_busy = self._is_busy()
+        has_more = not is_busy and self._read_chunk() > 0
         self._note_place()
-        self._watch(self.backlog())
+        self._watch(self.backlog() if is_busy or has_more else 0)
         self._timer = self._loop.call_later(0 if has_more else POLL_SECONDS, self.start)
 
     def drain(self) -> bool:

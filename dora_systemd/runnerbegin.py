@@ -7,7 +7,6 @@ from pathlib import Path
 from dora_systemd import cgroup, engine
 from dora_systemd.cellpaths import CellPaths
 
-SUPERVISOR = "supervisor"
 OPENSSL = ("ssl", "_ssl", "_hashlib")
 
 
@@ -32,10 +31,10 @@ def enter_supervisor() -> Path:
     DelegateSubgroup= puts it there; systemd before 254 does not have that. Raises OSError.
     """
     own = cgroup.group_path(cgroup.own_group())
-    if own.name == SUPERVISOR:
+    if own.name == cgroup.SUPERVISOR:
         return own.parent
-    cgroup.make_group(own / SUPERVISOR)
-    cgroup.move_process(own / SUPERVISOR, 0)
+    cgroup.make_group(own / cgroup.SUPERVISOR)
+    cgroup.move_process(own / cgroup.SUPERVISOR, 0)
     return own
 
 

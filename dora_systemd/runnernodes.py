@@ -20,7 +20,6 @@ from dora_systemd.limits import NodeLimits
 from dora_systemd.lograte import RateLimits, rate_of
 from dora_systemd.oom import Oom
 from dora_systemd.pipes import LogPipes
-from dora_systemd.runnerbegin import SUPERVISOR
 from dora_systemd.runnerhold import Hold
 from dora_systemd.runnerresources import Resources
 from dora_systemd.status import WHOLE_CELL, CpuSample
@@ -156,7 +155,9 @@ class Nodes:
 
         Until its launcher has moved it, it is where the daemon is.
         """
-        return any(pid in cgroup.pids(one) for one in (self._group(node), self._unit / SUPERVISOR))
+        return any(
+            pid in cgroup.pids(one) for one in (self._group(node), self._unit / cgroup.SUPERVISOR)
+        )
 
     def find_oom(self, node: str) -> Oom | None:
         """What the kernel has just killed `node` for, if it was for want of memory."""
@@ -164,7 +165,7 @@ class Nodes:
 
     def find_oom_of_dora(self) -> Oom | None:
         """The same for dora's coordinator and daemon."""
-        return self.resources.explain(self._unit / SUPERVISOR)
+        return self.resources.explain(self._unit / cgroup.SUPERVISOR)
 
     def kill(self) -> None:
         """End every node at once, and take its last words from the pipes."""

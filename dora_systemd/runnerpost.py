@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
 QUIET_SECONDS = 0.1
 DAEMON_SECONDS = 5.0
-SUPERVISOR = "supervisor"
 STREAMS = {".out": "stdout", ".err": "stderr"}
 
 
@@ -141,7 +140,7 @@ def out_of_memory(unit: Path) -> str:
     from dora_systemd.oom import largest
     from dora_systemd.values import format_rounded_size
 
-    if not cgroup.read_oom(unit / SUPERVISOR).kills:
+    if not cgroup.read_oom(unit / cgroup.SUPERVISOR).kills:
         return ""
     groups = cgroup.node_groups(unit)
     node, held = largest({key: cgroup.read_usage(one).memory or 0 for key, one in groups.items()})

@@ -15,7 +15,6 @@ from websockets.frames import Frame, Opcode
 from websockets.protocol import State
 from websockets.uri import parse_uri
 
-HOST = "127.0.0.1"
 OPEN_SECONDS = 10.0
 CHUNK = 1 << 16
 
@@ -36,13 +35,13 @@ class WebSocket:
         self._messages: deque[str | bytes] = deque()
 
     @classmethod
-    async def connect(cls, port: int, path: str, headers: Mapping[str, str]) -> "WebSocket":
-        """Connect to `port` of this machine. Raises OSError, also without an answer in time, and
+    async def connect(cls, url: str, headers: Mapping[str, str]) -> "WebSocket":
+        """Connect to a ws:// URL. Raises OSError, also without an answer in time, and
         WebSocketException."""
+        uri = parse_uri(url)
         async with asyncio.timeout(OPEN_SECONDS):
-            reader, writer = await asyncio.open_connection(HOST, port)
-            protocol = ClientProtocol(parse_uri(f"ws://{HOST}:{port}{path}"), max_size=None)
-            socket = cls(protocol, reader, writer)
+            reader, writer = await asyncio.open_connection(uri.host, uri.port)
+            socket = cls(ClientProtocol(uri, max_size=None), reader, writer)
             try:
                 await socket._shake_hands(headers)
             except BaseException:

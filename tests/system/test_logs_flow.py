@@ -13,7 +13,6 @@ from pathlib import Path
 
 import pytest
 
-from dora_systemd import cgroup
 from dora_systemd.events import EVENTS
 from tests.system.cells import Cell, Project, run, wait_for
 
@@ -310,10 +309,6 @@ def without_journald() -> Iterator[None]:
         os.kill(pid, signal.SIGCONT)
 
 
-def group_of(cell: Cell, node: str) -> Path:
-    return cgroup.group_path(cell.show("ControlGroup")) / f"node-{node}"
-
-
 def is_frozen(group: Path) -> bool:
     return "frozen 1" in (group / "cgroup.events").read_text().splitlines()
 
@@ -333,6 +328,17 @@ def held(project: Project) -> Iterator[Path]:
     place.rmdir()
 
 
+@contextmanager
+def waiting(cell: Cell, project: Project, flow: Path, *options: str) -> Iterator[Path]:
+    """The group of n, which floods and is held: journald takes nothing."""
+    cell.start(flow, *options)
+    group = cell.group / "node-n"
+    with without_journald():
+        project.write("go", "")
+        wait_for("the node is held", lambda: is_frozen(group))
+        yield group
+
+
 def assert_whole(cell: Cell) -> None:
     *lines, last = printed(cell, "n")
     assert lines == numbered(len(lines))
@@ -343,11 +349,7 @@ def assert_whole(cell: Cell) -> None:
 def test_node_whose_output_dora_reads_waits_for_the_journal(
     cell: Cell, project: Project, held: Path
 ) -> None:
-    cell.start(held)
-    group = group_of(cell, "n")
-    with without_journald():
-        project.write("go", "")
-        wait_for("the node is held", lambda: is_frozen(group))
+    with waiting(cell, project, held):
         assert "Running" in cell.doractl("list").stdout
     wait_for("a flood that goes on", lambda: len(printed(cell, "n")) > 60_000, 60)
     cell.systemctl("stop")
@@ -356,11 +358,7 @@ def test_node_whose_output_dora_reads_waits_for_the_journal(
 
 @pytest.mark.lab
 def test_stop_while_a_node_waits_for_the_journal(cell: Cell, project: Project, held: Path) -> None:
-    cell.start(held)
-    group = group_of(cell, "n")
-    with without_journald():
-        project.write("go", "")
-        wait_for("the node is held", lambda: is_frozen(group))
+    with waiting(cell, project, held):
         begun = time.monotonic()
         cell.systemctl("stop", "--no-block")
         stopped = Path("/run/logs-held/stopped")
@@ -376,11 +374,7 @@ def test_stop_while_a_node_waits_for_the_journal(cell: Cell, project: Project, h
 def test_reload_while_a_node_waits_for_the_journal(
     cell: Cell, project: Project, held: Path
 ) -> None:
-    cell.start(held, "--hot-reload")
-    group = group_of(cell, "n")
-    with without_journald():
-        project.write("go", "")
-        wait_for("the node is held", lambda: is_frozen(group))
+    with waiting(cell, project, held, "--hot-reload") as group:
         project.write("flood.py", WHEN_TOLD + "# changed\n")
         wait_for("the old one ends", Path("/run/logs-held/stopped").exists, 5)
         wait_for("the new one is held", lambda: is_frozen(group))
@@ -398,11 +392,7 @@ def test_reload_while_a_node_waits_for_the_journal(
 def test_node_that_dies_while_it_waits_for_the_journal(
     cell: Cell, project: Project, held: Path
 ) -> None:
-    cell.start(held)
-    group = group_of(cell, "n")
-    with without_journald():
-        project.write("go", "")
-        wait_for("the node is held", lambda: is_frozen(group))
+    with waiting(cell, project, held) as group:
         os.kill(cell.status.nodes["n"].pid, signal.SIGKILL)
         wait_for("it is gone", lambda: not (group / "cgroup.procs").read_text())
     wait_for("it starts again", lambda: len(cell.journal("DORA_EVENT=node-ready")) == 2)
@@ -420,11 +410,7 @@ def test_node_that_dies_while_it_waits_for_the_journal(
 def test_runner_killed_while_a_node_waits_for_the_journal(
     cell: Cell, project: Project, held: Path
 ) -> None:
-    cell.start(held)
-    group = group_of(cell, "n")
-    with without_journald():
-        project.write("go", "")
-        wait_for("the node is held", lambda: is_frozen(group))
+    with waiting(cell, project, held):
         os.kill(cell.supervisor_pid("runner"), signal.SIGKILL)
     begun = time.monotonic()
     wait_end(cell)

@@ -110,13 +110,18 @@ def test_a_kill_and_who_comes_after(loop: asyncio.AbstractEventLoop, tmp_path: P
     first.close()
 
 
-def test_truncated_by_dora_1_0(loop: asyncio.AbstractEventLoop, tmp_path: Path) -> None:
-    dora = Dora(tmp_path)
-    follower, found = tail(loop, dora)
+def truncate(dora: Dora, follower: JsonlTail) -> None:
+    """Three lines that were read, and a fourth at the beginning again."""
     dora.write(3)
     follower.drain()
     dora.path.write_text("")
     dora.write(1)
+
+
+def test_truncated_by_dora_1_0(loop: asyncio.AbstractEventLoop, tmp_path: Path) -> None:
+    dora = Dora(tmp_path)
+    follower, found = tail(loop, dora)
+    truncate(dora, follower)
     follower.close()
     assert found == numbers(4)
 
@@ -179,10 +184,7 @@ def test_backlog_over_rotations(loop: asyncio.AbstractEventLoop, tmp_path: Path)
 def test_backlog_of_a_truncated_file(loop: asyncio.AbstractEventLoop, tmp_path: Path) -> None:
     dora = Dora(tmp_path)
     follower, found = tail(loop, dora)
-    dora.write(3)
-    follower.drain()
-    dora.path.write_text("")
-    dora.write(1)
+    truncate(dora, follower)
     assert follower.backlog() == dora.path.stat().st_size
     follower.drain()
     assert found == numbers(4)

@@ -235,7 +235,7 @@ PLACES = {
 ONLY_IMPORTERS = {
     "click": {name for name in module_paths() if name.startswith("cli.")},
     "pydantic": {"settingschema"},
-    "pystemd": {"bus", "buserrors"},
+    "pystemd": {"buslibrary"},
     "systemd": {"journal", "journalread", "notify"},
     "websockets": {"control", "websocket", "gatewayserver"},
     "yaml": {"files", "yamlloader"},

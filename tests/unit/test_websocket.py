@@ -14,6 +14,10 @@ Handler = Callable[[ServerConnection], Awaitable[None]]
 TOKEN = {"Authorization": "Bearer token"}
 
 
+def url(port: int) -> str:
+    return f"ws://127.0.0.1:{port}/any"
+
+
 async def refuse_others(socket: ServerConnection, request: Request) -> Response | None:
     if request.headers.get("Authorization") == TOKEN["Authorization"]:
         return None
@@ -28,7 +32,7 @@ def talk(handler: Handler, use: Callable[[WebSocket], Awaitable[object]]) -> obj
             handler, "127.0.0.1", 0, process_request=refuse_others, max_size=None
         ) as server:
             port = next(iter(server.sockets)).getsockname()[1]
-            socket = await WebSocket.connect(port, "/any", TOKEN)
+            socket = await WebSocket.connect(url(port), TOKEN)
             try:
                 return await use(socket)
             finally:
@@ -94,7 +98,7 @@ def test_refused() -> None:
         async with serve(echo, "127.0.0.1", 0, process_request=refuse_others) as server:
             port = next(iter(server.sockets)).getsockname()[1]
             with pytest.raises(WebSocketException, match="401"):
-                await WebSocket.connect(port, "/any", {})
+                await WebSocket.connect(url(port), {})
 
     asyncio.run(both())
 
@@ -107,10 +111,10 @@ def test_nobody_there_and_no_websocket() -> None:
         server = await asyncio.start_server(hang_up, "127.0.0.1", 0)
         port = server.sockets[0].getsockname()[1]
         with pytest.raises((OSError, WebSocketException)):
-            await WebSocket.connect(port, "/any", TOKEN)
+            await WebSocket.connect(url(port), TOKEN)
         server.close()
         await server.wait_closed()
         with pytest.raises(OSError):
-            await WebSocket.connect(port, "/any", TOKEN)
+            await WebSocket.connect(url(port), TOKEN)
 
     asyncio.run(both())
