@@ -46,6 +46,9 @@ _PLAIN_FLAGS = frozenset({"ignore-failure", "no-env-expand"})
 # The runner makes the group and moves into it where systemd does not.
 _REPLACED = frozenset({"DelegateSubgroup"})
 
+# The sandbox has it where it can, which dora-systemd(7) says.
+_WELCOME = {"PrivateUsers": "identity"}
+
 
 def drop_unsupported(
     properties: Properties, systemd_version: int
@@ -64,7 +67,7 @@ def drop_unsupported(
         f"{slot.removesuffix('~')}= is left out: systemd {systemd_version} lacks it, "
         f"version {_since(one)} has it"
         for slot, one in dropped.items()
-        if slot not in _REPLACED
+        if slot not in _REPLACED and one.value != _WELCOME.get(slot)
     )
     return kept, warnings
 

@@ -14,6 +14,7 @@ _RUNNERS_VERDICT = "failed: "
 
 _REFUSED = {
     201: "the nice value was refused",
+    217: "its user, or the user namespace of its sandbox, could not be set up",
     226: "its sandbox could not be set up",
     243: "a credential could not be read",
     214: "realtime scheduling was refused, see LimitRTPRIO= in systemd.exec(5)",

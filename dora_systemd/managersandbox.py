@@ -18,6 +18,7 @@ from dora_systemd.settings import Settings
 from dora_systemd.settingtable import PROPERTY
 from dora_systemd.values import shown
 
+_MAX_USER_NAMESPACES = Path("/proc/sys/user/max_user_namespaces")
 _UV_PLACES = (".cache/uv", ".local/share/uv")
 """What uv writes below the home directory, see `uv cache dir` and `uv python dir`."""
 
@@ -38,6 +39,7 @@ def make_sandbox(
         is_root=user is not None and user.pw_uid == 0,
         has_devices=bool(settings[DEVICE]) or is_named,
         is_realtime=settings[REALTIME] is not None,
+        has_user_namespaces=_has_user_namespaces(),
         needed=tuple(dict.fromkeys(_existing(_needed(prepared)))),
         writable=(*given, *_existing(_written_by_uv(prepared.plan.options, user))),
     )
@@ -55,6 +57,14 @@ def sandbox_warnings(sandbox: Sandbox) -> Iterator[str]:
         yield "the network cannot be limited to the loopback interface in user scope"
     if sandbox.network == "private":
         yield "a private network in user scope needs user namespaces, see systemd.exec(5)"
+
+
+def _has_user_namespaces() -> bool:
+    """Whether there may be any, see user_namespaces(7) and namespaces(7)."""
+    try:
+        return int(_MAX_USER_NAMESPACES.read_text()) > 0
+    except OSError:
+        return False
 
 
 def _checked(path: str) -> str:

@@ -58,7 +58,7 @@ class Sandbox:
 
     level: one of LEVELS. network: one of NETWORKS. is_user: of a user's manager.
     is_root: the nodes run as root. has_devices: some are allowed by name.
-    is_realtime: the nodes are scheduled so.
+    is_realtime: the nodes are scheduled so. has_user_namespaces: the kernel does not refuse them.
     needed: absolute paths that are read, such as the project. writable: those that are written.
     """
 
@@ -68,6 +68,7 @@ class Sandbox:
     is_root: bool = False
     has_devices: bool = False
     is_realtime: bool = False
+    has_user_namespaces: bool = True
     needed: Sequence[str] = ()
     writable: Sequence[str] = ()
 
@@ -123,8 +124,18 @@ def _privileges(sandbox: Sandbox) -> list[str]:
     if sandbox.is_root:
         # Who asks for root wants every file; in a user namespace it would be root of its own only.
         return ["CapabilityBoundingSet=CAP_DAC_OVERRIDE CAP_DAC_READ_SEARCH"]
-    users = ["PrivateUsers=yes"] if sandbox.level == "strict" else []
-    return ["CapabilityBoundingSet=", *users]
+    return ["CapabilityBoundingSet=", *_users(sandbox)]
+
+
+def _users(sandbox: Sandbox) -> list[str]:
+    """A user namespace: all dataflows have one user, whose processes could else trace each other.
+
+    ProtectProc= hides what cannot be traced, which also spares dora's daemon most of its work: it
+    reads all processes that it sees, every two seconds. With "identity" files keep their owners.
+    """
+    if sandbox.level == "strict":
+        return ["PrivateUsers=yes"]
+    return ["PrivateUsers=identity"] if sandbox.has_user_namespaces else []
 
 
 def _path_properties(sandbox: Sandbox) -> dict[str, Property]:

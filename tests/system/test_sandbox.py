@@ -1,5 +1,6 @@
 """The sandbox on a real system: its score, what nodes can still do, and what they cannot."""
 
+import grp
 import json
 import os
 import pwd
@@ -164,6 +165,33 @@ def test_writable(cell: Cell, project: Project, place: Path, level: str) -> None
     tries = [f"write:{place}/x", f"write:{project.root}/out/x", f"write:{project.root}/x"]
     assert probe(cell, project, *flags, tries=tries) == ["ok", "ok", "EROFS"]
     assert (place / "x").read_text() == (project.root / "out" / "x").read_text() == "x"
+
+
+def test_recordings_of_a_group(cell: Cell, project: Project, place: Path) -> None:
+    """A directory that gives what is made in it to a group, as shared ones do."""
+    audio = grp.getgrnam("audio").gr_gid
+    os.chown(place, 0, audio)
+    place.chmod(0o2777)
+    assert probe(cell, project, "--writable", str(place), tries=[f"write:{place}/x"]) == ["ok"]
+    made = (place / "x").stat()
+    assert (made.st_uid, made.st_gid) == (pwd.getpwnam("dora").pw_uid, audio)
+
+
+@pytest.mark.parametrize(
+    ("level", "found"), [("none", "ok"), ("default", "ENOENT"), ("strict", "ENOENT")]
+)
+def test_another_dataflow_of_the_same_user(
+    cell: Cell, project: Project, level: str, found: str
+) -> None:
+    """Its secrets may be in its memory and its environment."""
+    other = Cell("other")
+    try:
+        other.start(project.three_nodes(), "--sandbox", level)
+        (pid,) = other.pids("node-sink")
+        tries = [f"read:/proc/{pid}/environ"]
+        assert probe(cell, project, "--sandbox", level, tries=tries) == [found]
+    finally:
+        other.end()
 
 
 def test_none_writes_everywhere(cell: Cell, project: Project, place: Path) -> None:

@@ -46,6 +46,7 @@ sandboxes = st.builds(
     is_root=st.booleans(),
     has_devices=st.booleans(),
     is_realtime=st.booleans(),
+    has_user_namespaces=st.booleans(),
     needed=st.lists(places).map(tuple),
     writable=st.lists(places).map(tuple),
 )
@@ -63,7 +64,7 @@ def test_levels_only_add() -> None:
     assert sandbox_properties(Sandbox(level="none")) == {}
     assert DEFAULT.keys() < STRICT.keys()
     changed = {slot for slot, one in DEFAULT.items() if STRICT[slot] != one}
-    assert changed == {"ProtectHome"}
+    assert changed == {"ProtectHome", "PrivateUsers"}
 
 
 @given(sandboxes)
@@ -72,7 +73,10 @@ def test_every_property_is_declared_and_old(sandbox: Sandbox) -> None:
     for slot, one in properties.items():
         kinds = dict(TABLE[slot.removesuffix("~")].choices)
         assert kinds[one.name].signature == one.signature
-    assert drop_unsupported(properties, MIN_VERSION) == (properties, ())
+    kept, warnings = drop_unsupported(properties, MIN_VERSION)
+    left_out = {slot for slot, one in properties.items() if one.value == "identity"}
+    assert properties.keys() - kept.keys() == left_out
+    assert not warnings
 
 
 @given(sandboxes)
