@@ -1,8 +1,7 @@
 """What the use cases ask of systemd; `bus` does it in real life, a fake in unit tests."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 JOB_DONE = "done"
 
@@ -12,8 +11,7 @@ Observer = Callable[[Mapping[str, Any]], None]
 """Is told the properties of a unit that changed while something waits."""
 
 
-@dataclass(frozen=True)
-class UnitState:
+class UnitState(NamedTuple):
     """One unit as ListUnits gives it: the words of `systemctl list-units`."""
 
     unit: str

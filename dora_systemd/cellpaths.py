@@ -1,11 +1,10 @@
 """The files of one cell: what lies where in the RuntimeDirectory of its unit."""
 
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 
-@dataclass(frozen=True)
-class CellPaths:
+class CellPaths(NamedTuple):
     """The RuntimeDirectory `root` (mode 0700, see RuntimeDirectory= in systemd.exec(5)) by name."""
 
     root: Path

@@ -6,16 +6,14 @@ Everything here follows the kernel's "Control Group v2" document. A group is nam
 
 import contextlib
 import errno
+import io
 import os
-import re
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.limits import NodeLimits
-from dora_systemd.oom import OomCounts
-from dora_systemd.pressure import Load
 from dora_systemd.usage import UNLIMITED, Usage
 from dora_systemd.values import SECOND
 
@@ -72,43 +70,16 @@ def read_usage(path: Path) -> Usage:
 
     Without a memory controller the memory is the sum of the processes' resident sets.
     """
-    current = _read_number(path / "memory.current")
-    cpu = read_cpu(path)
-    return Usage(
-        cpu_us=cpu.cpu_us,
-        memory=sum(map(_resident_bytes, pids(path))) if current is None else current,
-        memory_peak=_read_number(path / "memory.peak"),
-        memory_max=_read_number(path / "memory.max"),
+    current, cpu = read_number(path / "memory.current"), read_cpu(path)
+    if current is None:
+        memory = sum(map(_resident_bytes, pids(path)))
+        return cpu._replace(memory=memory, cpu_max=_read_share(path / "cpu.max"))
+    return cpu._replace(
+        memory=current,
+        memory_peak=read_number(path / "memory.peak"),
+        memory_max=read_number(path / "memory.max"),
         cpu_max=_read_share(path / "cpu.max"),
-        throttling=cpu.throttling,
     )
-
-
-def read_oom(path: Path) -> OomCounts:
-    """How often the kernel has killed in a group, and how often its own limit was the reason."""
-    return OomCounts(
-        read_numbers(path / "memory.events").get("oom_kill", 0),
-        read_numbers(path / "memory.events.local").get("oom", 0),
-    )
-
-
-def read_load(path: Path) -> Load:
-    """How close a group is to its limit of memory; its throttling is for the caller to say.
-
-    What counts is what the kernel cannot drop: it fills every group up with files it has read.
-    """
-    limits = [_read_number(path / name) for name in ("memory.max", "memory.high")]
-    limit = min((one for one in limits if one is not None), default=UNLIMITED)
-    if limit == UNLIMITED:
-        return Load()
-    stat = read_numbers(path / "memory.stat")
-    return Load(stat.get("anon", 0) + stat.get("shmem", 0), limit, _read_stalled(path))
-
-
-def _read_stalled(path: Path) -> float:
-    """avg10 of "some" in memory.pressure, see the kernel's "PSI" document; 0 where it is off."""
-    match = re.search(r"^some avg10=([0-9.]+)", read_text(path / "memory.pressure"))
-    return float(match[1]) if match else 0.0
 
 
 def read_cpu(path: Path) -> Usage:
@@ -237,12 +208,14 @@ def _write(path: Path, text: str) -> bool:
 def read_text(path: Path) -> str:
     """The text of a control file; "" where there is none, or no group any more."""
     # A group may vanish between any two looks at it: that is the same as an empty one.
-    with contextlib.suppress(OSError):
-        return path.read_text()
+    # There are many of them, and a text file's machinery takes longer than the kernel does.
+    with contextlib.suppress(OSError), io.FileIO(path) as file:
+        return file.readall().decode()
     return ""
 
 
-def _read_number(path: Path) -> int | None:
+def read_number(path: Path) -> int | None:
+    """The number in a control file, UNLIMITED for "max", None where there is none."""
     text = read_text(path).strip()
     if not text:
         return None

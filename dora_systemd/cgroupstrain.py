@@ -3,7 +3,8 @@
 import re
 from pathlib import Path
 
-from dora_systemd.cgroup import read_numbers, read_oom, read_text
+from dora_systemd.cgroup import read_numbers, read_text
+from dora_systemd.cgroupmemory import read_oom
 from dora_systemd.usage import RESOURCES, Strain
 
 _TOTAL = re.compile(r"^(some|full) .*total=(\d+)$", re.M)

@@ -6,7 +6,6 @@ holds limits of nodes, so this module imports nothing that costs time.
 
 import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
 from typing import NamedTuple
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -90,8 +89,7 @@ def _weight_file(weight: int) -> str:
     return f"default {weight}"
 
 
-@dataclass(frozen=True)
-class Limit:
+class Limit(NamedTuple):
     """Something that can be limited, for a dataflow and for a node.
 
     word: its name in `--node-limit NODE:WORD=VALUE`. key: of the setting, in settings files.

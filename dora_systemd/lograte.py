@@ -4,7 +4,7 @@ Off unless somebody asks for it: a limit of ours takes lines away, however exact
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import INFINITY, SECOND, format_duration, parse_duration, quoted
@@ -17,8 +17,7 @@ _HINT = "write LINES/TIME such as 1000/1s, with at least one line and 100ms; or 
 ALL_NODES = ""
 
 
-@dataclass(frozen=True)
-class RateLimit:
+class RateLimit(NamedTuple):
     """`lines` of each of a node's streams in `interval` µs."""
 
     lines: int
@@ -27,6 +26,8 @@ class RateLimit:
 
 RateLimits = Mapping[str, RateLimit | None]
 """By node, ALL_NODES for those that are not named; None: no limit."""
+
+UNLIMITED: RateLimits = {}
 
 
 def parse_rate(text: str) -> RateLimit | None:
@@ -85,47 +86,6 @@ def merge_rates(nodes: Mapping[str, RateLimits], given: RateLimits) -> RateLimit
                 raise DoraSystemdError(message, _HINT, ExitCode.BAD_INPUT)
             limits[node] = limit
     return {**limits, **given}
-
-
-@dataclass
-class _Window:
-    end: float
-    left: int
-
-
-@dataclass
-class LineLimiter:
-    """Counts the lines of one node.
-
-    Each stream has a window of its own: a flood on standard output does not take a traceback on
-    standard error away. A window begins with a stream's first line after the one before it.
-
-    suppressed: how many lines were refused since take_suppressed().
-    """
-
-    limit: RateLimit
-    suppressed: int = 0
-    _windows: dict[str, _Window] = field(default_factory=dict)
-
-    def admit(self, stream: str, count: int, now: float) -> int:
-        """How many of the `count` lines that have come at `now`, in seconds, may pass."""
-        window = self._windows.get(stream)
-        if window is None or now >= window.end:
-            window = _Window(now + self.limit.interval / SECOND, self.limit.lines)
-            self._windows[stream] = window
-        passed = min(count, window.left)
-        window.left -= passed
-        self.suppressed += count - passed
-        return passed
-
-    def end(self, stream: str) -> float:
-        """When the window of a stream that has written is over, in seconds."""
-        return self._windows[stream].end
-
-    def take_suppressed(self) -> int:
-        """How many lines were refused since the last call."""
-        count, self.suppressed = self.suppressed, 0
-        return count
 
 
 def _refusal(text: str) -> DoraSystemdError:

@@ -1,8 +1,7 @@
 """The dataflows of one systemd manager, and the selectors that name them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from dora_systemd.busprotocol import Manager, UnitState
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -21,8 +20,7 @@ _PATTERN = f"{UNIT_PREFIX}*{UNIT_SUFFIX}"
 _UP = frozenset({"active", "activating", "deactivating", "reloading", "refreshing"})
 
 
-@dataclass(frozen=True)
-class Cell:
+class Cell(NamedTuple):
     """One dataflow that systemd knows: the state of its unit, and what its runner was told."""
 
     state: UnitState

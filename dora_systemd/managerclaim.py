@@ -60,7 +60,7 @@ def with_known_uuid(plan: Plan, boot: BootUnit) -> Plan:
     known = boot.options
     if not boot.is_enabled or known is None or known.dataflow != plan.options.dataflow:
         return plan
-    return replace(plan, options=replace(plan.options, uuid=known.uuid))
+    return replace(plan, options=plan.options._replace(uuid=known.uuid))
 
 
 def place_unit_file(

@@ -5,9 +5,8 @@ Nothing of ours has to be alive for it: the node table is only read.
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from dora_systemd import cgroup
 from dora_systemd.busprotocol import Manager
@@ -16,6 +15,7 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.managerbudget import restart_budget
 from dora_systemd.managercells import Cell, matching_cells, read_cells, select_cell
 from dora_systemd.managerenabled import enabled_units
+from dora_systemd.names import SLICE
 from dora_systemd.scope import Scope
 from dora_systemd.status import (
     WHOLE_CELL,
@@ -29,18 +29,13 @@ from dora_systemd.statuswords import DataflowRow, NodeRow, status_word
 from dora_systemd.usage import UNLIMITED, Usage
 from dora_systemd.values import SECOND
 
-_PROPERTIES = (
-    "ControlGroup",
-    "NRestarts",
-    "ActiveEnterTimestampMonotonic",
-    "InactiveExitTimestampMonotonic",
-)
-_DETAILS = ("StatusText", "ActiveEnterTimestamp")
+_UP_SINCE = "ActiveEnterTimestampMonotonic"
+_STARTED = "InactiveExitTimestampMonotonic"
+_ALL = ("ControlGroup", "NRestarts", _UP_SINCE, _STARTED, "StatusText", "ActiveEnterTimestamp")
 _MICROSECOND_NS = 1000
 
 
-@dataclass(frozen=True)
-class Reading:
+class Reading(NamedTuple):
     """One look at a dataflow: what systemd and its runner say, and what its groups have used.
 
     unit: properties of its unit. groups, usage: by node, WHOLE_CELL is the unit's own; empty for a
@@ -49,9 +44,9 @@ class Reading:
 
     cell: Cell
     unit: Mapping[str, Any]
-    status: CellStatus = field(default_factory=CellStatus)
-    groups: Mapping[str, Path] = field(default_factory=dict)
-    usage: Mapping[str, Usage] = field(default_factory=dict)
+    status: CellStatus = CellStatus()
+    groups: Mapping[str, Path] = {}
+    usage: Mapping[str, Usage] = {}
     at_us: int = 0
 
     @property
@@ -64,18 +59,35 @@ class Reading:
         )
 
 
-def read_dataflow(manager: Manager, scope: Scope, cell: Cell, with_details: bool = True) -> Reading:
-    """Look at one dataflow; at more than the table of `list` has only if asked."""
-    unit = manager.read(cell.unit, (*_PROPERTIES, *(_DETAILS if with_details else ())))
+def read_dataflow(
+    manager: Manager, scope: Scope, cell: Cell, slice_path: Path | None = None
+) -> Reading:
+    """Look at one dataflow.
+
+    slice_path: where the groups of dataflows usually are, for no more than the table of `list` has.
+    """
     status = read_status(scope, cell) if cell.is_up else CellStatus()
-    if not cell.is_up or not unit["ControlGroup"]:
+    path = slice_path / cell.unit if slice_path else None
+    path = path if path and path.is_dir() else None
+    unit = manager.read(cell.unit, _few(cell, status, path) if slice_path else _ALL)
+    if not cell.is_up or not (path or unit["ControlGroup"]):
         return Reading(cell, unit, status)
-    path = cgroup.group_path(unit["ControlGroup"])
+    path = path or cgroup.group_path(unit["ControlGroup"])
     # Without the runner's table the groups are all that is known of the nodes.
-    nodes = cgroup.node_groups(path) if with_details or not status.nodes else {}
+    nodes = cgroup.node_groups(path) if not slice_path or not status.nodes else {}
     groups = {WHOLE_CELL: path, **nodes}
     usage = {key: cgroup.read_usage(group) for key, group in groups.items()}
     return Reading(cell, unit, status, groups, usage, _monotonic_us())
+
+
+def _few(cell: Cell, status: CellStatus, path: Path | None) -> list[str]:
+    """The properties that a line of the table cannot do without: each costs as much as a file."""
+    names = ["NRestarts"]
+    if cell.is_up:
+        names += [_UP_SINCE] if path else [_UP_SINCE, "ControlGroup"]
+        # Once it is up that is younger, and the runner has samples.
+        names += [] if cell.state.active == "active" and status.samples else [_STARTED]
+    return names
 
 
 def row_of(reading: Reading, before: Reading | None = None) -> DataflowRow:
@@ -99,23 +111,26 @@ def row_of(reading: Reading, before: Reading | None = None) -> DataflowRow:
     return DataflowRow(**facts, **_life(unit), **_usage(reading, samples))
 
 
-def dataflow_row(
-    manager: Manager, scope: Scope, cell: Cell, with_details: bool = True
-) -> DataflowRow:
+def dataflow_row(manager: Manager, scope: Scope, cell: Cell) -> DataflowRow:
     """The line of one dataflow."""
-    return row_of(read_dataflow(manager, scope, cell, with_details))
+    return row_of(read_dataflow(manager, scope, cell))
 
 
 def read_rows(manager: Manager, scope: Scope, with_details: bool = True) -> list[DataflowRow]:
     """All dataflows that systemd knows. with_details: for more than the table."""
-    rows = [dataflow_row(manager, scope, cell, with_details) for cell in read_cells(manager)]
+    cells = read_cells(manager)
+    if with_details or not cells:
+        slice_path = None
+    else:
+        slice_path = cgroup.group_path(manager.control_group()) / SLICE
+    rows = [row_of(read_dataflow(manager, scope, cell, slice_path)) for cell in cells]
     return mark_enabled(manager, scope, rows) if rows else []
 
 
 def mark_enabled(manager: Manager, scope: Scope, rows: Sequence[DataflowRow]) -> list[DataflowRow]:
     """The rows, with a mark on those that a boot starts."""
     enabled = enabled_units(manager, scope)
-    return [replace(row, enabled=row.unit in enabled) for row in rows]
+    return [row._replace(enabled=row.unit in enabled) for row in rows]
 
 
 def find_row(manager: Manager, scope: Scope, selector: str) -> DataflowRow:
@@ -132,7 +147,7 @@ def find_row(manager: Manager, scope: Scope, selector: str) -> DataflowRow:
             return row
     cell = select_cell(cells, selector)
     row = dataflow_row(manager, scope, cell)
-    row = replace(row, restart_budget=restart_budget(manager, scope, cell))
+    row = row._replace(restart_budget=restart_budget(manager, scope, cell))
     return mark_enabled(manager, scope, [row])[0]
 
 
@@ -147,15 +162,15 @@ def read_status(scope: Scope, cell: Cell) -> CellStatus:
 
 def _life(unit: Mapping[str, Any]) -> dict[str, Any]:
     """Times of the present run; the monotonic ones do not care when the clock is set."""
-    since = unit["ActiveEnterTimestampMonotonic"]
-    if since < unit["InactiveExitTimestampMonotonic"]:
-        return {"uptime": _monotonic_us() - unit["InactiveExitTimestampMonotonic"]}
+    since, started = unit[_UP_SINCE], unit.get(_STARTED, 0)
+    if since < started:
+        return {"uptime": _monotonic_us() - started}
     return {"uptime": _monotonic_us() - since, "started": unit.get("ActiveEnterTimestamp", 0)}
 
 
 def _usage(reading: Reading, known: tuple[CpuSample, ...]) -> dict[str, Any]:
     status, use, now = reading.status, reading.usage, reading.sample
-    samples = known or (CpuSample(reading.unit["InactiveExitTimestampMonotonic"]),)
+    samples = known or (CpuSample(reading.unit[_STARTED]),)
     groups = {key: path for key, path in reading.groups.items() if key != WHOLE_CELL}
     names = status.nodes or dict.fromkeys(groups)
     return {

@@ -25,7 +25,7 @@ def has_process(nodes: Nodes) -> bool:
 def all_ready(nodes: Nodes, at_us: int) -> Nodes:
     """The table when dora opened its start barrier."""
     return {
-        ident: replace(node, state="running", since_us=at_us) if node.state == "ready" else node
+        ident: node._replace(state="running", since_us=at_us) if node.state == "ready" else node
         for ident, node in nodes.items()
     }
 
@@ -69,20 +69,20 @@ def _set(nodes: Nodes, ident: str, at_us: int, **changes: str | int) -> Nodes:
     old = nodes.get(ident, NodeStatus())
     if changes.get("state") != old.state:
         changes["since_us"] = at_us
-    return {**nodes, ident: replace(old, **changes)}  # type: ignore[arg-type]
+    return {**nodes, ident: old._replace(**changes)}  # type: ignore[arg-type]
 
 
 def _reloading(nodes: Nodes, event: life.NodeReloading) -> Nodes:
     """Its successor has restarts of its own."""
     old = nodes.get(event.node, NodeStatus())
-    status = replace(event.status or old, state="reloading", pid=old.pid, since_us=event.at_us)
+    status = (event.status or old)._replace(state="reloading", pid=old.pid, since_us=event.at_us)
     return {**nodes, event.node: status}
 
 
 def _hung(nodes: Nodes, event: life.NodeHung) -> tuple[Nodes, RecordParts | None]:
     if event.node not in nodes:
         return nodes, None
-    nodes = {**nodes, event.node: replace(nodes[event.node], hung=event.reason)}
+    nodes = {**nodes, event.node: nodes[event.node]._replace(hung=event.reason)}
     return nodes, ("node-hung", event.node, {"reason": event.reason})
 
 
@@ -99,7 +99,7 @@ def _exited(
 ) -> tuple[Nodes, RecordParts | None]:
     old = nodes.get(event.node, NodeStatus())
     if old.state == "reloading" and not is_stopping and not event.is_stale:
-        nodes = {**nodes, event.node: replace(old, pid=0)}
+        nodes = {**nodes, event.node: old._replace(pid=0)}
         return nodes, ("node-exited", event.node, {"exit": event.exit} if event.exit else {})
     if event.will_restart and old.policy == HELD:
         # Not by itself: dora has been told to wait, so that a reload can start it again.
@@ -110,7 +110,7 @@ def _exited(
     if event.is_stale and not event.will_restart:
         return nodes, None  # it was replaced: its successor is what counts
     if event.is_stale:  # dora said so only after it had executed the next one
-        nodes = {**nodes, event.node: replace(old, restarts=old.restarts + 1)}
+        nodes = {**nodes, event.node: old._replace(restarts=old.restarts + 1)}
         return nodes, (name, event.node, details)
     nodes = _set(
         nodes,

@@ -5,8 +5,8 @@ module imports nothing that costs time.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import PurePath
+from typing import NamedTuple
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.hotreload import (
@@ -17,7 +17,7 @@ from dora_systemd.hotreload import (
     parse_reload,
 )
 from dora_systemd.limits import NodeLimits, format_node_limits, parse_node_limits
-from dora_systemd.lograte import RateLimits, format_rates, parse_rates
+from dora_systemd.lograte import UNLIMITED, RateLimits, format_rates, parse_rates
 from dora_systemd.names import parse_name, parse_uuid
 from dora_systemd.restarts import DEFAULT, RestartPolicy, format_policy, parse_policy
 from dora_systemd.values import (
@@ -45,8 +45,7 @@ _REPEATED = ("env-key", "log-rate-limit", "node-limit", "node-restart", *ARGUMEN
 _REQUIRED = ("name", "uuid", "working-directory", "dora")
 
 
-@dataclass(frozen=True)
-class RunnerOptions:
+class RunnerOptions(NamedTuple):
     """Everything that one runner needs to know; fixed for the life of its unit.
 
     name, uuid: of the dataflow.
@@ -82,12 +81,15 @@ class RunnerOptions:
     attached: bool = False
     exit_when_nodes_finish: bool | None = None
     env_keys: tuple[str, ...] = ()
-    log_rates: RateLimits = field(default_factory=dict, hash=False)
+    log_rates: RateLimits = UNLIMITED
     node_limits: tuple[NodeLimits, ...] = ()
     restart: RestartPolicy = DEFAULT
     node_restarts: tuple[tuple[str, RestartPolicy], ...] = ()
     start_timeout: int = INFINITY
     reload: HotReload = DEFAULT_RELOAD
+
+    def __hash__(self) -> int:
+        return hash(self.uuid)
 
     @property
     def hot_reload(self) -> bool:

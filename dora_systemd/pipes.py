@@ -18,7 +18,7 @@ from dora_systemd.events import event_fields
 from dora_systemd.heldlines import HeldLines, held_path, read_held
 from dora_systemd.logfields import Value, encode_entry
 from dora_systemd.logqueue import Journal, LogQueue
-from dora_systemd.lograte import LineLimiter, RateLimit, format_rate
+from dora_systemd.lograte import RateLimit, format_rate
 from dora_systemd.logs import LineEncoder, LineSplitter, Origin, dora_log_fields
 from dora_systemd.pipesource import CHUNK, PIPE_SIZE, Pipe, Source, fifos
 from dora_systemd.status import WHOLE_CELL, LineCount
@@ -64,7 +64,7 @@ class LogPipes:
 
     def limit(self, node_id: str, limit: RateLimit) -> None:
         """Keep only so many of a node's lines from now on; an event counts the others."""
-        self._source(node_id).limiter = LineLimiter(limit)
+        self._source(node_id).limit(limit)
 
     def open(self, node_id: str) -> None:
         """Begin to read a node's FIFOs: who waits to open one for writing goes on. OSError."""

@@ -8,7 +8,8 @@ from typing import Any
 
 from dora_systemd.cellpaths import CellPaths
 from dora_systemd.heldlines import HeldLines
-from dora_systemd.lograte import LineLimiter
+from dora_systemd.linelimiter import LineLimiter
+from dora_systemd.lograte import RateLimit
 from dora_systemd.logs import LineEncoder, LineSplitter, Origin
 from dora_systemd.status import LineCount
 
@@ -106,6 +107,10 @@ class Source:
     # Lines that did not come by a pipe, and those that the limiter took and that were told.
     written: int = 0
     suppressed: int = 0
+
+    def limit(self, limit: RateLimit) -> None:
+        """Keep only so many of its lines from now on."""
+        self.limiter = LineLimiter(limit)
 
     @property
     def line_count(self) -> LineCount:

@@ -3,7 +3,7 @@ before there is a unit, and for the runner, which does it at every start."""
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -65,7 +65,7 @@ def with_changes(options: RunnerOptions, environment: Mapping[str, str]) -> Runn
     changes = parse_changes(environment.get(CHANGES_VARIABLE, ""))
     limits = merge_node_limits(options.node_limits, changes)
     is_on = parse_bool(environment.get(CHANGE_VARIABLE) or format_bool(options.hot_reload))
-    return replace(options, node_limits=limits, reload=options.reload._replace(is_on=is_on))
+    return options._replace(node_limits=limits, reload=options.reload._replace(is_on=is_on))
 
 
 def load_dataflow(options: RunnerOptions) -> Dataflow:

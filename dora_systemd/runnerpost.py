@@ -137,10 +137,11 @@ def unit_group() -> Path:
 def out_of_memory(unit: Path) -> str:
     """What there is to say if the kernel has killed the runner for want of memory, else ""."""
     from dora_systemd import cgroup
+    from dora_systemd.cgroupmemory import read_oom
     from dora_systemd.oom import largest
     from dora_systemd.values import format_rounded_size
 
-    if not cgroup.read_oom(unit / cgroup.SUPERVISOR).kills:
+    if not read_oom(unit / cgroup.SUPERVISOR).kills:
         return ""
     groups = cgroup.node_groups(unit)
     node, held = largest({key: cgroup.read_usage(one).memory or 0 for key, one in groups.items()})

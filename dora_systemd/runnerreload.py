@@ -162,7 +162,7 @@ class Reloader:
         run.nodes.limit(change.limits)
         self._settings.keep()
         merged = merge_node_limits(self.options.node_limits, change.limits)
-        self.options = replace(self.options, node_limits=merged)
+        self.options = self.options._replace(node_limits=merged)
         name = PurePath(self._settings.path).name
         for one in change.limits:
             run.pipes.write_event("node-reloaded", one.node, how="limited anew", reason=name)
@@ -237,7 +237,7 @@ class Reloader:
     async def _switch(self, is_on: bool) -> Answer:
         async with self._lock:
             reload = self.options.reload._replace(is_on=is_on)
-            self.options = replace(self.options, reload=reload)
+            self.options = self.options._replace(reload=reload)
             self._sources = Sources(self.options, self._environment)
             # Only how nodes that fail are treated differs: each gets it with its next reload.
             self.current = await asyncio.to_thread(self._sources.prepare)

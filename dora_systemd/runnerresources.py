@@ -5,6 +5,7 @@ from pathlib import Path
 
 from dora_systemd import cgroup
 from dora_systemd.cellstate import Record
+from dora_systemd.cgroupmemory import read_load, read_oom
 from dora_systemd.oom import Oom, OomCounts, Owner, find_owner, largest
 from dora_systemd.pressure import Alarms, Load, look
 from dora_systemd.status import WHOLE_CELL, CpuSample, throttled_percent
@@ -15,15 +16,15 @@ class Resources:
 
     def __init__(self, unit: Path) -> None:
         self._unit = unit
-        self._seen: dict[Path, OomCounts] = {unit: cgroup.read_oom(unit)}
+        self._seen: dict[Path, OomCounts] = {unit: read_oom(unit)}
         self._alarms: Alarms = {}
 
     def explain(self, group: Path) -> Oom | None:
         """Why something in a group has just ended, if it was for want of memory."""
-        node = self._seen.get(group, OomCounts()), cgroup.read_oom(group)
+        node = self._seen.get(group, OomCounts()), read_oom(group)
         if node[1] == node[0]:
             return None
-        unit = self._seen[self._unit], cgroup.read_oom(self._unit)
+        unit = self._seen[self._unit], read_oom(self._unit)
         self._seen |= {group: node[1], self._unit: unit[1]}
         owner = find_owner(node, unit)
         return None if owner is None else self._oom(owner, group)
@@ -49,7 +50,7 @@ class Resources:
 
 
 def _load(path: Path, key: str, samples: tuple[CpuSample, ...], now: CpuSample) -> Load:
-    load = cgroup.read_load(path)
+    load = read_load(path)
     # A group without a limit of CPU time is never throttled.
     if not any(now.throttling.get(key, ())):
         return load

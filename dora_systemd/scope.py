@@ -1,14 +1,13 @@
 """System scope or user scope: which manager, which directories."""
 
 import os
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 RUNTIME_NAME = "dora-systemd"
 
 
-@dataclass(frozen=True)
-class Scope:
+class Scope(NamedTuple):
     """One systemd manager: the system's, or the one of user `uid`."""
 
     is_user: bool

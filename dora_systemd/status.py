@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, field, fields
 from typing import Any, NamedTuple
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -28,8 +27,7 @@ SAMPLES_KEPT = 2
 SHORTEST_WINDOW_US = 1_000_000
 
 
-@dataclass(frozen=True)
-class NodeStatus:
+class NodeStatus(NamedTuple):
     """One node as the runner sees it.
 
     state: one of NODE_STATES. pid: 0 when no process is known. restarts: how often dora restarted
@@ -57,8 +55,7 @@ class NodeStatus:
         return self.state in ALIVE_NODE_STATES
 
 
-@dataclass(frozen=True)
-class CpuSample:
+class CpuSample(NamedTuple):
     """CPU time used up to the moment `at_us` (CLOCK_MONOTONIC µs), in µs, by node id.
 
     throttling: periods in which the node wanted to run and in which it had to wait for its limit.
@@ -66,8 +63,8 @@ class CpuSample:
     """
 
     at_us: int
-    cpu_us: Mapping[str, int] = field(default_factory=dict)
-    throttling: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    cpu_us: Mapping[str, int] = {}
+    throttling: Mapping[str, tuple[int, int]] = {}
 
 
 class LineCount(NamedTuple):
@@ -78,8 +75,7 @@ class LineCount(NamedTuple):
     lost: int = 0
 
 
-@dataclass(frozen=True)
-class CellStatus:
+class CellStatus(NamedTuple):
     """What status.json holds.
 
     run: dora's own id of this run, or "". stage: one of STAGES. text: the unit's STATUS=.
@@ -94,9 +90,9 @@ class CellStatus:
     text: str = ""
     started_us: int = 0
     ready_us: int = 0
-    nodes: Mapping[str, NodeStatus] = field(default_factory=dict)
+    nodes: Mapping[str, NodeStatus] = {}
     samples: tuple[CpuSample, ...] = ()
-    lines: Mapping[str, LineCount] = field(default_factory=dict)
+    lines: Mapping[str, LineCount] = {}
 
     @property
     def alive_count(self) -> int:
@@ -110,11 +106,13 @@ class CellStatus:
 
     def to_json(self) -> str:
         """The text of status.json."""
-        values = {**vars(self), "nodes": {key: vars(node) for key, node in self.nodes.items()}}
+        values = self._asdict()
+        values["nodes"] = {key: node._asdict() for key, node in self.nodes.items()}
         values["samples"] = [
-            {**vars(sample), "cpu_us": dict(sample.cpu_us), "throttling": dict(sample.throttling)}
-            for sample in self.samples
+            {**one._asdict(), "cpu_us": {**one.cpu_us}, "throttling": {**one.throttling}}
+            for one in self.samples
         ]
+        values["lines"] = {**self.lines}
         return json.dumps(values)
 
     @classmethod
@@ -188,10 +186,9 @@ def _parse_sample(raw: Any) -> CpuSample:
 
 
 def _known(kind: type[Any], raw: Any) -> dict[str, Any]:
-    scalars = {one.name: type(one.default) for one in fields(kind) if one.default is not MISSING}
-    names = {one.name for one in fields(kind)}
+    defaults = kind._field_defaults
     return {
-        key: scalars[key](value) if scalars.get(key) in (int, str) else value
+        key: type(defaults[key])(value) if isinstance(defaults[key], int | str) else value
         for key, value in raw.items()
-        if key in names
+        if key in defaults
     }

@@ -2,8 +2,7 @@
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 from dora_systemd.restarts import budget_words
 from dora_systemd.values import SECOND, format_rounded_size
@@ -29,8 +28,7 @@ UNKNOWN = "-"
 SHORTEST_PREFIX = 8
 
 
-@dataclass(frozen=True)
-class NodeRow:
+class NodeRow(NamedTuple):
     """One line of `list SELECTOR`. Sizes in bytes, cpu in percent of one processor, None: unknown.
 
     cpu_limit, memory_limit: the group's own, or None. throttled: the percentage of the time in
@@ -53,8 +51,7 @@ class NodeRow:
     since: int = 0
 
 
-@dataclass(frozen=True)
-class DataflowRow:
+class DataflowRow(NamedTuple):
     """One line of `list`. uptime in µs; started, ended in CLOCK_REALTIME µs, 0: not known.
 
     The numbers are those of NodeRow, for the whole dataflow.
@@ -80,7 +77,7 @@ class DataflowRow:
     throttled: float | None = None
     restarts: int | None = None
     restart_budget: Mapping[str, int | None] | None = None
-    nodes: tuple[NodeRow, ...] = field(default=())
+    nodes: tuple[NodeRow, ...] = ()
     enabled: bool = False
 
 
@@ -259,9 +256,10 @@ def is_up_word(row: DataflowRow) -> bool:
 
 def row_values(row: DataflowRow) -> dict[str, Any]:
     """The row for JSON: exact numbers, their units in the keys, null for what is not known."""
-    values = {_JSON_KEYS.get(key, key): value for key, value in vars(row).items()}
+    values = {_JSON_KEYS.get(key, key): value for key, value in row._asdict().items()}
     values["nodes"] = [
-        {_JSON_KEYS.get(key, key): value for key, value in vars(node).items()} for node in row.nodes
+        {_JSON_KEYS.get(key, key): value for key, value in node._asdict().items()}
+        for node in row.nodes
     ]
     return values
 

@@ -1,7 +1,7 @@
 """What the processes of a group use, and what they had to wait for. Pure."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from typing import NamedTuple
 
 RESOURCES = ("cpu", "memory", "io")
 UNLIMITED = 2**64 - 1
@@ -10,8 +10,7 @@ WORTH_SHOWING = 1.0
 """Percent of the time from which on a wait is shown to people."""
 
 
-@dataclass(frozen=True)
-class Usage:
+class Usage(NamedTuple):
     """What one group uses. CPU in µs since the group was made, memory in bytes, None: not known.
 
     memory_max is UNLIMITED where there is no limit; cpu_max, in µs per second, too. throttling:
@@ -26,8 +25,7 @@ class Usage:
     throttling: tuple[int, int] = (0, 0)
 
 
-@dataclass(frozen=True)
-class Strain:
+class Strain(NamedTuple):
     """Counters of one group, which only grow, see the kernel's "Control Group v2" and "PSI".
 
     stalled: by resource, the µs in which some of its processes waited for it, and those in which
@@ -35,7 +33,7 @@ class Strain:
     CPU limit held them. oom_kills: processes killed for want of memory.
     """
 
-    stalled: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    stalled: Mapping[str, tuple[int, int]] = {}
     throttled: int = 0
     oom_kills: int = 0
 

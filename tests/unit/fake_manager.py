@@ -1,10 +1,9 @@
 """A systemd of a few dicts: what the use cases of doractl are tested against."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from dora_systemd.busprotocol import JOB_DONE, Observer, Property, UnitState
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -13,11 +12,15 @@ from dora_systemd.options import RunnerOptions, runner_command
 from dora_systemd.scope import Scope
 
 
-@dataclass(frozen=True)
 class ScopeIn(Scope):
     """A scope whose runtime directories are below `root`."""
 
-    root: Path = Path("/nowhere")
+    root: Path
+
+    def __new__(cls, is_user: bool, uid: int, root: Path = Path("/nowhere")) -> Self:
+        self = super().__new__(cls, is_user, uid)
+        self.root = root
+        return self
 
     @property
     def runtime_root(self) -> Path:

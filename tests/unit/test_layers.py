@@ -62,6 +62,7 @@ DECISIONS = {
         "logfields",
         "logquery",
         "livemessages",
+        "linelimiter",
         "lograte",
         "lograteplan",
         "logs",
@@ -114,7 +115,7 @@ DECISIONS = {
 }
 ADAPTERS = {
     "bus": ["bus", "buserrors", "buslibrary", "buswire"],
-    "cgroup": ["cgroup", "cgroupstrain"],
+    "cgroup": ["cgroup", "cgroupmemory", "cgroupstrain"],
     "control": ["control", "websocket"],
     "engine": ["engine"],
     "fdstore": ["fdstore"],

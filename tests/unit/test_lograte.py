@@ -7,10 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.linelimiter import LineLimiter
 from dora_systemd.lograte import (
     ALL_NODES,
     SHORTEST,
-    LineLimiter,
     RateLimit,
     format_rate,
     format_rates,

@@ -138,7 +138,7 @@ def test_other_settings_replace_on_request(manager: FakeManager, scope: Scope) -
 def test_another_dataflow_has_another_uuid(manager: FakeManager, scope: Scope) -> None:
     place(manager, make_plan(scope), want_boot=True)
     plan = make_plan(scope, uuid=OTHER)
-    plan = replace(plan, options=replace(plan.options, dataflow="/srv/other.yml"))
+    plan = replace(plan, options=plan.options._replace(dataflow="/srv/other.yml"))
     assert place(manager, plan, want_boot=True)
     assert f"--uuid={OTHER}" in unit_file(manager).read_text()
 

@@ -2,12 +2,13 @@
 
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from dora_systemd import cgroup, managerlist
 from dora_systemd.managercells import read_cells
-from dora_systemd.managerlist import dataflow_row, find_row
+from dora_systemd.managerlist import dataflow_row, find_row, read_rows
 from dora_systemd.scope import Scope
 from dora_systemd.status import CellStatus, CpuSample, NodeStatus
 from dora_systemd.statuswords import DataflowRow
@@ -76,6 +77,31 @@ def test_running_dataflow(scope: Scope) -> None:
     assert (camera.pid, camera.memory, camera.state) == (42, 1 << 20, "running")
     assert camera.cpu_percent == pytest.approx(25, rel=0.2)
     assert (plot.exit, plot.memory, plot.cpu_percent) == ("exit code 1", None, None)
+
+
+@pytest.mark.parametrize("group", [GROUP, "/other.slice/dora-robot.service"])
+@pytest.mark.parametrize("active", ["active", "activating", "failed"])
+@pytest.mark.parametrize("has_samples", [True, False])
+def test_the_table_asks_for_less_and_says_the_same(
+    scope: Scope, unit_group: Path, group: str, active: str, has_samples: bool
+) -> None:
+    if group != GROUP:
+        unit_group.parent.rename(unit_group.parents[1] / "other.slice")
+    manager = FakeManager()
+    started = now_us() - 40 * SECOND
+    times = {"InactiveExitTimestampMonotonic": started}
+    times["ActiveEnterTimestampMonotonic"] = started + (SECOND if active == "active" else -SECOND)
+    manager.add(options(), active=active, ControlGroup=group, NRestarts=1, **times)
+    samples = (CpuSample(now_us() - 4 * SECOND, {"": 2 * SECOND}),) if has_samples else ()
+    status = CellStatus(nodes={"camera": NodeStatus("running", 42)}, samples=samples)
+    write_status(scope, status)
+    (all_of_it,) = read_rows(manager, scope)
+    (line,) = read_rows(manager, scope, with_details=False)
+    assert (line.memory is None) == (active == "failed")
+    now: dict[str, Any] = {"uptime": None, "cpu_percent": None, "nodes": ()}
+    assert line._replace(**now) == all_of_it._replace(**now)
+    for mine, other in ((line.uptime, all_of_it.uptime), (line.cpu_percent, all_of_it.cpu_percent)):
+        assert mine == (other and pytest.approx(other, rel=0.1))
 
 
 @pytest.mark.usefixtures("unit_group")

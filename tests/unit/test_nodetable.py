@@ -1,7 +1,5 @@
 """The live table while reloads change which nodes there are."""
 
-from dataclasses import replace
-
 from dora_systemd import lifeevents as life
 from dora_systemd.nodetable import has_process, reshape, update
 from dora_systemd.status import HELD, NodeStatus
@@ -52,7 +50,7 @@ def test_a_node_that_is_held_fails_and_is_not_restarted() -> None:
 def test_processes_of_a_node_that_reloads() -> None:
     reloading = reshape(RUNNING, life.NodeReloading(1, "a"))
     assert has_process(reloading)
-    assert not has_process({"a": replace(reloading["a"], pid=0)})
+    assert not has_process({"a": reloading["a"]._replace(pid=0)})
 
 
 def test_nodes_come_and_go() -> None:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from dora_systemd import cgroup
+from dora_systemd.cgroupmemory import read_load, read_oom
 from dora_systemd.oom import Owner
 from dora_systemd.pressure import CPU, MEMORY
 from dora_systemd.runnerresources import Resources
@@ -70,5 +70,5 @@ def test_limits_that_come_close(unit: Path) -> None:
 
 
 def test_what_is_not_there_is_no_limit(tmp_path: Path) -> None:
-    assert cgroup.read_oom(tmp_path).kills == 0
-    assert cgroup.read_load(tmp_path).limit is None
+    assert read_oom(tmp_path).kills == 0
+    assert read_load(tmp_path).limit is None

@@ -1,7 +1,5 @@
 """Words and whole tables of `doractl list`."""
 
-from dataclasses import replace
-
 import pytest
 
 from dora_systemd.statuswords import (
@@ -120,14 +118,13 @@ def test_one_dataflow() -> None:
     )
 
 
-LIMITED = replace(
-    ROWS[0],
+LIMITED = ROWS[0]._replace(
     memory_limit=4 << 30,
     memory_peak=300 << 20,
     cpu_limit=200.0,
     throttled=12.0,
     nodes=(
-        replace(ROWS[0].nodes[0], memory_limit=1 << 30, cpu_limit=150.0, throttled=31.25),
+        ROWS[0].nodes[0]._replace(memory_limit=1 << 30, cpu_limit=150.0, throttled=31.25),
         ROWS[0].nodes[1],
     ),
 )
