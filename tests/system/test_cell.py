@@ -5,6 +5,7 @@ import os
 import signal
 import stat
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -32,6 +33,40 @@ def test_the_runner_does_without_openssl(cell: Cell, project: Project) -> None:
     maps = Path(f"/proc/{cell.supervisor_pid('runner')}/maps").read_text()
     assert "libsystemd" in maps
     assert "libcrypto" not in maps
+
+
+BURST = """
+import time
+time.sleep({late})
+from dora import Node
+import pyarrow as pa
+node = Node()
+for number in range(150):
+    size = (100, 8_000, 300_000)[number % 3]
+    node.send_output("burst", pa.array([0] * size, type=pa.uint8()), {{"number": number}})
+    time.sleep(0.002)
+"""
+CATCH = """
+from dora import Node
+found = {one["metadata"]["number"] for one in Node() if one["type"] == "INPUT"}
+print("caught", len(found), flush=True)
+"""
+BURST_YAML = """nodes:
+  - {id: burst, path: burst.py, outputs: [burst]}
+  - {id: one, path: catch.py, inputs: {burst: {source: burst/burst, queue_size: 500}}}
+  - {id: two, path: catch.py, inputs: {burst: {source: burst/burst, queue_size: 500}}}
+"""
+
+
+@pytest.mark.warns("dora-rs/dora#2742 diagnostic")
+@pytest.mark.parametrize("late", [0, 0.3, 1.0])
+def test_the_first_messages_arrive(cell: Cell, project: Project, late: float) -> None:
+    """However late the producer is: consumers do not wait for it for long."""
+    project.write("burst.py", BURST.format(late=late))
+    project.write("catch.py", CATCH)
+    cell.start(project.write("dataflow.yml", BURST_YAML))
+    for node in ("one", "two"):
+        assert wait_for("the end", partial(cell.messages, node)) == ["caught 150"]
 
 
 def test_stop_is_clean_and_quick(cell: Cell, project: Project) -> None:

@@ -55,7 +55,18 @@ def test_the_node_gets_group_pipes_directory_and_environment(
     assert (tmp_path / "node-one/cgroup.procs").read_text() == "0\n"
     assert "MODEL=yolo" in said
     assert "PATH=/usr/bin:/bin" in said
-    assert not [line for line in said if line.startswith(("DORA_", "RUST_"))]
+    left = [line for line in said if line.startswith(("DORA_", "RUST_"))]
+    assert left == [f"DORA_ZENOH_CONFIG_OVERLAY={PACKAGE}/zenoh.json5"]
+
+
+@pytest.mark.parametrize("key", ["ZENOH_CONFIG", "DORA_ZENOH_CONFIG_OVERLAY"])
+@pytest.mark.parametrize("text", ["/etc/own.json5", ""])
+def test_zenoh_of_ones_own(
+    environment: dict[str, str], tmp_path: Path, key: str, text: str
+) -> None:
+    done = launcher({**environment, key: text}, "kept", str(tmp_path), "keep", "/usr/bin/env")
+    said = done.stdout.splitlines()
+    assert [one for one in said if one.startswith(("DORA_Z", "ZENOH_"))] == [f"{key}={text}"]
 
 
 def test_output_that_dora_reads_is_left_alone(environment: dict[str, str], tmp_path: Path) -> None:
