@@ -19,6 +19,7 @@ from dora_systemd.settingtable import PROPERTY
 from dora_systemd.values import shown
 
 _MAX_USER_NAMESPACES = Path("/proc/sys/user/max_user_namespaces")
+_IDENTITY = 65536
 _UV_PLACES = (".cache/uv", ".local/share/uv")
 """What uv writes below the home directory, see `uv cache dir` and `uv python dir`."""
 
@@ -39,7 +40,7 @@ def make_sandbox(
         is_root=user is not None and user.pw_uid == 0,
         has_devices=bool(settings[DEVICE]) or is_named,
         is_realtime=settings[REALTIME] is not None,
-        has_user_namespaces=_has_user_namespaces(),
+        has_identity=_has_identity(user) and not _names_capabilities(settings),
         needed=tuple(dict.fromkeys(_existing(_needed(prepared)))),
         writable=(*given, *_existing(_written_by_uv(prepared.plan.options, user))),
     )
@@ -59,12 +60,30 @@ def sandbox_warnings(sandbox: Sandbox) -> Iterator[str]:
         yield "a private network in user scope needs user namespaces, see systemd.exec(5)"
 
 
-def _has_user_namespaces() -> bool:
-    """Whether there may be any, see user_namespaces(7) and namespaces(7)."""
+def _has_identity(user: pwd.struct_passwd | None) -> bool:
+    """Whether `user` can be in a user namespace with the first 65536 ids, and there can be one.
+
+    A kernel may refuse any, a container may have fewer ids, and a directory service gives higher
+    ones: see namespaces(7) and user_namespaces(7).
+    """
+    if user is not None and max(user.pw_uid, user.pw_gid) >= _IDENTITY:
+        return False
     try:
-        return int(_MAX_USER_NAMESPACES.read_text()) > 0
+        has_all = all(_maps_identity(Path("/proc/self", one)) for one in ("uid_map", "gid_map"))
+        return has_all and int(_MAX_USER_NAMESPACES.read_text()) > 0
     except OSError:
         return False
+
+
+def _maps_identity(path: Path) -> bool:
+    rows = ([int(number) for number in line.split()] for line in path.read_text().splitlines())
+    return any(inside == 0 and count >= _IDENTITY for inside, _, count in rows)
+
+
+def _names_capabilities(settings: Settings) -> bool:
+    """Whether properties give some: in a user namespace they would count for nothing."""
+    keys = {one.partition("=")[0] for one in settings[PROPERTY]}
+    return not keys.isdisjoint(("AmbientCapabilities", "CapabilityBoundingSet"))
 
 
 def _checked(path: str) -> str:

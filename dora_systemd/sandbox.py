@@ -58,7 +58,8 @@ class Sandbox:
 
     level: one of LEVELS. network: one of NETWORKS. is_user: of a user's manager.
     is_root: the nodes run as root. has_devices: some are allowed by name.
-    is_realtime: the nodes are scheduled so. has_user_namespaces: the kernel does not refuse them.
+    is_realtime: the nodes are scheduled so. has_identity: the user can be
+    in a namespace with the first 65536 ids.
     needed: absolute paths that are read, such as the project. writable: those that are written.
     """
 
@@ -68,7 +69,7 @@ class Sandbox:
     is_root: bool = False
     has_devices: bool = False
     is_realtime: bool = False
-    has_user_namespaces: bool = True
+    has_identity: bool = True
     needed: Sequence[str] = ()
     writable: Sequence[str] = ()
 
@@ -128,14 +129,14 @@ def _privileges(sandbox: Sandbox) -> list[str]:
 
 
 def _users(sandbox: Sandbox) -> list[str]:
-    """A user namespace: all dataflows have one user, whose processes could else trace each other.
+    """A user namespace: else ptrace(2) and /proc show a dataflow all others of the same user.
 
     ProtectProc= hides what cannot be traced, which also spares dora's daemon most of its work: it
     reads all processes that it sees, every two seconds. With "identity" files keep their owners.
     """
     if sandbox.level == "strict":
         return ["PrivateUsers=yes"]
-    return ["PrivateUsers=identity"] if sandbox.has_user_namespaces else []
+    return ["PrivateUsers=identity"] if sandbox.has_identity else []
 
 
 def _path_properties(sandbox: Sandbox) -> dict[str, Property]:

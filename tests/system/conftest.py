@@ -15,6 +15,7 @@ ALLOWED_ALWAYS = (
     # What zenoh says in nodes that start before their peers, or outlive them by milliseconds.
     "Scouting delay elapsed before start conditions are met",
     "Unable to find transport for link event",
+    "Error syncing transport with peer",
     "Unable to connect to any locator",
     "in response to an OpenSyn",
     "Attempt to establish transport to itself",

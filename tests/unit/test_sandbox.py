@@ -13,7 +13,7 @@ from dora_systemd.dataflow import parse_dataflow
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.files import absolute_path
 from dora_systemd.launch import LaunchPlan
-from dora_systemd.managersandbox import make_sandbox, sandbox_warnings
+from dora_systemd.managersandbox import _maps_identity, make_sandbox, sandbox_warnings
 from dora_systemd.preparation import Prepared
 from dora_systemd.properties import UnitContext, format_unit, unit_properties
 from dora_systemd.propertyset import parse_line, with_properties
@@ -46,7 +46,7 @@ sandboxes = st.builds(
     is_root=st.booleans(),
     has_devices=st.booleans(),
     is_realtime=st.booleans(),
-    has_user_namespaces=st.booleans(),
+    has_identity=st.booleans(),
     needed=st.lists(places).map(tuple),
     writable=st.lists(places).map(tuple),
 )
@@ -213,14 +213,19 @@ SYSTEM = Scope(is_user=False, uid=os.getuid())
 ME = pwd.getpwuid(os.getuid())
 
 
-def made(tmp_path: Path, nodes: str = "/opt/x/camera", **flags: object) -> Sandbox:
+def made(
+    tmp_path: Path,
+    nodes: str = "/opt/x/camera",
+    user: pwd.struct_passwd = ME,
+    **flags: object,
+) -> Sandbox:
     own = options(
         dataflow=f"{tmp_path}/flow.yml", working_directory=str(tmp_path), uv=bool(flags.get("uv"))
     )
     document = {"nodes": [{"id": "a", "path": nodes, "outputs": ["x"]}]}
     plan = LaunchPlan(own, "/l.sh", "/nowhere", os.path.exists)
     prepared = Prepared(parse_dataflow(document, "flow.yml"), plan, {})
-    return make_sandbox(SYSTEM, resolve_settings(flags, {}, []), ME, prepared)
+    return make_sandbox(SYSTEM, resolve_settings(flags, {}, []), user, prepared)
 
 
 def test_what_a_plan_needs(tmp_path: Path) -> None:
@@ -238,6 +243,33 @@ def test_choices_of_a_plan(tmp_path: Path) -> None:
     assert made(tmp_path, property=("DeviceAllow=/dev/null",)).has_devices
     assert made(tmp_path, realtime="20").is_realtime
     assert made(tmp_path).is_root == (os.getuid() == 0)
+
+
+@pytest.mark.parametrize(
+    ("uid", "gid", "has_identity"),
+    [(990, 990, True), (65535, 65535, True), (65536, 990, False), (990, 200_000, False)],
+)
+def test_users_of_a_directory_service(
+    tmp_path: Path, uid: int, gid: int, has_identity: bool
+) -> None:
+    """Their ids are not in the namespace."""
+    user = pwd.struct_passwd(("robot", "x", uid, gid, "", "/", "/bin/sh"))
+    assert made(tmp_path, user=user).has_identity == has_identity
+
+
+@pytest.mark.parametrize("key", ["AmbientCapabilities", "CapabilityBoundingSet"])
+def test_capabilities_that_are_given_count(tmp_path: Path, key: str) -> None:
+    user = pwd.struct_passwd(("robot", "x", 990, 990, "", "/", "/bin/sh"))
+    assert not made(tmp_path, user=user, property=(f"{key}=CAP_NET_RAW",)).has_identity
+
+
+@pytest.mark.parametrize(
+    ("rows", "expected"),
+    [("0 0 4294967295", True), ("0 100000 65536", True), ("0 1000 1\n1 100000 65536", False)],
+)
+def test_ids_of_a_container(tmp_path: Path, rows: str, expected: bool) -> None:
+    (tmp_path / "uid_map").write_text(f"{rows}\n")
+    assert _maps_identity(tmp_path / "uid_map") == expected
 
 
 def test_writable_paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
