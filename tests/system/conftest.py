@@ -29,6 +29,7 @@ ALLOWED_ALWAYS = (
     "closing node connection after I/O error",
     "server disconnected unexpectedly",
     "failed to report outputs done to dora-daemon",
+    "dropping event because event `tx` was already closed",
     # A container whose root may not raise limits: nodes lock 8 MiB of shared memory or more.
     "Unable to create POSIX shm segment",
     # Dora's daemon starts a dataflow's timers before it has noted the dataflow.

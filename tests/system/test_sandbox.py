@@ -106,7 +106,7 @@ def test_exposure_with_a_device_and_in_a_home(cell: Cell, project: Project) -> N
     assert exposure(cell) <= HIGHEST
 
 
-@pytest.mark.warns("is being restarted by dora", "dropping event because")
+@pytest.mark.warns("is being restarted by dora")
 @pytest.mark.parametrize("level", LEVELS)
 def test_a_dataflow_in_each_level(cell: Cell, project: Project, level: str) -> None:
     cell.start(project.three_nodes(), "--sandbox", level)
