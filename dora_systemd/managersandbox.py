@@ -20,6 +20,7 @@ from dora_systemd.values import shown
 
 _MAX_USER_NAMESPACES = Path("/proc/sys/user/max_user_namespaces")
 _IDENTITY = 65536
+_CAPABILITIES = ("AmbientCapabilities", "CapabilityBoundingSet")
 _UV_PLACES = (".cache/uv", ".local/share/uv")
 """What uv writes below the home directory, see `uv cache dir` and `uv python dir`."""
 
@@ -32,15 +33,15 @@ def make_sandbox(
     user: of the nodes, None in user scope.
     """
     given = [_checked(path) for path in settings[WRITABLE]]
-    is_named = any(one.partition("=")[0] == "DeviceAllow" for one in settings[PROPERTY])
     return Sandbox(
         level=settings[SANDBOX],
         network=settings[NETWORK],
         is_user=scope.is_user,
         is_root=user is not None and user.pw_uid == 0,
-        has_devices=bool(settings[DEVICE]) or is_named,
+        has_devices=bool(settings[DEVICE]) or _names(settings, "DeviceAllow"),
         is_realtime=settings[REALTIME] is not None,
-        has_identity=_has_identity(user) and not _names_capabilities(settings),
+        # In a user namespace capabilities would count for nothing.
+        has_identity=_has_identity(user) and not _names(settings, *_CAPABILITIES),
         needed=tuple(dict.fromkeys(_existing(_needed(prepared)))),
         writable=(*given, *_existing(_written_by_uv(prepared.plan.options, user))),
     )
@@ -80,10 +81,9 @@ def _maps_identity(path: Path) -> bool:
     return any(inside == 0 and count >= _IDENTITY for inside, _, count in rows)
 
 
-def _names_capabilities(settings: Settings) -> bool:
-    """Whether properties give some: in a user namespace they would count for nothing."""
-    keys = {one.partition("=")[0] for one in settings[PROPERTY]}
-    return not keys.isdisjoint(("AmbientCapabilities", "CapabilityBoundingSet"))
+def _names(settings: Settings, *keys: str) -> bool:
+    """Whether one of these properties is given."""
+    return any(one.partition("=")[0] in keys for one in settings[PROPERTY])
 
 
 def _checked(path: str) -> str:

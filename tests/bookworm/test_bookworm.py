@@ -134,9 +134,10 @@ def test_a_life(user: str, flow: Path) -> None:
     groups = {path.name for path in group(user).iterdir() if path.is_dir()}
     assert groups == {"supervisor", "node-source", "node-doubler", "node-sink"}
     assert "3/3 nodes running" in systemctl(user, "status", "--no-pager")
-    pid = (group(user) / "node-doubler/cgroup.procs").read_text()
+    pids = group(user) / "node-doubler/cgroup.procs"
+    pid = pids.read_text()
     doractl(user, "node", "restart", "robot", "doubler")
-    assert (group(user) / "node-doubler/cgroup.procs").read_text() != pid
+    wait_for("another doubler", lambda: pids.read_text() not in (pid, ""))
     assert "Dataflow stopped:" in doractl(user, "stop", "robot").stdout
     wait_for("it is gone", lambda: not dora_processes())
     assert warnings(before) == []
