@@ -19,9 +19,8 @@ echo 0 >"$DORA_SYSTEMD_GROUP/node-$node/cgroup.procs"
 cd -- "$directory"
 PATH=${PATH#"$DORA_SYSTEMD_LIBEXEC:"}
 # Who configures zenoh himself has the say; dora refuses both at once, and a file it cannot read.
-overlay=${0%/*}/zenoh.json5
-if [ -z "${ZENOH_CONFIG+set}${DORA_ZENOH_CONFIG_OVERLAY+set}" ] && [ -r "$overlay" ]; then
-    export DORA_ZENOH_CONFIG_OVERLAY="$overlay"
+if [ -z "${ZENOH_CONFIG+set}${DORA_ZENOH_CONFIG_OVERLAY+set}" ] && [ -r "${0%/*}/zenoh.json5" ]; then
+    export DORA_ZENOH_CONFIG_OVERLAY="${0%/*}/zenoh.json5"
 fi
 # shellcheck disable=SC2086 # a list of names
 unset $DORA_SYSTEMD_UNSET DORA_SYSTEMD_UNSET DORA_SYSTEMD_CELL DORA_SYSTEMD_GROUP \

@@ -16,6 +16,7 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.gatewayplace import SERVICE_UNIT, SOCKET_UNIT
 from dora_systemd.managercells import Cell, read_cell, read_cells
 from dora_systemd.managerreason import failure_reason
+from dora_systemd.managerslice import slice_group
 from dora_systemd.managerstop import release_enabled
 from dora_systemd.managerup import written_files
 from dora_systemd.names import SLICE, name_from_unit
@@ -125,10 +126,9 @@ def processes_left(
 
 def _populated(manager: Manager, others: Sequence[str]) -> list[Path]:
     """The groups of units in dora.slice that have a process."""
-    top = cgroup.group_path(manager.control_group()) / SLICE
     return [
         path
-        for path in sorted(top.glob("*.*"))
+        for path in sorted(slice_group(manager).glob("*.*"))
         if path.is_dir() and path.name not in others and cgroup.is_populated(path)
     ]
 

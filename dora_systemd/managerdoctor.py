@@ -28,6 +28,7 @@ from dora_systemd.managerenabled import enabled_units, own_directories
 from dora_systemd.managergateway import read_gateway
 from dora_systemd.managerlinger import is_lingering, linger_command
 from dora_systemd.managersettings import settings_files
+from dora_systemd.managerslice import slice_group
 from dora_systemd.names import unit_name
 from dora_systemd.process import (
     RECOMMENDED_DORA,
@@ -157,8 +158,8 @@ def _cell_directories(scope: Scope) -> list[Path]:
 
 
 def _unit_groups(manager: Manager) -> list[Path]:
-    top = cgroup.group_path(manager.control_group()) / "dora.slice"
-    return [path for path in sorted(top.glob("dora-*.service")) if cgroup.is_populated(path)]
+    paths = sorted(slice_group(manager).glob("dora-*.service"))
+    return [path for path in paths if cgroup.is_populated(path)]
 
 
 def _is_down(manager: Manager, unit: str) -> bool:

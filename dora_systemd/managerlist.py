@@ -15,7 +15,7 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.managerbudget import restart_budget
 from dora_systemd.managercells import Cell, matching_cells, read_cells, select_cell
 from dora_systemd.managerenabled import enabled_units
-from dora_systemd.names import SLICE
+from dora_systemd.managerslice import slice_group
 from dora_systemd.scope import Scope
 from dora_systemd.status import (
     WHOLE_CELL,
@@ -119,10 +119,7 @@ def dataflow_row(manager: Manager, scope: Scope, cell: Cell) -> DataflowRow:
 def read_rows(manager: Manager, scope: Scope, with_details: bool = True) -> list[DataflowRow]:
     """All dataflows that systemd knows. with_details: for more than the table."""
     cells = read_cells(manager)
-    if with_details or not cells:
-        slice_path = None
-    else:
-        slice_path = cgroup.group_path(manager.control_group()) / SLICE
+    slice_path = None if with_details or not cells else slice_group(manager)
     rows = [row_of(read_dataflow(manager, scope, cell, slice_path)) for cell in cells]
     return mark_enabled(manager, scope, rows) if rows else []
 

@@ -64,11 +64,17 @@ def sandbox_warnings(sandbox: Sandbox) -> Iterator[str]:
 def _has_identity(user: pwd.struct_passwd | None) -> bool:
     """Whether `user` can be in a user namespace with the first 65536 ids, and there can be one.
 
-    A kernel may refuse any, a container may have fewer ids, and a directory service gives higher
-    ones: see namespaces(7) and user_namespaces(7).
+    A directory service gives higher ones.
     """
-    if user is not None and max(user.pw_uid, user.pw_gid) >= _IDENTITY:
-        return False
+    is_known = user is None or max(user.pw_uid, user.pw_gid) < _IDENTITY
+    return is_known and _offers_identity()
+
+
+def _offers_identity() -> bool:
+    """Whether this machine can make one: a kernel may refuse any, a container may have fewer ids.
+
+    See namespaces(7) and user_namespaces(7).
+    """
     try:
         has_all = all(_maps_identity(Path("/proc/self", one)) for one in ("uid_map", "gid_map"))
         return has_all and int(_MAX_USER_NAMESPACES.read_text()) > 0

@@ -256,12 +256,11 @@ def is_up_word(row: DataflowRow) -> bool:
 
 def row_values(row: DataflowRow) -> dict[str, Any]:
     """The row for JSON: exact numbers, their units in the keys, null for what is not known."""
-    values = {_JSON_KEYS.get(key, key): value for key, value in row._asdict().items()}
-    values["nodes"] = [
-        {_JSON_KEYS.get(key, key): value for key, value in node._asdict().items()}
-        for node in row.nodes
-    ]
-    return values
+    return {**_json_values(row), "nodes": [_json_values(node) for node in row.nodes]}
+
+
+def _json_values(row: DataflowRow | NodeRow) -> dict[str, Any]:
+    return {_JSON_KEYS.get(key, key): value for key, value in row._asdict().items()}
 
 
 _JSON_KEYS = {

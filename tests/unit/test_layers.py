@@ -168,6 +168,7 @@ USE_CASES = {
         "managersandbox",
         "managerset",
         "managersettings",
+        "managerslice",
         "managersetup",
         "managershow",
         "managersnapshot",

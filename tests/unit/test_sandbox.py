@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dora_systemd import managersandbox
 from dora_systemd.compat import MIN_VERSION, drop_unsupported
 from dora_systemd.dataflow import parse_dataflow
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -250,15 +251,19 @@ def test_choices_of_a_plan(tmp_path: Path) -> None:
     [(990, 990, True), (65535, 65535, True), (65536, 990, False), (990, 200_000, False)],
 )
 def test_users_of_a_directory_service(
-    tmp_path: Path, uid: int, gid: int, has_identity: bool
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, uid: int, gid: int, has_identity: bool
 ) -> None:
     """Their ids are not in the namespace."""
+    monkeypatch.setattr(managersandbox, "_offers_identity", lambda: True)
     user = pwd.struct_passwd(("robot", "x", uid, gid, "", "/", "/bin/sh"))
     assert made(tmp_path, user=user).has_identity == has_identity
 
 
 @pytest.mark.parametrize("key", ["AmbientCapabilities", "CapabilityBoundingSet"])
-def test_capabilities_that_are_given_count(tmp_path: Path, key: str) -> None:
+def test_capabilities_that_are_given_count(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, key: str
+) -> None:
+    monkeypatch.setattr(managersandbox, "_offers_identity", lambda: True)
     user = pwd.struct_passwd(("robot", "x", 990, 990, "", "/", "/bin/sh"))
     assert not made(tmp_path, user=user, property=(f"{key}=CAP_NET_RAW",)).has_identity
 
