@@ -113,6 +113,10 @@ DECISIONS = {
         "watchrules",
     ],
 }
+TRUST = {
+    "trust": ["trust.paths"],
+}
+"""The one door to what others own; the adapters go through it, too."""
 ADAPTERS = {
     "bus": ["bus", "buserrors", "buslibrary", "buswire"],
     "cgroup": ["cgroup", "cgroupmemory", "cgroupstrain"],
@@ -225,7 +229,7 @@ GATEWAY = {
 of its business: they meet in systemd."""
 CLI = {"cli": sorted(name for name in module_paths() if name.startswith("cli."))}
 
-LAYERS = [WORDS, DECISIONS, ADAPTERS, SHARED, USE_CASES, GATEWAY, CLI]
+LAYERS = [WORDS, DECISIONS, TRUST, ADAPTERS, SHARED, USE_CASES, GATEWAY, CLI]
 
 PLACES = {
     module: (depth, group)

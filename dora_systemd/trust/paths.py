@@ -1,0 +1,227 @@
+"""Paths that others may own: walked by descriptor, read within bounds, their owner never guessed.
+
+The rules are those of systemd's own chase() with CHASE_SAFE:
+
+- A path is walked by descriptor, component by component. A symbolic link is followed only where
+  root alone can replace it.
+- Whoever owns a directory decides what is in it. So below a directory that is not root's, only
+  things of the same owner count as theirs; anything else was borrowed.
+- The owner is the owner of the descriptor that is read, never that of a path.
+- A read is bounded, and of a regular file. Nothing that a path can be makes it hang.
+
+A caller that is not root has no more rights than the files give: for it nothing is refused here.
+"""
+
+import contextlib
+import errno
+import grp
+import os
+import pwd
+import stat
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.values import shown
+
+MAX_BYTES = 1024 * 1024
+"""Bytes of a file that we read: dora takes no descriptor above 1 MiB."""
+
+_MAX_LINKS = 40
+_STEP = os.O_PATH | os.O_NOFOLLOW | os.O_CLOEXEC
+# O_NONBLOCK: opening a FIFO would wait for a writer. O_NOCTTY: nor become our terminal.
+_READ = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
+_OTHERS_WRITE = stat.S_IWOTH
+_NO_FILE = "there is no such file"
+_REASONS = {
+    errno.ENOENT: (_NO_FILE, "correct the path"),
+    errno.ENOTDIR: (_NO_FILE, "correct the path"),
+    errno.ELOOP: ("its links go round in a circle", "correct the path"),
+    errno.ENAMETOOLONG: ("its name is too long", "correct the path"),
+    errno.ENXIO: ("it is not a regular file", "give a file"),
+    errno.EACCES: ("permission denied", "let the calling user read it"),
+    errno.EPERM: ("permission denied", "let the calling user read it"),
+}
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a walk has arrived.
+
+    uid: owner of the thing. owners: of it and of all directories above it. shared: a directory
+    on the way whose entries more accounts than its owner can replace, or "".
+    """
+
+    path: str
+    uid: int
+    mode: int
+    owners: frozenset[int]
+    shared: str = ""
+
+    @property
+    def is_roots(self) -> bool:
+        """Whether nobody but root can change it or put something else in its place."""
+        others_write = self.mode & (stat.S_IWOTH | stat.S_IWGRP)
+        return self.owners == {0} and not self.shared and not others_write
+
+    @property
+    def borrowed(self) -> str:
+        """Why `uid` says nothing about who put the thing there, or ""."""
+        if strangers := sorted(self.owners - {0, self.uid}):
+            return f"{user_name(strangers[0])} owns a directory above it"
+        if self.shared:
+            return f"others than its owner can write in {shown(self.shared)}"
+        return ""
+
+
+@dataclass(frozen=True)
+class Text:
+    """A file that was read, and the place of the descriptor that it was read from."""
+
+    data: bytes
+    place: Place
+
+
+@contextlib.contextmanager
+def reached(path: str | Path) -> Iterator[tuple[int, Place]]:
+    """A descriptor (O_PATH) of what is at the absolute `path`, and its place.
+
+    Raises OSError, and DoraSystemdError (BAD_INPUT) for a link that somebody else could change.
+    """
+    with contextlib.ExitStack() as held:
+        walk = _Walk(held)
+        parts = _parts(str(path))
+        while parts:
+            parts = walk.enter(parts[0]) + parts[1:]
+        yield walk.fd, walk.place(str(path))
+
+
+def read_file(path: str | Path, max_bytes: int = MAX_BYTES) -> Text:
+    """The regular file at the absolute `path`, at most `max_bytes`.
+
+    Raises DoraSystemdError (BAD_INPUT) when there is no such file, it is anything but a regular
+    file, too large or unreadable, or behind a link that is not root's.
+    """
+    try:
+        with reached(path) as (found, place):
+            _check_regular(path, place)
+            # The same file again, now to be read: see proc_pid_fd(5).
+            fd = os.open(f"/proc/self/fd/{found}", _READ & ~os.O_NOFOLLOW)
+            with os.fdopen(fd, "rb") as file:
+                data = file.read(max_bytes + 1)
+    except (OSError, ValueError) as error:
+        raise unreadable(path, error) from error
+    if len(data) > max_bytes:
+        hint = "give a smaller file"
+        raise _refusal(path, f"it is larger than {max_bytes // 1024} KiB", hint)
+    return Text(data, place)
+
+
+def exists(path: str | Path) -> bool:
+    """Whether something is there; a link that may not be followed counts as something."""
+    try:
+        with reached(path):
+            return True
+    except DoraSystemdError:
+        return True
+    except (OSError, ValueError):
+        return False
+
+
+def unreadable(path: str | Path, error: OSError | ValueError) -> DoraSystemdError:
+    """The error for a file that cannot be read."""
+    known = _REASONS.get(getattr(error, "errno", 0) or 0)
+    reason, hint = known or (str(getattr(error, "strerror", None) or error), "")
+    return _refusal(path, reason, hint)
+
+
+def user_name(uid: int) -> str:
+    """The name of a uid, or its number where it has none."""
+    try:
+        return pwd.getpwuid(uid).pw_name
+    except (KeyError, OverflowError):
+        return f"uid {uid}"
+
+
+class _Walk:
+    """A walk from the root directory. Its descriptors are closed with `held`."""
+
+    def __init__(self, held: contextlib.ExitStack) -> None:
+        self._held = held
+        self._links = 0
+        self._cautious = os.geteuid() == 0
+        self._begin()
+
+    def _begin(self) -> None:
+        self.fd = self._open("/", None)
+        self._status = os.fstat(self.fd)
+        self._owners = {self._status.st_uid}
+        self._shared = ""
+        self._where = ""
+
+    def _open(self, name: str, parent: int | None) -> int:
+        fd = os.open(name, _STEP, dir_fd=parent)
+        self._held.callback(os.close, fd)
+        return fd
+
+    def enter(self, name: str) -> list[str]:
+        """Go into `name`; what is to be walked first where that is a link."""
+        fd = self._open(name, self.fd)
+        status = os.fstat(fd)
+        if stat.S_ISLNK(status.st_mode):
+            return self._follow(name, status)
+        self._shared = self._shared or self._sharing()
+        self._where = f"{self._where}/{name}"
+        self.fd, self._status = fd, status
+        self._owners.add(status.st_uid)
+        return []
+
+    def _follow(self, name: str, status: os.stat_result) -> list[str]:
+        link = f"{self._where}/{name}"
+        self._links += 1
+        if self._links > _MAX_LINKS:
+            raise OSError(errno.ELOOP, os.strerror(errno.ELOOP))
+        if self._cautious and (self._owners | {status.st_uid} != {0} or self._sharing()):
+            reason = f"{shown(link)} is a symbolic link that others than root can change"
+            raise _refusal(link, reason, "give the path that it leads to")
+        target = os.readlink(name, dir_fd=self.fd)
+        if target.startswith("/"):
+            self._begin()
+        return _parts(target)
+
+    def _sharing(self) -> str:
+        """The directory that was reached, if more than its owner can replace what is in it."""
+        mode, where = self._status.st_mode, self._where or "/"
+        if not stat.S_ISDIR(mode) or mode & stat.S_ISVTX:
+            return ""
+        is_shared = mode & _OTHERS_WRITE or (mode & stat.S_IWGRP and self._has_members())
+        return where if is_shared else ""
+
+    def _has_members(self) -> bool:
+        """Whether the group is more than its owner's own: user private groups bear his name."""
+        with contextlib.suppress(KeyError):
+            group = grp.getgrgid(self._status.st_gid)
+            owner = user_name(self._status.st_uid)
+            return group.gr_name != owner or not set(group.gr_mem) <= {owner}
+        return True
+
+    def place(self, path: str) -> Place:
+        """Where the walk has arrived."""
+        status = self._status
+        return Place(path, status.st_uid, status.st_mode, frozenset(self._owners), self._shared)
+
+
+def _parts(path: str) -> list[str]:
+    return [part for part in path.split("/") if part not in ("", ".")]
+
+
+def _check_regular(path: str | Path, place: Place) -> None:
+    if stat.S_ISDIR(place.mode):
+        raise _refusal(path, "it is a directory", "give the file in it")
+    if not stat.S_ISREG(place.mode):
+        raise _refusal(path, "it is not a regular file", "give a file")
+
+
+def _refusal(path: str | Path, reason: str, hint: str) -> DoraSystemdError:
+    return DoraSystemdError(f"cannot read {shown(str(path))}: {reason}", hint, ExitCode.BAD_INPUT)

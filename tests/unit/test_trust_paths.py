@@ -1,0 +1,139 @@
+"""Paths that others may own: whose they are, which links count, and what is read of them."""
+
+import os
+import stat
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.trust.paths import Place, exists, reached, read_file
+
+FILE = stat.S_IFREG | 0o644
+IS_ROOT = os.geteuid() == 0
+STRANGER, OTHER = 4_000_001, 4_000_002
+
+as_root = pytest.mark.skipif(not IS_ROOT, reason="gives files away")
+
+
+def place_of(path: Path) -> Place:
+    with reached(path) as (_, place):
+        return place
+
+
+def test_reads_a_file_and_tells_its_owner(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"text")
+    found = read_file(tmp_path / "a")
+    assert found.data == b"text"
+    assert found.place.uid == os.getuid()
+
+
+def test_at_most_so_many_bytes(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"x" * 1025)
+    assert len(read_file(tmp_path / "a", 1025).data) == 1025
+    with pytest.raises(DoraSystemdError, match="larger than 1 KiB"):
+        read_file(tmp_path / "a", 1024)
+
+
+@pytest.mark.parametrize("kind", ["fifo", "directory", "device", "socket"])
+def test_only_regular_files_and_without_waiting(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "a"
+    if kind == "fifo":
+        os.mkfifo(path)
+    elif kind == "directory":
+        path.mkdir()
+    elif kind == "device":
+        path = Path("/dev/zero")
+    else:
+        import socket
+
+        with socket.socket(socket.AF_UNIX) as one:
+            one.bind(str(path))
+    with pytest.raises(DoraSystemdError, match="it is"):
+        read_file(path)
+
+
+def test_names_what_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(DoraSystemdError, match="there is no such file"):
+        read_file(tmp_path / "a" / "b")
+    assert not exists(tmp_path / "a")
+    assert exists(tmp_path)
+
+
+def test_a_circle_of_links_ends(tmp_path: Path) -> None:
+    (tmp_path / "a").symlink_to("b")
+    (tmp_path / "b").symlink_to("a")
+    with pytest.raises(DoraSystemdError, match="round in a circle"):
+        read_file(tmp_path / "a")
+
+
+def test_own_links_are_followed(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"text")
+    (tmp_path / "b").symlink_to("a")
+    (tmp_path / "c").symlink_to(tmp_path / "b")
+    assert read_file(tmp_path / "c").data == b"text"
+
+
+@as_root
+def test_a_link_of_somebody_else_is_not_followed(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"text")
+    (tmp_path / "b").symlink_to("a")
+    os.chown(tmp_path / "b", STRANGER, 0, follow_symlinks=False)
+    with pytest.raises(DoraSystemdError, match="symbolic link that others than root can change"):
+        read_file(tmp_path / "b")
+
+
+@as_root
+@pytest.mark.parametrize("mode", [0o755, 0o1777])
+def test_a_link_below_a_directory_of_somebody_else_is_not_followed(
+    tmp_path: Path, mode: int
+) -> None:
+    (tmp_path / "home").mkdir(mode=mode)
+    (tmp_path / "a").write_bytes(b"text")
+    (tmp_path / "home" / "b").symlink_to(tmp_path / "a")
+    os.chown(tmp_path / "home", STRANGER, 0)
+    with pytest.raises(DoraSystemdError, match="symbolic link"):
+        read_file(tmp_path / "home" / "b")
+
+
+@as_root
+def test_what_is_borrowed_says_so(tmp_path: Path) -> None:
+    (tmp_path / "home").mkdir()
+    file = tmp_path / "home" / "a"
+    file.write_bytes(b"text")
+    assert place_of(file).is_roots
+    os.chown(tmp_path / "home", STRANGER, 0)
+    assert not place_of(file).is_roots
+    assert "owns a directory above it" in place_of(file).borrowed
+    os.chown(file, STRANGER, 0)
+    assert place_of(file).borrowed == ""
+    os.chown(file, OTHER, 0)
+    assert "owns a directory above it" in place_of(file).borrowed
+
+
+@as_root
+@pytest.mark.parametrize("mode", [0o777, 0o775])
+def test_a_directory_of_many_lends_nothing(tmp_path: Path, mode: int) -> None:
+    (tmp_path / "many").mkdir()
+    file = tmp_path / "many" / "a"
+    file.write_bytes(b"text")
+    os.chown(tmp_path / "many", STRANGER, STRANGER)
+    os.chown(file, STRANGER, STRANGER)
+    (tmp_path / "many").chmod(mode)
+    assert "others than its owner can write" in place_of(file).borrowed
+    (tmp_path / "many").chmod(0o1777)
+    assert place_of(file).borrowed == ""
+
+
+@pytest.mark.parametrize(
+    ("owners", "mode", "shared", "is_roots"),
+    [
+        ({0}, FILE, "", True),
+        ({0, 1}, FILE, "", False),
+        ({0}, FILE | 0o020, "", False),
+        ({0}, FILE | 0o002, "", False),
+        ({0}, FILE, "/tmp", False),
+    ],
+)
+def test_what_is_roots_alone(owners: set[int], mode: int, shared: str, is_roots: bool) -> None:
+    assert Place("/x", 0, mode, frozenset(owners), shared).is_roots is is_roots
