@@ -30,7 +30,9 @@ class Screen:
     """
 
     def __init__(self, stream: TextIO = sys.stdout) -> None:
-        self._stream = stream
+        stream.flush()
+        # Not the stream itself: a handler of a signal may not write where another call is writing.
+        self._terminal = stream.fileno()
         self._keys = sys.stdin.fileno()
         self._is_entered = False
         # A signal, such as that the window has another size, ends the wait for a key.
@@ -103,8 +105,9 @@ class Screen:
         self._take()
 
     def _write(self, text: str) -> None:
-        self._stream.write(text)
-        self._stream.flush()
+        data = text.encode()
+        while data:
+            data = data[os.write(self._terminal, data) :]
 
 
 def _drawn(line: str, columns: int, is_bold: bool) -> str:

@@ -7,6 +7,7 @@ import signal
 import sys
 import termios
 import time
+from pathlib import Path
 
 import pytest
 
@@ -20,18 +21,25 @@ with Screen() as screen:
         if key == "q":
             break
 """
+WIDE = """
+from dora_systemd.cli.screen import Screen
+with Screen() as screen:
+    screen.show(["x" * 100000] * 4)
+    screen.wait_key(30)
+"""
 ENTER, LEAVE = b"\x1b[?1049h", b"\x1b[?1049l"
 
 
 class Terminal:
     """A program on a terminal of its own."""
 
-    def __init__(self, script: str) -> None:
+    def __init__(self, script: str, **environment: str) -> None:
         self.pid, self.fd = pty.fork()
         if not self.pid:
             for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTSTP):
                 signal.signal(number, signal.SIG_DFL)  # a shell's background job ignores some
-            os.execve(sys.executable, [sys.executable, "-c", script], {**os.environ, "LINES": "8"})
+            environment = {**os.environ, "LINES": "8", **environment}
+            os.execve(sys.executable, [sys.executable, "-c", script], environment)
         self.before = termios.tcgetattr(self.fd)
         self.seen = b""
 
@@ -40,6 +48,11 @@ class Terminal:
         while text not in self.seen:
             assert select.select([self.fd], [], [], deadline - time.monotonic())[0], self.seen
             self.seen += os.read(self.fd, 65536)
+
+    def wait_asleep(self) -> None:
+        deadline = time.monotonic() + 20
+        while Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()[0] != "S":
+            assert time.monotonic() < deadline
 
     def end(self) -> int:
         """The exit status as waitpid has it, after all output was read."""
@@ -78,6 +91,21 @@ def test_a_signal_leaves_it_clean(terminal: Terminal, number: int) -> None:
     status = terminal.end()
     assert os.WTERMSIG(status) == number
     assert terminal.seen.endswith(LEAVE)
+
+
+def test_a_signal_in_the_middle_of_a_drawing() -> None:
+    """Nobody reads, so it is still drawing when the signal comes."""
+    terminal = Terminal(WIDE, COLUMNS="100000")
+    terminal.wait_for(ENTER)
+    terminal.wait_asleep()
+    os.kill(terminal.pid, signal.SIGTSTP)
+    terminal.wait_for(LEAVE)
+    _, status = os.waitpid(terminal.pid, os.WUNTRACED)
+    assert os.WIFSTOPPED(status)
+    os.kill(terminal.pid, signal.SIGCONT)
+    terminal.wait_for(b"x\x1b[J")
+    os.write(terminal.fd, b"q")
+    assert terminal.end() == 0
 
 
 def test_interrupt(terminal: Terminal) -> None:
