@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from tests.lab.pace import bound
 from tests.system.cells import run
 
 CHECKOUT = Path(__file__).resolve().parents[2]
@@ -71,7 +72,7 @@ def apt(*arguments: str) -> None:
         env=environment,
         capture_output=True,
         text=True,
-        timeout=900,
+        timeout=bound(900),
         check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr

@@ -14,6 +14,7 @@ from lab import cgroup, image
 from lab.cache import find_cache
 from lab.errors import LabError
 from lab.options import Options
+from lab.pace import bound
 from lab.process import die_with_parent, need_tools, read_last_line
 from lab.runs import Run, note, remove_cgroup
 from lab.service import service_command
@@ -100,7 +101,7 @@ def wait_ready(ready: socket.socket, nspawn: subprocess.Popen[bytes], run: Run) 
     ended = os.pidfd_open(nspawn.pid)
     told = ready.fileno()
     try:
-        while select.select([told, ended], [], [], BOOT_SECONDS)[0] == [told]:
+        while select.select([told, ended], [], [], bound(BOOT_SECONDS))[0] == [told]:
             message = ready.recv(4096).decode().splitlines()
             fields = dict(line.partition("=")[::2] for line in message)
             leader = int(fields.get("X_NSPAWN_LEADER_PID", leader))

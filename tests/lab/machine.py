@@ -21,6 +21,7 @@ from lab.image import (
 )
 from lab.initrd import write_initrd
 from lab.options import Options
+from lab.pace import bound
 from lab.process import need_tools, run_logged
 from lab.runs import Run, close_run, note, open_run
 from lab.service import service_command
@@ -117,7 +118,7 @@ def write_snapshot(path: Path, log: Path) -> None:
     run = open_run()
     try:
         with started_machine(run, path, disk) as guest:
-            guest.wait_boot(BOOT_SECONDS)
+            guest.wait_boot(bound(BOOT_SECONDS))
             warm_up(guest)
             qemu.ask_monitor(run.directory, f"savevm {SNAPSHOT}")
     finally:
@@ -212,4 +213,4 @@ def check_guest(status: int, what: str) -> None:
 
 def reboot(guest: Guest) -> None:
     guest.request(["systemctl", "reboot"])
-    guest.wait_boot(BOOT_SECONDS)
+    guest.wait_boot(bound(BOOT_SECONDS))

@@ -24,6 +24,7 @@ environment:
   LAB_OUT=DIR       this directory is /out inside
   DORA_LAB_CACHE    where images are kept (default: ~/.cache/dora-systemd-lab)
   LAB_MIRROR        another Debian mirror for building the image
+  LAB_SPEED=50      gives the virtual machine half of its time, to try tests on a slow one
 
 The command runs as root in a private copy of the checkout, /src; what it writes
 there is gone afterwards. Inside, LAB names the form. The exit status is the

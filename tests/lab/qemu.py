@@ -1,6 +1,7 @@
 """The emulator: its command line, its life, and its monitor."""
 
 import json
+import os
 import re
 import socket
 import subprocess
@@ -12,6 +13,7 @@ from typing import Any
 
 from lab.errors import LabError
 from lab.process import die_with_parent, read_last_line
+from lab.slow import read_speed, slowed
 
 KERNEL_OPTIONS = (
     "rw console=ttyS0 mitigations=off quiet loglevel=3 random.trust_cpu=on tsc=reliable nokaslr"
@@ -61,7 +63,9 @@ def started(command: Sequence[str], place: Path) -> Iterator[socket.socket]:
             command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True
         )
     try:
-        yield connect(place / "agent", process, place / "log")
+        port = connect(place / "agent", process, place / "log")
+        with slowed(process, read_speed(os.environ.get("LAB_SPEED"))):
+            yield port
     finally:
         process.kill()
         process.wait()

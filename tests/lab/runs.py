@@ -14,6 +14,7 @@ from pathlib import Path
 
 from lab.cache import take_lock, try_lock
 from lab.errors import LabError
+from lab.pace import bound
 
 RUNS = Path("/run/dora-systemd-lab")
 
@@ -101,7 +102,7 @@ def remove_disk(path: Path) -> None:
 
 
 def remove_cgroup(path: Path, patience: float = 20) -> None:
-    deadline = time.monotonic() + patience
+    deadline = time.monotonic() + bound(patience)
     while path.exists():
         if time.monotonic() > deadline:
             raise LabError(f"end the processes in {path}", "do they hang in the kernel?")

@@ -1,11 +1,14 @@
-"""The steps of `make test` and its parts, one after the other; the first failure ends them."""
+"""The steps of `make test` and its parts, one after the other. All of them run, whatever fails."""
 
 import os
 import re
 import subprocess
 import sys
+import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import IO
@@ -24,14 +27,19 @@ QUICK = (
 )
 # pytest's last line: "=== 3 passed, 1 skipped in 0.12s ==="
 SUMMARY = re.compile(r"=+ (\d+ .* in [\d.:s ()]+) =+")
+COUNTS = ("failed", "passed", "skipped", "error")
+IMAGES_MINUTES = 8
 
 
 @dataclass(frozen=True)
 class Step:
     name: str
     command: Sequence[str]
-    env: dict[str, str]
+    # Asked when the step begins: a venv that is missing is built then.
+    env: Callable[[], dict[str, str]]
     cwd: Path = CHECKOUT
+    # About, on two idle cores; 0 beside another step, and for less than half a minute.
+    minutes: int = 0
     # The next step begins together with this one: most of the time of a test is waiting.
     with_next: bool = False
 
@@ -49,22 +57,69 @@ def main(arguments: Sequence[str]) -> int:
         return 130
 
 
+@dataclass(frozen=True)
+class Result:
+    """How a step ended. summary: pytest's, or "done"."""
+
+    name: str
+    status: int
+    summary: str
+
+
 def run_steps(steps: Sequence[Step]) -> int:
-    results: list[str] = []
+    """Run them all; the worst exit status. The last line is a summary as pytest has it."""
+    if len(steps) > 1:
+        say_plan(steps)
+    begun = time.monotonic()
+    results: list[Result] = []
     early: Running | None = None
     for place, step in enumerate(steps):
         running = early or Running(step, sys.stdout)
         early = Running(steps[place + 1], spooled()) if step.with_next else None
-        if step is steps[-1] and results:
-            say("so far: " + "; ".join(results))
-        say(f"--- {step.name} ---")
-        status, summary = running.finish()
-        results.append(f"{step.name}: {summary}")
-        if status:
-            if early is not None:
-                early.finish()
-            return status
-    return 0
+        say(f"--- step {place + 1} of {len(steps)}: {step.name} ---")
+        results.append(running.finish())
+    if len(steps) > 1:
+        say_results(results, time.monotonic() - begun)
+    return max(result.status for result in results)
+
+
+def say_plan(steps: Sequence[Step]) -> None:
+    """What comes, and how long it takes."""
+    minutes = sum(step.minutes for step in steps)
+    say(f"{len(steps)} steps, about {minutes} minutes on two cores")
+    if minutes:
+        say(f"images that are missing are built first; all of them take {IMAGES_MINUTES} minutes")
+    for place, step in enumerate(steps):
+        known = f" (about {step.minutes} min)" if step.minutes else ""
+        say(f"  {place + 1}. {step.name}{known}")
+
+
+def say_results(results: Sequence[Result], seconds: float) -> None:
+    """One line for each step, and one for all, as pytest writes it."""
+    for result in results:
+        word = f"FAILED with exit status {result.status}" if result.status else "ok"
+        say(f"{result.name}: {word}; {result.summary}")
+    sys.stderr.flush()
+    print(f"===== {total(results)} in {seconds:.2f}s =====", flush=True)
+
+
+def total(results: Sequence[Result]) -> str:
+    """The sum of the summaries: "3 failed, 20 passed". A step without tests counts as one."""
+    counts: Counter[str] = Counter()
+    for result in results:
+        found = read_counts(result.summary)
+        # A step that failed without a failed test has failed all the same.
+        if result.status and not found["failed"] + found["error"]:
+            found["failed"] += 1
+        counts += found
+    known = (f"{counts[word]} {word}" for word in COUNTS if counts[word])
+    return ", ".join(known) or "1 passed"
+
+
+def read_counts(summary: str) -> Counter[str]:
+    """The numbers of a summary; "errors" count as "error"."""
+    found = re.findall(r"(\d+) ([a-z]+?)s?\b", summary.partition(" in ")[0])
+    return Counter({word: int(number) for number, word in found})
 
 
 class Running:
@@ -72,32 +127,36 @@ class Running:
     end, so that two steps can run at the same time."""
 
     def __init__(self, step: Step, output: IO[str]) -> None:
+        self.step = step
         self.output = output
         is_shown = output is sys.stdout
         self.process = subprocess.Popen(
             step.command,
-            env=step.env,
+            env=step.env(),
             cwd=step.cwd,
             stdout=subprocess.PIPE if is_shown else output,
             text=True,
             errors="replace",
         )
 
-    def finish(self) -> tuple[int, str]:
-        """Exit status, and pytest's summary, when the step has ended and all is shown."""
+    def finish(self) -> Result:
+        """How it ended, when it has ended and all is shown."""
         summary = "done"
-        for line in self.lines():
-            print(line, end="", flush=True)
-            summary = read_summary(line) or summary
-        return self.process.wait(), summary
+        with self.process:
+            for line in self.lines():
+                print(line, end="", flush=True)
+                summary = read_summary(line) or summary
+        status = self.process.wait()
+        return Result(self.step.name, status if status >= 0 else 128 - status, summary)
 
     def lines(self) -> Iterator[str]:
         if self.process.stdout is not None:
             yield from self.process.stdout
             return
         self.process.wait()
-        self.output.seek(0)
-        yield from self.output
+        with self.output as output:
+            output.seek(0)
+            yield from output
 
 
 def spooled() -> IO[str]:
@@ -118,11 +177,18 @@ def plan_test(form: str) -> list[Step]:
     return [*own, *plan_vm(form), packages_step(), *plan_system(form)]
 
 
+def in_venv(for_system_tests: bool = False) -> dict[str, str]:
+    return venv_environment(ensure_venv(find_cache(), for_system_tests))
+
+
+def in_lab(form: str) -> Callable[[], dict[str, str]]:
+    return lambda: {**os.environ, "LAB": form}
+
+
 def plan_unit(_form: str) -> list[Step]:
-    venv = ensure_venv(find_cache())
     command = ["python", "-m", "pytest", "tests/unit"]
     version = ".".join(map(str, sys.version_info[:2]))
-    return [Step(f"unit tests, Python {version}", command, venv_environment(venv))]
+    return [Step(f"unit tests, Python {version}", command, in_venv, minutes=1)]
 
 
 def unit_in_lab() -> Step:
@@ -130,22 +196,23 @@ def unit_in_lab() -> Step:
     # The linters, and Prometheus' parser, say the same of every Python; the image does without.
     without = ("test_linters", "test_metrics")
     arguments = ["tests/unit", *(f"--ignore=tests/unit/{name}.py" for name in without)]
-    return lab_step(f"unit tests, Python {version}", "container", arguments)
+    return lab_step(f"unit tests, Python {version}", "container", arguments, minutes=1)
 
 
 def plan_lab(_form: str) -> list[Step]:
     command = ["python", "-m", "pytest", "tests/lab"]
-    return [Step("tests of the lab", command, venv_environment(ensure_venv(find_cache())))]
+    return [Step("tests of the lab", command, in_venv, minutes=2)]
 
 
 def plan_vm(_form: str) -> list[Step]:
-    limits = lab_step("system tests that need limits, vm", "vm", ["tests/system", "-m", "vm"])
+    arguments = ["tests/system", "-m", "vm"]
+    limits = lab_step("system tests that need limits, vm", "vm", arguments, minutes=12)
     # The machine is emulated by one processor; the packages can be built by the other.
     return [replace(build_step(), with_next=True), limits, reboot_step()]
 
 
 def build_step() -> Step:
-    return Step("Debian packages", ["packaging/build"], dict(os.environ))
+    return Step("Debian packages", ["packaging/build"], os.environ.copy)
 
 
 def reboot_step() -> Step:
@@ -155,7 +222,7 @@ def reboot_step() -> Step:
     for place, stage in enumerate(stages):
         command += ["--reboot--"] if place else []
         command += ["pytest", *(f"tests/boot/test_{name}.py" for name in stage)]
-    return Step("the packages, a reboot and a power cut, vm", command, {**os.environ, "LAB": "vm"})
+    return Step("the packages, a reboot and a power cut, vm", command, in_lab("vm"), minutes=5)
 
 
 def plan_packages(_form: str) -> list[Step]:
@@ -164,12 +231,12 @@ def plan_packages(_form: str) -> list[Step]:
 
 
 def packages_step() -> Step:
-    return lab_step("tests of the Debian packages", "container", ["tests/deb"])
+    return lab_step("tests of the Debian packages", "container", ["tests/deb"], minutes=4)
 
 
 def plan_bookworm(_form: str) -> list[Step]:
     """The oldest systemd that the product takes, and the checkout installed there by pip."""
-    return [lab_step("tests on Debian 12", "bookworm", ["tests/bookworm"])]
+    return [lab_step("tests on Debian 12", "bookworm", ["tests/bookworm"], minutes=2)]
 
 
 def plan_system(form: str) -> list[Step]:
@@ -184,13 +251,13 @@ def plan_system(form: str) -> list[Step]:
         raise LabError("use LAB=host", "systemd is not running here; LAB=container brings its own")
     if os.geteuid() == 0:
         raise LabError("use LAB=host as root", "its tests run in user scope: be a user, not root")
-    venv = ensure_venv(find_cache(), for_system_tests=True)
     command = ["python", "-m", "pytest", *arguments]
-    return [Step("system tests, this machine", command, venv_environment(venv))]
+    return [Step("system tests, this machine", command, partial(in_venv, for_system_tests=True))]
 
 
 def plan_browser(_form: str) -> list[Step]:
-    return [lab_step("status page in a browser", "browser", ["tests/system", "-m", "browser"])]
+    arguments = ["tests/system", "-m", "browser"]
+    return [lab_step("status page in a browser", "browser", arguments, minutes=1)]
 
 
 def plan_faults(form: str) -> list[Step]:
@@ -198,8 +265,8 @@ def plan_faults(form: str) -> list[Step]:
     rounds = os.environ.get("ROUNDS") or "1"
     marks = "vm" if form == "vm" else "not vm"
     command = ["tests/lab/lab", "run", "--env", f"FAULT_ROUNDS={rounds}", "--", "pytest"]
-    env = {**os.environ, "LAB": form}
-    return [Step(f"faults, {form}", [*command, FAULTS, "-m", marks], env)]
+    command += [FAULTS, "-m", marks]
+    return [Step(f"faults, {form}", command, in_lab(form), minutes=3 * int(rounds))]
 
 
 def plan_quick(_form: str) -> list[Step]:
@@ -217,23 +284,22 @@ def quick_step(files: Sequence[str]) -> Step:
 def two_halves(arguments: Sequence[str]) -> list[Step]:
     """Two containers at the same time; a test that measures or floods has its half for itself."""
     first = lab_step("system tests, first half", "container", [*arguments, "--half=1"])
-    second = lab_step("system tests, second half", "container", [*arguments, "--half=2"])
+    second = lab_step("system tests, second half", "container", [*arguments, "--half=2"], minutes=8)
     return [replace(first, with_next=True), second]
 
 
-def lab_step(name: str, form: str, arguments: Sequence[str]) -> Step:
+def lab_step(name: str, form: str, arguments: Sequence[str], minutes: int = 0) -> Step:
     command = ["tests/lab/lab", "run", "--", "pytest", *arguments]
-    return Step(name, command, {**os.environ, "LAB": form})
+    return Step(name, command, in_lab(form), minutes=minutes)
 
 
 def plan_lint(_form: str) -> list[Step]:
     venv = ensure_venv(find_cache())
-    env = venv_environment(venv)
     config = f"--config-file={CHECKOUT / 'pyproject.toml'}"
     sources = ["dora_systemd", "lab"]
     return [
-        Step("ruff", ["ruff", "check", "."], env),
-        Step("mypy", ["mypy", config, *sources], env, write_package(venv)),
+        Step("ruff", ["ruff", "check", "."], in_venv),
+        Step("mypy", ["mypy", config, *sources], in_venv, write_package(venv)),
     ]
 
 

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.lab.pace import bound
+
 LAB = Path(__file__).with_name("lab")
 RUNS = Path("/run/dora-systemd-lab")
 
@@ -106,9 +108,9 @@ def test_ended_from_outside(env: dict[str, str], number: signal.Signals) -> None
         assert run.stdout and run.stdout.readline() == b"up\n"
         mine = own_runs() - before
         run.send_signal(number)
-        status = run.wait(timeout=20)
+        status = run.wait(timeout=bound(20))
     assert status == (-9 if number is signal.SIGKILL else 128 + number)
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + bound(20)
     while mine & own_runs() and time.monotonic() < deadline:
         time.sleep(0.1)
     # Others may have started one between the two looks; theirs end too, but not in our time.

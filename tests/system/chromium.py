@@ -14,6 +14,7 @@ from typing import Any
 
 from websockets.sync.client import connect
 
+from tests.lab.pace import bound
 from tests.system.cells import wait_for
 
 COMMAND = (
@@ -54,7 +55,7 @@ class Browser:
     ) -> None:
         self._link.close()
         self._process.terminate()
-        self._process.wait(20)
+        self._process.wait(bound(20))
         self._home.cleanup()
 
     def call(self, method: str, **params: Any) -> dict[str, Any]:
@@ -62,7 +63,7 @@ class Browser:
         self._count += 1
         self._link.send(json.dumps({"id": self._count, "method": method, "params": params}))
         while True:
-            message = json.loads(self._link.recv(timeout=60))
+            message = json.loads(self._link.recv(timeout=bound(60)))
             if message.get("id") == self._count:
                 assert "error" not in message, (method, message["error"])
                 result: dict[str, Any] = message["result"]

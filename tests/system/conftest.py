@@ -10,32 +10,7 @@ import pytest
 
 from tests.system.cells import Cell, Project, dora_processes, run, wait_for
 from tests.system.gateways import Front
-
-ALLOWED_ALWAYS = (
-    # What zenoh says in nodes that start before their peers, or outlive them by milliseconds.
-    "Scouting delay elapsed before start conditions are met",
-    "Unable to find transport for link event",
-    "Error syncing transport with peer",
-    "Unable to connect to any locator",
-    "in response to an OpenSyn",
-    "Attempt to establish transport to itself",
-    # Dora, when a loaded machine (or one that is emulated) is slow.
-    "Discarding event for input",
-    "ms for handling event",
-    "Didn't receive final reply for query",
-    "for unknown Query",
-    "for unknown Request",
-    # Dora's daemon and a node, one of which has just been ended.
-    "closing node connection after I/O error",
-    "server disconnected unexpectedly",
-    "failed to report outputs done to dora-daemon",
-    "dropping event because event `tx` was already closed",
-    # A container whose root may not raise limits: nodes lock 8 MiB of shared memory or more.
-    "Unable to create POSIX shm segment",
-    # Dora's daemon starts a dataflow's timers before it has noted the dataflow.
-    "Timer event for unknown dataflow",
-)
-
+from tests.system.tolerated import is_tolerated
 
 FIRST_HALF = (
     *("test_cell", "test_kinds", "test_start", "test_start_refused", "test_logs_cli"),
@@ -120,4 +95,4 @@ def _warnings(cursor: str) -> list[str]:
     records = [json.loads(line) for line in run(*command, check=False).stdout.splitlines()]
     ours = [r for r in records if "dora-" in r.get("_SYSTEMD_UNIT", "") + r.get("UNIT", "")]
     lines = [f"{r.get('SYSLOG_IDENTIFIER')}: {r.get('MESSAGE')}" for r in ours]
-    return [line for line in lines if not any(allowed in line for allowed in ALLOWED_ALWAYS)]
+    return [line for line in lines if not is_tolerated(line)]

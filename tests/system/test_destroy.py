@@ -9,6 +9,7 @@ import pytest
 
 from dora_systemd.gatewayplace import SOCKET_UNIT
 from dora_systemd.scope import Scope
+from tests.lab.pace import bound
 from tests.system.cells import Cell, Project, is_alive, run, wait_for
 from tests.system.gateways import Front
 from tests.system.test_stop import DEAF
@@ -57,7 +58,7 @@ def test_deaf_nodes(options: tuple[str, ...], front: Front, cell: Cell, project:
     pids = cell.all_pids()
     begin = time.monotonic()
     done = front.doractl("destroy", *options)
-    assert time.monotonic() - begin < (5 if options else 15)
+    assert time.monotonic() - begin < bound(5 if options else 15)
     assert f"  ✓ {cell.name} stopped" in done.stdout
     assert done.stdout.endswith(LEFT)
     assert not [pid for pid in pids if is_alive(pid)]

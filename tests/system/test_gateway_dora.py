@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 
+from tests.lab.pace import bound
 from tests.system.cells import Cell, Project, run, wait_for
 from tests.system.gateways import Front
 
@@ -283,7 +284,7 @@ def test_attached(dora: Dora, cell: Cell, places: Sequence[Project]) -> None:
         assert any("dora-systemd Node source is ready" in line for line in seen)
         assert cell.show("User") == "bob"
         attached.send_signal(signal.SIGINT)
-        assert attached.wait(30) == 0
+        assert attached.wait(bound(30)) == 0
     assert cell.is_gone
 
 
@@ -305,7 +306,7 @@ def test_attached_and_impatient(dora: Dora, cell: Cell, places: Sequence[Project
         attached.send_signal(signal.SIGINT)
         wait_for("it stops", lambda: cell.show("ActiveState") == "deactivating")
         attached.send_signal(signal.SIGINT)
-        assert attached.wait(5) == 1
+        assert attached.wait(bound(5)) == 1
     wait_for("it is gone", lambda: cell.is_gone)
 
 
@@ -317,7 +318,7 @@ def test_by_force(dora: Dora, cell: Cell, places: Sequence[Project]) -> None:
         began = time.monotonic()
         dora("restart", cell.name, *words)
         done = dora("stop", cell.name, *words, check=False)
-        assert time.monotonic() - began < 14
+        assert time.monotonic() - began < bound(14)
         assert cell.is_gone
         # As with dora itself, one whose patience was at an end is told so.
         assert done.returncode == ("--force" not in words), done

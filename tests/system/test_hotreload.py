@@ -20,7 +20,7 @@ OTHER_SINK = SINK.replace('"got"', '"got it"')
 BROKEN = "import nonsense_that_is_not_there\n"
 NOT_RELOADED = "was not reloaded"
 # Of a node that has a successor already dora's daemon still expects an answer.
-OVERLAP = ("failed to receive reply", "outputs done", "Signal(15)", "dropping `")
+OVERLAP = ("failed to receive reply", "Signal(15)", "dropping `")
 CRASHES = (NOT_RELOADED, "crashed", "exit code 1", "ExitCode(1)", "exited with code 1")
 
 

@@ -12,6 +12,7 @@ import pytest
 
 from dora_systemd.errors import ExitCode
 from dora_systemd.events import EVENTS
+from tests.lab.pace import bound
 from tests.system.cells import Cell, Project, run, sync_journal, wait_for
 
 TALK = """
@@ -173,7 +174,7 @@ def test_pager(talking: Cell, tmp_path: Path) -> None:
         ["script", "-qec", f"doractl logs {talking.name} --tail 5", "/dev/null"],
         env=environment,
         capture_output=True,
-        timeout=30,
+        timeout=bound(30),
         check=True,
     )
     assert len(seen.read_text().splitlines()) == 5

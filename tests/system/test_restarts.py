@@ -34,7 +34,7 @@ ON_FAILURE = ("--restart-policy", "on-failure")
 CRASHES = ("crashed", "exit code 3", "ExitCode(3)", "restarted", "after failure", "Failed with")
 KILLED = (
     *("code=killed", "Failed with result", "status=69", "is lost", "failed: ", "was ended"),
-    *("disconnected", "start-limit", "too quickly", "exited", "Failed to start", "outputs done"),
+    *("disconnected", "start-limit", "too quickly", "exited", "Failed to start"),
 )
 
 

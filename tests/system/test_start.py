@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.errors import ExitCode
+from tests.lab.pace import bound
 from tests.system.cells import Cell, Project, run, wait_for
 
 TICK = "inputs: {tick: dora/timer/millis/50}"
@@ -199,7 +200,7 @@ def test_ctrl_c_while_it_starts_ends_the_waiting_only(cell: Cell, project: Proje
     child = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     wait_for("it starts", lambda: cell.show("ActiveState") == "activating")
     child.send_signal(signal.SIGINT)
-    _, said = child.communicate(timeout=10)
+    _, said = child.communicate(timeout=bound(10))
     assert child.returncode == ExitCode.INTERRUPTED, said
     assert said.startswith(f"doractl: cannot wait for {cell.name}: interrupted\nhint: ")
     assert cell.show("ActiveState") == "activating"

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.lab.pace import bound
 from tests.system.cells import Cell, Project, is_alive, wait_for
 
 TICK = "inputs: {tick: dora/timer/millis/50}"
@@ -40,7 +41,7 @@ def test_run_ends_with_ctrl_c(cell: Cell, project: Project) -> None:
     child = run_attached(cell, project.three_nodes())
     wait_for("it prints", lambda: cell.messages("sink"))
     child.send_signal(signal.SIGINT)
-    out, err = child.communicate(timeout=30)
+    out, err = child.communicate(timeout=bound(30))
     assert (child.returncode, err) == (0, "")
     assert "got [0]" in out
     assert "stopped" in out.splitlines()[-1]
@@ -52,7 +53,7 @@ def test_run_takes_the_dataflow_with_it(cell: Cell, project: Project, how: signa
     child = run_attached(cell, project.three_nodes())
     pids = cell.all_pids()
     child.send_signal(how)
-    child.communicate(timeout=30)
+    child.communicate(timeout=bound(30))
     wait_for("it has ended", lambda: cell.is_gone)
     assert not [pid for pid in pids if is_alive(pid)]
     assert ("dataflow-stopped", "") in cell.events()
@@ -66,7 +67,7 @@ def test_second_ctrl_c_kills(cell: Cell, project: Project) -> None:
     child.send_signal(signal.SIGINT)
     wait_for("it stops", lambda: cell.show("ActiveState") == "deactivating")
     child.send_signal(signal.SIGINT)
-    child.communicate(timeout=5)
+    child.communicate(timeout=bound(5))
     assert child.returncode == 128 + signal.SIGKILL
     assert cell.is_gone
 

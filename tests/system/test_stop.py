@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.errors import ExitCode
+from tests.lab.pace import bound
 from tests.system.cells import Cell, Project, is_alive, run, wait_for
 
 DEAF = """
@@ -59,7 +60,7 @@ def test_stop_ends_in_time_whatever_the_nodes_do(cell: Cell, project: Project) -
     pids = cell.all_pids()
     begin = time.monotonic()
     cell.doractl("stop", cell.name)
-    assert time.monotonic() - begin < 1.5 + 10
+    assert time.monotonic() - begin < bound(1.5 + 10)
     assert not [pid for pid in pids if is_alive(pid)]
 
 

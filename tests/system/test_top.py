@@ -12,6 +12,7 @@ from collections.abc import Callable
 import pytest
 
 from dora_systemd.errors import ExitCode
+from tests.lab.pace import bound
 from tests.system.cells import Cell, Project, run
 
 BUSY = """
@@ -82,7 +83,7 @@ def test_live(key: bytes, cell: Cell, project: Project) -> None:
 
 def read_until(fd: int, is_done: Callable[[str], bool]) -> str:
     """The output of a terminal up to where `is_done` says of all of it that it is enough."""
-    deadline, seen = time.monotonic() + 30, b""
+    deadline, seen = time.monotonic() + bound(30), b""
     while not is_done(seen.decode()):
         assert select.select([fd], [], [], deadline - time.monotonic())[0], seen
         seen += os.read(fd, 65536)

@@ -31,7 +31,7 @@ LATE = 'import time\nprint("loading", flush=True)\ntime.sleep(1000)\n'
 CRASHES = ("crashed", "exit code 1", "ExitCode(1)", "restarted", "after failure", "Failed with")
 KILLED = (
     *("code=killed", "Failed with result", "status=69", "is lost", "failed: ", "was ended"),
-    *("disconnected", "start-limit", "too quickly", "exited", "Failed to start", "outputs done"),
+    *("disconnected", "start-limit", "too quickly", "exited", "Failed to start"),
 )
 
 

@@ -1,17 +1,24 @@
 """The parts of the test lab that need neither root nor an image."""
 
 import io
+import os
+import re
 import sys
+import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from lab import cache, definition, initrd, qemu, wire
+from lab import cache, definition, initrd, pace, qemu, wire
 from lab.errors import LabError
 from lab.options import parse_options
-from lab.steps import read_summary
+from lab.slow import read_speed
+from lab.steps import Result, Step, read_summary, run_steps, total
+
+from tests.system.tolerated import TOLERATED
 
 PYPROJECT = '[project]\nname = "x"\n[tool.ruff]\nline-length = 100\n'
 
@@ -138,3 +145,58 @@ def test_old_emulators_get_the_workaround(version: str, is_old: bool) -> None:
 )
 def test_summary_of_pytest(line: str, summary: str) -> None:
     assert read_summary(line) == summary
+
+
+@pytest.mark.parametrize(
+    ("results", "words"),
+    [
+        ([(0, "3 passed in 1.0s")], "3 passed"),
+        ([(0, "3 passed, 1 skipped in 1s"), (0, "done")], "3 passed, 1 skipped"),
+        ([(1, "1 failed, 2 passed, 2 errors in 9s"), (0, "4 passed in 1s")],
+         "1 failed, 6 passed, 2 error"),
+        ([(0, "3 passed in 1s"), (125, "done")], "1 failed, 3 passed"),
+        ([(0, "3 passed in 1s"), (1, "2 passed in 1s")], "1 failed, 5 passed"),
+        ([(0, "done")], "1 passed"),
+    ],
+)  # fmt: skip
+def test_one_summary_for_all(results: list[tuple[int, str]], words: str) -> None:
+    assert total([Result("one", *given) for given in results]) == words
+
+
+def test_all_steps_run_and_the_worst_status_counts(capfd: pytest.CaptureFixture[str]) -> None:
+    scripts = ["echo one", "echo '== 2 failed, 1 passed in 1.00s =='; exit 1", "kill -TERM $$"]
+    steps = [
+        Step(f"step {n}", ["sh", "-c", text], os.environ.copy) for n, text in enumerate(scripts)
+    ]
+    steps[0] = replace(steps[0], with_next=True, minutes=3)
+    assert run_steps(steps) == 143
+    out, said = capfd.readouterr()
+    assert "3 steps, about 3 minutes on two cores" in said
+    assert "step 2 of 3: step 1" in said
+    assert "step 0: ok; done" in said
+    assert "step 1: FAILED with exit status 1; 2 failed, 1 passed in 1.00s" in said
+    assert "step 2: FAILED with exit status 143; done" in said
+    assert re.fullmatch(r"===== 3 failed, 1 passed in \d+\.\d\ds =====", out.splitlines()[-1])
+
+
+def test_bounds_are_in_seconds_of_an_idle_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert pace.measure() >= 1
+    monkeypatch.setattr(pace, "_last", (time.monotonic(), 2.5))
+    assert pace.bound(4) == 10
+    monkeypatch.setattr(pace, "_last", (time.monotonic() - 60, 2.5))
+    monkeypatch.setattr(pace, "measure", lambda: 3.0)
+    assert pace.bound(4) == 12
+
+
+def test_what_is_tolerated_is_said_once_and_with_a_reason() -> None:
+    parts = [word.part for word in TOLERATED]
+    assert all(len(word.part) >= 14 and word.reason and word.dora for word in TOLERATED)
+    assert not [one for one in parts for other in parts if one != other and one in other]
+    assert len(set(parts)) == len(parts)
+
+
+def test_speed_is_percent() -> None:
+    assert [read_speed(text) for text in (None, "", "50", "100")] == [100, 100, 50, 100]
+    for text in ("0", "101", "-5", "half"):
+        with pytest.raises(LabError, match="LAB_SPEED"):
+            read_speed(text)

@@ -19,14 +19,11 @@ LOST = (
         "disconnected",
         "exited",
         "connection error",
-        "outputs done",
-        "outputs on drop",
         "channel closed",
     ),
 )
 CRASHED = (
     *("crashed", "node exited with error", "exit code", "signal", "restarted", "after failure"),
-    *("node has no daemon event stream", "zenoh teardown timed out"),
 )
 HUNG = (*LOST, "no heartbeat", "atchdog", "Killing process", "SIGABRT", "core-dump", "dumped")
 UNRESPONSIVE = (*CRASHED, "hang", "unresponsive", "SIGKILL", "Signal(9)")

@@ -1,0 +1,43 @@
+"""LAB_SPEED=50 gives the emulator half of its time: a slow machine, to try the tests on."""
+
+import os
+import signal
+import subprocess
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+
+from lab.errors import LabError
+
+PERIOD_SECONDS = 0.02
+
+
+def read_speed(text: str | None) -> int:
+    """Percent of the time that the emulator runs. Raises LabError."""
+    speed = int(text) if text and text.isdecimal() else 0 if text else 100
+    if not 1 <= speed <= 100:
+        raise LabError(f"use LAB_SPEED={text}", "percent, 1 to 100")
+    return speed
+
+
+@contextmanager
+def slowed(process: subprocess.Popen[bytes], speed: int) -> Iterator[None]:
+    """Stop `process` and let it go on, over and over again."""
+    is_over = threading.Event()
+    thread = threading.Thread(target=_alternate, args=(process, speed / 100, is_over), daemon=True)
+    if speed < 100:
+        thread.start()
+    try:
+        yield
+    finally:
+        is_over.set()
+        if speed < 100:
+            thread.join()
+
+
+def _alternate(process: subprocess.Popen[bytes], share: float, is_over: threading.Event) -> None:
+    with suppress(ProcessLookupError):
+        while not is_over.wait(PERIOD_SECONDS * share) and process.poll() is None:
+            os.kill(process.pid, signal.SIGSTOP)
+            is_over.wait(PERIOD_SECONDS * (1 - share))
+            os.kill(process.pid, signal.SIGCONT)
