@@ -34,7 +34,7 @@ def environment(tmp_path: Path) -> dict[str, str]:
 
 def launch(environment: dict[str, str], *words: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        words, env=environment, capture_output=True, text=True, check=False, timeout=10
+        words, env=environment, capture_output=True, text=True, check=False, timeout=120
     )
 
 

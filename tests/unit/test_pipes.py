@@ -8,8 +8,6 @@ from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
 from pathlib import Path
 
-import pytest
-
 from dora_systemd.cellpaths import CellPaths
 from dora_systemd.journal import JournalSocket
 from dora_systemd.lograte import RateLimit
@@ -46,14 +44,24 @@ class Cell:
                 return entries
             entries.append(dict(line.split("=", 1) for line in data.splitlines()))
 
-    async def messages(self, count: int) -> list[str]:
+    async def entries(self, count: int) -> list[dict[str, str]]:
         """Wait for so many entries."""
         found: list[dict[str, str]] = []
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(60):
             while len(found) < count:
                 await asyncio.sleep(0)
                 found += self.received()
-        return [entry["MESSAGE"] for entry in found]
+        return found
+
+    async def messages(self, count: int) -> list[str]:
+        """The messages of so many entries."""
+        return [entry["MESSAGE"] for entry in await self.entries(count)]
+
+    async def until(self, condition: Callable[[], bool]) -> None:
+        """Let the loop work until the condition holds."""
+        async with asyncio.timeout(60):
+            while not condition():
+                await asyncio.sleep(0)
 
 
 @asynccontextmanager
@@ -82,10 +90,9 @@ def test_lines_of_a_node(tmp_path: Path) -> None:
         cell.pipes.set_run("run1")
         cell.pipes.set_pid("camera", 42)
         cell.write(cell.paths.node_stdout("camera"), b"out\n")
-        await asyncio.sleep(0.05)
+        (out,) = await cell.entries(1)
         cell.write(cell.paths.node_stderr("camera"), b"err\n")
-        await asyncio.sleep(0.05)
-        out, err = cell.received()
+        (err,) = await cell.entries(1)
         assert (out["MESSAGE"], out["DORA_STREAM"], out["PRIORITY"]) == ("out", "stdout", "6")
         assert (err["MESSAGE"], err["DORA_STREAM"], err["PRIORITY"]) == ("err", "stderr", "5")
         assert out["DORA_RUN"] == "run1"
@@ -216,9 +223,8 @@ def test_journald_restarted(tmp_path: Path) -> None:
         cell.server.close()
         (tmp_path / "socket").unlink()
         cell.write(path, b"2\n3\n")
-        await asyncio.sleep(0.1)
+        await cell.until(lambda: cell.pipes.is_busy("a"))
         cell.write(path, b"4\n")
-        await asyncio.sleep(0.1)
         cell.server = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
         cell.server.bind(str(tmp_path / "socket"))
         assert await cell.messages(3) == ["2", "3", "4"]
@@ -234,14 +240,12 @@ def test_output_of_the_coordinator(tmp_path: Path) -> None:
         os.write(writer, b"2026-11-20T22:11:40.6Z  INFO dora_coordinator: SECRET\nListening on ")
         os.write(writer, b"port 33453\n2026-11-20T22:11:40.6Z ERROR dora_coordinator: bad\n")
         os.close(writer)
-        await asyncio.sleep(0.05)
-        (entry,) = cell.received()
+        (entry,) = await cell.entries(1)
         assert lines[1] == "Listening on port 33453"
         assert entry["MESSAGE"] == "dora_coordinator: bad"
         assert entry["DORA_NODE"] == "coordinator"
         assert entry["PRIORITY"] == "3"
-        with pytest.raises(OSError, match="Bad file"):
-            os.fstat(reader)
+        await cell.until(lambda: not Path(f"/proc/self/fd/{reader}").exists())
 
     run(tmp_path, scenario)
 

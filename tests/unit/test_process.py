@@ -40,7 +40,7 @@ def test_a_child_that_hangs_is_killed_with_its_children() -> None:
     begin = time.monotonic()
     with pytest.raises(DoraSystemdError, match=r"^cannot wait for"):
         process.run_command(["/bin/sh", "-c", "sleep 100 & sleep 100"], 0.2)
-    assert time.monotonic() - begin < 10
+    assert time.monotonic() - begin < 90
 
 
 def test_what_cannot_be_run() -> None:

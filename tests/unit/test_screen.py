@@ -44,13 +44,13 @@ class Terminal:
         self.seen = b""
 
     def wait_for(self, text: bytes) -> None:
-        deadline = time.monotonic() + 20
+        deadline = time.monotonic() + 120
         while text not in self.seen:
             assert select.select([self.fd], [], [], deadline - time.monotonic())[0], self.seen
             self.seen += os.read(self.fd, 65536)
 
     def wait_asleep(self) -> None:
-        deadline = time.monotonic() + 20
+        deadline = time.monotonic() + 120
         while Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()[0] != "S":
             assert time.monotonic() < deadline
 
