@@ -1,5 +1,6 @@
 """LAB=vm: the tree as a disk, booted once, and every run resumed from there."""
 
+import os
 import shutil
 import subprocess
 from collections.abc import Iterator
@@ -25,6 +26,7 @@ from lab.pace import bound
 from lab.process import need_tools, run_logged
 from lab.runs import Run, close_run, note, open_run
 from lab.service import service_command
+from lab.slow import FULL_SPEED, read_speed
 from lab.terminal import is_terminal, kept_terminal
 
 SNAPSHOT = "booted"
@@ -128,8 +130,10 @@ def write_snapshot(path: Path, log: Path) -> None:
 @contextmanager
 def started_machine(run: Run, layer: Path, disk: Path, snapshot: str = "") -> Iterator[Guest]:
     command = qemu.machine_command(layer, disk, run.directory, snapshot, MEMORY)
+    # An image is built as quickly as can be.
+    speed = read_speed(os.environ.get("LAB_SPEED")) if snapshot else FULL_SPEED
     try:
-        with qemu.started(command, run.directory) as port:
+        with qemu.started(command, run.directory, speed) as port:
             yield Guest(port)
     except LabError as error:
         kept = find_cache() / "console.log"

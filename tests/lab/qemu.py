@@ -1,7 +1,6 @@
 """The emulator: its command line, its life, and its monitor."""
 
 import json
-import os
 import re
 import socket
 import subprocess
@@ -13,7 +12,7 @@ from typing import Any
 
 from lab.errors import LabError
 from lab.process import die_with_parent, read_last_line
-from lab.slow import read_speed, slowed
+from lab.slow import slowed
 
 KERNEL_OPTIONS = (
     "rw console=ttyS0 mitigations=off quiet loglevel=3 random.trust_cpu=on tsc=reliable nokaslr"
@@ -56,15 +55,18 @@ def machine_command(layer: Path, disk: Path, place: Path, snapshot: str, memory:
 
 
 @contextmanager
-def started(command: Sequence[str], place: Path) -> Iterator[socket.socket]:
-    """The agent's port. The emulator waits for it to be opened, then starts the machine."""
+def started(command: Sequence[str], place: Path, speed: int) -> Iterator[socket.socket]:
+    """The agent's port. The emulator waits for it to be opened, then starts the machine.
+
+    speed: percent of the time that it runs.
+    """
     with (place / "log").open("wb") as log:
         process = subprocess.Popen(
             command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True
         )
     try:
         port = connect(place / "agent", process, place / "log")
-        with slowed(process, read_speed(os.environ.get("LAB_SPEED"))):
+        with slowed(process, speed):
             yield port
     finally:
         process.kill()

@@ -10,12 +10,13 @@ from contextlib import contextmanager, suppress
 from lab.errors import LabError
 
 PERIOD_SECONDS = 0.02
+FULL_SPEED = 100
 
 
 def read_speed(text: str | None) -> int:
     """Percent of the time that the emulator runs. Raises LabError."""
-    speed = int(text) if text and text.isdecimal() else 0 if text else 100
-    if not 1 <= speed <= 100:
+    speed = int(text) if text and text.isdecimal() else 0 if text else FULL_SPEED
+    if not 1 <= speed <= FULL_SPEED:
         raise LabError(f"use LAB_SPEED={text}", "percent, 1 to 100")
     return speed
 
@@ -24,14 +25,16 @@ def read_speed(text: str | None) -> int:
 def slowed(process: subprocess.Popen[bytes], speed: int) -> Iterator[None]:
     """Stop `process` and let it go on, over and over again."""
     is_over = threading.Event()
-    thread = threading.Thread(target=_alternate, args=(process, speed / 100, is_over), daemon=True)
-    if speed < 100:
+    thread = threading.Thread(
+        target=_alternate, args=(process, speed / FULL_SPEED, is_over), daemon=True
+    )
+    if speed < FULL_SPEED:
         thread.start()
     try:
         yield
     finally:
         is_over.set()
-        if speed < 100:
+        if speed < FULL_SPEED:
             thread.join()
 
 
