@@ -1,5 +1,6 @@
 """`doractl start`: a checked plan becomes a transient unit, and its start is waited for."""
 
+import select
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -8,9 +9,11 @@ from dora_systemd.busprotocol import JOB_DONE, Manager, Observer, Property
 from dora_systemd.compat import MIN_VERSION, transient_commands
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.managerplan import Plan
-from dora_systemd.managerreason import job_reason
+from dora_systemd.managerreason import job_reason, runners_refusal
 from dora_systemd.process import version_numbers
 from dora_systemd.scope import Scope
+
+_POLL_SECONDS = 0.2
 
 StageObserver = Callable[[str], None]
 """Is told the unit's STATUS= while its start is waited for."""
@@ -36,6 +39,7 @@ def start_plan(
     """Start the transient unit of a plan and wait until its nodes are ready, unless told not to.
 
     Raises DoraSystemdError when the start fails, with the reason; the unit is left as failed then.
+    What its runner refuses was never started: nothing is left of that.
     """
     number = next(iter(version_numbers(manager.version())), MIN_VERSION)
     told = transient_commands(properties, number)
@@ -75,11 +79,17 @@ def _started(
 
     try:
         result = start(observe)
+        if not wait:
+            _wait_until_checked(manager, plan.unit)
     except KeyboardInterrupt as error:
         raise _interruption(plan.options.name) from error
-    if result == JOB_DONE and wait and _has_failed(manager, plan.unit):
-        result = "failed"
-    if result != JOB_DONE:
+    has_failed = result != JOB_DONE or _has_failed(manager, plan.unit)
+    if has_failed and (refusal := runners_refusal(manager, plan.unit)):
+        # It never ran: its name is as free as before.
+        manager.reset_failed(plan.unit)
+        raise refusal
+    if has_failed and wait:
+        result = "failed" if result == JOB_DONE else result
         raise _start_failure(manager, plan.scope, plan.unit, plan.options.name, result)
     return Started(plan.options.uuid, plan.options.name, plan.unit, is_ready=wait)
 
@@ -110,6 +120,17 @@ def format_started(started: Started, watched: Sequence[str] = ()) -> str:
 def _interruption(name: str) -> DoraSystemdError:
     hint = f"it goes on starting: doractl list {name}, or doractl stop {name}"
     return DoraSystemdError(f"cannot wait for {name}: interrupted", hint, ExitCode.INTERRUPTED)
+
+
+def _wait_until_checked(manager: Manager, unit: str) -> None:
+    """Return when the runner has said its first word: then it has refused, or it goes on."""
+    while True:
+        state = manager.read(unit, ["ActiveState", "Job", "StatusText"])
+        is_on_the_way = state["ActiveState"] == "activating" or (state["Job"] or (0,))[0]
+        if state["StatusText"] or not is_on_the_way:
+            return
+        select.select([manager.fileno()], [], [], _POLL_SECONDS)
+        manager.changes(unit)
 
 
 def _has_failed(manager: Manager, unit: str) -> bool:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dora_systemd.cellpaths import CellPaths
+from dora_systemd.doracheck import DoraCheck
 from dora_systemd.environment import node_environment
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.options import parse_runner_argv
@@ -20,25 +21,30 @@ if TYPE_CHECKING:
     from dora_systemd.engine import Child
 
 
-def begin(argv: list[str]) -> "Child | None":
-    """The coordinator of the first run. None where that is not possible: who needs it says why."""
+def begin(argv: list[str]) -> "tuple[Child, DoraCheck] | None":
+    """The coordinator of the first run, and dora's checks beside it.
+
+    None where that is not possible: who needs it says why.
+    """
     directory = os.environ.get("RUNTIME_DIRECTORY")
     if directory:
         with contextlib.suppress(OSError, DoraSystemdError):
             options = parse_runner_argv(argv)
             enter_supervisor()
             paths = CellPaths(Path(directory))
-            return start_coordinator(options.dora, paths, node_environment(os.environ))
+            environment = node_environment(os.environ)
+            coordinator = start_coordinator(options.dora, paths, environment)
+            return coordinator, DoraCheck(options, environment)
     return None
 
 
 def main(argv: list[str]) -> int:
     """Run the cell that `argv` describes; the exit status."""
-    coordinator = begin(argv)
+    begun = begin(argv)
     leave_out_openssl()
     from dora_systemd.runnercell import run
 
-    return run(argv, coordinator)
+    return run(argv, begun)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,9 @@ import pytest
 
 from dora_systemd.errors import ExitCode
 from tests.system.cells import Cell, Project
-from tests.system.refusals import Refusal, check_refusals
+from tests.system.refusals import IN_THE_JOURNAL, Refusal, check_refusals
+
+pytestmark = pytest.mark.warns(*IN_THE_JOURNAL)
 
 TICK = "inputs: {tick: dora/timer/millis/50}"
 

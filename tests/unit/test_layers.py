@@ -83,6 +83,7 @@ DECISIONS = {
         "propertytable",
         "protocol",
         "pythonimports",
+        "refusal",
         "reload",
         "reloadplan",
         "reloadsettings",
@@ -114,7 +115,7 @@ DECISIONS = {
     ],
 }
 TRUST = {
-    "trust": ["trust.paths"],
+    "trust": ["trust.paths", "trust.programs", "trust.sight"],
 }
 """The one door to what others own; the adapters go through it, too."""
 ADAPTERS = {
@@ -138,7 +139,7 @@ ADAPTERS = {
     "watch": ["watch"],
 }
 SHARED = {
-    "preparation": ["preparation"],
+    "preparation": ["doracheck", "preparation"],
 }
 """What both use cases do with several adapters."""
 USE_CASES = {
@@ -147,6 +148,7 @@ USE_CASES = {
         "managerask",
         "managerbudget",
         "managercells",
+        "managercheck",
         "managerclaim",
         "managercredentials",
         "managerdestroy",
@@ -162,8 +164,10 @@ USE_CASES = {
         "managerlinger",
         "managerfollow",
         "managerlist",
+        "managerlook",
         "managerlogs",
         "managernode",
+        "managernodes",
         "managerplan",
         "managerreason",
         "managerreload",
@@ -190,6 +194,7 @@ USE_CASES = {
         "runner",
         "runnerapply",
         "runnerbegin",
+        "runnercheck",
         "runnercell",
         "runnerask",
         "runnerdialogue",
