@@ -11,12 +11,20 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from dora_systemd.busprotocol import Manager, Property
+from dora_systemd.compat import MIN_VERSION, transient_commands
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.managerplan import Plan
 from dora_systemd.managerreason import exit_status, failure_reason
 from dora_systemd.managerunit import plan_properties
 from dora_systemd.options import check_command
-from dora_systemd.process import DORA_SECONDS, Beside, Completed, read_streams, run_command
+from dora_systemd.process import (
+    DORA_SECONDS,
+    Beside,
+    Completed,
+    read_streams,
+    run_command,
+    version_numbers,
+)
 from dora_systemd.properties import typed
 from dora_systemd.refusal import parse_refusal
 from dora_systemd.trust.programs import own_account
@@ -80,8 +88,9 @@ def _properties(
     for key in ("StandardOutput", "StandardError"):
         del kept[key]
     stdout, stderr = streams
+    number = next(iter(version_numbers(manager.version())), MIN_VERSION)
     return [
-        *kept.values(),
+        *transient_commands(list(kept.values()), number),
         ("StandardOutputFileDescriptor", "h", stdout),
         ("StandardErrorFileDescriptor", "h", stderr),
         ("CollectMode", "s", "inactive-or-failed"),

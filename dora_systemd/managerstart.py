@@ -2,6 +2,7 @@
 
 import select
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,9 +12,11 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.managerplan import Plan
 from dora_systemd.managerreason import job_reason, runners_refusal
 from dora_systemd.process import version_numbers
+from dora_systemd.refusal import FAILED
 from dora_systemd.scope import Scope
 
 _POLL_SECONDS = 0.2
+_ON_THE_WAY = ("activating", "deactivating")
 
 StageObserver = Callable[[str], None]
 """Is told the unit's STATUS= while its start is waited for."""
@@ -86,7 +89,8 @@ def _started(
     has_failed = result != JOB_DONE or _has_failed(manager, plan.unit)
     if has_failed and (refusal := runners_refusal(manager, plan.unit)):
         # It never ran: its name is as free as before.
-        manager.reset_failed(plan.unit)
+        with suppress(DoraSystemdError):
+            manager.reset_failed(plan.unit)
         raise refusal
     if has_failed and wait:
         result = "failed" if result == JOB_DONE else result
@@ -123,11 +127,12 @@ def _interruption(name: str) -> DoraSystemdError:
 
 
 def _wait_until_checked(manager: Manager, unit: str) -> None:
-    """Return when the runner has said its first word: then it has refused, or it goes on."""
+    """Return when the runner has said that it goes on, or has ended."""
     while True:
         state = manager.read(unit, ["ActiveState", "Job", "StatusText"])
-        is_on_the_way = state["ActiveState"] == "activating" or (state["Job"] or (0,))[0]
-        if state["StatusText"] or not is_on_the_way:
+        is_on_the_way = state["ActiveState"] in _ON_THE_WAY or (state["Job"] or (0,))[0]
+        goes_on = state["StatusText"] and not state["StatusText"].startswith(FAILED)
+        if goes_on or not is_on_the_way:
             return
         select.select([manager.fileno()], [], [], _POLL_SECONDS)
         manager.changes(unit)

@@ -13,7 +13,7 @@ FAILED = "failed: "
 
 _HINT = "; hint: "
 _LONGEST = 1500
-"""Characters of each of the two: systemd takes 4096 bytes in a notification."""
+"""Bytes of each of the two: systemd takes 4096 bytes in a notification."""
 _CODES = {
     RunnerExit.BAD_DATAFLOW: ExitCode.BAD_INPUT,
     RunnerExit.NO_ACCESS: ExitCode.NO_PERMISSION,
@@ -49,5 +49,6 @@ def _plain(text: str) -> str:
     """One short line without control characters."""
     words = "".join(char if char.isprintable() else " " for char in text).split()
     line = " ".join(words)
-    line = line if len(line) <= _LONGEST else f"{line[: _LONGEST - 3]}..."
-    return line if len(line.encode()) <= 2 * _LONGEST else f"{line[: _LONGEST // 3]}..."
+    if len(line.encode()) <= _LONGEST:
+        return line
+    return f"{line.encode()[: _LONGEST - 3].decode(errors='ignore')}..."

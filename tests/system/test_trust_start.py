@@ -23,7 +23,7 @@ FLOW = "nodes: [{id: a, path: a.py, inputs: {t: dora/timer/millis/50}}]\n"
 MODULE = "module: {name: m}\n" + FLOW
 SPY = """#!/bin/sh
 { echo "uid $(id -u)"; env; } >>{root}/proof
-exec dora "$@"
+exec {dora} "$@"
 """
 
 
@@ -50,7 +50,8 @@ class Home:
 
     def spy(self) -> Path:
         """A dora of hers that notes who runs it with what."""
-        self.write("spy", SPY.replace("{root}", str(self.root)), 0o755)
+        text = SPY.replace("{root}", str(self.root)).replace("{dora}", shutil.which("dora") or "")
+        self.write("spy", text, 0o755)
         self.write("dataflow.systemd.yml", "dora: ./spy\nsandbox: none\n")
         return self.write("proof", "", 0o666)
 
