@@ -23,6 +23,7 @@ from dora_systemd.managerlaunch import claim, start_claim
 from dora_systemd.managerplan import StartRequest, make_plan
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import read_file
+from dora_systemd.values import shown
 
 _SUFFIXES = (".yml", ".yaml")
 _MOST_FILES = 200
@@ -93,9 +94,10 @@ def _files(directory: Path) -> list[Path]:
         raise DoraSystemdError(f"cannot start in {directory}: it is no absolute path")
     try:
         found = sorted(path for path in directory.iterdir() if path.suffix in _SUFFIXES)
-    except OSError as error:
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or "it is no path"
         raise DoraSystemdError(
-            f"cannot look for the dataflow in {directory}: {error.strerror}",
+            f"cannot look for the dataflow in {shown(str(directory))}: {reason}",
             "doractl start FILE takes the file itself",
             ExitCode.BAD_INPUT,
         ) from error
