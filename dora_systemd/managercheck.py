@@ -87,6 +87,11 @@ def _properties(
     )
     for key in ("StandardOutput", "StandardError"):
         del kept[key]
+    if binds := kept.pop("BindPaths", None):
+        # The directory of the cell is there when it runs, and not ours if one of that name does.
+        cell = str(plan.scope.cell_directory(plan.options.name))
+        others = tuple(one for one in binds.value if one[0] != cell)
+        kept |= {"BindPaths": binds._replace(value=others)} if others else {}
     stdout, stderr = streams
     number = next(iter(version_numbers(manager.version())), MIN_VERSION)
     return [

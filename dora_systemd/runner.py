@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dora_systemd.cellpaths import CellPaths
-from dora_systemd.doracheck import DoraCheck
 from dora_systemd.environment import node_environment
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.options import parse_runner_argv
 from dora_systemd.runnerbegin import enter_supervisor, leave_out_openssl, start_coordinator
 
 if TYPE_CHECKING:
+    from dora_systemd.doracheck import DoraCheck
     from dora_systemd.engine import Child
 
 
@@ -34,6 +34,8 @@ def begin(argv: list[str]) -> "tuple[Child, DoraCheck] | None":
             paths = CellPaths(Path(directory))
             environment = node_environment(os.environ)
             coordinator = start_coordinator(options.dora, paths, environment)
+            from dora_systemd.doracheck import DoraCheck
+
             return coordinator, DoraCheck(options, environment)
     return None
 
