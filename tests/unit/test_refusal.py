@@ -1,5 +1,7 @@
 """A refusal survives its way through STATUS= and the exit status; nothing else passes for one."""
 
+from typing import Any
+
 import pytest
 
 from dora_systemd.cellstate import RunnerExit
@@ -56,7 +58,7 @@ def test_a_refused_start_leaves_no_unit(wait: bool) -> None:
 
 def test_a_start_that_is_not_waited_for_waits_for_the_first_word() -> None:
     manager = FakeManager()
-    states = [
+    states: list[dict[str, Any]] = [
         {"ActiveState": "inactive", "Job": [7, "/job"]},
         {"ActiveState": "activating", "StatusText": ""},
         {"ActiveState": "activating", "StatusText": "failed: cannot use x"},
@@ -64,12 +66,12 @@ def test_a_start_that_is_not_waited_for_waits_for_the_first_word() -> None:
         {"ActiveState": "failed", "ExecMainStatus": 78, "ExecMainCode": 1},
     ]
 
-    def changes(unit: str) -> list[dict[str, object]]:
+    def changes(unit: str) -> list[dict[str, Any]]:
         manager.units[unit] |= states.pop(0)
         return []
 
     manager.changes = changes  # type: ignore[assignment,method-assign]
-    manager.add(options(), **states.pop(0))  # type: ignore[arg-type]
+    manager.add(options(), **states.pop(0))
     manager.after_job[UNIT] = {"ActiveState": "inactive", "Job": [7, "/job"]}
     with pytest.raises(DoraSystemdError, match="cannot use x"):
         start_plan(manager, make_plan(), [], None, wait=False)
