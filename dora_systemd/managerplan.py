@@ -14,7 +14,7 @@ from dora_systemd.dataflow import Dataflow, parse_dataflow
 from dora_systemd.dataflownodes import UNEXPANDED
 from dora_systemd.environment import parse_environment_file, unit_environment
 from dora_systemd.files import decoded, parse_yaml, read_text
-from dora_systemd.launch import LaunchPlan
+from dora_systemd.launch import LaunchPlan, launch_descriptor
 from dora_systemd.limitchecks import settings_node_limits
 from dora_systemd.lograteplan import log_rates
 from dora_systemd.manageraccount import account_of, choose_user
@@ -147,11 +147,13 @@ def _make_plan(found: _Found, directory: str, look: Look) -> Plan:
     )
     environment = unit_environment(search_path, venv, variables)
     check_credentials(found.scope, credential_files(settings))
-    if not any(node.kind in UNEXPANDED for node in found.dataflow.nodes):
-        check_named_nodes(options, found.dataflow)
     launch = LaunchPlan(
         options, "", environment["PATH"], look.sight.exists, look.read_session(path)
     )
+    if not any(node.kind in UNEXPANDED for node in found.dataflow.nodes):
+        # The runner does it again; what can be refused without a unit needs none.
+        check_named_nodes(options, found.dataflow)
+        launch_descriptor(found.dataflow, launch)
     prepared = Prepared(found.dataflow, launch, {})
     sandbox = make_sandbox(found.scope, settings, found.user, prepared, look.sight)
     return Plan(found.scope, options, settings, found.user, environment, sandbox)
