@@ -18,6 +18,7 @@ from dora_systemd.cli.parameters import (
 from dora_systemd.cli.settingoptions import setting_options
 from dora_systemd.cli.stageline import StageLine
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.managercheck import check_plan
 from dora_systemd.managerenable import boot_target
 from dora_systemd.managerlaunch import Claim, claim, start_claim
 from dora_systemd.managerlinger import ensure_linger
@@ -69,7 +70,9 @@ def command(
     request = StartRequest(dataflow, name, flags, os.environ)
     if dry_run:
         target = boot_target(Bus(scope), scope) if want_boot else None
-        print(format_plan(make_plan(scope, request), target), end="")
+        plan = make_plan(scope, request)
+        check_plan(lambda: Bus(scope), plan)
+        print(format_plan(plan, target), end="")
         return
     bus = Bus(scope)
     claimed = claim(bus, scope, request, want_boot)

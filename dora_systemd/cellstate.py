@@ -16,6 +16,8 @@ class RunnerExit(IntEnum):
     FAILED = 1
     ENGINE_LOST = 69
     NODES_FAILED = 70
+    NO_DORA = 72
+    NO_ACCESS = 77
     BAD_DATAFLOW = 78
 
 

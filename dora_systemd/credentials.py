@@ -63,5 +63,6 @@ CREDENTIALS = Setting[Mapping[str, str]](
     "Secret that the nodes read as the file NAME in $CREDENTIALS_DIRECTORY.",
     flags=("--credential",),
     metavar="NAME=FILE",
+    root_only=True,
 )
 CREDENTIAL_SETTINGS = (CREDENTIALS,)

@@ -58,6 +58,13 @@ def read_text(path: Path) -> str:
         known = _REASONS.get(getattr(error, "errno", 0) or 0)
         reason, hint = known or (str(getattr(error, "strerror", None) or error), "")
         raise _refusal(path, reason, hint) from error
+    return decoded(data, path)
+
+
+def decoded(data: bytes, path: Path) -> str:
+    """The text that was read from `path`. Raises DoraSystemdError (BAD_INPUT) if not UTF-8."""
+    if len(data) > MAX_BYTES:
+        raise _too_large(path)
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:

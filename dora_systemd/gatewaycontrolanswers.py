@@ -6,6 +6,7 @@ nodes in four words, times of results as the 64 bits of NTP.
 
 import json
 import re
+import shlex
 import signal
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
@@ -131,7 +132,10 @@ def bare_descriptor(nodes: Iterable[str]) -> dict[str, Any]:
 def restored_descriptor(
     running: Mapping[str, Any], written: Sequence[Mapping[str, Any]], keys: Sequence[str]
 ) -> dict[str, Any]:
-    """What a coordinator runs, with each node's `keys` as they are written in its file."""
+    """What a coordinator runs, with each node's `keys` as they are written in its file.
+
+    Of nodes that are in the file of a module, the program is as our launcher was told it: absolute.
+    """
     by_id = {node.get("id"): node for node in written}
     nodes = [_restored(node, by_id.get(node.get("id"), {}), keys) for node in running["nodes"]]
     return {**running, "nodes": nodes}
@@ -140,8 +144,27 @@ def restored_descriptor(
 def _restored(
     node: Mapping[str, Any], written: Mapping[str, Any], keys: Sequence[str]
 ) -> dict[str, Any]:
-    kept = {key: value for key, value in node.items() if key not in keys} if written else node
+    if not written:
+        return {**node, **_program(node)}
+    kept = {key: value for key, value in node.items() if key not in keys}
     return {**kept, **{key: written[key] for key in keys if key in written}}
+
+
+def _program(node: Mapping[str, Any]) -> dict[str, str]:
+    """Path and arguments of a node, out of what it tells our launcher; {} for any other."""
+    try:
+        launcher, *words = shlex.split(str(node.get("args")))
+    except ValueError:
+        return {}
+    command = words[3:]
+    if not launcher.endswith("/launcher.sh") or not command:
+        return {}
+    if command[:2] == ["/bin/sh", "-c"]:
+        return {"path": "shell", "args": " ".join(command[2:])}
+    start = 1 + command.index("-u") if "-u" in command else 0
+    # A program may have an argument "-u" as well as Python.
+    start = start if command[start : start + 1] and command[start].endswith(".py") else 0
+    return {"path": command[start], "args": shlex.join(command[start + 1 :])}
 
 
 def log_line(record: Record) -> bytes:

@@ -13,15 +13,17 @@ from dora_systemd.buildsession import session_path
 from dora_systemd.bus import Bus
 from dora_systemd.doraerrors import parse_dora_error
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.files import parse_yaml, read_text, read_yaml
+from dora_systemd.files import decoded, parse_yaml
 from dora_systemd.gatewaycontrolframes import Request
 from dora_systemd.gatewaycontrolmatch import could_be, sent_flags
 from dora_systemd.gatewaycontrolstate import spawned
 from dora_systemd.gatewaycontroltalk import Result, Talk
+from dora_systemd.managercheck import run_beside
 from dora_systemd.managerlaunch import claim, start_claim
-from dora_systemd.managerplan import StartRequest, find_engine
-from dora_systemd.process import run_dora
+from dora_systemd.managerplan import StartRequest, make_plan
 from dora_systemd.scope import Scope
+from dora_systemd.trust.paths import read_file
+from dora_systemd.values import shown
 
 _SUFFIXES = (".yml", ".yaml")
 _MOST_FILES = 200
@@ -92,9 +94,10 @@ def _files(directory: Path) -> list[Path]:
         raise DoraSystemdError(f"cannot start in {directory}: it is no absolute path")
     try:
         found = sorted(path for path in directory.iterdir() if path.suffix in _SUFFIXES)
-    except OSError as error:
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or "it is no path"
         raise DoraSystemdError(
-            f"cannot look for the dataflow in {directory}: {error.strerror}",
+            f"cannot look for the dataflow in {shown(str(directory))}: {reason}",
             "doractl start FILE takes the file itself",
             ExitCode.BAD_INPUT,
         ) from error
@@ -103,27 +106,30 @@ def _files(directory: Path) -> list[Path]:
 
 def _read(path: Path) -> object:
     with suppress(DoraSystemdError):
-        return read_yaml(path)
+        return parse_yaml(_text(path), path)
     return None
 
 
+def _text(path: Path) -> str:
+    return decoded(read_file(path).data, path)
+
+
 def _match(scope: Scope, path: Path, request: Request, sent: Mapping[str, Any]) -> Match | None:
-    dora, account = find_engine(scope, path, os.environ)
-    done = run_dora(dora, ["expand", str(path)], directory=str(path.parent), account=account)
+    # What dora makes of the file only dora knows: that of its user, in a unit like the dataflow's.
+    plan = make_plan(scope, StartRequest(str(path), None, {}, os.environ))
+    done = run_beside(lambda: Bus(scope), plan, [plan.options.dora, "expand", str(path)])
     if done.status:
         reason = parse_dora_error(done.stderr)
         raise DoraSystemdError(f"cannot expand {path}: {reason}", "", ExitCode.BAD_INPUT)
     expanded = parse_yaml(done.stdout, path)
     if not isinstance(expanded, dict):
         return None
-    has_variables = "$" in read_text(path)
+    has_variables = "$" in _text(path)
     flags = sent_flags(sent, expanded, bool(request.body.get("uv")), has_variables)
     return None if flags is None else Match(path, flags)
 
 
 def _session(path: Path) -> object:
     """The id that the dora command sends for this file."""
-    with suppress(DoraSystemdError):
-        document = read_yaml(Path(session_path(str(path))))
-        return document.get("session_id") if isinstance(document, dict) else None
-    return None
+    document = _read(Path(session_path(str(path))))
+    return document.get("session_id") if isinstance(document, dict) else None

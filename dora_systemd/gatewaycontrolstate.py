@@ -20,11 +20,11 @@ from dora_systemd.managercells import Cell, read_cells
 from dora_systemd.managerended import ended_rows
 from dora_systemd.managerfollow import is_unit_up
 from dora_systemd.managerlist import read_rows
+from dora_systemd.managernodes import written_dataflow
 from dora_systemd.managerreason import failure_reason
 from dora_systemd.managerwhy import explain
 from dora_systemd.managerwords import last_words
 from dora_systemd.postmortemtext import Report
-from dora_systemd.preparation import load_dataflow
 from dora_systemd.scope import Scope
 from dora_systemd.statuswords import FAILED, FINISHED, DataflowRow, status_word
 
@@ -64,8 +64,8 @@ def list_daemons(scope: Scope) -> dict[str, Any]:
 
 
 def written_descriptor(cell: Cell) -> dict[str, Any]:
-    """The descriptor as its file has it, modules expanded. Raises DoraSystemdError."""
-    return dict(load_dataflow(cell.options).raw)
+    """The descriptor as its file has it, modules as they are. Raises DoraSystemdError."""
+    return dict(written_dataflow(cell.options.dataflow).raw)
 
 
 def ended_descriptor(scope: Scope, uuid: str) -> tuple[str, dict[str, Any]]:

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from dora_systemd.limits import NodeLimits
+from dora_systemd.suggestions import missing_node
 
 START_FIRST = "start-first"
 REPLACE_WORDS = ("stop-first", START_FIRST)
@@ -76,3 +77,10 @@ def _pair(text: str) -> tuple[str, str]:
     # Ids of nodes have no "=".
     node, _, value = text.partition("=")
     return node, value
+
+
+def check_reload_nodes(reload: HotReload, nodes: Sequence[str]) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) for a node that is none of `nodes`."""
+    for node in (*dict(reload.node_watch), *filter(None, dict(reload.replace))):
+        if node not in nodes:
+            raise missing_node("cannot watch files of", node, nodes)

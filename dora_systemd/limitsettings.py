@@ -56,6 +56,8 @@ def _limit_setting(key: str) -> Setting[int | None]:
         metavar="WEIGHT" if is_weight else _METAVARS[limit.controller],
         per_node=True,
         property=limit.property,
+        # A share is taken from all others on the machine.
+        root_only=is_weight,
     )
 
 
@@ -134,6 +136,7 @@ NICE = Setting[int | None](
     variable="DORA_NICE",
     metavar="N",
     property="Nice",
+    root_only=True,
 )
 REALTIME = Setting[str | None](
     "realtime",
@@ -145,6 +148,7 @@ REALTIME = Setting[str | None](
     flags=("--realtime",),
     variable="DORA_REALTIME",
     metavar="[rr:|fifo:]PRIORITY",
+    root_only=True,
 )
 DEVICE = Setting[tuple[str, ...]](
     "device",

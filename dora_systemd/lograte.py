@@ -3,10 +3,11 @@
 Off unless somebody asks for it: a limit of ours takes lines away, however exactly it counts them.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.suggestions import missing_node
 from dora_systemd.values import INFINITY, SECOND, format_duration, parse_duration, quoted
 
 SHORTEST = SECOND // 10
@@ -91,3 +92,10 @@ def merge_rates(nodes: Mapping[str, RateLimits], given: RateLimits) -> RateLimit
 def _refusal(text: str) -> DoraSystemdError:
     message = f"cannot read {quoted(text)} as a rate of lines"
     return DoraSystemdError(message, _HINT, ExitCode.USAGE)
+
+
+def check_rates(limits: RateLimits, nodes: Sequence[str]) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) for a limit of a node that is none of `nodes`."""
+    for node in limits:
+        if node != ALL_NODES and node not in nodes:
+            raise missing_node("cannot limit the lines of", node, nodes)

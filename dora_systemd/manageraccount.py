@@ -1,27 +1,26 @@
-"""Whom the nodes of a dataflow run as, and what that user can reach."""
+"""Whom the nodes of a dataflow run as."""
 
 import os
 import pwd
-from collections.abc import Sequence
-from pathlib import Path
+from contextlib import suppress
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.process import Account, run_command
 from dora_systemd.scope import Scope
-from dora_systemd.values import quoted
+from dora_systemd.trust.paths import Place, reached, user_name
+from dora_systemd.trust.programs import Account, account_from
+from dora_systemd.values import quoted, shown
 
 DEFAULT_USER = "dora"
 """Runs the dataflows whose files are root's; the package makes that user."""
 
-_TEST_SECONDS = 10.0
-# Asked as that user: access control lists, groups and mounts are the kernel's business.
-_TEST_SCRIPT = 'for one; do test "-${one%%:*}" "${one#*:}" || { echo "${one#*:}"; exit 1; }; done'
 
-
-def choose_user(scope: Scope, wanted: str | None, dataflow: Path) -> pwd.struct_passwd | None:
+def choose_user(
+    scope: Scope, wanted: str | None, dataflow: Place, directory: str
+) -> pwd.struct_passwd | None:
     """The user for User=, or None where the manager's own user runs everything.
 
-    Default: the owner of the dataflow file, DEFAULT_USER if that is root. Raises DoraSystemdError.
+    Default: the owner of the dataflow file that was read, DEFAULT_USER if that is root. directory:
+    where its programs are. Raises DoraSystemdError.
     """
     if scope.is_user:
         if wanted is not None:
@@ -33,35 +32,35 @@ def choose_user(scope: Scope, wanted: str | None, dataflow: Path) -> pwd.struct_
         return None
     if wanted is not None:
         return _entry(wanted)
-    owner = dataflow.stat().st_uid
-    return _default_entry() if owner == 0 else _owner_entry(owner, dataflow)
+    # That it is there is checked later, with that user's eyes.
+    with suppress(FileNotFoundError, NotADirectoryError), reached(directory) as (_, place):
+        check_identity(dataflow, place)
+    return _default_entry() if dataflow.uid == 0 else _owner_entry(dataflow.uid, dataflow.path)
 
 
 def account_of(user: pwd.struct_passwd | None) -> Account | None:
     """What a child needs to become `user`; None for no change, which is all that others can do."""
     if user is None or os.geteuid() != 0:
         return None
-    groups = os.getgrouplist(user.pw_name, user.pw_gid)
-    return Account(user.pw_uid, user.pw_gid, tuple(groups))
+    return account_from(user)
 
 
-def check_access(
-    user: pwd.struct_passwd | None, readable: Sequence[str], executable: Sequence[str]
-) -> None:
-    """Raise DoraSystemdError (NO_PERMISSION) for the first path that the user cannot reach.
+def check_identity(dataflow: Place, directory: Place) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) where the owner of `dataflow` may not have meant it.
 
-    executable: programs, and directories to enter.
+    What runs is in `directory`: who lends somebody's file to programs of his own must not get them
+    run as that user.
     """
-    tests = [f"r:{path}" for path in readable] + [f"x:{path}" for path in executable]
-    command = ("/bin/sh", "-c", _TEST_SCRIPT, "sh", *tests)
-    done = run_command(command, _TEST_SECONDS, directory="/", account=account_of(user))
-    if done.status:
-        name = user.pw_name if user else pwd.getpwuid(os.getuid()).pw_name
-        where = "put it where that user can read it, or choose another user with --uid"
+    reason = dataflow.borrowed or directory.borrowed
+    if directory.uid not in (0, dataflow.uid):
+        reason = reason or f"{user_name(directory.uid)} owns {shown(directory.path)}"
+    if directory.is_open:
+        reason = reason or f"everybody can write in {shown(directory.path)}"
+    if reason:
         raise DoraSystemdError(
-            f"cannot start the dataflow as user {name}, who cannot reach {done.stdout.strip()}",
-            where if user else "correct its permissions",
-            ExitCode.NO_PERMISSION,
+            f"cannot choose a user by the owner of {shown(dataflow.path)}: {reason}",
+            "choose one with --uid USER",
+            ExitCode.BAD_INPUT,
         )
 
 
@@ -74,7 +73,7 @@ def _entry(wanted: str) -> pwd.struct_passwd:
         ) from error
 
 
-def _owner_entry(owner: int, dataflow: Path) -> pwd.struct_passwd:
+def _owner_entry(owner: int, dataflow: str) -> pwd.struct_passwd:
     try:
         return pwd.getpwuid(owner)
     except KeyError as error:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from dora_systemd.busprotocol import Manager
+from dora_systemd.managercheck import check_plan
 from dora_systemd.managerclaim import place_unit_file, require_free_name, with_known_uuid
 from dora_systemd.managerplan import Plan, StartRequest, make_plan, request_name
 from dora_systemd.managerstart import StageObserver, Started, start_plan, start_unit_file
@@ -29,6 +30,9 @@ def claim(manager: Manager, scope: Scope, request: StartRequest, want_boot: bool
     boot = require_free_name(manager, scope, unit_name(request_name(request)))
     plan = with_known_uuid(make_plan(scope, request), boot)
     properties, warnings = plan_properties(plan, manager)
+    if want_boot:
+        # Its unit file is there before its runner can refuse it.
+        check_plan(lambda: manager, plan)
     has_file = place_unit_file(manager, plan, properties, boot, want_boot)
     return Claim(plan, None if has_file else properties, tuple(warnings))
 

@@ -16,6 +16,7 @@ from dora_systemd.protocol import Params, Reply, node_params, replace_params
 from dora_systemd.reload import has_readers
 from dora_systemd.scope import Scope
 from dora_systemd.status import CellStatus
+from dora_systemd.trust.programs import account_of_uid, become, fresh_environment
 from dora_systemd.values import quoted
 
 Ask = Callable[[Scope, Cell, Params], Reply]
@@ -98,35 +99,31 @@ def stop_node(scope: Scope, cell: Cell, node: str, ask: Ask = ask_coordinator) -
 
 
 def exec_dora(scope: Scope, manager: Manager, cell: Cell, arguments: Sequence[str]) -> NoReturn:
-    """Become the dora command, told to speak to the coordinator of this dataflow."""
+    """Become the dora command, told to speak to the coordinator of this dataflow.
+
+    Root runs it as the dataflow's user, who may have written it. Raises DoraSystemdError.
+    """
     coordinator = read_coordinator(scope, cell)
-    environment = {**os.environ, **dora_environment(coordinator)}
-    uid = manager.read(cell.unit, ["UID"])["UID"]
-    _become(uid)
-    dora = cell.options.dora
+    dora, environment = cell.options.dora, dict(os.environ)
     try:
-        os.execve(dora, [dora, *arguments], environment)
+        if os.geteuid() == 0 and not scope.is_user:
+            account = account_of_uid(manager.read(cell.unit, ["UID"])["UID"])
+            environment = {**fresh_environment(account), **_terminal()}
+            become(account)
+        os.execve(dora, [dora, *arguments], {**environment, **dora_environment(coordinator)})
     except OSError as error:
         raise DoraSystemdError(
             f"cannot run {dora}: {error.strerror}", "", ExitCode.NO_DORA
         ) from error
 
 
+def _terminal() -> dict[str, str]:
+    return {key: os.environ[key] for key in ("TERM", "NO_COLOR") if key in os.environ}
+
+
 def dora_environment(coordinator: Coordinator) -> dict[str, str]:
     """The variables with which the dora command finds a coordinator and its daemon."""
     return coordinator_variables(coordinator.port, coordinator.token, coordinator.local_listen_port)
-
-
-def _become(uid: int) -> None:
-    """Root runs dora as the dataflow's user: that user may have written the executable."""
-    if os.geteuid() != 0 or uid in (0, 2**32 - 1):
-        return
-    import pwd
-
-    entry = pwd.getpwuid(uid)
-    os.initgroups(entry.pw_name, entry.pw_gid)
-    os.setgid(entry.pw_gid)
-    os.setuid(uid)
 
 
 def _checked_status(scope: Scope, cell: Cell, node: str) -> CellStatus:

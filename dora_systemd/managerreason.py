@@ -4,13 +4,12 @@ import signal
 from typing import Any
 
 from dora_systemd.busprotocol import Manager
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.refusal import FAILED, parse_refusal
 
 _PROPERTIES = ("Result", "StatusText", "ExecMainCode", "ExecMainStatus")
 _CLD_EXITED = 1
 """ExecMainCode of a process that ended by itself, see waitid(2)."""
-
-_RUNNERS_VERDICT = "failed: "
-"""How STATUS= begins once the runner knows why a dataflow failed."""
 
 _REFUSED = {
     201: "the nice value was refused",
@@ -41,11 +40,23 @@ def job_reason(manager: Manager, unit: str, result: str) -> str:
     return failure_reason(manager, unit)
 
 
+def runners_refusal(manager: Manager, unit: str) -> DoraSystemdError | None:
+    """What the runner of `unit` refused at its start, None if it did not end so."""
+    text = str(manager.read(unit, ["StatusText"])["StatusText"])
+    return parse_refusal(text, exit_status(manager, unit) or 0)
+
+
+def exit_status(manager: Manager, unit: str) -> int | None:
+    """The exit status of the main process of `unit`, None if it did not end by itself."""
+    facts = manager.read(unit, ["ExecMainCode", "ExecMainStatus"])
+    return int(facts["ExecMainStatus"]) if facts["ExecMainCode"] == _CLD_EXITED else None
+
+
 def failure_reason(manager: Manager, unit: str) -> str:
     """One line about the end of `unit`: the runner's own last words, else systemd's result."""
     facts = manager.read(unit, _PROPERTIES)
     special = _WORDS.get(facts["Result"], "")
-    last_words = str(facts["StatusText"]).removeprefix(_RUNNERS_VERDICT)
+    last_words = str(facts["StatusText"]).removeprefix(FAILED)
     if not last_words:
         return special or _exit_words(facts)
     # A verdict of the runner says more than its exit status.

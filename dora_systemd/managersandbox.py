@@ -9,6 +9,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.files import absolute_path
 from dora_systemd.launch import python_of
 from dora_systemd.limitsettings import DEVICE, REALTIME
+from dora_systemd.managernodes import named_places
 from dora_systemd.options import RunnerOptions
 from dora_systemd.preparation import PACKAGE, Prepared
 from dora_systemd.sandbox import Sandbox, odd_paths
@@ -16,6 +17,7 @@ from dora_systemd.sandboxsettings import NETWORK, SANDBOX, WRITABLE
 from dora_systemd.scope import Scope
 from dora_systemd.settings import Settings
 from dora_systemd.settingtable import PROPERTY
+from dora_systemd.trust.sight import OwnSight, Sight
 from dora_systemd.values import shown
 
 _MAX_USER_NAMESPACES = Path("/proc/sys/user/max_user_namespaces")
@@ -26,13 +28,18 @@ _UV_PLACES = (".cache/uv", ".local/share/uv")
 
 
 def make_sandbox(
-    scope: Scope, settings: Settings, user: pwd.struct_passwd | None, prepared: Prepared
+    scope: Scope,
+    settings: Settings,
+    user: pwd.struct_passwd | None,
+    prepared: Prepared,
+    sight: Sight | None = None,
 ) -> Sandbox:
     """The sandbox that the settings ask for. Raises DoraSystemdError for a path that is not there.
 
-    user: of the nodes, None in user scope.
+    user: of the nodes, None in user scope. sight: of that user; None: the caller's.
     """
-    given = [_checked(path) for path in settings[WRITABLE]]
+    sight = sight or OwnSight()
+    given = [_checked(path, sight) for path in settings[WRITABLE]]
     return Sandbox(
         level=settings[SANDBOX],
         network=settings[NETWORK],
@@ -42,8 +49,8 @@ def make_sandbox(
         is_realtime=settings[REALTIME] is not None,
         # In a user namespace capabilities would count for nothing.
         has_identity=_has_identity(user) and not _names(settings, *_CAPABILITIES),
-        needed=tuple(dict.fromkeys(_existing(_needed(prepared)))),
-        writable=(*given, *_existing(_written_by_uv(prepared.plan.options, user))),
+        needed=tuple(dict.fromkeys(_existing(_needed(prepared, sight), sight))),
+        writable=(*given, *_existing(_written_by_uv(prepared.plan.options, user), sight)),
     )
 
 
@@ -92,22 +99,22 @@ def _names(settings: Settings, *keys: str) -> bool:
     return any(one.partition("=")[0] in keys for one in settings[PROPERTY])
 
 
-def _checked(path: str) -> str:
-    absolute = absolute_path(path)
-    if not Path(absolute).exists():
+def _checked(path: str, sight: Sight) -> str:
+    absolute = str(Path(path).absolute())
+    if not sight.exists(absolute):
         raise DoraSystemdError(
             f"cannot let the nodes write {shown(absolute)}: it is not there",
             f"mkdir -p {absolute}, or correct --writable",
             ExitCode.BAD_INPUT,
         )
-    return absolute
+    return absolute_path(absolute)
 
 
-def _existing(paths: Iterator[Path]) -> Iterator[str]:
-    yield from (absolute_path(str(path)) for path in paths if path.exists())
+def _existing(paths: Iterator[Path], sight: Sight) -> Iterator[str]:
+    yield from (absolute_path(str(path)) for path in paths if sight.exists(str(path)))
 
 
-def _needed(prepared: Prepared) -> Iterator[Path]:
+def _needed(prepared: Prepared, sight: Sight) -> Iterator[Path]:
     """Where the dataflow, its programs and their interpreters are, and we ourselves."""
     options = prepared.plan.options
     yield Path(options.dataflow).parent
@@ -115,10 +122,8 @@ def _needed(prepared: Prepared) -> Iterator[Path]:
     yield from (Path(sys.prefix), Path(sys.base_prefix), PACKAGE.parent)
     for program in (options.dora, python_of(prepared.plan)):
         # A virtual environment has links to the Python that it is made from.
-        yield from (_prefix(Path(program)), _prefix(Path(program).resolve()))
-    for node in prepared.dataflow.nodes:
-        yield from (Path(one) for one in (node.working_directory,) if one.startswith("/"))
-        yield from (Path(one).parent for one in (node.path,) if one.startswith("/"))
+        yield from (_prefix(Path(program)), _prefix(Path(sight.real(program))))
+    yield from named_places(prepared.dataflow, sight)
     session = prepared.plan.session
     yield from map(Path, (*session.directories.values(), *session.envs.values()))
 

@@ -11,6 +11,7 @@ from typing import Any
 
 from dora_systemd import cgroup
 from dora_systemd.busprotocol import Manager
+from dora_systemd.dataflownodes import UNEXPANDED
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.limitchecks import (
     check_controllers,
@@ -32,7 +33,7 @@ from dora_systemd.machine import read_machine
 from dora_systemd.managercells import Cell
 from dora_systemd.managerenabled import enabled_units
 from dora_systemd.managerlist import read_status
-from dora_systemd.preparation import load_dataflow
+from dora_systemd.managernodes import written_dataflow
 from dora_systemd.properties import format_unit, settings_properties, typed
 from dora_systemd.scope import Scope
 from dora_systemd.settings import Settings, resolve_settings
@@ -88,7 +89,10 @@ def _check_nodes(scope: Scope, cell: Cell, limits: tuple[NodeLimits, ...]) -> No
         return
     kinds = {node: one.kind for node, one in read_status(scope, cell).nodes.items()}
     if not kinds:
-        kinds = {node.id: str(node.kind) for node in load_dataflow(cell.options).nodes}
+        written = written_dataflow(cell.options.dataflow).nodes
+        if any(node.kind in UNEXPANDED for node in written):
+            return  # what is in them only its runner finds out, who refuses the next start then
+        kinds = {node.id: str(node.kind) for node in written}
     check_nodes(limits, kinds, [node for node, kind in kinds.items() if kind == "dynamic"])
 
 

@@ -1,6 +1,8 @@
 """`doractl start`: a checked plan becomes a transient unit, and its start is waited for."""
 
+import select
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,9 +10,13 @@ from dora_systemd.busprotocol import JOB_DONE, Manager, Observer, Property
 from dora_systemd.compat import MIN_VERSION, transient_commands
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.managerplan import Plan
-from dora_systemd.managerreason import job_reason
+from dora_systemd.managerreason import job_reason, runners_refusal
 from dora_systemd.process import version_numbers
+from dora_systemd.refusal import FAILED
 from dora_systemd.scope import Scope
+
+_POLL_SECONDS = 0.2
+_ON_THE_WAY = ("activating", "deactivating")
 
 StageObserver = Callable[[str], None]
 """Is told the unit's STATUS= while its start is waited for."""
@@ -36,6 +42,7 @@ def start_plan(
     """Start the transient unit of a plan and wait until its nodes are ready, unless told not to.
 
     Raises DoraSystemdError when the start fails, with the reason; the unit is left as failed then.
+    What its runner refuses was never started: nothing is left of that.
     """
     number = next(iter(version_numbers(manager.version())), MIN_VERSION)
     told = transient_commands(properties, number)
@@ -75,11 +82,18 @@ def _started(
 
     try:
         result = start(observe)
+        if not wait:
+            _wait_until_checked(manager, plan.unit)
     except KeyboardInterrupt as error:
         raise _interruption(plan.options.name) from error
-    if result == JOB_DONE and wait and _has_failed(manager, plan.unit):
-        result = "failed"
-    if result != JOB_DONE:
+    has_failed = result != JOB_DONE or _has_failed(manager, plan.unit)
+    if has_failed and (refusal := runners_refusal(manager, plan.unit)):
+        # It never ran: its name is as free as before.
+        with suppress(DoraSystemdError):
+            manager.reset_failed(plan.unit)
+        raise refusal
+    if has_failed and wait:
+        result = "failed" if result == JOB_DONE else result
         raise _start_failure(manager, plan.scope, plan.unit, plan.options.name, result)
     return Started(plan.options.uuid, plan.options.name, plan.unit, is_ready=wait)
 
@@ -110,6 +124,18 @@ def format_started(started: Started, watched: Sequence[str] = ()) -> str:
 def _interruption(name: str) -> DoraSystemdError:
     hint = f"it goes on starting: doractl list {name}, or doractl stop {name}"
     return DoraSystemdError(f"cannot wait for {name}: interrupted", hint, ExitCode.INTERRUPTED)
+
+
+def _wait_until_checked(manager: Manager, unit: str) -> None:
+    """Return when the runner has said that it goes on, or has ended."""
+    while True:
+        state = manager.read(unit, ["ActiveState", "Job", "StatusText"])
+        is_on_the_way = state["ActiveState"] in _ON_THE_WAY or (state["Job"] or (0,))[0]
+        goes_on = state["StatusText"] and not state["StatusText"].startswith(FAILED)
+        if goes_on or not is_on_the_way:
+            return
+        select.select([manager.fileno()], [], [], _POLL_SECONDS)
+        manager.changes(unit)
 
 
 def _has_failed(manager: Manager, unit: str) -> bool:

@@ -33,6 +33,7 @@ from dora_systemd.values import (
 RUNNER_MODULE = "dora_systemd.runner"
 POST_MODULE = "dora_systemd.runnerpost"
 RELOAD_MODULE = "dora_systemd.runnerask"
+CHECK_MODULE = "dora_systemd.runnercheck"
 _STOP_POST = str(PurePath(__file__).with_name("stoppost.sh"))
 
 _PYTHON_FLAGS = ("-E", "-P", "-m", RUNNER_MODULE)
@@ -163,6 +164,11 @@ def post_command(python: str, options: RunnerOptions) -> list[str]:
 def reload_command(python: str) -> list[str]:
     """ExecReload= of the unit: what `systemctl reload` runs."""
     return [python, *_PYTHON_FLAGS[:-1], RELOAD_MODULE]
+
+
+def check_command(python: str, options: RunnerOptions) -> list[str]:
+    """What finds out whether a runner with these options would refuse them."""
+    return [python, *_PYTHON_FLAGS[:-1], CHECK_MODULE, *format_runner_argv(options)]
 
 
 def options_from_command(command: Sequence[str]) -> RunnerOptions:

@@ -1,5 +1,4 @@
-"""From a descriptor on disk to what is sent to dora: the same for doractl, which refuses a bad one
-before there is a unit, and for the runner, which does it at every start."""
+"""From a descriptor on disk to what is sent to dora: what the runner does at every start."""
 
 import os
 from collections.abc import Mapping
@@ -13,7 +12,7 @@ from dora_systemd.dataflow import Dataflow, parse_dataflow
 from dora_systemd.dataflownodes import UNEXPANDED, NodeKind
 from dora_systemd.doraerrors import parse_dora_error
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.hotreload import CHANGE_VARIABLE
+from dora_systemd.hotreload import CHANGE_VARIABLE, check_reload_nodes
 from dora_systemd.launch import LaunchPlan, launch_descriptor
 from dora_systemd.limits import (
     CHANGES_VARIABLE,
@@ -21,8 +20,10 @@ from dora_systemd.limits import (
     merge_node_limits,
     parse_changes,
 )
+from dora_systemd.lograte import check_rates
 from dora_systemd.options import RunnerOptions
 from dora_systemd.restarts import check_restart_nodes
+from dora_systemd.trust.programs import own_account
 from dora_systemd.values import format_bool, parse_bool
 
 PACKAGE = Path(__file__).parent
@@ -46,10 +47,7 @@ def prepare(options: RunnerOptions, environment: Mapping[str, str]) -> Prepared:
     Raises DoraSystemdError when it cannot be read or a node of it cannot be run.
     """
     dataflow = load_dataflow(options)
-    ids = [node.id for node in dataflow.nodes]
-    dynamic = [node.id for node in dataflow.nodes if node.kind is NodeKind.DYNAMIC]
-    check_nodes(options.node_limits, ids, dynamic)
-    check_restart_nodes(options.node_restarts, ids)
+    _check_limited(options, dataflow)
     plan = LaunchPlan(
         options,
         str(PACKAGE / "launcher.sh"),
@@ -58,6 +56,24 @@ def prepare(options: RunnerOptions, environment: Mapping[str, str]) -> Prepared:
         _load_session(options),
     )
     return Prepared(dataflow, plan, launch_descriptor(dataflow, plan))
+
+
+def check_named_nodes(options: RunnerOptions, dataflow: Dataflow) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) where the options name a node that is not there.
+
+    dataflow: with its modules expanded.
+    """
+    _check_limited(options, dataflow)
+    ids = [node.id for node in dataflow.nodes]
+    check_rates(options.log_rates, ids)
+    check_reload_nodes(options.reload, ids)
+
+
+def _check_limited(options: RunnerOptions, dataflow: Dataflow) -> None:
+    ids = [node.id for node in dataflow.nodes]
+    dynamic = [node.id for node in dataflow.nodes if node.kind is NodeKind.DYNAMIC]
+    check_nodes(options.node_limits, ids, dynamic)
+    check_restart_nodes(options.node_restarts, ids)
 
 
 def with_changes(options: RunnerOptions, environment: Mapping[str, str]) -> RunnerOptions:
@@ -74,32 +90,13 @@ def load_dataflow(options: RunnerOptions) -> Dataflow:
     dataflow = parse_dataflow(files.read_yaml(path), str(path))
     if not any(node.kind in UNEXPANDED for node in dataflow.nodes):
         return dataflow
-    done = process.run_dora(options.dora, ["expand", str(path)], directory=str(path.parent))
+    # Inside the cell: as root in somebody else's name nobody comes this way.
+    account, directory = own_account(), str(path.parent)
+    done = process.run_dora(options.dora, ["expand", str(path)], account, os.environ, directory)
     if done.status != 0:
         reason = parse_dora_error(done.stderr)
         raise DoraSystemdError(f"cannot expand {path}: {reason}", "", ExitCode.BAD_INPUT)
     return parse_dataflow(files.parse_yaml(done.stdout, path), str(path))
-
-
-def refusal_of_dora(
-    options: RunnerOptions,
-    environment: Mapping[str, str],
-    account: process.Account | None = None,
-) -> str:
-    """What `dora validate` says against the dataflow of `options`, or "".
-
-    environment: of the nodes. account: whom dora runs as, None for the caller.
-    """
-    done = process.run_dora(
-        options.dora,
-        ["validate", options.dataflow],
-        {**os.environ, **environment},
-        options.working_directory,
-        account,
-    )
-    if done.status == 0:
-        return ""
-    return parse_dora_error(done.stderr) or parse_dora_error(done.stdout) or "dora refuses it"
 
 
 def _load_session(options: RunnerOptions) -> BuildSession:

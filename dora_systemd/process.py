@@ -4,9 +4,7 @@ import contextlib
 import os
 import re
 import selectors
-import shutil
 import signal
-import subprocess
 import sys
 import threading
 import time
@@ -16,6 +14,8 @@ from pathlib import Path
 from typing import Generic, TypeVar, cast
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.trust.programs import Account, fresh_environment, spawn
+from dora_systemd.trust.sight import OwnSight, Sight
 
 T = TypeVar("T")
 
@@ -40,15 +40,6 @@ class Completed:
     stderr: str
 
 
-@dataclass(frozen=True)
-class Account:
-    """The user whom a child runs as, with all groups."""
-
-    uid: int
-    gid: int
-    groups: tuple[int, ...] = ()
-
-
 def run_command(
     command: Sequence[str],
     seconds: float,
@@ -58,27 +49,18 @@ def run_command(
 ) -> Completed:
     """Run a child to its end, with no input; of each stream OUTPUT_LIMIT bytes are kept.
 
-    After `seconds` its whole process group is killed. Raises DoraSystemdError when it cannot be
-    run or took too long.
+    environment, account: as programs.spawn takes them. After `seconds` its whole process group is
+    killed. Raises DoraSystemdError when it cannot or must not be run, or took too long.
     """
     try:
-        child = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            env=environment,
-            cwd=directory,
-            start_new_session=True,
-            user=None if account is None else account.uid,
-            group=None if account is None else account.gid,
-            extra_groups=None if account is None else account.groups,
-        )
+        child = spawn(command, account, environment, directory)
     except OSError as error:
         raise DoraSystemdError(f"cannot run {command[0]}: {error.strerror}") from error
     with child:
         try:
-            streams = _collect(child, time.monotonic() + seconds)
+            assert child.stdout and child.stderr
+            pipes = (child.stdout.fileno(), child.stderr.fileno())
+            streams = _collect(pipes, time.monotonic() + seconds, command[0])
         except BaseException:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(child.pid, signal.SIGKILL)
@@ -116,42 +98,57 @@ class Beside(Generic[T]):
 def run_dora(
     dora: str,
     arguments: Sequence[str],
+    account: Account | None,
     environment: Mapping[str, str] | None = None,
     directory: str | None = None,
-    account: Account | None = None,
 ) -> Completed:
-    """Run a dora command that ends by itself, such as `dora validate`, without colours."""
-    surroundings = {**(os.environ if environment is None else environment)}
+    """Run a dora command that ends by itself, such as `dora validate`, without colours.
+
+    account: whose dora it is; None: as root only a dora that is root's.
+    """
+    own = os.environ if account is None else fresh_environment(account)
+    surroundings = {**(own if environment is None else environment)}
     surroundings |= {"RUST_BACKTRACE": "0", "NO_COLOR": "1"}
     return run_command((dora, *arguments), DORA_SECONDS, surroundings, directory, account)
 
 
-def find_dora(given: str | None, venv: str | None, search_path: str) -> str:
+def find_dora(
+    given: str | None, venv: str | None, search_path: str, sight: Sight | None = None
+) -> str:
     """Absolute path of the dora command: the one given, else of the venv, else on `search_path`.
 
     Last comes that beside our own Python: pip has put both into one virtual environment, and what
-    is linked onto PATH is only doractl. Raises DoraSystemdError (NO_DORA).
+    is linked onto PATH is only doractl. sight: whose eyes look. Raises DoraSystemdError (NO_DORA).
     """
+    sight = sight or OwnSight()
     if given is not None:
-        found = shutil.which(given, path=search_path)
+        found = _which(given, search_path.split(os.pathsep), sight)
         if found is None:
             raise DoraSystemdError(
                 f"cannot run the dora command {given}", _INSTALL_HINT, ExitCode.NO_DORA
             )
-        return str(Path(found).absolute())
-    places = [*([f"{venv}/bin"] if venv else []), search_path, str(Path(sys.executable).parent)]
-    found = shutil.which("dora", path=os.pathsep.join(places))
+        return found
+    last = str(Path(sys.executable).parent)
+    places = [*([f"{venv}/bin"] if venv else []), *search_path.split(os.pathsep), last]
+    found = _which("dora", places, sight)
     if found is None:
         raise DoraSystemdError("cannot find the dora command", _INSTALL_HINT, ExitCode.NO_DORA)
-    return str(Path(found).absolute())
+    return found
 
 
-def dora_version(dora: str, account: Account | None = None) -> str:
-    """The version of a dora command, as in "1.1.0".
+def _which(name: str, places: Sequence[str], sight: Sight) -> str | None:
+    paths = [name] if "/" in name else [f"{place}/{name}" for place in places if place]
+    return next(filter(sight.is_program, (str(Path(one).absolute()) for one in paths)), None)
+
+
+def dora_version(
+    dora: str, account: Account | None = None, environment: Mapping[str, str] | None = None
+) -> str:
+    """The version of a dora command, as in "1.1.0". account, environment: as for run_dora.
 
     Raises DoraSystemdError (NO_DORA) if it is none, or older than OLDEST_DORA.
     """
-    done = run_dora(dora, ["--version"], account=account)
+    done = run_dora(dora, ["--version"], account, environment)
     version = parse_dora_version(done.stdout) if done.status == 0 else None
     if version is None:
         words = " ".join((done.stderr or done.stdout).split())[:200]
@@ -181,22 +178,28 @@ def version_numbers(version: str) -> tuple[int, ...]:
     return tuple(map(int, match[0].split("."))) if match else ()
 
 
-def _collect(child: "subprocess.Popen[bytes]", deadline: float) -> tuple[bytes, bytes]:
-    """Both streams until their end; what exceeds the limit is read and dropped."""
-    assert child.stdout and child.stderr
-    kept = {child.stdout.fileno(): bytearray(), child.stderr.fileno(): bytearray()}
+def read_streams(streams: Sequence[int], seconds: float) -> list[bytes]:
+    """What can be read from pipes until their end, which closes them. Raises DoraSystemdError."""
+    try:
+        return _collect(streams, time.monotonic() + seconds, "a check")
+    finally:
+        for fd in streams:
+            os.close(fd)
+
+
+def _collect(streams: Sequence[int], deadline: float, command: str) -> list[bytes]:
+    """All streams until their end; what exceeds the limit is read and dropped."""
+    kept = {fd: bytearray() for fd in streams}
     with selectors.DefaultSelector() as selector:
         for stream in kept:
             selector.register(stream, selectors.EVENT_READ)
         while selector.get_map():
             left = deadline - time.monotonic()
             if left <= 0:
-                command = child.args[0] if isinstance(child.args, (list, tuple)) else child.args
                 raise DoraSystemdError(f"cannot wait for {command!r} any longer: it hangs")
             for key, _ in selector.select(left):
                 chunk = os.read(key.fd, _CHUNK)
                 kept[key.fd] += chunk[: OUTPUT_LIMIT - len(kept[key.fd])]
                 if not chunk:
                     selector.unregister(key.fd)
-    stdout, stderr = kept.values()
-    return bytes(stdout), bytes(stderr)
+    return [bytes(one) for one in kept.values()]

@@ -148,7 +148,8 @@ def restart_properties(options: RunnerOptions) -> dict[str, Property]:
     policy = options.restart
     # Of nodes that dora gave up, and of a bad dataflow, another start makes nothing better. Who
     # runs it attached wants its end to be the end.
-    final = (RunnerExit.NODES_FAILED, RunnerExit.BAD_DATAFLOW, *([0] if options.attached else []))
+    refused = (RunnerExit.BAD_DATAFLOW, RunnerExit.NO_ACCESS, RunnerExit.NO_DORA)
+    final = (RunnerExit.NODES_FAILED, *refused, *([0] if options.attached else []))
     common = typed(RestartPreventExitStatus=(tuple(sorted(map(int, final))), ()))
     if policy.policy == "no":
         return common | typed(Restart="no")

@@ -1,11 +1,10 @@
 """From settings to what the runner is told about reloads."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 from dora_systemd.hotreload import HotReload
 from dora_systemd.reloadsettings import HOT_RELOAD, IGNORE, RELOAD_SETTINGS, REPLACE, WATCH
 from dora_systemd.settings import DEFAULT_SOURCE, Settings
-from dora_systemd.suggestions import missing_node
 from dora_systemd.watchrules import relative_patterns
 
 
@@ -31,13 +30,6 @@ def _replace_words(settings: Settings) -> Iterator[tuple[str, str]]:
     for node, given in settings.nodes.items():
         if REPLACE.name in given:
             yield node, given[REPLACE.name]
-
-
-def check_reload_nodes(reload: HotReload, nodes: Sequence[str]) -> None:
-    """Raise DoraSystemdError (BAD_INPUT) for a node that is none of `nodes`."""
-    for node in (*dict(reload.node_watch), *filter(None, dict(reload.replace))):
-        if node not in nodes:
-            raise missing_node("cannot watch files of", node, nodes)
 
 
 def reload_warnings(settings: Settings) -> Iterator[str]:

@@ -17,28 +17,36 @@ from dora_systemd.options import parse_runner_argv
 from dora_systemd.runnerbegin import enter_supervisor, leave_out_openssl, start_coordinator
 
 if TYPE_CHECKING:
+    from dora_systemd.doracheck import DoraCheck
     from dora_systemd.engine import Child
 
 
-def begin(argv: list[str]) -> "Child | None":
-    """The coordinator of the first run. None where that is not possible: who needs it says why."""
+def begin(argv: list[str]) -> "tuple[Child, DoraCheck] | None":
+    """The coordinator of the first run, and dora's checks beside it.
+
+    None where that is not possible: who needs it says why.
+    """
     directory = os.environ.get("RUNTIME_DIRECTORY")
     if directory:
         with contextlib.suppress(OSError, DoraSystemdError):
             options = parse_runner_argv(argv)
             enter_supervisor()
             paths = CellPaths(Path(directory))
-            return start_coordinator(options.dora, paths, node_environment(os.environ))
+            environment = node_environment(os.environ)
+            coordinator = start_coordinator(options.dora, paths, environment)
+            from dora_systemd.doracheck import DoraCheck
+
+            return coordinator, DoraCheck(options, environment)
     return None
 
 
 def main(argv: list[str]) -> int:
     """Run the cell that `argv` describes; the exit status."""
-    coordinator = begin(argv)
+    begun = begin(argv)
     leave_out_openssl()
     from dora_systemd.runnercell import run
 
-    return run(argv, coordinator)
+    return run(argv, begun)
 
 
 if __name__ == "__main__":

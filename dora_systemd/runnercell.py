@@ -14,6 +14,7 @@ from dora_systemd.causes import Cause
 from dora_systemd.cellpaths import CellPaths
 from dora_systemd.cellstate import Cell, RunnerExit, State
 from dora_systemd.cellview import initial_nodes
+from dora_systemd.doracheck import DoraCheck
 from dora_systemd.engine import Child
 from dora_systemd.environment import node_environment
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -23,7 +24,14 @@ from dora_systemd.logs import Origin
 from dora_systemd.names import settings_path
 from dora_systemd.options import RunnerOptions, parse_runner_argv
 from dora_systemd.pipes import LogPipes
-from dora_systemd.preparation import PACKAGE, Prepared, prepare, with_changes
+from dora_systemd.preparation import (
+    PACKAGE,
+    Prepared,
+    check_named_nodes,
+    prepare,
+    with_changes,
+)
+from dora_systemd.refusal import format_refusal, refusal_exit
 from dora_systemd.runnerapply import Run
 from dora_systemd.runnerbegin import enter_supervisor
 from dora_systemd.runnerdialogue import Dialogue
@@ -43,6 +51,9 @@ JOURNAL_SECONDS = 1.0
 STOP_SECONDS = 7.0
 BACKLOG_SECONDS = 60.0
 """How long journald may take for what the nodes have left to say, when nobody waits."""
+
+Begun = tuple[Child, DoraCheck]
+"""A coordinator that boots, and what dora is asked meanwhile."""
 
 
 def daemon_variables(prepared: Prepared, paths: CellPaths, unit: Path) -> dict[str, str]:
@@ -71,11 +82,11 @@ def make_directories(paths: CellPaths) -> None:
 
 
 async def run_cell(
-    options: RunnerOptions, paths: CellPaths, coordinator: Child | None = None
+    options: RunnerOptions, paths: CellPaths, begun: Begun | None = None
 ) -> RunnerExit:
     """Live the life of one cell: one run of the dataflow after the other, until it has to end.
 
-    coordinator: that of the first run, if it is there already.
+    begun: what there is of the first run already.
     """
     loop = asyncio.get_running_loop()
     unit = enter_supervisor()
@@ -88,13 +99,14 @@ async def run_cell(
     nodes = Nodes(unit, paths, pipes)
     settings = SettingsFile(settings_path(options.dataflow), paths.settings)
     reloader = Reloader(options, environment, settings)
-    cell = Runs(paths, unit, environment, pipes, nodes, reloader, coordinator)
+    coordinator, check = begun or (None, DoraCheck(options, environment))
+    cell = Runs(paths, unit, environment, pipes, nodes, reloader, check, coordinator)
     losses = losses_of_user(journal, pipes) if paths.is_of_user else None
     try:
         pipes.write_event("dataflow-starting")
         return await live(cell, losses)
     except DoraSystemdError as error:
-        notify.send_status(f"failed: {error.message}")
+        notify.send_status(format_refusal(error))
         pipes.write_event("dataflow-failed", reason=error.message, cause=Cause.BAD_DATAFLOW)
         raise
     finally:
@@ -106,7 +118,7 @@ async def run_cell(
 class Runs:
     """What all runs of the dataflow share. unit: cgroup directory. environment: of the nodes.
 
-    coordinator: that of the first run, if it is there already.
+    check: dora's, of the first run. coordinator: of that run, if it is there already.
     """
 
     paths: CellPaths
@@ -115,6 +127,7 @@ class Runs:
     pipes: LogPipes
     nodes: Nodes
     reloader: Reloader
+    check: DoraCheck
     coordinator: Child | None = None
 
 
@@ -154,7 +167,7 @@ async def run_once(cell: Runs, is_again: bool) -> Cell:
     dora = Engine(options.dora, cell.paths, cell.environment)
     try:
         coordinator = dora.start_coordinator(None if is_again else cell.coordinator)
-        prepared = reloader.current or prepare(options, cell.environment)
+        prepared = reloader.current or prepare_first(cell, options)
         cell.nodes.prepare(prepared.dataflow, options.log_rates, options.node_limits)
         table = initial_nodes(
             kinds(prepared.dataflow, prepared.plan), prepared.descriptor, started_us
@@ -185,6 +198,13 @@ async def run_once(cell: Runs, is_again: bool) -> Cell:
         return pump.cell
     finally:
         dora.kill()
+
+
+def prepare_first(cell: Runs, options: RunnerOptions) -> Prepared:
+    """The dataflow of the first run. Raises DoraSystemdError for what is refused."""
+    prepared = cell.check.beside(lambda: prepare(options, cell.environment))
+    check_named_nodes(options, prepared.dataflow)
+    return prepared
 
 
 async def tell_started(pump: Pump, reloader: Reloader) -> None:
@@ -224,18 +244,18 @@ async def stop_at_eof(pump: Pump) -> None:
     stop(pump, "terminal")
 
 
-def run(argv: list[str], coordinator: Child | None) -> int:
-    """Run the cell that `argv` describes; the exit status. coordinator: see run_cell."""
+def run(argv: list[str], begun: Begun | None) -> int:
+    """Run the cell that `argv` describes; the exit status. begun: see run_cell."""
     try:
         options = with_changes(parse_runner_argv(argv), os.environ)
         directory = os.environ.get("RUNTIME_DIRECTORY")
         if not directory:
             hint = "it is started by systemd: use `doractl start`"
             raise DoraSystemdError("cannot run without RUNTIME_DIRECTORY", hint, ExitCode.USAGE)
-        return asyncio.run(run_cell(options, CellPaths(Path(directory)), coordinator))
+        return asyncio.run(run_cell(options, CellPaths(Path(directory)), begun))
     except DoraSystemdError as error:
         print(f"{error.message}\n{error.hint}".strip(), file=sys.stderr)
-        return RunnerExit.BAD_DATAFLOW
+        return refusal_exit(error)
     except OSError as error:
         print(f"cannot run the dataflow: {error}", file=sys.stderr)
         return RunnerExit.FAILED

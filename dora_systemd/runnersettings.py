@@ -5,6 +5,7 @@ Reading settings takes a library that the runner does without, so a child of it 
 """
 
 import json
+import os
 import shutil
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ from dora_systemd import process
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.hotreload import SettingsChange
 from dora_systemd.limits import format_node_limits, parse_node_limits
+from dora_systemd.trust.programs import own_account
 
 _SECONDS = 120.0
 
@@ -33,7 +35,7 @@ class SettingsFile:
     def change(self) -> SettingsChange:
         """What has changed since. Raises DoraSystemdError when the file cannot be used."""
         command = [sys.executable, "-E", "-P", "-m", __name__, str(self._copy), self.path]
-        done = process.run_command(command, _SECONDS)
+        done = process.run_command(command, _SECONDS, os.environ, account=own_account())
         if done.status:
             raise DoraSystemdError(done.stderr.strip(), "", ExitCode.BAD_INPUT)
         found = json.loads(done.stdout)

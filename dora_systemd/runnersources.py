@@ -6,11 +6,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from dora_systemd.dataflownodes import NodeKind
+from dora_systemd.doracheck import refusal_of_dora
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.hotreload import HotReload
 from dora_systemd.launch import kinds, sources
 from dora_systemd.options import RunnerOptions
-from dora_systemd.preparation import Prepared, prepare, refusal_of_dora
+from dora_systemd.preparation import Prepared, prepare
 from dora_systemd.pythonimports import program_files, syntax_error
 from dora_systemd.reload import Difference, NodeSources, difference, touched
 from dora_systemd.reloadsteps import How, Step, plan_steps

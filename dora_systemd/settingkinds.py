@@ -54,6 +54,8 @@ class Setting(Generic[T]):
     variable: the environment variable, or "".
     per_node: may stand below `nodes: NODE:` of a settings file too.
     property: the systemd property it becomes as it is, as in a unit file, or "".
+    root_only: whoever sets it has root read, run or give something: in system scope a settings
+        file may hold it only if root alone can have written it.
     """
 
     name: str
@@ -65,6 +67,7 @@ class Setting(Generic[T]):
     metavar: str = ""
     per_node: bool = False
     property: str = ""
+    root_only: bool = False
 
 
 def scalar_text(value: Scalar) -> str:

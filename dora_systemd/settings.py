@@ -29,12 +29,14 @@ class Settings:
     sources: a flag, a variable's name, a file's path or DEFAULT_SOURCE by name of the setting.
     nodes: by node id, the per-node values by name of the setting.
     table: the settings that there are.
+    lent: environment files that only somebody else than root names, in system scope.
     """
 
     values: Mapping[str, Any]
     sources: Mapping[str, str]
     nodes: Mapping[str, Mapping[str, Any]]
     table: Sequence[Setting[Any]] = field(default=SETTINGS, repr=False)
+    lent: frozenset[str] = frozenset()
 
     def __getitem__(self, setting: Setting[T]) -> T:
         return cast(T, self.values[setting.name])

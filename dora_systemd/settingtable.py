@@ -93,6 +93,7 @@ PROPERTY = Setting[tuple[str, ...]](
     "Property of the unit, as systemd-run(1) takes it.",
     flags=("--property", "-p"),
     metavar="KEY=VALUE",
+    root_only=True,
 )
 USER = Setting[str | None](
     "user",
@@ -102,6 +103,7 @@ USER = Setting[str | None](
     flags=("--uid",),
     variable="DORA_UID",
     metavar="USER",
+    root_only=True,
 )
 ALLOW_SHELL_NODES = Setting[bool](
     "allow_shell_nodes",

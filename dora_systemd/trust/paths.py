@@ -50,7 +50,7 @@ class Place:
     """Where a walk has arrived.
 
     uid: owner of the thing. owners: of it and of all directories above it. shared: a directory
-    on the way whose entries more accounts than its owner can replace, or "".
+    on the way, or at its end, whose entries more accounts than its owner can replace, or "".
     """
 
     path: str
@@ -64,6 +64,11 @@ class Place:
         """Whether nobody but root can change it or put something else in its place."""
         others_write = self.mode & (stat.S_IWOTH | stat.S_IWGRP)
         return self.owners == {0} and not self.shared and not others_write
+
+    @property
+    def is_open(self) -> bool:
+        """Whether anybody can put something into it, as into /tmp."""
+        return stat.S_ISDIR(self.mode) and bool(self.mode & _OTHERS_WRITE)
 
     @property
     def borrowed(self) -> str:
@@ -208,8 +213,8 @@ class _Walk:
 
     def place(self, path: str) -> Place:
         """Where the walk has arrived."""
-        status = self._status
-        return Place(path, status.st_uid, status.st_mode, frozenset(self._owners), self._shared)
+        status, shared = self._status, self._shared or self._sharing()
+        return Place(path, status.st_uid, status.st_mode, frozenset(self._owners), shared)
 
 
 def _parts(path: str) -> list[str]:

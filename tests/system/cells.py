@@ -107,11 +107,14 @@ class Project:
         root.chmod(0o755)
 
     def write(self, name: str, text: str) -> Path:
-        """Write a file of the project."""
+        """Write a file of the project, which is its owner's."""
         path = self.root / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
         path.chmod(0o644)
+        if os.geteuid() == 0:
+            owner = self.root.stat()
+            os.chown(path, owner.st_uid, owner.st_gid)
         return path
 
     def three_nodes(self) -> Path:

@@ -19,6 +19,10 @@ def files_of(*places: Path) -> set[str]:
     return {str(path) for place in places for path in place.rglob("*")}
 
 
+IN_THE_JOURNAL = ("failed: cannot ", "Failed with result 'exit-code'", "Failed to start ")
+"""What the journal keeps of a dataflow that its runner refuses, dora's checks being made there."""
+
+
 class Refusal(NamedTuple):
     """Words behind `start`, the exit status, and a part of what is said about it."""
 

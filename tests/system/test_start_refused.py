@@ -7,7 +7,9 @@ import pytest
 
 from dora_systemd.errors import ExitCode
 from tests.system.cells import Cell, Project
-from tests.system.refusals import Refusal, check_refusals
+from tests.system.refusals import IN_THE_JOURNAL, Refusal, check_refusals, units
+
+pytestmark = pytest.mark.warns(*IN_THE_JOURNAL)
 
 TICK = "inputs: {tick: dora/timer/millis/50}"
 
@@ -134,3 +136,24 @@ def test_half_written_settings(cell: Cell, project: Project, place: str) -> None
     finally:
         path.unlink()
     cell.wait_exchanging()
+
+
+def test_every_way_of_starting_refuses_the_same(cell: Cell, project: Project) -> None:
+    """What only the cell finds out, too: said in the same words, and nothing is left behind."""
+    project.three_nodes()
+    flow = str(project.write("flow.yml", BAD_FILES["unknown-key"]))
+    before, said = units(), set()
+    for verb, *words in (
+        ("start",),
+        ("start", "--no-wait"),
+        ("start", "--dry-run"),
+        ("start", "--enable"),
+        ("run",),
+    ):
+        done = cell.doractl(verb, flow, "--name", cell.name, *words, check=False)
+        assert (done.returncode, done.stdout) == (ExitCode.BAD_INPUT, ""), (verb, words)
+        said.add(done.stderr)
+        assert units() == before, (verb, words)
+    (words_of_all,) = said
+    assert "colour" in words_of_all
+    assert not cell.systemctl("list-unit-files", "--no-legend", check=False)

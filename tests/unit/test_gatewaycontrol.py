@@ -32,6 +32,7 @@ from dora_systemd.gatewaycontrolframes import (
     renamed,
 )
 from dora_systemd.gatewaycontrolmatch import could_be, sent_flags
+from dora_systemd.gatewaycontrolstart import find_file
 from dora_systemd.gatewayrequest import Request as HttpRequest
 from dora_systemd.scope import Scope
 from dora_systemd.statuswords import DataflowRow, NodeRow
@@ -242,6 +243,31 @@ def test_descriptors() -> None:
         "nodes": [{"id": "a", "path": "a.py", "inputs": 1}],
     }
     assert restored_descriptor(running, [], ("path", "args")) == running
+
+
+@pytest.mark.parametrize(
+    ("command", "path", "args"),
+    [
+        ("/venv/bin/python -u /x/a.py 'b c'", "/x/a.py", "'b c'"),
+        ("uv run python -u /x/a.py", "/x/a.py", ""),
+        ("/x/tool -u 5", "/x/tool", "-u 5"),
+        ("/bin/sh -c 'echo $X | cat'", "shell", "echo $X | cat"),
+    ],
+)
+def test_a_program_that_is_in_no_file(command: str, path: str, args: str) -> None:
+    """A node of a module: what it runs is in what our launcher is told."""
+    launched = {"id": "m.a", "path": "/bin/sh", "args": f"/p/launcher.sh m.a /x pipe {command}"}
+    (node,) = restored_descriptor({"nodes": [launched]}, [], ("path", "args"))["nodes"]
+    assert node == {"id": "m.a", "path": path, "args": args}
+
+
+@pytest.mark.parametrize("directory", ["/\0", "/nowhere"])
+def test_a_directory_that_is_none(directory: str) -> None:
+    body = {"Start": {"dataflow": {"nodes": []}, "local_working_dir": directory}}
+    request = parse_request(json.dumps({"id": UUID, "method": "control", "params": body}))
+    assert isinstance(request, Request)
+    with pytest.raises(DoraSystemdError, match="cannot look for the dataflow in"):
+        find_file(Scope(is_user=True, uid=1000), request)
 
 
 # What `dora expand` prints of a file, and what the dora command sends with it.

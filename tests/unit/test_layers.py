@@ -83,6 +83,7 @@ DECISIONS = {
         "propertytable",
         "protocol",
         "pythonimports",
+        "refusal",
         "reload",
         "reloadplan",
         "reloadsettings",
@@ -114,7 +115,7 @@ DECISIONS = {
     ],
 }
 TRUST = {
-    "trust": ["trust.paths"],
+    "trust": ["trust.paths", "trust.programs", "trust.sight"],
 }
 """The one door to what others own; the adapters go through it, too."""
 ADAPTERS = {
@@ -138,7 +139,7 @@ ADAPTERS = {
     "watch": ["watch"],
 }
 SHARED = {
-    "preparation": ["preparation"],
+    "preparation": ["doracheck", "preparation"],
 }
 """What both use cases do with several adapters."""
 USE_CASES = {
@@ -147,6 +148,7 @@ USE_CASES = {
         "managerask",
         "managerbudget",
         "managercells",
+        "managercheck",
         "managerclaim",
         "managercredentials",
         "managerdestroy",
@@ -162,8 +164,10 @@ USE_CASES = {
         "managerlinger",
         "managerfollow",
         "managerlist",
+        "managerlook",
         "managerlogs",
         "managernode",
+        "managernodes",
         "managerplan",
         "managerreason",
         "managerreload",
@@ -190,6 +194,7 @@ USE_CASES = {
         "runner",
         "runnerapply",
         "runnerbegin",
+        "runnercheck",
         "runnercell",
         "runnerask",
         "runnerdialogue",
@@ -344,3 +349,49 @@ def test_short_lived_verbs_load_little(verb: str, tmp_path: Path) -> None:
     assert not done.returncode, done.stderr
     loaded = {module.partition(".")[0] for module in done.stdout.split()}
     assert not loaded & NOT_IN_SHORT_LIVED_VERBS
+
+
+STARTS_PROGRAMS = {
+    "trust.programs": "for others",
+    "engine": "dora's, in a cell",
+    "journalread": "journalctl",
+    "managernode": "dora, after it has become the user",
+    "cli.logs": "the caller's own pager",
+}
+"""The modules that start programs, and which."""
+
+CALLS_OF_PROGRAMS = {"Popen", "check_call", "check_output", "execv", "execve", "execvp", "execvpe"}
+CALLS_OF_PROGRAMS |= {"fork", "posix_spawn", "posix_spawnp", "system", "popen", "setuid", "setgid"}
+
+
+def called(name: str) -> set[str]:
+    """The names after a dot that a module uses."""
+    tree = ast.parse(module_paths()[name].read_text())
+    return {
+        node.func.attr
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)
+    }
+
+
+def test_who_starts_programs() -> None:
+    found = {name for name in module_paths() if called(name) & CALLS_OF_PROGRAMS}
+    assert found == STARTS_PROGRAMS.keys()
+
+
+RUNS_DORA = {"run_dora", "dora_version", "load_dataflow", "prepare", "DoraCheck", "refusal_of_dora"}
+ASKS_ROOTS_DORA = {"managerdoctor", "managerversion"}
+"""They ask for a version only, of a dora that is root's when root asks."""
+
+
+@pytest.mark.parametrize("name", [*USE_CASES["manager"], *GATEWAY["gateway"], *CLI["cli"]])
+def test_dora_is_run_in_cells_only(name: str) -> None:
+    tree = ast.parse(module_paths()[name].read_text())
+    imported = {
+        alias.name
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    allowed = {"dora_version"} if name in ASKS_ROOTS_DORA else set()
+    assert not (imported & RUNS_DORA) - allowed

@@ -12,6 +12,7 @@ from dora_systemd.lograte import (
     ALL_NODES,
     SHORTEST,
     RateLimit,
+    check_rates,
     format_rate,
     format_rates,
     merge_rates,
@@ -19,7 +20,7 @@ from dora_systemd.lograte import (
     parse_rates,
     rate_of,
 )
-from dora_systemd.lograteplan import check_rates, log_rates
+from dora_systemd.lograteplan import log_rates
 from dora_systemd.settings import Settings, resolve_settings
 from dora_systemd.values import INFINITY, SECOND
 

@@ -7,12 +7,16 @@ from typing import Any
 
 import pytest
 
+from dora_systemd.doracheck import check_access
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.manageraccount import check_access, choose_user
+from dora_systemd.manageraccount import account_of, choose_user
+from dora_systemd.managercheck import check_plan
 from dora_systemd.managerplan import Plan, StartRequest, make_plan, request_name
 from dora_systemd.managersettings import read_settings, settings_files
 from dora_systemd.scope import Scope
-from dora_systemd.settingtable import UV
+from dora_systemd.settingtable import ENV_FILE, SETTINGS, UV
+from dora_systemd.trust.paths import Place, reached
+from dora_systemd.trust.sight import sight_of
 
 USER = Scope(is_user=True, uid=os.getuid())
 SYSTEM = Scope(is_user=False, uid=os.getuid())
@@ -104,16 +108,34 @@ def test_what_is_refused(project: Path, flags: dict[str, Any], code: ExitCode, w
     assert caught.value.hint
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [("# refused\n" + FLOW, "it is refused"), (FLOW.replace("a.py", "b.py"), "b.py")],
-)
-def test_what_dora_or_the_path_check_refuses(project: Path, text: str, words: str) -> None:
-    (project / "robot.yml").write_text(text)
-    with pytest.raises(DoraSystemdError) as caught:
+def test_what_dora_refuses(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not while the plan is made, which runs no dora: that is for the cell, or a dry run."""
+    (project / "robot.yml").write_text("# refused\n" + FLOW)
+    plan = plan_of(project)
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)  # root would ask in a unit
+    monkeypatch.setattr("dora_systemd.managercheck.own_account", lambda: None)
+    with pytest.raises(DoraSystemdError, match="it is refused") as caught:
+        check_plan(no_manager, plan)
+    assert caught.value.code is ExitCode.BAD_INPUT
+
+
+def test_a_program_that_is_not_there(project: Path) -> None:
+    (project / "robot.yml").write_text(FLOW.replace("a.py", "b.py"))
+    with pytest.raises(DoraSystemdError, match=r"b\.py") as caught:
         plan_of(project)
     assert caught.value.code is ExitCode.BAD_INPUT
-    assert words in caught.value.message
+
+
+def no_manager() -> Any:
+    raise AssertionError
+
+
+def test_no_dora_runs_while_a_plan_is_made(project: Path) -> None:
+    make_program(project / "bin" / "dora", f"#!/bin/sh\ntouch {project}/proof\n")
+    (project / "mod.yml").write_text("module: {name: m}\n" + FLOW)
+    (project / "robot.yml").write_text("nodes: [{id: m, module: mod.yml}]\n")
+    plan_of(project)
+    assert not (project / "proof").exists()
 
 
 def test_names() -> None:
@@ -141,48 +163,125 @@ def test_settings_beside_the_dataflow(project: Path) -> None:
     assert read_settings(USER, project / "robot.yml", {"uv": False}, {})[UV] is False
 
 
+ROOT_ONLY = {
+    "user": "root",
+    "property": "{Nice: 5}",
+    "credentials": "{a: /etc/shadow}",
+    "nice": "-5",
+    "realtime": "20",
+    "cpu_weight": "10000",
+    "io_weight": "10000",
+}
+
+
+def test_which_settings_are_for_root_only() -> None:
+    assert {one.name for one in SETTINGS if one.root_only} == ROOT_ONLY.keys()
+
+
 @pytest.mark.skipif(os.getuid() != 0, reason="gives files to somebody else")
-@pytest.mark.parametrize(
-    "text", ["user: root\n", "property: {Nice: 5}\n", "credentials: {a: /etc/shadow}\n"]
-)
-def test_whom_to_believe(project: Path, text: str) -> None:
+@pytest.mark.parametrize("key", ROOT_ONLY)
+def test_whom_to_believe(project: Path, key: str) -> None:
     beside = project / "robot.systemd.yml"
-    beside.write_text(text)
+    beside.write_text(f"{key}: {ROOT_ONLY[key]}\n")
     read_settings(SYSTEM, project / "robot.yml", {}, {})
     os.chown(beside, 65534, 65534)
     read_settings(USER, project / "robot.yml", {}, {})
     with pytest.raises(DoraSystemdError) as caught:
         read_settings(SYSTEM, project / "robot.yml", {}, {})
     assert caught.value.code is ExitCode.NO_PERMISSION
+    os.chown(beside, 0, 0)
+    os.chown(project, 65534, 65534)
+    with pytest.raises(DoraSystemdError, match="nobody owns a directory above it"):
+        read_settings(SYSTEM, project / "robot.yml", {}, {})
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="gives files to somebody else")
+def test_environment_files_of_others_are_lent(project: Path) -> None:
+    flow, beside = project / "robot.yml", project / "robot.systemd.yml"
+    beside.write_text("env_file: [/a, /b]\n")
+    assert not read_settings(SYSTEM, flow, {}, {}).lent
+    os.chown(beside, 65534, 65534)
+    settings = read_settings(SYSTEM, flow, {"env_file": ("/b", "/c")}, {})
+    assert settings[ENV_FILE] == ("/a", "/b", "/b", "/c")
+    assert settings.lent == {"/a"}
+    assert not read_settings(USER, flow, {}, {}).lent
+
+
+def place_of(path: Path) -> Place:
+    with reached(path) as (_, place):
+        return place
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="gives files to somebody else")
 def test_the_owner_of_the_dataflow_runs_it(project: Path) -> None:
     flow = project / "robot.yml"
     os.chown(flow, 65534, 65534)
-    user = choose_user(SYSTEM, None, flow)
+    user = choose_user(SYSTEM, None, place_of(flow), str(project))
     assert user is not None
     assert user.pw_uid == 65534
     os.chown(flow, 4_000_000, 0)
     with pytest.raises(DoraSystemdError, match="has no name"):
-        choose_user(SYSTEM, None, flow)
+        choose_user(SYSTEM, None, place_of(flow), str(project))
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="gives files to somebody else")
+def test_an_identity_is_not_borrowed(project: Path, tmp_path: Path) -> None:
+    """The file, the directories above it and the working directory are of one owner, or root's."""
+    flow, other = project / "robot.yml", tmp_path / "other"
+    other.mkdir()
+    os.chown(other, 1, 1)
+    os.chown(flow, 65534, 65534)
+    for directory, words in ((other, "owns"), (Path("/tmp"), "everybody can write")):
+        with pytest.raises(DoraSystemdError, match=words) as caught:
+            choose_user(SYSTEM, None, place_of(flow), str(directory))
+        assert "--uid" in caught.value.hint
+        assert choose_user(SYSTEM, "root", place_of(flow), str(directory)) == pwd.getpwuid(0)
+    os.chown(flow, 0, 0)
+    os.chown(project, 1, 1)
+    with pytest.raises(DoraSystemdError, match="owns a directory above it"):
+        choose_user(SYSTEM, None, place_of(flow), str(project))
 
 
 def test_a_user_that_is_asked_for(project: Path) -> None:
+    place = place_of(project / "robot.yml")
     for wanted in ("root", "0"):
-        assert choose_user(SYSTEM, wanted, project) == pwd.getpwuid(0)
+        assert choose_user(SYSTEM, wanted, place, str(project)) == pwd.getpwuid(0)
     for wanted in ("nobody-of-that-name", "9" * 30, "-1"):
         with pytest.raises(DoraSystemdError, match="cannot find a user"):
-            choose_user(SYSTEM, wanted, project)
+            choose_user(SYSTEM, wanted, place, str(project))
+
+
+def test_what_the_cell_can_reach(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    options = plan_of(project).options
+    check_access(options)
+    check_access(options._replace(dataflow="/nowhere"))  # who reads it says so
+    with pytest.raises(DoraSystemdError) as caught:
+        check_access(options._replace(dora="/nowhere"))
+    assert caught.value.code is ExitCode.NO_DORA
+    monkeypatch.setattr(os, "access", lambda path, _mode: path != options.working_directory)
+    with pytest.raises(DoraSystemdError, match=f"cannot reach {project}") as caught:
+        check_access(options)
+    assert caught.value.code is ExitCode.NO_PERMISSION
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="becomes somebody else")
-def test_what_a_user_can_reach(project: Path) -> None:
-    closed = project / "closed dir"
+def test_what_a_user_sees(tmp_path: Path) -> None:
+    """Not what is behind doors that are closed for him, whatever root could see."""
+    closed, opened = tmp_path / "closed dir", Path("/etc")
     closed.mkdir(mode=0o700)
-    nobody = pwd.getpwuid(65534)
-    check_access(nobody, ["/etc/passwd"], ["/bin/sh", "/"])
-    with pytest.raises(DoraSystemdError) as caught:
-        check_access(nobody, ["/etc/passwd"], ["/bin/sh", str(closed)])
-    assert caught.value.message.endswith(f"who cannot reach {closed}")
-    check_access(None, [], [str(closed)])
+    (closed / "x").write_text("secret")
+    with sight_of(account_of(pwd.getpwuid(65534))) as sight:
+        assert not sight.exists(str(closed / "x"))
+        assert not sight.is_directory(str(closed / "x"))
+        with pytest.raises(PermissionError):
+            sight.read(str(closed / "x"))
+        assert sight.exists("/etc/passwd")
+        assert sight.is_directory(str(opened))
+        assert sight.is_program("/bin/sh")
+        assert not sight.is_program("/etc")
+        assert sight.real("/proc/self/../version") == "/proc/version"
+        assert sight.read("/etc/passwd") == Path("/etc/passwd").read_bytes()
+        with pytest.raises(OSError, match="No such device"):
+            sight.read("/dev/null")
+    with sight_of(None) as sight:
+        assert sight.read(str(closed / "x")) == b"secret"

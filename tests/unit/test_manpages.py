@@ -102,6 +102,13 @@ def test_entries_are_true(setting: Setting[Any]) -> None:
     assert re.search(rf"^Default: {re.escape(default)}[.;,]", entry, flags=re.M), default
 
 
+def test_which_settings_are_roots_alone() -> None:
+    text = (MAN / "dora-systemd.yml.5").read_text()
+    text = text.partition(".Ss Whom a file may command\n")[2].partition("Below\n")[0]
+    named = re.findall(r"^\.Va (\S+)", text, flags=re.M)
+    assert sorted(named) == sorted(one.name for one in SETTINGS if one.root_only)
+
+
 def test_variables_of_the_command() -> None:
     text = sections("doractl.1")["ENVIRONMENT"]
     listed = re.findall(r"\b(DORA_[A-Z_]+)", text)

@@ -50,7 +50,7 @@ def test_what_cannot_be_run() -> None:
 
 def test_dora_is_told_to_print_plainly(tmp_path: Path) -> None:
     dora = make_program(tmp_path / "dora", 'echo "$NO_COLOR $RUST_BACKTRACE $1"')
-    assert process.run_dora(dora, ["validate"], {}).stdout == "1 0 validate\n"
+    assert process.run_dora(dora, ["validate"], None, {}).stdout == "1 0 validate\n"
 
 
 def test_dora_given_wins_over_venv_and_path(tmp_path: Path) -> None:

@@ -125,12 +125,12 @@ def test_three_restarts_are_four_starts() -> None:
     assert found["StartLimitIntervalSec"] == 10 * MINUTE
     assert (found["RestartSec"], found["RestartMaxDelaySec"]) == (SECOND, 8 * SECOND)
     assert found["RestartSteps"] == 3
-    assert found["RestartPreventExitStatus"] == ((70, 78), ())
+    assert found["RestartPreventExitStatus"] == ((70, 72, 77, 78), ())
 
 
 def test_unit_without_restarts() -> None:
-    assert unit(DEFAULT) == {"Restart": "no", "RestartPreventExitStatus": ((70, 78), ())}
-    assert unit(POLICY, attached=True)["RestartPreventExitStatus"] == ((0, 70, 78), ())
+    assert unit(DEFAULT) == {"Restart": "no", "RestartPreventExitStatus": ((70, 72, 77, 78), ())}
+    assert unit(POLICY, attached=True)["RestartPreventExitStatus"] == ((0, 70, 72, 77, 78), ())
     assert unit(POLICY._replace(max_restarts=INFINITY))["StartLimitIntervalSec"] == 0
 
 

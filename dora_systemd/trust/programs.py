@@ -1,0 +1,159 @@
+"""Programs that somebody else may have written: nothing else starts a process for another user.
+
+- A program runs as the account whose it is, and with that account's environment: what stands in
+  root's is root's.
+- As root, without an account, only a program runs that nobody but root can change, all the way
+  up, and its interpreter likewise.
+"""
+
+import os
+import pwd
+import shutil
+import subprocess
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.trust.paths import reached, user_name
+from dora_systemd.values import shown
+
+DEFAULT_PATH = "/usr/local/bin:/usr/bin:/bin"
+_LANGUAGE = "C.UTF-8"
+_FIRST_LINE = 256
+"""Bytes of "#!INTERPRETER" that the kernel reads, see execve(2)."""
+
+Stream = int | IO[bytes]
+
+
+@dataclass(frozen=True)
+class Account:
+    """The user whom a program runs as, with all groups."""
+
+    uid: int
+    gid: int
+    groups: tuple[int, ...] = ()
+    name: str = ""
+    home: str = "/"
+    shell: str = "/bin/sh"
+
+
+def account_from(entry: pwd.struct_passwd) -> Account:
+    """The account of an entry of passwd(5)."""
+    groups = tuple(os.getgrouplist(entry.pw_name, entry.pw_gid))
+    uid, gid = entry.pw_uid, entry.pw_gid
+    return Account(uid, gid, groups, entry.pw_name, entry.pw_dir, entry.pw_shell)
+
+
+def account_of_uid(uid: int) -> Account:
+    """The account of a uid. Raises DoraSystemdError (NOT_FOUND) for one that is gone."""
+    try:
+        return account_from(pwd.getpwuid(uid))
+    except (KeyError, OverflowError) as error:
+        hint = "the user was deleted while the dataflow ran: stop it, or make that user again"
+        message = f"cannot become the user with the uid {uid}: there is none"
+        raise DoraSystemdError(message, hint, ExitCode.NOT_FOUND) from error
+
+
+def own_account() -> Account:
+    """The account that this process has already: in the cell of a dataflow, even if it is root."""
+    uid = os.geteuid()
+    return Account(uid, os.getegid(), tuple(os.getgroups()), user_name(uid))
+
+
+def fresh_environment(account: Account) -> dict[str, str]:
+    """What a program of the account finds, as after a login: nothing of the caller's."""
+    return {
+        "HOME": account.home,
+        "USER": account.name,
+        "LOGNAME": account.name,
+        "SHELL": account.shell or "/bin/sh",
+        "PATH": DEFAULT_PATH,
+        "LANG": _LANGUAGE,
+    }
+
+
+def spawn(
+    command: Sequence[str],
+    account: Account | None,
+    environment: Mapping[str, str] | None = None,
+    directory: str | None = None,
+    stdin: Stream = subprocess.DEVNULL,
+    stdout: Stream = subprocess.PIPE,
+    stderr: Stream = subprocess.PIPE,
+) -> "subprocess.Popen[bytes]":
+    """Start a child in a session of its own, with no other descriptor than these three.
+
+    account: whom it runs as; None: the caller, and as root root's own programs only. environment:
+    all of it; None: that of the account, or the caller's own where there is no account. Raises
+    OSError, and DoraSystemdError (NO_PERMISSION) for a program that root must not run.
+    """
+    if account is None:
+        check_program(command[0])
+    elif environment is None:
+        environment = fresh_environment(account)
+    other = account if account is not None and account.uid != os.geteuid() else None
+    return subprocess.Popen(
+        command,
+        stdin=stdin,
+        stdout=stdout,
+        stderr=stderr,
+        env=environment,
+        cwd=directory,
+        start_new_session=True,
+        user=None if other is None else other.uid,
+        group=None if other is None else other.gid,
+        extra_groups=None if other is None else other.groups,
+    )
+
+
+def become(account: Account) -> None:
+    """This process is the account's from now on, for good. Raises OSError."""
+    if account.uid != os.geteuid():
+        os.setgroups(account.groups)
+        os.setgid(account.gid)
+        os.setuid(account.uid)
+
+
+def check_program(program: str) -> None:
+    """Raise DoraSystemdError (NO_PERMISSION) where root would run what others can change.
+
+    program: a path, or a name that is looked up in PATH. One that is not there is not judged: who
+    runs it hears of that.
+    """
+    if os.geteuid() != 0:
+        return
+    found: str | None = program
+    for _ in range(3):  # a script, "env" in its first line, and what that finds
+        found = found if found and "/" in found else shutil.which(found or "")
+        if found is None or not os.path.lexists(found):
+            return
+        found = _interpreter(str(Path(found).absolute()))
+        if found is None:
+            return
+    raise _refusal(program, "its interpreter is a script of a script")
+
+
+def _interpreter(program: str) -> str | None:
+    """What runs a script, None for a binary. Raises DoraSystemdError for what is not root's."""
+    with reached(program) as (found, place):
+        if not place.is_roots:
+            owner = next((uid for uid in sorted(place.owners) if uid != 0), None)
+            who = "others" if owner is None else user_name(owner)
+            raise _refusal(program, f"{who} can change it")
+        with Path(f"/proc/self/fd/{found}").open("rb") as file:
+            words = file.read(_FIRST_LINE).partition(b"\n")[0]
+    if not words.startswith(b"#!"):
+        return None
+    interpreter, *more = os.fsdecode(words[2:]).split() or [""]
+    is_env = Path(interpreter).name == "env"
+    return next((one for one in more if not one.startswith("-")), None) if is_env else interpreter
+
+
+def _refusal(program: str, reason: str) -> DoraSystemdError:
+    return DoraSystemdError(
+        f"cannot run {shown(program)} as root: {reason}",
+        "run it as its owner, or have it installed by root",
+        ExitCode.NO_PERMISSION,
+    )

@@ -1,0 +1,195 @@
+"""Paths that somebody else names, seen with his eyes: root's see behind doors closed to him.
+
+A child that has become the account answers; it runs nothing but the few lines below. The account
+could trace it and make it lie, so its answers are believed no more than the account itself is.
+"""
+
+import contextlib
+import errno
+import os
+import select
+import stat
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Protocol
+
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.trust.paths import MAX_BYTES
+from dora_systemd.trust.programs import Account, spawn
+from dora_systemd.values import shown
+
+_SECONDS = 10.0
+"""For one answer: what the account has mounted may hang."""
+_HEAD = 8
+_CHUNK = 65536
+
+# Requests and answers: a letter, the length in 7 digits, that many bytes.
+_EYES = """
+import os, stat, sys
+def read(path):
+    fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY)
+    if not stat.S_ISREG(os.fstat(fd).st_mode):
+        os.close(fd)
+        raise OSError(6, "")
+    with os.fdopen(fd, "rb") as file:
+        return file.read(LIMIT + 1)
+def answer(letter, path):
+    if letter == b"e":
+        return b"1" if os.path.exists(path) else b""
+    if letter == b"d":
+        return b"1" if os.path.isdir(path) else b""
+    if letter == b"x":
+        return b"1" if os.path.isfile(path) and os.access(path, os.X_OK) else b""
+    return os.path.realpath(path) if letter == b"l" else read(path)
+while head := sys.stdin.buffer.read(8):
+    path = sys.stdin.buffer.read(int(head[1:]))
+    try:
+        kind, data = b"+", answer(head[:1], path)
+    except (OSError, ValueError) as error:
+        kind, data = b"-", b"%d" % (getattr(error, "errno", 0) or 22)
+    sys.stdout.buffer.write(b"%s%07d%s" % (kind, len(data), data))
+    sys.stdout.buffer.flush()
+""".replace("LIMIT", str(MAX_BYTES))
+
+
+class Sight(Protocol):
+    """What somebody sees. All paths are absolute."""
+
+    def exists(self, path: str) -> bool:
+        """Whether something is there."""
+
+    def is_directory(self, path: str) -> bool:
+        """Whether a directory is there."""
+
+    def is_program(self, path: str) -> bool:
+        """Whether it can be run."""
+
+    def real(self, path: str) -> str:
+        """Where the path leads, all links followed."""
+
+    def read(self, path: str) -> bytes:
+        """The regular file, at most MAX_BYTES + 1 of it. Raises OSError."""
+
+
+class OwnSight:
+    """That of the caller."""
+
+    def exists(self, path: str) -> bool:
+        return self._mode(path) is not None
+
+    def is_directory(self, path: str) -> bool:
+        return stat.S_ISDIR(self._mode(path) or 0)
+
+    def is_program(self, path: str) -> bool:
+        return stat.S_ISREG(self._mode(path) or 0) and os.access(path, os.X_OK)
+
+    def real(self, path: str) -> str:
+        return os.path.realpath(path)
+
+    def read(self, path: str) -> bytes:
+        fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
+        with os.fdopen(fd, "rb") as file:
+            if not stat.S_ISREG(os.fstat(fd).st_mode):
+                raise OSError(errno.ENXIO, os.strerror(errno.ENXIO))
+            return file.read(MAX_BYTES + 1)
+
+    def _mode(self, path: str) -> int | None:
+        with contextlib.suppress(OSError, ValueError):
+            return Path(path).stat().st_mode
+        return None
+
+
+class LentSight:
+    """That of an account. Raises DoraSystemdError where its child cannot be asked."""
+
+    def __init__(self, child: "subprocess.Popen[bytes]", account: Account) -> None:
+        self._child = child
+        self._account = account
+
+    def exists(self, path: str) -> bool:
+        return bool(self._ask("e", path))
+
+    def is_directory(self, path: str) -> bool:
+        return bool(self._ask("d", path))
+
+    def is_program(self, path: str) -> bool:
+        return bool(self._ask("x", path))
+
+    def real(self, path: str) -> str:
+        found = os.fsdecode(self._ask("l", path))
+        return found if found.startswith("/") else path
+
+    def read(self, path: str) -> bytes:
+        return self._ask("r", path)
+
+    def _ask(self, letter: str, path: str) -> bytes:
+        """One question. Raises OSError with what the account met."""
+        assert self._child.stdin and self._child.stdout
+        question = os.fsencode(path)
+        deadline = time.monotonic() + _SECONDS
+        try:
+            self._child.stdin.write(b"%s%07d%s" % (letter.encode(), len(question), question))
+            self._child.stdin.flush()
+            head = self._receive(_HEAD, deadline)
+            data = self._receive(min(int(head[1:]), MAX_BYTES + 1), deadline)
+        except (BrokenPipeError, ValueError) as error:
+            raise self._silence(path) from error
+        if head[:1] != b"+":
+            number = int(data) if data.isdigit() else 22
+            raise OSError(number, os.strerror(number))
+        return data
+
+    def _receive(self, count: int, deadline: float) -> bytes:
+        assert self._child.stdout
+        fd, received = self._child.stdout.fileno(), b""
+        while len(received) < count:
+            ready = select.select([fd], [], [], max(deadline - time.monotonic(), 0))[0]
+            chunk = os.read(fd, min(count - len(received), _CHUNK)) if ready else b""
+            if not chunk:
+                raise BrokenPipeError
+            received += chunk
+        return received
+
+    def _silence(self, path: str) -> DoraSystemdError:
+        message = f"cannot look at {shown(path)} as user {self._account.name}: no answer"
+        return DoraSystemdError(message, "see whether a mount of that user hangs")
+
+
+@contextlib.contextmanager
+def sight_of(account: Account | None) -> Iterator[Sight]:
+    """How the account sees paths; None, or somebody who cannot become another: as the caller does.
+
+    Raises DoraSystemdError (NO_PERMISSION) if the account cannot run our own Python.
+    """
+    if account is None or account.uid == os.geteuid() or os.geteuid() != 0:
+        yield OwnSight()
+        return
+    command = (sys.executable, "-I", "-S", "-c", _EYES)
+    try:
+        child = spawn(
+            command, account, directory="/", stdin=subprocess.PIPE, stderr=subprocess.DEVNULL
+        )
+    except OSError as error:
+        raise cannot_reach(account.name, sys.executable) from error
+    try:
+        yield LentSight(child, account)
+    finally:
+        child.kill()
+        for stream in (child.stdin, child.stdout):
+            with contextlib.suppress(OSError):
+                if stream:
+                    stream.close()
+        child.wait()
+
+
+def cannot_reach(user: str, path: str, is_own: bool = False) -> DoraSystemdError:
+    """The error for what the user of a dataflow cannot get at."""
+    where = "put it where that user can read it, or choose another user with --uid"
+    return DoraSystemdError(
+        f"cannot start the dataflow as user {user}, who cannot reach {shown(path)}",
+        "correct its permissions" if is_own else where,
+        ExitCode.NO_PERMISSION,
+    )

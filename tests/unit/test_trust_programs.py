@@ -1,0 +1,105 @@
+"""Programs run as whose they are, with nothing of root's, and root runs only its own."""
+
+import os
+import pwd
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.trust.programs import (
+    Account,
+    account_from,
+    account_of_uid,
+    check_program,
+    fresh_environment,
+    own_account,
+    spawn,
+)
+
+root_only = pytest.mark.skipif(os.getuid() != 0, reason="becomes somebody else")
+NOBODY = 65534
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Iterator[Path]:
+    """Where everybody may look: pytest's own directories are closed."""
+    for one in (tmp_path, *list(tmp_path.parents)[:2]):
+        one.chmod(0o755)
+    yield tmp_path
+
+
+def script(path: Path, text: str = "#!/bin/sh\n", owner: int = 0) -> str:
+    path.write_text(text)
+    path.chmod(0o755)
+    os.chown(path, owner, owner)
+    return str(path)
+
+
+def output(command: list[str], account: Account | None) -> str:
+    with spawn(command, account, directory="/") as child:
+        return child.communicate(timeout=30)[0].decode()
+
+
+@root_only
+def test_a_fresh_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "x")
+    account = account_of_uid(NOBODY)
+    found = dict(line.split("=", 1) for line in output(["/usr/bin/env"], account).splitlines())
+    assert found == fresh_environment(account)
+    assert (found["USER"], found["HOME"]) == ("nobody", pwd.getpwuid(NOBODY).pw_dir)
+    assert output(["/usr/bin/id", "-u"], account).strip() == str(NOBODY)
+    assert set(output(["/usr/bin/id", "-G"], account).split()) == {
+        str(group) for group in os.getgrouplist("nobody", account.gid)
+    }
+
+
+@root_only
+def test_root_runs_only_its_own(place: Path) -> None:
+    check_program("sh")
+    check_program("/usr/bin/env")
+    check_program(script(place / "own", "#!/usr/bin/env -S sh -e\n"))
+    check_program("/nowhere/x")
+    theirs = script(place / "theirs", owner=NOBODY)
+    link = place / "link"
+    link.symlink_to(theirs)
+    shared = script(place / "shared")
+    Path(shared).chmod(0o777)
+    behind = script(place / "behind", f"#!{theirs}\n")
+    for program in (theirs, str(link), shared, behind):
+        with pytest.raises(DoraSystemdError, match="as root") as caught:
+            check_program(program)
+        assert caught.value.code is ExitCode.NO_PERMISSION
+    with pytest.raises(DoraSystemdError):
+        spawn([theirs], None)
+    assert output([script(place / "id", "#!/bin/sh\nid -u\n", NOBODY)], account_of_uid(NOBODY))
+
+
+@root_only
+def test_a_directory_of_others_is_enough(place: Path) -> None:
+    below = place / "below"
+    below.mkdir()
+    program = script(below / "own")
+    check_program(program)
+    os.chown(below, NOBODY, NOBODY)
+    with pytest.raises(DoraSystemdError, match="nobody can change it"):
+        check_program(program)
+
+
+def test_the_own_account_needs_no_change() -> None:
+    account = own_account()
+    assert account.uid == os.geteuid()
+    command = [sys.executable, "-c", "print('ran')"]
+    child = spawn(command, account, os.environ, stderr=subprocess.DEVNULL)
+    assert child.communicate(timeout=30)[0] == b"ran\n"
+
+
+def test_a_user_that_is_gone() -> None:
+    for uid in (4_000_000, 2**32 - 1, 2**40):
+        with pytest.raises(DoraSystemdError, match="there is none") as caught:
+            account_of_uid(uid)
+        assert caught.value.code is ExitCode.NOT_FOUND
+    assert account_from(pwd.getpwuid(0)).home == "/root"
