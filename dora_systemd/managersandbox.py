@@ -11,11 +11,12 @@ from dora_systemd.launch import python_of
 from dora_systemd.limitsettings import DEVICE, REALTIME
 from dora_systemd.options import RunnerOptions
 from dora_systemd.preparation import PACKAGE, Prepared
-from dora_systemd.sandbox import Sandbox, odd_paths
+from dora_systemd.sandbox import Sandbox, loose_paths, odd_paths, widened_paths
 from dora_systemd.sandboxsettings import NETWORK, SANDBOX, WRITABLE
 from dora_systemd.scope import Scope
 from dora_systemd.settings import Settings
 from dora_systemd.settingtable import PROPERTY
+from dora_systemd.trust.paths import firm_part
 from dora_systemd.values import shown
 
 _MAX_USER_NAMESPACES = Path("/proc/sys/user/max_user_namespaces")
@@ -32,7 +33,10 @@ def make_sandbox(
 
     user: of the nodes, None in user scope.
     """
+    options = prepared.plan.options
     given = [_checked(path) for path in settings[WRITABLE]]
+    needed = tuple(dict.fromkeys(_existing(_needed(prepared))))
+    writable = (*given, *_existing(_written_by_uv(options, user)))
     return Sandbox(
         level=settings[SANDBOX],
         network=settings[NETWORK],
@@ -42,8 +46,10 @@ def make_sandbox(
         is_realtime=settings[REALTIME] is not None,
         # In a user namespace capabilities would count for nothing.
         has_identity=_has_identity(user) and not _names(settings, *_CAPABILITIES),
-        needed=tuple(dict.fromkeys(_existing(_needed(prepared)))),
-        writable=(*given, *_existing(_written_by_uv(prepared.plan.options, user))),
+        needed=needed,
+        writable=writable,
+        firm={} if scope.is_user else {path: firm_part(path) for path in (*needed, *writable)},
+        directory=str(scope.cell_directory(options.name)),
     )
 
 
@@ -51,6 +57,10 @@ def sandbox_warnings(sandbox: Sandbox) -> Iterator[str]:
     """What a user's manager takes and cannot keep, and what the name of a path keeps open."""
     for path in odd_paths(sandbox):
         yield f"the sandbox cannot hide what is around {shown(path)}, whose name no mount can have"
+    for place, path in {place: path for path, place in loose_paths(sandbox)}.items():
+        yield f"the sandbox cannot hide {place}: others than root can replace {shown(path)}"
+    for place, path in {place: path for path, place in widened_paths(sandbox)}.items():
+        yield f"the nodes may write all of {shown(place)}: its user could replace {shown(path)}"
     if not sandbox.is_user:
         return
     if sandbox.level == "strict":
