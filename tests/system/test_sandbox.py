@@ -11,8 +11,10 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.errors import ExitCode
+from dora_systemd.sandbox import NETWORKS
 from dora_systemd.scope import Scope
 from tests.system.cells import Cell, Project, run, sync_journal, wait_for
+from tests.system.gateways import Front
 from tests.system.refusals import Refusal, check_refusals
 
 pytestmark = pytest.mark.lab
@@ -268,13 +270,41 @@ def test_projects_in_a_home(cell: Cell, home: str, user: str, level: str) -> Non
         Path(home).chmod(mode)
 
 
-def test_a_private_network(cell: Cell, project: Project) -> None:
-    cell.start(project.three_nodes(), "--network", "private")
+@pytest.mark.warns("is being restarted by dora")
+@pytest.mark.parametrize("network", NETWORKS)
+def test_no_verb_is_poorer_in_any_network(
+    cell: Cell, project: Project, front: Front, network: str
+) -> None:
+    cell.start(project.three_nodes(), "--network", network, "--debug")
     cell.wait_exchanging()
     (pid,) = cell.pids("node-sink")
-    assert Path(f"/proc/{pid}/ns/net").readlink() != Path("/proc/self/ns/net").readlink()
-    done = cell.doractl("node", "restart", cell.name, "sink", check=False)
-    assert "private network" in done.stderr
+    is_own = Path(f"/proc/{pid}/ns/net").readlink() != Path("/proc/self/ns/net").readlink()
+    assert is_own == (network == "private")
+    cell.doractl("node", "restart", cell.name, "sink")
+    wait_for("another sink", lambda: cell.pids("node-sink") not in ([pid], []))
+    cell.wait_exchanging()
+    nodes = ("node", "list")
+    assert "doubler" in cell.doractl("dora", cell.name, "--", *nodes).stdout
+    echo = ("topic", "echo", "-d", cell.name, "doubler/double", "--count", "2", "--format", "json")
+    assert cell.doractl("dora", cell.name, "--", *echo).stdout.count("data") >= 2
+    front.up()
+    gate = {**os.environ, "DORA_COORDINATOR_PORT": str(front.port)}
+    assert "doubler" in run("dora", *nodes, env=gate).stdout
+    assert run("dora", *echo, env=gate).stdout.count("data") >= 2
+    wait_for("no relay is left", lambda: not relays())
+    told = cell.doractl("env", cell.name, check=False)
+    if network == "private":
+        assert told.returncode == ExitCode.USAGE
+        assert f"doractl --system dora {cell.name} -- ..." in told.stderr
+    else:
+        assert "DORA_DAEMON_LOCAL_LISTEN_PORT" in told.stdout
+    cell.doractl("node", "stop", cell.name, "sink")
+    wait_for("it is gone", lambda: not cell.pids("node-sink"))
+
+
+def relays() -> list[str]:
+    """What is left of `doractl dora`."""
+    return run("pgrep", "-f", "doractl.* dora ", check=False).stdout.split()
 
 
 def test_a_unit_file_is_the_same(cell: Cell, project: Project, place: Path) -> None:

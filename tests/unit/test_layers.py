@@ -34,6 +34,7 @@ DECISIONS = {
         "causes",
         "cellview",
         "compat",
+        "coordinator",
         "credentials",
         "dataflow",
         "dataflownodes",
@@ -114,7 +115,7 @@ DECISIONS = {
     ],
 }
 TRUST = {
-    "trust": ["trust.paths"],
+    "trust": ["trust.paths", "trust.sockets", "sockettable"],
 }
 """The one door to what others own; the adapters go through it, too."""
 ADAPTERS = {
@@ -133,8 +134,7 @@ ADAPTERS = {
     "pipes": ["pipes", "pipesource", "heldlines", "logqueue"],
     "process": ["process"],
     "proctable": ["proctable"],
-    "runnersocket": ["runnersocket"],
-    "sockettable": ["sockettable"],
+    "runnersocket": ["runnersocket", "runnerlistener", "relay", "splice"],
     "watch": ["watch"],
 }
 SHARED = {
