@@ -160,6 +160,7 @@ USE_CASES = {
         "managerlaunch",
         "managerlimits",
         "managerlinger",
+        "managerlogins",
         "managerfollow",
         "managerlist",
         "managerlogs",
