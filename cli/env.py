@@ -31,8 +31,8 @@ Examples:
 def command(selector: str | None, shell: str, want_unset: bool) -> None:
     """Print the variables with which a stock dora command finds the gateway.
 
-    With SELECTOR: the coordinator of that dataflow alone. The output has a token that is as good
-    as a password; it is for eval.
+    With SELECTOR: the coordinator of that dataflow alone, unless its network is private. The output
+    has a token that is as good as a password; it is for eval.
     """
     if want_unset and selector is not None:
         hint = "leave the dataflow out: all variables are unset"

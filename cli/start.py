@@ -22,6 +22,7 @@ from dora_systemd.managercheck import check_plan
 from dora_systemd.managerenable import boot_target
 from dora_systemd.managerlaunch import Claim, claim, start_claim
 from dora_systemd.managerlinger import ensure_linger
+from dora_systemd.managerlogins import start_notes
 from dora_systemd.managerplan import DEFAULT_FILE, Plan, StartRequest, make_plan
 from dora_systemd.managerstart import Started, format_started
 from dora_systemd.managerunit import format_plan
@@ -76,7 +77,7 @@ def command(
         return
     bus = Bus(scope)
     claimed = claim(bus, scope, request, want_boot)
-    print_warnings(claimed.warnings)
+    print_warnings((*claimed.warnings, *start_notes(claimed.plan)))
     print_warnings([note for note in [ensure_linger(scope) if want_boot else ""] if note])
     started = _start(bus, claimed, not no_wait)
     if output == "json":

@@ -21,12 +21,12 @@ class CellPaths(NamedTuple):
 
     @property
     def control(self) -> Path:
-        """Port and token of the cell's coordinator, mode 0600."""
+        """Port and token of the cell's coordinator, mode 0600: a note of the runner to itself."""
         return self.root / "control.json"
 
     @property
     def socket(self) -> Path:
-        """Where the runner answers doractl."""
+        """Where the runner answers doractl, and relays to the coordinator."""
         return self.root / "runner.sock"
 
     @property

@@ -2,29 +2,38 @@
 
 import asyncio
 import json
+import time
 from collections.abc import AsyncIterator, Callable
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from dora_systemd.coordinator import Coordinator, parse_coordinator
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.protocol import LogRecord, Params, Reply, encode_request, parse_frame
+from dora_systemd.trust.sockets import plain
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    import socket as sockets
 
     from dora_systemd.websocket import WebSocket
 
+MAX_BYTES = 64 * 1024 * 1024
+"""Of a message over a relay: what is there may be hostile. A picture of a topic is smaller."""
+
 _OPTIONS: dict[str, Any] = {
-    # A coordinator answers no ping while a request is pending; frames are as large as a descriptor;
-    # and a proxy has no business between two processes of one machine.
+    # A coordinator answers no ping while a request is pending, and a proxy has no business between
+    # two processes of one machine.
     "ping_interval": None,
     "compression": None,
-    "max_size": None,
+    "max_size": MAX_BYTES,
     "proxy": None,
 }
 REQUEST_SECONDS = 35.0
 """Just above the 30 s after which the coordinator itself gives up on its daemon."""
+
+
+_RELAY = "ws://127.0.0.1/api/control"
 
 
 def _url(port: int) -> str:
@@ -49,7 +58,18 @@ class Connection:
         try:
             return cls(await WebSocket.connect(_url(port), _headers(token)))
         except (OSError, WebSocketException) as error:
-            raise _unreachable(port, error) from error
+            raise _unreachable(f" on port {port}", error) from error
+
+    @classmethod
+    async def over(cls, stream: "sockets.socket", token: str) -> "Connection":
+        """Connect over a relay of a cell's runner. Raises DoraSystemdError."""
+        from dora_systemd.websocket import WebSocket, WebSocketException
+
+        try:
+            return cls(await WebSocket.connect(_RELAY, _headers(token), stream, MAX_BYTES))
+        except (OSError, WebSocketException) as error:
+            stream.close()
+            raise _unreachable("", error) from error
 
     async def request(self, params: Params, seconds: float = REQUEST_SECONDS) -> Reply:
         """Send a request and wait for its reply. Raises DoraSystemdError, also after `seconds`."""
@@ -83,60 +103,52 @@ class Connection:
         self._socket.abort()
 
 
-def request(control: Path, params: Params, seconds: float = REQUEST_SECONDS) -> Reply:
-    """One request to the cell whose control.json is at `control`, without asyncio.
+def request(
+    stream: "sockets.socket", token: str, params: Params, seconds: float = REQUEST_SECONDS
+) -> Reply:
+    """One request over a relay of a cell's runner, without asyncio; the connection is closed.
 
-    Raises DoraSystemdError: NO_PERMISSION or NOT_RUNNING when there is no way in.
+    The answer may take `seconds`, whatever comes before it. Raises DoraSystemdError.
     """
     from websockets.exceptions import WebSocketException
-    from websockets.sync.client import connect
+    from websockets.sync.client import unix_connect
 
-    port, token = read_access(control)
     ident, text = encode_request(params)
+    deadline = time.monotonic() + seconds
+    headers = _headers(token)
     try:
-        with connect(_url(port), additional_headers=_headers(token), **_OPTIONS) as socket:
+        with unix_connect(
+            None, _RELAY, sock=stream, additional_headers=headers, **_OPTIONS
+        ) as socket:
             socket.send(text)
             while True:
-                frame = parse_frame(socket.recv(timeout=seconds))
+                left = max(deadline - time.monotonic(), 0)
+                frame = parse_frame(socket.recv(timeout=left))
                 if isinstance(frame, Reply) and frame.id == ident:
                     return frame
     except TimeoutError as error:
         raise _silent(params, error) from error
     except (OSError, WebSocketException) as error:
-        raise _unreachable(port, error) from error
+        raise _unreachable("", error) from error
 
 
-def read_access(control: Path) -> tuple[int, str]:
-    """Port and token in a control.json.
+def read_coordinator(path: Path) -> Coordinator:
+    """What the runner has noted in the control.json at `path`.
 
-    Raises DoraSystemdError: NO_PERMISSION for another user's cell, NOT_RUNNING when there is none.
+    Raises DoraSystemdError (NOT_RUNNING) as long as there is none.
     """
-    with _reading(control):
-        access = json.loads(control.read_text())
-        return int(access["port"]), str(access["token"])
-
-
-@contextmanager
-def _reading(control: Path) -> "Iterator[None]":
-    what = f"cannot reach the dora coordinator of {control.parent.name}"
     try:
-        yield
-    except PermissionError as error:
-        hint = "only root and the user whom it runs as may"
-        raise DoraSystemdError(what, hint, ExitCode.NO_PERMISSION) from error
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        hint = f"it is not running: see `doractl status {control.parent.name}`"
-        raise DoraSystemdError(what, hint, ExitCode.NOT_RUNNING) from error
+        return parse_coordinator(json.loads(path.read_text()))
+    except (OSError, ValueError) as error:
+        message = f"cannot reach the dora coordinator of {path.parent.name}: it is not there"
+        hint = "it may be starting or stopping; see doractl list"
+        raise DoraSystemdError(message, hint, ExitCode.NOT_RUNNING) from error
 
 
-def _unreachable(port: int, error: Exception) -> DoraSystemdError:
-    hint = (
-        "see `doractl list`; a dataflow that starts or stops has no coordinator for a moment, "
-        "and one with a private network none that can be reached from here"
-    )
-    return DoraSystemdError(
-        f"cannot reach the dora coordinator on port {port}: {error or type(error).__name__}", hint
-    )
+def _unreachable(where: str, error: Exception) -> DoraSystemdError:
+    hint = "see `doractl list`; a dataflow that starts or stops has no coordinator for a moment"
+    reason = plain(str(error) or type(error).__name__)
+    return DoraSystemdError(f"cannot reach the dora coordinator{where}: {reason}", hint)
 
 
 def _silent(params: Params, error: Exception) -> DoraSystemdError:

@@ -55,7 +55,7 @@ def _read_descriptor(scope: Scope, cell: Cell) -> object:
             reply = ask_coordinator(scope, cell, {"Info": {"dataflow_uuid": run}})
             if isinstance(reply.result, dict) and not reply.error:
                 return reply.result["DataflowInfo"]["descriptor"]
-        except (DoraSystemdError, KeyError):
+        except (DoraSystemdError, KeyError, TypeError):
             # It may just be ending.
             pass
     return read_yaml(Path(cell.options.dataflow))

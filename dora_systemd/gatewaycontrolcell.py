@@ -10,7 +10,7 @@ from contextlib import suppress
 from typing import Any
 
 from dora_systemd.cellpaths import CellPaths
-from dora_systemd.control import Connection, read_access
+from dora_systemd.control import Connection
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.gatewaycontrolanswers import restored_descriptor
 from dora_systemd.gatewaycontrolframes import Request, renamed
@@ -21,6 +21,7 @@ from dora_systemd.managercells import Cell
 from dora_systemd.managerlist import read_status
 from dora_systemd.managernode import require_running, restart_node
 from dora_systemd.protocol import Params, Reply
+from dora_systemd.runnersocket import relay
 from dora_systemd.scope import Scope
 
 _GOING_AWAY = 1001
@@ -121,9 +122,8 @@ def _running(scope: Scope, uuid: str) -> tuple[Cell, str]:
 
 
 async def _open(scope: Scope, cell: Cell) -> Connection:
-    control = CellPaths(scope.cell_directory(cell.name)).control
-    port, token = await asyncio.to_thread(read_access, control)
-    return await Connection.open(port, token)
+    path = CellPaths(scope.cell_directory(cell.name)).socket
+    return await Connection.over(*await asyncio.to_thread(relay, path))
 
 
 async def _ask(scope: Scope, cell: Cell, params: Params) -> Reply:

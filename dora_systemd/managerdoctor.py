@@ -27,6 +27,7 @@ from dora_systemd.managerenable import boot_target
 from dora_systemd.managerenabled import enabled_units, own_directories
 from dora_systemd.managergateway import read_gateway
 from dora_systemd.managerlinger import is_lingering, linger_command
+from dora_systemd.managerlogins import judge_logins
 from dora_systemd.managersettings import settings_files
 from dora_systemd.managerslice import slice_group
 from dora_systemd.names import unit_name
@@ -233,4 +234,4 @@ def _processes(scope: Scope) -> Iterator[Finding]:
 
 
 _WITH_SYSTEMD = (_controllers, _linger, _boot, _units, _leftovers, _ports)
-_WITHOUT = (_journal, _dora, _user, _settings, _processes)
+_WITHOUT = (_journal, _dora, _user, judge_logins, _settings, _processes)

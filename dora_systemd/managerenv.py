@@ -4,16 +4,18 @@ from dora_systemd.busprotocol import Manager
 from dora_systemd.doraenv import coordinator_variables
 from dora_systemd.managercells import read_cells, select_cell
 from dora_systemd.managergateway import read_token, require_gateway
-from dora_systemd.managernode import dora_environment, read_coordinator
+from dora_systemd.managernode import dora_environment, reached_coordinator
 from dora_systemd.scope import Scope
 
 
 def read_variables(manager: Manager, scope: Scope, selector: str | None) -> dict[str, str]:
     """The variables by name; `selector`: of that dataflow, not of the gateway.
 
-    Raises DoraSystemdError: NOT_RUNNING, NOT_FOUND, or NO_PERMISSION when it is another user's.
+    Raises DoraSystemdError: NOT_RUNNING, NOT_FOUND, NO_PERMISSION when it is another user's, or
+    USAGE for one with a network of its own.
     """
     if selector is None:
         port = require_gateway(manager, scope)
         return coordinator_variables(port, read_token(scope, port))
-    return dora_environment(read_coordinator(scope, select_cell(read_cells(manager), selector)))
+    cell = select_cell(read_cells(manager), selector)
+    return dora_environment(reached_coordinator(scope, manager, cell))

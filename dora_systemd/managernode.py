@@ -1,13 +1,15 @@
 """What goes to the coordinator of one dataflow: single nodes, and the stock dora command."""
 
-import json
 import os
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
 from typing import Any, NoReturn
 
+from dora_systemd import runnersocket
 from dora_systemd.busprotocol import Manager
 from dora_systemd.cellpaths import CellPaths
+from dora_systemd.coordinator import Coordinator
 from dora_systemd.doraenv import coordinator_variables
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.managercells import Cell, not_found
@@ -16,43 +18,40 @@ from dora_systemd.protocol import Params, Reply, node_params, replace_params
 from dora_systemd.reload import has_readers
 from dora_systemd.scope import Scope
 from dora_systemd.status import CellStatus
-from dora_systemd.trust.programs import account_of_uid, become, fresh_environment
+from dora_systemd.trust.programs import Account, account_of_uid, become, fresh_environment
+from dora_systemd.trust.sockets import plain, require_listener
 from dora_systemd.values import quoted
+
+_NO_USER = 2**32 - 1
+"""UID of a unit without User=: it runs as who the manager is."""
 
 Ask = Callable[[Scope, Cell, Params], Reply]
 
 
-@dataclass(frozen=True)
-class Coordinator:
-    """Where a cell's coordinator listens on 127.0.0.1, and the token that it asks for."""
-
-    port: int
-    token: str
-    local_listen_port: int
-
-
 def read_coordinator(scope: Scope, cell: Cell) -> Coordinator:
-    """The coordinator of a running dataflow.
+    """The coordinator of a running dataflow, as its runner tells: to be checked before it is used.
 
     Raises DoraSystemdError: NOT_RUNNING, or NO_PERMISSION when it is another user's.
     """
     require_running(cell)
-    paths = CellPaths(scope.cell_directory(cell.name))
-    try:
-        raw = json.loads(paths.control.read_text())
-        return Coordinator(raw["port"], raw["token"], raw["local_listen_port"])
-    except PermissionError as error:
+    return runnersocket.ask_coordinator(_socket(scope, cell))
+
+
+def reached_coordinator(scope: Scope, manager: Manager, cell: Cell) -> Coordinator:
+    """The same, if its port leads to it: from here, and to nobody but the dataflow's user.
+
+    Raises DoraSystemdError.
+    """
+    coordinator = read_coordinator(scope, cell)
+    uid, is_private = _unit_facts(manager, cell)
+    if is_private:
         raise DoraSystemdError(
-            f"cannot speak to the dataflow {cell.name}: permission denied",
-            "use sudo: only root and the user it runs as may",
-            ExitCode.NO_PERMISSION,
-        ) from error
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DoraSystemdError(
-            f"cannot speak to the dataflow {cell.name}: its coordinator is not there",
-            "it may be starting or stopping; see doractl list",
-            ExitCode.NOT_RUNNING,
-        ) from error
+            f"cannot reach the coordinator of {cell.name} by a port: its network is private",
+            f"doractl {scope.flag} dora {cell.name} -- ..., or doractl env for the gateway",
+            ExitCode.USAGE,
+        )
+    require_listener(coordinator.port, uid)
+    return coordinator
 
 
 def require_running(cell: Cell) -> None:
@@ -70,7 +69,7 @@ def ask_coordinator(scope: Scope, cell: Cell, params: Params) -> Reply:
     # WebSockets are slow to import, and no other verb needs them.
     from dora_systemd import control
 
-    return control.request(CellPaths(scope.cell_directory(cell.name)).control, params)
+    return control.request(*runnersocket.relay(_socket(scope, cell)), params)
 
 
 def restart_node(scope: Scope, cell: Cell, node: str, ask: Ask = ask_coordinator) -> None:
@@ -82,7 +81,7 @@ def restart_node(scope: Scope, cell: Cell, node: str, ask: Ask = ask_coordinator
     """
     status = _checked_status(scope, cell, node)
     info = _answer(cell, ask(scope, cell, {"Info": {"dataflow_uuid": status.run}}))
-    nodes: list[dict[str, Any]] = info["DataflowInfo"]["descriptor"]["nodes"]
+    nodes = _nodes(cell, info)
     definition = next((one for one in nodes if one.get("id") == node), {})
     is_replaceable = definition.get("restart_policy", "never") == "never"
     if is_replaceable and has_readers(node, nodes):
@@ -103,11 +102,15 @@ def exec_dora(scope: Scope, manager: Manager, cell: Cell, arguments: Sequence[st
 
     Root runs it as the dataflow's user, who may have written it. Raises DoraSystemdError.
     """
-    coordinator = read_coordinator(scope, cell)
+    uid, is_private = _unit_facts(manager, cell)
+    account = account_of_uid(uid) if os.geteuid() == 0 and not scope.is_user else None
+    if is_private:
+        coordinator = _relayed(scope, cell, uid, account)
+    else:
+        coordinator = reached_coordinator(scope, manager, cell)
     dora, environment = cell.options.dora, dict(os.environ)
     try:
-        if os.geteuid() == 0 and not scope.is_user:
-            account = account_of_uid(manager.read(cell.unit, ["UID"])["UID"])
+        if account is not None:
             environment = {**fresh_environment(account), **_terminal()}
             become(account)
         os.execve(dora, [dora, *arguments], {**environment, **dora_environment(coordinator)})
@@ -121,13 +124,39 @@ def _terminal() -> dict[str, str]:
     return {key: os.environ[key] for key in ("TERM", "NO_COLOR") if key in os.environ}
 
 
+def _relayed(scope: Scope, cell: Cell, uid: int, account: Account | None) -> Coordinator:
+    """A port that leads into the dataflow's own network as long as this process lives."""
+    # asyncio is slow to import, and only a private network needs it.
+    from dora_systemd.relay import open_port
+
+    coordinator = read_coordinator(scope, cell)
+    port = open_port(_socket(scope, cell), {uid, os.getuid()}, lambda: _settle(account))
+    return replace(coordinator, port=port, local_listen_port=None)
+
+
+def _unit_facts(manager: Manager, cell: Cell) -> tuple[int, bool]:
+    """The uid that the unit runs as, and whether its network is one of its own."""
+    facts = manager.read(cell.unit, ["UID", "PrivateNetwork"])
+    return os.getuid() if facts["UID"] == _NO_USER else facts["UID"], facts["PrivateNetwork"]
+
+
+def _socket(scope: Scope, cell: Cell) -> Path:
+    return CellPaths(scope.cell_directory(cell.name)).socket
+
+
+def _settle(account: Account | None) -> None:
+    if account is not None:
+        become(account)
+
+
 def dora_environment(coordinator: Coordinator) -> dict[str, str]:
     """The variables with which the dora command finds a coordinator and its daemon."""
     return coordinator_variables(coordinator.port, coordinator.token, coordinator.local_listen_port)
 
 
 def _checked_status(scope: Scope, cell: Cell, node: str) -> CellStatus:
-    read_coordinator(scope, cell)
+    require_running(cell)
+    runnersocket.require_access(_socket(scope, cell))
     return require_node(scope, cell, node)
 
 
@@ -146,7 +175,21 @@ def require_node(scope: Scope, cell: Cell, node: str) -> CellStatus:
 def _answer(cell: Cell, reply: Reply) -> dict[str, Any]:
     if reply.error:
         raise DoraSystemdError(
-            f"cannot do that in the dataflow {cell.name}: {reply.error}",
+            f"cannot do that in the dataflow {cell.name}: {plain(reply.error)}",
             f"doractl restart {cell.name} starts all of it again",
         )
     return reply.result if isinstance(reply.result, dict) else {}
+
+
+def _nodes(cell: Cell, info: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The nodes of dora's answer to Info: whoever owns the dataflow may have written it."""
+    try:
+        nodes = info["DataflowInfo"]["descriptor"]["nodes"]
+        if all(isinstance(one, dict) for one in nodes):
+            return list(nodes)
+    except (KeyError, TypeError):
+        pass
+    raise DoraSystemdError(
+        f"cannot understand dora's answer in the dataflow {cell.name}",
+        f"doractl restart {cell.name} starts all of it again",
+    )

@@ -10,7 +10,7 @@ from dora_systemd.hotreload import CHANGE_VARIABLE
 from dora_systemd.managercells import Cell
 from dora_systemd.managernode import require_node, require_running
 from dora_systemd.properties import format_unit, typed
-from dora_systemd.runnersocket import ask
+from dora_systemd.runnersocket import ask, done_of
 from dora_systemd.scope import Scope
 from dora_systemd.unitfiles import HOT_RELOAD_FILE, drop_in_directory, write_unit_file
 from dora_systemd.values import format_bool
@@ -26,7 +26,8 @@ def reload_cell(scope: Scope, cell: Cell, node: str | None, ask: Ask = ask) -> l
     require_running(cell)
     if node is not None:
         require_node(scope, cell, node)
-    return list(ask(_socket(scope, cell), {"verb": "reload", "node": node})["done"])
+    path = _socket(scope, cell)
+    return done_of(path, ask(path, {"verb": "reload", "node": node}))
 
 
 def switch_hot_reload(

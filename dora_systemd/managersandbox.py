@@ -12,11 +12,12 @@ from dora_systemd.limitsettings import DEVICE, REALTIME
 from dora_systemd.managernodes import named_places
 from dora_systemd.options import RunnerOptions
 from dora_systemd.preparation import PACKAGE, Prepared
-from dora_systemd.sandbox import Sandbox, odd_paths
+from dora_systemd.sandbox import Sandbox, loose_paths, odd_paths, widened_paths
 from dora_systemd.sandboxsettings import NETWORK, SANDBOX, WRITABLE
 from dora_systemd.scope import Scope
 from dora_systemd.settings import Settings
 from dora_systemd.settingtable import PROPERTY
+from dora_systemd.trust.paths import firm_part
 from dora_systemd.trust.sight import OwnSight, Sight
 from dora_systemd.values import shown
 
@@ -39,7 +40,10 @@ def make_sandbox(
     user: of the nodes, None in user scope. sight: of that user; None: the caller's.
     """
     sight = sight or OwnSight()
+    options = prepared.plan.options
     given = [_checked(path, sight) for path in settings[WRITABLE]]
+    needed = tuple(dict.fromkeys(_existing(_needed(prepared, sight), sight)))
+    writable = (*given, *_existing(_written_by_uv(options, user), sight))
     return Sandbox(
         level=settings[SANDBOX],
         network=settings[NETWORK],
@@ -49,8 +53,10 @@ def make_sandbox(
         is_realtime=settings[REALTIME] is not None,
         # In a user namespace capabilities would count for nothing.
         has_identity=_has_identity(user) and not _names(settings, *_CAPABILITIES),
-        needed=tuple(dict.fromkeys(_existing(_needed(prepared, sight), sight))),
-        writable=(*given, *_existing(_written_by_uv(prepared.plan.options, user), sight)),
+        needed=needed,
+        writable=writable,
+        firm={} if scope.is_user else {path: firm_part(path) for path in (*needed, *writable)},
+        directory=str(scope.cell_directory(options.name)),
     )
 
 
@@ -58,6 +64,10 @@ def sandbox_warnings(sandbox: Sandbox) -> Iterator[str]:
     """What a user's manager takes and cannot keep, and what the name of a path keeps open."""
     for path in odd_paths(sandbox):
         yield f"the sandbox cannot hide what is around {shown(path)}, whose name no mount can have"
+    for place, path in {place: path for path, place in loose_paths(sandbox)}.items():
+        yield f"the sandbox cannot hide {place}: others than root can replace {shown(path)}"
+    for place, path in {place: path for path, place in widened_paths(sandbox)}.items():
+        yield f"the nodes may write all of {shown(place)}: its user could replace {shown(path)}"
     if not sandbox.is_user:
         return
     if sandbox.level == "strict":

@@ -49,7 +49,7 @@ def parse_frame(text: str | bytes) -> Reply | LogRecord | None:
     """A frame of the coordinator; None for what is of no use to us."""
     try:
         frame = json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
     if not isinstance(frame, dict):
         return None
@@ -70,7 +70,12 @@ def _reply(frame: Mapping[str, Any]) -> Reply:
     result, error = frame.get("result"), frame.get("error")
     if isinstance(result, dict) and "Error" in result:
         error = result["Error"]
-    return Reply(frame["id"], result, "" if error is None else str(error))
+    return Reply(frame["id"], result, "" if error is None else _words(error))
+
+
+def _words(error: object) -> str:
+    """What dora says is text; whoever plays dora may say anything."""
+    return error if isinstance(error, str) else "an error without words"
 
 
 def result_of(reply: Reply, key: str) -> Any:

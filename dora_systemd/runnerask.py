@@ -9,14 +9,15 @@ from pathlib import Path
 
 from dora_systemd.cellpaths import CellPaths
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.runnersocket import ask
+from dora_systemd.runnersocket import ask, done_of
 
 
 def main() -> int:
     """Ask the runner of this unit; 0, or the exit status of doractl for what went wrong."""
     directory = os.environ.get("RUNTIME_DIRECTORY", "")
     try:
-        done = ask(CellPaths(Path(directory)).socket, {"verb": "reload"})["done"]
+        path = CellPaths(Path(directory)).socket
+        done = done_of(path, ask(path, {"verb": "reload"}))
     except DoraSystemdError as error:
         print(error.message, file=sys.stderr)
         return error.code

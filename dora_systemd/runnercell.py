@@ -14,6 +14,7 @@ from dora_systemd.causes import Cause
 from dora_systemd.cellpaths import CellPaths
 from dora_systemd.cellstate import Cell, RunnerExit, State
 from dora_systemd.cellview import initial_nodes
+from dora_systemd.control import read_coordinator
 from dora_systemd.doracheck import DoraCheck
 from dora_systemd.engine import Child
 from dora_systemd.environment import node_environment
@@ -36,12 +37,12 @@ from dora_systemd.runnerapply import Run
 from dora_systemd.runnerbegin import enter_supervisor
 from dora_systemd.runnerdialogue import Dialogue
 from dora_systemd.runnerengine import Engine
+from dora_systemd.runnerlistener import serve
 from dora_systemd.runnerloss import LossWatch, losses_of_user
 from dora_systemd.runnernodes import Nodes, wait_eof
 from dora_systemd.runnerpump import Pump, now_us
 from dora_systemd.runnerreload import Reloader
 from dora_systemd.runnersettings import SettingsFile
-from dora_systemd.runnersocket import serve
 from dora_systemd.runnerswap import READY_SECONDS, Swapper
 from dora_systemd.values import INFINITY, SECOND
 from dora_systemd.wiring import downstream_of
@@ -134,7 +135,8 @@ class Runs:
 async def live(cell: Runs, losses: LossWatch | None) -> RunnerExit:
     """Run the dataflow, and again as long as reloads ask for it."""
     beside = [asyncio.create_task(cell.reloader.work())]
-    beside.append(asyncio.create_task(serve(cell.paths.socket, cell.reloader.answer)))
+    reach = partial(read_coordinator, cell.paths.control)
+    beside.append(asyncio.create_task(serve(cell.paths.socket, cell.reloader.answer, reach)))
     if losses is not None:
         beside.append(asyncio.create_task(losses.run()))
     try:

@@ -2,11 +2,18 @@
 
 Every property is one of systemd.exec(5) or systemd.resource-control(5). What each costs is in the
 table SANDBOX of dora-systemd(7).
+
+systemd mounts as root, at every start and restart: BindPaths= follows the links that it finds, and
+ReadWritePaths= is a mount, too, with a moment between the look and the mount. A link in a directory
+of the nodes' user would have it mount what lies below another user's closed home, past the
+permissions of that home. To check again does not help. So no path is mounted that has a component
+which anybody but root can replace, but the part of it before that: a whole home for a project in
+it. Where that part is a place to be hidden, such as /tmp, the place stays open.
 """
 
 import re
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 
 from dora_systemd.propertykinds import Property
 from dora_systemd.propertyset import parse_property, with_properties
@@ -61,6 +68,8 @@ class Sandbox:
     is_realtime: the nodes are scheduled so. has_identity: the user can be
     in a namespace with the first 65536 ids.
     needed: absolute paths that are read, such as the project. writable: those that are written.
+    firm: by path of these two, the part of it that only root can replace; else all of it.
+    directory: the RuntimeDirectory of the unit, the only one of its kind that nodes see; "": all.
     """
 
     level: str = DEFAULT_LEVEL
@@ -72,6 +81,17 @@ class Sandbox:
     has_identity: bool = True
     needed: Sequence[str] = ()
     writable: Sequence[str] = ()
+    firm: Mapping[str, str] = field(default_factory=dict)
+    directory: str = ""
+
+    @property
+    def has_mounts(self) -> bool:
+        """Whether anything is hidden at all."""
+        return self.level != "none" and not self.is_user
+
+    def mounted(self, paths: Iterable[str]) -> list[str]:
+        """What systemd is told of these paths."""
+        return list(dict.fromkeys(self.firm.get(path, path) for path in paths))
 
 
 def sandbox_properties(sandbox: Sandbox) -> dict[str, Property]:
@@ -84,11 +104,33 @@ def sandbox_properties(sandbox: Sandbox) -> dict[str, Property]:
 
 def odd_paths(sandbox: Sandbox) -> list[str]:
     """The paths that keep whole places of the machine open: systemd cannot mount them alone."""
-    if sandbox.level == "none" or sandbox.is_user:
+    if not sandbox.has_mounts:
         return []
-    places = (*_TEMPORARY, *(_HOMES if sandbox.level == "strict" else ()))
-    paths = _unmountable((*sandbox.needed, *sandbox.writable))
-    return [path for path in dict.fromkeys(paths) if _is_below(path, places)]
+    paths = _unmountable(sandbox.mounted((*sandbox.needed, *sandbox.writable)))
+    return [path for path in paths if _is_below(path, _hideable(sandbox))]
+
+
+def loose_paths(sandbox: Sandbox) -> Iterator[tuple[str, str]]:
+    """Paths that somebody else than root can replace, and the place that stays open for each."""
+    if sandbox.has_mounts:
+        for path in dict.fromkeys((*sandbox.needed, *sandbox.writable)):
+            firm = sandbox.firm.get(path, path)
+            for place in _hideable(sandbox):
+                if _is_below(path, [place]) and path != place and _is_below(place, [firm]):
+                    yield path, place
+
+
+def widened_paths(sandbox: Sandbox) -> Iterator[tuple[str, str]]:
+    """Paths that are to be written, and the larger part of the machine that is written for each."""
+    if sandbox.has_mounts:
+        loose = dict(loose_paths(sandbox))
+        for path in sandbox.writable:
+            if sandbox.firm.get(path, path) != path and path not in loose:
+                yield path, sandbox.firm[path]
+
+
+def _hideable(sandbox: Sandbox) -> tuple[str, ...]:
+    return (*_TEMPORARY, *(_HOMES if sandbox.level == "strict" else ()))
 
 
 def _assignments(sandbox: Sandbox) -> list[str]:
@@ -141,28 +183,35 @@ def _users(sandbox: Sandbox) -> list[str]:
 
 def _path_properties(sandbox: Sandbox) -> dict[str, Property]:
     """What is hidden and what stays: private directories, and mounts of what is needed in them."""
-    if sandbox.level == "none" or sandbox.is_user:
+    if not sandbox.has_mounts:
         return {}
-    hides_tmp = _can_hide(_TEMPORARY, sandbox)
-    hides_home = sandbox.level == "strict" and _can_hide(_HOMES, sandbox)
+    needed, writable = sandbox.mounted(sandbox.needed), sandbox.mounted(sandbox.writable)
+    hides_tmp = _can_hide(_TEMPORARY, (*needed, *writable))
+    hides_home = sandbox.level == "strict" and _can_hide(_HOMES, (*needed, *writable))
     hidden = (*(_TEMPORARY if hides_tmp else ()), *(_HOMES if hides_home else ()))
     # Without temporary directories of their own the nodes write to the machine's.
     shared = () if hides_tmp else _TEMPORARY
-    bound = [path for path in sandbox.writable if _is_below(path, hidden)]
-    written = [path for path in sandbox.writable if path not in bound]
-    read = [path for path in sandbox.needed if _is_below(path, hidden)]
+    bound = [path for path in writable if _is_below(path, hidden)]
+    written = [path for path in writable if path not in bound]
+    read = [path for path in needed if _is_below(path, hidden)]
+    own = [sandbox.directory] if sandbox.directory else []
     return {
         **parse_property(f"ProtectHome={'tmpfs' if hides_home else 'read-only'}"),
         **parse_property(f"PrivateTmp={format_bool(hides_tmp)}"),
+        **(_empty_but(sandbox.directory) if own else {}),
         **_words("ReadWritePaths", (*shared, *written)),
-        **_binds("BindPaths", bound),
+        **_binds("BindPaths", [*bound, *own]),
         **_binds("BindReadOnlyPaths", [path for path in read if not _is_below(path, bound)]),
     }
 
 
-def _can_hide(places: Iterable[str], sandbox: Sandbox) -> bool:
+def _empty_but(directory: str) -> dict[str, Property]:
+    """Nothing beside the cell's own directory: others of the same user have their tokens there."""
+    return parse_property(f"TemporaryFileSystem={directory.rpartition('/')[0]}:ro")
+
+
+def _can_hide(places: Iterable[str], paths: Sequence[str]) -> bool:
     """Whether nobody wants a whole place, and all that is needed in it can be mounted."""
-    paths = (*sandbox.needed, *sandbox.writable)
     wants_whole = any(_is_below(place, paths) for place in places)
     return not wants_whole and not any(_is_below(one, places) for one in _unmountable(paths))
 

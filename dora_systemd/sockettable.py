@@ -16,6 +16,9 @@ TABLES = (Path("/proc/net/tcp"), Path("/proc/net/tcp6"))
 
 Address = tuple[str, int]
 
+_REACHED = ("127.0.0.1", "0.0.0.0", "::", "::ffff:127.0.0.1")
+"""The addresses of listeners who get what is sent to 127.0.0.1."""
+
 _TRIES = 5
 _LISTENING = b"0A"
 
@@ -87,6 +90,16 @@ def listener_uids(port: int, tables: tuple[Path, ...] = TABLES) -> frozenset[int
         int(fields[7])
         for fields in _lines(tables, ending)
         if fields[3] == _LISTENING and fields[1].endswith(ending)
+    )
+
+
+def loopback_listeners(port: int, tables: tuple[Path, ...] = TABLES) -> frozenset[int]:
+    """The users who get the connections to a TCP port of 127.0.0.1."""
+    ends = {_entry((address, port)) for address in _REACHED}
+    return frozenset(
+        int(fields[7])
+        for fields in _lines(tables, b":%04X" % port)
+        if fields[3] == _LISTENING and fields[1] in ends
     )
 
 

@@ -6,6 +6,7 @@ https://websockets.readthedocs.io/en/stable/howto/sansio.html
 """
 
 import asyncio
+import socket as sockets
 from collections import deque
 from collections.abc import Mapping
 
@@ -20,7 +21,7 @@ CHUNK = 1 << 16
 
 
 class WebSocket:
-    """One connection. Frames may be as large as a descriptor, so there is no limit."""
+    """One connection. Frames may be as large as a descriptor; the own cell's have no limit."""
 
     def __init__(
         self,
@@ -35,13 +36,25 @@ class WebSocket:
         self._messages: deque[str | bytes] = deque()
 
     @classmethod
-    async def connect(cls, url: str, headers: Mapping[str, str]) -> "WebSocket":
+    async def connect(
+        cls,
+        url: str,
+        headers: Mapping[str, str],
+        stream: sockets.socket | None = None,
+        max_size: int | None = None,
+    ) -> "WebSocket":
         """Connect to a ws:// URL. Raises OSError, also without an answer in time, and
-        WebSocketException."""
+        WebSocketException.
+
+        stream: a connection that is there already. max_size: bytes of a message.
+        """
         uri = parse_uri(url)
         async with asyncio.timeout(OPEN_SECONDS):
-            reader, writer = await asyncio.open_connection(uri.host, uri.port)
-            socket = cls(ClientProtocol(uri, max_size=None), reader, writer)
+            if stream is None:
+                reader, writer = await asyncio.open_connection(uri.host, uri.port)
+            else:
+                reader, writer = await asyncio.open_connection(sock=stream)
+            socket = cls(ClientProtocol(uri, max_size=max_size), reader, writer)
             try:
                 await socket._shake_hands(headers)
             except BaseException:

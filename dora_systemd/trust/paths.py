@@ -102,6 +102,25 @@ def reached(path: str | Path) -> Iterator[tuple[int, Place]]:
         yield walk.fd, walk.place(str(path))
 
 
+def firm_part(path: str | Path) -> str:
+    """The longest part of the absolute `path` in which nobody but root can replace anything.
+
+    It is what may be told to a program that walks paths as root and follows links, such as systemd
+    when it mounts: what follows in `path` may be a link to anywhere by then.
+    """
+    firm = "/"
+    with contextlib.ExitStack() as held, contextlib.suppress(OSError, DoraSystemdError):
+        walk = _Walk(held)
+        for part in _parts(str(path)):
+            ahead = [part]
+            while ahead:
+                if not walk.is_firm(ahead[0]):
+                    return firm
+                ahead = walk.enter(ahead[0]) + ahead[1:]
+            firm = f"{firm.rstrip('/')}/{part}"
+    return firm
+
+
 def read_file(path: str | Path, max_bytes: int = MAX_BYTES) -> Text:
     """The regular file at the absolute `path`, at most `max_bytes`.
 
@@ -181,6 +200,18 @@ class _Walk:
         self.fd, self._status = fd, status
         self._owners.add(status.st_uid)
         return []
+
+    def is_firm(self, name: str) -> bool:
+        """Whether root alone can put something else in the place of `name`. Raises OSError.
+
+        In a sticky directory its owner can, too. A group counts whoever is in it: ACLs show as one.
+        """
+        if self._status.st_uid != 0:
+            return False
+        if not self._status.st_mode & (stat.S_IWOTH | stat.S_IWGRP):
+            return True
+        owner = os.stat(name, dir_fd=self.fd, follow_symlinks=False).st_uid
+        return owner == 0 and bool(self._status.st_mode & stat.S_ISVTX)
 
     def _follow(self, name: str, status: os.stat_result) -> list[str]:
         link = f"{self._where}/{name}"

@@ -58,7 +58,9 @@ def doractl(user: str, *words: str, check: bool = True) -> CompletedProcess[str]
 
 
 def start(user: str, flow: Path, *words: str) -> CompletedProcess[str]:
-    command = ("start", str(flow), "--name", "robot", "--venv", LAB, *words)
+    # Whoever names the host's network is not told of the other users of the machine.
+    network = () if "--network" in words else ("--network", "host")
+    command = ("start", str(flow), "--name", "robot", "--venv", LAB, *network, *words)
     return doractl(user, *command)
 
 
@@ -141,6 +143,22 @@ def test_a_life(user: str, flow: Path) -> None:
     assert "Dataflow stopped:" in doractl(user, "stop", "robot").stdout
     wait_for("it is gone", lambda: not dora_processes())
     assert warnings(before) == []
+
+
+def test_a_network_of_its_own_and_a_directory_of_its_own(flow: Path) -> None:
+    assert start("root", flow, "--network", "private", "--debug").stderr == ""
+    (pid,) = (group("root") / "node-sink/cgroup.procs").read_text().split()
+    seen = run("nsenter", "--target", pid, "--mount", "ls", "/run/dora-systemd").stdout
+    assert seen == "robot\n"
+    doractl("root", "node", "restart", "robot", "sink")
+    wait_for("it runs", lambda: row("root")["nodes_alive"] == 3)
+    assert "doubler" in doractl("root", "dora", "robot", "--", "node", "list").stdout
+    doractl("root", "up")
+    script = f'eval "$({VENV}/bin/doractl env)"; {VENV}/bin/dora node list'
+    assert "doubler" in as_user("root", "bash", "-c", script).stdout
+    doractl("root", "reload", "robot")
+    doractl("root", "restart", "robot")
+    doractl("root", "destroy")
 
 
 @pytest.mark.parametrize("user", USERS)

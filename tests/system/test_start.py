@@ -37,6 +37,12 @@ def uuid_of(printed: str) -> str:
     return str(uuid.UUID(first.rpartition(" ")[2]))
 
 
+ALICE_AND_BOB = (
+    "doractl: alice, bob can log in here, and so can read, forge and end what the nodes "
+    "exchange; --network private prevents it, --network host is for those you trust\n"
+)
+
+
 def test_start_prints_what_users_know(cell: Cell, project: Project) -> None:
     done = cell.start(project.three_nodes())
     name = cell.name
@@ -49,7 +55,15 @@ def test_start_prints_what_users_know(cell: Cell, project: Project) -> None:
         "Use 'doractl list' to view status\n"
         f"Use 'doractl logs {name}' to view logs\n"
     )
-    assert done.stderr == ""
+    # The lab has two users besides.
+    assert done.stderr in ("", ALICE_AND_BOB)
+
+
+@pytest.mark.lab
+@pytest.mark.parametrize("network", ["loopback", "private", "host"])
+def test_start_tells_of_other_users_once(cell: Cell, project: Project, network: str) -> None:
+    done = cell.start(project.three_nodes(), "--network", network)
+    assert done.stderr == (ALICE_AND_BOB if network == "loopback" else "")
 
 
 def test_start_as_json(cell: Cell, project: Project) -> None:
@@ -202,5 +216,5 @@ def test_ctrl_c_while_it_starts_ends_the_waiting_only(cell: Cell, project: Proje
     child.send_signal(signal.SIGINT)
     _, said = child.communicate(timeout=bound(10))
     assert child.returncode == ExitCode.INTERRUPTED, said
-    assert said.startswith(f"doractl: cannot wait for {cell.name}: interrupted\nhint: ")
+    assert f"doractl: cannot wait for {cell.name}: interrupted\nhint: " in said
     assert cell.show("ActiveState") == "activating"

@@ -78,6 +78,7 @@ class FakeManager:
             "InactiveExitTimestampMonotonic": 0,
             "Job": [0, "/"],
             "UID": 1000,
+            "PrivateNetwork": False,
             **facts,
         }
         return unit

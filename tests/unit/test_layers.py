@@ -34,6 +34,7 @@ DECISIONS = {
         "causes",
         "cellview",
         "compat",
+        "coordinator",
         "credentials",
         "dataflow",
         "dataflownodes",
@@ -115,7 +116,7 @@ DECISIONS = {
     ],
 }
 TRUST = {
-    "trust": ["trust.paths", "trust.programs", "trust.sight"],
+    "trust": ["trust.paths", "trust.programs", "trust.sight", "trust.sockets", "sockettable"],
 }
 """The one door to what others own; the adapters go through it, too."""
 ADAPTERS = {
@@ -134,8 +135,7 @@ ADAPTERS = {
     "pipes": ["pipes", "pipesource", "heldlines", "logqueue"],
     "process": ["process"],
     "proctable": ["proctable"],
-    "runnersocket": ["runnersocket"],
-    "sockettable": ["sockettable"],
+    "runnersocket": ["runnersocket", "runnerlistener", "relay", "splice"],
     "watch": ["watch"],
 }
 SHARED = {
@@ -162,6 +162,7 @@ USE_CASES = {
         "managerlaunch",
         "managerlimits",
         "managerlinger",
+        "managerlogins",
         "managerfollow",
         "managerlist",
         "managerlook",

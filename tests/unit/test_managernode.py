@@ -1,13 +1,15 @@
 """What is asked of a coordinator, and who may ask."""
 
-import json
-from collections.abc import Mapping
+import os
+import socket
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from dora_systemd import managernode
+from dora_systemd.coordinator import Coordinator
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.managercells import Cell, read_cells
 from dora_systemd.protocol import Params, Reply
@@ -41,14 +43,15 @@ class FakeCoordinator:
 
 
 @pytest.fixture
-def cell(scope: Scope) -> Cell:
+def cell(scope: Scope) -> Iterator[Cell]:
     directory = scope.cell_directory("robot")
     directory.mkdir(parents=True)
-    access = {"port": 4711, "token": "secret", "local_listen_port": 4712}
-    (directory / "control.json").write_text(json.dumps(access))
     status = CellStatus(run="run-1", nodes={"camera": NodeStatus("running")})
     (directory / "status.json").write_text(status.to_json())
-    return make_cell("active")
+    with socket.socket(socket.AF_UNIX) as one:
+        one.bind(str(directory / "runner.sock"))
+        one.listen()
+        yield make_cell("active")
 
 
 def make_cell(active: str) -> Cell:
@@ -109,16 +112,60 @@ def test_dataflow_that_does_not_run(scope: Scope) -> None:
     assert caught.value.code is ExitCode.NOT_RUNNING
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"port": 1}'])
-def test_damaged_access(scope: Scope, cell: Cell, text: str) -> None:
-    (scope.cell_directory("robot") / "control.json").write_text(text)
+def test_nothing_is_asked_of_what_is_no_runner(scope: Scope, cell: Cell) -> None:
+    (scope.cell_directory("robot") / "runner.sock").unlink()
+    fake = FakeCoordinator(None)
     with pytest.raises(DoraSystemdError) as caught:
-        managernode.read_coordinator(scope, cell)
+        managernode.stop_node(scope, cell, "camera", fake)
     assert caught.value.code is ExitCode.NOT_RUNNING
+    assert not fake.requests
 
 
-def test_environment_of_the_dora_command(scope: Scope, cell: Cell) -> None:
-    assert managernode.dora_environment(managernode.read_coordinator(scope, cell)) == {
+@pytest.mark.parametrize(
+    "info",
+    [
+        {},
+        {"DataflowInfo": 5},
+        {"DataflowInfo": {"descriptor": {"nodes": 5}}},
+        {"DataflowInfo": {"descriptor": {"nodes": [5]}}},
+    ],
+)
+def test_an_odd_answer(scope: Scope, cell: Cell, info: dict[str, Any]) -> None:
+    with pytest.raises(DoraSystemdError, match="cannot understand dora's answer"):
+        managernode.restart_node(scope, cell, "camera", lambda *_: Reply("", info, ""))
+
+
+def test_words_of_dora_are_no_orders_for_a_terminal(scope: Scope, cell: Cell) -> None:
+    fake = FakeCoordinator(None)
+    fake.error = "no\x1b]0;title\x07"
+    with pytest.raises(DoraSystemdError) as caught:
+        managernode.stop_node(scope, cell, "camera", fake)
+    assert caught.value.message.isprintable()
+
+
+def test_a_port_of_somebody_else(scope: Scope, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the runner names is its user's to say: root gives no token to another's port."""
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        told = Coordinator(other.getsockname()[1], "secret", 4712)
+        monkeypatch.setattr("dora_systemd.runnersocket.ask_coordinator", lambda _: told)
+        manager = FakeManager()
+        manager.add(options())
+        (cell,) = read_cells(manager)
+        facts = manager.units[cell.unit]
+        facts["UID"] = os.getuid() + 1
+        with pytest.raises(DoraSystemdError, match="listens there, not") as caught:
+            managernode.reached_coordinator(scope, manager, cell)
+        assert caught.value.code is ExitCode.NO_PERMISSION
+        facts["UID"] = 2**32 - 1
+        assert managernode.reached_coordinator(scope, manager, cell) == told
+        facts["PrivateNetwork"] = True
+        with pytest.raises(DoraSystemdError, match="its network is private") as caught:
+            managernode.reached_coordinator(scope, manager, cell)
+        assert "dora robot -- ..." in caught.value.hint
+
+
+def test_environment_of_the_dora_command() -> None:
+    assert managernode.dora_environment(Coordinator(4711, "secret", 4712)) == {
         "DORA_COORDINATOR_ADDR": "127.0.0.1",
         "DORA_COORDINATOR_PORT": "4711",
         "DORA_AUTH_TOKEN": "secret",

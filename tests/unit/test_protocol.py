@@ -165,3 +165,13 @@ def test_heartbeat(result: object, age: int) -> None:
 )
 def test_spawn_failures(error: str, failure: str) -> None:
     assert protocol.parse_spawn_failure(Reply("1", None, error)) == failure
+
+
+def test_what_nobody_who_is_dora_would_send() -> None:
+    """Over a relay it is the owner of the dataflow who answers, with dora or without."""
+    assert protocol.parse_frame("[" * 100_000) is None
+    for error in (5, [], {"a": ["\x1b"]}, True):
+        for frame in ({"id": "x", "error": error}, {"id": "x", "result": {"Error": error}}):
+            reply = protocol.parse_frame(json.dumps(frame))
+            assert isinstance(reply, protocol.Reply)
+            assert reply.error == "an error without words"

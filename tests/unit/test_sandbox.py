@@ -50,7 +50,9 @@ sandboxes = st.builds(
     has_identity=st.booleans(),
     needed=st.lists(places).map(tuple),
     writable=st.lists(places).map(tuple),
-)
+    firm=st.dictionaries(places, st.sampled_from(["/", "/tmp", "/home", "/home/x", "/srv"])),
+    directory=st.sampled_from(["", "/run/dora-systemd/robot"]),
+).filter(lambda one: all(Path(path).is_relative_to(firm) for path, firm in one.firm.items()))
 DEFAULT = sandbox_properties(Sandbox())
 STRICT = sandbox_properties(Sandbox(level="strict"))
 
@@ -120,7 +122,22 @@ def test_everything_needed_is_visible_and_everything_writable_is_written(sandbox
             assert any(Path(path).is_relative_to(place) for place in (*bound, *read)), path
     for path in sandbox.writable:
         is_bound = any(Path(path).is_relative_to(place) for place in bound)
-        assert is_bound or path in written  # type: ignore
+        assert is_bound or sandbox.firm.get(path, path) in written  # type: ignore
+
+
+@given(sandboxes)
+def test_nothing_is_mounted_that_somebody_could_replace(sandbox: Sandbox) -> None:
+    properties = sandbox_properties(sandbox)
+    given = {*sandbox.needed, *sandbox.writable}
+    firm = {sandbox.firm.get(path, path) for path in given} | {
+        sandbox.directory,
+        "/tmp",
+        "/var/tmp",
+    }
+    for key in ("BindPaths", "BindReadOnlyPaths"):
+        assert {one[0] for one in (value(sandbox, key) or ())} <= firm  # type: ignore
+    assert {*(value(sandbox, "ReadWritePaths") or ())} <= firm  # type: ignore
+    assert bool(sandbox.directory and sandbox.has_mounts) == ("TemporaryFileSystem" in properties)
 
 
 @given(sandboxes)
@@ -154,6 +171,37 @@ def test_what_no_mount_can_be_called_keeps_its_place_open(odd: str) -> None:
     strict = Sandbox(level="strict", needed=(f"/home/x/{odd}",))
     assert value(strict, "ProtectHome") == "read-only"
     assert len(list(sandbox_warnings(strict))) == 1
+
+
+def test_what_its_user_can_replace() -> None:
+    hers = {"/tmp/p": "/tmp", "/home/x/p": "/home/x", "/home/x/p/out": "/home/x"}
+    below_tmp = Sandbox(needed=("/tmp/p", "/srv"), firm=hers)
+    assert value(below_tmp, "PrivateTmp") is False
+    assert value(below_tmp, "BindReadOnlyPaths") is None
+    assert list(sandbox_warnings(below_tmp)) == [
+        "the sandbox cannot hide /tmp: others than root can replace /tmp/p"
+    ]
+    at_home = Sandbox(level="strict", needed=("/home/x/p",), firm=hers)
+    assert [one[0] for one in value(at_home, "BindReadOnlyPaths")] == ["/home/x"]  # type: ignore
+    assert not list(sandbox_warnings(at_home))
+    for level, key in (("strict", "BindPaths"), ("default", "ReadWritePaths")):
+        written = Sandbox(level=level, writable=("/home/x/p/out",), firm=hers)
+        assert "/home/x" in str(value(written, key))
+        assert "/home/x/p" not in format_unit(sandbox_properties(written))
+        assert list(sandbox_warnings(written)) == [
+            "the nodes may write all of /home/x: its user could replace /home/x/p/out"
+        ]
+    assert not list(sandbox_warnings(Sandbox(level="none", writable=("/tmp/p",), firm=hers)))
+
+
+def test_no_other_cell_is_seen() -> None:
+    sandbox = Sandbox(directory="/run/dora-systemd/robot", writable=("/tmp/p",))
+    text = format_unit(sandbox_properties(sandbox))
+    assert "TemporaryFileSystem=/run/dora-systemd:ro\n" in text
+    assert [one[0] for one in value(sandbox, "BindPaths")] == [  # type: ignore
+        "/tmp/p",
+        "/run/dora-systemd/robot",
+    ]
 
 
 def test_tmp_itself_is_shared_when_asked_for() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.trust.paths import Place, exists, reached, read_file
+from dora_systemd.trust.paths import Place, exists, firm_part, reached, read_file
 
 FILE = stat.S_IFREG | 0o644
 IS_ROOT = os.geteuid() == 0
@@ -137,3 +137,48 @@ def test_a_directory_of_many_lends_nothing(tmp_path: Path, mode: int) -> None:
 )
 def test_what_is_roots_alone(owners: set[int], mode: int, shared: str, is_roots: bool) -> None:
     assert Place("/x", 0, mode, frozenset(owners), shared).is_roots is is_roots
+
+
+@as_root
+def test_the_part_that_only_root_can_replace(tmp_path: Path) -> None:
+    home = tmp_path / "home"
+    (home / "hers/p").mkdir(parents=True)
+    for path in (home / "hers", home / "hers/p"):
+        os.chown(path, STRANGER, STRANGER)
+    (home / "link").symlink_to("hers")
+    (home / "deep").symlink_to(home / "hers/p")
+    assert firm_part(home / "hers") == str(home / "hers")
+    assert firm_part(home / "hers/p") == str(home / "hers")
+    assert firm_part(home / "hers/p/none/x") == str(home / "hers")
+    assert firm_part(home / "link/p") == str(home / "link"), "root's own link"
+    assert firm_part(home / "deep") == str(home), "it leads through what is hers"
+    assert firm_part(home / "none/x") == str(home)
+    assert firm_part("/") == "/"
+
+
+@as_root
+@pytest.mark.parametrize(
+    ("mode", "owner", "is_firm"),
+    [
+        (0o1777, 0, True),
+        (0o1777, STRANGER, False),
+        (0o777, 0, False),
+        (0o775, 0, False),
+        (0o1775, 0, True),
+        (0o755, STRANGER, True),
+    ],
+)
+def test_directories_that_others_write(
+    tmp_path: Path, mode: int, owner: int, is_firm: bool
+) -> None:
+    above = tmp_path / "tmp"
+    (above / "p").mkdir(parents=True)
+    above.chmod(mode)
+    os.chown(above / "p", owner, owner)
+    assert firm_part(above / "p") == str(above / "p" if is_firm else above)
+
+
+@as_root
+def test_links_without_end_are_not_firm(tmp_path: Path) -> None:
+    (tmp_path / "a").symlink_to("a")
+    assert firm_part(tmp_path / "a") == str(tmp_path)
