@@ -114,7 +114,7 @@ DECISIONS = {
     ],
 }
 TRUST = {
-    "trust": ["trust.paths"],
+    "trust": ["trust.cells", "trust.paths"],
 }
 """The one door to what others own; the adapters go through it, too."""
 ADAPTERS = {
