@@ -3,6 +3,7 @@
 import click
 
 from dora_systemd.bus import Bus
+from dora_systemd.cli.edge import write_exactly
 from dora_systemd.cli.parameters import current_scope, output_option, print_json, scope_options
 from dora_systemd.managercells import find_cell
 from dora_systemd.managershow import format_unit_files, unit_files
@@ -29,4 +30,4 @@ def command(selector: str, output: str) -> None:
     if output == "json":
         print_json({"unit": cell.unit, "name": cell.name, "uuid": cell.uuid, "files": files})
     else:
-        click.echo(format_unit_files(files), nl=False)
+        write_exactly(format_unit_files(files))

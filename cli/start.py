@@ -7,6 +7,7 @@ from typing import Any
 import click
 
 from dora_systemd.bus import Bus
+from dora_systemd.cli.edge import write_exactly
 from dora_systemd.cli.parameters import (
     current_scope,
     name_option,
@@ -69,7 +70,7 @@ def command(
     request = StartRequest(dataflow, name, flags, os.environ)
     if dry_run:
         target = boot_target(Bus(scope), scope) if want_boot else None
-        print(format_plan(make_plan(scope, request), target), end="")
+        write_exactly(format_plan(make_plan(scope, request), target))
         return
     bus = Bus(scope)
     claimed = claim(bus, scope, request, want_boot)

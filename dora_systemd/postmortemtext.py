@@ -9,6 +9,7 @@ from dora_systemd.lifestory import Happening
 from dora_systemd.restarts import budget_words
 from dora_systemd.sandboxsigns import sandbox_remedy
 from dora_systemd.statuswords import RESTARTING, UNKNOWN, local_time
+from dora_systemd.terminaltext import one_line
 from dora_systemd.values import SECOND, format_duration, format_rounded_size
 from dora_systemd.verdict import Restart, Verdict
 
@@ -130,7 +131,8 @@ def _remedy(verdict: Verdict) -> str:
 def format_report(report: Report, width: int | None = None, want_colors: bool = False) -> str:
     """The report as at most 45 lines, each cut at `width` characters if that is given."""
     blocks = [_head(report), _timeline(report), _words(report), _todo(report)]
-    lines = "\n\n".join("\n".join(block) for block in blocks if block).split("\n")
+    # What nodes wrote must not command the terminal, nor make a line of its own here.
+    lines = [one_line(line) for block in blocks if block for line in (*block, "")][:-1]
     cut = [line if width is None else _cut(line, width) for line in lines]
     return "\n".join(_colored(cut, report.verdict)) if want_colors else "\n".join(cut)
 
@@ -165,7 +167,7 @@ def _head(report: Report) -> list[str]:
     }
     title = f"{subject.name}: {verdict.status}"
     rows = [f"  {key + ':':<{_TITLE_WIDTH}}{text}" for key, text in facts.items() if text]
-    return [_printable(one) for one in (title, *rows)]
+    return [title, *rows]
 
 
 def _budget_words(report: Report) -> str:
@@ -222,7 +224,7 @@ def _timeline(report: Report) -> list[str]:
 
 
 def _news(one: Happening) -> str:
-    return f"  {_clock(one.at_us)}  {_printable(one.text or one.name)}"
+    return f"  {_clock(one.at_us)}  {one.text or one.name}"
 
 
 def _clock(moment: int) -> str:
@@ -240,18 +242,12 @@ def _words(report: Report) -> list[str]:
 
 
 def _line(word: Word, node: str) -> str:
-    text = _printable(word.text)
-    return text if node else f"{word.node}: {text}"
+    return word.text if node else f"{word.node}: {word.text}"
 
 
 def _todo(report: Report) -> list[str]:
     found = remedies(report)
-    return ["What to do:", *(f"  {_printable(one)}" for one in found)] if found else []
-
-
-def _printable(text: str) -> str:
-    """What a node wrote must not command the terminal."""
-    return "".join(c if c.isprintable() else " " if c in "\n\t" else "�" for c in text)
+    return ["What to do:", *(f"  {one}" for one in found)] if found else []
 
 
 def report_values(report: Report) -> dict[str, Any]:

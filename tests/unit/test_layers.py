@@ -103,6 +103,7 @@ DECISIONS = {
         "status",
         "statuswords",
         "suggestions",
+        "terminaltext",
         "toptable",
         "unitfile",
         "unitplaces",
