@@ -35,6 +35,7 @@ MAX_TEXT = 4000
 """Characters of one line that a page is sent."""
 
 _DEFAULT_PRIORITY = 6
+_PRIORITIES = frozenset(b"%d" % number for number in range(8))
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,7 @@ def line_values(record: Mapping[str, bytes]) -> dict[str, Any]:
         "at_us": int(record.get("__REALTIME_TIMESTAMP", b"0")),
         "node": node or _decoded(record.get("SYSLOG_IDENTIFIER", b"")).partition("/")[2],
         "text": _printable(_decoded(record.get("MESSAGE", b""))),
-        "priority": int(priority) if priority.isdigit() else _DEFAULT_PRIORITY,
+        "priority": int(priority) if priority in _PRIORITIES else _DEFAULT_PRIORITY,
         "event": _decoded(record.get("DORA_EVENT", b"")),
     }
 

@@ -35,6 +35,14 @@ _HINT = (
 )
 
 
+def is_name(text: str) -> bool:
+    """Whether a dataflow can be called so."""
+    try:
+        return parse_name(text) == text
+    except DoraSystemdError:
+        return False
+
+
 def parse_name(text: str) -> str:
     """The name of a dataflow, unchanged; raises DoraSystemdError (USAGE) on any other text."""
     if not _NAME.fullmatch(text):

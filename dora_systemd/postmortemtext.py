@@ -1,5 +1,6 @@
 """The verdict of `doractl why` as one screen of text, or as values for JSON."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -19,6 +20,7 @@ _TOLD = ("event", "node", "nodes", "dataflow", "dataflow_name", "downstream", "c
 LINES = 20
 """How many of the last lines are shown."""
 _TIMELINE = 7
+_SIZE = re.compile("[1-9][0-9]{0,18}")
 _TITLE_WIDTH = 10
 _RED, _GREEN, _BOLD, _PLAIN = "\x1b[31m", "\x1b[32m", "\x1b[1m", "\x1b[0m"
 
@@ -196,7 +198,7 @@ def _memory_words(details: Mapping[str, str]) -> str:
     sizes = [
         f"{words} {format_rounded_size(int(details[key]))}"
         for key, words in (("peak", "peak"), ("limit", "limit"), ("held", "held"))
-        if details.get(key, "").isdecimal() and details.get(key) != "0"
+        if _SIZE.fullmatch(details.get(key, ""))
     ]
     owner = {"dataflow": " of the dataflow", "machine": "; the machine had none left"}
     return ", ".join(sizes) + owner.get(details.get("owner", ""), "") if sizes else ""
