@@ -42,4 +42,6 @@ def command(selector: str | None, shell: str, want_unset: bool) -> None:
         click.echo(format_unsets(shell))
         return
     scope = current_scope()
-    write_exactly(f"{format_exports(shell, read_variables(Bus(scope), scope, selector))}\n")
+    write_exactly(
+        f"{format_exports(shell, read_variables(Bus(scope, for_reading=True), scope, selector))}\n"
+    )

@@ -25,5 +25,5 @@ def command(selector: str) -> None:
     the runner. Environment variables are printed as well, with their values.
     """
     scope = current_scope()
-    bus = Bus(scope)
+    bus = Bus(scope, for_reading=True)
     write_exactly(export_cell(bus, scope, find_cell(bus, selector)))

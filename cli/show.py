@@ -24,7 +24,7 @@ def command(selector: str, output: str) -> None:
 
     Environment variables are printed as well, with their values.
     """
-    bus = Bus(current_scope())
+    bus = Bus(current_scope(), for_reading=True)
     cell = find_cell(bus, selector)
     files = unit_files(bus, cell)
     if output == "json":

@@ -32,7 +32,7 @@ def command(selector: str, output: str) -> int:
     """
     scope = current_scope()
     check_readable(scope)
-    report = explain(Bus(scope), scope, selector, JournalReader())
+    report = explain(Bus(scope, for_reading=True), scope, selector, JournalReader())
     if output == "json":
         print_json(report_values(report))
         return ExitCode.OK

@@ -8,6 +8,7 @@ import contextlib
 import errno
 import io
 import os
+from collections import deque
 from collections.abc import Iterable, Iterator
 from functools import cache
 from itertools import islice
@@ -22,8 +23,8 @@ from dora_systemd.values import SECOND
 NODE_PREFIX = "node-"
 SUPERVISOR = "supervisor"
 """The group of the runner and of dora's own processes, below that of the unit."""
-MAX_GROUPS = 2000
-"""Groups that are looked at: the nodes' user can make as many as the kernel has memory for."""
+MAX_GROUPS = 300
+"""Groups that are looked at where nobody says which: the nodes' user can make any number."""
 MAX_PROCESSES = 5000
 """Processes that are counted one by one where there is no memory controller."""
 _MAX_ENTRIES = 10_000
@@ -73,7 +74,7 @@ def node_groups(path: Path) -> dict[str, Path]:
 
 
 def shown_groups(path: Path, nodes: Iterable[str] = ()) -> dict[str, Path]:
-    """The groups of `nodes` that are there, or all that may be of nodes; MAX_GROUPS at most.
+    """The groups of `nodes` that are there, or MAX_GROUPS of those that may be of nodes.
 
     For a look from outside: the nodes' user can make groups there, of any name and number.
     """
@@ -81,10 +82,9 @@ def shown_groups(path: Path, nodes: Iterable[str] = ()) -> dict[str, Path]:
     with contextlib.suppress(OSError):
         if not names:
             with os.scandir(path) as entries:
-                names = sorted(
-                    filter(_is_node_group, (one.name for one in islice(entries, _MAX_ENTRIES)))
-                )
-        groups = (path / name for name in names[:MAX_GROUPS])
+                found = [one.name for one in islice(entries, _MAX_ENTRIES)]
+            names = sorted(filter(_is_node_group, found))[:MAX_GROUPS]
+        groups = (path / name for name in names)
         return {one.name.removeprefix(NODE_PREFIX): one for one in groups if one.is_dir()}
     return {}
 
@@ -217,11 +217,11 @@ def freeze_group(path: Path, is_frozen: bool) -> bool:
 
 def _tree(path: Path) -> Iterator[Path]:
     """The group and all below it; no recursion, as the nodes' user can nest them very deeply."""
-    left = [path]
+    left = deque([path])
     while left:
-        yield (group := left.pop())
+        yield (group := left.popleft())
         with contextlib.suppress(OSError), os.scandir(group) as entries:
-            left += [Path(one.path) for one in entries if one.is_dir(follow_symlinks=False)]
+            left.extend(Path(one.path) for one in entries if one.is_dir(follow_symlinks=False))
 
 
 def _write(path: Path, text: str) -> bool:

@@ -91,7 +91,7 @@ def test_groups(cell: Cell, project: Project, front: Front) -> None:
         "os.chdir(sys.argv[1])\n"
         "for name in ('node-\\x1b]0;x\\a', 'node-\\x9b', *map('node-{}'.format, range(3000))):\n"
         "    os.mkdir(name)\n"
-        "for _ in range(1500):\n"
+        "for _ in range(200):\n"
         "    os.mkdir('d'); os.chdir('d')\n"
     )
     run("runuser", "-u", "alice", "--", "python3", "-c", script, str(cell.group))
@@ -102,7 +102,7 @@ def test_groups(cell: Cell, project: Project, front: Front) -> None:
 
 
 FORGER = r"""
-import json, os, socket, struct
+import fcntl, json, os, socket, struct
 from dora import Node
 
 def send(**fields):
@@ -116,9 +116,9 @@ def send(**fields):
     except OSError:
         fd = os.memfd_create("x", os.MFD_ALLOW_SEALING)
         os.write(fd, data)
-        import fcntl
-        fcntl.fcntl(fd, 1033, 15)
-        socket.send_fds(journal, [b""], [fd], address="/run/systemd/journal/socket")
+        fcntl.fcntl(fd, fcntl.F_ADD_SEALS, 15)
+        journal.connect("/run/systemd/journal/socket")
+        socket.send_fds(journal, [b""], [fd])
 
 name, uuid = os.environ["FLOW"], os.environ["FLOW_UUID"]
 ids = json.loads(os.environ["IDS"])
@@ -147,3 +147,24 @@ def test_records(cell: Cell, project: Project, front: Front) -> None:
     look_at_all(cell, front)
     assert "victim" not in looked_at(cell, "list", "-a")
     assert cell.doractl("why", "victim", check=False).returncode == ExitCode.NOT_FOUND
+
+
+def test_a_link_in_a_users_directory(alice: Front, tmp_path: Path) -> None:
+    """The maintainer script removes nothing behind it."""
+    victim = tmp_path / "user/dora-gateway.socket.d"
+    victim.mkdir(parents=True)
+    (victim / "precious").touch()
+    place = alice.scope.runtime_root / "systemd"
+    away = place.with_name("systemd-away")
+    own = place.with_name("dora-systemd")
+    own.mkdir(exist_ok=True)
+    os.chown(own, 1000, 1000)
+    place.rename(away)
+    try:
+        place.symlink_to(tmp_path)
+        run("sh", str(Path(__file__).parents[2] / "packaging/debian/dora-systemd.postrm"), "remove")
+        assert (victim / "precious").exists()
+        assert not own.exists()
+    finally:
+        place.unlink()
+        away.rename(place)
