@@ -4,9 +4,9 @@ The interfaces are those of org.freedesktop.systemd1(5). Only pystemd's low leve
 connection that is told every signature: nothing is introspected, and no XML is parsed.
 """
 
+import _thread
 import os
 import select
-import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -36,7 +36,7 @@ CALL_SECONDS = 25.0
 """For any other answer, as systemctl has it: systemd may be reading all its units again."""
 _TIMEOUT = "SYSTEMD_BUS_TIMEOUT"
 """The only way to tell sd-bus through pystemd: read at the first call of a connection."""
-_environment = threading.Lock()
+_environment = _thread.allocate_lock()  # threading takes a while to load
 
 _IDLE_SECONDS = 1.0
 _UNIT_PROPERTIES = frozenset(

@@ -240,8 +240,7 @@ def test_groups_that_are_nested_deeply(tmp_path: Path) -> None:
     for group in reversed(groups):  # pytest's own way to remove them is recursive
         group.rmdir()
     assert found == [os.getpid()]
-    assert memory is not None
-    assert memory > 0
+    assert memory == 0  # so deep, it is not looked for
 
 
 @pytest.mark.usefixtures("unit_group")
