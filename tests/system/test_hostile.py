@@ -167,3 +167,23 @@ def test_a_link_in_a_users_directory(alice: Front, tmp_path: Path) -> None:
     finally:
         place.unlink()
         away.rename(place)
+
+
+def test_a_directory_whose_name_is_an_order(cell: Cell, project: Project) -> None:
+    place = "evil\x1b]0;x\x07\u202e"
+    project.write(f"{place}/a.py", NODE)
+    cell.start(project.write(f"{place}/dataflow.yml", SLEEPER))
+    for words in (["list", cell.name], ["status", cell.name], ["why", cell.name]):
+        assert r"evil\x1b]0;x\x07\u202e" in looked_at(cell, *words)
+    assert place in json.loads(looked_at(cell, "list", cell.name, "-o", "json"))["dataflow"]
+
+
+def test_lines_on_a_terminal(cell: Cell, project: Project) -> None:
+    """Colours pass, orders are shown; in a pipe they are what the node wrote."""
+    line = "\\x1b[32mgreen\\x1b[0m \\x1b]52;c;eA==\\x07 \\x9b2J"
+    project.write("a.py", f'print("{line}", flush=True)\nfrom dora import Node\nNode()\n')
+    flow = project.write("dataflow.yml", "nodes: [{id: a, path: a.py}]\n")
+    command = ["doractl", "run", str(flow), "--name", cell.name]
+    shown = run("script", "-qec", " ".join(command), "/dev/null").stdout
+    assert "\x1b[32mgreen\x1b[0m \\x1b]52;c;eA==\\x07 \\u009b2J" in shown
+    assert "\x1b[32mgreen\x1b[0m \x1b]52;c;eA==\x07 \x9b2J" in run(*command).stdout
