@@ -130,4 +130,4 @@ def _set_types(command: click.Command) -> click.Command:
 
 
 def _bus() -> Bus:
-    return Bus(current_scope())
+    return Bus(current_scope(), for_reading=True)

@@ -1,5 +1,7 @@
 """doractl doctor: what on this machine hinders dataflows, and what helps."""
 
+from functools import partial
+
 import click
 
 from dora_systemd.bus import Bus
@@ -24,7 +26,7 @@ def command(output: str) -> int:
     Changes nothing. The exit status is 1 if a problem keeps dataflows from working; notes and
     warnings do not count.
     """
-    findings = examine(Bus, current_scope())
+    findings = examine(partial(Bus, for_reading=True), current_scope())
     if output == "json":
         print_json([finding_values(one) for one in findings])
     else:

@@ -3,6 +3,7 @@
 import click
 
 from dora_systemd.bus import Bus
+from dora_systemd.cli.edge import write_exactly
 from dora_systemd.cli.parameters import current_scope, scope_options
 from dora_systemd.doraenv import SHELLS, format_exports, format_unsets
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -41,4 +42,6 @@ def command(selector: str | None, shell: str, want_unset: bool) -> None:
         click.echo(format_unsets(shell))
         return
     scope = current_scope()
-    click.echo(format_exports(shell, read_variables(Bus(scope), scope, selector)))
+    write_exactly(
+        f"{format_exports(shell, read_variables(Bus(scope, for_reading=True), scope, selector))}\n"
+    )

@@ -3,6 +3,7 @@
 import click
 
 from dora_systemd.bus import Bus
+from dora_systemd.cli.edge import write_exactly
 from dora_systemd.cli.parameters import current_scope, scope_options
 from dora_systemd.managercells import find_cell
 from dora_systemd.managerexport import export_cell
@@ -24,5 +25,5 @@ def command(selector: str) -> None:
     the runner. Environment variables are printed as well, with their values.
     """
     scope = current_scope()
-    bus = Bus(scope)
-    click.echo(export_cell(bus, scope, find_cell(bus, selector)), nl=False)
+    bus = Bus(scope, for_reading=True)
+    write_exactly(export_cell(bus, scope, find_cell(bus, selector)))

@@ -19,7 +19,7 @@ from dora_systemd.statuswords import (
 def print_dataflows(request: ListRequest) -> int:
     """Print what is asked for; NOT_RUNNING if a single dataflow was asked for and is not up."""
     scope = scope_of(request.is_user)
-    bus = Bus(scope)
+    bus = Bus(scope, for_reading=True)
     if request.selector is None:
         _print_all(_rows(bus, scope, request), request)
         return ExitCode.OK

@@ -13,8 +13,11 @@ from dora_systemd.cli.parameters import current_scope, scope_options
 from dora_systemd.errors import ExitCode
 from dora_systemd.journalread import JournalReader, check_readable
 from dora_systemd.logquery import OUTPUTS, LogQuery, parse_level
-from dora_systemd.logterminal import TerminalLines
+from dora_systemd.logterminal import ShownLines, TerminalLines
 from dora_systemd.managerlogs import LogRequest, find_query, pass_logs, read_logs
+
+Lines = TerminalLines | ShownLines | None
+"""What makes lines for a terminal, None for a pipe."""
 
 _EPILOG = """\b
 Examples:
@@ -89,7 +92,7 @@ Examples:
     "--all",
     "want_unprintable",
     is_flag=True,
-    help="Print messages with control characters as they are.",
+    help="Messages with control characters, too: escaped on a terminal, as they are in a pipe.",
 )
 @click.option(
     "-o",
@@ -124,7 +127,7 @@ def command(
         check_until_end(selector, options["is_reverse"])
     journal = JournalReader()
     query = find_query(journal, LogRequest(selector, nodes, run, LogQuery(scope, **options)))
-    lines = None
+    lines: Lines = ShownLines() if sys.stdout.isatty() else None
     if sys.stdout.isatty() and query.output.startswith("short"):
         known = query.nodes or (journal.known_nodes(query.name) if query.name else ())
         lines = TerminalLines([*known, query.name], want_dataflow=not query.name)
@@ -137,7 +140,7 @@ def command(
     return ExitCode.OK
 
 
-def _print(query: LogQuery, lines: TerminalLines | None) -> int:
+def _print(query: LogQuery, lines: Lines) -> int:
     """Print the records of a query, rewritten for a terminal or as journalctl does."""
     if not sys.stdout.isatty():
         return pass_logs(query, sys.stdout.fileno())

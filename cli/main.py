@@ -1,21 +1,19 @@
 """The command doractl: where it begins, and the one place where its errors are printed."""
 
-import io
 import os
 import sys
 from contextlib import suppress
 from typing import NoReturn
 
 from dora_systemd import __version__
+from dora_systemd.cli.edge import put_in_place
 from dora_systemd.cli.quick import parse_quick_list
 from dora_systemd.errors import DoraSystemdError, ExitCode
 
 
 def main() -> None:
     """Run doractl and end the process with its exit status, see ExitCode."""
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        # Names of files need not be in the terminal's encoding.
-        sys.stdout.reconfigure(errors="backslashreplace")
+    put_in_place()
     _leave(run(sys.argv[1:]))
 
 

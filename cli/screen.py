@@ -14,6 +14,8 @@ from collections.abc import Iterable
 from types import FrameType, TracebackType
 from typing import TextIO
 
+from dora_systemd.terminaltext import one_line
+
 _ENTER = "\x1b[?1049h\x1b[?25l"
 _LEAVE = "\x1b[?25h\x1b[?1049l"
 _HOME = "\x1b[H"
@@ -111,5 +113,5 @@ class Screen:
 
 
 def _drawn(line: str, columns: int, is_bold: bool) -> str:
-    text = "".join(char if char.isprintable() else "?" for char in line)[:columns]
+    text = one_line(line)[:columns]
     return f"{_BOLD}{text}{_PLAIN}" if is_bold else text

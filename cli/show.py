@@ -3,6 +3,7 @@
 import click
 
 from dora_systemd.bus import Bus
+from dora_systemd.cli.edge import write_exactly
 from dora_systemd.cli.parameters import current_scope, output_option, print_json, scope_options
 from dora_systemd.managercells import find_cell
 from dora_systemd.managershow import format_unit_files, unit_files
@@ -23,10 +24,10 @@ def command(selector: str, output: str) -> None:
 
     Environment variables are printed as well, with their values.
     """
-    bus = Bus(current_scope())
+    bus = Bus(current_scope(), for_reading=True)
     cell = find_cell(bus, selector)
     files = unit_files(bus, cell)
     if output == "json":
         print_json({"unit": cell.unit, "name": cell.name, "uuid": cell.uuid, "files": files})
     else:
-        click.echo(format_unit_files(files), nl=False)
+        write_exactly(format_unit_files(files))

@@ -4,6 +4,9 @@ import shutil
 from types import TracebackType
 from typing import TextIO
 
+from dora_systemd.cli.edge import write_own
+from dora_systemd.terminaltext import one_line
+
 _BACK_AND_CLEAR = "\r\x1b[K"
 
 
@@ -17,7 +20,7 @@ class StageLine:
     def __call__(self, text: str) -> None:
         if self._is_terminal:
             columns = shutil.get_terminal_size().columns
-            shown = "".join(char for char in text if char.isprintable())[: columns - 1]
+            shown = one_line(text)[: columns - 1]
             self._write(f"{_BACK_AND_CLEAR}{shown}")
 
     def __enter__(self) -> "StageLine":
@@ -33,5 +36,5 @@ class StageLine:
             self._write(_BACK_AND_CLEAR)
 
     def _write(self, text: str) -> None:
-        self._stream.write(text)
+        write_own(self._stream, text)
         self._stream.flush()

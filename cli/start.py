@@ -7,6 +7,7 @@ from typing import Any
 import click
 
 from dora_systemd.bus import Bus
+from dora_systemd.cli.edge import write_exactly
 from dora_systemd.cli.parameters import (
     current_scope,
     name_option,
@@ -73,7 +74,7 @@ def command(
         target = boot_target(Bus(scope), scope) if want_boot else None
         plan = make_plan(scope, request)
         check_plan(lambda: Bus(scope), plan)
-        print(format_plan(plan, target), end="")
+        write_exactly(format_plan(plan, target))
         return
     bus = Bus(scope)
     claimed = claim(bus, scope, request, want_boot)

@@ -55,7 +55,7 @@ def command(
     printed; JSON goes on, one object in a line for each reading.
     """
     scope = current_scope()
-    top = Top(Bus(scope), scope, selectors)
+    top = Top(Bus(scope, for_reading=True), scope, selectors)
     top.look()
     is_terminal = sys.stdin.isatty() and sys.stdout.isatty()
     try:

@@ -6,6 +6,7 @@ import sys
 import click
 
 from dora_systemd.bus import Bus
+from dora_systemd.cli.edge import write_own
 from dora_systemd.cli.parameters import current_scope, output_option, print_json, scope_options
 from dora_systemd.errors import ExitCode
 from dora_systemd.journalread import JournalReader, check_readable
@@ -31,12 +32,11 @@ def command(selector: str, output: str) -> int:
     """
     scope = current_scope()
     check_readable(scope)
-    report = explain(Bus(scope), scope, selector, JournalReader())
+    report = explain(Bus(scope, for_reading=True), scope, selector, JournalReader())
     if output == "json":
         print_json(report_values(report))
         return ExitCode.OK
     is_terminal = sys.stdout.isatty()
     width = shutil.get_terminal_size().columns if is_terminal else None
-    # Bytes of nodes are replaced before they get here; colours only where they are seen.
-    print(format_report(report, width, want_colors=is_terminal))
+    write_own(sys.stdout, f"{format_report(report, width, want_colors=is_terminal)}\n")
     return ExitCode.OK

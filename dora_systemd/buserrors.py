@@ -69,6 +69,16 @@ def connection_error(scope: Scope) -> Iterator[None]:
         ) from error
 
 
+def silent_bus(scope: Scope, is_private: bool) -> DoraSystemdError:
+    """The error for a manager, or a message bus before it, that says nothing."""
+    flag = "--user " if scope.is_user else ""
+    silent, verb = (
+        ("systemd", "is-system-running") if is_private else ("the message bus", "status dbus")
+    )
+    message = f"cannot reach systemd: {silent} does not answer"
+    return DoraSystemdError(message, f"see systemctl {flag}{verb}", ExitCode.NO_SYSTEMD)
+
+
 def _connection_hint(scope: Scope) -> str:
     if not Path("/run/systemd/system").is_dir():
         return "this machine was not booted with systemd"

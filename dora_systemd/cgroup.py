@@ -8,18 +8,26 @@ import contextlib
 import errno
 import io
 import os
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Iterable, Iterator
 from functools import cache
+from itertools import islice
 from pathlib import Path
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.limits import NodeLimits
+from dora_systemd.names import is_node_id
 from dora_systemd.usage import UNLIMITED, Usage
 from dora_systemd.values import SECOND
 
 NODE_PREFIX = "node-"
 SUPERVISOR = "supervisor"
 """The group of the runner and of dora's own processes, below that of the unit."""
+MAX_GROUPS = 300
+"""Groups that are looked at where nobody says which: the nodes' user can make any number."""
+MAX_PROCESSES = 5000
+"""Processes that are counted one by one where there is no memory controller."""
+_MAX_ENTRIES = 10_000
 MOUNTS = (Path("/sys/fs/cgroup"), Path("/sys/fs/cgroup/unified"))
 
 _ABSENT = (errno.ENOENT, errno.ENODEV, errno.EOPNOTSUPP, errno.ENOTSUP)
@@ -65,6 +73,26 @@ def node_groups(path: Path) -> dict[str, Path]:
     return {}
 
 
+def shown_groups(path: Path, nodes: Iterable[str] = ()) -> dict[str, Path]:
+    """The groups of `nodes` that are there, or MAX_GROUPS of those that may be of nodes.
+
+    For a look from outside: the nodes' user can make groups there, of any name and number.
+    """
+    names = [f"{NODE_PREFIX}{node}" for node in nodes]
+    with contextlib.suppress(OSError):
+        if not names:
+            with os.scandir(path) as entries:
+                found = [one.name for one in islice(entries, _MAX_ENTRIES)]
+            names = sorted(filter(_is_node_group, found))[:MAX_GROUPS]
+        groups = (path / name for name in names)
+        return {one.name.removeprefix(NODE_PREFIX): one for one in groups if one.is_dir()}
+    return {}
+
+
+def _is_node_group(name: str) -> bool:
+    return name.startswith(NODE_PREFIX) and is_node_id(name.removeprefix(NODE_PREFIX))
+
+
 def read_usage(path: Path) -> Usage:
     """CPU and memory of one group with all below it; zero for a group that has just gone.
 
@@ -72,7 +100,8 @@ def read_usage(path: Path) -> Usage:
     """
     current, cpu = read_number(path / "memory.current"), read_cpu(path)
     if current is None:
-        memory = sum(map(_resident_bytes, pids(path)))
+        some = islice(_pids(islice(_tree(path), MAX_GROUPS)), MAX_PROCESSES)
+        memory = sum(map(_resident_bytes, some))
         return cpu._replace(memory=memory, cpu_max=_read_share(path / "cpu.max"))
     return cpu._replace(
         memory=current,
@@ -97,7 +126,11 @@ def read_numbers(path: Path) -> dict[str, int]:
 
 def pids(path: Path) -> list[int]:
     """The processes of a group and of all groups below it."""
-    return [int(pid) for one in _tree(path) for pid in read_text(one / "cgroup.procs").split()]
+    return list(_pids(_tree(path)))
+
+
+def _pids(groups: Iterable[Path]) -> Iterator[int]:
+    return (int(pid) for one in groups for pid in read_text(one / "cgroup.procs").split())
 
 
 def is_populated(path: Path) -> bool:
@@ -183,11 +216,12 @@ def freeze_group(path: Path, is_frozen: bool) -> bool:
 
 
 def _tree(path: Path) -> Iterator[Path]:
-    yield path
-    with contextlib.suppress(OSError):
-        for entry in os.scandir(path):
-            if entry.is_dir(follow_symlinks=False):
-                yield from _tree(Path(entry.path))
+    """The group and all below it; no recursion, as the nodes' user can nest them very deeply."""
+    left = deque([path])
+    while left:
+        yield (group := left.popleft())
+        with contextlib.suppress(OSError), os.scandir(group) as entries:
+            left.extend(Path(one.path) for one in entries if one.is_dir(follow_symlinks=False))
 
 
 def _write(path: Path, text: str) -> bool:

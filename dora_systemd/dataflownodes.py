@@ -1,17 +1,13 @@
 """The nodes of a descriptor, as far as we read them; the whole is in the module dataflow."""
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import MAX_NODE_ID, NODE_ID
 from dora_systemd.values import quoted, shown
 
-MAX_NODE_ID = 200
-"""Characters of an id: "node-ID" names a cgroup and "ID.out" a pipe, and names end at 255 bytes."""
-
-_NODE_ID = re.compile(r"(?!\.)[A-Za-z0-9_.-]+")
 _RESERVED_IDS = frozenset({"dora"})
 _BACKOFF_KEYS = ("max_restarts", "restart_delay", "max_restart_delay", "restart_window")
 
@@ -114,7 +110,7 @@ def _parse_id(node_id: object, place: int, source: str) -> str:
         hint = f'in quotes it is text: id: "{node_id}"'
         raise dataflow_refusal(source, f"the id of {what} is {described(node_id)}", hint)
     hint = "an id is letters, digits, '_', '-' and '.', and begins with no '.'"
-    if not _NODE_ID.fullmatch(node_id):
+    if not NODE_ID.fullmatch(node_id):
         raise dataflow_refusal(source, f"{what} has the id {quoted(node_id)}", hint)
     if node_id in _RESERVED_IDS:
         hint = "'dora' stands for dora's own sources, such as dora/timer"

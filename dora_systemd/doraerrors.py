@@ -3,7 +3,8 @@
 import re
 from itertools import pairwise
 
-_ANSI = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
+from dora_systemd.terminaltext import one_line, without_sequences
+
 _NUMBERED = re.compile(r"\d+: +")
 _OS_ERROR = re.compile(r"\(os error \d+\)$")
 _END = ("Location:", "Stack backtrace:", "Backtrace omitted", "Run with ")
@@ -18,7 +19,7 @@ def parse_dora_error(stderr: str) -> str:
     ones, then where in its source and sometimes a backtrace. Without causes it is the headline,
     without any of it the line of a wrong command line or the last one; "" for no output at all.
     """
-    lines = [_ANSI.sub("", line).strip() for line in stderr.splitlines()]
+    lines = [line.strip() for line in without_sequences(stderr).splitlines()]
     headline = _after(lines, "[ERROR]")[:1]
     usage = [line for line in lines if line.startswith("error: ")][:1]
     last = [line for line in lines if line][-1:]
@@ -50,6 +51,5 @@ def _innermost(causes: list[str]) -> str:
 
 
 def _shortened(text: str) -> str:
-    words = "".join(char if char.isprintable() else " " for char in text).split()
-    line = " ".join(words)
+    line = " ".join(one_line(text).split())
     return line if len(line) <= _MAX_LENGTH else line[: _MAX_LENGTH - 3] + "..."

@@ -6,8 +6,18 @@ A browser gives itself away by Origin:, and a name that was bent to this machine
 
 import hmac
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+
+MAX_CONNECTIONS = 256
+"""Of root and of the gateway's own user; dora's own limit for its coordinator."""
+MAX_STRANGERS = 32
+"""Connections of all others together: they are refused, or have a token."""
+MAX_OF_STRANGER = 16
+"""Connections of one of them."""
+STRANGER_SECONDS = 2.0
+"""For the headers of a stranger's request to arrive."""
 
 _HOST = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:[0-9]{1,5})?", re.IGNORECASE)
 _BEARER = "bearer "
@@ -32,6 +42,39 @@ class Refusal:
 
     status: int
     text: str
+
+
+class Door:
+    """Counts who is in. Whatever others do, there is room for root and for the gateway's owner.
+
+    uid: of the other end of a connection, None where the kernel does not tell.
+    """
+
+    def __init__(self, own_uid: int) -> None:
+        self._known = frozenset({0, own_uid})
+        self._inside: Counter[int | None] = Counter()
+
+    def is_stranger(self, uid: int | None) -> bool:
+        """Whether it is neither root nor the user whose gateway this is."""
+        return uid not in self._known
+
+    def enter(self, uid: int | None) -> bool:
+        """Let a connection in, if there is room for it."""
+        of_all = sum(n for one, n in self._inside.items() if self._is_like(one, uid))
+        has_room = of_all < (MAX_STRANGERS if self.is_stranger(uid) else MAX_CONNECTIONS)
+        if self.is_stranger(uid):
+            has_room = has_room and self._inside[uid] < MAX_OF_STRANGER
+        self._inside[uid] += has_room
+        return has_room
+
+    def _is_like(self, one: int | None, other: int | None) -> bool:
+        return self.is_stranger(one) == self.is_stranger(other)
+
+    def leave(self, uid: int | None) -> None:
+        """A connection that was let in has ended."""
+        self._inside[uid] -= 1
+        if not self._inside[uid]:
+            del self._inside[uid]
 
 
 def refuse_address(caller: Caller) -> Refusal | None:

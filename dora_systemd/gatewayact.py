@@ -6,7 +6,7 @@ from typing import Any
 from dora_systemd.bus import Bus
 from dora_systemd.dataflow import parse_dataflow
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.files import read_yaml
+from dora_systemd.files import parse_yaml
 from dora_systemd.livemessages import PageMessage, graph_values
 from dora_systemd.managerask import note_stop
 from dora_systemd.managercells import Cell, find_cell
@@ -14,6 +14,7 @@ from dora_systemd.managerlist import read_status
 from dora_systemd.managernode import ask_coordinator, restart_node, stop_node
 from dora_systemd.managerstop import restart_cells, stop_cells
 from dora_systemd.scope import Scope
+from dora_systemd.trust.paths import read_file
 
 _BY = "status page"
 
@@ -58,4 +59,5 @@ def _read_descriptor(scope: Scope, cell: Cell) -> object:
         except (DoraSystemdError, KeyError, TypeError):
             # It may just be ending.
             pass
-    return read_yaml(Path(cell.options.dataflow))
+    path = Path(cell.options.dataflow)
+    return parse_yaml(read_file(path).data.decode("utf-8-sig", "replace"), path)

@@ -220,7 +220,7 @@ def _level(record: Record) -> str:
     if "DORA_STREAM" in record:
         return "stdout"
     priority = _text(record, "PRIORITY")
-    number = int(priority) if priority.isdigit() else INFO
+    number = int(priority) if len(priority) == 1 and priority.isdecimal() else INFO
     return _BY_PRIORITY.get(max(number, ERR), "info")
 
 

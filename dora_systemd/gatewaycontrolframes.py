@@ -15,12 +15,14 @@ DORA_COORDINATOR_PORT, measured by a proxy before a bare coordinator:
 """
 
 import json
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import parse_uuid
+from dora_systemd.terminaltext import escaped
 from dora_systemd.values import SECOND, quoted
 
 NO_ID = "00000000-0000-0000-0000-000000000000"
@@ -29,6 +31,8 @@ NO_ID = "00000000-0000-0000-0000-000000000000"
 LOGS_LIMIT = 15 << 20
 """Bytes of one answer to Logs: each becomes up to 4 characters of a message of at most 64 MiB."""
 _PART = 1 << 16
+_NUL = re.compile(r"(?<!\\)(?:\\\\)*\\u0000")
+"""As json writes it, and no backslash before "u0000" that is meant as one."""
 _MICROSECOND_NS = 1000
 
 
@@ -94,11 +98,15 @@ def parse_request(text: str | bytes) -> Request | Malformed:
     try:
         frame = json.loads(text)
         # Half a surrogate pair is no text to anybody else: a coordinator would not answer at all.
-        json.dumps(frame, ensure_ascii=False).encode()
+        text = json.dumps(frame, ensure_ascii=False)
+        text.encode()
     except (ValueError, RecursionError) as error:
         return Malformed(NO_ID, f"cannot read the request: {error}"[:300])
     if not isinstance(frame, dict) or not isinstance(frame.get("id"), str):
         return Malformed(NO_ID, "cannot read the request: it has no id")
+    if _NUL.search(text):
+        # No path, no name and no argument of a program can have one: what takes it would fail.
+        return Malformed(frame["id"], "cannot read the request: it has a NUL character")
     return _parse_params(frame["id"], frame.get("params"))
 
 
@@ -130,7 +138,7 @@ def format_event(payload: Mapping[str, Any]) -> str:
 def error_result(error: DoraSystemdError) -> dict[str, str]:
     """What failed, as the dora command prints it, with the hint as its own are."""
     text = error.message + (f"\n\n  hint: {error.hint}" if error.hint else "")
-    return {"Error": text}
+    return {"Error": escaped(text)}
 
 
 def logs_parts(ident: str, lines: list[bytes]) -> Iterator[str]:

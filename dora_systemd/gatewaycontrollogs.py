@@ -80,7 +80,7 @@ def _read_logs(scope: Scope, request: Request, node: str) -> tuple[str, list[byt
 
 def _uuid_of(scope: Scope, request: Request) -> str:
     if request.body.get("uuid") is None:
-        return find_cell(Bus(scope), request.text("name")).uuid
+        return find_cell(Bus(scope, for_reading=True), request.text("name")).uuid
     return request.text("uuid").lower()
 
 
@@ -165,7 +165,9 @@ class Follower:
         return not await self._is_up()
 
     async def _is_up(self) -> bool:
-        return await asyncio.to_thread(lambda: is_unit_up(Bus(self._talk.scope), self._name))
+        return await asyncio.to_thread(
+            lambda: is_unit_up(Bus(self._talk.scope, for_reading=True), self._name)
+        )
 
 
 def _place(record: Record) -> Place:

@@ -74,7 +74,7 @@ class Talk:
 
 def find_by_uuid(scope: Scope, uuid: str) -> Cell:
     """The dataflow that systemd knows by this UUID. Raises DoraSystemdError (NOT_FOUND)."""
-    for cell in read_cells(Bus(scope)):
+    for cell in read_cells(Bus(scope, for_reading=True)):
         if cell.uuid == uuid:
             return cell
     raise DoraSystemdError(

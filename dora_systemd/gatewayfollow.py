@@ -59,7 +59,7 @@ async def _batches(stream: asyncio.StreamReader) -> AsyncIterator[tuple[Lines, i
 
 def _query(scope: Scope, message: PageMessage) -> LogQuery:
     check_readable(scope)
-    cell = find_cell(Bus(scope), message.dataflow)
+    cell = find_cell(Bus(scope, for_reading=True), message.dataflow)
     return LogQuery(
         scope,
         name=cell.name,

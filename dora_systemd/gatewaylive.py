@@ -150,4 +150,4 @@ def _greeting(scope: Scope) -> dict[str, str]:
 
 
 def _snapshot(scope: Scope) -> list[dict[str, Any]]:
-    return [observed_values(one) for one in read_snapshot(Bus(scope), scope)]
+    return [observed_values(one) for one in read_snapshot(Bus(scope, for_reading=True), scope)]

@@ -17,4 +17,4 @@ async def answer_metrics(request: Request) -> Answer:
 
 
 def _read(scope: Scope) -> str:
-    return format_metrics(read_snapshot(Bus(scope), scope), __version__)
+    return format_metrics(read_snapshot(Bus(scope, for_reading=True), scope), __version__)

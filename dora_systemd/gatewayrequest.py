@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from dora_systemd.scope import Scope
+from dora_systemd.terminaltext import escaped
 
 PLAIN = "text/plain; charset=utf-8"
 
@@ -57,5 +58,5 @@ Talk = Callable[[Socket, Request], Awaitable[None]]
 
 
 def text_answer(status: int, text: str, **headers: str) -> Answer:
-    """An answer of one line."""
-    return Answer(status, PLAIN, f"{text}\n".encode(), headers)
+    """An answer of one line, which curl may well write to a terminal."""
+    return Answer(status, PLAIN, f"{escaped(text)}\n".encode(), headers)

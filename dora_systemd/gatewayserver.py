@@ -20,7 +20,15 @@ from websockets.http11 import Request as RawRequest
 from websockets.http11 import Response
 
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.gatewayaccess import Caller, Refusal, has_token, refuse_address, refuse_user
+from dora_systemd.gatewayaccess import (
+    STRANGER_SECONDS,
+    Caller,
+    Door,
+    Refusal,
+    has_token,
+    refuse_address,
+    refuse_user,
+)
 from dora_systemd.gatewayrequest import Answer, Request, text_answer
 from dora_systemd.gatewayroutes import GET, OPEN_TO_ALL, SOCKETS
 from dora_systemd.scope import Scope
@@ -28,9 +36,8 @@ from dora_systemd.sockettable import peer_uid
 
 log = logging.getLogger(__name__)
 
-MAX_CONNECTIONS = 256
 MAX_FRAME = 1024 * 1024
-"""Bytes; both are dora's own limits for its coordinator."""
+"""Bytes; dora's own limit for its coordinator."""
 
 OPEN_SECONDS = 20.0
 """For a request to arrive whole and be answered."""
@@ -52,6 +59,7 @@ class Gateway:
         self._scope = scope
         self._token = token
         self._count = 0
+        self._door = Door(os.getuid())
         self._since = time.monotonic()
 
     async def run(self, sockets: Sequence[socket.socket], idle_seconds: float) -> None:
@@ -100,13 +108,23 @@ class Gateway:
         class Counted(ServerConnection):
             def connection_made(self, transport: asyncio.BaseTransport) -> None:
                 gateway._came()
+                self._uid = _uid_behind(transport)
+                self._is_in = gateway._door.enter(self._uid)
                 super().connection_made(transport)
-                if gateway._count > MAX_CONNECTIONS:
+                if not self._is_in:
                     self.transport.abort()
+                elif gateway._door.is_stranger(self._uid):
+                    self.loop.call_later(STRANGER_SECONDS, self._end_if_silent)
 
             def connection_lost(self, exc: Exception | None) -> None:
+                if self._is_in:
+                    gateway._door.leave(self._uid)
                 gateway._went()
                 super().connection_lost(exc)
+
+            def _end_if_silent(self) -> None:
+                if self.request is None:
+                    self.transport.abort()
 
         return Counted
 
@@ -141,7 +159,7 @@ class Gateway:
         refusal = refuse_address(caller)
         if refusal or _path(raw) in OPEN_TO_ALL or has_token(caller, self._token):
             return refusal
-        # Not the last word on who it is: an address may be None once the other side has gone.
+        # Asked again, and not the last word: an address may be None once the other side has gone.
         ends = (connection.remote_address, connection.local_address)
         if all(ends):
             peer, own = (tuple(end[:2]) for end in ends)
@@ -179,6 +197,12 @@ class Gateway:
     def _request(self, raw: RawRequest) -> Request:
         headers = {name.lower(): value for name, value in raw.headers.raw_items()}
         return Request(_path(raw), self._scope, raw.path.partition("?")[2], headers)
+
+
+def _uid_behind(transport: asyncio.BaseTransport) -> int | None:
+    """Whose the other end is; asked at once, as long as that has not gone."""
+    ends = (transport.get_extra_info("peername"), transport.get_extra_info("sockname"))
+    return peer_uid(ends[0][:2], ends[1][:2]) if all(ends) else None
 
 
 def _path(raw: RawRequest) -> str:

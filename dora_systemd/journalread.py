@@ -6,7 +6,9 @@ records in the time in which Python's binding reads 5,000.
 
 import json
 import os
+import select
 import subprocess
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,6 +17,7 @@ from typing import Any
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.logquery import journal_timestamp, scope_matches
+from dora_systemd.names import is_name, is_node_id, is_uuid, unit_name
 from dora_systemd.scope import Scope
 
 PERSISTENT = Path("/var/log/journal")
@@ -24,7 +27,19 @@ _NOTICE = "to turn off this notice."
 """How the hint to users who see their own records only ends."""
 
 _LIFE_EVENTS = ("starting", "started", "stopping", "finished", "stopped", "failed")
-_LIFE_FIELDS = ("DORA_DATAFLOW", "DORA_DATAFLOW_NAME", "DORA_EVENT", "DORA_EXIT", "DORA_REASON")
+_LIFE_FIELDS = ("DORA_DATAFLOW", "DORA_EVENT", "DORA_EXIT", "DORA_REASON")
+
+MAX_LINE = 1024 * 1024
+"""Bytes of a record, or of a value, that is read."""
+MAX_BYTES = 32 * 1024 * 1024
+"""Bytes that are read for one question."""
+FIRST_SECONDS = 20.0
+"""Until journalctl has found the first record: it may have to open large files on a slow disk."""
+READ_SECONDS = 2.0
+"""From then on."""
+_CHUNK = 1 << 18
+_MOST_FORGED = 100
+_MOST_DETAIL = 300
 
 
 @dataclass(frozen=True)
@@ -102,22 +117,22 @@ class JournalReader:
         """All values that `field` has anywhere in the journal, sorted."""
         with open_journalctl([f"--field={field}", "--quiet"]) as child:
             assert child.stdout
-            values = child.stdout.read().decode("utf-8", "replace").splitlines()
+            lines = list(_lines(child))
             end_journalctl(child)
-        return sorted(values)
+        return sorted(line.decode("utf-8", "replace").rstrip("\n") for line in lines)
 
     def known_names(self) -> list[str]:
         """The names of all dataflows that ever wrote a record, of all scopes."""
-        return self.unique("DORA_DATAFLOW_NAME")
+        return list(filter(is_name, self.unique("DORA_DATAFLOW_NAME")))
 
     def known_uuids(self) -> list[str]:
         """The UUIDs of all dataflows that ever wrote a record, of all scopes."""
-        return self.unique("DORA_DATAFLOW")
+        return list(filter(is_uuid, self.unique("DORA_DATAFLOW")))
 
     def known_nodes(self, name: str) -> list[str]:
         """The nodes of the dataflows called `name` that ever wrote a record."""
         found = (one.partition("/") for one in self.unique("SYSLOG_IDENTIFIER"))
-        return [node for dataflow, _, node in found if dataflow == name and node]
+        return [node for dataflow, _, node in found if dataflow == name and is_node_id(node)]
 
     def count_own(self, since_us: int, until_us: int) -> int:
         """How many records of this very process there are; CLOCK_REALTIME, µs, both included."""
@@ -132,9 +147,8 @@ class JournalReader:
 
     def name_of(self, uuid: str) -> str:
         """The name of the dataflow `uuid`, "" if it never wrote a record."""
-        for record in self.newest([f"DORA_DATAFLOW={uuid}"], 1):
-            return str(record.get("DORA_DATAFLOW_NAME", ""))
-        return ""
+        records = self.newest([f"DORA_DATAFLOW={uuid}"], _MOST_FORGED)
+        return next(filter(None, map(_trusted_name, records)), "")
 
     def newest(
         self,
@@ -152,18 +166,17 @@ class JournalReader:
         options += ["--all"] if is_whole else []
         arguments = ["--output=json", "--reverse", "--quiet", *options, "--", *matches]
         with open_journalctl(arguments) as child:
-            assert child.stdout
-            for line in child.stdout:
+            for line in _lines(child):
                 yield json.loads(line)
             end_journalctl(child)
 
     def last_events(self, scope: Scope, limit: int = 100) -> list[LastEvent]:
         """The last life event of each of the `limit` newest dataflows, newest first."""
         matches = [f"DORA_EVENT=dataflow-{event}" for event in _LIFE_EVENTS]
-        found: dict[str, LastEvent] = {}
+        found: dict[tuple[str, str], LastEvent] = {}
         for record in self.newest([*scope_matches(scope), *matches], None):
-            event = _last_event(record)
-            found.setdefault(event.uuid, event)
+            if event := _last_event(record):
+                found.setdefault((event.name, event.uuid), event)
             if len(found) >= limit:
                 break
         return list(found.values())
@@ -186,9 +199,55 @@ class JournalReader:
             previous = invocation
 
 
-def _last_event(record: dict[str, Any]) -> LastEvent:
-    uuid, name, event, ending, reason = (str(record.get(field, "")) for field in _LIFE_FIELDS)
-    return LastEvent(name, uuid, event, int(record["__REALTIME_TIMESTAMP"]), ending or reason)
+def _lines(child: "subprocess.Popen[bytes]") -> Iterator[bytes]:
+    """What a journalctl prints, as far as it is worth reading.
+
+    Whoever may write to the journal, and every node may, can fill it with records of 32 MiB each:
+    lines that are too long are left out, and all ends after so many bytes or so much time.
+    """
+    assert child.stdout
+    fd, rest, left, deadline = child.stdout.fileno(), b"", MAX_BYTES, None
+    poll = select.poll()
+    poll.register(fd, select.POLLIN)
+    while left > 0 and poll.poll(_seconds_until(deadline) * 1000):
+        if not (data := os.read(fd, _CHUNK)):
+            if rest and len(rest) <= MAX_LINE:
+                yield rest
+            return
+        deadline = deadline or time.monotonic() + READ_SECONDS
+        left -= len(data)
+        *lines, last = data.split(b"\n")
+        for line in lines:
+            if len(rest) + len(line) <= MAX_LINE:
+                yield rest + line + b"\n"
+            rest = b""
+        # Of a line that is too long no more is kept than shows that.
+        rest = (rest + last)[: MAX_LINE + 1]
+    child.kill()
+
+
+def _seconds_until(deadline: float | None) -> float:
+    return FIRST_SECONDS if deadline is None else max(deadline - time.monotonic(), 0.0)
+
+
+def _trusted_name(record: dict[str, Any]) -> str:
+    """Whose record it is, "" for one that was written in the name of another dataflow."""
+    name = record.get("DORA_DATAFLOW_NAME")
+    if not isinstance(name, str) or not is_name(name):
+        return ""
+    # These journald vouches for; a user's own services have the second one.
+    units = (record.get("_SYSTEMD_UNIT"), record.get("_SYSTEMD_USER_UNIT"))
+    return name if unit_name(name) in units else ""
+
+
+def _last_event(record: dict[str, Any]) -> LastEvent | None:
+    values = (record.get(field, "") for field in _LIFE_FIELDS)
+    uuid, event, ending, reason = (one if isinstance(one, str) else "" for one in values)
+    name = _trusted_name(record)
+    if not name or not is_uuid(uuid) or event.removeprefix("dataflow-") not in _LIFE_EVENTS:
+        return None
+    detail = (ending or reason)[:_MOST_DETAIL]
+    return LastEvent(name, uuid, event, int(record["__REALTIME_TIMESTAMP"]), detail)
 
 
 def _system_files(top: Path) -> list[Path]:

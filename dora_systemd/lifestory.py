@@ -27,6 +27,8 @@ SHUTDOWN_MESSAGE = "98268866d1d54a499c4e98921d93bc40"
 START_LIMIT_FUNCTION = "unit_test_start_limit"
 """CODE_FUNC of systemd's "Start request repeated too quickly.", which has no MESSAGE_ID."""
 
+_MAX_TEXT = 4000
+"""Characters of a field: its writer may be a node."""
 _BEGINNINGS = ("unit-starting", "dataflow-starting")
 _SYSTEMD_FIELDS = ("EXIT_CODE", "EXIT_STATUS", "COMMAND", "UNIT_RESULT", "N_RESTARTS")
 
@@ -97,7 +99,7 @@ def plain_text(value: Any) -> str:
 
 def parse_happening(record: Mapping[str, Any]) -> Happening | None:
     """The happening that a record is, or None for any other record."""
-    texts = {str(key): plain_text(value) for key, value in record.items()}
+    texts = {str(key): plain_text(value)[:_MAX_TEXT] for key, value in record.items()}
     name = texts.get("DORA_EVENT") or UNIT_MESSAGES.get(texts.get("MESSAGE_ID", ""), "")
     if texts.get("CODE_FUNC") == START_LIMIT_FUNCTION:
         name = "start-limit"

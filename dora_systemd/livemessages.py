@@ -20,13 +20,13 @@ It gets:
 """
 
 import json
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from dora_systemd.dataflow import Dataflow
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.terminaltext import escaped, without_sequences
 
 TYPES = ("follow", "unfollow", "graph", "act")
 ACTIONS = ("stop", "restart")
@@ -35,8 +35,7 @@ MAX_TEXT = 4000
 """Characters of one line that a page is sent."""
 
 _DEFAULT_PRIORITY = 6
-# CSI and OSC sequences, see console_codes(4).
-_ESCAPES = re.compile(r"\x1b(?:\[[0-?]*[ -/]*[@-~]|\][^\x07\x1b]*(?:\x07|\x1b\\)?|[@-Z\\-_])")
+_PRIORITIES = frozenset(b"%d" % number for number in range(8))
 
 
 @dataclass(frozen=True)
@@ -88,7 +87,7 @@ def line_values(record: Mapping[str, bytes]) -> dict[str, Any]:
         "at_us": int(record.get("__REALTIME_TIMESTAMP", b"0")),
         "node": node or _decoded(record.get("SYSLOG_IDENTIFIER", b"")).partition("/")[2],
         "text": _printable(_decoded(record.get("MESSAGE", b""))),
-        "priority": int(priority) if priority.isdigit() else _DEFAULT_PRIORITY,
+        "priority": int(priority) if priority in _PRIORITIES else _DEFAULT_PRIORITY,
         "event": _decoded(record.get("DORA_EVENT", b"")),
     }
 
@@ -99,9 +98,8 @@ def _decoded(data: bytes) -> str:
 
 def _printable(text: str) -> str:
     """Without colours and other orders to a terminal; what is left of them can be seen."""
-    text = _ESCAPES.sub("", text)
-    text = text if len(text) <= MAX_TEXT else f"{text[:MAX_TEXT]}…"
-    return "".join(char if char.isprintable() or char in "\n\t" else "\ufffd" for char in text)
+    text = without_sequences(text)
+    return escaped(text if len(text) <= MAX_TEXT else f"{text[:MAX_TEXT]}…")
 
 
 def graph_values(dataflow: Dataflow) -> dict[str, Any]:

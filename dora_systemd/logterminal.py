@@ -9,6 +9,8 @@ import time
 import zlib
 from collections.abc import Iterable, Mapping
 
+from dora_systemd.terminaltext import one_line, shown_log
+
 # The beginning of a line of `journalctl -o short`, with or without journalctl's own colours, or
 # what it puts before the second and later lines of a message.
 _PREFIX = re.compile(
@@ -51,14 +53,16 @@ class TerminalLines:
         data = self._rest + data
         end = data.rfind(b"\n") + 1
         self._rest = data[end:]
-        return _PREFIX.sub(self._rewrite, data[:end])
+        return _PREFIX.sub(self._rewrite, shown_log(data[:end]))
 
     def record(self, record: Mapping[str, bytes]) -> bytes:
         """The line, or lines, of one record of the Journal Export Format."""
         seconds = int(record.get("__REALTIME_TIMESTAMP", b"0")) // 1_000_000
         when = time.strftime("%b %d %H:%M:%S", time.localtime(seconds)).encode()
         start = self._start(when, *record.get("SYSLOG_IDENTIFIER", b"").partition(b"/")[::2])
-        text = record.get("MESSAGE", b"").replace(b"\n", b"\n" + b" " * self._new_indent)
+        text = record.get("MESSAGE", b"")
+        text = shown_log(text) if self._want_colors else text
+        text = text.replace(b"\n", b"\n" + b" " * self._new_indent)
         color = _MESSAGE_COLORS.get(record.get("PRIORITY", b""))
         if color and self._want_colors:
             text = color + text + b"\x1b[0m"
@@ -83,7 +87,7 @@ class TerminalLines:
         return b"%s %s " % (when, label)
 
     def _label(self, name: bytes) -> bytes:
-        text = name.decode("utf-8", "replace")
+        text = one_line(name.decode("utf-8", "replace"))
         if len(text) > self._width:
             self._width = min(len(text), MAX_WIDTH)
             self._labels.clear()
@@ -91,6 +95,22 @@ class TerminalLines:
         if self._want_colors:
             padded = f"\x1b[{color_of(text)}m{padded}\x1b[0m"
         return self._labels.setdefault(name, padded.encode("utf-8", "replace"))
+
+
+class ShownLines:
+    """Lines of journalctl's other forms, for a terminal: as they are, but for what commands it."""
+
+    def __init__(self) -> None:
+        self._rest = b""
+
+    def feed(self, data: bytes) -> bytes:
+        """The lines that `data` completes."""
+        whole, end, rest = data.rpartition(b"\n")
+        if not end:
+            self._rest += data
+            return b""
+        done, self._rest = self._rest + whole + end, rest
+        return shown_log(done)
 
 
 def _escapes(text: bytes) -> int:

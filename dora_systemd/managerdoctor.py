@@ -40,6 +40,7 @@ from dora_systemd.process import (
 )
 from dora_systemd.proctable import listening_sockets, read_processes, socket_owners
 from dora_systemd.scope import RUNTIME_NAME, Scope
+from dora_systemd.trust.paths import exists
 from dora_systemd.unitfile import BOOT_TARGET, runner_of
 from dora_systemd.unitfiles import read_unit_file
 
@@ -133,7 +134,7 @@ def _enabled(path: Path) -> Iterator[Finding]:
         broken = "is gone" if text is None else "starts no dataflow"
         remedy = f"systemctl disable {path.name}"
         yield Finding("boot", State.WARNING, f"{path} is enabled and {broken}", remedy)
-    elif not Path(options.dataflow).exists():
+    elif not exists(options.dataflow):
         text = f"{options.name} is enabled, but {options.dataflow} is not there"
         yield Finding("boot", State.WARNING, text, f"doractl disable {options.name}")
 

@@ -115,7 +115,7 @@ def follow_to_end(query: LogQuery, print_query: Callable[[LogQuery], object]) ->
     from dora_systemd.bus import Bus
 
     start_us = time.time_ns() // 1000
-    bus = Bus(query.scope)
+    bus = Bus(query.scope, for_reading=True)
     with (
         closing(UnitWatch(query.scope, query.name, start_us)) as watch,
         TemporaryDirectory(prefix="doractl-") as directory,

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 from dora_systemd import cgroup
 from dora_systemd.busprotocol import Manager
-from dora_systemd.cellpaths import CellPaths
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.managerbudget import restart_budget
 from dora_systemd.managercells import Cell, matching_cells, read_cells, select_cell
@@ -26,6 +25,7 @@ from dora_systemd.status import (
     throttled_percent,
 )
 from dora_systemd.statuswords import DataflowRow, NodeRow, status_word
+from dora_systemd.trust.cells import read_table
 from dora_systemd.usage import UNLIMITED, Usage
 from dora_systemd.values import SECOND
 
@@ -38,13 +38,15 @@ _MICROSECOND_NS = 1000
 class Reading(NamedTuple):
     """One look at a dataflow: what systemd and its runner say, and what its groups have used.
 
-    unit: properties of its unit. groups, usage: by node, WHOLE_CELL is the unit's own; empty for a
-    dataflow that is not up. at_us: when, CLOCK_MONOTONIC.
+    unit: properties of its unit. problem: why its node table says nothing, or "". groups, usage:
+    by node, WHOLE_CELL is the unit's own; empty for a dataflow that is not up. at_us: when,
+    CLOCK_MONOTONIC.
     """
 
     cell: Cell
     unit: Mapping[str, Any]
     status: CellStatus = CellStatus()
+    problem: str = ""
     groups: Mapping[str, Path] = {}
     usage: Mapping[str, Usage] = {}
     at_us: int = 0
@@ -66,18 +68,19 @@ def read_dataflow(
 
     slice_path: where the groups of dataflows usually are, for no more than the table of `list` has.
     """
-    status = read_status(scope, cell) if cell.is_up else CellStatus()
+    status, problem = look_at_table(scope, cell) if cell.is_up else (CellStatus(), "")
     path = slice_path / cell.unit if slice_path else None
     path = path if path and path.is_dir() else None
     unit = manager.read(cell.unit, _few(cell, status, path) if slice_path else _ALL)
     if not cell.is_up or not (path or unit["ControlGroup"]):
-        return Reading(cell, unit, status)
+        return Reading(cell, unit, status, problem)
     path = path or cgroup.group_path(unit["ControlGroup"])
-    # Without the runner's table the groups are all that is known of the nodes.
-    nodes = cgroup.node_groups(path) if not slice_path or not status.nodes else {}
+    # Without the runner's table the groups are all that is known of the nodes, and even those
+    # their user can make. With it, those that it names are enough.
+    nodes = cgroup.shown_groups(path, status.nodes) if not slice_path or not status.nodes else {}
     groups = {WHOLE_CELL: path, **nodes}
     usage = {key: cgroup.read_usage(group) for key, group in groups.items()}
-    return Reading(cell, unit, status, groups, usage, _monotonic_us())
+    return Reading(cell, unit, status, problem, groups, usage, _monotonic_us())
 
 
 def _few(cell: Cell, status: CellStatus, path: Path | None) -> list[str]:
@@ -104,6 +107,7 @@ def row_of(reading: Reading, before: Reading | None = None) -> DataflowRow:
         "dataflow": cell.options.dataflow,
         "text": unit.get("StatusText", ""),
         "restarts": unit["NRestarts"] + status.node_restarts,
+        "problem": reading.problem,
     }
     if not reading.usage:
         return DataflowRow(**facts)
@@ -149,12 +153,20 @@ def find_row(manager: Manager, scope: Scope, selector: str) -> DataflowRow:
 
 
 def read_status(scope: Scope, cell: Cell) -> CellStatus:
-    """The runner's node table; an empty one where it is missing or another user's."""
+    """The runner's node table; an empty one where there is none that can be believed."""
+    return look_at_table(scope, cell)[0]
+
+
+def look_at_table(scope: Scope, cell: Cell) -> tuple[CellStatus, str]:
+    """The runner's node table, and what is wrong with it, or "".
+
+    It is empty then, and where it is missing or another user's: the nodes' user can break his own
+    table, but not the list of all.
+    """
     try:
-        text = CellPaths(scope.cell_directory(cell.name)).status.read_text()
-        return CellStatus.from_json(text)
-    except (OSError, UnicodeDecodeError, DoraSystemdError):
-        return CellStatus()
+        return read_table(scope.cell_directory(cell.name)) or CellStatus(), ""
+    except DoraSystemdError as error:
+        return CellStatus(), error.message
 
 
 def _life(unit: Mapping[str, Any]) -> dict[str, Any]:

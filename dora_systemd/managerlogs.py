@@ -22,7 +22,7 @@ from dora_systemd.logquery import (
     query_arguments,
     query_matches,
 )
-from dora_systemd.logterminal import TerminalLines
+from dora_systemd.logterminal import ShownLines, TerminalLines
 from dora_systemd.names import is_uuid_prefix, name_from_unit
 from dora_systemd.scope import Scope
 from dora_systemd.suggestions import did_you_mean
@@ -143,7 +143,9 @@ def _select_run(journal: Journal, query: LogQuery, run: str) -> LogQuery:
     return replace(query, invocation=invocation)
 
 
-def read_logs(query: LogQuery, terminal: TerminalLines | None = None) -> Iterator[bytes]:
+def read_logs(
+    query: LogQuery, terminal: TerminalLines | ShownLines | None = None
+) -> Iterator[bytes]:
     """The output of journalctl for a query, in chunks; rewritten for a terminal if one is given.
 
     Raises DoraSystemdError: USAGE for a time or pattern that journalctl does not understand.

@@ -22,7 +22,7 @@ def read_versions(scope: Scope) -> dict[str, str | None]:
 
 def _systemd(scope: Scope) -> str | None:
     try:
-        return Bus(scope).version()
+        return Bus(scope, for_reading=True).version()
     except DoraSystemdError:
         return None
 

@@ -13,7 +13,7 @@ from dora_systemd.logquery import scope_matches, story_matches
 from dora_systemd.managerbudget import restart_budget
 from dora_systemd.managercells import Cell, find_cell, matching_cells, read_cells
 from dora_systemd.managerended import select_ended
-from dora_systemd.managerlist import read_status
+from dora_systemd.managerlist import look_at_table
 from dora_systemd.names import unit_name
 from dora_systemd.postmortem import examine
 from dora_systemd.postmortemtext import LINES, Report, Subject, Word
@@ -73,11 +73,11 @@ def _subject(scope: Scope, cell: Cell) -> Subject:
 
 
 def _facts(manager: Manager, scope: Scope, cell: Cell) -> Facts:
-    status = read_status(scope, cell) if cell.is_up else CellStatus()
+    status, problem = look_at_table(scope, cell) if cell.is_up else (CellStatus(), "")
     nodes, spent = status.nodes.items(), nodetable.spent(status.nodes)
     return Facts(
         status_word(cell.state.active, cell.state.sub, status.stage),
-        str(manager.read(cell.unit, ["StatusText"])["StatusText"]),
+        problem or str(manager.read(cell.unit, ["StatusText"])["StatusText"]),
         {key: spent.get(key, node.exit) for key, node in nodes if node.state == "failed"},
         tuple(key for key, node in nodes if node.state == "restarting"),
         _now_boot(),

@@ -16,6 +16,12 @@ MAX_NAME = 200
 """Characters of a name: unit names end at 255 (systemd.unit(5)), and node names follow in paths."""
 
 _NAME = re.compile(rf"[A-Za-z0-9][A-Za-z0-9._-]{{0,{MAX_NAME - 1}}}")
+MAX_NODE_ID = 200
+"""Characters of an id: "node-ID" names a cgroup and "ID.out" a pipe, and names end at 255 bytes."""
+
+NODE_ID = re.compile(r"(?!\.)[A-Za-z0-9_.-]+")
+"""Dora's own rule for the id of a node."""
+
 _UNIT_TYPES = (
     *("service", "socket", "device", "mount", "automount", "swap"),
     *("target", "path", "timer", "slice", "scope"),
@@ -27,6 +33,14 @@ _MIN_PREFIX = 4
 _HINT = (
     f"a name is 1 to {MAX_NAME} letters, digits, '.', '_' or '-', and begins with a letter or digit"
 )
+
+
+def is_name(text: str) -> bool:
+    """Whether a dataflow can be called so."""
+    try:
+        return parse_name(text) == text
+    except DoraSystemdError:
+        return False
 
 
 def parse_name(text: str) -> str:
@@ -81,6 +95,16 @@ def name_from_unit(unit: str) -> str | None:
         return parse_name(unit.removeprefix(UNIT_PREFIX).removesuffix(UNIT_SUFFIX))
     except DoraSystemdError:
         return None
+
+
+def is_node_id(text: str) -> bool:
+    """Whether dora lets a node be called so, and a cgroup can."""
+    return len(text) <= MAX_NODE_ID and NODE_ID.fullmatch(text) is not None
+
+
+def is_uuid(text: str) -> bool:
+    """Whether it is a UUID, in lower case and with dashes."""
+    return _UUID.fullmatch(text) is not None
 
 
 def parse_uuid(text: str) -> str:

@@ -1,5 +1,6 @@
 """The verdict of `doractl why` as one screen of text, or as values for JSON."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -9,6 +10,7 @@ from dora_systemd.lifestory import Happening
 from dora_systemd.restarts import budget_words
 from dora_systemd.sandboxsigns import sandbox_remedy
 from dora_systemd.statuswords import RESTARTING, UNKNOWN, local_time
+from dora_systemd.terminaltext import one_line
 from dora_systemd.values import SECOND, format_duration, format_rounded_size
 from dora_systemd.verdict import Restart, Verdict
 
@@ -18,6 +20,7 @@ _TOLD = ("event", "node", "nodes", "dataflow", "dataflow_name", "downstream", "c
 LINES = 20
 """How many of the last lines are shown."""
 _TIMELINE = 7
+_SIZE = re.compile("[1-9][0-9]{0,18}")
 _TITLE_WIDTH = 10
 _RED, _GREEN, _BOLD, _PLAIN = "\x1b[31m", "\x1b[32m", "\x1b[1m", "\x1b[0m"
 
@@ -130,7 +133,8 @@ def _remedy(verdict: Verdict) -> str:
 def format_report(report: Report, width: int | None = None, want_colors: bool = False) -> str:
     """The report as at most 45 lines, each cut at `width` characters if that is given."""
     blocks = [_head(report), _timeline(report), _words(report), _todo(report)]
-    lines = "\n\n".join("\n".join(block) for block in blocks if block).split("\n")
+    # What nodes wrote must not command the terminal, nor make a line of its own here.
+    lines = [one_line(line) for block in blocks if block for line in (*block, "")][:-1]
     cut = [line if width is None else _cut(line, width) for line in lines]
     return "\n".join(_colored(cut, report.verdict)) if want_colors else "\n".join(cut)
 
@@ -165,7 +169,7 @@ def _head(report: Report) -> list[str]:
     }
     title = f"{subject.name}: {verdict.status}"
     rows = [f"  {key + ':':<{_TITLE_WIDTH}}{text}" for key, text in facts.items() if text]
-    return [_printable(one) for one in (title, *rows)]
+    return [title, *rows]
 
 
 def _budget_words(report: Report) -> str:
@@ -194,7 +198,7 @@ def _memory_words(details: Mapping[str, str]) -> str:
     sizes = [
         f"{words} {format_rounded_size(int(details[key]))}"
         for key, words in (("peak", "peak"), ("limit", "limit"), ("held", "held"))
-        if details.get(key, "").isdecimal() and details.get(key) != "0"
+        if _SIZE.fullmatch(details.get(key, ""))
     ]
     owner = {"dataflow": " of the dataflow", "machine": "; the machine had none left"}
     return ", ".join(sizes) + owner.get(details.get("owner", ""), "") if sizes else ""
@@ -222,7 +226,7 @@ def _timeline(report: Report) -> list[str]:
 
 
 def _news(one: Happening) -> str:
-    return f"  {_clock(one.at_us)}  {_printable(one.text or one.name)}"
+    return f"  {_clock(one.at_us)}  {one.text or one.name}"
 
 
 def _clock(moment: int) -> str:
@@ -240,18 +244,12 @@ def _words(report: Report) -> list[str]:
 
 
 def _line(word: Word, node: str) -> str:
-    text = _printable(word.text)
-    return text if node else f"{word.node}: {text}"
+    return word.text if node else f"{word.node}: {word.text}"
 
 
 def _todo(report: Report) -> list[str]:
     found = remedies(report)
-    return ["What to do:", *(f"  {_printable(one)}" for one in found)] if found else []
-
-
-def _printable(text: str) -> str:
-    """What a node wrote must not command the terminal."""
-    return "".join(c if c.isprintable() else " " if c in "\n\t" else "�" for c in text)
+    return ["What to do:", *(f"  {one}" for one in found)] if found else []
 
 
 def report_values(report: Report) -> dict[str, Any]:

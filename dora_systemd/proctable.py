@@ -14,6 +14,7 @@ from dora_systemd.diagnosis import Process
 PROC = Path("/proc")
 
 _LISTENING = "0A"
+_MOST_BYTES = 256 * 1024
 _SOCKET = re.compile(r"socket:\[(\d+)\]")
 
 
@@ -43,7 +44,7 @@ def socket_owners(inodes: Collection[str]) -> frozenset[int]:
 
 def _read_process(path: Path) -> Process | None:
     try:
-        command = (path / "cmdline").read_text(errors="replace").split("\0")[:-1]
+        command = _beginning(path / "cmdline").decode(errors="replace").split("\0")[:-1]
         # The name may hold blanks and parentheses; what follows it does not.
         parent = int((path / "stat").read_text(errors="replace").rpartition(")")[2].split()[1])
         group = (path / "cgroup").read_text().rpartition("0::")[2].strip()
@@ -56,9 +57,15 @@ def _read_process(path: Path) -> Process | None:
 
 def _is_node(path: Path) -> bool:
     try:
-        return b"\0DORA_NODE_CONFIG=" in b"\0" + (path / "environ").read_bytes()
+        return b"\0DORA_NODE_CONFIG=" in b"\0" + _beginning(path / "environ")
     except OSError:
         return False
+
+
+def _beginning(path: Path) -> bytes:
+    """As much as is needed: a process can have megabytes of arguments, and there are many."""
+    with path.open("rb") as file:
+        return file.read(_MOST_BYTES)
 
 
 def _holds(directory: Path, inodes: Collection[str]) -> bool:

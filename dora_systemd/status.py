@@ -1,10 +1,13 @@
 """The live table of one cell: what its runner writes to status.json and what `list` reads there."""
 
 import json
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import is_node_id
+
+Value = TypeVar("Value")
 
 STAGES = ("starting", "waiting", "running", "degraded", "stopping", "ended")
 NODE_STATES = (
@@ -25,6 +28,16 @@ WHOLE_CELL = ""
 """The key of a CPU sample that stands for the unit's whole cgroup."""
 SAMPLES_KEPT = 2
 SHORTEST_WINDOW_US = 1_000_000
+
+MAX_NODES = 2000
+"""Nodes of a table that is believed."""
+_MAX_SAMPLES = 8
+_MAX_TEXT = 1000
+"""Characters that are kept of a text."""
+_MAX_NUMBER = 2**63 - 1
+_MAX_TIME = 253_370_764_800_000_000
+"""The year 9999, CLOCK_REALTIME in µs: the last one that a date can be made of."""
+_UNREADABLE = (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError)
 
 
 class NodeStatus(NamedTuple):
@@ -116,16 +129,17 @@ class CellStatus(NamedTuple):
         return json.dumps(values)
 
     @classmethod
-    def from_json(cls, text: str) -> "CellStatus":
-        """Inverse of to_json. Unknown keys are left aside: the runner may be a newer version.
+    def from_json(cls, text: str | bytes) -> "CellStatus":
+        """Inverse of to_json, of a text that the nodes' user may have written instead of a runner.
 
-        Raises DoraSystemdError when the text is not such a table at all.
+        Unknown keys are left aside: the runner may be a newer version. Raises DoraSystemdError for
+        everything that no runner writes.
         """
         try:
-            return _parse_cell(json.loads(text))
-        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            return _parse_cell(json.loads(text, parse_constant=_refuse_constant))
+        except _UNREADABLE as error:
             raise DoraSystemdError(
-                f"cannot read the node table of a dataflow: {error}",
+                f"cannot read the node table of a dataflow: {_reason(error)}",
                 "it was written by another version of dora-systemd, or damaged",
                 ExitCode.FAILURE,
             ) from error
@@ -166,29 +180,111 @@ def _window_start(samples: tuple[CpuSample, ...], now: CpuSample) -> CpuSample:
     return old_enough[-1] if old_enough else next(iter(samples), CpuSample(0))
 
 
+class _Wrong(ValueError):
+    """What is wrong with a table; other errors have words of Python's."""
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, _Wrong):
+        return str(error)
+    return "it is nested too deeply" if isinstance(error, RecursionError) else "it is not JSON"
+
+
+def _refuse_constant(name: str) -> float:
+    raise _Wrong(f"{name} is no number")
+
+
 def _parse_cell(raw: Any) -> CellStatus:
-    known = _known(CellStatus, raw)
-    nodes = {
-        str(key): NodeStatus(**_known(NodeStatus, node))
-        for key, node in known.pop("nodes", {}).items()
-    }
-    samples = tuple(_parse_sample(one) for one in known.pop("samples", ()))
-    lines = {str(key): LineCount(*map(int, one)) for key, one in known.pop("lines", {}).items()}
-    return CellStatus(**known, nodes=nodes, samples=samples, lines=lines)
+    known = _object(raw, "the table")
+    nodes = _by_node(known.get("nodes", {}), _parse_node)
+    if WHOLE_CELL in nodes:
+        raise _Wrong("it has a node without an id")
+    samples = known.get("samples", [])
+    if not isinstance(samples, list) or len(samples) > _MAX_SAMPLES:
+        raise _Wrong("its samples are no short list")
+    return CellStatus(
+        uuid=_text(known, "uuid"),
+        run=_text(known, "run"),
+        stage=_word(known, "stage", STAGES),
+        text=_text(known, "text"),
+        started_us=_number(known, "started_us", _MAX_TIME),
+        ready_us=_number(known, "ready_us", _MAX_TIME),
+        nodes=nodes,
+        samples=tuple(map(_parse_sample, samples)),
+        lines=_by_node(known.get("lines", {}), lambda one: LineCount(*_numbers(one, 3))),
+    )
+
+
+def _parse_node(raw: Any) -> NodeStatus:
+    known = _object(raw, "a node")
+    return NodeStatus(
+        state=_word(known, "state", NODE_STATES),
+        pid=_number(known, "pid"),
+        restarts=_number(known, "restarts"),
+        since_us=_number(known, "since_us", _MAX_TIME),
+        exit=_text(known, "exit"),
+        kind=_text(known, "kind"),
+        policy=_text(known, "policy", "never"),
+        max_restarts=_number(known, "max_restarts"),
+        hung=_text(known, "hung"),
+    )
 
 
 def _parse_sample(raw: Any) -> CpuSample:
-    usage = {str(key): int(value) for key, value in raw.get("cpu_us", {}).items()}
-    throttling = {
-        str(key): (int(one), int(two)) for key, (one, two) in raw.get("throttling", {}).items()
-    }
-    return CpuSample(int(raw["at_us"]), usage, throttling)
+    known = _object(raw, "a sample")
+    if "at_us" not in known:
+        raise _Wrong("a sample has no time")
+    return CpuSample(
+        _number(known, "at_us"),
+        _by_node(known.get("cpu_us", {}), lambda one: _numbers([one], 1)[0]),
+        _by_node(known.get("throttling", {}), lambda pair: _pair(_numbers(pair, 2))),
+    )
 
 
-def _known(kind: type[Any], raw: Any) -> dict[str, Any]:
-    defaults = kind._field_defaults
-    return {
-        key: type(defaults[key])(value) if isinstance(defaults[key], int | str) else value
-        for key, value in raw.items()
-        if key in defaults
-    }
+def _object(raw: Any, what: str) -> dict[str, Any]:
+    if not isinstance(raw, dict):
+        raise _Wrong(f"{what} is no object")
+    return raw
+
+
+def _by_node(raw: Any, parse: Callable[[Any], Value]) -> dict[str, Value]:
+    given = _object(raw, "what is kept by node")
+    if len(given) > MAX_NODES + 1:
+        raise _Wrong(f"it has more than {MAX_NODES} nodes")
+    if any(key != WHOLE_CELL and not is_node_id(key) for key in given):
+        raise _Wrong("it has a node whose id dora would refuse")
+    return {key: parse(value) for key, value in given.items()}
+
+
+def _text(raw: Mapping[str, Any], key: str, default: str = "") -> str:
+    value = raw.get(key, default)
+    if not isinstance(value, str):
+        raise _Wrong(f"its {key} is no text")
+    return value[:_MAX_TEXT]
+
+
+def _word(raw: Mapping[str, Any], key: str, words: Sequence[str]) -> str:
+    value = raw.get(key, words[0])
+    if value not in words:
+        raise _Wrong(f"its {key} is none of those there are")
+    return str(value)
+
+
+def _number(raw: Mapping[str, Any], key: str, most: int = _MAX_NUMBER) -> int:
+    return _checked(raw.get(key, 0), most)
+
+
+def _numbers(raw: Any, count: int) -> list[int]:
+    if not isinstance(raw, list) or len(raw) != count:
+        raise _Wrong(f"it has no {count} numbers where it should")
+    return [_checked(one, _MAX_NUMBER) for one in raw]
+
+
+def _pair(numbers: list[int]) -> tuple[int, int]:
+    return numbers[0], numbers[1]
+
+
+def _checked(value: Any, most: int) -> int:
+    if type(value) is not int or not 0 <= value <= most:
+        raise _Wrong("it has a number that cannot be")
+    return value

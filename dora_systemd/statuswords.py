@@ -25,6 +25,8 @@ _BY_ACTIVE = {
 _BY_STAGE = {"degraded": DEGRADED, "stopping": STOPPING}
 
 UNKNOWN = "-"
+UNREADABLE = "?"
+"""For the nodes of a dataflow whose node table is not what its runner writes."""
 SHORTEST_PREFIX = 8
 
 
@@ -55,7 +57,7 @@ class DataflowRow(NamedTuple):
     """One line of `list`. uptime in µs; started, ended in CLOCK_REALTIME µs, 0: not known.
 
     The numbers are those of NodeRow, for the whole dataflow.
-    enabled: whether a boot starts it.
+    enabled: whether a boot starts it. problem: why its node table is not believed, or "".
     """
 
     uuid: str
@@ -79,6 +81,7 @@ class DataflowRow(NamedTuple):
     restart_budget: Mapping[str, int | None] | None = None
     nodes: tuple[NodeRow, ...] = ()
     enabled: bool = False
+    problem: str = ""
 
 
 def status_word(active: str, sub: str, stage: str = "") -> str:
@@ -164,12 +167,18 @@ def _dataflow_cells(row: DataflowRow, prefix: str) -> tuple[str, ...]:
         row.name,
         row.status,
         format_uptime(row.uptime),
-        f"{row.nodes_alive}/{row.nodes_total}" if row.nodes_total else UNKNOWN,
+        _node_count(row),
         format_percent(row.cpu_percent),
         format_memory(row.memory, row.memory_limit),
         format_count(row.restarts),
         "yes" if row.enabled else UNKNOWN,
     )
+
+
+def _node_count(row: DataflowRow) -> str:
+    if row.problem:
+        return UNREADABLE
+    return f"{row.nodes_alive}/{row.nodes_total}" if row.nodes_total else UNKNOWN
 
 
 def format_nodes(rows: Sequence[NodeRow]) -> str:
@@ -217,6 +226,7 @@ def format_dataflow(row: DataflowRow) -> str:
         ("Uptime", format_uptime(row.uptime)),
         ("Started", local_time(row.started)),
         ("Ended", local_time(row.ended) if row.ended else ""),
+        ("Nodes", row.problem),
         ("CPU", _cpu_words(row)),
         ("Memory", _memory_words(row)),
         ("Restarts", format_count(row.restarts)),

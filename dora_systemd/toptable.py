@@ -7,6 +7,7 @@ from typing import Any
 from dora_systemd.status import ALIVE_NODE_STATES, WHOLE_CELL
 from dora_systemd.statuswords import (
     UNKNOWN,
+    UNREADABLE,
     DataflowRow,
     NodeRow,
     format_count,
@@ -64,7 +65,8 @@ def format_top(look: Look, by: str) -> str:
 def _lines(entry: TopEntry, look: Look, by: str) -> list[tuple[str, ...]]:
     row = entry.row
     nodes = row.nodes if by == "name" else sorted(row.nodes, key=lambda one: -_amount(one, by))
-    state = f"{row.status} {row.nodes_alive}/{row.nodes_total}" if row.nodes_total else row.status
+    count = UNREADABLE if row.problem else f"{row.nodes_alive}/{row.nodes_total}"
+    state = f"{row.status} {count}" if row.nodes_total or row.problem else row.status
     first = (row.name, state, format_uptime(row.uptime), *_numbers(row, entry.waits, WHOLE_CELL))
     return [first, *(_node_line(node, entry, look) for node in nodes)]
 

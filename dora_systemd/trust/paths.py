@@ -19,8 +19,8 @@ import os
 import pwd
 import stat
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import shown
@@ -45,8 +45,7 @@ _REASONS = {
 }
 
 
-@dataclass(frozen=True)
-class Place:
+class Place(NamedTuple):
     """Where a walk has arrived.
 
     uid: owner of the thing. owners: of it and of all directories above it. shared: a directory
@@ -80,8 +79,7 @@ class Place:
         return ""
 
 
-@dataclass(frozen=True)
-class Text:
+class Text(NamedTuple):
     """A file that was read, and the place of the descriptor that it was read from."""
 
     data: bytes

@@ -4,10 +4,13 @@ By hand, in the lab, with the gateway up: python -m tests.system.gatewayload 60
 """
 
 import http.client
+import subprocess
 import sys
 import time
 from collections import Counter
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -56,6 +59,34 @@ def ask_steadily(port: int, paths: tuple[str, ...], seconds: float) -> Load:
             answers[f"{path} {status}"] += 1
             longest = max(longest, took)
     return Load(answers, longest, time.monotonic() - begin)
+
+
+HALF_OPEN = """
+import socket, sys, time
+held = []
+for _ in range(int(sys.argv[2])):
+    held.append(socket.create_connection(("127.0.0.1", int(sys.argv[1])), 5))
+    try:
+        held[-1].send(b"GET / HTTP/1.1\\r\\n")
+    except OSError:
+        pass
+print("held", flush=True)
+time.sleep(float(sys.argv[3]))
+"""
+
+
+@contextmanager
+def half_open(port: int, user: str, count: int, seconds: float) -> Iterator[None]:
+    """A user who begins so many requests at once and ends none of them."""
+    script = ["python3", "-c", HALF_OPEN, str(port), str(count), str(seconds)]
+    command = ["runuser", "-u", user, "--", *script]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as child:
+        assert child.stdout
+        assert child.stdout.readline() == "held\n"
+        try:
+            yield
+        finally:
+            child.kill()
 
 
 def _ask(port: int, begin: float, number: int, path: str) -> tuple[str, int, float]:

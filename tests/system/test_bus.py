@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -61,3 +62,25 @@ def test_a_connection_ends_with_its_object() -> None:
     for _ in range(3):
         bus.Bus(scope_of(None)).version()
     assert len(list(Path("/proc/self/fd").iterdir())) == before
+
+
+@pytest.mark.lab
+def test_a_message_bus_that_does_not_answer() -> None:
+    """Root reads without it; the rest is told in time."""
+    unit = "dbus.service"
+    run("systemctl", "kill", "--signal=STOP", unit)
+    try:
+        begin = time.monotonic()
+        assert run("doractl", "list").stdout == "No dataflow is running.\n"
+        assert time.monotonic() - begin < 3
+        for switch, verb in (("root", "restart"), ("alice", "list")):
+            begin = time.monotonic()
+            done = run("runuser", "-u", switch, "--", "doractl", "--system", verb, "x", check=False)
+            assert time.monotonic() - begin < 8
+            assert done.returncode == ExitCode.NO_SYSTEMD
+            assert done.stderr.startswith(
+                "doractl: cannot reach systemd: the message bus does not answer\n"
+            )
+    finally:
+        run("systemctl", "kill", "--signal=CONT", unit)
+    assert bus.Bus(scope_of(None)).version()

@@ -3,6 +3,7 @@
 import os
 import signal
 import socket
+import time
 
 import pytest
 from websockets.exceptions import InvalidStatus
@@ -13,7 +14,7 @@ from dora_systemd.errors import ExitCode
 from dora_systemd.gatewayplace import SERVICE_UNIT, SOCKET_UNIT
 from tests.system.cells import Cell, Project, run, wait_for
 from tests.system.gatewayfuzz import attack
-from tests.system.gatewayload import ask_steadily, read_use
+from tests.system.gatewayload import ask_steadily, half_open, read_use
 from tests.system.gateways import Front
 
 # Speaks as several users, and opens the port.
@@ -220,3 +221,21 @@ def test_many_who_say_nothing(front: Front) -> None:
     wait_for("connections end", lambda: read_use(pid).descriptors < 30)
     assert front.pid == pid
     assert "Traceback" not in front.journal()
+
+
+def test_a_stranger_cannot_shut_the_others_out(front: Front) -> None:
+    """He holds 400 requests half open; root is answered at once, and he is let go of soon."""
+    front.up()
+    assert front.get("/health").status == 200
+    with half_open(front.port, "alice", 400, 20):
+        begin = time.monotonic()
+        answers = [front.get("/metrics").status for _ in range(5)]
+        took = time.monotonic() - begin
+        assert answers == [200] * 5
+        assert took < 5
+        open_ones = f"state established sport = :{front.port}".split()
+        count = len(run("ss", "-Htn", *open_ones).stdout.splitlines())
+        assert count <= 16
+        wait_for("they are let go of", lambda: not run("ss", "-Htn", *open_ones).stdout, 5)
+        token = f"Authorization: Bearer {front.token}"
+        assert front.get("/metrics", "-H", token, user="alice").status == 200

@@ -4,7 +4,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dora_systemd.gatewayaccess import Caller, has_token, refuse_address, refuse_user
+from dora_systemd.gatewayaccess import (
+    MAX_CONNECTIONS,
+    MAX_OF_STRANGER,
+    MAX_STRANGERS,
+    Caller,
+    Door,
+    has_token,
+    refuse_address,
+    refuse_user,
+)
 
 TOKEN = "3f" * 32
 ME, OTHER = 1000, 1001
@@ -97,3 +106,22 @@ def test_nothing_else_is_a_token(text: str) -> None:
 def test_two_tokens_are_none() -> None:
     right = f"Bearer {TOKEN}"
     assert not has_token(Caller(OTHER, authorizations=[right, right]), TOKEN)
+
+
+def test_whatever_others_do_root_and_the_owner_get_in() -> None:
+    door = Door(ME)
+    strangers = [*([OTHER] * 400), *([None] * 100), *range(2000, 2100)]
+    inside = [uid for uid in strangers if door.enter(uid)]
+    assert len(inside) == MAX_STRANGERS
+    assert inside.count(OTHER) == MAX_OF_STRANGER
+    assert all(door.enter(uid) for uid in [0, ME] * (MAX_CONNECTIONS // 2))
+    assert not door.enter(0)
+    for uid in (OTHER, ME):
+        door.leave(uid)
+        assert door.enter(uid)
+        assert not door.enter(uid)
+
+
+def test_who_is_a_stranger() -> None:
+    assert [uid for uid in (0, ME, OTHER, None) if Door(ME).is_stranger(uid)] == [OTHER, None]
+    assert Door(0).is_stranger(ME)

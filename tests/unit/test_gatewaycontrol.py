@@ -92,6 +92,9 @@ def test_requests(params: Any, name: str, body: dict[str, str]) -> None:
         frame({"Stop": {}, "List": {}}),
         frame({"Stop": "now"}),
         frame({"Stop": {"name": "\ud800"}}),
+        frame({"Start": {"local_working_dir": "/\0"}}),
+        frame({"Start": {"local_working_dir": "/\\\0"}}),
+        frame({"St\0op": {}}),
         "[" * 100_000,
     ],
 )
@@ -99,6 +102,11 @@ def test_frames_that_are_none(text: str | bytes) -> None:
     found = parse_request(text)
     assert isinstance(found, Malformed)
     assert found.reason.startswith("cannot ")
+
+
+def test_a_backslash_is_no_nul() -> None:
+    text = frame({"Start": {"local_working_dir": r"/\u0000"}})
+    assert isinstance(parse_request(text), Request)
 
 
 def test_the_fields_of_a_request() -> None:

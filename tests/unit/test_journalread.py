@@ -1,5 +1,7 @@
 """journalctl as a child process, played by a script."""
 
+import json
+import shlex
 from pathlib import Path
 
 import pytest
@@ -67,17 +69,17 @@ def test_nodes(journalctl: Path) -> None:
 
 def test_last_event_of_each_dataflow(journalctl: Path) -> None:
     records = [
-        '{"DORA_DATAFLOW":"u2","DORA_DATAFLOW_NAME":"b","DORA_EVENT":"dataflow-failed",'
+        '{"DORA_DATAFLOW":"22222222-2222-2222-2222-222222222222","DORA_DATAFLOW_NAME":"b","_SYSTEMD_UNIT":"dora-b.service","DORA_EVENT":"dataflow-failed",'
         '"DORA_REASON":"daemon lost","__REALTIME_TIMESTAMP":"30"}',
-        '{"DORA_DATAFLOW":"u1","DORA_DATAFLOW_NAME":"a","DORA_EVENT":"dataflow-stopped",'
+        '{"DORA_DATAFLOW":"11111111-1111-1111-1111-111111111111","DORA_DATAFLOW_NAME":"a","_SYSTEMD_UNIT":"dora-a.service","DORA_EVENT":"dataflow-stopped",'
         '"__REALTIME_TIMESTAMP":"20"}',
-        '{"DORA_DATAFLOW":"u2","DORA_DATAFLOW_NAME":"b","DORA_EVENT":"dataflow-started",'
+        '{"DORA_DATAFLOW":"22222222-2222-2222-2222-222222222222","DORA_DATAFLOW_NAME":"b","_SYSTEMD_UNIT":"dora-b.service","DORA_EVENT":"dataflow-started",'
         '"__REALTIME_TIMESTAMP":"10"}',
     ]
     play(journalctl, "cat <<'E'\n" + "\n".join(records) + "\nE")
     first, second = JournalReader().last_events(SYSTEM)
     assert (first.name, first.event, first.detail) == ("b", "dataflow-failed", "daemon lost")
-    assert (second.uuid, second.event, second.at_us) == ("u1", "dataflow-stopped", 20)
+    assert (second.name, second.event, second.at_us) == ("a", "dataflow-stopped", 20)
     assert len(JournalReader().last_events(SYSTEM, limit=1)) == 1
 
 
@@ -122,3 +124,56 @@ def test_unreadable(
         check_readable(scope)
     assert caught.value.code is code
     assert word in caught.value.hint
+
+
+UUID = "550e8400-e29b-41d4-a716-446655440000"
+
+
+def test_records_in_the_name_of_others_are_left_out(journalctl: Path) -> None:
+    """A node can write any field; the unit that it wrote it in is journald's word."""
+    own = {"DORA_DATAFLOW": UUID, "DORA_EVENT": "dataflow-failed", "__REALTIME_TIMESTAMP": "9"}
+    good = {**own, "DORA_DATAFLOW_NAME": "a", "_SYSTEMD_UNIT": "dora-a.service"}
+    bad: list[dict[str, object]] = [
+        {**own, "DORA_DATAFLOW_NAME": "b", "_SYSTEMD_UNIT": "dora-a.service"},
+        {**own, "DORA_DATAFLOW_NAME": "a"},
+        {**own, "DORA_DATAFLOW_NAME": ["a", "b"], "_SYSTEMD_UNIT": "dora-a.service"},
+        {**own, "DORA_DATAFLOW_NAME": [27, 93], "_SYSTEMD_UNIT": "dora-a.service"},
+        {**own, "DORA_DATAFLOW_NAME": "\x1b]0;x", "_SYSTEMD_UNIT": "dora-\x1b]0;x.service"},
+        {**good, "DORA_DATAFLOW": "u1"},
+        {**good, "DORA_DATAFLOW": None},
+        {**good, "DORA_EVENT": ["dataflow-failed"]},
+    ]
+    lines = "\n".join(map(json.dumps, [*bad, good]))
+    play(journalctl, f"cat <<'E'\n{lines}\nE")
+    (event,) = JournalReader().last_events(SYSTEM)
+    assert (event.name, event.uuid) == ("a", UUID)
+    assert JournalReader().name_of(UUID) == "a"
+
+
+def test_an_endless_journal_has_an_end(journalctl: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(journalread, "MAX_BYTES", 1 << 20)
+    play(journalctl, """while :; do printf '{"MESSAGE":"%02000d"}\\n' 7; done""")
+    assert 0 < len(list(JournalReader().newest([], None))) < 600
+
+
+def test_a_journal_that_stops_in_the_middle(
+    journalctl: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(journalread, "READ_SECONDS", 0.3)
+    play(journalctl, """echo '{"MESSAGE":"x"}'; exec sleep 60""")
+    assert list(JournalReader().newest([], None)) == [{"MESSAGE": "x"}]
+
+
+def test_a_record_that_is_too_long_is_left_out(journalctl: Path) -> None:
+    long = """printf '{"MESSAGE":"'; head -c 3000000 /dev/zero | tr '\\0' 7; echo '"}'"""
+    play(journalctl, f"""echo '{{"MESSAGE":"a"}}'; {long}; echo '{{"MESSAGE":"b"}}'""")
+    found = [one["MESSAGE"] for one in JournalReader().newest([], None)]
+    assert found == ["a", "b"]
+
+
+def test_values_that_can_be_no_names(journalctl: Path) -> None:
+    names = ("robot", "../x", "\x1b]0;x", "a b", "robot/a\x1b")
+    play(journalctl, f"printf '%s\\n' {' '.join(map(shlex.quote, names))} {UUID} robot/a")
+    assert JournalReader().known_names() == [UUID, "robot"]
+    assert JournalReader().known_uuids() == [UUID]
+    assert JournalReader().known_nodes("robot") == ["a"]

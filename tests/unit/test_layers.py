@@ -105,6 +105,7 @@ DECISIONS = {
         "status",
         "statuswords",
         "suggestions",
+        "terminaltext",
         "toptable",
         "unitfile",
         "unitplaces",
@@ -116,7 +117,14 @@ DECISIONS = {
     ],
 }
 TRUST = {
-    "trust": ["trust.paths", "trust.programs", "trust.sight", "trust.sockets", "sockettable"],
+    "trust": [
+        "trust.cells",
+        "trust.paths",
+        "trust.programs",
+        "trust.sight",
+        "trust.sockets",
+        "sockettable",
+    ],
 }
 """The one door to what others own; the adapters go through it, too."""
 ADAPTERS = {

@@ -1,18 +1,25 @@
 """Rows of `list` from a fake systemd, a fake cgroup tree and a node table."""
 
+import os
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from dora_systemd import cgroup, managerlist
+from dora_systemd import cgroup, managerlist, managerwhy
+from dora_systemd.errors import DoraSystemdError
 from dora_systemd.managercells import read_cells
 from dora_systemd.managerlist import dataflow_row, find_row, read_rows
+from dora_systemd.managersnapshot import read_snapshot
+from dora_systemd.metrics import format_metrics
 from dora_systemd.scope import Scope
 from dora_systemd.status import CellStatus, CpuSample, NodeStatus
-from dora_systemd.statuswords import DataflowRow
-from tests.unit.fake_manager import FakeManager, ScopeIn, options
+from dora_systemd.statuswords import DataflowRow, format_dataflow, format_dataflows
+from dora_systemd.toptable import Look, TopEntry, format_top
+from dora_systemd.trust.cells import MAX_TABLE, read_table
+from tests.unit.fake_manager import UUID, FakeManager, ScopeIn, options
 
 GROUP = "/dora.slice/dora-robot.service"
 SECOND = 1_000_000
@@ -121,15 +128,119 @@ def test_node_table_that_cannot_be_read(scope: Scope) -> None:
     assert row.nodes[0].state == "unknown"
 
 
+DAMAGE: dict[str, Callable[[Path], object]] = {
+    "nothing": lambda path: path.write_text(""),
+    "no JSON": lambda path: path.write_text("{"),
+    "no object": lambda path: path.write_text("[]"),
+    "no nodes": lambda path: path.write_text('{"nodes": 3}'),
+    "no UTF-8": lambda path: path.write_bytes(b"\xff"),
+    "Infinity": lambda path: path.write_text('{"samples": [{"at_us": Infinity}]}'),
+    "deep": lambda path: path.write_text("[" * 100_000),
+    "huge": lambda path: path.write_bytes(b" " * (MAX_TABLE + 1)),
+    "ESC in an id": lambda path: path.write_text('{"nodes": {"a\\u001b]0;x": {}}}'),
+    "a FIFO": os.mkfifo,
+    "a directory": Path.mkdir,
+    "a device": lambda path: path.symlink_to("/dev/zero"),
+    "a circle": lambda path: path.symlink_to(path),
+}
+
+
 @pytest.mark.usefixtures("unit_group")
-@pytest.mark.parametrize("text", ["", "{", "[]", '{"nodes": 3}', "\udcff"])
-def test_damaged_node_table(scope: Scope, text: str) -> None:
+@pytest.mark.parametrize("what", DAMAGE)
+@pytest.mark.parametrize("with_details", [True, False])
+def test_damaged_node_table(scope: Scope, what: str, with_details: bool) -> None:
+    """It is a word in its own row, and the others are shown."""
     directory = scope.cell_directory("robot")
     directory.mkdir(parents=True)
-    (directory / "status.json").write_bytes(text.encode(errors="surrogateescape"))
+    DAMAGE[what](directory / "status.json")
+    manager = FakeManager()
+    now = now_us()
+    times: dict[str, Any] = {
+        "InactiveExitTimestampMonotonic": now,
+        "ActiveEnterTimestampMonotonic": now,
+    }
+    manager.add(options(), ControlGroup=GROUP, **times)
+    manager.add(options("other", UUID[:-1] + "1"), ControlGroup=GROUP, **times)
+    other, row = read_rows(manager, scope, with_details)
+    assert (row.status, bool(row.problem)) == ("Running", True)
+    assert (other.status, other.problem) == ("Running", "")
+    assert " ?  " in format_dataflows([row])
+    assert row.problem in format_dataflow(row)
+    assert " ?  " in format_top(Look(now, [TopEntry(row)]), "cpu")
+    assert format_metrics(read_snapshot(manager, scope), "1").count("dora_dataflow_info{") == 2
+    facts = managerwhy.explain(manager, scope, "robot", NoJournal())  # type: ignore[arg-type]
+    assert facts.verdict.now == row.problem
+
+
+class NoJournal:
+    """A journal without any record."""
+
+    def newest(self, *_words: object, **_more: object) -> Iterator[dict[str, Any]]:
+        return iter(())
+
+
+def test_a_table_of_a_stranger_is_not_believed(scope: Scope) -> None:
+    """The RuntimeDirectory is one user's, the file in it another's: somebody put it there."""
+    if os.geteuid():
+        pytest.skip("only root can make files of others")
+    directory = scope.cell_directory("robot")
+    write_status(scope, CellStatus(nodes={"a": NodeStatus()}))
+    os.chown(directory, 1000, 1000)
+    os.chown(directory / "status.json", 1001, 1001)
+    with pytest.raises(DoraSystemdError, match="not of the user whose dataflow it is"):
+        read_table(directory)
+    os.chown(directory / "status.json", 1000, 1000)
+    assert read_table(directory) is not None
+
+
+def test_a_secret_behind_a_link_is_not_read(scope: Scope, tmp_path: Path) -> None:
+    """Root would read it, and the parser's words would tell what is in it."""
+    if os.geteuid():
+        pytest.skip("links are refused to root alone")
+    directory = scope.cell_directory("robot")
+    directory.mkdir(parents=True)
+    os.chown(directory, 1000, 1000)
+    (tmp_path / "secret").write_text(CellStatus(nodes={"a": NodeStatus()}).to_json())
+    (directory / "status.json").symlink_to(tmp_path / "secret")
+    with pytest.raises(DoraSystemdError, match="symbolic link"):
+        read_table(directory)
+
+
+@pytest.mark.usefixtures("unit_group")
+def test_a_table_that_is_not_there_yet_is_no_problem(scope: Scope) -> None:
     manager = FakeManager()
     manager.add(options(), ControlGroup=GROUP)
-    assert row_of(manager, scope).status == "Running"
+    assert row_of(manager, scope).problem == ""
+
+
+def test_groups_that_the_nodes_user_has_made(scope: Scope, unit_group: Path) -> None:
+    for name in ("node-\x1b]0;x\a", "node-a\nb", "node-", "node-.x", "node-" + "x" * 201, "other"):
+        (unit_group / name).mkdir()
+    for count in range(cgroup.MAX_GROUPS + 10):
+        (unit_group / f"node-{count:05}").mkdir()
+    found = cgroup.shown_groups(unit_group)
+    assert len(found) == cgroup.MAX_GROUPS
+    assert all(node.isdigit() for node in found)
+    assert list(cgroup.shown_groups(unit_group, ["camera", "gone"])) == ["camera"]
+    manager = FakeManager()
+    manager.add(options(), ControlGroup=GROUP)
+    write_status(scope, CellStatus(nodes={"camera": NodeStatus("running")}))
+    reading = managerlist.read_dataflow(manager, scope, read_cells(manager)[0])
+    assert list(reading.usage) == ["", "camera"]
+
+
+def test_groups_that_are_nested_deeply(tmp_path: Path) -> None:
+    groups = [tmp_path / "/".join("a" * depth) for depth in range(1, 1100)]
+    for group in groups:
+        group.mkdir()
+    (groups[-1] / "cgroup.procs").write_text(f"{os.getpid()}\n")
+    found = cgroup.pids(tmp_path)
+    memory = cgroup.read_usage(tmp_path).memory
+    (groups[-1] / "cgroup.procs").unlink()
+    for group in reversed(groups):  # pytest's own way to remove them is recursive
+        group.rmdir()
+    assert found == [os.getpid()]
+    assert memory == 0  # so deep, it is not looked for
 
 
 @pytest.mark.usefixtures("unit_group")

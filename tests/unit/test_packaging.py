@@ -106,3 +106,12 @@ def test_upgrades_restart_nothing() -> None:
     assert re.search(
         r"^override_dh_installsystemd override_dh_installsystemduser:\n\n", rules, re.M
     )
+
+
+def test_root_does_nothing_in_directories_of_users() -> None:
+    """A user can put a link into the place of anything below /run/user/UID."""
+    for script in (PACKAGING / "debian").glob("dora-systemd.p*"):
+        for line in script.read_text().splitlines():
+            is_meant = "/run/user" in line or '"$place' in line
+            is_loop = line.lstrip().startswith(("#", "for place in "))
+            assert not is_meant or is_loop or "as_owner " in line, f"{script.name}: {line}"

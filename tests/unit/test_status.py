@@ -13,27 +13,33 @@ from dora_systemd.status import (
     STAGES,
     CellStatus,
     CpuSample,
+    LineCount,
     NodeStatus,
     add_sample,
     cpu_percent,
     throttled_percent,
 )
 
-counts = st.integers(0, 2**63)
+counts = st.integers(0, 2**63 - 1)
+times = st.integers(0, 2**56)
+ids = st.from_regex(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,20}", fullmatch=True)
 nodes = st.builds(
-    NodeStatus, st.sampled_from(NODE_STATES), counts, counts, counts, st.text(), st.text()
+    NodeStatus,
+    *(st.sampled_from(NODE_STATES), counts, counts, times, st.text(), st.text()),
+    max_restarts=counts,
 )
 samples = st.builds(
     CpuSample,
     counts,
-    st.dictionaries(st.text(), counts),
-    st.dictionaries(st.text(), st.tuples(counts, counts)),
+    st.dictionaries(ids | st.just(""), counts),
+    st.dictionaries(ids, st.tuples(counts, counts)),
 )
 cells = st.builds(
     CellStatus,
-    *(st.text(), st.text(), st.sampled_from(STAGES), st.text(), counts, counts),
-    st.dictionaries(st.text(), nodes),
+    *(st.text(), st.text(), st.sampled_from(STAGES), st.text(), times, times),
+    st.dictionaries(ids, nodes),
     st.lists(samples, max_size=2).map(tuple),
+    st.dictionaries(ids, st.builds(LineCount, counts, counts, counts)),
 )
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.text(),
@@ -59,7 +65,14 @@ def test_missing_keys_have_defaults() -> None:
 
 @given(json_values)
 def test_any_json_is_a_table_or_an_error(value: Any) -> None:
-    for text in (json.dumps(value), json.dumps({"nodes": value}), json.dumps({"samples": value})):
+    for text in (
+        json.dumps(value),
+        json.dumps({"nodes": value}),
+        json.dumps({"samples": value}),
+        json.dumps({"samples": [{"at_us": 1, "throttling": value, "cpu_us": value}]}),
+        json.dumps({"lines": value, "stage": value}),
+        json.dumps({"nodes": {"a": {"pid": value, "state": value}}}),
+    ):
         try:
             CellStatus.from_json(text)
         except DoraSystemdError as error:
@@ -70,6 +83,48 @@ def test_any_json_is_a_table_or_an_error(value: Any) -> None:
 def test_no_table(text: str) -> None:
     with pytest.raises(DoraSystemdError):
         CellStatus.from_json(text)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '{"started_us": Infinity}',
+        '{"ready_us": NaN}',
+        '{"samples": [{"at_us": -Infinity}]}',
+        '{"nodes": {"a": {"restarts": 1e999}}}',
+        '{"nodes": {"a": {"pid": "7"}}}',
+        '{"nodes": {"a": {"pid": true}}}',
+        '{"nodes": {"a": {"restarts": -1}}}',
+        '{"nodes": {"a": {"since_us": 99999999999999999999}}}',
+        '{"nodes": {"a": {"since_us": 1' + "0" * 5000 + "}}}",
+        '{"nodes": {"a": {"since_us": 253402300800000000}}}',
+        '{"nodes": {"a": {"state": "on fire"}}}',
+        '{"nodes": {"a": {"exit": ["x"]}}}',
+        '{"nodes": {"a\\u001b]0;pwned\\u0007": {}}}',
+        '{"nodes": {"a b": {}}}',
+        '{"nodes": {"": {}}}',
+        '{"nodes": {"../a": {}}}',
+        '{"samples": [{"at_us": 1, "cpu_us": {"a\\nb": 1}}]}',
+        '{"lines": {"a": [1, 2]}}',
+        '{"lines": {"a": "123"}}',
+        '{"stage": "weird"}',
+        '{"text": 7}',
+        "[" * 100_000,
+        '{"nodes":' * 100_000,
+        json.dumps({"nodes": {f"n{one}": {} for one in range(3000)}}),
+        json.dumps({"samples": [{"at_us": 1}] * 9}),
+    ],
+)
+def test_what_no_runner_writes_is_refused_in_one_line(text: str) -> None:
+    with pytest.raises(DoraSystemdError) as caught:
+        CellStatus.from_json(text)
+    assert caught.value.message.isprintable()
+    assert len(caught.value.message) < 100
+
+
+def test_a_long_text_is_cut() -> None:
+    node = CellStatus.from_json(json.dumps({"nodes": {"a": {"exit": "x" * 10**6}}})).nodes["a"]
+    assert len(node.exit) == 1000
 
 
 def test_counts() -> None:
