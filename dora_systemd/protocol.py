@@ -70,12 +70,8 @@ def _reply(frame: Mapping[str, Any]) -> Reply:
     result, error = frame.get("result"), frame.get("error")
     if isinstance(result, dict) and "Error" in result:
         error = result["Error"]
-    return Reply(frame["id"], result, "" if error is None else _words(error))
-
-
-def _words(error: object) -> str:
-    """What dora says is text; whoever plays dora may say anything."""
-    return error if isinstance(error, str) else "an error without words"
+    words = error if isinstance(error, str) else "an error without words"
+    return Reply(frame["id"], result, "" if error is None else words)
 
 
 def result_of(reply: Reply, key: str) -> Any:

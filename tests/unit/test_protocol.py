@@ -170,7 +170,8 @@ def test_spawn_failures(error: str, failure: str) -> None:
 def test_what_nobody_who_is_dora_would_send() -> None:
     """Over a relay it is the owner of the dataflow who answers, with dora or without."""
     assert protocol.parse_frame("[" * 100_000) is None
-    for error in (5, [], {"a": ["\x1b"]}, True):
+    errors: list[object] = [5, [], {"a": ["\x1b"]}, True]
+    for error in errors:
         for frame in ({"id": "x", "error": error}, {"id": "x", "result": {"Error": error}}):
             reply = protocol.parse_frame(json.dumps(frame))
             assert isinstance(reply, protocol.Reply)
