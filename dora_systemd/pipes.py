@@ -203,13 +203,12 @@ class LogPipes:
             self._journal.wait_ready(deadline - time.monotonic())
             self._queue.flush()
 
-    async def wait_empty(self, seconds: float) -> None:
-        """Return when journald has taken all that was put so far, or after `seconds`.
+    async def wait_empty(self, left: Callable[[], float]) -> None:
+        """Return when journald has taken all that was put so far, or no second is `left`.
 
         Unlike settle() and close() it lets the loop run, so that the watchdog is fed meanwhile.
         """
-        deadline = time.monotonic() + seconds
-        while not self._queue.is_empty and time.monotonic() < deadline:
+        while not self._queue.is_empty and left() > 0:
             await asyncio.sleep(0.01)
 
     def close(self, seconds: float = 7.0) -> None:

@@ -26,10 +26,8 @@ from dora_systemd.sandbox import Sandbox, sandbox_properties
 from dora_systemd.scope import RUNTIME_NAME
 from dora_systemd.settings import Settings
 from dora_systemd.settingtable import PROPERTY
+from dora_systemd.stopbudget import unit_timeout
 from dora_systemd.values import INFINITY, SECOND, quoted
-
-STOP_MARGIN = 10 * SECOND
-"""What TimeoutStopSec= allows beyond 1.5 grace durations, dora's own last resort."""
 
 WATCHDOG = 30 * SECOND
 
@@ -135,9 +133,7 @@ def stop_properties(options: RunnerOptions) -> dict[str, Property]:
 
     dora kills a node at 1.5 times its grace duration.
     """
-    is_endless = options.grace == INFINITY
-    timeout = INFINITY if is_endless else options.grace * 3 // 2 + STOP_MARGIN
-    return typed(KillMode="mixed", TimeoutStopSec=timeout)
+    return typed(KillMode="mixed", TimeoutStopSec=unit_timeout(options.grace))
 
 
 def restart_properties(options: RunnerOptions) -> dict[str, Property]:

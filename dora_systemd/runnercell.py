@@ -1,12 +1,16 @@
 """The life of a cell: what the main process of a dataflow's unit does, see dora_systemd.runner."""
 
 import asyncio
+import contextlib
 import os
 import signal
 import sys
+import traceback
+from collections.abc import Coroutine
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from dora_systemd import fdstore, notify
 from dora_systemd import lifeevents as life
@@ -26,8 +30,10 @@ from dora_systemd.pipes import LogPipes
 from dora_systemd.preparation import PACKAGE, Prepared, prepare, with_changes
 from dora_systemd.runnerapply import Run
 from dora_systemd.runnerbegin import enter_supervisor
+from dora_systemd.runnerclock import StopClock
 from dora_systemd.runnerdialogue import Dialogue
 from dora_systemd.runnerengine import Engine
+from dora_systemd.runnerfailure import Beside, words
 from dora_systemd.runnerloss import LossWatch, losses_of_user
 from dora_systemd.runnernodes import Nodes, wait_eof
 from dora_systemd.runnerpump import Pump, now_us
@@ -40,9 +46,9 @@ from dora_systemd.wiring import downstream_of
 
 SAMPLE_SECONDS = 5.0
 JOURNAL_SECONDS = 1.0
-STOP_SECONDS = 7.0
-BACKLOG_SECONDS = 60.0
-"""How long journald may take for what the nodes have left to say, when nobody waits."""
+CLOSE_SECONDS = 7.0
+LOSSES_SECONDS = 10.0
+CANCEL_SECONDS = 0.5
 
 
 def daemon_variables(prepared: Prepared, paths: CellPaths, unit: Path) -> dict[str, str]:
@@ -78,33 +84,53 @@ async def run_cell(
     coordinator: that of the first run, if it is there already.
     """
     loop = asyncio.get_running_loop()
-    unit = enter_supervisor()
-    make_directories(paths)
-    journal = JournalSocket()
+    journal, clock = JournalSocket(), StopClock(options.grace)
     # While systemd holds the pipes too, what is in them outlives a kill of this process.
     fdstore.forget_inherited()
     pipes = LogPipes(loop, journal, Origin(options.name, options.uuid), fdstore.store)
-    environment = node_environment(os.environ)
-    nodes = Nodes(unit, paths, pipes)
-    settings = SettingsFile(settings_path(options.dataflow), paths.settings)
-    reloader = Reloader(options, environment, settings)
-    cell = Runs(paths, unit, environment, pipes, nodes, reloader, coordinator)
-    losses = losses_of_user(journal, pipes) if paths.is_of_user else None
     try:
         pipes.write_event("dataflow-starting")
-        return await live(cell, losses)
+        cell = furnish(options, paths, pipes, clock, coordinator)
+        return await live(cell, losses_of_user(journal, pipes) if paths.is_of_user else None)
     except DoraSystemdError as error:
-        notify.send_status(f"failed: {error.message}")
-        pipes.write_event("dataflow-failed", reason=error.message, cause=Cause.BAD_DATAFLOW)
+        tell_failure(pipes, error.message, Cause.BAD_DATAFLOW)
+        raise
+    except Exception as error:
+        tell_failure(pipes, f"cannot run the dataflow: {words(error)}", Cause.RUNNER_BROKEN)
         raise
     finally:
-        pipes.close()
-        journal.wait_read(JOURNAL_SECONDS)
+        pipes.close(clock.left(JOURNAL_SECONDS if clock.by else CLOSE_SECONDS))
+        journal.wait_read(clock.left(JOURNAL_SECONDS))
+
+
+def tell_failure(pipes: LogPipes, reason: str, cause: Cause) -> None:
+    """Say why there is no run of the dataflow."""
+    pipes.write_event("dataflow-failed", reason=reason, cause=cause)
+    notify.send_status(f"failed: {reason}")
+
+
+def furnish(
+    options: RunnerOptions,
+    paths: CellPaths,
+    pipes: LogPipes,
+    clock: StopClock,
+    coordinator: Child | None,
+) -> "Runs":
+    """Enter the unit's group, and make what all runs share. Raises OSError."""
+    unit = enter_supervisor()
+    make_directories(paths)
+    environment = node_environment(os.environ)
+    settings = SettingsFile(settings_path(options.dataflow), paths.settings)
+    reloader = Reloader(options, environment, settings)
+    nodes, beside = Nodes(unit, paths, pipes), Beside(asyncio.get_running_loop())
+    return Runs(paths, unit, environment, pipes, nodes, reloader, beside, clock, coordinator)
 
 
 @dataclass(frozen=True)
 class Runs:
     """What all runs of the dataflow share. unit: cgroup directory. environment: of the nodes.
+
+    beside: their tasks. clock: of the stop that ends the last of them.
 
     coordinator: that of the first run, if it is there already.
     """
@@ -115,27 +141,31 @@ class Runs:
     pipes: LogPipes
     nodes: Nodes
     reloader: Reloader
+    beside: Beside
+    clock: StopClock
     coordinator: Child | None = None
 
 
 async def live(cell: Runs, losses: LossWatch | None) -> RunnerExit:
     """Run the dataflow, and again as long as reloads ask for it."""
-    beside = [asyncio.create_task(cell.reloader.work())]
-    beside.append(asyncio.create_task(serve(cell.paths.socket, cell.reloader.answer)))
+    beside = cell.beside
+    beside.spawn("reload", cell.reloader.work())
+    beside.spawn("serve its socket", serve(cell.paths.socket, cell.reloader.answer))
     if losses is not None:
-        beside.append(asyncio.create_task(losses.run()))
+        beside.spawn("count what journald throws away", losses.run())
     try:
         last = await run_once(cell, is_again=False)
         while goes_on(cell, last):
             notify.send_reloading()
             last = await run_once(cell, is_again=True)
         if losses is not None:
-            await losses.finish()
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(cell.clock.left(LOSSES_SECONDS)):
+                    await losses.finish()
         return last.exit
     finally:
         cell.reloader.close()
-        for task in beside:
-            task.cancel()
+        beside.cancel()
 
 
 def goes_on(cell: Runs, last: Cell) -> bool:
@@ -167,20 +197,20 @@ async def run_once(cell: Runs, is_again: bool) -> Cell:
         variables = daemon_variables(prepared, cell.paths, cell.unit)
         pump.connect(dialogue.actions(prepared.descriptor, variables))
         cell.pipes.mute()
-        listen(asyncio.get_running_loop(), options, pump, dialogue)
+        listen(options, pump, dialogue, cell.clock)
         dialogue.watch(coordinator, dialogue.read_coordinator)
         run = Run(pump, cell.nodes, cell.pipes, Swapper(pump, dora))
         reloader.begin(run, prepared, started_us * 1000)
-        dialogue.spawn(tell_started(pump, reloader))
+        dialogue.spawn("tell that it has started", tell_started(pump, reloader))
+        cell.beside.attach(pump.push)
         try:
-            await dialogue.end
+            await pump.end
         finally:
             reloader.end()
             cell.nodes.close()
             if not pump.cell.reload:
-                # The loop runs on and the watchdog is fed; a stop has systemd's clock against it.
-                seconds = STOP_SECONDS if pump.cell.stop_by else BACKLOG_SECONDS
-                await cell.pipes.wait_empty(seconds)
+                # The loop runs on and the watchdog is fed.
+                await cell.pipes.wait_empty(cell.clock.for_journal())
             dialogue.cancel()
         return pump.cell
     finally:
@@ -193,16 +223,17 @@ async def tell_started(pump: Pump, reloader: Reloader) -> None:
         reloader.has_started()
 
 
-def listen(
-    loop: asyncio.AbstractEventLoop, options: RunnerOptions, pump: Pump, dialogue: Dialogue
-) -> None:
+def listen(options: RunnerOptions, pump: Pump, dialogue: Dialogue, clock: StopClock) -> None:
     """Hear what asks the cell to stop, and do what is done from time to time."""
+    loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-        loop.add_signal_handler(number, partial(stop, pump, number.name))
-    dialogue.spawn(dialogue.take_samples(SAMPLE_SECONDS))
+        loop.add_signal_handler(number, partial(stop, pump, clock, number.name))
+    if clock.by:  # it came when the run before had ended already
+        loop.call_soon(stop, pump, clock, clock.by)
+    dialogue.spawn("take samples", dialogue.take_samples(SAMPLE_SECONDS))
     if "WATCHDOG_USEC" in os.environ:
         seconds = int(os.environ["WATCHDOG_USEC"]) / 1_000_000 / 3
-        dialogue.spawn(dialogue.feed_watchdog(seconds))
+        dialogue.spawn("feed the watchdog", dialogue.feed_watchdog(seconds))
     timeout = options.start_timeout
     if pump.cell.is_trial:
         timeout = min(timeout, round(READY_SECONDS * SECOND))
@@ -210,18 +241,31 @@ def listen(
         late = life.StartTimedOut(now_us(), timeout)
         loop.call_later(timeout / SECOND, pump.push, late)
     if options.attached:
-        dialogue.spawn(stop_at_eof(pump))
+        dialogue.spawn("watch its terminal", stop_at_eof(pump, clock))
 
 
-def stop(pump: Pump, by: str) -> None:
+def stop(pump: Pump, clock: StopClock, by: str) -> None:
     """Ask the cell to stop."""
+    clock.begin(by)
     pump.push(life.StopAsked(now_us(), by))
 
 
-async def stop_at_eof(pump: Pump) -> None:
+async def stop_at_eof(pump: Pump, clock: StopClock) -> None:
     """Stop when who started the cell, attached, is gone."""
     await wait_eof(sys.stdin.fileno())
-    stop(pump, "terminal")
+    stop(pump, clock, "terminal")
+
+
+def run_loop(cell: Coroutine[Any, Any, RunnerExit]) -> RunnerExit:
+    """As asyncio.run(), which would wait at the end for threads that nobody needs any more."""
+    loop = asyncio.new_event_loop()
+    try:
+        return loop.run_until_complete(cell)
+    finally:
+        if tasks := asyncio.all_tasks(loop):
+            for task in tasks:
+                task.cancel()
+            loop.run_until_complete(asyncio.wait(tasks, timeout=CANCEL_SECONDS))
 
 
 def run(argv: list[str], coordinator: Child | None) -> int:
@@ -232,10 +276,12 @@ def run(argv: list[str], coordinator: Child | None) -> int:
         if not directory:
             hint = "it is started by systemd: use `doractl start`"
             raise DoraSystemdError("cannot run without RUNTIME_DIRECTORY", hint, ExitCode.USAGE)
-        return asyncio.run(run_cell(options, CellPaths(Path(directory)), coordinator))
+        return run_loop(run_cell(options, CellPaths(Path(directory)), coordinator))
     except DoraSystemdError as error:
         print(f"{error.message}\n{error.hint}".strip(), file=sys.stderr)
         return RunnerExit.BAD_DATAFLOW
-    except OSError as error:
-        print(f"cannot run the dataflow: {error}", file=sys.stderr)
+    except Exception as error:
+        if not isinstance(error, OSError):
+            traceback.print_exc()
+        print(f"cannot run the dataflow: {words(error)}", file=sys.stderr)
         return RunnerExit.FAILED
