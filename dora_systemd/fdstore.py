@@ -8,13 +8,23 @@ import contextlib
 import os
 import socket
 
-NAME = "dora-log"
+PREFIX = "dora-log-"
+"""What we keep is named after its node, so that it can go with it."""
 _FIRST = 3  # SD_LISTEN_FDS_START, see sd_listen_fds(3)
 
 
-def store(fd: int) -> None:
+def store(fd: int, node: str) -> None:
     """Have systemd keep `fd` open too; without systemd, or a store, nothing happens."""
-    _send(f"FDSTORE=1\nFDNAME={NAME}\nFDPOLL=0", [fd])
+    _send(f"FDSTORE=1\nFDNAME={PREFIX}{node}\nFDPOLL=0", [fd])
+
+
+def forget(node: str) -> None:
+    """Have systemd close what it keeps of a node that is gone for good."""
+    _forget(PREFIX + node)
+
+
+def _forget(name: str) -> None:
+    _send(f"FDSTOREREMOVE=1\nFDNAME={name}", [])
 
 
 def forget_inherited() -> None:
@@ -24,10 +34,11 @@ def forget_inherited() -> None:
     names = os.environ.pop("LISTEN_FDNAMES", "").split(":")
     count = int(os.environ.pop("LISTEN_FDS", "0"))
     for fd, name in zip(range(_FIRST, _FIRST + count), names, strict=False):
-        if name == NAME:
+        if name.startswith(PREFIX):
             os.close(fd)
-    if NAME in names:
-        _send(f"FDSTOREREMOVE=1\nFDNAME={NAME}", [])
+    for name in sorted({*names}):
+        if name.startswith(PREFIX):
+            _forget(name)
 
 
 def _send(text: str, fds: list[int]) -> None:

@@ -31,7 +31,8 @@ class LogPipes:
     """The output of all nodes of a cell, and the cell's life events, into the journal.
 
     journal: where entries go. origin: of what is of no node. keep: is given each descriptor whose
-    content shall outlive this process. All methods belong to `loop`'s thread and return at once.
+    content shall outlive this process, and its node. release: is given a node that is gone for
+    good. All methods belong to `loop`'s thread and return at once.
     """
 
     def __init__(
@@ -39,10 +40,12 @@ class LogPipes:
         loop: asyncio.AbstractEventLoop,
         journal: Journal,
         origin: Origin,
-        keep: Callable[[int], object] | None = None,
+        keep: Callable[[int, str], object] | None = None,
+        release: Callable[[str], object] | None = None,
     ) -> None:
         self._loop = loop
         self._keep = keep
+        self._release = release
         self._journal = journal
         self._queue = LogQueue(loop, journal, self._pause, self._resume)
         self._origin = origin
@@ -74,7 +77,7 @@ class LogPipes:
             # Read and write: no end of file between two lives of the node.
             fd = os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
             if self._keep is not None:
-                self._keep(fd)
+                self._keep(fd, node_id)
             self.adopt(node_id, stream, fd, HeldLines(path))
 
     def forget(self, node_id: str) -> None:
@@ -84,6 +87,8 @@ class LogPipes:
         for pipe in source.pipes:
             self._loop.remove_reader(pipe.fd)
             pipe.close()
+        if self._release is not None and source.pipes:
+            self._release(node_id)
         if node_id in self._paths:
             for path in fifos(node_id, self._paths.pop(node_id)).values():
                 path.unlink(missing_ok=True)

@@ -87,7 +87,8 @@ async def run_cell(
     journal, clock = JournalSocket(), StopClock(options.grace)
     # While systemd holds the pipes too, what is in them outlives a kill of this process.
     fdstore.forget_inherited()
-    pipes = LogPipes(loop, journal, Origin(options.name, options.uuid), fdstore.store)
+    origin = Origin(options.name, options.uuid)
+    pipes = LogPipes(loop, journal, origin, fdstore.store, fdstore.forget)
     try:
         pipes.write_event("dataflow-starting")
         cell = furnish(options, paths, pipes, clock, coordinator)

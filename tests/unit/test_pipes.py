@@ -258,3 +258,25 @@ def test_close_counts_what_it_cannot_write(tmp_path: Path) -> None:
         cell.server.bind(str(tmp_path / "socket"))
 
     run(tmp_path, scenario)
+
+
+def test_what_systemd_keeps_of_a_node_goes_with_it(tmp_path: Path) -> None:
+    async def scenario(cell: Cell) -> None:
+        kept: list[str] = []
+        pipes = LogPipes(
+            asyncio.get_running_loop(),
+            cell.journal,
+            IDENTITY,
+            lambda _, node: kept.append(node),
+            kept.remove,
+        )
+        for node in ("a", "b"):
+            pipes.make(node, cell.paths)
+        pipes.open("a")
+        pipes.forget("b")  # never opened
+        assert kept == ["a", "a"]
+        pipes.forget("a")
+        assert kept == ["a"], "released by name, once"
+        pipes.close(0.1)
+
+    run(tmp_path, scenario)

@@ -104,8 +104,11 @@ class Bench:
 
 
 def live(work: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    async def bounded() -> None:
+        await asyncio.wait_for(work(), 3600)  # at once, if nothing else can happen
+
     with asyncio.Runner(loop_factory=ImpatientLoop) as runner:
-        runner.run(work())
+        runner.run(bounded())
 
 
 def refuse() -> None:
