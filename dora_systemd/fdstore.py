@@ -10,6 +10,9 @@ import socket
 
 PREFIX = "dora-log-"
 """What we keep is named after its node, so that it can go with it."""
+LIFE = "dora-life"
+"""One such descriptor for each life of the runner since the last quiet window."""
+_MOST_LIVES = 64
 _FIRST = 3  # SD_LISTEN_FDS_START, see sd_listen_fds(3)
 
 
@@ -27,6 +30,32 @@ def _forget(name: str) -> None:
     _send(f"FDSTOREREMOVE=1\nFDNAME={name}", [])
 
 
+def lives() -> int:
+    """How many lives came before this one with no quiet window between them, _MOST_LIVES at most.
+
+    systemd keeps the count from one restart to the next, and forgets it when the unit is stopped.
+    `systemd-analyze fdstore` shows it.
+    """
+    if os.environ.get("LISTEN_PID", "") != str(os.getpid()):
+        return 0
+    return os.environ.get("LISTEN_FDNAMES", "").split(":").count(LIFE)
+
+
+def count_life() -> None:
+    """This life is one more."""
+    if lives() < _MOST_LIVES:
+        # Of its own: systemd keeps what it has already only once.
+        fd = os.memfd_create(LIFE, os.MFD_CLOEXEC)
+        _send(f"FDSTORE=1\nFDNAME={LIFE}\nFDPOLL=0", [fd])
+        os.close(fd)
+
+
+def forget_lives() -> None:
+    """This life is the first one."""
+    _forget(LIFE)
+    count_life()
+
+
 def forget_inherited() -> None:
     """Close what an earlier life of this process left in the store, and take it out of it."""
     if os.environ.pop("LISTEN_PID", "") != str(os.getpid()):
@@ -34,7 +63,7 @@ def forget_inherited() -> None:
     names = os.environ.pop("LISTEN_FDNAMES", "").split(":")
     count = int(os.environ.pop("LISTEN_FDS", "0"))
     for fd, name in zip(range(_FIRST, _FIRST + count), names, strict=False):
-        if name.startswith(PREFIX):
+        if name.startswith(PREFIX) or name == LIFE:
             os.close(fd)
     for name in sorted({*names}):
         if name.startswith(PREFIX):

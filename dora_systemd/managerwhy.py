@@ -38,7 +38,9 @@ def explain(manager: Manager, scope: Scope, selector: str, journal: JournalReade
     facts = _facts(manager, scope, cell) if cell else Facts(now_boot=_now_boot())
     shutdowns = _shutdowns(journal)
     verdict = examine(lives, facts, shutdowns)
-    budget = restart_budget(manager, scope, cell) if cell and not verdict.is_given_up else None
+    budget = None
+    if cell and not verdict.is_given_up:
+        budget = restart_budget(manager, scope, cell, read_status(scope, cell))
     return Report(subject, verdict, _last_words(journal, scope, subject, verdict), budget)
 
 

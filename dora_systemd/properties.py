@@ -32,7 +32,8 @@ from dora_systemd.values import INFINITY, SECOND, quoted
 WATCHDOG = 30 * SECOND
 
 START_MARGIN = 10 * SECOND
-"""What TimeoutStartSec= allows beyond --start-timeout, which is the runner's."""
+"""What TimeoutStartSec= allows beyond the pause before a restart and --start-timeout, which are
+the runner's."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,8 @@ def service_properties(options: RunnerOptions, context: UnitContext) -> dict[str
     reload = tuple(reload_command(context.python))
     # The runner names the nodes that are late; systemd ends one that cannot even do that.
     is_endless = options.start_timeout == INFINITY
-    start_timeout = INFINITY if is_endless else options.start_timeout + START_MARGIN
+    most = options.start_timeout + START_MARGIN + options.restart.max_delay
+    start_timeout = INFINITY if is_endless else most
     return typed(
         Type="notify",
         NotifyAccess="main",
@@ -149,13 +151,11 @@ def restart_properties(options: RunnerOptions) -> dict[str, Property]:
     if policy.policy == "no":
         return common | typed(Restart="no")
     is_endless = policy.max_restarts == INFINITY
-    growth = {"RestartSteps": policy.steps(), "RestartMaxDelaySec": policy.max_delay}
-    if policy.steps() < 1:
-        growth = {}
     return common | typed(
         Restart=policy.policy,
+        # The runner itself waits longer, see dora_systemd.runnerpause: RestartSteps= would never
+        # forget what was long ago.
         RestartSec=policy.delay,
-        **growth,
         StartLimitIntervalSec=0 if is_endless else policy.window,
         StartLimitBurst=1 if is_endless else policy.max_restarts + 1,
     )

@@ -36,6 +36,7 @@ from dora_systemd.runnerengine import Engine
 from dora_systemd.runnerfailure import Beside, words
 from dora_systemd.runnerloss import LossWatch, losses_of_user
 from dora_systemd.runnernodes import Nodes, wait_eof
+from dora_systemd.runnerpause import forget_restarts
 from dora_systemd.runnerpump import Pump, now_us
 from dora_systemd.runnerreload import Reloader
 from dora_systemd.runnersettings import SettingsFile
@@ -151,6 +152,7 @@ async def live(cell: Runs, losses: LossWatch | None) -> RunnerExit:
     """Run the dataflow, and again as long as reloads ask for it."""
     beside = cell.beside
     beside.spawn("reload", cell.reloader.work())
+    beside.spawn("forget restarts", forget_restarts(cell.reloader.options))
     beside.spawn("serve its socket", serve(cell.paths.socket, cell.reloader.answer))
     if losses is not None:
         beside.spawn("count what journald throws away", losses.run())

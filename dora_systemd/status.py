@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
 
-STAGES = ("starting", "waiting", "running", "degraded", "stopping", "ended")
+STAGES = ("restarting", "starting", "waiting", "running", "degraded", "stopping", "ended")
 NODE_STATES = (
     "starting",
     "ready",

@@ -190,6 +190,7 @@ USE_CASES = {
         "runnerbegin",
         "runnerclock",
         "runnerfailure",
+        "runnerpause",
         "runnercell",
         "runnerask",
         "runnerdialogue",
