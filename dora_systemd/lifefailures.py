@@ -72,7 +72,7 @@ def _lose(cell: Cell, child: str, reason: str, how: str) -> Step:
     return cell, (Record(f"{child}-lost", "", {"exit": how} if how else {}), *actions)
 
 
-def engine_deadline(cell: Cell, event: life.Event) -> Step:
+def engine_deadline(cell: Cell, event: life.Event) -> Step:  # noqa: ARG001 - as all handlers
     """Dora does not answer."""
     reason = f"dora did not answer within {ENGINE_TIMEOUT // SECOND} s while {cell.state.value}"
     return fail(because(cell, Cause.NO_ANSWER), reason, RunnerExit.ENGINE_LOST)

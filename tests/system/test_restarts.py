@@ -141,8 +141,8 @@ def test_the_delay_grows_and_begins_anew_after_a_quiet_window(cell: Cell, projec
     assert (row["status"], 0 < budget["next_us"] <= 3 * SECOND) == ("Restarting", True)
     assert "Restarting" in cell.doractl("why", cell.name, check=False).stdout
     wait_for("it is back", lambda: cell.show("ActiveState") == "active", 30)
-    count = ["systemd-analyze", cell.scope.flag, "fdstore", cell.unit]
-    wait_for("the window is quiet", lambda: run(*count).stdout.count("dora-life") == 1, 30)
+    store = ("systemd-analyze", cell.scope.flag, "fdstore", cell.unit)
+    wait_for("the window is quiet", lambda: run(*store).stdout.count("\ndora-life ") == 1)
     assert lose() < first + 1
     # Who restarts it by hand does not wait.
     cell.systemctl("restart")
