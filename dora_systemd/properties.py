@@ -111,7 +111,8 @@ def service_properties(options: RunnerOptions, context: UnitContext) -> dict[str
     reload = tuple(reload_command(context.python))
     # The runner names the nodes that are late; systemd ends one that cannot even do that.
     is_endless = options.start_timeout == INFINITY
-    most = options.start_timeout + START_MARGIN + options.restart.max_delay
+    pause = 0 if options.restart.policy == "no" else options.restart.max_delay
+    most = pause + options.start_timeout + START_MARGIN
     start_timeout = INFINITY if is_endless else most
     return typed(
         Type="notify",

@@ -6,8 +6,9 @@ Nobody but root and the user of the dataflow gets into that directory: see unix(
 import asyncio
 import contextlib
 import json
+import os
 import socket
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -32,10 +33,22 @@ async def serve(path: Path, answer: Answer) -> None:
         writer.close()
 
     path.unlink(missing_ok=True)
-    server = await asyncio.start_unix_server(talk, path, limit=MAX_BYTES)
-    path.chmod(0o600)
-    async with server:
-        await server.serve_forever()
+    with _short(path) as address, socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(address)
+        path.chmod(0o600)
+        server = await asyncio.start_unix_server(talk, sock=listener, limit=MAX_BYTES)
+        async with server:
+            await server.serve_forever()
+
+
+@contextlib.contextmanager
+def _short(path: Path) -> Iterator[str]:
+    """The address of a socket has 107 bytes, see unix(7); a dataflow's name may have 200."""
+    directory = os.open(path.parent, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        yield f"/proc/self/fd/{directory}/{path.name}"
+    finally:
+        os.close(directory)
 
 
 async def _answer(line: bytes, answer: Answer) -> dict[str, Any]:
@@ -46,6 +59,10 @@ async def _answer(line: bytes, answer: Answer) -> dict[str, Any]:
         return _refusal(DoraSystemdError("cannot read the request", "", ExitCode.USAGE))
     except DoraSystemdError as error:
         return _refusal(error)
+    except Exception as error:
+        # A request that we do not understand ends nothing but itself.
+        what = f"cannot do that: {type(error).__name__}: {error}"
+        return _refusal(DoraSystemdError(what, "please report it"))
 
 
 def _refusal(error: DoraSystemdError) -> dict[str, Any]:
@@ -57,7 +74,8 @@ def ask(path: Path, request: Request, seconds: float = ANSWER_SECONDS) -> dict[s
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as stream:
             stream.settimeout(seconds)
-            stream.connect(str(path))
+            with _short(path) as address:
+                stream.connect(address)
             stream.sendall(json.dumps(request).encode() + b"\n")
             reply = json.loads(stream.makefile().readline())
     except PermissionError as error:
