@@ -120,19 +120,20 @@ def test_the_budget_is_seen_used_up_and_reset(cell: Cell, project: Project) -> N
 
 @pytest.mark.warns(*KILLED)
 def test_the_delay_grows_and_begins_anew_after_a_quiet_window(cell: Cell, project: Project) -> None:
-    words = ("--restart-policy", "always", "--max-restarts", "1000", "--restart-window", "8s")
+    words = ("--restart-policy", "always", "--max-restarts", "1000", "--restart-window", "20s")
     cell.start(project.three_nodes(), *words, "--restart-delay", "1s")
 
-    def lose() -> float:
-        """Kill the runner, for the daemon takes its time to be ready; how long it was away."""
+    def lose() -> bool:
+        """Kill the runner, which the daemon would take its time to do; whether the next waits."""
+        texts = []
         kill(cell, "runner")
-        began = time.monotonic()
         wait_for("it is away", lambda: cell.show("ActiveState") != "active")
-        wait_for("it is back", lambda: cell.show("ActiveState") == "active", 30)
-        return time.monotonic() - began
+        while cell.show("ActiveState") != "active":
+            texts.append(cell.show("StatusText"))
+        return any("restarting in" in text for text in texts)
 
-    first = lose()
-    assert lose() > first + 0.5
+    assert not lose()
+    assert lose()
     kill(cell, "runner")
     wait_for("its runner waits", lambda: "restarting in" in cell.show("StatusText"))
     row = listed(cell)
@@ -143,7 +144,7 @@ def test_the_delay_grows_and_begins_anew_after_a_quiet_window(cell: Cell, projec
     wait_for("it is back", lambda: cell.show("ActiveState") == "active", 30)
     store = ("systemd-analyze", cell.scope.flag, "fdstore", cell.unit)
     wait_for("the window is quiet", lambda: run(*store).stdout.count("\ndora-life ") == 1)
-    assert lose() < first + 1
+    assert not lose()
     # Who restarts it by hand does not wait.
     cell.systemctl("restart")
     assert cell.show("NRestarts") == "0"
