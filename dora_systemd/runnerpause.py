@@ -6,7 +6,6 @@ waits for the rest of a longer one before it does anything else. How many lives 
 to systemd, see lives() in dora_systemd.fdstore.
 """
 
-import asyncio
 import contextlib
 import time
 
@@ -60,6 +59,8 @@ def show(uuid: str, paths: CellPaths, seconds: float) -> None:
 
 async def forget_restarts(options: RunnerOptions) -> None:
     """After a quiet window the next pause is the shortest one."""
+    import asyncio  # takes longer than all else that is needed before the coordinator is started
+
     if options.restart.policy != "no" and options.restart.window != INFINITY:
         await asyncio.sleep(options.restart.window / SECOND)
         fdstore.forget_lives()

@@ -233,7 +233,8 @@ def test_of_alice(cell: Cell, project: Project) -> None:
 
 @pytest.mark.warns("cannot run", "Failed", "failed", "exited", "PermissionError")
 def test_a_runner_that_cannot_begin_says_why(cell: Cell, project: Project) -> None:
-    words = ("--property", "RuntimeDirectoryMode=0500")
+    calls = ("SystemCallFilter=~mkdir mkdirat", "SystemCallErrorNumber=EPERM")
+    words = [word for one in calls for word in ("--property", one)]
     done = cell.start(project.three_nodes(), *words, check=False)
     assert cell.show("ActiveState") == "failed", done
     told = json.loads(cell.doractl("why", cell.name, "-o", "json", check=False).stdout)
