@@ -4,7 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import click
@@ -160,14 +160,28 @@ def _write(chunks: Iterator[bytes], fd: int) -> None:
             rest = rest[os.write(fd, rest) :]
 
 
+def pager_of(environ: Mapping[str, str]) -> tuple[str, dict[str, str]]:
+    """The pager and its environment.
+
+    Who may call doractl as root may not do all else as root: under sudo it is less, without its
+    commands that start others. $SYSTEMD_PAGERSECURE decides otherwise, as in systemctl(1).
+    """
+    is_lent = any(environ.get(name) for name in ("SUDO_UID", "PKEXEC_UID", "DOAS_USER"))
+    word = environ.get("SYSTEMD_PAGERSECURE", "").lower()
+    is_secure = word not in ("0", "no", "n", "false", "f", "off") if word else is_lent
+    environment = {"LESS": "FRSXMK", **environ, **({"LESSSECURE": "1"} if is_secure else {})}
+    if is_secure and not word:
+        return "less", environment
+    names = (environ.get(name, "") for name in ("DORACTL_PAGER", "SYSTEMD_PAGER", "PAGER"))
+    return next(filter(None, names), "less"), environment
+
+
 def _page(chunks: Iterator[bytes]) -> None:
     """Through the pager that journalctl(1) would use, with the options that it would give it."""
-    names = (os.environ.get(name, "") for name in ("DORACTL_PAGER", "SYSTEMD_PAGER", "PAGER"))
-    pager = next(filter(None, names), "less")
+    pager, environment = pager_of(os.environ)
     if not shutil.which(pager.split()[0]) or pager == "cat":
         _write(chunks, sys.stdout.fileno())
         return
-    environment = {"LESS": "FRSXMK", **os.environ}
     with subprocess.Popen(pager, shell=True, stdin=subprocess.PIPE, env=environment) as child:
         assert child.stdin
         try:

@@ -14,6 +14,7 @@ class Cause(StrEnum):
     COORDINATOR_LOST = "coordinator-lost"
     NO_ANSWER = "no-answer"
     DIRECTORY_LOST = "directory-lost"
+    RUNNER_BROKEN = "runner-broken"
     RUNNER_KILLED = "runner-killed"
     WATCHDOG = "watchdog"
     TIMEOUT = "timeout"

@@ -9,7 +9,7 @@ import errno
 import io
 import os
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from itertools import islice
 from pathlib import Path
@@ -182,6 +182,18 @@ def limit_group(path: Path, limits: NodeLimits) -> None:
                 "the kernel, or the container, does not give that to this dataflow",
                 ExitCode.NO_SYSTEMD,
             )
+
+
+def read_files(path: Path, names: Iterable[str]) -> dict[str, str]:
+    """The texts of control files of a group, for restore_group."""
+    return {name: read_text(path / name) for name in names}
+
+
+def restore_group(path: Path, texts: Mapping[str, str]) -> None:
+    """Write back what read_files has read, as far as the kernel lets us."""
+    for name, text in texts.items():
+        with contextlib.suppress(OSError):
+            _write(path / name, text.strip())
 
 
 def move_process(path: Path, pid: int) -> None:

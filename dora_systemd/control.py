@@ -100,6 +100,10 @@ class Connection:
 
     async def close(self) -> None:
         """Close at once: the peer may be dead or hang."""
+        self.abort()
+
+    def abort(self) -> None:
+        """The same for who cannot wait."""
         self._socket.abort()
 
 

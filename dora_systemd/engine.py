@@ -60,6 +60,13 @@ class Child:
         with contextlib.suppress(ProcessLookupError):
             signal.pidfd_send_signal(self.pidfd, number)
 
+    def close(self, loop: "asyncio.AbstractEventLoop", seconds: float) -> None:
+        """Reap it, if it ends within `seconds`, and give back its descriptor."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.popen.wait(seconds)
+        loop.remove_reader(self.pidfd)
+        os.close(self.pidfd)
+
 
 def spawn(
     label: str, command: Sequence[str], environment: Mapping[str, str], directory: Path

@@ -8,13 +8,52 @@ import contextlib
 import os
 import socket
 
-NAME = "dora-log"
+PREFIX = "dora-log-"
+"""What we keep is named after its node, so that it can go with it."""
+LIFE = "dora-life"
+"""One such descriptor for each life of the runner since the last quiet window."""
+_MOST_LIVES = 64
 _FIRST = 3  # SD_LISTEN_FDS_START, see sd_listen_fds(3)
 
 
-def store(fd: int) -> None:
+def store(fd: int, node: str) -> None:
     """Have systemd keep `fd` open too; without systemd, or a store, nothing happens."""
-    _send(f"FDSTORE=1\nFDNAME={NAME}\nFDPOLL=0", [fd])
+    _send(f"FDSTORE=1\nFDNAME={PREFIX}{node}\nFDPOLL=0", [fd])
+
+
+def forget(node: str) -> None:
+    """Have systemd close what it keeps of a node that is gone for good."""
+    _forget(PREFIX + node)
+
+
+def _forget(name: str) -> None:
+    _send(f"FDSTOREREMOVE=1\nFDNAME={name}", [])
+
+
+def lives() -> int:
+    """How many lives came before this one with no quiet window between them, _MOST_LIVES at most.
+
+    systemd keeps the count from one restart to the next, and forgets it when the unit is stopped.
+    `systemd-analyze fdstore` shows it.
+    """
+    if os.environ.get("LISTEN_PID", "") != str(os.getpid()):
+        return 0
+    return os.environ.get("LISTEN_FDNAMES", "").split(":").count(LIFE)
+
+
+def count_life() -> None:
+    """This life is one more."""
+    if lives() < _MOST_LIVES:
+        # Of its own: systemd keeps what it has already only once.
+        fd = os.memfd_create(LIFE, os.MFD_CLOEXEC)
+        _send(f"FDSTORE=1\nFDNAME={LIFE}\nFDPOLL=0", [fd])
+        os.close(fd)
+
+
+def forget_lives() -> None:
+    """This life is the first one."""
+    _forget(LIFE)
+    count_life()
 
 
 def forget_inherited() -> None:
@@ -24,10 +63,11 @@ def forget_inherited() -> None:
     names = os.environ.pop("LISTEN_FDNAMES", "").split(":")
     count = int(os.environ.pop("LISTEN_FDS", "0"))
     for fd, name in zip(range(_FIRST, _FIRST + count), names, strict=False):
-        if name == NAME:
+        if name.startswith(PREFIX) or name == LIFE:
             os.close(fd)
-    if NAME in names:
-        _send(f"FDSTOREREMOVE=1\nFDNAME={NAME}", [])
+    for name in sorted({*names}):
+        if name.startswith(PREFIX):
+            _forget(name)
 
 
 def _send(text: str, fds: list[int]) -> None:

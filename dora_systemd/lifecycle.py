@@ -9,9 +9,10 @@ Every pair of state and event has an entry in TABLE; tests/unit/test_lifecycle.p
 from collections.abc import Mapping
 
 from dora_systemd import lifeevents as life
+from dora_systemd import lifefailures as failures
 from dora_systemd import lifehandlers as handle
 from dora_systemd.cellstate import Cell, State
-from dora_systemd.lifehandlers import Handler, Step
+from dora_systemd.lifefailures import Handler, Step
 
 
 def step(cell: Cell, event: life.Event) -> Step:
@@ -35,15 +36,17 @@ _RELOADS: dict[str, Handler] = {
 }
 _NODES_STOPPING: dict[str, Handler] = dict.fromkeys(_NODES, handle.node_event_stopping)
 _LOST: dict[str, Handler] = {
-    "ChildExited": handle.child_exited,
-    "ConnectionLost": handle.connection_lost,
-    "Refused": handle.refused,
+    "ChildExited": failures.child_exited,
+    "ConnectionLost": failures.connection_lost,
+    "Refused": failures.refused,
+    "Failed": failures.broken,
 }
 _EARLY: dict[str, Handler] = {
     **_LOST,
     "StartTimedOut": handle.start_timed_out,
     "StopAsked": handle.stop_early,
-    "DeadlinePassed": handle.engine_deadline,
+    "DeadlinePassed": failures.engine_deadline,
+    "ReloadNoted": handle.note_reload,
 }
 _ALIVE: dict[str, Handler] = {
     **_LOST,
@@ -64,6 +67,7 @@ _STOPPING: dict[str, Handler] = {
         ),
         handle.leave_now,
     ),
+    "Failed": failures.broken,
     "StopAsked": handle.stop_again,
 }
 
@@ -83,12 +87,13 @@ TABLE: Mapping[State, Mapping[type[life.Event], Handler]] = {
         **{**_LOST, **_NODES},
         ResultKnown=handle.result,
         StopAsked=handle.stop_while_closing,
-        DeadlinePassed=handle.engine_deadline,
+        DeadlinePassed=failures.engine_deadline,
     ),
     State.LEAVING: _row(
         **_NODES,
         ChildExited=handle.daemon_left,
-        DeadlinePassed=handle.end,
+        # How it ended is known by now: it stays so.
+        **dict.fromkeys(("DeadlinePassed", "Failed"), handle.end),
         StopAsked=handle.stop_leaving,
     ),
     State.ENDED: _row(),

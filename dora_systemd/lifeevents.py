@@ -47,6 +47,17 @@ class Refused(Event):
 
 
 @dataclass(frozen=True)
+class Failed(Event):
+    """Something of the runner raised. what: what it could not do. error: the exception, in words.
+
+    It can be an action of the table, a task beside it, or a callback of the loop.
+    """
+
+    what: str
+    error: str
+
+
+@dataclass(frozen=True)
 class NodeSpawned(Event):
     """Dora executed a node for the first time or again."""
 
@@ -200,6 +211,7 @@ EVENTS: tuple[type[Event], ...] = (
     RunStarted,
     Subscribed,
     Refused,
+    Failed,
     NodeSpawned,
     NodeReady,
     AllReady,

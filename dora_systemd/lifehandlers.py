@@ -1,31 +1,20 @@
 """What the runner's state machine does about an event: the entries of dora_systemd.lifecycle."""
 
-from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 from dora_systemd import lifeevents as life
 from dora_systemd import nodetable as table
 from dora_systemd.causes import Cause
 from dora_systemd.cellstate import Action, Cell, Deadline, Do, Record, RunnerExit, State
-from dora_systemd.oom import Owner
+from dora_systemd.lifefailures import ENGINE_TIMEOUT, Step, because, fail, oom_of_all, to
 from dora_systemd.status import HELD
+from dora_systemd.stopbudget import LEAVE_TIMEOUT, stop_timeout
 from dora_systemd.values import SECOND, format_duration
 from dora_systemd.wiring import with_downstream
 
-Step = tuple[Cell, tuple[Action, ...]]
-Handler = Callable[[Cell, life.Event], Step]
-
-ENGINE_TIMEOUT = 30 * SECOND
-"""What dora itself allows its parts to answer each other."""
-LEAVE_TIMEOUT = 2 * SECOND
 _NOT_READY = ("starting", "restarting")
 CASCADE_TIMEOUT = 5 * SECOND
 """Dora ends a dataflow within milliseconds when a node failed before it was ready."""
-
-
-def stop_timeout(grace: int) -> int:
-    """µs until a Stop without an answer is given up: dora kills after 1.5 times the grace."""
-    return grace + grace // 2 + 2 * SECOND
 
 
 def ignore(cell: Cell, event: life.Event) -> Step:
@@ -33,18 +22,14 @@ def ignore(cell: Cell, event: life.Event) -> Step:
     return cell, ()
 
 
-def _to(cell: Cell, state: State, *actions: Action, after: int | None = None) -> Step:
-    return replace(cell, state=state), (*actions, Deadline(after))
-
-
 def listening(cell: Cell, event: life.Event) -> Step:
     """The coordinator is there: the daemon comes next."""
-    return _to(cell, State.JOINING, Do.START_DAEMON, after=ENGINE_TIMEOUT)
+    return to(cell, State.JOINING, Do.START_DAEMON, after=ENGINE_TIMEOUT)
 
 
 def joined(cell: Cell, event: life.Event) -> Step:
     """Both are there: dora is sent the descriptor."""
-    return _to(cell, State.STARTING, Do.SEND_START, after=ENGINE_TIMEOUT)
+    return to(cell, State.STARTING, Do.SEND_START, after=ENGINE_TIMEOUT)
 
 
 def started(cell: Cell, event: life.Event) -> Step:
@@ -57,7 +42,7 @@ def subscribed(cell: Cell, event: life.Event) -> Step:
     """From here on nothing that happens to a node is missed."""
     # The launchers wait for OPEN_PIPES, so no node can end before its events are heard; the kinds
     # that dora starts itself can, hence ASK_RESULT.
-    return _to(cell, State.WAITING, Do.OPEN_PIPES, Do.ASK_SPAWN, Do.ASK_RESULT)
+    return to(cell, State.WAITING, Do.OPEN_PIPES, Do.ASK_SPAWN, Do.ASK_RESULT)
 
 
 def barrier_opened(cell: Cell, event: life.Event) -> Step:
@@ -72,7 +57,7 @@ def barrier_opened(cell: Cell, event: life.Event) -> Step:
 def run(cell: Cell, event: life.Event) -> Step:
     """The dataflow runs."""
     cell = replace(cell, nodes=table.all_ready(cell.nodes, event.at_us), ready_us=event.at_us)
-    return _to(cell, State.RUNNING, Record("dataflow-started"))
+    return to(cell, State.RUNNING, Record("dataflow-started"))
 
 
 def start_timed_out(cell: Cell, event: life.Event) -> Step:
@@ -80,63 +65,19 @@ def start_timed_out(cell: Cell, event: life.Event) -> Step:
     assert isinstance(event, life.StartTimedOut)
     late = [ident for ident, node in cell.nodes.items() if node.state in _NOT_READY]
     reason = f"{_nodes(late)} not ready within {format_duration(event.after)}"
-    return _fail_start(_because(cell, Cause.START_TIMEOUT, late), reason)
+    return _fail_start(because(cell, Cause.START_TIMEOUT, late), reason)
 
 
 def _fail_start(cell: Cell, reason: str) -> Step:
     if not cell.is_trial:
-        return _fail(cell, reason, RunnerExit.FAILED)
+        return fail(cell, reason, RunnerExit.FAILED)
     # Another run follows, so this one ends in good order.
     cell = replace(cell, failure=reason, exit=RunnerExit.FAILED)
-    return _to(cell, State.STOPPING, Do.ASK_STOP, after=stop_timeout(cell.grace))
+    return to(cell, State.STOPPING, Do.ASK_STOP, after=stop_timeout(cell.grace))
 
 
 def _nodes(idents: list[str]) -> str:
     return f"node {idents[0]} was" if len(idents) == 1 else f"nodes {', '.join(idents)} were"
-
-
-def refused(cell: Cell, event: life.Event) -> Step:
-    """Dora does not want it, or does not understand us."""
-    assert isinstance(event, life.Refused)
-    return _fail(_because(cell, event.cause), event.reason, RunnerExit.FAILED)
-
-
-def _because(cell: Cell, cause: Cause, nodes: Iterable[str] = ()) -> Cell:
-    return replace(cell, cause=cause, culprits=tuple(nodes))
-
-
-def _fail(cell: Cell, reason: str, code: RunnerExit) -> Step:
-    cell = replace(cell, failure=reason, exit=code)
-    name = "reload-failed" if cell.is_trial and not cell.ready_us else "dataflow-failed"
-    details = {"reason": reason, "cause": str(cell.cause), "nodes": " ".join(cell.culprits)}
-    known = {key: text for key, text in details.items() if text}
-    return _to(cell, State.ENDED, Record(name, "", known), Do.EXIT)
-
-
-def child_exited(cell: Cell, event: life.Event) -> Step:
-    """Without coordinator or daemon there is no dataflow."""
-    assert isinstance(event, life.ChildExited)
-    reason = f"the dora {event.child} is gone ({event.exit})"
-    cell, actions = _lose(cell, event.child, reason, event.exit)
-    return cell, (*_oom_of_all(event), *actions)
-
-
-def connection_lost(cell: Cell, event: life.Event) -> Step:
-    """The same, learned another way."""
-    assert isinstance(event, life.ConnectionLost)
-    return _lose(cell, event.child, event.reason, "")
-
-
-def _lose(cell: Cell, child: str, reason: str, how: str) -> Step:
-    cell = _because(cell, Cause(f"{child}-lost"))
-    cell, actions = _fail(cell, reason, RunnerExit.ENGINE_LOST)
-    return cell, (Record(f"{child}-lost", "", {"exit": how} if how else {}), *actions)
-
-
-def engine_deadline(cell: Cell, event: life.Event) -> Step:
-    """Dora does not answer."""
-    reason = f"dora did not answer within {ENGINE_TIMEOUT // SECOND} s while {cell.state.value}"
-    return _fail(_because(cell, Cause.NO_ANSWER), reason, RunnerExit.ENGINE_LOST)
 
 
 def node_event(cell: Cell, event: life.Event) -> Step:
@@ -145,27 +86,18 @@ def node_event(cell: Cell, event: life.Event) -> Step:
     stops = _is_stopping(cell)
     nodes, record = table.update(cell.nodes, event, is_stopping=stops, is_open=is_open)
     actions = () if record is None else (Record(*with_downstream(record, cell.downstream)),)
-    return replace(cell, nodes=nodes), (*_oom_of_all(event), *actions)
+    return replace(cell, nodes=nodes), (*oom_of_all(event), *actions)
 
 
 def _is_stopping(cell: Cell) -> bool:
     return bool(cell.stop_by) or cell.reload or (cell.is_trial and bool(cell.failure))
 
 
-def _oom_of_all(event: life.Event) -> tuple[Action, ...]:
-    """What there is to say about the dataflow when its own limit has killed something of it."""
-    if not isinstance(event, life.NodeExited | life.ChildExited) or event.oom is None:
-        return ()
-    if event.oom.owner is not Owner.DATAFLOW:
-        return ()
-    return (Record("dataflow-oom", "", event.oom.dataflow_details()),)
-
-
 def stop_early(cell: Cell, event: life.Event) -> Step:
     """No node is there yet, or none that dora could be asked to stop."""
     assert isinstance(event, life.StopAsked)
     cell = replace(cell, stop_by=event.by)
-    return _to(cell, State.ENDED, _stopping(event), Record("dataflow-stopped"), Do.EXIT)
+    return to(cell, State.ENDED, _stopping(event), Record("dataflow-stopped"), Do.EXIT)
 
 
 def stop(cell: Cell, event: life.Event) -> Step:
@@ -188,7 +120,7 @@ def node_event_stopping(cell: Cell, event: life.Event) -> Step:
 
 
 def _leave(cell: Cell, *actions: Action) -> Step:
-    return _to(cell, State.LEAVING, *actions, Do.DISMISS_DAEMON, after=LEAVE_TIMEOUT)
+    return to(cell, State.LEAVING, *actions, Do.DISMISS_DAEMON, after=LEAVE_TIMEOUT)
 
 
 def leave_now(cell: Cell, event: life.Event) -> Step:
@@ -204,7 +136,7 @@ def reload(cell: Cell, event: life.Event) -> Step:
 def _wind_down(cell: Cell, *actions: Action) -> Step:
     if not table.has_process(cell.nodes):
         return _leave(cell, *actions)
-    return _to(cell, State.STOPPING, *actions, Do.ASK_STOP, after=stop_timeout(cell.grace))
+    return to(cell, State.STOPPING, *actions, Do.ASK_STOP, after=stop_timeout(cell.grace))
 
 
 def stop_again(cell: Cell, event: life.Event) -> Step:
@@ -240,7 +172,7 @@ def node_event_waiting(cell: Cell, event: life.Event) -> Step:
         node = after.nodes[event.node]
         if node.state == "failed" and node.policy == HELD:
             reason = f"node {event.node}: {node.exit} before it was ready"
-            after = _because(after, Cause.NODE_FAILED, [event.node])
+            after = because(after, Cause.NODE_FAILED, [event.node])
             failed, more = _fail_start(after, reason)
             return failed, (*actions, *more)
     return after, actions
@@ -248,7 +180,7 @@ def node_event_waiting(cell: Cell, event: life.Event) -> Step:
 
 def run_finished(cell: Cell, event: life.Event) -> Step:
     """No node is left: dora knows how they ended."""
-    return _to(cell, State.CLOSING, Do.ASK_RESULT, after=ENGINE_TIMEOUT)
+    return to(cell, State.CLOSING, Do.ASK_RESULT, after=ENGINE_TIMEOUT)
 
 
 def result(cell: Cell, event: life.Event) -> Step:
@@ -256,14 +188,14 @@ def result(cell: Cell, event: life.Event) -> Step:
     assert isinstance(event, life.ResultKnown)
     cell = replace(cell, nodes=table.apply_results(cell.nodes, event.results, event.at_us))
     if not event.results:
-        lost = _because(cell, Cause.NO_ANSWER)
-        return _fail(lost, "dora lost the dataflow", RunnerExit.ENGINE_LOST)
+        lost = because(cell, Cause.NO_ANSWER)
+        return fail(lost, "dora lost the dataflow", RunnerExit.ENGINE_LOST)
     failed = {node: _known_exit(cell, node, how) for node, how in event.results.items() if how}
     spent = table.spent(cell.nodes)
     if failed or spent:
         reason = ", ".join(f"node {node}: {how}" for node, how in {**failed, **spent}.items())
         code = RunnerExit.NODES_FAILED if spent else RunnerExit.FAILED
-        cell = _because(cell, Cause.NODE_FAILED, {**failed, **spent})
+        cell = because(cell, Cause.NODE_FAILED, {**failed, **spent})
         cell = replace(cell, failure=reason, exit=code)
     return _leave(cell)
 
@@ -283,12 +215,12 @@ def end(cell: Cell, event: life.Event) -> Step:
     if cell.stop_by:
         # Who asked for the end gets a clean one, whatever a node did on its way out.
         cell = replace(cell, failure="", exit=RunnerExit.OK)
-        return _to(cell, State.ENDED, Record("dataflow-stopped"), Do.EXIT)
+        return to(cell, State.ENDED, Record("dataflow-stopped"), Do.EXIT)
     if cell.reload:
-        return _to(replace(cell, failure="", exit=RunnerExit.OK), State.ENDED, Do.EXIT)
+        return to(replace(cell, failure="", exit=RunnerExit.OK), State.ENDED, Do.EXIT)
     if cell.failure:
-        return _fail(cell, cell.failure, cell.exit)
-    return _to(cell, State.ENDED, Record("dataflow-finished"), Do.EXIT)
+        return fail(cell, cell.failure, cell.exit)
+    return to(cell, State.ENDED, Record("dataflow-finished"), Do.EXIT)
 
 
 def daemon_left(cell: Cell, event: life.Event) -> Step:

@@ -9,6 +9,8 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.managercells import Cell
 from dora_systemd.restarts import unit_budget
 from dora_systemd.scope import Scope
+from dora_systemd.status import CellStatus
+from dora_systemd.statuswords import RESTARTING, status_word
 from dora_systemd.values import INFINITY
 
 _PROPERTIES = ("Restart", "NRestarts", "StartLimitBurst", "StartLimitIntervalUSec")
@@ -16,9 +18,12 @@ _WAITING = ("RestartUSec", "StateChangeTimestampMonotonic")
 _MOST_STARTS = 1000
 
 
-def restart_budget(manager: Manager, scope: Scope, cell: Cell) -> Mapping[str, int | None] | None:
+def restart_budget(
+    manager: Manager, scope: Scope, cell: Cell, status: CellStatus
+) -> Mapping[str, int | None] | None:
     """The restarts of a dataflow's unit, or None where systemd restarts nothing or without limit.
 
+    status: what its runner says.
     used, max: restarts. next_us, resets_us: µs until the next one, and until they are counted
     anew; None: there is none to come.
     """
@@ -37,7 +42,7 @@ def restart_budget(manager: Manager, scope: Scope, cell: Cell) -> Mapping[str, i
     return {
         "used": budget.used,
         "max": most,
-        "next_us": _next(manager, cell),
+        "next_us": _next(manager, cell, status),
         "resets_us": budget.resets_in,
     }
 
@@ -56,13 +61,12 @@ def _starts(scope: Scope, cell: Cell, restarts: int) -> list[int]:
     return sorted(found)
 
 
-def _next(manager: Manager, cell: Cell) -> int | None:
-    if not cell.state.sub.startswith("auto-restart"):
+def _next(manager: Manager, cell: Cell, status: CellStatus) -> int | None:
+    """systemd waits for the shortest delay, and the runner for what is left of a longer one."""
+    if status_word(cell.state.active, cell.state.sub, status.stage) != RESTARTING:
         return None
+    if not cell.state.sub.startswith("auto-restart"):
+        return max(status.started_us - time.time_ns() // 1000, 0)
     facts: dict[str, Any] = manager.read(cell.unit, _WAITING)
-    try:  # systemd before 254 has no steps, so each delay is the same
-        delay = manager.read(cell.unit, ["RestartUSecNext"])["RestartUSecNext"]
-    except DoraSystemdError:
-        delay = facts["RestartUSec"]
     now = time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000
-    return max(int(facts["StateChangeTimestampMonotonic"]) + int(delay) - now, 0)
+    return max(int(facts["StateChangeTimestampMonotonic"]) + int(facts["RestartUSec"]) - now, 0)

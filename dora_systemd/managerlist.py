@@ -148,7 +148,8 @@ def find_row(manager: Manager, scope: Scope, selector: str) -> DataflowRow:
             return row
     cell = select_cell(cells, selector)
     row = dataflow_row(manager, scope, cell)
-    row = row._replace(restart_budget=restart_budget(manager, scope, cell))
+    budget = restart_budget(manager, scope, cell, read_status(scope, cell))
+    row = row._replace(restart_budget=budget)
     return mark_enabled(manager, scope, [row])[0]
 
 

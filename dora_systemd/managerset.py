@@ -6,6 +6,7 @@ ours beside systemd's: those of a transient unit go with it, those of a unit fil
 
 import os
 from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,14 @@ from dora_systemd.managernodes import written_dataflow
 from dora_systemd.properties import format_unit, settings_properties, typed
 from dora_systemd.scope import Scope
 from dora_systemd.settings import Settings, resolve_settings
-from dora_systemd.unitfiles import NODE_LIMITS_FILE, drop_in_directory, write_unit_file
+from dora_systemd.unitfiles import (
+    NODE_LIMITS_FILE,
+    drop_in_directory,
+    read_unit_file,
+    remove_empty,
+    remove_unit_file,
+    write_unit_file,
+)
 
 _PROPERTIES = ("ControlGroup", "Environment", "FragmentPath", "Transient")
 
@@ -66,11 +74,16 @@ def set_limits(
     warnings = _warnings(settings, nodes, unit)
     # systemd keeps those of a transient unit beside it, whatever it is told.
     is_fleeting = Path(unit["FragmentPath"]).is_relative_to("/run")
-    if properties:
-        manager.set_properties(cell.unit, list(properties.values()), is_fleeting)
+    # The kernel refuses most easily, systemd after it; what has been done by then is taken back.
+    with ExitStack() as undo:
+        _limit_groups(unit, nodes, undo)
+        if nodes:
+            _remember(unit, nodes, undo)
+        if properties:
+            manager.set_properties(cell.unit, list(properties.values()), is_fleeting)
+        undo.pop_all()
     if nodes:
-        _remember(manager, unit, nodes)
-        _limit_groups(unit, nodes)
+        manager.reload()
     return (*warnings, *_unit_file_warnings(manager, scope, cell, unit))
 
 
@@ -108,18 +121,30 @@ def _warnings(
     return (*warnings, *use_warnings(values, nodes, cgroup.read_usage(path).memory, held))
 
 
-def _remember(manager: Manager, unit: Mapping[str, Any], nodes: tuple[NodeLimits, ...]) -> None:
-    """Write the drop-in, and have systemd read it: the next start of the runner is told of it."""
+def _remember(unit: Mapping[str, Any], nodes: tuple[NodeLimits, ...], undo: ExitStack) -> None:
+    """Write the drop-in: when systemd has read it, the next start of the runner is told of it."""
     before = dict(entry.split("=", 1) for entry in unit["Environment"] or ())
     changes = merge_node_limits(parse_changes(before.get(CHANGES_VARIABLE, "")), nodes)
     text = format_unit(typed(Environment=(f"{CHANGES_VARIABLE}={format_changes(changes)}",)))
     directory = drop_in_directory(Path(unit["FragmentPath"]), bool(unit["Transient"]))
-    write_unit_file(directory / NODE_LIMITS_FILE, f"# Written by doractl set.\n{text}")
-    manager.reload()
+    path = directory / NODE_LIMITS_FILE
+    undo.callback(_put_back, path, read_unit_file(path))
+    write_unit_file(path, f"# Written by doractl set.\n{text}")
 
 
-def _limit_groups(unit: Mapping[str, Any], nodes: tuple[NodeLimits, ...]) -> None:
-    if unit["ControlGroup"]:
-        groups = cgroup.node_groups(cgroup.group_path(unit["ControlGroup"]))
-        for one in nodes:
-            cgroup.limit_group(groups[one.node], one)
+def _put_back(path: Path, text: str | None) -> None:
+    if text is not None:
+        write_unit_file(path, text)
+    else:
+        remove_unit_file(path)
+        remove_empty(path.parent)
+
+
+def _limit_groups(unit: Mapping[str, Any], nodes: tuple[NodeLimits, ...], undo: ExitStack) -> None:
+    if not nodes or not unit["ControlGroup"]:
+        return
+    groups = cgroup.node_groups(cgroup.group_path(unit["ControlGroup"]))
+    for one in nodes:
+        if group := groups.get(one.node):  # else its next start finds the limit in the drop-in
+            undo.callback(cgroup.restore_group, group, cgroup.read_files(group, one.files()))
+            cgroup.limit_group(group, one)

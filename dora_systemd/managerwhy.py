@@ -13,7 +13,7 @@ from dora_systemd.logquery import scope_matches, story_matches
 from dora_systemd.managerbudget import restart_budget
 from dora_systemd.managercells import Cell, find_cell, matching_cells, read_cells
 from dora_systemd.managerended import select_ended
-from dora_systemd.managerlist import look_at_table
+from dora_systemd.managerlist import look_at_table, read_status
 from dora_systemd.names import unit_name
 from dora_systemd.postmortem import examine
 from dora_systemd.postmortemtext import LINES, Report, Subject, Word
@@ -38,7 +38,9 @@ def explain(manager: Manager, scope: Scope, selector: str, journal: JournalReade
     facts = _facts(manager, scope, cell) if cell else Facts(now_boot=_now_boot())
     shutdowns = _shutdowns(journal)
     verdict = examine(lives, facts, shutdowns)
-    budget = restart_budget(manager, scope, cell) if cell and not verdict.is_given_up else None
+    budget = None
+    if cell and not verdict.is_given_up:
+        budget = restart_budget(manager, scope, cell, read_status(scope, cell))
     return Report(subject, verdict, _last_words(journal, scope, subject, verdict), budget)
 
 

@@ -30,8 +30,9 @@ DRAIN_LIMIT = 4 * PIPE_SIZE
 class LogPipes:
     """The output of all nodes of a cell, and the cell's life events, into the journal.
 
-    journal: where entries go. origin: of what is of no node. keep: is given each descriptor whose
-    content shall outlive this process. All methods belong to `loop`'s thread and return at once.
+    journal: where entries go. origin: of what is of no node. keep: gets each descriptor whose
+    content shall outlive this process, and its node; release: a node that is gone for good. All
+    methods belong to `loop`'s thread and return at once.
     """
 
     def __init__(
@@ -39,10 +40,11 @@ class LogPipes:
         loop: asyncio.AbstractEventLoop,
         journal: Journal,
         origin: Origin,
-        keep: Callable[[int], object] | None = None,
+        keep: Callable[[int, str], object] = lambda *_: None,
+        release: Callable[[str], object] = lambda _: None,
     ) -> None:
         self._loop = loop
-        self._keep = keep
+        self._keep, self._release = keep, release
         self._journal = journal
         self._queue = LogQueue(loop, journal, self._pause, self._resume)
         self._origin = origin
@@ -73,17 +75,16 @@ class LogPipes:
         for stream, path in fifos(node_id, self._paths[node_id]).items():
             # Read and write: no end of file between two lives of the node.
             fd = os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
-            if self._keep is not None:
-                self._keep(fd)
+            self._keep(fd, node_id)
             self.adopt(node_id, stream, fd, HeldLines(path))
 
     def forget(self, node_id: str) -> None:
         """The node is gone for good: take its last words, close its pipes and remove them."""
         self.drain(node_id)
         source = self._sources.pop(node_id)
-        for pipe in source.pipes:
-            self._loop.remove_reader(pipe.fd)
-            pipe.close()
+        if source.pipes:
+            self._release(node_id)
+        self._close_pipes(source)
         if node_id in self._paths:
             for path in fifos(node_id, self._paths.pop(node_id)).values():
                 path.unlink(missing_ok=True)
@@ -146,10 +147,9 @@ class LogPipes:
 
     def write_event(self, name: str, node: str | None = None, **details: Value) -> None:
         """Write life event `name` (see dora_systemd.events), after all lines put before it."""
-        origin = self._source(node).origin if node else self._origin
         if name == "lines-lost" and isinstance(lost := details["count"], int):
             self._lost += lost
-        fields = event_fields(name, dataflow=origin.name, node=origin.node, **details)
+        fields = event_fields(name, dataflow=self._origin.name, node=node or "", **details)
         if node:
             self._queue.put_record(node, self._entry(fields, node))
         else:
@@ -203,13 +203,9 @@ class LogPipes:
             self._journal.wait_ready(deadline - time.monotonic())
             self._queue.flush()
 
-    async def wait_empty(self, seconds: float) -> None:
-        """Return when journald has taken all that was put so far, or after `seconds`.
-
-        Unlike settle() and close() it lets the loop run, so that the watchdog is fed meanwhile.
-        """
-        deadline = time.monotonic() + seconds
-        while not self._queue.is_empty and time.monotonic() < deadline:
+    async def wait_empty(self, left: Callable[[], float]) -> None:
+        """Return when journald has taken all so far, or no second is `left`; the loop runs on."""
+        while not self._queue.is_empty and left() > 0:
             await asyncio.sleep(0.01)
 
     def close(self, seconds: float = 7.0) -> None:
@@ -222,12 +218,15 @@ class LogPipes:
         if lost := self._queue.give_up():
             self.write_event("lines-lost", count=lost, reason="journald did not take them")
         for source in self._sources.values():
-            for pipe in source.pipes:
-                self._loop.remove_reader(pipe.fd)
-                pipe.close()
-            source.pipes.clear()
+            self._close_pipes(source)
         for fd in list(self._outputs):
             self._end_output(fd)
+
+    def _close_pipes(self, source: Source) -> None:
+        for pipe in source.pipes:
+            self._loop.remove_reader(pipe.fd)
+            pipe.close()
+        source.pipes.clear()
 
     def _source(self, node_id: str) -> Source:
         if node_id not in self._sources:

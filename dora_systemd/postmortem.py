@@ -51,6 +51,8 @@ def examine(lives: Sequence[Life], facts: Facts, shutdowns: Sequence[int] = ()) 
     """
     chain = with_restarts(lives)
     life = chain[-1] if chain else Life()
+    if facts.status == RESTARTING and len(chain) > 1 and _only_begins(life):
+        life = chain[-2]  # its runner waits before it does anything
     status = facts.status if facts.status in UP_WORDS else ended_word(life, facts.status)
     if status in UP_WORDS and status != RESTARTING:
         found = _present(life, facts)
@@ -76,6 +78,10 @@ def examine(lives: Sequence[Life], facts: Facts, shutdowns: Sequence[int] = ()) 
         tuple(one for each in chain for one in each.happenings if _is_news(one)),
         *_before(lives[: -len(chain)] if chain else (), facts, shutdowns),
     )
+
+
+def _only_begins(life: Life) -> bool:
+    return all(one.name == "unit-starting" for one in life.happenings)
 
 
 def _before(lives: Sequence[Life], facts: Facts, shutdowns: Sequence[int]) -> tuple[str, int]:

@@ -36,6 +36,8 @@ _REMEDIES = {
     Cause.COORDINATOR_LOST: "doractl restart {name}; --restart-policy on-failure does it by itself",
     Cause.NO_ANSWER: "doractl restart {name}; was the machine overloaded?",
     Cause.DIRECTORY_LOST: "doractl restart {name}; nobody but systemd may tidy up there",
+    Cause.RUNNER_BROKEN: "doractl restart {name}; unless the machine was short of processes, files "
+    "or space, please report it",
     Cause.RUNNER_KILLED: "doractl restart {name}; --restart-policy on-failure does it by itself",
     Cause.WATCHDOG: "doractl restart {name}; was the machine overloaded?",
     Cause.OUT_OF_MEMORY: "limit single nodes (--node-limit NODE:memory=SIZE), so that one is named",

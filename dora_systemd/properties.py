@@ -26,15 +26,14 @@ from dora_systemd.sandbox import Sandbox, sandbox_properties
 from dora_systemd.scope import RUNTIME_NAME
 from dora_systemd.settings import Settings
 from dora_systemd.settingtable import PROPERTY
+from dora_systemd.stopbudget import unit_timeout
 from dora_systemd.values import INFINITY, SECOND, quoted
-
-STOP_MARGIN = 10 * SECOND
-"""What TimeoutStopSec= allows beyond 1.5 grace durations, dora's own last resort."""
 
 WATCHDOG = 30 * SECOND
 
 START_MARGIN = 10 * SECOND
-"""What TimeoutStartSec= allows beyond --start-timeout, which is the runner's."""
+"""What TimeoutStartSec= allows beyond the pause before a restart and --start-timeout, which are
+the runner's."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +111,9 @@ def service_properties(options: RunnerOptions, context: UnitContext) -> dict[str
     reload = tuple(reload_command(context.python))
     # The runner names the nodes that are late; systemd ends one that cannot even do that.
     is_endless = options.start_timeout == INFINITY
-    start_timeout = INFINITY if is_endless else options.start_timeout + START_MARGIN
+    pause = 0 if options.restart.policy == "no" else options.restart.max_delay
+    most = pause + options.start_timeout + START_MARGIN
+    start_timeout = INFINITY if is_endless else most
     return typed(
         Type="notify",
         NotifyAccess="main",
@@ -135,9 +136,7 @@ def stop_properties(options: RunnerOptions) -> dict[str, Property]:
 
     dora kills a node at 1.5 times its grace duration.
     """
-    is_endless = options.grace == INFINITY
-    timeout = INFINITY if is_endless else options.grace * 3 // 2 + STOP_MARGIN
-    return typed(KillMode="mixed", TimeoutStopSec=timeout)
+    return typed(KillMode="mixed", TimeoutStopSec=unit_timeout(options.grace))
 
 
 def restart_properties(options: RunnerOptions) -> dict[str, Property]:
@@ -154,13 +153,11 @@ def restart_properties(options: RunnerOptions) -> dict[str, Property]:
     if policy.policy == "no":
         return common | typed(Restart="no")
     is_endless = policy.max_restarts == INFINITY
-    growth = {"RestartSteps": policy.steps(), "RestartMaxDelaySec": policy.max_delay}
-    if policy.steps() < 1:
-        growth = {}
     return common | typed(
         Restart=policy.policy,
+        # The runner itself waits longer, see dora_systemd.runnerpause: RestartSteps= would never
+        # forget what was long ago.
         RestartSec=policy.delay,
-        **growth,
         StartLimitIntervalSec=0 if is_endless else policy.window,
         StartLimitBurst=1 if is_endless else policy.max_restarts + 1,
     )

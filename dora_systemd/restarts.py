@@ -53,9 +53,9 @@ class RestartPolicy(NamedTuple):
             **window,
         }
 
-    def steps(self) -> int:
-        """RestartSteps=: so many doublings lead from delay to max_delay; 0 is no growth."""
-        return (self.max_delay // max(self.delay, 1)).bit_length() - 1
+    def delay_before(self, restart: int) -> int:
+        """Before a restart, counted from 1 since the last quiet window: it doubles each time."""
+        return min(self.delay << min(max(restart - 1, 0), 64), self.max_delay)
 
 
 DEFAULT = RestartPolicy()

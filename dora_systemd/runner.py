@@ -15,6 +15,7 @@ from dora_systemd.environment import node_environment
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.options import parse_runner_argv
 from dora_systemd.runnerbegin import enter_supervisor, leave_out_openssl, start_coordinator
+from dora_systemd.runnerpause import pause
 
 if TYPE_CHECKING:
     from dora_systemd.doracheck import DoraCheck
@@ -32,6 +33,7 @@ def begin(argv: list[str]) -> "tuple[Child, DoraCheck] | None":
             options = parse_runner_argv(argv)
             enter_supervisor()
             paths = CellPaths(Path(directory))
+            pause(options, paths)
             environment = node_environment(os.environ)
             coordinator = start_coordinator(options.dora, paths, environment)
             from dora_systemd.doracheck import DoraCheck

@@ -1,12 +1,16 @@
 """The life of a cell: what the main process of a dataflow's unit does, see dora_systemd.runner."""
 
 import asyncio
+import contextlib
 import os
 import signal
 import sys
+import traceback
+from collections.abc import Coroutine
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from dora_systemd import fdstore, notify
 from dora_systemd import lifeevents as life
@@ -20,13 +24,12 @@ from dora_systemd.engine import Child
 from dora_systemd.environment import node_environment
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.journal import JournalSocket
-from dora_systemd.launch import has_pipes, kinds, python_of
+from dora_systemd.launch import kinds
 from dora_systemd.logs import Origin
 from dora_systemd.names import settings_path
 from dora_systemd.options import RunnerOptions, parse_runner_argv
 from dora_systemd.pipes import LogPipes
 from dora_systemd.preparation import (
-    PACKAGE,
     Prepared,
     check_named_nodes,
     prepare,
@@ -35,13 +38,17 @@ from dora_systemd.preparation import (
 from dora_systemd.refusal import format_refusal, refusal_exit
 from dora_systemd.runnerapply import Run
 from dora_systemd.runnerbegin import enter_supervisor
+from dora_systemd.runnerclock import StopClock
 from dora_systemd.runnerdialogue import Dialogue
 from dora_systemd.runnerengine import Engine
+from dora_systemd.runnerfailure import Beside, words
 from dora_systemd.runnerlistener import serve
 from dora_systemd.runnerloss import LossWatch, losses_of_user
 from dora_systemd.runnernodes import Nodes, wait_eof
+from dora_systemd.runnerpause import forget_restarts
 from dora_systemd.runnerpump import Pump, now_us
 from dora_systemd.runnerreload import Reloader
+from dora_systemd.runnerrooms import daemon_variables, make_directories
 from dora_systemd.runnersettings import SettingsFile
 from dora_systemd.runnerswap import READY_SECONDS, Swapper
 from dora_systemd.values import INFINITY, SECOND
@@ -49,37 +56,12 @@ from dora_systemd.wiring import downstream_of
 
 SAMPLE_SECONDS = 5.0
 JOURNAL_SECONDS = 1.0
-STOP_SECONDS = 7.0
-BACKLOG_SECONDS = 60.0
-"""How long journald may take for what the nodes have left to say, when nobody waits."""
+CLOSE_SECONDS = 7.0
+LOSSES_SECONDS = 10.0
+CANCEL_SECONDS = 0.5
 
 Begun = tuple[Child, DoraCheck]
 """A coordinator that boots, and what dora is asked meanwhile."""
-
-
-def daemon_variables(prepared: Prepared, paths: CellPaths, unit: Path) -> dict[str, str]:
-    """What the daemon's environment has besides the nodes'; launcher.sh takes it out again."""
-    libexec = str(PACKAGE / "libexec")
-    own = {"DORA_QUIET": "1", "RUST_BACKTRACE": "0"}
-    added = {key: text for key, text in own.items() if key not in os.environ}
-    kept = [node.id for node in prepared.dataflow.nodes if not has_pipes(node)]
-    return {
-        **added,
-        "DORA_SYSTEMD_UNSET": " ".join(("DORA_QUIET", *added)),
-        "DORA_SYSTEMD_CELL": str(paths.root),
-        "DORA_SYSTEMD_GROUP": str(unit),
-        "DORA_SYSTEMD_LIBEXEC": libexec,
-        "DORA_SYSTEMD_DIRECTORY": prepared.plan.options.working_directory,
-        "DORA_SYSTEMD_PYTHON": python_of(prepared.plan),
-        "DORA_SYSTEMD_KEEP": " ".join(kept),
-        "PATH": f"{libexec}:{prepared.plan.search_path}",
-    }
-
-
-def make_directories(paths: CellPaths) -> None:
-    """The rooms of the RuntimeDirectory. Raises OSError."""
-    for path in (paths.daemon, paths.work, paths.io):
-        path.mkdir(mode=0o700, exist_ok=True)
 
 
 async def run_cell(
@@ -90,36 +72,57 @@ async def run_cell(
     begun: what there is of the first run already.
     """
     loop = asyncio.get_running_loop()
-    unit = enter_supervisor()
-    make_directories(paths)
-    journal = JournalSocket()
+    journal, clock = JournalSocket(), StopClock(options.grace)
     # While systemd holds the pipes too, what is in them outlives a kill of this process.
     fdstore.forget_inherited()
-    pipes = LogPipes(loop, journal, Origin(options.name, options.uuid), fdstore.store)
-    environment = node_environment(os.environ)
-    nodes = Nodes(unit, paths, pipes)
-    settings = SettingsFile(settings_path(options.dataflow), paths.settings)
-    reloader = Reloader(options, environment, settings)
-    coordinator, check = begun or (None, DoraCheck(options, environment))
-    cell = Runs(paths, unit, environment, pipes, nodes, reloader, check, coordinator)
-    losses = losses_of_user(journal, pipes) if paths.is_of_user else None
+    origin = Origin(options.name, options.uuid)
+    pipes = LogPipes(loop, journal, origin, fdstore.store, fdstore.forget)
     try:
         pipes.write_event("dataflow-starting")
-        return await live(cell, losses)
+        cell = furnish(options, paths, pipes, clock, begun)
+        return await live(cell, losses_of_user(journal, pipes) if paths.is_of_user else None)
     except DoraSystemdError as error:
-        notify.send_status(format_refusal(error))
-        pipes.write_event("dataflow-failed", reason=error.message, cause=Cause.BAD_DATAFLOW)
+        tell_failure(pipes, error, Cause.BAD_DATAFLOW)
+        raise
+    except Exception as error:
+        broken = DoraSystemdError(f"cannot run the dataflow: {words(error)}")
+        tell_failure(pipes, broken, Cause.RUNNER_BROKEN)
         raise
     finally:
-        pipes.close()
-        journal.wait_read(JOURNAL_SECONDS)
+        pipes.close(clock.left(JOURNAL_SECONDS if clock.by else CLOSE_SECONDS))
+        journal.wait_read(clock.left(JOURNAL_SECONDS))
+
+
+def tell_failure(pipes: LogPipes, error: DoraSystemdError, cause: Cause) -> None:
+    """Say why there is no run of the dataflow."""
+    pipes.write_event("dataflow-failed", reason=error.message, cause=cause)
+    notify.send_status(format_refusal(error))
+
+
+def furnish(
+    options: RunnerOptions,
+    paths: CellPaths,
+    pipes: LogPipes,
+    clock: StopClock,
+    begun: Begun | None,
+) -> "Runs":
+    """Enter the unit's group, and make what all runs share. Raises OSError."""
+    unit = enter_supervisor()
+    make_directories(paths)
+    environment = node_environment(os.environ)
+    settings = SettingsFile(settings_path(options.dataflow), paths.settings)
+    reloader = Reloader(options, environment, settings)
+    nodes, beside = Nodes(unit, paths, pipes), Beside(asyncio.get_running_loop())
+    coordinator, check = begun or (None, DoraCheck(options, environment))
+    return Runs(paths, unit, environment, pipes, nodes, reloader, check, beside, clock, coordinator)
 
 
 @dataclass(frozen=True)
 class Runs:
     """What all runs of the dataflow share. unit: cgroup directory. environment: of the nodes.
 
-    check: dora's, of the first run. coordinator: of that run, if it is there already.
+    check: dora's, of the first run. beside: their tasks. clock: of the stop that ends the last of
+    them. coordinator: that of the first run, if it is there already.
     """
 
     paths: CellPaths
@@ -129,28 +132,33 @@ class Runs:
     nodes: Nodes
     reloader: Reloader
     check: DoraCheck
+    beside: Beside
+    clock: StopClock
     coordinator: Child | None = None
 
 
 async def live(cell: Runs, losses: LossWatch | None) -> RunnerExit:
     """Run the dataflow, and again as long as reloads ask for it."""
-    beside = [asyncio.create_task(cell.reloader.work())]
     reach = partial(read_coordinator, cell.paths.control)
-    beside.append(asyncio.create_task(serve(cell.paths.socket, cell.reloader.answer, reach)))
+    beside = cell.beside
+    beside.spawn("reload", cell.reloader.work())
+    beside.spawn("forget restarts", forget_restarts(cell.reloader.options))
+    beside.spawn("serve its socket", serve(cell.paths.socket, cell.reloader.answer, reach))
     if losses is not None:
-        beside.append(asyncio.create_task(losses.run()))
+        beside.spawn("count what journald throws away", losses.run())
     try:
         last = await run_once(cell, is_again=False)
         while goes_on(cell, last):
             notify.send_reloading()
             last = await run_once(cell, is_again=True)
         if losses is not None:
-            await losses.finish()
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(cell.clock.left(LOSSES_SECONDS)):
+                    await losses.finish()
         return last.exit
     finally:
         cell.reloader.close()
-        for task in beside:
-            task.cancel()
+        beside.cancel()
 
 
 def goes_on(cell: Runs, last: Cell) -> bool:
@@ -182,20 +190,20 @@ async def run_once(cell: Runs, is_again: bool) -> Cell:
         variables = daemon_variables(prepared, cell.paths, cell.unit)
         pump.connect(dialogue.actions(prepared.descriptor, variables))
         cell.pipes.mute()
-        listen(asyncio.get_running_loop(), options, pump, dialogue)
+        listen(options, pump, dialogue, cell.clock)
         dialogue.watch(coordinator, dialogue.read_coordinator)
         run = Run(pump, cell.nodes, cell.pipes, Swapper(pump, dora))
         reloader.begin(run, prepared, started_us * 1000)
-        dialogue.spawn(tell_started(pump, reloader))
+        dialogue.spawn("tell that it has started", tell_started(pump, reloader))
+        cell.beside.attach(pump.push)
         try:
-            await dialogue.end
+            await pump.end
         finally:
             reloader.end()
             cell.nodes.close()
             if not pump.cell.reload:
-                # The loop runs on and the watchdog is fed; a stop has systemd's clock against it.
-                seconds = STOP_SECONDS if pump.cell.stop_by else BACKLOG_SECONDS
-                await cell.pipes.wait_empty(seconds)
+                # The loop runs on and the watchdog is fed.
+                await cell.pipes.wait_empty(cell.clock.for_journal())
             dialogue.cancel()
         return pump.cell
     finally:
@@ -215,16 +223,17 @@ async def tell_started(pump: Pump, reloader: Reloader) -> None:
         reloader.has_started()
 
 
-def listen(
-    loop: asyncio.AbstractEventLoop, options: RunnerOptions, pump: Pump, dialogue: Dialogue
-) -> None:
+def listen(options: RunnerOptions, pump: Pump, dialogue: Dialogue, clock: StopClock) -> None:
     """Hear what asks the cell to stop, and do what is done from time to time."""
+    loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-        loop.add_signal_handler(number, partial(stop, pump, number.name))
-    dialogue.spawn(dialogue.take_samples(SAMPLE_SECONDS))
+        loop.add_signal_handler(number, partial(stop, pump, clock, number.name))
+    if clock.by:  # it came when the run before had ended already
+        loop.call_soon(stop, pump, clock, clock.by)
+    dialogue.spawn("take samples", dialogue.take_samples(SAMPLE_SECONDS))
     if "WATCHDOG_USEC" in os.environ:
         seconds = int(os.environ["WATCHDOG_USEC"]) / 1_000_000 / 3
-        dialogue.spawn(dialogue.feed_watchdog(seconds))
+        dialogue.spawn("feed the watchdog", dialogue.feed_watchdog(seconds))
     timeout = options.start_timeout
     if pump.cell.is_trial:
         timeout = min(timeout, round(READY_SECONDS * SECOND))
@@ -232,18 +241,31 @@ def listen(
         late = life.StartTimedOut(now_us(), timeout)
         loop.call_later(timeout / SECOND, pump.push, late)
     if options.attached:
-        dialogue.spawn(stop_at_eof(pump))
+        dialogue.spawn("watch its terminal", stop_at_eof(pump, clock))
 
 
-def stop(pump: Pump, by: str) -> None:
+def stop(pump: Pump, clock: StopClock, by: str) -> None:
     """Ask the cell to stop."""
+    clock.begin(by)
     pump.push(life.StopAsked(now_us(), by))
 
 
-async def stop_at_eof(pump: Pump) -> None:
+async def stop_at_eof(pump: Pump, clock: StopClock) -> None:
     """Stop when who started the cell, attached, is gone."""
     await wait_eof(sys.stdin.fileno())
-    stop(pump, "terminal")
+    stop(pump, clock, "terminal")
+
+
+def run_loop(cell: Coroutine[Any, Any, RunnerExit]) -> RunnerExit:
+    """As asyncio.run(), which would wait at the end for threads that nobody needs any more."""
+    loop = asyncio.new_event_loop()
+    try:
+        return loop.run_until_complete(cell)
+    finally:
+        if tasks := asyncio.all_tasks(loop):
+            for task in tasks:
+                task.cancel()
+            loop.run_until_complete(asyncio.wait(tasks, timeout=CANCEL_SECONDS))
 
 
 def run(argv: list[str], begun: Begun | None) -> int:
@@ -254,10 +276,12 @@ def run(argv: list[str], begun: Begun | None) -> int:
         if not directory:
             hint = "it is started by systemd: use `doractl start`"
             raise DoraSystemdError("cannot run without RUNTIME_DIRECTORY", hint, ExitCode.USAGE)
-        return asyncio.run(run_cell(options, CellPaths(Path(directory)), begun))
+        return run_loop(run_cell(options, CellPaths(Path(directory)), begun))
     except DoraSystemdError as error:
         print(f"{error.message}\n{error.hint}".strip(), file=sys.stderr)
         return refusal_exit(error)
-    except OSError as error:
-        print(f"cannot run the dataflow: {error}", file=sys.stderr)
+    except Exception as error:
+        if not isinstance(error, OSError):
+            traceback.print_exc()
+        print(f"cannot run the dataflow: {words(error)}", file=sys.stderr)
         return RunnerExit.FAILED

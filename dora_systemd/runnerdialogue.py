@@ -6,14 +6,15 @@ from typing import Any
 
 from dora_systemd import engine, notify, protocol
 from dora_systemd import lifeevents as life
-from dora_systemd.cellstate import Do, RunnerExit, State
+from dora_systemd.cellstate import Do, State
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.lifehandlers import stop_timeout
 from dora_systemd.options import RunnerOptions
 from dora_systemd.pipes import LogPipes
 from dora_systemd.runnerengine import Engine
+from dora_systemd.runnerfailure import failed
 from dora_systemd.runnernodes import Nodes
 from dora_systemd.runnerpump import Pump, now_us
+from dora_systemd.stopbudget import stop_timeout
 from dora_systemd.values import SECOND
 
 _LISTENING = "Listening on port "
@@ -38,7 +39,6 @@ class Dialogue:
         self._pipes = pipes
         self._loop = asyncio.get_running_loop()
         self._tasks: set[asyncio.Task[None]] = set()
-        self.end: asyncio.Future[RunnerExit] = self._loop.create_future()
 
     def actions(
         self, descriptor: Mapping[str, Any], variables: Mapping[str, str]
@@ -46,29 +46,40 @@ class Dialogue:
         """What each Do does. variables: what the daemon's environment has besides the nodes'."""
         return {
             Do.START_DAEMON: lambda: self._start_daemon(variables),
-            Do.SEND_START: lambda: self.spawn(self._send_start(descriptor)),
-            Do.SUBSCRIBE: lambda: self.spawn(self._subscribe()),
+            Do.SEND_START: lambda: self._ask(Do.SEND_START, self._send_start(descriptor)),
+            Do.SUBSCRIBE: lambda: self._ask(Do.SUBSCRIBE, self._subscribe()),
             Do.OPEN_PIPES: lambda: self._nodes.listen(self._pump.cell.run),
-            Do.ASK_SPAWN: lambda: self.spawn(self._ask_spawn()),
-            Do.ASK_RESULT: lambda: self.spawn(self._ask_result()),
-            Do.ASK_STOP: lambda: self.spawn(self._ask_stop()),
+            Do.ASK_SPAWN: lambda: self._ask(Do.ASK_SPAWN, self._ask_spawn()),
+            Do.ASK_RESULT: lambda: self._ask(Do.ASK_RESULT, self._ask_result()),
+            Do.ASK_STOP: lambda: self._ask(Do.ASK_STOP, self._ask_stop()),
             Do.DISMISS_DAEMON: self._dismiss_daemon,
-            Do.EXIT: lambda: self.end.set_result(self._pump.cell.exit),
+            Do.EXIT: lambda: self._pump.end.set_result(self._pump.cell.exit),
         }
 
-    def spawn(self, work: Coroutine[Any, Any, None]) -> None:
-        """Run `work` beside all else; what it cannot do ends the cell."""
-        task = self._loop.create_task(self._guard(work))
+    def _ask(self, what: Do, work: Coroutine[Any, Any, None]) -> None:
+        self.spawn(what.value, work)
+
+    def spawn(self, what: str, work: Coroutine[Any, Any, None]) -> None:
+        """Run `work` beside all else; what it cannot do ends the cell.
+
+        what: what it does, as after "could not".
+        """
+        task = self._loop.create_task(self._guard(what, work))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
-    async def _guard(self, work: Coroutine[Any, Any, None]) -> None:
+    async def _guard(self, what: str, work: Coroutine[Any, Any, None]) -> None:
+        event: life.Event | None = None
         try:
             await work
         except DoraSystemdError as error:
+            event = life.Refused(now_us(), error.message)
+        except Exception as error:
+            event = failed(what, error)
+        if event is not None:
             # While a child is dying, its end says more than what its connection suffers.
             await asyncio.sleep(_SETTLE_SECONDS)
-            self._pump.push(life.Refused(now_us(), error.message))
+            self._pump.push(event)
 
     def cancel(self) -> None:
         """Give up all that is still asked."""
@@ -93,7 +104,7 @@ class Dialogue:
 
     def _start_daemon(self, variables: Mapping[str, str]) -> None:
         self.watch(self._engine.start_daemon(variables), self._read_daemon)
-        self.spawn(self._wait_joined())
+        self.spawn("wait until the daemon has joined", self._wait_joined())
 
     def _read_daemon(self, line: str) -> None:
         event = protocol.parse_daemon_line(line, now_us())
@@ -162,7 +173,7 @@ class Dialogue:
         self._nodes.let_go()
         # What the two say about each other's end is no news.
         self._pipes.mute("coordinator", "daemon")
-        self.spawn(self._dismiss_when_quiet())
+        self._ask(Do.DISMISS_DAEMON, self._dismiss_when_quiet())
 
     async def _dismiss_when_quiet(self) -> None:
         # The daemon writes what its nodes said last after the news that they have ended.

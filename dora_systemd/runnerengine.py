@@ -15,6 +15,9 @@ from dora_systemd.values import SECOND
 POLL_SECONDS = 0.002
 """Between two questions whether the daemon has registered: dora tells it by no event."""
 
+KILL_SECONDS = 0.5
+"""What SIGKILL may take; what sleeps in the kernel and takes longer is left to systemd."""
+
 SILENCE = 20
 """Seconds without a word of the daemon after which it hangs; it sends a heartbeat every 5."""
 
@@ -112,11 +115,14 @@ class Engine:
     ) -> None:
         """Subscribe to the events of a run, tell on_start, and give them on until the end."""
         connection = await self.connect()
-        reply = await connection.request(protocol.subscribe_params(run))
-        if reply.error:
-            raise DoraSystemdError(f"cannot read events of dora: {reply.error}")
-        on_start()
-        await connection.read_events(on_record)
+        try:
+            reply = await connection.request(protocol.subscribe_params(run))
+            if reply.error:
+                raise DoraSystemdError(f"cannot read events of dora: {reply.error}")
+            on_start()
+            await connection.read_events(on_record)
+        finally:
+            connection.abort()
 
     def dismiss_daemon(self) -> bool:
         """Let the daemon end in good order; False when it already has."""
@@ -129,7 +135,11 @@ class Engine:
         return True
 
     def kill(self) -> None:
-        """SIGKILL to what is left of the two, and reap."""
+        """SIGKILL to what is left of the two, and reap; the connection goes, too."""
+        if self._requests is not None:
+            self._requests.abort()
         for child in self._children.values():
             child.send_signal(signal.SIGKILL)
-            child.popen.wait()
+        for child in self._children.values():
+            child.close(asyncio.get_running_loop(), KILL_SECONDS)
+        self._children.clear()

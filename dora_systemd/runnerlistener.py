@@ -6,7 +6,9 @@ A request to be relayed becomes a connection to the coordinator, whatever networ
 import asyncio
 import contextlib
 import json
-from collections.abc import Awaitable, Callable, Mapping
+import os
+import socket
+from collections.abc import Awaitable, Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -33,10 +35,22 @@ async def serve(path: Path, answer: Answer, reach: Reach) -> None:
         writer.close()
 
     path.unlink(missing_ok=True)
-    server = await asyncio.start_unix_server(talk, path, limit=MAX_BYTES)
-    path.chmod(0o600)
-    async with server:
-        await server.serve_forever()
+    with _short(path) as address, socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(address)
+        path.chmod(0o600)
+        server = await asyncio.start_unix_server(talk, sock=listener, limit=MAX_BYTES)
+        async with server:
+            await server.serve_forever()
+
+
+@contextlib.contextmanager
+def _short(path: Path) -> Iterator[str]:
+    """The address of a socket has 107 bytes, see unix(7); a dataflow's name may have 200."""
+    directory = os.open(path.parent, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        yield f"/proc/self/fd/{directory}/{path.name}"
+    finally:
+        os.close(directory)
 
 
 async def _answer(request: Request | None, answer: Answer, reach: Reach) -> dict[str, Any]:
@@ -48,6 +62,10 @@ async def _answer(request: Request | None, answer: Answer, reach: Reach) -> dict
         return await answer(request)
     except DoraSystemdError as error:
         return _refusal(error)
+    except Exception as error:
+        # A request that we do not understand ends nothing but itself.
+        what = f"cannot do that: {type(error).__name__}: {error}"
+        return _refusal(DoraSystemdError(what, "please report it"))
 
 
 async def _relay(caller: Ends, reach: Reach) -> None:

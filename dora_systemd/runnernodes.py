@@ -223,9 +223,10 @@ def raise_file_limit() -> None:
 def _with_descendants(pid: int) -> list[int]:
     found = [pid]
     for known in found:
-        for task in Path(f"/proc/{known}/task").glob("*/children"):
-            with contextlib.suppress(OSError):
-                found += map(int, task.read_text().split())
+        # Each of them may end at any moment, its whole directory with it.
+        with contextlib.suppress(OSError):
+            for task in Path(f"/proc/{known}/task").iterdir():
+                found += map(int, (task / "children").read_text().split())
     return found
 
 

@@ -24,11 +24,18 @@ if TYPE_CHECKING:
 
 QUIET_SECONDS = 0.1
 DAEMON_SECONDS = 5.0
+KILL_SECONDS = 2.0
+READ_SECONDS = 1.0
+KILLED_SECONDS = 0.005
+ALL_SECONDS = 8.0
+"""For everything: systemd allows as much as for a stop, so STOP_MARGIN in
+dora_systemd.stopbudget is the least, and Python has to start."""
 STREAMS = {".out": "stdout", ".err": "stderr"}
 
 
 def main(argv: list[str]) -> int:
     """Kill the nodes, write what they said last, and the event dataflow-failed."""
+    deadline = time.monotonic() + ALL_SECONDS
     reason, directory = killed_by(os.environ), os.environ.get("RUNTIME_DIRECTORY", "")
     if not reason or len(argv) != 2 or not directory:
         return 0
@@ -37,8 +44,9 @@ def main(argv: list[str]) -> int:
     if memory:
         cause, reason = Cause.OUT_OF_MEMORY, memory
     with contextlib.suppress(OSError):
-        kill_nodes(unit)
-    write_last_words(argv[0], argv[1], Path(directory), reason, cause=cause)
+        kill_nodes(unit, KILL_SECONDS)
+    left = deadline - time.monotonic()
+    write_last_words(argv[0], argv[1], Path(directory), reason, cause=cause, seconds=left)
     return 0
 
 
@@ -62,12 +70,19 @@ def killed_cause(environ: Mapping[str, str]) -> Cause:
 
 
 def write_last_words(
-    name: str, uuid: str, directory: Path, reason: str, journal_socket: str = "", cause: str = ""
+    name: str,
+    uuid: str,
+    directory: Path,
+    reason: str,
+    journal_socket: str = "",
+    cause: str = "",
+    seconds: float = ALL_SECONDS,
 ) -> None:
-    """Write what is in the pipes below `directory`, and that the dataflow failed.
+    """Write what is in the pipes below `directory`, and that the dataflow failed, in `seconds`.
 
     journal_socket: another one than journald's, for tests.
     """
+    deadline = time.monotonic() + seconds
     # Nearly always there is nothing to do: only then these imports cost their time.
     import asyncio
 
@@ -94,16 +109,18 @@ def write_last_words(
                 pipes.adopt(path.stem, STREAMS[path.suffix], fd)
                 pipes.replay(path.stem, path)
                 pipes.drain(path.stem)
-        read_logs_of_dora(loop, pipes, paths.io)
+        read_logs_of_dora(loop, pipes, paths.io, min(DAEMON_SECONDS, seconds / 2))
     pipes.write_event("dataflow-failed", reason=reason, cause=cause)
-    pipes.close()
-    journal.wait_read(1.0)
+    pipes.close(max(deadline - time.monotonic() - READ_SECONDS, 0.0))
+    journal.wait_read(READ_SECONDS)
     journal.close()
     loop.close()
 
 
-def read_logs_of_dora(loop: "AbstractEventLoop", pipes: "LogPipes", io: Path) -> None:
-    """Write what dora's own log files have more than the runner has read.
+def read_logs_of_dora(
+    loop: "AbstractEventLoop", pipes: "LogPipes", io: Path, seconds: float
+) -> None:
+    """Write what dora's own log files have more than the runner has read, in `seconds`.
 
     The daemon may still live, and writes what the nodes said last. Raises OSError.
     """
@@ -115,7 +132,7 @@ def read_logs_of_dora(loop: "AbstractEventLoop", pipes: "LogPipes", io: Path) ->
         for path in places
     }
     tails = {node: tail for node, tail in found.items() if tail is not None}
-    deadline = time.monotonic() + DAEMON_SECONDS
+    deadline = time.monotonic() + seconds
     while sum(tail.drain() for tail in tails.values()) and time.monotonic() < deadline:
         time.sleep(QUIET_SECONDS)
     for node, tail in tails.items():
@@ -149,14 +166,19 @@ def out_of_memory(unit: Path) -> str:
     return f"its runner was killed for want of memory{most}"
 
 
-def kill_nodes(unit: Path) -> None:
-    """End every node of this unit: with KillMode=mixed they outlive the runner until now."""
+def kill_nodes(unit: Path, seconds: float) -> None:
+    """End every node of this unit: with KillMode=mixed they outlive the runner until now.
+
+    One that sleeps in the kernel does not die: after `seconds` it is left to systemd.
+    """
     from dora_systemd import cgroup
 
-    for group in cgroup.node_groups(unit).values():
+    groups = list(cgroup.node_groups(unit).values())
+    for group in groups:
         cgroup.kill_group(group)
-        while cgroup.is_populated(group):
-            os.sched_yield()
+    deadline = time.monotonic() + seconds
+    while any(map(cgroup.is_populated, groups)) and time.monotonic() < deadline:
+        time.sleep(KILLED_SECONDS)
 
 
 if __name__ == "__main__":

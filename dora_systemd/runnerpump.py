@@ -5,18 +5,21 @@ import contextlib
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 
 from dora_systemd import files, notify
 from dora_systemd import lifeevents as life
 from dora_systemd.causes import Cause
 from dora_systemd.cellpaths import CellPaths
-from dora_systemd.cellstate import Action, Cell, Deadline, Do, Record, State
+from dora_systemd.cellstate import Action, Cell, Deadline, Do, Record, RunnerExit, State
 from dora_systemd.cellview import cell_status, format_status
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.events import END_EVENTS
 from dora_systemd.lifecycle import step
+from dora_systemd.lifefailures import ENGINE_TIMEOUT
 from dora_systemd.pipes import LogPipes
+from dora_systemd.runnerfailure import failed
 from dora_systemd.runnernodes import Nodes
 from dora_systemd.status import CpuSample, add_sample
 from dora_systemd.values import SECOND
@@ -31,6 +34,7 @@ class Pump:
     """Holds the cell, moves it by events, and shows what it has become.
 
     uuid: of the dataflow. What Do means is given by connect(), before the first event.
+    end: how the cell has ended, whatever became of the action EXIT.
     """
 
     def __init__(
@@ -44,6 +48,8 @@ class Pump:
         self._loop = asyncio.get_running_loop()
         self._actions: Mapping[Do, Callable[[], None]] = {}
         self._queue: deque[life.Event] = deque()
+        self._is_busy = False
+        self.end: asyncio.Future[RunnerExit] = self._loop.create_future()
         self._deadline: asyncio.TimerHandle | None = None
         self._samples: tuple[CpuSample, ...] = ()
         self._text = ""
@@ -54,25 +60,56 @@ class Pump:
     def connect(self, actions: Mapping[Do, Callable[[], None]]) -> None:
         """Say what each Do does."""
         self._actions = actions
+        self._set_deadline(ENGINE_TIMEOUT)  # until the coordinator listens
         self._publish()
 
     def push(self, event: life.Event) -> None:
-        """Take one event through the table, then those that its actions cause."""
+        """Take one event through the table, then those that its actions cause.
+
+        Raises nothing: what an action raises is the next event, which ends the cell.
+        """
         self._queue.append(event)
-        if len(self._queue) > 1:
+        if self._is_busy:
             return  # caused by an action: the loop below takes it when that event is done
-        while self._queue:
-            self._take(self._queue[0])
-            self._queue.popleft()
+        self._is_busy = True
+        try:
+            while self._queue:
+                self._take(self._queue.popleft())
+        finally:
+            self._is_busy = False
 
     def _take(self, event: life.Event) -> None:
         before = self.cell
-        self.cell, actions = step(before, event)
+        actions = self._step(event)
         if self.cell is not before:
-            self._publish()
-            self._tell_waiting()
+            with self._guard("show its state"):
+                self._publish()
+            with self._guard("tell its state to its own tasks"):
+                self._tell_waiting()
         for action in actions:
-            self._perform(action)
+            with self._guard(_name(action)):
+                self._perform(action)
+        if self.cell.state is State.ENDED and not self.end.done():
+            self.end.set_result(self.cell.exit)  # EXIT could not do it
+
+    def _step(self, event: life.Event) -> tuple[Action, ...]:
+        try:
+            self.cell, actions = step(self.cell, event)
+            return actions
+        except Exception as error:
+            failure = failed(f"handle the event {type(event).__name__}", error)
+        if isinstance(event, life.Failed):  # not even that: this must end all the same
+            self.cell = replace(self.cell, state=State.ENDED, exit=RunnerExit.FAILED)
+        else:
+            self.push(failure)
+        return ()
+
+    @contextlib.contextmanager
+    def _guard(self, what: str) -> Iterator[None]:
+        try:
+            yield
+        except Exception as error:
+            self.push(failed(what, error))
 
     def _perform(self, action: Action) -> None:
         match action:
@@ -84,13 +121,17 @@ class Pump:
                 self._set_deadline(action.after)
 
     def _record(self, record: Record) -> None:
+        with self._guard(f"do what comes before the event {record.event}"):
+            self._prepare(record)
+        self._pipes.write_event(record.event, record.node or None, **record.details)
+
+    def _prepare(self, record: Record) -> None:
         if record.event in END_EVENTS:
             self._nodes.kill()  # no word of theirs after the last of ours
         elif record.node:
             self._nodes.drain([record.node])
         elif record.event == "dataflow-stopping":
             notify.send_stopping()
-        self._pipes.write_event(record.event, record.node or None, **record.details)
 
     async def wait(self, is_so: Callable[[Cell], bool], seconds: float | None) -> bool:
         """Return True as soon as `is_so` holds of the cell, or False after so many seconds."""
@@ -161,3 +202,14 @@ class Pump:
             reason = f"its directory {self._paths.root} is gone"
             lost = life.Refused(now_us(), reason, Cause.DIRECTORY_LOST)
             self._loop.call_soon(self.push, lost)
+
+
+def _name(action: Action) -> str:
+    """What the action does, as after "could not"."""
+    match action:
+        case Do():
+            return action.value
+        case Record():
+            return f"write the event {action.event}"
+        case Deadline():
+            return "set its deadline"

@@ -55,6 +55,7 @@ class Reloader:
         self._watcher: asyncio.Task[None] | None = None
         self._run: Run | None = None
         self._outcome: asyncio.Future[str] | None = None
+        self._untold: DoraSystemdError | None = None
         # What of the dataflow has been read when: all of it at the beginning, then file by file.
         self._read_ns = 0
         self._taken: dict[str, int] = {}
@@ -66,6 +67,8 @@ class Reloader:
         """A run of the dataflow begins. read_ns: since when its files are read, CLOCK_REALTIME."""
         self._run, self.current, self._read_ns = run, prepared, read_ns
         self._begun.set()
+        if self._untold is not None:
+            self._refuse(self._untold)
 
     def end(self) -> None:
         """The run has ended."""
@@ -92,7 +95,10 @@ class Reloader:
 
     async def work(self) -> None:
         """Reload what has changed, again and again."""
-        self._settings.keep()
+        try:
+            self._settings.keep()
+        except DoraSystemdError as error:
+            self._refuse(error)  # of that file; all others can be reloaded
         self._watch(self.options.hot_reload)
         while True:
             await self._wake.wait()
@@ -116,17 +122,21 @@ class Reloader:
         self._watcher = asyncio.create_task(self._collect()) if is_on else None
 
     async def _collect(self) -> None:
-        rules = await asyncio.to_thread(watch_rules, self.options)
-        let_openssl_in()  # watchfiles imports anyio, which imports ssl
         try:
+            rules = await asyncio.to_thread(watch_rules, self.options)
+            let_openssl_in()  # watchfiles imports anyio, which imports ssl
             async for files in changed_files(rules):
                 self._changed |= files
                 self._wake.set()
         except DoraSystemdError as error:
             self._refuse(error)
+        except Exception as error:
+            what = f"cannot watch files any more: {type(error).__name__}: {error}"
+            self._refuse(DoraSystemdError(what, "please report it"))
 
     def _refuse(self, error: DoraSystemdError) -> None:
-        """The old one runs on: say so where the operator looks."""
+        """The old one runs on: say so where the operator looks, as soon as there is a run."""
+        self._untold = error if self._run is None else None
         self.notice = f"not reloaded: {error.message.removeprefix('cannot use ')}"
         if self._run is not None:
             self._run.pump.push(life.ReloadNoted(now_us(), self.notice))
@@ -160,7 +170,7 @@ class Reloader:
         change = await asyncio.to_thread(self._settings.change)
         check_nodes(change.limits, run.pump.cell.nodes, ())
         run.nodes.limit(change.limits)
-        self._settings.keep()
+        self._settings.accept()
         merged = merge_node_limits(self.options.node_limits, change.limits)
         self.options = self.options._replace(node_limits=merged)
         name = PurePath(self._settings.path).name
@@ -240,7 +250,8 @@ class Reloader:
             self.options = self.options._replace(reload=reload)
             self._sources = Sources(self.options, self._environment)
             # Only how nodes that fail are treated differs: each gets it with its next reload.
-            self.current = await asyncio.to_thread(self._sources.prepare)
+            if self.current is not None:
+                self.current = self._sources.replan(self.current)
             self._watch(is_on)
         return {"done": []}
 

@@ -1,16 +1,15 @@
 """The settings file beside a dataflow, when it changes while the dataflow runs.
 
 Reading settings takes a library that the runner does without, so a child of it does that:
-`python3 -m dora_systemd.runnersettings BEFORE AFTER`.
+`python3 -m dora_systemd.runnersettings BEFORE AFTER PATH`, two versions of the file at PATH.
 """
 
 import json
 import os
-import shutil
 import sys
 from pathlib import Path
 
-from dora_systemd import process
+from dora_systemd import files, process
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.hotreload import SettingsChange
 from dora_systemd.limits import format_node_limits, parse_node_limits
@@ -20,21 +19,39 @@ _SECONDS = 120.0
 
 
 class SettingsFile:
-    """The file at `path`; `copy` is where the version that is in use is kept."""
+    """The file at `path`; `copy` is where the version that is in use is kept.
+
+    Each version is read once: it may be saved again at any moment.
+    """
 
     def __init__(self, path: str, copy: Path) -> None:
         self.path = path
         self._copy = copy
+        self._taken = copy.with_name(f"{copy.name}.read")
 
     def keep(self) -> None:
-        """The file as it is now is in use. Raises OSError."""
-        self._copy.unlink(missing_ok=True)
+        """The file as it is now is in use. Raises DoraSystemdError."""
+        self.take()
+        self.accept()
+
+    def take(self) -> None:
+        """Read the file as it is now. Raises DoraSystemdError."""
+        self._taken.unlink(missing_ok=True)
         if Path(self.path).exists():
-            shutil.copyfile(self.path, self._copy)
+            files.write_atomic(self._taken, files.read_text(Path(self.path)), 0o600)
+
+    def accept(self) -> None:
+        """What was taken last is in use."""
+        if self._taken.exists():
+            self._taken.replace(self._copy)
+        else:
+            self._copy.unlink(missing_ok=True)
 
     def change(self) -> SettingsChange:
-        """What has changed since. Raises DoraSystemdError when the file cannot be used."""
-        command = [sys.executable, "-E", "-P", "-m", __name__, str(self._copy), self.path]
+        """Take the file: what has changed. Raises DoraSystemdError when it cannot be used."""
+        self.take()
+        versions = (str(self._copy), str(self._taken))
+        command = [sys.executable, "-E", "-P", "-m", __name__, *versions, self.path]
         done = process.run_command(command, _SECONDS, os.environ, account=own_account())
         if done.status:
             raise DoraSystemdError(done.stderr.strip(), "", ExitCode.BAD_INPUT)
@@ -43,17 +60,17 @@ class SettingsFile:
         return SettingsChange(limits, tuple(found["others"]))
 
 
-def main(before: str, after: str) -> int:
-    """Print what is different as JSON."""
-    from dora_systemd.files import read_yaml
+def main(before: str, after: str, name: str) -> int:
+    """Print what is different as JSON. name: what errors call both."""
     from dora_systemd.settings import resolve_settings
     from dora_systemd.settingschange import settings_change
 
     try:
         both = []
         for path in (before, after):
-            document = read_yaml(Path(path), allow_empty=True) if Path(path).exists() else None
-            both.append(resolve_settings({}, {}, [(after, document)]))
+            text = files.read_text(Path(path)) if Path(path).exists() else ""
+            document = files.parse_yaml(text, Path(name), allow_empty=True)
+            both.append(resolve_settings({}, {}, [(name, document)]))
     except DoraSystemdError as error:
         print(error.message, file=sys.stderr)
         return error.code

@@ -2,14 +2,14 @@
 
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from dora_systemd.dataflownodes import NodeKind
 from dora_systemd.doracheck import refusal_of_dora
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.hotreload import HotReload
-from dora_systemd.launch import kinds, sources
+from dora_systemd.launch import kinds, launch_descriptor, sources
 from dora_systemd.options import RunnerOptions
 from dora_systemd.preparation import Prepared, prepare
 from dora_systemd.pythonimports import program_files, syntax_error
@@ -72,6 +72,12 @@ class Sources:
             message = f"cannot use {options.dataflow}: {reason}"
             raise DoraSystemdError(message, "", ExitCode.BAD_INPUT)
         return prepared
+
+    def replan(self, current: Prepared) -> Prepared:
+        """What `current` is with these options. No file is read: who edits it has not said so."""
+        plan = replace(current.plan, options=self._options)
+        descriptor = launch_descriptor(current.dataflow, plan)
+        return Prepared(current.dataflow, plan, descriptor)
 
     def files(self, current: Prepared) -> set[str]:
         """The files that the dataflow is made of, absolute."""

@@ -13,10 +13,10 @@ from dora_systemd import protocol
 from dora_systemd.cellstate import Cell
 from dora_systemd.cellview import initial_nodes
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.lifehandlers import stop_timeout
 from dora_systemd.runnerengine import Engine
 from dora_systemd.runnerpump import Pump, now_us
 from dora_systemd.status import NodeStatus
+from dora_systemd.stopbudget import stop_timeout
 from dora_systemd.values import SECOND, format_duration
 
 READY_SECONDS = 30.0

@@ -9,7 +9,7 @@ from dora_systemd.names import is_node_id
 
 Value = TypeVar("Value")
 
-STAGES = ("starting", "waiting", "running", "degraded", "stopping", "ended")
+STAGES = ("starting", "restarting", "waiting", "running", "degraded", "stopping", "ended")
 NODE_STATES = (
     "starting",
     "ready",

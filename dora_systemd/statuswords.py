@@ -90,7 +90,7 @@ def status_word(active: str, sub: str, stage: str = "") -> str:
     active, sub: ActiveState and SubState of its unit, see org.freedesktop.systemd1(5).
     stage: the runner's own, or "" where that cannot be read.
     """
-    if sub.startswith("auto-restart"):
+    if sub.startswith("auto-restart") or (active == "activating" and stage == "restarting"):
         return RESTARTING
     word = _BY_ACTIVE.get(active, STOPPED)
     return _BY_STAGE.get(stage, word) if word == RUNNING else word

@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import os
 import stat
 from pathlib import Path
 
@@ -47,13 +48,28 @@ def remove_empty(directory: Path) -> None:
 def write_unit_file(path: Path, text: str) -> None:
     """Put `text` at `path` and onto the disk; missing directories are made.
 
-    Raises DoraSystemdError; then all is as it was.
+    Raises DoraSystemdError; then `path` is as it was, unless the disk is broken.
     """
+    made = [one for one in path.parents if not one.exists()]
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise _failure("write", path, error) from error
     write_atomic(path, text, is_durable=True)
+    # The file is on the disk; whether its name is, too, is the business of its directory.
+    for directory in (path.parent, *(one.parent for one in made)):
+        _sync_directory(directory, path)
+
+
+def _sync_directory(directory: Path, path: Path) -> None:
+    try:
+        descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+    except OSError as error:
+        raise _failure("write", path, error) from error
 
 
 def remove_unit_file(path: Path) -> None:

@@ -167,11 +167,7 @@ def test_what_is_left_out_is_named(user: str, flow: Path) -> None:
     said = start(user, flow, *words).stderr.splitlines()
     assert said == [
         f"doractl: {name}= is left out: systemd 252 lacks it, version {version} has it"
-        for name, version in (
-            ("RestartSteps", 254),
-            ("RestartMaxDelaySec", 254),
-            ("PrivatePIDs", 257),
-        )
+        for name, version in (("PrivatePIDs", 257),)
     ]
     assert (show(user, "Restart"), show(user, "ActiveState")) == ("on-failure", "active")
 

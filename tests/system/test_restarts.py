@@ -3,12 +3,13 @@
 import json
 import os
 import signal
+import time
 
 import pytest
 
 from dora_systemd.errors import ExitCode
 from dora_systemd.values import SECOND
-from tests.system.cells import Cell, Project, is_alive, wait_for
+from tests.system.cells import Cell, Project, is_alive, run, wait_for
 
 CRASHING = """
 import sys
@@ -115,6 +116,53 @@ def test_the_budget_is_seen_used_up_and_reset(cell: Cell, project: Project) -> N
     # Who restarts it by hand begins anew.
     assert cell.doractl("restart", cell.name).returncode == 0
     assert cell.show("NRestarts") == "0"
+
+
+@pytest.mark.warns(*KILLED)
+def test_the_delay_grows_and_begins_anew_after_a_quiet_window(cell: Cell, project: Project) -> None:
+    words = ("--restart-policy", "always", "--max-restarts", "1000", "--restart-window", "20s")
+    cell.start(project.three_nodes(), *words, "--restart-delay", "1s")
+
+    def lose() -> bool:
+        """Kill the runner, which the daemon would take its time to do; whether the next waits."""
+        texts = []
+        kill(cell, "runner")
+        wait_for("it is away", lambda: cell.show("ActiveState") != "active")
+        while cell.show("ActiveState") != "active":
+            texts.append(cell.show("StatusText"))
+        return any("restarting in" in text for text in texts)
+
+    assert not lose()
+    assert lose()
+    kill(cell, "runner")
+    wait_for("its runner waits", lambda: "restarting in" in cell.show("StatusText"))
+    row = listed(cell)
+    budget = row["restart_budget"]
+    assert isinstance(budget, dict)
+    assert (row["status"], 0 < budget["next_us"] <= 3 * SECOND) == ("Restarting", True)
+    assert "Restarting" in cell.doractl("why", cell.name, check=False).stdout
+    wait_for("it is back", lambda: cell.show("ActiveState") == "active", 30)
+    store = ("systemd-analyze", cell.scope.flag, "fdstore", cell.unit)
+    wait_for("the window is quiet", lambda: run(*store).stdout.count("\ndora-life ") == 1)
+    assert not lose()
+    # Who restarts it by hand does not wait.
+    cell.systemctl("restart")
+    assert cell.show("NRestarts") == "0"
+
+
+@pytest.mark.warns(*KILLED)
+def test_a_stop_while_its_runner_waits_for_the_restart(cell: Cell, project: Project) -> None:
+    words = ("--restart-policy", "always", "--restart-delay", "1s", "--max-restarts", "9")
+    cell.start(project.three_nodes(), *words)
+    for _ in range(3):
+        wait_for("it runs", lambda: cell.show("ActiveState") == "active", 30)
+        kill(cell, "runner")
+        wait_for("it is away", lambda: cell.show("ActiveState") != "active")
+    wait_for("its runner waits", lambda: "restarting in" in cell.show("StatusText"), 10)
+    began = time.monotonic()
+    cell.doractl("stop", cell.name)
+    assert time.monotonic() - began < 5
+    assert (cell.show("ActiveState"), cell.show("Result")) == ("inactive", "success")
 
 
 def test_always_restarts_what_ended_by_itself(cell: Cell, project: Project) -> None:

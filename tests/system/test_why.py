@@ -229,3 +229,14 @@ def test_of_alice(cell: Cell, project: Project) -> None:
         run(
             "systemctl", "--user", "--machine=alice@.host", "reset-failed", "dora-hers", check=False
         )
+
+
+@pytest.mark.warns("cannot run", "Failed", "failed", "exited", "PermissionError")
+def test_a_runner_that_cannot_begin_says_why(cell: Cell, project: Project) -> None:
+    calls = ("SystemCallFilter=~mkdir mkdirat", "SystemCallErrorNumber=EPERM")
+    words = [word for one in calls for word in ("--property", one)]
+    done = cell.start(project.three_nodes(), *words, check=False)
+    assert cell.show("ActiveState") == "failed", done
+    told = json.loads(cell.doractl("why", cell.name, "-o", "json", check=False).stdout)
+    assert told["cause"] == "runner-broken"
+    assert "cannot run the dataflow: PermissionError: " in told["summary"]

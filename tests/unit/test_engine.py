@@ -1,10 +1,14 @@
 """What coordinator and daemon are started with."""
 
+import asyncio
 import os
+import time
 from pathlib import Path
 
 from dora_systemd import engine
+from dora_systemd.cellpaths import CellPaths
 from dora_systemd.environment import node_environment
+from dora_systemd.runnerengine import Engine
 
 
 def test_what_is_systemds_stays_with_the_runner() -> None:
@@ -46,3 +50,37 @@ def test_a_program_that_is_not_there(tmp_path: Path) -> None:
 
 def test_a_free_port_is_free() -> None:
     assert 0 < engine.free_port() < 65536
+
+
+def open_files() -> set[str]:
+    return {name for name in map(str, range(256)) if Path(f"/proc/self/fd/{name}").is_symlink()}
+
+
+def test_a_run_leaves_no_descriptor_behind(tmp_path: Path) -> None:
+    async def one_run() -> None:
+        dora = Engine("/bin/true", CellPaths(tmp_path), {})
+        child = dora.start_coordinator()
+        engine.watch(asyncio.get_running_loop(), child, lambda *_: None)
+        dora.kill()
+        os.close(child.output)
+
+    async def runs() -> None:
+        await one_run()
+        before = open_files()
+        await one_run()
+        assert open_files() == before
+
+    asyncio.run(runs())
+
+
+def test_a_child_that_does_not_die_does_not_hold_the_end(tmp_path: Path) -> None:
+    async def work() -> None:
+        child = engine.spawn("x", ["/bin/sleep", "1000"], {}, tmp_path)
+        began = time.monotonic()
+        child.close(asyncio.get_running_loop(), 0.05)
+        assert time.monotonic() - began < 5
+        child.popen.kill()
+        child.popen.wait()
+        os.close(child.output)
+
+    asyncio.run(work())

@@ -22,22 +22,24 @@ def manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> socket.socket:
 
 def test_store(manager: socket.socket) -> None:
     reader, writer = os.pipe()
-    fdstore.store(reader)
+    fdstore.store(reader, "m1.camera")
     os.close(reader)
     os.write(writer, b"kept")
     text, (fd,), _, _ = socket.recv_fds(manager, 100, 1)
-    assert text.decode().splitlines() == ["FDSTORE=1", "FDNAME=dora-log", "FDPOLL=0"]
+    assert text.decode().splitlines() == ["FDSTORE=1", "FDNAME=dora-log-m1.camera", "FDPOLL=0"]
     assert os.read(fd, 10) == b"kept"
     os.close(fd)
     os.close(writer)
+    fdstore.forget("m1.camera")
+    assert manager.recv(100) == b"FDSTOREREMOVE=1\nFDNAME=dora-log-m1.camera"
     manager.close()
 
 
 def test_without_systemd(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
-    fdstore.store(0)
+    fdstore.store(0, "a")
     monkeypatch.setenv("NOTIFY_SOCKET", "/nonexistent")
-    fdstore.store(0)
+    fdstore.store(0, "a")
     fdstore.forget_inherited()
 
 
@@ -46,7 +48,7 @@ import os
 from dora_systemd import fdstore
 os.environ["LISTEN_PID"] = str(os.getpid())
 fdstore.forget_inherited()
-for fd in (3, 4):
+for fd in (3, 4, 5):
     try:
         os.fstat(fd)
         print(fd, "open")
@@ -57,11 +59,11 @@ print([key for key in os.environ if key.startswith("LISTEN_")])
 
 
 def test_forget_inherited(manager: socket.socket) -> None:
-    script = f'exec 3</dev/null 4</dev/null; exec "{sys.executable}" -c "$0"'
-    environment = {**os.environ, "LISTEN_FDS": "2", "LISTEN_FDNAMES": "dora-log:other"}
+    script = f'exec 3</dev/null 4</dev/null 5</dev/null; exec "{sys.executable}" -c "$0"'
+    environment = {**os.environ, "LISTEN_FDS": "3", "LISTEN_FDNAMES": "dora-log-a:other:dora-log-a"}
     done = subprocess.run(
         ["sh", "-c", script, CHILD], env=environment, capture_output=True, text=True, check=True
     )
-    assert done.stdout.splitlines() == ["3 closed", "4 open", "[]"]
-    assert manager.recv(100) == b"FDSTOREREMOVE=1\nFDNAME=dora-log"
+    assert done.stdout.splitlines() == ["3 closed", "4 open", "5 closed", "[]"]
+    assert manager.recv(100) == b"FDSTOREREMOVE=1\nFDNAME=dora-log-a"
     manager.close()

@@ -54,6 +54,7 @@ DECISIONS = {
         "jsonvalues",
         "launch",
         "lifecycle",
+        "lifefailures",
         "lifehandlers",
         "lifeevents",
         "lifestory",
@@ -104,6 +105,7 @@ DECISIONS = {
         "snapshot",
         "status",
         "statuswords",
+        "stopbudget",
         "suggestions",
         "terminaltext",
         "toptable",
@@ -204,6 +206,9 @@ USE_CASES = {
         "runnerapply",
         "runnerbegin",
         "runnercheck",
+        "runnerclock",
+        "runnerfailure",
+        "runnerpause",
         "runnercell",
         "runnerask",
         "runnerdialogue",
@@ -214,6 +219,7 @@ USE_CASES = {
         "runnerpost",
         "runnerpump",
         "runnerreload",
+        "runnerrooms",
         "runnerresources",
         "runnersettings",
         "runnersources",
@@ -366,6 +372,7 @@ STARTS_PROGRAMS = {
     "journalread": "journalctl",
     "managernode": "dora, after it has become the user",
     "cli.logs": "the caller's own pager",
+    "relay": "itself, as the user of the dataflow",
 }
 """The modules that start programs, and which."""
 

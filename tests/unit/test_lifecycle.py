@@ -6,9 +6,11 @@ import pytest
 
 from dora_systemd import lifeevents as life
 from dora_systemd.cellstate import Cell, Deadline, Do, Record, RunnerExit, State
+from dora_systemd.events import END_EVENTS
 from dora_systemd.lifecycle import TABLE, step
-from dora_systemd.lifehandlers import ENGINE_TIMEOUT, stop_timeout
+from dora_systemd.lifefailures import ENGINE_TIMEOUT
 from dora_systemd.status import HELD, NodeStatus
+from dora_systemd.stopbudget import stop_timeout
 from dora_systemd.values import SECOND
 
 SAMPLES: dict[type[life.Event], tuple[life.Event, ...]] = {
@@ -17,6 +19,7 @@ SAMPLES: dict[type[life.Event], tuple[life.Event, ...]] = {
     life.RunStarted: (life.RunStarted(1, "run"),),
     life.Subscribed: (life.Subscribed(1),),
     life.Refused: (life.Refused(1, "no"),),
+    life.Failed: (life.Failed(1, "start the daemon", "OSError: no"),),
     life.NodeSpawned: (life.NodeSpawned(1, "a", 7), life.NodeSpawned(1, "unknown", 7)),
     life.NodeReady: (life.NodeReady(1, "a"), life.NodeReady(1, "unknown")),
     life.AllReady: (life.AllReady(1),),
@@ -80,6 +83,55 @@ def test_each_state_ends_when_it_is_told_to_and_nothing_answers(state: State) ->
     assert now.state is State.ENDED
     if state not in (State.CLOSING,):
         assert now.exit is RunnerExit.OK
+
+
+LIVING = [state for state in State if state is not State.ENDED]
+CHANGES: list[dict[str, object]] = [
+    {},
+    {"stop_by": "SIGTERM"},
+    {"is_trial": True, "stop_by": "SIGTERM"},
+    {"failure": "node a: exit code 1", "exit": RunnerExit.NODES_FAILED},
+]
+
+
+@pytest.mark.parametrize("changes", CHANGES, ids=str)
+@pytest.mark.parametrize("state", LIVING)
+@pytest.mark.parametrize("kind", life.EVENTS, ids=lambda kind: kind.__name__)
+def test_every_pair_when_its_action_raises(
+    state: State, kind: type[life.Event], changes: dict[str, object]
+) -> None:
+    broken = life.Failed(2, "do it", "OSError: no")
+    for event in SAMPLES[kind]:
+        between, before = step(cell(state, **changes), event)
+        after, actions = step(between, broken)
+        done = (*before, *actions)
+        assert after.state is State.ENDED
+        assert done.count(Do.EXIT) == 1, "EXIT is reachable from every state"
+        told = [one for one in done if isinstance(one, Record) and one.event in END_EVENTS]
+        assert len(told) == 1, "its end has one name"
+
+
+@pytest.mark.parametrize("state", [s for s in LIVING if s is not State.LEAVING])
+def test_what_raised_has_its_name_in_the_journal(state: State) -> None:
+    after, actions = step(cell(state), life.Failed(1, "start the daemon", "OSError: no"))
+    assert after.failure == "the runner could not start the daemon: OSError: no"
+    details = {"reason": after.failure, "cause": "runner-broken"}
+    assert Record("dataflow-failed", "", details) in actions
+    assert after.exit is RunnerExit.FAILED
+
+
+def test_no_run_follows_one_that_raised_while_a_reload_ended_it() -> None:
+    after, _ = step(cell(State.STOPPING, reload=True), life.Failed(1, "ask dora to stop", "no"))
+    assert (after.reload, after.exit) == (False, RunnerExit.FAILED)
+
+
+def test_an_end_that_is_known_stays_known() -> None:
+    known = cell(State.LEAVING, failure="node a: exit code 1", exit=RunnerExit.NODES_FAILED)
+    for now in (known, replace(known, state=State.STOPPING)):
+        after, _ = step(now, life.Failed(1, "tell the daemon to end", "OSError: no"))
+        assert (after.failure, after.exit) == (known.failure, known.exit)
+    after, actions = step(cell(State.LEAVING), life.Failed(1, "x", "y"))
+    assert Record("dataflow-finished") in actions
 
 
 def live(

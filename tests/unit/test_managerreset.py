@@ -1,11 +1,14 @@
 """doractl reset, and what is left of restarts."""
 
+import time
+
 import pytest
 
 from dora_systemd import managerbudget
 from dora_systemd.managerbudget import restart_budget
 from dora_systemd.managercells import read_cells
 from dora_systemd.managerreset import reset_cells
+from dora_systemd.status import CellStatus
 from dora_systemd.values import SECOND
 from tests.unit.fake_manager import UUID, FakeManager, ScopeIn, options
 
@@ -26,7 +29,7 @@ def test_no_budget_without_policy() -> None:
     manager = FakeManager()
     manager.add(options())
     (cell,) = read_cells(manager)
-    assert restart_budget(manager, ScopeIn(True, 1000), cell) is None
+    assert restart_budget(manager, ScopeIn(True, 1000), cell, CellStatus()) is None
 
 
 def test_budget(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -38,15 +41,29 @@ def test_budget(monkeypatch: pytest.MonkeyPatch) -> None:
         SubState="auto-restart",
         NRestarts=1,
         RestartUSec=SECOND,
-        RestartUSecNext=2 * SECOND,
         StateChangeTimestampMonotonic=0,
         **facts,
     )
     (cell,) = read_cells(manager)
     monkeypatch.setattr(managerbudget, "_starts", lambda *_: [])
-    assert restart_budget(manager, ScopeIn(True, 1000), cell) == {
+    assert restart_budget(manager, ScopeIn(True, 1000), cell, CellStatus()) == {
         "used": 0,
         "max": 3,
         "next_us": 0,
         "resets_us": None,
     }
+
+
+def test_the_runner_waits_for_the_rest_of_a_long_delay() -> None:
+    manager = FakeManager()
+    facts = {"Restart": "on-failure", "StartLimitBurst": 4, "StartLimitIntervalUSec": 60 * SECOND}
+    manager.add(options(), active="activating", SubState="start", NRestarts=0, **facts)
+    (cell,) = read_cells(manager)
+    begins = time.time_ns() // 1000 + 60 * SECOND
+    status = CellStatus(stage="restarting", started_us=begins)
+    budget = restart_budget(manager, ScopeIn(True, 1000), cell, status)
+    assert budget is not None
+    assert 50 * SECOND < (budget["next_us"] or 0) <= 60 * SECOND
+    early = restart_budget(manager, ScopeIn(True, 1000), cell, CellStatus(stage="starting"))
+    assert early is not None
+    assert early["next_us"] is None

@@ -134,6 +134,54 @@ def test_nothing_changes_if_anything_is_wrong(
     assert (place.group / "cpu.max").read_text() == "1"
 
 
+@pytest.mark.parametrize("refuser", ["kernel", "systemd", "disk"])
+def test_nothing_changes_if_somebody_refuses(
+    place: Place, refuser: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flags = {"node_limit": ("camera:memory=2M,tasks=9",), "memory_limit": "6M"}
+    (place.group / "memory.max").write_text(str(1 << 20))
+    if refuser == "kernel":
+        (place.group / "pids.max").unlink()
+        (place.group / "pids.max").mkdir()
+    elif refuser == "systemd":
+
+        def refuse(*_: object) -> None:
+            raise DoraSystemdError("cannot change it: systemd says no")
+
+        monkeypatch.setattr(place.manager, "set_properties", refuse)
+    else:
+        (place.units / "dora-robot.service.d").write_text("in its way")
+    with pytest.raises(DoraSystemdError):
+        place.set(**flags)
+    assert place.manager.calls == []
+    assert not place.drop_in.is_file()
+    assert (place.group / "memory.max").read_text() == str(1 << 20)
+
+
+def test_what_was_changed_before_stays_when_systemd_refuses(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place.set(node_limit=("camera:memory=2M",))
+    before = place.drop_in.read_text()
+
+    def refuse(*_: object) -> None:
+        raise DoraSystemdError("cannot change it: systemd says no")
+
+    monkeypatch.setattr(place.manager, "set_properties", refuse)
+    with pytest.raises(DoraSystemdError):
+        place.set(node_limit=("camera:memory=3M",), memory_limit="6M")
+    assert place.drop_in.read_text() == before
+    assert (place.group / "memory.max").read_text() == str(2 << 20)
+
+
+def test_a_node_without_a_group_is_limited_at_its_next_start(place: Place) -> None:
+    for name in FILES:
+        (place.group / name).unlink()
+    place.group.rmdir()
+    place.set(node_limit=("camera:memory=2M",))
+    assert "camera:memory=2M" in place.drop_in.read_text()
+
+
 def test_root_is_needed_for_others(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("os.geteuid", lambda: 1000)
     place.scope = ScopeIn(is_user=False, uid=1000, root=place.scope.root)

@@ -204,10 +204,10 @@ def test_wait_until_journald_has_taken_all(tmp_path: Path) -> None:
         cell.node("a")
         cell.write(cell.paths.node_stdout("a"), b"x\n" * 5000)
         cell.pipes.drain("a")
-        await cell.pipes.wait_empty(0.05)
+        await cell.pipes.wait_empty(iter([0.1, 0.1, 0.0]).__next__)
         assert cell.pipes.is_busy("a")
         reader = asyncio.create_task(cell.messages(5000))
-        await cell.pipes.wait_empty(10)
+        await cell.pipes.wait_empty(lambda: 1.0)
         assert not cell.pipes.is_busy("a")
         assert len(await reader) == 5000
 
@@ -260,5 +260,27 @@ def test_close_counts_what_it_cannot_write(tmp_path: Path) -> None:
         cell.server = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
         cell.pipes.close(0.0)
         cell.server.bind(str(tmp_path / "socket"))
+
+    run(tmp_path, scenario)
+
+
+def test_what_systemd_keeps_of_a_node_goes_with_it(tmp_path: Path) -> None:
+    async def scenario(cell: Cell) -> None:
+        kept: list[str] = []
+        pipes = LogPipes(
+            asyncio.get_running_loop(),
+            cell.journal,
+            IDENTITY,
+            lambda _, node: kept.append(node),
+            kept.remove,
+        )
+        for node in ("a", "b"):
+            pipes.make(node, cell.paths)
+        pipes.open("a")
+        pipes.forget("b")  # never opened
+        assert kept == ["a", "a"]
+        pipes.forget("a")
+        assert kept == ["a"], "released by name, once"
+        pipes.close(0.1)
 
     run(tmp_path, scenario)

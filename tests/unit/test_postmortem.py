@@ -103,6 +103,11 @@ CASES: dict[str, tuple[tuple[Record, ...], str, Cause, str, str]] = {
         (*RUNS, event("daemon-lost"), event("dataflow-failed", reason="gone")),
         *("Failed", Cause.DAEMON_LOST, "", "gone"),
     ),
+    "the runner itself": (
+        (*RUNS, failed("runner-broken", "the runner could not start the daemon: OSError: no")),
+        *("Failed", Cause.RUNNER_BROKEN, ""),
+        "the runner could not start the daemon: OSError: no",
+    ),
     "watchdog": (
         (*RUNS, failed("watchdog", "its runner hung"), unit("unit-failed", UNIT_RESULT="watchdog")),
         *("Failed", Cause.WATCHDOG, "", "its runner hung"),

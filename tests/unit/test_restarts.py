@@ -123,9 +123,14 @@ def test_three_restarts_are_four_starts() -> None:
     found = unit(POLICY)
     assert (found["Restart"], found["StartLimitBurst"]) == ("on-failure", 4)
     assert found["StartLimitIntervalSec"] == 10 * MINUTE
-    assert (found["RestartSec"], found["RestartMaxDelaySec"]) == (SECOND, 8 * SECOND)
-    assert found["RestartSteps"] == 3
+    assert found["RestartSec"] == SECOND
+    assert "RestartSteps" not in found, "it never forgets"
     assert found["RestartPreventExitStatus"] == ((70, 72, 77, 78), ())
+
+
+def test_delays_double_up_to_the_longest() -> None:
+    delays = [POLICY.delay_before(restart) // SECOND for restart in (0, 1, 2, 3, 4, 5, 10**6)]
+    assert delays == [1, 1, 2, 4, 8, 8, 8]
 
 
 def test_unit_without_restarts() -> None:

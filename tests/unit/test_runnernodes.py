@@ -1,6 +1,7 @@
 """The runner's side of the nodes."""
 
 import asyncio
+import os
 import resource
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,7 +12,7 @@ from dora_systemd.cellpaths import CellPaths
 from dora_systemd.dataflow import parse_dataflow
 from dora_systemd.logs import Origin
 from dora_systemd.pipes import LogPipes
-from dora_systemd.runnernodes import Nodes, raise_file_limit
+from dora_systemd.runnernodes import Nodes, _with_descendants, raise_file_limit
 from tests.unit.test_logqueue import SlowJournal
 
 
@@ -51,3 +52,12 @@ def test_a_node_that_dora_reads_is_removed_and_taken_back(tmp_path: Path) -> Non
 
     asyncio.run(live())
     assert b"MESSAGE=again\n" in b"".join(journal.taken)
+
+
+def test_an_operator_that_dies_while_it_is_adopted(monkeypatch: pytest.MonkeyPatch) -> None:
+    def gone(path: object) -> None:
+        raise FileNotFoundError(2, "No such file or directory", str(path))
+
+    monkeypatch.setattr(os, "scandir", gone)
+    monkeypatch.setattr(os, "listdir", gone)
+    assert _with_descendants(os.getpid()) == [os.getpid()]

@@ -3,11 +3,24 @@
 import os
 import socket
 import subprocess
+import time
 from pathlib import Path
 
 import pytest
 
-from dora_systemd.runnerpost import killed_by, killed_cause, main, out_of_memory, write_last_words
+from dora_systemd.runnerpost import (
+    ALL_SECONDS,
+    KILL_SECONDS,
+    READ_SECONDS,
+    kill_nodes,
+    killed_by,
+    killed_cause,
+    main,
+    out_of_memory,
+    write_last_words,
+)
+from dora_systemd.stopbudget import unit_timeout
+from dora_systemd.values import SECOND
 from tests.unit.checkout import CHECKOUT
 
 UUID = "550e8400-e29b-41d4-a716-446655440000"
@@ -41,6 +54,22 @@ def test_a_runner_that_was_killed_for_want_of_memory(tmp_path: Path) -> None:
     assert out_of_memory(tmp_path) == (
         "its runner was killed for want of memory; the node b held most, 500M"
     )
+
+
+def test_a_node_that_cannot_be_killed_is_left_to_systemd(tmp_path: Path) -> None:
+    for name in ("node-a", "node-b"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "cgroup.kill").write_text("")
+        (tmp_path / name / "cgroup.events").write_text("populated 1\nfrozen 0\n")
+    began, used = time.monotonic(), time.process_time()
+    kill_nodes(tmp_path, 0.3)
+    assert 0.3 <= time.monotonic() - began < 3
+    assert time.process_time() - used < 0.2, "it waits, it does not spin"
+    assert (tmp_path / "node-b" / "cgroup.kill").read_text() == "1"
+
+
+def test_all_of_it_fits_what_systemd_allows() -> None:
+    assert KILL_SECONDS + READ_SECONDS < ALL_SECONDS <= unit_timeout(0) / SECOND - 1
 
 
 def test_by_hand() -> None:

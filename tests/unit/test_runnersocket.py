@@ -30,6 +30,8 @@ def nowhere() -> Coordinator:
 
 
 async def answer(request: Mapping[str, Any]) -> dict[str, Any]:
+    if request.get("verb") == "broken":
+        raise KeyError("node")
     if request.get("verb") == "no":
         raise DoraSystemdError("cannot do it", "do that", ExitCode.NOT_FOUND)
     return {"done": [request.get("verb")]}
@@ -78,6 +80,19 @@ def test_a_line_without_end_does_no_harm(tmp_path: Path) -> None:
     first, second = ask_server(tmp_path / "s", b"x" * 200_000 + b"\n", {"verb": "yes"})
     assert first == b""
     assert second == {"done": ["yes"]}
+
+
+def test_a_long_name(tmp_path: Path) -> None:
+    path = tmp_path / ("x" * 200) / "runner.sock"
+    path.parent.mkdir()
+    (answered,) = ask_server(path, {"verb": "yes"})
+    assert answered == {"done": ["yes"]}
+
+
+def test_an_answer_that_breaks_ends_nothing_but_itself(tmp_path: Path) -> None:
+    broken, good = ask_server(tmp_path / "s", {"verb": "broken"}, {"verb": "yes"})
+    assert broken.message == "cannot do that: KeyError: 'node'"
+    assert good == {"done": ["yes"]}
 
 
 def test_nobody_there(tmp_path: Path) -> None:
