@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from dora_systemd.busprotocol import Manager, Property
-from dora_systemd.compat import MIN_VERSION, transient_commands
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.managerplan import Plan
 from dora_systemd.managerreason import exit_status, failure_reason
@@ -23,7 +22,6 @@ from dora_systemd.process import (
     Completed,
     read_streams,
     run_command,
-    version_numbers,
 )
 from dora_systemd.properties import typed
 from dora_systemd.refusal import parse_refusal
@@ -93,9 +91,9 @@ def _properties(
         others = tuple(one for one in binds.value if one[0] != cell)
         kept |= {"BindPaths": binds._replace(value=others)} if others else {}
     stdout, stderr = streams
-    number = next(iter(version_numbers(manager.version())), MIN_VERSION)
+    # It need not outlive a reload of systemd, as units do that go through transient_commands.
     return [
-        *transient_commands(list(kept.values()), number),
+        *kept.values(),
         ("StandardOutputFileDescriptor", "h", stdout),
         ("StandardErrorFileDescriptor", "h", stderr),
         ("CollectMode", "s", "inactive-or-failed"),
