@@ -4,21 +4,17 @@ The interfaces are those of org.freedesktop.systemd1(5). Only pystemd's low leve
 connection that is told every signature: nothing is introspected, and no XML is parsed.
 """
 
-import _thread
-import os
 import select
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
-from dora_systemd.buserrors import connection_error, explained, silent_bus
+from dora_systemd.busconnection import MANAGER_OBJECT, SERVICE, connect
+from dora_systemd.buserrors import explained
 from dora_systemd.busprotocol import JOB_DONE, Observer, Property, UnitState
 from dora_systemd.buswire import decoded, encoded
 from dora_systemd.scope import Scope
 
-SERVICE = b"org.freedesktop.systemd1"
-ROOT = b"/org/freedesktop/systemd1"
+ROOT = MANAGER_OBJECT
 MANAGER = b"org.freedesktop.systemd1.Manager"
 UNIT = b"org.freedesktop.systemd1.Unit"
 BY_TYPE = {
@@ -27,16 +23,6 @@ BY_TYPE = {
     "slice": b"org.freedesktop.systemd1.Slice",
 }
 PROPERTIES = b"org.freedesktop.DBus.Properties"
-
-SYSTEM_BUS = Path("/run/dbus/system_bus_socket")
-
-READ_SECONDS = 5.0
-"""For an answer to who only reads."""
-CALL_SECONDS = 25.0
-"""For any other answer, as systemctl has it: systemd may be reading all its units again."""
-_TIMEOUT = "SYSTEMD_BUS_TIMEOUT"
-"""The only way to tell sd-bus through pystemd: read at the first call of a connection."""
-_environment = _thread.allocate_lock()  # threading takes a while to load
 
 _IDLE_SECONDS = 1.0
 _UNIT_PROPERTIES = frozenset(
@@ -54,13 +40,13 @@ _UNIT_PROPERTIES = frozenset(
 class Bus:
     """A connection to the manager of `scope`: the Manager of busprotocol, which documents it.
 
-    for_reading: nothing is going to be changed. Such a connection needs no message bus where it may
-    do without, and gives systemd READ_SECONDS for each answer.
+    for_reading: nothing is going to be changed. Such a connection gives systemd READ_SECONDS for
+    each answer, and goes around a message bus that does not answer.
     """
 
     def __init__(self, scope: Scope, for_reading: bool = False) -> None:
         self.scope = scope
-        self._bus = _connect(scope, for_reading)
+        self._bus = connect(scope, for_reading)
         self._matches: dict[bytes, Callable[..., None]] = {}
 
     def __del__(self) -> None:
@@ -228,60 +214,6 @@ class Bus:
         poll = select.poll()
         poll.register(self.fileno(), select.POLLIN)
         return bool(poll.poll(seconds * 1000))
-
-
-def _connect(scope: Scope, for_reading: bool) -> Any:
-    address = _address(scope, for_reading)
-    seconds = READ_SECONDS if for_reading else CALL_SECONDS
-    # What only explains itself or asks for a version need not find pystemd.
-    from dora_systemd.buslibrary import dbuslib
-
-    with connection_error(scope):
-        # A manager's private socket takes no part in the bus: there is nobody to say hello to.
-        is_private = address.endswith("/private")
-        bus = dbuslib.DBusAddress(f"unix:path={address}".encode(), peer_to_peer=is_private)
-        with _deadline(seconds):
-            bus.open()  # says hello, its first call
-        _await_answer(bus, scope, is_private)
-        if is_private:
-            with _deadline(seconds):
-                bus.call_method(SERVICE, ROOT, b"org.freedesktop.DBus.Peer", b"Ping", [])
-    return bus
-
-
-@contextmanager
-def _deadline(seconds: float) -> Iterator[None]:
-    """The time that the connection whose first call is made here has for each answer."""
-    with _environment:
-        before = os.environ.get(_TIMEOUT)
-        os.environ[_TIMEOUT] = before or f"{seconds:g}s"
-        try:
-            yield
-        finally:
-            if before is None:
-                del os.environ[_TIMEOUT]
-
-
-def _await_answer(bus: Any, scope: Scope, is_private: bool) -> None:
-    """Return when the other side has said anything; sd-bus would wait 90 s for that."""
-    poll = select.poll()
-    poll.register(bus.get_fd(), select.POLLIN)
-    if not poll.poll(READ_SECONDS * 1000):
-        bus.close()
-        raise silent_bus(scope, is_private)
-
-
-def _address(scope: Scope, for_reading: bool = False) -> str:
-    """The message bus, or the manager's private socket.
-
-    That is for who reads, as for systemctl: there is one process less that may not answer. Only on
-    the bus can systemd tell that a client has gone, as hold() needs. A user may have no bus of his
-    own. The system's private socket is for root alone.
-    """
-    bus = scope.runtime_root / "bus" if scope.is_user else SYSTEM_BUS
-    private = scope.runtime_root / "systemd" / "private"
-    wants_private = for_reading and (scope.is_user or os.geteuid() == 0)
-    return str(private) if (wants_private or not bus.exists()) and private.exists() else str(bus)
 
 
 def _unit_path(unit: str) -> bytes:

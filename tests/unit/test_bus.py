@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dora_systemd import bus, buserrors
+from dora_systemd import bus, busconnection, buserrors
 from dora_systemd.buswire import decoded, encoded
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
@@ -130,9 +130,9 @@ def test_other_errors_pass() -> None:
 
 def test_private_socket_where_a_user_has_no_bus(tmp_path: Path) -> None:
     scope = ScopeIn(is_user=True, uid=1000, root=tmp_path)
-    assert bus._address(scope) == str(tmp_path / "bus")
+    assert busconnection._address(scope) == str(tmp_path / "bus")
     (tmp_path / "systemd").mkdir()
     (tmp_path / "systemd" / "private").touch()
-    assert bus._address(scope) == str(tmp_path / "systemd" / "private")
+    assert busconnection._address(scope) == str(tmp_path / "systemd" / "private")
     (tmp_path / "bus").touch()
-    assert bus._address(scope) == str(tmp_path / "bus")
+    assert busconnection._address(scope) == str(tmp_path / "bus")

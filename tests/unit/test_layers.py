@@ -130,7 +130,7 @@ TRUST = {
 }
 """The one door to what others own; the adapters go through it, too."""
 ADAPTERS = {
-    "bus": ["bus", "buserrors", "buslibrary", "buswire"],
+    "bus": ["bus", "busconnection", "buserrors", "buslibrary", "buswire"],
     "cgroup": ["cgroup", "cgroupmemory", "cgroupstrain"],
     "control": ["control", "websocket"],
     "engine": ["engine"],
