@@ -274,7 +274,7 @@ def test_a_directory_that_is_none(directory: str) -> None:
     body = {"Start": {"dataflow": {"nodes": []}, "local_working_dir": directory}}
     request = parse_request(json.dumps({"id": UUID, "method": "control", "params": body}))
     assert isinstance(request, Request)
-    with pytest.raises(DoraSystemdError, match="^cannot (look for the dataflow|start) in"):
+    with pytest.raises(DoraSystemdError, match=r"^cannot (look for the dataflow|start) in"):
         find_file(Scope(is_user=True, uid=1000), request)
 
 
