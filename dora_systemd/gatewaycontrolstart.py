@@ -22,11 +22,12 @@ from dora_systemd.managercheck import run_beside
 from dora_systemd.managerlaunch import claim, start_claim
 from dora_systemd.managerplan import StartRequest, make_plan
 from dora_systemd.scope import Scope
-from dora_systemd.trust.paths import read_file
+from dora_systemd.trust.paths import list_directory, read_file
 from dora_systemd.values import shown
 
 _SUFFIXES = (".yml", ".yaml")
 _MOST_FILES = 200
+_MOST_NAMES = 20_000
 _POLL_SECONDS = 0.1
 
 
@@ -93,7 +94,7 @@ def _files(directory: Path) -> list[Path]:
     if not directory.is_absolute():
         raise DoraSystemdError(f"cannot start in {directory}: it is no absolute path")
     try:
-        found = sorted(path for path in directory.iterdir() if path.suffix in _SUFFIXES)
+        names = list_directory(directory, _MOST_NAMES)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "it is no path"
         raise DoraSystemdError(
@@ -101,7 +102,7 @@ def _files(directory: Path) -> list[Path]:
             "doractl start FILE takes the file itself",
             ExitCode.BAD_INPUT,
         ) from error
-    return found[:_MOST_FILES]
+    return [directory / name for name in names if name.endswith(_SUFFIXES)][:_MOST_FILES]
 
 
 def _read(path: Path) -> object:

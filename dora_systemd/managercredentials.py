@@ -10,6 +10,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.files import absolute_path
 from dora_systemd.scope import Scope
 from dora_systemd.settings import Settings
+from dora_systemd.trust.paths import reached
 from dora_systemd.values import shown
 
 
@@ -21,13 +22,17 @@ def credential_files(settings: Settings) -> dict[str, str]:
 def check_credentials(scope: Scope, files: Mapping[str, str]) -> None:
     """Raise DoraSystemdError for the first file that systemd could not read, and for too much.
 
-    In system scope root reads them, whoever calls: what others cannot see is not judged here.
+    In system scope root reads them, whoever calls: what others cannot see is not judged here. And
+    it does so at every start, by a path that is followed anew: a link that somebody has put there
+    by then would give the nodes any file of root's. So nobody but root may be able to.
     """
     is_reader = scope.is_user or os.geteuid() == 0
     total = 0
     for name, file in files.items():
         try:
             total += _checked_size(name, file)
+            if not scope.is_user:
+                _check_firm(name, file)
         except PermissionError as error:
             if is_reader:
                 reason, hint = "permission denied", "let the calling user read it"
@@ -49,6 +54,14 @@ def _checked_size(name: str, file: str) -> int:
     if not os.access(file, os.R_OK):
         raise PermissionError
     return status.st_size
+
+
+def _check_firm(name: str, file: str) -> None:
+    with reached(file) as (_, place):
+        if not place.is_roots and os.geteuid() == 0:
+            reason = "others than root could put another file in its place"
+            hint = "systemd reads it as root: keep it where only root can write, as in /etc"
+            raise _refusal(name, file, reason, hint, ExitCode.NO_PERMISSION)
 
 
 def _refusal(

@@ -19,6 +19,7 @@ import os
 import pwd
 import stat
 from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -138,6 +139,20 @@ def read_file(path: str | Path, max_bytes: int = MAX_BYTES) -> Text:
         hint = "give a smaller file"
         raise _refusal(path, f"it is larger than {max_bytes // 1024} KiB", hint)
     return Text(data, place)
+
+
+def list_directory(path: str | Path, most: int) -> list[str]:
+    """At most `most` of the names in the directory `path`, in order.
+
+    Raises OSError, and DoraSystemdError as reached() does.
+    """
+    with reached(path) as (found, _):
+        fd = os.open(f"/proc/self/fd/{found}", os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            with os.scandir(fd) as entries:
+                return sorted(entry.name for entry in islice(entries, most))
+        finally:
+            os.close(fd)
 
 
 def exists(path: str | Path) -> bool:

@@ -124,3 +124,27 @@ def test_nodes_keep_the_directory_and_nobody_else_names_it() -> None:
     assert node_environment({**directory, "NOTIFY_SOCKET": "/x"}) == directory
     with pytest.raises(DoraSystemdError, match="CREDENTIALS_DIRECTORY"):
         parse_assignment("CREDENTIALS_DIRECTORY=/tmp")
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="gives files away")
+@pytest.mark.parametrize("what", ["file", "directory", "link"])
+def test_a_file_that_others_can_replace_is_refused(tmp_path: Path, what: str) -> None:
+    """PID 1 follows its path anew at each start, as root."""
+    place = tmp_path / "place"
+    place.mkdir()
+    path = place / "token"
+    path.write_text("secret")
+    system = Scope(is_user=False, uid=0)
+    check_credentials(system, {"token": str(path)})
+    if what == "link":
+        path = place / "link"
+        path.symlink_to("token")
+        os.chown(path, 4_000_001, 0, follow_symlinks=False)
+    else:
+        os.chown(path if what == "file" else place, 4_000_001, 0)
+    with pytest.raises(DoraSystemdError) as caught:
+        check_credentials(system, {"token": str(path)})
+    words = (
+        "a symbolic link that others" if what == "link" else "as credential token: others than root"
+    )
+    assert words in caught.value.message
