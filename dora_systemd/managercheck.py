@@ -80,7 +80,6 @@ def _properties(
     kept = {key: one for key, one in properties.items() if not key.startswith(_OF_RUNNERS)}
     kept |= typed(
         Type="oneshot",
-        ExecStart=((command[0], tuple(command), ("no-env-expand",)),),
         TimeoutStartSec=int(DORA_SECONDS) * SECOND,
     )
     for key in ("StandardOutput", "StandardError"):
@@ -91,9 +90,11 @@ def _properties(
         others = tuple(one for one in binds.value if one[0] != cell)
         kept |= {"BindPaths": binds._replace(value=others)} if others else {}
     stdout, stderr = streams
-    # It need not outlive a reload of systemd, as units do that go through transient_commands.
+    # systemd 252 cannot read ExecStartEx back at a reload, and "$$" is "$" in all of them.
+    words = tuple(word.replace("$", "$$") for word in command)
     return [
         *kept.values(),
+        ("ExecStart", "a(sasb)", ((command[0], words, False),)),
         ("StandardOutputFileDescriptor", "h", stdout),
         ("StandardErrorFileDescriptor", "h", stderr),
         ("CollectMode", "s", "inactive-or-failed"),

@@ -43,7 +43,7 @@ def test_the_unit_of_a_check() -> None:
     assert manager.given["Type"] == "oneshot"
     assert manager.given["CollectMode"] == "inactive-or-failed"
     assert manager.given["SystemCallErrorNumber"]
-    assert "dora_systemd.runnercheck" in manager.given["ExecStartEx"][0][1]
+    assert "dora_systemd.runnercheck" in manager.given["ExecStart"][0][1]
     for name in ("RuntimeDirectory", "Restart", "ExecStopPostEx", "WatchdogUSec", "LogExtraFields"):
         assert name not in manager.given
 
