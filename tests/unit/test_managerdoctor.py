@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from dora_systemd import cgroup, journalread, managerdoctor
+from dora_systemd import cgroup, journalread, managerdoctor, managerlogins
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.findings import Finding, State
 from dora_systemd.gatewayplace import SOCKET_UNIT
@@ -38,6 +38,7 @@ def manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FakeManager:
     monkeypatch.setattr(managerdoctor, "DEFAULT_USER", "root")
     monkeypatch.setattr(managerdoctor, "settings_files", lambda *_: [Path("/x")])
     monkeypatch.setattr(managerdoctor, "read_processes", list)
+    monkeypatch.setattr(managerlogins, "_logins", lambda _passwd: [])
     monkeypatch.setattr(managerdoctor, "listening_sockets", lambda _port: frozenset())
     return manager
 

@@ -123,7 +123,7 @@ def runner(path: Path, coordinator: Coordinator | None) -> Iterator[None]:
         loop.call_soon_threadsafe(task.cancel)
         thread.join(20)
         loop.close()
-        path.unlink()
+        path.unlink(missing_ok=True)  # Python 3.13 does it by itself
 
 
 def is_listening(path: Path) -> bool:
