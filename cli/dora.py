@@ -18,7 +18,7 @@ Examples:
 @click.argument("selector")
 @click.argument("arguments", nargs=-1, type=click.UNPROCESSED, metavar="-- ARGUMENT...")
 @scope_options
-def command(selector: str, arguments: tuple[str, ...]) -> None:
+def command(selector: str, arguments: tuple[str, ...]) -> int:
     """Run dora ARGUMENT... against the coordinator of the dataflow SELECTOR.
 
     Only root and the user that the dataflow runs as may. Read logs with doractl logs: dora logs
@@ -26,4 +26,4 @@ def command(selector: str, arguments: tuple[str, ...]) -> None:
     """
     scope = current_scope()
     bus = Bus(scope)
-    exec_dora(scope, bus, select_cell(read_cells(bus), selector), arguments)
+    return exec_dora(scope, bus, select_cell(read_cells(bus), selector), arguments)

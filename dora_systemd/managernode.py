@@ -4,7 +4,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from dora_systemd import runnersocket
 from dora_systemd.busprotocol import Manager
@@ -20,6 +20,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.status import CellStatus
 from dora_systemd.trust.programs import Account, account_of_uid, become, fresh_environment
 from dora_systemd.trust.sockets import plain, require_listener
+from dora_systemd.trust.terminals import run_apart
 from dora_systemd.values import quoted
 
 _NO_USER = 2**32 - 1
@@ -97,10 +98,11 @@ def stop_node(scope: Scope, cell: Cell, node: str, ask: Ask = ask_coordinator) -
     _answer(cell, ask(scope, cell, node_params("StopNode", status.run, node)))
 
 
-def exec_dora(scope: Scope, manager: Manager, cell: Cell, arguments: Sequence[str]) -> NoReturn:
+def exec_dora(scope: Scope, manager: Manager, cell: Cell, arguments: Sequence[str]) -> int:
     """Become the dora command, told to speak to the coordinator of this dataflow.
 
-    Root runs it as the dataflow's user, who may have written it. Raises DoraSystemdError.
+    Root runs it as the dataflow's user, who may have written it, and on a terminal of its own:
+    this is its exit status. Raises DoraSystemdError.
     """
     uid, is_private = _unit_facts(manager, cell)
     account = account_of_uid(uid) if os.geteuid() == 0 and not scope.is_user else None
@@ -108,15 +110,15 @@ def exec_dora(scope: Scope, manager: Manager, cell: Cell, arguments: Sequence[st
         coordinator = _relayed(scope, cell, uid, account)
     else:
         coordinator = reached_coordinator(scope, manager, cell)
-    dora, environment = cell.options.dora, dict(os.environ)
+    command, found = [cell.options.dora, *arguments], dora_environment(coordinator)
     try:
         if account is not None:
-            environment = {**fresh_environment(account), **_terminal()}
-            become(account)
-        os.execve(dora, [dora, *arguments], {**environment, **dora_environment(coordinator)})
+            environment = {**fresh_environment(account), **_terminal(), **found}
+            return run_apart(command, environment, account)
+        os.execve(command[0], command, {**os.environ, **found})
     except OSError as error:
         raise DoraSystemdError(
-            f"cannot run {dora}: {error.strerror}", "", ExitCode.NO_DORA
+            f"cannot run {command[0]}: {error.strerror}", "", ExitCode.NO_DORA
         ) from error
 
 

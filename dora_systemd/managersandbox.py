@@ -2,7 +2,7 @@
 
 import pwd
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -18,6 +18,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.settings import Settings
 from dora_systemd.settingtable import PROPERTY
 from dora_systemd.trust.paths import firm_part
+from dora_systemd.trust.programs import account_from
 from dora_systemd.trust.sight import OwnSight, Sight
 from dora_systemd.values import shown
 
@@ -55,9 +56,19 @@ def make_sandbox(
         has_identity=_has_identity(user) and not _names(settings, *_CAPABILITIES),
         needed=needed,
         writable=writable,
-        firm={} if scope.is_user else {path: firm_part(path) for path in (*needed, *writable)},
+        firm={} if scope.is_user else _firm((*needed, *writable), user),
         directory=str(scope.cell_directory(options.name)),
     )
+
+
+def _firm(paths: Sequence[str], user: pwd.struct_passwd | None) -> dict[str, str]:
+    """Of each path what systemd may mount for `user`, whose own word on what is there is no proof.
+
+    A program of that user can trace the child that is asked, and have it say anything.
+    """
+    account = None if user is None else account_from(user)
+    uid, groups = (0, ()) if account is None else (account.uid, (account.gid, *account.groups))
+    return {path: firm_part(path, uid, groups) for path in paths}
 
 
 def sandbox_warnings(sandbox: Sandbox) -> Iterator[str]:

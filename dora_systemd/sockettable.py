@@ -9,6 +9,7 @@ import os
 import socket
 import struct
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -64,11 +65,30 @@ def peer_uid(peer: Address, own: Address, look: Lookup | None = None) -> int | N
 
 
 def find_owner(peer: Address, own: Address) -> Owner | None:
-    """The owner of the socket that is bound to `peer` and connected to `own`."""
+    """The owner of the socket that is bound to `peer` and connected to `own`.
+
+    A reading of the table takes milliseconds, and who connects and vanishes again must not have
+    us read it each time.
+    """
     try:
         return _ask_kernel(peer, own)
+    except FileNotFoundError:
+        # No such socket, or nobody in the kernel who knows about TCP.
+        if _kernel_knows():
+            return None
     except (OSError, struct.error):
-        return read_owner(peer, own)
+        pass
+    return read_owner(peer, own)
+
+
+@cache
+def _kernel_knows() -> bool:
+    """Whether the kernel tells of a socket that is there."""
+    try:
+        with socket.create_server(("127.0.0.1", 0)) as one:
+            return _ask_kernel(one.getsockname(), ("0.0.0.0", 0)).inode != 0
+    except (OSError, struct.error):
+        return False
 
 
 def read_owner(peer: Address, own: Address, tables: tuple[Path, ...] = TABLES) -> Owner | None:
@@ -103,7 +123,7 @@ def loopback_listeners(port: int, tables: tuple[Path, ...] = TABLES) -> frozense
     )
 
 
-def _ask_kernel(peer: Address, own: Address) -> Owner | None:
+def _ask_kernel(peer: Address, own: Address) -> Owner:
     """Raises OSError where the kernel does not answer such questions, or knows no such socket."""
     family, source, target = _family(peer), _packed(peer), _packed(own)
     identity = struct.pack("!HH16s16sI8s", peer[1], own[1], source, target, 0, _NO_COOKIE)

@@ -18,7 +18,7 @@ import grp
 import os
 import pwd
 import stat
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -101,11 +101,14 @@ def reached(path: str | Path) -> Iterator[tuple[int, Place]]:
         yield walk.fd, walk.place(str(path))
 
 
-def firm_part(path: str | Path) -> str:
+def firm_part(path: str | Path, uid: int = 0, groups: Collection[int] = ()) -> str:
     """The longest part of the absolute `path` in which nobody but root can replace anything.
 
     It is what may be told to a program that walks paths as root and follows links, such as systemd
     when it mounts: what follows in `path` may be a link to anywhere by then.
+
+    uid, groups: for whom it mounts. The part ends at a directory that is closed to that account,
+    whatever it says that it sees behind: mounted by itself, what is in there would be open to it.
     """
     firm = "/"
     with contextlib.ExitStack() as held, contextlib.suppress(OSError, DoraSystemdError):
@@ -113,7 +116,7 @@ def firm_part(path: str | Path) -> str:
         for part in _parts(str(path)):
             ahead = [part]
             while ahead:
-                if not walk.is_firm(ahead[0]):
+                if not (walk.is_firm(ahead[0]) and walk.is_open_to(uid, groups)):
                     return firm
                 ahead = walk.enter(ahead[0]) + ahead[1:]
             firm = f"{firm.rstrip('/')}/{part}"
@@ -225,6 +228,18 @@ class _Walk:
             return True
         owner = os.stat(name, dir_fd=self.fd, follow_symlinks=False).st_uid
         return owner == 0 and bool(self._status.st_mode & stat.S_ISVTX)
+
+    def is_open_to(self, uid: int, groups: Collection[int]) -> bool:
+        """Whether an account may go through the directory that was reached, see inode(7).
+
+        An ACL that lets it in by name does not count: that closes more than need be.
+        """
+        status, bit = self._status, stat.S_IXOTH
+        if uid == status.st_uid:
+            bit = stat.S_IXUSR
+        elif status.st_gid in groups:
+            bit = stat.S_IXGRP
+        return uid == 0 or bool(status.st_mode & bit)
 
     def _follow(self, name: str, status: os.stat_result) -> list[str]:
         link = f"{self._where}/{name}"

@@ -125,6 +125,7 @@ TRUST = {
         "trust.programs",
         "trust.sight",
         "trust.sockets",
+        "trust.terminals",
         "sockettable",
     ],
 }
@@ -370,9 +371,10 @@ STARTS_PROGRAMS = {
     "trust.programs": "for others",
     "engine": "dora's, in a cell",
     "journalread": "journalctl",
-    "managernode": "dora, after it has become the user",
+    "managernode": "dora, as the caller",
     "cli.logs": "the caller's own pager",
     "relay": "itself, as the user of the dataflow",
+    "trust.terminals": "another user's program, on a terminal of its own",
 }
 """The modules that start programs, and which."""
 

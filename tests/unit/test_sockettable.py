@@ -2,10 +2,12 @@
 
 import os
 import socket
+import struct
 from pathlib import Path
 
 import pytest
 
+from dora_systemd import sockettable
 from dora_systemd.sockettable import (
     Address,
     Lookup,
@@ -87,3 +89,35 @@ def test_with_this_kernel(host: str, look: Lookup) -> None:
 def ends(connection: socket.socket) -> tuple[Address, Address]:
     peer, own = connection.getsockname(), connection.getpeername()
     return (peer[0], peer[1]), (own[0], own[1])
+
+
+def test_a_socket_that_has_gone_costs_no_table(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who connects and vanishes again and again would keep the gateway reading."""
+    read: list[object] = []
+    monkeypatch.setattr(sockettable, "read_owner", lambda *ends: read.append(ends))
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        with socket.create_connection(server.getsockname()) as client:
+            peer, own = client.getsockname(), client.getpeername()
+            if find_owner(peer, own) is None:
+                pytest.skip("the kernel does not tell of single sockets")
+            client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        assert find_owner(peer, own) is None
+    assert not read
+
+
+def test_a_kernel_that_knows_of_no_socket_is_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def ignorant(*_ends: object) -> Owner:
+        raise FileNotFoundError
+
+    monkeypatch.setattr(sockettable, "_ask_kernel", ignorant)
+    sockettable._kernel_knows.cache_clear()
+    try:
+        with (
+            socket.create_server(("127.0.0.1", 0)) as server,
+            socket.create_connection(server.getsockname()) as client,
+        ):
+            found = find_owner(client.getsockname(), client.getpeername())
+            assert found is not None
+            assert found.uid == os.getuid()
+    finally:
+        sockettable._kernel_knows.cache_clear()

@@ -42,7 +42,7 @@ OTHERWISE = (
 )
 
 _TABLE = {
-    DOOR: "trust.paths trust.programs trust.sight trust.sockets",
+    DOOR: "trust.paths trust.programs trust.sight trust.sockets trust.terminals",
     OWN: "files managercredentials managerlimits cli.logs cli.main preparation launch",
     KERNEL: "cgroup machine managerdestroy managerlist managersandbox managerwhy proctable "
     "sockettable",

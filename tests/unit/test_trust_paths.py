@@ -179,6 +179,27 @@ def test_directories_that_others_write(
 
 
 @as_root
+def test_what_is_behind_a_closed_directory_is_not_mounted_by_itself(tmp_path: Path) -> None:
+    """Whoever is to see it could have lied about seeing it."""
+    for path in (tmp_path, *list(tmp_path.parents)[:-2]):
+        path.chmod(0o755)
+    closed, group = tmp_path / "closed", 4_000_003
+    (closed / "open").mkdir(parents=True)
+    (tmp_path / "link").symlink_to("closed/open")
+    closed.chmod(0o700)
+    assert firm_part(closed / "open", STRANGER) == str(closed)
+    assert firm_part(tmp_path / "link", STRANGER) == str(tmp_path)
+    assert firm_part(closed / "open") == str(closed / "open"), "root gets anywhere"
+    closed.chmod(0o750)
+    os.chown(closed, 0, group)
+    assert firm_part(closed / "open", STRANGER, [group]) == str(closed / "open")
+    assert firm_part(closed / "open", STRANGER, [OTHER]) == str(closed)
+    closed.chmod(0o705)
+    assert firm_part(closed / "open", STRANGER, [group]) == str(closed), "closed to the group alone"
+    assert firm_part(closed / "open", STRANGER) == str(closed / "open")
+
+
+@as_root
 def test_links_without_end_are_not_firm(tmp_path: Path) -> None:
     (tmp_path / "a").symlink_to("a")
     assert firm_part(tmp_path / "a") == str(tmp_path)

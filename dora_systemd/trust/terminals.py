@@ -1,0 +1,124 @@
+"""A program of somebody else that speaks to root's terminal: it gets one of its own instead.
+
+Whoever has a terminal can put words into its input, TIOCSTI in ioctl_tty(2), which root's shell
+then runs, and can go on reading from it when root believes the program has ended. So it is in a
+session of its own, on a pseudoterminal, and we carry over what either side writes.
+"""
+
+import contextlib
+import fcntl
+import os
+import select
+import signal
+import sys
+import termios
+import tty
+from collections.abc import Iterator, Mapping, Sequence
+from types import FrameType
+from typing import NoReturn
+
+from dora_systemd.errors import ExitCode
+from dora_systemd.trust.programs import Account, become
+
+_CHUNK = 65536
+_MOST_LATE = 64
+"""Chunks that are still shown after the program has ended: what it left behind may go on."""
+_STREAMS = range(3)
+_BY_SIGNAL = 128
+
+
+def run_apart(command: Sequence[str], environment: Mapping[str, str], account: Account) -> int:
+    """Run a program as `account` to its end; its exit status, 128 + the signal that killed it.
+
+    Its streams are the caller's, but for those that are a terminal. Raises OSError.
+    """
+    ours, theirs = os.openpty()
+    child = os.fork()
+    if child == 0:
+        _become_program(command, environment, account, theirs)
+    os.close(theirs)
+    screen = next((fd for fd in (1, 2, 0) if os.isatty(fd)), None)
+    try:
+        with _carried(child, ours, screen):
+            _carry(child, ours, screen)
+        status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    finally:
+        os.close(ours)
+    return status if status >= 0 else _BY_SIGNAL - status
+
+
+def _become_program(
+    command: Sequence[str], environment: Mapping[str, str], account: Account, terminal: int
+) -> NoReturn:
+    try:
+        os.setsid()
+        fcntl.ioctl(terminal, termios.TIOCSCTTY, 0)
+        for fd in _STREAMS:
+            if os.isatty(fd):
+                os.dup2(terminal, fd)
+        become(account)
+        os.execve(command[0], list(command), dict(environment))
+    except OSError as error:
+        print(f"doractl: cannot run {command[0]}: {error.strerror}", file=sys.stderr, flush=True)
+    finally:
+        os._exit(ExitCode.NO_DORA)
+
+
+@contextlib.contextmanager
+def _carried(child: int, ours: int, screen: int | None) -> Iterator[None]:
+    """Our own terminal as dumb as a wire, its size and our signals handed on."""
+
+    def hand_on(number: int, _frame: FrameType | None) -> None:
+        if number == signal.SIGWINCH:
+            _copy_size(screen, ours)
+        else:
+            os.kill(child, number)
+
+    numbers = (signal.SIGWINCH, signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = {number: signal.signal(number, hand_on) for number in numbers}
+    _copy_size(screen, ours)
+    mode = termios.tcgetattr(0) if os.isatty(0) else None
+    try:
+        if mode is not None:
+            termios.tcsetattr(ours, termios.TCSANOW, mode)
+            tty.setraw(0)
+        yield
+    finally:
+        if mode is not None:
+            termios.tcsetattr(0, termios.TCSADRAIN, mode)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _copy_size(screen: int | None, ours: int) -> None:
+    if screen is not None:
+        with contextlib.suppress(OSError):
+            fcntl.ioctl(ours, termios.TIOCSWINSZ, fcntl.ioctl(screen, termios.TIOCGWINSZ, bytes(8)))
+
+
+def _carry(child: int, ours: int, screen: int | None) -> None:
+    """Hand on what is typed and what is written until the program has ended."""
+    end = os.pidfd_open(child)
+    sources = [end, ours, *([0] if os.isatty(0) else [])]
+    try:
+        while end not in (ready := select.select(sources, [], [])[0]):
+            if ours in ready and not _copy(ours, screen):
+                sources.remove(ours)
+            if 0 in ready and not _copy(0, ours):
+                sources.remove(0)
+        for _ in range(_MOST_LATE):
+            if not (select.select([ours], [], [], 0)[0] and _copy(ours, screen)):
+                return
+    finally:
+        os.close(end)
+
+
+def _copy(source: int, target: int | None) -> bool:
+    """One chunk; False at the end, which a pseudoterminal tells by an error."""
+    try:
+        data = left = os.read(source, _CHUNK)
+        while left and target is not None:
+            left = left[os.write(target, left) :]
+    except OSError:
+        return False
+    return bool(data)
