@@ -29,6 +29,7 @@ _OPTIONS: dict[str, Any] = {
     "max_size": MAX_BYTES,
     "proxy": None,
 }
+OPEN_SECONDS = 4.0
 REQUEST_SECONDS = 35.0
 """Just above the 30 s after which the coordinator itself gives up on its daemon."""
 
@@ -122,7 +123,12 @@ def request(
     headers = _headers(token)
     try:
         with unix_connect(
-            None, _RELAY, sock=stream, additional_headers=headers, **_OPTIONS
+            None,
+            _RELAY,
+            sock=stream,
+            additional_headers=headers,
+            open_timeout=OPEN_SECONDS,
+            **_OPTIONS,
         ) as socket:
             socket.send(text)
             while True:

@@ -4,6 +4,7 @@ No dora is asked: it would have to run as the user, and only knows what the file
 be read is left out, and the cell says so at its start.
 """
 
+import errno
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path, PurePath
@@ -12,7 +13,7 @@ from typing import Any
 from dora_systemd.dataflow import Dataflow, parse_dataflow
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.files import decoded, parse_yaml
-from dora_systemd.trust.paths import read_file
+from dora_systemd.trust.paths import read_file, unreadable
 from dora_systemd.trust.sight import Sight
 
 _MOST_FILES = 50
@@ -45,8 +46,14 @@ def named_places(dataflow: Dataflow, sight: Sight) -> Iterator[Path]:
 
 
 def _nodes_of(path: Path, sight: Sight) -> Iterator[dict[str, Any]]:
-    with suppress(OSError, DoraSystemdError):
-        document = parse_yaml(decoded(sight.read(str(path)), path), path)
+    try:
+        data = sight.read(str(path))
+    except OSError as error:
+        if error.errno == errno.ENXIO:  # dora would wait for ever for somebody to write
+            raise unreadable(path, error) from error
+        return
+    with suppress(DoraSystemdError):
+        document = parse_yaml(decoded(data, path), path)
         nodes = document.get("nodes") if isinstance(document, dict) else None
         yield from (node for node in nodes or () if isinstance(node, dict))
 

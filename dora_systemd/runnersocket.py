@@ -25,7 +25,7 @@ Request = Mapping[str, Any]
 MAX_BYTES = 1 << 16
 ANSWER_SECONDS = 150.0
 """A reload may have to wait for a grace duration, and for nodes to be ready."""
-RELAY_SECONDS = 10.0
+RELAY_SECONDS = 4.0
 
 
 def ask(path: Path, request: Request, seconds: float = ANSWER_SECONDS) -> dict[str, Any]:

@@ -21,8 +21,11 @@ from dora_systemd.trust.paths import MAX_BYTES
 from dora_systemd.trust.programs import Account, spawn
 from dora_systemd.values import shown
 
-_SECONDS = 10.0
-"""For one answer: what the account has mounted may hang."""
+_SECONDS = 5.0
+"""For all answers together: what the account has mounted may hang, and it may stop the child."""
+_LONGEST = 4096
+"""Bytes of a path, see PATH_MAX in limits.h(0p): a longer one would not fit into the pipe."""
+_MOST_DIGITS = 4
 _HEAD = 8
 _CHUNK = 65536
 
@@ -108,28 +111,39 @@ class LentSight:
     def __init__(self, child: "subprocess.Popen[bytes]", account: Account) -> None:
         self._child = child
         self._account = account
+        self._left = _SECONDS
 
     def exists(self, path: str) -> bool:
-        return bool(self._ask("e", path))
+        return self._is("e", path)
 
     def is_directory(self, path: str) -> bool:
-        return bool(self._ask("d", path))
+        return self._is("d", path)
 
     def is_program(self, path: str) -> bool:
-        return bool(self._ask("x", path))
+        return self._is("x", path)
 
     def real(self, path: str) -> str:
-        found = os.fsdecode(self._ask("l", path))
-        return found if found.startswith("/") else path
+        with contextlib.suppress(OSError):
+            found = os.fsdecode(self._ask("l", path))
+            return found if found.startswith("/") else path
+        return path
 
     def read(self, path: str) -> bytes:
         return self._ask("r", path)
+
+    def _is(self, letter: str, path: str) -> bool:
+        with contextlib.suppress(OSError):
+            return bool(self._ask(letter, path))
+        return False
 
     def _ask(self, letter: str, path: str) -> bytes:
         """One question. Raises OSError with what the account met."""
         assert self._child.stdin and self._child.stdout
         question = os.fsencode(path)
-        deadline = time.monotonic() + _SECONDS
+        if len(question) > _LONGEST:
+            raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG))
+        begun = time.monotonic()
+        deadline = begun + self._left
         try:
             self._child.stdin.write(b"%s%07d%s" % (letter.encode(), len(question), question))
             self._child.stdin.flush()
@@ -137,8 +151,11 @@ class LentSight:
             data = self._receive(min(int(head[1:]), MAX_BYTES + 1), deadline)
         except (BrokenPipeError, ValueError) as error:
             raise self._silence(path) from error
+        finally:
+            self._left -= time.monotonic() - begun
         if head[:1] != b"+":
-            number = int(data) if data.isdigit() else 22
+            is_number = data.isdigit() and len(data) <= _MOST_DIGITS
+            number = int(data) if is_number else errno.EINVAL
             raise OSError(number, os.strerror(number))
         return data
 

@@ -2,22 +2,25 @@
 
 import os
 import pwd
+import signal
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from dora_systemd.dataflow import parse_dataflow
 from dora_systemd.doracheck import check_access
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.manageraccount import account_of, choose_user
 from dora_systemd.managercheck import check_plan
+from dora_systemd.managernodes import named_places
 from dora_systemd.managerplan import Plan, StartRequest, make_plan, request_name
 from dora_systemd.managersettings import read_settings, settings_files
 from dora_systemd.scope import Scope
 from dora_systemd.settingtable import ENV_FILE, SETTINGS, UV
 from dora_systemd.trust.paths import Place, reached
-from dora_systemd.trust.sight import sight_of
+from dora_systemd.trust.sight import LentSight, OwnSight, sight_of
 
 USER = Scope(is_user=True, uid=os.getuid())
 SYSTEM = Scope(is_user=False, uid=os.getuid())
@@ -288,3 +291,25 @@ def test_what_a_user_sees(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
             sight.read("/dev/null")
     with sight_of(None) as sight:
         assert sight.read(str(closed / "x")) == b"secret"
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="becomes somebody else")
+def test_a_child_that_is_stopped_costs_one_budget(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its user may stop it, and slow each answer: all of them together have so much time."""
+    monkeypatch.setattr(sys, "executable", "/usr/bin/python3")
+    monkeypatch.setattr("dora_systemd.trust.sight._SECONDS", 0.5)
+    with sight_of(account_of(pwd.getpwuid(65534))) as sight:
+        assert not sight.exists("/" + "x" * 100_000)
+        assert isinstance(sight, LentSight)
+        os.kill(sight._child.pid, signal.SIGSTOP)
+        for _ in range(50):
+            with pytest.raises(DoraSystemdError, match="no answer"):
+                sight.exists("/etc")
+        assert sight._left <= 0.5
+
+
+def test_a_module_that_is_no_file_is_refused(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "module.yml")
+    flow = parse_dataflow({"nodes": [{"id": "a", "module": "module.yml"}]}, str(tmp_path / "f.yml"))
+    with pytest.raises(DoraSystemdError, match="it is not a regular file"):
+        list(named_places(flow, OwnSight()))
