@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from pathlib import Path
 
 from dora_systemd import files, notify
 from dora_systemd import lifeevents as life
@@ -28,6 +29,14 @@ from dora_systemd.values import SECOND
 def now_us() -> int:
     """CLOCK_REALTIME in µs."""
     return time.time_ns() // 1000
+
+
+def is_deleted(directory: Path) -> bool:
+    """Whether a directory is gone. One that is mounted here stays, but nothing leads to it."""
+    try:
+        return directory.stat().st_nlink == 0
+    except OSError:
+        return True
 
 
 class Pump:
@@ -198,7 +207,7 @@ class Pump:
             return
         self._is_unwritten = True
         print(f"<4>{error.message}", file=sys.stderr, flush=True)
-        if not self._paths.root.exists():
+        if is_deleted(self._paths.root):
             reason = f"its directory {self._paths.root} is gone"
             lost = life.Refused(now_us(), reason, Cause.DIRECTORY_LOST)
             self._loop.call_soon(self.push, lost)

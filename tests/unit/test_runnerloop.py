@@ -1,6 +1,7 @@
 """The runner's loop: its actions and tasks raise, hang and lie, and the cell ends all the same."""
 
 import asyncio
+import os
 from collections import deque
 from collections.abc import Awaitable, Callable, Coroutine
 from pathlib import Path
@@ -17,7 +18,7 @@ from dora_systemd.options import RunnerOptions
 from dora_systemd.protocol import Reply
 from dora_systemd.runnerdialogue import Dialogue
 from dora_systemd.runnerfailure import Beside
-from dora_systemd.runnerpump import Pump
+from dora_systemd.runnerpump import Pump, is_deleted
 from dora_systemd.status import NodeStatus
 from dora_systemd.values import SECOND
 
@@ -310,3 +311,15 @@ def test_a_callback_of_the_loop_that_raises_ends_the_cell(tmp_path: Path) -> Non
         assert "could not finish refuse: BlockingIOError" in bench.reasons[0]
 
     live(work)
+
+
+def test_a_directory_that_was_deleted_under_somebody(tmp_path: Path) -> None:
+    """As a mount has it, whose source is gone: it is there, and has no name any more."""
+    place = tmp_path / "robot"
+    place.mkdir()
+    assert not is_deleted(place)
+    held = os.open(place, os.O_PATH)
+    place.rmdir()
+    assert is_deleted(place)
+    assert is_deleted(Path(f"/proc/self/fd/{held}"))
+    os.close(held)
