@@ -23,7 +23,7 @@ TOLERATED = (
     Word("Scouting delay elapsed before start conditions are met", _ORDER),
     Word("Unable to find transport for link event", _ORDER),
     Word("Error syncing transport with peer", _ORDER),
-    Word("Unable to connect to any locator", _ORDER),
+    Word("Unable to connect to ", _ORDER),  # a locator, any of them, a newly scouted peer
     Word("in response to an OpenSyn", _ORDER),
     Word("Attempt to establish transport to itself", _ORDER),
     Word("zenoh teardown timed out", _SLOW),
