@@ -10,26 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.trust.paths import MAX_BYTES, unreadable
 from dora_systemd.values import shown
-
-MAX_BYTES = 1024 * 1024
-"""Bytes of a file that we read: dora takes no descriptor above 1 MiB."""
 
 MAX_DEPTH = 64
 """Levels of nesting: libyaml's composer recurses in C and crashes on some 100,000 of them."""
 
 MAX_VALUES = 100_000
 """Values in a YAML file; a small file can hold enough of them to take seconds."""
-
-_REASONS = {
-    errno.ENOENT: ("there is no such file", "correct the path"),
-    errno.ENOTDIR: ("there is no such file", "correct the path"),
-    errno.ELOOP: ("its links go round in a circle", "correct the path"),
-    errno.ENAMETOOLONG: ("its name is too long", "correct the path"),
-    errno.ENXIO: ("it is not a regular file", "give a file"),
-    errno.EACCES: ("permission denied", "let the calling user read it"),
-    errno.EPERM: ("permission denied", "let the calling user read it"),
-}
 
 _WRITE_HINTS = {
     errno.EACCES: "use sudo, or choose a place that is yours",
@@ -55,9 +43,7 @@ def read_text(path: Path) -> str:
     try:
         data = _read_bytes(path)
     except (OSError, ValueError) as error:
-        known = _REASONS.get(getattr(error, "errno", 0) or 0)
-        reason, hint = known or (str(getattr(error, "strerror", None) or error), "")
-        raise _refusal(path, reason, hint) from error
+        raise unreadable(path, error) from error
     return decoded(data, path)
 
 

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.files import (
-    MAX_BYTES,
     MAX_DEPTH,
     MAX_VALUES,
     read_json,
@@ -20,6 +19,7 @@ from dora_systemd.files import (
     read_yaml,
     write_atomic,
 )
+from dora_systemd.trust.paths import MAX_BYTES
 
 
 @pytest.fixture
