@@ -78,9 +78,11 @@ def command(
         return
     bus = Bus(scope)
     claimed = claim(bus, scope, request, want_boot)
-    print_warnings((*claimed.warnings, *start_notes(claimed.plan)))
+    print_warnings(claimed.warnings)
     print_warnings([note for note in [ensure_linger(scope) if want_boot else ""] if note])
     started = _start(bus, claimed, not no_wait)
+    # Of something that runs: a refusal is one line and a hint.
+    print_warnings([*start_notes(claimed.plan)])
     if output == "json":
         print_json({**vars(started), "dataflow": claimed.plan.options.dataflow})
     else:

@@ -8,8 +8,9 @@ from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
-from lab import definition, qemu
+from lab import definition, emulator, qemu
 from lab.cache import Layer, ensure, ensure_locked, find_cache
+from lab.emulator import emulator_layer, program
 from lab.errors import LabError, Stage
 from lab.guest import Guest, write_all, write_err, write_out
 from lab.image import (
@@ -34,7 +35,7 @@ MEMORY = "2G"
 DISK = "6G"
 BOOT_SECONDS = 180.0
 
-SOURCES = ("machine.py", "qemu.py", "agent.py", "wire.py", "initrd.py")
+SOURCES = ("machine.py", "qemu.py", "emulator.py", "agent.py", "wire.py", "initrd.py")
 
 AGENT_UNIT = """\
 [Unit]
@@ -54,10 +55,17 @@ WARM_UP = (
 
 
 def ensure_machine(cache: Path) -> Path:
-    need_tools("qemu-system-x86_64", "qemu-img", "mke2fs")
+    need_tools("mmdebstrap", "mke2fs")
+    ensure(cache, emulator_layer(cache))
     sources = [definition.read_part(definition.HERE / name) for name in SOURCES]
-    key = definition.digest(definition.base_key(), kernel_key(), qemu.read_version(), sources)
+    key = definition.digest(definition.base_key(), kernel_key(), emulator.key(), sources)
     return ensure(cache, Layer("machine", key, lambda path: build_machine(path, cache)))
+
+
+def find_emulator() -> Path:
+    """It is there, and held, once the machine has been asked for."""
+    cache = find_cache()
+    return cache / emulator_layer(cache).name
 
 
 def kernel_key() -> str:
@@ -115,8 +123,8 @@ def write_disk(path: Path, base: Path, log: Path) -> None:
 def write_snapshot(path: Path, log: Path) -> None:
     disk = path / "booted.qcow2"
     # A relative name, for the directory is renamed when it is finished.
-    create = ["qemu-img", "create", "-q", "-f", "qcow2", "-F", "raw", "-b", "root.ext4", str(disk)]
-    run_logged(create, log, "make the snapshot's disk")
+    create = ["create", "-q", "-f", "qcow2", "-F", "raw", "-b", "root.ext4", str(disk)]
+    run_logged([*program(find_emulator(), "qemu-img"), *create], log, "make the snapshot's disk")
     run = open_run()
     try:
         with started_machine(run, path, disk) as guest:
@@ -129,7 +137,7 @@ def write_snapshot(path: Path, log: Path) -> None:
 
 @contextmanager
 def started_machine(run: Run, layer: Path, disk: Path, snapshot: str = "") -> Iterator[Guest]:
-    command = qemu.machine_command(layer, disk, run.directory, snapshot, MEMORY)
+    command = qemu.machine_command(find_emulator(), layer, disk, run.directory, snapshot, MEMORY)
     # An image is built as quickly as can be.
     speed = read_speed(os.environ.get("LAB_SPEED")) if snapshot else FULL_SPEED
     try:

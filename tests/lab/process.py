@@ -13,10 +13,7 @@ from lab.errors import LabError
 TOOLS = {
     "mmdebstrap": "mmdebstrap",
     "systemd-nspawn": "systemd-container",
-    "qemu-system-x86_64": "qemu-system-x86",
-    "qemu-img": "qemu-utils",
     "mke2fs": "e2fsprogs",
-    "cpio": "cpio",
 }
 
 

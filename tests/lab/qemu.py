@@ -1,7 +1,6 @@
 """The emulator: its command line, its life, and its monitor."""
 
 import json
-import re
 import socket
 import subprocess
 import time
@@ -10,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from lab.emulator import firmware, program
 from lab.errors import LabError
 from lab.process import die_with_parent, read_last_line
 from lab.slow import slowed
@@ -18,30 +18,19 @@ KERNEL_OPTIONS = (
     "rw console=ttyS0 mitigations=off quiet loglevel=3 random.trust_cpu=on tsc=reliable nokaslr"
     " panic=1"
 )
-# Before 10, the emulator spoils the flags after cmpxchg16b, and half of all boots of the kernel
-# panic. This keeps the kernel from using it. (Hiding it from all programs would stop numpy.)
-OLD_EMULATOR_OPTIONS = " clearcpuid=cx16"
 
 
-def read_version() -> str:
-    output = subprocess.check_output(["qemu-system-x86_64", "--version"], text=True)
-    return output.splitlines()[0]
-
-
-def kernel_options(version: str) -> str:
-    found = re.search(r"version (\d+)", version)
-    is_old = not found or int(found[1]) < 10
-    return KERNEL_OPTIONS + (OLD_EMULATOR_OPTIONS if is_old else "")
-
-
-def machine_command(layer: Path, disk: Path, place: Path, snapshot: str, memory: str) -> list[str]:
+def machine_command(
+    emulator: Path, layer: Path, disk: Path, place: Path, snapshot: str, memory: str
+) -> list[str]:
     """Never with KVM: where it exists without working, the machine hangs."""
     load = ["-loadvm", snapshot] if snapshot else []
     return die_with_parent([
-        "qemu-system-x86_64", "-M", "pc", "-accel", "tcg,thread=multi", "-cpu", "max",
+        *program(emulator, "qemu-system-x86_64"), *firmware(emulator),
+        "-M", "pc", "-accel", "tcg,thread=multi", "-cpu", "max",
         "-smp", "2", "-m", memory, "-nodefaults", "-no-user-config", "-display", "none",
         "-kernel", str(layer / "vmlinuz"), "-initrd", str(layer / "initrd"),
-        "-append", kernel_options(read_version()),
+        "-append", KERNEL_OPTIONS,
         "-drive", f"file={disk},if=none,id=disk,format=qcow2,cache=unsafe",
         "-device", "virtio-blk-pci,drive=disk",
         "-device", "virtio-serial-pci",

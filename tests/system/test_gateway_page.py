@@ -164,7 +164,7 @@ def test_what_nodes_print_is_text(browser: Browser, cell: Cell, project: Project
     flow = project.three_nodes()
     project.write("sink.py", HOSTILE)
     cell.start(flow)
-    browser.wait_text(".lines", "<img src=x onerror=alert(1)>red &amp; \ufffdbell")
+    browser.wait_text(".lines", "<img src=x onerror=alert(1)>red &amp; \\x07bell")
     assert browser.js("document.querySelectorAll('.lines img').length") == 0
     assert browser.failures() == []
 

@@ -8,7 +8,15 @@ import pytest
 
 pytestmark = pytest.mark.lab
 
-BURN = "import time\nstart = time.monotonic()\nwhile time.monotonic() - start < 3: pass"
+BURN = """
+import time
+from pathlib import Path
+_, _, group = Path("/proc/self/cgroup").read_text().strip().rpartition("::")
+start = time.monotonic()
+while time.monotonic() - start < 3:
+    pass
+print(Path(f"/sys/fs/cgroup{group}/cpu.stat").read_text())
+"""
 
 
 def run(*command: str) -> subprocess.CompletedProcess[str]:
@@ -63,10 +71,11 @@ def test_memory_limit_kills() -> None:
 @pytest.mark.vm
 def test_cpu_quota_throttles() -> None:
     burn = ("/usr/bin/python3", "-c", BURN)
-    done = run("systemd-run", "--wait", "--collect", "--property=CPUQuota=20%", *burn)
+    done = run("systemd-run", "--wait", "--pipe", "--collect", "--property=CPUQuota=20%", *burn)
     assert done.returncode == 0
-    used = next(line for line in done.stderr.splitlines() if "CPU time consumed" in line)
-    assert "ms" in used or float(used.split(":")[1].strip().rstrip("s")) < 1.5, used
+    stat = dict(line.split() for line in done.stdout.splitlines() if line)
+    # A slow machine gives the process less than it may have in some of the periods, not in all.
+    assert int(stat["nr_throttled"]) > 0, stat
 
 
 @pytest.mark.vm

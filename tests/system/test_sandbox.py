@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.errors import ExitCode
+from dora_systemd.manageraccount import DEFAULT_USER
 from dora_systemd.sandbox import NETWORKS
 from dora_systemd.scope import Scope
 from tests.system.cells import Cell, Project, run, sync_journal, wait_for
@@ -134,7 +135,7 @@ def test_user_scope(project: Project, level: str) -> None:
         done = run(*become, *start)
         assert ("protects no files in user scope" in done.stderr) == (level == "strict")
         match = ("journalctl", "-q", "-o", "cat", f"DORA_DATAFLOW_NAME={hers.name}")
-        wait_for("messages", lambda: "got [4]" in run(*match, "DORA_NODE=sink").stdout)
+        wait_for("messages", lambda: "got [" in run(*match, "DORA_NODE=sink").stdout)
         row = json.loads(run(*become, "list", hers.name, "-o", "json").stdout)
         (pid,) = [one["pid"] for one in row["nodes"] if one["node"] == "sink"]
         status = Path(f"/proc/{pid}/status").read_text()
@@ -150,7 +151,7 @@ def test_files(cell: Cell, project: Project, place: Path) -> None:
     tries = [f"write:{project.root}/x", f"write:{place}/x", "write:/tmp/y", f"read:{host}"]
     tries += ["write:/dev/shm/dora-systemd-test", f"read:{project.root}/probe.py"]
     try:
-        found = probe(cell, project, tries=tries)
+        found = probe(cell, project, "--uid", DEFAULT_USER, tries=tries)
     finally:
         host.unlink()
         Path("/dev/shm/dora-systemd-test").unlink(missing_ok=True)
@@ -388,7 +389,8 @@ for event in node:
 def test_why_names_the_sandbox(cell: Cell, project: Project) -> None:
     project.root.chmod(0o777)
     project.write("probe.py", RECORDER)
-    cell.start(project.write("dataflow.yml", FLOW), check=False)
+    flow = project.write("dataflow.yml", FLOW)
+    cell.start(flow, "--uid", DEFAULT_USER, check=False)
     wait_for("it has failed", lambda: cell.show("ActiveState") == "failed")
     sync_journal()
     text = cell.doractl("why", cell.name).stdout

@@ -12,7 +12,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from lab import cache, definition, initrd, pace, qemu, wire
+from lab import cache, definition, initrd, pace, wire
 from lab.errors import LabError
 from lab.options import parse_options
 from lab.slow import read_speed
@@ -120,18 +120,6 @@ def test_initrd_members_are_aligned() -> None:
     assert entry.startswith(b"070701")
     assert len(entry) % 4 == 0
     assert b"init\0" in entry
-
-
-@pytest.mark.parametrize(
-    ("version", "is_old"),
-    [
-        ("QEMU emulator version 7.2.22 (Debian 1:7.2)", True),
-        ("QEMU emulator version 10.0.2 (Debian 1:10)", False),
-        ("no idea", True),
-    ],
-)
-def test_old_emulators_get_the_workaround(version: str, is_old: bool) -> None:
-    assert ("clearcpuid=cx16" in qemu.kernel_options(version)) is is_old
 
 
 @pytest.mark.parametrize(
