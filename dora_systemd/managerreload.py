@@ -10,7 +10,7 @@ from dora_systemd.hotreload import CHANGE_VARIABLE
 from dora_systemd.managercells import Cell
 from dora_systemd.managernode import require_node, require_running
 from dora_systemd.properties import format_unit, typed
-from dora_systemd.runnersocket import ask, done_of
+from dora_systemd.runnersocket import done_of, order
 from dora_systemd.scope import Scope
 from dora_systemd.unitfiles import HOT_RELOAD_FILE, drop_in_directory, write_unit_file
 from dora_systemd.values import format_bool
@@ -18,7 +18,7 @@ from dora_systemd.values import format_bool
 Ask = Callable[[Path, Mapping[str, Any]], dict[str, Any]]
 
 
-def reload_cell(scope: Scope, cell: Cell, node: str | None, ask: Ask = ask) -> list[str]:
+def reload_cell(scope: Scope, cell: Cell, node: str | None, ask: Ask = order) -> list[str]:
     """What was done, in words: nothing if no file has changed and no node is named.
 
     Raises DoraSystemdError; then the old version runs on.
@@ -31,7 +31,7 @@ def reload_cell(scope: Scope, cell: Cell, node: str | None, ask: Ask = ask) -> l
 
 
 def switch_hot_reload(
-    manager: Manager, scope: Scope, cell: Cell, is_on: bool, ask: Ask = ask
+    manager: Manager, scope: Scope, cell: Cell, is_on: bool, ask: Ask = order
 ) -> None:
     """Watch the files of a dataflow from now on, or no longer; also after a restart of its unit.
 

@@ -34,6 +34,18 @@ def ask(path: Path, request: Request, seconds: float = ANSWER_SECONDS) -> dict[s
         return _exchange(stream, path, request, seconds)
 
 
+def order(path: Path, request: Request) -> dict[str, Any]:
+    """The same for what may take long, of a runner that answers now. Raises DoraSystemdError.
+
+    A runner that is stopped, or that is silent on purpose, is found out in RELAY_SECONDS.
+    """
+    # A refusal is an answer, too: a coordinator that is not up yet hinders no reload.
+    refused = contextlib.suppress(DoraSystemdError)
+    with _reaching(path), connect_unix(path, RELAY_SECONDS) as stream, refused:
+        _exchange(stream, path, {"verb": "coordinator"}, RELAY_SECONDS)
+    return ask(path, request)
+
+
 def ask_coordinator(path: Path) -> Coordinator:
     """Where the coordinator of the runner at `path` listens. Raises DoraSystemdError."""
     reply = ask(path, {"verb": "coordinator"}, RELAY_SECONDS)

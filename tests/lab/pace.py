@@ -12,6 +12,9 @@ import time
 REFERENCE_SECONDS = 0.012
 """What the work below takes on an idle machine with two cores, natively."""
 
+SLOWEST = 20.0
+"""Slower than this is no machine to test on: a bound that grows for ever is none."""
+
 _SAMPLES = 5
 _FRESH_SECONDS = 30.0
 _WORK = [sys.executable, "-I", "-S", "-c", "for _ in range(10000): pass"]
@@ -24,7 +27,8 @@ def measure() -> float:
     begun = time.monotonic()
     for _ in range(_SAMPLES):
         subprocess.run(_WORK, check=True)
-    return max(1.0, (time.monotonic() - begun) / _SAMPLES / REFERENCE_SECONDS)
+    taken = (time.monotonic() - begun) / _SAMPLES
+    return min(max(1.0, taken / REFERENCE_SECONDS), SLOWEST)
 
 
 def pace() -> float:

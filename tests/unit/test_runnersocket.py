@@ -20,7 +20,7 @@ from dora_systemd.coordinator import Coordinator, parse_coordinator
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.relay import open_port
 from dora_systemd.runnerlistener import serve
-from dora_systemd.runnersocket import ask, ask_coordinator, done_of, relay
+from dora_systemd.runnersocket import ask, ask_coordinator, done_of, order, relay
 
 TOKEN = "0123abc"
 
@@ -93,6 +93,24 @@ def test_an_answer_that_breaks_ends_nothing_but_itself(tmp_path: Path) -> None:
     broken, good = ask_server(tmp_path / "s", {"verb": "broken"}, {"verb": "yes"})
     assert broken.message == "cannot do that: KeyError: 'node'"
     assert good == {"done": ["yes"]}
+
+
+def test_an_order_for_a_runner_whose_coordinator_is_nowhere(tmp_path: Path) -> None:
+    with runner(path := tmp_path / "runner.sock", None):
+        assert order(path, {"verb": "reload"}) == {"done": ["reload"]}
+
+
+def test_an_order_for_a_runner_that_is_silent(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dora_systemd.runnersocket.RELAY_SECONDS", 0.05)
+    path = tmp_path / "runner.sock"
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(path))
+        listener.listen()
+        with pytest.raises(DoraSystemdError, match="timed out") as caught:
+            order(path, {"verb": "reload"})
+    assert caught.value.code == ExitCode.NOT_RUNNING
 
 
 def test_nobody_there(tmp_path: Path) -> None:
