@@ -1,5 +1,6 @@
 """What `doractl start --hot-reload` says about the files that are going to be watched."""
 
+import os
 from collections.abc import Iterator
 
 from dora_systemd.managerplan import Plan
@@ -16,8 +17,11 @@ def watched_patterns(plan: Plan) -> tuple[str, ...]:
 
 
 def watch_warnings(plan: Plan) -> Iterator[str]:
-    """One for each pattern that was given and fits no file."""
-    if not plan.options.hot_reload or not plan.options.reload.watch:
+    """One for each pattern that was given and fits no file.
+
+    Only the owner of the files walks through them: as root, doractl would open somebody else's.
+    """
+    if not plan.options.hot_reload or not plan.options.reload.watch or _is_anothers(plan):
         return
     # Only who gives patterns pays for a walk through the files.
     from dora_systemd.watch import watch_rules, watched_files
@@ -27,3 +31,7 @@ def watch_warnings(plan: Plan) -> Iterator[str]:
     found = [path for path, _ in watched_files(rules)]
     for pattern in unmatched_patterns(rules, found):
         yield f"no file below {rules.root} fits --watch {quoted(pattern)}"
+
+
+def _is_anothers(plan: Plan) -> bool:
+    return plan.user is not None and plan.user.pw_uid != os.geteuid()

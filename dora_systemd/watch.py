@@ -9,6 +9,7 @@ from pathlib import Path
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import settings_path
 from dora_systemd.options import RunnerOptions
+from dora_systemd.trust.paths import read_file
 from dora_systemd.watchrules import DEFAULT_WATCH, WatchRules
 
 DEBOUNCE_MS = 400
@@ -76,9 +77,11 @@ def read_gitignores(root: str) -> dict[str, tuple[str, ...]]:
     found: dict[str, tuple[str, ...]] = {}
     for directory in watched_directories(WatchRules(root)):
         try:
-            lines = Path(directory, ".gitignore").read_text(errors="replace").splitlines()
-        except OSError:
+            # A link is not followed, as git does not follow it: see NOTES in gitignore(5).
+            data = read_file(Path(directory, ".gitignore")).data
+        except DoraSystemdError:
             continue
+        lines = data.decode(errors="replace").splitlines()
         found[os.path.relpath(directory, root).removeprefix(".")] = tuple(lines)
     return found
 

@@ -307,7 +307,9 @@ def test_directories_come_and_go(cell: Cell, project: Project) -> None:
 def test_what_is_not_watched(cell: Cell, project: Project) -> None:
     flow = project.three_nodes()
     project.write(".gitignore", "generated/\n")
-    done = cell.start(flow, HOT, "--watch", "*.py,*.nothing", "--ignore", "draft_*")
+    done = cell.start(
+        flow, HOT, "--watch", "*.py,*.nothing", "--ignore", "draft_*", "--uid", "root"
+    )
     assert "no file below" in done.stderr
     assert "--watch '*.nothing'" in done.stderr.replace('"', "'")
     for name in (

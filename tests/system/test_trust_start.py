@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.errors import ExitCode
-from tests.system.cells import Cell, run
+from tests.system.cells import Cell, run, wait_for
 from tests.system.refusals import units
 
 pytestmark = pytest.mark.lab
@@ -182,6 +182,17 @@ def test_her_environment_file_is_read_as_her(cell: Cell, mallory: Home) -> None:
     text = cell.start(flow, "--dry-run", "--env-file", str(secret)).stdout
     assert "OWN=1" in text
     assert "SECRET=x" in text
+
+
+def test_the_files_to_watch_are_not_walked_as_root(cell: Cell, mallory: Home) -> None:
+    """A FIFO as .gitignore stops neither root's start nor her own runner."""
+    flow = mallory.write("dataflow.yml", FLOW)
+    os.mkfifo(mallory.root / ".gitignore")
+    cell.start(flow, "--hot-reload", "--watch", "*.nothing", "--dry-run")
+    cell.start(flow, "--hot-reload", "--watch", "*.nothing,*.py")
+    count = len(cell.events())
+    mallory.write("a.py", NODE + "\n")
+    wait_for("a reload", lambda: ("node-reloaded", "a") in cell.events()[count:])
 
 
 def test_what_is_there_is_not_told(cell: Cell, mallory: Home) -> None:
