@@ -34,6 +34,12 @@ def test_versions() -> None:
     assert version_of(DEBIANS[0]) == pyproject["project"]["version"] == __version__
 
 
+def test_changes_are_told_for_each_version() -> None:
+    told = re.findall(r"^## (\S+)$", (CHECKOUT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    packaged = re.findall(r"^\S+ \((.+)\) ", (DEBIANS[0] / "changelog").read_text(), re.MULTILINE)
+    assert told == packaged
+
+
 def test_wheels_are_those_of_the_changelog() -> None:
     version = version_of(DEBIANS[1]).partition("-")[0]
     lines = (DEBIANS[1] / "SHA256SUMS").read_text().splitlines()
