@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.errors import ExitCode
+from dora_systemd.gatewayplace import SERVICE_UNIT
 from dora_systemd.manageraccount import DEFAULT_USER
 from dora_systemd.sandbox import NETWORKS
 from dora_systemd.scope import Scope
@@ -23,6 +24,7 @@ pytestmark = pytest.mark.lab
 LEVELS = ("none", "default", "strict")
 HIGHEST = 2.0
 """What `systemd-analyze security` may say of a unit that nobody has configured."""
+HIGHEST_OF_THE_GATEWAY = 2.7
 
 PROBE = """
 import errno, json, os, socket
@@ -81,10 +83,9 @@ def place() -> Iterator[Path]:
     shutil.rmtree(path)
 
 
-def exposure(cell: Cell) -> float:
-    """The score of the unit, as systemd-analyze prints it."""
-    user = ["--user"] if cell.scope.is_user else []
-    words = ("systemd-analyze", *user, "security", "--no-pager", cell.unit)
+def exposure(unit: str) -> float:
+    """The score of a unit of the system, as systemd-analyze prints it."""
+    words = ("systemd-analyze", "security", "--no-pager", unit)
     last = run(*words).stdout.splitlines()[-1]
     return float(last.partition(": ")[2].split()[0])
 
@@ -94,7 +95,7 @@ def test_exposure(cell: Cell, project: Project, capsys: pytest.CaptureFixture[st
     for level in LEVELS:
         flags = [] if level == "default" else ["--sandbox", level]
         cell.start(project.three_nodes(), *flags)
-        found[level] = exposure(cell)
+        found[level] = exposure(cell.unit)
         rows = run("systemd-analyze", "security", "--json=short", "--no-pager", cell.unit).stdout
         weak = [row["json_field"] for row in json.loads(rows) if row.get("exposure")]
         assert "NoNewPrivileges" not in weak or level == "none"
@@ -106,7 +107,16 @@ def test_exposure(cell: Cell, project: Project, capsys: pytest.CaptureFixture[st
 
 def test_exposure_with_a_device_and_in_a_home(cell: Cell, project: Project) -> None:
     cell.start(project.three_nodes(), "--device", "/dev/null")
-    assert exposure(cell) <= HIGHEST
+    assert exposure(cell.unit) <= HIGHEST
+
+
+def test_exposure_of_the_gateway(front: Front, capsys: pytest.CaptureFixture[str]) -> None:
+    front.up()
+    front.get("/metrics")
+    found = exposure(SERVICE_UNIT)
+    with capsys.disabled():
+        print(f" exposure of the gateway: {found} ", end="")
+    assert found <= HIGHEST_OF_THE_GATEWAY
 
 
 @pytest.mark.warns("is being restarted by dora")
@@ -314,13 +324,13 @@ def test_a_unit_file_is_the_same(cell: Cell, project: Project, place: Path) -> N
     cell.start(flow, *flags, "--enable")
     try:
         cell.wait_exchanging()
-        before = exposure(cell)
+        before = exposure(cell.unit)
         cell.doractl("stop", cell.name)
         # Started from its file: the settings are the same.
         cell.start(flow, *flags)
         assert cell.show("FragmentPath").startswith("/etc/")
         cell.wait_exchanging()
-        assert exposure(cell) == before
+        assert exposure(cell.unit) == before
     finally:
         cell.end()
         cell.doractl("disable", cell.name)
