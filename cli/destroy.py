@@ -29,9 +29,10 @@ Examples:
 @click.option("--force", is_flag=True, help="Kill the nodes, instead of telling them to stop.")
 @scope_options
 def command(force: bool) -> int:
-    """Stop all dataflows, the gateway and dora.slice, and look whether any process is left.
+    """Stop all dataflows, the gateway and dora.slice, and check that no process is left.
 
-    Only what is of this scope: the system's, or the calling user's. What is enabled stays enabled.
+    Only this scope is affected: the system's, or the calling user's. Enabled dataflows
+    stay enabled.
     """
     scope = current_scope()
     bus = Bus(scope)
@@ -67,7 +68,7 @@ def _stop_dataflows(bus: Bus, scope: Scope, force: bool) -> bool:
 def _print_left(bus: Bus, scope: Scope, others: list[str]) -> bool:
     """Say what is left; whether nothing of ours is."""
     if others:
-        click.echo(f"Left alone in dora.slice, not doractl's: {', '.join(others)}")
+        click.echo(f"Not touched in dora.slice, not managed by doractl: {', '.join(others)}")
     left = processes_left(bus, others)
     for one in left:
         click.echo(f"doractl: cannot end {one}", err=True)
@@ -75,5 +76,5 @@ def _print_left(bus: Bus, scope: Scope, others: list[str]) -> bool:
         click.echo("Nothing is left: no process in dora.slice.")
     names = sorted(filter(None, map(name_from_unit, enabled_units(bus, scope))))
     if names:
-        click.echo(f"Still enabled: {', '.join(names)}; the next boot starts what is enabled.")
+        click.echo(f"Still enabled: {', '.join(names)}; they start at the next boot.")
     return not left

@@ -17,9 +17,9 @@ Examples:
 @click.argument("selectors", nargs=-1, required=True, metavar="SELECTOR...")
 @scope_options
 def command(selectors: tuple[str, ...]) -> None:
-    """No longer have dataflows started at boot; those that run go on until they end.
+    """No longer start dataflows at boot. Running dataflows keep running.
 
-    Takes away what enable has made. That a dataflow is not enabled is no error.
+    Removes what enable has created. A dataflow that is not enabled is not an error.
     """
     scope = current_scope()
     bus = Bus(scope)

@@ -21,7 +21,7 @@ Examples:
 @output_option
 @scope_options
 def command(output: str) -> int:
-    """Look at everything that dataflows need, and say what helps where something is amiss.
+    """Check everything that dataflows need, and say how to fix what is wrong.
 
     Changes nothing. The exit status is 1 if a problem keeps dataflows from working; notes and
     warnings do not count.

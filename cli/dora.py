@@ -21,8 +21,8 @@ Examples:
 def command(selector: str, arguments: tuple[str, ...]) -> int:
     """Run dora ARGUMENT... against the coordinator of the dataflow SELECTOR.
 
-    Only root and the user that the dataflow runs as may. Read logs with doractl logs: dora logs
-    knows nothing of them here.
+    Only root and the user that the dataflow runs as may do this. Use doractl logs to read logs:
+    dora logs cannot show them.
     """
     scope = current_scope()
     bus = Bus(scope)

@@ -19,10 +19,10 @@ Examples:
 @click.argument("selectors", nargs=-1, required=True, metavar="SELECTOR...")
 @scope_options
 def command(selectors: tuple[str, ...]) -> None:
-    """Have dataflows started at every boot, as they run now.
+    """Start dataflows at every boot, as they run now.
 
-    UUID and settings stay, and what runs goes on. The unit becomes a file that systemctl edits,
-    shows and disables like any other.
+    UUID and settings stay, and running dataflows keep running. The unit becomes a file that
+    systemctl edits, shows and disables like any other.
     """
     scope = current_scope()
     bus = Bus(scope)

@@ -25,18 +25,20 @@ Examples:
     type=click.Choice(list(SHELLS)),
     default="sh",
     show_default=True,
-    help="The shell that is to read it; sh is for bash and zsh, too.",
+    help="Shell to print for; sh also works for bash and zsh.",
 )
-@click.option("--unset", "want_unset", is_flag=True, help="Print what takes it all back.")
+@click.option(
+    "--unset", "want_unset", is_flag=True, help="Print commands that unset these variables."
+)
 @scope_options
 def command(selector: str | None, shell: str, want_unset: bool) -> None:
-    """Print the variables with which a stock dora command finds the gateway.
+    """Print the variables with which the stock dora command finds the gateway.
 
-    With SELECTOR: the coordinator of that dataflow alone, unless its network is private. The output
-    has a token that is as good as a password; it is for eval.
+    With SELECTOR: the coordinator of that dataflow only, unless its network is private. The output
+    contains a token that is as good as a password; it is meant for eval.
     """
     if want_unset and selector is not None:
-        hint = "leave the dataflow out: all variables are unset"
+        hint = "leave SELECTOR out: --unset is for all variables"
         raise DoraSystemdError("cannot unset for one dataflow", hint, ExitCode.USAGE)
     if want_unset:
         click.echo(format_unsets(shell))

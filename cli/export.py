@@ -19,10 +19,10 @@ Examples:
 @click.argument("selector")
 @scope_options
 def command(selector: str) -> None:
-    """Print the unit of a dataflow as one unit file, with its drop-ins in it.
+    """Print the unit of a dataflow as one unit file, including its drop-ins.
 
-    Put it where unit files are and systemctl enable does the rest: of dora-systemd it needs only
-    the runner. Environment variables are printed as well, with their values.
+    Copy it to a unit directory and run systemctl enable. Of dora-systemd it needs only the runner.
+    Environment variables are printed with their values.
     """
     scope = current_scope()
     bus = Bus(scope, for_reading=True)

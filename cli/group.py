@@ -21,26 +21,26 @@ VERBS = {
     "start": Verb("start", "Start a dataflow as a systemd service."),
     "run": Verb("run", "Run a dataflow in the foreground."),
     "list": Verb("list", "List dataflows, or the nodes of one."),
-    "top": Verb("top", "Show what dataflows and nodes use, live."),
+    "top": Verb("top", "Show live resource usage of dataflows and nodes."),
     "logs": Verb("logs", "Print what the nodes of a dataflow wrote."),
-    "why": Verb("why", "Say what became of a dataflow, and why."),
+    "why": Verb("why", "Explain what happened to a dataflow and why."),
     "stop": Verb("stop", "Stop dataflows."),
     "restart": Verb("restart", "Restart dataflows."),
-    "reset": Verb("reset", "Forget failures, and count restarts anew."),
+    "reset": Verb("reset", "Clear failures and reset restart counters."),
     "node": Verb("node", "Restart or stop a single node."),
-    "reload": Verb("reload", "Take over what has changed, node by node."),
-    "set": Verb("set", "Change limits, or hot reload, of a dataflow that runs."),
+    "reload": Verb("reload", "Apply changed files, restarting only the affected nodes."),
+    "set": Verb("set", "Change limits or hot reload of a running dataflow."),
     "enable": Verb("enable", "Start dataflows at every boot."),
     "disable": Verb("disable", "No longer start dataflows at boot."),
     "show": Verb("show", "Print the unit of a dataflow."),
-    "export": Verb("export", "Print a unit file that needs nothing of doractl."),
+    "export": Verb("export", "Print a unit file that works without doractl."),
     "dora": Verb("dora", "Run the dora command against one dataflow."),
-    "up": Verb("up", "Open the port of the gateway to all dataflows."),
-    "env": Verb("env", "Print what points a stock dora command at the gateway."),
+    "up": Verb("up", "Open one port for all dataflows."),
+    "env": Verb("env", "Print variables that point the stock dora command at the gateway."),
     "destroy": Verb("destroy", "Stop all dataflows and the gateway."),
-    "doctor": Verb("doctor", "Say what on this machine hinders dataflows."),
-    "setup": Verb("setup", "Put slice, target and manuals in place after pip install."),
-    "version": Verb("version", "Print the versions of all that takes part."),
+    "doctor": Verb("doctor", "Check this machine for problems."),
+    "setup": Verb("setup", "Install units, completions and manuals after pip install."),
+    "version": Verb("version", "Print the versions of doractl, Python, systemd and dora."),
 }
 ALIASES = {"ps": "list", "status": "list"}
 
@@ -78,8 +78,8 @@ class VerbGroup(click.Group):
         from difflib import get_close_matches
 
         near = get_close_matches(name, [*VERBS, *ALIASES], n=1)
-        hint = f"did you mean doractl {near[0]}?" if near else "doractl --help lists the verbs"
-        raise DoraSystemdError(f"cannot understand the verb {name!r}", hint, ExitCode.USAGE)
+        hint = f"did you mean doractl {near[0]}?" if near else "doractl --help lists all commands"
+        raise DoraSystemdError(f"unknown command {name!r}", hint, ExitCode.USAGE)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """The verbs with their lines of the table: --help imports none of them."""
@@ -128,7 +128,7 @@ def _usage_error(error: click.ClickException) -> DoraSystemdError:
     possible = getattr(error, "possibilities", None)
     hint = f"did you mean {' or '.join(sorted(possible))}?" if possible else f"see {command} --help"
     words = text.split(". Did you mean")[0]
-    words = words.split(" (Possible options")[0]
-    return DoraSystemdError(
-        f"cannot read the command line: {words[:1].lower()}{words[1:]}", hint, ExitCode.USAGE
-    )
+    words = f"{words[:1].lower()}{words[1:]}".replace("no such command", "unknown command", 1)
+    if isinstance(error, click.NoSuchOption):
+        words = f"unknown option {error.option_name}"
+    return DoraSystemdError(words, hint, ExitCode.USAGE)

@@ -17,13 +17,13 @@ Examples:
 
 @click.command("list", epilog=_EPILOG)
 @click.argument("selector", required=False)
-@click.option("-a", "--all", "want_all", is_flag=True, help="Failed and ended dataflows too.")
+@click.option("-a", "--all", "want_all", is_flag=True, help="Include failed and ended dataflows.")
 @output_option
 @scope_options
 def command(selector: str | None, want_all: bool, output: str) -> int:
     """List dataflows; with a SELECTOR, one dataflow and its nodes.
 
-    CPU% is in percent of one processor. The exit status for a SELECTOR is 3 unless that dataflow
-    runs, as with systemctl status.
+    CPU% is the percentage of one processor. With a SELECTOR the exit status is 3 unless that
+    dataflow is running, as with systemctl status.
     """
     return print_dataflows(ListRequest(selector, want_all, output, current_scope().is_user))

@@ -38,22 +38,22 @@ Examples:
     "nodes",
     multiple=True,
     metavar="NODE",
-    help="Only this node; a pattern as in the shell, may be repeated.",
+    help="Only this node; shell patterns are allowed, may be repeated.",
 )
 @click.option(
-    "--all-nodes", is_flag=True, hidden=True, help="All nodes: the default, known from dora."
+    "--all-nodes", is_flag=True, hidden=True, help="All nodes: the default, accepted as by dora."
 )
 @click.option(
     "-f",
     "--follow",
     "is_follow",
     is_flag=True,
-    help="Wait for new lines; begins with the last 10 unless --tail or --since says more.",
+    help="Wait for new lines; starts with the last 10 unless --tail or --since is given.",
 )
 @click.option(
     "--until-end",
     is_flag=True,
-    help="Follow until the dataflow has ended; a restart is no end.",
+    help="Follow until the dataflow has ended; keeps following across restarts.",
 )
 @click.option("--tail", type=click.IntRange(min=0), metavar="N", help="Only the last N lines.")
 @click.option(
@@ -92,7 +92,7 @@ Examples:
     "--all",
     "want_unprintable",
     is_flag=True,
-    help="Messages with control characters, too: escaped on a terminal, as they are in a pipe.",
+    help="Include messages with control characters: escaped on a terminal, unchanged in a pipe.",
 )
 @click.option(
     "-o",
@@ -100,7 +100,7 @@ Examples:
     type=click.Choice(OUTPUTS),
     default="short",
     show_default=True,
-    help="Form of the output, as journalctl has them.",
+    help="Output format, as in journalctl.",
 )
 @click.option("--no-pager", is_flag=True, help="Do not use a pager.")
 @scope_options
@@ -114,7 +114,7 @@ def command(
 ) -> int:
     """Print what the nodes of a dataflow wrote, and what happened to them.
 
-    Without SELECTOR: of all dataflows. It may have ended long ago.
+    Without SELECTOR: the logs of all dataflows. The dataflow may have ended long ago.
     """
     options.pop("all_nodes")
     options["level"] = parse_level(options["level"]) if options["level"] else ""

@@ -1,5 +1,6 @@
 """The command doractl: where it begins, and the one place where its errors are printed."""
 
+import errno
 import os
 import sys
 from contextlib import suppress
@@ -43,7 +44,8 @@ def run(arguments: list[str]) -> int:
         return _SIGPIPE_STATUS
     except OSError as error:
         _give_up_output()
-        return _report(DoraSystemdError(f"cannot go on: {error.strerror}", error.filename or ""))
+        what = "write output" if error.errno in _OUTPUT_ERRORS else "continue"
+        return _report(DoraSystemdError(f"cannot {what}: {error.strerror}", error.filename or ""))
     except KeyboardInterrupt:
         return ExitCode.INTERRUPTED
     except Exception as error:
@@ -54,11 +56,12 @@ def run(arguments: list[str]) -> int:
 
 
 def _mistake_of_ours(error: Exception) -> DoraSystemdError:
-    what = f"cannot go on: a mistake in doractl, {type(error).__name__}: {error}"
+    what = f"internal error in doractl ({type(error).__name__}: {error})"
     return DoraSystemdError(what, "please report it; DORACTL_DEBUG=1 shows where it happened")
 
 
 _SIGPIPE_STATUS = 128 + 13
+_OUTPUT_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 
 def _give_up_output() -> None:

@@ -25,7 +25,7 @@ def command() -> None:
 @click.argument("node")
 @scope_options
 def restart(selector: str, node: str) -> None:
-    """Restart NODE of the dataflow SELECTOR; the other nodes run on."""
+    """Restart NODE of the dataflow SELECTOR; the other nodes keep running."""
     restart_node(current_scope(), _cell(selector), node)
     click.echo(f"Node restarting: {node}")
 

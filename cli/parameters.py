@@ -43,7 +43,7 @@ def output_option(function: F) -> F:
         type=click.Choice(["table", "json"]),
         default="table",
         show_default=True,
-        help="A table for people, or JSON for programs.",
+        help="Table or JSON.",
     )
     return option(function)
 

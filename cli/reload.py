@@ -16,13 +16,13 @@ Examples:
 
 @click.command("reload", epilog=_EPILOG)
 @click.argument("selector")
-@click.option("--node", metavar="NODE", help="Reload this node, changed or not.")
+@click.option("--node", metavar="NODE", help="Reload this node, whether it has changed or not.")
 @scope_options
 def command(selector: str, node: str | None) -> None:
-    """Have a running dataflow take over files that have changed since it read them.
+    """Apply files that have changed since a running dataflow read them.
 
-    As hot reload does it when a file is saved: only the nodes that a change concerns start again,
-    and what cannot be used changes nothing. See HOT RELOAD in dora-systemd(7).
+    Like hot reload when a file is saved: only the affected nodes restart, and a change that cannot
+    be used has no effect. See HOT RELOAD in dora-systemd(7).
     """
     scope = current_scope()
     cell = select_cell(read_cells(Bus(scope)), selector)

@@ -20,14 +20,14 @@ Examples:
 @click.option("-a", "--all", "want_all", is_flag=True, help="All dataflows that systemd knows.")
 @scope_options
 def command(selectors: tuple[str, ...], want_all: bool) -> int:
-    """Forget the failure of dataflows, and the restarts that they have used up.
+    """Clear the failure of dataflows and reset their restart counters.
 
-    As systemctl reset-failed: what runs goes on, and may be restarted by systemd as often as at
-    the beginning. The restarts of single nodes are dora's; doractl restart begins those anew.
+    Like systemctl reset-failed: running dataflows keep running, and systemd may restart them as
+    often as at the beginning. dora counts restarts of single nodes; doractl restart resets those.
     """
     if bool(selectors) == want_all:
         raise DoraSystemdError(
-            "cannot tell what to reset",
+            "cannot reset: give names or --all",
             "doractl reset NAME, or doractl reset --all",
             ExitCode.USAGE,
         )

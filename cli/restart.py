@@ -25,8 +25,8 @@ Examples:
 def command(selectors: tuple[str, ...]) -> int:
     """Restart dataflows and wait until all their nodes are ready again.
 
-    Name, UUID and settings stay; the descriptor is read anew. A dataflow that has failed is
-    started again.
+    Name, UUID and settings stay; the dataflow file is read again. A failed dataflow is started
+    again.
     """
     bus = Bus(current_scope())
     chosen = dict.fromkeys(find_cell(bus, one) for one in selectors)

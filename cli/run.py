@@ -38,8 +38,8 @@ _MICROSECOND_NS = 1000
 def command(dataflow: str, name: str | None, **flags: Any) -> int:
     """Run the dataflow in FILE and print its logs until it ends.
 
-    Ctrl+C stops it gracefully, a second Ctrl+C kills it. It ends with this command, however that
-    ends. The exit status is that of the dataflow: 0 when all nodes ended well.
+    Ctrl+C stops it gracefully, a second Ctrl+C kills it. The dataflow ends with this command,
+    however that ends. The exit status is that of the dataflow: 0 when all nodes ended well.
     """
     scope = current_scope()
     request = StartRequest(dataflow, name, flags, os.environ, attached=True)

@@ -23,13 +23,14 @@ Examples:
 @click.command("set", epilog=_EPILOG)
 @click.argument("selector")
 @live_options
-@click.option("--hot-reload", type=click.Choice(["on", "off"]), help="Watch its files, or not.")
+@click.option("--hot-reload", type=click.Choice(["on", "off"]), help="Turn hot reload on or off.")
 @scope_options
 def command(selector: str, hot_reload: str | None, **flags: Any) -> None:
-    """Change limits of a dataflow, or hot reload, while it runs.
+    """Change limits or hot reload of a running dataflow.
 
-    They hold at once and stay over restarts, until the dataflow is stopped; those of an enabled
-    one until it is disabled. Infinity lifts a limit. Nothing is changed if anything is wrong.
+    Changes take effect at once and survive restarts, until the dataflow is stopped; those of an
+    enabled dataflow, until it is disabled. infinity removes a limit. If one change is invalid,
+    nothing is changed.
     """
     scope = current_scope()
     bus = Bus(scope)

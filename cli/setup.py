@@ -24,17 +24,19 @@ Examples:
 
 
 @click.command("setup", epilog=_EPILOG)
-@click.option("--remove", "want_removal", is_flag=True, help="Take all of it away again.")
+@click.option(
+    "--remove", "want_removal", is_flag=True, help="Remove everything that setup has installed."
+)
 @scope_options
 def command(want_removal: bool) -> None:
-    """Put dora.slice, dora.target, catalog, completions and manuals in place after pip install.
+    """Install dora.slice, dora.target, catalog, completions and manuals after pip install.
 
-    Below /usr/local for the system, below ~/.local/share for a user; the Debian package has it all
-    already. A file there that is not ours is refused and not touched.
+    Below /usr/local for the system, below ~/.local/share for a user; the Debian package contains
+    all of it. A file of the same name that is not from dora-systemd is refused and not touched.
     """
     scope = current_scope()
     if not want_removal and (packaged := packaged_unit(scope)):
-        click.echo(f"A package has put everything in place: {packaged}")
+        click.echo(f"Everything is installed by a package: {packaged}")
         return
     steps = plan_setup(scope)
     if want_removal:
@@ -46,7 +48,7 @@ def command(want_removal: bool) -> None:
     if changed:
         print_warnings(tell_systemd(Bus, scope))
     else:
-        click.echo("Nothing to remove." if want_removal else "Everything is in place.")
+        click.echo("Nothing to remove." if want_removal else "Everything is installed.")
 
 
 def _check_use(scope: Scope) -> None:

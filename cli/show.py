@@ -22,7 +22,7 @@ Examples:
 def command(selector: str, output: str) -> None:
     """Print the unit of a dataflow, each file below a comment with its path.
 
-    Environment variables are printed as well, with their values.
+    Environment variables are printed with their values.
     """
     bus = Bus(current_scope(), for_reading=True)
     cell = find_cell(bus, selector)

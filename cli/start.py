@@ -48,8 +48,8 @@ Examples:
 @click.argument("dataflow", default=DEFAULT_FILE, metavar="[FILE]")
 @name_option
 @setting_options
-@click.option("--no-wait", is_flag=True, help="Do not wait until the nodes are ready.")
-@click.option("--enable", "want_boot", is_flag=True, help="Start it at every boot as well.")
+@click.option("--no-wait", is_flag=True, help="Do not wait until all nodes are ready.")
+@click.option("--enable", "want_boot", is_flag=True, help="Also start it at every boot.")
 @click.option("--dry-run", is_flag=True, help="Print the unit and start nothing.")
 @output_option
 @scope_options
@@ -64,9 +64,9 @@ def command(
 ) -> None:
     """Start the dataflow in FILE as the service dora-NAME.service.
 
-    Ends when all nodes are ready, or fails with the reason. The name must be free; a dataflow of
-    that name that has failed is replaced, its logs stay. One that is enabled is started as it is
-    if its settings are the same; --enable replaces it.
+    Returns when all nodes are ready, or fails with the reason. The name must be free; a failed
+    dataflow of that name is replaced, its logs stay. An enabled dataflow is started from its unit
+    file if its settings are the same; --enable replaces that file.
     """
     scope = current_scope()
     request = StartRequest(dataflow, name, flags, os.environ)

@@ -25,12 +25,14 @@ Examples:
 def command(selectors: tuple[str, ...], want_all: bool) -> int:
     """Stop dataflows and wait until they have ended.
 
-    Nodes are told to stop; what is left after the grace duration that the dataflow was started
-    with is killed. Several dataflows stop at the same time.
+    Nodes are told to stop; those still running after the grace duration of the dataflow are
+    killed. Several dataflows stop at the same time.
     """
     if bool(selectors) == want_all:
         raise DoraSystemdError(
-            "cannot tell what to stop", "doractl stop NAME, or doractl stop --all", ExitCode.USAGE
+            "cannot stop: give names or --all",
+            "doractl stop NAME, or doractl stop --all",
+            ExitCode.USAGE,
         )
     scope = current_scope()
     bus = Bus(scope)

@@ -21,7 +21,7 @@ Examples:
 """
 
 _FIRST_SECONDS = 0.5
-"""Between the two looks that make one reading."""
+"""Between the two samples of one reading."""
 
 _KEYS = {sort[0]: sort for sort in SORTS}
 
@@ -41,7 +41,7 @@ _KEYS = {sort[0]: sort for sort in SORTS}
     type=click.Choice(SORTS),
     default="cpu",
     show_default=True,
-    help="What stands first: most CPU, most memory, or names from A to Z.",
+    help="Sort by CPU, memory (highest first) or name.",
 )
 @click.option("--once", "is_once", is_flag=True, help="Print one reading and exit.")
 @output_option
@@ -49,10 +49,10 @@ _KEYS = {sort[0]: sort for sort in SORTS}
 def command(
     selectors: tuple[str, ...], interval: float, sort: str, is_once: bool, output: str
 ) -> int:
-    """Show what dataflows and their nodes use, live; without SELECTOR, all that run.
+    """Show live resource usage of dataflows and their nodes; without SELECTOR, of all that run.
 
-    On a terminal: q ends it, and c, m and n sort by CPU, memory and name. In a pipe one reading is
-    printed; JSON goes on, one object in a line for each reading.
+    On a terminal: q quits, and c, m and n sort by CPU, memory and name. In a pipe one reading is
+    printed; with JSON, one object per line until it is interrupted.
     """
     scope = current_scope()
     top = Top(Bus(scope, for_reading=True), scope, selectors)

@@ -26,10 +26,10 @@ Examples:
 )
 @scope_options
 def command(port: int | None) -> None:
-    """Open the port of the gateway, which speaks for all dataflows as one coordinator would.
+    """Open the port of the gateway, which acts as one coordinator for all dataflows.
 
-    systemd holds the port and starts the gateway with the first connection. No dataflow needs it:
-    doractl start and all other verbs work without.
+    systemd holds the port and starts the gateway on the first connection. Dataflows, doractl start
+    and all other verbs work without it.
     """
     scope = current_scope()
     bus = Bus(scope)

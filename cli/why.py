@@ -26,9 +26,9 @@ Examples:
 @output_option
 @scope_options
 def command(selector: str, output: str) -> int:
-    """Say what became of a dataflow, and why: what ended, when, which node, what to do.
+    """Explain what happened to a dataflow and why: what ended, when, which node, what to do.
 
-    It may run, have failed, been stopped, or be known to the journal only. Nothing is changed.
+    The dataflow may be running, failed, stopped, or known only to the journal. Nothing is changed.
     """
     scope = current_scope()
     check_readable(scope)

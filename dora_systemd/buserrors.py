@@ -13,7 +13,7 @@ _REASONS = {
     "AccessDenied": ("permission denied", ExitCode.NO_PERMISSION),
     "InteractiveAuthorizationRequired": ("permission denied", ExitCode.NO_PERMISSION),
     "AuthFailed": ("permission denied", ExitCode.NO_PERMISSION),
-    "UnitExists": ("a unit of that name is there already", ExitCode.NAME_IN_USE),
+    "UnitExists": ("a unit of that name already exists", ExitCode.NAME_IN_USE),
     "NoSuchUnit": ("there is no such unit", ExitCode.NOT_FOUND),
     "ConnectionRefused": ("systemd does not answer", ExitCode.NO_SYSTEMD),
     "Disconnected": ("systemd hung up", ExitCode.NO_SYSTEMD),
@@ -47,7 +47,7 @@ def bus_error(action: str, scope: Scope, name: str, message: str) -> DoraSystemd
 
 _HINTS = {
     ExitCode.NO_PERMISSION: "use sudo, or --user for a dataflow of your own",
-    ExitCode.NOT_FOUND: "doractl list --all shows what there is",
+    ExitCode.NOT_FOUND: "doractl list --all shows all dataflows",
     ExitCode.NAME_IN_USE: "doractl list shows it; stop it, or choose another --name",
     ExitCode.NO_SYSTEMD: "see systemctl is-system-running",
 }

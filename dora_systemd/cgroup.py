@@ -179,7 +179,7 @@ def limit_group(path: Path, limits: NodeLimits) -> None:
         if not is_limited and not text.startswith("max"):
             raise DoraSystemdError(
                 f"cannot limit the node {limits.node}: {reason}",
-                "the kernel, or the container, does not give that to this dataflow",
+                "the kernel or the container does not provide it to this dataflow",
                 ExitCode.NO_SYSTEMD,
             )
 

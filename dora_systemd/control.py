@@ -150,7 +150,7 @@ def read_coordinator(path: Path) -> Coordinator:
     try:
         return parse_coordinator(json.loads(path.read_text()))
     except (OSError, ValueError) as error:
-        message = f"cannot reach the dora coordinator of {path.parent.name}: it is not there"
+        message = f"cannot reach the dora coordinator of {path.parent.name}: it is not running"
         hint = "it may be starting or stopping; see doractl list"
         raise DoraSystemdError(message, hint, ExitCode.NOT_RUNNING) from error
 

@@ -102,7 +102,7 @@ def _missing(source: str, nodes: Mapping[str, Node]) -> str:
     if origin not in nodes:
         # An expanded module's nodes are called MODULE.NODE.
         is_inside = nodes.get(origin.partition(".")[0])
-        return "" if is_inside and is_inside.kind in UNEXPANDED else "a node that is not there"
+        return "" if is_inside and is_inside.kind in UNEXPANDED else "a node that does not exist"
     node = nodes[origin]
     # ros2 nodes get outputs from their topics.
     if node.kind in UNEXPANDED or node.kind == NodeKind.ROS2 or output in node.outputs:

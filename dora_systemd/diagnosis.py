@@ -74,7 +74,7 @@ def judge_controllers(available: Collection[str], is_user: bool) -> Finding:
     if not missing:
         return Finding("cgroup", State.OK, f"v2, with {', '.join(CONTROLLERS)}")
     text = f"v2, but systemd has no controller for {', '.join(missing)}: no limits of that"
-    remedy = "the kernel or the container does not give it to systemd"
+    remedy = "the kernel or the container does not provide it"
     if is_user:
         remedy = "as root: systemctl edit user@.service, [Service] Delegate=cpu memory pids io"
     # What a user's manager gets is the admin's choice; without I/O is what distributions choose.
@@ -89,11 +89,11 @@ def judge_rate(config: str, is_user: bool) -> Finding:
         values[key] = value or _RATE_DEFAULTS.get(key, "")
     interval, burst = values["RateLimitIntervalSec"], values["RateLimitBurst"]
     if interval in ("0", "0s") or burst == "0":
-        return Finding("log rate", State.OK, "journald limits nothing")
+        return Finding("log rate", State.OK, "journald has no rate limit")
     rate = f"{burst} lines in {_duration(interval)}"
     if not is_user:
-        return Finding("log rate", State.OK, f"journald's {rate} does not concern dataflows")
-    text = f"journald takes {rate} from all services of a user together, and counts the rest"
+        return Finding("log rate", State.OK, f"journald's {rate} does not apply to dataflows")
+    text = f"journald takes {rate} from all services of a user together and drops the rest"
     remedy = "as root, for more: RateLimitBurst= in journald.conf(5), or use --system"
     return Finding("log rate", State.NOTE, text, remedy)
 
@@ -104,7 +104,10 @@ def judge_port(port: int, owners: Sequence[Process], is_used: bool) -> Finding:
     if not is_used:
         return Finding(topic, State.OK, "free")
     if not owners:
-        text, remedy = "used by a process of another user", "as root, doractl doctor names it"
+        text, remedy = (
+            "used by a process of another user",
+            "run doractl doctor as root to see which",
+        )
         return Finding(topic, State.NOTE, text, remedy)
     text = f"used by {owners[0]}: {DORA_PORTS[port]} talks to that"
     return Finding(topic, State.NOTE, text, "doractl dora NAME -- talks to a dataflow of doractl")

@@ -24,13 +24,15 @@ EVENTS = {
         "0486727a2190411eb78f66e816da2520", INFO, "Dataflow {dataflow} is starting"
     ),
     "dataflow-started": EventKind(
-        "c8e3833d172d44c5a32de08c980c4d67", NOTICE, "Dataflow {dataflow} runs, all nodes are ready"
+        "c8e3833d172d44c5a32de08c980c4d67",
+        NOTICE,
+        "Dataflow {dataflow} is running, all nodes are ready",
     ),
     "dataflow-stopping": EventKind(
         "822b051bbbe24788bf93c0952aafa491", INFO, "Dataflow {dataflow} is stopping"
     ),
     "stop-asked": EventKind(
-        "958c39b63a3d47cd9dd585937d57d927", INFO, "Dataflow {dataflow} is told to stop by {by}"
+        "958c39b63a3d47cd9dd585937d57d927", INFO, "Stop of dataflow {dataflow} requested by {by}"
     ),
     "dataflow-finished": EventKind(
         "61a9895e49214871ae2381a42f2a1968", NOTICE, "Dataflow {dataflow} finished"
@@ -47,17 +49,19 @@ EVENTS = {
     "node-restarted": EventKind(
         "436622a1703a4db68ed8a1aac4ddc336", WARNING, "Node {node} is being restarted by dora"
     ),
-    "node-oom": EventKind(
-        "1e5f89981faf4b0ba7cd69e0b844f9a3", ERR, "Node {node} was killed for want of memory"
-    ),
+    "node-oom": EventKind("1e5f89981faf4b0ba7cd69e0b844f9a3", ERR, "Node {node} was killed"),
     "dataflow-oom": EventKind(
         "074b91207b234b46973343bb14a637a9", ERR, "Dataflow {dataflow} has used up its memory limit"
     ),
     "memory-pressure": EventKind(
-        "df01123a855d446d8a751cc3e2f99656", WARNING, "Memory gets short in dataflow {dataflow}"
+        "df01123a855d446d8a751cc3e2f99656",
+        WARNING,
+        "Dataflow {dataflow} is close to a memory limit",
     ),
     "cpu-throttled": EventKind(
-        "1c40798a51c14a89a416ed625e0afc1a", NOTICE, "CPU time gets short in dataflow {dataflow}"
+        "1c40798a51c14a89a416ed625e0afc1a",
+        NOTICE,
+        "Dataflow {dataflow} is throttled by a CPU limit",
     ),
     "node-hung": EventKind("6bb24464fee34a848c077fc1b20c1802", ERR, "Node {node} hangs"),
     "coordinator-lost": EventKind(
@@ -82,7 +86,7 @@ EVENTS = {
     "lines-suppressed": EventKind(
         "c1c721542288459ebe040a240a583d9d",
         WARNING,
-        "{count} log lines of node {node} are beyond its limit of {limit}",
+        "{count} log lines of node {node} exceed its limit of {limit}",
     ),
 }
 

@@ -87,7 +87,7 @@ def refuse_address(caller: Caller) -> Refusal | None:
         return Refusal(403, "the gateway answers to 127.0.0.1 and localhost only")
     own = f"http://{caller.hosts[0]}".lower()
     if any(origin.lower() != own for origin in caller.origins):
-        return Refusal(403, "pages of other origins may not ask the gateway")
+        return Refusal(403, "pages of other origins may not use the gateway")
     return None
 
 
@@ -95,7 +95,7 @@ def refuse_user(caller: Caller, own_uid: int, token: str) -> Refusal | None:
     """Let in root, the user whose gateway this is, and whoever has the token."""
     if caller.uid in (0, own_uid) or has_token(caller, token):
         return None
-    return Refusal(401, "only root and its own user may ask this gateway, or who has its token")
+    return Refusal(401, "only root, its own user and holders of its token may use this gateway")
 
 
 def has_token(caller: Caller, token: str) -> bool:

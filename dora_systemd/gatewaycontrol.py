@@ -40,7 +40,7 @@ _LOOPBACK = "127.0.0.1"
 _AT_ONCE = 8
 """Requests of one connection that are answered at the same time."""
 _LONGEST = 500
-_BY_FILE = "change its file, then: doractl reload NAME"
+_BY_FILE = "edit its file, then run: doractl reload NAME"
 _OWN = "doractl dora NAME -- {} asks the coordinator of one dataflow"
 
 
@@ -86,9 +86,7 @@ async def _result(talk: Talk, request: Request) -> Result:
         return error_result(DoraSystemdError(*REFUSED[request.name]))
     handler = HANDLERS.get(request.name)
     if handler is None:
-        return error_result(
-            DoraSystemdError(f"cannot do {request.name[:80]}: the gateway does not know it")
-        )
+        return error_result(DoraSystemdError(f"unknown request {request.name[:80]}"))
     try:
         return await handler(talk, request)
     except DoraSystemdError as error:
@@ -158,8 +156,8 @@ REFUSED: dict[str, tuple[str, str]] = {
         "doractl destroy stops all of them, doractl stop NAME one",
     ),
     "Clean": (
-        "cannot clean: which dataflows have ended is in the journal, and systemd tidies that up",
-        "systemctl reset-failed 'dora-*' forgets those that have failed",
+        "cannot clean: ended dataflows are known from the journal, which journald cleans up",
+        "systemctl reset-failed 'dora-*' clears the failed ones",
     ),
     **dict.fromkeys(
         ("Build", "WaitForBuild", "BuildLogSubscribe"),
@@ -171,7 +169,7 @@ REFUSED: dict[str, tuple[str, str]] = {
     ),
     **dict.fromkeys(
         ("AddNode", "RemoveNode", "ReplaceNode", "AddMapping", "RemoveMapping"),
-        ("cannot change a supervised dataflow behind its file", _BY_FILE),
+        ("cannot change a supervised dataflow except through its file", _BY_FILE),
     ),
 }
 """Message and hint for what is not offered here."""

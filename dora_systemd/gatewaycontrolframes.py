@@ -117,7 +117,7 @@ def _parse_params(ident: str, params: Any) -> Request | Malformed:
         name, body = next(iter(params.items()))
         if body is None or isinstance(body, dict):
             return Request(ident, name, body or {})
-    return Malformed(ident, "cannot read the request: params is no request of dora's")
+    return Malformed(ident, "cannot read the request: params is not a request of dora's")
 
 
 def format_result(ident: str, result: Any) -> str:

@@ -36,7 +36,7 @@ from dora_systemd.values import quoted
 _CHUNK = 1 << 18
 _EXPORT = ("--output=export", "--quiet", "--all", f"--output-fields={','.join(LOG_FIELDS)}")
 _LINES = ("DORA_STREAM=stdout", "DORA_STREAM=stderr")
-_CUT_NOTE = "earlier lines are left out here: doractl logs {name} --node {node} has them all"
+_CUT_NOTE = "earlier lines are skipped here; all lines: doractl logs {name} --node {node}"
 _SETTLE_SECONDS = 0.3
 """After the end of a unit, until systemd starts it anew, if it does."""
 
@@ -92,7 +92,7 @@ def _check_node(scope: Scope, uuid: str, name: str, node: str) -> None:
         return
     raise DoraSystemdError(
         f"cannot find a node {quoted(node)} of dataflow {name}",
-        did_you_mean(node, known) or f"there are {', '.join(sorted(set(known))) or 'none'}",
+        did_you_mean(node, known) or f"nodes: {', '.join(sorted(set(known))) or 'none'}",
         ExitCode.NOT_FOUND,
     )
 

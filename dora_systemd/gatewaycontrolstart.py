@@ -92,11 +92,11 @@ def find_file(scope: Scope, request: Request) -> Match:
 
 def _files(directory: Path) -> list[Path]:
     if not directory.is_absolute():
-        raise DoraSystemdError(f"cannot start in {directory}: it is no absolute path")
+        raise DoraSystemdError(f"cannot start in {directory}: it is not an absolute path")
     try:
         names = list_directory(directory, _MOST_NAMES)
     except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or "it is no path"
+        reason = getattr(error, "strerror", None) or "it is not a path"
         raise DoraSystemdError(
             f"cannot look for the dataflow in {shown(str(directory))}: {reason}",
             "doractl start FILE takes the file itself",

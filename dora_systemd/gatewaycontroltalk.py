@@ -48,9 +48,7 @@ class Talk:
         """
         if len(self._running) >= _MOST_TASKS:
             task.close()
-            raise DoraSystemdError(
-                f"cannot follow more: {_MOST_TASKS} on one connection are enough"
-            )
+            raise DoraSystemdError(f"cannot follow more: at most {_MOST_TASKS} on one connection")
         self._next.append(task)
 
     def begin_tasks(self) -> None:
@@ -78,8 +76,8 @@ def find_by_uuid(scope: Scope, uuid: str) -> Cell:
         if cell.uuid == uuid:
             return cell
     raise DoraSystemdError(
-        f"cannot find a dataflow with the UUID {uuid}",
-        "dora list shows what runs, doractl list --all what ended long ago, too",
+        f"no dataflow with the UUID {uuid}",
+        "running: dora list; ended long ago, too: doractl list --all",
         ExitCode.NOT_FOUND,
     )
 

@@ -88,8 +88,8 @@ class _Page:
     def _spawn(self, work: Coroutine[Any, Any, None]) -> "asyncio.Task[None]":
         if len(self.tasks) >= MAX_TASKS:
             work.close()
-            hint = "wait until what was asked before is done"
-            raise DoraSystemdError("cannot do so much at once", hint)
+            problem = f"cannot start another action: {len(self.tasks)} are still running"
+            raise DoraSystemdError(problem, "wait until one of them has finished")
         task = asyncio.ensure_future(work)
         self.tasks.add(task)
         task.add_done_callback(self._done)

@@ -46,6 +46,6 @@ def _parse(variable: str, text: str) -> int | None:
     if not text:
         return None
     if not (text.isascii() and text.isdecimal() and 0 < int(text[:6]) < 65536):
-        message = f"cannot read {variable}: {quoted(text)} is no port"
+        message = f"cannot read {variable}: {quoted(text)} is not a port"
         raise DoraSystemdError(message, "a port is 1 to 65535", ExitCode.BAD_INPUT)
     return int(text)

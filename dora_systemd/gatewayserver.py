@@ -146,7 +146,7 @@ class Gateway:
             answer = text_answer(503, f"{error.message}\n{error.hint}".strip())
         except Exception as error:
             log.error("cannot answer %.200s: %s: %s", raw.path, type(error).__name__, error)
-            answer = text_answer(500, "a mistake in the gateway, see its journal")
+            answer = text_answer(500, "internal error in the gateway, see its journal")
         return None if answer is None else _response(answer)
 
     async def _refusal(self, connection: ServerConnection, raw: RawRequest) -> Refusal | None:
@@ -191,8 +191,8 @@ class Gateway:
         except DoraSystemdError as error:
             await connection.close(1011, _short(error.message))
         except Exception as error:
-            log.error("cannot go on with %.200s: %s: %s", raw.path, type(error).__name__, error)
-            await connection.close(1011, "a mistake in the gateway, see its journal")
+            log.error("cannot continue with %.200s: %s: %s", raw.path, type(error).__name__, error)
+            await connection.close(1011, "internal error in the gateway, see its journal")
 
     def _request(self, raw: RawRequest) -> Request:
         headers = {name.lower(): value for name, value in raw.headers.raw_items()}

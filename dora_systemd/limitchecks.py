@@ -70,12 +70,10 @@ def check_controllers(needed: Mapping[str, str], available: Collection[str], is_
     """
     for controller, what in needed.items():
         if controller not in available:
-            hint = (
-                "they are given to this manager by Delegate= of user@.service, see systemctl edit"
-            )
+            hint = "as root: systemctl edit user@.service, [Service] Delegate=cpu memory pids io"
             raise DoraSystemdError(
-                f"cannot limit {what}: this systemd has no cgroup controller {controller!r}",
-                hint if is_user else "the kernel or the container does not give it to systemd",
+                f"cannot enforce {what}: systemd has no {controller!r} cgroup controller",
+                hint if is_user else "the kernel or the container does not provide it",
                 ExitCode.NO_SYSTEMD,
             )
 

@@ -61,7 +61,7 @@ def parse_tasks(text: str) -> int:
 
 def parse_weight(text: str) -> int:
     """A share in relation to others, from 1 to 10000. Raises DoraSystemdError (USAGE)."""
-    hint = f"write a number from 1 to {HIGHEST_WEIGHT}; 100 is everyone's"
+    hint = f"write a number from 1 to {HIGHEST_WEIGHT}; other units have 100"
     return _parse_number(text, 1, HIGHEST_WEIGHT, "a weight", hint)
 
 
@@ -167,7 +167,7 @@ def parse_node_limits(text: str) -> NodeLimits:
     for assignment in assignments.split(","):
         word, _, value = assignment.partition("=")
         if word not in BY_WORD:
-            hint = did_you_mean(word, BY_WORD) or f"there are {', '.join(BY_WORD)}"
+            hint = did_you_mean(word, BY_WORD) or f"valid values: {', '.join(BY_WORD)}"
             raise _refusal(f"{quoted(assignment)} as a limit of the node {quoted(node)}", hint)
         if word in limits:
             raise _refusal(f"{quoted(text)}: {word} is given twice", "leave one of them out")

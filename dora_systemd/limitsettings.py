@@ -32,8 +32,8 @@ _HELPS = {
     "memory_high": "Memory beyond which the nodes are slowed down.",
     "swap_limit": "Swap space that all nodes together may use.",
     "tasks_limit": "Processes and threads that the dataflow may have.",
-    "cpu_weight": "Share of CPU time when it is short, 1 to 10000; 100 is everyone's.",
-    "io_weight": "Share of disk time when it is short, 1 to 10000; 100 is everyone's.",
+    "cpu_weight": "Share of CPU time under contention, 1 to 10000; other units have 100.",
+    "io_weight": "Share of disk time under contention, 1 to 10000; other units have 100.",
 }
 
 
@@ -161,7 +161,7 @@ DEVICE = Setting[tuple[str, ...]](
         merge=lambda lower, higher: lower + higher,
     ),
     (),
-    "Device that the nodes may use; all others are closed then.",
+    "Device that the nodes may use; all other devices are then blocked.",
     flags=("--device",),
     metavar="PATH[:r|w|rw]",
     property="DeviceAllow",

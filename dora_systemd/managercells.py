@@ -108,10 +108,10 @@ def not_found(selector: str, names: Sequence[str]) -> DoraSystemdError:
     if near:
         hint = f"did you mean {' or '.join(near)}?"
     elif names:
-        hint = f"there are {', '.join(sorted(names)[:10])}"
+        hint = f"known dataflows: {', '.join(sorted(names)[:10])}"
     else:
-        hint = "no dataflow is there; doractl list --all shows ended ones too"
-    message = f"cannot find a dataflow {quoted(selector)}"
+        hint = "nothing is running; ended ones: doractl list --all"
+    message = f"no dataflow named {quoted(selector)}"
     return DoraSystemdError(message, hint, ExitCode.NOT_FOUND)
 
 

@@ -35,7 +35,7 @@ def require_free_name(manager: Manager, scope: Scope, unit: str) -> BootUnit:
     state = manager.read(unit, ["LoadState", "Transient"])
     if cell is None and state["LoadState"] != "not-found":
         raise DoraSystemdError(
-            f"cannot start {unit}: a unit of that name is there already",
+            f"cannot start {unit}: a unit of that name already exists",
             f"see systemctl {scope.flag} cat {unit}; choose another --name",
             ExitCode.NAME_IN_USE,
         )

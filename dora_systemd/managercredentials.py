@@ -59,7 +59,7 @@ def _checked_size(name: str, file: str) -> int:
 def _check_firm(name: str, file: str) -> None:
     with reached(file) as (_, place):
         if not place.is_roots and os.geteuid() == 0:
-            reason = "others than root could put another file in its place"
+            reason = "users other than root could replace it"
             hint = "systemd reads it as root: keep it where only root can write, as in /etc"
             raise _refusal(name, file, reason, hint, ExitCode.NO_PERMISSION)
 

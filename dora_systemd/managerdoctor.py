@@ -83,7 +83,7 @@ def _linger(manager: Manager, scope: Scope) -> Iterator[Finding]:
     if not scope.is_user:
         return
     if is_lingering(scope):
-        yield Finding("linger", State.OK, "dataflows run on after logout and start at boot")
+        yield Finding("linger", State.OK, "dataflows keep running after logout and start at boot")
     else:
         text = "dataflows end when you log out, and none starts at boot"
         yield Finding("linger", State.WARNING, text, f"as root: {linger_command(scope)}")
@@ -135,7 +135,7 @@ def _enabled(path: Path) -> Iterator[Finding]:
         remedy = f"systemctl disable {path.name}"
         yield Finding("boot", State.WARNING, f"{path} is enabled and {broken}", remedy)
     elif not exists(options.dataflow):
-        text = f"{options.name} is enabled, but {options.dataflow} is not there"
+        text = f"{options.name} is enabled, but {options.dataflow} does not exist"
         yield Finding("boot", State.WARNING, text, f"doractl disable {options.name}")
 
 
@@ -149,7 +149,7 @@ def _leftovers(manager: Manager, scope: Scope) -> Iterator[Finding]:
         text = f"processes are left in {path}"
         yield Finding("left over", State.WARNING, text, f"as root: echo 1 > {path}/cgroup.kill")
     if not left and not groups:
-        yield Finding("left over", State.OK, "nothing of dataflows that have ended")
+        yield Finding("left over", State.OK, "nothing is left of dataflows that have ended")
 
 
 def _cell_directories(scope: Scope) -> list[Path]:
@@ -174,11 +174,14 @@ def _journal(scope: Scope) -> Iterator[Finding]:
     except DoraSystemdError as error:
         yield Finding("journal", State.WARNING, error.message, error.hint)
     if journalread.is_volatile():
-        text, remedy = "it is in memory and gone after a reboot", "as root: mkdir /var/log/journal"
+        text, remedy = (
+            "it is kept in memory and lost at a reboot",
+            "as root: mkdir /var/log/journal",
+        )
         remedy += " and systemctl restart systemd-journald"
         yield Finding("journal", State.WARNING, text, remedy)
     else:
-        yield Finding("journal", State.OK, "it outlives a reboot")
+        yield Finding("journal", State.OK, "it survives a reboot")
     command = ("systemd-analyze", "--no-pager", "cat-config", "systemd/journald.conf")
     try:
         config = run_command(command, _SECONDS).stdout

@@ -10,7 +10,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.statuswords import FAILED, FINISHED, STOPPED, DataflowRow
 
 _WORDS = {"dataflow-finished": FINISHED, "dataflow-stopped": STOPPED, "dataflow-failed": FAILED}
-_NO_END = "its end is not on record: it was killed, or the machine went down"
+_NO_END = "its end is not recorded: it was killed, or the machine went down"
 
 
 def ended_rows(scope: Scope, rows: Sequence[DataflowRow]) -> list[DataflowRow]:

@@ -51,7 +51,7 @@ def start_notes(plan: Plan, passwd: Path = PASSWD) -> Iterator[str]:
     others = [name for name in users if name != plan.user.pw_name]
     if len(users) > 1 and others:
         yield (
-            f"{_names(others)} can log in here, and so can read, forge and end what the nodes "
+            f"{_names(others)} can log in here and can read, forge and end what the nodes "
             "exchange; --network private prevents it, --network host is for those you trust"
         )
 

@@ -99,10 +99,10 @@ def _select_dataflow(journal: Journal, query: LogQuery, selector: str) -> LogQue
 def _unknown_dataflow(selector: str, names: list[str]) -> DoraSystemdError:
     hint = did_you_mean(selector, names)
     if not hint and names:
-        hint = f"there are {', '.join(names[:10])}"
+        hint = f"in the journal: {', '.join(names[:10])}"
     if is_volatile():
         hint = f"{hint + '; ' if hint else ''}the journal is volatile: a reboot empties it"
-    message = f"cannot find a dataflow {quoted(selector)} in the journal"
+    message = f"no dataflow named {quoted(selector)} in the journal"
     return DoraSystemdError(message, hint, ExitCode.NOT_FOUND)
 
 
@@ -115,7 +115,7 @@ def _select_nodes(journal: Journal, query: LogQuery, patterns: tuple[str, ...]) 
     for pattern in patterns:
         fitting = [node for node in known if _fits(node, pattern)]
         if not fitting:
-            there = f"there are {', '.join(known)}" if known else "none has written anything yet"
+            there = f"nodes: {', '.join(known)}" if known else "no node has written anything yet"
             message = f"cannot find a node {quoted(pattern)} of dataflow {query.name}"
             raise DoraSystemdError(message, there, ExitCode.NOT_FOUND)
         found.update(dict.fromkeys(fitting))

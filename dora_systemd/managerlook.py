@@ -57,7 +57,7 @@ class Look:
         if not self.sight.is_directory(directory):
             self._blame(WORKING_DIRECTORY, directory, _OWN.is_directory(directory))
             raise DoraSystemdError(
-                f"cannot use {directory} as working directory: it is no directory",
+                f"cannot use {directory} as working directory: it is not a directory",
                 "correct --working-directory",
                 ExitCode.BAD_INPUT,
             )

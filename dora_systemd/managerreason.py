@@ -21,9 +21,9 @@ _REFUSED = {
 """What systemd could not do before the runner: exit statuses of systemd.exec(5)."""
 
 _WORDS = {
-    "protocol": "its runner ended without a word",
+    "protocol": "its supervisor process ended without a message",
     "timeout": "it did not end in time and was killed",
-    "watchdog": "its runner hung and was killed by the watchdog",
+    "watchdog": "the supervisor process hung and was killed by the watchdog",
     "oom-kill": "it ran out of memory",
     "start-limit-hit": "it was started too often",
     "resources": "systemd could not set it up",

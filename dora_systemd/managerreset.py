@@ -20,5 +20,6 @@ def reset_cells(manager: Manager, cells: Sequence[Cell]) -> list[Outcome]:
 def _reset(manager: Manager, cell: Cell) -> Outcome:
     used = manager.read(cell.unit, _FACTS)["NRestarts"]
     manager.reset_failed(cell.unit)
-    words = "1 restart" if used == 1 else f"{used} restarts"
-    return Outcome(cell, f"Dataflow reset: {cell.uuid} ({cell.name}, {words} forgotten)")
+    return Outcome(
+        cell, f"Dataflow reset: {cell.uuid} ({cell.name}, restart counter reset, was {used})"
+    )

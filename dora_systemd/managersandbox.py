@@ -76,7 +76,7 @@ def sandbox_warnings(sandbox: Sandbox) -> Iterator[str]:
     for path in odd_paths(sandbox):
         yield f"the sandbox cannot hide what is around {shown(path)}, whose name no mount can have"
     for place, path in {place: path for path, place in loose_paths(sandbox)}.items():
-        yield f"the sandbox cannot hide {place}: others than root can replace {shown(path)}"
+        yield f"the sandbox cannot hide {place}: users other than root can replace {shown(path)}"
     for place, path in {place: path for path, place in widened_paths(sandbox)}.items():
         yield f"the nodes may write all of {shown(place)}: its user could replace {shown(path)}"
     if not sandbox.is_user:
@@ -124,7 +124,7 @@ def _checked(path: str, sight: Sight) -> str:
     absolute = str(Path(path).absolute())
     if not sight.exists(absolute):
         raise DoraSystemdError(
-            f"cannot let the nodes write {shown(absolute)}: it is not there",
+            f"cannot let the nodes write {shown(absolute)}: there is no such file",
             f"mkdir -p {absolute}, or correct --writable",
             ExitCode.BAD_INPUT,
         )

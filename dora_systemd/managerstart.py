@@ -122,8 +122,8 @@ def format_started(started: Started, watched: Sequence[str] = ()) -> str:
 
 
 def _interruption(name: str) -> DoraSystemdError:
-    hint = f"it goes on starting: doractl list {name}, or doractl stop {name}"
-    return DoraSystemdError(f"cannot wait for {name}: interrupted", hint, ExitCode.INTERRUPTED)
+    hint = f"doractl list {name} shows it, doractl stop {name} stops it"
+    return DoraSystemdError(f"interrupted; {name} is still starting", hint, ExitCode.INTERRUPTED)
 
 
 def _wait_until_checked(manager: Manager, unit: str) -> None:

@@ -34,42 +34,42 @@ class Family:
 # For dataflows (dora_dataflow_...) and for nodes (dora_node_...) alike.
 GROUP_FAMILIES = (
     Family("cpu_seconds_total", "counter", "CPU time used.", lambda use, _: use.cpu_us / SECOND),
-    Family("cpu_limit_cores", "gauge", "CPUs it may use at most.", lambda use, _: _cores(use)),
+    Family("cpu_limit_cores", "gauge", "CPU limit, in cores.", lambda use, _: _cores(use)),
     Family(
         "cpu_periods_total",
         "counter",
-        "Periods of the CPU limit in which it wanted to run.",
+        "CPU quota periods in which it was runnable.",
         lambda use, _: use.throttling[0],
     ),
     Family(
         "cpu_throttled_periods_total",
         "counter",
-        "Periods in which it had to wait for its CPU limit.",
+        "CPU quota periods in which its CPU limit throttled it.",
         lambda use, _: use.throttling[1],
     ),
     Family(
         "cpu_throttled_seconds_total",
         "counter",
-        "Time for which its CPU limit held it.",
+        "Time for which its CPU limit throttled it.",
         lambda _, strain: strain.throttled / SECOND,
     ),
     Family("memory_bytes", "gauge", "Memory used.", lambda use, _: use.memory),
     Family(
         "memory_peak_bytes",
         "gauge",
-        "Most memory used since it was started.",
+        "Peak memory used since its start.",
         lambda use, _: use.memory_peak,
     ),
     Family(
         "memory_limit_bytes",
         "gauge",
-        "Memory it may use at most.",
+        "Memory limit.",
         lambda use, _: _limit(use.memory_max),
     ),
     Family(
         "oom_kills_total",
         "counter",
-        "Processes killed for want of memory.",
+        "Processes killed by the kernel, out of memory.",
         lambda _, strain: strain.oom_kills,
     ),
 )
@@ -78,14 +78,14 @@ PRESSURE = Family(
     "counter",
     "Time in which some, or all, of its processes waited for a resource.",
 )
-STATE = Family("state", "gauge", "1 for the state that it is in, 0 for the others.")
-RESTARTS = Family("restarts_total", "counter", "Restarts that nobody asked for.")
+STATE = Family("state", "gauge", "1 for the current state, 0 for all others.")
+RESTARTS = Family("restarts_total", "counter", "Automatic restarts.")
 START = Family("start_time_seconds", "gauge", "When all nodes were ready, in Unix time.")
 NODE_START = Family("start_time_seconds", "gauge", "When it became ready, in Unix time.")
 INFO = Family("info", "gauge", "UUID and unit of a dataflow; the value is always 1.")
 NODES = Family("nodes", "gauge", "Nodes that the dataflow has.")
-ALIVE = Family("nodes_alive", "gauge", "Nodes that are there.")
-LINES = Family("log_lines_total", "counter", "Lines that journald was given.")
+ALIVE = Family("nodes_alive", "gauge", "Nodes that are running.")
+LINES = Family("log_lines_total", "counter", "Lines sent to journald.")
 SUPPRESSED = Family(
     "log_lines_suppressed_total", "counter", "Lines that log_rate_limit kept out of the journal."
 )

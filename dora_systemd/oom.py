@@ -50,10 +50,10 @@ class Oom:
         """How the node ended, for the table of nodes."""
         peak, limit = format_rounded_size(self.peak), format_rounded_size(self.limit)
         if self.owner is Owner.NODE:
-            return f"out of memory: peak {peak}, limit {limit}"
+            return f"out of memory, peak {peak}, limit {limit}"
         if self.owner is Owner.DATAFLOW:
-            return f"out of memory: peak {peak}, limit of the dataflow {limit}"
-        return f"out of memory: peak {peak}, the machine had none left"
+            return f"out of memory, peak {peak}, limit of the dataflow {limit}"
+        return f"out of memory, peak {peak}, the machine had no memory left"
 
     def node_details(self) -> dict[str, str]:
         """Details of the event node-oom."""

@@ -174,7 +174,7 @@ def check_command(python: str, options: RunnerOptions) -> list[str]:
 def options_from_command(command: Sequence[str]) -> RunnerOptions:
     """The options in the ExecStart= that runner_command made; DoraSystemdError for any other."""
     if RUNNER_MODULE not in command:
-        raise _refusal(f"{quoted(' '.join(command))} is no runner of dora-systemd")
+        raise _refusal(f"{quoted(' '.join(command))} is not a runner of dora-systemd")
     return parse_runner_argv(command[list(command).index(RUNNER_MODULE) + 1 :])
 
 

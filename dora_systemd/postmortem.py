@@ -24,12 +24,12 @@ _END_WORDS = {"dataflow-finished": FINISHED, "dataflow-stopped": STOPPED, "dataf
 _ENDS = (*_END_WORDS, "unit-succeeded", "unit-failed")
 _RESULTS = {
     "timeout": (Cause.TIMEOUT, "systemd ended it: it did not start or stop in time"),
-    "watchdog": (Cause.WATCHDOG, "its runner hung and was ended by the watchdog"),
+    "watchdog": (Cause.WATCHDOG, "the supervisor process hung and was killed by the watchdog"),
     "oom-kill": (Cause.OUT_OF_MEMORY, "it ran out of memory"),
 }
 _STATUS = re.compile(r"status=(\S+)")
-NO_END = "its end is not on record: it was killed, or the machine went down"
-UNKNOWN_PERSON = "a request to systemd, which does not note whose"
+NO_END = "its end is not recorded: it was killed, or the machine went down"
+UNKNOWN_PERSON = "a request to systemd (by whom is not recorded)"
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ def final_crashes(life: Life) -> list[Happening]:
 
 
 def _crash(crash: Happening) -> _Finding:
-    how = crash.detail("exit") or "ended, unknown how"
+    how = crash.detail("exit") or "ended, how is not recorded"
     cause = Cause.NODE_FAILED
     if crash.name == "node-oom":
         cause = Cause.NODE_OUT_OF_MEMORY
@@ -190,17 +190,19 @@ def _unit_failure(life: Life, end: Happening) -> _Finding:
 def _exit_words(exit: Happening) -> str:
     status = exit.detail("exit_status") or "unknown"
     if exit.detail("exit_code") != "exited":
-        return f"its runner was ended by signal {status}"
+        return f"the supervisor process was killed (signal {status})"
     named = _STATUS.search(exit.text)  # as "217/USER"
-    return f"systemd could not start its runner: exit code {named[1] if named else status}"
+    return (
+        f"systemd could not start the supervisor process: exit code {named[1] if named else status}"
+    )
 
 
 def _without_end(life: Life, facts: Facts) -> _Finding:
     if not life.happenings:
-        return _Finding(Cause.NONE, "nothing of it is on record")
+        return _Finding(Cause.NONE, "nothing is recorded about it")
     last = life.happenings[-1]
     if life.boot and facts.now_boot and life.boot != facts.now_boot:
-        words = "the machine went down while it ran, without telling it: the last record is older"
+        words = "the machine went down while it ran, without a shutdown"
         return _Finding(Cause.NO_END, words, last)
     return _Finding(Cause.NO_END, NO_END, last)
 
@@ -213,13 +215,13 @@ def stopped_by(life: Life, shutdowns: Sequence[int]) -> str:
     order, job = life.last("dataflow-stopping"), life.last("unit-stopping")
     by = order.detail("by") if order else ""
     if by == "terminal":
-        return "the end of the terminal that it was run from"
+        return "the end of its terminal"
     moments = [one.at_us for one in (order, job) if one is not None]
     if any(life.began_us <= shutdown <= max(moments, default=0) for shutdown in shutdowns):
         return "the shutdown of the machine"
     if job is not None:
         return UNKNOWN_PERSON
-    return f"the signal {by}" if by else "somebody unknown"
+    return f"the signal {by}" if by else "an unknown caller"
 
 
 def _starved(found: _Finding, life: Life) -> tuple[str, ...]:

@@ -24,26 +24,28 @@ _SIZE = re.compile("[1-9][0-9]{0,18}")
 _TITLE_WIDTH = 10
 _RED, _GREEN, _BOLD, _PLAIN = "\x1b[31m", "\x1b[32m", "\x1b[1m", "\x1b[0m"
 
+_AUTOMATIC = "run: doractl restart {name}; --restart-policy on-failure does this automatically"
+_OVERLOADED = "run: doractl restart {name}; check whether the machine was overloaded"
 _REMEDIES = {
-    Cause.NODE_FAILED: "mend {node}, then: doractl restart {name}",
-    Cause.NODE_HUNG: "find out what {node} waited for; health_check_timeout: in its YAML",
-    Cause.NODE_OUT_OF_MEMORY: "look for a leak in {node}, or: "
+    Cause.NODE_FAILED: "fix {node}, then run: doractl restart {name}",
+    Cause.NODE_HUNG: "find out what {node} waited for, or raise health_check_timeout: in its YAML",
+    Cause.NODE_OUT_OF_MEMORY: "look for a leak in {node}, or run: "
     "doractl set {name} --node-limit {node}:memory=SIZE",
-    Cause.START_TIMEOUT: "see why {node} does not call Node(), or give it a longer --start-timeout",
-    Cause.REFUSED: "mend {file}, then: doractl restart {name}",
-    Cause.BAD_DATAFLOW: "mend {file}, then: doractl restart {name}",
-    Cause.DAEMON_LOST: "doractl restart {name}; --restart-policy on-failure does it by itself",
-    Cause.COORDINATOR_LOST: "doractl restart {name}; --restart-policy on-failure does it by itself",
-    Cause.NO_ANSWER: "doractl restart {name}; was the machine overloaded?",
-    Cause.DIRECTORY_LOST: "doractl restart {name}; nobody but systemd may tidy up there",
-    Cause.RUNNER_BROKEN: "doractl restart {name}; unless the machine was short of processes, files "
-    "or space, please report it",
-    Cause.RUNNER_KILLED: "doractl restart {name}; --restart-policy on-failure does it by itself",
-    Cause.WATCHDOG: "doractl restart {name}; was the machine overloaded?",
-    Cause.OUT_OF_MEMORY: "limit single nodes (--node-limit NODE:memory=SIZE), so that one is named",
+    Cause.START_TIMEOUT: "find out why {node} does not call Node(), or raise --start-timeout",
+    Cause.REFUSED: "fix {file}, then run: doractl restart {name}",
+    Cause.BAD_DATAFLOW: "fix {file}, then run: doractl restart {name}",
+    Cause.DAEMON_LOST: _AUTOMATIC,
+    Cause.COORDINATOR_LOST: _AUTOMATIC,
+    Cause.NO_ANSWER: _OVERLOADED,
+    Cause.DIRECTORY_LOST: "run: doractl restart {name}; only systemd may delete files there",
+    Cause.RUNNER_BROKEN: "run: doractl restart {name}; please report it, unless the machine "
+    "ran out of processes, files or disk space",
+    Cause.RUNNER_KILLED: _AUTOMATIC,
+    Cause.WATCHDOG: _OVERLOADED,
+    Cause.OUT_OF_MEMORY: "limit single nodes (--node-limit NODE:memory=SIZE) to find which one",
     Cause.UNIT_FAILED: "systemctl {flag} status {unit} shows what systemd did",
-    Cause.TIMEOUT: "start it with a longer --start-timeout or --grace-duration",
-    Cause.NO_END: "doractl start {file}; doractl enable {name} brings it back after a reboot",
+    Cause.TIMEOUT: "raise --start-timeout or --grace-duration",
+    Cause.NO_END: "run: doractl start {file}; to start it at every boot, doractl enable {name}",
 }
 _MEMORY_REMEDIES = {
     "dataflow": "doractl set {name} --memory-limit SIZE, or limit single nodes (--node-limit)",
@@ -54,13 +56,13 @@ _SIGNAL_REMEDIES = {
     "SIGKILL": "find out who killed {node}: journalctl -k, or somebody's kill -9",
     **dict.fromkeys(
         ("SIGSEGV", "SIGABRT", "SIGBUS", "SIGILL", "SIGFPE"),
-        "mend {node}; where it was: coredumpctl info {pid}",
+        "fix {node}; coredumpctl info {pid} shows where it crashed",
     ),
 }
-_GIVEN_UP = "systemd has given it up: doractl restart {name} counts its restarts anew"
-_WAITING = "systemd starts it again by itself; doractl stop {name} keeps it from that"
-_AGAIN = "nothing: dora starts {node} again by itself"
-_AWAY = "{node} stays away until doractl restart {name}; the others run on"
+_GIVEN_UP = "systemd has stopped restarting it; doractl restart {name} resets the counter"
+_WAITING = "systemd restarts it automatically; doractl stop {name} prevents that"
+_AGAIN = "nothing: dora restarts {node} automatically"
+_AWAY = "{node} stays down until doractl restart {name}; the other nodes keep running"
 
 
 @dataclass(frozen=True)
@@ -182,11 +184,11 @@ def _budget_words(report: Report) -> str:
 
 
 def _when(verdict: Verdict) -> str:
-    since = f"began {local_time(verdict.began_us)}" if verdict.began_us else ""
+    since = f"started {local_time(verdict.began_us)}" if verdict.began_us else ""
     if not verdict.at_us:
         return since
     lasted = verdict.at_us - verdict.began_us
-    words = f", {_span(lasted)} after it began" if verdict.began_us and lasted >= 0 else ""
+    words = f", {_span(lasted)} after its start" if verdict.began_us and lasted >= 0 else ""
     return f"{local_time(verdict.at_us)}{words}"
 
 
@@ -202,7 +204,7 @@ def _memory_words(details: Mapping[str, str]) -> str:
         for key, words in (("peak", "peak"), ("limit", "limit"), ("held", "held"))
         if _SIZE.fullmatch(details.get(key, ""))
     ]
-    owner = {"dataflow": " of the dataflow", "machine": "; the machine had none left"}
+    owner = {"dataflow": " of the dataflow", "machine": "; the machine had no memory left"}
     return ", ".join(sizes) + owner.get(details.get("owner", ""), "") if sizes else ""
 
 
@@ -210,7 +212,7 @@ def _restart_words(restarts: Sequence[Restart]) -> str:
     """As "detector 3 (exit code 1), all of it 1 (the dora daemon is gone)"."""
     groups: dict[tuple[str, str], int] = {}
     for one in restarts:
-        key = (one.node or "all of it", one.reason)
+        key = (one.node or "dataflow", one.reason)
         groups[key] = groups.get(key, 0) + 1
     return ", ".join(f"{who} {count} ({why})" for (who, why), count in groups.items())
 

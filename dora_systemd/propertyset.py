@@ -107,7 +107,7 @@ def _check_key(key: str) -> None:
         raise DoraSystemdError(f"{message} from here", hint, ExitCode.USAGE)
     if key not in TABLE:
         hint = did_you_mean(key, TABLE.keys() - _REFUSED.keys()) or "see systemd.directives(7)"
-        raise DoraSystemdError(f"{message}: services have none", hint, ExitCode.USAGE)
+        raise DoraSystemdError(f"{message}: services have no such property", hint, ExitCode.USAGE)
 
 
 def _parse_one(key: str, text: str) -> dict[str, Property]:

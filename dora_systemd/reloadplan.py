@@ -38,4 +38,4 @@ def reload_warnings(settings: Settings) -> Iterator[str]:
         return
     for setting in RELOAD_SETTINGS:
         if setting not in (HOT_RELOAD, REPLACE) and settings.source(setting) != DEFAULT_SOURCE:
-            yield f"{setting.flags[0]} does nothing without {HOT_RELOAD.flags[0]}"
+            yield f"{setting.flags[0]} has no effect without {HOT_RELOAD.flags[0]}"

@@ -11,7 +11,7 @@ class How(Enum):
     """What becomes of a node."""
 
     REMOVE = "removed"
-    REWIRE = "wired anew"
+    REWIRE = "reconnected"
     SWAP = "reloaded"
     OPERATOR = "reloaded in place"
     ADD = "added"

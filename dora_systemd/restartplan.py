@@ -47,4 +47,4 @@ def restart_warnings(settings: Settings) -> Iterator[str]:
     for setting in RESTART_SETTINGS:
         is_given = settings.source(setting) != DEFAULT_SOURCE
         if setting.name in _FIELDS and setting is not RESTART_POLICY and is_given:
-            yield f"{setting.flags[0]} does nothing without {RESTART_POLICY.flags[0]}"
+            yield f"{setting.flags[0]} has no effect without {RESTART_POLICY.flags[0]}"

@@ -86,7 +86,7 @@ def parse_policy(text: str) -> RestartPolicy:
     given = dict(pair.split("=", 1) for pair in pairs if "=" in pair)
     if word not in POLICIES or set(given) != set(_KEYS[1:]):
         message = f"cannot use {quoted(text)} as restart policy"
-        raise DoraSystemdError(message, f"there are {', '.join(POLICIES)}", ExitCode.USAGE)
+        raise DoraSystemdError(message, f"valid values: {', '.join(POLICIES)}", ExitCode.USAGE)
     return RestartPolicy(
         word,
         parse_count(given["max"]),
@@ -112,7 +112,7 @@ def parse_delay(text: str) -> int:
     delay = parse_duration(text)
     if not MIN_DELAY <= delay < INFINITY:
         message = f"cannot use {quoted(text)} as the delay of a restart"
-        hint = f"write {format_duration(MIN_DELAY)} or more: crash loops cost the machine its time"
+        hint = f"write {format_duration(MIN_DELAY)} or more: a crash loop uses up the CPU"
         raise DoraSystemdError(message, hint, ExitCode.USAGE)
     return delay
 

@@ -14,7 +14,7 @@ def _parse_choice(value: Any, base: Base) -> str:
     text = "no" if value is False else scalar_text(value).strip()
     if text not in POLICIES:
         message = f"cannot use {quoted(text)} as restart policy"
-        raise DoraSystemdError(message, f"there are {', '.join(POLICIES)}", ExitCode.USAGE)
+        raise DoraSystemdError(message, f"valid values: {', '.join(POLICIES)}", ExitCode.USAGE)
     return text
 
 
@@ -51,7 +51,7 @@ RESTART_POLICY = Setting[str](
     "restart_policy",
     Kind[str](bool | str, "no, on-failure or always", _parse_choice, lambda value: [value]),
     DEFAULT.policy,
-    "What starts again by itself: no, on-failure or always.",
+    "When to restart automatically: no, on-failure or always.",
     flags=("--restart-policy",),
     variable="DORA_RESTART_POLICY",
     metavar="POLICY",
@@ -61,7 +61,7 @@ MAX_RESTARTS = Setting[int](
     "max_restarts",
     _COUNT,
     DEFAULT.max_restarts,
-    "How many restarts one window has.",
+    "Maximum restarts per window.",
     flags=("--max-restarts",),
     variable="DORA_MAX_RESTARTS",
     metavar="N",
@@ -71,7 +71,7 @@ RESTART_WINDOW = Setting[int](
     "restart_window",
     _WINDOW,
     DEFAULT.window,
-    "Time after which restarts are counted anew.",
+    "Time after which the restart counter is reset.",
     flags=("--restart-window",),
     variable="DORA_RESTART_WINDOW",
     metavar="TIME",
@@ -81,7 +81,7 @@ RESTART_DELAY = Setting[int](
     "restart_delay",
     _DELAY,
     DEFAULT.delay,
-    "Time before a restart; it doubles with each one.",
+    "Delay before a restart; doubles with each restart.",
     flags=("--restart-delay",),
     variable="DORA_RESTART_DELAY",
     metavar="TIME",
@@ -91,7 +91,7 @@ MAX_RESTART_DELAY = Setting[int](
     "max_restart_delay",
     _DELAY,
     DEFAULT.max_delay,
-    "The longest time before a restart.",
+    "Longest delay before a restart.",
     flags=("--max-restart-delay",),
     variable="DORA_MAX_RESTART_DELAY",
     metavar="TIME",
@@ -101,7 +101,7 @@ START_TIMEOUT = Setting[int](
     "start_timeout",
     _WINDOW,
     INFINITY,
-    "How long the nodes may take to be ready; infinity: as long as they like.",
+    "Time for all nodes to become ready; infinity for no limit.",
     flags=("--start-timeout",),
     variable="DORA_START_TIMEOUT",
     metavar="TIME",

@@ -57,10 +57,10 @@ def killed_by(environ: Mapping[str, str]) -> str:
     if environ.get("SERVICE_RESULT") == "success":
         return ""  # SIGTERM before it could listen to it: stopped as soon as it was started
     if environ.get("SERVICE_RESULT") == "watchdog":
-        return "its runner hung and was ended by the watchdog"
+        return "the supervisor process hung and was killed by the watchdog"
     if environ.get("SERVICE_RESULT") == "timeout":
         return "it did not start or stop in time and was killed"
-    return f"its runner was ended by signal SIG{environ.get('EXIT_STATUS', '')}"
+    return f"the supervisor process was killed (SIG{environ.get('EXIT_STATUS', '')})"
 
 
 def killed_cause(environ: Mapping[str, str]) -> Cause:
@@ -163,7 +163,7 @@ def out_of_memory(unit: Path) -> str:
     groups = cgroup.node_groups(unit)
     node, held = largest({key: cgroup.read_usage(one).memory or 0 for key, one in groups.items()})
     most = f"; the node {node} held most, {format_rounded_size(held)}" if node else ""
-    return f"its runner was killed for want of memory{most}"
+    return f"the supervisor process was killed, out of memory{most}"
 
 
 def kill_nodes(unit: Path, seconds: float) -> None:

@@ -175,12 +175,12 @@ class Reloader:
         self.options = self.options._replace(node_limits=merged)
         name = PurePath(self._settings.path).name
         for one in change.limits:
-            run.pipes.write_event("node-reloaded", one.node, how="limited anew", reason=name)
+            run.pipes.write_event("node-reloaded", one.node, how="given new limits", reason=name)
         if change.others:
             keys = ", ".join(change.others)
-            reason = f"{name}: {keys}: only doractl stop and start take that over"
+            reason = f"{name}: {keys}: only doractl stop and start apply this"
             run.pipes.write_event("reload-failed", reason=reason)
-        return [f"the node {one.node} was limited anew: {name}" for one in change.limits]
+        return [f"the node {one.node} was given new limits: {name}" for one in change.limits]
 
     async def _apply(self, run: Run, change: Change) -> list[str]:
         applier = Applier(run, change, self.options)
@@ -202,7 +202,9 @@ class Reloader:
             return DoraSystemdError(f"cannot use what was saved: {error}")
         assert self.current is not None
         await applier.undo(self.current)
-        message = f"cannot use {self.options.dataflow}: {error}; the version before runs again"
+        message = (
+            f"cannot use {self.options.dataflow}: {error}; the previous version is running again"
+        )
         return DoraSystemdError(message)
 
     async def _restart(self, run: Run, change: Change, reason: str) -> list[str]:

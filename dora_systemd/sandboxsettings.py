@@ -17,7 +17,7 @@ def _choice(what: str, choices: Sequence[str]) -> Kind[str]:
         del base
         text = scalar_text(value).strip()
         if text not in choices:
-            hint = did_you_mean(text, choices) or f"there are {', '.join(choices)}"
+            hint = did_you_mean(text, choices) or f"valid values: {', '.join(choices)}"
             raise DoraSystemdError(f"cannot use {quoted(text)} as {what}", hint, ExitCode.USAGE)
         return text
 
@@ -28,7 +28,7 @@ SANDBOX = Setting[str](
     "sandbox",
     _choice("sandbox", LEVELS),
     DEFAULT_LEVEL,
-    "How much the dataflow is kept from: none, default or strict.",
+    "Sandbox level: none, default or strict.",
     flags=("--sandbox",),
     variable="DORA_SANDBOX",
     metavar="LEVEL",
@@ -37,7 +37,7 @@ WRITABLE = Setting[tuple[str, ...]](
     "writable",
     PATHS,
     (),
-    "Directory or file that the nodes may write, in spite of the sandbox.",
+    "Directory or file that the nodes may write to despite the sandbox.",
     flags=("--writable",),
     metavar="PATH",
 )
@@ -45,7 +45,7 @@ NETWORK = Setting[str](
     "network",
     _choice("network", NETWORKS),
     DEFAULT_NETWORK,
-    "What the nodes reach: the host's network, its loopback alone, or a private loopback.",
+    "Network of the nodes: host, loopback (the host's loopback only) or private (one of its own).",
     flags=("--network",),
     variable="DORA_NETWORK",
     metavar="REACH",

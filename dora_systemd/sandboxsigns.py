@@ -6,19 +6,19 @@ _MORE = "see SANDBOX in dora-systemd(7)"
 _SIGNS: Sequence[tuple[tuple[str, ...], str]] = (
     (
         ("Read-only file system", "EROFS"),
-        f"the sandbox has files read-only: --writable PATH opens a place, {_MORE}",
+        f"files are read-only in the sandbox: --writable PATH allows one, {_MORE}",
     ),
     (
         ("No such file or directory: '/dev/", "No such file or directory: /dev/"),
-        f"the sandbox hides devices: --device PATH opens one, {_MORE}",
+        f"devices are hidden in the sandbox: --device PATH allows one, {_MORE}",
     ),
     (
         ("No such file or directory: '/tmp/", "No such file or directory: '/var/tmp/"),
-        f"the sandbox has a /tmp of its own: --writable /tmp shares that of the machine, {_MORE}",
+        f"/tmp is private in the sandbox: --writable /tmp shares the one of the machine, {_MORE}",
     ),
     (
         ("Operation not permitted", "Address family not supported", "EPERM"),
-        f"the sandbox may have refused that; --sandbox none tells, {_MORE}",
+        f"the sandbox may have refused that; try --sandbox none, {_MORE}",
     ),
 )
 """Parts of lines as the C library, Python and Rust write them, the plainest signs first."""

@@ -78,7 +78,7 @@ def check_document(
 ) -> Mapping[str, Any]:
     """The settings file `document` without the keys that are empty.
 
-    Raises DoraSystemdError (BAD_INPUT) with file and key when it is no mapping, a key is unknown
+    Raises DoraSystemdError (BAD_INPUT) with file and key when it is not a mapping, a key is unknown
     or a value is of another type than its setting has.
     """
     # Only a command that meets a settings file pays for pydantic.
@@ -88,7 +88,7 @@ def check_document(
         return {}
     if not isinstance(document, dict):
         hint = "a settings file is a mapping, KEY: VALUE"
-        message = f"cannot use {shown(source)}: it is no mapping"
+        message = f"cannot use {shown(source)}: it is not a mapping"
         raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
     check_json(document, source, MAX_JSON)
     try:

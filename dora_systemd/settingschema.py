@@ -33,7 +33,7 @@ def validation_error(
 ) -> DoraSystemdError:
     """The first of the mistakes that pydantic found in the file `source`, in one line."""
     if not isinstance(error, ValidationError):
-        message = f"cannot use {shown(source)}: it is no settings file"
+        message = f"cannot use {shown(source)}: it is not a settings file"
         return DoraSystemdError(message, str(error), ExitCode.BAD_INPUT)
     first = error.errors(include_url=False, include_input=False)[0]
     place = [str(part) for part in first["loc"]]

@@ -191,7 +191,7 @@ def _reason(error: Exception) -> str:
 
 
 def _refuse_constant(name: str) -> float:
-    raise _Wrong(f"{name} is no number")
+    raise _Wrong(f"{name} is not a number")
 
 
 def _parse_cell(raw: Any) -> CellStatus:
@@ -201,7 +201,7 @@ def _parse_cell(raw: Any) -> CellStatus:
         raise _Wrong("it has a node without an id")
     samples = known.get("samples", [])
     if not isinstance(samples, list) or len(samples) > _MAX_SAMPLES:
-        raise _Wrong("its samples are no short list")
+        raise _Wrong("its samples are not a short list")
     return CellStatus(
         uuid=_text(known, "uuid"),
         run=_text(known, "run"),
@@ -243,7 +243,7 @@ def _parse_sample(raw: Any) -> CpuSample:
 
 def _object(raw: Any, what: str) -> dict[str, Any]:
     if not isinstance(raw, dict):
-        raise _Wrong(f"{what} is no object")
+        raise _Wrong(f"{what} is not an object")
     return raw
 
 
@@ -259,14 +259,14 @@ def _by_node(raw: Any, parse: Callable[[Any], Value]) -> dict[str, Value]:
 def _text(raw: Mapping[str, Any], key: str, default: str = "") -> str:
     value = raw.get(key, default)
     if not isinstance(value, str):
-        raise _Wrong(f"its {key} is no text")
+        raise _Wrong(f"its {key} is not a text")
     return value[:_MAX_TEXT]
 
 
 def _word(raw: Mapping[str, Any], key: str, words: Sequence[str]) -> str:
     value = raw.get(key, words[0])
     if value not in words:
-        raise _Wrong(f"its {key} is none of those there are")
+        raise _Wrong(f"its {key} is unknown")
     return str(value)
 
 

@@ -12,8 +12,8 @@ def missing_node(problem: str, node: str, nodes: Iterable[str]) -> DoraSystemdEr
     problem: such as "cannot limit", what stands before "the node".
     """
     known = list(nodes)
-    message = f"{problem} the node {quoted(node)}: it is not there"
-    hint = did_you_mean(node, known) or f"there are {', '.join(known)}"
+    message = f"{problem} the node {quoted(node)}: no such node"
+    hint = did_you_mean(node, known) or f"nodes: {', '.join(known)}"
     return DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
 
 

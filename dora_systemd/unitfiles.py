@@ -116,7 +116,7 @@ def wanted_units(directory: Path) -> frozenset[str]:
 def foreign_file(path: Path) -> DoraSystemdError:
     """The error for a file in our place that somebody else has put there."""
     return DoraSystemdError(
-        f"cannot use {path}: it is there already and not doractl's",
+        f"cannot use {path}: it already exists and is not doractl's",
         "look at it; then move it away, or take another name",
         ExitCode.NAME_IN_USE,
     )

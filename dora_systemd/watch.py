@@ -120,12 +120,12 @@ async def _bursts(rules: WatchRules) -> AsyncIterator[frozenset[str]]:
         if error.errno == errno.ENOSPC or "limit" in str(error).lower():
             raise DoraSystemdError(
                 f"cannot watch {rules.root}: the kernel gives no more inotify watches",
-                "raise them with sysctl fs.inotify.max_user_watches, or narrow it by --ignore",
+                "raise sysctl fs.inotify.max_user_watches, or exclude files with --ignore",
                 ExitCode.FAILURE,
             ) from error
         raise DoraSystemdError(f"cannot watch {rules.root}: {error}") from error
     except RuntimeError as error:  # watchfiles's own, when the kernel gives no inotify instance
-        hint = "more of them: sysctl fs.inotify.max_user_instances"
+        hint = "raise sysctl fs.inotify.max_user_instances"
         raise DoraSystemdError(f"cannot watch {rules.root}: {error}", hint) from error
 
 

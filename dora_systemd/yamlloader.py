@@ -40,7 +40,7 @@ class _Loader(_BASE):  # type: ignore[misc]
         for key_node, _ in node.value if isinstance(node, yaml.MappingNode) else ():
             key = self.construct_object(key_node, deep=True)
             if isinstance(key, Hashable) and key in seen:
-                problem = f"the key {key_node.value!r} is there twice"
+                problem = f"duplicate key {key_node.value!r}"
                 raise yaml.constructor.ConstructorError(None, None, problem, key_node.start_mark)
             seen |= {key} if isinstance(key, Hashable) else set()
         mapping: dict[Hashable, Any] = super().construct_mapping(node, deep)

@@ -50,7 +50,7 @@ export class Chart {
     );
     this.limit.setAttribute("d", isNear ? `M0 ${y(limit)}H${span}` : "");
     const above = limit == null ? "" : ` of ${this.format(limit)}`;
-    const label = `${this.name}: ${now == null ? "not known" : this.format(now) + above}`;
+    const label = `${this.name}: ${now == null ? "unknown" : this.format(now) + above}`;
     this.picture.setAttribute("aria-label", label);
   }
 }

@@ -69,7 +69,7 @@ export class Logs {
     this.lines.querySelector(".empty")?.remove();
     const added = lines.map((line) => this.#line(line));
     if (skipped) {
-      const text = `${plural(skipped, "line")} left out here; doractl logs has them all`;
+      const text = `${plural(skipped, "line")} skipped here; doractl logs shows all`;
       added.unshift(el("p", { class: "note" }, text));
     }
     this.lines.append(...added);

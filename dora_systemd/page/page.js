@@ -98,10 +98,10 @@ function showProblem({ text, hint }) {
 }
 
 const CONSEQUENCES = {
-  stop: ["Stop", "It ends after its nodes were told to; what is left after the grace time is killed."],
-  restart: ["Restart", "All its nodes end and begin anew; name, UUID and settings stay."],
-  "stop node": ["Stop", "It stays away until the dataflow is restarted; its neighbours run on."],
-  "restart node": ["Restart", "The others run on meanwhile."],
+  stop: ["Stop", "Its nodes are told to stop; those still running after the grace duration are killed."],
+  restart: ["Restart", "All nodes stop and start again; name, UUID and settings stay."],
+  "stop node": ["Stop", "It stays down until the dataflow is restarted; the other nodes keep running."],
+  "restart node": ["Restart", "The other nodes keep running."],
 };
 
 function ask(action, node) {

@@ -26,7 +26,7 @@ def read_cell_file(path: Path, max_bytes: int) -> bytes:
     if text.place.borrowed:
         reason = f"it is not of the user whose dataflow it is: {text.place.borrowed}"
         message = f"cannot read {shown(str(path))}: {reason}"
-        raise DoraSystemdError(message, "somebody put it there", ExitCode.BAD_INPUT)
+        raise DoraSystemdError(message, "another user put it there", ExitCode.BAD_INPUT)
     return text.data
 
 

@@ -38,7 +38,7 @@ _NO_FILE = "there is no such file"
 _REASONS = {
     errno.ENOENT: (_NO_FILE, "correct the path"),
     errno.ENOTDIR: (_NO_FILE, "correct the path"),
-    errno.ELOOP: ("its links go round in a circle", "correct the path"),
+    errno.ELOOP: ("its symbolic links form a loop", "correct the path"),
     errno.ENAMETOOLONG: ("its name is too long", "correct the path"),
     errno.ENXIO: ("it is not a regular file", "give a file"),
     errno.EACCES: ("permission denied", "let the calling user read it"),
@@ -76,7 +76,7 @@ class Place(NamedTuple):
         if strangers := sorted(self.owners - {0, self.uid}):
             return f"{user_name(strangers[0])} owns a directory above it"
         if self.shared:
-            return f"others than its owner can write in {shown(self.shared)}"
+            return f"users other than its owner can write to {shown(self.shared)}"
         return ""
 
 
@@ -247,7 +247,7 @@ class _Walk:
         if self._links > _MAX_LINKS:
             raise OSError(errno.ELOOP, os.strerror(errno.ELOOP))
         if self._cautious and (self._owners | {status.st_uid} != {0} or self._sharing()):
-            reason = f"{shown(link)} is a symbolic link that others than root can change"
+            reason = f"{shown(link)} is a symbolic link that users other than root can change"
             raise _refusal(link, reason, "give the path that it leads to")
         target = os.readlink(name, dir_fd=self.fd)
         if target.startswith("/"):

@@ -49,7 +49,7 @@ def connect_unix(path: Path, seconds: float, peer: Peer = peer_of) -> socket.soc
         held.callback(os.close, fd)
         status = os.fstat(fd)
         if not stat.S_ISSOCK(status.st_mode):
-            raise _refusal(path, "it is no socket")
+            raise _refusal(path, "it is not a socket")
         _check_owner(path, status.st_uid, place.uid)
         stream = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         undo = held.enter_context(contextlib.ExitStack())
@@ -73,7 +73,7 @@ def require_listener(
     what = f"cannot use port {port} of 127.0.0.1"
     if not found:
         hint = "the dataflow may be starting or stopping; see doractl list"
-        raise DoraSystemdError(f"{what}: nobody listens there", hint, ExitCode.NOT_RUNNING)
+        raise DoraSystemdError(f"{what}: nothing listens there", hint, ExitCode.NOT_RUNNING)
     if strangers := sorted(found - {uid}):
         reason = f"{user_name(strangers[0])} listens there, not {user_name(uid)}"
         hint = f"a process of {user_name(uid)} named it; stop that dataflow"

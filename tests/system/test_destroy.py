@@ -118,7 +118,8 @@ def test_others_are_left_alone(
     try:
         before = _pids(alice), _pids(Front(), "foreign"), _pids(Front(), "dora-foreign")
         done = front.doractl("destroy")
-        words = "Left alone in dora.slice, not doractl's: dora-foreign.service, foreign.service\n"
+        words = "Not touched in dora.slice, not managed by doractl: "
+        words += "dora-foreign.service, foreign.service\n"
         assert words in done.stdout
         assert done.stdout.endswith(LEFT)
         after = _pids(alice), _pids(Front(), "foreign"), _pids(Front(), "dora-foreign")
@@ -151,7 +152,7 @@ def test_what_is_enabled_stays_enabled(front: Front, cell: Cell, project: Projec
     try:
         cell.start(project.three_nodes(), "--enable")
         done = front.doractl("destroy")
-        last = f"Still enabled: {cell.name}; the next boot starts what is enabled."
+        last = f"Still enabled: {cell.name}; they start at the next boot."
         assert done.stdout.splitlines()[-1] == last
         assert front.show("ActiveState", "dora.target") == "inactive"
         assert f"  ✓ Enabled dataflows started: {cell.name}\n" in front.doractl("up").stdout

@@ -233,7 +233,9 @@ def test_stop_and_restart(dora: Dora, three: list[Cell]) -> None:
     assert three[2].supervisor_pid("runner") != pid
     dora("stop", known["two"])
     assert three[1].is_gone
-    assert "two is told to stop by root (dora stop)" in run("doractl", "why", "two").stdout
+    assert (
+        "Stop of dataflow two requested by root (dora stop)" in run("doractl", "why", "two").stdout
+    )
     assert three[0].show("ActiveState") == three[2].show("ActiveState") == "active"
     dora("stop", "--all")
     assert all(cell.is_gone for cell in three)
@@ -310,7 +312,7 @@ def test_attached_and_impatient(dora: Dora, cell: Cell, places: Sequence[Project
     wait_for("it is gone", lambda: cell.is_gone)
 
 
-@pytest.mark.warns("Killing process", "Main process exited", "Failed with", "by signal SIGKILL")
+@pytest.mark.warns("Killing process", "Main process exited", "Failed with", "was killed (SIGKILL)")
 def test_by_force(dora: Dora, cell: Cell, places: Sequence[Project]) -> None:
     flow = hanging(places[0])
     for words in (("--force",), ("--grace-duration", "1s")):
@@ -384,10 +386,10 @@ def test_which_file_is_meant(dora: Dora, cell: Cell, places: Sequence[Project]) 
 @pytest.mark.warns("control request failed: node `sonk` not found")
 def test_refusals(dora: Dora, three: list[Cell], places: Sequence[Project]) -> None:
     for words, expected in (
-        (("stop", NO_SUCH_UUID), "cannot find a dataflow with the UUID"),
+        (("stop", NO_SUCH_UUID), "no dataflow with the UUID"),
         (("stop", "tow"), "did you mean two?"),
-        (("restart", "nobody"), "cannot find a dataflow 'nobody'"),
-        (("logs", NO_SUCH_UUID, "--node", "a"), "cannot find a dataflow with the UUID"),
+        (("restart", "nobody"), "no dataflow named 'nobody'"),
+        (("logs", NO_SUCH_UUID, "--node", "a"), "no dataflow with the UUID"),
         (("logs", "two", "--node", "sonk"), "did you mean sink?"),
         (("node", "restart", "sonk", "-d", "two"), "did you mean sink?"),
         (("node", "stop", "sonk", "-d", "two"), "not found"),

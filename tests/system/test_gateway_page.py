@@ -173,7 +173,7 @@ def test_a_flood_is_bounded(browser: Browser, cell: Cell, project: Project) -> N
     flow = project.three_nodes()
     project.write("sink.py", FLOOD)
     cell.start(flow)
-    browser.wait_text(".lines", "left out here", 60)
+    browser.wait_text(".lines", "skipped here", 60)
     browser.wait_js("document.querySelectorAll('.lines p').length === 1000", 60)
     # And the numbers go on meanwhile.
     before = browser.text("#detail dl")

@@ -94,7 +94,7 @@ def test_without_the_node_table(cell: Cell, project: Project) -> None:
 
 
 @pytest.mark.warns(
-    *("code=killed", "Failed with result", "status=69", "its runner was ended"),
+    *("code=killed", "Failed with result", "status=69", "process was killed ("),
     "server disconnected unexpectedly",
 )
 def test_restarts_are_counted_and_the_uuid_stays(cell: Cell, project: Project) -> None:

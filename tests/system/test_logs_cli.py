@@ -71,7 +71,7 @@ def test_what_is_shown(talking: Cell) -> None:
     assert not messages(talking, "--until", "1 hour ago")
     first, *_, last = messages(talking, "--events")
     assert first == f"Dataflow {talking.name} is starting"
-    assert last == f"Dataflow {talking.name} runs, all nodes are ready"
+    assert last == f"Dataflow {talking.name} is running, all nodes are ready"
     assert messages(talking, "--events", "--reverse")[-1] == first
 
 
@@ -183,7 +183,7 @@ def test_pager(talking: Cell, tmp_path: Path) -> None:
 
 BAD_INPUT = [
     (["{name}", "--node", "cam"], 4, "cannot find a node 'cam'", "cam-left, cam-right"),
-    (["{name}x"], 4, "cannot find a dataflow", "did you mean"),
+    (["{name}x"], 4, "no dataflow named ", "did you mean"),
     (["{name}", "--since", "foo"], 2, "cannot read the time: foo", "systemd.time(7)"),
     (["{name}", "--level", "loud"], 2, "cannot use 'loud' as a level", "error, warn"),
     (["{name}", "--grep", "("], 2, "cannot use the pattern", ""),
@@ -191,8 +191,8 @@ BAD_INPUT = [
     (["--until-end"], 2, "cannot wait for the end of all dataflows", "doractl logs NAME"),
     (["{name}", "-r", "--until-end"], 2, "cannot follow with the newest", "--reverse"),
     (["--node", "cam-left"], 2, "cannot select nodes of all dataflows", ""),
-    (["{name}", "-o", "yaml"], 2, "cannot read the command line", ""),
-    (["{name}", "--tail", "-1"], 2, "cannot read the command line", ""),
+    (["{name}", "-o", "yaml"], 2, "invalid value for '-o'", ""),
+    (["{name}", "--tail", "-1"], 2, "invalid value for '--tail'", ""),
 ]
 
 

@@ -259,7 +259,7 @@ def suppressed(cell: Cell, node: str) -> int:
 
 
 @pytest.mark.lab
-@pytest.mark.warns("beyond its limit")
+@pytest.mark.warns("exceed its limit")
 def test_limits_of_nodes(cell: Cell, project: Project) -> None:
     """What a limit takes is counted to the line, whichever way the lines come."""
     project.write("flood.py", FLOOD)

@@ -34,7 +34,7 @@ for event in node:
 ON_FAILURE = ("--restart-policy", "on-failure")
 CRASHES = ("crashed", "exit code 3", "ExitCode(3)", "restarted", "after failure", "Failed with")
 KILLED = (
-    *("code=killed", "Failed with result", "status=69", "is lost", "failed: ", "was ended"),
+    *("code=killed", "Failed with result", "status=69", "is lost", "failed: ", "was killed ("),
     *("disconnected", "start-limit", "too quickly", "exited", "Failed to start"),
 )
 
@@ -108,7 +108,7 @@ def test_the_budget_is_seen_used_up_and_reset(cell: Cell, project: Project) -> N
     assert "Budget:   1/1 restarts used, resets in " in cell.doractl("list", cell.name).stdout
 
     done = cell.doractl("reset", cell.name)
-    assert done.stdout.endswith(f"({cell.name}, 1 restart forgotten)\n")
+    assert done.stdout.endswith(f"({cell.name}, restart counter reset, was 1)\n")
     assert cell.show("ActiveState") == "active"
     # The start of what runs is forgotten, too: there is one restart more.
     for restarts in ("1", "2"):
@@ -224,6 +224,6 @@ def test_unknown_node(cell: Cell, project: Project) -> None:
     project.write("dataflow.systemd.yml", "nodes: {sinc: {restart_policy: always}}")
     done = cell.start(flow, check=False)
     assert done.returncode == ExitCode.BAD_INPUT
-    assert "the node 'sinc': it is not there" in done.stderr
+    assert "the node 'sinc': no such node" in done.stderr
     assert "did you mean sink" in done.stderr
     assert cell.show("LoadState") == "not-found"

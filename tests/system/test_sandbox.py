@@ -405,4 +405,4 @@ def test_why_names_the_sandbox(cell: Cell, project: Project) -> None:
     sync_journal()
     text = cell.doractl("why", cell.name).stdout
     assert "Read-only file system: 'recording'" in text
-    assert "--writable PATH opens a place" in text
+    assert "--writable PATH allows one" in text

@@ -40,7 +40,7 @@ def test_setup_and_remove(removed: set[Path]) -> None:
     assert "Dataflow @DORA_DATAFLOW_NAME@" in run("journalctl", "--dump-catalog").stdout
     assert run("id", "-un", "dora").stdout == "dora\n"
     assert LOCAL / "share/man/man1/doractl.1" in new
-    assert run("doractl", "setup").stdout == "Everything is in place.\n"
+    assert run("doractl", "setup").stdout == "Everything is installed.\n"
     done = run("doractl", "setup", "--remove")
     assert done.stderr == ""
     assert len(done.stdout.splitlines()) == len(new)

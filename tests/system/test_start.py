@@ -38,7 +38,7 @@ def uuid_of(printed: str) -> str:
 
 
 ALICE_AND_BOB = (
-    "doractl: alice, bob can log in here, and so can read, forge and end what the nodes "
+    "doractl: alice, bob can log in here and can read, forge and end what the nodes "
     "exchange; --network private prevents it, --network host is for those you trust\n"
 )
 
@@ -216,5 +216,5 @@ def test_ctrl_c_while_it_starts_ends_the_waiting_only(cell: Cell, project: Proje
     child.send_signal(signal.SIGINT)
     _, said = child.communicate(timeout=bound(10))
     assert child.returncode == ExitCode.INTERRUPTED, said
-    assert f"doractl: cannot wait for {cell.name}: interrupted\nhint: " in said
+    assert f"doractl: interrupted; {cell.name} is still starting\nhint: " in said
     assert cell.show("ActiveState") == "activating"

@@ -59,7 +59,7 @@ def test_run_takes_the_dataflow_with_it(cell: Cell, project: Project, how: signa
     assert ("dataflow-stopped", "") in cell.events()
 
 
-@pytest.mark.warns("code=killed", "Failed with result 'signal'", "Killing process", "was ended by")
+@pytest.mark.warns("code=killed", "Failed with result 'signal'", "Killing process", "was killed (")
 def test_second_ctrl_c_kills(cell: Cell, project: Project) -> None:
     project.write("stubborn.py", STUBBORN)
     flow = project.write("dataflow.yml", f"nodes: [{{id: one, path: stubborn.py, {TICK}}}]")

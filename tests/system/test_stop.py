@@ -36,7 +36,7 @@ def test_stop(cell: Cell, project: Project) -> None:
 def test_stop_what_is_not_there() -> None:
     done = run("doractl", "stop", "nothing-of-that-name", check=False)
     assert done.returncode == ExitCode.NOT_FOUND
-    assert done.stderr.startswith("doractl: cannot find a dataflow 'nothing-of-that-name'\nhint: ")
+    assert done.stderr.startswith("doractl: no dataflow named 'nothing-of-that-name'\nhint: ")
 
 
 def test_stop_all(cell: Cell, project: Project) -> None:

@@ -30,7 +30,7 @@ nodes:
 LATE = 'import time\nprint("loading", flush=True)\ntime.sleep(1000)\n'
 CRASHES = ("crashed", "exit code 1", "ExitCode(1)", "restarted", "after failure", "Failed with")
 KILLED = (
-    *("code=killed", "Failed with result", "status=69", "is lost", "failed: ", "was ended"),
+    *("code=killed", "Failed with result", "status=69", "is lost", "failed: ", "was killed ("),
     *("disconnected", "start-limit", "too quickly", "exited", "Failed to start"),
 )
 
@@ -131,13 +131,13 @@ def test_systemd_restarts_it_and_gives_it_up(cell: Cell, project: Project) -> No
     found = verdict(cell)
     assert (found["status"], found["is_failure"]) == ("Running", False)
     ((owner, reason),) = [(one["owner"], one["reason"]) for one in found["restarts"]]
-    assert (owner, reason) == ("systemd", "its runner was ended by signal SIGKILL")
+    assert (owner, reason) == ("systemd", "the supervisor process was killed (SIGKILL)")
     assert found["restart_budget"]["used"] == 1
     os.kill(cell.supervisor_pid("daemon"), signal.SIGKILL)
     failed(cell)
     found = verdict(cell)
     assert (found["cause"], found["given_up"]) == ("daemon-lost", True)
-    assert "systemd has given it up" in found["remedies"][-1]
+    assert "systemd has stopped restarting it" in found["remedies"][-1]
 
 
 @pytest.mark.warns(*KILLED, "watchdog", "Watchdog", "Killing process", "SIGABRT", "core-dump")
@@ -147,7 +147,7 @@ def test_a_runner_that_hung(cell: Cell, project: Project) -> None:
     wait_for("it has failed", lambda: cell.show("ActiveState") == "failed", 60)
     found = verdict(cell)
     assert (found["cause"], found["is_failure"]) == ("watchdog", True)
-    assert found["summary"] == "its runner hung and was ended by the watchdog"
+    assert found["summary"] == "the supervisor process hung and was killed by the watchdog"
 
 
 @pytest.mark.warns("not ready within", "Failed with result", "exited", "failed", "Failed to start")
@@ -193,7 +193,7 @@ def test_finished_by_itself(cell: Cell, project: Project) -> None:
 def test_unknown_and_in_a_pipe(cell: Cell, project: Project) -> None:
     done = cell.doractl("why", "x" + cell.name, check=False)
     assert done.returncode == ExitCode.NOT_FOUND
-    assert done.stderr.startswith("doractl: cannot find a dataflow")
+    assert done.stderr.startswith("doractl: no dataflow named ")
     cell.start(project.three_nodes())
     command = f"doractl why {cell.name} | head -1"
     assert run("sh", "-c", command).stdout == f"{cell.name}: Running\n"

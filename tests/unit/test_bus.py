@@ -88,7 +88,7 @@ def test_object_paths() -> None:
     [
         ("AccessDenied", SYSTEM, ExitCode.NO_PERMISSION, "permission denied"),
         ("InteractiveAuthorizationRequired", SYSTEM, ExitCode.NO_PERMISSION, "permission denied"),
-        ("UnitExists", USER, ExitCode.NAME_IN_USE, "there already"),
+        ("UnitExists", USER, ExitCode.NAME_IN_USE, "already exists"),
         ("NoSuchUnit", USER, ExitCode.NOT_FOUND, "no such unit"),
         ("NoReply", USER, ExitCode.NO_SYSTEMD, "does not answer"),
         ("InvalidArgs", USER, ExitCode.FAILURE, "its own words"),

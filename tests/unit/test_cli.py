@@ -86,14 +86,14 @@ def test_every_option_says_what_it_does(name: str) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message", "hint"),
     [
-        (["strat"], "cannot understand the verb 'strat'", "did you mean doractl start?"),
-        (["qqq"], "cannot understand the verb 'qqq'", "doractl --help lists the verbs"),
-        (["list", "--oll"], "cannot read the command line: no such option", "did you mean --all?"),
-        (["stop"], "cannot tell what to stop", "doractl stop NAME, or doractl stop --all"),
-        (["stop", "x", "--all"], "cannot tell what to stop", ""),
-        (["show"], "cannot read the command line: missing argument", "see doractl show --help"),
-        (["list", "a", "b"], "cannot read the command line: got unexpected extra", ""),
-        (["list", "-o", "xml"], "cannot read the command line: invalid value", ""),
+        (["strat"], "unknown command 'strat'", "did you mean doractl start?"),
+        (["qqq"], "unknown command 'qqq'", "doractl --help lists all commands"),
+        (["list", "--oll"], "unknown option --oll", "did you mean --all?"),
+        (["stop"], "cannot stop: give names or --all", "doractl stop NAME, or doractl stop --all"),
+        (["stop", "x", "--all"], "cannot stop: give names or --all", ""),
+        (["show"], "missing argument", "see doractl show --help"),
+        (["list", "a", "b"], "got unexpected extra", ""),
+        (["list", "-o", "xml"], "invalid value", ""),
     ],
 )
 def test_wrong_command_lines(
@@ -224,7 +224,7 @@ def test_list_does_without_click() -> None:
 @pytest.mark.parametrize(
     ("redirection", "status", "said"),
     [
-        (">/dev/full", 1, "doractl: cannot go on: No space left on device\n"),
+        (">/dev/full", 1, "doractl: cannot write output: No space left on device\n"),
         (">&-", 0, ""),
         ("2>&- >&-", 0, ""),
     ],
@@ -270,7 +270,7 @@ def test_a_mistake_of_ours_is_one_line(
     monkeypatch.setattr(main, "_dispatch", fail)
     assert main.run(["list"]) == 1
     said = capsys.readouterr().err.splitlines()
-    assert said[0] == "doractl: cannot go on: a mistake in doractl, TypeError: oh"
+    assert said[0] == "doractl: internal error in doractl (TypeError: oh)"
     assert "DORACTL_DEBUG" in said[1]
     monkeypatch.setenv("DORACTL_DEBUG", "1")
     with pytest.raises(TypeError):

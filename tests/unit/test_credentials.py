@@ -145,6 +145,6 @@ def test_a_file_that_others_can_replace_is_refused(tmp_path: Path, what: str) ->
     with pytest.raises(DoraSystemdError) as caught:
         check_credentials(system, {"token": str(path)})
     words = (
-        "a symbolic link that others" if what == "link" else "as credential token: others than root"
+        "a symbolic link that users" if what == "link" else "as credential token: users other than"
     )
     assert words in caught.value.message

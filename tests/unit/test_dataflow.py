@@ -156,7 +156,7 @@ def test_bad_nodes(nodes: list[object], reason: str) -> None:
 @pytest.mark.parametrize(
     ("source", "reason"),
     [
-        ("nobody/image", "a node that is not there"),
+        ("nobody/image", "a node that does not exist"),
         ("camera/depth", "an output that it does not declare"),
         ("camera", "which names no output"),
         (None, "which names no output"),

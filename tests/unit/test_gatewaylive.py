@@ -167,7 +167,7 @@ def test_not_too_much_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
         for _ in range(MAX_TASKS + 1):
             browser.say(**ACT)
         (problem,) = await browser.wait_for("problem")
-        assert problem["text"] == "cannot do so much at once"
+        assert problem["text"] == "cannot start another action: 8 are still running"
 
     play(story)
 

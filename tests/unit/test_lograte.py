@@ -98,7 +98,7 @@ def test_a_limit_must_name_a_node_that_is_there() -> None:
     assert caught.value.hint == "did you mean camera?"
     with pytest.raises(DoraSystemdError) as caught:
         check_rates(limits, ["one", "two"])
-    assert caught.value.hint == "there are one, two"
+    assert caught.value.hint == "nodes: one, two"
     check_rates(limits, ["camra"])
 
 

@@ -78,7 +78,7 @@ def test_a_failed_one_is_forgotten(manager: FakeManager, scope: Scope) -> None:
 @pytest.mark.parametrize("facts", [{"ExecStart": []}, {"LoadState": "bad-setting"}])
 def test_a_unit_that_is_not_ours(facts: dict[str, Any], manager: FakeManager, scope: Scope) -> None:
     manager.add(options(), active="failed", **facts)
-    with pytest.raises(DoraSystemdError, match="there already") as caught:
+    with pytest.raises(DoraSystemdError, match="already exists") as caught:
         require_free_name(manager, scope, UNIT)
     assert caught.value.code is ExitCode.NAME_IN_USE
     assert manager.calls == []

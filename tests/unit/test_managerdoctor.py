@@ -98,7 +98,7 @@ def test_what_ended_dataflows_have_left(manager: FakeManager, scope: Scope, tmp_
 def test_an_enabled_dataflow_whose_file_is_gone(manager: FakeManager, scope: Scope) -> None:
     place(manager, make_plan(scope), want_boot=True)
     (finding,) = found(manager, scope).values()
-    assert finding.text == "robot is enabled, but /srv/robot.yml is not there"
+    assert finding.text == "robot is enabled, but /srv/robot.yml does not exist"
     assert finding.remedy == "doractl disable robot"
 
 

@@ -75,7 +75,7 @@ def test_a_foreign_file_is_not_touched(manager: FakeManager, scope: Scope) -> No
     path_of(manager).parent.mkdir(parents=True)
     path_of(manager).write_text("[Service]\nExecStart=/bin/true\n")
     for change in (enable_cell, disable_cell):
-        with pytest.raises(DoraSystemdError, match=r"^cannot use .*: it is there already") as error:
+        with pytest.raises(DoraSystemdError, match=r"^cannot use .*: it already exists") as error:
             change(manager, scope, cell)
         assert error.value.code is ExitCode.NAME_IN_USE
     assert path_of(manager).read_text() == "[Service]\nExecStart=/bin/true\n"
@@ -86,7 +86,7 @@ def test_a_masked_unit_is_not_touched(manager: FakeManager, scope: Scope) -> Non
     cell = started(manager)
     path_of(manager).parent.mkdir(parents=True)
     path_of(manager).symlink_to("/dev/null")
-    with pytest.raises(DoraSystemdError, match="there already"):
+    with pytest.raises(DoraSystemdError, match="already exists"):
         enable_cell(manager, scope, cell)
     assert path_of(manager).is_symlink()
 

@@ -15,7 +15,7 @@ UUID = "550e8400-e29b-41d4-a716-446655440000"
         ("dataflow-finished", "Finished", "detail"),
         ("dataflow-stopped", "Stopped", "detail"),
         ("dataflow-failed", "Failed", "detail"),
-        ("dataflow-started", "Failed", "its end is not on record"),
+        ("dataflow-started", "Failed", "its end is not recorded"),
     ],
 )
 def test_rows(event: str, word: str, text: str) -> None:

@@ -57,7 +57,7 @@ def test_selector(selector: str, name: str, uuid: str) -> None:
     ("selector", "hint"),
     [
         ("robto", "did you mean robot?"),
-        ("zzz", "there are arm, robot"),
+        ("zzz", "in the journal: arm, robot"),
         *(("550e-", ""), ("5", ""), ("\n", ""), ("../x", ""), ("é", "")),
     ],
 )
@@ -96,10 +96,10 @@ def test_unknown_node_lists_the_known_ones() -> None:
     with pytest.raises(DoraSystemdError) as caught:
         find(nodes=("sink", "nope*"))
     assert caught.value.code is ExitCode.NOT_FOUND
-    assert caught.value.hint == "there are cam-left, cam-right, sink"
+    assert caught.value.hint == "nodes: cam-left, cam-right, sink"
     with pytest.raises(DoraSystemdError) as caught:
         find("arm", nodes=("x",))
-    assert caught.value.hint == "none has written anything yet"
+    assert caught.value.hint == "no node has written anything yet"
 
 
 def test_run() -> None:

@@ -97,7 +97,7 @@ def test_environment(project: Path) -> None:
     ("flags", "code", "words"),
     [
         ({"venv": "/nowhere"}, ExitCode.BAD_INPUT, "no bin/python"),
-        ({"working_directory": "/nowhere"}, ExitCode.BAD_INPUT, "no directory"),
+        ({"working_directory": "/nowhere"}, ExitCode.BAD_INPUT, "not a directory"),
         ({"dora": "/nowhere"}, ExitCode.NO_DORA, "/nowhere"),
         ({"user": "root"}, ExitCode.USAGE, "--user"),
         ({"env": ("X",)}, ExitCode.USAGE, "'X'"),

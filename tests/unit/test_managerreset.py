@@ -19,10 +19,10 @@ def test_reset_of_what_runs() -> None:
     manager = FakeManager()
     manager.add(options(), NRestarts=3)
     (outcome,) = reset_cells(manager, read_cells(manager))
-    assert outcome.text == f"Dataflow reset: {UUID} (robot, 3 restarts forgotten)"
+    assert outcome.text == f"Dataflow reset: {UUID} (robot, restart counter reset, was 3)"
     assert manager.calls == [("reset", UNIT)]
     (again,) = reset_cells(manager, read_cells(manager))
-    assert again.text.endswith("(robot, 0 restarts forgotten)")
+    assert again.text.endswith("(robot, restart counter reset, was 0)")
 
 
 def test_no_budget_without_policy() -> None:

@@ -120,7 +120,7 @@ def test_what_is_too_small_or_too_large_is_said(place: Place) -> None:
         ({"memory_limit": "6M", "node_limit": ("camera:cpu=x",)}, ExitCode.USAGE, "'x'"),
         ({"memory_limit": "6M", "node_limit": ("nobody:cpu=1",)}, ExitCode.BAD_INPUT, "'nobody'"),
         ({"node_limit": ("camera:cpu=1", "ui:cpu=1")}, ExitCode.BAD_INPUT, "dynamic"),
-        ({"memory_limit": "6M", "io_weight": "5"}, ExitCode.NO_SYSTEMD, "controller 'io'"),
+        ({"memory_limit": "6M", "io_weight": "5"}, ExitCode.NO_SYSTEMD, "'io' cgroup controller"),
     ],
 )
 def test_nothing_changes_if_anything_is_wrong(

@@ -76,7 +76,7 @@ def test_foreign_files_stay(is_link: bool, tmp_path: Path) -> None:
         path = tmp_path / "usr/local/lib/systemd/system/multi-user.target.wants/dora.target"
     path.parent.mkdir(parents=True)
     path.write_text("[Slice]\n")
-    with pytest.raises(DoraSystemdError, match="there already") as caught:
+    with pytest.raises(DoraSystemdError, match="already exists") as caught:
         plan_setup(SYSTEM, tmp_path)
     assert caught.value.code is ExitCode.NAME_IN_USE
     assert path.read_text() == "[Slice]\n"

@@ -84,7 +84,7 @@ def test_restart_that_fails() -> None:
             {"Result": "timeout", "StatusText": "failed: node a hangs"},
             "node a hangs (it did not end in time and was killed)",
         ),
-        ({"Result": "watchdog"}, "its runner hung and was killed by the watchdog"),
+        ({"Result": "watchdog"}, "the supervisor process hung and was killed by the watchdog"),
         ({"Result": "brand-new", "ExecMainCode": 0}, "brand-new"),
         (
             {"Result": "oom-kill", "StatusText": "detector used 2G"},

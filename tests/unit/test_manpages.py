@@ -104,7 +104,7 @@ def test_entries_are_true(setting: Setting[Any]) -> None:
 
 def test_which_settings_are_roots_alone() -> None:
     text = (MAN / "dora-systemd.yml.5").read_text()
-    text = text.partition(".Ss Whom a file may command\n")[2].partition("Below\n")[0]
+    text = text.partition(".Ss Trust in settings files\n")[2].partition("Below\n")[0]
     named = re.findall(r"^\.Va (\S+)", text, flags=re.M)
     assert sorted(named) == sorted(one.name for one in SETTINGS if one.root_only)
 

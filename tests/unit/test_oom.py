@@ -32,13 +32,13 @@ def test_owner(node: OomCounts, unit: OomCounts, owner: Owner | None) -> None:
 
 def test_words() -> None:
     own = Oom(Owner.NODE, 64 * MIB, 64 * MIB)
-    assert own.text == "out of memory: peak 64M, limit 64M"
+    assert own.text == "out of memory, peak 64M, limit 64M"
     assert own.node_details()["limit"] == str(64 * MIB)
     whole = Oom(Owner.DATAFLOW, 64 * MIB, 700 * MIB, "other", 500 * MIB)
-    assert whole.text == "out of memory: peak 64M, limit of the dataflow 700M"
+    assert whole.text == "out of memory, peak 64M, limit of the dataflow 700M"
     assert whole.dataflow_details()["reason"] == "of 700M the node other held most, 500M"
     machine = Oom(Owner.MACHINE, 64 * MIB)
-    assert machine.text == "out of memory: peak 64M, the machine had none left"
+    assert machine.text == "out of memory, peak 64M, the machine had no memory left"
     assert "limit" not in machine.node_details()
 
 
@@ -82,7 +82,7 @@ def test_the_dataflow_without_its_daemon() -> None:
     said = [one for one in actions if isinstance(one, Record)]
     assert [one.event for one in said] == ["dataflow-oom", "daemon-lost", "dataflow-failed"]
     assert after.failure == (
-        "the dora daemon is gone (out of memory: peak 19M, limit of the dataflow 700M)"
+        "the dora daemon is gone (out of memory, peak 19M, limit of the dataflow 700M)"
     )
 
 

@@ -112,7 +112,7 @@ def test_bad_command_lines(argv: list[str]) -> None:
 
 
 def test_other_commands_are_no_runners() -> None:
-    with pytest.raises(DoraSystemdError, match="is no runner"):
+    with pytest.raises(DoraSystemdError, match="is not a runner"):
         options_from_command(["/usr/bin/python3", "-m", "http.server"])
 
 

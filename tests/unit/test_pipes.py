@@ -142,7 +142,7 @@ def test_what_a_limit_takes_is_counted(tmp_path: Path) -> None:
         assert await cell.messages(3) == [
             "1",
             "2",
-            "2 log lines of node a are beyond its limit of 2/100ms",
+            "2 log lines of node a exceed its limit of 2/100ms",
         ]
         cell.write(path, b"5\n6\n7\n8")
         cell.write(cell.paths.node_stderr("a"), b"the last words")

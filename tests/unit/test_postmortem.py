@@ -41,7 +41,7 @@ LIMIT = {"CODE_FUNC": START_LIMIT_FUNCTION, "INVOCATION_ID": "1", "_BOOT_ID": "b
 RUNS = (event("dataflow-starting"), event("dataflow-started"))
 CRASH = event("node-crashed", "camera", exit="exit code 1", downstream="detector plot")
 OOM = event(
-    "node-oom", "camera", exit="out of memory: peak 300M, limit 300M", peak="314572800",
+    "node-oom", "camera", exit="out of memory, peak 300M, limit 300M", peak="314572800",
     limit="314572800", owner="node",
 )  # fmt: skip
 STOPPED = (event("dataflow-stopping", by="SIGTERM"), event("dataflow-stopped"))
@@ -85,7 +85,7 @@ CASES: dict[str, tuple[tuple[Record, ...], str, Cause, str, str]] = {
     "out of memory": (
         (*RUNS, OOM, NODE_FAILED),
         *("Failed", Cause.NODE_OUT_OF_MEMORY, "camera"),
-        "node camera: out of memory: peak 300M, limit 300M",
+        "node camera: out of memory, peak 300M, limit 300M",
     ),
     "start timeout": (
         (RUNS[0], failed("start-timeout", "node late was not ready within 2s", "late")),
@@ -116,7 +116,7 @@ CASES: dict[str, tuple[tuple[Record, ...], str, Cause, str, str]] = {
         (unit("process-exited", EXIT_CODE="exited", MESSAGE="status=217/USER"),
          unit("unit-failed", UNIT_RESULT="exit-code")),
         *("Failed", Cause.UNIT_FAILED, ""),
-        "systemd could not start its runner: exit code 217/USER",
+        "systemd could not start the supervisor process: exit code 217/USER",
     ),
     "systemd lost patience": (
         (*RUNS, unit("unit-failed", UNIT_RESULT="timeout")),
@@ -141,7 +141,7 @@ CASES: dict[str, tuple[tuple[Record, ...], str, Cause, str, str]] = {
     "stopped with its terminal": (
         (*RUNS, event("dataflow-stopping", by="terminal"), event("dataflow-stopped")),
         *("Stopped", Cause.STOPPED, ""),
-        "stopped by the end of the terminal that it was run from",
+        "stopped by the end of its terminal",
     ),
     "stopped before its runner could listen": (
         (RUNS[0], JOB, unit("unit-succeeded")),
@@ -150,9 +150,9 @@ CASES: dict[str, tuple[tuple[Record, ...], str, Cause, str, str]] = {
     "no end": (
         RUNS,
         *("Failed", Cause.NO_END, ""),
-        "its end is not on record: it was killed, or the machine went down",
+        "its end is not recorded: it was killed, or the machine went down",
     ),
-    "nothing at all": ((), *("Stopped", Cause.NONE, "", "nothing of it is on record")),
+    "nothing at all": ((), *("Stopped", Cause.NONE, "", "nothing is recorded about it")),
 }  # fmt: skip
 
 
@@ -218,8 +218,8 @@ def test_restarts_of_the_whole_and_the_limit_of_them() -> None:
     text = format_report(Report(SUBJECT, verdict))
     assert (verdict.before, verdict.before_us) == ("another matter", 2)
     assert "Before:   another matter (" in text
-    assert "Restarts: all of it 1 (gone)" in text
-    assert "systemd has given it up" in text
+    assert "Restarts: dataflow 1 (gone)" in text
+    assert "systemd has stopped restarting it" in text
 
 
 def test_running_degraded_and_restarting() -> None:
@@ -232,15 +232,15 @@ def test_running_degraded_and_restarting() -> None:
     assert (verdict.status, verdict.node, verdict.is_failure) == ("Degraded", "camera", True)
     text = format_report(Report(SUBJECT, verdict))
     assert "Why:      node camera: exit code 1 after 2 restarts\n  Now:      1/2\n" in text
-    assert "camera stays away" in text
+    assert "camera stays down" in text
     waiting = Facts("Running", "1/2", restarting=("camera",))
     verdict = judge(*RUNS, CRASH, facts=waiting)
     assert (verdict.node, verdict.is_passing, verdict.is_failure) == ("camera", True, False)
-    assert "dora starts camera again by itself" in format_report(Report(SUBJECT, verdict))
+    assert "dora restarts camera automatically" in format_report(Report(SUBJECT, verdict))
     facts = Facts("Restarting")
     verdict = judge(*RUNS, failed("daemon-lost", "gone"), unit("unit-restart"), facts=facts)
     assert (verdict.status, verdict.summary) == ("Restarting", "gone")
-    assert "systemd starts it again by itself" in format_report(Report(SUBJECT, verdict))
+    assert "systemd restarts it automatically" in format_report(Report(SUBJECT, verdict))
 
 
 def test_one_screen() -> None:
@@ -273,7 +273,7 @@ def test_values_of_fields() -> None:
         ("signal SIGKILL", "", "journalctl -k"),
         ("out of memory: x", "dataflow", "doractl set robot --memory-limit SIZE"),
         ("out of memory: x", "machine", "the machine is short of memory"),
-        ("exit code 1", "", "mend camera"),
+        ("exit code 1", "", "fix camera"),
     ],
 )
 def test_remedies(exit: str, owner: str, words: str) -> None:
@@ -286,7 +286,7 @@ def test_remedies(exit: str, owner: str, words: str) -> None:
 def test_one_that_is_gone_is_started_anew() -> None:
     gone = Subject(UUID, "robot", "dora-robot.service", "--user")
     text = format_report(Report(gone, judge(*RUNS, CRASH, NODE_FAILED)))
-    assert "mend camera, then: doractl start FILE --name robot" in text
+    assert "fix camera, then run: doractl start FILE --name robot" in text
 
 
 SEVERAL = [record for records, *_ in CASES.values() for record in records]

@@ -48,7 +48,7 @@ def test_default_restarts_nothing() -> None:
 
 def test_warnings() -> None:
     warnings = list(restart_warnings(settings({"max_restarts": "3"})))
-    assert warnings == ["--max-restarts does nothing without --restart-policy"]
+    assert warnings == ["--max-restarts has no effect without --restart-policy"]
     assert not list(restart_warnings(settings({"max_restarts": "3", "restart_policy": "always"})))
 
 

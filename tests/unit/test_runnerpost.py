@@ -29,8 +29,20 @@ UUID = "550e8400-e29b-41d4-a716-446655440000"
 @pytest.mark.parametrize(
     ("code", "status", "result", "reason", "cause"),
     [
-        ("killed", "KILL", "signal", "its runner was ended by signal SIGKILL", "runner-killed"),
-        ("dumped", "ABRT", "watchdog", "its runner hung and was ended by the watchdog", "watchdog"),
+        (
+            "killed",
+            "KILL",
+            "signal",
+            "the supervisor process was killed (SIGKILL)",
+            "runner-killed",
+        ),
+        (
+            "dumped",
+            "ABRT",
+            "watchdog",
+            "the supervisor process hung and was killed by the watchdog",
+            "watchdog",
+        ),
         ("killed", "KILL", "timeout", "it did not start or stop in time and was killed", "timeout"),
         ("exited", "0", "success", "", "runner-killed"),
         ("exited", "1", "exit-code", "", "runner-killed"),
@@ -52,7 +64,7 @@ def test_a_runner_that_was_killed_for_want_of_memory(tmp_path: Path) -> None:
     assert out_of_memory(tmp_path) == ""
     (tmp_path / "supervisor/memory.events").write_text("oom_kill 1\n")
     assert out_of_memory(tmp_path) == (
-        "its runner was killed for want of memory; the node b held most, 500M"
+        "the supervisor process was killed, out of memory; the node b held most, 500M"
     )
 
 

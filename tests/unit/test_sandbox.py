@@ -179,7 +179,7 @@ def test_what_its_user_can_replace() -> None:
     assert value(below_tmp, "PrivateTmp") is False
     assert value(below_tmp, "BindReadOnlyPaths") is None
     assert list(sandbox_warnings(below_tmp)) == [
-        "the sandbox cannot hide /tmp: others than root can replace /tmp/p"
+        "the sandbox cannot hide /tmp: users other than root can replace /tmp/p"
     ]
     at_home = Sandbox(level="strict", needed=("/home/x/p",), firm=hers)
     assert [one[0] for one in value(at_home, "BindReadOnlyPaths")] == ["/home/x"]  # type: ignore
@@ -247,8 +247,12 @@ def test_warnings(level: str, network: str, words: list[str]) -> None:
     ("flags", "message", "hint"),
     [
         ({"sandbox": "strikt"}, "cannot use 'strikt' as sandbox", "did you mean strict?"),
-        ({"sandbox": "xyz"}, "cannot use 'xyz' as sandbox", "there are none, default, strict"),
-        ({"network": "lan"}, "cannot use 'lan' as network", "there are host, loopback, private"),
+        ({"sandbox": "xyz"}, "cannot use 'xyz' as sandbox", "valid values: none, default, strict"),
+        (
+            {"network": "lan"},
+            "cannot use 'lan' as network",
+            "valid values: host, loopback, private",
+        ),
     ],
 )
 def test_unknown_words(flags: dict[str, str], message: str, hint: str) -> None:
@@ -329,7 +333,7 @@ def test_writable_paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     (tmp_path / "a").mkdir()
     monkeypatch.chdir(tmp_path / "a")
     assert made(tmp_path, writable=("..", ".")).writable == (str(tmp_path), f"{tmp_path}/a")
-    with pytest.raises(DoraSystemdError, match="it is not there") as caught:
+    with pytest.raises(DoraSystemdError, match="there is no such file") as caught:
         made(tmp_path, writable=("none",))
     assert caught.value.hint == f"mkdir -p {tmp_path}/a/none, or correct --writable"
     assert caught.value.code is ExitCode.BAD_INPUT

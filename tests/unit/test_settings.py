@@ -143,8 +143,8 @@ def test_a_numeric_user_is_a_text() -> None:
 @pytest.mark.parametrize(
     ("document", "message", "hint"),
     [
-        ([], "it is no mapping", "mapping"),
-        ("text", "it is no mapping", "mapping"),
+        ([], "it is not a mapping", "mapping"),
+        ("text", "it is not a mapping", "mapping"),
         ({"grace_duratoin": 1}, "unknown key 'grace_duratoin'", "did you mean grace_duration?"),
         ({"grace-duration": 1}, "unknown key 'grace-duration'", "did you mean grace_duration?"),
         ({"zzzzzz": 1}, "unknown key 'zzzzzz'", "--help"),

@@ -63,7 +63,7 @@ def test_names_what_is_not_there(tmp_path: Path) -> None:
 def test_a_circle_of_links_ends(tmp_path: Path) -> None:
     (tmp_path / "a").symlink_to("b")
     (tmp_path / "b").symlink_to("a")
-    with pytest.raises(DoraSystemdError, match="round in a circle"):
+    with pytest.raises(DoraSystemdError, match="symbolic links form a loop"):
         read_file(tmp_path / "a")
 
 
@@ -79,7 +79,9 @@ def test_a_link_of_somebody_else_is_not_followed(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"text")
     (tmp_path / "b").symlink_to("a")
     os.chown(tmp_path / "b", STRANGER, 0, follow_symlinks=False)
-    with pytest.raises(DoraSystemdError, match="symbolic link that others than root can change"):
+    with pytest.raises(
+        DoraSystemdError, match="symbolic link that users other than root can change"
+    ):
         read_file(tmp_path / "b")
 
 
@@ -120,7 +122,7 @@ def test_a_directory_of_many_lends_nothing(tmp_path: Path, mode: int) -> None:
     os.chown(tmp_path / "many", STRANGER, STRANGER)
     os.chown(file, STRANGER, STRANGER)
     (tmp_path / "many").chmod(mode)
-    assert "others than its owner can write" in place_of(file).borrowed
+    assert "users other than its owner can write" in place_of(file).borrowed
     (tmp_path / "many").chmod(0o1777)
     assert place_of(file).borrowed == ""
 

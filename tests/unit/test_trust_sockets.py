@@ -96,7 +96,7 @@ def test_what_is_no_socket(path: Path, kind: str) -> None:
         os.mkfifo(path)
     else:
         path.mkdir()
-    with pytest.raises(DoraSystemdError, match="it is no socket"):
+    with pytest.raises(DoraSystemdError, match="it is not a socket"):
         connect_unix(path, 5.0)
 
 
@@ -131,7 +131,7 @@ def test_a_port_must_be_the_units() -> None:
         with pytest.raises(DoraSystemdError, match="listens there, not uid") as caught:
             require_listener(port, STRANGER)
         assert caught.value.code is ExitCode.NO_PERMISSION
-    with pytest.raises(DoraSystemdError, match="nobody listens there") as caught:
+    with pytest.raises(DoraSystemdError, match="nothing listens there") as caught:
         require_listener(port, os.getuid())
     assert caught.value.code is ExitCode.NOT_RUNNING
     with pytest.raises(DoraSystemdError, match=f"uid {STRANGER} listens"):

@@ -14,7 +14,7 @@ WATCHED = (*ON_FAILURE, "--property", "WatchdogSec=2s")
 SHORT_GRACE = (*ON_FAILURE, "--grace-duration", "1s")
 
 LOST = (
-    *("code=killed", "Failed with result", "status=69", "is lost", "failed: ", "was ended"),
+    *("code=killed", "Failed with result", "status=69", "is lost", "failed: ", "was killed ("),
     *(
         "disconnected",
         "exited",
