@@ -17,7 +17,7 @@ from functools import partial
 from benchmarks.contestants import ENVIRONMENT
 from benchmarks.flows import HOME, STAMP, clear_stamps, make_home, wait_stamps
 from benchmarks.rounds import OURS, Figure, alternate, keep
-from dora_systemd.cgroup import group_path, read_cpu
+from dora_systemd.adapters.cgroup.groups import group_path, read_cpu
 from tests.system.cells import Cell, Project, run, sync_journal, wait_for
 
 LINES = 200_000

@@ -12,13 +12,13 @@ from typing import Any
 import click
 from click.shell_completion import CompletionItem, shell_complete
 
-from dora_systemd.bus import Bus
+from dora_systemd.adapters.bus.systemd import Bus
+from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.cli.group import VERBS, VerbGroup, doractl
 from dora_systemd.cli.parameters import current_scope
+from dora_systemd.decisions.properties.sandbox import LEVELS, NETWORKS
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.journalread import JournalReader
 from dora_systemd.names import is_uuid_prefix
-from dora_systemd.sandbox import LEVELS, NETWORKS
 
 VARIABLE = "_DORACTL_COMPLETE"
 
@@ -49,7 +49,7 @@ class Live(click.types.StringParamType):
 
 def dataflow_names(ctx: click.Context, incomplete: str) -> list[str]:
     """The dataflows that systemd knows and, for logs, the journal; by UUID if that is begun."""
-    from dora_systemd.managercells import read_cells
+    from dora_systemd.verbs.facts.cells import read_cells
 
     verb = ctx.command.name or ""
     cells = [cell for cell in read_cells(_bus()) if cell.is_up or verb not in _RUNNING_ONLY]
@@ -64,8 +64,8 @@ def dataflow_names(ctx: click.Context, incomplete: str) -> list[str]:
 
 def node_names(ctx: click.Context, incomplete: str) -> list[str]:
     """The nodes of the dataflow that the line names already."""
-    from dora_systemd.managercells import read_cells, select_cell
-    from dora_systemd.managerlist import dataflow_row
+    from dora_systemd.verbs.facts.cells import read_cells, select_cell
+    from dora_systemd.verbs.facts.list import dataflow_row
 
     del incomplete
     # Behind an option without its value click leaves the arguments where they are.

@@ -2,21 +2,21 @@
 
 import click
 
-from dora_systemd.bus import Bus
+from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import current_scope, scope_options
 from dora_systemd.errors import ExitCode
-from dora_systemd.managerask import note_stop
-from dora_systemd.managerdestroy import (
+from dora_systemd.names import name_from_unit
+from dora_systemd.scope import Scope
+from dora_systemd.verbs.destroy import (
     processes_left,
     running_cells,
     stop_all,
     stop_gateway,
     stop_slice,
 )
-from dora_systemd.managerenabled import enabled_units
-from dora_systemd.managergateway import read_gateway
-from dora_systemd.names import name_from_unit
-from dora_systemd.scope import Scope
+from dora_systemd.verbs.facts.enabled import enabled_units
+from dora_systemd.verbs.gateway import read_gateway
+from dora_systemd.verbs.stop_note import note_stop
 
 _EPILOG = """\b
 Examples:

@@ -2,10 +2,10 @@
 
 import click
 
-from dora_systemd.bus import Bus
+from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import current_scope, scope_options
-from dora_systemd.managercells import find_cell
-from dora_systemd.managerenable import disable_cell
+from dora_systemd.verbs.facts.cells import find_cell
+from dora_systemd.verbs.start.enable import disable_cell
 
 _EPILOG = """\b
 Examples:

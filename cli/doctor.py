@@ -4,11 +4,11 @@ from functools import partial
 
 import click
 
-from dora_systemd.bus import Bus
+from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import current_scope, output_option, print_json, scope_options
+from dora_systemd.decisions.views.findings import finding_values, format_findings, has_problem
 from dora_systemd.errors import ExitCode
-from dora_systemd.findings import finding_values, format_findings, has_problem
-from dora_systemd.managerdoctor import examine
+from dora_systemd.verbs.doctor import examine
 
 _EPILOG = """\b
 Examples:

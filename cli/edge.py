@@ -8,11 +8,11 @@ import io
 import sys
 from typing import TextIO
 
-from dora_systemd.terminaltext import escaped
+from dora_systemd.terminal_text import escaped
 
 
 class Edge(io.TextIOWrapper):
-    """A stream that writes text as terminaltext.escaped() shows it."""
+    """A stream that writes text as terminal_text.escaped() shows it."""
 
     def write(self, text: str) -> int:
         """Write `text`, with what would command a terminal escaped."""

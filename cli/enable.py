@@ -2,11 +2,11 @@
 
 import click
 
-from dora_systemd.bus import Bus
+from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import current_scope, print_warnings, scope_options
-from dora_systemd.managercells import find_cell
-from dora_systemd.managerenable import enable_cell
-from dora_systemd.managerlinger import ensure_linger
+from dora_systemd.verbs.facts.cells import find_cell
+from dora_systemd.verbs.start.enable import enable_cell
+from dora_systemd.verbs.start.linger import ensure_linger
 
 _EPILOG = """\b
 Examples:

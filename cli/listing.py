@@ -2,18 +2,18 @@
 
 import json
 
-from dora_systemd.bus import Bus
+from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.quick import ListRequest
-from dora_systemd.errors import ExitCode
-from dora_systemd.managerlist import find_row, read_rows
-from dora_systemd.scope import Scope, scope_of
-from dora_systemd.statuswords import (
+from dora_systemd.decisions.views.dataflows import (
     DataflowRow,
     format_dataflow,
     format_dataflows,
     is_up_word,
     row_values,
 )
+from dora_systemd.errors import ExitCode
+from dora_systemd.scope import Scope, scope_of
+from dora_systemd.verbs.facts.list import find_row, read_rows
 
 
 def print_dataflows(request: ListRequest) -> int:
@@ -38,7 +38,7 @@ def _rows(bus: Bus, scope: Scope, request: ListRequest) -> list[DataflowRow]:
     if not request.want_all:
         return [row for row in rows if is_up_word(row)]
     # The journal is read only for those that systemd has forgotten.
-    from dora_systemd.managerended import ended_rows
+    from dora_systemd.verbs.facts.ended import ended_rows
 
     return [*rows, *ended_rows(scope, rows)]
 

@@ -9,12 +9,12 @@ from typing import Any
 
 import click
 
+from dora_systemd.adapters.journal.reader import JournalReader, check_readable
 from dora_systemd.cli.parameters import current_scope, scope_options
+from dora_systemd.decisions.logs.query import OUTPUTS, LogQuery, parse_level
+from dora_systemd.decisions.logs.terminal import ShownLines, TerminalLines
 from dora_systemd.errors import ExitCode
-from dora_systemd.journalread import JournalReader, check_readable
-from dora_systemd.logquery import OUTPUTS, LogQuery, parse_level
-from dora_systemd.logterminal import ShownLines, TerminalLines
-from dora_systemd.managerlogs import LogRequest, find_query, pass_logs, read_logs
+from dora_systemd.verbs.logs import LogRequest, find_query, pass_logs, read_logs
 
 Lines = TerminalLines | ShownLines | None
 """What makes lines for a terminal, None for a pipe."""
@@ -122,7 +122,7 @@ def command(
     check_readable(scope)
     if until_end:
         # What this way of reading logs needs is no business of the others.
-        from dora_systemd.managerfollow import check_until_end, follow_to_end
+        from dora_systemd.verbs.follow import check_until_end, follow_to_end
 
         check_until_end(selector, options["is_reverse"])
     journal = JournalReader()

@@ -2,10 +2,10 @@
 
 import click
 
-from dora_systemd.bus import Bus
+from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import current_scope, scope_options
-from dora_systemd.managercells import Cell, read_cells, select_cell
-from dora_systemd.managernode import restart_node, stop_node
+from dora_systemd.verbs.facts.cells import Cell, read_cells, select_cell
+from dora_systemd.verbs.node import restart_node, stop_node
 
 _EPILOG = """\b
 Examples:

@@ -10,7 +10,7 @@ from dora_systemd.scope import Scope, scope_of
 
 if TYPE_CHECKING:
     # Verbs that print no outcomes need not wait for it.
-    from dora_systemd.managerstop import Outcome
+    from dora_systemd.verbs.stop import Outcome
 
 F = TypeVar("F", bound=Callable[..., Any])
 

@@ -2,10 +2,10 @@
 
 import click
 
-from dora_systemd.bus import Bus
+from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import current_scope, scope_options
-from dora_systemd.managercells import read_cells, select_cell
-from dora_systemd.managerreload import reload_cell
+from dora_systemd.verbs.facts.cells import read_cells, select_cell
+from dora_systemd.verbs.reload import reload_cell
 
 _EPILOG = """\b
 Examples:

@@ -6,11 +6,11 @@ from typing import Any
 
 import click
 
-from dora_systemd.bus import Bus
+from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import current_scope, print_outcomes, scope_options
 from dora_systemd.cli.stageline import StageLine
-from dora_systemd.managercells import find_cell
-from dora_systemd.managerstop import restart_cells
+from dora_systemd.verbs.facts.cells import find_cell
+from dora_systemd.verbs.stop import restart_cells
 
 _EPILOG = """\b
 Examples:

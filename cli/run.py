@@ -8,18 +8,18 @@ from typing import Any
 
 import click
 
-from dora_systemd.bus import Bus
+from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import current_scope, name_option, print_warnings, scope_options
 from dora_systemd.cli.settingoptions import setting_options
 from dora_systemd.cli.stageline import StageLine
-from dora_systemd.logterminal import TerminalLines
-from dora_systemd.managerclaim import refuse_unit_file, require_free_name
-from dora_systemd.managerlogs import FollowedLog
-from dora_systemd.managerplan import DEFAULT_FILE, StartRequest, make_plan, request_name
-from dora_systemd.managerrun import attached_properties, follow_unit, life_line
-from dora_systemd.managerstart import start_plan
-from dora_systemd.managerunit import plan_properties
+from dora_systemd.decisions.logs.terminal import TerminalLines
 from dora_systemd.names import unit_name
+from dora_systemd.verbs.logs import FollowedLog
+from dora_systemd.verbs.start.claim import refuse_unit_file, require_free_name
+from dora_systemd.verbs.start.job import start_plan
+from dora_systemd.verbs.start.plan import DEFAULT_FILE, StartRequest, make_plan, request_name
+from dora_systemd.verbs.start.run import attached_properties, follow_unit, life_line
+from dora_systemd.verbs.start.unit import plan_properties
 
 _EPILOG = """\b
 Examples:

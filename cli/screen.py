@@ -14,7 +14,7 @@ from collections.abc import Iterable
 from types import FrameType, TracebackType
 from typing import TextIO
 
-from dora_systemd.terminaltext import one_line
+from dora_systemd.terminal_text import one_line
 
 _ENTER = "\x1b[?1049h\x1b[?25l"
 _LEAVE = "\x1b[?25h\x1b[?1049l"

@@ -4,12 +4,12 @@ from typing import Any
 
 import click
 
-from dora_systemd.bus import Bus
+from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import current_scope, print_warnings, scope_options
 from dora_systemd.cli.settingoptions import live_options
-from dora_systemd.managercells import read_cells, select_cell
-from dora_systemd.managerreload import switch_hot_reload
-from dora_systemd.managerset import set_limits
+from dora_systemd.verbs.facts.cells import read_cells, select_cell
+from dora_systemd.verbs.reload import switch_hot_reload
+from dora_systemd.verbs.set import set_limits
 
 _EPILOG = """\b
 Examples:

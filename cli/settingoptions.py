@@ -5,9 +5,9 @@ from typing import Any, TypeVar
 
 import click
 
-from dora_systemd.limitsettings import LIVE_SETTINGS
-from dora_systemd.settingkinds import Setting
-from dora_systemd.settingtable import SETTINGS
+from dora_systemd.decisions.settings.kinds import Setting
+from dora_systemd.decisions.settings.limits import LIVE_SETTINGS
+from dora_systemd.decisions.settings.table import SETTINGS
 
 F = TypeVar("F", bound=Callable[..., Any])
 

@@ -2,10 +2,11 @@
 
 import click
 
-from dora_systemd.bus import Bus
+from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import current_scope, print_warnings, scope_options
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.managersetup import (
+from dora_systemd.scope import Scope
+from dora_systemd.verbs.setup import (
     packaged_unit,
     plan_setup,
     put_in_place,
@@ -13,7 +14,6 @@ from dora_systemd.managersetup import (
     take_away,
     tell_systemd,
 )
-from dora_systemd.scope import Scope
 
 _EPILOG = """\b
 Examples:

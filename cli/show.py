@@ -2,11 +2,11 @@
 
 import click
 
-from dora_systemd.bus import Bus
+from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.edge import write_exactly
 from dora_systemd.cli.parameters import current_scope, output_option, print_json, scope_options
-from dora_systemd.managercells import find_cell
-from dora_systemd.managershow import format_unit_files, unit_files
+from dora_systemd.verbs.facts.cells import find_cell
+from dora_systemd.verbs.show import format_unit_files, unit_files
 
 _EPILOG = """\b
 Examples:

@@ -5,7 +5,7 @@ from types import TracebackType
 from typing import TextIO
 
 from dora_systemd.cli.edge import write_own
-from dora_systemd.terminaltext import one_line
+from dora_systemd.terminal_text import one_line
 
 _BACK_AND_CLEAR = "\r\x1b[K"
 

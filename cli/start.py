@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from dora_systemd.bus import Bus
+from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.edge import write_exactly
 from dora_systemd.cli.parameters import (
     current_scope,
@@ -19,15 +19,15 @@ from dora_systemd.cli.parameters import (
 from dora_systemd.cli.settingoptions import setting_options
 from dora_systemd.cli.stageline import StageLine
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.managercheck import check_plan
-from dora_systemd.managerenable import boot_target
-from dora_systemd.managerlaunch import Claim, claim, start_claim
-from dora_systemd.managerlinger import ensure_linger
-from dora_systemd.managerlogins import start_notes
-from dora_systemd.managerplan import DEFAULT_FILE, Plan, StartRequest, make_plan
-from dora_systemd.managerstart import Started, format_started
-from dora_systemd.managerunit import format_plan
-from dora_systemd.managerwatch import watched_patterns
+from dora_systemd.verbs.start.check import check_plan
+from dora_systemd.verbs.start.enable import boot_target
+from dora_systemd.verbs.start.job import Started, format_started
+from dora_systemd.verbs.start.launch import Claim, claim, start_claim
+from dora_systemd.verbs.start.linger import ensure_linger
+from dora_systemd.verbs.start.logins import start_notes
+from dora_systemd.verbs.start.plan import DEFAULT_FILE, Plan, StartRequest, make_plan
+from dora_systemd.verbs.start.unit import format_plan
+from dora_systemd.verbs.start.watch import watched_patterns
 
 _EPILOG = """\b
 Examples:
@@ -101,7 +101,7 @@ def _start(bus: Bus, claimed: Claim, wait: bool) -> Started:
 
 def _print_last_words(plan: Plan) -> None:
     # Only a failure pays for the way to the journal.
-    from dora_systemd.managerwords import last_words
+    from dora_systemd.verbs.facts.last_words import last_words
 
     for line in last_words(plan.scope, plan.options.uuid):
         click.echo(f"  {line}", err=True)

@@ -2,13 +2,13 @@
 
 import click
 
-from dora_systemd.bus import Bus
+from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import current_scope, print_outcomes, scope_options
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.managerask import note_stop
-from dora_systemd.managercells import Cell, matching_cells, not_found, read_cells, select_cell
-from dora_systemd.managerstop import stop_cells
 from dora_systemd.scope import Scope
+from dora_systemd.verbs.facts.cells import Cell, matching_cells, not_found, read_cells, select_cell
+from dora_systemd.verbs.stop import stop_cells
+from dora_systemd.verbs.stop_note import note_stop
 
 _EPILOG = """\b
 Examples:
@@ -56,7 +56,7 @@ def _print_ended(scope: Scope, selectors: list[str], cells: list[Cell]) -> None:
     """Say which ones have ended long ago; raise DoraSystemdError for the others."""
     for selector in selectors:
         # Only the journal knows; it is not read for dataflows that systemd knows.
-        from dora_systemd.managerended import select_ended
+        from dora_systemd.verbs.facts.ended import select_ended
 
         row = select_ended(scope, selector)
         if row is None:

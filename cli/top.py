@@ -6,11 +6,11 @@ import time
 
 import click
 
-from dora_systemd.bus import Bus
+from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import current_scope, output_option, scope_options
+from dora_systemd.decisions.views.top import SORTS, Look, format_summary, format_top, look_values
 from dora_systemd.errors import ExitCode
-from dora_systemd.managertop import Top
-from dora_systemd.toptable import SORTS, Look, format_summary, format_top, look_values
+from dora_systemd.verbs.top import Top
 
 _EPILOG = """\b
 Examples:

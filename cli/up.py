@@ -4,11 +4,11 @@ import os
 
 import click
 
-from dora_systemd.bus import Bus
+from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import current_scope, scope_options
-from dora_systemd.gatewayport import wanted_port
-from dora_systemd.managergateway import check_answer, read_gateway
-from dora_systemd.managerup import check_machine, open_port, start_boot_target
+from dora_systemd.decisions.gateway.port import wanted_port
+from dora_systemd.verbs.gateway import check_answer, read_gateway
+from dora_systemd.verbs.up import check_machine, open_port, start_boot_target
 
 _EPILOG = """\b
 Examples:

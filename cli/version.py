@@ -3,7 +3,7 @@
 import click
 
 from dora_systemd.cli.parameters import current_scope, output_option, print_json, scope_options
-from dora_systemd.managerversion import read_versions
+from dora_systemd.verbs.version import read_versions
 
 _EPILOG = """\b
 Examples:

@@ -5,13 +5,13 @@ import sys
 
 import click
 
-from dora_systemd.bus import Bus
+from dora_systemd.adapters.bus.systemd import Bus
+from dora_systemd.adapters.journal.reader import JournalReader, check_readable
 from dora_systemd.cli.edge import write_own
 from dora_systemd.cli.parameters import current_scope, output_option, print_json, scope_options
+from dora_systemd.decisions.why.report import format_report, report_values
 from dora_systemd.errors import ExitCode
-from dora_systemd.journalread import JournalReader, check_readable
-from dora_systemd.managerwhy import explain
-from dora_systemd.postmortemtext import format_report, report_values
+from dora_systemd.verbs.why import explain
 
 _EPILOG = """\b
 Examples:

@@ -1,33 +1,8 @@
-"""What a runner would refuse: `python3 -m dora_systemd.runnercheck`, with the runner's arguments.
+"""The old name of dora_systemd.runner.check: a doractl that an upgrade overtakes runs this one."""
 
-`doractl start --dry-run` asks it. It prints the refusal and ends as the runner would; nothing is
-started but dora's own checks.
-"""
-
-import os
 import sys
 
-from dora_systemd.doracheck import DoraCheck
-from dora_systemd.environment import node_environment
-from dora_systemd.errors import DoraSystemdError
-from dora_systemd.options import parse_runner_argv
-from dora_systemd.preparation import check_named_nodes, prepare
-from dora_systemd.refusal import format_refusal, refusal_exit
-
-
-def main(argv: list[str]) -> int:
-    """Check the dataflow that `argv` describes; the exit status of a runner."""
-    try:
-        options = parse_runner_argv(argv)
-        environment = node_environment(os.environ)
-        check = DoraCheck(options, environment)
-        prepared = check.beside(lambda: prepare(options, environment))
-        check_named_nodes(options, prepared.dataflow)
-    except DoraSystemdError as error:
-        print(format_refusal(error))
-        return refusal_exit(error)
-    return 0
-
+from dora_systemd.runner.check import main
 
 if __name__ == "__main__":
     sys.exit(main(sys.argv[1:]))

@@ -1,84 +1,11 @@
-"""The settings file beside a dataflow, when it changes while the dataflow runs.
+"""The old name of dora_systemd.runner.reload.settings_file.
 
-Reading settings takes a library that the runner does without, so a child of it does that:
-`python3 -m dora_systemd.runnersettings BEFORE AFTER PATH`, two versions of the file at PATH.
+A runner goes on through an upgrade, and runs it by the name that it has loaded.
 """
 
-import json
-import os
 import sys
-from pathlib import Path
 
-from dora_systemd import files, process
-from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.hotreload import SettingsChange
-from dora_systemd.limits import format_node_limits, parse_node_limits
-from dora_systemd.trust.programs import own_account
-
-_SECONDS = 120.0
-
-
-class SettingsFile:
-    """The file at `path`; `copy` is where the version that is in use is kept.
-
-    Each version is read once: it may be saved again at any moment.
-    """
-
-    def __init__(self, path: str, copy: Path) -> None:
-        self.path = path
-        self._copy = copy
-        self._taken = copy.with_name(f"{copy.name}.read")
-
-    def keep(self) -> None:
-        """The file as it is now is in use. Raises DoraSystemdError."""
-        self.take()
-        self.accept()
-
-    def take(self) -> None:
-        """Read the file as it is now. Raises DoraSystemdError."""
-        self._taken.unlink(missing_ok=True)
-        if Path(self.path).exists():
-            files.write_atomic(self._taken, files.read_text(Path(self.path)), 0o600)
-
-    def accept(self) -> None:
-        """What was taken last is in use."""
-        if self._taken.exists():
-            self._taken.replace(self._copy)
-        else:
-            self._copy.unlink(missing_ok=True)
-
-    def change(self) -> SettingsChange:
-        """Take the file: what has changed. Raises DoraSystemdError when it cannot be used."""
-        self.take()
-        versions = (str(self._copy), str(self._taken))
-        command = [sys.executable, "-E", "-P", "-m", __name__, *versions, self.path]
-        done = process.run_command(command, _SECONDS, os.environ, account=own_account())
-        if done.status:
-            raise DoraSystemdError(done.stderr.strip(), "", ExitCode.BAD_INPUT)
-        found = json.loads(done.stdout)
-        limits = tuple(map(parse_node_limits, found["limits"]))
-        return SettingsChange(limits, tuple(found["others"]))
-
-
-def main(before: str, after: str, name: str) -> int:
-    """Print what is different as JSON. name: what errors call both."""
-    from dora_systemd.settings import resolve_settings
-    from dora_systemd.settingschange import settings_change
-
-    try:
-        both = []
-        for path in (before, after):
-            text = files.read_text(Path(path)) if Path(path).exists() else ""
-            document = files.parse_yaml(text, Path(name), allow_empty=True)
-            both.append(resolve_settings({}, {}, [(name, document)]))
-    except DoraSystemdError as error:
-        print(error.message, file=sys.stderr)
-        return error.code
-    change = settings_change(*both)
-    limits = [format_node_limits(one) for one in change.limits]
-    print(json.dumps({"limits": limits, "others": change.others}))
-    return 0
-
+from dora_systemd.runner.reload.settings_file import main
 
 if __name__ == "__main__":
     sys.exit(main(*sys.argv[1:]))

@@ -6,9 +6,9 @@ wrote, and all dataflows are in one list: whatever is there, the others must be 
 
 from pathlib import Path
 
-from dora_systemd.cellpaths import CellPaths
+from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.status import CellStatus
+from dora_systemd.paths import CellPaths
 from dora_systemd.trust.paths import read_file
 from dora_systemd.values import shown
 

@@ -16,8 +16,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.sockettable import loopback_listeners
 from dora_systemd.trust.paths import reached, user_name
+from dora_systemd.trust.socket_table import loopback_listeners
 from dora_systemd.values import shown
 
 _STEP = os.O_PATH | os.O_NOFOLLOW | os.O_CLOEXEC

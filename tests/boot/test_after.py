@@ -4,7 +4,7 @@ import json
 from functools import partial
 from typing import Any
 
-from dora_systemd.bus import Bus
+from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.scope import scope_of
 from tests.boot.flows import ALICE, NOTES, ROOT, doractl, listed
 from tests.system.cells import run, wait_for

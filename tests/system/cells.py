@@ -8,11 +8,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from dora_systemd import cgroup
-from dora_systemd.cellpaths import CellPaths
-from dora_systemd.journal import JournalSocket
+from dora_systemd.adapters.cgroup import groups as cgroup
+from dora_systemd.adapters.journal.socket import JournalSocket
+from dora_systemd.decisions.cell.status import CellStatus
+from dora_systemd.paths import CellPaths
 from dora_systemd.scope import Scope, scope_of
-from dora_systemd.status import CellStatus
 from tests.lab.pace import bound, pace
 from tests.system.tolerated import is_tolerated
 

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 
-from dora_systemd.gatewayroutes import GET, SOCKETS
+from dora_systemd.gateway.routes import GET, SOCKETS
 
 PATIENCE = 30.0
 """Seconds within which the gateway must have closed a connection on which nothing more comes."""

@@ -5,7 +5,7 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-from dora_systemd.gatewayplace import DEFAULT_PORT, SERVICE_UNIT, SOCKET_UNIT, token_path
+from dora_systemd.decisions.gateway.place import DEFAULT_PORT, SERVICE_UNIT, SOCKET_UNIT, token_path
 from dora_systemd.scope import Scope
 from tests.system.cells import run, wait_for
 

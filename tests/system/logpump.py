@@ -17,12 +17,12 @@ import time
 import uuid
 from pathlib import Path
 
-from dora_systemd.cellpaths import CellPaths
-from dora_systemd.journal import JOURNAL_SOCKET, JournalSocket
-from dora_systemd.journalread import JournalReader
-from dora_systemd.logs import Origin
-from dora_systemd.pipes import LogPipes
-from dora_systemd.runnerloss import LossWatch
+from dora_systemd.adapters.journal.reader import JournalReader
+from dora_systemd.adapters.journal.socket import JOURNAL_SOCKET, JournalSocket
+from dora_systemd.adapters.logs.pipes import LogPipes
+from dora_systemd.decisions.logs.lines import Origin
+from dora_systemd.paths import CellPaths
+from dora_systemd.runner.nodes.losses import LossWatch
 
 FLOOD = """
 import sys

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dora_systemd import bus
-from dora_systemd.buslibrary import dbuslib
+from dora_systemd.adapters.bus import systemd as bus
+from dora_systemd.adapters.bus.library import dbuslib
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import scope_of
 from tests.system.cells import run
-from tests.unit.fake_manager import ScopeIn
+from tests.unit.fakes.manager import ScopeIn
 
 
 @given(st.from_regex(r"[A-Za-z0-9._-]+", fullmatch=True))
@@ -33,7 +33,7 @@ def test_no_manager(tmp_path: Path) -> None:
 
 def test_pystemd_is_loaded_without_lxml_and_stays_usable() -> None:
     script = (
-        "import sys; from dora_systemd.buslibrary import dbuslib\n"
+        "import sys; from dora_systemd.adapters.bus.library import dbuslib\n"
         "assert 'lxml' not in sys.modules and 'pystemd' not in sys.modules\n"
         "import pystemd; from pystemd.dbuslib import DBus\n"
         "assert pystemd.SDUnit and DBus is dbuslib.DBus\n"
@@ -45,7 +45,8 @@ def test_threads_load_pystemd_at_the_same_time() -> None:
     """As requests do that reach a gateway which has just been started."""
     script = (
         "import sys, threading\n"
-        "from dora_systemd import bus; from dora_systemd.scope import scope_of\n"
+        "from dora_systemd.adapters.bus import systemd as bus\n"
+        "from dora_systemd.scope import scope_of\n"
         "from concurrent.futures import ThreadPoolExecutor\n"
         "sys.setswitchinterval(1e-6)\n"
         "barrier = threading.Barrier(8)\n"

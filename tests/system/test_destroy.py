@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from dora_systemd.gatewayplace import SOCKET_UNIT
+from dora_systemd.decisions.gateway.place import SOCKET_UNIT
 from dora_systemd.scope import Scope
 from tests.lab.pace import bound
 from tests.system.cells import Cell, Project, is_alive, run, wait_for

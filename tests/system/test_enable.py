@@ -12,12 +12,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from dora_systemd.bus import Bus
+from dora_systemd.adapters.bus.systemd import Bus
+from dora_systemd.decisions.cell.options import RunnerOptions, options_from_command
+from dora_systemd.decisions.settings.resolve import resolve_settings
+from dora_systemd.decisions.unit.file import persistent_unit
+from dora_systemd.decisions.unit.properties import UnitContext, format_unit, unit_properties
 from dora_systemd.errors import ExitCode
-from dora_systemd.options import RunnerOptions, options_from_command
-from dora_systemd.properties import UnitContext, format_unit, unit_properties
-from dora_systemd.settings import resolve_settings
-from dora_systemd.unitfile import persistent_unit
 from tests.system.cells import Cell, Project, run, wait_for
 
 # They write to /etc, or would make the user linger.

@@ -10,8 +10,8 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Origin
 
+from dora_systemd.decisions.gateway.place import SERVICE_UNIT, SOCKET_UNIT
 from dora_systemd.errors import ExitCode
-from dora_systemd.gatewayplace import SERVICE_UNIT, SOCKET_UNIT
 from tests.system.cells import Cell, Project, run, wait_for
 from tests.system.gatewayfuzz import attack
 from tests.system.gatewayload import ask_steadily, half_open, read_use

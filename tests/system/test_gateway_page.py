@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from dora_systemd.gatewayplace import SERVICE_UNIT, SOCKET_UNIT
+from dora_systemd.decisions.gateway.place import SERVICE_UNIT, SOCKET_UNIT
 from tests.system.cells import Cell, Project, run, wait_for
 from tests.system.chromium import Browser
 from tests.system.gateways import Front

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from dora_systemd.decisions.logs.events import EVENTS
 from dora_systemd.errors import ExitCode
-from dora_systemd.events import EVENTS
 from tests.system.cells import Cell, Project, run, wait_for
 from tests.system.gateways import Front
 

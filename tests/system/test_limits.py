@@ -3,7 +3,7 @@
 import os
 from pathlib import Path
 
-from dora_systemd.cgroup import mount_point, read_controllers
+from dora_systemd.adapters.cgroup.groups import mount_point, read_controllers
 from dora_systemd.errors import ExitCode
 from tests.system.cells import Cell, Project
 from tests.system.refusals import Refusal, check_refusals

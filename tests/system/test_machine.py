@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from dora_systemd.cgroup import read_cpu
+from dora_systemd.adapters.cgroup.groups import read_cpu
 from dora_systemd.errors import ExitCode
 from tests.system.cells import TICK, Cell, Project, is_alive, run, wait_for
 

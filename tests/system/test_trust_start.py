@@ -104,9 +104,9 @@ def test_her_dora_never_runs_as_root(cell: Cell, mallory: Home) -> None:
 
 def test_a_gateway_runs_no_dora_of_hers(cell: Cell, mallory: Home) -> None:
     """A1: nor does root's gateway, when it is asked about a node of hers."""
-    from dora_systemd.bus import Bus
-    from dora_systemd.gatewaycontrolstate import written_descriptor
-    from dora_systemd.managercells import read_cell
+    from dora_systemd.adapters.bus.systemd import Bus
+    from dora_systemd.gateway.control.state import written_descriptor
+    from dora_systemd.verbs.facts.cells import read_cell
 
     proof = mallory.spy()
     mallory.write("mod.yml", MODULE)

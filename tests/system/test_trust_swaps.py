@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.managerplan import Plan, StartRequest, make_plan
-from dora_systemd.managerunit import format_plan
 from dora_systemd.scope import Scope
+from dora_systemd.verbs.start.plan import Plan, StartRequest, make_plan
+from dora_systemd.verbs.start.unit import format_plan
 from tests.system.cells import run, wait_for
 from tests.system.test_trust_start import FLOW, Home
 

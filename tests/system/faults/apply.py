@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from dora_systemd.cgroup import read_numbers
+from dora_systemd.adapters.cgroup.groups import read_numbers
 from tests.system.cells import is_alive, run, wait_for
 from tests.system.faults.scene import ROLES, Scene
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from dora_systemd.statuswords import format_table
+from dora_systemd.decisions.views.dataflows import format_table
 from tests.system.cells import run
 from tests.system.faults.table import TABLE, Fault
 

@@ -1,0 +1,89 @@
+"""The way to systemd: its message bus or its private socket, and how long each may be silent."""
+
+import _thread
+import os
+import select
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from dora_systemd.adapters.bus.errors import connection_error, silent_bus
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.scope import Scope
+
+SERVICE = b"org.freedesktop.systemd1"
+MANAGER_OBJECT = b"/org/freedesktop/systemd1"
+SYSTEM_BUS = Path("/run/dbus/system_bus_socket")
+
+READ_SECONDS = 5.0
+"""For an answer to who only reads."""
+CALL_SECONDS = 25.0
+"""For any other answer, as systemctl has it: systemd may be reading all its units again."""
+_BUS_SECONDS = 1.0
+"""For the first word of the message bus, where there is another way."""
+_TIMEOUT = "SYSTEMD_BUS_TIMEOUT"
+"""The only way to tell sd-bus through pystemd: read at the first call of a connection."""
+_environment = _thread.allocate_lock()  # threading takes a while to load
+
+
+def connect(scope: Scope, for_reading: bool) -> Any:
+    """A connection of pystemd to the manager of `scope`. Raises DoraSystemdError (NO_SYSTEMD)."""
+    address, private = _address(scope), _private_socket(scope)
+    seconds = READ_SECONDS if for_reading else CALL_SECONDS
+    # The system's private socket is for root alone. It is the second choice, as systemd takes some
+    # milliseconds for each connection to it; and only on the bus can systemd tell that a client has
+    # gone, which hold() needs.
+    has_other_way = address != private and Path(private).exists()
+    if for_reading and has_other_way and (scope.is_user or os.geteuid() == 0):
+        with suppress(DoraSystemdError):
+            return _open(scope, address, seconds, _BUS_SECONDS)
+        address = private
+    return _open(scope, address, seconds, READ_SECONDS)
+
+
+def _open(scope: Scope, address: str, seconds: float, patience: float) -> Any:
+    """A connection with `seconds` for each answer, whose other side speaks within `patience`."""
+    # What only explains itself or asks for a version need not find pystemd.
+    from dora_systemd.adapters.bus.library import dbuslib
+
+    # A manager's private socket takes no part in the bus: there is nobody to say hello to.
+    is_private = address.endswith("/private")
+    with connection_error(scope):
+        bus = dbuslib.DBusAddress(f"unix:path={address}".encode(), peer_to_peer=is_private)
+        with _deadline(seconds):
+            bus.open()  # says hello, its first call
+        # sd-bus itself would wait 90 s for the first word.
+        poll = select.poll()
+        poll.register(bus.get_fd(), select.POLLIN)
+        if not poll.poll(patience * 1000):
+            bus.close()
+            raise silent_bus(scope, is_private)
+        if is_private:
+            with _deadline(seconds):
+                bus.call_method(SERVICE, MANAGER_OBJECT, b"org.freedesktop.DBus.Peer", b"Ping", [])
+    return bus
+
+
+@contextmanager
+def _deadline(seconds: float) -> Iterator[None]:
+    """The time that the connection whose first call is made here has for each answer."""
+    with _environment:
+        before = os.environ.get(_TIMEOUT)
+        os.environ[_TIMEOUT] = before or f"{seconds:g}s"
+        try:
+            yield
+        finally:
+            if before is None:
+                del os.environ[_TIMEOUT]
+
+
+def _address(scope: Scope) -> str:
+    """The message bus, else the manager's private socket: a user may have no bus of his own."""
+    bus = scope.runtime_root / "bus" if scope.is_user else SYSTEM_BUS
+    private = Path(_private_socket(scope))
+    return str(private) if not bus.exists() and private.exists() else str(bus)
+
+
+def _private_socket(scope: Scope) -> str:
+    return str(scope.runtime_root / "systemd" / "private")

@@ -1,0 +1,229 @@
+"""systemd over D-Bus: the only module that talks to it.
+
+The interfaces are those of org.freedesktop.systemd1(5). Only pystemd's low level is used, on a
+connection that is told every signature: nothing is introspected, and no XML is parsed.
+"""
+
+import select
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+from dora_systemd.adapters.bus.connection import MANAGER_OBJECT, SERVICE, connect
+from dora_systemd.adapters.bus.errors import explained
+from dora_systemd.adapters.bus.manager import JOB_DONE, Observer, Property, UnitState
+from dora_systemd.adapters.bus.wire import decoded, encoded
+from dora_systemd.scope import Scope
+
+ROOT = MANAGER_OBJECT
+MANAGER = b"org.freedesktop.systemd1.Manager"
+UNIT = b"org.freedesktop.systemd1.Unit"
+BY_TYPE = {
+    "service": b"org.freedesktop.systemd1.Service",
+    "socket": b"org.freedesktop.systemd1.Socket",
+    "slice": b"org.freedesktop.systemd1.Slice",
+}
+PROPERTIES = b"org.freedesktop.DBus.Properties"
+
+_IDLE_SECONDS = 1.0
+_UNIT_PROPERTIES = frozenset(
+    (
+        *("ActiveState", "SubState", "LoadState", "FragmentPath", "DropInPaths", "Transient"),
+        *("ActiveEnterTimestamp", "ActiveEnterTimestampMonotonic", "InactiveEnterTimestamp"),
+        *("InactiveExitTimestamp", "InactiveExitTimestampMonotonic", "InvocationID", "Job"),
+        *("StateChangeTimestamp", "Description", "UnitFileState", "NeedDaemonReload", "WantedBy"),
+        *("RequiredBy",),
+        *("StateChangeTimestampMonotonic", "StartLimitBurst", "StartLimitIntervalUSec"),
+    )
+)
+
+
+class Bus:
+    """A connection to the manager of `scope`: the Manager of `manager`, which documents it.
+
+    for_reading: nothing is going to be changed. Such a connection gives systemd READ_SECONDS for
+    each answer, and goes around a message bus that does not answer.
+    """
+
+    def __init__(self, scope: Scope, for_reading: bool = False) -> None:
+        self.scope = scope
+        self._bus = connect(scope, for_reading)
+        self._matches: dict[bytes, Callable[..., None]] = {}
+
+    def __del__(self) -> None:
+        # pystemd keeps the connection, two descriptors, until it is told. A gateway has many.
+        if hasattr(self, "_bus"):
+            self._bus.close()
+
+    def list_units(self, pattern: str) -> list[UnitState]:
+        rows = self._call(
+            "list units", ROOT, MANAGER, "ListUnitsByPatterns", ("as", []), ("as", [pattern])
+        )
+        return [UnitState(row[0], row[2], row[3], row[4]) for row in rows or ()]
+
+    def read(self, unit: str, names: Sequence[str]) -> dict[str, Any]:
+        return {name: self._read_one(unit, name) for name in names}
+
+    def start_transient(
+        self, unit: str, properties: Sequence[Property], observer: Observer | None, wait: bool
+    ) -> str:
+        self._listen(unit)
+        typed = [(name, (signature, value)) for name, signature, value in properties]
+        arguments: tuple[tuple[str, Any], ...] = (
+            ("s", unit),
+            ("s", "fail"),
+            ("a(sv)", typed),
+            ("a(sa(sv))", []),
+        )
+        job = self._call(f"start {unit}", ROOT, MANAGER, "StartTransientUnit", *arguments)
+        return self._wait_for_jobs({job: unit}, observer)[unit] if wait else JOB_DONE
+
+    def run_jobs(
+        self, method: str, units: Sequence[str], observer: Observer | None = None
+    ) -> dict[str, str]:
+        jobs = {self.queue_job(method, unit): unit for unit in units}
+        return self._wait_for_jobs(jobs, observer)
+
+    def queue_job(self, method: str, unit: str) -> str:
+        self._listen(unit)
+        action = f"{method.removesuffix('Unit').lower()} {unit}"
+        job: str = self._call(action, ROOT, MANAGER, method, ("s", unit), ("s", "replace"))
+        return job
+
+    def kill(self, unit: str, signal: int, whom: str = "all") -> None:
+        arguments = (("s", unit), ("s", whom), ("i", signal))
+        self._call(f"kill {unit}", ROOT, MANAGER, "KillUnit", *arguments)
+
+    def reset_failed(self, unit: str) -> None:
+        self._call(f"reset {unit}", ROOT, MANAGER, "ResetFailedUnit", ("s", unit))
+
+    def hold(self, unit: str) -> None:
+        self._call(f"hold {unit}", ROOT, MANAGER, "RefUnit", ("s", unit))
+
+    def set_properties(self, unit: str, properties: Sequence[Property], runtime: bool) -> None:
+        typed = [(name, (signature, value)) for name, signature, value in properties]
+        arguments = (("s", unit), ("b", runtime), ("a(sv)", typed))
+        self._call(f"change {unit}", ROOT, MANAGER, "SetUnitProperties", *arguments)
+
+    def changes(self, unit: str) -> list[Mapping[str, Any]]:
+        self._listen(unit)
+        return [body[1] for member, body in self._signals() if member == "PropertiesChanged"]
+
+    def control_group(self) -> str:
+        group: str = self._get("read systemd's cgroup", ROOT, MANAGER, "ControlGroup")
+        return group
+
+    def reload(self) -> None:
+        self._call("reload systemd", ROOT, MANAGER, "Reload")
+
+    def unit_path(self) -> list[str]:
+        paths: list[str] = self._get("read where units are", ROOT, MANAGER, "UnitPath")
+        return paths
+
+    def enable_unit_files(self, names: Sequence[str]) -> bool:
+        arguments = (("as", names), ("b", False), ("b", True))
+        reply = self._call(f"enable {names[0]}", ROOT, MANAGER, "EnableUnitFiles", *arguments)
+        return bool(reply[0])
+
+    def disable_unit_files(self, units: Sequence[str]) -> None:
+        arguments = (("as", units), ("b", False))
+        self._call(f"disable {units[0]}", ROOT, MANAGER, "DisableUnitFiles", *arguments)
+
+    def version(self) -> str:
+        text: str = self._get("read systemd's version", ROOT, MANAGER, "Version")
+        return text
+
+    def fileno(self) -> int:
+        number: int = self._bus.get_fd()
+        return number
+
+    def _read_one(self, unit: str, name: str) -> Any:
+        own = BY_TYPE.get(unit.rpartition(".")[2], UNIT)
+        interface = UNIT if name in _UNIT_PROPERTIES else own
+        return self._get(f"read {name} of {unit}", _unit_path(unit), interface, name)
+
+    def _get(self, action: str, path: bytes, interface: bytes, name: str) -> Any:
+        return self._call(action, path, PROPERTIES, "Get", ("s", interface.decode()), ("s", name))
+
+    def _call(
+        self, action: str, path: bytes, interface: bytes, method: str, *arguments: tuple[str, Any]
+    ) -> Any:
+        words = [word for signature, value in arguments for word in encoded(signature, value)]
+        with explained(action, self.scope):
+            reply = self._bus.call_method(SERVICE, path, interface, method.encode(), words)
+        return decoded(reply.body)
+
+    def _listen(self, unit: str) -> None:
+        """Hear the end of jobs and the changed properties of `unit` from now on."""
+        path = _unit_path(unit)
+        if not self._matches:
+            self._call("listen to systemd", ROOT, MANAGER, "Subscribe")
+            self._match(ROOT, MANAGER, b"JobRemoved")
+        if path not in self._matches:
+            self._match(path, PROPERTIES, b"PropertiesChanged")
+
+    def _match(self, path: bytes, interface: bytes, member: bytes) -> None:
+        # pystemd keeps only a bare pointer to the callback, and needs a function of its own each
+        # time. It does nothing: process() returns every message as well.
+        def ignore(_message: Any, error: Any = None, userdata: Any = None) -> None:
+            del error, userdata
+
+        self._matches[path] = ignore
+        with explained("listen to systemd", self.scope):
+            self._bus.match_signal(None, path, interface, member, ignore)
+
+    def _signals(self) -> Iterator[tuple[str, Any]]:
+        """Member and body of what has arrived.
+
+        process() says nothing about steps that brought no message, hence the few empty tries.
+        """
+        empty = 0
+        while empty < 3:
+            with explained("hear from systemd", self.scope):
+                message = self._bus.process()
+                if message.is_empty():
+                    empty += 1
+                    continue
+                member = _member(message)
+                message.process_reply(False)
+            yield member, decoded(message.body)
+
+    def _wait_for_jobs(self, jobs: dict[str, str], observer: Observer | None) -> dict[str, str]:
+        """The results by unit. `jobs`: object paths of queued jobs and their units."""
+        results: dict[str, str] = {}
+        while len(results) < len(jobs):
+            heard = False
+            for member, body in self._signals():
+                heard = True
+                if member == "JobRemoved" and body[1] in jobs:
+                    results[jobs[body[1]]] = body[3]
+                if member == "PropertiesChanged" and observer:
+                    observer(body[1])
+            # A signal can be lost with a restart of the message bus: the units are asked too.
+            if not heard and not self._sleep(_IDLE_SECONDS):
+                left = [unit for unit in jobs.values() if unit not in results]
+                results |= {unit: word for unit in left if (word := self._job_result(unit))}
+        return results
+
+    def _job_result(self, unit: str) -> str:
+        if self._read_one(unit, "Job")[0]:
+            return ""
+        active = self._read_one(unit, "ActiveState")
+        return JOB_DONE if active in ("active", "inactive") else "failed"
+
+    def _sleep(self, seconds: float) -> bool:
+        poll = select.poll()
+        poll.register(self.fileno(), select.POLLIN)
+        return bool(poll.poll(seconds * 1000))
+
+
+def _unit_path(unit: str) -> bytes:
+    """The object path of a unit, escaped as sd_bus_path_encode(3) does."""
+    escaped = (c if c.isascii() and c.isalnum() else f"_{ord(c):02x}" for c in unit)
+    return ROOT + b"/unit/" + "".join(escaped).encode()
+
+
+def _member(message: Any) -> str:
+    for interface, member in ((MANAGER, b"JobRemoved"), (PROPERTIES, b"PropertiesChanged")):
+        if message.is_signal(interface, member):
+            return member.decode()
+    return ""

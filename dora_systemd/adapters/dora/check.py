@@ -1,0 +1,91 @@
+"""What dora itself has to say against a dataflow, asked inside the cell and beside other things.
+
+doractl runs no dora: that may be the user's own, or a program that stands in for it. Here it is the
+user who runs it, in the sandbox, with the environment of the nodes.
+"""
+
+import os
+from collections.abc import Callable, Mapping
+from typing import TypeVar
+
+from dora_systemd.adapters.host.process import Beside, dora_version, find_dora, run_dora
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.dora.errors import parse_dora_error
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.trust.programs import own_account
+from dora_systemd.trust.sight import cannot_reach
+
+T = TypeVar("T")
+
+
+class DoraCheck:
+    """Begins when it is made. Two programs are asked, both at the same time.
+
+    environment: of the nodes.
+    """
+
+    def __init__(self, options: RunnerOptions, environment: Mapping[str, str]) -> None:
+        self._options = options
+        self._version = Beside(lambda: dora_version(options.dora, own_account(), environment))
+        self._refusal = Beside(lambda: refusal_of_dora(options, environment))
+
+    def beside(self, call: Callable[[], T]) -> T:
+        """The result of `call`, which is made meanwhile. What dora refuses counts first."""
+        try:
+            done = call()
+        except DoraSystemdError:
+            self.result()
+            raise
+        self.result()
+        return done
+
+    def result(self) -> None:
+        """Wait until both have answered. Raises DoraSystemdError for what is refused.
+
+        Whose answer comes first in the code is whose refusal counts.
+        """
+        options = self._options
+        check_access(options)
+        self._version.result()
+        if reason := self._refusal.result():
+            raise DoraSystemdError(
+                f"cannot use {options.dataflow}: {reason}",
+                f"see {options.dora} validate {options.dataflow}",
+                ExitCode.BAD_INPUT,
+            )
+
+
+def refusal_of_dora(options: RunnerOptions, environment: Mapping[str, str]) -> str:
+    """What `dora validate` says against the dataflow of `options`, or "".
+
+    environment: of the nodes.
+    """
+    arguments = ["validate", options.dataflow]
+    directory = options.working_directory
+    done = run_dora(options.dora, arguments, own_account(), environment, directory)
+    if done.status == 0:
+        return ""
+    return parse_dora_error(done.stderr) or parse_dora_error(done.stdout) or "dora refuses it"
+
+
+def check_access(options: RunnerOptions) -> None:
+    """Raise DoraSystemdError (NO_PERMISSION) for the first path that this user cannot reach.
+
+    Of a dora that is not there (NO_DORA); a dataflow that is not there says so itself.
+    """
+    places = (options.working_directory, options.dora)
+    wanted = [(options.dataflow, os.R_OK), *((one, os.X_OK) for one in places)]
+    for path, mode in wanted:
+        if not os.access(path, mode) and not _is_missing(path):
+            raise cannot_reach(own_account().name, path)
+    find_dora(options.dora, None, "")
+
+
+def _is_missing(path: str) -> bool:
+    try:
+        os.lstat(path)
+    except (FileNotFoundError, NotADirectoryError):
+        return True
+    except OSError:
+        return False
+    return False

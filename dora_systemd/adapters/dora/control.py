@@ -1,0 +1,173 @@
+"""One WebSocket connection to the coordinator of a cell."""
+
+import asyncio
+import json
+import time
+from collections.abc import AsyncIterator, Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dora_systemd.decisions.dora.coordinator import Coordinator, parse_coordinator
+from dora_systemd.decisions.dora.protocol import (
+    LogRecord,
+    Params,
+    Reply,
+    encode_request,
+    parse_frame,
+)
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.trust.sockets import plain
+
+if TYPE_CHECKING:
+    import socket as sockets
+
+    from dora_systemd.adapters.dora.websocket import WebSocket
+
+MAX_BYTES = 64 * 1024 * 1024
+"""Of a message over a relay: what is there may be hostile. A picture of a topic is smaller."""
+
+_OPTIONS: dict[str, Any] = {
+    # A coordinator answers no ping while a request is pending, and a proxy has no business between
+    # two processes of one machine.
+    "ping_interval": None,
+    "compression": None,
+    "max_size": MAX_BYTES,
+    "proxy": None,
+}
+OPEN_SECONDS = 4.0
+REQUEST_SECONDS = 35.0
+"""Just above the 30 s after which the coordinator itself gives up on its daemon."""
+
+
+_RELAY = "ws://127.0.0.1/api/control"
+
+
+def _url(port: int) -> str:
+    return f"ws://127.0.0.1:{port}/api/control"
+
+
+def _headers(token: str) -> dict[str, str]:
+    return {"Authorization": f"Bearer {token}"}
+
+
+class Connection:
+    """A connection for requests, answered one after the other, or for the events of one run."""
+
+    def __init__(self, socket: "WebSocket") -> None:
+        self._socket = socket
+
+    @classmethod
+    async def open(cls, port: int, token: str) -> "Connection":
+        """Connect. Raises DoraSystemdError."""
+        from dora_systemd.adapters.dora.websocket import WebSocket, WebSocketException
+
+        try:
+            return cls(await WebSocket.connect(_url(port), _headers(token)))
+        except (OSError, WebSocketException) as error:
+            raise _unreachable(f" on port {port}", error) from error
+
+    @classmethod
+    async def over(cls, stream: "sockets.socket", token: str) -> "Connection":
+        """Connect over a relay of a cell's runner. Raises DoraSystemdError."""
+        from dora_systemd.adapters.dora.websocket import WebSocket, WebSocketException
+
+        try:
+            return cls(await WebSocket.connect(_RELAY, _headers(token), stream, MAX_BYTES))
+        except (OSError, WebSocketException) as error:
+            stream.close()
+            raise _unreachable("", error) from error
+
+    async def request(self, params: Params, seconds: float = REQUEST_SECONDS) -> Reply:
+        """Send a request and wait for its reply. Raises DoraSystemdError, also after `seconds`."""
+        from dora_systemd.adapters.dora.websocket import WebSocketException
+
+        ident, text = encode_request(params)
+        try:
+            async with asyncio.timeout(seconds):
+                await self._socket.send(text)
+                while True:
+                    frame = parse_frame(await self._socket.recv())
+                    if isinstance(frame, Reply) and frame.id == ident:
+                        return frame
+        except (OSError, WebSocketException) as error:
+            raise _silent(params, error) from error
+
+    async def read_events(self, on_record: Callable[[LogRecord], None]) -> None:
+        """Give every event to on_record, until the connection is closed by either side."""
+        async for text in self.frames():
+            if isinstance(frame := parse_frame(text), LogRecord):
+                on_record(frame)
+
+    async def frames(self) -> AsyncIterator[str | bytes]:
+        """Every message as it comes, until the connection is closed by either side."""
+        with suppress(OSError):
+            while True:
+                yield await self._socket.recv()
+
+    async def close(self) -> None:
+        """Close at once: the peer may be dead or hang."""
+        self.abort()
+
+    def abort(self) -> None:
+        """The same for who cannot wait."""
+        self._socket.abort()
+
+
+def request(
+    stream: "sockets.socket", token: str, params: Params, seconds: float = REQUEST_SECONDS
+) -> Reply:
+    """One request over a relay of a cell's runner, without asyncio; the connection is closed.
+
+    The answer may take `seconds`, whatever comes before it. Raises DoraSystemdError.
+    """
+    from websockets.exceptions import WebSocketException
+    from websockets.sync.client import unix_connect
+
+    ident, text = encode_request(params)
+    deadline = time.monotonic() + seconds
+    headers = _headers(token)
+    try:
+        with unix_connect(
+            None,
+            _RELAY,
+            sock=stream,
+            additional_headers=headers,
+            open_timeout=OPEN_SECONDS,
+            **_OPTIONS,
+        ) as socket:
+            socket.send(text)
+            while True:
+                left = max(deadline - time.monotonic(), 0)
+                frame = parse_frame(socket.recv(timeout=left))
+                if isinstance(frame, Reply) and frame.id == ident:
+                    return frame
+    except TimeoutError as error:
+        raise _silent(params, error) from error
+    except (OSError, WebSocketException) as error:
+        raise _unreachable("", error) from error
+
+
+def read_coordinator(path: Path) -> Coordinator:
+    """What the runner has noted in the control.json at `path`.
+
+    Raises DoraSystemdError (NOT_RUNNING) as long as there is none.
+    """
+    try:
+        return parse_coordinator(json.loads(path.read_text()))
+    except (OSError, ValueError) as error:
+        message = f"cannot reach the dora coordinator of {path.parent.name}: it is not running"
+        hint = "it may be starting or stopping; see doractl list"
+        raise DoraSystemdError(message, hint, ExitCode.NOT_RUNNING) from error
+
+
+def _unreachable(where: str, error: Exception) -> DoraSystemdError:
+    hint = "see `doractl list`; a dataflow that starts or stops has no coordinator for a moment"
+    reason = plain(str(error) or type(error).__name__)
+    return DoraSystemdError(f"cannot reach the dora coordinator{where}: {reason}", hint)
+
+
+def _silent(params: Params, error: Exception) -> DoraSystemdError:
+    name = params if isinstance(params, str) else next(iter(params))
+    how = "no reply in time" if isinstance(error, TimeoutError) else "it closed the connection"
+    return DoraSystemdError(f"cannot get an answer from dora to {name}: {how}")

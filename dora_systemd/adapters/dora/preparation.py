@@ -1,0 +1,110 @@
+"""From a descriptor on disk to what is sent to dora: what the runner does at every start."""
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dora_systemd.adapters.host import files, process
+from dora_systemd.decisions.cell.hot_reload import CHANGE_VARIABLE, check_reload_nodes
+from dora_systemd.decisions.cell.launch import LaunchPlan, launch_descriptor
+from dora_systemd.decisions.cell.limits import (
+    CHANGES_VARIABLE,
+    check_nodes,
+    merge_node_limits,
+    parse_changes,
+)
+from dora_systemd.decisions.cell.line_rates import check_rates
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.restarts import check_restart_nodes
+from dora_systemd.decisions.descriptor.build_session import (
+    BuildSession,
+    parse_session,
+    session_path,
+)
+from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
+from dora_systemd.decisions.descriptor.nodes import UNEXPANDED, NodeKind
+from dora_systemd.decisions.dora.errors import parse_dora_error
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.trust.programs import own_account
+from dora_systemd.values import format_bool, parse_bool
+
+PACKAGE = Path(__file__).parents[2]
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A dataflow that can be started.
+
+    dataflow: with its modules expanded. descriptor: what is sent to dora.
+    """
+
+    dataflow: Dataflow
+    plan: LaunchPlan
+    descriptor: Mapping[str, Any]
+
+
+def prepare(options: RunnerOptions, environment: Mapping[str, str]) -> Prepared:
+    """Read the dataflow of `options` and rewrite it. environment: of the nodes.
+
+    Raises DoraSystemdError when it cannot be read or a node of it cannot be run.
+    """
+    dataflow = load_dataflow(options)
+    _check_limited(options, dataflow)
+    plan = LaunchPlan(
+        options,
+        str(PACKAGE / "launcher.sh"),
+        environment.get("PATH") or os.defpath,
+        os.path.exists,
+        _load_session(options),
+    )
+    return Prepared(dataflow, plan, launch_descriptor(dataflow, plan))
+
+
+def check_named_nodes(options: RunnerOptions, dataflow: Dataflow) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) where the options name a node that is not there.
+
+    dataflow: with its modules expanded.
+    """
+    _check_limited(options, dataflow)
+    ids = [node.id for node in dataflow.nodes]
+    check_rates(options.log_rates, ids)
+    check_reload_nodes(options.reload, ids)
+
+
+def _check_limited(options: RunnerOptions, dataflow: Dataflow) -> None:
+    ids = [node.id for node in dataflow.nodes]
+    dynamic = [node.id for node in dataflow.nodes if node.kind is NodeKind.DYNAMIC]
+    check_nodes(options.node_limits, ids, dynamic)
+    check_restart_nodes(options.node_restarts, ids)
+
+
+def with_changes(options: RunnerOptions, environment: Mapping[str, str]) -> RunnerOptions:
+    """The options with what `doractl set` has changed since the unit was made."""
+    changes = parse_changes(environment.get(CHANGES_VARIABLE, ""))
+    limits = merge_node_limits(options.node_limits, changes)
+    is_on = parse_bool(environment.get(CHANGE_VARIABLE) or format_bool(options.hot_reload))
+    return options._replace(node_limits=limits, reload=options.reload._replace(is_on=is_on))
+
+
+def load_dataflow(options: RunnerOptions) -> Dataflow:
+    """The dataflow of `options`, its modules expanded. Raises DoraSystemdError."""
+    path = Path(options.dataflow)
+    dataflow = parse_dataflow(files.read_yaml(path), str(path))
+    if not any(node.kind in UNEXPANDED for node in dataflow.nodes):
+        return dataflow
+    # Inside the cell: as root in somebody else's name nobody comes this way.
+    account, directory = own_account(), str(path.parent)
+    done = process.run_dora(options.dora, ["expand", str(path)], account, os.environ, directory)
+    if done.status != 0:
+        reason = parse_dora_error(done.stderr)
+        raise DoraSystemdError(f"cannot expand {path}: {reason}", "", ExitCode.BAD_INPUT)
+    return parse_dataflow(files.parse_yaml(done.stdout, path), str(path))
+
+
+def _load_session(options: RunnerOptions) -> BuildSession:
+    path = Path(session_path(options.dataflow))
+    if not path.exists():
+        return BuildSession()
+    return parse_session(files.read_yaml(path, allow_empty=True))

@@ -1,0 +1,182 @@
+"""Files: YAML and JSON in, atomic writes out. Nothing that a path can be makes a read hang."""
+
+import contextlib
+import errno
+import json
+import os
+import stat
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.trust.paths import MAX_BYTES, unreadable
+from dora_systemd.values import shown
+
+MAX_DEPTH = 64
+"""Levels of nesting: libyaml's composer recurses in C and crashes on some 100,000 of them."""
+
+MAX_VALUES = 100_000
+"""Values in a YAML file; a small file can hold enough of them to take seconds."""
+
+_WRITE_HINTS = {
+    errno.EACCES: "use sudo, or choose a place that is yours",
+    errno.EPERM: "use sudo, or choose a place that is yours",
+    errno.EROFS: "the file system is mounted read-only",
+    errno.ENOSPC: "the disk is full, see df",
+    errno.EDQUOT: "the quota is used up, see quota",
+}
+
+
+def absolute_path(text: str) -> str:
+    """The path as systemd wants it: absolute and without "..", links before which are followed."""
+    path = Path(text).absolute()
+    return "/" + str(path.resolve() if ".." in path.parts else path).lstrip("/")
+
+
+def read_text(path: Path) -> str:
+    """The text of the regular file `path`, at most MAX_BYTES of UTF-8.
+
+    Raises DoraSystemdError (BAD_INPUT) when there is no such file, it is anything but a regular
+    file (a FIFO would let us wait for ever), too large, unreadable or not UTF-8.
+    """
+    try:
+        data = _read_bytes(path)
+    except (OSError, ValueError) as error:
+        raise unreadable(path, error) from error
+    return decoded(data, path)
+
+
+def decoded(data: bytes, path: Path) -> str:
+    """The text that was read from `path`. Raises DoraSystemdError (BAD_INPUT) if not UTF-8."""
+    if len(data) > MAX_BYTES:
+        raise _too_large(path)
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise _refusal(path, f"line {line} is not UTF-8", "save it as UTF-8 text") from error
+
+
+def read_yaml(path: Path, allow_empty: bool = False) -> object:
+    """The document in the YAML file `path`, as dora reads it: YAML 1.2, no merge keys, no dates.
+
+    Raises DoraSystemdError (BAD_INPUT) as read_text does, and with the line number when it is not
+    YAML, holds several documents, is nested too deeply or has a key twice, and when it is empty
+    unless `allow_empty` (then it is None). The same anchor is the same object everywhere, however
+    often it is used: walk the result with a limit.
+    """
+    return parse_yaml(read_text(path), path, allow_empty)
+
+
+def parse_yaml(text: str, path: Path, allow_empty: bool = False) -> object:
+    """The document in `text`, as read_yaml reads it from `path`, which errors name."""
+    import yaml
+
+    try:
+        _check_shape(text, path)
+        document = yaml.load(text, Loader=_loader())
+    except yaml.YAMLError as error:
+        raise _refusal(path, _yaml_reason(error), "correct the YAML there") from error
+    except (ValueError, OverflowError, RecursionError) as error:
+        raise _refusal(path, "it is not YAML that can be read", "correct the YAML") from error
+    if document is None and not allow_empty:
+        raise _refusal(path, "it is empty", "write something into it")
+    return document
+
+
+def read_json(path: Path) -> Any:
+    """The JSON value in `path`; raises DoraSystemdError (BAD_INPUT) as read_text does."""
+    text = read_text(path)
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise _refusal(path, "it is not JSON", "") from error
+
+
+def write_atomic(
+    path: Path, data: str | bytes, mode: int = 0o644, is_durable: bool = False
+) -> None:
+    """Replaces `path` by `data` in one step: readers see the old file or the new one, whole.
+
+    `mode` holds from the first byte on, whatever the umask. is_durable: the same is true after a
+    power cut. Nothing is left behind on failure, which raises DoraSystemdError.
+    """
+    from tempfile import mkstemp  # imports every compressor, and most commands write nothing
+
+    content = data.encode() if isinstance(data, str) else data
+    temporary = ""
+    try:
+        descriptor, temporary = mkstemp(prefix=f".{path.name}.", dir=path.parent)
+        with os.fdopen(descriptor, "wb") as file:
+            os.fchmod(file.fileno(), mode)
+            file.write(content)
+            if is_durable:
+                file.flush()
+                os.fsync(file.fileno())
+        Path(temporary).replace(path)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            Path(temporary).unlink()
+        is_refused = error.errno in (errno.EACCES, errno.EPERM, errno.EROFS)
+        code = ExitCode.NO_PERMISSION if is_refused else ExitCode.FAILURE
+        message = f"cannot write {shown(str(path))}: {error.strerror}"
+        raise DoraSystemdError(message, _WRITE_HINTS.get(error.errno or 0, ""), code) from error
+
+
+def _read_bytes(path: Path) -> bytes:
+    # O_NONBLOCK: opening a FIFO would wait for a writer. No controlling terminal either.
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
+    try:
+        _check_regular(os.fstat(descriptor), path)
+        with os.fdopen(descriptor, "rb", closefd=False) as file:
+            data = file.read(MAX_BYTES + 1)
+    finally:
+        os.close(descriptor)
+    if len(data) > MAX_BYTES:
+        raise _too_large(path)
+    return data
+
+
+def _check_regular(status: os.stat_result, path: Path) -> None:
+    if stat.S_ISDIR(status.st_mode):
+        raise _refusal(path, "it is a directory", "give the file in it")
+    if not stat.S_ISREG(status.st_mode):
+        raise _refusal(path, "it is not a regular file", "give a file")
+    if status.st_size > MAX_BYTES:
+        raise _too_large(path)
+
+
+def _too_large(path: Path) -> DoraSystemdError:
+    return _refusal(path, f"it is larger than {MAX_BYTES // 1024} KiB", "give a smaller file")
+
+
+def _check_shape(text: str, path: Path) -> None:
+    """Events are read one by one without recursion, unlike nodes."""
+    import yaml
+
+    depth = 0
+    for count, event in enumerate(yaml.parse(text, Loader=_loader())):
+        depth += isinstance(event, yaml.CollectionStartEvent)
+        depth -= isinstance(event, yaml.CollectionEndEvent)
+        if depth > MAX_DEPTH or count > MAX_VALUES:
+            what = f"nested more than {MAX_DEPTH} levels deep"
+            reason = what if depth > MAX_DEPTH else f"more than {MAX_VALUES} values"
+            raise _refusal(path, f"it is {reason}", "make it simpler")
+
+
+@cache
+def _loader() -> Any:
+    from dora_systemd.adapters.host.yaml_loader import loader_class
+
+    return loader_class()
+
+
+def _yaml_reason(error: Exception) -> str:
+    mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
+    problem = getattr(error, "problem", None) or getattr(error, "reason", None) or "not YAML"
+    return f"line {mark.line + 1}: {problem}" if mark else f"not YAML: {problem}"
+
+
+def _refusal(path: Path, reason: str, hint: str) -> DoraSystemdError:
+    return DoraSystemdError(f"cannot read {shown(str(path))}: {reason}", hint, ExitCode.BAD_INPUT)

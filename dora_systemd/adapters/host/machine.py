@@ -1,0 +1,16 @@
+"""The size of this machine, from proc(5)."""
+
+import os
+from pathlib import Path
+
+from dora_systemd.decisions.settings.limit_checks import Machine
+
+_KIB = 1024
+
+
+def read_machine() -> Machine:
+    """Memory, processors and numbers for tasks. Raises OSError without /proc."""
+    lines = Path("/proc/meminfo").read_text().splitlines()
+    total = next(int(line.split()[1]) for line in lines if line.startswith("MemTotal:"))
+    tasks = int(Path("/proc/sys/kernel/pid_max").read_text())
+    return Machine(total * _KIB, os.cpu_count() or 1, tasks)

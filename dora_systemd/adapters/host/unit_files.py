@@ -1,0 +1,129 @@
+"""Unit files on disk: read, written so that a power cut leaves the old one or the new one."""
+
+import contextlib
+import errno
+import os
+import stat
+from pathlib import Path
+
+from dora_systemd.adapters.host.files import read_text, write_atomic
+from dora_systemd.errors import DoraSystemdError, ExitCode
+
+_REFUSED = {errno.EACCES, errno.EPERM, errno.EROFS}
+
+
+def read_unit_file(path: Path) -> str | None:
+    """The text of `path`, None where nothing is.
+
+    Raises DoraSystemdError: NAME_IN_USE for a link (as systemctl mask makes) or anything else that
+    is no regular file, BAD_INPUT for what cannot be read.
+    """
+    try:
+        mode = path.lstat().st_mode
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise _failure("read", path, error) from error
+    if not stat.S_ISREG(mode):
+        raise foreign_file(path)
+    return read_text(path)
+
+
+def write_link(path: Path, target: str) -> None:
+    """Make the symbolic link `path`, unless it is there. Raises DoraSystemdError."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if not path.is_symlink():
+            path.symlink_to(target)
+    except OSError as error:
+        raise _failure("write", path, error) from error
+
+
+def remove_empty(directory: Path) -> None:
+    """Take a directory away if nothing is in it."""
+    with contextlib.suppress(OSError):
+        directory.rmdir()
+
+
+def write_unit_file(path: Path, text: str) -> None:
+    """Put `text` at `path` and onto the disk; missing directories are made.
+
+    Raises DoraSystemdError; then `path` is as it was, unless the disk is broken.
+    """
+    made = [one for one in path.parents if not one.exists()]
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _failure("write", path, error) from error
+    write_atomic(path, text, is_durable=True)
+    # The file is on the disk; whether its name is, too, is the business of its directory.
+    for directory in (path.parent, *(one.parent for one in made)):
+        _sync_directory(directory, path)
+
+
+def _sync_directory(directory: Path, path: Path) -> None:
+    try:
+        descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+    except OSError as error:
+        raise _failure("write", path, error) from error
+
+
+def remove_unit_file(path: Path) -> None:
+    """Take `path` away, if it is there. Raises DoraSystemdError."""
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise _failure("remove", path, error) from error
+
+
+NODE_LIMITS_FILE = "60-node-limits.conf"
+HOT_RELOAD_FILE = "60-hot-reload.conf"
+_CHANGES = ("50-*.conf", NODE_LIMITS_FILE, HOT_RELOAD_FILE)
+"""systemd's own drop-ins for changed properties, and ours for limits of nodes."""
+
+
+def drop_in_directory(fragment: Path, is_transient: bool) -> Path:
+    """Where drop-ins for what was changed belong: those of a transient unit go with it."""
+    place = fragment.parent
+    if not is_transient:
+        place = place.with_name(f"{place.name}.control")
+    return place / f"{fragment.name}.d"
+
+
+def changed_files(fragment: Path) -> list[Path]:
+    """The drop-ins with which `doractl set` or systemctl set-property has changed a unit file."""
+    place = drop_in_directory(fragment, is_transient=False)
+    return sorted(path for pattern in _CHANGES for path in place.glob(pattern))
+
+
+def remove_changes(fragment: Path) -> None:
+    """Take these drop-ins away. Raises DoraSystemdError."""
+    for path in changed_files(fragment):
+        remove_unit_file(path)
+    with contextlib.suppress(OSError):  # there may be others, or none
+        drop_in_directory(fragment, is_transient=False).rmdir()
+
+
+def wanted_units(directory: Path) -> frozenset[str]:
+    """The units that the targets of `directory` start: the links in its .wants directories."""
+    return frozenset(path.name for path in directory.glob("*.wants/dora-*.service"))
+
+
+def foreign_file(path: Path) -> DoraSystemdError:
+    """The error for a file in our place that somebody else has put there."""
+    return DoraSystemdError(
+        f"cannot use {path}: it already exists and is not doractl's",
+        "look at it; then move it away, or take another name",
+        ExitCode.NAME_IN_USE,
+    )
+
+
+def _failure(what: str, path: Path, error: OSError) -> DoraSystemdError:
+    is_refused = error.errno in _REFUSED
+    hint = "use sudo, or --user for a dataflow of your own" if is_refused else ""
+    code = ExitCode.NO_PERMISSION if is_refused else ExitCode.FAILURE
+    return DoraSystemdError(f"cannot {what} {path}: {error.strerror}", hint, code)

@@ -1,0 +1,146 @@
+"""Changes of files below a directory, by inotify(7). The only importer of watchfiles."""
+
+import asyncio
+import errno
+import os
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.reload.watch_rules import DEFAULT_WATCH, WatchRules
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import settings_path
+from dora_systemd.trust.paths import read_file
+
+DEBOUNCE_MS = 400
+"""Changes that follow each other faster belong together, up to this time."""
+_STEP_MS = 100
+_GONE_SECONDS = 0.25
+
+
+def watch_rules(options: RunnerOptions) -> WatchRules:
+    """Which files of a dataflow mean a reload; the .gitignore files are read now."""
+    root, given = options.working_directory, options.reload
+    own = frozenset({options.dataflow, settings_path(options.dataflow)})
+    watched = given.watch or DEFAULT_WATCH
+    return WatchRules(root, watched, given.ignore, read_gitignores(root), own)
+
+
+async def changed_files(rules: WatchRules) -> AsyncIterator[frozenset[str]]:
+    """The files that `rules` has and that were written, made, renamed or deleted, burst by burst.
+
+    Directories are watched, not files: editors save by renaming. What ignored directories hold
+    costs nothing. Raises DoraSystemdError when the kernel gives no more watches.
+    """
+    # A large tree takes seconds to walk, and the loop of the runner feeds the watchdog.
+    seen = await asyncio.to_thread(_stamps, rules)
+    while True:
+        await _wait_root(rules.root)
+        async for paths in _bursts(rules):
+            files = frozenset(path for path in paths if rules.has(path))
+            if files:
+                seen.update((path, change_time(path)) for path in files)
+                yield files
+        # Directories came or went. What changed while they were not watched is found by its time.
+        now = await asyncio.to_thread(_stamps, rules)
+        missed = frozenset(path for path in {*seen, *now} if seen.get(path) != now.get(path))
+        seen = now
+        if missed:
+            yield missed
+
+
+def _stamps(rules: WatchRules) -> dict[str, int]:
+    return dict(watched_files(rules))
+
+
+def watched_files(rules: WatchRules) -> Iterator[tuple[str, int]]:
+    """The files that `rules` has now, with their times of change in ns."""
+    for directory in watched_directories(rules):
+        for entry in _entries(directory):
+            if rules.has(entry.path) and not entry.is_dir(follow_symlinks=False):
+                yield entry.path, change_time(entry.path)
+
+
+def watched_directories(rules: WatchRules) -> list[str]:
+    """The directories in which there may be such files, the top one first."""
+    apart = {str(Path(one).parent) for one in rules.files}
+    found = [rules.root, *sorted(one for one in apart if not rules.has_directory(one))]
+    for directory in found:
+        for entry in _entries(directory):
+            if entry.is_dir(follow_symlinks=False) and rules.has_directory(entry.path):
+                found.append(entry.path)
+    return found
+
+
+def read_gitignores(root: str) -> dict[str, tuple[str, ...]]:
+    """The lines of each .gitignore below `root`, by relative directory, as WatchRules has them."""
+    found: dict[str, tuple[str, ...]] = {}
+    for directory in watched_directories(WatchRules(root)):
+        try:
+            # A link is not followed, as git does not follow it: see NOTES in gitignore(5).
+            data = read_file(Path(directory, ".gitignore")).data
+        except DoraSystemdError:
+            continue
+        lines = data.decode(errors="replace").splitlines()
+        found[os.path.relpath(directory, root).removeprefix(".")] = tuple(lines)
+    return found
+
+
+def change_time(path: str) -> int:
+    """When a file was written or put in its place, in ns since the epoch; 0: it is not there."""
+    try:
+        return Path(path).stat().st_ctime_ns
+    except OSError:
+        return 0
+
+
+async def _bursts(rules: WatchRules) -> AsyncIterator[frozenset[str]]:
+    """Paths of files that change, until a directory comes or goes."""
+    # Only who asks for a reload pays for it.
+    from watchfiles import Change, awatch
+
+    directories = await asyncio.to_thread(watched_directories, rules)
+    try:
+        async for changes in awatch(
+            *directories,
+            watch_filter=None,
+            debounce=DEBOUNCE_MS,
+            step=_STEP_MS,
+            recursive=False,
+        ):
+            yield frozenset(path for _, path in changes)
+            gone = {path for change, path in changes if change is Change.deleted}
+            if gone.intersection(directories) or any(
+                _is_new_directory(p, rules) for _, p in changes
+            ):
+                return
+    except FileNotFoundError:
+        return  # a directory went while the watches were being set
+    except OSError as error:
+        if error.errno == errno.ENOSPC or "limit" in str(error).lower():
+            raise DoraSystemdError(
+                f"cannot watch {rules.root}: the kernel gives no more inotify watches",
+                "raise sysctl fs.inotify.max_user_watches, or exclude files with --ignore",
+                ExitCode.FAILURE,
+            ) from error
+        raise DoraSystemdError(f"cannot watch {rules.root}: {error}") from error
+    except RuntimeError as error:  # watchfiles's own, when the kernel gives no inotify instance
+        hint = "raise sysctl fs.inotify.max_user_instances"
+        raise DoraSystemdError(f"cannot watch {rules.root}: {error}", hint) from error
+
+
+def _is_new_directory(path: str, rules: WatchRules) -> bool:
+    return Path(path).is_dir() and rules.has_directory(path)
+
+
+async def _wait_root(root: str) -> None:
+    """Wait for a root that was moved away to come back: there is nothing to watch meanwhile."""
+    while not Path(root).is_dir():
+        await asyncio.sleep(_GONE_SECONDS)
+
+
+def _entries(directory: str) -> list["os.DirEntry[str]"]:
+    try:
+        return sorted(os.scandir(directory), key=lambda entry: entry.name)
+    except OSError:
+        return []

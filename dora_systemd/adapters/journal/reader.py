@@ -1,0 +1,280 @@
+"""Reading the journal: journalctl(1) as a child process.
+
+It is on every machine that has a journal, of the journal's own version, and prints 100,000
+records in the time in which Python's binding reads 5,000.
+"""
+
+import json
+import os
+import select
+import subprocess
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dora_systemd.decisions.logs.query import journal_timestamp, scope_matches
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import is_name, is_node_id, is_uuid, unit_name
+from dora_systemd.scope import Scope
+
+PERSISTENT = Path("/var/log/journal")
+VOLATILE = Path("/run/log/journal")
+_JOIN = "join the group systemd-journal or adm (usermod -aG) and log in again"
+_NOTICE = "to turn off this notice."
+"""How the hint to users who see their own records only ends."""
+
+_LIFE_EVENTS = ("starting", "started", "stopping", "finished", "stopped", "failed")
+_LIFE_FIELDS = ("DORA_DATAFLOW", "DORA_EVENT", "DORA_EXIT", "DORA_REASON")
+
+MAX_LINE = 1024 * 1024
+"""Bytes of a record, or of a value, that is read."""
+MAX_BYTES = 32 * 1024 * 1024
+"""Bytes that are read for one question."""
+FIRST_SECONDS = 20.0
+"""Until journalctl has found the first record: it may have to open large files on a slow disk."""
+READ_SECONDS = 2.0
+"""From then on."""
+_CHUNK = 1 << 18
+_MOST_FORGED = 100
+_MOST_DETAIL = 300
+
+
+@dataclass(frozen=True)
+class LastEvent:
+    """The last life event that the journal has of a dataflow.
+
+    event: such as "dataflow-failed"; a "dataflow-started" of a dataflow that systemd does not
+    know any more means that its runner was killed, or the machine lost power.
+    at_us: CLOCK_REALTIME, µs. detail: exit status or reason, or "".
+    """
+
+    name: str
+    uuid: str
+    event: str
+    at_us: int
+    detail: str
+
+
+@contextmanager
+def open_journalctl(
+    arguments: Sequence[str], want_colors: bool = False, stdout: int = subprocess.PIPE
+) -> "Iterator[subprocess.Popen[bytes]]":
+    """A running journalctl; it ends with the block. stdout: a pipe, or the descriptor to use.
+
+    Raises DoraSystemdError (NO_SYSTEMD) if there is no journalctl.
+    """
+    environment = {**os.environ, "SYSTEMD_COLORS": "1" if want_colors else "0", "LC_ALL": "C.UTF-8"}
+    try:
+        child = subprocess.Popen(
+            ["journalctl", "--no-pager", *arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=stdout,
+            stderr=subprocess.PIPE,
+            env=environment,
+        )
+    except OSError as error:
+        message = f"cannot execute journalctl: {error.strerror}"
+        raise DoraSystemdError(message, "it is part of systemd", ExitCode.NO_SYSTEMD) from error
+    with child:
+        try:
+            yield child
+        finally:
+            child.kill()
+
+
+def end_journalctl(child: "subprocess.Popen[bytes]") -> int:
+    """The exit status of a journalctl whose output has been read to its end.
+
+    Raises DoraSystemdError for what it complained about.
+    """
+    complaint = child.stderr.read().decode("utf-8", "replace").strip() if child.stderr else ""
+    status = child.wait()
+    if status and complaint and not complaint.endswith(_NOTICE):
+        raise _complaint_error(complaint.splitlines()[-1])
+    return status
+
+
+def _complaint_error(complaint: str) -> DoraSystemdError:
+    if complaint.startswith("Failed to parse timestamp"):
+        hint = 'such as "2026-11-20 18:00", "10 min ago", "today" or "5m", see systemd.time(7)'
+        return DoraSystemdError(f"cannot read the time{complaint[25:]}", hint, ExitCode.USAGE)
+    if complaint.startswith("Bad pattern"):
+        return DoraSystemdError(
+            f"cannot use the {complaint[4:]}", "see pcre2pattern(3)", ExitCode.USAGE
+        )
+    if "insufficient permissions" in complaint:
+        return DoraSystemdError("cannot read the journal", _JOIN, ExitCode.NO_PERMISSION)
+    return DoraSystemdError(f"cannot read the journal: {complaint}", "see journalctl(1)")
+
+
+class JournalReader:
+    """The questions that are asked of the journal."""
+
+    def unique(self, field: str) -> list[str]:
+        """All values that `field` has anywhere in the journal, sorted."""
+        with open_journalctl([f"--field={field}", "--quiet"]) as child:
+            assert child.stdout
+            lines = list(_lines(child))
+            end_journalctl(child)
+        return sorted(line.decode("utf-8", "replace").rstrip("\n") for line in lines)
+
+    def known_names(self) -> list[str]:
+        """The names of all dataflows that ever wrote a record, of all scopes."""
+        return list(filter(is_name, self.unique("DORA_DATAFLOW_NAME")))
+
+    def known_uuids(self) -> list[str]:
+        """The UUIDs of all dataflows that ever wrote a record, of all scopes."""
+        return list(filter(is_uuid, self.unique("DORA_DATAFLOW")))
+
+    def known_nodes(self, name: str) -> list[str]:
+        """The nodes of the dataflows called `name` that ever wrote a record."""
+        found = (one.partition("/") for one in self.unique("SYSLOG_IDENTIFIER"))
+        return [node for dataflow, _, node in found if dataflow == name and is_node_id(node)]
+
+    def count_own(self, since_us: int, until_us: int) -> int:
+        """How many records of this very process there are; CLOCK_REALTIME, µs, both included."""
+        times = (("since", since_us), ("until", until_us))
+        options = [f"--{name}={journal_timestamp(us)}" for name, us in times]
+        options += ["--quiet", "--boot", "--output=cat", "--output-fields=_PID"]
+        with open_journalctl([*options, "--", f"_PID={os.getpid()}"]) as child:
+            assert child.stdout
+            count = sum(1 for _ in child.stdout)
+            end_journalctl(child)
+        return count
+
+    def name_of(self, uuid: str) -> str:
+        """The name of the dataflow `uuid`, "" if it never wrote a record."""
+        records = self.newest([f"DORA_DATAFLOW={uuid}"], _MOST_FORGED)
+        return next(filter(None, map(_trusted_name, records)), "")
+
+    def newest(
+        self,
+        matches: Sequence[str],
+        limit: int | None,
+        until_us: int = 0,
+        is_whole: bool = False,
+    ) -> Iterator[dict[str, Any]]:
+        """The records that fit, newest first, as journalctl's JSON has them.
+
+        until_us: CLOCK_REALTIME µs of the newest one, 0 for now. is_whole: long fields, too.
+        """
+        options = [] if limit is None else [f"--lines={limit}"]
+        options += [f"--until={journal_timestamp(until_us)}"] if until_us else []
+        options += ["--all"] if is_whole else []
+        arguments = ["--output=json", "--reverse", "--quiet", *options, "--", *matches]
+        with open_journalctl(arguments) as child:
+            for line in _lines(child):
+                yield json.loads(line)
+            end_journalctl(child)
+
+    def last_events(self, scope: Scope, limit: int = 100) -> list[LastEvent]:
+        """The last life event of each of the `limit` newest dataflows, newest first."""
+        matches = [f"DORA_EVENT=dataflow-{event}" for event in _LIFE_EVENTS]
+        found: dict[tuple[str, str], LastEvent] = {}
+        for record in self.newest([*scope_matches(scope), *matches], None):
+            if event := _last_event(record):
+                found.setdefault((event.name, event.uuid), event)
+            if len(found) >= limit:
+                break
+        return list(found.values())
+
+    def starts(self, scope: Scope, uuid: str, limit: int) -> list[int]:
+        """When the newest lives of a dataflow began, CLOCK_REALTIME µs, newest first."""
+        matches = [*scope_matches(scope), f"DORA_DATAFLOW={uuid}", "DORA_EVENT=dataflow-starting"]
+        return [int(one["__REALTIME_TIMESTAMP"]) for one in self.newest(matches, limit)]
+
+    def invocations(self, scope: Scope, name: str, uuid: str) -> Iterator[str]:
+        """systemd's ids of the lives of a dataflow's unit, newest first."""
+        matches = [*scope_matches(scope, name), "DORA_EVENT=dataflow-starting"]
+        if uuid:
+            matches.append(f"DORA_DATAFLOW={uuid}")
+        previous = ""
+        for record in self.newest(matches, None):
+            invocation = str(record.get("_SYSTEMD_INVOCATION_ID", ""))
+            if invocation != previous:
+                yield invocation
+            previous = invocation
+
+
+def _lines(child: "subprocess.Popen[bytes]") -> Iterator[bytes]:
+    """What a journalctl prints, as far as it is worth reading.
+
+    Whoever may write to the journal, and every node may, can fill it with records of 32 MiB each:
+    lines that are too long are left out, and all ends after so many bytes or so much time.
+    """
+    assert child.stdout
+    fd, rest, left, deadline = child.stdout.fileno(), b"", MAX_BYTES, None
+    poll = select.poll()
+    poll.register(fd, select.POLLIN)
+    while left > 0 and poll.poll(_seconds_until(deadline) * 1000):
+        if not (data := os.read(fd, _CHUNK)):
+            if rest and len(rest) <= MAX_LINE:
+                yield rest
+            return
+        deadline = deadline or time.monotonic() + READ_SECONDS
+        left -= len(data)
+        *lines, last = data.split(b"\n")
+        for line in lines:
+            if len(rest) + len(line) <= MAX_LINE:
+                yield rest + line + b"\n"
+            rest = b""
+        # Of a line that is too long no more is kept than shows that.
+        rest = (rest + last)[: MAX_LINE + 1]
+    child.kill()
+
+
+def _seconds_until(deadline: float | None) -> float:
+    return FIRST_SECONDS if deadline is None else max(deadline - time.monotonic(), 0.0)
+
+
+def _trusted_name(record: dict[str, Any]) -> str:
+    """Whose record it is, "" for one that was written in the name of another dataflow."""
+    name = record.get("DORA_DATAFLOW_NAME")
+    if not isinstance(name, str) or not is_name(name):
+        return ""
+    # These journald vouches for; a user's own services have the second one.
+    units = (record.get("_SYSTEMD_UNIT"), record.get("_SYSTEMD_USER_UNIT"))
+    return name if unit_name(name) in units else ""
+
+
+def _last_event(record: dict[str, Any]) -> LastEvent | None:
+    values = (record.get(field, "") for field in _LIFE_FIELDS)
+    uuid, event, ending, reason = (one if isinstance(one, str) else "" for one in values)
+    name = _trusted_name(record)
+    if not name or not is_uuid(uuid) or event.removeprefix("dataflow-") not in _LIFE_EVENTS:
+        return None
+    detail = (ending or reason)[:_MOST_DETAIL]
+    return LastEvent(name, uuid, event, int(record["__REALTIME_TIMESTAMP"]), detail)
+
+
+def _system_files(top: Path) -> list[Path]:
+    """The system's journal; in a directory that is closed to this user it is taken to be there."""
+    try:
+        files = [directory / "system.journal" for directory in top.iterdir()]
+    except OSError:
+        return []
+    return [path for path in files if not os.access(path.parent, os.X_OK) or path.exists()]
+
+
+def is_volatile() -> bool:
+    """Whether the journal does not outlive a boot, see Storage= in journald.conf(5)."""
+    return not _system_files(PERSISTENT)
+
+
+def check_readable(scope: Scope) -> None:
+    """Raise DoraSystemdError if this user may not read what dataflows of `scope` write."""
+    files = [*_system_files(PERSISTENT), *_system_files(VOLATILE)]
+    if any(os.access(path, os.R_OK) for path in files):
+        return
+    if not files:
+        hint = "is systemd-journald running?"
+        raise DoraSystemdError("cannot find a journal on this machine", hint, ExitCode.NO_SYSTEMD)
+    if not scope.is_user:
+        raise DoraSystemdError("cannot read the system's journal", _JOIN, ExitCode.NO_PERMISSION)
+    if is_volatile():
+        hint = f"it is volatile: {_JOIN}, or have Storage=persistent set in journald.conf(5)"
+        message = "cannot read the records of user services in this machine's journal"
+        raise DoraSystemdError(message, hint, ExitCode.NO_PERMISSION)

@@ -1,0 +1,298 @@
+"""The nodes' output pipes, read into the journal.
+
+Nothing is ever dropped, unless the node has a limit: when journald does not take an entry, the
+entries of the chunk just read wait in memory (at most CHUNK bytes of a pipe), the pipe is not
+read, and the node itself blocks in writing once its pipe is full. fifo(7), pipe(7)
+"""
+
+import asyncio
+import contextlib
+import os
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from dora_systemd.adapters.logs.held import HeldLines, held_path, read_held
+from dora_systemd.adapters.logs.queue import Journal, LogQueue
+from dora_systemd.adapters.logs.source import CHUNK, PIPE_SIZE, Pipe, Source, fifos
+from dora_systemd.decisions.cell.line_rates import RateLimit, format_rate
+from dora_systemd.decisions.cell.status import WHOLE_CELL, LineCount
+from dora_systemd.decisions.logs.events import event_fields
+from dora_systemd.decisions.logs.fields import Value, encode_entry
+from dora_systemd.decisions.logs.lines import LineEncoder, LineSplitter, Origin, dora_log_fields
+from dora_systemd.paths import CellPaths
+
+# Children that a dead node left behind may go on writing: drain() must still end.
+DRAIN_LIMIT = 4 * PIPE_SIZE
+
+
+class LogPipes:
+    """The output of all nodes of a cell, and the cell's life events, into the journal.
+
+    journal: where entries go. origin: of what is of no node. keep: gets each descriptor whose
+    content shall outlive this process, and its node; release: a node that is gone for good. All
+    methods belong to `loop`'s thread and return at once.
+    """
+
+    def __init__(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        journal: Journal,
+        origin: Origin,
+        keep: Callable[[int, str], object] = lambda *_: None,
+        release: Callable[[str], object] = lambda _: None,
+    ) -> None:
+        self._loop = loop
+        self._keep, self._release = keep, release
+        self._journal = journal
+        self._queue = LogQueue(loop, journal, self._pause, self._resume)
+        self._origin = origin
+        self._paths: dict[str, CellPaths] = {}
+        self._sources: dict[str, Source] = {}
+        self._outputs: dict[int, LineSplitter] = {}
+        self._muted: frozenset[str] = frozenset()
+        self._lost = 0
+
+    def make(self, node_id: str, paths: CellPaths) -> None:
+        """Create the two FIFOs of a node, mode 0600, unless it has them already. Raises OSError."""
+        if node_id in self._paths:
+            return
+        for path in fifos(node_id, paths).values():
+            with contextlib.suppress(FileNotFoundError):
+                path.unlink()
+            os.mkfifo(path, 0o600)
+        self._paths[node_id] = paths
+
+    def limit(self, node_id: str, limit: RateLimit) -> None:
+        """Keep only so many of a node's lines from now on; an event counts the others."""
+        self._source(node_id).limit(limit)
+
+    def open(self, node_id: str) -> None:
+        """Begin to read a node's FIFOs: who waits to open one for writing goes on. OSError."""
+        if self._source(node_id).pipes:
+            return
+        for stream, path in fifos(node_id, self._paths[node_id]).items():
+            # Read and write: no end of file between two lives of the node.
+            fd = os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
+            self._keep(fd, node_id)
+            self.adopt(node_id, stream, fd, HeldLines(path))
+
+    def forget(self, node_id: str) -> None:
+        """The node is gone for good: take its last words, close its pipes and remove them."""
+        self.drain(node_id)
+        source = self._sources.pop(node_id)
+        if source.pipes:
+            self._release(node_id)
+        self._close_pipes(source)
+        if node_id in self._paths:
+            for path in fifos(node_id, self._paths.pop(node_id)).values():
+                path.unlink(missing_ok=True)
+                held_path(path).unlink(missing_ok=True)
+
+    def adopt(self, node_id: str, stream: str, fd: int, held: HeldLines | None = None) -> None:
+        """Begin to read `fd`, a pipe that is open already, as "stdout" or "stderr" of a node.
+
+        held: where to note what has been read of it and is not in the journal.
+        """
+        source = self._source(node_id)
+        os.set_blocking(fd, False)
+        pipe = Pipe(fd, stream, LineEncoder(source.origin, stream), held=held)
+        source.pipes.append(pipe)
+        if not self._queue.waiting(node_id):
+            self._loop.add_reader(fd, self._read_pipe, node_id, pipe)
+
+    def replay(self, node_id: str, path: Path) -> None:
+        """Write what another process had read of the FIFO at `path`, and could not write any more.
+
+        It comes before what is in the pipe, which was adopted last.
+        """
+        pipe = self._source(node_id).pipes[-1]
+        data, done = read_held(path)
+        lines = pipe.lines(data)[done:] if data else []
+        self._queue.put(node_id, lambda: list(map(pipe.encoder.entry, lines)))
+
+    def set_pid(self, node_id: str, pid: int) -> None:
+        """The node's lines come from process `pid` from now on; 0: from its next one."""
+        self._source(node_id).renew(pid=pid)
+
+    def _learn_pid(self, source: Source) -> None:
+        """Dora tells the pid tens of milliseconds after the launcher has noted it."""
+        node_id = source.origin.node
+        if node_id in self._paths:
+            with contextlib.suppress(OSError, ValueError):
+                source.renew(pid=int(self._paths[node_id].node_pid(node_id).read_text()))
+
+    def set_run(self, run_id: str) -> None:
+        """All lines and events belong to dora's run `run_id` from now on."""
+        self._origin = replace(self._origin, run=run_id)
+        for source in self._sources.values():
+            source.renew(run=run_id)
+
+    def drain(self, node_id: str) -> None:
+        """Take all that is in a node's pipes now, and an unterminated line, before what follows.
+
+        For a node that has ended: its last words then come before the event that says so.
+        """
+        source = self._source(node_id)
+        for pipe in source.pipes:
+            # A full pipe again, and journald has not come back: the lines are safe where they are.
+            while source.drained < DRAIN_LIMIT and (data := pipe.read()):
+                source.drained += len(data)
+                self._put(node_id, pipe, data, is_flood=True)
+            self._put(node_id, pipe, b"", is_flood=False)
+        self._tell_suppressed(node_id)
+        if not self._queue.waiting(node_id):
+            source.drained = 0
+
+    def write_event(self, name: str, node: str | None = None, **details: Value) -> None:
+        """Write life event `name` (see decisions/logs/events.py), after all lines put before it."""
+        if name == "lines-lost" and isinstance(lost := details["count"], int):
+            self._lost += lost
+        fields = event_fields(name, dataflow=self._origin.name, node=node or "", **details)
+        if node:
+            self._queue.put_record(node, self._entry(fields, node))
+        else:
+            self._queue.put_event(self._entry(fields, node))
+
+    def write_fields(self, fields: dict[str, Value], node: str) -> None:
+        """Write a node's line that came another way than by a pipe; nothing bounds how many wait.
+
+        Who writes them looks at is_busy() before it reads on.
+        """
+        source, stream = self._source(node), str(fields.get("DORA_STREAM", "stdout"))
+        if source.admit(stream, 1, self._loop.time()):
+            source.written += 1
+            entry = self._entry(fields, node)
+            self._queue.put(node, lambda: [entry])
+        self._watch_limit(source, stream)
+
+    def _entry(self, fields: dict[str, Value], node: str | None) -> bytes:
+        origin = self._source(node).origin if node else self._origin
+        return encode_entry({**origin.fields(), **fields})
+
+    def line_counts(self) -> dict[str, LineCount]:
+        """What became of the lines so far, by node; of those that are lost nobody knows whose."""
+        whole = {WHOLE_CELL: LineCount(lost=self._lost)}
+        return whole | {node: source.line_count for node, source in self._sources.items()}
+
+    def is_busy(self, node: str) -> bool:
+        """Whether journald has not taken the node's records so far: what can wait should."""
+        return self._queue.waiting(node) > 0
+
+    def add_output(self, label: str, fd: int, on_line: Callable[[str], None] | None = None) -> None:
+        """Read what coordinator or daemon prints; warnings and errors become records of `label`.
+
+        on_line is given every line as it is, without its newline. Reading ends with the pipe;
+        `fd` is closed then.
+        """
+        os.set_blocking(fd, False)
+        self._outputs[fd] = LineSplitter()
+        self._loop.add_reader(fd, self._read_output, label, fd, on_line)
+
+    def mute(self, *labels: str) -> None:
+        """Make no more records of what these children print, but of all others."""
+        self._muted = frozenset(labels)
+
+    def settle(self, seconds: float = 7.0) -> None:
+        """Drain all pipes and block until journald has taken it all, at most `seconds`."""
+        for node_id in self._sources:
+            self.drain(node_id)
+        deadline = time.monotonic() + seconds
+        while not self._queue.is_empty and time.monotonic() < deadline:
+            self._journal.wait_ready(deadline - time.monotonic())
+            self._queue.flush()
+
+    async def wait_empty(self, left: Callable[[], float]) -> None:
+        """Return when journald has taken all so far, or no second is `left`; the loop runs on."""
+        while not self._queue.is_empty and left() > 0:
+            await asyncio.sleep(0.01)
+
+    def close(self, seconds: float = 7.0) -> None:
+        """Drain all pipes, wait up to `seconds` until journald has taken it all, and close.
+
+        Lines that it has not taken by then are counted in a last event, lines-lost, if it can be
+        written at all.
+        """
+        self.settle(seconds)
+        if lost := self._queue.give_up():
+            self.write_event("lines-lost", count=lost, reason="journald did not take them")
+        for source in self._sources.values():
+            self._close_pipes(source)
+        for fd in list(self._outputs):
+            self._end_output(fd)
+
+    def _close_pipes(self, source: Source) -> None:
+        for pipe in source.pipes:
+            self._loop.remove_reader(pipe.fd)
+            pipe.close()
+        source.pipes.clear()
+
+    def _source(self, node_id: str) -> Source:
+        if node_id not in self._sources:
+            self._sources[node_id] = Source(replace(self._origin, node=node_id))
+        return self._sources[node_id]
+
+    def _pause(self, node_id: str) -> None:
+        for pipe in self._source(node_id).pipes:
+            self._loop.remove_reader(pipe.fd)
+
+    def _resume(self, node_id: str) -> None:
+        source = self._source(node_id)
+        source.drained = 0
+        for pipe in source.pipes:
+            self._loop.add_reader(pipe.fd, self._read_pipe, node_id, pipe)
+        if lost := self._queue.take_lost():
+            self.write_event("lines-lost", count=lost, reason="journald was away for too long")
+
+    def _read_pipe(self, node_id: str, pipe: Pipe) -> None:
+        data = pipe.read()
+        is_flood = pipe.is_flood(len(data), self._loop.time())
+        if data:
+            source = self._source(node_id)
+            if not source.origin.pid:
+                self._learn_pid(source)
+            self._put(node_id, pipe, data, is_flood)
+
+    def _put(self, node_id: str, pipe: Pipe, data: bytes, is_flood: bool) -> None:
+        source = self._source(node_id)
+        batch = source.batch(pipe, data, self._loop.time())
+        self._queue.put(node_id, batch.entries, is_flood, batch.note)
+        self._watch_limit(source, pipe.stream)
+
+    def _watch_limit(self, source: Source, stream: str) -> None:
+        """See that what is suppressed from now on is told at the end of the stream's window."""
+        limiter = source.limiter
+        if limiter is not None and limiter.suppressed and source.report is None:
+            tell = self._tell_suppressed
+            source.report = self._loop.call_at(limiter.end(stream), tell, source.origin.node)
+
+    def _tell_suppressed(self, node_id: str) -> None:
+        source = self._source(node_id)
+        limiter = source.limiter
+        if source.report is not None:
+            source.report.cancel()
+            source.report = None
+        if limiter is not None and (count := limiter.take_suppressed()):
+            source.suppressed += count
+            limit = format_rate(limiter.limit)
+            self.write_event("lines-suppressed", node_id, count=count, limit=limit)
+
+    def _read_output(self, label: str, fd: int, on_line: Callable[[str], None] | None) -> None:
+        try:
+            data = os.read(fd, CHUNK)
+        except BlockingIOError:
+            return
+        lines = self._outputs[fd].feed(data) if data else self._outputs[fd].flush()
+        for line in lines:
+            if label not in self._muted and (fields := dora_log_fields(line)):
+                self._queue.put_record(label, self._entry(fields, label))
+            if on_line is not None:
+                on_line(line.decode("utf-8", "replace"))
+        if not data:
+            self._end_output(fd)
+
+    def _end_output(self, fd: int) -> None:
+        self._loop.remove_reader(fd)
+        del self._outputs[fd]
+        os.close(fd)

@@ -1,0 +1,148 @@
+"""What the runner is asked: one request, one answer, both a line of JSON. See listener.py.
+
+Nobody but root and the user of the dataflow gets into that directory: see unix(7). To root that
+user may be hostile, and have put anything there: `trust.sockets` looks whose it is, an answer has a
+deadline, a size and a shape, and its words are shown without what a terminal would obey.
+
+The request {"verb": "relay"} is answered with the coordinator's token, and from then on the
+connection is one to the coordinator: so whatever network the dataflow has, and whoever listens on
+the ports of this machine, it is the dataflow that is spoken to.
+"""
+
+import contextlib
+import json
+import socket
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from dora_systemd.decisions.dora.coordinator import Coordinator, parse_coordinator, parse_token
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.trust.sockets import connect_unix, plain
+
+Request = Mapping[str, Any]
+MAX_BYTES = 1 << 16
+ANSWER_SECONDS = 150.0
+"""A reload may have to wait for a grace duration, and for nodes to be ready."""
+RELAY_SECONDS = 4.0
+
+
+def ask(path: Path, request: Request, seconds: float = ANSWER_SECONDS) -> dict[str, Any]:
+    """The answer of the runner at `path`. Raises DoraSystemdError, what it refuses included."""
+    with _reaching(path), connect_unix(path, seconds) as stream:
+        return _exchange(stream, path, request, seconds)
+
+
+def order(path: Path, request: Request) -> dict[str, Any]:
+    """The same for what may take long, of a runner that answers now. Raises DoraSystemdError.
+
+    A runner that is stopped, or that is silent on purpose, is found out in RELAY_SECONDS.
+    """
+    # A refusal is an answer, too: a coordinator that is not up yet hinders no reload.
+    refused = contextlib.suppress(DoraSystemdError)
+    with _reaching(path), connect_unix(path, RELAY_SECONDS) as stream, refused:
+        _exchange(stream, path, {"verb": "coordinator"}, RELAY_SECONDS)
+    return ask(path, request)
+
+
+def ask_coordinator(path: Path) -> Coordinator:
+    """Where the coordinator of the runner at `path` listens. Raises DoraSystemdError."""
+    reply = ask(path, {"verb": "coordinator"}, RELAY_SECONDS)
+    with _reaching(path):
+        return parse_coordinator(reply)
+
+
+def relay(path: Path) -> tuple[socket.socket, str]:
+    """A connection to the coordinator of the runner at `path`, and the coordinator's token.
+
+    It is blocking, without a timeout. Raises DoraSystemdError.
+    """
+    with _reaching(path), contextlib.ExitStack() as undo:
+        stream = undo.enter_context(connect_unix(path, RELAY_SECONDS))
+        reply = _exchange(stream, path, {"verb": "relay"}, RELAY_SECONDS)
+        token = parse_token(reply.get("token"))
+        stream.settimeout(None)
+        undo.pop_all()
+        return stream, token
+
+
+def require_access(path: Path) -> None:
+    """Return if there is a runner at `path` that may be asked. Raises DoraSystemdError."""
+    with _reaching(path):
+        connect_unix(path, RELAY_SECONDS).close()
+
+
+def done_of(path: Path, reply: Request) -> list[str]:
+    """What the runner at `path` says it has done, for people. Raises DoraSystemdError."""
+    done = reply.get("done")
+    if not isinstance(done, list) or not all(isinstance(one, str) for one in done):
+        raise _unreadable(path)
+    return [plain(one) for one in done]
+
+
+def parse_line(line: bytes) -> dict[str, Any] | None:
+    """A request or an answer; None for what is no JSON, and empty for what is no object."""
+    try:
+        request = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    return request if isinstance(request, dict) else {}
+
+
+def _exchange(
+    stream: socket.socket, path: Path, request: Request, seconds: float
+) -> dict[str, Any]:
+    deadline = time.monotonic() + seconds
+    stream.sendall(json.dumps(request).encode() + b"\n")
+    reply = parse_line(_read_line(stream, deadline))
+    if not reply:
+        raise _unreadable(path)
+    if "error" in reply:
+        message, hint = (reply.get(key) for key in ("error", "hint"))
+        raise DoraSystemdError(_words(message), _words(hint), _code(reply.get("code")))
+    return reply
+
+
+def _read_line(stream: socket.socket, deadline: float) -> bytes:
+    """One line, and all of it in time. Raises OSError, ValueError for one without an end."""
+    line = b""
+    while not line.endswith(b"\n"):
+        stream.settimeout(max(deadline - time.monotonic(), 0.001))
+        data = stream.recv(MAX_BYTES)
+        line += data
+        if not data or len(line) > MAX_BYTES:
+            raise ValueError("it does not answer")
+    return line
+
+
+def _words(found: object) -> str:
+    return plain(found) if isinstance(found, str) else ""
+
+
+def _code(found: object) -> ExitCode:
+    known = {int(code): code for code in ExitCode if code}
+    return known.get(found, ExitCode.FAILURE) if type(found) is int else ExitCode.FAILURE
+
+
+@contextlib.contextmanager
+def _reaching(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except PermissionError as error:
+        hint = "use sudo: only root and the user it runs as may"
+        raise _unreachable(path, "permission denied", hint, ExitCode.NO_PERMISSION) from error
+    except (OSError, ValueError) as error:
+        hint = "it may be starting or stopping; see doractl list"
+        raise _unreachable(path, str(error), hint, ExitCode.NOT_RUNNING) from error
+
+
+def _unreadable(path: Path) -> DoraSystemdError:
+    reason = "it answers something else than was asked"
+    hint = "restart the dataflow; it may be of another version"
+    return _unreachable(path, reason, hint, ExitCode.FAILURE)
+
+
+def _unreachable(path: Path, reason: str, hint: str, code: ExitCode) -> DoraSystemdError:
+    name = path.parent.name
+    return DoraSystemdError(f"cannot reach the runner of {name}: {reason}", hint, code)

@@ -1,0 +1,92 @@
+"""The runner's own socket in the RuntimeDirectory: who may reach it is said in client.py.
+
+A request to be relayed becomes a connection to the coordinator, whatever network the cell has.
+"""
+
+import asyncio
+import contextlib
+import json
+import os
+import socket
+from collections.abc import Awaitable, Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from dora_systemd.adapters.runner_socket.client import MAX_BYTES, Request, parse_line
+from dora_systemd.adapters.runner_socket.splice import Ends, splice
+from dora_systemd.decisions.dora.coordinator import Coordinator
+from dora_systemd.errors import DoraSystemdError, ExitCode
+
+Answer = Callable[[Request], Awaitable[dict[str, Any]]]
+Reach = Callable[[], Coordinator]
+"""Where the coordinator is. Raises DoraSystemdError (NOT_RUNNING) as long as it is nowhere."""
+
+
+async def serve(path: Path, answer: Answer, reach: Reach) -> None:
+    """Answer requests at `path` for ever. An error is {"error": ..., "hint": ..., "code": ...}."""
+
+    async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with contextlib.suppress(OSError, ValueError):
+            request = parse_line(await reader.readline())
+            if request is not None and request.get("verb") == "relay":
+                await _relay(Ends(reader, writer), reach)
+            else:
+                await _send(writer, await _answer(request, answer, reach))
+        writer.close()
+
+    path.unlink(missing_ok=True)
+    with _short(path) as address, socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(address)
+        path.chmod(0o600)
+        server = await asyncio.start_unix_server(talk, sock=listener, limit=MAX_BYTES)
+        async with server:
+            await server.serve_forever()
+
+
+@contextlib.contextmanager
+def _short(path: Path) -> Iterator[str]:
+    """The address of a socket has 107 bytes, see unix(7); a dataflow's name may have 200."""
+    directory = os.open(path.parent, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        yield f"/proc/self/fd/{directory}/{path.name}"
+    finally:
+        os.close(directory)
+
+
+async def _answer(request: Request | None, answer: Answer, reach: Reach) -> dict[str, Any]:
+    if request is None:
+        return _refusal(DoraSystemdError("cannot read the request", "", ExitCode.USAGE))
+    try:
+        if request.get("verb") == "coordinator":
+            return reach().raw()
+        return await answer(request)
+    except DoraSystemdError as error:
+        return _refusal(error)
+    except Exception as error:
+        # A request that we do not understand ends nothing but itself.
+        what = f"cannot do that: {type(error).__name__}: {error}"
+        return _refusal(DoraSystemdError(what, "please report it"))
+
+
+async def _relay(caller: Ends, reach: Reach) -> None:
+    try:
+        coordinator = reach()
+        there = Ends(*await asyncio.open_connection("127.0.0.1", coordinator.port))
+    except (DoraSystemdError, OSError) as error:
+        hint = "it may be starting or stopping; see doractl list"
+        message = "cannot reach the dora coordinator"
+        own = error if isinstance(error, DoraSystemdError) else None
+        lost = own or DoraSystemdError(f"{message}: {error}", hint, ExitCode.NOT_RUNNING)
+        await _send(caller.writer, _refusal(lost))
+        return
+    await _send(caller.writer, {"token": coordinator.token})
+    await splice(caller, there)
+
+
+async def _send(writer: asyncio.StreamWriter, reply: Mapping[str, Any]) -> None:
+    writer.write(json.dumps(reply).encode() + b"\n")
+    await writer.drain()
+
+
+def _refusal(error: DoraSystemdError) -> dict[str, Any]:
+    return {"error": error.message, "hint": error.hint, "code": int(error.code)}

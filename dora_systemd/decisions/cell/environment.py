@@ -1,0 +1,148 @@
+"""Environment variables of a dataflow: `KEY=VALUE` from flags and files, checked before systemd."""
+
+import re
+from collections.abc import Mapping
+
+from dora_systemd.decisions.cell.hot_reload import CHANGE_VARIABLE
+from dora_systemd.decisions.cell.limits import CHANGES_VARIABLE
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.values import quoted, shown
+
+MAX_ENTRY = 128 * 1024 - 1
+"""Bytes of one `KEY=VALUE`: execve(2) refuses a longer one (MAX_ARG_STRLEN) with its final NUL."""
+
+_KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_CONTROL = re.compile(r"[\x00-\x08\x0a-\x1f\x7f]")
+MANAGER_VARIABLES = frozenset(
+    {
+        *("NOTIFY_SOCKET", "JOURNAL_STREAM", "INVOCATION_ID", "SYSTEMD_EXEC_PID", "MAINPID"),
+        *("MANAGERPID", "MANAGERPIDFDID", "WATCHDOG_PID", "WATCHDOG_USEC", "RUNTIME_DIRECTORY"),
+        *("LISTEN_FDS", "LISTEN_FDNAMES", "LISTEN_PID", "LISTEN_PIDFDID", "FDSTORE"),
+        *("MEMORY_PRESSURE_WATCH", "MEMORY_PRESSURE_WRITE", CHANGES_VARIABLE, CHANGE_VARIABLE),
+    }
+)
+"""What systemd means for the runner alone, see systemd.exec(5). A node that speaks sd_notify must
+not speak for the cell; and Environment= would win over what the manager itself sets: a
+NOTIFY_SOCKET from a flag would let the start job wait for ever."""
+
+_RESERVED = MANAGER_VARIABLES | {"CREDENTIALS_DIRECTORY"}
+"""What only systemd sets; the last one is for the nodes, who find their secrets by it."""
+
+# One word of an environment file: quoted parts, escaped characters and plain ones, in any order.
+_QUOTED = re.compile(r"""'(?P<single>[^']*)'|"(?P<double>(?:[^"\\]|\\.)*)"|\\(?P<char>.)""", re.S)
+
+
+def node_environment(environment: Mapping[str, str]) -> dict[str, str]:
+    """The runner's environment without what is systemd's."""
+    return {key: text for key, text in environment.items() if key not in MANAGER_VARIABLES}
+
+
+def parse_assignment(text: str) -> tuple[str, str]:
+    """Key and value of `KEY=VALUE` as `--env` takes it.
+
+    Raises DoraSystemdError (USAGE) without "=", for a key or value that systemd refuses in
+    Environment= of systemd.exec(5), for control characters and for keys that are systemd's.
+    """
+    key, equals, value = text.partition("=")
+    if not equals:
+        hint = "write KEY=VALUE, such as MODEL=yolov8n.pt"
+        raise DoraSystemdError(f"cannot set environment {quoted(text)}", hint, ExitCode.USAGE)
+    return checked_variable(key, value)
+
+
+def checked_variable(key: str, value: str) -> tuple[str, str]:
+    """`key` and `value` unchanged; raises as parse_assignment does. The value is never shown."""
+    if not _KEY.fullmatch(key):
+        raise _refusal(key, "a name is letters, digits and '_', and begins with no digit")
+    if key in _RESERVED:
+        raise _refusal(key, "systemd sets this one itself")
+    if _CONTROL.search(value) or not _is_unicode(value):
+        raise _refusal(key, "a value is one line of text without control characters")
+    if len(f"{key}={value}".encode()) > MAX_ENTRY:
+        raise _refusal(key, "a value has at most 128 KiB: put it in a file and give its path")
+    return key, value
+
+
+def parse_environment_file(text: str, source: str) -> dict[str, str]:
+    """The variables of an environment file in the syntax of EnvironmentFile= in systemd.exec(5).
+
+    Comments begin with # or ;, values may be quoted, a backslash at the end of a line joins the
+    next one. `source` names the file in errors. Raises DoraSystemdError (BAD_INPUT).
+    """
+    variables: dict[str, str] = {}
+    for number, line in _logical_lines(text):
+        try:
+            key, equals, value = line.partition("=")
+            parse_assignment(key.strip() + equals + (unquoted := _unquoted(value.strip())))
+            variables[key.strip()] = unquoted
+        except DoraSystemdError as error:
+            # The line itself may hold a secret.
+            message = f"cannot read line {number} of {shown(source)} as KEY=VALUE"
+            raise DoraSystemdError(message, error.hint, ExitCode.BAD_INPUT) from error
+    return variables
+
+
+def unit_environment(
+    search_path: str, venv: str | None, variables: Mapping[str, str]
+) -> dict[str, str]:
+    """The environment of a unit: the caller's PATH, its virtual environment first, and `variables`.
+
+    Relative entries of PATH are left out: they would mean another place than they do for the
+    caller. `variables` win.
+    """
+    entries = [entry for entry in search_path.split(":") if _is_usable(entry)]
+    if venv is None:
+        return {"PATH": ":".join(entries), **variables}
+    path = ":".join([f"{venv}/bin", *entries])
+    return {"PATH": path, "VIRTUAL_ENV": venv, **variables}
+
+
+def environment_entries(variables: Mapping[str, str]) -> tuple[str, ...]:
+    """The variables as Environment= has them on D-Bus: one "KEY=VALUE" each."""
+    return tuple(f"{key}={value}" for key, value in variables.items())
+
+
+def _logical_lines(text: str) -> list[tuple[int, str]]:
+    """The lines that are neither empty nor comments, with their numbers, continued ones joined."""
+    lines: list[tuple[int, str]] = []
+    joined = False
+    for number, line in enumerate(text.split("\n"), 1):
+        bare = line.strip()
+        if joined:
+            lines[-1] = (lines[-1][0], lines[-1][1] + bare)
+        elif bare and bare[0] not in "#;":
+            lines.append((number, bare))
+        else:
+            continue
+        joined = lines[-1][1].endswith("\\")
+        lines[-1] = (lines[-1][0], lines[-1][1].removesuffix("\\"))
+    return lines
+
+
+def _unquoted(value: str) -> str:
+    """`value` as a shell would read it: quotes removed, backslash taking the next one literally."""
+    if re.search("[\"']", _QUOTED.sub("", value)):
+        raise _refusal("", "a quote is not closed: a value is one line of text")
+
+    def plain(match: re.Match[str]) -> str:
+        if match["single"] is not None:
+            return match["single"]
+        if match["char"] is not None:
+            return match["char"]
+        return re.sub(r'\\(["\\$`])', r"\1", match["double"])
+
+    return _QUOTED.sub(plain, value)
+
+
+def _is_usable(entry: str) -> bool:
+    return entry.startswith("/") and not _CONTROL.search(entry) and _is_unicode(entry)
+
+
+def _is_unicode(text: str) -> bool:
+    """Whether `text` is no remains of bytes that were not UTF-8, which D-Bus cannot carry."""
+    return not any("\ud800" <= char <= "\udfff" for char in text)
+
+
+def _refusal(key: str, hint: str) -> DoraSystemdError:
+    message = f"cannot set environment variable {quoted(key)}"
+    return DoraSystemdError(message, hint, ExitCode.USAGE)

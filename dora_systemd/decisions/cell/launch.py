@@ -1,0 +1,236 @@
+"""The descriptor as it is sent to dora: every node's program replaced by our launcher.
+
+What a node runs is decided here as dora's daemon would decide it, because the daemon only sees the
+launcher. Kinds that dora has to start itself are left as they are.
+"""
+
+import shlex
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import PurePath
+from typing import Any
+
+from dora_systemd.decisions.cell.log_backlog import with_bounds
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.restarts import DEFAULT, HELD_KEYS
+from dora_systemd.decisions.descriptor.build_session import BuildSession
+from dora_systemd.decisions.descriptor.dataflow import Dataflow
+from dora_systemd.decisions.descriptor.nodes import Node, NodeKind
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.values import SECOND, quoted
+
+LAUNCHED = frozenset({NodeKind.PYTHON, NodeKind.EXECUTABLE, NodeKind.SHELL})
+PROGRAM_KEYS = ("path", "args", "build", "git", "branch", "tag", "rev")
+"""The keys of a node that say what it runs: dora is told something else."""
+DEFAULT_OPERATOR = "op"
+"""dora's id of the operator of a node that has one only."""
+
+
+@dataclass(frozen=True)
+class LaunchPlan:
+    """What the descriptor is rewritten with.
+
+    launcher: absolute path of launcher.sh. search_path: PATH of the nodes.
+    exists: whether a file of that absolute path is there.
+    """
+
+    options: RunnerOptions
+    launcher: str
+    search_path: str
+    exists: Callable[[str], bool]
+    session: BuildSession = field(default_factory=BuildSession)
+
+
+def launch_descriptor(dataflow: Dataflow, plan: LaunchPlan) -> dict[str, Any]:
+    """The descriptor to send. Raises DoraSystemdError (BAD_INPUT) for a node that cannot run."""
+    document = dict(dataflow.raw)
+    document["nodes"] = [_launch_node(node, dataflow.source, plan) for node in dataflow.nodes]
+    if plan.options.env_keys and dataflow.env:
+        # As with `dora start --env`: above the dataflow's env, below a node's own.
+        document["env"] = {
+            key: value for key, value in dataflow.env.items() if key not in plan.options.env_keys
+        }
+    if plan.options.debug:
+        given = document.get("debug")
+        debug = given if isinstance(given, Mapping) else {}
+        document["debug"] = {**debug, "enable_debug_inspection": True}
+    if plan.options.exit_when_nodes_finish is not None:
+        document["exit_when_nodes_finish"] = plan.options.exit_when_nodes_finish
+    return document
+
+
+def is_launched(node: Node) -> bool:
+    """Whether our launcher starts the node. path_sha256 is checked by dora on the real file."""
+    return node.kind in LAUNCHED and node.raw.get("path_sha256") is None
+
+
+def has_pipes(node: Node) -> bool:
+    """Whether the node's output comes through our pipes and not through dora's log files."""
+    return not node.keeps_output and (is_launched(node) or node.kind is NodeKind.OPERATOR)
+
+
+def kinds(dataflow: Dataflow, plan: LaunchPlan) -> dict[str, str]:
+    """How each node is started, as the live table names it."""
+    return {node.id: _kind(node, plan) for node in dataflow.nodes}
+
+
+def _kind(node: Node, plan: LaunchPlan) -> str:
+    is_uv = plan.options.uv and node.kind is NodeKind.PYTHON and not _env_python(node, plan)
+    return "uv" if is_uv else str(node.kind)
+
+
+def _launch_node(node: Node, source: str, plan: LaunchPlan) -> dict[str, Any]:
+    raw = {**node.raw, **_restart_keys(node, plan.options)}
+    if plan.options.hot_reload and raw.get("restart_policy", "never") == "never":
+        raw |= HELD_KEYS if is_launched(node) else {}
+    if node.keeps_output or not (is_launched(node) or node.kind is NodeKind.OPERATOR):
+        raw = with_bounds(raw)
+    if node.kind is NodeKind.OPERATOR:
+        return _with_absolute_operators(raw, plan.options.working_directory)
+    if not is_launched(node):
+        return raw
+    output = "keep" if node.keeps_output else "pipe"
+    directory = _directory(node, source, plan)
+    words = [plan.launcher, node.id, directory, output, *_command(node, directory, source, plan)]
+    kept = {key: value for key, value in raw.items() if key not in PROGRAM_KEYS}
+    if isinstance(kept.get("deploy"), Mapping):
+        kept["deploy"] = {**kept["deploy"], "working_dir": None}
+    return {**kept, "path": "/bin/sh", "args": shlex.join(words)}
+
+
+def _restart_keys(node: Node, options: RunnerOptions) -> dict[str, Any]:
+    """What the node's restarts become: the settings' word for it, its own, or the dataflow's."""
+    for ident, policy in options.node_restarts:
+        if ident == node.id:
+            return policy.dora_keys()
+    if node.restart_policy:
+        return _restart_bounds(node)
+    # Of nodes made of operators, and those that others start, dora restarts none.
+    is_restarted = node.kind not in (NodeKind.OPERATOR, NodeKind.DYNAMIC)
+    return options.restart.dora_keys() if is_restarted and options.restart.policy != "no" else {}
+
+
+def _restart_bounds(node: Node) -> dict[str, Any]:
+    """Bounds for the delays of a node that dora restarts, where the descriptor has none."""
+    if node.restart_policy not in ("on-failure", "always"):
+        return {}
+    shortest, longest = DEFAULT.delay / SECOND, DEFAULT.max_delay / SECOND
+    delay = max(_seconds(node, "restart_delay", shortest), shortest)
+    longest = max(_seconds(node, "max_restart_delay", longest), delay)
+    return {"restart_delay": delay, "max_restart_delay": longest}
+
+
+def _seconds(node: Node, key: str, default: float) -> float:
+    value = node.backoff.get(key, default)
+    return float(value) if isinstance(value, int | float) else default
+
+
+def _directory(node: Node, source: str, plan: LaunchPlan) -> str:
+    if node.git:
+        if node.id not in plan.session.directories:
+            raise _refusal(source, node, "it comes from git and was not built", "run `dora build`")
+        return plan.session.directories[node.id]
+    return str(PurePath(plan.options.working_directory, node.working_directory))
+
+
+def _command(node: Node, directory: str, source: str, plan: LaunchPlan) -> list[str]:
+    if node.kind is NodeKind.SHELL:
+        if not plan.options.allow_shell_nodes:
+            hint = "start with --allow-shell-nodes if you trust the dataflow"
+            raise _refusal(source, node, "shell nodes are not allowed by default", hint)
+        return ["/bin/sh", "-c", node.args]
+    program = _find(node, directory, source, plan)
+    arguments = _split(node, source)
+    if node.kind is NodeKind.EXECUTABLE:
+        return [program, *arguments]
+    return [*_interpreter(node, plan), "-u", program, *arguments]
+
+
+def _split(node: Node, source: str) -> list[str]:
+    try:
+        return shlex.split(node.args)
+    except ValueError as error:
+        raise _refusal(source, node, f"its args: {error}", "quote args as in a shell") from error
+
+
+def sources(dataflow: Dataflow, plan: LaunchPlan) -> dict[str, dict[str, str]]:
+    """The files that each node is started from, absolute, by the operator's id or ""."""
+    return {node.id: dict(_node_sources(node, dataflow.source, plan)) for node in dataflow.nodes}
+
+
+def _node_sources(node: Node, source: str, plan: LaunchPlan) -> Iterator[tuple[str, str]]:
+    if node.kind in (NodeKind.PYTHON, NodeKind.EXECUTABLE):
+        yield "", _find(node, _directory(node, source, plan), source, plan)
+    if node.kind is NodeKind.OPERATOR:
+        raw = _with_absolute_operators(dict(node.raw), plan.options.working_directory)
+        for operator in (raw.get("operator"), *(raw.get("operators") or ())):
+            python = operator.get("python") if isinstance(operator, Mapping) else None
+            file = python.get("source") if isinstance(python, Mapping) else python
+            if isinstance(file, str):
+                yield str(operator.get("id") or DEFAULT_OPERATOR), file
+
+
+def _find(node: Node, directory: str, source: str, plan: LaunchPlan) -> str:
+    places = [directory, *filter(None, plan.search_path.split(":"))]
+    for place in places:
+        path = str(PurePath(place, node.path))
+        if plan.exists(path):
+            return path
+    reason = f"its path {quoted(node.path)} is neither in {directory} nor in PATH"
+    hint = "run `dora build` first" if node.build else "correct the path of the node"
+    raise _refusal(source, node, reason, hint)
+
+
+def _interpreter(node: Node, plan: LaunchPlan) -> list[str]:
+    if not plan.options.uv:
+        return [python_of(plan)]
+    own = _env_python(node, plan)
+    return [own] if own else ["uv", "run", "python"]
+
+
+def _env_python(node: Node, plan: LaunchPlan) -> str | None:
+    if not plan.options.uv or node.id not in plan.session.envs:
+        return None
+    python = str(PurePath(plan.session.envs[node.id], "bin", "python"))
+    return python if plan.exists(python) else None
+
+
+def python_of(plan: LaunchPlan) -> str:
+    """The interpreter of the nodes: of --venv, else the first on PATH; as dora looks for it."""
+    if plan.options.venv is not None:
+        return str(PurePath(plan.options.venv, "bin", "python"))
+    places = [place for place in plan.search_path.split(":") if place]
+    found = (str(PurePath(p, name)) for name in ("python", "python3") for p in places)
+    return next(filter(plan.exists, found), "python3")
+
+
+def _with_absolute_operators(raw: dict[str, Any], directory: str) -> dict[str, Any]:
+    """Dora looks for the files of operators in its own working directory, which is not theirs."""
+    if isinstance(raw.get("operator"), Mapping):
+        raw["operator"] = _absolute_operator(raw["operator"], directory)
+    if isinstance(raw.get("operators"), list):
+        raw["operators"] = [_absolute_operator(one, directory) for one in raw["operators"]]
+    return raw
+
+
+def _absolute_operator(operator: Any, directory: str) -> Any:
+    if not isinstance(operator, Mapping):
+        return operator
+    changed = dict(operator)
+    for key in ("python", "shared-library"):
+        value = changed.get(key)
+        if isinstance(value, str):
+            changed[key] = _absolute(value, directory)
+        elif isinstance(value, Mapping) and isinstance(value.get("source"), str):
+            changed[key] = {**value, "source": _absolute(value["source"], directory)}
+    return changed
+
+
+def _absolute(path: str, directory: str) -> str:
+    return path if "://" in path else str(PurePath(directory, path))
+
+
+def _refusal(source: str, node: Node, reason: str, hint: str) -> DoraSystemdError:
+    return DoraSystemdError(
+        f"cannot start {source}: node {node.id}: {reason}", hint, ExitCode.BAD_INPUT
+    )

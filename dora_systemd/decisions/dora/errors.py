@@ -1,0 +1,55 @@
+"""What dora prints when something fails, in one line."""
+
+import re
+from itertools import pairwise
+
+from dora_systemd.terminal_text import one_line, without_sequences
+
+_NUMBERED = re.compile(r"\d+: +")
+_OS_ERROR = re.compile(r"\(os error \d+\)$")
+_END = ("Location:", "Stack backtrace:", "Backtrace omitted", "Run with ")
+_CHOICES = re.compile(r", expected one of (?:`[^`]*`(?:, )?){6,}")
+_MAX_LENGTH = 300
+
+
+def parse_dora_error(stderr: str) -> str:
+    """The reason in dora's error output: the innermost of its causes, on one line.
+
+    dora (eyre) prints a headline after "[ERROR]", hints, "Caused by:" with one cause or numbered
+    ones, then where in its source and sometimes a backtrace. Without causes it is the headline,
+    without any of it the line of a wrong command line or the last one; "" for no output at all.
+    """
+    lines = [line.strip() for line in without_sequences(stderr).splitlines()]
+    headline = _after(lines, "[ERROR]")[:1]
+    usage = [line for line in lines if line.startswith("error: ")][:1]
+    last = [line for line in lines if line][-1:]
+    reason = _innermost(_after(lines, "Caused by:")) or " ".join(headline or usage or last)
+    return _shortened(_CHOICES.sub("", reason))
+
+
+def _after(lines: list[str], mark: str) -> list[str]:
+    """The lines after `mark` up to the end of that paragraph of the report; [] without mark."""
+    if mark not in lines:
+        return []
+    block: list[str] = []
+    for line in lines[lines.index(mark) + 1 :]:
+        if line.startswith(_END) or (block and not line):
+            break
+        block += [line] * bool(line)
+    return block
+
+
+def _innermost(causes: list[str]) -> str:
+    """The last numbered cause with its continued lines, or all of an unnumbered one.
+
+    An error of the operating system says what happened and not to what: that is one cause before.
+    """
+    starts = [place for place, line in enumerate(causes) if _NUMBERED.match(line)]
+    blocks = [" ".join(causes[begin:end]) for begin, end in pairwise([*starts, len(causes)])]
+    reasons = [_NUMBERED.sub("", block, count=1) for block in blocks] or [" ".join(causes)]
+    return ": ".join(reasons[-2:]) if _OS_ERROR.search(reasons[-1]) else reasons[-1]
+
+
+def _shortened(text: str) -> str:
+    line = " ".join(one_line(text).split())
+    return line if len(line) <= _MAX_LENGTH else line[: _MAX_LENGTH - 3] + "..."

@@ -1,0 +1,298 @@
+"""Dora's control protocol: frames to values and back. No socket, no clock.
+
+The frames are those of dora 1.0 and 1.1 on `/api/control`; dora's
+docs/websocket-control-plane.md lists part of them.
+"""
+
+import json
+import re
+import signal
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+from uuid import uuid4
+
+from dora_systemd.decisions.life import events as life
+from dora_systemd.decisions.resources.oom import Oom
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.values import INFINITY, SECOND
+
+Params = str | Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Reply:
+    """The answer to request `id`. error: "" or dora's text; result: what came otherwise."""
+
+    id: str
+    result: Any
+    error: str
+
+
+@dataclass(frozen=True)
+class LogRecord:
+    """One line of dora's event stream. node: "" when it concerns the whole dataflow."""
+
+    level: str
+    target: str
+    node: str
+    message: str
+
+
+def encode_request(params: Params) -> tuple[str, str]:
+    """The id and the text frame of a request."""
+    ident = str(uuid4())
+    return ident, json.dumps({"id": ident, "method": "control", "params": params})
+
+
+def parse_frame(text: str | bytes) -> Reply | LogRecord | None:
+    """A frame of the coordinator; None for what is of no use to us."""
+    try:
+        frame = json.loads(text)
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(frame, dict):
+        return None
+    if frame.get("event") == "log" and isinstance(frame.get("payload"), dict):
+        return _log_record(frame["payload"])
+    if isinstance(frame.get("id"), str):
+        return _reply(frame)
+    return None
+
+
+def _log_record(payload: Mapping[str, Any]) -> LogRecord:
+    texts = {key: str(payload.get(key) or "") for key in ("level", "target", "node_id", "message")}
+    return LogRecord(texts["level"].upper(), texts["target"], texts["node_id"], texts["message"])
+
+
+def _reply(frame: Mapping[str, Any]) -> Reply:
+    # A malformed request is answered by "error", one that failed by {"result": {"Error": ...}}.
+    result, error = frame.get("result"), frame.get("error")
+    if isinstance(result, dict) and "Error" in result:
+        error = result["Error"]
+    words = error if isinstance(error, str) else "an error without words"
+    return Reply(frame["id"], result, "" if error is None else words)
+
+
+def result_of(reply: Reply, key: str) -> Any:
+    """The value under `key` in a good reply.
+
+    Raises DoraSystemdError for an error reply and for a reply of another kind.
+    """
+    if reply.error:
+        raise DoraSystemdError(f"cannot do this in dora: {first_line(reply.error)}")
+    if not isinstance(reply.result, dict) or key not in reply.result:
+        raise DoraSystemdError(
+            f"cannot understand dora: {key} expected, got {str(reply.result)[:80]}",
+            "dora-systemd speaks with dora 1.0 and 1.1; see `doractl version`",
+        )
+    return reply.result[key]
+
+
+def start_params(descriptor: Mapping[str, Any], name: str, work: str) -> Params:
+    """Start a run. work: absolute directory for dora's `out/` and, by default, for the nodes."""
+    return {
+        "Start": {
+            "build_id": None,
+            "session_id": str(uuid4()),
+            "dataflow": descriptor,
+            "name": name,
+            "local_working_dir": work,
+            "uv": False,
+            "write_events_to": None,
+        }
+    }
+
+
+def stop_params(run: str, grace: int) -> Params:
+    """Stop a run. grace: µs until dora sends SIGTERM; SIGKILL follows after half as much again."""
+    return {
+        "Stop": {"dataflow_uuid": run, "grace_duration": duration(grace), "force": False},
+    }
+
+
+def duration(microseconds: int) -> Mapping[str, int]:
+    """Microseconds as Rust's serde writes a Duration."""
+    seconds, rest = divmod(microseconds, SECOND)
+    return {"secs": seconds, "nanos": rest * 1000}
+
+
+def subscribe_params(run: str) -> Params:
+    """The life events of a run. Debug is the level of `spawned node with pid`."""
+    return {"LogSubscribe": {"dataflow_id": run, "level": "Debug"}}
+
+
+def wait_spawn_params(run: str) -> Params:
+    """Answered when all nodes were executed, or with the reason why one could not be."""
+    return {"WaitForSpawn": {"dataflow_id": run}}
+
+
+def check_params(run: str) -> Params:
+    """Has the run ended, and how?"""
+    return {"Check": {"dataflow_uuid": run}}
+
+
+def node_params(method: str, run: str, node: str, grace: int | None = None) -> Params:
+    """RestartNode, StopNode or RemoveNode. grace: µs as above; None: dora's own."""
+    limit = None if grace is None else duration(grace)
+    return {method: {"dataflow_id": run, "node_id": node, "grace_duration": limit}}
+
+
+OVERLAP = SECOND
+"""µs for which a node and its replacement run at the same time, at most."""
+
+
+def replace_params(run: str, definition: Mapping[str, Any]) -> Params:
+    """Start `definition` in place of the node of that id, which then has OVERLAP to end."""
+    overlap = duration(OVERLAP)
+    return {"ReplaceNode": {"dataflow_id": run, "node": definition, "grace_duration": overlap}}
+
+
+def add_params(run: str, definition: Mapping[str, Any]) -> Params:
+    """Add a node to a dataflow that runs."""
+    return {"AddNode": {"dataflow_id": run, "node": definition}}
+
+
+def reload_params(run: str, node: str, operator: str) -> Params:
+    """Have a Python operator read its file again."""
+    return {"Reload": {"dataflow_id": run, "node_id": node, "operator_id": operator}}
+
+
+DAEMON_CONNECTED: Params = "DaemonConnected"
+CONNECTED_DAEMONS: Params = "ConnectedMachines"
+HELLO: Params = {"Hello": {"dora_version": "1.0.0"}}
+
+
+def parse_heartbeat(reply: Reply) -> int:
+    """µs since the coordinator last heard of its daemon, as CONNECTED_DAEMONS is answered.
+
+    INFINITY when it has none any more, 0 when the answer does not tell.
+    """
+    daemons = _mapping(reply.result).get("ConnectedDaemons")
+    if not isinstance(daemons, list):
+        return 0
+    ages = (_mapping(one).get("last_heartbeat_ago_ms") or 0 for one in daemons)
+    return min((int(age) * 1000 for age in ages), default=INFINITY)
+
+
+def parse_results(reply: Reply) -> dict[str, str] | None:
+    """The reply to Check or Stop: None while it runs, else node id -> "" or why it failed.
+
+    An empty mapping means that dora does not know, never success: that is what a coordinator says
+    whose daemon is gone.
+    """
+    result = _mapping(reply.result)
+    if "DataflowSpawned" in result:
+        return None
+    nodes = _mapping(
+        _mapping(_mapping(result.get("DataflowStopped")).get("result")).get("node_results")
+    )
+    return {node: _failure(verdict) for node, verdict in sorted(nodes.items())}
+
+
+def parse_spawn_failure(reply: Reply) -> str:
+    """The reply to WaitForSpawn: "" or why a node could not be executed.
+
+    A run that dora does not know any more was executed and has ended: its life events tell how.
+    """
+    return "" if _ENDED_ALREADY.match(reply.error) else first_line(reply.error)
+
+
+def _mapping(value: Any) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}
+
+
+def _failure(verdict: Any) -> str:
+    if "Err" not in _mapping(verdict):
+        return ""
+    error = _mapping(verdict["Err"])
+    cause = _mapping(error.get("cause"))
+    if "FailedToSpawn" in cause:
+        return f"failed to spawn: {first_line(str(cause['FailedToSpawn']))}"
+    ended = _exit_status(_mapping(error.get("exit_status")))
+    if "Cascading" in cause:
+        by = _mapping(cause["Cascading"]).get("caused_by_node")
+        return f"{ended} because node {by} failed"
+    return f"{ended} after the grace duration" if error.get("cause") == "GraceDuration" else ended
+
+
+def _exit_status(status: dict[str, Any]) -> str:
+    if "ExitCode" in status:
+        return f"exit code {status['ExitCode']}"
+    number = status.get("Signal")
+    return f"signal {signal_name(number)}" if isinstance(number, int) else "unknown exit status"
+
+
+def signal_name(number: int) -> str:
+    """SIGKILL for 9; the number as text where it has no name."""
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return str(number)
+
+
+def first_line(text: str) -> str:
+    """An error of dora without what follows it: its location and its backtrace."""
+    head = re.split(r"\n\s*\n?(?:Location|Stack backtrace|Suggestion)\b", text, maxsplit=1)[0]
+    return " ".join(head.split())
+
+
+_ENDED_ALREADY = re.compile(r"unknown dataflow\b")
+_SPAWNED = re.compile(r"spawned node with pid (\d+)")
+_EXITED = re.compile(
+    r"handling node stop with exit status (\w+)(?:\((-?\d+)\))? \(restart: (true|false)"
+)
+_CASCADED = re.compile(r"marking `(.+)` as cascading error caused by `(.+)`")
+
+
+def parse_life_event(record: LogRecord, at_us: int) -> life.Event | None:
+    """The life event that a line of dora's own stands for; None for all others.
+
+    What nodes print cannot forge one: those lines carry the level "stdout" or a target of theirs.
+    """
+    if record.target == "coordinator":
+        return life.RunFinished(at_us) if record.message == "dataflow finished" else None
+    if record.node:
+        return _node_event(record, at_us) if record.target in ("daemon", "spawner") else None
+    if record.target == "daemon" and record.message.endswith("starting dataflow"):
+        return life.AllReady(at_us)
+    return None
+
+
+def _node_event(record: LogRecord, at_us: int) -> life.Event | None:
+    if record.message == "node is ready":
+        return life.NodeReady(at_us, record.node)
+    if spawned := _SPAWNED.fullmatch(record.message):
+        return life.NodeSpawned(at_us, record.node, int(spawned[1]))
+    if exited := _EXITED.match(record.message):
+        how = _exit_text(exited[1], exited[2])
+        return life.NodeExited(at_us, record.node, how, exited[3] == "true")
+    if cascaded := _CASCADED.match(record.message):
+        return life.NodeCascaded(at_us, cascaded[1], cascaded[2])
+    return None
+
+
+def _exit_text(kind: str, number: str | None) -> str:
+    if kind == "Success":
+        return ""
+    if kind == "Signal" and number:
+        return f"signal {signal_name(int(number))}"
+    return f"exit code {number}" if kind == "ExitCode" and number else "unknown exit status"
+
+
+_UNRESPONSIVE = re.compile(r"node `([^`]+)` (unresponsive for \d+ms \(timeout: [^)]*\)), killing")
+
+
+def parse_daemon_line(line: str, at_us: int) -> life.Event | None:
+    """What a line that the daemon printed says about a node; dora tells hangs nowhere else."""
+    match = _UNRESPONSIVE.search(line)
+    return life.NodeHung(at_us, match[1], match[2]) if match else None
+
+
+def with_facts(event: life.NodeExited, is_stale: bool, oom: Oom | None) -> life.NodeExited:
+    """The event with what only the runner can tell.
+
+    is_stale: whether the node's process lives on. oom: the want of memory that ended it.
+    """
+    how = event.exit if oom is None or not event.exit else oom.text
+    return replace(event, exit=how, is_stale=is_stale, oom=oom if event.exit else None)

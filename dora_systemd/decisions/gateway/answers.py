@@ -1,0 +1,234 @@
+"""What systemd, the journal and the node tables know, in the form of dora's answers. Pure.
+
+The forms are those that dora's coordinator 1.1.0 sends: sizes in MB of 1,000,000 bytes, states of
+nodes in four words, times of results as the 64 bits of NTP.
+"""
+
+import json
+import re
+import shlex
+import signal
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import UTC, datetime
+from typing import Any
+
+from dora_systemd.decisions.logs.lines import DEBUG, ERR, INFO, WARNING
+from dora_systemd.decisions.views.dataflows import FAILED, UP_WORDS, DataflowRow, NodeRow
+from dora_systemd.values import SECOND
+
+Record = Mapping[str, bytes]
+"""An entry of the journal, as its export format has it."""
+
+LOG_FIELDS = (
+    *("MESSAGE", "PRIORITY", "MESSAGE_ID", "UNIT", "USER_UNIT"),
+    *("DORA_NODE", "DORA_LEVEL", "DORA_TARGET", "DORA_STREAM"),
+)
+"""The fields of a record that are made use of."""
+
+_OWN_TARGET = "dora-systemd"
+_MEGABYTE = 1_000_000
+_NTP_BITS = 32
+_NODE_STATES = {"failed": "failed", "finished": "stopped", "stopped": "stopped"}
+_RESTARTING = frozenset({"restarting", "reloading"})
+_LEVELS = ("off", "error", "warn", "info", "debug", "trace")
+_BY_PRIORITY = {ERR: "error", WARNING: "warn", DEBUG: "debug"}
+_EXIT = re.compile(r"(?:exit code (?P<code>\d+)|signal (?P<signal>SIG[A-Z0-9]+))")
+_SYSTEMD_FIELDS = ("UNIT", "USER_UNIT")
+
+
+def dataflow_list(rows: Iterable[DataflowRow]) -> dict[str, Any]:
+    """The answer to List."""
+    return {
+        "DataflowList": [
+            {"id": {"uuid": row.uuid, "name": row.name}, "status": _status(row.status)}
+            for row in rows
+        ]
+    }
+
+
+def _status(word: str) -> str:
+    if word in UP_WORDS:
+        return "Running"
+    return "Failed" if word == FAILED else "Finished"
+
+
+def node_list(rows: Iterable[DataflowRow]) -> dict[str, Any]:
+    """The answer to GetNodeInfo."""
+    return {"NodeInfoList": [_node_info(row, node) for row in rows for node in row.nodes]}
+
+
+def _node_info(row: DataflowRow, node: NodeRow) -> dict[str, Any]:
+    return {
+        "dataflow_id": row.uuid,
+        "dataflow_name": row.name,
+        "node_id": node.node,
+        "daemon_id": _daemon_id(row.uuid),
+        "metrics": {
+            "pid": node.pid,
+            "cpu_usage": node.cpu_percent or 0.0,
+            "memory_mb": (node.memory or 0) / _MEGABYTE,
+            "disk_read_mb_s": None,
+            "disk_write_mb_s": None,
+            "restart_count": node.restarts or 0,
+            "broken_inputs": [],
+            "status": _node_state(node.state),
+            "pending_messages": 0,
+        },
+        "network": None,
+    }
+
+
+def _node_state(state: str) -> str:
+    return "restarting" if state in _RESTARTING else _NODE_STATES.get(state, "running")
+
+
+def daemon_list(uuids: Iterable[str]) -> dict[str, Any]:
+    """The answer to ConnectedMachines: each dataflow has a daemon of its own."""
+    daemons = [{"daemon_id": _daemon_id(one), "last_heartbeat_ago_ms": 0} for one in uuids]
+    return {"ConnectedDaemons": daemons}
+
+
+def _daemon_id(uuid: str) -> dict[str, Any]:
+    return {"machine_id": None, "uuid": uuid}
+
+
+def stopped(uuid: str, at_us: int, failures: Mapping[str, str]) -> dict[str, Any]:
+    """DataflowStopped. at_us: CLOCK_REALTIME µs. failures: how nodes ended that ended badly."""
+    stamp = {"time": _ntp(at_us), "id": list(bytes.fromhex(uuid.replace("-", "")))}
+    results = {
+        node: {
+            "Err": {
+                "timestamp": stamp,
+                "cause": {"Other": {"stderr": text}},
+                "exit_status": _exit_status(text),
+            }
+        }
+        for node, text in failures.items()
+    }
+    result = {"uuid": uuid, "timestamp": stamp, "node_results": results}
+    return {"DataflowStopped": {"uuid": uuid, "result": result}}
+
+
+def _ntp(at_us: int) -> int:
+    seconds, rest = divmod(at_us, SECOND)
+    return seconds << _NTP_BITS | (rest << _NTP_BITS) // SECOND
+
+
+def _exit_status(text: str) -> Any:
+    found = _EXIT.search(text)
+    if found is None:
+        return "Unknown"
+    if found["code"]:
+        return {"ExitCode": int(found["code"])}
+    number = getattr(signal, found["signal"], None)
+    return {"Signal": int(number)} if number is not None else "Unknown"
+
+
+def bare_descriptor(nodes: Iterable[str]) -> dict[str, Any]:
+    """All that is known of the descriptor of a dataflow whose unit is gone: its nodes."""
+    return {"nodes": [{"id": node, "path": ""} for node in nodes]}
+
+
+def restored_descriptor(
+    running: Mapping[str, Any], written: Sequence[Mapping[str, Any]], keys: Sequence[str]
+) -> dict[str, Any]:
+    """What a coordinator runs, with each node's `keys` as they are written in its file.
+
+    Of nodes that are in the file of a module, the program is as our launcher was told it: absolute.
+    """
+    by_id = {node.get("id"): node for node in written}
+    nodes = [_restored(node, by_id.get(node.get("id"), {}), keys) for node in running["nodes"]]
+    return {**running, "nodes": nodes}
+
+
+def _restored(
+    node: Mapping[str, Any], written: Mapping[str, Any], keys: Sequence[str]
+) -> dict[str, Any]:
+    if not written:
+        return {**node, **_program(node)}
+    kept = {key: value for key, value in node.items() if key not in keys}
+    return {**kept, **{key: written[key] for key in keys if key in written}}
+
+
+def _program(node: Mapping[str, Any]) -> dict[str, str]:
+    """Path and arguments of a node, out of what it tells our launcher; {} for any other."""
+    try:
+        launcher, *words = shlex.split(str(node.get("args")))
+    except ValueError:
+        return {}
+    command = words[3:]
+    if not launcher.endswith("/launcher.sh") or not command:
+        return {}
+    if command[:2] == ["/bin/sh", "-c"]:
+        return {"path": "shell", "args": " ".join(command[2:])}
+    start = 1 + command.index("-u") if "-u" in command else 0
+    # A program may have an argument "-u" as well as Python.
+    start = start if command[start : start + 1] and command[start].endswith(".py") else 0
+    return {"path": command[start], "args": shlex.join(command[start + 1 :])}
+
+
+def log_line(record: Record) -> bytes:
+    """A line of a node as it is in dora's log files, log_<node>.jsonl, but for empty keys."""
+    line = {
+        "ts": _timestamp(record),
+        "level": _level(record),
+        "node": _text(record, "DORA_NODE"),
+        "msg": _text(record, "MESSAGE"),
+    }
+    if "DORA_TARGET" in record:
+        line["target"] = _text(record, "DORA_TARGET")
+    return json.dumps(line, separators=(",", ":")).encode() + b"\n"
+
+
+def log_payload(record: Record, uuid: str) -> dict[str, Any]:
+    """A record of the journal as an event of dora's log stream. uuid: of the dataflow."""
+    level = _level(record)
+    target = _text(record, "DORA_TARGET") or ("" if "DORA_STREAM" in record else _OWN_TARGET)
+    return {
+        "build_id": None,
+        "dataflow_id": uuid,
+        "node_id": _text(record, "DORA_NODE") or None,
+        "daemon_id": None,
+        "level": level if level == "stdout" else level.upper(),
+        "target": target or None,
+        "module_path": None,
+        "file": None,
+        "line": None,
+        "message": _text(record, "MESSAGE"),
+        "timestamp": _timestamp(record),
+        "fields": None,
+    }
+
+
+def is_wanted(record: Record, level: object) -> bool:
+    """Whether who follows at `level`, a word of dora's, is sent the record; plain lines always."""
+    own, asked = _level(record), str(level).lower()
+    if own == "stdout" or asked not in _LEVELS:
+        return True
+    return _LEVELS.index(own) <= _LEVELS.index(asked)
+
+
+def is_from_systemd(record: Record) -> bool:
+    """Whether systemd says that the unit has ended."""
+    return any(name in record for name in _SYSTEMD_FIELDS)
+
+
+def _level(record: Record) -> str:
+    level = _text(record, "DORA_LEVEL")
+    if level in _LEVELS:
+        return level
+    if "DORA_STREAM" in record:
+        return "stdout"
+    priority = _text(record, "PRIORITY")
+    number = int(priority) if len(priority) == 1 and priority.isdecimal() else INFO
+    return _BY_PRIORITY.get(max(number, ERR), "info")
+
+
+def _text(record: Record, name: str) -> str:
+    return record.get(name, b"").decode("utf-8", "replace")
+
+
+def _timestamp(record: Record) -> str:
+    at_us = int(record.get("__REALTIME_TIMESTAMP", b"0"))
+    moment = datetime.fromtimestamp(at_us // SECOND, UTC).replace(microsecond=at_us % SECOND)
+    return moment.isoformat(timespec="microseconds").replace("+00:00", "Z")

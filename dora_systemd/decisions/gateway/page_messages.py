@@ -1,0 +1,119 @@
+"""What the status page and the gateway say to each other on /api/live: JSON objects. Pure.
+
+The page sends, each with its `type`:
+  follow    {dataflow, node, number}          what a node writes from now on, "" for all of them;
+                                              takes the place of what was followed before
+  unfollow  {}
+  graph     {dataflow}
+  act       {action, dataflow, node, number}  action: "stop" or "restart"; node "": the dataflow
+
+It gets:
+  hello     {version, host, scope}            first of all
+  snapshot  {dataflows}                       again and again; each as in snapshot.observed_values
+  graph     {dataflow, nodes, edges, problem}
+  lines     {number, lines, skipped}          lines: {at_us, node, text, priority, event};
+                                              skipped: so many before these were too many
+  acted     {number, text, problem, hint}     how an action ended
+  problem   {text, hint}                      what hinders all of it for now
+
+`dataflow` is a UUID, `number` is the page's own and comes back with what belongs to it.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from dora_systemd.decisions.descriptor.dataflow import Dataflow
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.terminal_text import escaped, without_sequences
+
+TYPES = ("follow", "unfollow", "graph", "act")
+ACTIONS = ("stop", "restart")
+LOG_FIELDS = "MESSAGE,PRIORITY,DORA_NODE,DORA_EVENT,SYSLOG_IDENTIFIER"
+MAX_TEXT = 4000
+"""Characters of one line that a page is sent."""
+
+_DEFAULT_PRIORITY = 6
+_PRIORITIES = frozenset(b"%d" % number for number in range(8))
+
+
+@dataclass(frozen=True)
+class PageMessage:
+    """Something that a page asks for."""
+
+    type: str
+    dataflow: str = ""
+    node: str = ""
+    action: str = ""
+    number: int = 0
+
+
+def parse_message(text: str | bytes) -> PageMessage:
+    """What a page asks for; raises DoraSystemdError (USAGE) for what is no message at all."""
+    try:
+        raw = json.loads(text)
+        message = PageMessage(
+            type=_text(raw, "type"),
+            dataflow=_text(raw, "dataflow"),
+            node=_text(raw, "node"),
+            action=_text(raw, "action"),
+            number=int(raw.get("number", 0)),
+        )
+    except (ValueError, TypeError, AttributeError, RecursionError, OverflowError) as error:
+        raise _refusal() from error
+    if message.type not in TYPES or (message.type == "act" and message.action not in ACTIONS):
+        raise _refusal()
+    return message
+
+
+def _text(raw: Mapping[str, Any], key: str) -> str:
+    value = raw.get(key, "")
+    if not isinstance(value, str):
+        raise TypeError(key)
+    return value
+
+
+def _refusal() -> DoraSystemdError:
+    hint = "the page may be of another version: reload it"
+    return DoraSystemdError("cannot read what the page sent", hint, ExitCode.USAGE)
+
+
+def line_values(record: Mapping[str, bytes]) -> dict[str, Any]:
+    """A record of the journal as a line of the page."""
+    node = _decoded(record.get("DORA_NODE", b""))
+    priority = record.get("PRIORITY", b"")
+    return {
+        "at_us": int(record.get("__REALTIME_TIMESTAMP", b"0")),
+        "node": node or _decoded(record.get("SYSLOG_IDENTIFIER", b"")).partition("/")[2],
+        "text": _printable(_decoded(record.get("MESSAGE", b""))),
+        "priority": int(priority) if priority in _PRIORITIES else _DEFAULT_PRIORITY,
+        "event": _decoded(record.get("DORA_EVENT", b"")),
+    }
+
+
+def _decoded(data: bytes) -> str:
+    return data.decode("utf-8", "replace")
+
+
+def _printable(text: str) -> str:
+    """Without colours and other orders to a terminal; what is left of them can be seen."""
+    text = without_sequences(text)
+    return escaped(text if len(text) <= MAX_TEXT else f"{text[:MAX_TEXT]}…")
+
+
+def graph_values(dataflow: Dataflow) -> dict[str, Any]:
+    """Nodes and edges of a descriptor; dora's own sources, such as timers, are nodes as well."""
+    nodes = [{"id": node.id, "kind": str(node.kind)} for node in dataflow.nodes]
+    edges = [
+        _edge(node.id, given.name, given.source) for node in dataflow.nodes for given in node.inputs
+    ]
+    sources = dict.fromkeys(edge["from"] for edge in edges if edge["from"].startswith("dora/"))
+    return {"nodes": [*({"id": one, "kind": "dora"} for one in sources), *nodes], "edges": edges}
+
+
+def _edge(node: str, name: str, source: str) -> dict[str, str]:
+    origin, _, output = ("dora", "", "") if source.startswith("dora/") else source.partition("/")
+    if origin == "dora":
+        origin = source
+    return {"from": origin, "output": output, "to": node, "input": name}

@@ -1,0 +1,100 @@
+"""The runner's life as one total table: step(cell, event) -> (cell, actions). No I/O, no clock.
+
+    booting -> joining -> starting -> waiting -> running -> closing -> leaving -> ended
+                                         \\----------\\-> stopping ---/
+
+Every pair of state and event has an entry in TABLE; its unit test takes them all.
+"""
+
+from collections.abc import Mapping
+
+from dora_systemd.decisions.life import events as life
+from dora_systemd.decisions.life import failures
+from dora_systemd.decisions.life import handlers as handle
+from dora_systemd.decisions.life.failures import Handler, Step
+from dora_systemd.decisions.life.states import Cell, State
+
+
+def step(cell: Cell, event: life.Event) -> Step:
+    """The cell after `event`, and what the runner has to do about it, in this order."""
+    return TABLE[cell.state][type(event)](cell, event)
+
+
+def _row(**handlers: Handler) -> dict[type[life.Event], Handler]:
+    """One line of the table: what is not named does nothing in that state."""
+    assert handlers.keys() <= {event.__name__ for event in life.EVENTS}
+    return {event: handlers.get(event.__name__, handle.ignore) for event in life.EVENTS}
+
+
+_NODES: dict[str, Handler] = dict.fromkeys(
+    ("NodeSpawned", "NodeReady", "NodeExited", "NodeCascaded", "NodeHung"), handle.node_event
+)
+_RELOADS: dict[str, Handler] = {
+    **dict.fromkeys(("NodeReloading", "NodeAdded", "NodeRemoved"), handle.reshape),
+    "ReloadNoted": handle.note_reload,
+    "ReloadAsked": handle.reload,
+}
+_NODES_STOPPING: dict[str, Handler] = dict.fromkeys(_NODES, handle.node_event_stopping)
+_LOST: dict[str, Handler] = {
+    "ChildExited": failures.child_exited,
+    "ConnectionLost": failures.connection_lost,
+    "Refused": failures.refused,
+    "Failed": failures.broken,
+}
+_EARLY: dict[str, Handler] = {
+    **_LOST,
+    "StartTimedOut": handle.start_timed_out,
+    "StopAsked": handle.stop_early,
+    "DeadlinePassed": failures.engine_deadline,
+    "ReloadNoted": handle.note_reload,
+}
+_ALIVE: dict[str, Handler] = {
+    **_LOST,
+    **_NODES,
+    "RunFinished": handle.run_finished,
+    "ResultKnown": handle.result,
+    "StopAsked": handle.stop,
+}
+_STOPPING: dict[str, Handler] = {
+    **_NODES_STOPPING,
+    **dict.fromkeys(
+        (
+            "StopAnswered",
+            "RunFinished",
+            "DeadlinePassed",
+            "ChildExited",
+            "ConnectionLost",
+        ),
+        handle.leave_now,
+    ),
+    "Failed": failures.broken,
+    "StopAsked": handle.stop_again,
+}
+
+TABLE: Mapping[State, Mapping[type[life.Event], Handler]] = {
+    State.BOOTING: _row(**_EARLY, CoordinatorListening=handle.listening),
+    State.JOINING: _row(**_EARLY, DaemonConnected=handle.joined),
+    State.STARTING: _row(**_EARLY, RunStarted=handle.started, Subscribed=handle.subscribed),
+    State.WAITING: _row(
+        **{**_ALIVE, **_RELOADS, "NodeExited": handle.node_event_waiting},
+        AllReady=handle.barrier_opened,
+        DeadlinePassed=handle.run,
+        StartTimedOut=handle.start_timed_out,
+    ),
+    State.RUNNING: _row(**_ALIVE, **_RELOADS),
+    State.STOPPING: _row(**_STOPPING),
+    State.CLOSING: _row(
+        **{**_LOST, **_NODES},
+        ResultKnown=handle.result,
+        StopAsked=handle.stop_while_closing,
+        DeadlinePassed=failures.engine_deadline,
+    ),
+    State.LEAVING: _row(
+        **_NODES,
+        ChildExited=handle.daemon_left,
+        # How it ended is known by now: it stays so.
+        **dict.fromkeys(("DeadlinePassed", "Failed"), handle.end),
+        StopAsked=handle.stop_leaving,
+    ),
+    State.ENDED: _row(),
+}

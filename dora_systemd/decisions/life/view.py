@@ -1,0 +1,130 @@
+"""What a cell shows of itself: STATUS= of its unit and the table in status.json."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from dora_systemd.decisions.cell.restarts import HELD_SECONDS
+from dora_systemd.decisions.cell.status import HELD, CellStatus, CpuSample, LineCount, NodeStatus
+from dora_systemd.decisions.life.states import Cell, State
+
+_STAGES = {
+    State.BOOTING: "starting",
+    State.JOINING: "starting",
+    State.STARTING: "starting",
+    State.WAITING: "waiting",
+    State.STOPPING: "stopping",
+    State.CLOSING: "stopping",
+    State.LEAVING: "stopping",
+    State.ENDED: "ended",
+}
+_FIXED = {
+    State.BOOTING: "starting the dora coordinator",
+    State.JOINING: "starting the dora daemon",
+    State.STARTING: "starting the nodes",
+    State.CLOSING: "asking dora how the dataflow ended",
+    State.LEAVING: "stopping the dora daemon",
+}
+_NAMED = 5
+"""How many nodes a status line names."""
+
+
+def format_status(cell: Cell) -> str:
+    """One line for STATUS=, see sd_notify(3)."""
+    if cell.failure:
+        return f"failed: {cell.failure}"
+    if cell.state in _FIXED:
+        return _FIXED[cell.state]
+    if cell.state is State.ENDED:
+        return "stopped" if cell.stop_by else "finished"
+    if cell.state is State.STOPPING:
+        return f"stopping, {_plural(_count(cell, 'starting', 'ready', 'running'))} left"
+    return _format_waiting(cell) if cell.state is State.WAITING else _format_running(cell)
+
+
+def _format_waiting(cell: Cell) -> str:
+    waiting = [ident for ident, node in cell.nodes.items() if node.state == "starting"]
+    failed = [_with_exit(*one) for one in cell.nodes.items() if one[1].state == "failed"]
+    text = f"{_count(cell, 'ready', 'dynamic')}/{len(cell.nodes)} nodes ready"
+    text = f"{text}, waiting for {_names(waiting)}" if waiting else text
+    return f"{text}; failed: {_names(failed)}" if failed else text
+
+
+def _format_running(cell: Cell) -> str:
+    parts = [f"{_count(cell, 'running', 'ready', 'dynamic')}/{len(cell.nodes)} nodes running"]
+    for state in ("starting", "restarting", "reloading", "finished", "failed"):
+        nodes = {ident: node for ident, node in cell.nodes.items() if node.state == state}
+        if nodes:
+            parts.append(f"{state}: {_names([_with_exit(*one) for one in nodes.items()])}")
+    if cell.notice:
+        parts.append(cell.notice)
+    return "; ".join(parts)
+
+
+def _with_exit(ident: str, node: NodeStatus) -> str:
+    return f"{ident} ({node.exit})" if node.exit else ident
+
+
+def _names(texts: list[str]) -> str:
+    more = len(texts) - _NAMED
+    return ", ".join(texts[:_NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
+def _plural(count: int) -> str:
+    return f"{count} node" if count == 1 else f"{count} nodes"
+
+
+def _count(cell: Cell, *states: str) -> int:
+    return sum(node.state in states for node in cell.nodes.values())
+
+
+def stage(cell: Cell) -> str:
+    """One of dora_systemd.decisions.cell.status.STAGES."""
+    if cell.state is State.RUNNING:
+        return "degraded" if _count(cell, "failed") else "running"
+    return _STAGES[cell.state]
+
+
+def cell_status(
+    cell: Cell,
+    uuid: str,
+    samples: tuple[CpuSample, ...],
+    lines: Mapping[str, LineCount],
+) -> CellStatus:
+    """The table that status.json holds."""
+    return CellStatus(
+        uuid=uuid,
+        run=cell.run,
+        stage=stage(cell),
+        text=format_status(cell),
+        started_us=cell.started_us,
+        ready_us=cell.ready_us,
+        nodes=dict(cell.nodes),
+        samples=samples,
+        lines=lines,
+    )
+
+
+def _policy(raw: Mapping[str, Any]) -> str:
+    if raw.get("restart_delay") == HELD_SECONDS:
+        return HELD
+    return raw.get("restart_policy") or "never"
+
+
+def initial_nodes(
+    kinds: Mapping[str, str], descriptor: Mapping[str, Any], at_us: int
+) -> dict[str, NodeStatus]:
+    """The table before anything happened.
+
+    kinds: node id -> how dora starts it. descriptor: what dora is sent.
+    """
+    raw = {node["id"]: node for node in descriptor["nodes"]}
+    return {
+        ident: NodeStatus(
+            state="dynamic" if kind == "dynamic" else "starting",
+            kind=kind,
+            since_us=at_us,
+            policy=_policy(raw[ident]),
+            max_restarts=int(raw[ident].get("max_restarts") or 0),
+        )
+        for ident, kind in kinds.items()
+    }

@@ -1,0 +1,124 @@
+"""The life events of a dataflow: one table, name -> what is stored in the journal.
+
+units/templates/dora-systemd.catalog explains each MESSAGE_ID to `journalctl -x`; a test holds
+the two together. A MESSAGE_ID is for ever, never reuse one: https://systemd.io/CATALOG
+"""
+
+from dataclasses import dataclass
+
+from dora_systemd.decisions.logs.fields import Value, legal_name
+from dora_systemd.decisions.logs.lines import ERR, INFO, NOTICE, WARNING
+
+
+@dataclass(frozen=True)
+class EventKind:
+    """One kind of event; `text` may name the details `{dataflow}`, `{node}` and `{count}`."""
+
+    message_id: str
+    priority: int
+    text: str
+
+
+EVENTS = {
+    "dataflow-starting": EventKind(
+        "0486727a2190411eb78f66e816da2520", INFO, "Dataflow {dataflow} is starting"
+    ),
+    "dataflow-started": EventKind(
+        "c8e3833d172d44c5a32de08c980c4d67",
+        NOTICE,
+        "Dataflow {dataflow} is running, all nodes are ready",
+    ),
+    "dataflow-stopping": EventKind(
+        "822b051bbbe24788bf93c0952aafa491", INFO, "Dataflow {dataflow} is stopping"
+    ),
+    "stop-asked": EventKind(
+        "958c39b63a3d47cd9dd585937d57d927", INFO, "Stop of dataflow {dataflow} requested by {by}"
+    ),
+    "dataflow-finished": EventKind(
+        "61a9895e49214871ae2381a42f2a1968", NOTICE, "Dataflow {dataflow} finished"
+    ),
+    "dataflow-stopped": EventKind(
+        "5e9f54e3c8fa448fab7d9114ae8f8e87", NOTICE, "Dataflow {dataflow} was stopped"
+    ),
+    "dataflow-failed": EventKind(
+        "99f4f6038d0146de8190e12fc9726881", ERR, "Dataflow {dataflow} failed"
+    ),
+    "node-ready": EventKind("b365b9011367406fafffd2bbd63d5693", INFO, "Node {node} is ready"),
+    "node-exited": EventKind("617721968a69470486dcfe591e37fd3c", INFO, "Node {node} exited"),
+    "node-crashed": EventKind("c2afc7aa5aac4b8882b951d397ce9297", ERR, "Node {node} crashed"),
+    "node-restarted": EventKind(
+        "436622a1703a4db68ed8a1aac4ddc336", WARNING, "Node {node} is being restarted by dora"
+    ),
+    "node-oom": EventKind("1e5f89981faf4b0ba7cd69e0b844f9a3", ERR, "Node {node} was killed"),
+    "dataflow-oom": EventKind(
+        "074b91207b234b46973343bb14a637a9", ERR, "Dataflow {dataflow} has used up its memory limit"
+    ),
+    "memory-pressure": EventKind(
+        "df01123a855d446d8a751cc3e2f99656",
+        WARNING,
+        "Dataflow {dataflow} is close to a memory limit",
+    ),
+    "cpu-throttled": EventKind(
+        "1c40798a51c14a89a416ed625e0afc1a",
+        NOTICE,
+        "Dataflow {dataflow} is throttled by a CPU limit",
+    ),
+    "node-hung": EventKind("6bb24464fee34a848c077fc1b20c1802", ERR, "Node {node} hangs"),
+    "coordinator-lost": EventKind(
+        "11b7330be3fb484584286f274012f05a", ERR, "The coordinator of dataflow {dataflow} is lost"
+    ),
+    "daemon-lost": EventKind(
+        "4252b5e8e29d4cc4be2e3acdae5f3da4", ERR, "The daemon of dataflow {dataflow} is lost"
+    ),
+    "reloaded": EventKind(
+        "6ddc74129bfd4d61bd13747edb506634", NOTICE, "Dataflow {dataflow} was reloaded"
+    ),
+    "files-changed": EventKind("902dc080ec514a37b5dfa7ecceb95347", INFO, "File changed: {files}"),
+    "node-reloaded": EventKind("4c9f8decbcc94dfbb46948d6c865191d", NOTICE, "Node {node} was {how}"),
+    "reload-failed": EventKind(
+        "47ac7b36b7204f468199e716c9176175", WARNING, "Dataflow {dataflow} was not reloaded"
+    ),
+    "lines-lost": EventKind(
+        "d880d0e56bbe4318ac5ac2afbb8cb42f",
+        WARNING,
+        "{count} log lines of dataflow {dataflow} are lost",
+    ),
+    "lines-suppressed": EventKind(
+        "c1c721542288459ebe040a240a583d9d",
+        WARNING,
+        "{count} log lines of node {node} exceed its limit of {limit}",
+    ),
+}
+
+# An end of the dataflow: each life of it ends with one of these, unless the runner was killed.
+END_EVENTS = ("dataflow-finished", "dataflow-stopped", "dataflow-failed")
+
+# Details that only go into the text: the fields for them come from the origin of the record.
+_TEXT_ONLY = ("dataflow", "node")
+
+
+class _Unnamed(dict[str, object]):
+    def __missing__(self, key: str) -> str:
+        return f"({key} unknown)"
+
+
+def event_fields(name: str, **details: Value) -> dict[str, Value]:
+    """The journal fields of event `name`; the caller adds those of the origin.
+
+    Each detail becomes DORA_<DETAIL>, except `dataflow` and `node`, which only complete the text.
+    `exit` (such as "exit code 1") and `reason` are put at the end of the text.
+    Raises KeyError for an event that the table does not have.
+    """
+    kind = EVENTS[name]
+    text = kind.text.format_map(_Unnamed(details))
+    ending = [str(details[key]) for key in ("exit", "reason") if details.get(key)]
+    fields: dict[str, Value] = {
+        "MESSAGE": ": ".join([text, *ending]),
+        "MESSAGE_ID": kind.message_id,
+        "PRIORITY": kind.priority,
+        "DORA_EVENT": name,
+    }
+    own = {
+        legal_name(key, "DORA_"): value for key, value in details.items() if key not in _TEXT_ONLY
+    }
+    return {**own, **fields}

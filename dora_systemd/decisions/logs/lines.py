@@ -1,0 +1,211 @@
+"""A node's bytes -> lines -> journal fields. Pure: no file, no clock.
+
+The fields of the common plain line are fixed per node, so they are encoded once
+(`LineEncoder`) and a line costs one concatenation; tens of thousands a second pass here.
+"""
+
+import json
+import re
+from dataclasses import dataclass
+
+from dora_systemd.decisions.logs.fields import Value, encode_entry, legal_name
+
+LINE_LIMIT = 1 << 20
+# How dora marks a line above 1 MiB, which it cuts.
+TRUNCATED = "... [truncated]"
+MAX_FIELDS = 200  # journald refuses entries of more than 1024 fields, its own included
+
+ERR, WARNING, NOTICE, INFO, DEBUG = 3, 4, 5, 6, 7
+PRIORITIES = {"error": ERR, "warn": WARNING, "info": INFO, "debug": DEBUG, "trace": DEBUG}
+PLAIN_PRIORITY = {"stdout": INFO, "stderr": NOTICE}
+
+_ANSI = re.compile(r"\x1b\[[0-9;]*m")
+_TRACING = re.compile(
+    r"^(?P<time>\d{4}-\d\d-\d\dT\S+Z)\s+(?P<level>ERROR|WARN|INFO|DEBUG|TRACE)\s+(?P<rest>.*)$"
+)
+_TARGET = re.compile(r"(?:^|: )(?P<target>dora_[a-z0-9_]+(?:::[a-z0-9_]+)*): ")
+
+
+class Piece(bytes):
+    """A part of a line that no newline ended: the line goes on, or its writer ended, there."""
+
+
+class LineSplitter:
+    """Bytes in, lines out. Lines above `limit` bytes come as several `Piece`s and the rest.
+
+    A newline is taken off, and one carriage return before it, as dora does. No other byte means
+    anything, NUL included.
+    """
+
+    def __init__(self, limit: int = LINE_LIMIT) -> None:
+        self.limit = limit
+        self._rest = b""
+
+    def feed(self, data: bytes) -> list[bytes]:
+        """The lines that `data` completes."""
+        data = self._rest + data
+        lines = data.split(b"\n")
+        self._rest = lines.pop()
+        if len(data) > self.limit:
+            lines = [piece for line in lines for piece in self._cut(line)]
+            *pieces, self._rest = self._cut(self._rest)
+            lines += pieces
+        if b"\r\n" in data:
+            lines = [line if type(line) is Piece else line.removesuffix(b"\r") for line in lines]
+        return lines
+
+    @property
+    def rest(self) -> bytes:
+        """What came after the last newline."""
+        return self._rest
+
+    def _cut(self, line: bytes) -> list[bytes]:
+        cuts = range(0, max(len(line), 1), self.limit)
+        pieces: list[bytes] = [Piece(line[cut : cut + self.limit]) for cut in cuts]
+        pieces[-1] = bytes(pieces[-1])
+        return pieces
+
+    def flush(self) -> list[bytes]:
+        """What came after the last newline, as a `Piece`: call it when the writer has ended."""
+        rest, self._rest = self._rest, b""
+        return [Piece(rest)] if rest else []
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Whose lines these are; `pid` 0 and `run` "" mean not known yet."""
+
+    name: str
+    uuid: str
+    node: str = ""
+    run: str = ""
+    pid: int = 0
+
+    @property
+    def identifier(self) -> str:
+        """What `journalctl -t` takes: <name>/<node>, <name> for the dataflow itself."""
+        return f"{self.name}/{self.node}" if self.node else self.name
+
+    def fields(self) -> dict[str, Value]:
+        """The fields that every record of this origin carries."""
+        fields: dict[str, Value] = {
+            "SYSLOG_IDENTIFIER": self.identifier,
+            "DORA_DATAFLOW": self.uuid,
+            "DORA_DATAFLOW_NAME": self.name,
+            "DORA_NODE": self.node,
+            "DORA_NODE_PID": self.pid or "",
+            "DORA_RUN": self.run,
+        }
+        return {name: value for name, value in fields.items() if value != ""}
+
+
+class LineEncoder:
+    """The lines of one stream of one node as journal entries."""
+
+    def __init__(self, origin: Origin, stream: str) -> None:
+        self._constant = encode_entry({**origin.fields(), "DORA_STREAM": stream})
+        priority = encode_entry({"PRIORITY": PLAIN_PRIORITY.get(stream, INFO)})
+        self._plain = self._constant + priority + b"MESSAGE="
+        self._piece = self._constant + priority + b"DORA_CUT=1\nMESSAGE="
+
+    def entry(self, line: bytes) -> bytes:
+        """The journal entry of one line (without its newline)."""
+        if line[:1] == b"{" and (fields := json_fields(line)):
+            cut = b"DORA_CUT=1\n" if type(line) is Piece else b""
+            return self._constant + cut + encode_entry(fields)
+        return (self._piece if type(line) is Piece else self._plain) + line + b"\n"
+
+
+def line_fields(line: bytes, stream: str) -> dict[str, Value]:
+    """The fields that come from the line itself: level and message, more for dora's JSON form."""
+    fields = json_fields(line) if line[:1] == b"{" else None
+    return fields or {"PRIORITY": PLAIN_PRIORITY.get(stream, INFO), "MESSAGE": line}
+
+
+def json_fields(line: bytes) -> dict[str, Value] | None:
+    """The fields of a line in dora's JSON log form (`node.log()`, Rust's tracing), else None."""
+    if b'"level"' not in line or b'"timestamp"' not in line:
+        return None
+    try:
+        record = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    return _record_fields(record) if isinstance(record, dict) else None
+
+
+def _record_fields(record: dict[str, object]) -> dict[str, Value] | None:
+    level = str(record.get("level")).lower()
+    if level not in PRIORITIES:
+        return None
+    nested = record.get("fields")
+    own = dict(nested) if isinstance(nested, dict) else {}
+    message = record.get("message")
+    if message is None:
+        message = own.pop("message", "")
+    fields: dict[str, Value] = {
+        "PRIORITY": PRIORITIES[level],
+        "DORA_LEVEL": level,
+        "DORA_TIMESTAMP": _text(record.get("timestamp")),
+        "DORA_TARGET": _text(record.get("target")),
+        "CODE_FILE": _text(record.get("file", record.get("filename"))),
+        "CODE_LINE": _text(record.get("line", record.get("line_number"))),
+    }
+    fields = {name: value for name, value in fields.items() if value != ""}
+    return {**fields, **_structured(own), "MESSAGE": _text(message)}
+
+
+def jsonl_fields(line: bytes) -> dict[str, Value]:
+    """The fields of a line of dora's own log file, log_<node>.jsonl."""
+    try:
+        record = json.loads(line)
+        stream, level = str(record["stream"] or "stdout"), str(record["level"])
+        text = _text(record["msg"])
+    except (ValueError, RecursionError, TypeError, KeyError):
+        return {"PRIORITY": INFO, "MESSAGE": line}
+    renamed = {**record, "timestamp": record.get("ts"), "message": text}
+    fields = _record_fields(renamed) or {
+        "PRIORITY": PLAIN_PRIORITY.get(level if level == "stderr" else stream, INFO),
+        "DORA_TIMESTAMP": _text(record.get("ts")),
+        "MESSAGE": text,
+    }
+    fields["DORA_STREAM"] = stream
+    if text.endswith(TRUNCATED):
+        fields["DORA_CUT"] = 1
+    return fields
+
+
+def _structured(own: dict[str, object]) -> dict[str, Value]:
+    fields: dict[str, Value] = {}
+    for key in list(own)[:MAX_FIELDS]:
+        fields[legal_name(key, "DORA_FIELD_")] = _text(own.pop(key))
+    if own:
+        fields["DORA_FIELDS_MORE"] = _text(own)
+    return fields
+
+
+def _text(value: object) -> str:
+    if value is None:
+        return ""
+    text = value if isinstance(value, str) else json.dumps(value)
+    # JSON may hold half of a surrogate pair, which UTF-8 cannot: escape it instead of failing.
+    return text.encode("utf-8", "backslashreplace").decode()
+
+
+def dora_log_fields(line: bytes) -> dict[str, Value] | None:
+    """A WARN or ERROR line that coordinator or daemon printed; None for all that they print else.
+
+    Their INFO lines hold the descriptor with its `env:` values and must not be stored.
+    """
+    match = _TRACING.match(_ANSI.sub("", line.decode("utf-8", "replace")))
+    if match is None or match["level"] not in ("WARN", "ERROR"):
+        return None
+    level = match["level"].lower()
+    fields: dict[str, Value] = {
+        "PRIORITY": PRIORITIES[level],
+        "DORA_LEVEL": level,
+        "DORA_TIMESTAMP": match["time"],
+        "MESSAGE": match["rest"],
+    }
+    if target := _TARGET.search(match["rest"]):
+        fields["DORA_TARGET"] = target["target"]
+    return fields

@@ -1,0 +1,157 @@
+"""What to read of the journal, as arguments of journalctl(1).
+
+journalctl finds, filters and formats faster and better than any code of ours could; what is ours
+is to say exactly which records are those of a dataflow.
+"""
+
+from dataclasses import dataclass
+
+from dora_systemd.decisions.logs.events import EVENTS
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import SLICE, unit_name
+from dora_systemd.scope import Scope
+
+OUTPUTS = ("short", "short-precise", "json", "cat", "export")
+RUNS = ("CURRENT", "PREVIOUS", "ALL")
+
+# dora's words and those of syslog(3), to the highest PRIORITY that is shown.
+LEVELS = {
+    **{"emerg": 0, "alert": 1, "crit": 2, "err": 3, "error": 3, "warning": 4, "warn": 4},
+    **{"notice": 5, "info": 6, "debug": 7, "trace": 7, "stdout": 7},
+}
+
+UNIT_ENDS = ("7ad2d189f7e94e70a38c781354912448", "d9b373ed55a64feb8242e02dbe79a49c")
+
+_UNITS = ("ms", "s", "min", "m", "h", "d", "w")
+
+
+@dataclass(frozen=True)
+class LogQuery:
+    """Which records, in which order and form. "" and None: not restricted.
+
+    invocation: of systemd, one life of the unit. run: dora's id of one run.
+    since, until: as in systemd.time(7), or a bare duration, which means so long ago.
+    tail: the last so many records.
+    cursor_file: begin behind the record that it names, write the last one's place there.
+    """
+
+    scope: Scope
+    name: str = ""
+    uuid: str = ""
+    nodes: tuple[str, ...] = ()
+    invocation: str = ""
+    run: str = ""
+    is_events: bool = False
+    level: str = ""
+    since: str = ""
+    until: str = ""
+    grep: str = ""
+    tail: int | None = None
+    is_follow: bool = False
+    is_reverse: bool = False
+    want_unprintable: bool = False
+    output: str = "short"
+    cursor_file: str = ""
+
+
+def parse_level(text: str) -> str:
+    """A level, in lower case; raises DoraSystemdError (USAGE) for an unknown one."""
+    level = text.lower()
+    if level not in LEVELS:
+        known = "error, warn, info, debug, trace; those of syslog are understood too"
+        raise DoraSystemdError(f"cannot use {text!r} as a level", f"one of {known}", ExitCode.USAGE)
+    return level
+
+
+def journal_time(text: str) -> str:
+    """A point in time for journalctl; `5m`, as dora takes it, becomes `-5m`."""
+    number = text.rstrip("abcdefghijklmnopqrstuvwxyz")
+    is_duration = number.replace(".", "", 1).isdigit() and text[len(number) :] in _UNITS
+    return f"-{text}" if is_duration else text
+
+
+def journal_timestamp(us: int) -> str:
+    """A CLOCK_REALTIME in µs as journalctl takes it."""
+    return f"@{us // 1_000_000}.{us % 1_000_000:06d}"
+
+
+def scope_matches(scope: Scope, name: str = "") -> list[str]:
+    """Fields that journald itself vouches for: no other user's process can make such records."""
+    unit = unit_name(name) if name else ""
+    if scope.is_user:
+        where = f"_SYSTEMD_USER_UNIT={unit}" if unit else f"_SYSTEMD_USER_SLICE={SLICE}"
+        return [where, f"_UID={scope.uid}"]
+    return [f"_SYSTEMD_UNIT={unit}" if unit else f"_SYSTEMD_SLICE={SLICE}"]
+
+
+def query_matches(query: LogQuery) -> list[str]:
+    """The matches of a query, see "Matches" in journalctl(1)."""
+    # Each further match costs journalctl time: the unit says the name already.
+    base = scope_matches(query.scope, query.name)
+    for field, value in (
+        ("DORA_DATAFLOW", query.uuid),
+        ("_SYSTEMD_INVOCATION_ID", query.invocation),
+        ("DORA_RUN", query.run),
+    ):
+        if value:
+            base.append(f"{field}={value}")
+    base += [f"DORA_NODE={node}" for node in query.nodes]
+    if query.is_events:
+        base += [f"MESSAGE_ID={kind.message_id}" for kind in EVENTS.values()]
+    return _with_level(base, query.level)
+
+
+def end_matches(scope: Scope, name: str) -> list[str]:
+    """The records in which systemd says that the unit has ended, after all that its processes said.
+
+    7ad2... SD_MESSAGE_UNIT_SUCCESS and d9b3... SD_MESSAGE_UNIT_FAILURE_RESULT, see sd-messages.h.
+    """
+    unit = unit_name(name)
+    who = (
+        [f"USER_UNIT={unit}", f"_UID={scope.uid}"] if scope.is_user else [f"UNIT={unit}", "_PID=1"]
+    )
+    return [*who, *(f"MESSAGE_ID={message_id}" for message_id in UNIT_ENDS)]
+
+
+def story_matches(scope: Scope, name: str, uuid: str) -> list[str]:
+    """What happened to a dataflow: our life events, what systemd says of its unit, who asked."""
+    own = [*scope_matches(scope, name), f"DORA_DATAFLOW={uuid}"]
+    events = [f"MESSAGE_ID={kind.message_id}" for kind in EVENTS.values()]
+    unit = unit_name(name)
+    who = f"_UID={scope.uid}" if scope.is_user else "_UID=0"
+    systemd = [f"USER_UNIT={unit}", who] if scope.is_user else [f"UNIT={unit}", "_PID=1"]
+    asked = [f"DORA_DATAFLOW={uuid}", "DORA_EVENT=stop-asked", who]
+    return [*own, *events, "+", *systemd, "+", *asked]
+
+
+def _with_level(base: list[str], level: str) -> list[str]:
+    if level in ("", "trace", "stdout"):
+        return base
+    if level == "debug":
+        # Both debug and trace are PRIORITY 7.
+        return [*_with_level(base, "info"), "+", *base, "PRIORITY=7", "DORA_LEVEL=debug"]
+    return base + [f"PRIORITY={number}" for number in range(LEVELS[level] + 1)]
+
+
+def query_arguments(query: LogQuery) -> list[str]:
+    """The arguments of journalctl for a query."""
+    options = [f"--output={query.output}"]
+    if query.output not in ("short", "short-precise") or query.cursor_file:
+        options.append("--quiet")  # no line between two boots
+    for option, value in (
+        ("--since", journal_time(query.since)),
+        ("--until", journal_time(query.until)),
+        ("--grep", query.grep),
+        ("--lines", "" if query.tail is None else str(query.tail)),
+        ("--cursor-file", query.cursor_file),
+    ):
+        if value:
+            options.append(f"{option}={value}")
+    for flag, is_set in (
+        ("--follow", query.is_follow),
+        ("--reverse", query.is_reverse),
+        ("--all", query.want_unprintable),
+    ):
+        if is_set:
+            options.append(flag)
+    return [*options, "--", *query_matches(query)]

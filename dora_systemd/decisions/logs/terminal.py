@@ -1,0 +1,117 @@
+"""Lines of the journal as people read them on a terminal: aligned, each node in its colour.
+
+journalctl's `short` lines are rewritten many at a time: a terminal is often asked to show
+hundreds of thousands.
+"""
+
+import re
+import time
+import zlib
+from collections.abc import Iterable, Mapping
+
+from dora_systemd.terminal_text import one_line, shown_log
+
+# The beginning of a line of `journalctl -o short`, with or without journalctl's own colours, or
+# what it puts before the second and later lines of a message.
+_PREFIX = re.compile(
+    rb"^(?:(?P<time>[A-Z][a-z]{2} [ \d]\d \d\d:\d\d:\d\d(?:\.\d+)?) \S+ (?:\x1b\[[0-9;:]*m)*"
+    rb"(?P<dataflow>[A-Za-z0-9][A-Za-z0-9._-]*)(?:/(?P<node>[^\s\[]+))?(?:\[\d+\])?"
+    rb"(?:\x1b\[[0-9;:]*m)*: |(?P<indent> {20,}))",
+    re.M,
+)
+# Readable on dark and on light ground, none of journalctl's own red and yellow.
+_COLORS = (32, 34, 35, 36, 92, 94, 95, 96)
+# Of a message by PRIORITY, as journalctl has them.
+_MESSAGE_COLORS = {b"3": b"\x1b[0;1;31m", b"4": b"\x1b[0;1;38:5:185m", b"7": b"\x1b[0;38:5:245m"}
+MAX_WIDTH = 24
+
+
+def color_of(node: str) -> int:
+    """The ANSI colour of a node: the same in every call, on every machine."""
+    return _COLORS[zlib.crc32(node.encode("utf-8", "replace")) % len(_COLORS)]
+
+
+class TerminalLines:
+    """Rewrites journalctl's short lines; makes such lines of records.
+
+    nodes: known names, for the width of their column. want_dataflow: more than one is shown.
+    want_colors: whether the reader is a terminal.
+    """
+
+    def __init__(
+        self, nodes: Iterable[str] = (), want_dataflow: bool = False, want_colors: bool = True
+    ) -> None:
+        self._width = min(max(map(len, nodes), default=0), MAX_WIDTH)
+        self._want_dataflow = want_dataflow
+        self._want_colors = want_colors
+        self._labels: dict[bytes, bytes] = {}
+        self._rest = b""
+        self._old_indent = self._new_indent = 0
+
+    def feed(self, data: bytes) -> bytes:
+        """The lines that `data` completes, rewritten."""
+        data = self._rest + data
+        end = data.rfind(b"\n") + 1
+        self._rest = data[end:]
+        return _PREFIX.sub(self._rewrite, shown_log(data[:end]))
+
+    def record(self, record: Mapping[str, bytes]) -> bytes:
+        """The line, or lines, of one record of the Journal Export Format."""
+        seconds = int(record.get("__REALTIME_TIMESTAMP", b"0")) // 1_000_000
+        when = time.strftime("%b %d %H:%M:%S", time.localtime(seconds)).encode()
+        start = self._start(when, *record.get("SYSLOG_IDENTIFIER", b"").partition(b"/")[::2])
+        text = record.get("MESSAGE", b"")
+        text = shown_log(text) if self._want_colors else text
+        text = text.replace(b"\n", b"\n" + b" " * self._new_indent)
+        color = _MESSAGE_COLORS.get(record.get("PRIORITY", b""))
+        if color and self._want_colors:
+            text = color + text + b"\x1b[0m"
+        return start + text + b"\n"
+
+    def _rewrite(self, match: re.Match[bytes]) -> bytes:
+        if (indent := match["indent"]) is not None:
+            if len(indent) < self._old_indent:
+                return indent
+            return b" " * (len(indent) - self._old_indent + self._new_indent)
+        self._old_indent = len(match[0]) - _escapes(match[0])
+        return self._start(match["time"], match["dataflow"], match["node"] or b"")
+
+    def _start(self, when: bytes, dataflow: bytes, node: bytes) -> bytes:
+        name = node
+        if self._want_dataflow or not node:
+            name = dataflow + (b"/" + node if node else b"")
+        label = self._labels.get(name)
+        if label is None:
+            label = self._label(name)
+        self._new_indent = len(when) + self._width + 2
+        return b"%s %s " % (when, label)
+
+    def _label(self, name: bytes) -> bytes:
+        text = one_line(name.decode("utf-8", "replace"))
+        if len(text) > self._width:
+            self._width = min(len(text), MAX_WIDTH)
+            self._labels.clear()
+        padded = f"{text:<{self._width}}"
+        if self._want_colors:
+            padded = f"\x1b[{color_of(text)}m{padded}\x1b[0m"
+        return self._labels.setdefault(name, padded.encode("utf-8", "replace"))
+
+
+class ShownLines:
+    """Lines of journalctl's other forms, for a terminal: as they are, but for what commands it."""
+
+    def __init__(self) -> None:
+        self._rest = b""
+
+    def feed(self, data: bytes) -> bytes:
+        """The lines that `data` completes."""
+        whole, end, rest = data.rpartition(b"\n")
+        if not end:
+            self._rest += data
+            return b""
+        done, self._rest = self._rest + whole + end, rest
+        return shown_log(done)
+
+
+def _escapes(text: bytes) -> int:
+    return sum(map(len, re.findall(rb"\x1b\[[0-9;:]*m", text))) if b"\x1b" in text else 0

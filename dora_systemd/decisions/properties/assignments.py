@@ -1,0 +1,151 @@
+"""Properties of one unit: read from assignments as `--property` takes them, and put together."""
+
+from collections.abc import Mapping
+
+from dora_systemd.decisions.properties.kinds import Property
+from dora_systemd.decisions.properties.table import RLIMITS, TABLE, Row
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.suggestions import did_you_mean
+from dora_systemd.values import quoted, shown
+
+Properties = Mapping[str, Property]
+"""Properties by slot: the key of the unit file, with "~" behind it for a filter that leaves out.
+
+What is set later under a slot replaces what was there or, for lists, is joined to it. Two slots can
+have the same name on D-Bus: ConditionPathExists and ConditionHost are both Conditions.
+"""
+
+_DOUBLE_KEYS = {"TimeoutSec": ("TimeoutStartSec", "TimeoutStopSec")}
+
+_SUPERVISED = "dora-systemd needs it to supervise the dataflow"
+_REFUSED = {
+    **dict.fromkeys(("Type", "NotifyAccess", "BusName", "PIDFile", "GuessMainPID"), _SUPERVISED),
+    **dict.fromkeys(("ExecStart", "KillMode", "KillSignal", "RestartKillSignal"), _SUPERVISED),
+    **dict.fromkeys(("Delegate", "DelegateControllers", "DelegateSubgroup"), _SUPERVISED),
+    **dict.fromkeys(
+        ("RuntimeDirectory", "RuntimeDirectoryMode", "RuntimeDirectoryPreserve"),
+        "the state of the running dataflow is there",
+    ),
+    "WorkingDirectory": "--working-directory is that of the nodes",
+    "StandardInput": "its end is the end of `doractl run`",
+    "SetCredential": "everybody could read it in the unit, unlike LoadCredential=ID:PATH",
+}
+_UNSUPPORTED = frozenset(
+    {
+        *("OpenFile", "NFTSet", "MountImages", "ExtensionImages", "RootImageOptions", "RootHash"),
+        *("RootHashSignature", "SocketBindAllow", "SocketBindDeny", "SetCredentialEncrypted"),
+        *("StandardInputText", "StandardInputData", "TTYRows", "TTYColumns", "CoredumpFilter"),
+        *("NonBlocking", "TimeoutCleanSec", "ReloadSignal", "DebugInvocation", "JobTimeoutSec"),
+    }
+)
+
+
+def parse_property(assignment: str) -> dict[str, Property]:
+    """The properties that KEY=VALUE sets, by slot: one, or two for a resource limit.
+
+    Keys and values are those of systemd-run(1) --property. Raises DoraSystemdError (USAGE) for what
+    is no property of a service, what dora-systemd needs for itself, and a bad value.
+    """
+    key, equals, text = assignment.partition("=")
+    if not equals:
+        message = f"cannot set property {quoted(assignment)}: it has no value"
+        raise DoraSystemdError(message, "write KEY=VALUE, such as Nice=5", ExitCode.USAGE)
+    keys = _DOUBLE_KEYS.get(key, (key,))
+    for one in keys:
+        _check_key(one)
+    return {slot: one for each in keys for slot, one in parse_line(each, text).items()}
+
+
+def parse_line(key: str, text: str) -> dict[str, Property]:
+    """The properties that the line KEY=TEXT of one of our own unit files sets, by slot.
+
+    The text has no specifiers. Raises KeyError for a key that is not in the table, DoraSystemdError
+    (USAGE) for a bad value.
+    """
+    if key in RLIMITS:
+        soft, hard = _split_limit(text)
+        return {**_parse_one(f"{key}Soft", soft), **_parse_one(key, hard)}
+    return _parse_one(key, text)
+
+
+def with_properties(properties: Properties, changes: Properties) -> dict[str, Property]:
+    """`properties` and then `changes`: scalars replace, lists are joined, empty lists reset."""
+    result = dict(properties)
+    for slot, new in changes.items():
+        old = result.get(slot)
+        result[slot] = _joined(old, new) if old and old.name == new.name else new
+        if new.signature == "(bas)" and not new.value[1]:
+            result.pop(f"{slot}~", None)
+    return result
+
+
+def format_property(slot: str, properties: Properties) -> list[str]:
+    """The lines of a unit file that say the same as the property in `slot`.
+
+    A soft resource limit is said with its hard one; what no unit file can say is a comment.
+    """
+    name, _, value = properties[slot]
+    row = TABLE.get(slot.removesuffix("~"))
+    kind = dict(row.choices).get(name) if row else None
+    if row is None or kind is None:
+        return [f"# {name} is set by doractl"]
+    if slot.removesuffix("Soft") in RLIMITS and slot not in RLIMITS:
+        return []
+    texts = kind.format(value)
+    soft = properties.get(f"{slot}Soft")
+    if soft and soft.value != value:
+        texts = [f"{kind.format(soft.value)[0]}:{texts[0]}"]
+    return [f"{row.key}={text}" for text in texts]
+
+
+def _check_key(key: str) -> None:
+    message = f"cannot set property {shown(key)}"
+    if key in _REFUSED:
+        raise DoraSystemdError(f"{message}: {_REFUSED[key]}", "leave it out", ExitCode.USAGE)
+    if key in _UNSUPPORTED:
+        hint = "write it into a drop-in instead: systemctl edit dora-NAME.service"
+        raise DoraSystemdError(f"{message} from here", hint, ExitCode.USAGE)
+    if key not in TABLE:
+        hint = did_you_mean(key, TABLE.keys() - _REFUSED.keys()) or "see systemd.directives(7)"
+        raise DoraSystemdError(f"{message}: services have no such property", hint, ExitCode.USAGE)
+
+
+def _parse_one(key: str, text: str) -> dict[str, Property]:
+    row = TABLE[key]
+    reason: Exception | None = None
+    for name, kind in row.choices:
+        try:
+            value = kind.parse(text)
+        except (ValueError, DoraSystemdError) as error:
+            reason = error
+            continue
+        slot = f"{key}~" if kind.signature == "(bas)" and not value[0] else key
+        return {slot: Property(name, kind.signature, value)}
+    raise _bad_value(row, text, reason)
+
+
+def _bad_value(row: Row, text: str, reason: Exception | None) -> DoraSystemdError:
+    expected = " or ".join(kind.expected for _, kind in row.choices)
+    if row.key == "Environment":
+        # The value may be a secret; the error names the variable.
+        hint = reason.hint if isinstance(reason, DoraSystemdError) else f"write {expected}"
+        return DoraSystemdError("cannot set property Environment", hint, ExitCode.USAGE)
+    message = f"cannot set property {row.key.removesuffix('Soft')} to {quoted(text)}"
+    return DoraSystemdError(message, f"write {expected}", ExitCode.USAGE)
+
+
+def _split_limit(text: str) -> tuple[str, str]:
+    """Soft and hard limit of SOFT:HARD; one number is both."""
+    soft, colon, hard = text.partition(":")
+    return soft, hard if colon else soft
+
+
+def _joined(old: Property, new: Property) -> Property:
+    if new.signature == "(bas)" and new.value[1]:
+        return new._replace(value=(new.value[0], (*old.value[1], *new.value[1])))
+    if new.signature == "(aiai)" and any(new.value):
+        joined = tuple((*one, *two) for one, two in zip(old.value, new.value, strict=True))
+        return new._replace(value=joined)
+    if new.signature.startswith("a") and new.signature != "ay" and new.value:
+        return new._replace(value=(*old.value, *new.value))
+    return new

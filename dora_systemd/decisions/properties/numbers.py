@@ -1,0 +1,169 @@
+"""Kinds whose words stand for numbers: signals, exit statuses, capabilities, levels, classes."""
+
+import errno
+import signal
+from collections.abc import Callable, Mapping, Sequence
+from functools import reduce
+
+from dora_systemd.decisions.properties.kinds import PropertyKind, named_kind
+
+_CAPABILITY_NAMES = (
+    *("chown", "dac_override", "dac_read_search", "fowner", "fsetid", "kill", "setgid", "setuid"),
+    *("setpcap", "linux_immutable", "net_bind_service", "net_broadcast", "net_admin", "net_raw"),
+    *("ipc_lock", "ipc_owner", "sys_module", "sys_rawio", "sys_chroot", "sys_ptrace", "sys_pacct"),
+    *("sys_admin", "sys_boot", "sys_nice", "sys_resource", "sys_time", "sys_tty_config", "mknod"),
+    *("lease", "audit_write", "audit_control", "setfcap", "mac_override", "mac_admin", "syslog"),
+    *("wake_alarm", "block_suspend", "audit_read", "perfmon", "bpf", "checkpoint_restore"),
+)
+"""In the order of their numbers, see capabilities(7)."""
+
+_CAPABILITIES = {f"CAP_{name.upper()}": 1 << bit for bit, name in enumerate(_CAPABILITY_NAMES)}
+
+_NAMESPACES = {
+    "cgroup": 0x02000000,
+    "ipc": 0x08000000,
+    "net": 0x40000000,
+    "mnt": 0x00020000,
+    "pid": 0x20000000,
+    "user": 0x10000000,
+    "uts": 0x04000000,
+}
+"""The CLONE_NEW* flags of clone(2)."""
+
+_SECURE_BITS = {
+    "keep-caps": 1 << 4,
+    "keep-caps-locked": 1 << 5,
+    "no-setuid-fixup": 1 << 2,
+    "no-setuid-fixup-locked": 1 << 3,
+    "noroot": 1 << 0,
+    "noroot-locked": 1 << 1,
+}
+_LEVELS = ("emerg", "alert", "crit", "err", "warning", "notice", "info", "debug")
+_FACILITIES = (
+    *("kern", "user", "mail", "daemon", "auth", "syslog", "lpr", "news", "uucp", "cron"),
+    "authpriv",
+    "ftp",
+)
+_EXIT_WORDS = {"SUCCESS": 0, "FAILURE": 1}
+
+
+def parse_signal(text: str) -> int:
+    """The number of a signal given as SIGTERM, TERM, 15 or RTMIN+3; ValueError for no signal."""
+    word = text.strip().upper().removeprefix("SIG")
+    base, plus, offset = word.partition("+")
+    if base == "RTMIN" and (not plus or (offset.isascii() and offset.isdigit())):
+        number = signal.SIGRTMIN + int(offset[:4] or 0)
+    elif word.isascii() and word.isdigit():
+        number = int(word[:4])
+    else:
+        number = getattr(signal.Signals, f"SIG{word}", 0)
+    if not 1 <= number <= signal.SIGRTMAX:
+        raise ValueError("not a signal")
+    return int(number)
+
+
+def format_signal(number: int) -> str:
+    """The name of a signal as systemd writes it, such as SIGTERM or SIGRTMIN+3."""
+    if number > signal.SIGRTMIN:
+        return f"SIGRTMIN+{number - signal.SIGRTMIN}"
+    return signal.Signals(number).name
+
+
+def _parse_statuses(text: str) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Exit statuses and signals; a number is an exit status, as in systemd.service(5)."""
+    statuses: list[int] = []
+    signals: list[int] = []
+    for word in text.split():
+        status = _EXIT_WORDS.get(word, int(word) if word.isascii() and word.isdigit() else -1)
+        if status > 255:
+            raise ValueError("not an exit status")
+        (statuses if status >= 0 else signals).append(status if status >= 0 else parse_signal(word))
+    return tuple(statuses), tuple(signals)
+
+
+def _format_statuses(value: tuple[Sequence[int], Sequence[int]]) -> Sequence[str]:
+    return [" ".join([*map(str, value[0]), *map(format_signal, value[1])])]
+
+
+def _mask_parser(bits: Mapping[str, int], everything: int) -> Callable[[str], int]:
+    """Words to the sum of their bits; "~" in front takes them out of `everything`."""
+
+    def parse(text: str) -> int:
+        words = text.strip().removeprefix("~").split()
+        known = {name.lower(): bit for name, bit in bits.items()}
+        if any(word.lower() not in known for word in words):
+            raise ValueError("unknown word")
+        mask = reduce(int.__or__, (known[word.lower()] for word in words), 0)
+        return everything & ~mask if text.strip().startswith("~") else mask
+
+    return parse
+
+
+def _mask_words(bits: Mapping[str, int], mask: int) -> str:
+    return " ".join(name for name, bit in bits.items() if mask & bit)
+
+
+def _format_capabilities(mask: int) -> Sequence[str]:
+    # Kernels have capabilities that this list does not, so a mask of nearly all is best inverted.
+    if mask >> len(_CAPABILITY_NAMES):
+        return [f"~{_mask_words(_CAPABILITIES, ~mask)}".strip()]
+    return [_mask_words(_CAPABILITIES, mask)]
+
+
+def _parse_namespaces(text: str) -> int:
+    if text.strip() in ("yes", "true", "on", "1"):
+        return 0
+    everything = sum(_NAMESPACES.values())
+    # An empty line of a unit file resets it.
+    if text.strip() in ("", "no", "false", "off", "0"):
+        return everything
+    return _mask_parser(_NAMESPACES, everything)(text)
+
+
+def _format_namespaces(mask: int) -> Sequence[str]:
+    everything = sum(_NAMESPACES.values())
+    words = {0: "yes", everything: "no"}
+    return [words.get(mask) or _mask_words(_NAMESPACES, mask)]
+
+
+SIGNAL = PropertyKind(
+    "i", "a signal such as SIGINT", parse_signal, lambda value: [format_signal(value)]
+)
+STATUSES = PropertyKind(
+    "(aiai)", "exit statuses and signals such as 75 SIGKILL", _parse_statuses, _format_statuses
+)
+CAPABILITIES = PropertyKind(
+    "t",
+    "capabilities such as CAP_NET_RAW CAP_SYS_NICE, or ~ and those to leave out",
+    _mask_parser(_CAPABILITIES, 2**64 - 1),
+    _format_capabilities,
+)
+NAMESPACES = PropertyKind(
+    "t",
+    "yes, no, or namespaces among " + ", ".join(_NAMESPACES),
+    _parse_namespaces,
+    _format_namespaces,
+)
+SECURE_BITS = PropertyKind(
+    "i",
+    "words among " + ", ".join(_SECURE_BITS),
+    _mask_parser(_SECURE_BITS, 0),
+    lambda value: [_mask_words(_SECURE_BITS, value)],
+)
+LOG_LEVEL = named_kind("i", {name: number for number, name in enumerate(_LEVELS)}, is_open=True)
+FACILITY = named_kind(
+    "i",
+    {name: number for number, name in enumerate(_FACILITIES)}
+    | {f"local{number}": 16 + number for number in range(8)},
+)
+CPU_POLICY = named_kind("i", {"other": 0, "fifo": 1, "rr": 2, "batch": 3, "idle": 5})
+IO_CLASS = named_kind("i", {"none": 0, "realtime": 1, "best-effort": 2, "idle": 3}, is_open=True)
+NUMA_POLICY = named_kind(
+    "i", {"default": 0, "preferred": 1, "bind": 2, "interleave": 3, "local": 4}
+)
+MOUNT_FLAGS = named_kind("t", {"": 0, "shared": 1 << 20, "slave": 1 << 19, "private": 1 << 18})
+ERROR_NUMBER = named_kind(
+    "i",
+    {name: number for number, name in sorted(errno.errorcode.items())} | {"kill": 0x7FFFFFFE},
+    is_open=True,
+)

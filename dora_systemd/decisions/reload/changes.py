@@ -1,0 +1,135 @@
+"""What has to start again when files change: the least that makes every change take effect."""
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import PurePath
+from typing import Any
+
+from dora_systemd.decisions.reload.watch_rules import WatchRules
+
+_EDGES = ("inputs", "outputs", "operator", "operators", "ros2")
+"""Keys of a node that dora cannot change in place."""
+
+
+@dataclass(frozen=True)
+class NodeSources:
+    """What one node is made of.
+
+    files: absolute paths of its program and the modules that it imports. text: all that its
+    definition says, where names of configuration files may be. rules: its own `watch` patterns.
+    """
+
+    files: frozenset[str] = frozenset()
+    text: str = ""
+    rules: WatchRules | None = None
+
+    def names(self, path: str) -> bool:
+        """Whether the definition mentions the file `path`."""
+        return PurePath(path).name in self.text
+
+
+@dataclass(frozen=True)
+class Touched:
+    """Nodes that changed files belong to, each with the first of these files.
+
+    descriptor: whether the dataflow file itself is among the changed ones.
+    """
+
+    nodes: Mapping[str, str] = field(default_factory=dict)
+    descriptor: bool = False
+
+
+def touched(changed: Iterable[str], dataflow: str, nodes: Mapping[str, NodeSources]) -> Touched:
+    """Whom the files `changed` concern.
+
+    A file of programs concerns the nodes that are made of it. Any other concerns the nodes that
+    watch or mention it; if there is none, all: it may be read by each.
+    """
+    found: dict[str, str] = {}
+    paths = sorted(changed)
+    for path in paths:
+        if path != dataflow:
+            for node in _owners(path, nodes):
+                found.setdefault(node, path)
+    return Touched(found, dataflow in paths)
+
+
+def _owners(path: str, nodes: Mapping[str, NodeSources]) -> list[str]:
+    owners = [
+        node
+        for node, sources in nodes.items()
+        if path in sources.files or (sources.rules is not None and sources.rules.has(path))
+    ]
+    if owners or path.endswith(".py"):
+        return owners
+    return [node for node, sources in nodes.items() if sources.names(path)] or list(nodes)
+
+
+@dataclass(frozen=True)
+class Difference:
+    """What is new in a descriptor: ids of nodes.
+
+    replaced: of which anything but inputs and outputs has changed. rewired: of which those have,
+    and nobody reads from them. whole: why only the dataflow as a whole can follow, or "".
+    """
+
+    replaced: tuple[str, ...] = ()
+    rewired: tuple[str, ...] = ()
+    added: tuple[str, ...] = ()
+    removed: tuple[str, ...] = ()
+    whole: str = ""
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing that dora sees has changed."""
+        return self == Difference()
+
+
+def difference(old: Mapping[str, Any], new: Mapping[str, Any]) -> Difference:
+    """What has changed between two expanded descriptors.
+
+    dora adds, removes and replaces nodes of a dataflow that runs. It keeps the edges of a replaced
+    node: one with other edges has to go and come again, which ends who reads from it. What is not
+    in `nodes` dora reads at the start only.
+    """
+    if _without_nodes(old) != _without_nodes(new):
+        return Difference(whole="keys of the dataflow itself have changed")
+    before, after = _by_id(old["nodes"]), _by_id(new["nodes"])
+    changed = [node for node in after if node in before and after[node] != before[node]]
+    rewired = tuple(node for node in changed if _edges(before[node]) != _edges(after[node]))
+    for node in rewired:
+        if has_readers(node, before.values()) or has_readers(node, after.values()):
+            return Difference(whole=f"inputs or outputs of the node {node} have changed")
+    added = tuple(node for node in after if node not in before)
+    for node in (*added, *changed):
+        if _has_operators(after[node]):
+            return Difference(whole=f"the node {node} is made of operators")
+    return Difference(
+        replaced=tuple(node for node in changed if node not in rewired),
+        rewired=rewired,
+        added=added,
+        removed=tuple(node for node in before if node not in after),
+    )
+
+
+def has_readers(node: str, nodes: Iterable[Mapping[str, Any]]) -> bool:
+    """Whether an input of another one of `nodes` names this one, in one of its many forms."""
+    source = json.dumps(f"{node}/")[:-1]
+    return any(source in json.dumps(one) for one in nodes if one.get("id") != node)
+
+
+def _without_nodes(descriptor: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in descriptor.items() if key != "nodes"}
+
+
+def _edges(node: Mapping[str, Any]) -> list[Any]:
+    return [node.get(key) for key in _EDGES]
+
+
+def _has_operators(node: Mapping[str, Any]) -> bool:
+    return bool(node.get("operator") or node.get("operators"))
+
+
+def _by_id(nodes: Sequence[Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:
+    return {str(node["id"]): node for node in nodes}

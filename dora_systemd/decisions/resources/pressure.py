@@ -1,0 +1,115 @@
+"""When to say that memory or CPU time gets short, before something is killed. Pure: no clock.
+
+Each group with a limit is looked at every few seconds. It is reported once, and again only when it
+was well for a while in between and the last report is old enough, so nothing floods the journal.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from dora_systemd.decisions.cell.status import WHOLE_CELL
+from dora_systemd.values import SECOND, format_rounded_size
+
+MEMORY, CPU = "memory-pressure", "cpu-throttled"
+FULL, NOT_FULL = 0.9, 0.8
+"""Shares of the limit that are taken by what cannot be dropped: alarm from, well again below."""
+STALLED, NOT_STALLED = 20.0, 5.0
+"""Percent of the last 10 s in which something waited for memory."""
+THROTTLED, NOT_THROTTLED = 50.0, 25.0
+"""Percent of the time in which something had to wait for the CPU limit."""
+BAD_LOOKS = {MEMORY: 1, CPU: 3}
+"""Looks in a row that make an alarm: a program that starts uses all the CPU it gets."""
+GOOD_LOOKS = 6
+"""Looks in a row after which all is well again."""
+QUIET = 300 * SECOND
+"""µs between two reports about the same."""
+
+
+@dataclass(frozen=True)
+class Load:
+    """One look at a group.
+
+    held: bytes that the kernel cannot drop. limit: bytes, or None. stalled: percent of the last
+    10 s in which something waited for memory. throttled: percent of the time since the last look
+    in which something waited for the CPU limit, None without one.
+    """
+
+    held: int = 0
+    limit: int | None = None
+    stalled: float = 0.0
+    throttled: float | None = None
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """What is known about one thing that may get short.
+
+    bad, good: looks in a row. is_on: reported, and not well again since. reported_us: when, or 0.
+    """
+
+    bad: int = 0
+    good: int = 0
+    is_on: bool = False
+    reported_us: int = 0
+
+
+Report = tuple[str, str, Mapping[str, str]]
+"""Event, node (WHOLE_CELL: the dataflow) and details."""
+
+Alarms = Mapping[tuple[str, str], Alarm]
+"""By node (WHOLE_CELL: the dataflow) and event."""
+
+
+def look(alarms: Alarms, loads: Mapping[str, Load], now_us: int) -> tuple[Alarms, list[Report]]:
+    """The alarms after one look at all groups, and what is to be reported."""
+    after = dict(alarms)  # who is without a limit for a while has been reported all the same
+    reports = []
+    for key, load in loads.items():
+        for event, is_bad, is_good in _judged(load):
+            old = after.get((key, event), Alarm())
+            new = _counted(old, is_bad, is_good)
+            if _is_due(new, event, now_us):
+                new = replace(new, is_on=True, reported_us=now_us)
+                reports.append(_report(event, key, load))
+            after[key, event] = new
+    return after, reports
+
+
+def _judged(load: Load) -> list[tuple[str, bool, bool]]:
+    """For each thing that is limited: the event, whether it is bad, and whether it is well."""
+    judged = []
+    if load.limit is not None:
+        is_bad = load.held >= FULL * load.limit or load.stalled >= STALLED
+        is_good = load.held < NOT_FULL * load.limit and load.stalled < NOT_STALLED
+        judged.append((MEMORY, is_bad, is_good))
+    if load.throttled is not None:
+        judged.append((CPU, load.throttled >= THROTTLED, load.throttled < NOT_THROTTLED))
+    return judged
+
+
+def _counted(alarm: Alarm, is_bad: bool, is_good: bool) -> Alarm:
+    good = alarm.good + 1 if is_good else 0
+    is_on = alarm.is_on and good < GOOD_LOOKS
+    return replace(alarm, bad=alarm.bad + 1 if is_bad else 0, good=good, is_on=is_on)
+
+
+def _is_due(alarm: Alarm, event: str, now_us: int) -> bool:
+    is_quiet = not alarm.reported_us or now_us - alarm.reported_us >= QUIET
+    return not alarm.is_on and is_quiet and alarm.bad >= BAD_LOOKS[event]
+
+
+def _report(event: str, key: str, load: Load) -> Report:
+    whose = "its nodes together" if key == WHOLE_CELL else f"node {key}"
+    if event == CPU:
+        share = f"{load.throttled or 0.0:.0f}"
+        reason = f"{whose} had to wait for the limit {share}% of the time"
+        return (event, key, {"reason": reason, "throttled": share})
+    held, limit = format_rounded_size(load.held), format_rounded_size(load.limit or 0)
+    stalled = f"{load.stalled:.0f}"
+    reason = (
+        f"{whose} hold {held} of {limit}"
+        if key == WHOLE_CELL
+        else f"{whose} holds {held} of {limit}"
+    )
+    details = {"held": str(load.held), "limit": str(load.limit), "stalled": stalled}
+    return (event, key, {"reason": f"{reason}, waiting {stalled}% of the time", **details})

@@ -1,0 +1,43 @@
+"""What is different between two versions of a settings file."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from dora_systemd.decisions.cell.hot_reload import SettingsChange
+from dora_systemd.decisions.cell.limits import BY_KEY, NodeLimits, node_limits
+from dora_systemd.decisions.settings.limit_checks import settings_node_limits
+from dora_systemd.decisions.settings.limits import NODE_LIMIT
+from dora_systemd.decisions.settings.resolve import Settings
+from dora_systemd.values import INFINITY
+
+_USUAL_WEIGHT = 100
+
+
+def settings_change(before: Settings, after: Settings) -> SettingsChange:
+    """What of `after`, made of the one file, is not as in `before`."""
+    old, new = (_by_node(settings) for settings in (before, after))
+    changed = [_changed(node, old.get(node, {}), new.get(node, {})) for node in {**old, **new}]
+    own = {key for key in before.values if before.values[key] != after.values[key]}
+    nodes = {
+        f"nodes.{node}.{key}"
+        for node in {**before.nodes, **after.nodes}
+        for key, _ in _items(before, node) ^ _items(after, node)
+        if key not in BY_KEY
+    }
+    others = sorted(own - {NODE_LIMIT.name}) + sorted(nodes)
+    return SettingsChange(tuple(one for one in changed if one.limits), tuple(others))
+
+
+def _by_node(settings: Settings) -> dict[str, dict[str, int]]:
+    return {one.node: dict(one.limits) for one in settings_node_limits(settings)}
+
+
+def _changed(node: str, old: Mapping[str, int], new: Mapping[str, int]) -> NodeLimits:
+    """What is no longer there is lifted."""
+    gone = {word: _USUAL_WEIGHT if "weight" in word else INFINITY for word in old.keys() - new}
+    return node_limits(node, {**{w: v for w, v in new.items() if old.get(w) != v}, **gone})
+
+
+def _items(settings: Settings, node: str) -> set[tuple[str, str]]:
+    values: Mapping[str, Any] = settings.nodes.get(node, {})
+    return {(key, repr(value)) for key, value in values.items()}

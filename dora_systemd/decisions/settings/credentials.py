@@ -1,0 +1,68 @@
+"""Secrets of the nodes: names and files, which systemd hands over, see systemd.exec(5)."""
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from dora_systemd.decisions.properties.kinds import Property
+from dora_systemd.decisions.settings.kinds import PATH, Base, Kind, Setting, scalar_text, texts_of
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.values import quoted
+
+MAX_SIZE = 1024 * 1024
+"""Bytes of all credentials of a unit together: systemd takes no more."""
+
+_NAME = re.compile(r"(?!\.{1,2}\Z)[!-.0-9;-~]{1,255}")
+
+
+def parse_credentials(value: Any, base: Base) -> Mapping[str, str]:
+    """File by name, from a mapping or from texts NAME=FILE. Raises DoraSystemdError (USAGE)."""
+    if isinstance(value, Mapping):
+        return dict(_pair(scalar_text(name), file, base) for name, file in value.items())
+    return dict(_parse_one(scalar_text(one), base) for one in texts_of(value))
+
+
+def credential_properties(files: Mapping[str, str]) -> dict[str, Property]:
+    """LoadCredential= of systemd.exec(5). files: absolute path by name."""
+    if not files:
+        return {}
+    return {"LoadCredential": Property("LoadCredential", "a(ss)", tuple(files.items()))}
+
+
+def _parse_one(text: str, base: Base) -> tuple[str, str]:
+    name, equals, file = text.partition("=")
+    if not equals:
+        hint = "write NAME=FILE, such as token=/etc/robot/token"
+        raise DoraSystemdError(f"cannot set credential {quoted(text)}", hint, ExitCode.USAGE)
+    return _pair(name, file, base)
+
+
+def _pair(name: str, file: Any, base: Base) -> tuple[str, str]:
+    if not _NAME.fullmatch(name):
+        hint = "a name is ASCII without blanks, '/' and ':', as that of a file"
+        raise DoraSystemdError(f"cannot name a credential {quoted(name)}", hint, ExitCode.USAGE)
+    path = PATH.parse(file, base)
+    if path.endswith("\\"):
+        # In a unit file it would join the next line to this one.
+        hint = "give the file another name"
+        raise DoraSystemdError(f"cannot use {quoted(path)} as credential", hint, ExitCode.USAGE)
+    return name, path
+
+
+CREDENTIALS = Setting[Mapping[str, str]](
+    "credentials",
+    Kind[Mapping[str, str]](
+        dict[str, str] | list[str],
+        "a mapping, NAME: FILE",
+        parse_credentials,
+        lambda value: [f"{name}={file}" for name, file in value.items()],
+        is_repeatable=True,
+        merge=lambda lower, higher: {**lower, **higher},
+    ),
+    {},
+    "Secret that the nodes read as the file NAME in $CREDENTIALS_DIRECTORY.",
+    flags=("--credential",),
+    metavar="NAME=FILE",
+    root_only=True,
+)
+CREDENTIAL_SETTINGS = (CREDENTIALS,)

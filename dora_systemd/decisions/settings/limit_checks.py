@@ -1,0 +1,143 @@
+"""Whether limits can be kept: the controllers that they need, and the size of the machine."""
+
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+
+from dora_systemd.decisions.cell.limits import (
+    BY_KEY,
+    BY_WORD,
+    LIMITS,
+    NodeLimits,
+    merge_node_limits,
+    node_limits,
+)
+from dora_systemd.decisions.properties.assignments import Properties
+from dora_systemd.decisions.settings.limits import NODE_LIMIT
+from dora_systemd.decisions.settings.resolve import Settings
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.values import INFINITY, SECOND, format_rounded_size
+
+_CONTROLLERS = {
+    **{limit.property: limit.controller for limit in LIMITS},
+    **dict.fromkeys(("StartupCPUWeight",), "cpu"),
+    **dict.fromkeys(("MemoryMin", "MemoryLow", "MemoryZSwapMax"), "memory"),
+    **dict.fromkeys(("StartupIOWeight", "IODeviceWeight", "IODeviceLatencyTargetSec"), "io"),
+    **dict.fromkeys(("IOReadBandwidthMax", "IOWriteBandwidthMax"), "io"),
+    **dict.fromkeys(("IOReadIOPSMax", "IOWriteIOPSMax"), "io"),
+}
+"""Keys of a unit that do nothing without a controller, see systemd.resource-control(5)."""
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What there is to share: memory in bytes, processors, and numbers for tasks."""
+
+    memory: int
+    cores: int
+    tasks: int
+
+
+def settings_node_limits(settings: Settings) -> tuple[NodeLimits, ...]:
+    """The limits of all nodes: those of settings files, over them those of `node_limit`."""
+    given = settings[NODE_LIMIT]
+    return merge_node_limits(_of_files(settings), given)
+
+
+def _of_files(settings: Settings) -> Iterator[NodeLimits]:
+    for node, values in settings.nodes.items():
+        limits = {BY_KEY[key].word: value for key, value in values.items() if key in BY_KEY}
+        yield node_limits(node, limits)
+
+
+def needed_controllers(properties: Properties, nodes: Iterable[NodeLimits]) -> dict[str, str]:
+    """The controllers that limits need, each with one of the limits in words."""
+    needed = {
+        _CONTROLLERS[slot]: f"{slot}="
+        for slot, one in properties.items()
+        if slot in _CONTROLLERS and one.value != INFINITY
+    }
+    for one in nodes:
+        for word, value in one.limits:
+            if value != INFINITY:
+                needed.setdefault(BY_WORD[word].controller, f"{word} of the node {one.node}")
+    return needed
+
+
+def check_controllers(needed: Mapping[str, str], available: Collection[str], is_user: bool) -> None:
+    """Raise DoraSystemdError (NO_SYSTEMD) unless all controllers are there: no limit is pretended.
+
+    available: the controllers that the manager of the unit has itself.
+    """
+    for controller, what in needed.items():
+        if controller not in available:
+            hint = "as root: systemctl edit user@.service, [Service] Delegate=cpu memory pids io"
+            raise DoraSystemdError(
+                f"cannot enforce {what}: systemd has no {controller!r} cgroup controller",
+                hint if is_user else "the kernel or the container does not provide it",
+                ExitCode.NO_SYSTEMD,
+            )
+
+
+def size_warnings(
+    limits: Mapping[str, int | None], nodes: Iterable[NodeLimits], machine: Machine
+) -> tuple[str, ...]:
+    """One warning for each limit that is more than there is. limits: of the dataflow, by word."""
+    own = {word: value for word, value in limits.items() if value is not None}
+    found = list(_too_large("the dataflow", own, machine))
+    for one in nodes:
+        of_node = dict(one.limits)
+        found += _too_large(f"the node {one.node}", of_node, machine)
+        found += _above_whole(one.node, of_node, own)
+    return tuple(found)
+
+
+def use_warnings(
+    limits: Mapping[str, int | None],
+    nodes: Iterable[NodeLimits],
+    whole: int | None,
+    held: Mapping[str, int | None],
+) -> tuple[str, ...]:
+    """One warning for each limit of memory that is less than what is in use now.
+
+    limits: of the dataflow, by word. whole, held: bytes in use by it and by each node.
+    """
+    pairs = [("the dataflow", limits.get("memory"), whole)]
+    pairs += [(f"the node {n.node}", dict(n.limits).get("memory"), held.get(n.node)) for n in nodes]
+    return tuple(
+        f"the limit memory={_shown('memory', limit)} of {whose} is less than it uses now: "
+        f"{_shown('memory', used)}; something may be killed"
+        for whose, limit, used in pairs
+        if limit is not None and used is not None and limit < used
+    )
+
+
+def _too_large(whose: str, limits: Mapping[str, int], machine: Machine) -> Iterator[str]:
+    there = {
+        "memory": machine.memory,
+        "memory-high": machine.memory,
+        "cpu": machine.cores * SECOND,
+        "tasks": machine.tasks,
+    }
+    for word, most in there.items():
+        value = limits.get(word, 0)
+        if most < value < INFINITY:
+            yield (
+                f"the limit {word}={_shown(word, value)} of {whose} is more than this machine "
+                f"has: {_shown(word, most)}"
+            )
+
+
+def _above_whole(node: str, limits: Mapping[str, int], whole: Mapping[str, int]) -> Iterator[str]:
+    for word in ("memory", "cpu", "tasks"):
+        most = whole.get(word, INFINITY)
+        if most < limits.get(word, 0) < INFINITY:
+            yield (
+                f"the limit {word}={_shown(word, limits[word])} of the node {node} is more than "
+                f"the dataflow may use: {_shown(word, most)}"
+            )
+
+
+def _shown(word: str, value: int) -> str:
+    if word == "cpu":
+        return f"{value / SECOND:g} cores"
+    return str(value) if word == "tasks" else format_rounded_size(value)

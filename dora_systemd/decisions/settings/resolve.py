@@ -1,0 +1,160 @@
+"""Where the value of each setting comes from: flag, variable, settings file or its default."""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import reduce
+from pathlib import PurePath
+from typing import Any, TypeVar, cast
+
+from dora_systemd.decisions.descriptor.json_size import check_json
+from dora_systemd.decisions.settings.kinds import Base, Setting
+from dora_systemd.decisions.settings.table import SETTINGS
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.values import shown
+
+T = TypeVar("T")
+Given = tuple[str, Any]
+"""A source as messages name it, and the value that it gives."""
+
+DEFAULT_SOURCE = "default"
+
+MAX_JSON = 1024 * 1024
+"""Bytes of a settings file once its anchors are written out."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Every setting's value and where it comes from; `settings[VENV]` has the type of VENV.
+
+    sources: a flag, a variable's name, a file's path or DEFAULT_SOURCE by name of the setting.
+    nodes: by node id, the per-node values by name of the setting.
+    table: the settings that there are.
+    lent: environment files that only somebody else than root names, in system scope.
+    """
+
+    values: Mapping[str, Any]
+    sources: Mapping[str, str]
+    nodes: Mapping[str, Mapping[str, Any]]
+    table: Sequence[Setting[Any]] = field(default=SETTINGS, repr=False)
+    lent: frozenset[str] = frozenset()
+
+    def __getitem__(self, setting: Setting[T]) -> T:
+        return cast(T, self.values[setting.name])
+
+    def source(self, setting: Setting[Any]) -> str:
+        """Where the value of `setting` comes from, for messages and `show`."""
+        return self.sources[setting.name]
+
+
+def resolve_settings(
+    flags: Mapping[str, object],
+    environment: Mapping[str, str],
+    files: Sequence[tuple[str, object]],
+    table: Sequence[Setting[Any]] = SETTINGS,
+) -> Settings:
+    """Every setting from flag, DORA_* variable, files (the most important first) or its default.
+
+    flags: raw values by name of the setting: a text, a sequence of texts, a boolean, or None and ()
+    for a flag that was not given. environment: the caller's variables. files: pairs of the file's
+    absolute path and the document in it, None if empty; relative paths in it start beside it.
+    Variables of `env` merge key by key; lists of files and of properties are joined, the most
+    important last. Raises DoraSystemdError: USAGE for flags and variables, BAD_INPUT for files.
+    """
+    documents = [(source, check_document(source, document, table)) for source, document in files]
+    values: dict[str, Any] = {}
+    sources: dict[str, str] = {}
+    for setting in table:
+        given = [
+            *_from_files(setting, reversed(documents)),
+            *_from_variable(setting, environment),
+            *_from_flag(setting, flags),
+        ]
+        sources[setting.name], values[setting.name] = _merged(setting, given)
+    return Settings(values, sources, _resolve_nodes(documents, table), table)
+
+
+def check_document(
+    source: str, document: object, table: Sequence[Setting[Any]] = SETTINGS
+) -> Mapping[str, Any]:
+    """The settings file `document` without the keys that are empty.
+
+    Raises DoraSystemdError (BAD_INPUT) with file and key when it is not a mapping, a key is unknown
+    or a value is of another type than its setting has.
+    """
+    # Only a command that meets a settings file pays for pydantic.
+    from dora_systemd.decisions.settings.schema import settings_model, validation_error
+
+    if document is None:
+        return {}
+    if not isinstance(document, dict):
+        hint = "a settings file is a mapping, KEY: VALUE"
+        message = f"cannot use {shown(source)}: it is not a mapping"
+        raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+    check_json(document, source, MAX_JSON)
+    try:
+        settings_model(table).model_validate(document)
+    except ValueError as error:
+        raise validation_error(source, error, table) from error
+    return {key: value for key, value in document.items() if value is not None}
+
+
+def _from_flag(setting: Setting[Any], flags: Mapping[str, object]) -> Iterator[Given]:
+    value = flags.get(setting.name)
+    if value is not None and value != ():
+        yield setting.flags[0], _parsed(setting, value, setting.flags[0], ExitCode.USAGE)
+
+
+def _from_variable(setting: Setting[Any], environment: Mapping[str, str]) -> Iterator[Given]:
+    # An empty variable is how shells say that it is not set.
+    value = environment.get(setting.variable, "") if setting.variable else ""
+    if value:
+        yield setting.variable, _parsed(setting, value, setting.variable, ExitCode.USAGE)
+
+
+def _from_files(
+    setting: Setting[Any], documents: Iterable[tuple[str, Mapping[str, Any]]]
+) -> Iterator[Given]:
+    for source, document in documents:
+        if setting.name in document:
+            yield source, _parsed_in_file(setting, document[setting.name], source, setting.name)
+
+
+def _parsed_in_file(setting: Setting[Any], value: object, source: str, key: str) -> Any:
+    base = PurePath(source).parent
+    where = f"{key} in {shown(source)}"
+    return _parsed(setting, value, where, ExitCode.BAD_INPUT, base if base.is_absolute() else None)
+
+
+def _parsed(
+    setting: Setting[Any], value: object, where: str, code: ExitCode, base: Base = None
+) -> Any:
+    try:
+        return setting.kind.parse(value, base)
+    except DoraSystemdError as error:
+        raise DoraSystemdError(f"{error.message} ({where})", error.hint, code) from error
+
+
+def _merged(setting: Setting[Any], given: Sequence[Given]) -> Given:
+    """The value of all sources together, the most important last, and where it comes from."""
+    if not given:
+        return DEFAULT_SOURCE, setting.default
+    merge = setting.kind.merge
+    if merge is None:
+        return given[-1]
+    names = ", ".join(source for source, _ in reversed(given))
+    return names, reduce(merge, (value for _, value in given))
+
+
+def _resolve_nodes(
+    documents: Sequence[tuple[str, Mapping[str, Any]]], table: Sequence[Setting[Any]]
+) -> dict[str, dict[str, Any]]:
+    """The per-node values of all files, the most important file first in `documents`."""
+    settings = {setting.name: setting for setting in table if setting.per_node}
+    nodes: dict[str, dict[str, Any]] = {}
+    for source, document in reversed(documents):
+        for node, values in document.get("nodes", {}).items():
+            for name, value in (values or {}).items():
+                key = f"nodes.{node}.{name}"
+                parsed = _parsed_in_file(settings[name], value, source, key)
+                nodes.setdefault(node, {})[name] = parsed
+    return nodes

@@ -1,0 +1,61 @@
+"""The schema of settings files, made from the table of settings. The only importer of pydantic."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, ValidationError, create_model
+
+from dora_systemd.decisions.settings.kinds import Setting
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.suggestions import did_you_mean
+from dora_systemd.values import quoted, shown
+
+NODES = "nodes"
+"""The key below which a settings file has per-node settings: `nodes: NODE: KEY: VALUE`."""
+
+# strict: a list is no text and a text no boolean; the kinds read texts themselves.
+_CONFIG = ConfigDict(extra="forbid", strict=True)
+
+
+def settings_model(table: Sequence[Setting[Any]]) -> type[BaseModel]:
+    """The model of a settings file: every key optional, unknown keys refused."""
+    fields = _fields(table)
+    of_nodes = [setting for setting in table if setting.per_node]
+    if of_nodes:
+        node = create_model("NodeSettings", __config__=_CONFIG, **_fields(of_nodes))
+        fields[NODES] = (dict[str, node | None] | None, None)  # type: ignore[valid-type]
+    model: type[BaseModel] = create_model("SettingsFile", __config__=_CONFIG, **fields)
+    return model
+
+
+def validation_error(
+    source: str, error: ValueError, table: Sequence[Setting[Any]]
+) -> DoraSystemdError:
+    """The first of the mistakes that pydantic found in the file `source`, in one line."""
+    if not isinstance(error, ValidationError):
+        message = f"cannot use {shown(source)}: it is not a settings file"
+        return DoraSystemdError(message, str(error), ExitCode.BAD_INPUT)
+    first = error.errors(include_url=False, include_input=False)[0]
+    place = [str(part) for part in first["loc"]]
+    settings = {setting.name: setting for setting in table}
+    if first["type"] == "extra_forbidden":
+        hint = (
+            did_you_mean(place[-1], _known(place, table))
+            or "doractl start --help lists the settings"
+        )
+        reason = f"unknown key {quoted(place[-1])}"
+    else:
+        key = next((part for part in reversed(place) if part in settings), place[0])
+        expected = settings[key].kind.expected if key in settings else "a mapping"
+        reason, hint = f"the value of {key} is of another type", f"write {expected}"
+    message = f"cannot use {shown(source)}: {reason}"
+    return DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+
+
+def _fields(table: Sequence[Setting[Any]]) -> dict[str, Any]:
+    return {setting.name: (setting.kind.schema | None, None) for setting in table}
+
+
+def _known(place: Sequence[str], table: Sequence[Setting[Any]]) -> list[str]:
+    inside_node = len(place) > 1
+    return [setting.name for setting in table if setting.per_node or not inside_node]

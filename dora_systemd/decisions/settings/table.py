@@ -1,0 +1,153 @@
+"""The settings of a dataflow, one declaration each.
+
+Flags, settings-file keys, environment variables and manual entries derive from this table or are
+checked against it. A new setting is one more assignment.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+from dora_systemd.decisions.cell.line_rates import RateLimits
+from dora_systemd.decisions.settings.credentials import CREDENTIAL_SETTINGS
+from dora_systemd.decisions.settings.kinds import (
+    BOOL,
+    DURATION,
+    ENVIRONMENT,
+    LINE_RATES,
+    PATH,
+    PATHS,
+    PROGRAM,
+    PROPERTIES,
+    TEXT,
+    Setting,
+)
+from dora_systemd.decisions.settings.limits import LIMIT_SETTINGS
+from dora_systemd.decisions.settings.reload import RELOAD_SETTINGS
+from dora_systemd.decisions.settings.restarts import RESTART_SETTINGS
+from dora_systemd.decisions.settings.sandbox import SANDBOX_SETTINGS
+from dora_systemd.values import SECOND
+
+ENV = Setting[Mapping[str, str]](
+    "env",
+    ENVIRONMENT,
+    {},
+    "Environment variable of all nodes.",
+    flags=("--env",),
+    metavar="KEY=VALUE",
+)
+ENV_FILE = Setting[tuple[str, ...]](
+    "env_file",
+    PATHS,
+    (),
+    "File with environment variables, as EnvironmentFile= in systemd.exec(5).",
+    flags=("--env-file",),
+    metavar="FILE",
+)
+VENV = Setting[str | None](
+    "venv",
+    PATH,
+    None,
+    "Virtual environment whose Python runs the nodes.",
+    flags=("--venv",),
+    variable="DORA_VENV",
+    metavar="DIR",
+)
+UV = Setting[bool](
+    "uv",
+    BOOL,
+    False,
+    "Run Python nodes with uv, like dora start --uv.",
+    flags=("--uv",),
+    variable="DORA_UV",
+)
+DEBUG = Setting[bool](
+    "debug",
+    BOOL,
+    False,
+    "Allow inspection of topics, like dora start --debug.",
+    flags=("--debug",),
+    variable="DORA_DEBUG",
+)
+WORKING_DIRECTORY = Setting[str | None](
+    "working_directory",
+    PATH,
+    None,
+    "Working directory of the nodes and of relative paths; default: that of the dataflow file.",
+    flags=("--working-directory",),
+    variable="DORA_WORKING_DIRECTORY",
+    metavar="DIR",
+)
+GRACE_DURATION = Setting[int](
+    "grace_duration",
+    DURATION,
+    10 * SECOND,
+    "Time for a node to exit after it is told to stop; then it is killed.",
+    flags=("--grace-duration",),
+    variable="DORA_GRACE_DURATION",
+    metavar="TIME",
+)
+PROPERTY = Setting[tuple[str, ...]](
+    "property",
+    PROPERTIES,
+    (),
+    "Property of the unit, as systemd-run(1) takes it.",
+    flags=("--property", "-p"),
+    metavar="KEY=VALUE",
+    root_only=True,
+)
+USER = Setting[str | None](
+    "user",
+    TEXT,
+    None,
+    "User that the nodes run as; default: the owner of the dataflow file, or dora for root's.",
+    flags=("--uid",),
+    variable="DORA_UID",
+    metavar="USER",
+    root_only=True,
+)
+ALLOW_SHELL_NODES = Setting[bool](
+    "allow_shell_nodes",
+    BOOL,
+    False,
+    "Allow nodes with the path 'shell'.",
+    flags=("--allow-shell-nodes",),
+    variable="DORA_ALLOW_SHELL_NODES",
+)
+EXIT_WHEN_NODES_FINISH = Setting[bool | None](
+    "exit_when_nodes_finish",
+    BOOL,
+    None,
+    "End the dataflow when its nodes have finished; default: as in the dataflow file.",
+    flags=("--exit-when-nodes-finish",),
+    variable="DORA_EXIT_WHEN_NODES_FINISH",
+)
+DORA = Setting[str](
+    "dora",
+    PROGRAM,
+    "dora",
+    "The dora program to run.",
+    flags=("--dora",),
+    variable="DORA_PROGRAM",
+    metavar="FILE",
+)
+LOG_RATE_LIMIT = Setting[RateLimits](
+    "log_rate_limit",
+    LINE_RATES,
+    {},
+    "Log lines per time to keep of each node, or of NODE; the rest is dropped and counted.",
+    flags=("--log-rate-limit",),
+    variable="DORA_LOG_RATE_LIMIT",
+    metavar="[NODE=]LINES/TIME",
+    per_node=True,
+)
+
+# All of the above, in that order, so that a setting is declared in one place only, and then those
+# of other modules.
+SETTINGS: tuple[Setting[Any], ...] = (
+    *(value for value in list(globals().values()) if isinstance(value, Setting)),
+    *LIMIT_SETTINGS,
+    *RESTART_SETTINGS,
+    *CREDENTIAL_SETTINGS,
+    *SANDBOX_SETTINGS,
+    *RELOAD_SETTINGS,
+)

@@ -1,0 +1,160 @@
+"""Unit files that outlive a run: their text, whose they are, and where they belong.
+
+The text is that of systemd.unit(5), made from what `properties` gives or from what systemd itself
+wrote for a transient unit: both say the same of the same dataflow.
+"""
+
+import posixpath
+import re
+from collections.abc import Iterator, Mapping, Sequence
+
+from dora_systemd.decisions.cell.options import RunnerOptions, options_from_command
+from dora_systemd.decisions.properties.assignments import parse_line, with_properties
+from dora_systemd.decisions.properties.kinds import Property
+from dora_systemd.decisions.properties.structs import MS_REC
+from dora_systemd.decisions.properties.table import TABLE
+from dora_systemd.errors import DoraSystemdError
+
+BOOT_TARGET = "dora.target"
+"""Starts the enabled dataflows at boot where it is set up; nothing waits for it."""
+
+HEADER = "# Written by doractl(1). To change something: systemctl edit, see dora-systemd(7).\n"
+
+_SECTION = re.compile(r"\[([^\]]+)\]")
+_SPECIFIER = re.compile(r"%[a-zA-Z]")
+_ORDERS = ("After=default.target", "After=multi-user.target")
+_MOUNTABLE = re.compile(r"[^\x00-\x1f\x7f\"'\\]+")
+_TRANSIENT = "# This is a transient unit file"
+# How systemd 257 writes a bind mount into such a file. It quotes nothing there, and would itself
+# read other paths from a line with blanks.
+_TRANSIENT_BIND = re.compile(r"(Bind(?:ReadOnly)?Paths)=(-?)(/[^:]*):(/[^:]*):(rbind|norbind)")
+
+
+def plain_target(is_user: bool) -> str:
+    """The target that every boot (or every start of a user's manager) reaches."""
+    return "default.target" if is_user else "multi-user.target"
+
+
+def persistent_unit(
+    texts: Sequence[str], options: RunnerOptions, is_user: bool, target: str
+) -> str:
+    """One unit file that says what `texts` (a fragment and its drop-ins) say, hung below `target`.
+
+    A plain target is not kept waiting for the dataflow: it comes first.
+    """
+    sections = _sections(texts)
+    unit = sections.setdefault("Unit", [])
+    boot = [] if target == BOOT_TARGET else [f"After={target}"]
+    boot += [] if is_user else _mounts(options)
+    unit += [line for line in boot if line not in unit]
+    sections["Install"] = [f"WantedBy={target}"]
+    return _format(sections)
+
+
+def without_install(text: str) -> str:
+    """The same unit as a file that nothing starts by itself."""
+    return _format(_sections([text]))
+
+
+def runner_of(text: str) -> RunnerOptions | None:
+    """What the runner is told in the unit file `text`; None for a file that is none of ours."""
+    lines = _sections([text]).get("Service", ())
+    commands = [line.partition("=")[2] for line in lines if re.match(r"ExecStart\s*=\s*\S", line)]
+    if len(commands) != 1:
+        return None
+    kind = TABLE["ExecStart"].choices[0][1]
+    try:
+        ((_, argv, _),) = kind.parse(commands[0])
+        return options_from_command([word.replace("%%", "%") for word in argv])
+    except (DoraSystemdError, ValueError):
+        return None
+
+
+def says_the_same(text: str, other: str) -> bool:
+    """Whether two unit files start the same dataflow in the same way, whichever target starts it.
+
+    False as well where one of them holds what only its admin can have written there.
+    """
+    first = _properties(text)
+    return first is not None and first == _properties(other)
+
+
+def _properties(text: str) -> dict[str, Property] | None:
+    sections = _sections([text])
+    properties: dict[str, Property] = {}
+    for line in (line for lines in sections.values() for line in lines):
+        key, _, value = line.partition("=")
+        if line in _ORDERS:
+            continue
+        if _SPECIFIER.search(value.replace("%%", "")):
+            return None
+        try:
+            change = parse_line(key, value.replace("%%", "%"))
+        except (KeyError, DoraSystemdError):
+            return None
+        properties = with_properties(properties, change)
+    return {slot: _ordered(one) for slot, one in properties.items()}
+
+
+def _ordered(one: Property) -> Property:
+    """The property, networks in one order: systemd keeps those as a set."""
+    return one._replace(value=tuple(sorted(one.value))) if one.signature == "a(iayu)" else one
+
+
+def _mounts(options: RunnerOptions) -> list[str]:
+    """What has to be mounted first. Paths that this line cannot hold are mounted by then, or not.
+
+    systemd.unit(5) knows quotes there, but no escapes.
+    """
+    paths = (posixpath.dirname(options.dataflow), options.working_directory)
+    clean = dict.fromkeys(posixpath.normpath(path).replace("%", "%%") for path in paths)
+    words = [f'"{path}"' if " " in path else path for path in clean if _MOUNTABLE.fullmatch(path)]
+    return [f"RequiresMountsFor={' '.join(words)}"] if words else []
+
+
+def _format(sections: Mapping[str, Sequence[str]]) -> str:
+    parts = ["\n".join((f"[{name}]", *lines)) for name, lines in sections.items() if lines]
+    return HEADER + "\n\n".join(parts) + "\n"
+
+
+def _sections(texts: Sequence[str]) -> dict[str, list[str]]:
+    """The lines of all texts by section, without comments; what is for another file is left out."""
+    sections: dict[str, list[str]] = {"Unit": [], "Service": []}
+    for text in texts:
+        name = ""
+        for line in _logical_lines(text):
+            heading = _SECTION.fullmatch(line)
+            if heading:
+                name = heading[1]
+            elif name and name != "Install":
+                quoted = _quoted_bind(line) if text.startswith(_TRANSIENT) else line
+                sections.setdefault(name, []).append(quoted)
+    return sections
+
+
+def _quoted_bind(line: str) -> str:
+    """The bind mount of a transient unit so that systemd reads what it has mounted."""
+    found = _TRANSIENT_BIND.fullmatch(line.replace("%%", "%"))
+    if not found:
+        return line
+    key, optional, source, target, option = found.groups()
+    bind = (source, target, bool(optional), MS_REC if option == "rbind" else 0)
+    (text,) = TABLE[key].choices[0][1].format((bind,))
+    return f"{key}={text}"
+
+
+def _logical_lines(text: str) -> Iterator[str]:
+    """Lines without comments; those that end in a backslash are joined to the next."""
+    pending = ""
+    # Not splitlines: only a newline ends a line here.
+    for raw in text.split("\n"):
+        line = raw.strip(" \t\r")
+        if (not line and not pending) or line.startswith(("#", ";")):
+            continue
+        if line.endswith("\\"):
+            pending += line[:-1] + " "
+            continue
+        yield pending + line
+        pending = ""
+    if pending:
+        yield pending.rstrip()

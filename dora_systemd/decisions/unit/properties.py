@@ -1,0 +1,272 @@
+"""The unit of a dataflow: one small builder per concern, all of them pure.
+
+Keys are those of unit files; the values are typed as StartTransientUnit wants them.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from dora_systemd.decisions.cell.environment import checked_variable, environment_entries
+from dora_systemd.decisions.cell.options import (
+    RunnerOptions,
+    post_command,
+    reload_command,
+    runner_command,
+)
+from dora_systemd.decisions.life.states import RunnerExit
+from dora_systemd.decisions.life.stop_budget import unit_timeout
+from dora_systemd.decisions.properties.assignments import (
+    Properties,
+    format_property,
+    parse_property,
+    with_properties,
+)
+from dora_systemd.decisions.properties.kinds import Property
+from dora_systemd.decisions.properties.sandbox import Sandbox, sandbox_properties
+from dora_systemd.decisions.properties.table import TABLE
+from dora_systemd.decisions.settings.credentials import credential_properties
+from dora_systemd.decisions.settings.limits import REALTIME
+from dora_systemd.decisions.settings.resolve import Settings
+from dora_systemd.decisions.settings.table import PROPERTY
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import SLICE
+from dora_systemd.scope import RUNTIME_NAME
+from dora_systemd.values import INFINITY, SECOND, quoted
+
+WATCHDOG = 30 * SECOND
+
+START_MARGIN = 10 * SECOND
+"""What TimeoutStartSec= allows beyond the pause before a restart and --start-timeout, which are
+the runner's."""
+
+
+@dataclass(frozen=True)
+class UnitContext:
+    """What the unit takes from its caller besides the runner's options.
+
+    python: absolute path of the interpreter that runs dora-systemd itself.
+    is_user: whether the unit is one of a user's manager.
+    user: User= in system scope; None runs everything as root.
+    environment: all of Environment=, see unit_environment.
+    credentials: absolute path by name.
+    sandbox: what the dataflow is kept from; None for nothing.
+    """
+
+    python: str
+    is_user: bool
+    user: str | None = None
+    environment: Mapping[str, str] = field(default_factory=dict)
+    credentials: Mapping[str, str] = field(default_factory=dict)
+    sandbox: Sandbox | None = None
+
+
+def unit_properties(
+    options: RunnerOptions, context: UnitContext, settings: Settings
+) -> dict[str, Property]:
+    """Every property of the unit by key: ours, those of settings, and --property, the last word.
+
+    Raises DoraSystemdError (USAGE) for a property that cannot be set, and for a user other than the
+    caller in user scope.
+    """
+    own = {
+        **identity_properties(options),
+        **service_properties(options, context),
+        **stop_properties(options),
+        **restart_properties(options),
+        **cgroup_properties(),
+        **memory_lock_properties(),
+        **directory_properties(options),
+        **environment_properties(context),
+        **credential_properties(context.credentials),
+        **user_properties(context),
+        **log_properties(options, context),
+        **(sandbox_properties(context.sandbox) if context.sandbox else {}),
+        **realtime_properties(settings),
+    }
+    properties = with_properties(own, settings_properties(settings))
+    for assignment in settings[PROPERTY]:
+        properties = with_properties(properties, _given_property(assignment, settings))
+    return properties
+
+
+def format_unit(properties: Properties) -> str:
+    """The properties as a unit file, see systemd.unit(5) and systemd.service(5)."""
+    sections: dict[str, list[str]] = {"Unit": [], "Service": []}
+    for slot in properties:
+        row = TABLE.get(slot.removesuffix("~"))
+        section = row.section if row else "Service"
+        sections[section] += format_property(slot, properties)
+    texts = ["\n".join([f"[{name}]", *body]) for name, body in sections.items() if body]
+    return "\n\n".join(texts) + "\n"
+
+
+def identity_properties(options: RunnerOptions) -> dict[str, Property]:
+    """What the unit is called, and its place in the tree of slices."""
+    return typed(Description=f"dora dataflow {options.name}", Slice=SLICE)
+
+
+def service_properties(options: RunnerOptions, context: UnitContext) -> dict[str, Property]:
+    """The runner as the main process of a Type=notify service, see systemd.service(5).
+
+    "no-env-expand" is ":" in a unit file: a "$" in a path is a "$".
+    """
+    argv = tuple(runner_command(context.python, options))
+    post = tuple(post_command(context.python, options))
+    reload = tuple(reload_command(context.python))
+    # The runner names the nodes that are late; systemd ends one that cannot even do that.
+    is_endless = options.start_timeout == INFINITY
+    pause = 0 if options.restart.policy == "no" else options.restart.max_delay
+    most = pause + options.start_timeout + START_MARGIN
+    start_timeout = INFINITY if is_endless else most
+    return typed(
+        Type="notify",
+        NotifyAccess="main",
+        ExecStart=((argv[0], argv, ("no-env-expand",)),),
+        ExecStopPost=((post[0], post, ("ignore-failure", "no-env-expand")),),
+        ExecReload=((reload[0], reload, ("no-env-expand",)),),
+        # Two pipes a node: what is in them is kept when the runner is killed.
+        FileDescriptorStoreMax=4096,
+        # Never the project: its modules must not be found before the runner's.
+        WorkingDirectory="/",
+        TimeoutStartSec=start_timeout,
+        WatchdogSec=WATCHDOG,
+        # One node out of memory is not the end of the others; the runner says what happened.
+        OOMPolicy="continue",
+    )
+
+
+def stop_properties(options: RunnerOptions) -> dict[str, Property]:
+    """SIGTERM for the runner alone, which tells dora; then SIGKILL for all, see systemd.kill(5).
+
+    dora kills a node at 1.5 times its grace duration.
+    """
+    return typed(KillMode="mixed", TimeoutStopSec=unit_timeout(options.grace))
+
+
+def restart_properties(options: RunnerOptions) -> dict[str, Property]:
+    """What systemd starts again, see systemd.service(5) and StartLimitBurst= in systemd.unit(5).
+
+    The first start counts as one: "3 restarts" are four starts.
+    """
+    policy = options.restart
+    # Of nodes that dora gave up, and of a bad dataflow, another start makes nothing better. Who
+    # runs it attached wants its end to be the end.
+    refused = (RunnerExit.BAD_DATAFLOW, RunnerExit.NO_ACCESS, RunnerExit.NO_DORA)
+    final = (RunnerExit.NODES_FAILED, *refused, *([0] if options.attached else []))
+    common = typed(RestartPreventExitStatus=(tuple(sorted(map(int, final))), ()))
+    if policy.policy == "no":
+        return common | typed(Restart="no")
+    is_endless = policy.max_restarts == INFINITY
+    return common | typed(
+        Restart=policy.policy,
+        # The runner itself waits longer, see runner/cell/pause.py: RestartSteps= would never
+        # forget what was long ago.
+        RestartSec=policy.delay,
+        StartLimitIntervalSec=0 if is_endless else policy.window,
+        StartLimitBurst=1 if is_endless else policy.max_restarts + 1,
+    )
+
+
+def cgroup_properties() -> dict[str, Property]:
+    """A delegated tree with numbers and without limits, see systemd.resource-control(5).
+
+    TasksMax: systemd's default would be an implicit limit.
+    """
+    return typed(
+        Delegate=True,
+        DelegateSubgroup="supervisor",
+        CPUAccounting=True,
+        MemoryAccounting=True,
+        TasksAccounting=True,
+        IOAccounting=True,
+        TasksMax=INFINITY,
+    )
+
+
+def memory_lock_properties() -> dict[str, Property]:
+    """No limit on locked memory, see systemd.exec(5).
+
+    Dora's nodes lock 8 MiB of shared memory each for messages; with systemd's default of 8 MiB in
+    all they fall back to copying. A user's manager gives as much as it has been given itself.
+    """
+    return parse_property("LimitMEMLOCK=infinity")
+
+
+def directory_properties(options: RunnerOptions) -> dict[str, Property]:
+    """The cell's own directory below /run, which goes when the unit ends, see systemd.exec(5)."""
+    return typed(
+        RuntimeDirectory=(f"{RUNTIME_NAME}/{options.name}",),
+        RuntimeDirectoryMode=0o700,
+    )
+
+
+def environment_properties(context: UnitContext) -> dict[str, Property]:
+    """Environment= as unit_environment made it; the values are literal, "$" and "%" too."""
+    for key, value in context.environment.items():
+        checked_variable(key, value)
+    return typed(Environment=environment_entries(context.environment))
+
+
+def user_properties(context: UnitContext) -> dict[str, Property]:
+    """User= of system scope; a user's manager runs everything as that user."""
+    if context.user is None:
+        return {}
+    if context.is_user:
+        message = f"cannot run as the user {quoted(context.user)} in user scope"
+        raise DoraSystemdError(message, "leave --uid out or add --system", ExitCode.USAGE)
+    return typed(User=context.user)
+
+
+def log_properties(options: RunnerOptions, context: UnitContext) -> dict[str, Property]:
+    """The journal; the last two have no effect in a user's manager, see systemd.exec(5)."""
+    common = typed(StandardOutput="journal", StandardError="journal", SyslogIdentifier=options.name)
+    if context.is_user:
+        return common
+    fields = (f"DORA_DATAFLOW={options.uuid}", f"DORA_DATAFLOW_NAME={options.name}")
+    extra = tuple(field.encode() for field in fields)
+    # No limit: systemd 257 does not pass 0 on to journald, which then applies its own.
+    limits = typed(LogRateLimitIntervalSec=SECOND, LogRateLimitBurst=500_000_000)
+    return common | typed(LogExtraFields=extra) | limits
+
+
+def settings_properties(settings: Settings) -> dict[str, Property]:
+    """The properties of those settings that are one, such as MemoryMax=, and have a value."""
+    properties: dict[str, Property] = {}
+    for setting in settings.table:
+        value = settings[setting]
+        if setting.property and value != setting.default:
+            texts = setting.kind.format(value)
+            for text in texts:
+                given = parse_property(f"{setting.property}={text}")
+                properties = with_properties(properties, given)
+    return properties
+
+
+def realtime_properties(settings: Settings) -> dict[str, Property]:
+    """CPUSchedulingPolicy= and its priority, see systemd.exec(5) and sched(7)."""
+    given = settings[REALTIME]
+    if given is None:
+        return {}
+    policy, _, priority = given.partition(":")
+    return {
+        **parse_property(f"CPUSchedulingPolicy={policy}"),
+        **parse_property(f"CPUSchedulingPriority={priority}"),
+    }
+
+
+def _given_property(assignment: str, settings: Settings) -> dict[str, Property]:
+    try:
+        return parse_property(assignment)
+    except DoraSystemdError as error:
+        message = f"{error.message} ({settings.source(PROPERTY)})"
+        raise DoraSystemdError(message, error.hint, error.code) from error
+
+
+def typed(**values: Any) -> dict[str, Property]:
+    """Properties by key of the unit file, from values of the types they have on D-Bus."""
+    properties = {}
+    for key, value in values.items():
+        name, kind = TABLE[key].choices[-1]
+        properties[key] = Property(name, kind.signature, value)
+    return properties

@@ -1,0 +1,108 @@
+"""What older versions of systemd lack: dropped from a unit in a pass of its own, with warnings."""
+
+import re
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from dora_systemd.decisions.properties.assignments import Properties
+from dora_systemd.decisions.properties.kinds import Property
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.values import quoted
+
+Told = tuple[str, str, Any]
+"""A property as it goes over D-Bus: name, signature and value."""
+
+MIN_VERSION = 252
+"""Debian 12's: the first with all that a cell cannot do without."""
+
+_ADDED: Mapping[int, tuple[str, ...]] = {
+    253: ("MemoryZSwapMax", "LogFilterPatterns"),
+    254: (
+        *("RestartMode", "RestartSteps", "RestartMaxDelayUSec", "FileDescriptorStorePreserve"),
+        *("DelegateSubgroup", "DefaultStartupMemoryLow", "StartupMemoryLow", "StartupMemoryHigh"),
+        *("StartupMemoryMax", "StartupMemorySwapMax", "StartupMemoryZSwapMax", "ImportCredential"),
+        *("MemoryPressureWatch", "MemoryPressureThresholdUSec", "RootEphemeral", "MemoryKSM"),
+        *("RootImagePolicy", "MountImagePolicy", "ExtensionImagePolicy"),
+    ),
+    255: ("SurviveFinalKillSignal", "SetLoginEnvironment", "CoredumpReceive"),
+    256: ("WantsMountsFor", "MemoryZSwapWriteback"),
+    257: (
+        *("PrivateTmpEx", "BindLogSockets", "ProtectControlGroupsEx"),
+        *("PrivateUsersEx", "PrivatePIDs", "ManagedOOMMemoryPressureDurationUSec"),
+    ),
+}
+"""Names on D-Bus by the version that has them first: HISTORY in org.freedesktop.systemd1(5)."""
+
+_SINCE = {name: version for version, names in _ADDED.items() for name in names}
+
+_KEEPS_COMMANDS = 257
+"""The first version seen to write the command lines of a transient unit so that it can read them.
+
+252 writes ExecStartEx=, which it does not know, and "\\$" for a "$": at the next daemon-reload of
+anybody the unit has no command line, or another one."""
+
+_PLAIN_FLAGS = frozenset({"ignore-failure", "no-env-expand"})
+
+# The runner makes the group and moves into it where systemd does not.
+_REPLACED = frozenset({"DelegateSubgroup"})
+
+# The sandbox has it where it can, which dora-systemd(7) says.
+_WELCOME = {"PrivateUsers": "identity"}
+
+
+def drop_unsupported(
+    properties: Properties, systemd_version: int
+) -> tuple[dict[str, Property], tuple[str, ...]]:
+    """The properties that this systemd knows, and one warning for each other one that matters.
+
+    Raises DoraSystemdError (NO_SYSTEMD) below version 252.
+    """
+    if systemd_version < MIN_VERSION:
+        message = f"cannot use systemd {systemd_version}: it is too old"
+        hint = f"dora-systemd needs systemd {MIN_VERSION} or newer"
+        raise DoraSystemdError(message, hint, ExitCode.NO_SYSTEMD)
+    kept = {slot: one for slot, one in properties.items() if _since(one) <= systemd_version}
+    dropped = {slot: one for slot, one in properties.items() if slot not in kept}
+    warnings = tuple(
+        f"{slot.removesuffix('~')}= is left out: systemd {systemd_version} lacks it, "
+        f"version {_since(one)} has it"
+        for slot, one in dropped.items()
+        if slot not in _REPLACED and one.value != _WELCOME.get(slot)
+    )
+    return kept, warnings
+
+
+def lacking(systemd_version: int) -> list[str]:
+    """Names on D-Bus of the properties that this systemd does not know."""
+    later = (names for version, names in _ADDED.items() if version > systemd_version)
+    return [name for names in later for name in names]
+
+
+def transient_commands(properties: Iterable[Told], systemd_version: int) -> list[Told]:
+    """The properties of a transient unit, with command lines that outlive a daemon-reload.
+
+    Raises DoraSystemdError (USAGE) for those that do not with this version.
+    """
+    if systemd_version >= _KEEPS_COMMANDS:
+        return [*properties]
+    return [_plain_commands(one, systemd_version) for one in properties]
+
+
+def _plain_commands(one: Told, systemd_version: int) -> Told:
+    """ExecStart for ExecStartEx: without a "$" they are the same."""
+    name, signature, commands = one
+    if signature != "a(sasas)":
+        return one
+    for _, argv, flags in commands:
+        if {*flags} - _PLAIN_FLAGS or re.search(r"[$`]", "".join(argv)):
+            key, words = name.removesuffix("Ex"), quoted(" ".join(argv))
+            message = f"cannot keep {key}={words} over a reload of systemd {systemd_version}"
+            hint = 'use paths without "$", and command lines without "+" and "!"'
+            raise DoraSystemdError(message, hint, ExitCode.USAGE)
+    plain = tuple((path, argv, "ignore-failure" in flags) for path, argv, flags in commands)
+    return name.removesuffix("Ex"), "a(sasb)", plain
+
+
+def _since(one: Property) -> int:
+    """The first version of systemd that takes this property."""
+    return _SINCE.get(one.name.removesuffix("Scale"), MIN_VERSION)

@@ -1,0 +1,191 @@
+"""What Prometheus is told of dataflows and nodes: a snapshot in its text format. Pure.
+
+https://prometheus.io/docs/instrumenting/exposition_formats and .../docs/practices/naming
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+from dora_systemd.decisions.cell.status import ALIVE_NODE_STATES, NODE_STATES, WHOLE_CELL
+from dora_systemd.decisions.resources.usage import UNLIMITED, Strain, Usage
+from dora_systemd.decisions.views.dataflows import FAILED, STOPPED, UP_WORDS, NodeRow
+from dora_systemd.decisions.views.snapshot import Observed
+from dora_systemd.values import SECOND
+
+CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+
+STATES = tuple(sorted(word.lower() for word in (*UP_WORDS, STOPPED, FAILED)))
+UNKNOWN_STATE = "unknown"
+
+Labels = Mapping[str, str]
+Sample = tuple[Labels, float | int]
+
+
+@dataclass(frozen=True)
+class Family:
+    """One metric. kind: "counter" or "gauge"; value: of one group, None where there is none."""
+
+    name: str
+    kind: str
+    help: str
+    value: Callable[[Usage, Strain], float | int | None] = lambda _use, _strain: None
+
+
+# For dataflows (dora_dataflow_...) and for nodes (dora_node_...) alike.
+GROUP_FAMILIES = (
+    Family("cpu_seconds_total", "counter", "CPU time used.", lambda use, _: use.cpu_us / SECOND),
+    Family("cpu_limit_cores", "gauge", "CPU limit, in cores.", lambda use, _: _cores(use)),
+    Family(
+        "cpu_periods_total",
+        "counter",
+        "CPU quota periods in which it was runnable.",
+        lambda use, _: use.throttling[0],
+    ),
+    Family(
+        "cpu_throttled_periods_total",
+        "counter",
+        "CPU quota periods in which its CPU limit throttled it.",
+        lambda use, _: use.throttling[1],
+    ),
+    Family(
+        "cpu_throttled_seconds_total",
+        "counter",
+        "Time for which its CPU limit throttled it.",
+        lambda _, strain: strain.throttled / SECOND,
+    ),
+    Family("memory_bytes", "gauge", "Memory used.", lambda use, _: use.memory),
+    Family(
+        "memory_peak_bytes",
+        "gauge",
+        "Peak memory used since its start.",
+        lambda use, _: use.memory_peak,
+    ),
+    Family(
+        "memory_limit_bytes",
+        "gauge",
+        "Memory limit.",
+        lambda use, _: _limit(use.memory_max),
+    ),
+    Family(
+        "oom_kills_total",
+        "counter",
+        "Processes killed by the kernel, out of memory.",
+        lambda _, strain: strain.oom_kills,
+    ),
+)
+PRESSURE = Family(
+    "pressure_seconds_total",
+    "counter",
+    "Time in which some, or all, of its processes waited for a resource.",
+)
+STATE = Family("state", "gauge", "1 for the current state, 0 for all others.")
+RESTARTS = Family("restarts_total", "counter", "Automatic restarts.")
+START = Family("start_time_seconds", "gauge", "When all nodes were ready, in Unix time.")
+NODE_START = Family("start_time_seconds", "gauge", "When it became ready, in Unix time.")
+INFO = Family("info", "gauge", "UUID and unit of a dataflow; the value is always 1.")
+NODES = Family("nodes", "gauge", "Nodes that the dataflow has.")
+ALIVE = Family("nodes_alive", "gauge", "Nodes that are running.")
+LINES = Family("log_lines_total", "counter", "Lines sent to journald.")
+SUPPRESSED = Family(
+    "log_lines_suppressed_total", "counter", "Lines that log_rate_limit kept out of the journal."
+)
+LOST = Family("log_lines_lost_total", "counter", "Lines of its nodes that are not in the journal.")
+BUILD = Family("dora_systemd_build_info", "gauge", "Version of dora-systemd; always 1.")
+
+
+def format_metrics(observed: Sequence[Observed], version: str) -> str:
+    """All metrics of these dataflows."""
+    lines = list(_format(BUILD, "", [({"version": version}, 1)]))
+    for prefix, families in (
+        ("dora_dataflow_", _dataflow_samples(observed)),
+        ("dora_node_", _node_samples(observed)),
+    ):
+        for family, samples in families:
+            lines += _format(family, prefix, samples)
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _dataflow_samples(observed: Sequence[Observed]) -> Iterator[tuple[Family, list[Sample]]]:
+    labelled = [({"dataflow": one.row.name}, one) for one in observed]
+    yield INFO, [({**own, "uuid": o.row.uuid, "unit": o.row.unit}, 1) for own, o in labelled]
+    yield STATE, [s for own, o in labelled for s in _states(own, o.row.status.lower(), STATES)]
+    yield RESTARTS, [(own, one.unit_restarts) for own, one in labelled]
+    yield START, [(own, o.row.started / SECOND) for own, o in labelled if o.row.started]
+    yield NODES, [(own, one.row.nodes_total) for own, one in labelled if one.usage]
+    yield ALIVE, [(own, one.row.nodes_alive) for own, one in labelled if one.usage]
+    yield LOST, [(own, o.lines[WHOLE_CELL].lost) for own, o in labelled if WHOLE_CELL in o.lines]
+    yield from _group_samples([(own, one, WHOLE_CELL) for own, one in labelled])
+
+
+def _node_samples(observed: Sequence[Observed]) -> Iterator[tuple[Family, list[Sample]]]:
+    places = [
+        ({"dataflow": one.row.name, "node": node.node}, one, node)
+        for one in observed
+        for node in one.row.nodes
+    ]
+    states = (*NODE_STATES, UNKNOWN_STATE)
+    yield STATE, [sample for own, _, node in places for sample in _states(own, node.state, states)]
+    restarts = [(own, node.restarts) for own, _, node in places]
+    yield RESTARTS, [(own, count) for own, count in restarts if count is not None]
+    yield NODE_START, [(own, node.since / SECOND) for own, _, node in places if _is_there(node)]
+    counts = [(own, o.lines[node.node]) for own, o, node in places if node.node in o.lines]
+    yield LINES, [(own, count.written) for own, count in counts]
+    yield SUPPRESSED, [(own, count.suppressed) for own, count in counts]
+    yield from _group_samples([(own, one, node.node) for own, one, node in places])
+
+
+def _is_there(node: NodeRow) -> bool:
+    return node.state in ALIVE_NODE_STATES and node.since > 0
+
+
+def _states(own: Labels, state: str, states: Iterable[str]) -> Iterator[Sample]:
+    for one in states:
+        yield {**own, "state": one}, int(one == state)
+
+
+def _group_samples(
+    places: Sequence[tuple[Labels, Observed, str]],
+) -> Iterator[tuple[Family, list[Sample]]]:
+    groups = [
+        (own, one.usage[key], one.strains.get(key, Strain()))
+        for own, one, key in places
+        if key in one.usage
+    ]
+    for family in GROUP_FAMILIES:
+        values = [(own, family.value(use, strain)) for own, use, strain in groups]
+        yield family, [(own, value) for own, value in values if value is not None]
+    yield PRESSURE, [sample for own, _, strain in groups for sample in _pressure(own, strain)]
+
+
+def _pressure(own: Labels, strain: Strain) -> Iterator[Sample]:
+    for resource, stalls in strain.stalled.items():
+        for kind, stall in zip(("some", "full"), stalls, strict=True):
+            yield {**own, "resource": resource, "kind": kind}, stall / SECOND
+
+
+def _cores(use: Usage) -> float | None:
+    share = _limit(use.cpu_max)
+    return None if share is None else share / SECOND
+
+
+def _limit(value: int | None) -> int | None:
+    return None if value == UNLIMITED else value
+
+
+def _format(family: Family, prefix: str, samples: Iterable[Sample]) -> Iterator[str]:
+    """The lines of one metric; none where nobody has it."""
+    name = f"{prefix}{family.name}"
+    lines = [f"{name}{{{_format_labels(labels)}}} {value}" for labels, value in samples]
+    if lines:
+        yield f"# HELP {name} {family.help}"
+        yield f"# TYPE {name} {family.kind}"
+        yield from lines
+
+
+def _format_labels(labels: Labels) -> str:
+    return ",".join(f'{key}="{_escaped(value)}"' for key, value in labels.items())
+
+
+def _escaped(text: str) -> str:
+    """Backslash, quote and newline, as the format wants it."""
+    return text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")

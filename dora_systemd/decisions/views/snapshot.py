@@ -1,0 +1,45 @@
+"""One dataflow at one moment, with the counters of its groups: what is measured, not what follows.
+
+Whoever wants shares of time takes two of them: `doractl top`, a page in a browser, Prometheus.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from dora_systemd.decisions.cell.status import LineCount
+from dora_systemd.decisions.resources.usage import Strain, Usage
+from dora_systemd.decisions.views.dataflows import DataflowRow, row_values
+
+
+@dataclass(frozen=True)
+class Observed:
+    """A dataflow. at_us: when its counters were read, CLOCK_MONOTONIC.
+
+    row: its line in `list`. unit_restarts: how often systemd has started it again by itself.
+    usage, strains, lines: by node, WHOLE_CELL is all of it; nothing for one that is not up.
+    """
+
+    row: DataflowRow
+    at_us: int = 0
+    unit_restarts: int = 0
+    usage: Mapping[str, Usage] = field(default_factory=dict)
+    strains: Mapping[str, Strain] = field(default_factory=dict)
+    lines: Mapping[str, LineCount] = field(default_factory=dict)
+
+
+def observed_values(one: Observed) -> dict[str, Any]:
+    """The same for JSON; counters of time in µs."""
+    groups = {key: _counters(use, one.strains.get(key, Strain())) for key, use in one.usage.items()}
+    return {**row_values(one.row), "at_us": one.at_us, "groups": groups}
+
+
+def _counters(use: Usage, strain: Strain) -> dict[str, Any]:
+    periods, throttled = use.throttling
+    return {
+        "cpu_us": use.cpu_us,
+        "periods": periods,
+        "throttled_periods": throttled,
+        "stalled_us": {resource: some for resource, (some, _) in strain.stalled.items()},
+        "oom_kills": strain.oom_kills,
+    }

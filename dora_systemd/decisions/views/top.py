@@ -1,0 +1,126 @@
+"""What `doractl top` shows of one look at the dataflows. Pure: no clock, no terminal."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from dora_systemd.decisions.cell.status import ALIVE_NODE_STATES, WHOLE_CELL
+from dora_systemd.decisions.resources.usage import format_waits
+from dora_systemd.decisions.views.dataflows import (
+    UNKNOWN,
+    UNREADABLE,
+    DataflowRow,
+    NodeRow,
+    format_count,
+    format_memory,
+    format_percent,
+    format_table,
+    format_uptime,
+    row_values,
+)
+
+SORTS = ("cpu", "memory", "name")
+HEADER = ("NAME", "STATE", "UPTIME", "CPU%", "MEM", "PEAK", "RESTARTS", "WAITS FOR")
+NOTHING = "No dataflow is running."
+
+Waits = Mapping[str, float]
+"""By resource, the percentage of the time in which something waited for it."""
+
+
+@dataclass(frozen=True)
+class TopEntry:
+    """A dataflow with its nodes. waits: by node, WHOLE_CELL is all of it."""
+
+    row: DataflowRow
+    waits: Mapping[str, Waits] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Look:
+    """All that one look shows. at_us: CLOCK_REALTIME."""
+
+    at_us: int
+    entries: Sequence[TopEntry] = ()
+
+
+def sort_entries(entries: Sequence[TopEntry], by: str) -> list[TopEntry]:
+    """Entries by one of SORTS: those that use most first, or by name."""
+    if by == "name":
+        return sorted(entries, key=lambda entry: entry.row.name)
+    return sorted(entries, key=lambda entry: (-_amount(entry.row, by), entry.row.name))
+
+
+def _amount(row: DataflowRow | NodeRow, by: str) -> float:
+    return (row.cpu_percent if by == "cpu" else row.memory) or 0.0
+
+
+def format_top(look: Look, by: str) -> str:
+    """The table: a line for each dataflow, and below it one for each of its nodes."""
+    if not look.entries:
+        return NOTHING
+    lines = [line for one in sort_entries(look.entries, by) for line in _lines(one, look, by)]
+    return format_table(HEADER, lines)
+
+
+def _lines(entry: TopEntry, look: Look, by: str) -> list[tuple[str, ...]]:
+    row = entry.row
+    nodes = row.nodes if by == "name" else sorted(row.nodes, key=lambda one: -_amount(one, by))
+    count = UNREADABLE if row.problem else f"{row.nodes_alive}/{row.nodes_total}"
+    state = f"{row.status} {count}" if row.nodes_total or row.problem else row.status
+    first = (row.name, state, format_uptime(row.uptime), *_numbers(row, entry.waits, WHOLE_CELL))
+    return [first, *(_node_line(node, entry, look) for node in nodes)]
+
+
+def _node_line(node: NodeRow, entry: TopEntry, look: Look) -> tuple[str, ...]:
+    is_alive = node.state in ALIVE_NODE_STATES and node.since
+    uptime = format_uptime(max(look.at_us - node.since, 0)) if is_alive else UNKNOWN
+    state = node.state.capitalize()
+    state = f"{state} ({node.exit})" if node.exit and not is_alive else state
+    return (f"  {node.node}", state, uptime, *_numbers(node, entry.waits, node.node))
+
+
+def _numbers(
+    row: DataflowRow | NodeRow, waits: Mapping[str, Waits], key: str
+) -> tuple[str, str, str, str, str]:
+    cpu = format_percent(row.cpu_percent)
+    shares = dict(waits.get(key, {}))
+    if row.throttled:
+        shares["cpu limit"] = row.throttled
+    return (
+        cpu if row.cpu_limit is None else f"{cpu}/{row.cpu_limit:g}",
+        format_memory(row.memory, row.memory_limit),
+        format_memory(row.memory_peak),
+        format_count(row.restarts),
+        format_waits(shares),
+    )
+
+
+def format_summary(look: Look) -> str:
+    """How many there are and what they use together, in one line."""
+    rows = [entry.row for entry in look.entries]
+    nodes = sum(row.nodes_alive for row in rows)
+    cpu = sum(row.cpu_percent or 0.0 for row in rows)
+    memory = sum(row.memory or 0 for row in rows)
+    return (
+        f"{_counted(len(rows), 'dataflow')}, {_counted(nodes, 'node')}, "
+        f"CPU {cpu:.1f}%, memory {format_memory(memory)}"
+    )
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"
+
+
+def look_values(look: Look, by: str) -> dict[str, Any]:
+    """The look for JSON: rows as `doractl list` has them, with the waits in percent of the time."""
+    return {
+        "at_us": look.at_us,
+        "dataflows": [_entry_values(one) for one in sort_entries(look.entries, by)],
+    }
+
+
+def _entry_values(entry: TopEntry) -> dict[str, Any]:
+    values = row_values(entry.row)
+    for one in values["nodes"]:
+        one["waits_percent"] = dict(entry.waits.get(one["node"], {}))
+    return {**values, "waits_percent": dict(entry.waits.get(WHOLE_CELL, {}))}

@@ -1,0 +1,256 @@
+"""What became of a dataflow, and why: the verdict of `doractl why`. Values in, values out.
+
+Where nothing is recorded, the verdict says so; it never guesses.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from dora_systemd.decisions.life.causes import Cause
+from dora_systemd.decisions.views.dataflows import (
+    FAILED,
+    FINISHED,
+    RESTARTING,
+    STOPPED,
+    UP_WORDS,
+)
+from dora_systemd.decisions.why.lives import Happening, Life, with_restarts
+from dora_systemd.decisions.why.verdict import Facts, Restart, Verdict
+
+_CRASHES = ("node-crashed", "node-oom")
+_LOSSES = {"daemon-lost": Cause.DAEMON_LOST, "coordinator-lost": Cause.COORDINATOR_LOST}
+_END_WORDS = {"dataflow-finished": FINISHED, "dataflow-stopped": STOPPED, "dataflow-failed": FAILED}
+_ENDS = (*_END_WORDS, "unit-succeeded", "unit-failed")
+_RESULTS = {
+    "timeout": (Cause.TIMEOUT, "systemd ended it: it did not start or stop in time"),
+    "watchdog": (Cause.WATCHDOG, "the supervisor process hung and was killed by the watchdog"),
+    "oom-kill": (Cause.OUT_OF_MEMORY, "it ran out of memory"),
+}
+_STATUS = re.compile(r"status=(\S+)")
+NO_END = "its end is not recorded: it was killed, or the machine went down"
+UNKNOWN_PERSON = "a request to systemd (by whom is not recorded)"
+
+
+@dataclass(frozen=True)
+class _Finding:
+    """The part of a verdict that tells an end."""
+
+    cause: Cause
+    summary: str
+    at: Happening | None = None
+    node: str = ""
+    by: str = ""
+    is_passing: bool = False
+
+
+def examine(lives: Sequence[Life], facts: Facts, shutdowns: Sequence[int] = ()) -> Verdict:
+    """The verdict on the last of `lives`, oldest first.
+
+    shutdowns: CLOCK_REALTIME µs at which the machine was told to go down.
+    """
+    chain = with_restarts(lives)
+    life = chain[-1] if chain else Life()
+    if facts.status == RESTARTING and len(chain) > 1 and _only_begins(life):
+        life = chain[-2]  # its runner waits before it does anything
+    status = facts.status if facts.status in UP_WORDS else ended_word(life, facts.status)
+    if status in UP_WORDS and status != RESTARTING:
+        found = _present(life, facts)
+    else:
+        found = _end(life, facts, shutdowns)
+    if found.cause in (Cause.STOPPED, Cause.FINISHED):
+        status = STOPPED if found.cause is Cause.STOPPED else FINISHED
+    return Verdict(
+        status,
+        found.cause,
+        found.summary,
+        facts.text if status in UP_WORDS else "",
+        found.node,
+        found.at.at_us if found.at else 0,
+        life.began_us,
+        life.invocation,
+        found.by,
+        life.last("start-limit") is not None,
+        found.is_passing,
+        found.at.details if found.at else {},
+        _starved(found, life),
+        tuple(restarts_of(chain)),
+        tuple(one for each in chain for one in each.happenings if _is_news(one)),
+        *_before(lives[: -len(chain)] if chain else (), facts, shutdowns),
+    )
+
+
+def _only_begins(life: Life) -> bool:
+    return all(one.name == "unit-starting" for one in life.happenings)
+
+
+def _before(lives: Sequence[Life], facts: Facts, shutdowns: Sequence[int]) -> tuple[str, int]:
+    """How the life ended that somebody, or a boot, began anew."""
+    if not lives:
+        return "", 0
+    end = _end(lives[-1], facts, shutdowns)
+    return end.summary, end.at.at_us if end.at else 0
+
+
+def ended_word(life: Life, known: str = "") -> str:
+    """How a life that is over ended. known: what systemd says, "" if it has forgotten the unit."""
+    end = life.last(*_ENDS)
+    if end is None:
+        return FAILED if life.happenings else known or STOPPED
+    if end.name == "unit-succeeded":
+        own = life.last(*_END_WORDS)
+        return _END_WORDS[own.name] if own else STOPPED
+    return _END_WORDS.get(end.name, FAILED)
+
+
+def _present(life: Life, facts: Facts) -> _Finding:
+    """How a dataflow that runs is: what has gone for good, else what was restarted last."""
+    gone = [one for one in final_crashes(life) if one.node in facts.failed]
+    if gone:
+        # The table of nodes has counted their restarts.
+        first, how = gone[0].node, facts.failed[gone[0].node]
+        return replace(_crash(gone[0]), summary=f"node {first}: {how}")
+    waiting = [one for one in final_crashes(life) if one.node in facts.restarting]
+    if waiting:
+        return replace(_crash(waiting[-1]), is_passing=True)
+    return _Finding(Cause.NONE, "")
+
+
+def final_crashes(life: Life) -> list[Happening]:
+    """The last crash of each node, the earliest first: the others may only follow from that."""
+    last = {one.node: one for one in life.all(*_CRASHES)}
+    return sorted(last.values(), key=lambda one: one.at_us)
+
+
+def _crash(crash: Happening) -> _Finding:
+    how = crash.detail("exit") or "ended, how is not recorded"
+    cause = Cause.NODE_FAILED
+    if crash.name == "node-oom":
+        cause = Cause.NODE_OUT_OF_MEMORY
+    elif how.startswith("hung"):
+        cause = Cause.NODE_HUNG
+    return _Finding(cause, f"node {crash.node}: {how}", crash, crash.node)
+
+
+def _end(life: Life, facts: Facts, shutdowns: Sequence[int]) -> _Finding:
+    if (failure := life.last("dataflow-failed")) is not None:
+        return _failure(life, failure)
+    if (end := life.last("unit-failed")) is not None:
+        return _unit_failure(life, end)
+    if (end := life.last("dataflow-finished")) is not None:
+        return _Finding(Cause.FINISHED, "all nodes ended by themselves", end)
+    if (end := life.last("dataflow-stopped", "unit-succeeded")) is not None:
+        by = stopped_by(life, shutdowns)
+        return _Finding(Cause.STOPPED, f"stopped by {by}", end, by=by)
+    return _without_end(life, facts)
+
+
+def _failure(life: Life, end: Happening) -> _Finding:
+    reason = end.detail("reason") or "for a reason that is not recorded"
+    named = end.detail("nodes").split()
+    crashes = [one for one in final_crashes(life) if not named or one.node in named]
+    cause = _cause_of(life, end)
+    if cause is Cause.NODE_FAILED and crashes:
+        found = _crash(crashes[0])
+        return _Finding(found.cause, _with_tail(found, reason), found.at, found.node)
+    node = named[0] if named else ""
+    lost = life.last(*_LOSSES)
+    return _Finding(cause, reason, lost if cause in _LOSSES.values() and lost else end, node)
+
+
+def _with_tail(found: _Finding, reason: str) -> str:
+    """The runner's own words for that node, which say how many restarts it had."""
+    parts = [one for one in reason.split(", node ") if one.removeprefix("node ")]
+    own = [one for one in parts if one.removeprefix("node ").startswith(f"{found.node}: ")]
+    _, after, count = own[0].rpartition(" after ") if own else ("", "", "")
+    return found.summary + (after + count if count.endswith(("restart", "restarts")) else "")
+
+
+def _cause_of(life: Life, end: Happening) -> Cause:
+    word = end.detail("cause")
+    if word and word in list(Cause):
+        return Cause(word)
+    lost = life.last(*_LOSSES)  # a record without the word: of an older version
+    if lost is not None:
+        return _LOSSES[lost.name]
+    return Cause.NODE_FAILED if final_crashes(life) else Cause.UNIT_FAILED
+
+
+def _unit_failure(life: Life, end: Happening) -> _Finding:
+    """The runner said nothing: what systemd says is all there is."""
+    result = end.detail("unit_result")
+    if result in _RESULTS:
+        cause, words = _RESULTS[result]
+        return _Finding(cause, words, end)
+    exit = life.last("process-exited")
+    how = _exit_words(exit) if exit else f"the unit failed: {result or 'systemd does not say how'}"
+    return _Finding(Cause.UNIT_FAILED, how, end)
+
+
+def _exit_words(exit: Happening) -> str:
+    status = exit.detail("exit_status") or "unknown"
+    if exit.detail("exit_code") != "exited":
+        return f"the supervisor process was killed (signal {status})"
+    named = _STATUS.search(exit.text)  # as "217/USER"
+    return (
+        f"systemd could not start the supervisor process: exit code {named[1] if named else status}"
+    )
+
+
+def _without_end(life: Life, facts: Facts) -> _Finding:
+    if not life.happenings:
+        return _Finding(Cause.NONE, "nothing is recorded about it")
+    last = life.happenings[-1]
+    if life.boot and facts.now_boot and life.boot != facts.now_boot:
+        words = "the machine went down while it ran, without a shutdown"
+        return _Finding(Cause.NO_END, words, last)
+    return _Finding(Cause.NO_END, NO_END, last)
+
+
+def stopped_by(life: Life, shutdowns: Sequence[int]) -> str:
+    """Who or what wanted the end, as far as it is on record."""
+    asked = life.last("stop-asked")
+    if asked is not None and asked.detail("by"):
+        return asked.detail("by")
+    order, job = life.last("dataflow-stopping"), life.last("unit-stopping")
+    by = order.detail("by") if order else ""
+    if by == "terminal":
+        return "the end of its terminal"
+    moments = [one.at_us for one in (order, job) if one is not None]
+    if any(life.began_us <= shutdown <= max(moments, default=0) for shutdown in shutdowns):
+        return "the shutdown of the machine"
+    if job is not None:
+        return UNKNOWN_PERSON
+    return f"the signal {by}" if by else "an unknown caller"
+
+
+def _starved(found: _Finding, life: Life) -> tuple[str, ...]:
+    crash = next((one for one in reversed(life.all(*_CRASHES)) if one.node == found.node), None)
+    return tuple(crash.detail("downstream").split()) if crash and found.node else ()
+
+
+def restarts_of(chain: Sequence[Life]) -> list[Restart]:
+    """The restarts that led to the end of the last life of a chain, oldest first."""
+    found = []
+    for life in chain:
+        exits: dict[str, str] = {}
+        for one in life.happenings:
+            if one.name in (*_CRASHES, "node-exited"):
+                exits[one.node] = one.detail("exit") or "ended"
+            elif one.name == "node-restarted":
+                found.append(Restart(one.at_us, "dora", one.node, exits.get(one.node, "unknown")))
+            elif one.name == "unit-restart":
+                reason = _end(life, Facts(), ()).summary
+                found.append(Restart(one.at_us, "systemd", "", reason))
+    return found
+
+
+_NO_NEWS = (
+    *("node-ready", "node-exited", "unit-starting", "unit-started", "unit-stopping"),
+    *("unit-stopped", "unit-succeeded", "unit-failed", "process-exited", "dataflow-stopping"),
+    *("cpu-throttled", "lines-suppressed"),
+)
+
+
+def _is_news(one: Happening) -> bool:
+    return one.name not in _NO_NEWS

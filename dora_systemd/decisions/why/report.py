@@ -1,0 +1,290 @@
+"""The verdict of `doractl why` as one screen of text, or as values for JSON."""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from dora_systemd.decisions.cell.restarts import budget_words
+from dora_systemd.decisions.life.causes import Cause
+from dora_systemd.decisions.views.dataflows import RESTARTING, UNKNOWN, local_time
+from dora_systemd.decisions.why.lives import Happening
+from dora_systemd.decisions.why.sandbox_signs import sandbox_remedy
+from dora_systemd.decisions.why.verdict import Restart, Verdict
+from dora_systemd.terminal_text import one_line
+from dora_systemd.values import SECOND, format_duration, format_rounded_size
+
+_TOLD = ("event", "node", "nodes", "dataflow", "dataflow_name", "downstream", "cause", "reason")
+"""Details of an event that have a key of their own in JSON."""
+
+LINES = 20
+"""How many of the last lines are shown."""
+_TIMELINE = 7
+_SIZE = re.compile("[1-9][0-9]{0,18}")
+_TITLE_WIDTH = 10
+_RED, _GREEN, _BOLD, _PLAIN = "\x1b[31m", "\x1b[32m", "\x1b[1m", "\x1b[0m"
+
+_AUTOMATIC = "run: doractl restart {name}; --restart-policy on-failure does this automatically"
+_OVERLOADED = "run: doractl restart {name}; check whether the machine was overloaded"
+_REMEDIES = {
+    Cause.NODE_FAILED: "fix {node}, then run: doractl restart {name}",
+    Cause.NODE_HUNG: "find out what {node} waited for, or raise health_check_timeout: in its YAML",
+    Cause.NODE_OUT_OF_MEMORY: "look for a leak in {node}, or run: "
+    "doractl set {name} --node-limit {node}:memory=SIZE",
+    Cause.START_TIMEOUT: "find out why {node} does not call Node(), or raise --start-timeout",
+    Cause.REFUSED: "fix {file}, then run: doractl restart {name}",
+    Cause.BAD_DATAFLOW: "fix {file}, then run: doractl restart {name}",
+    Cause.DAEMON_LOST: _AUTOMATIC,
+    Cause.COORDINATOR_LOST: _AUTOMATIC,
+    Cause.NO_ANSWER: _OVERLOADED,
+    Cause.DIRECTORY_LOST: "run: doractl restart {name}; only systemd may delete files there",
+    Cause.RUNNER_BROKEN: "run: doractl restart {name}; please report it, unless the machine "
+    "ran out of processes, files or disk space",
+    Cause.RUNNER_KILLED: _AUTOMATIC,
+    Cause.WATCHDOG: _OVERLOADED,
+    Cause.OUT_OF_MEMORY: "limit single nodes (--node-limit NODE:memory=SIZE) to find which one",
+    Cause.UNIT_FAILED: "systemctl {flag} status {unit} shows what systemd did",
+    Cause.TIMEOUT: "raise --start-timeout or --grace-duration",
+    Cause.NO_END: "run: doractl start {file}; to start it at every boot, doractl enable {name}",
+}
+_MEMORY_REMEDIES = {
+    "dataflow": "doractl set {name} --memory-limit SIZE, or limit single nodes (--node-limit)",
+    "machine": "the machine is short of memory: limit single nodes (--node-limit NODE:memory=SIZE)",
+}
+"""By whose memory was used up, where that is not the node's."""
+_SIGNAL_REMEDIES = {
+    "SIGKILL": "find out who killed {node}: journalctl -k, or somebody's kill -9",
+    **dict.fromkeys(
+        ("SIGSEGV", "SIGABRT", "SIGBUS", "SIGILL", "SIGFPE"),
+        "fix {node}; coredumpctl info {pid} shows where it crashed",
+    ),
+}
+_GIVEN_UP = "systemd has stopped restarting it; doractl restart {name} resets the counter"
+_WAITING = "systemd restarts it automatically; doractl stop {name} prevents that"
+_AGAIN = "nothing: dora restarts {node} automatically"
+_AWAY = "{node} stays down until doractl restart {name}; the other nodes keep running"
+
+
+@dataclass(frozen=True)
+class Subject:
+    """Whom a verdict is about. file: its descriptor, "" where that is not known any more."""
+
+    uuid: str
+    name: str
+    unit: str
+    flag: str
+    file: str = ""
+    is_loaded: bool = False
+
+
+@dataclass(frozen=True)
+class Word:
+    """One line that a node wrote; at_us: CLOCK_REALTIME µs."""
+
+    at_us: int
+    node: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Report:
+    """All that `doractl why` says. words: the last lines, of verdict.node or of all nodes."""
+
+    subject: Subject
+    verdict: Verdict
+    words: tuple[Word, ...] = ()
+    budget: Mapping[str, int | None] | None = None
+
+
+def remedies(report: Report) -> list[str]:
+    """What to do, each in one line."""
+    verdict, subject = report.verdict, report.subject
+    texts = [_remedy(verdict)]
+    if verdict.is_passing:
+        texts = [_AGAIN]
+    elif verdict.node and verdict.is_up and verdict.status != RESTARTING:
+        texts.append(_AWAY)
+    hint = sandbox_remedy(one.text for one in report.words) if verdict.node else ""
+    if verdict.is_given_up:
+        texts.append(_GIVEN_UP)
+    elif verdict.status == RESTARTING:
+        texts.append(_WAITING)
+    values = {
+        "name": subject.name,
+        "node": verdict.node or "the node",
+        "file": subject.file or "FILE",
+        "unit": subject.unit,
+        "flag": subject.flag,
+        "pid": verdict.details.get("node_pid", "PID"),
+    }
+    filled = [*([hint] if hint else []), *(text.format(**values) for text in texts if text)]
+    if subject.is_loaded:
+        return filled
+    again = f"doractl start {values['file']} --name {subject.name}"
+    return [text.replace(f"doractl restart {subject.name}", again) for text in filled]
+
+
+def _remedy(verdict: Verdict) -> str:
+    if verdict.cause is Cause.NODE_OUT_OF_MEMORY:
+        owner = verdict.details.get("owner", "")
+        return _MEMORY_REMEDIES.get(owner, _REMEDIES[verdict.cause])
+    signal = verdict.details.get("exit", "").removeprefix("signal ")
+    if verdict.cause is Cause.NODE_FAILED and signal in _SIGNAL_REMEDIES:
+        return _SIGNAL_REMEDIES[signal]
+    return _REMEDIES.get(verdict.cause, "")
+
+
+def format_report(report: Report, width: int | None = None, want_colors: bool = False) -> str:
+    """The report as at most 45 lines, each cut at `width` characters if that is given."""
+    blocks = [_head(report), _timeline(report), _words(report), _todo(report)]
+    # What nodes wrote must not command the terminal, nor make a line of its own here.
+    lines = [one_line(line) for block in blocks if block for line in (*block, "")][:-1]
+    cut = [line if width is None else _cut(line, width) for line in lines]
+    return "\n".join(_colored(cut, report.verdict)) if want_colors else "\n".join(cut)
+
+
+def _cut(line: str, width: int) -> str:
+    return line if len(line) <= width else line[: max(width - 1, 0)] + "…"
+
+
+def _colored(lines: list[str], verdict: Verdict) -> list[str]:
+    color = _RED if verdict.is_failure else _GREEN
+    titles = [f"{_BOLD}{one}{_PLAIN}" if _is_title(one) else one for one in lines[1:]]
+    return [f"{color}{_BOLD}{lines[0]}{_PLAIN}", *titles]
+
+
+def _is_title(line: str) -> bool:
+    return line.endswith(":") and not line.startswith(" ")
+
+
+def _head(report: Report) -> list[str]:
+    verdict, subject = report.verdict, report.subject
+    facts = {
+        "Why": verdict.summary,
+        "Now": verdict.now,
+        "When": _when(verdict),
+        "Memory": _memory_words(verdict.details),
+        "Starved": ", ".join(verdict.starved),
+        "Restarts": _restart_words(verdict.restarts),
+        "Budget": _budget_words(report),
+        "Before": f"{verdict.before} ({local_time(verdict.before_us)})" if verdict.before else "",
+        "Unit": f"{subject.unit} ({subject.uuid})",
+        "File": subject.file,
+    }
+    title = f"{subject.name}: {verdict.status}"
+    rows = [f"  {key + ':':<{_TITLE_WIDTH}}{text}" for key, text in facts.items() if text]
+    return [title, *rows]
+
+
+def _budget_words(report: Report) -> str:
+    """What is left of systemd's restarts, as long as there may be one."""
+    budget = report.budget
+    is_due = budget and (budget["used"] or report.verdict.status == RESTARTING)
+    return budget_words(budget) if budget and is_due else ""
+
+
+def _when(verdict: Verdict) -> str:
+    since = f"started {local_time(verdict.began_us)}" if verdict.began_us else ""
+    if not verdict.at_us:
+        return since
+    lasted = verdict.at_us - verdict.began_us
+    words = f", {_span(lasted)} after its start" if verdict.began_us and lasted >= 0 else ""
+    return f"{local_time(verdict.at_us)}{words}"
+
+
+def _span(duration: int) -> str:
+    """µs in the roughness that helps: seconds from the second on."""
+    unit = SECOND if duration >= SECOND else 1000
+    return format_duration(duration // unit * unit)
+
+
+def _memory_words(details: Mapping[str, str]) -> str:
+    sizes = [
+        f"{words} {format_rounded_size(int(details[key]))}"
+        for key, words in (("peak", "peak"), ("limit", "limit"), ("held", "held"))
+        if _SIZE.fullmatch(details.get(key, ""))
+    ]
+    owner = {"dataflow": " of the dataflow", "machine": "; the machine had no memory left"}
+    return ", ".join(sizes) + owner.get(details.get("owner", ""), "") if sizes else ""
+
+
+def _restart_words(restarts: Sequence[Restart]) -> str:
+    """As "detector 3 (exit code 1), all of it 1 (the dora daemon is gone)"."""
+    groups: dict[tuple[str, str], int] = {}
+    for one in restarts:
+        key = (one.node or "dataflow", one.reason)
+        groups[key] = groups.get(key, 0) + 1
+    return ", ".join(f"{who} {count} ({why})" for (who, why), count in groups.items())
+
+
+def _timeline(report: Report) -> list[str]:
+    news = report.verdict.timeline
+    if not news:
+        return []
+    shown = list(news)
+    if len(news) > _TIMELINE:
+        shown = [*news[:2], None, *news[2 - _TIMELINE :]]  # type: ignore[list-item]
+    left = len(news) - _TIMELINE
+    lines = [f"  ... {left} more ..." if one is None else _news(one) for one in shown]
+    return ["What happened:", *lines]
+
+
+def _news(one: Happening) -> str:
+    return f"  {_clock(one.at_us)}  {one.text or one.name}"
+
+
+def _clock(moment: int) -> str:
+    return local_time(moment)[5:] if moment else UNKNOWN
+
+
+def _words(report: Report) -> list[str]:
+    if not report.words:
+        return []
+    node = report.verdict.node
+    count = "line" if len(report.words) == 1 else f"{len(report.words)} lines"
+    every = f"doractl logs {report.subject.name}" + (f" --node {node}" if node else "")
+    title = f"The last {count} of {node or 'its nodes'} (all: {every}):"
+    return [title, *(f"  {_clock(one.at_us)[6:]}  {_line(one, node)}" for one in report.words)]
+
+
+def _line(word: Word, node: str) -> str:
+    return word.text if node else f"{word.node}: {word.text}"
+
+
+def _todo(report: Report) -> list[str]:
+    found = remedies(report)
+    return ["What to do:", *(f"  {one}" for one in found)] if found else []
+
+
+def report_values(report: Report) -> dict[str, Any]:
+    """The report for JSON: exact numbers, their units in the keys."""
+    verdict, subject = report.verdict, report.subject
+    return {
+        "uuid": subject.uuid,
+        "name": subject.name,
+        "unit": subject.unit,
+        "dataflow": subject.file or None,
+        "status": verdict.status,
+        "is_failure": verdict.is_failure,
+        "cause": str(verdict.cause) or None,
+        "summary": verdict.summary or None,
+        "now": verdict.now or None,
+        "node": verdict.node or None,
+        "at_us": verdict.at_us or None,
+        "began_us": verdict.began_us or None,
+        "stopped_by": verdict.stopped_by or None,
+        "given_up": verdict.is_given_up,
+        "details": {k: text for k, text in verdict.details.items() if k not in _TOLD},
+        "starved": list(verdict.starved),
+        "restarts": [vars(one) for one in verdict.restarts],
+        "restart_budget": report.budget,
+        "before": {"summary": verdict.before, "at_us": verdict.before_us or None}
+        if verdict.before
+        else None,
+        "timeline": [
+            {"at_us": one.at_us, "event": one.name, "node": one.node or None, "text": one.text}
+            for one in verdict.timeline
+        ],
+        "last_lines": [vars(one) for one in report.words],
+        "remedies": remedies(report),
+    }

@@ -1,0 +1,141 @@
+"""What only the coordinator of a dataflow can answer, and the topics that are passed through.
+
+A dataflow has one UUID here for all its life, and in its cell another one for each run: requests
+get the one of the run, answers the one of the dataflow. Frames of topics are passed as they are:
+they begin with the id of a subscription, which every coordinator draws by itself.
+"""
+
+import asyncio
+from contextlib import suppress
+from typing import Any
+
+from dora_systemd.adapters.dora.control import Connection
+from dora_systemd.adapters.runner_socket.client import relay
+from dora_systemd.decisions.cell.launch import PROGRAM_KEYS
+from dora_systemd.decisions.dora.protocol import Params, Reply
+from dora_systemd.decisions.gateway.answers import restored_descriptor
+from dora_systemd.decisions.gateway.frames import Request, renamed
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.gateway.control.state import ended_descriptor, written_descriptor
+from dora_systemd.gateway.control.talk import Result, Talk, find_by_uuid
+from dora_systemd.paths import CellPaths
+from dora_systemd.scope import Scope
+from dora_systemd.verbs.facts.cells import Cell
+from dora_systemd.verbs.facts.list import read_status
+from dora_systemd.verbs.node import require_running, restart_node
+
+_GOING_AWAY = 1001
+
+
+async def forward(talk: Talk, request: Request) -> Result:
+    """Ask the dataflow's own coordinator. Raises DoraSystemdError."""
+    cell, run = await asyncio.to_thread(_running, talk.scope, request.dataflow)
+    reply = await _ask(talk.scope, cell, renamed(request.params, cell.uuid, run))
+    return _answer(reply, run, cell.uuid)
+
+
+async def restart_one_node(talk: Talk, request: Request) -> Result:
+    """RestartNode, without the loss of the nodes downstream. Raises DoraSystemdError."""
+    if request.grace is not None:
+        return await forward(talk, request)
+    node = request.text("node_id")
+    cell, _ = await asyncio.to_thread(_running, talk.scope, request.dataflow)
+    await asyncio.to_thread(restart_node, talk.scope, cell, node)
+    return {"NodeRestarted": {"dataflow_id": cell.uuid, "node_id": node}}
+
+
+async def describe(talk: Talk, request: Request) -> Result:
+    """Info: what runs, the programs of nodes as they are written. Raises DoraSystemdError."""
+    uuid = request.dataflow
+    with suppress(DoraSystemdError):
+        return await _describe_running(talk.scope, uuid)
+    name, descriptor = await asyncio.to_thread(ended_descriptor, talk.scope, uuid)
+    return {"DataflowInfo": {"uuid": uuid, "name": name, "descriptor": descriptor}}
+
+
+async def _describe_running(scope: Scope, uuid: str) -> dict[str, Any]:
+    cell, run = await asyncio.to_thread(_running, scope, uuid)
+    reply = await _ask(scope, cell, {"Info": {"dataflow_uuid": run}})
+    if reply.error or not isinstance(reply.result, dict):
+        raise DoraSystemdError(reply.error or "cannot understand dora")
+    running = reply.result["DataflowInfo"]["descriptor"]
+    written = await asyncio.to_thread(written_descriptor, cell)
+    descriptor = restored_descriptor(running, written["nodes"], PROGRAM_KEYS)
+    return {"DataflowInfo": {"uuid": uuid, "name": cell.name, "descriptor": descriptor}}
+
+
+async def subscribe_topics(talk: Talk, request: Request) -> Result:
+    """TopicSubscribe, on a connection to the dataflow of its own. Raises DoraSystemdError."""
+    cell, run = await asyncio.to_thread(_running, talk.scope, request.dataflow)
+    connection = await _open(talk.scope, cell)
+    try:
+        reply = await connection.request(renamed(request.params, cell.uuid, run))
+        ident = _subscription(reply)
+        talk.after_reply(_pass_frames(talk, ident, connection))
+    except BaseException:
+        await connection.close()
+        raise
+    talk.topics[ident] = connection
+    return _answer(reply, run, cell.uuid)
+
+
+def _subscription(reply: Reply) -> str:
+    """The id of a subscription that was made. Raises DoraSystemdError with dora's own words."""
+    made = reply.result.get("TopicSubscribed") if isinstance(reply.result, dict) else None
+    if isinstance(made, dict) and isinstance(made.get("subscription_id"), str):
+        return str(made["subscription_id"])
+    raise DoraSystemdError(f"cannot subscribe: {reply.error or 'dora does not say why'}")
+
+
+async def unsubscribe_topics(talk: Talk, request: Request) -> Result:
+    """TopicUnsubscribe."""
+    ident = request.text("subscription_id")
+    connection = talk.topics.pop(ident, None)
+    if connection is None:
+        raise DoraSystemdError("cannot unsubscribe: no such subscription", "", ExitCode.NOT_FOUND)
+    await connection.close()
+    return {"unsubscribed": True, "subscription_id": ident}
+
+
+async def _pass_frames(talk: Talk, ident: str, connection: Connection) -> None:
+    try:
+        async for frame in connection.frames():
+            await talk.socket.send(frame)
+    finally:
+        await connection.close()
+    if talk.topics.pop(ident, None) is not None:  # the dataflow has ended
+        await talk.socket.close(_GOING_AWAY, "the dataflow has ended")
+
+
+def _running(scope: Scope, uuid: str) -> tuple[Cell, str]:
+    """A dataflow that runs, and dora's id of its run. Raises DoraSystemdError."""
+    cell = find_by_uuid(scope, uuid)
+    require_running(cell)
+    run = read_status(scope, cell).run
+    if run:
+        return cell, run
+    raise DoraSystemdError(
+        f"cannot speak to the dataflow {cell.name}: it is starting or stopping",
+        f"see doractl {scope.flag} list {cell.name}",
+        ExitCode.NOT_RUNNING,
+    )
+
+
+async def _open(scope: Scope, cell: Cell) -> Connection:
+    path = CellPaths(scope.cell_directory(cell.name)).socket
+    return await Connection.over(*await asyncio.to_thread(relay, path))
+
+
+async def _ask(scope: Scope, cell: Cell, params: Params) -> Reply:
+    connection = await _open(scope, cell)
+    try:
+        return await connection.request(params)
+    finally:
+        await connection.close()
+
+
+def _answer(reply: Reply, run: str, uuid: str) -> Result:
+    if isinstance(reply.result, dict | str):
+        answer: Result = renamed(reply.result, run, uuid)
+        return answer
+    return {"Error": str(renamed(reply.error, run, uuid)) or "dora gave no answer"}

@@ -1,0 +1,174 @@
+"""Logs and LogSubscribe of dora's protocol, out of the journal.
+
+The dora command asks Logs for each node, sorts and filters by itself, and then subscribes. So that
+no line is missing or doubled between the two, a connection remembers up to where it has sent.
+"""
+
+import asyncio
+import os
+import time
+from collections.abc import AsyncIterator, Iterator, Sequence
+
+from dora_systemd.adapters.bus.systemd import Bus
+from dora_systemd.adapters.journal.reader import JournalReader, end_journalctl, open_journalctl
+from dora_systemd.decisions.gateway.answers import (
+    LOG_FIELDS,
+    Record,
+    is_from_systemd,
+    is_wanted,
+    log_line,
+    log_payload,
+)
+from dora_systemd.decisions.gateway.frames import LOGS_LIMIT, Request, format_event, logs_parts
+from dora_systemd.decisions.logs.fields import ExportReader
+from dora_systemd.decisions.logs.query import end_matches, journal_timestamp, scope_matches
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.gateway.control.state import find_name
+from dora_systemd.gateway.control.talk import Place, Result, Talk, find_if_loaded
+from dora_systemd.gateway.live.follow import open_stream
+from dora_systemd.scope import Scope
+from dora_systemd.suggestions import did_you_mean
+from dora_systemd.values import quoted
+from dora_systemd.verbs.facts.cells import find_cell
+from dora_systemd.verbs.facts.list import read_status
+from dora_systemd.verbs.follow import is_unit_up
+
+_CHUNK = 1 << 18
+_EXPORT = ("--output=export", "--quiet", "--all", f"--output-fields={','.join(LOG_FIELDS)}")
+_LINES = ("DORA_STREAM=stdout", "DORA_STREAM=stderr")
+_CUT_NOTE = "earlier lines are skipped here; all lines: doractl logs {name} --node {node}"
+_SETTLE_SECONDS = 0.3
+"""After the end of a unit, until systemd starts it anew, if it does."""
+
+
+async def send_logs(talk: Talk, request: Request) -> Result:
+    """Logs. Raises DoraSystemdError (NOT_FOUND)."""
+    node = request.text("node")
+    uuid, lines, place = await asyncio.to_thread(_read_logs, talk.scope, request, node)
+    talk.places.setdefault(uuid, {})[node] = place
+    await talk.socket.send(_yielding(logs_parts(request.id, lines)))
+    return None
+
+
+async def _yielding(parts: Iterator[str]) -> AsyncIterator[str]:
+    for part in parts:
+        yield part
+        await asyncio.sleep(0)
+
+
+def _read_logs(scope: Scope, request: Request, node: str) -> tuple[str, list[bytes], Place]:
+    now = time.time_ns() // 1000
+    uuid = _uuid_of(scope, request)
+    name = find_name(scope, uuid)
+    matches = [*scope_matches(scope, name), f"DORA_DATAFLOW={uuid}", f"DORA_NODE={node}", *_LINES]
+    tail = [] if request.tail is None else [f"--lines={request.tail}"]
+    lines: list[bytes] = []
+    size, place = 0, (now, 0)
+    for record in _records([*_EXPORT, "--reverse", *tail, "--", *matches]):
+        if not lines:
+            place = _place(record)
+        lines.append(log_line(record))
+        size += len(lines[-1])
+        if size > LOGS_LIMIT:
+            note = _CUT_NOTE.format(name=name, node=node).encode()
+            lines[-1] = log_line({**record, "MESSAGE": note, "DORA_LEVEL": b"warn"})
+            break
+    if not lines:
+        _check_node(scope, uuid, name, node)
+    return uuid, lines[::-1], place
+
+
+def _uuid_of(scope: Scope, request: Request) -> str:
+    if request.body.get("uuid") is None:
+        return find_cell(Bus(scope, for_reading=True), request.text("name")).uuid
+    return request.text("uuid").lower()
+
+
+def _check_node(scope: Scope, uuid: str, name: str, node: str) -> None:
+    """A node that has written nothing is no mistake, one that is not there is."""
+    cell = find_if_loaded(scope, uuid)
+    known = [*JournalReader().known_nodes(name), *(read_status(scope, cell).nodes if cell else ())]
+    if node in known:
+        return
+    raise DoraSystemdError(
+        f"cannot find a node {quoted(node)} of dataflow {name}",
+        did_you_mean(node, known) or f"nodes: {', '.join(sorted(set(known))) or 'none'}",
+        ExitCode.NOT_FOUND,
+    )
+
+
+def _records(arguments: Sequence[str]) -> Iterator[Record]:
+    reader = ExportReader()
+    with open_journalctl(arguments) as child:
+        assert child.stdout
+        while data := os.read(child.stdout.fileno(), _CHUNK):
+            yield from reader.feed(data)
+        end_journalctl(child)
+
+
+async def subscribe_logs(talk: Talk, request: Request) -> Result:
+    """LogSubscribe: lines and life events from now on. Raises DoraSystemdError (NOT_FOUND).
+
+    Of a dataflow that this connection has started, from its start on.
+    """
+    uuid = request.dataflow
+    name = await asyncio.to_thread(find_name, talk.scope, uuid)
+    since = talk.started.get(uuid, time.time_ns() // 1000)
+    follower = Follower(talk, uuid, name, since, request.body.get("level"))
+    talk.after_reply(follower.run())
+    return {"subscribed": True}
+
+
+class Follower:
+    """Sends what a dataflow writes, until it has ended for good.
+
+    since_us: CLOCK_REALTIME. level: dora's word, see is_wanted.
+    """
+
+    def __init__(self, talk: Talk, uuid: str, name: str, since_us: int, level: object) -> None:
+        self._talk, self._uuid, self._name, self._level = talk, uuid, name, level
+        self._since = (since_us, 0)
+        self._places = talk.places.get(uuid, {})
+
+    async def run(self) -> None:
+        """Send until there is nothing more to come, then close a connection that only follows."""
+        scope = self._talk.scope
+        first = min([self._since, *self._places.values()])[0]
+        matches = [*scope_matches(scope, self._name), f"DORA_DATAFLOW={self._uuid}"]
+        matches += ["+", *end_matches(scope, self._name)]
+        since = f"--since={journal_timestamp(first)}"
+        with open_journalctl([*_EXPORT, "--follow", since, "--", *matches]) as child:
+            assert child.stdout
+            async with open_stream(child.stdout) as stream:
+                if self._uuid in self._talk.started or await self._is_up():
+                    await self._send_all(stream)
+        if self._uuid not in self._talk.started:
+            await self._talk.socket.close()
+
+    async def _send_all(self, stream: asyncio.StreamReader) -> None:
+        records = ExportReader()
+        while data := await stream.read(_CHUNK):
+            for record in records.feed(data):
+                if is_from_systemd(record):
+                    if await self._has_ended():
+                        return
+                elif self._is_new(record) and is_wanted(record, self._level):
+                    payload = log_payload(record, self._uuid)
+                    await self._talk.socket.send(format_event(payload))
+
+    def _is_new(self, record: Record) -> bool:
+        node = record.get("DORA_NODE", b"").decode("utf-8", "replace")
+        return _place(record) > self._places.get(node, self._since)
+
+    async def _has_ended(self) -> bool:
+        await asyncio.sleep(_SETTLE_SECONDS)
+        return not await self._is_up()
+
+    async def _is_up(self) -> bool:
+        return await asyncio.to_thread(
+            lambda: is_unit_up(Bus(self._talk.scope, for_reading=True), self._name)
+        )
+
+
+def _place(record: Record) -> Place:
+    return int(record["__REALTIME_TIMESTAMP"]), int(record.get("__SEQNUM", b"0"))

@@ -1,0 +1,174 @@
+"""/api/control of the gateway: dora's control protocol, so that the stock dora command works here.
+
+It looks like one coordinator that has all dataflows of a scope. What systemd, the journal and the
+node tables know is answered from there, the rest by the coordinator of the dataflow that is meant,
+and what would go around the supervisor is refused.
+"""
+
+import asyncio
+import logging
+from collections.abc import Awaitable, Callable, Mapping
+from typing import Any
+
+from dora_systemd.decisions.gateway.frames import (
+    Malformed,
+    Request,
+    error_result,
+    format_malformed,
+    format_result,
+    parse_request,
+    refused_version,
+)
+from dora_systemd.decisions.gateway.request import Request as HttpRequest
+from dora_systemd.decisions.gateway.request import Socket
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.gateway.control import forward as cell
+from dora_systemd.gateway.control import logs, state
+from dora_systemd.gateway.control import start as starting
+from dora_systemd.gateway.control import stop as stopping
+from dora_systemd.gateway.control.talk import Result, Talk
+from dora_systemd.scope import Scope
+
+log = logging.getLogger(__name__)
+
+Handler = Callable[[Talk, Request], Awaitable[Result]]
+
+Task = asyncio.Task[None]
+
+_LOOPBACK = "127.0.0.1"
+_AT_ONCE = 8
+"""Requests of one connection that are answered at the same time."""
+_LONGEST = 500
+_BY_FILE = "edit its file, then run: doractl reload NAME"
+_OWN = "doractl dora NAME -- {} asks the coordinator of one dataflow"
+
+
+async def serve_control(socket: Socket, request: HttpRequest) -> None:
+    """Answer one dora command until it goes; what it has asked for then is still done.
+
+    One request does not wait for the one before it, which a coordinator's would: a start may take
+    long, and that nobody waits for it any more is seen by reading on.
+    """
+    talk, pending = Talk(socket, request.scope), set[Task]()
+    try:
+        async for message in socket:
+            task = asyncio.ensure_future(_answer(talk, message))
+            pending.add(task)
+            task.add_done_callback(_forget)
+            task.add_done_callback(pending.discard)
+            if len(pending) >= _AT_ONCE:
+                await asyncio.wait(pending, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        await talk.end()
+        await asyncio.gather(*pending, return_exceptions=True)
+
+
+def _forget(task: Task) -> None:
+    """There is nobody any more to whom the error, of the connection, could be told."""
+    if not task.cancelled():
+        task.exception()
+
+
+async def _answer(talk: Talk, message: str | bytes) -> None:
+    request = parse_request(message)
+    if isinstance(request, Malformed):
+        await talk.socket.send(format_malformed(request))
+        return
+    result = await _result(talk, request)
+    if result is not None:
+        await talk.socket.send(format_result(request.id, result))
+    talk.begin_tasks()
+
+
+async def _result(talk: Talk, request: Request) -> Result:
+    if request.name in REFUSED:
+        return error_result(DoraSystemdError(*REFUSED[request.name]))
+    handler = HANDLERS.get(request.name)
+    if handler is None:
+        return error_result(DoraSystemdError(f"unknown request {request.name[:80]}"))
+    try:
+        return await handler(talk, request)
+    except DoraSystemdError as error:
+        return error_result(error)
+    except Exception as error:
+        # What is sent can be wrong in more ways than are checked; once gone, nobody gets this.
+        log.info("cannot answer %s: %s: %s", request.name, type(error).__name__, error)
+        return error_result(DoraSystemdError(f"cannot do {request.name}: {error}"[:_LONGEST]))
+
+
+async def _hello(_talk: Talk, request: Request) -> Result:
+    refusal = refused_version(request.body.get("dora_version"))
+    return {"Error": refusal} if refusal else {"HelloOk": dict(request.body)}
+
+
+async def _same_machine(_talk: Talk, _request: Request) -> Result:
+    return {"CliAndDefaultDaemonIps": {"default_daemon": _LOOPBACK, "cli": _LOOPBACK}}
+
+
+async def _daemon_connected(_talk: Talk, _request: Request) -> Result:
+    return {"DaemonConnected": True}  # systemd is there, and starts one for each dataflow
+
+
+def _about_all(ask: Callable[[Scope], Mapping[str, Any]]) -> Handler:
+    async def handler(talk: Talk, _request: Request) -> Result:
+        return await asyncio.to_thread(ask, talk.scope)
+
+    return handler
+
+
+async def _check(talk: Talk, request: Request) -> Result:
+    return await asyncio.to_thread(state.check, talk.scope, request.dataflow)
+
+
+HANDLERS: dict[str, Handler] = {
+    "Hello": _hello,
+    "CliAndDefaultDaemonOnSameMachine": _same_machine,
+    "DaemonConnected": _daemon_connected,
+    "ConnectedMachines": _about_all(state.list_daemons),
+    "List": _about_all(state.list_dataflows),
+    "GetNodeInfo": _about_all(state.list_nodes),
+    "Check": _check,
+    "Info": cell.describe,
+    "Start": starting.start,
+    "WaitForSpawn": starting.wait_for_spawn,
+    "Stop": stopping.stop_uuid,
+    "StopByName": stopping.stop_name,
+    "Restart": stopping.restart_uuid,
+    "RestartByName": stopping.restart_name,
+    "Logs": logs.send_logs,
+    "LogSubscribe": logs.subscribe_logs,
+    "RestartNode": cell.restart_one_node,
+    "TopicSubscribe": cell.subscribe_topics,
+    "TopicUnsubscribe": cell.unsubscribe_topics,
+    **dict.fromkeys(
+        (
+            *("StopNode", "Reload", "TopicPublish"),
+            *("GetParams", "GetParam", "SetParam", "DeleteParam"),
+        ),
+        cell.forward,
+    ),
+}
+
+REFUSED: dict[str, tuple[str, str]] = {
+    "Destroy": (
+        "cannot take dora down: systemd runs the dataflows, and the gateway only shows them",
+        "doractl destroy stops all of them, doractl stop NAME one",
+    ),
+    "Clean": (
+        "cannot clean: ended dataflows are known from the journal, which journald cleans up",
+        "systemctl reset-failed 'dora-*' clears the failed ones",
+    ),
+    **dict.fromkeys(
+        ("Build", "WaitForBuild", "BuildLogSubscribe"),
+        ("cannot build through the gateway", "dora build FILE --local, then start it"),
+    ),
+    **dict.fromkeys(
+        ("GetTraces", "GetTraceSpans"),
+        ("cannot show traces of all dataflows", _OWN.format("trace list")),
+    ),
+    **dict.fromkeys(
+        ("AddNode", "RemoveNode", "ReplaceNode", "AddMapping", "RemoveMapping"),
+        ("cannot change a supervised dataflow except through its file", _BY_FILE),
+    ),
+}
+"""Message and hint for what is not offered here."""

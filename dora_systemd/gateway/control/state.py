@@ -1,0 +1,145 @@
+"""What dora's requests ask about dataflows, from systemd, the journal and the node tables."""
+
+import time
+from contextlib import suppress
+from functools import lru_cache
+from typing import Any
+
+from dora_systemd.adapters.bus.systemd import Bus
+from dora_systemd.adapters.journal.reader import JournalReader
+from dora_systemd.decisions.gateway.answers import (
+    bare_descriptor,
+    daemon_list,
+    dataflow_list,
+    node_list,
+    stopped,
+)
+from dora_systemd.decisions.views.dataflows import FAILED, FINISHED, DataflowRow, status_word
+from dora_systemd.decisions.why.report import Report
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.gateway.control.talk import find_by_uuid, find_if_loaded
+from dora_systemd.scope import Scope
+from dora_systemd.verbs.facts.cells import Cell, read_cells
+from dora_systemd.verbs.facts.ended import ended_rows
+from dora_systemd.verbs.facts.last_words import last_words
+from dora_systemd.verbs.facts.list import read_rows
+from dora_systemd.verbs.facts.nodes import written_dataflow
+from dora_systemd.verbs.facts.reason import failure_reason
+from dora_systemd.verbs.follow import is_unit_up
+from dora_systemd.verbs.why import explain
+
+_MOST_ENDED = 20
+"""How many dataflows that have ended long ago dora list shows."""
+_FRESH_SECONDS = 5.0
+"""For which the journal's answer about ended dataflows is good, at most."""
+_SEEN_UP = ("active", "reloading", "refreshing")
+_ON_THE_WAY = ("activating", "deactivating")
+
+
+def list_dataflows(scope: Scope) -> dict[str, Any]:
+    """What runs, what has failed, and what ended last."""
+    rows = tuple(map(_row, read_cells(Bus(scope))))
+    return dataflow_list([*rows, *_ended(scope, rows, int(time.monotonic() / _FRESH_SECONDS))])
+
+
+@lru_cache(maxsize=1)
+def _ended(scope: Scope, rows: tuple[DataflowRow, ...], _period: int) -> tuple[DataflowRow, ...]:
+    """The newest that ended; the journal is not asked again while systemd says the same."""
+    return tuple(ended_rows(scope, rows)[:_MOST_ENDED])
+
+
+def _row(cell: Cell) -> DataflowRow:
+    word = status_word(cell.state.active, cell.state.sub)
+    return DataflowRow(cell.uuid, cell.name, cell.unit, word)
+
+
+def list_nodes(scope: Scope) -> dict[str, Any]:
+    """All nodes of all dataflows that run, with what they use."""
+    return node_list(read_rows(Bus(scope), scope))
+
+
+def list_daemons(scope: Scope) -> dict[str, Any]:
+    """The daemons of what runs."""
+    return daemon_list(cell.uuid for cell in read_cells(Bus(scope)) if cell.is_up)
+
+
+def written_descriptor(cell: Cell) -> dict[str, Any]:
+    """The descriptor as its file has it, modules as they are. Raises DoraSystemdError."""
+    return dict(written_dataflow(cell.options.dataflow).raw)
+
+
+def ended_descriptor(scope: Scope, uuid: str) -> tuple[str, dict[str, Any]]:
+    """Name and descriptor of a dataflow that has no coordinator (any more).
+
+    Of one that systemd has forgotten the journal knows the nodes. Raises DoraSystemdError.
+    """
+    cell = find_if_loaded(scope, uuid)
+    if cell is not None:
+        with suppress(DoraSystemdError):
+            return cell.name, written_descriptor(cell)
+    name = find_name(scope, uuid)
+    return name, bare_descriptor(JournalReader().known_nodes(name))
+
+
+def find_name(scope: Scope, uuid: str) -> str:
+    """The name of a dataflow that runs or ever ran. Raises DoraSystemdError (NOT_FOUND)."""
+    cell = find_if_loaded(scope, uuid)
+    name = cell.name if cell else JournalReader().name_of(uuid)
+    return name or find_by_uuid(scope, uuid).name
+
+
+def check(scope: Scope, uuid: str) -> dict[str, Any]:
+    """Whether a dataflow runs, or how it has ended. Raises DoraSystemdError (NOT_FOUND)."""
+    cell = find_if_loaded(scope, uuid)
+    if cell is not None and is_unit_up(Bus(scope), cell.name):
+        return {"DataflowSpawned": {"uuid": uuid}}
+    return ended_result(scope, uuid)
+
+
+def ended_result(scope: Scope, uuid: str) -> dict[str, Any]:
+    """How a dataflow has ended, with its node's last words. Raises DoraSystemdError."""
+    report = explain(Bus(scope), scope, uuid, JournalReader())
+    failed = report.verdict.status == FAILED
+    failures = {report.verdict.node or report.subject.name: _account(report)} if failed else {}
+    return stopped(uuid, time.time_ns() // 1000, failures)
+
+
+def _account(report: Report) -> str:
+    lines = [report.verdict.summary, *(word.text for word in report.words)]
+    return "\n".join(
+        [*lines, f"doractl {report.subject.flag} why {report.subject.name} tells more"]
+    )
+
+
+def spawned(scope: Scope, uuid: str) -> dict[str, Any] | None:
+    """The answer to WaitForSpawn, None while all nodes are not ready yet.
+
+    Raises DoraSystemdError for a start that failed.
+    """
+    cell = find_if_loaded(scope, uuid)
+    if cell is None:
+        return _over(scope, uuid)
+    bus = Bus(scope)
+    state = bus.read(cell.unit, ["ActiveState", "Job"])
+    if state["ActiveState"] in _SEEN_UP:
+        return {"DataflowSpawned": {"uuid": uuid}}
+    if state["ActiveState"] in _ON_THE_WAY or state["Job"][0]:
+        return None
+    if state["ActiveState"] != "failed":
+        return _over(scope, uuid)
+    lines = "".join(f"\n  {line}" for line in last_words(scope, uuid))
+    hint = f"doractl {scope.flag} why {cell.name} tells more"
+    error = f"cannot start {cell.name}: {failure_reason(bus, cell.unit)}\n\n  hint: {hint}"
+    return {"Error": error + (f"\n{lines}" if lines else "")}
+
+
+def _over(scope: Scope, uuid: str) -> dict[str, Any]:
+    """The dora command knows by these words that a dataflow has ended as soon as it had started."""
+    word = explain(Bus(scope), scope, uuid, JournalReader()).verdict.status
+    if word == FINISHED:
+        return {"Error": f"unknown dataflow {uuid}: it has finished already"}
+    raise DoraSystemdError(
+        f"cannot wait for the dataflow {uuid}: it is {word.lower()}",
+        "dora list shows what runs",
+        ExitCode.NOT_RUNNING,
+    )

@@ -1,0 +1,101 @@
+"""Stop and Restart of dora's protocol: jobs of systemd, with dora's grace duration on top."""
+
+import asyncio
+import signal
+from collections.abc import Callable
+from typing import Any
+
+from dora_systemd.adapters.bus.systemd import Bus
+from dora_systemd.decisions.gateway.answers import stopped
+from dora_systemd.decisions.gateway.frames import Request
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.gateway.control.state import ended_result
+from dora_systemd.gateway.control.talk import Talk, find_by_uuid
+from dora_systemd.scope import Scope
+from dora_systemd.values import SECOND
+from dora_systemd.verbs.facts.cells import Cell, find_cell
+from dora_systemd.verbs.stop import Outcome, restart_cells, stop_cells
+from dora_systemd.verbs.stop_note import note_stop
+
+_KILL_FACTOR = 1.5
+"""dora sends SIGTERM after the grace duration, and SIGKILL after half as much again."""
+_FORCE_SECONDS = 0.2
+"""For systemd to know that it is to be stopped: a kill before that would count as a failure."""
+
+
+async def stop_uuid(talk: Talk, request: Request) -> dict[str, Any]:
+    """Stop. Raises DoraSystemdError."""
+    cell = await asyncio.to_thread(find_by_uuid, talk.scope, request.dataflow)
+    return await _stop(talk.scope, cell, request)
+
+
+async def stop_name(talk: Talk, request: Request) -> dict[str, Any]:
+    """StopByName. Raises DoraSystemdError."""
+    return await _stop(talk.scope, await _named(talk.scope, request), request)
+
+
+async def restart_uuid(talk: Talk, request: Request) -> dict[str, Any]:
+    """Restart. Raises DoraSystemdError."""
+    cell = await asyncio.to_thread(find_by_uuid, talk.scope, request.dataflow)
+    return await _restart(talk.scope, cell, request)
+
+
+async def restart_name(talk: Talk, request: Request) -> dict[str, Any]:
+    """RestartByName. Raises DoraSystemdError."""
+    return await _restart(talk.scope, await _named(talk.scope, request), request)
+
+
+async def _named(scope: Scope, request: Request) -> Cell:
+    return await asyncio.to_thread(lambda: find_cell(Bus(scope), request.text("name")))
+
+
+async def _stop(scope: Scope, cell: Cell, request: Request) -> dict[str, Any]:
+    if not cell.is_up:
+        raise DoraSystemdError(
+            f"cannot stop {cell.name}: it does not run",
+            f"doractl {scope.flag} why {cell.name} says how it ended",
+            ExitCode.NOT_RUNNING,
+        )
+    await asyncio.to_thread(note_stop, [cell], "dora stop")
+    outcome = await _within(scope, cell, request, lambda: stop_cells(Bus(scope), scope, [cell])[0])
+    if outcome.problem:
+        raise DoraSystemdError(outcome.problem)
+    if request.body.get("force"):
+        return stopped(cell.uuid, 0, {})  # it has ended as it was asked to
+    return await asyncio.to_thread(ended_result, scope, cell.uuid)
+
+
+async def _restart(scope: Scope, cell: Cell, request: Request) -> dict[str, Any]:
+    outcome = await _within(scope, cell, request, lambda: restart_cells(Bus(scope), [cell])[0])
+    if outcome.problem:
+        raise DoraSystemdError(outcome.problem, f"doractl {scope.flag} why {cell.name} tells more")
+    return {"DataflowRestarted": {"old_uuid": cell.uuid, "new_uuid": cell.uuid}}
+
+
+async def _within(
+    scope: Scope, cell: Cell, request: Request, act: Callable[[], Outcome]
+) -> Outcome:
+    """Do it, and kill what is left of this life of the unit when the request's patience is over."""
+    task = asyncio.ensure_future(asyncio.to_thread(act))
+    seconds = _patience(request)
+    if seconds is not None and cell.is_up:
+        life = await asyncio.to_thread(_life, scope, cell)
+        await asyncio.wait([task], timeout=seconds)
+        if not task.done() and await asyncio.to_thread(_life, scope, cell) == life:
+            await asyncio.to_thread(_kill, scope, cell)
+    return await task
+
+
+def _patience(request: Request) -> float | None:
+    if request.body.get("force"):
+        return _FORCE_SECONDS
+    grace = request.grace
+    return None if grace is None else max(_KILL_FACTOR * grace / SECOND, _FORCE_SECONDS)
+
+
+def _life(scope: Scope, cell: Cell) -> object:
+    return Bus(scope).read(cell.unit, ["InvocationID"])["InvocationID"]
+
+
+def _kill(scope: Scope, cell: Cell) -> None:
+    Bus(scope).kill(cell.unit, signal.SIGKILL)

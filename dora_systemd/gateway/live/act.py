@@ -1,0 +1,63 @@
+"""What the buttons of the status page do, and where its drawing of a dataflow comes from."""
+
+from pathlib import Path
+from typing import Any
+
+from dora_systemd.adapters.bus.systemd import Bus
+from dora_systemd.adapters.host.files import parse_yaml
+from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
+from dora_systemd.decisions.gateway.page_messages import PageMessage, graph_values
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.scope import Scope
+from dora_systemd.trust.paths import read_file
+from dora_systemd.verbs.facts.cells import Cell, find_cell
+from dora_systemd.verbs.facts.list import read_status
+from dora_systemd.verbs.node import ask_coordinator, restart_node, stop_node
+from dora_systemd.verbs.stop import restart_cells, stop_cells
+from dora_systemd.verbs.stop_note import note_stop
+
+_BY = "status page"
+
+
+def act(scope: Scope, message: PageMessage) -> str:
+    """Stop or restart a dataflow, or one node of it, and say what was done.
+
+    Raises DoraSystemdError as the verbs of doractl do.
+    """
+    bus = Bus(scope)
+    cell = find_cell(bus, message.dataflow)
+    if message.node:
+        do = stop_node if message.action == "stop" else restart_node
+        do(scope, cell, message.node)
+        return f"Node {message.node} of {cell.name}: {message.action} begun"
+    if message.action == "stop":
+        note_stop([cell], _BY)
+        (outcome,) = stop_cells(bus, scope, [cell])
+    else:
+        (outcome,) = restart_cells(bus, [cell])
+    if outcome.problem:
+        raise DoraSystemdError(outcome.problem, f"doractl why {cell.name}")
+    return outcome.text
+
+
+def read_graph(scope: Scope, uuid: str) -> dict[str, Any]:
+    """Nodes and edges of a dataflow. Raises DoraSystemdError where its descriptor is out of reach.
+
+    Dora's own copy is what runs, modules and all; the file may have changed since.
+    """
+    cell = find_cell(Bus(scope), uuid)
+    return graph_values(parse_dataflow(_read_descriptor(scope, cell), cell.options.dataflow))
+
+
+def _read_descriptor(scope: Scope, cell: Cell) -> object:
+    run = read_status(scope, cell).run if cell.is_up else ""
+    if run:
+        try:
+            reply = ask_coordinator(scope, cell, {"Info": {"dataflow_uuid": run}})
+            if isinstance(reply.result, dict) and not reply.error:
+                return reply.result["DataflowInfo"]["descriptor"]
+        except (DoraSystemdError, KeyError, TypeError):
+            # It may just be ending.
+            pass
+    path = Path(cell.options.dataflow)
+    return parse_yaml(read_file(path).data.decode("utf-8-sig", "replace"), path)

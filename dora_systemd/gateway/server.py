@@ -1,0 +1,231 @@
+"""The gateway's server: HTTP and WebSockets on the sockets that systemd has opened.
+
+Every connection passes the same gate (access.py) before a route sees it. The library takes GET
+requests and one request for each connection, which is all that is needed.
+"""
+
+import asyncio
+import logging
+import os
+import socket
+import time
+from collections.abc import Sequence
+from http import HTTPStatus
+from typing import Any
+
+from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.datastructures import Headers
+from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request as RawRequest
+from websockets.http11 import Response
+
+from dora_systemd.decisions.gateway.access import (
+    STRANGER_SECONDS,
+    Caller,
+    Door,
+    Refusal,
+    has_token,
+    refuse_address,
+    refuse_user,
+)
+from dora_systemd.decisions.gateway.request import Answer, Request, text_answer
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.gateway.routes import GET, OPEN_TO_ALL, SOCKETS
+from dora_systemd.scope import Scope
+from dora_systemd.trust.socket_table import peer_uid
+
+log = logging.getLogger(__name__)
+
+MAX_FRAME = 1024 * 1024
+"""Bytes; dora's own limit for its coordinator."""
+
+OPEN_SECONDS = 20.0
+"""For a request to arrive whole and be answered."""
+_ANSWER_SECONDS = 15.0
+_BACKLOG = 1024
+_REASON_BYTES = 120
+
+_ALWAYS = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
+
+_quiet = logging.getLogger("dora_systemd.websockets")
+# What strangers send is no event of ours, and the library writes tracebacks about it.
+_quiet.setLevel(logging.CRITICAL + 1)
+
+
+class Gateway:
+    """Answers for one scope. token: what callers of other users must have."""
+
+    def __init__(self, scope: Scope, token: str) -> None:
+        self._scope = scope
+        self._token = token
+        self._count = 0
+        self._door = Door(os.getuid())
+        self._since = time.monotonic()
+
+    async def run(self, sockets: Sequence[socket.socket], idle_seconds: float) -> None:
+        """Serve until nobody has been connected for that long; cancel to end it at once."""
+        while not await self._round(sockets, idle_seconds):
+            log.debug("somebody came at the last moment")
+
+    async def _round(self, sockets: Sequence[socket.socket], idle_seconds: float) -> bool:
+        """Listen until it is quiet, then no longer; whether nobody came between the two."""
+        servers = [await self._listen(one) for one in sockets]
+        try:
+            while (left := self._idle_left(idle_seconds)) > 0:
+                await asyncio.sleep(left)
+        finally:
+            # systemd keeps the sockets: who connects from here on starts the next gateway.
+            for server in servers:
+                server.close(close_connections=False)
+        await asyncio.sleep(0)
+        await asyncio.sleep(0)
+        return self._count == 0
+
+    def _idle_left(self, idle_seconds: float) -> float:
+        if self._count:
+            return idle_seconds
+        return self._since + idle_seconds - time.monotonic()
+
+    async def _listen(self, listener: socket.socket) -> Server:
+        return await serve(
+            self._talk,
+            sock=listener.dup(),
+            process_request=self._answer,
+            create_connection=self._connection_class(),
+            backlog=_BACKLOG,
+            server_header="dora-systemd",
+            logger=_quiet,
+            compression=None,
+            max_size=MAX_FRAME,
+            open_timeout=OPEN_SECONDS,
+            # A dora command that waits for an answer reads nothing, and answers no ping.
+            ping_interval=None,
+        )
+
+    def _connection_class(self) -> type[ServerConnection]:
+        gateway = self
+
+        class Counted(ServerConnection):
+            def connection_made(self, transport: asyncio.BaseTransport) -> None:
+                gateway._came()
+                self._uid = _uid_behind(transport)
+                self._is_in = gateway._door.enter(self._uid)
+                super().connection_made(transport)
+                if not self._is_in:
+                    self.transport.abort()
+                elif gateway._door.is_stranger(self._uid):
+                    self.loop.call_later(STRANGER_SECONDS, self._end_if_silent)
+
+            def connection_lost(self, exc: Exception | None) -> None:
+                if self._is_in:
+                    gateway._door.leave(self._uid)
+                gateway._went()
+                super().connection_lost(exc)
+
+            def _end_if_silent(self) -> None:
+                if self.request is None:
+                    self.transport.abort()
+
+        return Counted
+
+    def _came(self) -> None:
+        self._count += 1
+
+    def _went(self) -> None:
+        self._count -= 1
+        self._since = time.monotonic()
+
+    async def _answer(self, connection: ServerConnection, raw: RawRequest) -> Response | None:
+        """The response to an HTTP request; None lets a WebSocket connection begin."""
+        try:
+            refusal = await self._refusal(connection, raw)
+            answer = _refused(refusal) if refusal else await self._routed(raw)
+        except TimeoutError:
+            answer = text_answer(504, "no answer in time")
+        except DoraSystemdError as error:
+            answer = text_answer(503, f"{error.message}\n{error.hint}".strip())
+        except Exception as error:
+            log.error("cannot answer %.200s: %s: %s", raw.path, type(error).__name__, error)
+            answer = text_answer(500, "internal error in the gateway, see its journal")
+        return None if answer is None else _response(answer)
+
+    async def _refusal(self, connection: ServerConnection, raw: RawRequest) -> Refusal | None:
+        caller = Caller(
+            None,
+            raw.headers.get_all("Host"),
+            raw.headers.get_all("Origin"),
+            raw.headers.get_all("Authorization"),
+        )
+        refusal = refuse_address(caller)
+        if refusal or _path(raw) in OPEN_TO_ALL or has_token(caller, self._token):
+            return refusal
+        # Asked again, and not the last word: an address may be None once the other side has gone.
+        ends = (connection.remote_address, connection.local_address)
+        if all(ends):
+            peer, own = (tuple(end[:2]) for end in ends)
+            uid = peer_uid(peer, own)
+            caller = Caller(uid, caller.hosts, caller.origins, caller.authorizations)
+        return refuse_user(caller, os.getuid(), self._token)
+
+    async def _routed(self, raw: RawRequest) -> Answer | None:
+        # Any header may be there twice, which get() takes for an error.
+        upgrade = ",".join(raw.headers.get_all("Upgrade")).lower()
+        path, wants_socket = _path(raw), "websocket" in upgrade
+        if getattr(raw, "method", "GET") != "GET":
+            return text_answer(405, "the gateway takes GET only", Allow="GET")
+        if path in SOCKETS:
+            return None if wants_socket else text_answer(426, "a WebSocket", Upgrade="websocket")
+        if path not in GET or wants_socket:
+            return text_answer(404, "there is nothing here")
+        async with asyncio.timeout(_ANSWER_SECONDS):
+            return await GET[path](self._request(raw))
+
+    async def _talk(self, connection: ServerConnection) -> None:
+        """A WebSocket connection from its beginning to its end."""
+        raw = connection.request
+        assert raw is not None
+        try:
+            await SOCKETS[_path(raw)](connection, self._request(raw))
+        except ConnectionClosed:
+            return
+        except DoraSystemdError as error:
+            await connection.close(1011, _short(error.message))
+        except Exception as error:
+            log.error("cannot continue with %.200s: %s: %s", raw.path, type(error).__name__, error)
+            await connection.close(1011, "internal error in the gateway, see its journal")
+
+    def _request(self, raw: RawRequest) -> Request:
+        headers = {name.lower(): value for name, value in raw.headers.raw_items()}
+        return Request(_path(raw), self._scope, raw.path.partition("?")[2], headers)
+
+
+def _uid_behind(transport: asyncio.BaseTransport) -> int | None:
+    """Whose the other end is; asked at once, as long as that has not gone."""
+    ends = (transport.get_extra_info("peername"), transport.get_extra_info("sockname"))
+    return peer_uid(ends[0][:2], ends[1][:2]) if all(ends) else None
+
+
+def _path(raw: RawRequest) -> str:
+    return raw.path.partition("?")[0]
+
+
+def _refused(refusal: Refusal) -> Answer:
+    more = {"WWW-Authenticate": "Bearer"} if refusal.status == HTTPStatus.UNAUTHORIZED else {}
+    return text_answer(refusal.status, refusal.text, **more)
+
+
+def _response(answer: Answer) -> Response:
+    status = HTTPStatus(answer.status)
+    fields: dict[str, Any] = {
+        "Connection": "close",
+        "Content-Length": str(len(answer.body)),
+        "Content-Type": answer.content_type,
+        **_ALWAYS,
+        **answer.headers,
+    }
+    return Response(status.value, status.phrase, Headers(fields), answer.body)
+
+
+def _short(text: str) -> str:
+    """As much as a closing frame takes."""
+    return text.encode()[:_REASON_BYTES].decode(errors="ignore")

@@ -1,0 +1,58 @@
+"""The main process of a dataflow's unit: `python3 -m dora_systemd.runner`, started by systemd.
+
+Its exit status is RunnerExit in decisions/life/states.py. Here is what comes before the rest of
+it is imported, which takes longer than dora's coordinator takes to listen.
+"""
+
+import contextlib
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dora_systemd.decisions.cell.environment import node_environment
+from dora_systemd.decisions.cell.options import parse_runner_argv
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.paths import CellPaths
+from dora_systemd.runner.cell.begin import enter_supervisor, leave_out_openssl, start_coordinator
+from dora_systemd.runner.cell.pause import pause
+
+if TYPE_CHECKING:
+    from dora_systemd.adapters.dora.check import DoraCheck
+    from dora_systemd.adapters.dora.engine import Child
+
+
+def begin(argv: list[str]) -> "tuple[Child, DoraCheck] | None":
+    """The coordinator of the first run, and dora's checks beside it.
+
+    None where that is not possible: who needs it says why.
+    """
+    directory = os.environ.get("RUNTIME_DIRECTORY")
+    if directory:
+        with contextlib.suppress(OSError, DoraSystemdError):
+            options = parse_runner_argv(argv)
+            enter_supervisor()
+            paths = CellPaths(Path(directory))
+            pause(options, paths)
+            environment = node_environment(os.environ)
+            coordinator = start_coordinator(options.dora, paths, environment)
+            from dora_systemd.adapters.dora.check import DoraCheck
+
+            return coordinator, DoraCheck(options, environment)
+    return None
+
+
+def main(argv: list[str]) -> int:
+    """Run the cell that `argv` describes; the exit status."""
+    begun = begin(argv)
+    leave_out_openssl()
+    from dora_systemd.runner.main import run
+
+    return run(argv, begun)
+
+
+if __name__ == "__main__":
+    status = main(sys.argv[1:])
+    sys.stderr.flush()
+    # Not sys.exit: taking the interpreter apart is a third of what a stop waits for.
+    os._exit(status)

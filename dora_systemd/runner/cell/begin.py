@@ -1,0 +1,46 @@
+"""How a cell begins: its group and its coordinator. Imports nothing that takes time."""
+
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+from dora_systemd.adapters.cgroup import groups as cgroup
+from dora_systemd.adapters.dora import engine
+from dora_systemd.paths import CellPaths
+
+OPENSSL = ("ssl", "_ssl", "_hashlib")
+
+
+def leave_out_openssl() -> None:
+    """Let the standard library do without OpenSSL, as it does where Python is built without.
+
+    A cell speaks over loopback and Unix sockets only, and OpenSSL would be a fifth of its memory.
+    """
+    sys.modules.update(dict.fromkeys(OPENSSL))  # type: ignore[arg-type]
+
+
+def let_openssl_in() -> None:
+    """Undo it, for a library that asks for it by name."""
+    for name in OPENSSL:
+        if name in sys.modules and sys.modules[name] is None:
+            del sys.modules[name]
+
+
+def enter_supervisor() -> Path:
+    """The cgroup directory of the unit, with this process in its group `supervisor`.
+
+    DelegateSubgroup= puts it there; systemd before 254 does not have that. Raises OSError.
+    """
+    own = cgroup.group_path(cgroup.own_group())
+    if own.name == cgroup.SUPERVISOR:
+        return own.parent
+    cgroup.make_group(own / cgroup.SUPERVISOR)
+    cgroup.move_process(own / cgroup.SUPERVISOR, 0)
+    return own
+
+
+def start_coordinator(dora: str, paths: CellPaths, environment: Mapping[str, str]) -> engine.Child:
+    """Start a coordinator, which prints its port. environment: of the nodes. Raises OSError."""
+    paths.coordinator.mkdir(mode=0o700, exist_ok=True)
+    own = engine.coordinator_environment(environment, paths.coordinator)
+    return engine.spawn("coordinator", engine.coordinator_command(dora), own, paths.coordinator)

@@ -1,0 +1,204 @@
+"""What the runner asks dora and hears from it: the actions of dora_systemd.decisions.life.table."""
+
+import asyncio
+from collections.abc import Callable, Coroutine, Mapping
+from typing import Any
+
+from dora_systemd.adapters.dora import engine
+from dora_systemd.adapters.host import notify
+from dora_systemd.adapters.logs.pipes import LogPipes
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.dora import protocol
+from dora_systemd.decisions.life import events as life
+from dora_systemd.decisions.life.states import Do, State
+from dora_systemd.decisions.life.stop_budget import stop_timeout
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.runner.cell.engine import Engine
+from dora_systemd.runner.cell.failure import failed
+from dora_systemd.runner.cell.pump import Pump, now_us
+from dora_systemd.runner.nodes.nodes import Nodes
+from dora_systemd.values import SECOND
+
+_LISTENING = "Listening on port "
+_SETTLE_SECONDS = 0.02
+"""`systemctl kill` signals all of the cell at once: let our own signal be heard before the news
+that a child died of it."""
+_AGAIN_SECONDS = 0.02
+_QUIET_SECONDS = 0.1
+_LONG_SECONDS = 3600.0 * 24 * 365
+
+
+class Dialogue:
+    """Carries out each Do; every answer becomes an event of the pump."""
+
+    def __init__(
+        self, options: RunnerOptions, pump: Pump, dora: Engine, nodes: Nodes, pipes: LogPipes
+    ) -> None:
+        self._options = options
+        self._pump = pump
+        self._engine = dora
+        self._nodes = nodes
+        self._pipes = pipes
+        self._loop = asyncio.get_running_loop()
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    def actions(
+        self, descriptor: Mapping[str, Any], variables: Mapping[str, str]
+    ) -> dict[Do, Callable[[], None]]:
+        """What each Do does. variables: what the daemon's environment has besides the nodes'."""
+        return {
+            Do.START_DAEMON: lambda: self._start_daemon(variables),
+            Do.SEND_START: lambda: self._ask(Do.SEND_START, self._send_start(descriptor)),
+            Do.SUBSCRIBE: lambda: self._ask(Do.SUBSCRIBE, self._subscribe()),
+            Do.OPEN_PIPES: lambda: self._nodes.listen(self._pump.cell.run),
+            Do.ASK_SPAWN: lambda: self._ask(Do.ASK_SPAWN, self._ask_spawn()),
+            Do.ASK_RESULT: lambda: self._ask(Do.ASK_RESULT, self._ask_result()),
+            Do.ASK_STOP: lambda: self._ask(Do.ASK_STOP, self._ask_stop()),
+            Do.DISMISS_DAEMON: self._dismiss_daemon,
+            Do.EXIT: lambda: self._pump.end.set_result(self._pump.cell.exit),
+        }
+
+    def _ask(self, what: Do, work: Coroutine[Any, Any, None]) -> None:
+        self.spawn(what.value, work)
+
+    def spawn(self, what: str, work: Coroutine[Any, Any, None]) -> None:
+        """Run `work` beside all else; what it cannot do ends the cell.
+
+        what: what it does, as after "could not".
+        """
+        task = self._loop.create_task(self._guard(what, work))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _guard(self, what: str, work: Coroutine[Any, Any, None]) -> None:
+        event: life.Event | None = None
+        try:
+            await work
+        except DoraSystemdError as error:
+            event = life.Refused(now_us(), error.message)
+        except Exception as error:
+            event = failed(what, error)
+        if event is not None:
+            # While a child is dying, its end says more than what its connection suffers.
+            await asyncio.sleep(_SETTLE_SECONDS)
+            self._pump.push(event)
+
+    def cancel(self) -> None:
+        """Give up all that is still asked."""
+        for task in self._tasks:
+            task.cancel()
+
+    def watch(self, child: engine.Child, on_line: Callable[[str], None] | None = None) -> None:
+        """Read a child's output and hear of its end."""
+        self._pipes.add_output(child.label, child.output, on_line)
+        engine.watch(self._loop, child, self._child_exited)
+
+    def _child_exited(self, label: str, how: str) -> None:
+        oom = self._nodes.find_oom_of_dora()
+        event = life.ChildExited(now_us(), label, how if oom is None else oom.text, oom)
+        self._loop.call_later(_SETTLE_SECONDS, self._pump.push, event)
+
+    def read_coordinator(self, line: str) -> None:
+        """A line that the coordinator printed: one of them tells its port."""
+        if line.startswith(_LISTENING) and self._pump.cell.state is State.BOOTING:
+            self._engine.set_port(int(line.removeprefix(_LISTENING)))
+            self._pump.push(life.CoordinatorListening(now_us()))
+
+    def _start_daemon(self, variables: Mapping[str, str]) -> None:
+        self.watch(self._engine.start_daemon(variables), self._read_daemon)
+        self.spawn("wait until the daemon has joined", self._wait_joined())
+
+    def _read_daemon(self, line: str) -> None:
+        event = protocol.parse_daemon_line(line, now_us())
+        if event is not None:
+            self._pump.push(event)
+
+    async def _wait_joined(self) -> None:
+        await self._engine.wait_joined()
+        self._pump.push(life.DaemonConnected(now_us()))
+
+    async def _send_start(self, descriptor: Mapping[str, Any]) -> None:
+        run = await self._engine.start_run(descriptor, self._options.name)
+        self._pipes.set_run(run)
+        self._pump.push(life.RunStarted(now_us(), run))
+
+    async def _subscribe(self) -> None:
+        def subscribed() -> None:
+            self._pump.push(life.Subscribed(now_us()))
+
+        await self._engine.read_events(self._pump.cell.run, subscribed, self._hear)
+        await asyncio.sleep(2 * _SETTLE_SECONDS)  # after the coordinator's own end, if it is that
+        self._pump.push(life.ConnectionLost(now_us()))
+
+    def _hear(self, record: protocol.LogRecord) -> None:
+        event = protocol.parse_life_event(record, now_us())
+        if isinstance(event, life.NodeSpawned):
+            self._nodes.adopt(event.node, event.pid)
+        if isinstance(event, life.NodeExited):
+            node = self._pump.cell.nodes.get(event.node)
+            is_stale = node is not None and self._nodes.has_process(event.node, node.pid)
+            event = protocol.with_facts(event, is_stale, self._nodes.find_oom(event.node))
+            if node is not None and event.exit and event.will_restart and not is_stale:
+                self._nodes.clear(event.node, node.pid)
+        if event is not None:
+            self._pump.push(event)
+        if isinstance(event, life.NodeExited) and not event.is_stale:
+            self._nodes.forget(event.node)
+
+    async def _ask_spawn(self) -> None:
+        params = protocol.wait_spawn_params(self._pump.cell.run)
+        reply = await self._engine.ask_apart(params, _LONG_SECONDS)
+        failure = protocol.parse_spawn_failure(reply)
+        if failure:
+            self._pump.push(life.Refused(now_us(), failure))
+
+    async def _ask_result(self) -> None:
+        while True:
+            reply = await self._engine.ask(protocol.check_params(self._pump.cell.run))
+            results = protocol.parse_results(reply)
+            if results is not None:
+                return self._pump.push(life.ResultKnown(now_us(), results))
+            if self._pump.cell.state is not State.CLOSING:
+                return None  # it runs: that was the question
+            await asyncio.sleep(_AGAIN_SECONDS)
+
+    async def _ask_stop(self) -> None:
+        self._nodes.let_go()
+        cell = self._pump.cell
+        seconds = stop_timeout(cell.grace) / SECOND
+        # A refusal means that nothing of the run is left; a Stop without an answer is known to
+        # happen, and the deadline of the state is for that.
+        await self._engine.ask_apart(protocol.stop_params(cell.run, cell.grace), seconds)
+        self._pump.push(life.StopAnswered(now_us()))
+
+    def _dismiss_daemon(self) -> None:
+        self._nodes.let_go()
+        # What the two say about each other's end is no news.
+        self._pipes.mute("coordinator", "daemon")
+        self._ask(Do.DISMISS_DAEMON, self._dismiss_when_quiet())
+
+    async def _dismiss_when_quiet(self) -> None:
+        # The daemon writes what its nodes said last after the news that they have ended.
+        await self._nodes.wait_quiet(_QUIET_SECONDS)
+        if not self._engine.dismiss_daemon():
+            self._pump.push(life.ChildExited(now_us(), "daemon", "earlier"))
+
+    async def feed_watchdog(self, seconds: float) -> None:
+        """Every `seconds`: WATCHDOG=1, and see that neither coordinator nor daemon hangs.
+
+        While it stops, systemd's TimeoutStopSec= is what bounds it.
+        """
+        while True:
+            await asyncio.sleep(seconds)
+            if self._pump.cell.state is State.RUNNING:
+                silent = await self._engine.find_silent(1.5 * seconds)
+                if silent and self._pump.cell.state is State.RUNNING:
+                    reason = f"the dora {silent} does not answer any more"
+                    self._pump.push(life.ConnectionLost(now_us(), silent, reason))
+            notify.send_alive()
+
+    async def take_samples(self, seconds: float) -> None:
+        """Every `seconds`: CPU time used so far."""
+        while True:
+            self._pump.sample()
+            await asyncio.sleep(seconds)

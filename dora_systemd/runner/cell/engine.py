@@ -1,0 +1,147 @@
+"""The runner's side of dora: its two children and the connections to the coordinator."""
+
+import asyncio
+import json
+import signal
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from dora_systemd.adapters.dora import control, engine
+from dora_systemd.adapters.host import files
+from dora_systemd.decisions.dora import protocol
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.paths import CellPaths
+from dora_systemd.runner.cell.begin import start_coordinator
+from dora_systemd.values import SECOND
+
+POLL_SECONDS = 0.002
+"""Between two questions whether the daemon has registered: dora tells it by no event."""
+
+KILL_SECONDS = 0.5
+"""What SIGKILL may take; what sleeps in the kernel and takes longer is left to systemd."""
+
+SILENCE = 20
+"""Seconds without a word of the daemon after which it hangs; it sends a heartbeat every 5."""
+
+OnRecord = Callable[[protocol.LogRecord], None]
+
+
+class Engine:
+    """Coordinator and daemon of a cell, and how they are asked.
+
+    environment: of the nodes, without what is systemd's.
+    """
+
+    def __init__(self, dora: str, paths: CellPaths, environment: Mapping[str, str]) -> None:
+        self._dora = dora
+        self._paths = paths
+        self._environment = dict(environment)
+        self._children: dict[str, engine.Child] = {}
+        self._requests: control.Connection | None = None
+        self._lock = asyncio.Lock()
+        self._port = 0
+        self._token = ""
+
+    def start_coordinator(self, early: engine.Child | None = None) -> engine.Child:
+        """Start the coordinator, unless `early` is there; it prints its port. Raises OSError."""
+        child = early or start_coordinator(self._dora, self._paths, self._environment)
+        self._children[child.label] = child
+        return child
+
+    def set_port(self, port: int) -> None:
+        """The coordinator listens on `port`; its token is in its directory by now. OSError."""
+        self._port = port
+        self._token = (self._paths.coordinator / ".dora-token").read_text().strip()
+
+    def start_daemon(self, added: Mapping[str, str]) -> engine.Child:
+        """Start the daemon with `added` variables, and say where the cell is reached. OSError."""
+        listen = engine.free_port()
+        access = {"port": self._port, "token": self._token, "local_listen_port": listen}
+        files.write_atomic(self._paths.control, json.dumps(access), 0o600)
+        environment = {**self._environment, **added, "DORA_AUTH_TOKEN": self._token}
+        command = engine.daemon_command(self._dora, self._port, listen)
+        daemon = engine.spawn("daemon", command, environment, self._paths.daemon)
+        self._children[daemon.label] = daemon
+        return daemon
+
+    async def wait_joined(self) -> None:
+        """Return once the daemon has registered with the coordinator."""
+        self._requests = await self.connect()
+        while not await self.is_joined():
+            await asyncio.sleep(POLL_SECONDS)
+
+    async def is_joined(self) -> bool:
+        """Whether the daemon has registered. Raises DoraSystemdError without an answer."""
+        reply = await self.ask(protocol.DAEMON_CONNECTED)
+        return bool(protocol.result_of(reply, "DaemonConnected"))
+
+    async def find_silent(self, seconds: float) -> str:
+        """The one of the two that hangs, or "": they were heard of just now.
+
+        seconds: how long the coordinator may take to answer. It does not ask the daemon: that would
+        keep it from answering anybody else for 30 s.
+        """
+        try:
+            async with asyncio.timeout(seconds):
+                reply = await self.ask(protocol.CONNECTED_DAEMONS)
+        except TimeoutError:
+            return "coordinator"
+        return "" if protocol.parse_heartbeat(reply) <= SILENCE * SECOND else "daemon"
+
+    async def ask(self, params: protocol.Params) -> protocol.Reply:
+        """One request that dora answers at once."""
+        assert self._requests is not None
+        async with self._lock:
+            return await self._requests.request(params)
+
+    async def ask_apart(self, params: protocol.Params, seconds: float) -> protocol.Reply:
+        """One request that may take long, on its own connection: each one answers in turn."""
+        connection = await self.connect()
+        try:
+            return await connection.request(params, seconds)
+        finally:
+            await connection.close()
+
+    async def connect(self) -> control.Connection:
+        """A new connection."""
+        return await control.Connection.open(self._port, self._token)
+
+    async def start_run(self, descriptor: Mapping[str, Any], name: str) -> str:
+        """Send the descriptor; dora's id of the run. Raises DoraSystemdError."""
+        params = protocol.start_params(descriptor, name, str(self._paths.work))
+        reply = await self.ask(params)
+        return str(protocol.result_of(reply, "DataflowStartTriggered")["uuid"])
+
+    async def read_events(
+        self, run: str, on_start: Callable[[], None], on_record: OnRecord
+    ) -> None:
+        """Subscribe to the events of a run, tell on_start, and give them on until the end."""
+        connection = await self.connect()
+        try:
+            reply = await connection.request(protocol.subscribe_params(run))
+            if reply.error:
+                raise DoraSystemdError(f"cannot read events of dora: {reply.error}")
+            on_start()
+            await connection.read_events(on_record)
+        finally:
+            connection.abort()
+
+    def dismiss_daemon(self) -> bool:
+        """Let the daemon end in good order; False when it already has."""
+        daemon = self._children.get("daemon")
+        if daemon is None or daemon.popen.returncode is not None:
+            return False
+        # SIGTERM would kill it where it stands; on SIGINT it cleans up, in half the time that
+        # the protocol's Destroy takes.
+        daemon.send_signal(signal.SIGINT)
+        return True
+
+    def kill(self) -> None:
+        """SIGKILL to what is left of the two, and reap; the connection goes, too."""
+        if self._requests is not None:
+            self._requests.abort()
+        for child in self._children.values():
+            child.send_signal(signal.SIGKILL)
+        for child in self._children.values():
+            child.close(asyncio.get_running_loop(), KILL_SECONDS)
+        self._children.clear()

@@ -1,0 +1,82 @@
+"""What becomes of an exception in the runner: an event that ends the cell, never a deaf runner."""
+
+import asyncio
+import contextlib
+import sys
+import time
+import traceback
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+from dora_systemd.decisions.life import events as life
+from dora_systemd.errors import DoraSystemdError
+
+Push = Callable[[life.Event], None]
+
+
+def failed(what: str, error: Exception) -> life.Failed:
+    """The event. The traceback goes to the journal, for who has to mend it."""
+    at_us = time.time_ns() // 1000
+    if isinstance(error, DoraSystemdError):
+        return life.Failed(at_us, what, error.message)
+    lines = "".join(traceback.format_exception(error)).splitlines()
+    # A dead journald must not keep anybody from being told.
+    with contextlib.suppress(OSError, ValueError):
+        print("\n".join(f"<7>{line}" for line in lines), file=sys.stderr, flush=True)
+    return life.Failed(at_us, what, words(error))
+
+
+def words(error: Exception) -> str:
+    """The exception in one line."""
+    return " ".join(f"{type(error).__name__}: {error}".removesuffix(": ").split())
+
+
+class Beside:
+    """What runs beside all runs of the dataflow. An exception there ends the run that there is.
+
+    push: takes the events of that run; between two runs the next one is told.
+    """
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._loop = loop
+        self._tasks: list[asyncio.Task[None]] = []
+        self._push: Push | None = None
+        self._failure: life.Failed | None = None
+        loop.set_exception_handler(self._callback_raised)
+
+    def attach(self, push: Push) -> None:
+        """A run begins."""
+        self._push = push
+        if self._failure is not None:
+            push(self._failure)
+
+    def spawn(self, what: str, work: Coroutine[Any, Any, None]) -> None:
+        """Run `work` until cancel(). what: what it does, as after "could not"."""
+        self._tasks.append(self._loop.create_task(self._guard(what, work)))
+
+    async def _guard(self, what: str, work: Coroutine[Any, Any, None]) -> None:
+        try:
+            await work
+        except Exception as error:
+            # It is missing in the runs that follow, too.
+            self._failure = failed(what, error)
+            self._tell(self._failure)
+
+    def _tell(self, failure: life.Failed) -> None:
+        if self._push is not None:
+            self._push(failure)
+
+    def _callback_raised(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        """What a reader, a timer or a signal handler raises would be lost otherwise."""
+        error = context.get("exception")
+        callback = getattr(context.get("handle"), "_callback", None)
+        if callback is None or not isinstance(error, Exception):
+            loop.default_exception_handler(context)
+            return
+        name = getattr(getattr(callback, "func", callback), "__qualname__", "a callback")
+        self._tell(failed(f"finish {name}", error))
+
+    def cancel(self) -> None:
+        """Give up all of it."""
+        for task in self._tasks:
+            task.cancel()

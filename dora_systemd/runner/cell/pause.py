@@ -1,0 +1,66 @@
+"""The pause before a restart: it grows with each one, and is short again after a quiet window.
+
+RestartSteps= of systemd.service(5) counts all restarts since the unit was started: two losses
+with months between them would be no exception. So RestartSec= is the shortest pause, and the runner
+waits for the rest of a longer one before it does anything else. How many lives there were is known
+to systemd, see lives() in dora_systemd.adapters.host.fd_store.
+"""
+
+import contextlib
+import time
+
+from dora_systemd.adapters.host import fd_store
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.names import unit_name
+from dora_systemd.paths import CellPaths
+from dora_systemd.values import INFINITY, SECOND, format_duration
+
+_ASK_SECONDS = 5.0
+
+
+def pause(options: RunnerOptions, paths: CellPaths) -> None:
+    """Wait as long as this restart has to; SIGTERM ends the process meanwhile. Raises OSError."""
+    policy = options.restart
+    if policy.policy == "no":
+        return
+    if (restart := fd_store.lives()) > 1:
+        restart = min(restart, counted_restarts(options.name, paths.is_of_user, restart))
+        seconds = (policy.delay_before(restart) - policy.delay) / SECOND
+        if seconds > 0:
+            show(options.uuid, paths, seconds)
+            time.sleep(seconds)
+    fd_store.count_life()
+
+
+def counted_restarts(name: str, is_user: bool, otherwise: int) -> int:
+    """NRestarts=, which begins anew when somebody resets or restarts the unit."""
+    from dora_systemd.adapters.host import process
+    from dora_systemd.errors import DoraSystemdError
+
+    scope = ["--user"] if is_user else []
+    command = ["systemctl", *scope, "show", "--value", "--property=NRestarts", unit_name(name)]
+    with contextlib.suppress(DoraSystemdError, ValueError):
+        return int(process.run_command(command, _ASK_SECONDS).stdout)
+    return otherwise
+
+
+def show(uuid: str, paths: CellPaths, seconds: float) -> None:
+    """Say in `systemctl status` and `list` what this waits for."""
+    from dora_systemd.adapters.host import files, notify
+    from dora_systemd.decisions.cell.status import CellStatus
+
+    duration = round(seconds * SECOND)
+    begin_us = time.time_ns() // 1000 + duration
+    text = f"restarting in {format_duration(-(-duration // SECOND) * SECOND)}"
+    table = CellStatus(uuid=uuid, stage="restarting", text=text, started_us=begin_us)
+    files.write_atomic(paths.status, table.to_json(), 0o600)
+    notify.send_status(text)
+
+
+async def forget_restarts(options: RunnerOptions) -> None:
+    """After a quiet window the next pause is the shortest one."""
+    import asyncio  # takes longer than all else that is needed before the coordinator is started
+
+    if options.restart.policy != "no" and options.restart.window != INFINITY:
+        await asyncio.sleep(options.restart.window / SECOND)
+        fd_store.forget_lives()

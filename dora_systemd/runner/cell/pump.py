@@ -1,0 +1,224 @@
+"""The runner's event pump: events in, the table of decisions/life/, actions out."""
+
+import asyncio
+import contextlib
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from dora_systemd.adapters.host import files, notify
+from dora_systemd.adapters.logs.pipes import LogPipes
+from dora_systemd.decisions.cell.status import CpuSample, add_sample
+from dora_systemd.decisions.life import events as life
+from dora_systemd.decisions.life.causes import Cause
+from dora_systemd.decisions.life.failures import ENGINE_TIMEOUT
+from dora_systemd.decisions.life.states import Action, Cell, Deadline, Do, Record, RunnerExit, State
+from dora_systemd.decisions.life.table import step
+from dora_systemd.decisions.life.view import cell_status, format_status
+from dora_systemd.decisions.logs.events import END_EVENTS
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.paths import CellPaths
+from dora_systemd.runner.cell.failure import failed
+from dora_systemd.runner.nodes.nodes import Nodes
+from dora_systemd.values import SECOND
+
+
+def now_us() -> int:
+    """CLOCK_REALTIME in µs."""
+    return time.time_ns() // 1000
+
+
+def is_deleted(directory: Path) -> bool:
+    """Whether a directory is gone. One that is mounted here stays, but nothing leads to it."""
+    try:
+        return directory.stat().st_nlink == 0
+    except OSError:
+        return True
+
+
+class Pump:
+    """Holds the cell, moves it by events, and shows what it has become.
+
+    uuid: of the dataflow. What Do means is given by connect(), before the first event.
+    end: how the cell has ended, whatever became of the action EXIT.
+    """
+
+    def __init__(
+        self, cell: Cell, uuid: str, paths: CellPaths, nodes: Nodes, pipes: LogPipes
+    ) -> None:
+        self.cell = cell
+        self._uuid = uuid
+        self._paths = paths
+        self._nodes = nodes
+        self._pipes = pipes
+        self._loop = asyncio.get_running_loop()
+        self._actions: Mapping[Do, Callable[[], None]] = {}
+        self._queue: deque[life.Event] = deque()
+        self._is_busy = False
+        self.end: asyncio.Future[RunnerExit] = self._loop.create_future()
+        self._deadline: asyncio.TimerHandle | None = None
+        self._samples: tuple[CpuSample, ...] = ()
+        self._text = ""
+        self._is_ready = False
+        self._is_unwritten = False
+        self._waiting: list[tuple[Callable[[Cell], bool], asyncio.Future[None]]] = []
+
+    def connect(self, actions: Mapping[Do, Callable[[], None]]) -> None:
+        """Say what each Do does."""
+        self._actions = actions
+        self._set_deadline(ENGINE_TIMEOUT)  # until the coordinator listens
+        self._publish()
+
+    def push(self, event: life.Event) -> None:
+        """Take one event through the table, then those that its actions cause.
+
+        Raises nothing: what an action raises is the next event, which ends the cell.
+        """
+        self._queue.append(event)
+        if self._is_busy:
+            return  # caused by an action: the loop below takes it when that event is done
+        self._is_busy = True
+        try:
+            while self._queue:
+                self._take(self._queue.popleft())
+        finally:
+            self._is_busy = False
+
+    def _take(self, event: life.Event) -> None:
+        before = self.cell
+        actions = self._step(event)
+        if self.cell is not before:
+            with self._guard("show its state"):
+                self._publish()
+            with self._guard("tell its state to its own tasks"):
+                self._tell_waiting()
+        for action in actions:
+            with self._guard(_name(action)):
+                self._perform(action)
+        if self.cell.state is State.ENDED and not self.end.done():
+            self.end.set_result(self.cell.exit)  # EXIT could not do it
+
+    def _step(self, event: life.Event) -> tuple[Action, ...]:
+        try:
+            self.cell, actions = step(self.cell, event)
+            return actions
+        except Exception as error:
+            failure = failed(f"handle the event {type(event).__name__}", error)
+        if isinstance(event, life.Failed):  # not even that: this must end all the same
+            self.cell = replace(self.cell, state=State.ENDED, exit=RunnerExit.FAILED)
+        else:
+            self.push(failure)
+        return ()
+
+    @contextlib.contextmanager
+    def _guard(self, what: str) -> Iterator[None]:
+        try:
+            yield
+        except Exception as error:
+            self.push(failed(what, error))
+
+    def _perform(self, action: Action) -> None:
+        match action:
+            case Do():
+                self._actions[action]()
+            case Record():
+                self._record(action)
+            case Deadline():
+                self._set_deadline(action.after)
+
+    def _record(self, record: Record) -> None:
+        with self._guard(f"do what comes before the event {record.event}"):
+            self._prepare(record)
+        self._pipes.write_event(record.event, record.node or None, **record.details)
+
+    def _prepare(self, record: Record) -> None:
+        if record.event in END_EVENTS:
+            self._nodes.kill()  # no word of theirs after the last of ours
+        elif record.node:
+            self._nodes.drain([record.node])
+        elif record.event == "dataflow-stopping":
+            notify.send_stopping()
+
+    async def wait(self, is_so: Callable[[Cell], bool], seconds: float | None) -> bool:
+        """Return True as soon as `is_so` holds of the cell, or False after so many seconds."""
+        if is_so(self.cell):
+            return True
+        future: asyncio.Future[None] = self._loop.create_future()
+        self._waiting.append((is_so, future))
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(future, seconds)
+        return is_so(self.cell)
+
+    def _tell_waiting(self) -> None:
+        for is_so, future in self._waiting:
+            if not future.done() and is_so(self.cell):
+                future.set_result(None)
+        self._waiting = [one for one in self._waiting if not one[1].done()]
+
+    def _set_deadline(self, after: int | None) -> None:
+        if self._deadline is not None:
+            self._deadline.cancel()
+        self._deadline = None
+        if after is not None:
+            self._deadline = self._loop.call_later(
+                after / SECOND, lambda: self.push(life.DeadlinePassed(now_us()))
+            )
+
+    def _publish(self) -> None:
+        text = format_status(self.cell)
+        if text != self._text:
+            self._text = text
+            notify.send_status(text)
+        # The table first: who waited for READY=1 may read it at once.
+        self._write_table()
+        if self.cell.state is State.RUNNING and not self._is_ready:
+            self._is_ready = True
+            notify.send_ready()
+
+    def sample(self) -> None:
+        """Note CPU time used so far, so that `list` can tell CPU% without waiting.
+
+        Says so when CPU time or memory gets short, once the nodes run.
+        """
+        sample = self._nodes.sample(time.monotonic_ns() // 1000)
+        if self.cell.state is State.RUNNING:
+            for record in self._nodes.resources.look(self._samples, sample):
+                self._record(record)
+        self._samples = add_sample(self._samples, sample)
+        self._write_table()
+
+    def _write_table(self) -> None:
+        table = cell_status(self.cell, self._uuid, self._samples, self._pipes.line_counts())
+        try:
+            files.write_atomic(self._paths.status, table.to_json(), 0o600)
+        except DoraSystemdError as error:
+            # Nothing that happens may be lost for it: it is only for `list`.
+            self._report_unwritten(error)
+
+    def _report_unwritten(self, error: DoraSystemdError) -> None:
+        """Say once that the table is old; without its directory the cell cannot go on.
+
+        The pipes of the nodes are there: dora could start none of them again.
+        """
+        if self._is_unwritten:
+            return
+        self._is_unwritten = True
+        print(f"<4>{error.message}", file=sys.stderr, flush=True)
+        if is_deleted(self._paths.root):
+            reason = f"its directory {self._paths.root} is gone"
+            lost = life.Refused(now_us(), reason, Cause.DIRECTORY_LOST)
+            self._loop.call_soon(self.push, lost)
+
+
+def _name(action: Action) -> str:
+    """What the action does, as after "could not"."""
+    match action:
+        case Do():
+            return action.value
+        case Record():
+            return f"write the event {action.event}"
+        case Deadline():
+            return "set its deadline"

@@ -1,0 +1,33 @@
+"""What a runner would refuse: `python3 -m dora_systemd.runner.check`, with the runner's arguments.
+
+`doractl start --dry-run` asks it. It prints the refusal and ends as the runner would; nothing is
+started but dora's own checks.
+"""
+
+import os
+import sys
+
+from dora_systemd.adapters.dora.check import DoraCheck
+from dora_systemd.adapters.dora.preparation import check_named_nodes, prepare
+from dora_systemd.decisions.cell.environment import node_environment
+from dora_systemd.decisions.cell.options import parse_runner_argv
+from dora_systemd.decisions.life.refusal import format_refusal, refusal_exit
+from dora_systemd.errors import DoraSystemdError
+
+
+def main(argv: list[str]) -> int:
+    """Check the dataflow that `argv` describes; the exit status of a runner."""
+    try:
+        options = parse_runner_argv(argv)
+        environment = node_environment(os.environ)
+        check = DoraCheck(options, environment)
+        prepared = check.beside(lambda: prepare(options, environment))
+        check_named_nodes(options, prepared.dataflow)
+    except DoraSystemdError as error:
+        print(format_refusal(error))
+        return refusal_exit(error)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,287 @@
+"""The life of a cell: what the main process of a dataflow's unit does, see dora_systemd.runner."""
+
+import asyncio
+import contextlib
+import os
+import signal
+import sys
+import traceback
+from collections.abc import Coroutine
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from dora_systemd.adapters.dora.check import DoraCheck
+from dora_systemd.adapters.dora.control import read_coordinator
+from dora_systemd.adapters.dora.engine import Child
+from dora_systemd.adapters.dora.preparation import (
+    Prepared,
+    check_named_nodes,
+    prepare,
+    with_changes,
+)
+from dora_systemd.adapters.host import fd_store, notify
+from dora_systemd.adapters.journal.socket import JournalSocket
+from dora_systemd.adapters.logs.pipes import LogPipes
+from dora_systemd.adapters.runner_socket.listener import serve
+from dora_systemd.decisions.cell.environment import node_environment
+from dora_systemd.decisions.cell.launch import kinds
+from dora_systemd.decisions.cell.options import RunnerOptions, parse_runner_argv
+from dora_systemd.decisions.descriptor.wiring import downstream_of
+from dora_systemd.decisions.life import events as life
+from dora_systemd.decisions.life.causes import Cause
+from dora_systemd.decisions.life.refusal import format_refusal, refusal_exit
+from dora_systemd.decisions.life.states import Cell, RunnerExit, State
+from dora_systemd.decisions.life.view import initial_nodes
+from dora_systemd.decisions.logs.lines import Origin
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import settings_path
+from dora_systemd.paths import CellPaths
+from dora_systemd.runner.cell.begin import enter_supervisor
+from dora_systemd.runner.cell.clock import StopClock
+from dora_systemd.runner.cell.dialogue import Dialogue
+from dora_systemd.runner.cell.engine import Engine
+from dora_systemd.runner.cell.failure import Beside, words
+from dora_systemd.runner.cell.pause import forget_restarts
+from dora_systemd.runner.cell.pump import Pump, now_us
+from dora_systemd.runner.cell.rooms import daemon_variables, make_directories
+from dora_systemd.runner.nodes.losses import LossWatch, losses_of_user
+from dora_systemd.runner.nodes.nodes import Nodes, wait_eof
+from dora_systemd.runner.reload.apply import Run
+from dora_systemd.runner.reload.reloader import Reloader
+from dora_systemd.runner.reload.settings_file import SettingsFile
+from dora_systemd.runner.reload.swap import READY_SECONDS, Swapper
+from dora_systemd.values import INFINITY, SECOND
+
+SAMPLE_SECONDS = 5.0
+JOURNAL_SECONDS = 1.0
+CLOSE_SECONDS = 7.0
+LOSSES_SECONDS = 10.0
+CANCEL_SECONDS = 0.5
+
+Begun = tuple[Child, DoraCheck]
+"""A coordinator that boots, and what dora is asked meanwhile."""
+
+
+async def run_cell(
+    options: RunnerOptions, paths: CellPaths, begun: Begun | None = None
+) -> RunnerExit:
+    """Live the life of one cell: one run of the dataflow after the other, until it has to end.
+
+    begun: what there is of the first run already.
+    """
+    loop = asyncio.get_running_loop()
+    journal, clock = JournalSocket(), StopClock(options.grace)
+    # While systemd holds the pipes too, what is in them outlives a kill of this process.
+    fd_store.forget_inherited()
+    origin = Origin(options.name, options.uuid)
+    pipes = LogPipes(loop, journal, origin, fd_store.store, fd_store.forget)
+    try:
+        pipes.write_event("dataflow-starting")
+        cell = furnish(options, paths, pipes, clock, begun)
+        return await live(cell, losses_of_user(journal, pipes) if paths.is_of_user else None)
+    except DoraSystemdError as error:
+        tell_failure(pipes, error, Cause.BAD_DATAFLOW)
+        raise
+    except Exception as error:
+        broken = DoraSystemdError(f"cannot run the dataflow: {words(error)}")
+        tell_failure(pipes, broken, Cause.RUNNER_BROKEN)
+        raise
+    finally:
+        pipes.close(clock.left(JOURNAL_SECONDS if clock.by else CLOSE_SECONDS))
+        journal.wait_read(clock.left(JOURNAL_SECONDS))
+
+
+def tell_failure(pipes: LogPipes, error: DoraSystemdError, cause: Cause) -> None:
+    """Say why there is no run of the dataflow."""
+    pipes.write_event("dataflow-failed", reason=error.message, cause=cause)
+    notify.send_status(format_refusal(error))
+
+
+def furnish(
+    options: RunnerOptions,
+    paths: CellPaths,
+    pipes: LogPipes,
+    clock: StopClock,
+    begun: Begun | None,
+) -> "Runs":
+    """Enter the unit's group, and make what all runs share. Raises OSError."""
+    unit = enter_supervisor()
+    make_directories(paths)
+    environment = node_environment(os.environ)
+    settings = SettingsFile(settings_path(options.dataflow), paths.settings)
+    reloader = Reloader(options, environment, settings)
+    nodes, beside = Nodes(unit, paths, pipes), Beside(asyncio.get_running_loop())
+    coordinator, check = begun or (None, DoraCheck(options, environment))
+    return Runs(paths, unit, environment, pipes, nodes, reloader, check, beside, clock, coordinator)
+
+
+@dataclass(frozen=True)
+class Runs:
+    """What all runs of the dataflow share. unit: cgroup directory. environment: of the nodes.
+
+    check: dora's, of the first run. beside: their tasks. clock: of the stop that ends the last of
+    them. coordinator: that of the first run, if it is there already.
+    """
+
+    paths: CellPaths
+    unit: Path
+    environment: dict[str, str]
+    pipes: LogPipes
+    nodes: Nodes
+    reloader: Reloader
+    check: DoraCheck
+    beside: Beside
+    clock: StopClock
+    coordinator: Child | None = None
+
+
+async def live(cell: Runs, losses: LossWatch | None) -> RunnerExit:
+    """Run the dataflow, and again as long as reloads ask for it."""
+    reach = partial(read_coordinator, cell.paths.control)
+    beside = cell.beside
+    beside.spawn("reload", cell.reloader.work())
+    beside.spawn("forget restarts", forget_restarts(cell.reloader.options))
+    beside.spawn("serve its socket", serve(cell.paths.socket, cell.reloader.answer, reach))
+    if losses is not None:
+        beside.spawn("count what journald throws away", losses.run())
+    try:
+        last = await run_once(cell, is_again=False)
+        while goes_on(cell, last):
+            notify.send_reloading()
+            last = await run_once(cell, is_again=True)
+        if losses is not None:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(cell.clock.left(LOSSES_SECONDS)):
+                    await losses.finish()
+        return last.exit
+    finally:
+        cell.reloader.close()
+        beside.cancel()
+
+
+def goes_on(cell: Runs, last: Cell) -> bool:
+    """Whether another run follows: asked for, or the one before what has just failed."""
+    if last.reload:
+        return True
+    if not last.is_trial or last.ready_us or last.stop_by:
+        cell.reloader.go_back(last.failure or "it was stopped")
+        return False
+    return cell.reloader.go_back(last.failure)
+
+
+async def run_once(cell: Runs, is_again: bool) -> Cell:
+    """One run of the dataflow, with a dora of its own; how it ended. Raises DoraSystemdError."""
+    started_us, options, reloader = now_us(), cell.reloader.options, cell.reloader
+    dora = Engine(options.dora, cell.paths, cell.environment)
+    try:
+        coordinator = dora.start_coordinator(None if is_again else cell.coordinator)
+        prepared = reloader.current or prepare_first(cell, options)
+        cell.nodes.prepare(prepared.dataflow, options.log_rates, options.node_limits)
+        table = initial_nodes(
+            kinds(prepared.dataflow, prepared.plan), prepared.descriptor, started_us
+        )
+        first = Cell(options.grace, started_us, table, is_again=is_again, notice=reloader.notice)
+        fed = downstream_of(prepared.dataflow)
+        first = replace(first, is_trial=reloader.before is not None, downstream=fed)
+        pump = Pump(first, options.uuid, cell.paths, cell.nodes, cell.pipes)
+        dialogue = Dialogue(options, pump, dora, cell.nodes, cell.pipes)
+        variables = daemon_variables(prepared, cell.paths, cell.unit)
+        pump.connect(dialogue.actions(prepared.descriptor, variables))
+        cell.pipes.mute()
+        listen(options, pump, dialogue, cell.clock)
+        dialogue.watch(coordinator, dialogue.read_coordinator)
+        run = Run(pump, cell.nodes, cell.pipes, Swapper(pump, dora))
+        reloader.begin(run, prepared, started_us * 1000)
+        dialogue.spawn("tell that it has started", tell_started(pump, reloader))
+        cell.beside.attach(pump.push)
+        try:
+            await pump.end
+        finally:
+            reloader.end()
+            cell.nodes.close()
+            if not pump.cell.reload:
+                # The loop runs on and the watchdog is fed.
+                await cell.pipes.wait_empty(cell.clock.for_journal())
+            dialogue.cancel()
+        return pump.cell
+    finally:
+        dora.kill()
+
+
+def prepare_first(cell: Runs, options: RunnerOptions) -> Prepared:
+    """The dataflow of the first run. Raises DoraSystemdError for what is refused."""
+    prepared = cell.check.beside(lambda: prepare(options, cell.environment))
+    check_named_nodes(options, prepared.dataflow)
+    return prepared
+
+
+async def tell_started(pump: Pump, reloader: Reloader) -> None:
+    """A run that has started once is no trial any more."""
+    if await pump.wait(lambda cell: cell.state is State.RUNNING, None):
+        reloader.has_started()
+
+
+def listen(options: RunnerOptions, pump: Pump, dialogue: Dialogue, clock: StopClock) -> None:
+    """Hear what asks the cell to stop, and do what is done from time to time."""
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        loop.add_signal_handler(number, partial(stop, pump, clock, number.name))
+    if clock.by:  # it came when the run before had ended already
+        loop.call_soon(stop, pump, clock, clock.by)
+    dialogue.spawn("take samples", dialogue.take_samples(SAMPLE_SECONDS))
+    if "WATCHDOG_USEC" in os.environ:
+        seconds = int(os.environ["WATCHDOG_USEC"]) / 1_000_000 / 3
+        dialogue.spawn("feed the watchdog", dialogue.feed_watchdog(seconds))
+    timeout = options.start_timeout
+    if pump.cell.is_trial:
+        timeout = min(timeout, round(READY_SECONDS * SECOND))
+    if timeout != INFINITY:
+        late = life.StartTimedOut(now_us(), timeout)
+        loop.call_later(timeout / SECOND, pump.push, late)
+    if options.attached:
+        dialogue.spawn("watch its terminal", stop_at_eof(pump, clock))
+
+
+def stop(pump: Pump, clock: StopClock, by: str) -> None:
+    """Ask the cell to stop."""
+    clock.begin(by)
+    pump.push(life.StopAsked(now_us(), by))
+
+
+async def stop_at_eof(pump: Pump, clock: StopClock) -> None:
+    """Stop when who started the cell, attached, is gone."""
+    await wait_eof(sys.stdin.fileno())
+    stop(pump, clock, "terminal")
+
+
+def run_loop(cell: Coroutine[Any, Any, RunnerExit]) -> RunnerExit:
+    """As asyncio.run(), which would wait at the end for threads that nobody needs any more."""
+    loop = asyncio.new_event_loop()
+    try:
+        return loop.run_until_complete(cell)
+    finally:
+        if tasks := asyncio.all_tasks(loop):
+            for task in tasks:
+                task.cancel()
+            loop.run_until_complete(asyncio.wait(tasks, timeout=CANCEL_SECONDS))
+
+
+def run(argv: list[str], begun: Begun | None) -> int:
+    """Run the cell that `argv` describes; the exit status. begun: see run_cell."""
+    try:
+        options = with_changes(parse_runner_argv(argv), os.environ)
+        directory = os.environ.get("RUNTIME_DIRECTORY")
+        if not directory:
+            hint = "it is started by systemd: use `doractl start`"
+            raise DoraSystemdError("cannot run without RUNTIME_DIRECTORY", hint, ExitCode.USAGE)
+        return run_loop(run_cell(options, CellPaths(Path(directory)), begun))
+    except DoraSystemdError as error:
+        print(f"{error.message}\n{error.hint}".strip(), file=sys.stderr)
+        return refusal_exit(error)
+    except Exception as error:
+        if not isinstance(error, OSError):
+            traceback.print_exc()
+        print(f"cannot run the dataflow: {words(error)}", file=sys.stderr)
+        return RunnerExit.FAILED

@@ -1,0 +1,98 @@
+"""Counts what journald throws away: in user scope its rate limit cannot be lifted.
+
+All services of a user share one limit (RateLimitBurst= in journald.conf(5)), journald's own notice
+of what it suppressed is in the system's journal, which the user may not read. So what was sent is
+compared with what is there.
+"""
+
+import asyncio
+import time
+from collections.abc import Callable
+
+from dora_systemd.adapters.journal.socket import JournalSocket
+from dora_systemd.adapters.logs.pipes import LogPipes
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.scope import scope_of
+
+CHECK_SECONDS = 30.0
+"""RateLimitIntervalSec= of journald by default."""
+
+# Fewer entries than this cannot have hit a limit: not worth a look.
+WORTH = 1000
+# What may be on its way between the two ends, see BULK_BUFFER of JournalSocket.
+ON_ITS_WAY = 512
+_SETTLE_SECONDS = 0.2
+
+Count = Callable[[int, int], int]
+
+
+class LossWatch:
+    """Compares entries sent with entries stored.
+
+    sent: how many entries journald has been given so far. count: how many of them it has stored
+    in [since, until], CLOCK_REALTIME µs; may take its time. report: is told of each new loss.
+    """
+
+    def __init__(
+        self,
+        sent: Callable[[], int],
+        count: Count,
+        report: Callable[[int], None],
+        now_us: Callable[[], int],
+    ) -> None:
+        self._sent = sent
+        self._count = count
+        self._report = report
+        self._now_us = now_us
+        self._since = now_us()
+        self._base = sent()
+        self._seen = self._base
+        self._stored = 0
+        self._lost = 0
+        # Whether the last look found a difference that was not reported yet.
+        self._is_open = False
+
+    async def run(self) -> None:
+        """Look every CHECK_SECONDS, for ever."""
+        while True:
+            await asyncio.sleep(CHECK_SECONDS)
+            await self.check()
+
+    async def check(self, tolerance: int = ON_ITS_WAY) -> None:
+        """Look now; a difference up to `tolerance` entries is left to the next look."""
+        sent = self._sent()
+        if sent - self._seen < WORTH and not self._is_open:
+            return
+        until = self._now_us()
+        self._stored += await asyncio.to_thread(self._count, self._since, until - 1)
+        self._since, self._seen = until, sent
+        self._tell(sent - self._base - self._stored, tolerance)
+
+    async def finish(self) -> None:
+        """The last look, when everything has been sent: every single entry counts."""
+        if self._sent() - self._base < WORTH:
+            return
+        await asyncio.sleep(_SETTLE_SECONDS)
+        self._is_open = True
+        await self.check(tolerance=0)
+
+    def _tell(self, lost: int, tolerance: int) -> None:
+        if lost - self._lost > tolerance:
+            self._report(lost - self._lost)
+            self._lost = lost
+        self._is_open = lost > self._lost
+
+
+def losses_of_user(journal: JournalSocket, pipes: LogPipes) -> LossWatch | None:
+    """The watch over what this user's services share, or None if the user cannot read a journal."""
+    from dora_systemd.adapters.journal.reader import JournalReader, check_readable
+
+    def report(count: int) -> None:
+        pipes.write_event("lines-lost", count=count, reason="rate limit of journald")
+
+    try:
+        check_readable(scope_of(True))
+    except DoraSystemdError:
+        return None
+    reader = JournalReader()
+    return LossWatch(lambda: journal.sent, reader.count_own, report, lambda: time.time_ns() // 1000)

@@ -1,0 +1,57 @@
+"""What the runner reads of memory and CPU limits: who was killed by them, and who comes close."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from dora_systemd.adapters.cgroup import groups as cgroup
+from dora_systemd.adapters.cgroup.memory import read_load, read_oom
+from dora_systemd.decisions.cell.status import WHOLE_CELL, CpuSample, throttled_percent
+from dora_systemd.decisions.life.states import Record
+from dora_systemd.decisions.resources.oom import Oom, OomCounts, Owner, find_owner, largest
+from dora_systemd.decisions.resources.pressure import Alarms, Load, look
+
+
+class Resources:
+    """Counters of the unit's groups, remembered from one look to the next."""
+
+    def __init__(self, unit: Path) -> None:
+        self._unit = unit
+        self._seen: dict[Path, OomCounts] = {unit: read_oom(unit)}
+        self._alarms: Alarms = {}
+
+    def explain(self, group: Path) -> Oom | None:
+        """Why something in a group has just ended, if it was for want of memory."""
+        node = self._seen.get(group, OomCounts()), read_oom(group)
+        if node[1] == node[0]:
+            return None
+        unit = self._seen[self._unit], read_oom(self._unit)
+        self._seen |= {group: node[1], self._unit: unit[1]}
+        owner = find_owner(node, unit)
+        return None if owner is None else self._oom(owner, group)
+
+    def _oom(self, owner: Owner, group: Path) -> Oom:
+        peak = cgroup.read_usage(group).memory_peak or 0
+        if owner is Owner.MACHINE:
+            return Oom(owner, peak)
+        limited = group if owner is Owner.NODE else self._unit
+        limit = cgroup.read_usage(limited).memory_max or 0
+        groups = cgroup.node_groups(self._unit)
+        held = {node: cgroup.read_usage(path).memory or 0 for node, path in groups.items()}
+        # What the victim had is gone by now.
+        held |= {node: peak for node, path in groups.items() if path == group}
+        return Oom(owner, peak, limit, *largest(held))
+
+    def look(self, samples: tuple[CpuSample, ...], now: CpuSample) -> list[Record]:
+        """What is to be said about limits that come close. samples: those before `now`."""
+        groups = {WHOLE_CELL: self._unit, **cgroup.node_groups(self._unit)}
+        loads = {key: _load(path, key, samples, now) for key, path in groups.items()}
+        self._alarms, reports = look(self._alarms, loads, now.at_us)
+        return [Record(*one) for one in reports]
+
+
+def _load(path: Path, key: str, samples: tuple[CpuSample, ...], now: CpuSample) -> Load:
+    load = read_load(path)
+    # A group without a limit of CPU time is never throttled.
+    if not any(now.throttling.get(key, ())):
+        return load
+    return replace(load, throttled=throttled_percent(samples, now, key))

@@ -1,0 +1,126 @@
+"""One reload of single nodes: its steps, one after the other, and the way back."""
+
+import time
+from dataclasses import dataclass
+from pathlib import PurePath
+from typing import Any
+
+from dora_systemd.adapters.dora.preparation import Prepared
+from dora_systemd.adapters.logs.pipes import LogPipes
+from dora_systemd.decisions.cell.launch import has_pipes, kinds
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.status import HELD
+from dora_systemd.decisions.life.states import State
+from dora_systemd.decisions.reload.steps import How, Step
+from dora_systemd.runner.cell.pump import Pump
+from dora_systemd.runner.nodes.nodes import Nodes
+from dora_systemd.runner.reload.sources import Change
+from dora_systemd.runner.reload.swap import NotReady, Swapper
+
+_GONE = ("finished", "stopped")
+_BACK = {How.ADD: How.REMOVE, How.REMOVE: How.ADD}
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run of the dataflow, as far as reloads need it."""
+
+    pump: Pump
+    nodes: Nodes
+    pipes: LogPipes
+    swapper: Swapper
+
+
+class Applier:
+    """Carries out `change` in `run`. done: what was done, in words."""
+
+    def __init__(self, run: Run, change: Change, options: RunnerOptions) -> None:
+        self._run = run
+        self._change = change
+        self._options = options
+        self._begun: list[Step] = []
+        self.done: list[str] = []
+
+    def obstacle(self) -> str:
+        """Why dora cannot change single nodes now, or ""."""
+        if self._run.pump.cell.state is not State.RUNNING:
+            return "not all nodes were ready"
+        for step in self._change.steps:
+            if reason := self._obstacle(step):
+                return reason
+        return ""
+
+    def _obstacle(self, step: Step) -> str:
+        old = self._run.pump.cell.nodes.get(step.node)
+        if old is not None and step.how is not How.ADD:
+            is_gone = old.state in _GONE or (old.state == "failed" and old.policy != HELD)
+            return f"the node {step.node} had ended" if is_gone else ""
+        node = self._change.prepared.dataflow.node(step.node)
+        has_own_pipes = node is None or has_pipes(node)
+        return "" if has_own_pipes else f"dora itself reads the output of the node {step.node}"
+
+    async def apply(self) -> None:
+        """All steps. Raises DoraSystemdError when dora refuses one, and NotReady."""
+        for step in self._change.steps:
+            started = time.monotonic()
+            self._begun.append(step)
+            with self._run.nodes.exchanging(step.node):
+                await self._take(step, self._change.prepared)
+            self._tell(step, time.monotonic() - started)
+
+    async def undo(self, before: Prepared) -> None:
+        """Take back the steps so far. Raises DoraSystemdError."""
+        for step in reversed(self._begun):
+            back = Step(_BACK.get(step.how, step.how), step.node, step.file)
+            try:
+                with self._run.nodes.exchanging(step.node):
+                    await self._take(back, before)
+            except NotReady:
+                continue  # as it was
+
+    async def _take(self, step: Step, prepared: Prepared) -> None:
+        swapper = self._run.swapper
+        if step.how is How.REMOVE:
+            await swapper.remove(step.node)
+            self._run.nodes.remove(step.node)
+            return
+        if step.how is How.OPERATOR:
+            for operator, file in self._change.operators[step.node].items():
+                if file == step.file:
+                    await swapper.reload_operator(step.node, operator)
+            return
+        definition, kind = _definition(prepared, step.node)
+        if step.how is How.ADD:
+            node = prepared.dataflow.node(step.node)
+            assert node is not None
+            self._run.nodes.add(node, self._options.log_rates, self._options.node_limits)
+            await swapper.add(definition, kind)
+        elif step.how is How.REWIRE:
+            await swapper.rewire(definition, kind)
+        else:
+            starts_first = self._options.reload.starts_first(step.node)
+            await swapper.swap(definition, kind, starts_first)
+
+    def _tell(self, step: Step, seconds: float) -> None:
+        file = self._relative(step.file)
+        words = f"{file}, ready after {seconds:.2f}s" if step.how is not How.REMOVE else file
+        self.done.append(f"the node {step.node} was {step.how.value}: {words}")
+        node = None if step.how is How.REMOVE else step.node
+        self._run.pipes.write_event(
+            "node-reloaded",
+            node,
+            how=step.how.value,
+            reason=words,
+            file=step.file,
+            **({} if node else {"dora_node": step.node}),
+        )
+
+    def _relative(self, path: str) -> str:
+        root = self._options.working_directory
+        return str(PurePath(path).relative_to(root)) if path.startswith(f"{root}/") else path
+
+
+def _definition(prepared: Prepared, node: str) -> tuple[dict[str, Any], str]:
+    kind = kinds(prepared.dataflow, prepared.plan)[node]
+    nodes = prepared.descriptor["nodes"]
+    return next(one for one in nodes if one["id"] == node), kind

@@ -1,0 +1,284 @@
+"""Reloads: the runner watches files, decides what they mean, and has dora take it over.
+
+It outlives the runs of the dataflow: when only all of it can follow a change, the run ends and the
+next one begins, in the same unit and with the same process.
+"""
+
+import asyncio
+import time
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+from pathlib import PurePath
+from typing import Any
+
+from dora_systemd.adapters.dora.preparation import Prepared
+from dora_systemd.adapters.host.watch import change_time, changed_files, watch_rules
+from dora_systemd.decisions.cell.limits import check_nodes, merge_node_limits
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.descriptor.wiring import downstream_of
+from dora_systemd.decisions.life import events as life
+from dora_systemd.decisions.reload.steps import How, Step
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.runner.cell.begin import let_openssl_in
+from dora_systemd.runner.cell.pump import now_us
+from dora_systemd.runner.reload.apply import Applier, Run
+from dora_systemd.runner.reload.settings_file import SettingsFile
+from dora_systemd.runner.reload.sources import Change, Sources
+from dora_systemd.runner.reload.swap import NotReady
+from dora_systemd.values import quoted
+
+PAUSE_SECONDS = 1.0
+"""Between the beginnings of two reloads."""
+
+Answer = dict[str, Any]
+
+
+class Reloader:
+    """All that reloads need. options: of the runner. environment: of the nodes. settings: the
+    settings file beside the dataflow.
+
+    current: what runs. before: what ran before a reload of the whole dataflow that has yet to show
+    that it works, or None. notice: what the last reload has left to say.
+    """
+
+    def __init__(
+        self, options: RunnerOptions, environment: Mapping[str, str], settings: SettingsFile
+    ) -> None:
+        self.options = options
+        self._settings = settings
+        self._environment = environment
+        self._sources = Sources(options, environment)
+        self._lock = asyncio.Lock()
+        self._changed: set[str] = set()
+        self._wake = asyncio.Event()
+        self._begun = asyncio.Event()
+        self._watcher: asyncio.Task[None] | None = None
+        self._run: Run | None = None
+        self._outcome: asyncio.Future[str] | None = None
+        self._untold: DoraSystemdError | None = None
+        # What of the dataflow has been read when: all of it at the beginning, then file by file.
+        self._read_ns = 0
+        self._taken: dict[str, int] = {}
+        self.current: Prepared | None = None
+        self.before: Prepared | None = None
+        self.notice = ""
+
+    def begin(self, run: Run, prepared: Prepared, read_ns: int) -> None:
+        """A run of the dataflow begins. read_ns: since when its files are read, CLOCK_REALTIME."""
+        self._run, self.current, self._read_ns = run, prepared, read_ns
+        self._begun.set()
+        if self._untold is not None:
+            self._refuse(self._untold)
+
+    def end(self) -> None:
+        """The run has ended."""
+        self._run = None
+        self._begun.clear()
+
+    def has_started(self) -> None:
+        """All nodes of the run are ready: what it replaced is history."""
+        self.before = None
+        self._settle("")
+
+    def go_back(self, reason: str) -> bool:
+        """A run failed before it had started: whether the version before can run instead."""
+        self._settle(reason)
+        if self.before is None:
+            return False
+        self.current, self.before = self.before, None
+        self.notice = f"not reloaded: {reason}"
+        return True
+
+    def _settle(self, outcome: str) -> None:
+        if self._outcome is not None and not self._outcome.done():
+            self._outcome.set_result(outcome)
+
+    async def work(self) -> None:
+        """Reload what has changed, again and again."""
+        try:
+            self._settings.keep()
+        except DoraSystemdError as error:
+            self._refuse(error)  # of that file; all others can be reloaded
+        self._watch(self.options.hot_reload)
+        while True:
+            await self._wake.wait()
+            await self._begun.wait()
+            self._wake.clear()
+            changed, self._changed = self._changed, set()
+            pause = asyncio.create_task(asyncio.sleep(PAUSE_SECONDS))
+            try:
+                await self._reload(changed)
+            except DoraSystemdError as error:
+                self._refuse(error)
+            except Exception as error:
+                # Whatever it is: what runs goes on, and the next save has another chance.
+                what = f"cannot reload: {type(error).__name__}: {error}"
+                self._refuse(DoraSystemdError(what, "please report it"))
+            await pause
+
+    def _watch(self, is_on: bool) -> None:
+        if self._watcher is not None:
+            self._watcher.cancel()
+        self._watcher = asyncio.create_task(self._collect()) if is_on else None
+
+    async def _collect(self) -> None:
+        try:
+            rules = await asyncio.to_thread(watch_rules, self.options)
+            let_openssl_in()  # watchfiles imports anyio, which imports ssl
+            async for files in changed_files(rules):
+                self._changed |= files
+                self._wake.set()
+        except DoraSystemdError as error:
+            self._refuse(error)
+        except Exception as error:
+            what = f"cannot watch files any more: {type(error).__name__}: {error}"
+            self._refuse(DoraSystemdError(what, "please report it"))
+
+    def _refuse(self, error: DoraSystemdError) -> None:
+        """The old one runs on: say so where the operator looks, as soon as there is a run."""
+        self._untold = error if self._run is None else None
+        self.notice = f"not reloaded: {error.message.removeprefix('cannot use ')}"
+        if self._run is not None:
+            self._run.pump.push(life.ReloadNoted(now_us(), self.notice))
+            hint = f" ({error.hint})" if error.hint else ""
+            self._run.pipes.write_event("reload-failed", reason=error.message + hint)
+
+    async def _reload(self, changed: Collection[str], node: str = "") -> list[str]:
+        """What was done about the files `changed`, and about `node` in any case."""
+        async with self._lock:
+            run, current = self._run, self.current
+            if run is None or current is None:
+                hint = "wait until it has started"
+                raise DoraSystemdError("cannot reload: no node runs", hint, ExitCode.NOT_RUNNING)
+            taken = {path: change_time(path) for path in changed}
+            done = await self._take_settings(run) if self._settings.path in changed else []
+            changed = [path for path in changed if path != self._settings.path]
+            change = await asyncio.to_thread(self._sources.look, current, changed)
+            change = _with_node(change, node, self.options.dataflow)
+            if not change.is_empty:
+                run.pipes.write_event("files-changed", files=", ".join(_names(change, changed)))
+                done += await self._apply(run, change)
+            self._taken |= taken
+        self.notice = ""
+        if self._run is not None and (done or self._run.pump.cell.notice):
+            fed = downstream_of(change.prepared.dataflow)
+            self._run.pump.push(life.ReloadNoted(now_us(), "", fed))
+        return done
+
+    async def _take_settings(self, run: Run) -> list[str]:
+        """Other limits of nodes hold at once; what else has changed waits for the next start."""
+        change = await asyncio.to_thread(self._settings.change)
+        check_nodes(change.limits, run.pump.cell.nodes, ())
+        run.nodes.limit(change.limits)
+        self._settings.accept()
+        merged = merge_node_limits(self.options.node_limits, change.limits)
+        self.options = self.options._replace(node_limits=merged)
+        name = PurePath(self._settings.path).name
+        for one in change.limits:
+            run.pipes.write_event("node-reloaded", one.node, how="given new limits", reason=name)
+        if change.others:
+            keys = ", ".join(change.others)
+            reason = f"{name}: {keys}: only doractl stop and start apply this"
+            run.pipes.write_event("reload-failed", reason=reason)
+        return [f"the node {one.node} was given new limits: {name}" for one in change.limits]
+
+    async def _apply(self, run: Run, change: Change) -> list[str]:
+        applier = Applier(run, change, self.options)
+        reason = change.whole or applier.obstacle()
+        if not reason:
+            try:
+                await applier.apply()
+                self.current = change.prepared
+                return applier.done
+            except NotReady as error:
+                raise await self._undo(applier, change, error) from error
+            except DoraSystemdError as error:
+                reason = error.message
+        return await self._restart(run, change, reason)
+
+    async def _undo(self, applier: Applier, change: Change, error: NotReady) -> DoraSystemdError:
+        """Bring back the descriptor before; of a program there is no version before."""
+        if change.prepared is self.current:
+            return DoraSystemdError(f"cannot use what was saved: {error}")
+        assert self.current is not None
+        await applier.undo(self.current)
+        message = (
+            f"cannot use {self.options.dataflow}: {error}; the previous version is running again"
+        )
+        return DoraSystemdError(message)
+
+    async def _restart(self, run: Run, change: Change, reason: str) -> list[str]:
+        """End this run, and have the next one begin with what is new."""
+        begun = time.monotonic()
+        self.before = self.current if change.prepared is not self.current else None
+        self.current = change.prepared
+        self._outcome = asyncio.get_running_loop().create_future()
+        run.pump.push(life.ReloadAsked(now_us()))
+        if failure := await self._outcome:
+            raise DoraSystemdError(f"cannot use {self.options.dataflow}: {failure}")
+        took = f"{time.monotonic() - begun:.2f}s"
+        words = f"{reason}; ready after {took}"
+        run.pipes.write_event("reloaded", reason=words, file=", ".join(_files(change)))
+        return [f"the dataflow was reloaded: {words}"]
+
+    async def answer(self, request: Mapping[str, Any]) -> Answer:
+        """A request of doractl: {"verb": "reload"} or {"verb": "hot-reload", "on": true}.
+
+        Raises DoraSystemdError.
+        """
+        if request.get("verb") == "hot-reload":
+            return await self._switch(bool(request.get("on")))
+        if request.get("verb") != "reload":
+            raise DoraSystemdError(f"cannot do {quoted(str(request))}", "", ExitCode.USAGE)
+        node = str(request.get("node") or "")
+        changed = [] if node else await asyncio.to_thread(self._changed_since)
+        try:
+            return {"done": await self._reload(changed, node)}
+        except DoraSystemdError as error:
+            self._refuse(error)
+            raise
+
+    def _changed_since(self) -> list[str]:
+        if self.current is None:
+            return []
+        paths = {self._settings.path, *self._sources.files(self.current)}
+        now = {path: change_time(path) for path in paths}
+        taken = self._taken
+        return [path for path, at in now.items() if at > self._read_ns and taken.get(path) != at]
+
+    async def _switch(self, is_on: bool) -> Answer:
+        async with self._lock:
+            reload = self.options.reload._replace(is_on=is_on)
+            self.options = self.options._replace(reload=reload)
+            self._sources = Sources(self.options, self._environment)
+            # Only how nodes that fail are treated differs: each gets it with its next reload.
+            if self.current is not None:
+                self.current = self._sources.replan(self.current)
+            self._watch(is_on)
+        return {"done": []}
+
+    def close(self) -> None:
+        """Watch no more."""
+        if self._watcher is not None:
+            self._watcher.cancel()
+
+
+def _with_node(change: Change, node: str, dataflow: str) -> Change:
+    """The change, with `node` reloaded whatever has changed."""
+    if not node or any(step.node == node for step in change.steps):
+        return change
+    operators = change.operators.get(node, {})
+    steps = [Step(How.OPERATOR, node, file) for name, file in operators.items() if name]
+    if not steps:
+        steps = [Step(How.SWAP, node, operators.get("", dataflow))]
+    return replace(change, steps=(*change.steps, *steps))
+
+
+def _files(change: Change) -> list[str]:
+    return list(dict.fromkeys(step.file for step in change.steps))
+
+
+def _names(change: Change, changed: Collection[str]) -> list[str]:
+    """The last parts of those files that mean anything; all of them if it is the whole dataflow."""
+    found = _files(change) if change.steps else sorted(changed)
+    return [PurePath(path).name for path in found]

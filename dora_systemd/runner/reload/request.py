@@ -1,0 +1,29 @@
+"""What `systemctl reload` runs in the unit: it has the runner reload what has changed.
+
+ExecReload= in systemd.service(5): its exit status says whether the reload is good.
+"""
+
+import os
+import sys
+from pathlib import Path
+
+from dora_systemd.adapters.runner_socket.client import ask, done_of
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.paths import CellPaths
+
+
+def main() -> int:
+    """Ask the runner of this unit; 0, or the exit status of doractl for what went wrong."""
+    directory = os.environ.get("RUNTIME_DIRECTORY", "")
+    try:
+        path = CellPaths(Path(directory)).socket
+        done = done_of(path, ask(path, {"verb": "reload"}))
+    except DoraSystemdError as error:
+        print(error.message, file=sys.stderr)
+        return error.code
+    print("\n".join(done) or "Nothing has changed")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,136 @@
+"""The runner's look at the files of its dataflow: what has changed, and what that means."""
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from dora_systemd.adapters.dora.check import refusal_of_dora
+from dora_systemd.adapters.dora.preparation import Prepared, prepare
+from dora_systemd.adapters.host.watch import change_time
+from dora_systemd.decisions.cell.hot_reload import HotReload
+from dora_systemd.decisions.cell.launch import kinds, launch_descriptor, sources
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.descriptor.nodes import NodeKind
+from dora_systemd.decisions.reload.changes import Difference, NodeSources, difference, touched
+from dora_systemd.decisions.reload.imports import program_files, syntax_error
+from dora_systemd.decisions.reload.steps import How, Step, plan_steps
+from dora_systemd.decisions.reload.watch_rules import WatchRules
+from dora_systemd.errors import DoraSystemdError, ExitCode
+
+
+@dataclass(frozen=True)
+class Change:
+    """What changed files mean. whole: why the dataflow as a whole has to start again, or ""."""
+
+    prepared: Prepared
+    steps: tuple[Step, ...] = ()
+    whole: str = ""
+    operators: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing has to be done."""
+        return not self.steps and not self.whole
+
+
+class Sources:
+    """Looks at files, for a runner with these options. environment: of the nodes."""
+
+    def __init__(self, options: RunnerOptions, environment: Mapping[str, str]) -> None:
+        self._options = options
+        self._environment = environment
+
+    def look(self, current: Prepared, changed: Iterable[str]) -> Change:
+        """What the files `changed` mean for what runs, which is `current`.
+
+        It takes its time: not for the thread of the loop. Raises DoraSystemdError when a file
+        cannot be used as it is now; then nothing should be changed.
+        """
+        # What is gone cannot be loaded; it may come back in a moment, as in a git checkout.
+        paths = frozenset(path for path in changed if change_time(path))
+        dataflow = self._options.dataflow
+        prepared = self.prepare() if dataflow in paths else current
+        programs = sources(prepared.dataflow, prepared.plan)
+        found = touched(paths, dataflow, self._nodes(prepared, programs))
+        check_programs(found.nodes.values())
+        difference_ = (
+            difference(current.descriptor, prepared.descriptor)
+            if found.descriptor
+            else Difference()
+        )
+        how = kinds(prepared.dataflow, prepared.plan)
+        steps = plan_steps(found, difference_, how, dataflow)
+        whole = difference_.whole or _stubborn(steps, programs)
+        return Change(prepared, steps, whole, programs)
+
+    def prepare(self) -> Prepared:
+        """Read the dataflow again, as at a start. Raises DoraSystemdError."""
+        options = self._options
+        prepared = prepare(options, self._environment)
+        if reason := refusal_of_dora(options, self._environment):
+            message = f"cannot use {options.dataflow}: {reason}"
+            raise DoraSystemdError(message, "", ExitCode.BAD_INPUT)
+        return prepared
+
+    def replan(self, current: Prepared) -> Prepared:
+        """What `current` is with these options. No file is read: who edits it has not said so."""
+        plan = replace(current.plan, options=self._options)
+        descriptor = launch_descriptor(current.dataflow, plan)
+        return Prepared(current.dataflow, plan, descriptor)
+
+    def files(self, current: Prepared) -> set[str]:
+        """The files that the dataflow is made of, absolute."""
+        nodes = self._nodes(current, sources(current.dataflow, current.plan)).values()
+        return {self._options.dataflow, *(path for node in nodes for path in node.files)}
+
+    def _nodes(
+        self, prepared: Prepared, programs: Mapping[str, Mapping[str, str]]
+    ) -> dict[str, NodeSources]:
+        rules: HotReload = self._options.reload
+        root = self._options.working_directory
+        found = {}
+        for node in prepared.dataflow.nodes:
+            patterns = rules.watched_by(node.id)
+            found[node.id] = NodeSources(
+                self._files(programs[node.id].values(), node.kind),
+                json.dumps(node.raw, default=str),
+                WatchRules(root, patterns) if patterns else None,
+            )
+        return found
+
+    def _files(self, scripts: Iterable[str], kind: NodeKind) -> frozenset[str]:
+        if kind not in (NodeKind.PYTHON, NodeKind.OPERATOR):
+            return frozenset(scripts)
+        root = self._options.working_directory
+        path = self._environment.get("PYTHONPATH", "")
+        places = [*filter(None, path.split(":")), root, f"{root}/src"]
+        every = (program_files(one, _read, places) for one in scripts)
+        return frozenset().union(*every)
+
+
+def _stubborn(steps: Iterable[Step], operators: Mapping[str, Mapping[str, str]]) -> str:
+    """Why dora cannot take over what changed of an operator; it reads the operator's file only."""
+    for step in steps:
+        if step.how is How.OPERATOR and step.file not in operators[step.node].values():
+            return f"the operators of the node {step.node} import {Path(step.file).name}"
+    return ""
+
+
+def check_programs(paths: Iterable[str]) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) for one that cannot be read, or does not compile."""
+    for path in paths:
+        try:
+            text = Path(path).read_text(errors="replace")
+        except OSError as error:
+            message = f"cannot use {path}: {error.strerror}"
+            raise DoraSystemdError(message, "", ExitCode.BAD_INPUT) from error
+        if path.endswith(".py") and (reason := syntax_error(path, text)):
+            raise DoraSystemdError(f"cannot use {path}: {reason}", "", ExitCode.BAD_INPUT)
+
+
+def _read(path: str) -> str | None:
+    try:
+        return Path(path).read_text(errors="replace")
+    except OSError:
+        return None

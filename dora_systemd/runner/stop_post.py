@@ -1,0 +1,185 @@
+"""What is left to say when the runner was killed.
+
+ExecStopPost= of the unit: `python3 -m dora_systemd.runner.stop_post NAME UUID`. The runner's death
+leaves lines in the nodes' pipes, which systemd keeps open for us (adapters/host/fd_store.py), and
+no event says how the dataflow ended. After a runner that ended by itself there is nothing to do.
+It always ends with status 0: the unit's result is that of the runner.
+"""
+
+import contextlib
+import os
+import sys
+import time
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dora_systemd.decisions.life.causes import Cause
+
+if TYPE_CHECKING:
+    from asyncio import AbstractEventLoop
+
+    from dora_systemd.adapters.logs.pipes import LogPipes
+
+QUIET_SECONDS = 0.1
+DAEMON_SECONDS = 5.0
+KILL_SECONDS = 2.0
+READ_SECONDS = 1.0
+KILLED_SECONDS = 0.005
+ALL_SECONDS = 8.0
+"""For everything: systemd allows as much as for a stop, so STOP_MARGIN in
+dora_systemd.decisions.life.stop_budget is the least, and Python has to start."""
+STREAMS = {".out": "stdout", ".err": "stderr"}
+
+
+def main(argv: list[str]) -> int:
+    """Kill the nodes, write what they said last, and the event dataflow-failed."""
+    deadline = time.monotonic() + ALL_SECONDS
+    reason, directory = killed_by(os.environ), os.environ.get("RUNTIME_DIRECTORY", "")
+    if not reason or len(argv) != 2 or not directory:
+        return 0
+    unit = unit_group()
+    cause, memory = killed_cause(os.environ), out_of_memory(unit)
+    if memory:
+        cause, reason = Cause.OUT_OF_MEMORY, memory
+    with contextlib.suppress(OSError):
+        kill_nodes(unit, KILL_SECONDS)
+    left = deadline - time.monotonic()
+    write_last_words(argv[0], argv[1], Path(directory), reason, cause=cause, seconds=left)
+    return 0
+
+
+def killed_by(environ: Mapping[str, str]) -> str:
+    """What ended the runner, "" if it ended by itself: EXIT_CODE in systemd.exec(5)."""
+    if environ.get("EXIT_CODE", "") not in ("killed", "dumped"):
+        return ""
+    if environ.get("SERVICE_RESULT") == "success":
+        return ""  # SIGTERM before it could listen to it: stopped as soon as it was started
+    if environ.get("SERVICE_RESULT") == "watchdog":
+        return "the supervisor process hung and was killed by the watchdog"
+    if environ.get("SERVICE_RESULT") == "timeout":
+        return "it did not start or stop in time and was killed"
+    return f"the supervisor process was killed (SIG{environ.get('EXIT_STATUS', '')})"
+
+
+def killed_cause(environ: Mapping[str, str]) -> Cause:
+    """What DORA_CAUSE says about a runner that was killed."""
+    causes = {"watchdog": Cause.WATCHDOG, "timeout": Cause.TIMEOUT}
+    return causes.get(environ.get("SERVICE_RESULT", ""), Cause.RUNNER_KILLED)
+
+
+def write_last_words(
+    name: str,
+    uuid: str,
+    directory: Path,
+    reason: str,
+    journal_socket: str = "",
+    cause: str = "",
+    seconds: float = ALL_SECONDS,
+) -> None:
+    """Write what is in the pipes below `directory`, and that the dataflow failed, in `seconds`.
+
+    journal_socket: another one than journald's, for tests.
+    """
+    deadline = time.monotonic() + seconds
+    # Nearly always there is nothing to do: only then these imports cost their time.
+    import asyncio
+
+    from dora_systemd.adapters.journal.socket import JOURNAL_SOCKET, JournalSocket
+    from dora_systemd.adapters.logs.pipes import LogPipes
+    from dora_systemd.decisions.cell.status import CellStatus
+    from dora_systemd.decisions.logs.lines import Origin
+    from dora_systemd.errors import DoraSystemdError
+    from dora_systemd.paths import CellPaths
+
+    paths = CellPaths(directory)
+    loop = asyncio.new_event_loop()
+    journal = JournalSocket(journal_socket or JOURNAL_SOCKET)
+    pipes = LogPipes(loop, journal, Origin(name, uuid))
+    with contextlib.suppress(OSError, DoraSystemdError):
+        status = CellStatus.from_json(paths.status.read_text())
+        pipes.set_run(status.run)
+        for node, state in status.nodes.items():
+            pipes.set_pid(node, state.pid)
+    with contextlib.suppress(OSError):
+        for path in sorted(paths.io.iterdir()):
+            if path.suffix in STREAMS:
+                fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+                pipes.adopt(path.stem, STREAMS[path.suffix], fd)
+                pipes.replay(path.stem, path)
+                pipes.drain(path.stem)
+        read_logs_of_dora(loop, pipes, paths.io, min(DAEMON_SECONDS, seconds / 2))
+    pipes.write_event("dataflow-failed", reason=reason, cause=cause)
+    pipes.close(max(deadline - time.monotonic() - READ_SECONDS, 0.0))
+    journal.wait_read(READ_SECONDS)
+    journal.close()
+    loop.close()
+
+
+def read_logs_of_dora(
+    loop: "AbstractEventLoop", pipes: "LogPipes", io: Path, seconds: float
+) -> None:
+    """Write what dora's own log files have more than the runner has read, in `seconds`.
+
+    The daemon may still live, and writes what the nodes said last. Raises OSError.
+    """
+    from dora_systemd.adapters.logs.jsonl import PLACE_SUFFIX, resume_tail
+
+    places = [path for path in sorted(io.iterdir()) if path.suffix == PLACE_SUFFIX]
+    found = {
+        path.stem: resume_tail(loop, path, partial(pipes.write_fields, node=path.stem))
+        for path in places
+    }
+    tails = {node: tail for node, tail in found.items() if tail is not None}
+    deadline = time.monotonic() + seconds
+    while sum(tail.drain() for tail in tails.values()) and time.monotonic() < deadline:
+        time.sleep(QUIET_SECONDS)
+    for node, tail in tails.items():
+        tail.close()
+        if tail.loss:
+            pipes.write_event("lines-lost", node, count="Some", reason=tail.loss)
+
+
+def unit_group() -> Path:
+    """The cgroup directory of this unit."""
+    from dora_systemd.adapters.cgroup import groups as cgroup
+
+    unit = cgroup.group_path(cgroup.own_group())
+    while unit.suffix != ".service" and unit != unit.parent:
+        unit = unit.parent
+    return unit
+
+
+def out_of_memory(unit: Path) -> str:
+    """What there is to say if the kernel has killed the runner for want of memory, else ""."""
+    from dora_systemd.adapters.cgroup import groups as cgroup
+    from dora_systemd.adapters.cgroup.memory import read_oom
+    from dora_systemd.decisions.resources.oom import largest
+    from dora_systemd.values import format_rounded_size
+
+    if not read_oom(unit / cgroup.SUPERVISOR).kills:
+        return ""
+    groups = cgroup.node_groups(unit)
+    node, held = largest({key: cgroup.read_usage(one).memory or 0 for key, one in groups.items()})
+    most = f"; the node {node} held most, {format_rounded_size(held)}" if node else ""
+    return f"the supervisor process was killed, out of memory{most}"
+
+
+def kill_nodes(unit: Path, seconds: float) -> None:
+    """End every node of this unit: with KillMode=mixed they outlive the runner until now.
+
+    One that sleeps in the kernel does not die: after `seconds` it is left to systemd.
+    """
+    from dora_systemd.adapters.cgroup import groups as cgroup
+
+    groups = list(cgroup.node_groups(unit).values())
+    for group in groups:
+        cgroup.kill_group(group)
+    deadline = time.monotonic() + seconds
+    while any(map(cgroup.is_populated, groups)) and time.monotonic() < deadline:
+        time.sleep(KILLED_SECONDS)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,186 @@
+"""`doractl destroy`: stops everything of one scope, and looks whether anything is left.
+
+Every step has its deadline. Units that are not ours are not touched, even in our slice.
+"""
+
+import signal
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.cgroup import groups as cgroup
+from dora_systemd.adapters.host.process_table import read_processes
+from dora_systemd.adapters.host.unit_files import read_unit_file, remove_empty, remove_unit_file
+from dora_systemd.decisions.gateway.place import SERVICE_UNIT, SOCKET_UNIT
+from dora_systemd.decisions.unit.file import BOOT_TARGET
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.names import SLICE, name_from_unit
+from dora_systemd.scope import Scope
+from dora_systemd.values import SECOND
+from dora_systemd.verbs.facts.cells import Cell, read_cell, read_cells
+from dora_systemd.verbs.facts.reason import failure_reason
+from dora_systemd.verbs.facts.slice import slice_group
+from dora_systemd.verbs.stop import release_enabled
+from dora_systemd.verbs.up import written_files
+
+UNBOUNDED_SECONDS = 90.0
+"""For a dataflow whose TimeoutStopSec= is infinity: systemd's own default."""
+
+_MARGIN_SECONDS = 5.0
+_KILLED_SECONDS = 10.0
+_POLL_SECONDS = 0.05
+_ROUNDS = 5
+"""So often do we look for dataflows that somebody starts meanwhile."""
+
+_INFINITY = 2**64 - 1
+_DOWN = ("inactive", "failed")
+_GATEWAY = (SOCKET_UNIT, SERVICE_UNIT)
+
+
+@dataclass(frozen=True)
+class Ended:
+    """One dataflow that was to stop. note: what there is to say; problem: why it has not."""
+
+    name: str
+    note: str = ""
+    problem: str = ""
+
+
+@dataclass(frozen=True)
+class _Stop:
+    """A stop on its way. deadline: in seconds of the monotonic clock."""
+
+    cell: Cell
+    deadline: float
+    is_killed: bool
+
+
+def running_cells(manager: Manager) -> list[Cell]:
+    """The dataflows that there are to stop."""
+    return [cell for cell in read_cells(manager) if cell.is_up]
+
+
+def stop_all(
+    manager: Manager, scope: Scope, want_kill: bool, now: Callable[[], float] = time.monotonic
+) -> Iterator[Ended]:
+    """Stop all dataflows at the same time; each as soon as it has ended.
+
+    want_kill: without a word to the nodes. Otherwise each has the time that its unit gives it
+    (TimeoutStopSec=), and is killed then.
+    """
+    given_up: set[str] = set()
+    for _ in range(_ROUNDS):
+        cells = [cell for cell in running_cells(manager) if cell.unit not in given_up]
+        if not cells:
+            return
+        for cell, ended in _stop(manager, cells, want_kill, now):
+            given_up |= {cell.unit} if ended.problem else set()
+            yield ended
+        release_enabled(manager, scope, [cell.unit for cell in cells])
+
+
+def stop_gateway(manager: Manager, scope: Scope) -> bool:
+    """Close the port and take away what `up` has written; whether it was open."""
+    up = [unit for unit in _GATEWAY if _state(manager, unit) not in _DOWN]
+    if up:
+        manager.run_jobs("StopUnit", up)
+    written = [path for path in written_files(manager, scope) if read_unit_file(path) is not None]
+    for path in written:
+        remove_unit_file(path)
+        remove_empty(path.parent)
+    if written:
+        manager.reload()
+    return bool(up)
+
+
+def stop_slice(manager: Manager) -> list[str]:
+    """Stop dora.target and dora.slice; the units of others that keep the slice."""
+    facts = manager.read(SLICE, ["LoadState", "ActiveState", "RequiredBy"])
+    others = [unit for unit in facts["RequiredBy"] if _state(manager, unit) not in _DOWN]
+    wanted = [BOOT_TARGET, *([] if others else [SLICE])]
+    active = [unit for unit in wanted if _state(manager, unit) == "active"]
+    if active:
+        manager.run_jobs("StopUnit", active)
+    return sorted(unit for unit in others if not _is_ours(manager, unit))
+
+
+def processes_left(
+    manager: Manager, others: Sequence[str], now: Callable[[], float] = time.monotonic
+) -> list[str]:
+    """What still runs in dora.slice, as "process 12 (command)"; not that of the units `others`.
+
+    It is killed once more: systemd leaves processes behind where SendSIGKILL= is off.
+    """
+    deadline = now() + _KILLED_SECONDS
+    while (groups := _populated(manager, others)) and now() < deadline:
+        for group in groups:
+            with suppress(DoraSystemdError):
+                manager.kill(group.name, signal.SIGKILL)
+        time.sleep(_POLL_SECONDS)
+    pids = {pid for group in groups for pid in cgroup.pids(group)}
+    return [str(one) for one in read_processes() if one.pid in pids]
+
+
+def _populated(manager: Manager, others: Sequence[str]) -> list[Path]:
+    """The groups of units in dora.slice that have a process."""
+    return [
+        path
+        for path in sorted(slice_group(manager).glob("*.*"))
+        if path.is_dir() and path.name not in others and cgroup.is_populated(path)
+    ]
+
+
+def _is_ours(manager: Manager, unit: str) -> bool:
+    """Whether it is a dataflow, and not only named like one."""
+    return name_from_unit(unit) is not None and read_cell(manager, unit) is not None
+
+
+def _state(manager: Manager, unit: str) -> str:
+    active: str = manager.read(unit, ["ActiveState"])["ActiveState"]
+    return active
+
+
+def _stop(
+    manager: Manager, cells: Sequence[Cell], want_kill: bool, now: Callable[[], float]
+) -> Iterator[tuple[Cell, Ended]]:
+    pending = [_begin(manager, cell, want_kill, now()) for cell in cells]
+    while pending:
+        left = []
+        for one in pending:
+            if (state := _state(manager, one.cell.unit)) in _DOWN:
+                yield one.cell, _ended(manager, one, state)
+            elif now() < one.deadline:
+                left.append(one)
+            elif not one.is_killed:
+                left.append(_begin(manager, one.cell, True, now()))
+            else:
+                text = f"cannot stop {one.cell.unit}: it is {state} although it was killed"
+                yield one.cell, Ended(one.cell.name, problem=text)
+        pending = left
+        if pending:
+            time.sleep(_POLL_SECONDS)
+
+
+def _begin(manager: Manager, cell: Cell, want_kill: bool, now: float) -> _Stop:
+    """Also one that restarts or starts: the job takes the place of what systemd was about to do."""
+    given = manager.read(cell.unit, ["TimeoutStopUSec"])["TimeoutStopUSec"]
+    manager.queue_job("StopUnit", cell.unit)
+    if want_kill:
+        # There may be no process, as between two restarts.
+        with suppress(DoraSystemdError):
+            manager.kill(cell.unit, signal.SIGKILL)
+        return _Stop(cell, now + _KILLED_SECONDS, True)
+    seconds = given / SECOND if given and given != _INFINITY else UNBOUNDED_SECONDS
+    return _Stop(cell, now + seconds + _MARGIN_SECONDS, False)
+
+
+def _ended(manager: Manager, one: _Stop, state: str) -> Ended:
+    if one.is_killed:
+        with suppress(DoraSystemdError):
+            manager.reset_failed(one.cell.unit)
+        return Ended(one.cell.name, "killed")
+    note = failure_reason(manager, one.cell.unit) if state == "failed" else ""
+    return Ended(one.cell.name, note)

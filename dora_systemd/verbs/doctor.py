@@ -1,0 +1,246 @@
+"""`doractl doctor`: looks at everything that a dataflow needs; every check is one function.
+
+Without systemd the checks that ask it are left out: there is nothing to ask.
+"""
+
+import os
+import pwd
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.cgroup import groups as cgroup
+from dora_systemd.adapters.host.files import read_yaml
+from dora_systemd.adapters.host.process import (
+    RECOMMENDED_DORA,
+    dora_version,
+    find_dora,
+    run_command,
+    version_numbers,
+)
+from dora_systemd.adapters.host.process_table import (
+    listening_sockets,
+    read_processes,
+    socket_owners,
+)
+from dora_systemd.adapters.host.unit_files import read_unit_file
+from dora_systemd.adapters.journal import reader as journal_reader
+from dora_systemd.decisions.unit.file import BOOT_TARGET, runner_of
+from dora_systemd.decisions.views.diagnosis import (
+    DORA_PORTS,
+    Process,
+    judge_controllers,
+    judge_port,
+    judge_processes,
+    judge_rate,
+    judge_systemd,
+)
+from dora_systemd.decisions.views.findings import Finding, State
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.names import unit_name
+from dora_systemd.scope import RUNTIME_NAME, Scope
+from dora_systemd.trust.paths import exists
+from dora_systemd.verbs.facts.enabled import enabled_units, own_directories
+from dora_systemd.verbs.facts.slice import slice_group
+from dora_systemd.verbs.gateway import read_gateway
+from dora_systemd.verbs.start.account import DEFAULT_USER
+from dora_systemd.verbs.start.enable import boot_target
+from dora_systemd.verbs.start.linger import is_lingering, linger_command
+from dora_systemd.verbs.start.logins import judge_logins
+from dora_systemd.verbs.start.settings import settings_files
+
+_SECONDS = 20.0
+_BROKEN = ("bad-setting", "error")
+_DOWN = ("inactive", "failed")
+
+
+def examine(reach: Callable[[Scope], Manager], scope: Scope) -> list[Finding]:
+    """All findings. reach: opens the connection to systemd."""
+    try:
+        manager = reach(scope)
+        version = manager.version()
+    except DoraSystemdError as error:
+        found = [Finding("systemd", State.PROBLEM, error.message, error.hint)]
+    else:
+        found = [judge_systemd(version)]
+        found += [one for check in _WITH_SYSTEMD for one in _guarded(check, manager, scope)]
+    return found + [one for check in _WITHOUT for one in check(scope)]
+
+
+def _guarded(
+    check: Callable[[Manager, Scope], Iterator[Finding]], manager: Manager, scope: Scope
+) -> list[Finding]:
+    """What a check finds; one that cannot be done is a finding itself."""
+    topic = check.__name__.removeprefix("_")
+    try:
+        return list(check(manager, scope))
+    except DoraSystemdError as error:
+        return [Finding(topic, State.WARNING, error.message, error.hint)]
+
+
+def _controllers(manager: Manager, scope: Scope) -> Iterator[Finding]:
+    group = cgroup.group_path(manager.control_group())
+    yield judge_controllers(cgroup.read_controllers(group), scope.is_user)
+
+
+def _linger(manager: Manager, scope: Scope) -> Iterator[Finding]:
+    del manager
+    if not scope.is_user:
+        return
+    if is_lingering(scope):
+        yield Finding("linger", State.OK, "dataflows keep running after logout and start at boot")
+    else:
+        text = "dataflows end when you log out, and none starts at boot"
+        yield Finding("linger", State.WARNING, text, f"as root: {linger_command(scope)}")
+
+
+def _boot(manager: Manager, scope: Scope) -> Iterator[Finding]:
+    if boot_target(manager, scope) == BOOT_TARGET:
+        yield Finding("boot", State.OK, f"{BOOT_TARGET} starts what is enabled")
+    else:
+        text = f"{BOOT_TARGET} is not set up; dataflows can be enabled without it"
+        yield Finding("boot", State.NOTE, text, f"doractl {scope.flag} setup")
+    directory = own_directories(manager, scope)[0]
+    for unit in sorted(enabled_units(manager, scope)):
+        yield from _enabled(directory / unit)
+
+
+def _ports(manager: Manager, scope: Scope) -> Iterator[Finding]:
+    del scope
+    gateway = read_gateway(manager)
+    processes: list[Process] = []
+    for port in DORA_PORTS:
+        if gateway.is_up and gateway.port == port:
+            yield Finding(f"port {port}", State.OK, "the gateway to all dataflows, see doractl env")
+            continue
+        sockets = listening_sockets(port)
+        owners = socket_owners(sockets) if sockets else frozenset()
+        processes = processes or (read_processes() if owners else [])
+        yield judge_port(port, [one for one in processes if one.pid in owners], bool(sockets))
+
+
+def _units(manager: Manager, scope: Scope) -> Iterator[Finding]:
+    for one in manager.list_units("dora-*.service"):
+        if one.load in _BROKEN:
+            text = f"{one.unit} cannot be loaded: {one.load}"
+            remedy = f"systemd-analyze {scope.flag} verify {one.unit}"
+            yield Finding("units", State.WARNING, text, remedy)
+
+
+def _enabled(path: Path) -> Iterator[Finding]:
+    """Whether what a boot starts can be started."""
+    try:
+        text = read_unit_file(path)
+    except DoraSystemdError as error:
+        yield Finding("boot", State.WARNING, error.message, error.hint)
+        return
+    options = runner_of(text or "")
+    if text is None or options is None:
+        broken = "is gone" if text is None else "starts no dataflow"
+        remedy = f"systemctl disable {path.name}"
+        yield Finding("boot", State.WARNING, f"{path} is enabled and {broken}", remedy)
+    elif not exists(options.dataflow):
+        text = f"{options.name} is enabled, but {options.dataflow} does not exist"
+        yield Finding("boot", State.WARNING, text, f"doractl disable {options.name}")
+
+
+def _leftovers(manager: Manager, scope: Scope) -> Iterator[Finding]:
+    left = [path for path in _cell_directories(scope) if _is_down(manager, unit_name(path.name))]
+    for path in left:
+        text = f"{path} belongs to no dataflow that runs"
+        yield Finding("left over", State.WARNING, text, f"rm -r {path}")
+    groups = [path for path in _unit_groups(manager) if _is_down(manager, path.name)]
+    for path in groups:
+        text = f"processes are left in {path}"
+        yield Finding("left over", State.WARNING, text, f"as root: echo 1 > {path}/cgroup.kill")
+    if not left and not groups:
+        yield Finding("left over", State.OK, "nothing is left of dataflows that have ended")
+
+
+def _cell_directories(scope: Scope) -> list[Path]:
+    try:
+        return sorted((scope.runtime_root / RUNTIME_NAME).iterdir())
+    except OSError:
+        return []
+
+
+def _unit_groups(manager: Manager) -> list[Path]:
+    paths = sorted(slice_group(manager).glob("dora-*.service"))
+    return [path for path in paths if cgroup.is_populated(path)]
+
+
+def _is_down(manager: Manager, unit: str) -> bool:
+    return manager.read(unit, ["ActiveState"])["ActiveState"] in _DOWN
+
+
+def _journal(scope: Scope) -> Iterator[Finding]:
+    try:
+        journal_reader.check_readable(scope)
+    except DoraSystemdError as error:
+        yield Finding("journal", State.WARNING, error.message, error.hint)
+    if journal_reader.is_volatile():
+        text, remedy = (
+            "it is kept in memory and lost at a reboot",
+            "as root: mkdir /var/log/journal",
+        )
+        remedy += " and systemctl restart systemd-journald"
+        yield Finding("journal", State.WARNING, text, remedy)
+    else:
+        yield Finding("journal", State.OK, "it survives a reboot")
+    command = ("systemd-analyze", "--no-pager", "cat-config", "systemd/journald.conf")
+    try:
+        config = run_command(command, _SECONDS).stdout
+    except DoraSystemdError as error:
+        yield Finding("log rate", State.NOTE, error.message)
+    else:
+        yield judge_rate(config, scope.is_user)
+
+
+def _dora(scope: Scope) -> Iterator[Finding]:
+    del scope
+    path = os.environ.get("PATH", os.defpath)
+    try:
+        dora = find_dora(None, os.environ.get("VIRTUAL_ENV"), path)
+        version = dora_version(dora)
+    except DoraSystemdError as error:
+        yield Finding("dora", State.PROBLEM, error.message, error.hint)
+        return
+    if version_numbers(version) < RECOMMENDED_DORA:
+        remedy = "pip install --upgrade dora-rs-cli"
+        yield Finding("dora", State.NOTE, f"{dora} is {version}, older than recommended", remedy)
+    else:
+        yield Finding("dora", State.OK, f"{dora}, version {version}")
+
+
+def _user(scope: Scope) -> Iterator[Finding]:
+    if scope.is_user:
+        return
+    try:
+        pwd.getpwnam(DEFAULT_USER)
+    except KeyError:
+        text = f"there is no user {DEFAULT_USER} to run the dataflows of root's files"
+        yield Finding("user", State.NOTE, text, "doractl setup, or start them with --uid")
+    else:
+        yield Finding("user", State.OK, f"{DEFAULT_USER} runs the dataflows of root's files")
+
+
+def _settings(scope: Scope) -> Iterator[Finding]:
+    """The files that count for every dataflow; the one beside a dataflow is for start to check."""
+    del scope
+    for path in settings_files(Path("/dataflow.yml"), os.environ)[1:]:
+        if path.exists():
+            try:
+                read_yaml(path, allow_empty=True)
+            except DoraSystemdError as error:
+                yield Finding("settings", State.PROBLEM, error.message, error.hint)
+            else:
+                yield Finding("settings", State.OK, f"{path} can be read")
+
+
+def _processes(scope: Scope) -> Iterator[Finding]:
+    del scope
+    yield from judge_processes(read_processes())
+
+
+_WITH_SYSTEMD = (_controllers, _linger, _boot, _units, _leftovers, _ports)
+_WITHOUT = (_journal, _dora, _user, judge_logins, _settings, _processes)

@@ -1,0 +1,21 @@
+"""`doractl env`: how a stock dora command finds the gateway, or one dataflow."""
+
+from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.decisions.dora.variables import coordinator_variables
+from dora_systemd.scope import Scope
+from dora_systemd.verbs.facts.cells import read_cells, select_cell
+from dora_systemd.verbs.gateway import read_token, require_gateway
+from dora_systemd.verbs.node import dora_environment, reached_coordinator
+
+
+def read_variables(manager: Manager, scope: Scope, selector: str | None) -> dict[str, str]:
+    """The variables by name; `selector`: of that dataflow, not of the gateway.
+
+    Raises DoraSystemdError: NOT_RUNNING, NOT_FOUND, NO_PERMISSION when it is another user's, or
+    USAGE for one with a network of its own.
+    """
+    if selector is None:
+        port = require_gateway(manager, scope)
+        return coordinator_variables(port, read_token(scope, port))
+    cell = select_cell(read_cells(manager), selector)
+    return dora_environment(reached_coordinator(scope, manager, cell))

@@ -1,0 +1,72 @@
+"""What is left of a dataflow's restarts, from systemd and the journal."""
+
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.decisions.cell.restarts import unit_budget
+from dora_systemd.decisions.cell.status import CellStatus
+from dora_systemd.decisions.views.dataflows import RESTARTING, status_word
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.scope import Scope
+from dora_systemd.values import INFINITY
+from dora_systemd.verbs.facts.cells import Cell
+
+_PROPERTIES = ("Restart", "NRestarts", "StartLimitBurst", "StartLimitIntervalUSec")
+_WAITING = ("RestartUSec", "StateChangeTimestampMonotonic")
+_MOST_STARTS = 1000
+
+
+def restart_budget(
+    manager: Manager, scope: Scope, cell: Cell, status: CellStatus
+) -> Mapping[str, int | None] | None:
+    """The restarts of a dataflow's unit, or None where systemd restarts nothing or without limit.
+
+    status: what its runner says.
+    used, max: restarts. next_us, resets_us: µs until the next one, and until they are counted
+    anew; None: there is none to come.
+    """
+    facts = manager.read(cell.unit, _PROPERTIES)
+    window = facts["StartLimitIntervalUSec"]
+    if facts["Restart"] == "no" or window in (0, INFINITY):
+        return None
+    most = max(facts["StartLimitBurst"] - 1, 0)
+    budget = unit_budget(
+        _starts(scope, cell, facts["NRestarts"]),
+        most,
+        window,
+        time.time_ns() // 1000,
+        facts["NRestarts"],
+    )
+    return {
+        "used": budget.used,
+        "max": most,
+        "next_us": _next(manager, cell, status),
+        "resets_us": budget.resets_in,
+    }
+
+
+def _starts(scope: Scope, cell: Cell, restarts: int) -> list[int]:
+    """The starts that NRestarts= counts, and the one before them; CLOCK_REALTIME µs."""
+    if not restarts:
+        return []
+    # Only who has restarted pays for the journal.
+    from dora_systemd.adapters.journal.reader import JournalReader
+
+    try:
+        found = JournalReader().starts(scope, cell.uuid, min(restarts + 1, _MOST_STARTS))
+    except DoraSystemdError:
+        return []
+    return sorted(found)
+
+
+def _next(manager: Manager, cell: Cell, status: CellStatus) -> int | None:
+    """systemd waits for the shortest delay, and the runner for what is left of a longer one."""
+    if status_word(cell.state.active, cell.state.sub, status.stage) != RESTARTING:
+        return None
+    if not cell.state.sub.startswith("auto-restart"):
+        return max(status.started_us - time.time_ns() // 1000, 0)
+    facts: dict[str, Any] = manager.read(cell.unit, _WAITING)
+    now = time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000
+    return max(int(facts["StateChangeTimestampMonotonic"]) + int(facts["RestartUSec"]) - now, 0)

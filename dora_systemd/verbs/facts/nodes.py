@@ -1,0 +1,68 @@
+"""What a descriptor says before dora has seen it: its nodes, and the paths that they name.
+
+No dora is asked: it would have to run as the user, and only knows what the files say. What cannot
+be read is left out, and the cell says so at its start.
+"""
+
+import errno
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path, PurePath
+from typing import Any
+
+from dora_systemd.adapters.host.files import decoded, parse_yaml
+from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.trust.paths import read_file, unreadable
+from dora_systemd.trust.sight import Sight
+
+_MOST_FILES = 50
+"""Files of modules that are read; they may name each other in a circle."""
+
+
+def written_dataflow(path: str) -> Dataflow:
+    """The dataflow in the file `path`, its modules as they are written. Raises DoraSystemdError."""
+    text = decoded(read_file(path).data, Path(path))
+    return parse_dataflow(parse_yaml(text, Path(path)), path)
+
+
+def named_places(dataflow: Dataflow, sight: Sight) -> Iterator[Path]:
+    """The directories of programs that are named by absolute paths, and of modules."""
+    for node in dataflow.nodes:
+        yield from _places(node.raw)
+    queue = [
+        PurePath(dataflow.source).parent / str(node.raw["module"])
+        for node in dataflow.nodes
+        if isinstance(node.raw.get("module"), str)
+    ]
+    for count, path in enumerate(queue):
+        if count == _MOST_FILES:
+            return
+        yield Path(path.parent)
+        for raw in _nodes_of(Path(path), sight):
+            yield from _places(raw)
+            if isinstance(raw.get("module"), str):
+                queue.append(path.parent / raw["module"])
+
+
+def _nodes_of(path: Path, sight: Sight) -> Iterator[dict[str, Any]]:
+    try:
+        data = sight.read(str(path))
+    except OSError as error:
+        if error.errno == errno.ENXIO:  # dora would wait for ever for somebody to write
+            raise unreadable(path, error) from error
+        return
+    with suppress(DoraSystemdError):
+        document = parse_yaml(decoded(data, path), path)
+        nodes = document.get("nodes") if isinstance(document, dict) else None
+        yield from (node for node in nodes or () if isinstance(node, dict))
+
+
+def _places(raw: Any) -> Iterator[Path]:
+    deploy = raw.get("deploy")
+    directory = deploy.get("working_dir") if isinstance(deploy, dict) else None
+    if isinstance(directory, str) and directory.startswith("/"):
+        yield Path(directory)
+    program = raw.get("path")
+    if isinstance(program, str) and program.startswith("/"):
+        yield Path(program).parent

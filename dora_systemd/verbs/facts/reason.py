@@ -1,0 +1,83 @@
+"""Why a unit did not start or did not last, in words, from what systemd remembers of it."""
+
+import signal
+from typing import Any
+
+from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.decisions.life.refusal import FAILED, parse_refusal
+from dora_systemd.errors import DoraSystemdError
+
+_PROPERTIES = ("Result", "StatusText", "ExecMainCode", "ExecMainStatus")
+_CLD_EXITED = 1
+"""ExecMainCode of a process that ended by itself, see waitid(2)."""
+
+_REFUSED = {
+    201: "the nice value was refused",
+    217: "its user, or the user namespace of its sandbox, could not be set up",
+    226: "its sandbox could not be set up",
+    243: "a credential could not be read",
+    214: "realtime scheduling was refused, see LimitRTPRIO= in systemd.exec(5)",
+}
+"""What systemd could not do before the runner: exit statuses of systemd.exec(5)."""
+
+_WORDS = {
+    "protocol": "its supervisor process ended without a message",
+    "timeout": "it did not end in time and was killed",
+    "watchdog": "the supervisor process hung and was killed by the watchdog",
+    "oom-kill": "it ran out of memory",
+    "start-limit-hit": "it was started too often",
+    "resources": "systemd could not set it up",
+    "exec-condition": "a condition was not met",
+}
+
+
+def job_reason(manager: Manager, unit: str, result: str) -> str:
+    """Why a job that starts `unit` did not end well; `result`: JobRemoved's word."""
+    if result == "canceled":
+        return "it was stopped while it started"
+    if result == "dependency":
+        return "a unit that it needs failed"
+    return failure_reason(manager, unit)
+
+
+def runners_refusal(manager: Manager, unit: str) -> DoraSystemdError | None:
+    """What the runner of `unit` refused at its start, None if it did not end so."""
+    text = str(manager.read(unit, ["StatusText"])["StatusText"])
+    return parse_refusal(text, exit_status(manager, unit) or 0)
+
+
+def exit_status(manager: Manager, unit: str) -> int | None:
+    """The exit status of the main process of `unit`, None if it did not end by itself."""
+    facts = manager.read(unit, ["ExecMainCode", "ExecMainStatus"])
+    return int(facts["ExecMainStatus"]) if facts["ExecMainCode"] == _CLD_EXITED else None
+
+
+def failure_reason(manager: Manager, unit: str) -> str:
+    """One line about the end of `unit`: the runner's own last words, else systemd's result."""
+    facts = manager.read(unit, _PROPERTIES)
+    special = _WORDS.get(facts["Result"], "")
+    last_words = str(facts["StatusText"]).removeprefix(FAILED)
+    if not last_words:
+        return special or _exit_words(facts)
+    # A verdict of the runner says more than its exit status.
+    is_verdict = last_words != facts["StatusText"]
+    cause = special or ("" if is_verdict else _exit_words(facts))
+    return f"{last_words} ({cause})" if cause else last_words
+
+
+def _exit_words(unit: dict[str, Any]) -> str:
+    status = unit["ExecMainStatus"]
+    if unit["ExecMainCode"] == _CLD_EXITED:
+        refused = _REFUSED.get(status)
+        return f"{refused} (exit code {status})" if refused else f"exit code {status}"
+    if status:
+        return f"signal {signal_name(status)}"
+    return "ended" if unit["Result"] == "success" else str(unit["Result"])
+
+
+def signal_name(number: int) -> str:
+    """ "SIGKILL" for 9."""
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return str(number)

@@ -1,0 +1,12 @@
+"""Where the cgroup tree has the dataflows of one manager."""
+
+from pathlib import Path
+
+from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.cgroup import groups as cgroup
+from dora_systemd.names import SLICE
+
+
+def slice_group(manager: Manager) -> Path:
+    """The directory of dora.slice, below which units are unless a property puts them elsewhere."""
+    return cgroup.group_path(manager.control_group()) / SLICE

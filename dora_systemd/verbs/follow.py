@@ -1,0 +1,179 @@
+"""`doractl logs --until-end`: the records of a dataflow until it has ended.
+
+journalctl(1) selects and formats in all its forms, but cannot tell that nothing more will come. So
+it is called again and again, each time for what is new, and one more time after the end.
+"""
+
+import os
+import select
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Protocol
+
+from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.journal.reader import open_journalctl
+from dora_systemd.decisions.logs.query import (
+    UNIT_ENDS,
+    LogQuery,
+    end_matches,
+    journal_timestamp,
+    scope_matches,
+)
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import unit_name
+from dora_systemd.scope import Scope
+
+STEP_SECONDS = 0.2
+"""Between two calls of journalctl: opening all files of a journal takes tens of milliseconds."""
+POLL_SECONDS = 2.0
+"""systemd is asked that often in silence: its own word about the end may have got lost."""
+END_SECONDS = 3.0
+FIRST_LINES = 10
+"""What journalctl --follow begins with."""
+
+_CHUNK = 1 << 18
+
+
+class Watch(Protocol):
+    """What is asked of UnitWatch."""
+
+    def wait(self, seconds: float) -> bool:
+        """Return when there is something new, or after `seconds`; whether there is."""
+
+    def take_end(self) -> bool:
+        """Whether the unit has ended since the last call."""
+
+
+class UnitWatch:
+    """Hears of every new record of a unit and of its end.
+
+    since_us: CLOCK_REALTIME from which on, µs.
+    """
+
+    def __init__(self, scope: Scope, name: str, since_us: int) -> None:
+        self._stack = ExitStack()
+        self._rest = b""
+        self._has_ended = False
+        options = ["--follow", "--quiet", "--output=export", "--output-fields=MESSAGE_ID"]
+        matches = [*scope_matches(scope, name), "+", *end_matches(scope, name)]
+        arguments = [*options, f"--since={journal_timestamp(since_us)}", "--", *matches]
+        child = self._stack.enter_context(open_journalctl(arguments))
+        assert child.stdout
+        self._fd = child.stdout.fileno()
+        os.set_blocking(self._fd, False)
+
+    def wait(self, seconds: float) -> bool:
+        """See Watch."""
+        poll = select.poll()
+        poll.register(self._fd, select.POLLIN)
+        if not poll.poll(seconds * 1000):
+            return False
+        while data := self._read():
+            seen = self._rest + data
+            self._has_ended |= any(one.encode() in seen for one in UNIT_ENDS)
+            self._rest = seen[-len(UNIT_ENDS[0]) :]
+        return True
+
+    def _read(self) -> bytes:
+        try:
+            return os.read(self._fd, _CHUNK)
+        except BlockingIOError:
+            return b""
+
+    def take_end(self) -> bool:
+        """See Watch."""
+        ended, self._has_ended = self._has_ended, False
+        if ended:
+            self._rest = b""
+        return ended
+
+    def close(self) -> None:
+        """End the journalctl behind it."""
+        self._stack.close()
+
+
+def check_until_end(selector: str, is_reverse: bool) -> None:
+    """Raise DoraSystemdError (USAGE) for what cannot be followed to an end."""
+    if not selector:
+        hint = "say which dataflow: doractl logs NAME --until-end"
+        raise DoraSystemdError("cannot wait for the end of all dataflows", hint, ExitCode.USAGE)
+    if is_reverse:
+        hint = "leave --reverse or --until-end out"
+        raise DoraSystemdError("cannot follow with the newest lines first", hint, ExitCode.USAGE)
+
+
+def follow_to_end(query: LogQuery, print_query: Callable[[LogQuery], object]) -> None:
+    """Print the records of a query, one part of them after the other, until its unit has ended.
+
+    Raises DoraSystemdError.
+    """
+    # Only this way of reading logs asks systemd.
+    from dora_systemd.adapters.bus.systemd import Bus
+
+    start_us = time.time_ns() // 1000
+    bus = Bus(query.scope, for_reading=True)
+    with (
+        closing(UnitWatch(query.scope, query.name, start_us)) as watch,
+        TemporaryDirectory(prefix="doractl-") as directory,
+    ):
+        steps = _steps(query, Path(directory) / "cursor", start_us)
+        follow_steps(lambda: print_query(next(steps)), watch, lambda: is_unit_up(bus, query.name))
+
+
+def _steps(query: LogQuery, cursor: Path, start_us: int) -> Iterator[LogQuery]:
+    yield first_step(query, cursor)
+    while True:
+        yield next_step(query, cursor, start_us)
+
+
+def follow_steps(print_step: Callable[[], object], watch: Watch, is_up: Callable[[], bool]) -> None:
+    """Call `print_step` as there are new records, the last time when all are there.
+
+    is_up: whether the unit runs or is going to. It has ended when it does not, not when systemd
+    says that it has: a restart ends it, too.
+    """
+    has_more = is_up()
+    while True:
+        printed = time.monotonic()
+        print_step()
+        if not has_more:
+            return
+        has_news = watch.wait(POLL_SECONDS)
+        has_ended = watch.take_end()
+        if has_ended or not has_news:
+            has_more = is_up()
+        if not (has_more or has_ended):
+            _wait_end(watch)
+        elif has_more and has_news:
+            time.sleep(max(printed + STEP_SECONDS - time.monotonic(), 0))
+
+
+def _wait_end(watch: Watch) -> None:
+    """Return when systemd has said that the unit has ended, if it does so soon."""
+    deadline = time.monotonic() + END_SECONDS
+    while not watch.take_end() and time.monotonic() < deadline:
+        watch.wait(STEP_SECONDS)
+
+
+def is_unit_up(manager: Manager, name: str) -> bool:
+    """Whether the unit of a dataflow runs, or is about to."""
+    state = manager.read(unit_name(name), ("ActiveState", "Job"))
+    return state["ActiveState"] not in ("inactive", "failed") or bool(state["Job"][0])
+
+
+def first_step(query: LogQuery, cursor: Path) -> LogQuery:
+    """The query for what is there already; `cursor`: a file that is not there yet."""
+    is_bare = query.tail is None and not query.since
+    tail = FIRST_LINES if is_bare else query.tail
+    return replace(query, is_follow=False, tail=tail, cursor_file=str(cursor))
+
+
+def next_step(query: LogQuery, cursor: Path, start_us: int) -> LogQuery:
+    """The query for what has come since the step before it, or since `start_us` if nothing had."""
+    has_cursor = cursor.exists() and cursor.stat().st_size
+    since = "" if has_cursor else journal_timestamp(start_us)
+    return replace(query, is_follow=False, tail=None, since=since, cursor_file=str(cursor))

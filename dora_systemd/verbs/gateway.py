@@ -1,0 +1,68 @@
+"""What systemd knows of the gateway, and its token."""
+
+from dataclasses import dataclass
+
+from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.host.loopback import answers_health
+from dora_systemd.decisions.gateway.place import SOCKET_UNIT, token_path
+from dora_systemd.decisions.gateway.port import port_of
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.scope import Scope
+
+_READY_SECONDS = 30.0
+
+
+@dataclass(frozen=True)
+class Gateway:
+    """Whether its port is open. port: None where no unit of it is there."""
+
+    is_up: bool
+    port: int | None
+
+
+def read_gateway(manager: Manager) -> Gateway:
+    """Whether the port is open, and which one it is."""
+    facts = manager.read(SOCKET_UNIT, ["LoadState", "ActiveState"])
+    if facts["LoadState"] != "loaded":
+        return Gateway(False, None)
+    port = port_of(manager.read(SOCKET_UNIT, ["Listen"])["Listen"])
+    return Gateway(facts["ActiveState"] == "active", port)
+
+
+def require_gateway(manager: Manager, scope: Scope) -> int:
+    """Its port. Raises DoraSystemdError (NOT_RUNNING) unless it is up."""
+    gateway = read_gateway(manager)
+    if not gateway.is_up or gateway.port is None:
+        hint = f"doractl {scope.flag} up"
+        raise DoraSystemdError("cannot use the gateway: it is not up", hint, ExitCode.NOT_RUNNING)
+    return gateway.port
+
+
+def check_answer(scope: Scope, port: int) -> None:
+    """Return when the gateway answers. Raises DoraSystemdError when it does not."""
+    if not answers_health(port, _READY_SECONDS):
+        which = "--user-unit" if scope.is_user else "--unit"
+        raise DoraSystemdError(
+            f"cannot get an answer from the gateway on port {port}",
+            f"journalctl {which} dora-gateway.service -e",
+        )
+
+
+def read_token(scope: Scope, port: int) -> str:
+    """The gateway's token. Raises DoraSystemdError (NO_PERMISSION) for other users."""
+    path = token_path(scope)
+    try:
+        if not path.exists():
+            # It makes one when it is started for the first time, by whoever asks it anything.
+            check_answer(scope, port)
+        return path.read_text().strip()
+    except PermissionError as error:
+        raise DoraSystemdError(
+            f"cannot read {path}: permission denied",
+            "use sudo, or --user for a gateway of your own",
+            ExitCode.NO_PERMISSION,
+        ) from error
+    except (OSError, ValueError) as error:
+        raise DoraSystemdError(
+            f"cannot read {path}", f"systemctl {scope.flag} restart {SOCKET_UNIT}"
+        ) from error

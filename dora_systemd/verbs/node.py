@@ -1,0 +1,197 @@
+"""What goes to the coordinator of one dataflow: single nodes, and the stock dora command."""
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.runner_socket import client as runner_socket
+from dora_systemd.decisions.cell.status import CellStatus
+from dora_systemd.decisions.dora.coordinator import Coordinator
+from dora_systemd.decisions.dora.protocol import Params, Reply, node_params, replace_params
+from dora_systemd.decisions.dora.variables import coordinator_variables
+from dora_systemd.decisions.reload.changes import has_readers
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.paths import CellPaths
+from dora_systemd.scope import Scope
+from dora_systemd.trust.programs import Account, account_of_uid, become, fresh_environment
+from dora_systemd.trust.sockets import plain, require_listener
+from dora_systemd.trust.terminals import run_apart
+from dora_systemd.values import quoted
+from dora_systemd.verbs.facts.cells import Cell, not_found
+from dora_systemd.verbs.facts.list import read_status
+
+_NO_USER = 2**32 - 1
+"""UID of a unit without User=: it runs as who the manager is."""
+
+Ask = Callable[[Scope, Cell, Params], Reply]
+
+
+def read_coordinator(scope: Scope, cell: Cell) -> Coordinator:
+    """The coordinator of a running dataflow, as its runner tells: to be checked before it is used.
+
+    Raises DoraSystemdError: NOT_RUNNING, or NO_PERMISSION when it is another user's.
+    """
+    require_running(cell)
+    return runner_socket.ask_coordinator(_socket(scope, cell))
+
+
+def reached_coordinator(scope: Scope, manager: Manager, cell: Cell) -> Coordinator:
+    """The same, if its port leads to it: from here, and to nobody but the dataflow's user.
+
+    Raises DoraSystemdError.
+    """
+    coordinator = read_coordinator(scope, cell)
+    uid, is_private = _unit_facts(manager, cell)
+    if is_private:
+        raise DoraSystemdError(
+            f"cannot reach the coordinator of {cell.name} by a port: its network is private",
+            f"doractl {scope.flag} dora {cell.name} -- ..., or doractl env for the gateway",
+            ExitCode.USAGE,
+        )
+    require_listener(coordinator.port, uid)
+    return coordinator
+
+
+def require_running(cell: Cell) -> None:
+    """Raise DoraSystemdError (NOT_RUNNING) unless the dataflow is up."""
+    if not cell.is_up:
+        raise DoraSystemdError(
+            f"cannot use the dataflow {cell.name}: it is not running",
+            f"doractl restart {cell.name}",
+            ExitCode.NOT_RUNNING,
+        )
+
+
+def ask_coordinator(scope: Scope, cell: Cell, params: Params) -> Reply:
+    """One request to the cell's coordinator, and its answer. Raises DoraSystemdError."""
+    # WebSockets are slow to import, and no other verb needs them.
+    from dora_systemd.adapters.dora import control
+
+    return control.request(*runner_socket.relay(_socket(scope, cell)), params)
+
+
+def restart_node(scope: Scope, cell: Cell, node: str, ask: Ask = ask_coordinator) -> None:
+    """End one node and start it again, while the others run on.
+
+    dora's RestartNode ends every node downstream of one whose restart policy is "never". Such a
+    node is replaced by a copy of itself, which nobody downstream notices; dora starts the copy
+    before the old one ends, and does not tell that one to stop before its grace duration is over.
+    """
+    status = _checked_status(scope, cell, node)
+    info = _answer(cell, ask(scope, cell, {"Info": {"dataflow_uuid": status.run}}))
+    nodes = _nodes(cell, info)
+    definition = next((one for one in nodes if one.get("id") == node), {})
+    is_replaceable = definition.get("restart_policy", "never") == "never"
+    if is_replaceable and has_readers(node, nodes):
+        params = replace_params(status.run, definition)
+    else:
+        params = node_params("RestartNode", status.run, node)
+    _answer(cell, ask(scope, cell, params))
+
+
+def stop_node(scope: Scope, cell: Cell, node: str, ask: Ask = ask_coordinator) -> None:
+    """End one node for good; its neighbours see their input closed."""
+    status = _checked_status(scope, cell, node)
+    _answer(cell, ask(scope, cell, node_params("StopNode", status.run, node)))
+
+
+def exec_dora(scope: Scope, manager: Manager, cell: Cell, arguments: Sequence[str]) -> int:
+    """Become the dora command, told to speak to the coordinator of this dataflow.
+
+    Root runs it as the dataflow's user, who may have written it, and on a terminal of its own:
+    this is its exit status. Raises DoraSystemdError.
+    """
+    uid, is_private = _unit_facts(manager, cell)
+    account = account_of_uid(uid) if os.geteuid() == 0 and not scope.is_user else None
+    if is_private:
+        coordinator = _relayed(scope, cell, uid, account)
+    else:
+        coordinator = reached_coordinator(scope, manager, cell)
+    command, found = [cell.options.dora, *arguments], dora_environment(coordinator)
+    try:
+        if account is not None:
+            environment = {**fresh_environment(account), **_terminal(), **found}
+            return run_apart(command, environment, account)
+        os.execve(command[0], command, {**os.environ, **found})
+    except OSError as error:
+        raise DoraSystemdError(
+            f"cannot run {command[0]}: {error.strerror}", "", ExitCode.NO_DORA
+        ) from error
+
+
+def _terminal() -> dict[str, str]:
+    return {key: os.environ[key] for key in ("TERM", "NO_COLOR") if key in os.environ}
+
+
+def _relayed(scope: Scope, cell: Cell, uid: int, account: Account | None) -> Coordinator:
+    """A port that leads into the dataflow's own network as long as this process lives."""
+    # asyncio is slow to import, and only a private network needs it.
+    from dora_systemd.adapters.runner_socket.relay import open_port
+
+    coordinator = read_coordinator(scope, cell)
+    port = open_port(_socket(scope, cell), {uid, os.getuid()}, lambda: _settle(account))
+    return replace(coordinator, port=port, local_listen_port=None)
+
+
+def _unit_facts(manager: Manager, cell: Cell) -> tuple[int, bool]:
+    """The uid that the unit runs as, and whether its network is one of its own."""
+    facts = manager.read(cell.unit, ["UID", "PrivateNetwork"])
+    return os.getuid() if facts["UID"] == _NO_USER else facts["UID"], facts["PrivateNetwork"]
+
+
+def _socket(scope: Scope, cell: Cell) -> Path:
+    return CellPaths(scope.cell_directory(cell.name)).socket
+
+
+def _settle(account: Account | None) -> None:
+    if account is not None:
+        become(account)
+
+
+def dora_environment(coordinator: Coordinator) -> dict[str, str]:
+    """The variables with which the dora command finds a coordinator and its daemon."""
+    return coordinator_variables(coordinator.port, coordinator.token, coordinator.local_listen_port)
+
+
+def _checked_status(scope: Scope, cell: Cell, node: str) -> CellStatus:
+    require_running(cell)
+    runner_socket.require_access(_socket(scope, cell))
+    return require_node(scope, cell, node)
+
+
+def require_node(scope: Scope, cell: Cell, node: str) -> CellStatus:
+    """The live table that `node` is in. Raises DoraSystemdError (NOT_FOUND) if it is not."""
+    status = read_status(scope, cell)
+    if node not in status.nodes:
+        raise DoraSystemdError(
+            f"cannot find a node {quoted(node)} in the dataflow {cell.name}",
+            not_found(node, list(status.nodes)).hint,
+            ExitCode.NOT_FOUND,
+        )
+    return status
+
+
+def _answer(cell: Cell, reply: Reply) -> dict[str, Any]:
+    if reply.error:
+        raise DoraSystemdError(
+            f"cannot do that in the dataflow {cell.name}: {plain(reply.error)}",
+            f"doractl restart {cell.name} starts all of it again",
+        )
+    return reply.result if isinstance(reply.result, dict) else {}
+
+
+def _nodes(cell: Cell, info: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The nodes of dora's answer to Info: whoever owns the dataflow may have written it."""
+    try:
+        nodes = info["DataflowInfo"]["descriptor"]["nodes"]
+        if all(isinstance(one, dict) for one in nodes):
+            return list(nodes)
+    except (KeyError, TypeError):
+        pass
+    raise DoraSystemdError(
+        f"cannot understand dora's answer in the dataflow {cell.name}",
+        f"doractl restart {cell.name} starts all of it again",
+    )

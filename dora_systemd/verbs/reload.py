@@ -1,0 +1,54 @@
+"""`doractl reload`, and `doractl set --hot-reload`: requests to the runner of a dataflow."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.host.unit_files import (
+    HOT_RELOAD_FILE,
+    drop_in_directory,
+    write_unit_file,
+)
+from dora_systemd.adapters.runner_socket.client import done_of, order
+from dora_systemd.decisions.cell.hot_reload import CHANGE_VARIABLE
+from dora_systemd.decisions.unit.properties import format_unit, typed
+from dora_systemd.paths import CellPaths
+from dora_systemd.scope import Scope
+from dora_systemd.values import format_bool
+from dora_systemd.verbs.facts.cells import Cell
+from dora_systemd.verbs.node import require_node, require_running
+
+Ask = Callable[[Path, Mapping[str, Any]], dict[str, Any]]
+
+
+def reload_cell(scope: Scope, cell: Cell, node: str | None, ask: Ask = order) -> list[str]:
+    """What was done, in words: nothing if no file has changed and no node is named.
+
+    Raises DoraSystemdError; then the old version runs on.
+    """
+    require_running(cell)
+    if node is not None:
+        require_node(scope, cell, node)
+    path = _socket(scope, cell)
+    return done_of(path, ask(path, {"verb": "reload", "node": node}))
+
+
+def switch_hot_reload(
+    manager: Manager, scope: Scope, cell: Cell, is_on: bool, ask: Ask = order
+) -> None:
+    """Watch the files of a dataflow from now on, or no longer; also after a restart of its unit.
+
+    Raises DoraSystemdError.
+    """
+    require_running(cell)
+    unit = manager.read(cell.unit, ("FragmentPath", "Transient"))
+    ask(_socket(scope, cell), {"verb": "hot-reload", "on": is_on})
+    text = format_unit(typed(Environment=(f"{CHANGE_VARIABLE}={format_bool(is_on)}",)))
+    directory = drop_in_directory(Path(unit["FragmentPath"]), bool(unit["Transient"]))
+    write_unit_file(directory / HOT_RELOAD_FILE, f"# Written by doractl set.\n{text}")
+    manager.reload()
+
+
+def _socket(scope: Scope, cell: Cell) -> Path:
+    return CellPaths(scope.cell_directory(cell.name)).socket

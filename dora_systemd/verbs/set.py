@@ -1,0 +1,150 @@
+"""`doractl set`: limits of a dataflow and of its nodes, changed while it runs and remembered.
+
+systemd keeps the dataflow's own, as with `systemctl set-property`. The nodes' are in a drop-in of
+ours beside systemd's: those of a transient unit go with it, those of a unit file when that goes.
+"""
+
+import os
+from collections.abc import Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.cgroup import groups as cgroup
+from dora_systemd.adapters.host.machine import read_machine
+from dora_systemd.adapters.host.unit_files import (
+    NODE_LIMITS_FILE,
+    drop_in_directory,
+    read_unit_file,
+    remove_empty,
+    remove_unit_file,
+    write_unit_file,
+)
+from dora_systemd.decisions.cell.limits import (
+    BY_KEY,
+    CHANGES_VARIABLE,
+    NodeLimits,
+    check_nodes,
+    format_changes,
+    merge_node_limits,
+    parse_changes,
+)
+from dora_systemd.decisions.descriptor.nodes import UNEXPANDED
+from dora_systemd.decisions.settings.limit_checks import (
+    check_controllers,
+    needed_controllers,
+    size_warnings,
+    use_warnings,
+)
+from dora_systemd.decisions.settings.limits import LIVE_SETTINGS, NODE_LIMIT
+from dora_systemd.decisions.settings.resolve import Settings, resolve_settings
+from dora_systemd.decisions.unit.properties import format_unit, settings_properties, typed
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.scope import Scope
+from dora_systemd.verbs.facts.cells import Cell
+from dora_systemd.verbs.facts.enabled import enabled_units
+from dora_systemd.verbs.facts.list import read_status
+from dora_systemd.verbs.facts.nodes import written_dataflow
+
+_PROPERTIES = ("ControlGroup", "Environment", "FragmentPath", "Transient")
+
+
+def set_limits(
+    manager: Manager, scope: Scope, cell: Cell, flags: Mapping[str, object]
+) -> tuple[str, ...]:
+    """Change limits of a dataflow; warnings. flags: raw values by name of LIVE_SETTINGS.
+
+    Raises DoraSystemdError; as long as anything is wrong, nothing is changed.
+    """
+    settings = resolve_settings(flags, {}, (), LIVE_SETTINGS)
+    properties, nodes = settings_properties(settings), settings[NODE_LIMIT]
+    if not properties and not nodes:
+        hint = "see doractl set --help"
+        message = f"cannot change the limits of {cell.name}: none is given"
+        raise DoraSystemdError(message, hint, ExitCode.USAGE)
+    if not scope.is_user and os.geteuid() != 0:
+        message = f"cannot change the limits of {cell.name}: permission denied"
+        raise DoraSystemdError(message, "use sudo", ExitCode.NO_PERMISSION)
+    _check_nodes(scope, cell, nodes)
+    if needed := needed_controllers(properties, nodes):
+        available = cgroup.read_controllers(cgroup.group_path(manager.control_group()))
+        check_controllers(needed, available, scope.is_user)
+    unit = manager.read(cell.unit, _PROPERTIES)
+    warnings = _warnings(settings, nodes, unit)
+    # systemd keeps those of a transient unit beside it, whatever it is told.
+    is_fleeting = Path(unit["FragmentPath"]).is_relative_to("/run")
+    # The kernel refuses most easily, systemd after it; what has been done by then is taken back.
+    with ExitStack() as undo:
+        _limit_groups(unit, nodes, undo)
+        if nodes:
+            _remember(unit, nodes, undo)
+        if properties:
+            manager.set_properties(cell.unit, list(properties.values()), is_fleeting)
+        undo.pop_all()
+    if nodes:
+        manager.reload()
+    return (*warnings, *_unit_file_warnings(manager, scope, cell, unit))
+
+
+def _unit_file_warnings(
+    manager: Manager, scope: Scope, cell: Cell, unit: Mapping[str, Any]
+) -> list[str]:
+    """A dataflow that was enabled while it ran has a unit file beside its transient unit."""
+    if not unit["Transient"] or cell.unit not in enabled_units(manager, scope):
+        return []
+    name = cell.name
+    return [f"the next boot has the old limits, unless you disable {name} and enable it again"]
+
+
+def _check_nodes(scope: Scope, cell: Cell, limits: tuple[NodeLimits, ...]) -> None:
+    if not limits:
+        return
+    kinds = {node: one.kind for node, one in read_status(scope, cell).nodes.items()}
+    if not kinds:
+        written = written_dataflow(cell.options.dataflow).nodes
+        if any(node.kind in UNEXPANDED for node in written):
+            return  # what is in them only its runner finds out, who refuses the next start then
+        kinds = {node.id: str(node.kind) for node in written}
+    check_nodes(limits, kinds, [node for node, kind in kinds.items() if kind == "dynamic"])
+
+
+def _warnings(
+    settings: Settings, nodes: tuple[NodeLimits, ...], unit: Mapping[str, Any]
+) -> tuple[str, ...]:
+    values = {limit.word: settings.values[key] for key, limit in BY_KEY.items()}
+    warnings = size_warnings(values, nodes, read_machine())
+    if not unit["ControlGroup"]:
+        return warnings
+    path = cgroup.group_path(unit["ControlGroup"])
+    held = {node: cgroup.read_usage(one).memory for node, one in cgroup.node_groups(path).items()}
+    return (*warnings, *use_warnings(values, nodes, cgroup.read_usage(path).memory, held))
+
+
+def _remember(unit: Mapping[str, Any], nodes: tuple[NodeLimits, ...], undo: ExitStack) -> None:
+    """Write the drop-in: when systemd has read it, the next start of the runner is told of it."""
+    before = dict(entry.split("=", 1) for entry in unit["Environment"] or ())
+    changes = merge_node_limits(parse_changes(before.get(CHANGES_VARIABLE, "")), nodes)
+    text = format_unit(typed(Environment=(f"{CHANGES_VARIABLE}={format_changes(changes)}",)))
+    directory = drop_in_directory(Path(unit["FragmentPath"]), bool(unit["Transient"]))
+    path = directory / NODE_LIMITS_FILE
+    undo.callback(_put_back, path, read_unit_file(path))
+    write_unit_file(path, f"# Written by doractl set.\n{text}")
+
+
+def _put_back(path: Path, text: str | None) -> None:
+    if text is not None:
+        write_unit_file(path, text)
+    else:
+        remove_unit_file(path)
+        remove_empty(path.parent)
+
+
+def _limit_groups(unit: Mapping[str, Any], nodes: tuple[NodeLimits, ...], undo: ExitStack) -> None:
+    if not nodes or not unit["ControlGroup"]:
+        return
+    groups = cgroup.node_groups(cgroup.group_path(unit["ControlGroup"]))
+    for one in nodes:
+        if group := groups.get(one.node):  # else its next start finds the limit in the drop-in
+            undo.callback(cgroup.restore_group, group, cgroup.read_files(group, one.files()))
+            cgroup.limit_group(group, one)

@@ -1,0 +1,166 @@
+"""`doractl setup`: what the Debian package has and a pip install lacks, put there or taken away."""
+
+import contextlib
+import os
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import takewhile
+from pathlib import Path
+
+from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.host.files import read_text
+from dora_systemd.adapters.host.process import run_command
+from dora_systemd.adapters.host.unit_files import (
+    foreign_file,
+    read_unit_file,
+    remove_empty,
+    remove_unit_file,
+    write_link,
+    write_unit_file,
+)
+from dora_systemd.decisions.unit.file import BOOT_TARGET
+from dora_systemd.decisions.unit.setup_files import (
+    PACKAGED_UNIT,
+    SYSTEM_ROOT,
+    SetupFile,
+    is_ours,
+    setup_files,
+    with_interpreter,
+)
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import name_from_unit
+from dora_systemd.scope import Scope
+from dora_systemd.verbs.facts.enabled import own_directories
+
+_PACKAGE = Path(__file__).parents[1]
+_CHECKOUT = {"templates": "units/templates", "completions": "packaging/completions"}
+_SECONDS = 60.0
+_STANDARD = ("etc", "lib", "share", "man", "local")
+"""Directories that every machine has."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One file: where it belongs, its text, and what is there now."""
+
+    file: SetupFile
+    path: Path
+    text: str
+    present: str | None
+
+    @property
+    def is_done(self) -> bool:
+        """Whether it is in place already."""
+        return self.present == (self.file.link or self.text)
+
+
+def plan_setup(scope: Scope, root: Path | None = None) -> list[Step]:
+    """Every file with what is in its place now. Raises DoraSystemdError for a foreign one."""
+    manuals = [path.name for path in _directory("man").iterdir()]
+    place = root or data_root(scope)
+    return [_step(file, place / file.place) for file in setup_files(scope.is_user, manuals)]
+
+
+def put_in_place(steps: Sequence[Step]) -> list[Path]:
+    """Write what is not there yet; the paths. Raises DoraSystemdError."""
+    missing = [step for step in steps if not step.is_done]
+    for step in missing:
+        if step.file.link:
+            write_link(step.path, step.file.link)
+        else:
+            write_unit_file(step.path, step.text)
+    return [step.path for step in missing]
+
+
+def take_away(steps: Sequence[Step]) -> list[Path]:
+    """Remove what is there of ours, and the directories that are empty then; the paths."""
+    there = [step for step in steps if step.present is not None]
+    for step in there:
+        remove_unit_file(step.path)
+        for directory in takewhile(lambda one: one.name not in _STANDARD, step.path.parents):
+            remove_empty(directory)
+    return [step.path for step in there]
+
+
+def data_root(scope: Scope) -> Path:
+    """Where all of it goes. Raises DoraSystemdError for a user without a home directory."""
+    if not scope.is_user:
+        return Path(SYSTEM_ROOT)
+    given = os.environ.get("XDG_DATA_HOME", "")
+    if given.startswith("/"):
+        return Path(given)
+    try:
+        return Path.home() / ".local/share"
+    except RuntimeError as error:
+        hint = "set HOME, or XDG_DATA_HOME"
+        raise DoraSystemdError("cannot find your home directory", hint) from error
+
+
+def packaged_unit(scope: Scope) -> str:
+    """The file that shows that a package has done all this, or ""."""
+    path = Path(PACKAGED_UNIT.replace("/system/", "/user/") if scope.is_user else PACKAGED_UNIT)
+    return str(path) if path.exists() else ""
+
+
+def refuse_if_needed(manager: Manager, scope: Scope) -> None:
+    """Raise DoraSystemdError while a boot starts dataflows by way of dora.target."""
+    links = own_directories(manager, scope)[0].glob(f"{BOOT_TARGET}.wants/*")
+    names = sorted(filter(None, (name_from_unit(link.name) for link in links)))
+    if names:
+        raise DoraSystemdError(
+            f"cannot remove dora.target: a boot starts {', '.join(names)} with it",
+            f"doractl {scope.flag} disable {' '.join(names)}",
+            ExitCode.USAGE,
+        )
+
+
+def tell_systemd(reach: Callable[[Scope], Manager], scope: Scope) -> tuple[str, ...]:
+    """Have systemd read what has changed; warnings about what did not work.
+
+    reach: opens the connection. Without systemd, as in an image that is being built, the next boot
+    reads it.
+    """
+    with contextlib.suppress(DoraSystemdError):
+        reach(scope).reload()
+    if scope.is_user:
+        return ()
+    commands = (["systemd-sysusers"], ["journalctl", "--update-catalog"])
+    return tuple(filter(None, map(_run, commands)))
+
+
+def _run(command: Sequence[str]) -> str:
+    try:
+        done = run_command(command, _SECONDS)
+    except DoraSystemdError as error:
+        return error.message
+    reason = (done.stderr.strip().splitlines() or [f"exit code {done.status}"])[-1]
+    return f"{' '.join(command)}: {reason}" if done.status else ""
+
+
+def _step(file: SetupFile, path: Path) -> Step:
+    if not file.link:
+        present = read_unit_file(path)
+        if present is not None and not is_ours(present):
+            raise foreign_file(path)
+        return Step(file, path, text_of(file), present)
+    link = str(path.readlink()) if path.is_symlink() else None
+    if link not in (None, file.link) or (link is None and path.exists()):
+        raise foreign_file(path)
+    return Step(file, path, "", link)
+
+
+def text_of(file: SetupFile) -> str:
+    """What belongs into a file; units run the Python that this is."""
+    text = read_text(_directory(file.source[0]) / file.source[1])
+    return with_interpreter(text, sys.executable)
+
+
+def _directory(kind: str) -> Path:
+    """Where the files of one kind are: in the installed package, or in a checkout."""
+    installed = _PACKAGE / kind
+    return (
+        installed
+        if installed.is_dir()
+        else _PACKAGE.parent / _CHECKOUT.get(kind, f"packaging/{kind}")
+    )

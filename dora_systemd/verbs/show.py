@@ -1,0 +1,35 @@
+"""`doractl show`: the unit of a dataflow as text, from the files that systemd made or read."""
+
+from pathlib import Path
+
+from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.verbs.facts.cells import Cell
+
+_PROPERTIES = ("FragmentPath", "DropInPaths")
+
+
+def unit_files(manager: Manager, cell: Cell) -> dict[str, str]:
+    """Texts of the unit's files by path, drop-ins after the unit itself, as in systemctl cat.
+
+    A transient unit has a file as well: systemd writes it below /run.
+    """
+    places = manager.read(cell.unit, _PROPERTIES)
+    paths = [path for path in (places["FragmentPath"], *places["DropInPaths"]) if path]
+    return {path: _read(path) for path in paths}
+
+
+def format_unit_files(files: dict[str, str]) -> str:
+    """The files one after another, each below a comment with its path."""
+    return "\n".join(f"# {path}\n{text.rstrip()}\n" for path, text in files.items())
+
+
+def _read(path: str) -> str:
+    try:
+        return Path(path).read_text()
+    except OSError as error:
+        raise DoraSystemdError(
+            f"cannot read the unit file {path}: {error.strerror}",
+            "use sudo" if isinstance(error, PermissionError) else "systemctl daemon-reload",
+            ExitCode.NO_PERMISSION if isinstance(error, PermissionError) else ExitCode.FAILURE,
+        ) from error

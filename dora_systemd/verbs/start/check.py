@@ -1,0 +1,106 @@
+"""A dataflow is checked without being started, and dora is asked something about it.
+
+As root that happens in a unit of its own, which is like that of the dataflow: same user, sandbox
+and environment. So root runs no dora that might be somebody else's. Anybody else asks for himself.
+"""
+
+import os
+import secrets
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from dora_systemd.adapters.bus.manager import Manager, Property
+from dora_systemd.adapters.host.process import (
+    DORA_SECONDS,
+    Beside,
+    Completed,
+    read_streams,
+    run_command,
+)
+from dora_systemd.decisions.cell.options import check_command
+from dora_systemd.decisions.life.refusal import parse_refusal
+from dora_systemd.decisions.unit.properties import typed
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.trust.programs import own_account
+from dora_systemd.values import SECOND, shown
+from dora_systemd.verbs.facts.reason import exit_status, failure_reason
+from dora_systemd.verbs.start.plan import Plan
+from dora_systemd.verbs.start.unit import plan_properties
+
+_FORBIDDEN = 200
+"""Exit statuses from here on are systemd's own, see systemd.exec(5)."""
+_OF_RUNNERS = (
+    *("Exec", "Restart", "StartLimit", "RuntimeDirectory", "Watchdog", "FileDescriptorStore"),
+    *("Delegate", "LogExtraFields", "Type", "Timeout", "OOMPolicy", "Notify"),
+)
+"""How the keys begin that mean something for a runner only."""
+
+
+def check_plan(connect: Callable[[], Manager], plan: Plan) -> None:
+    """Raise DoraSystemdError for what the runner would refuse at its start."""
+    command = check_command(sys.executable, plan.options)
+    done = run_beside(connect, plan, command)
+    if refusal := parse_refusal(done.stdout, done.status):
+        raise refusal
+    if done.status:
+        raise _no_check(plan, done.stderr.strip() or f"exit code {done.status}")
+
+
+def run_beside(connect: Callable[[], Manager], plan: Plan, command: Sequence[str]) -> Completed:
+    """Run a command as the runner of `plan` would. Raises DoraSystemdError if that cannot be."""
+    if os.geteuid() != 0:
+        environment = {**os.environ, **plan.environment}
+        account, directory = own_account(), str(Path(plan.options.dataflow).parent)
+        return run_command(command, DORA_SECONDS, environment, directory, account)
+    return _run_unit(connect(), plan, command)
+
+
+def _run_unit(manager: Manager, plan: Plan, command: Sequence[str]) -> Completed:
+    unit = f"doractl-check-{secrets.token_hex(8)}.service"
+    reading, writing = zip(*(os.pipe2(os.O_CLOEXEC) for _ in range(2)), strict=True)
+    streams = Beside(lambda: read_streams(reading, DORA_SECONDS + 5))
+    try:
+        manager.start_transient(unit, _properties(manager, plan, command, writing), None, True)
+    finally:
+        for fd in writing:
+            os.close(fd)
+        stdout, stderr = streams.result()
+    status = exit_status(manager, unit)
+    if status is None or status >= _FORBIDDEN:
+        raise _no_check(plan, failure_reason(manager, unit))
+    return Completed(status, stdout.decode(errors="replace"), stderr.decode(errors="replace"))
+
+
+def _properties(
+    manager: Manager, plan: Plan, command: Sequence[str], streams: Sequence[int]
+) -> list[Property]:
+    """Those of the dataflow's unit, for a command; the unit is gone when this client is."""
+    properties, _ = plan_properties(plan, manager)
+    kept = {key: one for key, one in properties.items() if not key.startswith(_OF_RUNNERS)}
+    kept |= typed(
+        Type="oneshot",
+        TimeoutStartSec=int(DORA_SECONDS) * SECOND,
+    )
+    for key in ("StandardOutput", "StandardError"):
+        del kept[key]
+    if binds := kept.pop("BindPaths", None):
+        # The directory of the cell is there when it runs, and not ours if one of that name does.
+        cell = str(plan.scope.cell_directory(plan.options.name))
+        others = tuple(one for one in binds.value if one[0] != cell)
+        kept |= {"BindPaths": binds._replace(value=others)} if others else {}
+    stdout, stderr = streams
+    # systemd 252 cannot read ExecStartEx back at a reload, and "$$" is "$" in all of them.
+    words = tuple(word.replace("$", "$$") for word in command)
+    return [
+        *kept.values(),
+        ("ExecStart", "a(sasb)", ((command[0], words, False),)),
+        ("StandardOutputFileDescriptor", "h", stdout),
+        ("StandardErrorFileDescriptor", "h", stderr),
+        ("CollectMode", "s", "inactive-or-failed"),
+        ("AddRef", "b", True),
+    ]
+
+
+def _no_check(plan: Plan, reason: str) -> DoraSystemdError:
+    return DoraSystemdError(f"cannot check {shown(plan.options.dataflow)}: {reason}")

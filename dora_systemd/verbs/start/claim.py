@@ -1,0 +1,114 @@
+"""Whether a name is free for a dataflow that is to be started, and what is made of an ended one."""
+
+from dataclasses import replace
+
+from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.host.unit_files import remove_changes, remove_unit_file
+from dora_systemd.decisions.properties.assignments import Properties
+from dora_systemd.decisions.unit.file import persistent_unit, says_the_same
+from dora_systemd.decisions.unit.properties import format_unit
+from dora_systemd.decisions.views.dataflows import local_time
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.scope import Scope
+from dora_systemd.verbs.facts.cells import Cell, read_cell
+from dora_systemd.verbs.start.enable import (
+    BootUnit,
+    boot_target,
+    drop_unit_files,
+    install_unit_file,
+    read_boot_unit,
+    release_transient,
+    wait_until_forgotten,
+)
+from dora_systemd.verbs.start.plan import Plan
+
+
+def require_free_name(manager: Manager, scope: Scope, unit: str) -> BootUnit:
+    """Make sure that nothing runs as `unit`: an ended transient unit of that name is forgotten.
+
+    What is returned is its unit file, if it has one. Raises DoraSystemdError (NAME_IN_USE), which
+    says what runs there.
+    """
+    cell = read_cell(manager, unit)
+    if cell is not None and cell.is_up:
+        raise _in_use(manager, cell)
+    state = manager.read(unit, ["LoadState", "Transient"])
+    if cell is None and state["LoadState"] != "not-found":
+        raise DoraSystemdError(
+            f"cannot start {unit}: a unit of that name already exists",
+            f"see systemctl {scope.flag} cat {unit}; choose another --name",
+            ExitCode.NAME_IN_USE,
+        )
+    boot = read_boot_unit(manager, scope, unit)
+    if state["Transient"]:
+        _forget(manager, boot)
+    return boot
+
+
+def refuse_unit_file(boot: BootUnit) -> None:
+    """Raise DoraSystemdError (NAME_IN_USE) where a boot starts a dataflow of that name."""
+    if boot.is_enabled:
+        raise DoraSystemdError(
+            f"cannot use the name of {boot.unit}: it is enabled",
+            "choose another --name",
+            ExitCode.NAME_IN_USE,
+        )
+
+
+def with_known_uuid(plan: Plan, boot: BootUnit) -> Plan:
+    """The plan, with the UUID that the enabled dataflow has if it is of the same file."""
+    known = boot.options
+    if not boot.is_enabled or known is None or known.dataflow != plan.options.dataflow:
+        return plan
+    return replace(plan, options=plan.options._replace(uuid=known.uuid))
+
+
+def place_unit_file(
+    manager: Manager, plan: Plan, properties: Properties, boot: BootUnit, want_boot: bool
+) -> bool:
+    """Whether the plan is to be started from a unit file, which is there then.
+
+    want_boot: write it, whatever is there. Raises DoraSystemdError (NAME_IN_USE) if the dataflow is
+    enabled with other settings.
+    """
+    scope = plan.scope
+    target = boot_target(manager, scope)
+    text = persistent_unit([format_unit(properties)], plan.options, scope.is_user, target)
+    if want_boot:
+        install_unit_file(manager, boot, text)
+        remove_changes(boot.path)
+        remove_unit_file(boot.runtime)
+        manager.reload()
+        return True
+    if boot.text is not None and boot.is_enabled:
+        if not says_the_same(text, boot.text):
+            raise _differs(plan.options.name, boot)
+        return True
+    drop_unit_files(manager, boot)
+    return False
+
+
+def _forget(manager: Manager, boot: BootUnit) -> None:
+    manager.reset_failed(boot.unit)
+    if boot.is_enabled:
+        release_transient(manager, boot)
+    else:
+        wait_until_forgotten(manager, boot.unit)
+
+
+def _in_use(manager: Manager, cell: Cell) -> DoraSystemdError:
+    since = manager.read(cell.unit, ["InactiveExitTimestamp"])["InactiveExitTimestamp"]
+    return DoraSystemdError(
+        f"cannot start {cell.name}: dataflow {cell.uuid} of that name runs since "
+        f"{local_time(since)} from {cell.options.dataflow}",
+        f"doractl stop {cell.name}, or choose another --name",
+        ExitCode.NAME_IN_USE,
+    )
+
+
+def _differs(name: str, boot: BootUnit) -> DoraSystemdError:
+    return DoraSystemdError(
+        f"cannot start {name}: it is enabled with other settings, in {boot.path}",
+        f"doractl restart {name} starts that one, doractl start --enable replaces it",
+        ExitCode.NAME_IN_USE,
+    )

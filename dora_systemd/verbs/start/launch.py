@@ -1,0 +1,46 @@
+"""From what was asked for to a unit that starts: the steps that every way of starting shares."""
+
+from dataclasses import dataclass
+
+from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.decisions.properties.assignments import Properties
+from dora_systemd.names import unit_name
+from dora_systemd.scope import Scope
+from dora_systemd.verbs.start.check import check_plan
+from dora_systemd.verbs.start.claim import place_unit_file, require_free_name, with_known_uuid
+from dora_systemd.verbs.start.job import StageObserver, Started, start_plan, start_unit_file
+from dora_systemd.verbs.start.plan import Plan, StartRequest, make_plan, request_name
+from dora_systemd.verbs.start.unit import plan_properties
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A dataflow whose name is free. properties: of a transient unit; None: it has a unit file."""
+
+    plan: Plan
+    properties: Properties | None
+    warnings: tuple[str, ...]
+
+
+def claim(manager: Manager, scope: Scope, request: StartRequest, want_boot: bool = False) -> Claim:
+    """Check what is asked for and prepare its unit. want_boot: as a unit file that a boot starts.
+
+    Raises DoraSystemdError; nothing is changed then.
+    """
+    boot = require_free_name(manager, scope, unit_name(request_name(request)))
+    plan = with_known_uuid(make_plan(scope, request), boot)
+    properties, warnings = plan_properties(plan, manager)
+    if want_boot:
+        # Its unit file is there before its runner can refuse it.
+        check_plan(lambda: manager, plan)
+    has_file = place_unit_file(manager, plan, properties, boot, want_boot)
+    return Claim(plan, None if has_file else properties, tuple(warnings))
+
+
+def start_claim(
+    manager: Manager, claim: Claim, on_stage: StageObserver | None, wait: bool
+) -> Started:
+    """Start it; raises DoraSystemdError as start_plan does."""
+    if claim.properties is None:
+        return start_unit_file(manager, claim.plan, on_stage, wait)
+    return start_plan(manager, claim.plan, list(claim.properties.values()), on_stage, wait)

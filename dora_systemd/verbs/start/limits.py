@@ -1,0 +1,51 @@
+"""Whether the limits of a dataflow can be kept on this machine."""
+
+from pathlib import Path
+
+from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.cgroup import groups as cgroup
+from dora_systemd.adapters.host.machine import read_machine
+from dora_systemd.decisions.cell.limits import BY_KEY
+from dora_systemd.decisions.properties.assignments import Properties
+from dora_systemd.decisions.settings.limit_checks import (
+    check_controllers,
+    needed_controllers,
+    size_warnings,
+)
+from dora_systemd.decisions.settings.limits import DEVICE, NICE
+from dora_systemd.verbs.start.plan import Plan
+
+
+def check_limits(manager: Manager, plan: Plan, properties: Properties) -> tuple[str, ...]:
+    """Warnings about limits that go too far, and about devices that are not there.
+
+    Raises DoraSystemdError (NO_SYSTEMD) for a limit that nothing would hold up.
+    """
+    nodes = plan.options.node_limits
+    needed = needed_controllers(properties, nodes)
+    if needed:
+        available = cgroup.read_controllers(cgroup.group_path(manager.control_group()))
+        check_controllers(needed, available, plan.scope.is_user)
+    values = {limit.word: plan.settings.values[key] for key, limit in BY_KEY.items()}
+    sizes = size_warnings(values, nodes, read_machine())
+    return (*sizes, *_missing_devices(plan), *_powerless(plan))
+
+
+def _powerless(plan: Plan) -> list[str]:
+    """What a user's manager takes and cannot do."""
+    if not plan.scope.is_user:
+        return []
+    nice = plan.settings[NICE]
+    warnings = ["devices cannot be closed in user scope"] if plan.settings[DEVICE] else []
+    if nice is not None and nice < 0:
+        warnings.append(f"the nice value {nice} needs LimitNICE= of the user's manager")
+    return warnings
+
+
+def _missing_devices(plan: Plan) -> list[str]:
+    paths = (device.partition(" ")[0] for device in plan.settings[DEVICE])
+    return [
+        f"there is no device {path}"
+        for path in paths
+        if path.startswith("/") and not Path(path).exists()
+    ]

@@ -1,0 +1,51 @@
+"""Whether a user's manager runs without the user, as a boot needs it, see loginctl(1)."""
+
+import pwd
+
+from dora_systemd.adapters.host.process import run_command
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.scope import Scope
+
+_SECONDS = 20.0
+_LOGINCTL = ("loginctl", "--no-ask-password")
+
+
+def is_lingering(scope: Scope) -> bool | None:
+    """Whether the manager of the scope's user is started at boot; None: logind does not say."""
+    command = (*_LOGINCTL, "show-user", "--property=Linger", "--value", str(scope.uid))
+    try:
+        answer = run_command(command, _SECONDS).stdout.strip()
+    except DoraSystemdError:
+        return None
+    return {"yes": True, "no": False}.get(answer)
+
+
+def linger_command(scope: Scope) -> str:
+    """What root has to run so that it is."""
+    return f"loginctl enable-linger {_user_name(scope)}"
+
+
+def ensure_linger(scope: Scope) -> str:
+    """Have the user's manager started at boot; what there is to say about it, or "".
+
+    polkit lets users do that for themselves on most machines.
+    """
+    if not scope.is_user or is_lingering(scope):
+        return ""
+    try:
+        done = run_command((*_LOGINCTL, "enable-linger", str(scope.uid)), _SECONDS)
+    except DoraSystemdError:
+        done = None
+    if done is not None and done.status == 0:
+        return f"lingering is now on for {_user_name(scope)}: dataflows start at boot, not at login"
+    return (
+        f"it will start when {_user_name(scope)} logs in, not at boot; "
+        f"for that, as root: {linger_command(scope)}"
+    )
+
+
+def _user_name(scope: Scope) -> str:
+    try:
+        return pwd.getpwuid(scope.uid).pw_name
+    except KeyError:
+        return str(scope.uid)

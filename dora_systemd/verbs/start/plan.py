@@ -1,0 +1,170 @@
+"""What `doractl start` is going to do, found out before systemd hears of it.
+
+What dora and the programs of the dataflow have to say is found out in the cell:
+see adapters/dora/check.py.
+"""
+
+import os
+import pwd
+import uuid
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from dora_systemd.adapters.dora.preparation import Prepared, check_named_nodes
+from dora_systemd.adapters.host.files import decoded, parse_yaml, read_text
+from dora_systemd.decisions.cell.environment import parse_environment_file, unit_environment
+from dora_systemd.decisions.cell.launch import LaunchPlan, launch_descriptor
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
+from dora_systemd.decisions.descriptor.nodes import UNEXPANDED
+from dora_systemd.decisions.properties.sandbox import Sandbox
+from dora_systemd.decisions.settings.limit_checks import settings_node_limits
+from dora_systemd.decisions.settings.line_rates import log_rates
+from dora_systemd.decisions.settings.reload_rules import hot_reload
+from dora_systemd.decisions.settings.resolve import Settings
+from dora_systemd.decisions.settings.restart_policies import node_policies, restart_policy
+from dora_systemd.decisions.settings.restarts import START_TIMEOUT
+from dora_systemd.decisions.settings.table import (
+    ALLOW_SHELL_NODES,
+    DEBUG,
+    ENV,
+    ENV_FILE,
+    EXIT_WHEN_NODES_FINISH,
+    GRACE_DURATION,
+    USER,
+    UV,
+    WORKING_DIRECTORY,
+)
+from dora_systemd.names import name_from_path, parse_name, unit_name
+from dora_systemd.scope import Scope
+from dora_systemd.trust.paths import read_file
+from dora_systemd.trust.sight import sight_of
+from dora_systemd.verbs.start.account import account_of, choose_user
+from dora_systemd.verbs.start.credentials import check_credentials, credential_files
+from dora_systemd.verbs.start.places import Look
+from dora_systemd.verbs.start.sandbox import make_sandbox
+from dora_systemd.verbs.start.settings import read_settings
+
+DEFAULT_FILE = "dataflow.yml"
+
+
+@dataclass(frozen=True)
+class StartRequest:
+    """What was asked for. flags: raw values by setting name, see resolve_settings.
+
+    environment: the caller's variables. attached: the dataflow ends with the caller.
+    """
+
+    dataflow: str
+    name: str | None = None
+    flags: Mapping[str, object] = field(default_factory=dict)
+    environment: Mapping[str, str] = field(default_factory=dict)
+    attached: bool = False
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A checked request.
+
+    user: for User=, None in user scope. environment: all of Environment=.
+    """
+
+    scope: Scope
+    options: RunnerOptions
+    settings: Settings
+    user: pwd.struct_passwd | None
+    environment: Mapping[str, str]
+    sandbox: Sandbox = field(default_factory=Sandbox)
+
+    @property
+    def unit(self) -> str:
+        """The unit's name."""
+        return unit_name(self.options.name)
+
+
+def request_name(request: StartRequest) -> str:
+    """The name that the dataflow gets. Raises DoraSystemdError (USAGE)."""
+    if request.name is not None:
+        return parse_name(request.name)
+    return name_from_path(str(Path(request.dataflow).absolute()))
+
+
+def make_plan(scope: Scope, request: StartRequest) -> Plan:
+    """Read and check everything that needs no dora; nothing is changed anywhere.
+
+    Raises DoraSystemdError.
+    """
+    path = Path(request.dataflow).absolute()
+    request_name(request)
+    written = read_file(path)
+    dataflow = parse_dataflow(parse_yaml(decoded(written.data, path), path), str(path))
+    settings = read_settings(scope, path, request.flags, request.environment)
+    given = settings[WORKING_DIRECTORY]
+    directory = path.parent if given is None else Path(given).absolute()
+    user = choose_user(scope, settings[USER], written.place, str(directory))
+    with sight_of(account_of(user)) as sight:
+        look = Look(sight, settings, user)
+        return _make_plan(_Found(scope, request, dataflow, settings, user), str(directory), look)
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What was read, and whom it is for."""
+
+    scope: Scope
+    request: StartRequest
+    dataflow: Dataflow
+    settings: Settings
+    user: pwd.struct_passwd | None
+
+
+def _make_plan(found: _Found, directory: str, look: Look) -> Plan:
+    request, settings, path = found.request, found.settings, found.dataflow.source
+    venv = look.find_venv(path, request.environment)
+    search_path = request.environment.get("PATH") or os.defpath
+    variables = _variables(settings, look)
+    look.check_reach(path, directory)
+    options = RunnerOptions(
+        name=request_name(request),
+        uuid=str(uuid.uuid4()),
+        dataflow=path,
+        working_directory=directory,
+        dora=look.find_dora(venv, search_path),
+        venv=venv,
+        uv=settings[UV],
+        debug=settings[DEBUG],
+        allow_shell_nodes=settings[ALLOW_SHELL_NODES],
+        grace=settings[GRACE_DURATION],
+        attached=request.attached,
+        exit_when_nodes_finish=settings[EXIT_WHEN_NODES_FINISH],
+        env_keys=tuple(variables),
+        log_rates=log_rates(settings),
+        node_limits=settings_node_limits(settings),
+        restart=restart_policy(settings),
+        node_restarts=node_policies(settings),
+        start_timeout=settings[START_TIMEOUT],
+        reload=hot_reload(settings, directory),
+    )
+    environment = unit_environment(search_path, venv, variables)
+    check_credentials(found.scope, credential_files(settings))
+    launch = LaunchPlan(
+        options, "", environment["PATH"], look.sight.exists, look.read_session(path)
+    )
+    if not any(node.kind in UNEXPANDED for node in found.dataflow.nodes):
+        # The runner does it again; what can be refused without a unit needs none.
+        check_named_nodes(options, found.dataflow)
+        launch_descriptor(found.dataflow, launch)
+    prepared = Prepared(found.dataflow, launch, {})
+    sandbox = make_sandbox(found.scope, settings, found.user, prepared, look.sight)
+    return Plan(found.scope, options, settings, found.user, environment, sandbox)
+
+
+def _variables(settings: Settings, look: Look) -> dict[str, str]:
+    """What --env and --env-file set; --env wins, and a later file."""
+    variables: dict[str, str] = {}
+    for file in settings[ENV_FILE]:
+        text = look.read_lent(file) if file in settings.lent else read_text(Path(file))
+        variables |= parse_environment_file(text, file)
+    given = settings[ENV]
+    return {**variables, **given}

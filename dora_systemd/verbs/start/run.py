@@ -1,0 +1,128 @@
+"""`doractl run`: a dataflow that ends with the terminal it was started in."""
+
+import os
+import select
+import signal
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from dora_systemd.adapters.bus.manager import Manager, Property
+from dora_systemd.verbs.start.job import StageObserver
+
+_POLL_SECONDS = 0.5
+_CLD_EXITED = 1
+_ENDED = frozenset({"inactive", "failed"})
+_STATE = ("ActiveState", "Job", "ExecMainCode", "ExecMainStatus", "Result")
+
+
+class LogSource(Protocol):
+    """Where the lines of the dataflow come from."""
+
+    def fileno(self) -> int:
+        """For poll(2): readable when there may be lines."""
+
+    def print_new(self) -> None:
+        """Print the lines that have come since the last look."""
+
+    def finish(self) -> None:
+        """Print all lines up to the end of the unit, which has happened."""
+
+
+@dataclass(frozen=True)
+class Pipe:
+    """The pipe whose read end is the runner's standard input: its end of file means stop."""
+
+    read: int
+    write: int
+
+
+@contextmanager
+def life_line() -> Iterator[Pipe]:
+    """A pipe that only this process holds open: however it dies, the dataflow learns of it."""
+    read, write = os.pipe2(os.O_CLOEXEC)
+    try:
+        yield Pipe(read, write)
+    finally:
+        os.close(read)
+        os.close(write)
+
+
+def attached_properties(pipe: Pipe) -> list[Property]:
+    """What an attached unit has on top, see systemd.service(5) and org.freedesktop.systemd1(5).
+
+    It is not kept when it failed, but until we have read how it ended.
+    """
+    return [
+        ("StandardInputFileDescriptor", "h", pipe.read),
+        ("CollectMode", "s", "inactive-or-failed"),
+        ("AddRef", "b", True),
+    ]
+
+
+def follow_unit(
+    manager: Manager, unit: str, logs: LogSource, on_stage: StageObserver | None
+) -> int:
+    """Print the logs of a started unit until it has ended; its exit status.
+
+    The first Ctrl+C stops it gracefully, the second kills it.
+    """
+    interrupts = 0
+    with _interrupts() as wakeup:
+        poll = select.poll()
+        for source in (manager.fileno(), logs.fileno(), wakeup):
+            poll.register(source, select.POLLIN)
+        while True:
+            ready = {fd for fd, _ in poll.poll(_POLL_SECONDS * 1000)}
+            logs.print_new()
+            if wakeup in ready:
+                interrupts += len(os.read(wakeup, 16))
+                _interrupt(manager, unit, interrupts)
+            changed = manager.changes(unit)
+            _tell(changed, on_stage)
+            # A flood of lines is no reason to ask systemd again and again.
+            status = None if ready and not changed else _exit_status(manager, unit)
+            if status is not None:
+                logs.finish()
+                return status
+
+
+def _tell(changed: Sequence[Mapping[str, Any]], on_stage: StageObserver | None) -> None:
+    for changes in changed:
+        if on_stage and changes.get("StatusText"):
+            on_stage(changes["StatusText"])
+
+
+def _interrupt(manager: Manager, unit: str, count: int) -> None:
+    if count == 1:
+        manager.queue_job("StopUnit", unit)
+    else:
+        manager.kill(unit, signal.SIGKILL)
+
+
+def _exit_status(manager: Manager, unit: str) -> int | None:
+    """The exit status of a unit that has ended; of a killed one 128 + the signal, as in a shell."""
+    state = manager.read(unit, _STATE)
+    if state["ActiveState"] not in _ENDED or state["Job"][0]:
+        return None
+    status: int = state["ExecMainStatus"]
+    if state["ExecMainCode"] != _CLD_EXITED and status:
+        return 128 + status
+    # Killed in time or never executed: the main process itself has no exit status to tell.
+    return status or int(state["Result"] != "success")
+
+
+@contextmanager
+def _interrupts() -> Iterator[int]:
+    """A descriptor that receives a byte for every SIGINT, which interrupts nothing else."""
+    read, write = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
+    before = signal.signal(signal.SIGINT, lambda *_: None)
+    wakeup = signal.set_wakeup_fd(write)
+    try:
+        yield read
+    finally:
+        signal.set_wakeup_fd(wakeup)
+        signal.signal(signal.SIGINT, before)
+        os.close(read)
+        os.close(write)

@@ -1,0 +1,159 @@
+"""The sandbox of a plan: which paths have to stay open, and what a scope cannot keep."""
+
+import pwd
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from dora_systemd.adapters.dora.preparation import PACKAGE, Prepared
+from dora_systemd.adapters.host.files import absolute_path
+from dora_systemd.decisions.cell.launch import python_of
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.properties.sandbox import Sandbox, loose_paths, odd_paths, widened_paths
+from dora_systemd.decisions.settings.limits import DEVICE, REALTIME
+from dora_systemd.decisions.settings.resolve import Settings
+from dora_systemd.decisions.settings.sandbox import NETWORK, SANDBOX, WRITABLE
+from dora_systemd.decisions.settings.table import PROPERTY
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.scope import Scope
+from dora_systemd.trust.paths import firm_part
+from dora_systemd.trust.programs import account_from
+from dora_systemd.trust.sight import OwnSight, Sight
+from dora_systemd.values import shown
+from dora_systemd.verbs.facts.nodes import named_places
+
+_MAX_USER_NAMESPACES = Path("/proc/sys/user/max_user_namespaces")
+_IDENTITY = 65536
+_CAPABILITIES = ("AmbientCapabilities", "CapabilityBoundingSet")
+_UV_PLACES = (".cache/uv", ".local/share/uv")
+"""What uv writes below the home directory, see `uv cache dir` and `uv python dir`."""
+
+
+def make_sandbox(
+    scope: Scope,
+    settings: Settings,
+    user: pwd.struct_passwd | None,
+    prepared: Prepared,
+    sight: Sight | None = None,
+) -> Sandbox:
+    """The sandbox that the settings ask for. Raises DoraSystemdError for a path that is not there.
+
+    user: of the nodes, None in user scope. sight: of that user; None: the caller's.
+    """
+    sight = sight or OwnSight()
+    options = prepared.plan.options
+    given = [_checked(path, sight) for path in settings[WRITABLE]]
+    needed = tuple(dict.fromkeys(_existing(_needed(prepared, sight), sight)))
+    writable = (*given, *_existing(_written_by_uv(options, user), sight))
+    return Sandbox(
+        level=settings[SANDBOX],
+        network=settings[NETWORK],
+        is_user=scope.is_user,
+        is_root=user is not None and user.pw_uid == 0,
+        has_devices=bool(settings[DEVICE]) or _names(settings, "DeviceAllow"),
+        is_realtime=settings[REALTIME] is not None,
+        # In a user namespace capabilities would count for nothing.
+        has_identity=_has_identity(user) and not _names(settings, *_CAPABILITIES),
+        needed=needed,
+        writable=writable,
+        firm={} if scope.is_user else _firm((*needed, *writable), user),
+        directory=str(scope.cell_directory(options.name)),
+    )
+
+
+def _firm(paths: Sequence[str], user: pwd.struct_passwd | None) -> dict[str, str]:
+    """Of each path what systemd may mount for `user`, whose own word on what is there is no proof.
+
+    A program of that user can trace the child that is asked, and have it say anything.
+    """
+    account = None if user is None else account_from(user)
+    uid, groups = (0, ()) if account is None else (account.uid, (account.gid, *account.groups))
+    return {path: firm_part(path, uid, groups) for path in paths}
+
+
+def sandbox_warnings(sandbox: Sandbox) -> Iterator[str]:
+    """What a user's manager takes and cannot keep, and what the name of a path keeps open."""
+    for path in odd_paths(sandbox):
+        yield f"the sandbox cannot hide what is around {shown(path)}, whose name no mount can have"
+    for place, path in {place: path for path, place in loose_paths(sandbox)}.items():
+        yield f"the sandbox cannot hide {place}: users other than root can replace {shown(path)}"
+    for place, path in {place: path for path, place in widened_paths(sandbox)}.items():
+        yield f"the nodes may write all of {shown(place)}: its user could replace {shown(path)}"
+    if not sandbox.is_user:
+        return
+    if sandbox.level == "strict":
+        yield "the sandbox protects no files in user scope, strict or not"
+    if sandbox.network == "loopback":
+        yield "the network cannot be limited to the loopback interface in user scope"
+    if sandbox.network == "private":
+        yield "a private network in user scope needs user namespaces, see systemd.exec(5)"
+
+
+def _has_identity(user: pwd.struct_passwd | None) -> bool:
+    """Whether `user` can be in a user namespace with the first 65536 ids, and there can be one.
+
+    A directory service gives higher ones.
+    """
+    is_known = user is None or max(user.pw_uid, user.pw_gid) < _IDENTITY
+    return is_known and _offers_identity()
+
+
+def _offers_identity() -> bool:
+    """Whether this machine can make one: a kernel may refuse any, a container may have fewer ids.
+
+    See namespaces(7) and user_namespaces(7).
+    """
+    try:
+        has_all = all(_maps_identity(Path("/proc/self", one)) for one in ("uid_map", "gid_map"))
+        return has_all and int(_MAX_USER_NAMESPACES.read_text()) > 0
+    except OSError:
+        return False
+
+
+def _maps_identity(path: Path) -> bool:
+    rows = ([int(number) for number in line.split()] for line in path.read_text().splitlines())
+    return any(inside == 0 and count >= _IDENTITY for inside, _, count in rows)
+
+
+def _names(settings: Settings, *keys: str) -> bool:
+    """Whether one of these properties is given."""
+    return any(one.partition("=")[0] in keys for one in settings[PROPERTY])
+
+
+def _checked(path: str, sight: Sight) -> str:
+    absolute = str(Path(path).absolute())
+    if not sight.exists(absolute):
+        raise DoraSystemdError(
+            f"cannot let the nodes write {shown(absolute)}: there is no such file",
+            f"mkdir -p {absolute}, or correct --writable",
+            ExitCode.BAD_INPUT,
+        )
+    return absolute_path(absolute)
+
+
+def _existing(paths: Iterator[Path], sight: Sight) -> Iterator[str]:
+    yield from (absolute_path(str(path)) for path in paths if sight.exists(str(path)))
+
+
+def _needed(prepared: Prepared, sight: Sight) -> Iterator[Path]:
+    """Where the dataflow, its programs and their interpreters are, and we ourselves."""
+    options = prepared.plan.options
+    yield Path(options.dataflow).parent
+    yield Path(options.working_directory)
+    yield from (Path(sys.prefix), Path(sys.base_prefix), PACKAGE.parent)
+    for program in (options.dora, python_of(prepared.plan)):
+        # A virtual environment has links to the Python that it is made from.
+        yield from (_prefix(Path(program)), _prefix(Path(sight.real(program))))
+    yield from named_places(prepared.dataflow, sight)
+    session = prepared.plan.session
+    yield from map(Path, (*session.directories.values(), *session.envs.values()))
+
+
+def _prefix(program: Path) -> Path:
+    return program.parent.parent if program.parent.name == "bin" else program.parent
+
+
+def _written_by_uv(options: RunnerOptions, user: pwd.struct_passwd | None) -> Iterator[Path]:
+    if options.uv and user is not None:
+        yield Path(options.working_directory)
+        yield from (Path(user.pw_dir, place) for place in _UV_PLACES)

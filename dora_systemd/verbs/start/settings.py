@@ -1,0 +1,87 @@
+"""The settings of a dataflow that is to be started: which files there are, and whom to believe."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from dora_systemd.adapters.host.files import decoded, parse_yaml
+from dora_systemd.decisions.settings.resolve import Settings, resolve_settings
+from dora_systemd.decisions.settings.table import ENV_FILE, SETTINGS
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import settings_path
+from dora_systemd.scope import Scope
+from dora_systemd.trust.paths import Place, exists, read_file
+from dora_systemd.values import shown
+
+SYSTEM_FILE = Path("/etc/dora-systemd/config.yml")
+USER_FILE = Path("dora-systemd/config.yml")
+
+
+@dataclass(frozen=True)
+class _Read:
+    """A settings file that was read, and where from."""
+
+    path: Path
+    place: Place
+    document: object
+
+    @property
+    def is_roots(self) -> bool:
+        """Whether root wrote it and put it there."""
+        return self.place.uid == 0 and not self.place.borrowed
+
+    def words(self) -> Mapping[object, object]:
+        """Its keys."""
+        return self.document if isinstance(self.document, dict) else {}
+
+
+def settings_files(dataflow: Path, environment: Mapping[str, str]) -> list[Path]:
+    """The settings files that may exist, the most important first, see design."""
+    home = environment.get("HOME", "")
+    config = environment.get("XDG_CONFIG_HOME", "") or (f"{home}/.config" if home else "")
+    beside = Path(settings_path(str(dataflow)))
+    user = [Path(config) / USER_FILE] if config.startswith("/") else []
+    return [beside, *user, SYSTEM_FILE]
+
+
+def read_settings(
+    scope: Scope, dataflow: Path, flags: Mapping[str, object], environment: Mapping[str, str]
+) -> Settings:
+    """The settings from flags, variables and files. Raises DoraSystemdError.
+
+    dataflow: its absolute path. In system scope somebody else's file is believed only in what is
+    his to say, and the environment files that it names are `lent`.
+    """
+    found = [_read(path) for path in settings_files(dataflow, environment) if exists(path)]
+    documents = [(str(one.path), one.document) for one in found]
+    others = [] if scope.is_user else [one for one in found if not one.is_roots]
+    for one in others:
+        _check_trust(one)
+    settings = resolve_settings(flags, environment, documents, SETTINGS)
+    if not any(ENV_FILE.name in one.words() for one in others):
+        return settings
+    documents = [(str(one.path), one.document) for one in found if one not in others]
+    roots = resolve_settings(flags, environment, documents, SETTINGS)
+    named, by_root = settings[ENV_FILE], roots[ENV_FILE]
+    return replace(settings, lent=frozenset(one for one in named if one not in by_root))
+
+
+def _read(path: Path) -> _Read:
+    text = read_file(path)
+    document = parse_yaml(decoded(text.data, path), path, allow_empty=True)
+    return _Read(path, text.place, document)
+
+
+def _check_trust(read: _Read) -> None:
+    """Somebody else's file must not have root read, run or give something."""
+    only = {setting.name: setting for setting in SETTINGS if setting.root_only}
+    dangerous = [only[key] for key in read.words() if key in only]
+    if dangerous:
+        setting, path = dangerous[0], shown(str(read.path))
+        is_his = read.place.uid != 0
+        reason = "the file is not root's" if is_his else read.place.borrowed
+        raise DoraSystemdError(
+            f"cannot use {path}: {setting.name} is set there, and {reason}",
+            f"give {setting.flags[0]} on the command line, or set it in {SYSTEM_FILE}",
+            ExitCode.NO_PERMISSION,
+        )

@@ -1,0 +1,54 @@
+"""The unit of a plan: its properties for systemd, and the same as text for people."""
+
+import sys
+
+from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.host.process import version_numbers
+from dora_systemd.decisions.properties.kinds import Property
+from dora_systemd.decisions.settings.reload_rules import reload_warnings
+from dora_systemd.decisions.settings.restart_policies import restart_warnings
+from dora_systemd.decisions.unit.file import persistent_unit
+from dora_systemd.decisions.unit.properties import UnitContext, format_unit, unit_properties
+from dora_systemd.decisions.unit.versions import MIN_VERSION, drop_unsupported
+from dora_systemd.verbs.start.credentials import credential_files
+from dora_systemd.verbs.start.limits import check_limits
+from dora_systemd.verbs.start.plan import Plan
+from dora_systemd.verbs.start.sandbox import sandbox_warnings
+from dora_systemd.verbs.start.watch import watch_warnings
+
+
+def plan_properties(plan: Plan, manager: Manager) -> tuple[dict[str, Property], tuple[str, ...]]:
+    """All properties of the unit that this systemd takes, by slot, and warnings.
+
+    They are about the properties that it does not take and limits beyond the machine's own. Raises
+    DoraSystemdError.
+    """
+    number = next(iter(version_numbers(manager.version())), MIN_VERSION)
+    properties, warnings = drop_unsupported(_properties(plan), number)
+    warnings = (*warnings, *restart_warnings(plan.settings), *reload_warnings(plan.settings))
+    warnings = (*warnings, *watch_warnings(plan), *sandbox_warnings(plan.sandbox))
+    return properties, (*warnings, *check_limits(manager, plan, properties))
+
+
+def format_plan(plan: Plan, target: str | None = None) -> str:
+    """The unit as the text of a unit file, with its name and what it is made from on top.
+
+    target: what would start it at boot.
+    """
+    head = f"# {plan.unit}\n# source: {plan.options.dataflow}\n"
+    text = format_unit(_properties(plan))
+    if target is not None:
+        text = persistent_unit([text], plan.options, plan.scope.is_user, target)
+    return head + text
+
+
+def _properties(plan: Plan) -> dict[str, Property]:
+    context = UnitContext(
+        python=sys.executable,
+        is_user=plan.scope.is_user,
+        user=None if plan.user is None else plan.user.pw_name,
+        environment=plan.environment,
+        credentials=credential_files(plan.settings),
+        sandbox=plan.sandbox,
+    )
+    return dict(unit_properties(plan.options, context, plan.settings))

@@ -1,0 +1,37 @@
+"""What `doractl start --hot-reload` says about the files that are going to be watched."""
+
+import os
+from collections.abc import Iterator
+
+from dora_systemd.values import quoted
+from dora_systemd.verbs.start.plan import Plan
+
+
+def watched_patterns(plan: Plan) -> tuple[str, ...]:
+    """The patterns of the files that mean a reload, none if hot reload is off."""
+    from dora_systemd.decisions.reload.watch_rules import DEFAULT_WATCH
+
+    if not plan.options.hot_reload:
+        return ()
+    return plan.options.reload.watch or DEFAULT_WATCH
+
+
+def watch_warnings(plan: Plan) -> Iterator[str]:
+    """One for each pattern that was given and fits no file.
+
+    Only the owner of the files walks through them: as root, doractl would open somebody else's.
+    """
+    if not plan.options.hot_reload or not plan.options.reload.watch or _is_anothers(plan):
+        return
+    # Only who gives patterns pays for a walk through the files.
+    from dora_systemd.adapters.host.watch import watch_rules, watched_files
+    from dora_systemd.decisions.reload.watch_rules import unmatched_patterns
+
+    rules = watch_rules(plan.options)
+    found = [path for path, _ in watched_files(rules)]
+    for pattern in unmatched_patterns(rules, found):
+        yield f"no file below {rules.root} fits --watch {quoted(pattern)}"
+
+
+def _is_anothers(plan: Plan) -> bool:
+    return plan.user is not None and plan.user.pw_uid != os.geteuid()

@@ -1,0 +1,64 @@
+"""`doractl top`: looks at the dataflows, each compared with the one before it."""
+
+import time
+from collections.abc import Mapping, Sequence
+
+from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.decisions.resources.usage import Strain, waits
+from dora_systemd.decisions.views.top import Look, TopEntry
+from dora_systemd.scope import Scope
+from dora_systemd.verbs.facts.cells import Cell, read_cells, select_cell
+from dora_systemd.verbs.facts.list import Reading, read_dataflow, row_of
+from dora_systemd.verbs.facts.snapshot import read_strains
+from dora_systemd.verbs.node import require_running
+
+_Seen = tuple[Reading, Mapping[str, Strain]]
+
+
+class Top:
+    """Looks at some dataflows of a manager, or at all that run.
+
+    Raises DoraSystemdError: NOT_FOUND for a selector that fits nothing, USAGE for one that fits
+    several, NOT_RUNNING for a dataflow that is not up.
+    """
+
+    def __init__(self, manager: Manager, scope: Scope, selectors: Sequence[str] = ()) -> None:
+        self._manager = manager
+        self._scope = scope
+        self._before: dict[str, _Seen] = {}
+        cells = read_cells(manager) if selectors else []
+        chosen = [select_cell(cells, selector) for selector in selectors]
+        for cell in chosen:
+            require_running(cell)
+        self._units = frozenset(cell.unit for cell in chosen)
+
+    def look(self) -> Look:
+        """All that runs now; what the numbers are counted from is the last look."""
+        wanted = filter(self._want, read_cells(self._manager))
+        seen = {cell.unit: self._see(cell) for cell in wanted}
+        entries = [_entry(now, self._before.get(unit)) for unit, now in seen.items()]
+        self._before = seen
+        return Look(time.time_ns() // 1000, entries)
+
+    def _want(self, cell: Cell) -> bool:
+        return cell.is_up and (not self._units or cell.unit in self._units)
+
+    def _see(self, cell: Cell) -> _Seen:
+        reading = read_dataflow(self._manager, self._scope, cell)
+        return reading, read_strains(reading)
+
+
+def _entry(now: _Seen, before: _Seen | None) -> TopEntry:
+    reading, strains = now
+    if before is None or not _is_same_run(before[0], reading):
+        return TopEntry(row_of(reading))
+    window = reading.at_us - before[0].at_us
+    shares = {
+        key: waits(before[1].get(key, Strain()), strain, window) for key, strain in strains.items()
+    }
+    return TopEntry(row_of(reading, before[0]), shares)
+
+
+def _is_same_run(one: Reading, other: Reading) -> bool:
+    key = "InactiveExitTimestampMonotonic"
+    return bool(one.usage and other.usage) and one.unit[key] == other.unit[key]

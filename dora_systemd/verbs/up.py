@@ -1,0 +1,135 @@
+"""`doractl up`: opens the port behind which systemd starts the gateway."""
+
+import errno
+import pwd
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from dora_systemd.adapters.bus.manager import JOB_DONE, Manager
+from dora_systemd.adapters.host.loopback import port_error
+from dora_systemd.adapters.host.process_table import (
+    listening_sockets,
+    read_processes,
+    socket_owners,
+)
+from dora_systemd.adapters.host.unit_files import read_unit_file, remove_unit_file, write_unit_file
+from dora_systemd.decisions.gateway.place import ADDRESS, DEFAULT_PORT, SERVICE_UNIT, SOCKET_UNIT
+from dora_systemd.decisions.gateway.port import port_drop_in
+from dora_systemd.decisions.unit.file import BOOT_TARGET
+from dora_systemd.decisions.unit.setup_files import gateway_files
+from dora_systemd.decisions.views.diagnosis import Process
+from dora_systemd.decisions.views.findings import State
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import name_from_unit
+from dora_systemd.scope import Scope
+from dora_systemd.trust.socket_table import listener_uids
+from dora_systemd.verbs.doctor import examine
+from dora_systemd.verbs.facts.enabled import enabled_units, own_directories
+from dora_systemd.verbs.gateway import read_gateway
+from dora_systemd.verbs.setup import text_of
+
+PORT_FILE = f"{SOCKET_UNIT}.d/50-port.conf"
+
+
+def check_machine(reach: Callable[[Scope], Manager], scope: Scope) -> None:
+    """Raise DoraSystemdError for the first thing that `doractl doctor` calls a problem."""
+    for one in examine(reach, scope):
+        if one.state is State.PROBLEM:
+            is_said = one.text.startswith("cannot ")
+            message = one.text if is_said else f"cannot run dataflows here: {one.topic}: {one.text}"
+            raise DoraSystemdError(message, one.remedy)
+
+
+def open_port(manager: Manager, scope: Scope, port: int | None) -> int:
+    """Have systemd listen on `port`, or where the unit says; the port.
+
+    Raises DoraSystemdError; nothing is changed where the port cannot be had.
+    """
+    now = read_gateway(manager)
+    port_file = written_files(manager, scope)[0]
+    wanted = port or (None if port_file.exists() else now.port) or DEFAULT_PORT
+    if not (now.is_up and now.port == wanted):
+        _check_port(wanted)
+    if now.is_up:
+        manager.run_jobs("StopUnit", [SOCKET_UNIT])
+    if _write_units(manager, scope, port):
+        manager.reload()
+    for unit in (SOCKET_UNIT, SERVICE_UNIT):
+        with suppress(DoraSystemdError):
+            manager.reset_failed(unit)
+    result = manager.run_jobs("StartUnit", [SOCKET_UNIT])[SOCKET_UNIT]
+    opened = read_gateway(manager).port
+    if result != JOB_DONE or opened is None:
+        _check_port(opened or wanted)
+        raise DoraSystemdError(
+            f"cannot open port {opened or wanted}: the job of {SOCKET_UNIT} ended with {result}",
+            f"systemctl {scope.flag} status {SOCKET_UNIT}",
+        )
+    return opened
+
+
+def start_boot_target(manager: Manager, scope: Scope) -> list[str]:
+    """Start what a boot starts, unless that has been done; the names of these dataflows."""
+    state = manager.read(BOOT_TARGET, ["LoadState", "ActiveState"])
+    if state["LoadState"] != "loaded" or state["ActiveState"] == "active":
+        return []
+    manager.run_jobs("StartUnit", [BOOT_TARGET])
+    return sorted(filter(None, map(name_from_unit, enabled_units(manager, scope))))
+
+
+def written_files(manager: Manager, scope: Scope) -> list[Path]:
+    """Where `up` puts what it has to write, in the directory that a reboot empties."""
+    place = own_directories(manager, scope)[1]
+    return [place / PORT_FILE, *(place / file.place for file in gateway_files(scope.is_user))]
+
+
+def _write_units(manager: Manager, scope: Scope, port: int | None) -> bool:
+    """Make the files true; whether anything has changed."""
+    port_file, *units = written_files(manager, scope)
+    texts: dict[Path, str | None] = {}
+    facts = manager.read(SOCKET_UNIT, ["LoadState", "FragmentPath"])
+    if facts["LoadState"] != "loaded" or Path(facts["FragmentPath"]) in units:
+        files = gateway_files(scope.is_user)
+        texts |= {path: text_of(file) for path, file in zip(units, files, strict=True)}
+    texts[port_file] = None if port is None else port_drop_in(ADDRESS, port)
+    changed = [path for path, text in texts.items() if read_unit_file(path) != text]
+    for path in changed:
+        text = texts[path]
+        if text is None:
+            remove_unit_file(path)
+        else:
+            write_unit_file(path, text)
+    return bool(changed)
+
+
+def _check_port(port: int) -> None:
+    """Raise DoraSystemdError if nobody can listen there, with who does."""
+    number = port_error(port)
+    if number in (errno.EACCES, errno.EPERM):
+        hint = "only root may open ports below 1024: doractl up --port 53291"
+        raise DoraSystemdError(f"cannot open port {port}", hint, ExitCode.NO_PERMISSION)
+    if number:
+        hint = (
+            f"stop that process, or take another port: doractl up --port {port + 1}, "
+            "or use doractl start, which needs no port at all"
+        )
+        message = f"cannot open port {port}: it is in use by {_holder(port)}"
+        raise DoraSystemdError(message, hint, ExitCode.NAME_IN_USE)
+
+
+def _holder(port: int) -> str:
+    """Who listens there, as far as the kernel tells this user."""
+    owners = socket_owners(listening_sockets(port))
+    named: Sequence[Process] = [one for one in read_processes() if one.pid in owners]
+    if named:
+        return str(named[-1])
+    users = ", ".join(_user(uid) for uid in sorted(listener_uids(port)))
+    return f"a process of {users}" if users else "another process"
+
+
+def _user(uid: int) -> str:
+    try:
+        return pwd.getpwuid(uid).pw_name
+    except KeyError:
+        return f"the user {uid}"

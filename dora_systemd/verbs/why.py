@@ -1,0 +1,150 @@
+"""`doractl why`: gathers what systemd, the journal and the runner's table know of a dataflow."""
+
+from collections.abc import Iterable
+from itertools import islice
+from pathlib import Path
+
+from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.journal.reader import JournalReader, is_volatile
+from dora_systemd.decisions.cell.status import CellStatus
+from dora_systemd.decisions.life import nodes as node_table
+from dora_systemd.decisions.logs.query import scope_matches, story_matches
+from dora_systemd.decisions.views.dataflows import status_word
+from dora_systemd.decisions.why.lives import (
+    SHUTDOWN_MESSAGE,
+    Life,
+    find_lives,
+    parse_happening,
+    plain_text,
+)
+from dora_systemd.decisions.why.postmortem import examine
+from dora_systemd.decisions.why.report import LINES, Report, Subject, Word
+from dora_systemd.decisions.why.verdict import Facts, Verdict
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.names import unit_name
+from dora_systemd.scope import Scope
+from dora_systemd.verbs.facts.budget import restart_budget
+from dora_systemd.verbs.facts.cells import Cell, find_cell, matching_cells, read_cells
+from dora_systemd.verbs.facts.ended import select_ended
+from dora_systemd.verbs.facts.list import look_at_table, read_status
+
+_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+_MOST_RECORDS = 1000
+_MOST_SHUTDOWNS = 20
+_LINES_READ = 4 * LINES
+
+
+def explain(manager: Manager, scope: Scope, selector: str, journal: JournalReader) -> Report:
+    """What became of the dataflow that `selector` means, and why.
+
+    Raises DoraSystemdError: NOT_FOUND, USAGE where several fit.
+    """
+    cell, subject = _select(manager, scope, selector)
+    lives = read_lives(journal, scope, subject)
+    facts = _facts(manager, scope, cell) if cell else Facts(now_boot=_now_boot())
+    shutdowns = _shutdowns(journal)
+    verdict = examine(lives, facts, shutdowns)
+    budget = None
+    if cell and not verdict.is_given_up:
+        budget = restart_budget(manager, scope, cell, read_status(scope, cell))
+    return Report(subject, verdict, _last_words(journal, scope, subject, verdict), budget)
+
+
+def _select(manager: Manager, scope: Scope, selector: str) -> tuple[Cell | None, Subject]:
+    cells = read_cells(manager)
+    if not matching_cells(cells, selector):
+        ended = select_ended(scope, selector)
+        if ended is not None:
+            return _with_file(manager, scope, ended.uuid, ended.name)
+    try:
+        cell = find_cell(manager, selector)
+    except DoraSystemdError as error:
+        if is_volatile():
+            error.hint += "; the journal is volatile: a reboot empties it"
+        raise
+    return cell, _subject(scope, cell)
+
+
+def _with_file(manager: Manager, scope: Scope, uuid: str, name: str) -> tuple[Cell | None, Subject]:
+    """An ended dataflow; an enabled one has a unit file though systemd has not read it."""
+    try:
+        cell = find_cell(manager, name)
+    except DoraSystemdError:
+        cell = None
+    if cell is not None and cell.uuid == uuid:
+        return cell, _subject(scope, cell)
+    return None, Subject(uuid, name, unit_name(name), scope.flag)
+
+
+def _subject(scope: Scope, cell: Cell) -> Subject:
+    return Subject(cell.uuid, cell.name, cell.unit, scope.flag, cell.options.dataflow, True)
+
+
+def _facts(manager: Manager, scope: Scope, cell: Cell) -> Facts:
+    status, problem = look_at_table(scope, cell) if cell.is_up else (CellStatus(), "")
+    nodes, spent = status.nodes.items(), node_table.spent(status.nodes)
+    return Facts(
+        status_word(cell.state.active, cell.state.sub, status.stage),
+        problem or str(manager.read(cell.unit, ["StatusText"])["StatusText"]),
+        {key: spent.get(key, node.exit) for key, node in nodes if node.state == "failed"},
+        tuple(key for key, node in nodes if node.state == "restarting"),
+        _now_boot(),
+    )
+
+
+def _now_boot() -> str:
+    try:
+        return _BOOT_ID.read_text().strip().replace("-", "")
+    except OSError:
+        return ""
+
+
+def read_lives(journal: JournalReader, scope: Scope, subject: Subject) -> list[Life]:
+    """What the journal has of the dataflow, oldest life first; nothing of others of its name."""
+    matches = story_matches(scope, subject.name, subject.uuid)
+    records = islice(journal.newest(matches, None, is_whole=True), _MOST_RECORDS)
+    found = [one for one in map(parse_happening, records) if one is not None]
+    lives = find_lives(reversed(found))
+    own = [place for place, life in enumerate(lives) if _is_of(life, subject.uuid)]
+    # A life in which nothing of ours could begin has no UUID: it is of the one that is loaded.
+    begin = own[0] if own else -1
+    return lives[begin:] if subject.is_loaded else lives[begin : own[-1] + 1 if own else 0]
+
+
+def _is_of(life: Life, uuid: str) -> bool:
+    return any(one.detail("dataflow") == uuid for one in life.happenings)
+
+
+def _shutdowns(journal: JournalReader) -> list[int]:
+    records = journal.newest([f"MESSAGE_ID={SHUTDOWN_MESSAGE}", "_UID=0"], _MOST_SHUTDOWNS)
+    return [int(one["__REALTIME_TIMESTAMP"]) for one in records]
+
+
+def _last_words(
+    journal: JournalReader, scope: Scope, subject: Subject, verdict: Verdict
+) -> tuple[Word, ...]:
+    """The last lines of the node that began it, before it ended; of all nodes where none did."""
+    if not (verdict.is_failure or verdict.node) or not verdict.invocation:
+        return ()
+    matches = [
+        *scope_matches(scope, subject.name),
+        f"DORA_DATAFLOW={subject.uuid}",
+        f"_SYSTEMD_INVOCATION_ID={verdict.invocation}",
+    ]
+    if verdict.node:
+        matches.append(f"DORA_NODE={verdict.node}")
+    records = journal.newest(matches, None, until_us=verdict.at_us, is_whole=True)
+    return tuple(_words(islice(records, _LINES_READ)))[-LINES:]
+
+
+def _words(records: Iterable[dict[str, object]]) -> list[Word]:
+    found = [
+        Word(
+            int(plain_text(one.get("__REALTIME_TIMESTAMP")) or 0),
+            plain_text(one.get("DORA_NODE")),
+            plain_text(one.get("MESSAGE")),
+        )
+        for one in records
+        if "DORA_EVENT" not in one and "DORA_NODE" in one
+    ]
+    return found[::-1]

@@ -1,0 +1,86 @@
+"""What coordinator and daemon are started with."""
+
+import asyncio
+import os
+import time
+from pathlib import Path
+
+from dora_systemd.adapters.dora import engine
+from dora_systemd.decisions.cell.environment import node_environment
+from dora_systemd.paths import CellPaths
+from dora_systemd.runner.cell.engine import Engine
+
+
+def test_what_is_systemds_stays_with_the_runner() -> None:
+    given = {"NOTIFY_SOCKET": "/x", "WATCHDOG_USEC": "1", "PATH": "/bin", "MODEL": "yolo"}
+    assert node_environment(given) == {"PATH": "/bin", "MODEL": "yolo"}
+
+
+def test_everything_listens_on_loopback_and_with_a_token() -> None:
+    coordinator = engine.coordinator_command("/dora")
+    assert coordinator[coordinator.index("--interface") + 1] == "127.0.0.1"
+    assert "--auth" in coordinator
+    daemon = engine.daemon_command("/dora", 1, 2)
+    assert "--zenoh-no-multicast" in daemon
+    assert daemon[daemon.index("--coordinator-addr") + 1] == "127.0.0.1"
+
+
+def test_the_users_own_token_is_not_overwritten() -> None:
+    made = engine.coordinator_environment({"HOME": "/h", "XDG_CONFIG_HOME": "/h/c"}, Path("/run/c"))
+    assert made["XDG_CONFIG_HOME"] == made["TMPDIR"] == "/run/c"
+
+
+def test_children_and_their_ends(tmp_path: Path) -> None:
+    child = engine.spawn("x", ["/bin/sh", "-c", "echo out; echo err >&2; exit 3"], {}, tmp_path)
+    with os.fdopen(child.output) as output:
+        assert output.read() == "out\nerr\n"
+    assert engine.format_exit(child.popen.wait()) == "exit code 3"
+    assert engine.format_exit(-9) == "signal SIGKILL"
+    assert engine.format_exit(-200) == "signal 200"
+
+
+def test_a_program_that_is_not_there(tmp_path: Path) -> None:
+    try:
+        engine.spawn("x", ["/nonexistent"], {}, tmp_path)
+    except OSError as error:
+        assert error.errno == 2
+    else:
+        raise AssertionError
+
+
+def test_a_free_port_is_free() -> None:
+    assert 0 < engine.free_port() < 65536
+
+
+def open_files() -> set[str]:
+    return {name for name in map(str, range(256)) if Path(f"/proc/self/fd/{name}").is_symlink()}
+
+
+def test_a_run_leaves_no_descriptor_behind(tmp_path: Path) -> None:
+    async def one_run() -> None:
+        dora = Engine("/bin/true", CellPaths(tmp_path), {})
+        child = dora.start_coordinator()
+        engine.watch(asyncio.get_running_loop(), child, lambda *_: None)
+        dora.kill()
+        os.close(child.output)
+
+    async def runs() -> None:
+        await one_run()
+        before = open_files()
+        await one_run()
+        assert open_files() == before
+
+    asyncio.run(runs())
+
+
+def test_a_child_that_does_not_die_does_not_hold_the_end(tmp_path: Path) -> None:
+    async def work() -> None:
+        child = engine.spawn("x", ["/bin/sleep", "1000"], {}, tmp_path)
+        began = time.monotonic()
+        child.close(asyncio.get_running_loop(), 0.05)
+        assert time.monotonic() - began < 5
+        child.popen.kill()
+        child.popen.wait()
+        os.close(child.output)
+
+    asyncio.run(work())

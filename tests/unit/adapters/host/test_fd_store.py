@@ -1,0 +1,69 @@
+"""The file descriptor store, with a socket of our own as systemd."""
+
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.adapters.host import fd_store
+
+
+@pytest.fixture
+def manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> socket.socket:
+    server = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    server.bind(str(tmp_path / "notify"))
+    server.settimeout(5)
+    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+    return server
+
+
+def test_store(manager: socket.socket) -> None:
+    reader, writer = os.pipe()
+    fd_store.store(reader, "m1.camera")
+    os.close(reader)
+    os.write(writer, b"kept")
+    text, (fd,), _, _ = socket.recv_fds(manager, 100, 1)
+    assert text.decode().splitlines() == ["FDSTORE=1", "FDNAME=dora-log-m1.camera", "FDPOLL=0"]
+    assert os.read(fd, 10) == b"kept"
+    os.close(fd)
+    os.close(writer)
+    fd_store.forget("m1.camera")
+    assert manager.recv(100) == b"FDSTOREREMOVE=1\nFDNAME=dora-log-m1.camera"
+    manager.close()
+
+
+def test_without_systemd(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
+    fd_store.store(0, "a")
+    monkeypatch.setenv("NOTIFY_SOCKET", "/nonexistent")
+    fd_store.store(0, "a")
+    fd_store.forget_inherited()
+
+
+CHILD = """
+import os
+from dora_systemd.adapters.host import fd_store
+os.environ["LISTEN_PID"] = str(os.getpid())
+fd_store.forget_inherited()
+for fd in (3, 4, 5):
+    try:
+        os.fstat(fd)
+        print(fd, "open")
+    except OSError:
+        print(fd, "closed")
+print([key for key in os.environ if key.startswith("LISTEN_")])
+"""
+
+
+def test_forget_inherited(manager: socket.socket) -> None:
+    script = f'exec 3</dev/null 4</dev/null 5</dev/null; exec "{sys.executable}" -c "$0"'
+    environment = {**os.environ, "LISTEN_FDS": "3", "LISTEN_FDNAMES": "dora-log-a:other:dora-log-a"}
+    done = subprocess.run(
+        ["sh", "-c", script, CHILD], env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.splitlines() == ["3 closed", "4 open", "5 closed", "[]"]
+    assert manager.recv(100) == b"FDSTOREREMOVE=1\nFDNAME=dora-log-a"
+    manager.close()

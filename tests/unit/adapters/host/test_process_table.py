@@ -1,0 +1,54 @@
+"""Processes and listeners, from this machine's own /proc and from one of a few files."""
+
+import os
+import socket
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.adapters.host import process_table
+from dora_systemd.adapters.host.process_table import (
+    listening_sockets,
+    read_processes,
+    socket_owners,
+)
+
+
+def test_ourselves() -> None:
+    (own,) = [one for one in read_processes() if one.pid == os.getpid()]
+    assert own.parent == os.getppid()
+    assert "pytest" in " ".join(own.command)
+    assert not own.is_node
+
+
+def test_a_node_is_known_by_its_environment() -> None:
+    child = subprocess.Popen(["sleep", "60"], env={"DORA_NODE_CONFIG": "x"})
+    try:
+        (found,) = [one for one in read_processes() if one.pid == child.pid]
+    finally:
+        child.kill()
+        child.wait()
+    # Between fork and exec it still looks like us.
+    assert found.is_node or "sleep" not in found.command
+
+
+def test_who_listens() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        inodes = listening_sockets(server.getsockname()[1])
+        assert len(inodes) == 1
+        assert socket_owners(inodes) == {os.getpid()}
+    assert socket_owners(inodes) == set()
+
+
+def test_damaged_entries_are_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(process_table, "PROC", tmp_path)
+    whole = {"cmdline": "a b\0c\0", "stat": "7 (a) b) S 5 7 7", "cgroup": "0::/x\n", "environ": ""}
+    entries = {"7": whole, "8": whole | {"stat": ""}, "9": whole | {"cmdline": ""}, "10": {}}
+    for pid, files in entries.items():
+        (tmp_path / pid).mkdir()
+        for name, text in files.items():
+            (tmp_path / pid / name).write_text(text)
+    (found,) = read_processes()
+    assert (found.pid, found.parent, found.command, found.group) == (7, 5, ("a b", "c"), "/x")
+    assert listening_sockets(1) == set()

@@ -1,0 +1,179 @@
+"""journalctl as a child process, played by a script."""
+
+import json
+import shlex
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.adapters.journal import reader as journal_reader
+from dora_systemd.adapters.journal.reader import JournalReader, check_readable
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.scope import Scope
+
+SYSTEM = Scope(is_user=False, uid=0)
+USER = Scope(is_user=True, uid=1000)
+
+
+@pytest.fixture
+def journalctl(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A script that is found as journalctl."""
+    script = tmp_path / "bin" / "journalctl"
+    script.parent.mkdir()
+    monkeypatch.setenv("PATH", f"{script.parent}:/usr/bin:/bin")
+    return script
+
+
+def play(script: Path, text: str) -> None:
+    script.write_text(f"#!/bin/sh\n{text}\n")
+    script.chmod(0o755)
+
+
+@pytest.mark.parametrize(
+    ("complaint", "message", "code"),
+    [
+        ("Failed to parse timestamp: foo", "cannot read the time: foo", ExitCode.USAGE),
+        ('Bad pattern "(": missing )', 'cannot use the pattern "(": missing )', ExitCode.USAGE),
+        (
+            "No journal files were opened due to insufficient permissions.",
+            "cannot read the journal",
+            ExitCode.NO_PERMISSION,
+        ),
+        ("Something else", "cannot read the journal: Something else", ExitCode.FAILURE),
+    ],
+)
+def test_complaints(journalctl: Path, complaint: str, message: str, code: ExitCode) -> None:
+    play(journalctl, f"echo 'Hint: x' >&2; echo '{complaint}' >&2; exit 1")
+    with pytest.raises(DoraSystemdError) as caught:
+        JournalReader().known_names()
+    assert (caught.value.message, caught.value.code) == (message, code)
+
+
+def test_a_notice_is_no_complaint(journalctl: Path) -> None:
+    notice = "      Pass -q to turn off this notice."
+    play(journalctl, f"echo 'Hint: only your own' >&2; echo '{notice}' >&2; exit 1")
+    assert JournalReader().known_names() == []
+
+
+def test_no_journalctl(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(DoraSystemdError) as caught:
+        JournalReader().known_names()
+    assert caught.value.code is ExitCode.NO_SYSTEMD
+
+
+def test_nodes(journalctl: Path) -> None:
+    play(journalctl, "printf '%s\\n' robot robot/b robot/a robot2/c systemd")
+    assert JournalReader().known_nodes("robot") == ["a", "b"]
+
+
+def test_last_event_of_each_dataflow(journalctl: Path) -> None:
+    records = [
+        '{"DORA_DATAFLOW":"22222222-2222-2222-2222-222222222222","DORA_DATAFLOW_NAME":"b","_SYSTEMD_UNIT":"dora-b.service","DORA_EVENT":"dataflow-failed",'
+        '"DORA_REASON":"daemon lost","__REALTIME_TIMESTAMP":"30"}',
+        '{"DORA_DATAFLOW":"11111111-1111-1111-1111-111111111111","DORA_DATAFLOW_NAME":"a","_SYSTEMD_UNIT":"dora-a.service","DORA_EVENT":"dataflow-stopped",'
+        '"__REALTIME_TIMESTAMP":"20"}',
+        '{"DORA_DATAFLOW":"22222222-2222-2222-2222-222222222222","DORA_DATAFLOW_NAME":"b","_SYSTEMD_UNIT":"dora-b.service","DORA_EVENT":"dataflow-started",'
+        '"__REALTIME_TIMESTAMP":"10"}',
+    ]
+    play(journalctl, "cat <<'E'\n" + "\n".join(records) + "\nE")
+    first, second = JournalReader().last_events(SYSTEM)
+    assert (first.name, first.event, first.detail) == ("b", "dataflow-failed", "daemon lost")
+    assert (second.name, second.event, second.at_us) == ("a", "dataflow-stopped", 20)
+    assert len(JournalReader().last_events(SYSTEM, limit=1)) == 1
+
+
+def test_lives_of_a_unit(journalctl: Path) -> None:
+    lines = [f'{{"_SYSTEMD_INVOCATION_ID":"{one}"}}' for one in ("i2", "i2", "i1")]
+    play(journalctl, "cat <<'E'\n" + "\n".join(lines) + "\nE")
+    assert list(JournalReader().invocations(SYSTEM, "robot", "")) == ["i2", "i1"]
+
+
+def test_count(journalctl: Path) -> None:
+    play(journalctl, 'echo "$@" | grep -q -- "--since=@1.000002 --until=@3.000000" && seq 5')
+    assert JournalReader().count_own(1_000_002, 3_000_000) == 5
+
+
+@pytest.mark.parametrize(
+    ("scope", "where", "code", "word"),
+    [
+        (SYSTEM, "persistent", ExitCode.NO_PERMISSION, "systemd-journal"),
+        (USER, "persistent", None, ""),
+        (USER, "volatile", ExitCode.NO_PERMISSION, "Storage=persistent"),
+        (SYSTEM, "none", ExitCode.NO_SYSTEMD, "journald"),
+    ],
+)
+def test_unreadable(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    scope: Scope,
+    where: str,
+    code: ExitCode | None,
+    word: str,
+) -> None:
+    for name in ("persistent", "volatile"):
+        monkeypatch.setattr(journal_reader, name.upper(), tmp_path / name)
+    if where != "none":
+        (tmp_path / where / "machine").mkdir(parents=True)
+        (tmp_path / where / "machine" / "system.journal").touch()
+    monkeypatch.setattr("os.access", lambda *_: False)
+    if code is None:
+        check_readable(scope)
+        return
+    with pytest.raises(DoraSystemdError) as caught:
+        check_readable(scope)
+    assert caught.value.code is code
+    assert word in caught.value.hint
+
+
+UUID = "550e8400-e29b-41d4-a716-446655440000"
+
+
+def test_records_in_the_name_of_others_are_left_out(journalctl: Path) -> None:
+    """A node can write any field; the unit that it wrote it in is journald's word."""
+    own = {"DORA_DATAFLOW": UUID, "DORA_EVENT": "dataflow-failed", "__REALTIME_TIMESTAMP": "9"}
+    good = {**own, "DORA_DATAFLOW_NAME": "a", "_SYSTEMD_UNIT": "dora-a.service"}
+    bad: list[dict[str, object]] = [
+        {**own, "DORA_DATAFLOW_NAME": "b", "_SYSTEMD_UNIT": "dora-a.service"},
+        {**own, "DORA_DATAFLOW_NAME": "a"},
+        {**own, "DORA_DATAFLOW_NAME": ["a", "b"], "_SYSTEMD_UNIT": "dora-a.service"},
+        {**own, "DORA_DATAFLOW_NAME": [27, 93], "_SYSTEMD_UNIT": "dora-a.service"},
+        {**own, "DORA_DATAFLOW_NAME": "\x1b]0;x", "_SYSTEMD_UNIT": "dora-\x1b]0;x.service"},
+        {**good, "DORA_DATAFLOW": "u1"},
+        {**good, "DORA_DATAFLOW": None},
+        {**good, "DORA_EVENT": ["dataflow-failed"]},
+    ]
+    lines = "\n".join(map(json.dumps, [*bad, good]))
+    play(journalctl, f"cat <<'E'\n{lines}\nE")
+    (event,) = JournalReader().last_events(SYSTEM)
+    assert (event.name, event.uuid) == ("a", UUID)
+    assert JournalReader().name_of(UUID) == "a"
+
+
+def test_an_endless_journal_has_an_end(journalctl: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(journal_reader, "MAX_BYTES", 1 << 20)
+    play(journalctl, """while :; do printf '{"MESSAGE":"%02000d"}\\n' 7; done""")
+    assert 0 < len(list(JournalReader().newest([], None))) < 600
+
+
+def test_a_journal_that_stops_in_the_middle(
+    journalctl: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(journal_reader, "READ_SECONDS", 0.3)
+    play(journalctl, """echo '{"MESSAGE":"x"}'; exec sleep 60""")
+    assert list(JournalReader().newest([], None)) == [{"MESSAGE": "x"}]
+
+
+def test_a_record_that_is_too_long_is_left_out(journalctl: Path) -> None:
+    long = """printf '{"MESSAGE":"'; head -c 3000000 /dev/zero | tr '\\0' 7; echo '"}'"""
+    play(journalctl, f"""echo '{{"MESSAGE":"a"}}'; {long}; echo '{{"MESSAGE":"b"}}'""")
+    found = [one["MESSAGE"] for one in JournalReader().newest([], None)]
+    assert found == ["a", "b"]
+
+
+def test_values_that_can_be_no_names(journalctl: Path) -> None:
+    names = ("robot", "../x", "\x1b]0;x", "a b", "robot/a\x1b")
+    play(journalctl, f"printf '%s\\n' {' '.join(map(shlex.quote, names))} {UUID} robot/a")
+    assert JournalReader().known_names() == [UUID, "robot"]
+    assert JournalReader().known_uuids() == [UUID]
+    assert JournalReader().known_nodes("robot") == ["a"]

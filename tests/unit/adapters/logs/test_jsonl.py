@@ -1,0 +1,282 @@
+"""dora's own log file: complete over append, rotation and truncation."""
+
+import asyncio
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dora_systemd.adapters.logs.jsonl import JsonlTail, resume_tail
+from dora_systemd.decisions.logs.fields import Value
+from dora_systemd.decisions.logs.lines import jsonl_fields
+
+
+class Dora:
+    """Writes the file as dora's daemon does."""
+
+    def __init__(self, directory: Path) -> None:
+        self.path = directory / "log_a.jsonl"
+        self.count = 0
+
+    def write(self, lines: int = 1) -> None:
+        with self.path.open("a") as file:
+            for _ in range(lines):
+                record = {"ts": "t", "level": "stdout", "stream": "stdout", "msg": str(self.count)}
+                file.write(json.dumps(record) + "\n")
+                self.count += 1
+
+    def rotate(self, keep: int) -> None:
+        if not self.path.exists():
+            return
+        for number in range(keep, 0, -1):
+            newer = self.path.with_name(f"log_a.{number - 1}.jsonl") if number > 1 else self.path
+            if newer.exists():
+                newer.rename(self.path.with_name(f"log_a.{number}.jsonl"))
+
+
+@pytest.fixture
+def loop() -> Iterator[asyncio.AbstractEventLoop]:
+    loop = asyncio.new_event_loop()
+    yield loop
+    loop.close()
+
+
+def tail(loop: asyncio.AbstractEventLoop, dora: Dora) -> tuple[JsonlTail, list[str]]:
+    found: list[str] = []
+    return JsonlTail(loop, dora.path, lambda fields: found.append(str(fields["MESSAGE"]))), found
+
+
+def numbers(count: int) -> list[str]:
+    return [str(number) for number in range(count)]
+
+
+def test_appended(loop: asyncio.AbstractEventLoop, tmp_path: Path) -> None:
+    dora = Dora(tmp_path)
+    follower, found = tail(loop, dora)
+    follower.drain()
+    for _ in range(3):
+        dora.write(2)
+        follower.drain()
+    assert found == numbers(6)
+    follower.close()
+
+
+def test_many_lines(loop: asyncio.AbstractEventLoop, tmp_path: Path) -> None:
+    dora = Dora(tmp_path)
+    dora.write(10_000)
+    follower, found = tail(loop, dora)
+    follower.close()
+    assert found == numbers(10_000)
+
+
+def test_a_kill_and_who_comes_after(loop: asyncio.AbstractEventLoop, tmp_path: Path) -> None:
+    """The place that is noted is that of what the journal has, over rotations too."""
+    dora, place = Dora(tmp_path), tmp_path / "a.place"
+    busy: list[int] = []
+    found: list[str] = []
+
+    def put(fields: dict[str, Value]) -> None:
+        found.append(str(fields["MESSAGE"]))
+
+    first = JsonlTail(loop, dora.path, put, lambda: bool(busy), place)
+    first.start()
+    assert resume_tail(loop, place, put) is None
+    dora.write(5)
+    first.start()
+    with dora.path.open("a") as file:
+        file.write('{"ts": "t", "level": "stdout", ')
+    first.start()
+    assert found == numbers(5)
+    with dora.path.open("a") as file:
+        file.write('"stream": "stdout", "msg": "5"}\n')
+    dora.count = 6
+    dora.rotate(2)
+    dora.write(4)
+    second = resume_tail(loop, place, put)
+    assert second is not None
+    second.close()
+    assert found == numbers(10)
+    busy.append(1)  # what was read but not taken stays behind the place
+    first.drain()
+    first.start()
+    found.clear()
+    third = resume_tail(loop, place, put)
+    assert third is not None
+    third.close()
+    assert found == numbers(10)[5:]
+    first.close()
+
+
+def truncate(dora: Dora, follower: JsonlTail) -> None:
+    """Three lines that were read, and a fourth at the beginning again."""
+    dora.write(3)
+    follower.drain()
+    dora.path.write_text("")
+    dora.write(1)
+
+
+def test_truncated_by_dora_1_0(loop: asyncio.AbstractEventLoop, tmp_path: Path) -> None:
+    dora = Dora(tmp_path)
+    follower, found = tail(loop, dora)
+    truncate(dora, follower)
+    follower.close()
+    assert found == numbers(4)
+
+
+STEPS = st.lists(st.sampled_from(["write", "rotate", "look"]), max_size=30)
+
+
+@given(STEPS)
+def test_rotated(tmp_path_factory: pytest.TempPathFactory, steps: list[str]) -> None:
+    loop = asyncio.new_event_loop()
+    dora = Dora(tmp_path_factory.mktemp("out"))
+    follower, found = tail(loop, dora)
+    for step in steps:
+        if step == "write":
+            dora.write(3)
+        elif step == "rotate":
+            dora.rotate(keep=40)
+        else:
+            follower.drain()
+    follower.close()
+    loop.close()
+    assert found == numbers(dora.count)
+    assert follower.lost_files == 0
+    assert follower.loss == ""
+
+
+def test_deleted_before_it_was_read(loop: asyncio.AbstractEventLoop, tmp_path: Path) -> None:
+    dora = Dora(tmp_path)
+    follower, found = tail(loop, dora)
+    dora.write()
+    follower.drain()
+    for _ in range(3):
+        dora.write()
+        dora.rotate(keep=1)
+    dora.write()
+    follower.close()
+    assert found == ["0", "1", "3", "4"]
+    assert follower.loss == "dora deleted 1 of its log files before they were read"
+
+
+def test_backlog_over_rotations(loop: asyncio.AbstractEventLoop, tmp_path: Path) -> None:
+    dora = Dora(tmp_path)
+    follower, found = tail(loop, dora)
+    assert follower.backlog() == 0
+    dora.write(3)
+    size = dora.path.stat().st_size
+    assert follower.backlog() == size
+    follower.drain()
+    assert follower.backlog() == 0
+    for _ in range(2):
+        dora.write(2)
+        dora.rotate(keep=2)
+    assert follower.backlog() == size // 3 * 4
+    dora.path.with_name("log_a.2.jsonl").unlink()
+    assert follower.backlog() == size // 3 * 4  # it is still open
+    follower.close()
+    assert found == numbers(7)
+
+
+def test_backlog_of_a_truncated_file(loop: asyncio.AbstractEventLoop, tmp_path: Path) -> None:
+    dora = Dora(tmp_path)
+    follower, found = tail(loop, dora)
+    truncate(dora, follower)
+    assert follower.backlog() == dora.path.stat().st_size
+    follower.drain()
+    assert found == numbers(4)
+    follower.close()
+
+
+def test_drain_ends_while_dora_goes_on(loop: asyncio.AbstractEventLoop, tmp_path: Path) -> None:
+    dora = Dora(tmp_path)
+    found: list[str] = []
+
+    def put(fields: dict[str, Value]) -> None:
+        found.append(str(fields["MESSAGE"]))
+        dora.write()
+
+    follower = JsonlTail(loop, dora.path, put)
+    dora.write(3)
+    assert follower.drain()
+    assert found == numbers(3)
+    follower._put = lambda fields: found.append(str(fields["MESSAGE"]))
+    follower.close()
+    assert found == numbers(6)
+
+
+def test_watch_hears_of_the_backlog_while_the_journal_is_busy(
+    loop: asyncio.AbstractEventLoop, tmp_path: Path
+) -> None:
+    dora = Dora(tmp_path)
+    dora.write(3)
+    heard: list[int] = []
+    busy = [1]
+    follower = JsonlTail(loop, dora.path, lambda _: None, lambda: bool(busy), watch=heard.append)
+    follower.start()
+    busy.clear()
+    follower.start()
+    assert heard == [dora.path.stat().st_size, 0]
+    follower.close()
+
+
+def test_waits_while_the_journal_is_busy(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        dora = Dora(tmp_path)
+        dora.write(3)
+        found: list[object] = []
+        busy = [True]
+        loop = asyncio.get_running_loop()
+        follower = JsonlTail(loop, dora.path, found.append, lambda: busy[0])
+        follower.start()
+        await asyncio.sleep(0.12)
+        assert not found
+        busy[0] = False
+        async with asyncio.timeout(60):
+            while len(found) < 3:
+                await asyncio.sleep(0)
+        follower.close()
+
+    asyncio.run(scenario())
+
+
+def test_fields_of_a_raw_line() -> None:
+    line = (
+        b'{"ts":"T","level":"stdout","node":"b","stream":"stderr","msg":"err",'
+        b'"target":null,"fields":null}'
+    )
+    assert jsonl_fields(line) == {
+        "PRIORITY": 5,
+        "DORA_TIMESTAMP": "T",
+        "DORA_STREAM": "stderr",
+        "MESSAGE": "err",
+    }
+
+
+def test_fields_of_a_structured_line() -> None:
+    line = (
+        b'{"ts":"T","level":"warn","node":"b","stream":"stdout","msg":"m",'
+        b'"target":"my.t","fields":{"a":"1"}}'
+    )
+    assert jsonl_fields(line) == {
+        "PRIORITY": 4,
+        "DORA_LEVEL": "warn",
+        "DORA_TIMESTAMP": "T",
+        "DORA_TARGET": "my.t",
+        "DORA_FIELD_A": "1",
+        "DORA_STREAM": "stdout",
+        "MESSAGE": "m",
+    }
+
+
+def test_line_that_dora_cut() -> None:
+    line = b'{"ts":"T","level":"stdout","stream":"stdout","msg":"xx... [truncated]"}'
+    assert jsonl_fields(line)["DORA_CUT"] == 1
+
+
+@pytest.mark.parametrize("line", [b"", b"{", b"[]", b"{}", b'{"stream":1,"level":2}', b"\xff"])
+def test_broken_line_is_kept_as_it_is(line: bytes) -> None:
+    assert jsonl_fields(line) == {"PRIORITY": 6, "MESSAGE": line}

@@ -1,0 +1,286 @@
+"""The nodes' pipes, with real FIFOs and a socket of our own."""
+
+import asyncio
+import os
+import socket
+import stat
+from collections.abc import AsyncIterator, Callable, Coroutine
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+from dora_systemd.adapters.journal.socket import JournalSocket
+from dora_systemd.adapters.logs.pipes import LogPipes
+from dora_systemd.decisions.cell.line_rates import RateLimit
+from dora_systemd.decisions.cell.status import LineCount
+from dora_systemd.decisions.logs.lines import Origin
+from dora_systemd.paths import CellPaths
+from dora_systemd.values import SECOND
+
+IDENTITY = Origin("robot", "550e8400-e29b-41d4-a716-446655440000")
+
+
+class Cell:
+    def __init__(self, root: Path) -> None:
+        self.paths = CellPaths(root)
+        self.paths.io.mkdir()
+        self.server = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+        self.server.bind(str(root / "socket"))
+        self.journal = JournalSocket(str(root / "socket"))
+        self.pipes = LogPipes(asyncio.get_running_loop(), self.journal, IDENTITY)
+
+    def node(self, name: str) -> None:
+        self.pipes.make(name, self.paths)
+        self.pipes.open(name)
+
+    def write(self, path: Path, data: bytes) -> None:
+        path.write_bytes(data)
+
+    def received(self) -> list[dict[str, str]]:
+        entries: list[dict[str, str]] = []
+        while True:
+            try:
+                data = self.server.recv(1 << 20).decode()
+            except BlockingIOError:
+                return entries
+            entries.append(dict(line.split("=", 1) for line in data.splitlines()))
+
+    async def entries(self, count: int) -> list[dict[str, str]]:
+        """Wait for so many entries."""
+        found: list[dict[str, str]] = []
+        async with asyncio.timeout(60):
+            while len(found) < count:
+                await asyncio.sleep(0)
+                found += self.received()
+        return found
+
+    async def messages(self, count: int) -> list[str]:
+        """The messages of so many entries."""
+        return [entry["MESSAGE"] for entry in await self.entries(count)]
+
+    async def until(self, condition: Callable[[], bool]) -> None:
+        """Let the loop work until the condition holds."""
+        async with asyncio.timeout(60):
+            while not condition():
+                await asyncio.sleep(0)
+
+
+@asynccontextmanager
+async def open_cell(root: Path) -> AsyncIterator[Cell]:
+    cell = Cell(root)
+    try:
+        yield cell
+    finally:
+        cell.pipes.close(0.1)
+        cell.journal.close()
+        cell.server.close()
+
+
+def run(root: Path, scenario: Callable[[Cell], Coroutine[None, None, None]]) -> None:
+    async def main() -> None:
+        async with open_cell(root) as cell:
+            await scenario(cell)
+
+    asyncio.run(main())
+
+
+def test_lines_of_a_node(tmp_path: Path) -> None:
+    async def scenario(cell: Cell) -> None:
+        cell.node("camera")
+        assert stat.S_IMODE(cell.paths.node_stdout("camera").stat().st_mode) == 0o600
+        cell.pipes.set_run("run1")
+        cell.pipes.set_pid("camera", 42)
+        cell.write(cell.paths.node_stdout("camera"), b"out\n")
+        (out,) = await cell.entries(1)
+        cell.write(cell.paths.node_stderr("camera"), b"err\n")
+        (err,) = await cell.entries(1)
+        assert (out["MESSAGE"], out["DORA_STREAM"], out["PRIORITY"]) == ("out", "stdout", "6")
+        assert (err["MESSAGE"], err["DORA_STREAM"], err["PRIORITY"]) == ("err", "stderr", "5")
+        assert out["DORA_RUN"] == "run1"
+        assert out["DORA_NODE_PID"] == "42"
+        assert out["SYSLOG_IDENTIFIER"] == "robot/camera"
+
+    run(tmp_path, scenario)
+
+
+def test_fifos_left_by_an_earlier_life_are_replaced(tmp_path: Path) -> None:
+    async def scenario(cell: Cell) -> None:
+        cell.paths.node_stdout("a").write_text("left")
+        cell.node("a")
+        assert stat.S_ISFIFO(cell.paths.node_stdout("a").stat().st_mode)
+
+    run(tmp_path, scenario)
+
+
+def test_last_words_come_before_the_event(tmp_path: Path) -> None:
+    async def scenario(cell: Cell) -> None:
+        cell.node("a")
+        cell.write(cell.paths.node_stderr("a"), b"Traceback\nValueError: half a line")
+        cell.pipes.drain("a")
+        cell.pipes.write_event("node-crashed", "a", exit="exit code 1")
+        cell.pipes.write_event("dataflow-failed")
+        entries = cell.received()
+        assert [entry["MESSAGE"] for entry in entries] == [
+            "Traceback",
+            "ValueError: half a line",
+            "Node a crashed: exit code 1",
+            "Dataflow robot failed",
+        ]
+        assert entries[1]["DORA_CUT"] == "1"
+        assert entries[2]["DORA_NODE"] == "a"
+        assert entries[2]["DORA_EXIT"] == "exit code 1"
+        assert entries[3]["SYSLOG_IDENTIFIER"] == "robot"
+
+    run(tmp_path, scenario)
+
+
+def test_what_a_limit_takes_is_counted(tmp_path: Path) -> None:
+    async def scenario(cell: Cell) -> None:
+        cell.node("a")
+        cell.pipes.limit("a", RateLimit(2, SECOND // 10))
+        path = cell.paths.node_stdout("a")
+        cell.write(path, b"1\n2\n3\n4\n")
+        assert await cell.messages(3) == [
+            "1",
+            "2",
+            "2 log lines of node a exceed its limit of 2/100ms",
+        ]
+        cell.write(path, b"5\n6\n7\n8")
+        cell.write(cell.paths.node_stderr("a"), b"the last words")
+        cell.pipes.drain("a")
+        cell.pipes.write_fields({"MESSAGE": "from dora's file", "DORA_STREAM": "stdout"}, "a")
+        cell.pipes.drain("a")
+        cell.pipes.write_event("node-exited", "a")
+        entries = cell.received()
+        assert sorted(entry["MESSAGE"] for entry in entries[:3]) == ["5", "6", "the last words"]
+        suppressed, more, exited = entries[3:]
+        assert (suppressed["DORA_COUNT"], suppressed["DORA_NODE"]) == ("2", "a")
+        assert more["DORA_COUNT"] == "1"
+        assert suppressed["DORA_EVENT"] == "lines-suppressed"
+        assert suppressed["DORA_LIMIT"] == "2/100ms"
+        counts = cell.pipes.line_counts()
+        assert counts == {"a": LineCount(5, 5), "": LineCount()}
+        assert exited["MESSAGE"] == "Node a exited"
+
+    run(tmp_path, scenario)
+
+
+def test_flood_is_slowed_and_complete(tmp_path: Path) -> None:
+    async def scenario(cell: Cell) -> None:
+        cell.node("a")
+        data = b"".join(b"%d\n" % i for i in range(50_000))
+        writer = asyncio.get_running_loop().run_in_executor(
+            None, cell.write, cell.paths.node_stdout("a"), data
+        )
+        await asyncio.sleep(0.2)
+        assert cell.pipes._queue.waiting("a") < 20_000
+        cell.pipes.write_event("reloaded")
+        messages = await cell.messages(50_001)
+        await writer
+        messages.remove("Dataflow robot was reloaded")
+        assert messages == [str(i) for i in range(50_000)]
+
+    run(tmp_path, scenario)
+
+
+def test_quiet_node_passes_a_flood(tmp_path: Path) -> None:
+    async def scenario(cell: Cell) -> None:
+        cell.node("flood")
+        cell.node("quiet")
+        flood = os.open(cell.paths.node_stdout("flood"), os.O_WRONLY | os.O_NONBLOCK)
+        os.write(flood, b"x\n" * 20_000)
+        await asyncio.sleep(0.1)
+        # As many entries as the kernel lets wait (10, or 512 under systemd), then one at a time.
+        cell.write(cell.paths.node_stdout("quiet"), b"quiet\n")
+        messages = await cell.messages(1000)
+        assert "quiet" in messages
+        os.close(flood)
+        await cell.messages(20_001 - len(messages))
+
+    run(tmp_path, scenario)
+
+
+def test_wait_until_journald_has_taken_all(tmp_path: Path) -> None:
+    async def scenario(cell: Cell) -> None:
+        cell.node("a")
+        cell.write(cell.paths.node_stdout("a"), b"x\n" * 5000)
+        cell.pipes.drain("a")
+        await cell.pipes.wait_empty(iter([0.1, 0.1, 0.0]).__next__)
+        assert cell.pipes.is_busy("a")
+        reader = asyncio.create_task(cell.messages(5000))
+        await cell.pipes.wait_empty(lambda: 1.0)
+        assert not cell.pipes.is_busy("a")
+        assert len(await reader) == 5000
+
+    run(tmp_path, scenario)
+
+
+def test_journald_restarted(tmp_path: Path) -> None:
+    async def scenario(cell: Cell) -> None:
+        cell.node("a")
+        path = cell.paths.node_stdout("a")
+        cell.write(path, b"1\n")
+        assert await cell.messages(1) == ["1"]
+        cell.server.close()
+        (tmp_path / "socket").unlink()
+        cell.write(path, b"2\n3\n")
+        await cell.until(lambda: cell.pipes.is_busy("a"))
+        cell.write(path, b"4\n")
+        cell.server = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+        cell.server.bind(str(tmp_path / "socket"))
+        assert await cell.messages(3) == ["2", "3", "4"]
+
+    run(tmp_path, scenario)
+
+
+def test_output_of_the_coordinator(tmp_path: Path) -> None:
+    async def scenario(cell: Cell) -> None:
+        reader, writer = os.pipe()
+        lines: list[str] = []
+        cell.pipes.add_output("coordinator", reader, lines.append)
+        os.write(writer, b"2026-11-20T22:11:40.6Z  INFO dora_coordinator: SECRET\nListening on ")
+        os.write(writer, b"port 33453\n2026-11-20T22:11:40.6Z ERROR dora_coordinator: bad\n")
+        os.close(writer)
+        (entry,) = await cell.entries(1)
+        assert lines[1] == "Listening on port 33453"
+        assert entry["MESSAGE"] == "dora_coordinator: bad"
+        assert entry["DORA_NODE"] == "coordinator"
+        assert entry["PRIORITY"] == "3"
+        await cell.until(lambda: not Path(f"/proc/self/fd/{reader}").exists())
+
+    run(tmp_path, scenario)
+
+
+def test_close_counts_what_it_cannot_write(tmp_path: Path) -> None:
+    async def scenario(cell: Cell) -> None:
+        cell.node("a")
+        cell.server.close()
+        (tmp_path / "socket").unlink()
+        cell.write(cell.paths.node_stdout("a"), b"1\n2\n")
+        cell.pipes.drain("a")
+        cell.server = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+        cell.pipes.close(0.0)
+        cell.server.bind(str(tmp_path / "socket"))
+
+    run(tmp_path, scenario)
+
+
+def test_what_systemd_keeps_of_a_node_goes_with_it(tmp_path: Path) -> None:
+    async def scenario(cell: Cell) -> None:
+        kept: list[str] = []
+        pipes = LogPipes(
+            asyncio.get_running_loop(),
+            cell.journal,
+            IDENTITY,
+            lambda _, node: kept.append(node),
+            kept.remove,
+        )
+        for node in ("a", "b"):
+            pipes.make(node, cell.paths)
+        pipes.open("a")
+        pipes.forget("b")  # never opened
+        assert kept == ["a", "a"]
+        pipes.forget("a")
+        assert kept == ["a"], "released by name, once"
+        pipes.close(0.1)
+
+    run(tmp_path, scenario)

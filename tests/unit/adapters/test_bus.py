@@ -1,0 +1,140 @@
+"""D-Bus without a bus: how values are sent, and what its errors become."""
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dora_systemd.adapters.bus import connection
+from dora_systemd.adapters.bus import errors as bus_errors
+from dora_systemd.adapters.bus import systemd as bus
+from dora_systemd.adapters.bus.wire import decoded, encoded
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.scope import Scope
+from tests.unit.fakes.manager import ScopeIn
+
+SYSTEM = Scope(is_user=False, uid=0)
+USER = Scope(is_user=True, uid=1000)
+CLOSE = (-1, None)
+
+
+def test_basic_types() -> None:
+    assert encoded("s", "ä") == [(ord("s"), "ä".encode())]
+    assert encoded("b", True) == [(ord("b"), True)]
+    assert encoded("t", 2**64 - 1) == [(ord("t"), 2**64 - 1)]
+
+
+def test_containers() -> None:
+    assert encoded("a(sasb)", [("/bin/x", ["x", "y"], False)]) == [
+        (ord("a"), b"(sasb)"),
+        (ord("r"), b"sasb"),
+        (ord("s"), b"/bin/x"),
+        (ord("a"), b"s"),
+        (ord("s"), b"x"),
+        (ord("s"), b"y"),
+        CLOSE,
+        (ord("b"), False),
+        CLOSE,
+        CLOSE,
+    ]
+
+
+def test_variant() -> None:
+    assert encoded("v", ("as", [])) == [(ord("v"), b"as"), (ord("a"), b"s"), CLOSE, CLOSE]
+
+
+def test_nested_structs() -> None:
+    assert encoded("(i(ss)a(st))", (1, ("a", "b"), [])) == [
+        (ord("r"), b"i(ss)a(st)"),
+        (ord("i"), 1),
+        (ord("r"), b"ss"),
+        (ord("s"), b"a"),
+        (ord("s"), b"b"),
+        CLOSE,
+        (ord("a"), b"(st)"),
+        CLOSE,
+        CLOSE,
+    ]
+
+
+def test_a_struct_of_the_wrong_length_is_a_mistake_of_ours() -> None:
+    with pytest.raises(ValueError, match="zip"):
+        encoded("(ss)", ("a",))
+
+
+@pytest.mark.parametrize("text", ["a\0b", "\udcff", "\0"])
+def test_what_is_no_text_for_d_bus(text: str) -> None:
+    with pytest.raises(DoraSystemdError) as caught:
+        encoded("s", text)
+    assert caught.value.code is ExitCode.USAGE
+
+
+@given(st.lists(st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]))))
+def test_text_survives_the_way_there_and_back(texts: list[str]) -> None:
+    sent = [value for kind, value in encoded("as", texts) if kind == ord("s")]
+    assert decoded(sent) == texts
+
+
+def test_answers_are_decoded_at_every_depth() -> None:
+    assert decoded([(b"a", 1, {b"k": [b"v"]}), True]) == [["a", 1, {"k": ["v"]}], True]
+
+
+def test_object_paths() -> None:
+    path = bus._unit_path("dora-a_b.c.service")
+    assert path == b"/org/freedesktop/systemd1/unit/dora_2da_5fb_2ec_2eservice"
+
+
+@pytest.mark.parametrize(
+    ("name", "scope", "code", "words"),
+    [
+        ("AccessDenied", SYSTEM, ExitCode.NO_PERMISSION, "permission denied"),
+        ("InteractiveAuthorizationRequired", SYSTEM, ExitCode.NO_PERMISSION, "permission denied"),
+        ("UnitExists", USER, ExitCode.NAME_IN_USE, "already exists"),
+        ("NoSuchUnit", USER, ExitCode.NOT_FOUND, "no such unit"),
+        ("NoReply", USER, ExitCode.NO_SYSTEMD, "does not answer"),
+        ("InvalidArgs", USER, ExitCode.FAILURE, "its own words"),
+    ],
+)
+def test_errors(name: str, scope: Scope, code: ExitCode, words: str) -> None:
+    error = bus_errors.bus_error("start dora-x.service", scope, name, "its own words")
+    assert error.message.startswith("cannot start dora-x.service: ")
+    assert words in error.message
+    assert error.code is code
+
+
+def test_sudo_is_no_hint_for_a_user_manager() -> None:
+    assert "sudo" in bus_errors.bus_error("x", SYSTEM, "AccessDenied", "").hint
+    assert "sudo" not in bus_errors.bus_error("x", USER, "AccessDenied", "").hint
+
+
+def test_names_of_pystemds_errors() -> None:
+    class DBusBaseError(Exception):
+        err_name: bytes | str = b"org.freedesktop.systemd1.UnitExists"
+        err_message = b"told so"
+
+    class DBusAccessDeniedError(DBusBaseError):
+        err_name = ""
+
+    assert bus_errors.error_name(DBusBaseError()) == "UnitExists"
+    assert bus_errors.error_name(DBusAccessDeniedError()) == "AccessDenied"
+    with (
+        pytest.raises(DoraSystemdError, match="cannot do it: a unit"),
+        bus_errors.explained("do it", SYSTEM),
+    ):
+        raise DBusBaseError
+
+
+def test_other_errors_pass() -> None:
+    with pytest.raises(ZeroDivisionError), bus_errors.explained("do it", SYSTEM):
+        raise ZeroDivisionError
+
+
+def test_private_socket_where_a_user_has_no_bus(tmp_path: Path) -> None:
+    scope = ScopeIn(is_user=True, uid=1000, root=tmp_path)
+    assert connection._address(scope) == str(tmp_path / "bus")
+    (tmp_path / "systemd").mkdir()
+    (tmp_path / "systemd" / "private").touch()
+    assert connection._address(scope) == str(tmp_path / "systemd" / "private")
+    (tmp_path / "bus").touch()
+    assert connection._address(scope) == str(tmp_path / "bus")

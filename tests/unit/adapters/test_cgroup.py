@@ -1,0 +1,109 @@
+"""The cgroup adapter on a directory that looks like a cgroup tree."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.adapters.cgroup import groups as cgroup
+from dora_systemd.decisions.cell.limits import parse_node_limits
+from dora_systemd.decisions.resources.usage import UNLIMITED, Usage
+from dora_systemd.errors import DoraSystemdError
+
+
+@pytest.fixture
+def unit(tmp_path: Path) -> Path:
+    group = tmp_path / "dora-robot.service"
+    for name in ("supervisor", "node-camera", "node-a.b"):
+        (group / name).mkdir(parents=True)
+        (group / name / "cgroup.procs").write_text("")
+    (group / "cgroup.procs").write_text("")
+    (group / "cpu.stat").write_text("usage_usec 1500\nnr_periods 10\nnr_throttled 3\n")
+    return group
+
+
+def test_node_groups(unit: Path) -> None:
+    assert cgroup.node_groups(unit) == {
+        "a.b": unit / "node-a.b",
+        "camera": unit / "node-camera",
+    }
+    assert cgroup.node_groups(unit / "gone") == {}
+
+
+def test_usage_with_a_memory_controller(unit: Path) -> None:
+    (unit / "cpu.max").write_text("150000 100000\n")
+    for name, text in (("current", "4096\n"), ("peak", "8192\n"), ("max", "max\n")):
+        (unit / f"memory.{name}").write_text(text)
+    assert cgroup.read_usage(unit) == Usage(1500, 4096, 8192, UNLIMITED, 1_500_000, (10, 3))
+
+
+def test_usage_without_a_memory_controller(unit: Path) -> None:
+    (unit / "node-camera" / "cgroup.procs").write_text(f"{os.getpid()}\n")
+    usage = cgroup.read_usage(unit)
+    assert usage.memory is not None
+    assert usage.memory > 1024**2
+    assert usage.memory_peak is None
+
+
+def test_limits_of_a_node(unit: Path) -> None:
+    group = unit / "node-camera"
+    for name in ("memory.max", "cpu.max", "memory.oom.group"):
+        (group / name).write_text("")
+    cgroup.kill_as_one(group)
+    cgroup.limit_group(group, parse_node_limits("camera:memory=1G,cpu=infinity"))
+    assert (group / "memory.oom.group").read_text() == "1"
+    assert (group / "memory.max").read_text() == str(1 << 30)
+    assert (group / "cpu.max").read_text() == "max 100000"
+
+
+def test_a_limit_that_nothing_holds_up_is_an_error(unit: Path) -> None:
+    with pytest.raises(DoraSystemdError) as caught:
+        cgroup.limit_group(unit / "node-camera", parse_node_limits("camera:tasks=5"))
+    assert caught.value.message == "cannot limit the node camera: its group has no pids.max"
+
+
+def test_usage_of_a_group_that_has_gone(tmp_path: Path) -> None:
+    assert cgroup.read_usage(tmp_path / "gone") == Usage(0, 0)
+
+
+def test_pids_of_the_whole_tree(unit: Path) -> None:
+    (unit / "supervisor" / "cgroup.procs").write_text("1\n2\n")
+    (unit / "node-camera" / "cgroup.procs").write_text("3\n")
+    assert sorted(cgroup.pids(unit)) == [1, 2, 3]
+
+
+def test_controllers_are_enabled_one_by_one(unit: Path) -> None:
+    (unit / "cgroup.controllers").write_text("cpu memory\n")
+    (unit / "cgroup.subtree_control").write_text("")
+    cgroup.enable_controllers(unit)
+    assert (unit / "cgroup.subtree_control").read_text() in ("+memory", "+cpu+memory")
+
+
+def test_no_controllers_is_no_error(unit: Path) -> None:
+    (unit / "cgroup.controllers").write_text("\n")
+    cgroup.enable_controllers(unit)
+
+
+def test_populated(unit: Path) -> None:
+    assert not cgroup.is_populated(unit)
+    (unit / "cgroup.events").write_text("populated 1\nfrozen 0\n")
+    assert cgroup.is_populated(unit)
+
+
+def test_processes_are_killed_one_by_one_without_cgroup_kill(unit: Path) -> None:
+    child = os.posix_spawn("/bin/sleep", ["sleep", "100"], {})
+    (unit / "node-camera" / "cgroup.procs").write_text(f"{child}\n")
+    cgroup.kill_group(unit)
+    assert os.WTERMSIG(os.waitpid(child, 0)[1]) == 9
+
+
+def test_groups_are_made_and_removed(tmp_path: Path) -> None:
+    cgroup.make_group(tmp_path / "x")
+    cgroup.make_group(tmp_path / "x")
+    cgroup.remove_group(tmp_path / "x")
+    cgroup.remove_group(tmp_path / "x")
+    assert not (tmp_path / "x").exists()
+
+
+def test_own_group() -> None:
+    assert cgroup.own_group().startswith("/")

@@ -1,0 +1,147 @@
+"""Limits on a node's lines: their texts, whose they are, and what they take."""
+
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dora_systemd.decisions.cell.line_rates import (
+    ALL_NODES,
+    SHORTEST,
+    RateLimit,
+    check_rates,
+    format_rate,
+    format_rates,
+    merge_rates,
+    parse_rate,
+    parse_rates,
+    rate_of,
+)
+from dora_systemd.decisions.logs.limiter import LineLimiter
+from dora_systemd.decisions.settings.line_rates import log_rates
+from dora_systemd.decisions.settings.resolve import Settings, resolve_settings
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.values import INFINITY, SECOND
+
+LIMIT = RateLimit(3, SECOND)
+RATES = st.builds(RateLimit, st.integers(1, 10**18 - 1), st.integers(SHORTEST, INFINITY - 1))
+
+
+@pytest.mark.parametrize(
+    ("text", "limit"),
+    [
+        ("1000/1s", RateLimit(1000, SECOND)),
+        (" 5 / 500ms ", RateLimit(5, SECOND // 2)),
+        ("1/1min 30s", RateLimit(1, 90 * SECOND)),
+        ("10/2", RateLimit(10, 2 * SECOND)),
+        ("infinity", None),
+    ],
+)
+def test_parse(text: str, limit: RateLimit | None) -> None:
+    assert parse_rate(text) == limit
+
+
+@given(st.none() | RATES)
+def test_text_and_back(limit: RateLimit | None) -> None:
+    assert parse_rate(format_rate(limit)) == limit
+
+
+BAD = ["", "1000", "0/1s", "-1/1s", "1.5/1s", "1000/", "/1s", "x/1s", "1/x", "1/0", "1/99ms"]
+BAD += ["1/infinity", "1/1s/1s", "²/1s", "1" * 19 + "/1s"]
+
+
+@pytest.mark.parametrize("text", BAD)
+def test_bad_limits(text: str) -> None:
+    with pytest.raises(DoraSystemdError, match=r"^cannot read .* as a rate of lines$") as caught:
+        parse_rate(text)
+    assert "1000/1s" in caught.value.hint
+    assert caught.value.code is ExitCode.USAGE
+
+
+def test_limits_of_nodes() -> None:
+    texts = ["1000/1s", "camera=5/1s", "lidar=infinity"]
+    limits = parse_rates(texts)
+    assert format_rates(limits) == texts
+    assert rate_of(limits, "camera") == RateLimit(5, SECOND)
+    assert rate_of(limits, "lidar") is None
+    assert rate_of(limits, "other") == RateLimit(1000, SECOND)
+    assert rate_of({}, "other") is None
+
+
+def settings(flags: tuple[str, ...] = (), document: object = None) -> Settings:
+    return resolve_settings({"log_rate_limit": flags}, {}, [("/srv/robot.systemd.yml", document)])
+
+
+def test_a_flag_for_a_node_wins_and_one_for_all_does_not() -> None:
+    document = {
+        "log_rate_limit": "9/1s",
+        "nodes": {"camera": {"log_rate_limit": "5/1s"}, "lidar": {"log_rate_limit": "infinity"}},
+    }
+    texts = format_rates(log_rates(settings(("camera=1/1s", "8/1s"), document)))
+    assert sorted(texts) == ["8/1s", "camera=1/1s", "lidar=infinity"]
+    variables = {"DORA_LOG_RATE_LIMIT": "7/1s"}
+    assert log_rates(resolve_settings({}, variables, [])) == {ALL_NODES: RateLimit(7, SECOND)}
+
+
+def test_a_node_in_a_file_cannot_name_another() -> None:
+    document = {"nodes": {"camera": {"log_rate_limit": "lidar=5/1s"}}}
+    with pytest.raises(DoraSystemdError, match=r"'lidar=5/1s' as log_rate_limit of node camera"):
+        log_rates(settings((), document))
+    assert merge_rates({}, {}) == {}
+
+
+def test_a_limit_must_name_a_node_that_is_there() -> None:
+    limits = parse_rates(("1/1s", "camra=1/1s"))
+    with pytest.raises(DoraSystemdError, match=r"^cannot limit the lines .*'camra'") as caught:
+        check_rates(limits, ["camera", "lidar"])
+    assert caught.value.hint == "did you mean camera?"
+    with pytest.raises(DoraSystemdError) as caught:
+        check_rates(limits, ["one", "two"])
+    assert caught.value.hint == "nodes: one, two"
+    check_rates(limits, ["camra"])
+
+
+def test_window() -> None:
+    limiter = LineLimiter(LIMIT)
+    assert limiter.admit("stdout", 2, 10.0) == 2
+    assert limiter.admit("stdout", 2, 10.5) == 1
+    assert limiter.end("stdout") == 11.0
+    assert limiter.admit("stdout", 5, 10.9) == 0
+    assert limiter.take_suppressed() == 6
+    assert limiter.take_suppressed() == 0
+    assert limiter.admit("stdout", 5, 11.0) == 3
+    assert limiter.take_suppressed() == 2
+
+
+def test_a_flood_on_one_stream_leaves_the_other_alone() -> None:
+    limiter = LineLimiter(LIMIT)
+    assert limiter.admit("stdout", 100, 10.0) == 3
+    assert limiter.admit("stderr", 3, 10.0) == 3
+    assert limiter.suppressed == 97
+
+
+STEPS = st.lists(
+    st.tuples(st.sampled_from(["stdout", "stderr"]), st.integers(0, 9), st.floats(0.0, 0.7)),
+    max_size=50,
+)
+
+
+@given(STEPS)
+def test_any_history(steps: list[tuple[str, int, float]]) -> None:
+    """Each line passes or is counted, and no window of any stream has more than its limit."""
+    limiter, now = LineLimiter(LIMIT), 0.0
+    passed: dict[tuple[str, float], int] = {}
+    for stream, count, wait in steps:
+        now += wait
+        got = limiter.admit(stream, count, now)
+        key = (stream, limiter.end(stream))
+        passed[key] = passed.get(key, 0) + got
+    assert all(count <= LIMIT.lines for count in passed.values())
+    ends = sorted(passed)
+    assert all(
+        later - earlier > 0.999
+        for (stream, earlier), (other, later) in pairwise(ends)
+        if stream == other
+    )
+    assert sum(passed.values()) + limiter.suppressed == sum(count for _, count, _ in steps)

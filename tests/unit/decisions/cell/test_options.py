@@ -1,0 +1,123 @@
+"""The runner's command line: options to arguments and back."""
+
+import shlex
+import subprocess
+import sys
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dora_systemd.decisions.cell.hot_reload import REPLACE_WORDS, HotReload
+from dora_systemd.decisions.cell.line_rates import ALL_NODES, SHORTEST, RateLimit
+from dora_systemd.decisions.cell.options import (
+    RunnerOptions,
+    format_runner_argv,
+    options_from_command,
+    parse_runner_argv,
+    runner_command,
+)
+from dora_systemd.decisions.cell.restarts import POLICIES, RestartPolicy
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.values import INFINITY
+from tests.unit.fakes.limit_values import limits_of_a_node
+
+UUID = "550e8400-e29b-41d4-a716-446655440000"
+OPTIONS = RunnerOptions("robot", UUID, "/srv/robot.yml", "/srv", "/usr/bin/dora")
+
+texts = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]))
+paths = texts.map(lambda text: "/" + text)
+idents = st.from_regex(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,20}", fullmatch=True)
+nodes = st.just(ALL_NODES) | idents
+rates = st.builds(RateLimit, st.integers(1, 10**18 - 1), st.integers(SHORTEST, INFINITY - 1))
+times = st.integers(1, 10**12)
+policies = st.builds(
+    RestartPolicy,
+    st.sampled_from(POLICIES),
+    st.integers(1, 1_000_000) | st.just(INFINITY),
+    times | st.just(INFINITY),
+    times,
+    times,
+)
+options = st.builds(
+    RunnerOptions,
+    name=st.from_regex(r"[a-z][a-z0-9_-]{0,20}", fullmatch=True).filter(lambda n: n != "gateway"),
+    uuid=st.uuids().map(str),
+    dataflow=paths,
+    working_directory=paths,
+    dora=paths,
+    venv=st.none() | paths,
+    uv=st.booleans(),
+    debug=st.booleans(),
+    allow_shell_nodes=st.booleans(),
+    grace=st.integers(0, 2**64 - 1),
+    attached=st.booleans(),
+    exit_when_nodes_finish=st.none() | st.booleans(),
+    env_keys=st.lists(texts).map(tuple),
+    log_rates=st.dictionaries(nodes, st.none() | rates),
+    node_limits=st.lists(limits_of_a_node()).map(tuple),
+    restart=policies,
+    node_restarts=st.lists(st.tuples(st.text(min_size=1), policies)).map(tuple),
+    start_timeout=st.integers(min_value=1, max_value=10**12) | st.just(INFINITY),
+    reload=st.builds(
+        HotReload,
+        st.booleans(),
+        st.lists(texts).map(tuple),
+        st.lists(texts).map(tuple),
+        st.lists(st.tuples(idents, texts)).map(tuple),
+        st.lists(st.tuples(st.just("") | idents, st.sampled_from(REPLACE_WORDS))).map(tuple),
+    ),
+)
+
+
+def test_arguments_are_readable() -> None:
+    assert shlex.join(format_runner_argv(OPTIONS)) == (
+        f"--name=robot --uuid={UUID} --working-directory=/srv --dora=/usr/bin/dora "
+        "--grace-duration=10s /srv/robot.yml"
+    )
+
+
+@given(options)
+def test_arguments_and_back(given_options: RunnerOptions) -> None:
+    assert parse_runner_argv(format_runner_argv(given_options)) == given_options
+    command = runner_command("/usr/bin/python3", given_options)
+    assert options_from_command(command) == given_options
+    assert hash(given_options), "doractl stop and restart take each dataflow once"
+
+
+@given(st.lists(st.text() | st.sampled_from(format_runner_argv(OPTIONS))))
+def test_garbage_is_refused_by_our_error(argv: list[str]) -> None:
+    try:
+        parse_runner_argv(argv)
+    except DoraSystemdError as error:
+        assert error.message.isprintable()
+
+
+@pytest.mark.parametrize(
+    "argv",
+    [
+        [],
+        ["/srv/robot.yml"],
+        [*format_runner_argv(OPTIONS)[:-1], "robot.yml"],
+        ["--uv", *format_runner_argv(OPTIONS), "/x"],
+        ["--name=a", *format_runner_argv(OPTIONS)],
+        ["--colour=red", *format_runner_argv(OPTIONS)],
+        ["--uv=yes", *format_runner_argv(OPTIONS)],
+        ["--venv", *format_runner_argv(OPTIONS)],
+    ],
+)
+def test_bad_command_lines(argv: list[str]) -> None:
+    with pytest.raises(DoraSystemdError, match=r"^cannot read the runner's command line"):
+        parse_runner_argv(argv)
+
+
+def test_other_commands_are_no_runners() -> None:
+    with pytest.raises(DoraSystemdError, match="is not a runner"):
+        options_from_command(["/usr/bin/python3", "-m", "http.server"])
+
+
+def test_reading_options_is_cheap() -> None:
+    """`list` reads the command line of every unit."""
+    code = "import sys, dora_systemd.decisions.cell.options; print('argparse' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "False\n"

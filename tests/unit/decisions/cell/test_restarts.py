@@ -1,0 +1,168 @@
+"""Restart policies: read, handed to dora and systemd, and what is left of them."""
+
+from typing import Any
+
+import pytest
+
+from dora_systemd.decisions.cell.launch import launch_descriptor
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.restarts import (
+    DEFAULT,
+    Budget,
+    RestartPolicy,
+    budget_words,
+    check_restart_nodes,
+    unit_budget,
+)
+from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
+from dora_systemd.decisions.settings.resolve import Settings, resolve_settings
+from dora_systemd.decisions.settings.restart_policies import (
+    node_policies,
+    restart_policy,
+    restart_warnings,
+)
+from dora_systemd.decisions.unit.properties import restart_properties
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.values import INFINITY, SECOND
+from tests.unit.decisions.cell.test_launch import plan
+
+MINUTE = 60 * SECOND
+POLICY = RestartPolicy("on-failure", 3, 10 * MINUTE, SECOND, 8 * SECOND)
+
+
+def settings(flags: dict[str, object], document: object = None) -> Settings:
+    return resolve_settings(flags, {}, [("robot.systemd.yml", document)])
+
+
+def test_from_settings() -> None:
+    given = settings(
+        {"restart_policy": "on-failure", "restart_delay": "40s"},
+        {"max_restarts": 3, "nodes": {"camera": {"restart_policy": "always"}, "plot": None}},
+    )
+    expected = RestartPolicy("on-failure", 3, DEFAULT.window, 40 * SECOND, 40 * SECOND)
+    assert restart_policy(given) == expected
+    assert node_policies(given) == (("camera", expected._replace(policy="always")),)
+
+
+def test_default_restarts_nothing() -> None:
+    assert restart_policy(settings({})).policy == "no"
+    # A bare `no` is false in YAML.
+    assert restart_policy(settings({}, {"restart_policy": False})).policy == "no"
+
+
+def test_warnings() -> None:
+    warnings = list(restart_warnings(settings({"max_restarts": "3"})))
+    assert warnings == ["--max-restarts has no effect without --restart-policy"]
+    assert not list(restart_warnings(settings({"max_restarts": "3", "restart_policy": "always"})))
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("restart_policy", "never"),
+        ("restart_policy", "on-success"),
+        ("max_restarts", "0"),
+        ("max_restarts", "-1"),
+        ("max_restarts", "many"),
+        ("restart_delay", "0"),
+        ("restart_delay", "100ms"),
+        ("restart_delay", "infinity"),
+        ("restart_window", "0"),
+        ("start_timeout", "0"),
+    ],
+)
+def test_bad_values(name: str, text: str) -> None:
+    with pytest.raises(DoraSystemdError) as caught:
+        settings({name: text})
+    assert caught.value.code is ExitCode.USAGE
+    assert caught.value.message.startswith("cannot ")
+    assert caught.value.hint
+
+
+def test_unknown_node() -> None:
+    with pytest.raises(DoraSystemdError) as caught:
+        check_restart_nodes([("camra", POLICY)], ["camera", "plot"])
+    assert caught.value.hint == "did you mean camera?"
+
+
+def node(raw: dict[str, Any], **options: Any) -> dict[str, Any]:
+    flow = parse_dataflow({"nodes": [{"id": "n", "path": "a.py", **raw}]}, "flow.yml")
+    launched: dict[str, Any] = launch_descriptor(flow, plan(**options))["nodes"][0]
+    return {key: launched[key] for key in launched if "restart" in key}
+
+
+DORA = {
+    "restart_policy": "on-failure",
+    "max_restarts": 3,
+    "restart_delay": 1.0,
+    "max_restart_delay": 8.0,
+    "restart_window": 600.0,
+}
+
+
+def test_nodes_that_state_nothing_get_the_policy() -> None:
+    assert node({}) == {}
+    assert node({}, restart=POLICY) == DORA
+    assert node({"restart_policy": "never"}, restart=POLICY) == {"restart_policy": "never"}
+
+
+def test_the_settings_of_a_node_win() -> None:
+    given = {"restart_policy": "always", "max_restarts": 9}
+    assert node(given, node_restarts=(("n", POLICY),)) == DORA
+    assert node(given, node_restarts=(("n", DEFAULT),))["restart_policy"] == "never"
+
+
+def test_endless() -> None:
+    keys = POLICY._replace(max_restarts=INFINITY, window=INFINITY).dora_keys()
+    assert keys["max_restarts"] == 0
+    assert "restart_window" not in keys
+
+
+def unit(policy: RestartPolicy, **changes: Any) -> dict[str, Any]:
+    options = RunnerOptions("r", "u", "/f.yml", "/", "/dora", restart=policy, **changes)
+    return {key: one.value for key, one in restart_properties(options).items()}
+
+
+def test_three_restarts_are_four_starts() -> None:
+    found = unit(POLICY)
+    assert (found["Restart"], found["StartLimitBurst"]) == ("on-failure", 4)
+    assert found["StartLimitIntervalSec"] == 10 * MINUTE
+    assert found["RestartSec"] == SECOND
+    assert "RestartSteps" not in found, "it never forgets"
+    assert found["RestartPreventExitStatus"] == ((70, 72, 77, 78), ())
+
+
+def test_delays_double_up_to_the_longest() -> None:
+    delays = [POLICY.delay_before(restart) // SECOND for restart in (0, 1, 2, 3, 4, 5, 10**6)]
+    assert delays == [1, 1, 2, 4, 8, 8, 8]
+
+
+def test_unit_without_restarts() -> None:
+    assert unit(DEFAULT) == {"Restart": "no", "RestartPreventExitStatus": ((70, 72, 77, 78), ())}
+    assert unit(POLICY, attached=True)["RestartPreventExitStatus"] == ((0, 70, 72, 77, 78), ())
+    assert unit(POLICY._replace(max_restarts=INFINITY))["StartLimitIntervalSec"] == 0
+
+
+@pytest.mark.parametrize(
+    ("starts", "now", "counted", "expected"),
+    [
+        ([], 5, 0, Budget(0, None)),
+        ([0, 1, 2], 5, 2, Budget(2, 5)),
+        ([0, 1, 2, 3, 4, 5], 5, 5, Budget(3, 5)),
+        # The window of the first start is over: the next start began another one.
+        ([0, 9, 11, 12], 13, 3, Budget(1, 8)),
+        ([0, 1], 10, 1, Budget(0, None)),
+        # Cleared by `doractl reset`.
+        ([0, 1, 2], 5, 0, Budget(0, None)),
+    ],
+)
+def test_budget(starts: list[int], now: int, counted: int, expected: Budget) -> None:
+    assert unit_budget(starts, 3, 10, now, counted) == expected
+
+
+def test_words() -> None:
+    budget = {"used": 3, "max": 5, "next_us": 39_100_000, "resets_us": 480 * SECOND}
+    assert budget_words(budget) == "3/5 restarts used, next try in 40s, resets in 8min"
+    assert budget_words({"used": 0, "max": 5, "next_us": None, "resets_us": None}) == (
+        "0/5 restarts used"
+    )

@@ -1,0 +1,269 @@
+"""Descriptors: what is read, what is refused and how, and dora's own errors in one line."""
+
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dora_systemd.decisions.descriptor.dataflow import MAX_JSON, Dataflow, parse_dataflow
+from dora_systemd.decisions.descriptor.nodes import Input, NodeKind
+from dora_systemd.decisions.dora.errors import parse_dora_error
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.terminal_text import one_line
+
+CAMERA: dict[str, Any] = {"id": "camera", "path": "camera.py", "outputs": ["image"]}
+
+
+def flow(*nodes: object, **keys: object) -> Dataflow:
+    return parse_dataflow({"nodes": list(nodes), **keys}, "robot.yml")
+
+
+def refusal(*nodes: object) -> str:
+    with pytest.raises(DoraSystemdError) as caught:
+        flow(*nodes)
+    assert caught.value.code == ExitCode.BAD_INPUT
+    assert caught.value.hint
+    return caught.value.message
+
+
+def test_what_is_read() -> None:
+    detector = {
+        "id": "detector",
+        "path": "./detector",
+        "args": "--fast",
+        "env": {"MODEL": "x.pt"},
+        "inputs": {"image": "camera/image", "tick": {"source": "dora/timer/millis/20"}},
+        "restart_policy": "on-failure",
+        "restart_delay": 0.5,
+        "build": "cargo build",
+        "git": "https://example.org/detector",
+        "send_stdout_as": "log",
+        "deploy": {"working_dir": "sub"},
+        "unheard_of": 1,
+    }
+    dataflow = flow(CAMERA, detector, env={"A": 1}, exit_when_nodes_finish=True)
+    node = dataflow.node("detector")
+    assert node
+    assert (node.kind, node.path, node.args) == (NodeKind.EXECUTABLE, "./detector", "--fast")
+    assert node.inputs == (Input("image", "camera/image"), Input("tick", "dora/timer/millis/20"))
+    assert (node.restart_policy, node.backoff) == ("on-failure", {"restart_delay": 0.5})
+    assert (node.build, node.git) == ("cargo build", "https://example.org/detector")
+    assert node.keeps_output
+    assert node.working_directory == "sub"
+    assert node.raw["unheard_of"] == 1
+    assert (dataflow.env, dataflow.exit_when_nodes_finish) == ({"A": 1}, True)
+    assert dataflow.node("nobody") is None
+
+
+@pytest.mark.parametrize(
+    ("keys", "kind"),
+    [
+        ({"path": "x.py"}, NodeKind.PYTHON),
+        ({"path": "bin/x"}, NodeKind.EXECUTABLE),
+        ({"path": "shell", "args": "echo"}, NodeKind.SHELL),
+        ({"path": "dynamic"}, NodeKind.DYNAMIC),
+        ({"path": "https://example.org/x"}, NodeKind.URL),
+        ({"operator": {"python": "x.py"}}, NodeKind.OPERATOR),
+        ({"operators": [{"id": "a", "python": "x.py"}]}, NodeKind.OPERATOR),
+        ({"ros2": {"topic": "/x"}}, NodeKind.ROS2),
+        ({"module": "x.yml"}, NodeKind.MODULE),
+        ({"hub": "x"}, NodeKind.HUB),
+    ],
+)
+def test_kinds(keys: dict[str, Any], kind: NodeKind) -> None:
+    assert flow({"id": "a", **keys}).nodes[0].kind == kind
+
+
+def test_operators_have_inputs_and_outputs() -> None:
+    one = {
+        "id": "one",
+        "operator": {"python": "x.py", "outputs": ["o"], "inputs": {"i": "two/b/o"}},
+    }
+    part = {"id": "b", "python": "x.py", "outputs": ["o"], "inputs": {"i": "one/o"}}
+    dataflow = flow(one, {"id": "two", "operators": [part]})
+    assert dataflow.nodes[0].outputs == {"o"}
+    assert dataflow.nodes[1].outputs == {"b/o"}
+    assert dataflow.nodes[1].inputs == (Input("b/i", "one/o"),)
+
+
+def test_outputs_of_modules_are_not_known() -> None:
+    user = {"id": "a", "path": "a.py", "inputs": {"x": "m/out", "y": "m.inner/out"}}
+    assert flow({"id": "m", "module": "m.yml"}, user)
+
+
+@pytest.mark.parametrize(
+    ("document", "reason"),
+    [
+        ([], "it holds a list"),
+        ("text", "it holds the text 'text'"),
+        (None, "it holds nothing"),
+        (5, "it holds a number"),
+        ({}, "it has no nodes"),
+        ({"nodes": []}, "it has no nodes"),
+        ({"nodes": None}, "it has no nodes"),
+        ({"nodes": {"id": "a"}}, "'nodes' is a mapping"),
+        ({"nodes": ["a"]}, "node 1 is the text 'a'"),
+        ({"nodes": [{"id": "a", "path": "x"}], "env": 5}, "'env' is a number"),
+        ({1: 2}, "a key in it is int, not text"),
+        ({"a": {1, 2}}, "a value in it is of type set"),
+        ({"a": float("inf")}, "a number in it is too large for JSON"),
+        ({"a": 2**70}, "a number in it is too large for JSON"),
+        ({"a": "\udcff"}, "a text in it is not Unicode"),
+    ],
+)
+def test_documents_that_are_no_dataflows(document: object, reason: str) -> None:
+    with pytest.raises(DoraSystemdError) as caught:
+        parse_dataflow(document, "robot.yml")
+    assert caught.value.message == f"cannot use robot.yml: {reason}"
+
+
+@pytest.mark.parametrize(
+    ("node_id", "reason"),
+    [
+        (None, "has no id"),
+        (1, "is a number"),
+        (True, "is true or false"),
+        ("", "has the id ''"),
+        ("a/b", "has the id 'a/b'"),
+        ("a b", "has the id 'a b'"),
+        ("..", "has the id '..'"),
+        ("ü", "has the id 'ü'"),
+        ("a\n", r"has the id 'a\n'"),
+        ("dora", "has the id 'dora'"),
+        ("x" * 201, "has the id 'xxx"),
+    ],
+)
+def test_bad_ids(node_id: object, reason: str) -> None:
+    assert reason in refusal(CAMERA, {"id": node_id, "path": "x.py"})
+
+
+@pytest.mark.parametrize(
+    ("nodes", "reason"),
+    [
+        ([CAMERA, CAMERA], "two nodes have the id camera"),
+        ([{"id": "a"}], "node a has no path"),
+        ([{"id": "a", "path": "x", "inputs": ["b/c"]}], "node a: 'inputs' is a list"),
+        ([{"id": "a", "path": "x", "outputs": "b"}], "node a: 'outputs' is the text 'b'"),
+        ([{"id": "a", "path": "x", "env": ["b"]}], "node a: 'env' is a list"),
+        ([{"id": "a", "operators": [1]}], "node a: an operator is a number"),
+    ],
+)
+def test_bad_nodes(nodes: list[object], reason: str) -> None:
+    assert refusal(*nodes) == f"cannot use robot.yml: {reason}"
+
+
+@pytest.mark.parametrize(
+    ("source", "reason"),
+    [
+        ("nobody/image", "a node that does not exist"),
+        ("camera/depth", "an output that it does not declare"),
+        ("camera", "which names no output"),
+        (None, "which names no output"),
+        (["camera/image"], "which names no output"),
+    ],
+)
+def test_inputs_from_nowhere(source: object, reason: str) -> None:
+    message = refusal(CAMERA, {"id": "b", "path": "b.py", "inputs": {"x": source}})
+    assert message.startswith("cannot use robot.yml: node b: input 'x' comes from")
+    assert message.endswith(reason)
+
+
+def test_anchors_that_explode_are_refused_at_once() -> None:
+    bomb: Any = "x" * 10
+    for _ in range(40):
+        bomb = [bomb] * 10
+    assert "too large" in refusal({**CAMERA, "env": {"A": bomb}})
+
+
+def test_documents_that_hold_themselves_are_refused() -> None:
+    circle: list[Any] = []
+    circle.append(circle)
+    assert "nested more than" in refusal({**CAMERA, "env": {"A": circle}})
+
+
+def test_more_than_dora_takes_is_refused() -> None:
+    assert "too large" in refusal({**CAMERA, "args": "x" * MAX_JSON})
+
+
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
+    max_leaves=10,
+)
+node_keys = st.sampled_from(
+    ["id", "path", "inputs", "outputs", "env", "operator", "operators", "deploy", "args", "ros2"]
+)
+
+
+@given(
+    st.lists(st.dictionaries(node_keys, json_values | st.just("camera/image")), max_size=3)
+    | json_values
+)
+def test_any_document_is_read_or_refused(nodes: Any) -> None:
+    try:
+        parse_dataflow({"nodes": [CAMERA, *nodes] if isinstance(nodes, list) else nodes}, "x.yml")
+    except DoraSystemdError as error:
+        assert error.message.startswith("cannot use x.yml: ")
+        assert error.message.isprintable()
+
+
+WIRING = """Validating x.yml...
+
+
+[ERROR]
+wiring check failed
+
+Caused by:
+    source node `b` mapped to input `a/a` does not exist
+
+Location:
+    libraries/core/src/descriptor/validate.rs:562:17
+"""
+PARSING = """
+\x1b[31m[ERROR]\x1b[0m
+failed to read dataflow at `x.yml`
+
+  hint: check the file exists, is valid YAML, and matches the dataflow schema
+
+Caused by:
+   0: failed to parse given descriptor
+   1: nodes[0]: unknown field `foo`, expected one of `a`, `b`, `c`, `d`, `e`, `f`, `g` at line 1
+
+Location:
+    libraries/core/src/descriptor/mod.rs:487:38
+
+Stack backtrace:
+   0: <unknown>
+"""
+MISSING = """[ERROR]
+failed
+
+Caused by:
+   0: first
+   1: module file not found: m.yml
+   2: No such file or directory (os error 2)
+"""
+
+
+@pytest.mark.parametrize(
+    ("stderr", "reason"),
+    [
+        (WIRING, "source node `b` mapped to input `a/a` does not exist"),
+        (PARSING, "nodes[0]: unknown field `foo` at line 1"),
+        (MISSING, "module file not found: m.yml: No such file or directory (os error 2)"),
+        ("[ERROR]\ncannot connect\n\n  hint: x\n", "cannot connect"),
+        ("error: unexpected argument '-x'\n\nUsage: dora\n", "error: unexpected argument '-x'"),
+        ("one\ntwo\n\n", "two"),
+        ("", ""),
+    ],
+)
+def test_dora_errors_in_one_line(stderr: str, reason: str) -> None:
+    assert parse_dora_error(stderr) == reason
+
+
+@given(st.text() | st.lists(st.sampled_from([*PARSING.splitlines(), "x" * 500])).map("\n".join))
+def test_any_output_becomes_one_short_line(stderr: str) -> None:
+    reason = parse_dora_error(stderr)
+    assert one_line(reason) == reason
+    assert len(reason) <= 300

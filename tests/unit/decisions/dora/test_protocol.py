@@ -1,0 +1,178 @@
+"""Frames of dora 1.1, as they were seen on the wire."""
+
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dora_systemd.decisions.dora import protocol
+from dora_systemd.decisions.dora.protocol import LogRecord, Reply
+from dora_systemd.decisions.life import events as life
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.values import INFINITY
+
+RUN = "01a1fb9e-9464-7aee-adce-79cf1bfc2b24"
+
+
+def log_frame(message: str, target: str = "daemon", node: str | None = "a") -> str:
+    payload = {"level": "DEBUG", "target": target, "node_id": node, "message": message}
+    return json.dumps({"event": "log", "payload": payload})
+
+
+def event(message: str, target: str = "daemon", node: str | None = "a") -> life.Event | None:
+    record = protocol.parse_frame(log_frame(message, target, node))
+    assert isinstance(record, LogRecord)
+    return protocol.parse_life_event(record, 5)
+
+
+@pytest.mark.parametrize(
+    ("found", "expected"),
+    [
+        (event("spawned node with pid 14626", "spawner"), life.NodeSpawned(5, "a", 14626)),
+        (event("node is ready"), life.NodeReady(5, "a")),
+        (
+            event("handling node stop with exit status Success (restart: false, restart_count: 0)"),
+            life.NodeExited(5, "a", "", False),
+        ),
+        (
+            event(
+                "handling node stop with exit status ExitCode(3) (restart: true, restart_count: 1)"
+            ),
+            life.NodeExited(5, "a", "exit code 3", True),
+        ),
+        (
+            event(
+                "handling node stop with exit status Signal(9) (restart: false, restart_count: 0)"
+            ),
+            life.NodeExited(5, "a", "signal SIGKILL", False),
+        ),
+        (
+            event("marking `camera` as cascading error caused by `opnode`"),
+            life.NodeCascaded(5, "camera", "opnode"),
+        ),
+        (event("all nodes are ready, starting dataflow", node=None), life.AllReady(5)),
+        (
+            event("startup barrier completed by a node exit, starting dataflow", node=None),
+            life.AllReady(5),
+        ),
+        (event("dataflow finished", "coordinator", None), life.RunFinished(5)),
+        (event("dataflow finished on machine `x`", "daemon", None), None),
+        (event("node is ready", "stdout"), None),
+        (event("node is ready", ""), None),
+        (event("spawning `/bin/sh` in `/run`", "spawner"), None),
+    ],
+)
+def test_life_events(found: life.Event | None, expected: life.Event | None) -> None:
+    assert found == expected
+
+
+def test_results() -> None:
+    err = {"cause": {"Other": {"stderr": "x"}}, "exit_status": {"ExitCode": 1}}
+    cascading = {"cause": {"Cascading": {"caused_by_node": "a"}}, "exit_status": {"Signal": 15}}
+    grace = {"cause": "GraceDuration", "exit_status": {"Signal": 9}}
+    spawn = {"cause": {"FailedToSpawn": "no\n\nLocation:\n  x"}, "exit_status": "Unknown"}
+    nodes = {
+        "ok": {"Ok": None},
+        "a": {"Err": err},
+        "b": {"Err": cascading},
+        "c": {"Err": grace},
+        "d": {"Err": spawn},
+    }
+    reply = Reply("1", {"DataflowStopped": {"uuid": RUN, "result": {"node_results": nodes}}}, "")
+    assert protocol.parse_results(reply) == {
+        "a": "exit code 1",
+        "b": "signal SIGTERM because node a failed",
+        "c": "signal SIGKILL after the grace duration",
+        "d": "failed to spawn: no",
+        "ok": "",
+    }
+    assert protocol.parse_results(Reply("1", {"DataflowSpawned": {"uuid": RUN}}, "")) is None
+    assert protocol.parse_results(Reply("1", None, "no such dataflow")) == {}
+
+
+def test_requests_and_replies() -> None:
+    ident, text = protocol.encode_request(protocol.stop_params(RUN, 2_500_000))
+    frame = json.loads(text)
+    assert frame["id"] == ident
+    assert frame["method"] == "control"
+    assert frame["params"]["Stop"]["grace_duration"] == {"secs": 2, "nanos": 500_000_000}
+    good = protocol.parse_frame(json.dumps({"id": ident, "result": {"DaemonConnected": True}}))
+    assert isinstance(good, Reply)
+    assert protocol.result_of(good, "DaemonConnected") is True
+    for bad in ({"error": "no"}, {"result": {"Error": "no"}}, {"result": "DestroyOk"}):
+        reply = protocol.parse_frame(json.dumps({"id": ident, **bad}))
+        assert isinstance(reply, Reply)
+        with pytest.raises(DoraSystemdError, match=r"^cannot "):
+            protocol.result_of(reply, "DaemonConnected")
+
+
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.text(),
+    lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
+    max_leaves=8,
+)
+
+
+@given(st.text() | json_values.map(json.dumps))
+def test_no_frame_breaks_the_parser(text: str) -> None:
+    frame = protocol.parse_frame(text)
+    if isinstance(frame, LogRecord):
+        protocol.parse_life_event(frame, 1)
+    if isinstance(frame, Reply):
+        protocol.parse_results(frame)
+
+
+@given(
+    st.fixed_dictionaries(
+        {
+            "id": st.just("1"),
+            "result": st.dictionaries(
+                st.sampled_from(["DataflowStopped", "Error", "x"]), json_values
+            ),
+        }
+    )
+)
+def test_no_reply_breaks_the_results(frame: object) -> None:
+    reply = protocol.parse_frame(json.dumps(frame))
+    assert isinstance(reply, Reply)
+    protocol.parse_results(reply)
+
+
+@pytest.mark.parametrize(
+    ("result", "age"),
+    [
+        ({"ConnectedDaemons": [{"last_heartbeat_ago_ms": 2302}]}, 2_302_000),
+        ({"ConnectedDaemons": [{"daemon_id": {}}]}, 0),
+        ({"ConnectedDaemons": []}, INFINITY),
+        ({"ConnectedMachines": ["a"]}, 0),
+        (None, 0),
+    ],
+)
+def test_heartbeat(result: object, age: int) -> None:
+    assert protocol.parse_heartbeat(Reply("1", result, "")) == age
+
+
+@pytest.mark.parametrize(
+    ("error", "failure"),
+    [
+        ("", ""),
+        # On a slow machine a short run is over before dora is asked.
+        (f"unknown dataflow {RUN}", ""),
+        (f"unknown dataflow {RUN}\n\nLocation:\n    coordinator.rs:1", ""),
+        ("dataflow failed to start:\n  a: failed", "dataflow failed to start: a: failed"),
+    ],
+)
+def test_spawn_failures(error: str, failure: str) -> None:
+    assert protocol.parse_spawn_failure(Reply("1", None, error)) == failure
+
+
+def test_what_nobody_who_is_dora_would_send() -> None:
+    """Over a relay it is the owner of the dataflow who answers, with dora or without."""
+    assert protocol.parse_frame("[" * 100_000) is None
+    errors: list[object] = [5, [], {"a": ["\x1b"]}, True]
+    for error in errors:
+        for frame in ({"id": "x", "error": error}, {"id": "x", "result": {"Error": error}}):
+            reply = protocol.parse_frame(json.dumps(frame))
+            assert isinstance(reply, protocol.Reply)
+            assert reply.error == "an error without words"

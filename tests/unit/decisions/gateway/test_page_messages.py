@@ -1,0 +1,108 @@
+"""What the status page and the gateway say to each other."""
+
+import json
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
+from dora_systemd.decisions.gateway.page_messages import (
+    MAX_TEXT,
+    PageMessage,
+    graph_values,
+    line_values,
+    parse_message,
+)
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.terminal_text import escaped
+
+
+def test_messages() -> None:
+    text = '{"type": "act", "action": "stop", "dataflow": "u", "node": "camera", "number": 7}'
+    assert parse_message(text) == PageMessage("act", "u", "camera", "stop", 7)
+    assert parse_message(b'{"type": "unfollow"}') == PageMessage("unfollow")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("", "{", "[]", "3", "null", '"follow"', "{}", '{"type": "kill"}', b"\xff"),
+        *('{"type": "act", "action": "kill"}', '{"type": "follow", "node": 3}'),
+        *('{"type": "follow", "number": "x"}', '{"type": ["follow"]}', "[" * 100_000),
+        *('{"type": "follow", "number": 1e999}', '{"type": "follow", "number": null}'),
+    ],
+)
+def test_what_is_no_message(text: str | bytes) -> None:
+    with pytest.raises(DoraSystemdError) as caught:
+        parse_message(text)
+    assert caught.value.code is ExitCode.USAGE
+
+
+@given(st.binary(max_size=60) | st.text(max_size=60) | st.from_type(dict).map(str))
+def test_anything_else_is_refused(text: str | bytes) -> None:
+    with pytest.raises(DoraSystemdError):
+        parse_message(text)
+
+
+def record(message: bytes, **fields: bytes) -> dict[str, bytes]:
+    return {"MESSAGE": message, "__REALTIME_TIMESTAMP": b"17", **fields}
+
+
+def test_lines() -> None:
+    line = line_values(record(b"hello", PRIORITY=b"3", DORA_NODE=b"camera"))
+    assert line == {"at_us": 17, "node": "camera", "text": "hello", "priority": 3, "event": ""}
+    event = record(b"Node x crashed", DORA_EVENT=b"node-crashed", SYSLOG_IDENTIFIER=b"robot")
+    assert line_values(event)["event"] == "node-crashed"
+    assert line_values(record(b"x", SYSLOG_IDENTIFIER=b"robot/daemon"))["node"] == "daemon"
+
+
+@pytest.mark.parametrize(
+    ("message", "text"),
+    [
+        (b"\x1b[1;31mred\x1b[0m", "red"),
+        (b"\x1b]0;title\x07after", "after"),
+        (b"\x1b[2J\x1b[Hcleared", "cleared"),
+        (b"<script>alert(1)</script>", "<script>alert(1)</script>"),
+        (b"two\nlines\tand\x00more", "two\nlines\tand\\x00more"),
+        (b"\xff\xfe", "\ufffd\ufffd"),
+        ("left \u202e right".encode(), r"left \u202e right"),
+        (b"x" * (MAX_TEXT + 5), "x" * MAX_TEXT + "…"),
+        (b"", ""),
+    ],
+)
+def test_text_of_lines(message: bytes, text: str) -> None:
+    assert line_values(record(message))["text"] == text
+
+
+@given(st.binary(max_size=80))
+def test_no_line_commands_a_terminal(message: bytes) -> None:
+    text = line_values(record(message))["text"]
+    json.dumps(text).encode()
+    assert escaped(text) == text
+
+
+def test_graph() -> None:
+    nodes: list[dict[str, Any]] = [
+        {
+            "id": "camera",
+            "path": "camera.py",
+            "inputs": {"tick": "dora/timer/millis/100"},
+            "outputs": ["image"],
+            "env": {"TOKEN": "secret"},
+        },
+        {
+            "id": "plot",
+            "path": "plot.py",
+            "inputs": {"picture": {"source": "camera/image", "queue_size": 2}},
+        },
+    ]
+    values = graph_values(parse_dataflow({"nodes": nodes}, "flow.yml"))
+    assert [one["id"] for one in values["nodes"]] == ["dora/timer/millis/100", "camera", "plot"]
+    assert [one["kind"] for one in values["nodes"]] == ["dora", "python", "python"]
+    assert [(one["from"], one["output"], one["to"]) for one in values["edges"]] == [
+        ("dora/timer/millis/100", "", "camera"),
+        ("camera", "image", "plot"),
+    ]
+    assert "secret" not in json.dumps(values)

@@ -1,0 +1,59 @@
+"""The live table while reloads change which nodes there are."""
+
+from dora_systemd.decisions.cell.status import HELD, NodeStatus
+from dora_systemd.decisions.life import events as life
+from dora_systemd.decisions.life.nodes import has_process, reshape, update
+
+RUNNING = {"a": NodeStatus("running", 7, restarts=2, policy=HELD)}
+
+
+def updated(nodes: dict[str, NodeStatus], *events: life.Event) -> list[str]:
+    """States of `a` after each event, and what the journal was told."""
+    found = []
+    table = dict(nodes)
+    for event in events:
+        after, record = update(table, event, is_stopping=False, is_open=True)
+        table = dict(reshape(after, event))
+        found.append(f"{table['a'].state} {record[0] if record else ''}".strip())
+    return found
+
+
+def test_a_swap_is_no_crash_and_no_restart() -> None:
+    fresh = NodeStatus(policy=HELD)
+    assert updated(
+        RUNNING,
+        life.NodeReloading(1, "a", fresh),
+        life.NodeExited(2, "a", "", True),
+        life.NodeSpawned(3, "a", 8),
+        life.NodeReady(4, "a"),
+    ) == ["reloading", "reloading node-exited", "starting", "running node-ready"]
+
+
+def test_the_old_one_may_end_after_its_successor_has_begun() -> None:
+    assert updated(
+        RUNNING,
+        life.NodeReloading(1, "a"),
+        life.NodeSpawned(2, "a", 8),
+        life.NodeExited(3, "a", "signal SIGTERM", False, is_stale=True),
+        life.NodeReady(4, "a"),
+    ) == ["reloading", "starting", "starting", "running node-ready"]
+
+
+def test_a_node_that_is_held_fails_and_is_not_restarted() -> None:
+    nodes, record = update(
+        RUNNING, life.NodeExited(1, "a", "exit code 1", True), is_stopping=False, is_open=True
+    )
+    assert record is not None
+    assert (nodes["a"].state, nodes["a"].restarts, record[0]) == ("failed", 2, "node-crashed")
+
+
+def test_processes_of_a_node_that_reloads() -> None:
+    reloading = reshape(RUNNING, life.NodeReloading(1, "a"))
+    assert has_process(reloading)
+    assert not has_process({"a": reloading["a"]._replace(pid=0)})
+
+
+def test_nodes_come_and_go() -> None:
+    more = reshape(RUNNING, life.NodeAdded(1, "b", NodeStatus()))
+    assert set(more) == {"a", "b"}
+    assert set(reshape(more, life.NodeRemoved(1, "a"))) == {"b"}

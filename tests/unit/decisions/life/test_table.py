@@ -1,0 +1,382 @@
+"""The runner's state machine: every pair of state and event, and whole lives as tables."""
+
+from dataclasses import replace
+
+import pytest
+
+from dora_systemd.decisions.cell.status import HELD, NodeStatus
+from dora_systemd.decisions.life import events as life
+from dora_systemd.decisions.life.failures import ENGINE_TIMEOUT
+from dora_systemd.decisions.life.states import Cell, Deadline, Do, Record, RunnerExit, State
+from dora_systemd.decisions.life.stop_budget import stop_timeout
+from dora_systemd.decisions.life.table import TABLE, step
+from dora_systemd.decisions.logs.events import END_EVENTS
+from dora_systemd.values import SECOND
+
+SAMPLES: dict[type[life.Event], tuple[life.Event, ...]] = {
+    life.CoordinatorListening: (life.CoordinatorListening(1),),
+    life.DaemonConnected: (life.DaemonConnected(1),),
+    life.RunStarted: (life.RunStarted(1, "run"),),
+    life.Subscribed: (life.Subscribed(1),),
+    life.Refused: (life.Refused(1, "no"),),
+    life.Failed: (life.Failed(1, "start the daemon", "OSError: no"),),
+    life.NodeSpawned: (life.NodeSpawned(1, "a", 7), life.NodeSpawned(1, "unknown", 7)),
+    life.NodeReady: (life.NodeReady(1, "a"), life.NodeReady(1, "unknown")),
+    life.AllReady: (life.AllReady(1),),
+    life.NodeExited: (
+        life.NodeExited(1, "a", "", False),
+        life.NodeExited(1, "a", "exit code 1", False),
+        life.NodeExited(1, "a", "signal SIGKILL", True),
+        life.NodeExited(1, "a", "", False, is_stale=True),
+        life.NodeExited(1, "unknown", "", True, is_stale=True),
+    ),
+    life.NodeCascaded: (life.NodeCascaded(1, "a", "b"),),
+    life.NodeHung: (life.NodeHung(1, "a", "unresponsive"), life.NodeHung(1, "unknown", "")),
+    life.StartTimedOut: (life.StartTimedOut(1, 1_000_000),),
+    life.RunFinished: (life.RunFinished(1),),
+    life.ResultKnown: (life.ResultKnown(1), life.ResultKnown(1, {"a": "", "b": "exit code 1"})),
+    life.ChildExited: (
+        life.ChildExited(1, "daemon", "signal SIGKILL"),
+        life.ChildExited(1, "coordinator", "exit code 1"),
+    ),
+    life.ConnectionLost: (life.ConnectionLost(1),),
+    life.StopAsked: (life.StopAsked(1, "SIGTERM"),),
+    life.StopAnswered: (life.StopAnswered(1),),
+    life.NodeReloading: (life.NodeReloading(1, "a"),),
+    life.NodeAdded: (life.NodeAdded(1, "c", NodeStatus()),),
+    life.NodeRemoved: (life.NodeRemoved(1, "a"), life.NodeRemoved(1, "unknown")),
+    life.ReloadNoted: (life.ReloadNoted(1, "a.py: line 3: invalid syntax"),),
+    life.ReloadAsked: (life.ReloadAsked(1),),
+    life.DeadlinePassed: (life.DeadlinePassed(1),),
+}
+
+
+def cell(state: State = State.BOOTING, **changes: object) -> Cell:
+    nodes = {"a": NodeStatus("running", 7), "b": NodeStatus("running", 8)}
+    return replace(Cell(10 * SECOND, 0, nodes, state), **changes)  # type: ignore[arg-type]
+
+
+def test_the_table_is_total() -> None:
+    assert set(TABLE) == set(State)
+    for row in TABLE.values():
+        assert set(row) == set(life.EVENTS) == set(SAMPLES)
+
+
+@pytest.mark.parametrize("state", State)
+@pytest.mark.parametrize("kind", life.EVENTS, ids=lambda kind: kind.__name__)
+def test_every_pair(state: State, kind: type[life.Event]) -> None:
+    for event in SAMPLES[kind]:
+        after, actions = step(cell(state), event)
+        assert (Do.EXIT in actions) == (after.state is State.ENDED and state is not State.ENDED)
+        if after.state is not state:
+            deadlines = [one for one in actions if isinstance(one, Deadline)]
+            assert len(deadlines) == 1, "every change of state sets or clears the deadline"
+        if state is State.ENDED:
+            assert (after, actions) == (cell(state), ())
+
+
+@pytest.mark.parametrize("state", [s for s in State if s is not State.ENDED])
+def test_each_state_ends_when_it_is_told_to_and_nothing_answers(state: State) -> None:
+    now = cell(state)
+    for event in (life.StopAsked(1, "SIGTERM"), *[life.DeadlinePassed(2)] * 3):
+        now = step(now, event)[0]
+    assert now.state is State.ENDED
+    if state not in (State.CLOSING,):
+        assert now.exit is RunnerExit.OK
+
+
+LIVING = [state for state in State if state is not State.ENDED]
+CHANGES: list[dict[str, object]] = [
+    {},
+    {"stop_by": "SIGTERM"},
+    {"is_trial": True, "stop_by": "SIGTERM"},
+    {"failure": "node a: exit code 1", "exit": RunnerExit.NODES_FAILED},
+]
+
+
+@pytest.mark.parametrize("changes", CHANGES, ids=str)
+@pytest.mark.parametrize("state", LIVING)
+@pytest.mark.parametrize("kind", life.EVENTS, ids=lambda kind: kind.__name__)
+def test_every_pair_when_its_action_raises(
+    state: State, kind: type[life.Event], changes: dict[str, object]
+) -> None:
+    broken = life.Failed(2, "do it", "OSError: no")
+    for event in SAMPLES[kind]:
+        between, before = step(cell(state, **changes), event)
+        after, actions = step(between, broken)
+        done = (*before, *actions)
+        assert after.state is State.ENDED
+        assert done.count(Do.EXIT) == 1, "EXIT is reachable from every state"
+        told = [one for one in done if isinstance(one, Record) and one.event in END_EVENTS]
+        assert len(told) == 1, "its end has one name"
+
+
+@pytest.mark.parametrize("state", [s for s in LIVING if s is not State.LEAVING])
+def test_what_raised_has_its_name_in_the_journal(state: State) -> None:
+    after, actions = step(cell(state), life.Failed(1, "start the daemon", "OSError: no"))
+    assert after.failure == "the runner could not start the daemon: OSError: no"
+    details = {"reason": after.failure, "cause": "runner-broken"}
+    assert Record("dataflow-failed", "", details) in actions
+    assert after.exit is RunnerExit.FAILED
+
+
+def test_no_run_follows_one_that_raised_while_a_reload_ended_it() -> None:
+    after, _ = step(cell(State.STOPPING, reload=True), life.Failed(1, "ask dora to stop", "no"))
+    assert (after.reload, after.exit) == (False, RunnerExit.FAILED)
+
+
+def test_an_end_that_is_known_stays_known() -> None:
+    known = cell(State.LEAVING, failure="node a: exit code 1", exit=RunnerExit.NODES_FAILED)
+    for now in (known, replace(known, state=State.STOPPING)):
+        after, _ = step(now, life.Failed(1, "tell the daemon to end", "OSError: no"))
+        assert (after.failure, after.exit) == (known.failure, known.exit)
+    after, actions = step(cell(State.LEAVING), life.Failed(1, "x", "y"))
+    assert Record("dataflow-finished") in actions
+
+
+def live(
+    *events: life.Event, nodes: tuple[str, ...] = ("a", "b")
+) -> tuple[Cell, list[Do | Record]]:
+    now = Cell(2 * SECOND, 0, {n: NodeStatus() for n in nodes})
+    done: list[Do | Record] = []
+    for event in events:
+        now, actions = step(now, event)
+        done += [action for action in actions if not isinstance(action, Deadline)]
+    return now, done
+
+
+START = (
+    life.CoordinatorListening(1),
+    life.DaemonConnected(2),
+    life.RunStarted(3, "run"),
+    life.Subscribed(4),
+)
+READY = (
+    *START,
+    life.NodeSpawned(5, "a", 7),
+    life.NodeSpawned(5, "b", 8),
+    life.NodeReady(6, "a"),
+    life.NodeReady(7, "b"),
+    life.AllReady(8),
+)
+ASKED = [
+    Do.START_DAEMON,
+    Do.SEND_START,
+    Do.SUBSCRIBE,
+    Do.OPEN_PIPES,
+    Do.ASK_SPAWN,
+    Do.ASK_RESULT,
+]
+
+
+def test_history_ready() -> None:
+    now, done = live(*READY)
+    assert now.state is State.RUNNING
+    assert now.ready_us == 8
+    assert [one for one in done if isinstance(one, Do)] == ASKED
+    assert done[-1] == Record("dataflow-started")
+    assert [node.state for node in now.nodes.values()] == ["running", "running"]
+
+
+def test_history_stop() -> None:
+    now, done = live(
+        *READY,
+        life.StopAsked(9, "SIGTERM"),
+        life.NodeExited(10, "a", "", False),
+        life.NodeExited(10, "b", "signal SIGTERM", False),
+        life.ChildExited(11, "daemon", "exit code 0"),
+    )
+    assert now.exit is RunnerExit.OK
+    ends = done[done.index(Record("dataflow-stopping", "", {"by": "SIGTERM"})) :]
+    assert [one for one in ends if isinstance(one, Do)] == [
+        Do.ASK_STOP,
+        Do.DISMISS_DAEMON,
+        Do.EXIT,
+    ]
+    assert Record("dataflow-stopped") in ends
+    assert not [one for one in ends if isinstance(one, Record) and one.event == "node-crashed"]
+
+
+def test_history_finish() -> None:
+    now, done = live(
+        *READY,
+        life.NodeExited(9, "a", "", False),
+        life.NodeExited(9, "b", "", False),
+        life.RunFinished(10),
+        life.ResultKnown(11, {"a": "", "b": ""}),
+        life.ChildExited(12, "daemon", "exit code 0"),
+    )
+    assert now.exit is RunnerExit.OK
+    assert done[-2:] == [Record("dataflow-finished"), Do.EXIT]
+
+
+def test_history_failed_before_ready() -> None:
+    now, done = live(
+        *START,
+        life.NodeExited(9, "a", "exit code 1", False),
+        life.NodeCascaded(9, "b", "a"),
+        life.RunFinished(10),
+        life.ResultKnown(11, {"a": "exit code 1", "b": "exit code 1 because node a failed"}),
+        life.ChildExited(12, "daemon", "exit code 0"),
+    )
+    assert now.exit is RunnerExit.FAILED
+    assert Record("node-crashed", "a", {"exit": "exit code 1"}) in done
+    assert now.failure.startswith("node a: exit code 1")
+
+
+def test_the_barrier_opens_although_a_node_has_failed() -> None:
+    failed = (*START, life.NodeExited(5, "a", "exit code 1", False), life.NodeReady(6, "b"))
+    now, done = live(*failed, life.AllReady(7))
+    assert now.state is State.WAITING
+    assert Record("dataflow-started") not in done
+    now, actions = step(now, life.DeadlinePassed(8))
+    assert now.state is State.RUNNING
+    assert Record("dataflow-started") in actions
+
+
+def test_an_empty_result_is_unknown_and_not_success() -> None:
+    now, _ = live(*READY, life.RunFinished(10), life.ResultKnown(11))
+    assert now.exit is RunnerExit.ENGINE_LOST
+
+
+def test_stop_does_not_wait_for_a_node_in_its_restart_delay() -> None:
+    now, done = live(
+        *READY,
+        life.NodeExited(9, "a", "", False),
+        life.NodeExited(9, "b", "exit code 1", True),
+        life.StopAsked(10, "SIGTERM"),
+    )
+    assert now.state is State.LEAVING
+    assert Do.ASK_STOP not in done
+
+
+def test_stop_timeout_covers_what_dora_takes_to_kill() -> None:
+    assert stop_timeout(10 * SECOND) == 17 * SECOND
+    _, actions = step(cell(State.RUNNING), life.StopAsked(1, "x"))
+    assert Deadline(17 * SECOND) in actions
+    assert ENGINE_TIMEOUT == 30 * SECOND
+
+
+def test_crash_restart_and_stale_exits() -> None:
+    now, done = live(*READY, life.NodeExited(9, "a", "exit code 3", True))
+    assert now.nodes["a"].state == "restarting"
+    now, actions = step(now, life.NodeSpawned(10, "a", 70))
+    assert actions == (Record("node-restarted", "a", {"restarts": "1"}),)
+    now, _ = step(now, life.NodeExited(11, "a", "signal SIGKILL", False, is_stale=True))
+    assert (now.nodes["a"].pid, now.nodes["a"].state) == (70, "starting")
+    now, _ = step(now, life.NodeReady(12, "a"))
+    assert (now.nodes["a"].state, now.nodes["a"].restarts) == ("running", 1)
+    now, _ = step(now, life.NodeExited(13, "a", "signal SIGKILL", True, is_stale=True))
+    assert (now.nodes["a"].pid, now.nodes["a"].restarts) == (70, 2)
+    assert Record("node-crashed", "a", {"exit": "exit code 3"}) in done
+
+
+def lives(now: Cell, *events: life.Event) -> tuple[Cell, list[object]]:
+    done: list[object] = []
+    for event in events:
+        now, actions = step(now, event)
+        done += [one for one in actions if not isinstance(one, Deadline)]
+    return now, done
+
+
+def test_a_reload_of_the_whole_ends_without_a_word() -> None:
+    after, done = lives(
+        cell(State.RUNNING),
+        life.ReloadAsked(1),
+        life.NodeExited(2, "a", "", False),
+        life.NodeExited(3, "b", "", False),
+        life.ChildExited(4, "daemon", "exit code 0"),
+    )
+    assert after.state is State.ENDED
+    assert (after.reload, after.exit, after.failure) == (True, RunnerExit.OK, "")
+    names = [one.event for one in done if isinstance(one, Record)]
+    assert names == ["node-exited", "node-exited"]
+
+
+def test_a_stop_is_stronger_than_a_reload() -> None:
+    after, done = lives(
+        cell(State.RUNNING),
+        life.ReloadAsked(1),
+        life.StopAsked(2, "SIGTERM"),
+        life.StopAnswered(3),
+        life.ChildExited(4, "daemon", "exit code 0"),
+    )
+    assert (after.state, after.reload, after.stop_by) == (State.ENDED, False, "SIGTERM")
+    assert [one.event for one in done if isinstance(one, Record)] == [
+        "dataflow-stopping",
+        "dataflow-stopped",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("changes", "ends", "word"),
+    [
+        ({}, True, "dataflow-failed"),
+        ({"is_again": True}, False, ""),
+    ],
+)
+def test_a_held_node_that_fails_before_the_start(
+    changes: dict[str, bool], ends: bool, word: str
+) -> None:
+    nodes = {"a": NodeStatus("starting", 7, policy=HELD), "b": NodeStatus("ready", 8)}
+    now = cell(State.WAITING, nodes=nodes, **changes)
+    after, done = lives(now, life.NodeExited(1, "a", "exit code 1", True))
+    assert (after.state is State.ENDED) == ends
+    names = [one.event for one in done if isinstance(one, Record)]
+    assert names == ["node-crashed", *([word] if word else [])]
+
+
+def test_a_trial_that_fails_ends_in_good_order() -> None:
+    nodes = {"a": NodeStatus("starting", 7, policy=HELD), "b": NodeStatus("ready", 8)}
+    now = cell(State.WAITING, nodes=nodes, is_again=True, is_trial=True)
+    after, done = lives(
+        now,
+        life.NodeExited(1, "a", "exit code 1", True),
+        life.NodeExited(2, "b", "", False),
+        life.ChildExited(3, "daemon", "exit code 0"),
+    )
+    assert Do.ASK_STOP in done
+    assert after.state is State.ENDED
+    assert after.failure == "node a: exit code 1 before it was ready"
+    names = [one.event for one in done if isinstance(one, Record)]
+    assert names == ["node-crashed", "node-exited", "reload-failed"]
+
+
+def test_nodes_that_all_crashed_at_once_run_again() -> None:
+    crashes = [life.NodeExited(9, node, "signal SIGKILL", True) for node in ("a", "b")]
+    again = [life.NodeSpawned(10, "a", 70), life.NodeSpawned(10, "b", 80)]
+    now, _ = live(*READY, *crashes, *again, life.NodeReady(11, "a"), life.NodeReady(12, "b"))
+    assert [node.state for node in now.nodes.values()] == ["running", "running"]
+
+
+@pytest.mark.parametrize(
+    ("events", "cause", "nodes"),
+    [
+        ((life.Refused(9, "no"),), "refused", ""),
+        ((life.StartTimedOut(9, SECOND),), "start-timeout", "a b"),
+        ((life.ChildExited(9, "daemon", "signal SIGKILL"),), "daemon-lost", ""),
+        ((life.ConnectionLost(9),), "coordinator-lost", ""),
+    ],
+)
+def test_a_failure_names_its_cause(events: tuple[life.Event, ...], cause: str, nodes: str) -> None:
+    _, done = live(*START, *events)
+    (failure,) = [one for one in done if isinstance(one, Record) and one.event == "dataflow-failed"]
+    assert (failure.details["cause"], failure.details.get("nodes", "")) == (cause, nodes)
+
+
+def test_a_failed_node_names_itself_and_whom_it_starves() -> None:
+    now, _ = live(*READY)
+    now = replace(now, downstream={"a": ("b",)})
+    said: list[Record] = []
+    for event in (
+        life.NodeExited(9, "a", "exit code 1", False),
+        life.NodeExited(9, "b", "", False),
+        life.RunFinished(10),
+        life.ResultKnown(11, {"a": "exit code 1", "b": ""}),
+        life.ChildExited(12, "daemon", "exit code 0"),
+    ):
+        now, actions = step(now, event)
+        said += [one for one in actions if isinstance(one, Record)]
+    crash, _, failure = said
+    assert crash.details == {"exit": "exit code 1", "downstream": "b"}
+    assert (failure.details["cause"], failure.details["nodes"]) == ("node-failed", "a")

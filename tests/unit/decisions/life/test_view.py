@@ -1,0 +1,54 @@
+"""STATUS= lines, whole."""
+
+from dataclasses import replace
+
+from dora_systemd.decisions.cell.status import CellStatus, LineCount, NodeStatus
+from dora_systemd.decisions.life.states import Cell, State
+from dora_systemd.decisions.life.view import cell_status, format_status, initial_nodes, stage
+
+
+def cell(state: State, **states: str) -> Cell:
+    nodes = {ident: NodeStatus(text) for ident, text in states.items()}
+    return Cell(0, 0, nodes, state)
+
+
+def test_status_lines() -> None:
+    lines = [
+        (cell(State.BOOTING), "starting the dora coordinator"),
+        (cell(State.JOINING), "starting the dora daemon"),
+        (cell(State.STARTING), "starting the nodes"),
+        (
+            cell(State.WAITING, a="ready", b="starting", c="starting"),
+            "1/3 nodes ready, waiting for b, c",
+        ),
+        (cell(State.RUNNING, a="running", b="dynamic"), "2/2 nodes running"),
+        (cell(State.RUNNING, a="running", b="finished"), "1/2 nodes running; finished: b"),
+        (cell(State.STOPPING, a="running", b="stopped"), "stopping, 1 node left"),
+        (cell(State.CLOSING), "asking dora how the dataflow ended"),
+        (cell(State.LEAVING), "stopping the dora daemon"),
+        (cell(State.ENDED), "finished"),
+        (replace(cell(State.ENDED), stop_by="SIGTERM"), "stopped"),
+        (replace(cell(State.ENDED), failure="node a: exit code 1"), "failed: node a: exit code 1"),
+    ]
+    for one, expected in lines:
+        assert format_status(one) == expected
+
+
+def test_failures_are_named_and_many_are_counted() -> None:
+    nodes = {f"n{i}": NodeStatus("failed", exit="exit code 1") for i in range(7)}
+    text = format_status(Cell(0, 0, nodes, State.RUNNING))
+    assert text.startswith("0/7 nodes running; failed: n0 (exit code 1), ")
+    assert text.endswith("n4 (exit code 1) and 2 more")
+
+
+def test_stages_and_table() -> None:
+    assert stage(cell(State.RUNNING, a="running")) == "running"
+    assert stage(cell(State.RUNNING, a="failed")) == "degraded"
+    assert stage(cell(State.ENDED)) == "ended"
+    raw = [{"id": "a", "restart_policy": "always", "max_restarts": 3}, {"id": "b"}]
+    nodes = initial_nodes({"a": "python", "b": "dynamic"}, {"nodes": raw}, 5)
+    assert [node.state for node in nodes.values()] == ["starting", "dynamic"]
+    assert [node.policy for node in nodes.values()] == ["always", "never"]
+    assert [node.max_restarts for node in nodes.values()] == [3, 0]
+    table = cell_status(Cell(0, 3, nodes), "uuid", (), {"a": LineCount(3)})
+    assert CellStatus.from_json(table.to_json()) == table

@@ -1,0 +1,209 @@
+"""Bytes of a node -> lines -> fields."""
+
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dora_systemd.decisions.logs.fields import encode_entry
+from dora_systemd.decisions.logs.lines import (
+    LineEncoder,
+    LineSplitter,
+    Origin,
+    Piece,
+    dora_log_fields,
+    json_fields,
+    line_fields,
+)
+
+ORIGIN = Origin("robot", "550e8400-e29b-41d4-a716-446655440000", "camera", "run1", 42)
+
+
+def split(chunks: list[bytes], limit: int) -> list[bytes]:
+    splitter = LineSplitter(limit)
+    return [line for chunk in chunks for line in splitter.feed(chunk)] + splitter.flush()
+
+
+@given(
+    st.lists(st.binary(max_size=40) | st.sampled_from([b"\n", b"a" * 30, b"\x00\n"])),
+    st.integers(1, 30),
+)
+def test_splitter_loses_nothing(chunks: list[bytes], limit: int) -> None:
+    lines = split(chunks, limit)
+    ended = (line if type(line) is Piece else line + b"\n" for line in lines)
+    assert b"".join(ended).replace(b"\r", b"") == b"".join(chunks).replace(b"\r", b"")
+    assert all(len(line) <= limit for line in lines)
+
+
+@given(st.binary(max_size=300), st.integers(1, 20), st.integers(1, 300))
+def test_splitter_does_not_depend_on_chunks(data: bytes, size: int, limit: int) -> None:
+    data = data.replace(b"\r", b"")
+    chunks = [data[start : start + size] for start in range(0, len(data), size)]
+    assert split(chunks, limit) == split([data], limit)
+
+
+@pytest.mark.parametrize(
+    ("data", "lines"),
+    [
+        (b"", []),
+        (b"\n", [b""]),
+        (b"a\r\nb\n", [b"a", b"b"]),
+        (b"a\r\r\n", [b"a\r"]),
+        (b"a\rb\n", [b"a\rb"]),
+        (b"\x00\xff\n\n", [b"\x00\xff", b""]),
+        (b"abcdefgh\n", [Piece(b"abcd"), b"efgh"]),
+        (b"abcdefghi\n", [Piece(b"abcd"), Piece(b"efgh"), b"i"]),
+        (b"end", [Piece(b"end")]),
+    ],
+)
+def test_splitter(data: bytes, lines: list[bytes]) -> None:
+    found = split([data], 4)
+    assert found == lines
+    assert [type(line) for line in found] == [type(line) for line in lines]
+
+
+def test_carriage_return_and_newline_in_two_chunks() -> None:
+    assert split([b"a\r", b"\nb\r\n"], 100) == [b"a", b"b"]
+
+
+def test_plain_line() -> None:
+    entry = LineEncoder(ORIGIN, "stdout").entry(b"h\x00i")
+    assert set(entry.split(b"\n")) == {
+        b"SYSLOG_IDENTIFIER=robot/camera",
+        b"DORA_DATAFLOW=550e8400-e29b-41d4-a716-446655440000",
+        b"DORA_DATAFLOW_NAME=robot",
+        b"DORA_NODE=camera",
+        b"DORA_NODE_PID=42",
+        b"DORA_RUN=run1",
+        b"DORA_STREAM=stdout",
+        b"PRIORITY=6",
+        b"MESSAGE=h\x00i",
+        b"",
+    }
+
+
+def test_what_is_not_known_is_left_out() -> None:
+    entry = LineEncoder(Origin("robot", "u", "camera"), "stderr").entry(b"x")
+    assert b"DORA_NODE_PID" not in entry
+    assert b"DORA_RUN" not in entry
+    assert b"\nPRIORITY=5\n" in entry
+
+
+def test_piece_is_marked() -> None:
+    encoder = LineEncoder(ORIGIN, "stdout")
+    assert b"\nDORA_CUT=1\n" in encoder.entry(Piece(b"x"))
+    assert b"DORA_CUT" not in encoder.entry(b"x")
+    whole = json.dumps({"level": "info", "timestamp": "t", "message": "m"}).encode()
+    assert b"\nDORA_CUT=1\n" in encoder.entry(Piece(whole))
+
+
+def test_line_of_node_log() -> None:
+    line = (
+        rb'{"timestamp":"2026-11-21T00:43:18.648985609+00:00","level":"warn","node_id":"spoof",'
+        rb'"message":"hello \u00e4\nsecond","target":"my.t","file":"a.py","line":7,'
+        rb'"fields":{"a":"1","b c":{"x":[2]}}}'
+    )
+    assert line_fields(line, "stdout") == {
+        "PRIORITY": 4,
+        "DORA_LEVEL": "warn",
+        "DORA_TIMESTAMP": "2026-11-21T00:43:18.648985609+00:00",
+        "DORA_TARGET": "my.t",
+        "CODE_FILE": "a.py",
+        "CODE_LINE": "7",
+        "DORA_FIELD_A": "1",
+        "DORA_FIELD_B_C": '{"x": [2]}',
+        "MESSAGE": "hello ä\nsecond",
+    }
+
+
+def test_line_of_rust_tracing() -> None:
+    record = {
+        "timestamp": "t",
+        "level": "ERROR",
+        "fields": {"message": "m", "n": 1},
+        "filename": "main.rs",
+        "line_number": 3,
+    }
+    fields = json_fields(json.dumps(record).encode())
+    assert fields is not None
+    assert fields["PRIORITY"] == 3
+    assert fields["MESSAGE"] == "m"
+    assert fields["DORA_FIELD_N"] == "1"
+    assert "DORA_FIELD_MESSAGE" not in fields
+    assert (fields["CODE_FILE"], fields["CODE_LINE"]) == ("main.rs", "3")
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"{}",
+        b"{",
+        b'{"level":"info"}',
+        b'{"level":"loud","timestamp":"t","message":"x"}',
+        b'{"level":["info"],"timestamp":"t"}',
+        b'{"level":"info","timestamp":"t"',
+        b'{"level":"info","timestamp":"t","a":' + b"[" * 100_000,
+        b'{"level":"info","timestamp":' + b"9" * 5000 + b"}",
+    ],
+)
+def test_not_in_dora_form_is_plain(line: bytes) -> None:
+    assert line_fields(line, "stderr") == {"PRIORITY": 5, "MESSAGE": line}
+
+
+def test_half_a_surrogate_pair_is_no_error() -> None:
+    line = b'{"level":"info","timestamp":"t","message":"\\ud800"}'
+    assert b"MESSAGE=\\ud800\n" in LineEncoder(ORIGIN, "stdout").entry(line)
+
+
+def test_many_fields_stay_below_the_limit_of_journald() -> None:
+    record = {
+        "level": "info",
+        "timestamp": "t",
+        "message": "m",
+        "fields": {f"k{i}": i for i in range(2000)},
+    }
+    fields = json_fields(json.dumps(record).encode())
+    assert fields is not None
+    assert len(fields) < 300
+    assert json.loads(str(fields["DORA_FIELDS_MORE"]))["k1999"] == 1999
+
+
+@given(st.binary(max_size=200))
+def test_no_line_is_an_error(line: bytes) -> None:
+    for data in (line, b'{"level":"info","timestamp":"t",' + line):
+        assert encode_entry(line_fields(data, "stdout")).endswith(b"\n")
+
+
+@pytest.mark.parametrize(
+    ("line", "target"),
+    [
+        (b"2026-11-20T22:11:40.638554Z  WARN dora_coordinator: slow", "dora_coordinator"),
+        (
+            b"\x1b[2m2026-11-20T22:11:40.6Z\x1b[0m \x1b[33m WARN\x1b[0m \x1b[1mrun\x1b[0m: "
+            b"\x1b[2mdora_daemon::log\x1b[0m\x1b[2m:\x1b[0m slow",
+            "dora_daemon::log",
+        ),
+    ],
+)
+def test_warning_of_coordinator_or_daemon(line: bytes, target: str) -> None:
+    fields = dora_log_fields(line)
+    assert fields is not None
+    assert fields["PRIORITY"] == 4
+    assert fields["DORA_TARGET"] == target
+    assert str(fields["MESSAGE"]).endswith("slow")
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"2026-11-20T22:11:40.638554Z  INFO dora_coordinator: env: SECRET: hunter2",
+        b"2026-11-20T22:11:40.638554Z DEBUG dora_coordinator: x",
+        b"Listening on port 33453",
+        b"  WARN SECRET=1",
+        b"\xff\xfe",
+        b"",
+    ],
+)
+def test_all_else_that_they_print_is_dropped(line: bytes) -> None:
+    assert dora_log_fields(line) is None

@@ -1,0 +1,110 @@
+"""What doractl logs asks of journalctl."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dora_systemd.decisions.logs.events import EVENTS
+from dora_systemd.decisions.logs.query import (
+    LogQuery,
+    end_matches,
+    journal_time,
+    parse_level,
+    query_arguments,
+    query_matches,
+)
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.scope import Scope
+
+SYSTEM = Scope(is_user=False, uid=0)
+USER = Scope(is_user=True, uid=1000)
+
+
+def test_all_dataflows() -> None:
+    assert query_matches(LogQuery(SYSTEM)) == ["_SYSTEMD_SLICE=dora.slice"]
+    assert query_matches(LogQuery(USER)) == ["_SYSTEMD_USER_SLICE=dora.slice", "_UID=1000"]
+
+
+def test_one_dataflow() -> None:
+    assert query_matches(LogQuery(SYSTEM, name="robot")) == ["_SYSTEMD_UNIT=dora-robot.service"]
+    query = LogQuery(USER, name="robot", uuid="U", invocation="I", run="R", nodes=("a", "b"))
+    assert query_matches(query) == [
+        "_SYSTEMD_USER_UNIT=dora-robot.service",
+        "_UID=1000",
+        "DORA_DATAFLOW=U",
+        "_SYSTEMD_INVOCATION_ID=I",
+        "DORA_RUN=R",
+        "DORA_NODE=a",
+        "DORA_NODE=b",
+    ]
+
+
+def test_events() -> None:
+    assert len(query_matches(LogQuery(SYSTEM, is_events=True))) == 1 + len(EVENTS)
+
+
+@pytest.mark.parametrize(
+    ("level", "priorities"),
+    [("error", 4), ("warn", 5), ("notice", 6), ("info", 7), ("stdout", 0), ("trace", 0), ("", 0)],
+)
+def test_level(level: str, priorities: int) -> None:
+    matches = query_matches(LogQuery(SYSTEM, level=level))
+    assert matches[1:] == [f"PRIORITY={number}" for number in range(priorities)]
+
+
+def test_debug_leaves_out_trace() -> None:
+    matches = query_matches(LogQuery(SYSTEM, name="robot", level="debug"))
+    assert matches[-4:] == [
+        "+",
+        "_SYSTEMD_UNIT=dora-robot.service",
+        "PRIORITY=7",
+        "DORA_LEVEL=debug",
+    ]
+
+
+def test_arguments() -> None:
+    query = LogQuery(SYSTEM, since="5m", until="now", grep="-x", tail=0, is_follow=True)
+    assert query_arguments(query) == [
+        "--output=short",
+        "--since=-5m",
+        "--until=now",
+        "--grep=-x",
+        "--lines=0",
+        "--follow",
+        "--",
+        "_SYSTEMD_SLICE=dora.slice",
+    ]
+
+
+@pytest.mark.parametrize("output", ["json", "cat", "export"])
+def test_programs_get_records_only(output: str) -> None:
+    assert "--quiet" in query_arguments(LogQuery(SYSTEM, output=output))
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        *(("5m", "-5m"), ("1.5h", "-1.5h"), ("10s", "-10s"), ("today", "today")),
+        *(("10 min ago", "10 min ago"), ("-5m", "-5m"), ("2026-11-20 18:00", "2026-11-20 18:00")),
+        *(("", ""), ("m", "m"), ("12", "12"), ("@5", "@5")),
+    ],
+)
+def test_time(text: str, expected: str) -> None:
+    assert journal_time(text) == expected
+
+
+@given(st.text(max_size=30))
+def test_any_time(text: str) -> None:
+    assert journal_time(text) in (text, "-" + text)
+
+
+def test_unknown_level() -> None:
+    assert parse_level("WARN") == "warn"
+    with pytest.raises(DoraSystemdError) as caught:
+        parse_level("loud")
+    assert caught.value.code is ExitCode.USAGE
+
+
+def test_end_of_unit() -> None:
+    assert end_matches(SYSTEM, "robot")[:2] == ["UNIT=dora-robot.service", "_PID=1"]
+    assert end_matches(USER, "robot")[:2] == ["USER_UNIT=dora-robot.service", "_UID=1000"]

@@ -1,0 +1,323 @@
+"""Verdicts: each cause from the records that tell it, and from any part of them."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dora_systemd.decisions.life.causes import Cause
+from dora_systemd.decisions.why.lives import (
+    SHUTDOWN_MESSAGE,
+    START_LIMIT_FUNCTION,
+    UNIT_MESSAGES,
+    Happening,
+    find_lives,
+    parse_happening,
+    plain_text,
+)
+from dora_systemd.decisions.why.postmortem import UNKNOWN_PERSON, examine
+from dora_systemd.decisions.why.report import Report, Subject, Word, format_report, report_values
+from dora_systemd.decisions.why.verdict import Facts, Verdict
+
+Record = Mapping[str, Any]
+IDS = {name: message_id for message_id, name in UNIT_MESSAGES.items()}
+UUID = "550e8400-e29b-41d4-a716-446655440000"
+SUBJECT = Subject(UUID, "robot", "dora-robot.service", "--system", "/srv/robot.yml", True)
+
+
+def event(name: str, node: str = "", life: str = "1", **details: str) -> Record:
+    own = {f"DORA_{key.upper()}": text for key, text in details.items()}
+    record = {"DORA_EVENT": name, "_SYSTEMD_INVOCATION_ID": life, "_BOOT_ID": "b", **own}
+    return {**record, "DORA_NODE": node} if node else record
+
+
+def unit(name: str, life: str = "1", **fields: str) -> Record:
+    return {"MESSAGE_ID": IDS[name], "INVOCATION_ID": life, "_BOOT_ID": "b", **fields}
+
+
+LIMIT = {"CODE_FUNC": START_LIMIT_FUNCTION, "INVOCATION_ID": "1", "_BOOT_ID": "b"}
+RUNS = (event("dataflow-starting"), event("dataflow-started"))
+CRASH = event("node-crashed", "camera", exit="exit code 1", downstream="detector plot")
+OOM = event(
+    "node-oom", "camera", exit="out of memory, peak 300M, limit 300M", peak="314572800",
+    limit="314572800", owner="node",
+)  # fmt: skip
+STOPPED = (event("dataflow-stopping", by="SIGTERM"), event("dataflow-stopped"))
+JOB = unit("unit-stopping")
+
+
+def failed(cause: str, reason: str = "r", nodes: str = "", life: str = "1") -> Record:
+    return event("dataflow-failed", life=life, reason=reason, cause=cause, nodes=nodes)
+
+
+def judge(*records: Record, facts: Facts | None = None, shutdowns: tuple[int, ...] = ()) -> Verdict:
+    stamped = [{"__REALTIME_TIMESTAMP": str(n + 1), **one} for n, one in enumerate(records)]
+    found = [one for one in map(parse_happening, stamped) if one]
+    return examine(find_lives(found), facts or Facts(now_boot="b"), shutdowns)
+
+
+NODE_FAILED = failed("node-failed", "node camera: exit code 1", "camera")
+CASES: dict[str, tuple[tuple[Record, ...], str, Cause, str, str]] = {
+    "exit code": (
+        (*RUNS, CRASH, NODE_FAILED),
+        *("Failed", Cause.NODE_FAILED, "camera", "node camera: exit code 1"),
+    ),
+    "restarts used up": (
+        (*RUNS, CRASH, event("node-restarted", "camera"), CRASH,
+         failed("node-failed", "node camera: exit code 1 after 1 restart", "camera")),
+        *("Failed", Cause.NODE_FAILED, "camera", "node camera: exit code 1 after 1 restart"),
+    ),
+    "the first to go is the one": (
+        (*RUNS, event("node-crashed", "plot", exit="exit code 9"), CRASH,
+         failed("node-failed", "node camera: x, node plot: exit code 9", "camera plot")),
+        *("Failed", Cause.NODE_FAILED, "plot", "node plot: exit code 9"),
+    ),
+    "signal": (
+        (*RUNS, event("node-crashed", "camera", exit="signal SIGSEGV"), NODE_FAILED),
+        *("Failed", Cause.NODE_FAILED, "camera", "node camera: signal SIGSEGV"),
+    ),
+    "hung": (
+        (*RUNS, event("node-crashed", "camera", exit="hung, unresponsive"), NODE_FAILED),
+        *("Failed", Cause.NODE_HUNG, "camera", "node camera: hung, unresponsive"),
+    ),
+    "out of memory": (
+        (*RUNS, OOM, NODE_FAILED),
+        *("Failed", Cause.NODE_OUT_OF_MEMORY, "camera"),
+        "node camera: out of memory, peak 300M, limit 300M",
+    ),
+    "start timeout": (
+        (RUNS[0], failed("start-timeout", "node late was not ready within 2s", "late")),
+        *("Failed", Cause.START_TIMEOUT, "late", "node late was not ready within 2s"),
+    ),
+    "bad dataflow": (
+        (RUNS[0], failed("bad-dataflow", "cannot use x")),
+        *("Failed", Cause.BAD_DATAFLOW, "", "cannot use x"),
+    ),
+    "daemon": (
+        (*RUNS, event("daemon-lost", exit="signal SIGKILL"), failed("daemon-lost", "gone")),
+        *("Failed", Cause.DAEMON_LOST, "", "gone"),
+    ),
+    "daemon, by an older version": (
+        (*RUNS, event("daemon-lost"), event("dataflow-failed", reason="gone")),
+        *("Failed", Cause.DAEMON_LOST, "", "gone"),
+    ),
+    "the runner itself": (
+        (*RUNS, failed("runner-broken", "the runner could not start the daemon: OSError: no")),
+        *("Failed", Cause.RUNNER_BROKEN, ""),
+        "the runner could not start the daemon: OSError: no",
+    ),
+    "watchdog": (
+        (*RUNS, failed("watchdog", "its runner hung"), unit("unit-failed", UNIT_RESULT="watchdog")),
+        *("Failed", Cause.WATCHDOG, "", "its runner hung"),
+    ),
+    "systemd could not begin": (
+        (unit("process-exited", EXIT_CODE="exited", MESSAGE="status=217/USER"),
+         unit("unit-failed", UNIT_RESULT="exit-code")),
+        *("Failed", Cause.UNIT_FAILED, ""),
+        "systemd could not start the supervisor process: exit code 217/USER",
+    ),
+    "systemd lost patience": (
+        (*RUNS, unit("unit-failed", UNIT_RESULT="timeout")),
+        *("Failed", Cause.TIMEOUT, "", "systemd ended it: it did not start or stop in time"),
+    ),
+    "finished": (
+        (*RUNS, event("dataflow-finished"), unit("unit-succeeded")),
+        *("Finished", Cause.FINISHED, "", "all nodes ended by themselves"),
+    ),
+    "stopped by signal": (
+        (*RUNS, *STOPPED),
+        *("Stopped", Cause.STOPPED, "", "stopped by the signal SIGTERM"),
+    ),
+    "stopped by systemctl": (
+        (*RUNS, JOB, *STOPPED),
+        *("Stopped", Cause.STOPPED, "", f"stopped by {UNKNOWN_PERSON}"),
+    ),
+    "stopped by root": (
+        (*RUNS, event("stop-asked", life="session", by="root (doractl stop)"), JOB, *STOPPED),
+        *("Stopped", Cause.STOPPED, "", "stopped by root (doractl stop)"),
+    ),
+    "stopped with its terminal": (
+        (*RUNS, event("dataflow-stopping", by="terminal"), event("dataflow-stopped")),
+        *("Stopped", Cause.STOPPED, ""),
+        "stopped by the end of its terminal",
+    ),
+    "stopped before its runner could listen": (
+        (RUNS[0], JOB, unit("unit-succeeded")),
+        *("Stopped", Cause.STOPPED, "", f"stopped by {UNKNOWN_PERSON}"),
+    ),
+    "no end": (
+        RUNS,
+        *("Failed", Cause.NO_END, ""),
+        "its end is not recorded: it was killed, or the machine went down",
+    ),
+    "nothing at all": ((), *("Stopped", Cause.NONE, "", "nothing is recorded about it")),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_each_cause(case: str) -> None:
+    records, status, cause, node, summary = CASES[case]
+    verdict = judge(*records)
+    assert (verdict.status, verdict.cause, verdict.node) == (status, cause, node)
+    assert verdict.summary == summary
+    assert verdict.is_failure == (status == "Failed")
+    text = format_report(Report(SUBJECT, verdict))
+    assert text.startswith(f"robot: {status}\n")
+    assert summary in text
+
+
+def test_what_a_failed_node_says() -> None:
+    verdict = judge(*RUNS, CRASH, NODE_FAILED)
+    assert verdict.starved == ("detector", "plot")
+    assert (verdict.began_us, verdict.at_us) == (1, 3)
+    text = format_report(Report(SUBJECT, verdict))
+    assert "Starved:  detector, plot" in text
+    assert "doractl restart robot" in text
+
+
+def test_memory() -> None:
+    text = format_report(Report(SUBJECT, judge(*RUNS, OOM, NODE_FAILED)))
+    assert "Memory:   peak 300M, limit 300M\n" in text
+    assert "doractl set robot --node-limit camera:memory=SIZE" in text
+
+
+def test_memory_that_is_no_number() -> None:
+    crash = {**OOM, "DORA_PEAK": "²", "DORA_LIMIT": "many"}
+    text = format_report(Report(SUBJECT, judge(*RUNS, crash, NODE_FAILED)))
+    assert "Memory:" not in text
+
+
+def test_power_cut() -> None:
+    verdict = judge(*RUNS, facts=Facts(now_boot="another"))
+    assert verdict.cause is Cause.NO_END
+    assert verdict.summary.startswith("the machine went down while it ran")
+
+
+def test_shutdown() -> None:
+    # Started at 1, shutdown at 2, stopping at 3.
+    assert judge(*RUNS, *STOPPED, shutdowns=(2,)).stopped_by == "the shutdown of the machine"
+    assert judge(*RUNS, *STOPPED, shutdowns=(5,)).stopped_by == "the signal SIGTERM"
+
+
+def test_restarts_of_the_whole_and_the_limit_of_them() -> None:
+    lost = (event("daemon-lost"), failed("daemon-lost", "gone"))
+    verdict = judge(
+        event("dataflow-starting", life="0"),
+        failed("runner-killed", "another matter", life="0"),
+        *(*RUNS, *lost, unit("unit-restart", N_RESTARTS="1")),
+        event("dataflow-starting", life="2"),
+        event("daemon-lost", life="2"),
+        failed("daemon-lost", "gone again", life="2"),
+        {**LIMIT, "INVOCATION_ID": "2"},
+    )
+    assert [(one.owner, one.reason) for one in verdict.restarts] == [("systemd", "gone")]
+    assert verdict.is_given_up
+    assert (verdict.summary, verdict.invocation) == ("gone again", "2")
+    text = format_report(Report(SUBJECT, verdict))
+    assert (verdict.before, verdict.before_us) == ("another matter", 2)
+    assert "Before:   another matter (" in text
+    assert "Restarts: dataflow 1 (gone)" in text
+    assert "systemd has stopped restarting it" in text
+
+
+def test_running_degraded_and_restarting() -> None:
+    again = (CRASH, event("node-restarted", "camera"))
+    verdict = judge(*RUNS, *again, facts=Facts("Running", "2/2 nodes running"))
+    assert (verdict.now, verdict.node, verdict.is_failure) == ("2/2 nodes running", "", False)
+    assert [(one.node, one.reason) for one in verdict.restarts] == [("camera", "exit code 1")]
+    gone = Facts("Degraded", "1/2", {"camera": "exit code 1 after 2 restarts"})
+    verdict = judge(*RUNS, CRASH, facts=gone)
+    assert (verdict.status, verdict.node, verdict.is_failure) == ("Degraded", "camera", True)
+    text = format_report(Report(SUBJECT, verdict))
+    assert "Why:      node camera: exit code 1 after 2 restarts\n  Now:      1/2\n" in text
+    assert "camera stays down" in text
+    waiting = Facts("Running", "1/2", restarting=("camera",))
+    verdict = judge(*RUNS, CRASH, facts=waiting)
+    assert (verdict.node, verdict.is_passing, verdict.is_failure) == ("camera", True, False)
+    assert "dora restarts camera automatically" in format_report(Report(SUBJECT, verdict))
+    facts = Facts("Restarting")
+    verdict = judge(*RUNS, failed("daemon-lost", "gone"), unit("unit-restart"), facts=facts)
+    assert (verdict.status, verdict.summary) == ("Restarting", "gone")
+    assert "systemd restarts it automatically" in format_report(Report(SUBJECT, verdict))
+
+
+def test_one_screen() -> None:
+    crashes = [one for _ in range(50) for one in (CRASH, event("node-restarted", "camera"))]
+    verdict = judge(*RUNS, *crashes, CRASH, NODE_FAILED)
+    words = tuple(Word(n, "camera", "x" * 200 + "\x1b[31m") for n in range(20))
+    budget = {"used": 1, "max": 5, "next_us": None, "resets_us": 60_000_000}
+    text = format_report(Report(SUBJECT, verdict, words, budget), width=80)
+    lines = text.splitlines()
+    assert len(lines) <= 45
+    assert max(map(len, lines)) == 80
+    assert "\x1b" not in text
+    assert "... 97 more ..." in text
+    colored = format_report(Report(SUBJECT, verdict, words, budget), 80, want_colors=True)
+    assert colored.startswith("\x1b[31m")
+
+
+def test_values_of_fields() -> None:
+    assert plain_text([104, 105, 255]) == "hi�"
+    assert plain_text(["a", "b"]) == "b"
+    assert plain_text(None) == plain_text([]) == ""
+    assert parse_happening({"MESSAGE": "a line"}) is None
+    assert parse_happening({"MESSAGE_ID": SHUTDOWN_MESSAGE}) is None
+
+
+@pytest.mark.parametrize(
+    ("exit", "owner", "words"),
+    [
+        ("signal SIGSEGV", "", "coredumpctl info 7"),
+        ("signal SIGKILL", "", "journalctl -k"),
+        ("out of memory: x", "dataflow", "doractl set robot --memory-limit SIZE"),
+        ("out of memory: x", "machine", "the machine is short of memory"),
+        ("exit code 1", "", "fix camera"),
+    ],
+)
+def test_remedies(exit: str, owner: str, words: str) -> None:
+    name = "node-oom" if owner else "node-crashed"
+    crash = event(name, "camera", exit=exit, owner=owner, node_pid="7")
+    text = format_report(Report(SUBJECT, judge(*RUNS, crash, NODE_FAILED)))
+    assert words in text.partition("What to do:")[2]
+
+
+def test_one_that_is_gone_is_started_anew() -> None:
+    gone = Subject(UUID, "robot", "dora-robot.service", "--user")
+    text = format_report(Report(gone, judge(*RUNS, CRASH, NODE_FAILED)))
+    assert "fix camera, then run: doractl start FILE --name robot" in text
+
+
+SEVERAL = [record for records, *_ in CASES.values() for record in records]
+VALUES = st.one_of(
+    st.none(), st.text(max_size=9), st.integers(), st.lists(st.integers(), max_size=3)
+)
+
+
+@st.composite
+def broken(draw: st.DrawFn) -> Record:
+    record = dict(draw(st.sampled_from([*SEVERAL, LIMIT])))
+    for key in draw(st.lists(st.sampled_from(sorted(record)), max_size=4)):
+        record.pop(key, None)
+    record |= draw(st.dictionaries(st.sampled_from(sorted(SEVERAL[2])), VALUES, max_size=2))
+    return record
+
+
+FACTS = st.builds(
+    Facts,
+    st.sampled_from(["", "Running", "Degraded", "Restarting", "Failed", "Stopped", "Starting"]),
+    st.text(max_size=5),
+    st.dictionaries(st.sampled_from(["camera", "x"]), st.text(max_size=3), max_size=2),
+)
+
+
+@given(st.lists(broken(), max_size=12), FACTS, st.lists(st.integers(), max_size=2))
+def test_whatever_is_missing_there_is_a_verdict(
+    records: list[Record], facts: Facts, shutdowns: list[int]
+) -> None:
+    found: list[Happening] = [one for one in map(parse_happening, records) if one]
+    verdict = examine(find_lives(found), facts, shutdowns)
+    report = Report(SUBJECT, verdict)
+    assert format_report(report, 80, want_colors=True)
+    assert report_values(report)["status"] == verdict.status

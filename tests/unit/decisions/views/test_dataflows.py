@@ -1,0 +1,160 @@
+"""Words and whole tables of `doractl list`."""
+
+import pytest
+
+from dora_systemd.decisions.views.dataflows import (
+    DataflowRow,
+    NodeRow,
+    format_dataflow,
+    format_dataflows,
+    format_uptime,
+    row_values,
+    shortest_prefixes,
+    status_word,
+)
+from dora_systemd.values import SECOND
+
+A = "550e8400-e29b-41d4-a716-446655440000"
+B = "550e8401-e29b-41d4-a716-446655440000"
+C = "550e8400-e29b-51d4-a716-446655440000"
+
+
+@pytest.mark.parametrize(
+    ("active", "sub", "stage", "word"),
+    [
+        ("activating", "start", "waiting", "Starting"),
+        ("activating", "auto-restart", "", "Restarting"),
+        ("activating", "auto-restart-queued", "", "Restarting"),
+        ("active", "running", "running", "Running"),
+        ("active", "running", "", "Running"),
+        ("active", "running", "degraded", "Degraded"),
+        ("active", "running", "stopping", "Stopping"),
+        ("reloading", "reload", "running", "Running"),
+        ("deactivating", "stop-sigterm", "running", "Stopping"),
+        ("failed", "failed", "degraded", "Failed"),
+        ("inactive", "dead", "", "Stopped"),
+        ("something-new", "x", "", "Stopped"),
+    ],
+)
+def test_status_word(active: str, sub: str, stage: str, word: str) -> None:
+    assert status_word(active, sub, stage) == word
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [
+        (0, "00:00:00"),
+        (332, "00:05:32"),
+        (86399, "23:59:59"),
+        (86400, "1d 00:00:00"),
+        (93784, "1d 02:03:04"),
+    ],
+)
+def test_uptime(seconds: int, text: str) -> None:
+    assert format_uptime(seconds * SECOND) == text
+
+
+def test_unknown_uptime() -> None:
+    assert format_uptime(None) == "-"
+
+
+def test_prefixes_are_short_and_unambiguous() -> None:
+    assert shortest_prefixes([A, B, C]) == {A: A[:15], B: B[:8], C: C[:15]}
+
+
+def test_prefix_of_one() -> None:
+    assert shortest_prefixes([A]) == {A: "550e8400"}
+
+
+ROWS = (
+    DataflowRow(
+        uuid=A,
+        name="robot",
+        unit="dora-robot.service",
+        status="Running",
+        dataflow="/srv/robot.yml",
+        text="2/2 nodes running",
+        uptime=332 * SECOND,
+        nodes_alive=2,
+        nodes_total=2,
+        cpu_percent=12.46,
+        memory=256 * 1024**2,
+        restarts=0,
+        nodes=(
+            NodeRow("camera", "running", 42, 5.0, 128 * 1024**2, 200 * 1024**2, 0),
+            NodeRow("detector", "failed", 0, restarts=3, exit="exit code 1"),
+        ),
+        enabled=True,
+    ),
+    DataflowRow(uuid=B, name="a-longer-name", unit="u", status="Failed", restarts=12),
+)
+
+
+def test_table_of_dataflows() -> None:
+    assert format_dataflows(ROWS) == (
+        "UUID      NAME           STATUS     UPTIME  NODES  CPU%   MEM  RESTARTS  BOOT\n"
+        "550e8400  robot          Running  00:05:32  2/2    12.5  256M         0  yes\n"
+        "550e8401  a-longer-name  Failed          -  -         -     -        12  -"
+    )
+
+
+def test_one_dataflow() -> None:
+    assert format_dataflow(ROWS[0]) == (
+        f"Dataflow: {A}\n"
+        "Name:     robot\n"
+        "Unit:     dora-robot.service\n"
+        "File:     /srv/robot.yml\n"
+        "Status:   Running (2/2 nodes running)\n"
+        "Uptime:   00:05:32\n"
+        "Started:  -\n"
+        "CPU:      12.5%\n"
+        "Memory:   256M\n"
+        "Restarts: 0\n"
+        "At boot:  started\n"
+        "\n"
+        "NODE      STATE    PID  CPU%   MEM  PEAK  RESTARTS  EXIT\n"
+        "camera    Running   42   5.0  128M  200M         0  -\n"
+        "detector  Failed     -     -     -     -         3  exit code 1"
+    )
+
+
+LIMITED = ROWS[0]._replace(
+    memory_limit=4 << 30,
+    memory_peak=300 << 20,
+    cpu_limit=200.0,
+    throttled=12.0,
+    nodes=(
+        ROWS[0].nodes[0]._replace(memory_limit=1 << 30, cpu_limit=150.0, throttled=31.25),
+        ROWS[0].nodes[1],
+    ),
+)
+
+
+def test_limits_stand_beside_what_is_used() -> None:
+    assert format_dataflows([LIMITED]).splitlines()[1].split()[6:] == ["256M/4G", "0", "yes"]
+    lines = format_dataflow(LIMITED).splitlines()
+    assert "CPU:      12.5% of 200%, throttled 12.0% of the time" in lines
+    assert "Memory:   256M of 4G (peak 300M)" in lines
+    assert lines[-3:] == [
+        "NODE      STATE    PID     CPU%  THROTTLED%      MEM  PEAK  RESTARTS  EXIT",
+        "camera    Running   42  5.0/150        31.2  128M/1G  200M         0  -",
+        "detector  Failed     -        -           -        -     -         3  exit code 1",
+    ]
+    values = row_values(LIMITED)
+    assert (values["memory_limit_bytes"], values["cpu_limit_percent"]) == (4 << 30, 200.0)
+    assert values["nodes"][0]["throttled_percent"] == 31.25
+    assert values["nodes"][1]["memory_limit_bytes"] is None
+
+
+def test_one_dataflow_without_nodes() -> None:
+    assert format_dataflow(ROWS[1]).endswith("Restarts: 12\nReason:   doractl why a-longer-name")
+
+
+def test_json_has_units_in_its_keys() -> None:
+    values = row_values(ROWS[0])
+    assert values["uuid"] == A
+    assert values["uptime_us"] == 332 * SECOND
+    assert values["memory_bytes"] == 256 * 1024**2
+    assert values["memory_peak_bytes"] is None
+    assert values["nodes"][0]["memory_peak_bytes"] == 200 * 1024**2
+    assert values["nodes"][1]["cpu_percent"] is None

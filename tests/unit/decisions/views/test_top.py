@@ -1,0 +1,91 @@
+"""The screen of `doractl top`."""
+
+import json
+
+import pytest
+
+from dora_systemd.decisions.views.dataflows import DataflowRow, NodeRow
+from dora_systemd.decisions.views.top import (
+    NOTHING,
+    Look,
+    TopEntry,
+    format_summary,
+    format_top,
+    look_values,
+)
+
+SECOND = 1_000_000
+NOW = 1_000 * SECOND
+
+ROBOT = TopEntry(
+    DataflowRow(
+        "44f30e60-107e-41d2-b6a8-b30cefc153ae",
+        "robot",
+        "dora-robot.service",
+        "Degraded",
+        uptime=332 * SECOND,
+        nodes_alive=2,
+        nodes_total=3,
+        cpu_percent=112.0,
+        cpu_limit=200.0,
+        throttled=40.0,
+        memory=300 << 20,
+        memory_peak=400 << 20,
+        memory_limit=1 << 30,
+        restarts=2,
+        nodes=(
+            NodeRow("camera", "running", 7, 12.0, 200 << 20, restarts=0, since=NOW - 5 * SECOND),
+            NodeRow("detector", "running", 8, 100.0, 90 << 20, restarts=2, since=NOW - SECOND),
+            NodeRow("plot", "failed", exit="exit code 1", since=NOW - SECOND),
+        ),
+    ),
+    {"": {"memory": 12.3, "io": 0.2}, "detector": {"cpu": 30.0}},
+)
+ARM = TopEntry(
+    DataflowRow("u2", "arm", "dora-arm.service", "Starting", cpu_percent=1.0, memory=900 << 20)
+)
+LOOK = Look(NOW, (ROBOT, ARM))
+
+
+def test_table_by_cpu() -> None:
+    assert format_top(LOOK, "cpu").splitlines() == [
+        "NAME        STATE                   UPTIME       CPU%      MEM  PEAK  RESTARTS  WAITS FOR",
+        "robot       Degraded 2/3          00:05:32  112.0/200  300M/1G  400M         2"
+        "  cpu limit 40% memory 12%",
+        "  detector  Running               00:00:01      100.0      90M     -         2  cpu 30%",
+        "  camera    Running               00:00:05       12.0     200M     -         0",
+        "  plot      Failed (exit code 1)         -          -        -     -         -",
+        "arm         Starting                     -        1.0     900M     -         -",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("sort", "names"),
+    [
+        ("cpu", ["robot", "detector", "camera", "plot", "arm"]),
+        ("memory", ["arm", "robot", "camera", "detector", "plot"]),
+        ("name", ["arm", "robot", "camera", "detector", "plot"]),
+    ],
+)
+def test_order(sort: str, names: list[str]) -> None:
+    lines = format_top(LOOK, sort).splitlines()[1:]
+    assert [line.split()[0] for line in lines] == names
+
+
+def test_summary() -> None:
+    assert format_summary(LOOK) == "2 dataflows, 2 nodes, CPU 113.0%, memory 1.2G"
+
+
+def test_nothing_runs() -> None:
+    assert format_top(Look(NOW), "cpu") == NOTHING
+    assert format_summary(Look(NOW)) == "0 dataflows, 0 nodes, CPU 0.0%, memory 0B"
+
+
+def test_values_are_json() -> None:
+    values = json.loads(json.dumps(look_values(LOOK, "cpu")))
+    robot = values["dataflows"][0]
+    assert values["at_us"] == NOW
+    assert robot["waits_percent"] == {"memory": 12.3, "io": 0.2}
+    waits = {one["node"]: one["waits_percent"] for one in robot["nodes"]}
+    assert waits == {"camera": {}, "detector": {"cpu": 30.0}, "plot": {}}
+    assert robot["memory_bytes"] == 300 << 20

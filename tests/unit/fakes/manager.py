@@ -1,0 +1,177 @@
+"""A systemd of a few dicts: what the use cases of doractl are tested against."""
+
+from collections.abc import Mapping, Sequence
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any, Self
+
+from dora_systemd.adapters.bus.manager import JOB_DONE, Observer, Property, UnitState
+from dora_systemd.decisions.cell.options import RunnerOptions, runner_command
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import unit_name
+from dora_systemd.scope import Scope
+
+
+class ScopeIn(Scope):
+    """A scope whose runtime directories are below `root`."""
+
+    root: Path
+
+    def __new__(cls, is_user: bool, uid: int, root: Path = Path("/nowhere")) -> Self:
+        self = super().__new__(cls, is_user, uid)
+        self.root = root
+        return self
+
+    @property
+    def runtime_root(self) -> Path:
+        return self.root
+
+
+UUID = "550e8400-e29b-41d4-a716-446655440000"
+
+
+def options(name: str = "robot", uuid: str = UUID, **more: Any) -> RunnerOptions:
+    """What a runner of that name was told."""
+    values = {"dataflow": f"/srv/{name}.yml", "working_directory": "/srv", "dora": "/bin/dora"}
+    return RunnerOptions(name=name, uuid=uuid, **{**values, **more})
+
+
+class FakeManager:
+    """Units by name with their properties; every change that is asked for is in `calls`.
+
+    job_results: by unit, what its jobs end with. on_start: is called with each new unit's facts.
+    """
+
+    def __init__(self) -> None:
+        self.units: dict[str, dict[str, Any]] = {}
+        self.calls: list[tuple[Any, ...]] = []
+        self.job_results: dict[str, str] = {}
+        self.stages: list[str] = []
+        self.held: set[str] = set()
+        self.after_job: dict[str, dict[str, Any]] = {}
+        self.systemd = "257.13-1"
+        self.etc = Path("/nowhere/etc")
+
+    def add(self, runner: RunnerOptions, active: str = "active", **facts: Any) -> str:
+        """A unit of ours in state `active`."""
+        unit = unit_name(runner.name)
+        command = runner_command("/usr/bin/python3", runner)
+        self.units[unit] = {
+            "LoadState": "loaded",
+            "ActiveState": active,
+            "SubState": "running",
+            "Transient": True,
+            "FragmentPath": f"/run/systemd/transient/{unit}",
+            "ExecStart": [[command[0], command, False, 0, 0, 0, 0, 0, 0, 0]],
+            "ControlGroup": "",
+            "NRestarts": 0,
+            "Restart": "no",
+            "StartLimitBurst": 5,
+            "StartLimitIntervalUSec": 10_000_000,
+            "StatusText": "",
+            "Result": "success",
+            "ExecMainCode": 1,
+            "ExecMainStatus": 0,
+            "ActiveEnterTimestamp": 0,
+            "ActiveEnterTimestampMonotonic": 0,
+            "InactiveExitTimestamp": 0,
+            "InactiveExitTimestampMonotonic": 0,
+            "Job": [0, "/"],
+            "UID": 1000,
+            "PrivateNetwork": False,
+            **facts,
+        }
+        return unit
+
+    def list_units(self, pattern: str) -> list[UnitState]:
+        return [
+            UnitState(unit, facts["LoadState"], facts["ActiveState"], facts["SubState"])
+            for unit, facts in self.units.items()
+            if fnmatch(unit, pattern)
+        ]
+
+    def read(self, unit: str, names: Sequence[str]) -> dict[str, Any]:
+        unknown: dict[str, Any] = {"LoadState": "not-found", "ActiveState": "inactive"}
+        facts = self.units.get(unit, unknown)
+        return {name: facts.get(name, "") for name in names}
+
+    def start_transient(
+        self, unit: str, properties: Sequence[Property], observer: Observer | None, wait: bool
+    ) -> str:
+        self.calls.append(("start", unit, wait))
+        self._tell(observer)
+        self.units.setdefault(unit, {"LoadState": "loaded", "ActiveState": "active"})
+        self.units[unit] |= {name: value for name, _, value in properties}
+        return self._end(unit)
+
+    def run_jobs(
+        self, method: str, units: Sequence[str], observer: Observer | None = None
+    ) -> dict[str, str]:
+        self.calls.append((method, *units))
+        self._tell(observer)
+        return {unit: self._end(unit) for unit in units}
+
+    def queue_job(self, method: str, unit: str) -> str:
+        self.calls.append((method, unit))
+        return "/job"
+
+    def kill(self, unit: str, signal: int, whom: str = "all") -> None:
+        self.calls.append(("kill", unit, signal, whom))
+
+    def reset_failed(self, unit: str) -> None:
+        if unit not in self.units:
+            raise DoraSystemdError(f"cannot reset {unit}", "", ExitCode.NOT_FOUND)
+        self.calls.append(("reset", unit))
+        self.units[unit]["NRestarts"] = 0
+        if unit not in self.held and self.units[unit]["ActiveState"] != "active":
+            del self.units[unit]
+
+    def hold(self, unit: str) -> None:
+        self.held.add(unit)
+
+    def set_properties(self, unit: str, properties: Sequence[Property], runtime: bool) -> None:
+        self.calls.append(("set", unit, list(properties), runtime))
+
+    def fileno(self) -> int:
+        return 0
+
+    def changes(self, unit: str) -> list[Mapping[str, Any]]:
+        del unit
+        return []
+
+    def control_group(self) -> str:
+        return ""
+
+    def reload(self) -> None:
+        self.calls.append(("reload",))
+
+    def unit_path(self) -> list[str]:
+        return [f"{self.etc}/systemd/{kind}" for kind in ("system", "user")]
+
+    def enable_unit_files(self, names: Sequence[str]) -> bool:
+        self.calls.append(("enable", *names))
+        for name in names:
+            wants = self.etc / "systemd/system/dora.target.wants"
+            wants.mkdir(parents=True, exist_ok=True)
+            link = wants / Path(name).name
+            link.unlink(missing_ok=True)
+            link.symlink_to(self.etc / "systemd/system" / link.name)
+        return True
+
+    def disable_unit_files(self, units: Sequence[str]) -> None:
+        self.calls.append(("disable", *units))
+        for unit in units:
+            for link in self.etc.glob(f"systemd/*/*.wants/{unit}"):
+                link.unlink()
+
+    def version(self) -> str:
+        return self.systemd
+
+    def _tell(self, observer: Observer | None) -> None:
+        for stage in self.stages:
+            if observer:
+                observer({"StatusText": stage})
+
+    def _end(self, unit: str) -> str:
+        self.units[unit] |= self.after_job.get(unit, {})
+        return self.job_results.get(unit, JOB_DONE)

@@ -1,0 +1,183 @@
+"""One page's connection, with a page of a few lines and nothing behind the gateway."""
+
+import asyncio
+import json
+from collections.abc import AsyncIterable, AsyncIterator, Awaitable, Callable
+from typing import Any
+
+import pytest
+
+from dora_systemd.decisions.gateway.page_messages import PageMessage
+from dora_systemd.decisions.gateway.request import Request
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.gateway.live import talk as live_talk
+from dora_systemd.gateway.live.talk import MAX_TASKS, talk
+from dora_systemd.scope import Scope
+
+REQUEST = Request("/api/live", Scope(True, 1000))
+ACT = {"type": "act", "action": "stop", "dataflow": "u", "number": 1}
+
+
+class Browser:
+    """A page that says what it is told to. is_stuck: it takes nothing any more."""
+
+    def __init__(self) -> None:
+        self.inbox: asyncio.Queue[str | None] = asyncio.Queue()
+        self.got: list[dict[str, Any]] = []
+        self.is_stuck = False
+
+    async def send(self, message: str | bytes | AsyncIterable[str]) -> None:
+        assert isinstance(message, str)
+        while self.is_stuck:
+            await asyncio.sleep(1)
+        self.got.append(json.loads(message))
+
+    async def recv(self) -> str:
+        raise NotImplementedError
+
+    async def close(self, code: int = 1000, reason: str = "") -> None:
+        raise NotImplementedError
+
+    async def __aiter__(self) -> AsyncIterator[str | bytes]:
+        while (text := await self.inbox.get()) is not None:
+            yield text
+
+    def say(self, **message: Any) -> None:
+        self.inbox.put_nowait(json.dumps(message))
+
+    def leave(self) -> None:
+        self.inbox.put_nowait(None)
+
+    async def wait_for(self, kind: str, count: int = 1) -> list[dict[str, Any]]:
+        async with asyncio.timeout(10):
+            while len(found := [one for one in self.got if one["type"] == kind]) < count:
+                await asyncio.sleep(0.005)
+        return found
+
+
+Story = Callable[[Browser], Awaitable[None]]
+
+
+def play(story: Story) -> Browser:
+    async def both() -> Browser:
+        browser = Browser()
+        talking = asyncio.ensure_future(talk(browser, REQUEST))
+        await story(browser)
+        browser.leave()
+        await asyncio.wait_for(talking, 10)
+        assert len(asyncio.all_tasks()) == 1
+        return browser
+
+    return asyncio.run(both())
+
+
+@pytest.fixture(autouse=True)
+def behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Snapshots of nothing, very often."""
+    monkeypatch.setattr(live_talk, "INTERVAL_SECONDS", 0.01)
+    monkeypatch.setattr(live_talk, "_snapshot", lambda _scope: [{"name": "robot"}])
+
+
+def test_greeting_and_snapshots() -> None:
+    async def story(browser: Browser) -> None:
+        await browser.wait_for("snapshot", 3)
+
+    got = play(story).got
+    assert got[0]["type"] == "hello"
+    assert {"version", "host", "scope"} <= got[0].keys()
+    assert got[1] == {"type": "snapshot", "dataflows": [{"name": "robot"}]}
+
+
+def test_systemd_out_of_reach(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(_scope: Scope) -> list[Any]:
+        raise DoraSystemdError("cannot reach systemd", "see systemctl")
+
+    monkeypatch.setattr(live_talk, "_snapshot", fail)
+
+    async def story(browser: Browser) -> None:
+        first, second = await browser.wait_for("problem", 2)
+        assert first == second
+        assert first["hint"] == "see systemctl"
+
+    play(story)
+
+
+def test_garbage_ends_nothing() -> None:
+    async def story(browser: Browser) -> None:
+        for text in ("", "[]", '{"type": "x"}'):
+            browser.inbox.put_nowait(text)
+        await browser.wait_for("problem", 3)
+        await browser.wait_for("snapshot", len(browser.got) + 2)
+
+    play(story)
+
+
+def test_actions(monkeypatch: pytest.MonkeyPatch) -> None:
+    def act(_scope: Scope, message: PageMessage) -> str:
+        if message.node:
+            raise DoraSystemdError("cannot find it", "look")
+        return f"{message.action} {message.dataflow}"
+
+    monkeypatch.setattr(live_talk, "act", act)
+
+    async def story(browser: Browser) -> None:
+        browser.say(**ACT)
+        browser.say(**ACT | {"node": "x", "number": 2})
+        await browser.wait_for("acted", 2)
+
+    found = {one["number"]: one for one in play(story).got if one["type"] == "acted"}
+    assert found[1]["text"] == "stop u"
+    assert (found[2]["problem"], found[2]["hint"]) == ("cannot find it", "look")
+
+
+def test_what_is_followed_takes_the_place_of_the_last(monkeypatch: pytest.MonkeyPatch) -> None:
+    followed: list[str] = []
+
+    async def follow(_scope: Scope, message: PageMessage) -> AsyncIterator[tuple[list[Any], int]]:
+        followed.append(f"+{message.node}")
+        try:
+            while True:
+                yield [{"text": message.node}], 0
+                await asyncio.sleep(0.01)
+        finally:
+            followed.append(f"-{message.node}")
+
+    monkeypatch.setattr(live_talk, "follow_lines", follow)
+
+    async def story(browser: Browser) -> None:
+        browser.say(type="follow", node="a", number=1)
+        await browser.wait_for("lines")
+        browser.say(type="follow", node="b", number=2)
+        while browser.got[-1].get("number") != 2:
+            await asyncio.sleep(0.005)
+        browser.say(type="unfollow")
+        await browser.wait_for("snapshot", len(browser.got) + 2)
+        assert followed == ["+a", "-a", "+b", "-b"]
+
+    play(story)
+
+
+def test_not_too_much_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def wait(_page: Any, _message: PageMessage) -> None:
+        await asyncio.sleep(60)
+
+    monkeypatch.setattr(live_talk._Page, "_act", wait)
+
+    async def story(browser: Browser) -> None:
+        for _ in range(MAX_TASKS + 1):
+            browser.say(**ACT)
+        (problem,) = await browser.wait_for("problem")
+        assert problem["text"] == "cannot start another action: 8 are still running"
+
+    play(story)
+
+
+def test_a_page_that_takes_nothing_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live_talk, "SEND_SECONDS", 0.05)
+
+    async def both() -> None:
+        browser = Browser()
+        browser.is_stuck = True
+        await asyncio.wait_for(talk(browser, REQUEST), 10)
+
+    asyncio.run(both())

@@ -1,0 +1,73 @@
+"""The files of the status page: they need no other host, and the browser is told so."""
+
+import asyncio
+import re
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.decisions.gateway.request import Answer, Request
+from dora_systemd.gateway.page import DIRECTORY, HEADERS, PREFIX, TYPES, page_routes
+from dora_systemd.scope import Scope
+
+FILES = sorted(DIRECTORY.iterdir())
+SCRIPTS = [path for path in FILES if path.suffix == ".js"]
+
+
+def get(path: str) -> Answer:
+    async def ask() -> Answer:
+        return await page_routes()[path](Request(path, Scope(False, 0)))
+
+    return asyncio.run(ask())
+
+
+def test_every_file_has_a_route_and_a_type() -> None:
+    assert {path.suffix for path in FILES} <= TYPES.keys()
+    names = {path.name for path in FILES} - {"index.html"}
+    assert page_routes().keys() == {"/", *(f"{PREFIX}{name}" for name in names)}
+
+
+@pytest.mark.parametrize("path", sorted(page_routes()))
+def test_answers(path: str) -> None:
+    answer = get(path)
+    name = path.removeprefix(PREFIX).strip("/") or "index.html"
+    assert answer.status == 200
+    assert answer.body == (DIRECTORY / name).read_bytes()
+    assert answer.content_type == TYPES[Path(name).suffix]
+    policy = answer.headers["Content-Security-Policy"]
+    assert "default-src 'none'" in policy
+    assert "unsafe" not in policy
+    assert "http" not in policy
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
+def test_nothing_comes_from_elsewhere(path: Path) -> None:
+    text = path.read_text().replace("http://www.w3.org/2000/svg", "")
+    assert not re.search(r"https?://|//[a-z]+\.[a-z]|@import|url\((?!#)", text)
+
+
+@pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.name)
+def test_what_comes_from_outside_is_text(path: Path) -> None:
+    """No way to markup or code is used at all."""
+    text = path.read_text()
+    wrong = r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\b|Function\(|srcdoc"
+    assert not re.search(wrong, text)
+    assert not re.search(r"setAttribute\(\"on", text)
+
+
+def test_the_page_has_no_code_of_its_own() -> None:
+    """What the Content-Security-Policy forbids would silently not work."""
+    text = (DIRECTORY / "index.html").read_text()
+    assert not re.search(r"<style|\sstyle=|\son[a-z]+=|<script(?![^>]*src=)", text)
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
+def test_what_is_asked_for_is_there(path: Path) -> None:
+    text = path.read_text()
+    wanted = re.findall(r'(?:src|href)="(/[^"#]+)"', text)
+    wanted += [f"{PREFIX}{name}" for name in re.findall(r'from "\./([^"]+)"', text)]
+    assert set(wanted) <= page_routes().keys()
+
+
+def test_frames_are_refused() -> None:
+    assert HEADERS["X-Frame-Options"] == "DENY"

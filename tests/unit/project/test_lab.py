@@ -1,0 +1,190 @@
+"""The parts of the test lab that need neither root nor an image."""
+
+import io
+import os
+import re
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from lab import cache, definition, initrd, pace, wire
+from lab.errors import LabError
+from lab.options import parse_options
+from lab.slow import read_speed
+from lab.steps import Result, Step, read_summary, run_steps, total
+
+from tests.system.tolerated import TOLERATED
+
+PYPROJECT = '[project]\nname = "x"\n[tool.ruff]\nline-length = 100\n'
+
+
+def test_debian_12_gets_what_the_readme_asks_for() -> None:
+    readme = definition.read_part(definition.CHECKOUT / "README.md")
+    assert f"\napt install {' '.join(definition.README_PACKAGES)}\n" in readme
+
+
+def test_options_of_run() -> None:
+    options = parse_options(["run", "--env", "A=1=2", "--env", "B", "--", "x", "--env"], {"B": "b"})
+    assert options.form == "container"
+    assert options.commands == (("x", "--env"),)
+    assert options.env == (("A", "1=2"), ("B", "b"))
+
+
+def test_the_dashes_are_optional() -> None:
+    assert parse_options(["run", "ls", "-l"], {}).commands == (("ls", "-l"),)
+
+
+def test_only_the_first_dashes_are_the_labs() -> None:
+    assert parse_options(["run", "--", "x", "--", "y"], {}).commands == (("x", "--", "y"),)
+
+
+def test_commands_around_a_reboot() -> None:
+    options = parse_options(["run", "--", "a", "b", "--reboot--", "c"], {"LAB": "vm"})
+    assert options.form == "vm"
+    assert options.commands == (("a", "b"), ("c",))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "environ", "message"),
+    [
+        (["run"], {}, "lab: cannot run nothing (hint: lab run -- CMD)"),
+        (["run", "a", "--reboot--"], {}, "lab: cannot run nothing (hint: lab run -- CMD)"),
+        (
+            ["run", "x"],
+            {"LAB": "moon"},
+            "lab: cannot use LAB=moon (hint: one of container, vm, bookworm, rivals, browser)",
+        ),
+        (
+            ["run", "x"],
+            {"LAB_OUT": "/no/such"},
+            "lab: cannot use LAB_OUT=/no/such (hint: an existing directory)",
+        ),
+        (
+            ["run", "--env", "1=2", "x"],
+            {},
+            "lab: cannot pass the variable '1' (hint: --env NAME or --env NAME=VALUE)",
+        ),
+    ],
+)
+def test_refused(arguments: list[str], environ: dict[str, str], message: str) -> None:
+    with pytest.raises(LabError) as caught:
+        parse_options(arguments, environ)
+    assert str(caught.value) == message
+
+
+def test_key_ignores_linters_and_sees_dependencies() -> None:
+    key = definition.project_key(PYPROJECT, "")
+    assert key == definition.project_key(PYPROJECT.replace("100", "80"), "")
+    assert key != definition.project_key(PYPROJECT.replace('"x"', '"y"'), "")
+    assert key != definition.project_key(PYPROJECT, "u dora -")
+
+
+def test_interrupted_build_is_not_a_finished_one(tmp_path: Path) -> None:
+    def build_half(path: Path) -> None:
+        (path / "half").touch()
+        raise LabError("go on")
+
+    with pytest.raises(LabError):
+        cache.ensure(tmp_path, cache.Layer("tree", "k", build_half))
+    whole = cache.ensure(tmp_path, cache.Layer("tree", "k", lambda path: (path / "whole").touch()))
+    assert [path.name for path in whole.iterdir()] == ["whole"]
+    assert not list(tmp_path.glob("*.tmp"))
+
+
+def test_old_layers_are_removed_unless_in_use(tmp_path: Path) -> None:
+    for key in "abcd":
+        cache.ensure(tmp_path, cache.Layer("tree", key, lambda _: None))
+    # ensure() holds each against removal for as long as this process lives.
+    assert len([path for path in tmp_path.iterdir() if path.is_dir()]) == 4
+    old = tmp_path / "tree-old"
+    old.mkdir()
+    cache.remove_layer(old)
+    assert not old.exists()
+
+
+def test_frames_survive_any_split() -> None:
+    stream = io.BytesIO(wire.pack_frame(b"O", b"x" * 100_000) + wire.pack_frame(b"X", b"0"))
+    assert wire.read_frame(lambda count: stream.read(min(count, 7))) == (b"O", b"x" * 100_000)
+    assert wire.read_frame(stream.read) == (b"X", b"0")
+    with pytest.raises(EOFError):
+        wire.read_frame(stream.read)
+
+
+def test_initrd_members_are_aligned() -> None:
+    entry = initrd.format_entry("init", 0o100755, b"12345")
+    assert entry.startswith(b"070701")
+    assert len(entry) % 4 == 0
+    assert b"init\0" in entry
+
+
+@pytest.mark.parametrize(
+    ("line", "summary"),
+    [
+        ("===== 3 passed, 1 skipped in 0.12s =====", "3 passed, 1 skipped in 0.12s"),
+        ("=== 120 passed in 75.31s (0:01:15) ===", "120 passed in 75.31s (0:01:15)"),
+        ("tests/unit/project/test_lab.py ....", ""),
+        ("2 cats in a box", ""),
+    ],
+)
+def test_summary_of_pytest(line: str, summary: str) -> None:
+    assert read_summary(line) == summary
+
+
+@pytest.mark.parametrize(
+    ("results", "words"),
+    [
+        ([(0, "3 passed in 1.0s")], "3 passed"),
+        ([(0, "3 passed, 1 skipped in 1s"), (0, "done")], "3 passed, 1 skipped"),
+        ([(1, "1 failed, 2 passed, 2 errors in 9s"), (0, "4 passed in 1s")],
+         "1 failed, 6 passed, 2 error"),
+        ([(0, "3 passed in 1s"), (125, "done")], "1 failed, 3 passed"),
+        ([(0, "3 passed in 1s"), (1, "2 passed in 1s")], "1 failed, 5 passed"),
+        ([(0, "done")], "1 passed"),
+    ],
+)  # fmt: skip
+def test_one_summary_for_all(results: list[tuple[int, str]], words: str) -> None:
+    assert total([Result("one", *given) for given in results]) == words
+
+
+def test_all_steps_run_and_the_worst_status_counts(capfd: pytest.CaptureFixture[str]) -> None:
+    scripts = ["echo one", "echo '== 2 failed, 1 passed in 1.00s =='; exit 1", "kill -TERM $$"]
+    steps = [
+        Step(f"step {n}", ["sh", "-c", text], os.environ.copy) for n, text in enumerate(scripts)
+    ]
+    steps[0] = replace(steps[0], with_next=True, minutes=3)
+    assert run_steps(steps) == 143
+    out, said = capfd.readouterr()
+    assert "3 steps, about 3 minutes on two cores" in said
+    assert "step 2 of 3: step 1" in said
+    assert "step 0: ok; done" in said
+    assert "step 1: FAILED with exit status 1; 2 failed, 1 passed in 1.00s" in said
+    assert "step 2: FAILED with exit status 143; done" in said
+    assert re.fullmatch(r"===== 3 failed, 1 passed in \d+\.\d\ds =====", out.splitlines()[-1])
+
+
+def test_bounds_are_in_seconds_of_an_idle_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert pace.measure() >= 1
+    monkeypatch.setattr(pace, "_last", (time.monotonic(), 2.5))
+    assert pace.bound(4) == 10
+    monkeypatch.setattr(pace, "_last", (time.monotonic() - 60, 2.5))
+    monkeypatch.setattr(pace, "measure", lambda: 3.0)
+    assert pace.bound(4) == 12
+
+
+def test_what_is_tolerated_is_said_once_and_with_a_reason() -> None:
+    parts = [word.part for word in TOLERATED]
+    assert all(len(word.part) >= 14 and word.reason and word.dora for word in TOLERATED)
+    assert not [one for one in parts for other in parts if one != other and one in other]
+    assert len(set(parts)) == len(parts)
+
+
+def test_speed_is_percent() -> None:
+    assert [read_speed(text) for text in (None, "", "50", "100")] == [100, 100, 50, 100]
+    for text in ("0", "101", "-5", "half"):
+        with pytest.raises(LabError, match="LAB_SPEED"):
+            read_speed(text)

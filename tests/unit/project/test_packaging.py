@@ -1,0 +1,123 @@
+"""The Debian packages agree with the project and with themselves."""
+
+import re
+import subprocess
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from dora_systemd import __version__
+from dora_systemd.decisions.unit.versions import MIN_VERSION
+from dora_systemd.names import SLICE
+from dora_systemd.verbs.start.account import DEFAULT_USER
+from tests.unit.checkout import CHECKOUT
+
+PACKAGING = CHECKOUT / "packaging"
+DEBIANS = (PACKAGING / "debian", PACKAGING / "dora-cli/debian")
+TEMPLATES = CHECKOUT / "units/templates"
+UNITS = sorted(
+    path
+    for path in TEMPLATES.iterdir()
+    if path.suffix in (".slice", ".target", ".socket", ".service")
+)
+
+
+def version_of(debian: Path) -> str:
+    found = re.match(r"\S+ \((.+)\) ", (debian / "changelog").read_text())
+    assert found
+    return found[1]
+
+
+def test_versions() -> None:
+    pyproject = tomllib.loads((CHECKOUT / "pyproject.toml").read_text())
+    assert version_of(DEBIANS[0]) == pyproject["project"]["version"] == __version__
+
+
+def test_changes_are_told_for_each_version() -> None:
+    told = re.findall(r"^## (\S+)$", (CHECKOUT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    packaged = re.findall(r"^\S+ \((.+)\) ", (DEBIANS[0] / "changelog").read_text(), re.MULTILINE)
+    assert told == packaged
+
+
+def test_wheels_are_those_of_the_changelog() -> None:
+    version = version_of(DEBIANS[1]).partition("-")[0]
+    lines = (DEBIANS[1] / "SHA256SUMS").read_text().splitlines()
+    for line in lines:
+        assert re.fullmatch(rf"[0-9a-f]{{64}}  dora_rs_cli-{version}-\S+\.whl", line)
+    assert [line.rpartition("_28_")[2] for line in lines] == ["x86_64.whl", "aarch64.whl"]
+    assert f"-{version}-" in (DEBIANS[1] / "rules").read_text()
+
+
+def test_dependencies() -> None:
+    control = (DEBIANS[0] / "control").read_text()
+    assert f"systemd (>= {MIN_VERSION})" in control
+    assert "dora-cli (>= 1.0)" in control
+    assert "${python3:Depends}" in control
+    pyproject = tomllib.loads((CHECKOUT / "pyproject.toml").read_text())["project"]
+    assert f"X-Python3-Version: {pyproject['requires-python'].replace('>=', '>= ')}\n" in control
+    for needed in pyproject["dependencies"]:
+        # dh_python3 finds the packages, but leaves out which versions are enough.
+        name, _, version = needed.replace("py", "", needed.startswith("pyyaml")).partition(">=")
+        package = f"python3-{name.removesuffix('-python')}"
+        assert f"\n {package} (>= {version}),\n" in control
+
+
+def test_every_template_is_installed() -> None:
+    rules = (DEBIANS[0] / "rules").read_text()
+    for path in TEMPLATES.iterdir():
+        assert f"$(TEMPLATES)/{path.name}" in rules, f"{path.name} is in no package"
+
+
+@pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.name)
+def test_units_are_fixed_text_with_a_manual(unit: Path) -> None:
+    text = unit.read_text()
+    assert not re.search(r"[{}]|@(?!system-service)|%[a-zA-Z]", text)
+    assert "Documentation=man:dora-systemd(7)" in text
+
+
+def test_names_of_slice_and_user() -> None:
+    assert (TEMPLATES / SLICE).is_file()
+    assert f"\nu {DEFAULT_USER} " in (TEMPLATES / "dora-systemd.sysusers").read_text()
+
+
+def test_all_manuals_are_installed() -> None:
+    listed = (DEBIANS[0] / "dora-systemd.manpages").read_text().split()
+    there = [f"packaging/man/{path.name}" for path in (PACKAGING / "man").iterdir()]
+    assert sorted(listed) == sorted(there)
+
+
+@pytest.mark.parametrize("debian", DEBIANS, ids=str)
+def test_overrides_say_why(debian: Path) -> None:
+    for path in [*debian.glob("*lintian-overrides"), *debian.glob("source/lintian-overrides")]:
+        is_explained = False
+        for line in filter(None, path.read_text().splitlines()):
+            assert line.startswith("#") or is_explained, f"{path}: {line}"
+            is_explained = True
+
+
+@pytest.mark.parametrize("debian", DEBIANS, ids=str)
+def test_maintainer_scripts(debian: Path) -> None:
+    for path in (path for kind in ("*.p*inst", "*.p*rm") for path in debian.glob(kind)):
+        text = path.read_text()
+        assert text.startswith("#!/bin/sh\nset -e\n")
+        assert "#DEBHELPER#" in text
+        assert not re.search(r"\b(start|enable|restart)\b", re.sub("#.*", "", text)), path
+        subprocess.run(["sh", "-n", str(path)], check=True)
+
+
+def test_upgrades_restart_nothing() -> None:
+    """debhelper would: a restart of dora.slice is one of every dataflow."""
+    rules = (DEBIANS[0] / "rules").read_text()
+    assert re.search(
+        r"^override_dh_installsystemd override_dh_installsystemduser:\n\n", rules, re.M
+    )
+
+
+def test_root_does_nothing_in_directories_of_users() -> None:
+    """A user can put a link into the place of anything below /run/user/UID."""
+    for script in (PACKAGING / "debian").glob("dora-systemd.p*"):
+        for line in script.read_text().splitlines():
+            is_meant = "/run/user" in line or '"$place' in line
+            is_loop = line.lstrip().startswith(("#", "for place in "))
+            assert not is_meant or is_loop or "as_owner " in line, f"{script.name}: {line}"

@@ -1,0 +1,106 @@
+"""Nobody opens, stats, runs or connects around dora_systemd.trust: held over the syntax tree.
+
+A module that reaches the outside world is in TABLE, with the reason why nobody but root (or the
+account itself) can have put there what it finds. Whatever may be somebody else's goes through
+`trust`. A new line in the table is a decision about trust: read "Who trusts whom" in
+dora-systemd(7) first.
+"""
+
+import ast
+
+import pytest
+
+from tests.unit.checkout import module_paths
+
+MODULES = {
+    "os": "open stat lstat access listdir scandir readlink unlink remove rename replace mkdir "
+    "rmdir chmod chown symlink link execv execve execvp execvpe posix_spawn system popen fdopen "
+    "walk",
+    "shutil": "which copy copy2 copyfile copytree rmtree move",
+    "subprocess": "run Popen call check_call check_output",
+    "socket": "create_connection",
+    "asyncio": "create_subprocess_exec create_subprocess_shell open_unix_connection "
+    "open_connection",
+}
+CALLS = {(module, name) for module, names in MODULES.items() for name in names.split()}
+_METHODS = """
+read_text read_bytes write_text write_bytes open touch unlink rmdir resolve readlink
+stat lstat exists is_file is_dir is_socket is_fifo is_symlink owner samefile
+iterdir glob rglob connect connect_ex
+"""
+METHODS = set(_METHODS.split())
+"""Of pathlib.Path and of sockets; of whatever else bears such a name, too."""
+
+DOOR = "is the door"
+OWN = "reads for the caller; what may be another's comes through trust before it gets here"
+KERNEL = "reads what the kernel writes: /sys/fs/cgroup, /proc"
+ROOTS = "places of root's, or in user scope of the caller's: units, journal, bus, /run/dora-systemd"
+INSTALLED = "what is installed with us"
+CELL = "runs in a cell, as the user of the dataflow"
+OTHERWISE = (
+    "the name means something else here: what is asked is a sight, or a connection of trust's"
+)
+
+_TABLE = {
+    DOOR: """
+        trust.paths trust.programs trust.sight trust.sockets trust.terminals
+    """,
+    OWN: """
+        adapters.dora.preparation adapters.host.files cli.logs cli.main decisions.cell.launch
+        verbs.start.credentials verbs.start.limits
+    """,
+    KERNEL: """
+        adapters.cgroup.groups adapters.host.machine adapters.host.process_table
+        trust.socket_table verbs.destroy verbs.facts.list verbs.start.sandbox verbs.why
+    """,
+    ROOTS: """
+        adapters.bus.connection adapters.bus.errors adapters.host.unit_files
+        adapters.journal.reader adapters.journal.socket verbs.doctor verbs.follow verbs.gateway
+        verbs.setup verbs.show verbs.start.enable verbs.up
+    """,
+    INSTALLED: """
+        gateway.page
+    """,
+    CELL: """
+        adapters.dora.check adapters.dora.engine adapters.dora.websocket adapters.host.fd_store
+        adapters.host.watch adapters.logs.held adapters.logs.jsonl adapters.logs.pipes
+        adapters.runner_socket.listener adapters.runner_socket.relay runner.cell.engine
+        runner.cell.pump runner.main runner.nodes.nodes runner.reload.settings_file
+        runner.reload.sources runner.stop_post
+    """,
+    OTHERWISE: """
+        adapters.dora.control adapters.host.loopback verbs.node verbs.start.places
+    """,
+}
+TABLE = {name: reason for reason, names in _TABLE.items() for name in names.split()}
+"""Why a module may reach the outside world by itself."""
+
+
+def calls(name: str) -> set[str]:
+    """The calls of a module that reach the outside world."""
+    tree = ast.parse(module_paths()[name].read_text())
+    found = {_reach(node) for node in ast.walk(tree) if isinstance(node, ast.Call)}
+    return found - {""}
+
+
+def _reach(node: ast.Call) -> str:
+    function = node.func
+    if isinstance(function, ast.Name):
+        return function.id if function.id == "open" else ""
+    if not isinstance(function, ast.Attribute):
+        return ""
+    owner = function.value.id if isinstance(function.value, ast.Name) else ""
+    if (owner, function.attr) in CALLS:
+        return f"{owner}.{function.attr}"
+    return f".{function.attr}" if function.attr in METHODS and owner not in MODULES else ""
+
+
+@pytest.mark.parametrize("name", sorted(module_paths().keys() - TABLE.keys()))
+def test_nobody_goes_around_the_door(name: str) -> None:
+    assert not calls(name), f"{name} must go through dora_systemd.trust"
+
+
+@pytest.mark.parametrize("name", sorted(TABLE))
+def test_every_exception_is_needed(name: str) -> None:
+    assert name in module_paths(), "take it out of the table"
+    assert calls(name), f"{name} reaches nothing any more: take it out of the table"

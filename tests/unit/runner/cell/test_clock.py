@@ -1,0 +1,64 @@
+"""One budget for a stop: what TimeoutStopSec= allows, and what each part of the end may take."""
+
+import pytest
+
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.life.stop_budget import LEAVE_TIMEOUT, runner_timeout, stop_timeout
+from dora_systemd.decisions.unit.properties import stop_properties
+from dora_systemd.runner.cell.clock import BACKLOG_SECONDS, STOP_SECONDS, StopClock
+from dora_systemd.values import INFINITY, SECOND
+
+
+class Clock(StopClock):
+    """It is as late as the test says."""
+
+    def __init__(self, grace: int) -> None:
+        self.at = 100.0
+        super().__init__(grace, lambda: self.at)
+
+
+@pytest.mark.parametrize("grace", [0, SECOND, 10 * SECOND, 3600 * SECOND])
+def test_the_parts_fit_the_whole(grace: int) -> None:
+    options = RunnerOptions("r", "u", "/f.yml", "/", "/dora", grace=grace)
+    whole = stop_properties(options)["TimeoutStopSec"].value
+    # All that the states of the table may take; the rest is journald's.
+    states = stop_timeout(grace) + LEAVE_TIMEOUT
+    assert states + 3 * SECOND <= runner_timeout(grace) < whole
+
+
+@pytest.mark.parametrize("late", [0.0, 17.0, 22.0, 60.0])
+def test_no_part_gets_more_than_what_is_left(late: float) -> None:
+    clock = Clock(10 * SECOND)
+    clock.begin("SIGTERM")
+    clock.at += late
+    end = 100.0 + runner_timeout(10 * SECOND) / SECOND
+    left = clock.for_journal()
+    while left() > 0:
+        assert clock.at + left() <= end
+        clock.at += 0.5
+    assert clock.at <= max(end, 100.0 + late) + 0.5
+    assert clock.left(7.0) == max(min(7.0, end - clock.at), 0.0)
+
+
+def test_nobody_waits() -> None:
+    clock = Clock(10 * SECOND)
+    left = clock.for_journal()
+    assert (clock.left(7.0), left()) == (7.0, BACKLOG_SECONDS)
+    clock.at += 10
+    clock.begin("SIGTERM")
+    assert left() == STOP_SECONDS, "it is in a hurry now"
+
+
+def test_only_the_first_stop_counts() -> None:
+    clock = Clock(0)
+    clock.begin("SIGTERM")
+    clock.at += 8
+    clock.begin("SIGINT")
+    assert (clock.by, clock.left(7.0)) == ("SIGTERM", 1.0)
+
+
+def test_endless_grace() -> None:
+    clock = Clock(INFINITY)
+    clock.begin("SIGTERM")
+    clock.at += 10**9
+    assert clock.left(7.0) == 7.0

@@ -1,0 +1,143 @@
+"""The pause before a restart: it grows, is seen, and begins anew after a quiet window."""
+
+import asyncio
+import os
+import socket
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from dora_systemd.adapters.host import fd_store
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.restarts import RestartPolicy
+from dora_systemd.decisions.cell.status import CellStatus
+from dora_systemd.paths import CellPaths
+from dora_systemd.runner.cell.pause import counted_restarts, forget_restarts, pause
+from dora_systemd.values import SECOND
+
+DELAY = SECOND // 2
+POLICY = RestartPolicy("always", 1000, 600 * SECOND, DELAY, 30 * SECOND)
+
+
+class Unit:
+    """A unit that is restarted: systemd's store of descriptors, NRestarts=, and who sleeps."""
+
+    def __init__(self, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.paths = CellPaths(root)
+        self.monkeypatch = monkeypatch
+        self.server = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+        self.server.bind(str(root / "notify"))
+        monkeypatch.setenv("NOTIFY_SOCKET", str(root / "notify"))
+        monkeypatch.setenv("LISTEN_PID", str(os.getpid()))
+        monkeypatch.setattr(time, "sleep", self.sleep)
+        library = SimpleNamespace(notify=lambda _: None)
+        monkeypatch.setitem(sys.modules, "systemd", SimpleNamespace(daemon=library))
+        monkeypatch.setitem(sys.modules, "systemd.daemon", library)
+        self.store: Counter[str] = Counter({"dora-log-a": 2})
+        self.slept = 0.0
+        systemctl = root / "systemctl"
+        systemctl.write_text(f'#!/bin/sh\necho "$@" >{root}/asked\ncat {root}/restarts\n')
+        systemctl.chmod(0o755)
+        monkeypatch.setenv("PATH", f"{root}:{os.environ['PATH']}")
+
+    def sleep(self, seconds: float) -> None:
+        self.slept += seconds
+
+    def keep_store(self) -> None:
+        while True:
+            try:
+                text, fds, _, _ = socket.recv_fds(self.server, 1000, 2)
+            except BlockingIOError:
+                return
+            lines = dict(line.split("=", 1) for line in text.decode().splitlines())
+            if "FDSTOREREMOVE" in lines:
+                del self.store[lines["FDNAME"]]
+            else:
+                self.store[lines["FDNAME"]] += len(fds)
+            for fd in fds:
+                os.close(fd)
+
+    def start(self, restarts: int, policy: RestartPolicy = POLICY) -> float:
+        """One life begins: how long it is after systemd's own delay."""
+        self.monkeypatch.setenv("LISTEN_FDNAMES", ":".join(self.store.elements()))
+        (self.paths.root / "restarts").write_text(f"{restarts}\n")
+        self.slept = 0.0
+        pause(self.options(policy), self.paths)
+        self.keep_store()
+        return self.slept
+
+    def options(self, policy: RestartPolicy) -> RunnerOptions:
+        return RunnerOptions("robot", "uuid", "/f.yml", "/", "/dora", restart=policy)
+
+
+@pytest.fixture
+def unit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Unit]:
+    unit = Unit(tmp_path, monkeypatch)
+    yield unit
+    unit.server.close()
+
+
+def test_it_doubles_up_to_the_longest(unit: Unit) -> None:
+    pauses = [0.5 + unit.start(restarts) for restarts in range(9)]
+    assert pauses == [0.5, 0.5, 1, 2, 4, 8, 16, 30, 30]
+
+
+def test_a_quiet_window_is_forgotten(unit: Unit) -> None:
+    for restarts in range(8):
+        unit.start(restarts)
+
+    async def wait() -> None:
+        await forget_restarts(unit.options(POLICY._replace(window=1)))
+
+    asyncio.run(wait())
+    unit.keep_store()
+    assert [unit.start(restarts) for restarts in (8, 9)] == [0, 0.5]
+
+
+def test_what_is_reset_or_restarted_by_hand_is_forgotten(unit: Unit) -> None:
+    for restarts in range(8):
+        unit.start(restarts)
+    assert [unit.start(restarts) for restarts in (0, 1, 2)] == [0, 0, 0.5]
+    assert (unit.paths.root / "asked").read_text() == (
+        "show --value --property=NRestarts dora-robot.service\n"
+    )
+
+
+def test_it_is_seen(unit: Unit) -> None:
+    for restarts in range(5):
+        unit.start(restarts)
+    status = CellStatus.from_json(unit.paths.status.read_text())
+    assert (status.stage, status.text) == ("restarting", "restarting in 4s")
+    assert status.started_us > time.time_ns() // 1000
+
+
+def test_nothing_restarts(unit: Unit) -> None:
+    assert [unit.start(n, POLICY._replace(policy="no")) for n in range(5)] == [0] * 5
+    assert "dora-life" not in unit.store
+
+
+def test_the_store_does_not_fill(unit: Unit) -> None:
+    for restarts in range(100):
+        unit.start(restarts)
+    assert unit.store["dora-life"] == 64
+    assert unit.store["dora-log-a"] == 2
+
+
+def test_systemd_does_not_answer(unit: Unit) -> None:
+    (unit.paths.root / "systemctl").write_text("#!/bin/sh\nexit 1\n")
+    assert counted_restarts("robot", True, 7) == 7
+
+
+def test_without_systemd(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("LISTEN_PID", raising=False)
+    assert fd_store.lives() == 0
+    given: dict[str, Any] = {"LISTEN_PID": "1", "LISTEN_FDNAMES": "dora-life"}
+    for key, value in given.items():
+        monkeypatch.setenv(key, value)
+    assert fd_store.lives() == 0

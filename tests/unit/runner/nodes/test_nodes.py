@@ -1,0 +1,63 @@
+"""The runner's side of the nodes."""
+
+import asyncio
+import os
+import resource
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.adapters.logs.pipes import LogPipes
+from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
+from dora_systemd.decisions.logs.lines import Origin
+from dora_systemd.paths import CellPaths
+from dora_systemd.runner.nodes.nodes import Nodes, _with_descendants, raise_file_limit
+from tests.unit.adapters.logs.test_queue import SlowJournal
+
+
+@pytest.fixture
+def few_files() -> Iterator[None]:
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (256, before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_NOFILE, before)
+
+
+@pytest.mark.usefixtures("few_files")
+def test_more_nodes_than_a_process_has_files() -> None:
+    raise_file_limit()
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    assert soft == hard
+
+
+def test_a_node_that_dora_reads_is_removed_and_taken_back(tmp_path: Path) -> None:
+    raw = {"id": "a", "path": "a.py", "outputs": ["said"], "send_stdout_as": "said"}
+    dataflow = parse_dataflow({"nodes": [raw]}, "dataflow.yml")
+    journal = SlowJournal()
+    journal.make_room(100)
+    log = tmp_path / "work/out/run/log_a.jsonl"
+    log.parent.mkdir(parents=True)
+    (tmp_path / "io").mkdir()
+
+    async def live() -> None:
+        pipes = LogPipes(asyncio.get_running_loop(), journal, Origin("robot", "uuid"))
+        nodes = Nodes(tmp_path, CellPaths(tmp_path), pipes)
+        nodes.prepare(dataflow, {}, ())
+        nodes.listen("run")
+        nodes.remove("a")
+        nodes.add(dataflow.nodes[0], {}, ())
+        log.write_text("again\n")
+        nodes.close()
+
+    asyncio.run(live())
+    assert b"MESSAGE=again\n" in b"".join(journal.taken)
+
+
+def test_an_operator_that_dies_while_it_is_adopted(monkeypatch: pytest.MonkeyPatch) -> None:
+    def gone(path: object) -> None:
+        raise FileNotFoundError(2, "No such file or directory", str(path))
+
+    monkeypatch.setattr(os, "scandir", gone)
+    monkeypatch.setattr(os, "listdir", gone)
+    assert _with_descendants(os.getpid()) == [os.getpid()]

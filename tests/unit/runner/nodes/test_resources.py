@@ -1,0 +1,74 @@
+"""The runner's counters, on a directory that looks like a cgroup tree."""
+
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.adapters.cgroup.memory import read_load, read_oom
+from dora_systemd.decisions.cell.status import CpuSample
+from dora_systemd.decisions.resources.oom import Owner
+from dora_systemd.decisions.resources.pressure import CPU, MEMORY
+from dora_systemd.runner.nodes.resources import Resources
+
+MIB = 1 << 20
+
+
+@pytest.fixture
+def unit(tmp_path: Path) -> Path:
+    for name in (".", "supervisor", "node-a", "node-b"):
+        group = tmp_path / name
+        group.mkdir(exist_ok=True)
+        count(group)
+        numbers = {"max": 64 * MIB, "peak": 64 * MIB, "current": 10 * MIB, "high": "max"}
+        for key, number in numbers.items():
+            (group / f"memory.{key}").write_text(f"{number}\n")
+    (tmp_path / "node-b/memory.current").write_text(f"{40 * MIB}\n")
+    (tmp_path / "memory.max").write_text(f"{99 * MIB}\n")
+    return tmp_path
+
+
+def count(group: Path, kills: int = 0, refusals: int = 0) -> None:
+    (group / "memory.events").write_text(f"low 0\noom 9\noom_kill {kills}\n")
+    (group / "memory.events.local").write_text(f"oom {refusals}\noom_kill {kills}\n")
+
+
+def test_nothing_was_killed(unit: Path) -> None:
+    assert Resources(unit).explain(unit / "node-a") is None
+
+
+def test_each_death_is_explained_once(unit: Path) -> None:
+    resources, group = Resources(unit), unit / "node-a"
+    count(group, kills=2, refusals=1)
+    oom = resources.explain(group)
+    assert oom is not None
+    assert (oom.owner, oom.peak, oom.limit) == (Owner.NODE, 64 * MIB, 64 * MIB)
+    assert resources.explain(group) is None
+    count(group, kills=3, refusals=1)
+    count(unit, kills=3, refusals=1)
+    (group / "memory.peak").write_text(f"{30 * MIB}\n")
+    whole = resources.explain(group)
+    assert whole is not None
+    assert (whole.owner, whole.limit) == (Owner.DATAFLOW, 99 * MIB)
+    assert (whole.most, whole.most_held) == ("b", 40 * MIB)
+    count(group, kills=4, refusals=1)
+    last = resources.explain(group)
+    assert last is not None
+    assert last.owner is Owner.MACHINE
+
+
+def test_limits_that_come_close(unit: Path) -> None:
+    resources = Resources(unit)
+    (unit / "node-a/memory.stat").write_text(f"anon {50 * MIB}\nfile 7\nshmem {10 * MIB}\n")
+    stalled = "some avg10=31.00 avg60=0.00 avg300=0.00 total=1\nfull avg10=0.00\n"
+    (unit / "node-b/memory.pressure").write_text(stalled)
+    records = []
+    for number in range(4):
+        before = (CpuSample(number * 5_000_000, {}, {"b": (50 * number, 45 * number)}),)
+        later = 50 * (number + 1), 45 * (number + 1)
+        records += resources.look(before, CpuSample((number + 1) * 5_000_000, {}, {"b": later}))
+    assert [(one.event, one.node) for one in records] == [(MEMORY, "a"), (MEMORY, "b"), (CPU, "b")]
+
+
+def test_what_is_not_there_is_no_limit(tmp_path: Path) -> None:
+    assert read_oom(tmp_path).kills == 0
+    assert read_load(tmp_path).limit is None

@@ -1,0 +1,275 @@
+"""Rows of `list` from a fake systemd, a fake cgroup tree and a node table."""
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dora_systemd.adapters.cgroup import groups as cgroup
+from dora_systemd.decisions.cell.status import CellStatus, CpuSample, NodeStatus
+from dora_systemd.decisions.views.dataflows import DataflowRow, format_dataflow, format_dataflows
+from dora_systemd.decisions.views.prometheus import format_metrics
+from dora_systemd.decisions.views.top import Look, TopEntry, format_top
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.scope import Scope
+from dora_systemd.trust.cells import MAX_TABLE, read_table
+from dora_systemd.verbs import why
+from dora_systemd.verbs.facts import list as dataflow_list
+from dora_systemd.verbs.facts.cells import read_cells
+from dora_systemd.verbs.facts.list import dataflow_row, find_row, read_rows
+from dora_systemd.verbs.facts.snapshot import read_snapshot
+from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
+
+GROUP = "/dora.slice/dora-robot.service"
+SECOND = 1_000_000
+
+
+@pytest.fixture
+def scope(tmp_path: Path) -> Scope:
+    return ScopeIn(is_user=True, uid=1000, root=tmp_path / "run")
+
+
+@pytest.fixture
+def unit_group(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A cgroup tree with one node that used 2 s of CPU and 1 MiB, and an empty RuntimeDirectory."""
+    monkeypatch.setattr(cgroup, "mount_point", lambda: tmp_path / "cgroup")
+    group = tmp_path / "cgroup" / GROUP[1:]
+    node = group / "node-camera"
+    node.mkdir(parents=True)
+    for place, cpu, memory in ((group, 4 * SECOND, 3 << 20), (node, 2 * SECOND, 1 << 20)):
+        (place / "cpu.stat").write_text(f"usage_usec {cpu}\n")
+        (place / "memory.current").write_text(f"{memory}\n")
+        (place / "cgroup.events").write_text("populated 1\n")
+    return group
+
+
+def row_of(manager: FakeManager, scope: Scope) -> DataflowRow:
+    return dataflow_row(manager, scope, read_cells(manager)[0])
+
+
+def now_us() -> int:
+    return time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000
+
+
+def write_status(scope: Scope, status: CellStatus) -> None:
+    directory = scope.cell_directory("robot")
+    directory.mkdir(parents=True)
+    (directory / "status.json").write_text(status.to_json())
+
+
+@pytest.mark.usefixtures("unit_group")
+def test_running_dataflow(scope: Scope) -> None:
+    manager = FakeManager()
+    manager.add(
+        options(),
+        ControlGroup=GROUP,
+        NRestarts=1,
+        ActiveEnterTimestampMonotonic=now_us() - 90 * SECOND,
+        ActiveEnterTimestamp=17,
+    )
+    sample = CpuSample(now_us() - 4 * SECOND, {"": 2 * SECOND, "camera": SECOND})
+    nodes = {
+        "camera": NodeStatus("running", 42, restarts=2),
+        "plot": NodeStatus("failed", exit="exit code 1"),
+    }
+    write_status(scope, CellStatus(stage="degraded", nodes=nodes, samples=(sample,)))
+    row = row_of(manager, scope)
+    assert (row.status, row.restarts, row.nodes_alive, row.nodes_total) == ("Degraded", 3, 1, 2)
+    assert row.uptime is not None
+    assert 90 * SECOND <= row.uptime < 95 * SECOND
+    assert row.cpu_percent == pytest.approx(50, rel=0.2)
+    assert row.memory == 3 << 20
+    camera, plot = row.nodes
+    assert (camera.pid, camera.memory, camera.state) == (42, 1 << 20, "running")
+    assert camera.cpu_percent == pytest.approx(25, rel=0.2)
+    assert (plot.exit, plot.memory, plot.cpu_percent) == ("exit code 1", None, None)
+
+
+@pytest.mark.parametrize("group", [GROUP, "/other.slice/dora-robot.service"])
+@pytest.mark.parametrize("active", ["active", "activating", "failed"])
+@pytest.mark.parametrize("has_samples", [True, False])
+def test_the_table_asks_for_less_and_says_the_same(
+    scope: Scope, unit_group: Path, group: str, active: str, has_samples: bool
+) -> None:
+    if group != GROUP:
+        unit_group.parent.rename(unit_group.parents[1] / "other.slice")
+    manager = FakeManager()
+    started = now_us() - 40 * SECOND
+    times = {"InactiveExitTimestampMonotonic": started}
+    times["ActiveEnterTimestampMonotonic"] = started + (SECOND if active == "active" else -SECOND)
+    manager.add(options(), active=active, ControlGroup=group, NRestarts=1, **times)
+    samples = (CpuSample(now_us() - 4 * SECOND, {"": 2 * SECOND}),) if has_samples else ()
+    status = CellStatus(nodes={"camera": NodeStatus("running", 42)}, samples=samples)
+    write_status(scope, status)
+    (all_of_it,) = read_rows(manager, scope)
+    (line,) = read_rows(manager, scope, with_details=False)
+    assert (line.memory is None) == (active == "failed")
+    now: dict[str, Any] = {"uptime": None, "cpu_percent": None, "nodes": ()}
+    assert line._replace(**now) == all_of_it._replace(**now)
+    for mine, other in ((line.uptime, all_of_it.uptime), (line.cpu_percent, all_of_it.cpu_percent)):
+        assert mine == (other and pytest.approx(other, rel=0.1))
+
+
+@pytest.mark.usefixtures("unit_group")
+def test_node_table_that_cannot_be_read(scope: Scope) -> None:
+    """Another user's: the cgroups still tell which nodes there are."""
+    manager = FakeManager()
+    since = now_us() - 40 * SECOND
+    manager.add(
+        options(),
+        ControlGroup=GROUP,
+        InactiveExitTimestampMonotonic=since,
+        ActiveEnterTimestampMonotonic=since,
+    )
+    row = row_of(manager, scope)
+    assert (row.status, row.nodes_alive, row.nodes_total) == ("Running", 1, 1)
+    assert row.cpu_percent == pytest.approx(10, rel=0.2)
+    assert row.nodes[0].state == "unknown"
+
+
+DAMAGE: dict[str, Callable[[Path], object]] = {
+    "nothing": lambda path: path.write_text(""),
+    "no JSON": lambda path: path.write_text("{"),
+    "no object": lambda path: path.write_text("[]"),
+    "no nodes": lambda path: path.write_text('{"nodes": 3}'),
+    "no UTF-8": lambda path: path.write_bytes(b"\xff"),
+    "Infinity": lambda path: path.write_text('{"samples": [{"at_us": Infinity}]}'),
+    "deep": lambda path: path.write_text("[" * 100_000),
+    "huge": lambda path: path.write_bytes(b" " * (MAX_TABLE + 1)),
+    "ESC in an id": lambda path: path.write_text('{"nodes": {"a\\u001b]0;x": {}}}'),
+    "a FIFO": os.mkfifo,
+    "a directory": Path.mkdir,
+    "a device": lambda path: path.symlink_to("/dev/zero"),
+    "a circle": lambda path: path.symlink_to(path),
+}
+
+
+@pytest.mark.usefixtures("unit_group")
+@pytest.mark.parametrize("what", DAMAGE)
+@pytest.mark.parametrize("with_details", [True, False])
+def test_damaged_node_table(scope: Scope, what: str, with_details: bool) -> None:
+    """It is a word in its own row, and the others are shown."""
+    directory = scope.cell_directory("robot")
+    directory.mkdir(parents=True)
+    DAMAGE[what](directory / "status.json")
+    manager = FakeManager()
+    now = now_us()
+    times: dict[str, Any] = {
+        "InactiveExitTimestampMonotonic": now,
+        "ActiveEnterTimestampMonotonic": now,
+    }
+    manager.add(options(), ControlGroup=GROUP, **times)
+    manager.add(options("other", UUID[:-1] + "1"), ControlGroup=GROUP, **times)
+    other, row = read_rows(manager, scope, with_details)
+    assert (row.status, bool(row.problem)) == ("Running", True)
+    assert (other.status, other.problem) == ("Running", "")
+    assert " ?  " in format_dataflows([row])
+    assert row.problem in format_dataflow(row)
+    assert " ?  " in format_top(Look(now, [TopEntry(row)]), "cpu")
+    assert format_metrics(read_snapshot(manager, scope), "1").count("dora_dataflow_info{") == 2
+    facts = why.explain(manager, scope, "robot", NoJournal())  # type: ignore[arg-type]
+    assert facts.verdict.now == row.problem
+
+
+class NoJournal:
+    """A journal without any record."""
+
+    def newest(self, *_words: object, **_more: object) -> Iterator[dict[str, Any]]:
+        return iter(())
+
+
+def test_a_table_of_a_stranger_is_not_believed(scope: Scope) -> None:
+    """The RuntimeDirectory is one user's, the file in it another's: somebody put it there."""
+    if os.geteuid():
+        pytest.skip("only root can make files of others")
+    directory = scope.cell_directory("robot")
+    write_status(scope, CellStatus(nodes={"a": NodeStatus()}))
+    os.chown(directory, 1000, 1000)
+    os.chown(directory / "status.json", 1001, 1001)
+    with pytest.raises(DoraSystemdError, match="not of the user whose dataflow it is"):
+        read_table(directory)
+    os.chown(directory / "status.json", 1000, 1000)
+    assert read_table(directory) is not None
+
+
+def test_a_secret_behind_a_link_is_not_read(scope: Scope, tmp_path: Path) -> None:
+    """Root would read it, and the parser's words would tell what is in it."""
+    if os.geteuid():
+        pytest.skip("links are refused to root alone")
+    directory = scope.cell_directory("robot")
+    directory.mkdir(parents=True)
+    os.chown(directory, 1000, 1000)
+    (tmp_path / "secret").write_text(CellStatus(nodes={"a": NodeStatus()}).to_json())
+    (directory / "status.json").symlink_to(tmp_path / "secret")
+    with pytest.raises(DoraSystemdError, match="symbolic link"):
+        read_table(directory)
+
+
+@pytest.mark.usefixtures("unit_group")
+def test_a_table_that_is_not_there_yet_is_no_problem(scope: Scope) -> None:
+    manager = FakeManager()
+    manager.add(options(), ControlGroup=GROUP)
+    assert row_of(manager, scope).problem == ""
+
+
+def test_groups_that_the_nodes_user_has_made(scope: Scope, unit_group: Path) -> None:
+    for name in ("node-\x1b]0;x\a", "node-a\nb", "node-", "node-.x", "node-" + "x" * 201, "other"):
+        (unit_group / name).mkdir()
+    for count in range(cgroup.MAX_GROUPS + 10):
+        (unit_group / f"node-{count:05}").mkdir()
+    found = cgroup.shown_groups(unit_group)
+    assert len(found) == cgroup.MAX_GROUPS
+    assert all(node.isdigit() for node in found)
+    assert list(cgroup.shown_groups(unit_group, ["camera", "gone"])) == ["camera"]
+    manager = FakeManager()
+    manager.add(options(), ControlGroup=GROUP)
+    write_status(scope, CellStatus(nodes={"camera": NodeStatus("running")}))
+    reading = dataflow_list.read_dataflow(manager, scope, read_cells(manager)[0])
+    assert list(reading.usage) == ["", "camera"]
+
+
+def test_groups_that_are_nested_deeply(tmp_path: Path) -> None:
+    groups = [tmp_path / "/".join("a" * depth) for depth in range(1, 1100)]
+    for group in groups:
+        group.mkdir()
+    (groups[-1] / "cgroup.procs").write_text(f"{os.getpid()}\n")
+    found = cgroup.pids(tmp_path)
+    memory = cgroup.read_usage(tmp_path).memory
+    (groups[-1] / "cgroup.procs").unlink()
+    for group in reversed(groups):  # pytest's own way to remove them is recursive
+        group.rmdir()
+    assert found == [os.getpid()]
+    assert memory == 0  # so deep, it is not looked for
+
+
+@pytest.mark.usefixtures("unit_group")
+def test_starting_dataflow(scope: Scope) -> None:
+    manager = FakeManager()
+    manager.add(
+        options(),
+        active="activating",
+        ControlGroup=GROUP,
+        InactiveExitTimestampMonotonic=now_us() - 3 * SECOND,
+    )
+    row = row_of(manager, scope)
+    assert row.status == "Starting"
+    assert row.started == 0
+    assert row.uptime is not None
+    assert 3 * SECOND <= row.uptime < 5 * SECOND
+
+
+def test_failed_dataflow(scope: Scope) -> None:
+    manager = FakeManager()
+    manager.add(options(), active="failed", StatusText="node camera failed")
+    row = row_of(manager, scope)
+    assert (row.status, row.text, row.uptime) == ("Failed", "node camera failed", None)
+
+
+def test_a_row_is_found_by_selector(scope: Scope) -> None:
+    manager = FakeManager()
+    manager.add(options(), active="failed")
+    assert find_row(manager, scope, "robot").name == "robot"
+    assert dataflow_list.read_status(scope, read_cells(manager)[0]) == CellStatus()

@@ -1,0 +1,165 @@
+"""A name that is to be started: free, in use, enabled with the same settings or with others."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dora_systemd.decisions.settings.resolve import resolve_settings
+from dora_systemd.decisions.unit.file import runner_of
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.scope import Scope
+from dora_systemd.verbs.start.claim import (
+    place_unit_file,
+    refuse_unit_file,
+    require_free_name,
+    with_known_uuid,
+)
+from dora_systemd.verbs.start.plan import Plan
+from dora_systemd.verbs.start.unit import plan_properties
+from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
+
+UNIT = "dora-robot.service"
+OTHER = "11111111-e29b-41d4-a716-446655440000"
+
+
+@pytest.fixture
+def scope(tmp_path: Path) -> Scope:
+    return ScopeIn(is_user=False, uid=0, root=tmp_path / "run")
+
+
+@pytest.fixture
+def manager(tmp_path: Path) -> FakeManager:
+    manager = FakeManager()
+    manager.etc = tmp_path / "etc"
+    manager.units["dora.target"] = {"LoadState": "loaded", "WantedBy": ["multi-user.target"]}
+    return manager
+
+
+def make_plan(scope: Scope, uuid: str = UUID, **flags: object) -> Plan:
+    return Plan(scope, options(uuid=uuid), resolve_settings(flags, {}, []), None, {"PATH": "/bin"})
+
+
+def place(manager: FakeManager, plan: Plan, want_boot: bool = False) -> bool:
+    boot = require_free_name(manager, plan.scope, UNIT)
+    plan = with_known_uuid(plan, boot)
+    return place_unit_file(manager, plan, plan_properties(plan, manager)[0], boot, want_boot)
+
+
+def unit_file(manager: FakeManager) -> Path:
+    return manager.etc / "systemd/system" / UNIT
+
+
+def test_a_free_name(manager: FakeManager, scope: Scope) -> None:
+    boot = require_free_name(manager, scope, UNIT)
+    assert (boot.path, boot.text, boot.is_enabled) == (unit_file(manager), None, False)
+    assert not place(manager, make_plan(scope))
+    assert manager.calls == []
+
+
+@pytest.mark.parametrize("state", ["active", "activating", "deactivating", "reloading"])
+def test_a_name_in_use(state: str, manager: FakeManager, scope: Scope) -> None:
+    manager.add(options(), active=state, InactiveExitTimestamp=1_700_000_000_000_000)
+    with pytest.raises(DoraSystemdError) as caught:
+        require_free_name(manager, scope, UNIT)
+    assert caught.value.code is ExitCode.NAME_IN_USE
+    for part in (UUID, "/srv/robot.yml", "since 2023-11-1"):
+        assert part in caught.value.message
+    assert manager.calls == []
+
+
+def test_a_failed_one_is_forgotten(manager: FakeManager, scope: Scope) -> None:
+    manager.add(options(), active="failed")
+    require_free_name(manager, scope, UNIT)
+    assert manager.calls == [("reset", UNIT)]
+
+
+@pytest.mark.parametrize("facts", [{"ExecStart": []}, {"LoadState": "bad-setting"}])
+def test_a_unit_that_is_not_ours(facts: dict[str, Any], manager: FakeManager, scope: Scope) -> None:
+    manager.add(options(), active="failed", **facts)
+    with pytest.raises(DoraSystemdError, match="already exists") as caught:
+        require_free_name(manager, scope, UNIT)
+    assert caught.value.code is ExitCode.NAME_IN_USE
+    assert manager.calls == []
+
+
+@pytest.mark.parametrize("text", ["", "nonsense", "[Service]\nExecStart=/bin/sleep 1\n"])
+def test_a_file_that_is_not_ours(text: str, manager: FakeManager, scope: Scope) -> None:
+    path = unit_file(manager)
+    path.parent.mkdir(parents=True)
+    path.write_text(text)
+    with pytest.raises(DoraSystemdError, match="not doractl's") as caught:
+        require_free_name(manager, scope, UNIT)
+    assert caught.value.code is ExitCode.NAME_IN_USE
+    assert path.read_text() == text
+
+
+def test_started_and_enabled(manager: FakeManager, scope: Scope) -> None:
+    assert place(manager, make_plan(scope), want_boot=True)
+    text = unit_file(manager).read_text()
+    found = runner_of(text)
+    assert found is not None
+    assert found == options()
+    assert text.endswith("\n[Install]\nWantedBy=dora.target\n")
+    assert manager.calls == [("enable", str(unit_file(manager))), ("reload",)]
+
+
+def test_the_same_again_is_started_from_its_file(manager: FakeManager, scope: Scope) -> None:
+    place(manager, make_plan(scope), want_boot=True)
+    before = unit_file(manager).read_text()
+    manager.calls.clear()
+    # However the target came about: it says nothing about the dataflow.
+    del manager.units["dora.target"]
+    assert place(manager, make_plan(scope, uuid=OTHER))
+    assert unit_file(manager).read_text() == before
+    assert manager.calls == []
+
+
+def test_other_settings_are_refused(manager: FakeManager, scope: Scope) -> None:
+    place(manager, make_plan(scope), want_boot=True)
+    before = unit_file(manager).read_text()
+    with pytest.raises(DoraSystemdError, match="enabled with other settings") as caught:
+        place(manager, make_plan(scope, property=("Nice=5",)))
+    assert caught.value.code is ExitCode.NAME_IN_USE
+    assert "--enable" in caught.value.hint
+    assert unit_file(manager).read_text() == before
+
+
+def test_other_settings_replace_on_request(manager: FakeManager, scope: Scope) -> None:
+    """The UUID stays with the file of the dataflow."""
+    place(manager, make_plan(scope), want_boot=True)
+    assert place(manager, make_plan(scope, uuid=OTHER, property=("Nice=5",)), want_boot=True)
+    text = unit_file(manager).read_text()
+    assert "\nNice=5\n" in text
+    assert f"--uuid={UUID}" in text
+
+
+def test_another_dataflow_has_another_uuid(manager: FakeManager, scope: Scope) -> None:
+    place(manager, make_plan(scope), want_boot=True)
+    plan = make_plan(scope, uuid=OTHER)
+    plan = replace(plan, options=plan.options._replace(dataflow="/srv/other.yml"))
+    assert place(manager, plan, want_boot=True)
+    assert f"--uuid={OTHER}" in unit_file(manager).read_text()
+
+
+def test_a_disabled_one_gives_way(manager: FakeManager, scope: Scope) -> None:
+    place(manager, make_plan(scope), want_boot=True)
+    manager.disable_unit_files([UNIT])
+    assert not place(manager, make_plan(scope))
+    assert not unit_file(manager).exists()
+
+
+def test_run_refuses_an_enabled_name(manager: FakeManager, scope: Scope) -> None:
+    place(manager, make_plan(scope), want_boot=True)
+    with pytest.raises(DoraSystemdError, match="it is enabled"):
+        refuse_unit_file(require_free_name(manager, scope, UNIT))
+
+
+def test_an_ended_transient_one_makes_room_for_its_file(manager: FakeManager, scope: Scope) -> None:
+    place(manager, make_plan(scope), want_boot=True)
+    manager.add(options(), active="failed")
+    manager.calls.clear()
+    assert place(manager, make_plan(scope))
+    link = ("enable", str(unit_file(manager)))
+    assert manager.calls == [("reset", UNIT), ("disable", UNIT), ("reload",), link, ("reload",)]

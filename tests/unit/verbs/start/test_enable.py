@@ -1,0 +1,208 @@
+"""enable, disable and export against a fake systemd and real files."""
+
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.adapters.host.process import Completed
+from dora_systemd.decisions.settings.resolve import resolve_settings
+from dora_systemd.decisions.unit.properties import UnitContext, format_unit, unit_properties
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.scope import Scope
+from dora_systemd.verbs.export import export_cell
+from dora_systemd.verbs.facts.cells import Cell, find_cell
+from dora_systemd.verbs.facts.enabled import enabled_units
+from dora_systemd.verbs.facts.list import find_row
+from dora_systemd.verbs.start import linger
+from dora_systemd.verbs.start.enable import boot_target, disable_cell, enable_cell
+from dora_systemd.verbs.start.linger import ensure_linger
+from dora_systemd.verbs.stop import stop_cells
+from tests.unit.fakes.manager import FakeManager, ScopeIn, options
+
+UNIT = "dora-robot.service"
+
+
+@pytest.fixture
+def scope(tmp_path: Path) -> Scope:
+    return ScopeIn(is_user=False, uid=0, root=tmp_path / "run")
+
+
+@pytest.fixture
+def manager(tmp_path: Path) -> FakeManager:
+    manager = FakeManager()
+    manager.etc = tmp_path / "etc"
+    return manager
+
+
+def started(manager: FakeManager) -> Cell:
+    """A running transient unit, with the fragment that systemd has for it."""
+    context = UnitContext("/usr/bin/python3", False, "dora", {"A": "x 100% $B"})
+    text = format_unit(unit_properties(options(), context, resolve_settings({}, {}, [])))
+    fragment = manager.etc / "../run/systemd/transient" / UNIT
+    fragment.parent.mkdir(parents=True)
+    fragment.write_text(f"# This is a transient unit file\n{text}")
+    manager.add(options(), FragmentPath=str(fragment), DropInPaths=[])
+    return find_cell(manager, "robot")
+
+
+def path_of(manager: FakeManager) -> Path:
+    return manager.etc / "systemd/system" / UNIT
+
+
+def test_what_runs_goes_on(manager: FakeManager, scope: Scope) -> None:
+    """No reload: it would keep the transient unit loaded when it has ended."""
+    cell = started(manager)
+    boot, is_news = enable_cell(manager, scope, cell)
+    assert (boot.path, is_news) == (path_of(manager), True)
+    assert manager.calls == [("enable", str(path_of(manager)))]
+    text = path_of(manager).read_text()
+    assert 'Environment="A=x 100%% $B"\n' in text
+    assert "RequiresMountsFor=/srv\n" in text
+    assert text.endswith("[Install]\nWantedBy=multi-user.target\n")
+    assert enabled_units(manager, scope) == {UNIT}
+
+
+def test_enabled_twice(manager: FakeManager, scope: Scope) -> None:
+    cell = started(manager)
+    enable_cell(manager, scope, cell)
+    before = path_of(manager).stat()
+    assert enable_cell(manager, scope, cell)[1] is False
+    assert path_of(manager).stat().st_ino == before.st_ino
+
+
+def test_a_foreign_file_is_not_touched(manager: FakeManager, scope: Scope) -> None:
+    cell = started(manager)
+    path_of(manager).parent.mkdir(parents=True)
+    path_of(manager).write_text("[Service]\nExecStart=/bin/true\n")
+    for change in (enable_cell, disable_cell):
+        with pytest.raises(DoraSystemdError, match=r"^cannot use .*: it already exists") as error:
+            change(manager, scope, cell)
+        assert error.value.code is ExitCode.NAME_IN_USE
+    assert path_of(manager).read_text() == "[Service]\nExecStart=/bin/true\n"
+    assert manager.calls == []
+
+
+def test_a_masked_unit_is_not_touched(manager: FakeManager, scope: Scope) -> None:
+    cell = started(manager)
+    path_of(manager).parent.mkdir(parents=True)
+    path_of(manager).symlink_to("/dev/null")
+    with pytest.raises(DoraSystemdError, match="already exists"):
+        enable_cell(manager, scope, cell)
+    assert path_of(manager).is_symlink()
+
+
+class Refusing(FakeManager):
+    def enable_unit_files(self, names: object) -> bool:
+        raise DoraSystemdError(f"cannot enable {names}: No space left on device")
+
+
+def test_nothing_is_left_when_it_cannot_be_linked(tmp_path: Path, scope: Scope) -> None:
+    manager = Refusing()
+    manager.etc = tmp_path / "etc"
+    cell = started(manager)
+    with pytest.raises(DoraSystemdError, match="No space left"):
+        enable_cell(manager, scope, cell)
+    assert not path_of(manager).exists()
+
+
+def test_attached_dataflows_cannot_outlive_their_terminal(
+    manager: FakeManager, scope: Scope
+) -> None:
+    manager.add(options(attached=True))
+    with pytest.raises(DoraSystemdError, match="doractl run"):
+        enable_cell(manager, scope, find_cell(manager, "robot"))
+    with pytest.raises(DoraSystemdError, match="doractl run"):
+        export_cell(manager, scope, find_cell(manager, "robot"))
+
+
+def test_disabled_while_the_transient_unit_runs(manager: FakeManager, scope: Scope) -> None:
+    cell = started(manager)
+    enable_cell(manager, scope, cell)
+    manager.calls.clear()
+    assert disable_cell(manager, scope, cell)
+    assert manager.calls == [("disable", UNIT), ("reload",)]
+    assert not path_of(manager).exists()
+    assert enabled_units(manager, scope) == set()
+    assert not disable_cell(manager, scope, cell)
+
+
+def test_disabled_while_it_runs_from_its_file(manager: FakeManager, scope: Scope) -> None:
+    """Without a file systemd would forget how to stop it."""
+    cell = started(manager)
+    enable_cell(manager, scope, cell)
+    manager.units[UNIT] |= {"FragmentPath": str(path_of(manager)), "Transient": False}
+    disable_cell(manager, scope, cell)
+    runtime = scope.runtime_root / "systemd/system" / UNIT
+    assert "[Install]" not in runtime.read_text()
+    assert not path_of(manager).exists()
+    manager.units[UNIT] |= {"FragmentPath": str(runtime)}
+    enable_cell(manager, scope, cell)
+    assert path_of(manager).exists()
+    assert not runtime.exists()
+
+
+def test_after_its_end_the_file_counts(manager: FakeManager, scope: Scope) -> None:
+    cell = started(manager)
+    enable_cell(manager, scope, cell)
+    manager.calls.clear()
+    manager.after_job[UNIT] = {"ActiveState": "inactive"}
+    real = manager.disable_unit_files
+
+    def disable(units: list[str]) -> None:
+        real(units)
+        manager.units[UNIT]["Transient"] = False
+
+    manager.disable_unit_files = disable  # type: ignore[method-assign,assignment]
+    stop_cells(manager, scope, [cell])
+    link = ("enable", str(path_of(manager)))
+    stop = ("StopUnit", UNIT)
+    assert manager.calls == [stop, ("disable", UNIT), ("reload",), link, ("reload",)]
+
+
+def test_the_target(manager: FakeManager, scope: Scope) -> None:
+    user = ScopeIn(is_user=True, uid=1000)
+    assert boot_target(manager, scope) == "multi-user.target"
+    assert boot_target(manager, user) == "default.target"
+    manager.units["dora.target"] = {"LoadState": "loaded", "WantedBy": []}
+    assert boot_target(manager, scope) == "multi-user.target"
+    manager.units["dora.target"] = {"LoadState": "loaded", "WantedBy": ["multi-user.target"]}
+    assert boot_target(manager, scope) == "dora.target"
+
+
+def test_export_has_the_drop_ins_in_it(manager: FakeManager, scope: Scope, tmp_path: Path) -> None:
+    cell = started(manager)
+    drop_in = tmp_path / "override.conf"
+    drop_in.write_text("[Service]\nNice=5\n")
+    manager.units[UNIT]["DropInPaths"] = [str(drop_in)]
+    text = export_cell(manager, scope, cell)
+    assert text.count("[Service]") == 1
+    assert "\nNice=5\n" in text
+    assert "After=multi-user.target\n" in text
+
+
+def test_list_marks_it(manager: FakeManager, scope: Scope) -> None:
+    cell = started(manager)
+    assert not find_row(manager, scope, "robot").enabled
+    enable_cell(manager, scope, cell)
+    assert find_row(manager, scope, "robot").enabled
+
+
+@pytest.mark.parametrize(
+    ("answers", "note"),
+    [
+        (["yes\n"], ""),
+        (["no\n", 0], "lingering is now on"),
+        (["no\n", 1], "as root: loginctl enable-linger root"),
+        (["", 1], "as root: loginctl enable-linger root"),
+    ],
+)
+def test_linger(answers: list[str | int], note: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    rest = iter(answers)
+
+    def run(_command: object, _seconds: float) -> Completed:
+        answer = next(rest)
+        return Completed(0, answer, "") if isinstance(answer, str) else Completed(answer, "", "")
+
+    monkeypatch.setattr(linger, "run_command", run)
+    assert note in ensure_linger(Scope(is_user=True, uid=0))
+    assert (note == "") == (ensure_linger(Scope(is_user=False, uid=0)) == note)

@@ -1,0 +1,315 @@
+"""From a request to a checked plan, with a dora of three lines."""
+
+import os
+import pwd
+import signal
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dora_systemd.adapters.dora.check import check_access
+from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
+from dora_systemd.decisions.settings.table import ENV_FILE, SETTINGS, UV
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.scope import Scope
+from dora_systemd.trust.paths import Place, reached
+from dora_systemd.trust.sight import LentSight, OwnSight, sight_of
+from dora_systemd.verbs.facts.nodes import named_places
+from dora_systemd.verbs.start.account import account_of, choose_user
+from dora_systemd.verbs.start.check import check_plan
+from dora_systemd.verbs.start.plan import Plan, StartRequest, make_plan, request_name
+from dora_systemd.verbs.start.settings import read_settings, settings_files
+
+USER = Scope(is_user=True, uid=os.getuid())
+SYSTEM = Scope(is_user=False, uid=os.getuid())
+FLOW = "nodes: [{id: a, path: a.py, inputs: {t: dora/timer/millis/100}}]\n"
+DORA = """#!/bin/sh
+case $1 in
+    --version) echo dora-cli 1.1.0;;
+    validate) grep -q refused "$2" && { echo "[ERROR]"; echo "it is refused" >&2; exit 1; };;
+esac
+exit 0
+"""
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Path:
+    (tmp_path / "robot.yml").write_text(FLOW)
+    (tmp_path / "a.py").write_text("")
+    make_program(tmp_path / "bin" / "dora", DORA)
+    return tmp_path
+
+
+def make_program(path: Path, text: str = "#!/bin/sh\n") -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    path.chmod(0o755)
+
+
+def plan_of(project: Path, environment: dict[str, str] | None = None, **flags: Any) -> Plan:
+    variables = {"PATH": f"{project}/bin:/usr/bin:/bin", **(environment or {})}
+    return make_plan(USER, StartRequest(str(project / "robot.yml"), None, flags, variables))
+
+
+def test_a_plain_plan(project: Path) -> None:
+    plan = plan_of(project)
+    options = plan.options
+    assert (plan.unit, options.name) == ("dora-robot.service", "robot")
+    assert options.dataflow == str(project / "robot.yml")
+    assert options.working_directory == str(project)
+    assert options.dora == str(project / "bin" / "dora")
+    assert options.venv is None
+    assert plan.user is None
+    assert plan.environment["PATH"].startswith(f"{project}/bin:")
+
+
+def test_every_plan_has_a_uuid_of_its_own(project: Path) -> None:
+    assert plan_of(project).options.uuid != plan_of(project).options.uuid
+
+
+def test_interpreter(project: Path) -> None:
+    """--venv, else VIRTUAL_ENV, else .venv beside the dataflow."""
+    places = [project / name for name in ("flag", "variable", ".venv")]
+    for place in places:
+        make_program(place / "bin" / "python")
+    flag, variable, beside = map(str, places)
+    assert plan_of(project).options.venv == beside
+    plan = plan_of(project, {"VIRTUAL_ENV": variable})
+    assert plan.options.venv == variable
+    assert plan.environment["VIRTUAL_ENV"] == variable
+    assert plan.environment["PATH"].startswith(f"{variable}/bin:")
+    assert plan_of(project, {"VIRTUAL_ENV": variable}, venv=flag).options.venv == flag
+    assert plan_of(project, {"VIRTUAL_ENV": "/nowhere"}).options.venv == beside
+
+
+def test_environment(project: Path) -> None:
+    (project / "one").write_text("A=1\nB=1\nC=1\n")
+    (project / "two").write_text("B=2\nC=2\n")
+    files = (str(project / "one"), str(project / "two"))
+    plan = plan_of(project, env_file=files, env=("C=3",))
+    assert plan.options.env_keys == ("A", "B", "C")
+    assert {key: plan.environment[key] for key in "ABC"} == {"A": "1", "B": "2", "C": "3"}
+
+
+@pytest.mark.parametrize(
+    ("flags", "code", "words"),
+    [
+        ({"venv": "/nowhere"}, ExitCode.BAD_INPUT, "no bin/python"),
+        ({"working_directory": "/nowhere"}, ExitCode.BAD_INPUT, "not a directory"),
+        ({"dora": "/nowhere"}, ExitCode.NO_DORA, "/nowhere"),
+        ({"user": "root"}, ExitCode.USAGE, "--user"),
+        ({"env": ("X",)}, ExitCode.USAGE, "'X'"),
+        ({"env_file": ("/nowhere",)}, ExitCode.BAD_INPUT, "/nowhere"),
+    ],
+)
+def test_what_is_refused(project: Path, flags: dict[str, Any], code: ExitCode, words: str) -> None:
+    with pytest.raises(DoraSystemdError) as caught:
+        plan_of(project, **flags)
+    assert caught.value.code is code
+    assert words in caught.value.message
+    assert caught.value.hint
+
+
+def test_what_dora_refuses(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not while the plan is made, which runs no dora: that is for the cell, or a dry run."""
+    (project / "robot.yml").write_text("# refused\n" + FLOW)
+    plan = plan_of(project)
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)  # root would ask in a unit
+    monkeypatch.setattr("dora_systemd.verbs.start.check.own_account", lambda: None)
+    with pytest.raises(DoraSystemdError, match="it is refused") as caught:
+        check_plan(no_manager, plan)
+    assert caught.value.code is ExitCode.BAD_INPUT
+
+
+def test_a_program_that_is_not_there(project: Path) -> None:
+    (project / "robot.yml").write_text(FLOW.replace("a.py", "b.py"))
+    with pytest.raises(DoraSystemdError, match=r"b\.py") as caught:
+        plan_of(project)
+    assert caught.value.code is ExitCode.BAD_INPUT
+
+
+def no_manager() -> Any:
+    raise AssertionError
+
+
+def test_no_dora_runs_while_a_plan_is_made(project: Path) -> None:
+    make_program(project / "bin" / "dora", f"#!/bin/sh\ntouch {project}/proof\n")
+    (project / "mod.yml").write_text("module: {name: m}\n" + FLOW)
+    (project / "robot.yml").write_text("nodes: [{id: m, module: mod.yml}]\n")
+    plan_of(project)
+    assert not (project / "proof").exists()
+
+
+def test_names() -> None:
+    assert request_name(StartRequest("/x/my flow.yml")) == "my-flow"
+    assert request_name(StartRequest("/x/y.yml", "robot")) == "robot"
+    with pytest.raises(DoraSystemdError):
+        request_name(StartRequest("/x/y.yml", "../robot"))
+
+
+def test_settings_files(tmp_path: Path) -> None:
+    flow = tmp_path / "robot.yml"
+    home = {"HOME": "/home/alice"}
+    beside, user, system = settings_files(flow, home)
+    assert beside == tmp_path / "robot.systemd.yml"
+    assert user == Path("/home/alice/.config/dora-systemd/config.yml")
+    assert system == Path("/etc/dora-systemd/config.yml")
+    config = settings_files(flow, {**home, "XDG_CONFIG_HOME": "/c"})[1]
+    assert config == Path("/c/dora-systemd/config.yml")
+    assert settings_files(flow, {}) == [beside, system]
+
+
+def test_settings_beside_the_dataflow(project: Path) -> None:
+    (project / "robot.systemd.yml").write_text("uv: yes\n")
+    assert read_settings(USER, project / "robot.yml", {}, {})[UV] is True
+    assert read_settings(USER, project / "robot.yml", {"uv": False}, {})[UV] is False
+
+
+ROOT_ONLY = {
+    "user": "root",
+    "property": "{Nice: 5}",
+    "credentials": "{a: /etc/shadow}",
+    "nice": "-5",
+    "realtime": "20",
+    "cpu_weight": "10000",
+    "io_weight": "10000",
+}
+
+
+def test_which_settings_are_for_root_only() -> None:
+    assert {one.name for one in SETTINGS if one.root_only} == ROOT_ONLY.keys()
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="gives files to somebody else")
+@pytest.mark.parametrize("key", ROOT_ONLY)
+def test_whom_to_believe(project: Path, key: str) -> None:
+    beside = project / "robot.systemd.yml"
+    beside.write_text(f"{key}: {ROOT_ONLY[key]}\n")
+    read_settings(SYSTEM, project / "robot.yml", {}, {})
+    os.chown(beside, 65534, 65534)
+    read_settings(USER, project / "robot.yml", {}, {})
+    with pytest.raises(DoraSystemdError) as caught:
+        read_settings(SYSTEM, project / "robot.yml", {}, {})
+    assert caught.value.code is ExitCode.NO_PERMISSION
+    os.chown(beside, 0, 0)
+    os.chown(project, 65534, 65534)
+    with pytest.raises(DoraSystemdError, match="nobody owns a directory above it"):
+        read_settings(SYSTEM, project / "robot.yml", {}, {})
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="gives files to somebody else")
+def test_environment_files_of_others_are_lent(project: Path) -> None:
+    flow, beside = project / "robot.yml", project / "robot.systemd.yml"
+    beside.write_text("env_file: [/a, /b]\n")
+    assert not read_settings(SYSTEM, flow, {}, {}).lent
+    os.chown(beside, 65534, 65534)
+    settings = read_settings(SYSTEM, flow, {"env_file": ("/b", "/c")}, {})
+    assert settings[ENV_FILE] == ("/a", "/b", "/b", "/c")
+    assert settings.lent == {"/a"}
+    assert not read_settings(USER, flow, {}, {}).lent
+
+
+def place_of(path: Path) -> Place:
+    with reached(path) as (_, place):
+        return place
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="gives files to somebody else")
+def test_the_owner_of_the_dataflow_runs_it(project: Path) -> None:
+    flow = project / "robot.yml"
+    os.chown(flow, 65534, 65534)
+    user = choose_user(SYSTEM, None, place_of(flow), str(project))
+    assert user is not None
+    assert user.pw_uid == 65534
+    os.chown(flow, 4_000_000, 0)
+    with pytest.raises(DoraSystemdError, match="has no name"):
+        choose_user(SYSTEM, None, place_of(flow), str(project))
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="gives files to somebody else")
+def test_an_identity_is_not_borrowed(project: Path, tmp_path: Path) -> None:
+    """The file, the directories above it and the working directory are of one owner, or root's."""
+    flow, other = project / "robot.yml", tmp_path / "other"
+    other.mkdir()
+    os.chown(other, 1, 1)
+    os.chown(flow, 65534, 65534)
+    for directory, words in ((other, "owns"), (Path("/tmp"), "everybody can write")):
+        with pytest.raises(DoraSystemdError, match=words) as caught:
+            choose_user(SYSTEM, None, place_of(flow), str(directory))
+        assert "--uid" in caught.value.hint
+        assert choose_user(SYSTEM, "root", place_of(flow), str(directory)) == pwd.getpwuid(0)
+    os.chown(flow, 0, 0)
+    os.chown(project, 1, 1)
+    with pytest.raises(DoraSystemdError, match="owns a directory above it"):
+        choose_user(SYSTEM, None, place_of(flow), str(project))
+
+
+def test_a_user_that_is_asked_for(project: Path) -> None:
+    place = place_of(project / "robot.yml")
+    for wanted in ("root", "0"):
+        assert choose_user(SYSTEM, wanted, place, str(project)) == pwd.getpwuid(0)
+    for wanted in ("nobody-of-that-name", "9" * 30, "-1"):
+        with pytest.raises(DoraSystemdError, match="cannot find a user"):
+            choose_user(SYSTEM, wanted, place, str(project))
+
+
+def test_what_the_cell_can_reach(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    options = plan_of(project).options
+    check_access(options)
+    check_access(options._replace(dataflow="/nowhere"))  # who reads it says so
+    with pytest.raises(DoraSystemdError) as caught:
+        check_access(options._replace(dora="/nowhere"))
+    assert caught.value.code is ExitCode.NO_DORA
+    monkeypatch.setattr(os, "access", lambda path, _mode: path != options.working_directory)
+    with pytest.raises(DoraSystemdError, match=f"cannot reach {project}") as caught:
+        check_access(options)
+    assert caught.value.code is ExitCode.NO_PERMISSION
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="becomes somebody else")
+def test_what_a_user_sees(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not what is behind doors that are closed for him, whatever root could see."""
+    closed, opened = tmp_path / "closed dir", Path("/etc")
+    closed.mkdir(mode=0o700)
+    (closed / "x").write_text("secret")
+    # Ours may be in a home that is closed, too.
+    monkeypatch.setattr(sys, "executable", "/usr/bin/python3")
+    with sight_of(account_of(pwd.getpwuid(65534))) as sight:
+        assert not sight.exists(str(closed / "x"))
+        assert not sight.is_directory(str(closed / "x"))
+        with pytest.raises(PermissionError):
+            sight.read(str(closed / "x"))
+        assert sight.exists("/etc/passwd")
+        assert sight.is_directory(str(opened))
+        assert sight.is_program("/bin/sh")
+        assert not sight.is_program("/etc")
+        assert sight.real("/proc/self/../version") == "/proc/version"
+        assert sight.read("/etc/passwd") == Path("/etc/passwd").read_bytes()
+        with pytest.raises(OSError, match="No such device"):
+            sight.read("/dev/null")
+    with sight_of(None) as sight:
+        assert sight.read(str(closed / "x")) == b"secret"
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="becomes somebody else")
+def test_a_child_that_is_stopped_costs_one_budget(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its user may stop it, and slow each answer: all of them together have so much time."""
+    monkeypatch.setattr(sys, "executable", "/usr/bin/python3")
+    monkeypatch.setattr("dora_systemd.trust.sight._SECONDS", 0.5)
+    with sight_of(account_of(pwd.getpwuid(65534))) as sight:
+        assert not sight.exists("/" + "x" * 100_000)
+        assert isinstance(sight, LentSight)
+        os.kill(sight._child.pid, signal.SIGSTOP)
+        for _ in range(50):
+            with pytest.raises(DoraSystemdError, match="no answer"):
+                sight.exists("/etc")
+        assert sight._left <= 0.5
+
+
+def test_a_module_that_is_no_file_is_refused(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "module.yml")
+    flow = parse_dataflow({"nodes": [{"id": "a", "module": "module.yml"}]}, str(tmp_path / "f.yml"))
+    with pytest.raises(DoraSystemdError, match="it is not a regular file"):
+        list(named_places(flow, OwnSight()))

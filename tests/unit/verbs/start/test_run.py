@@ -1,0 +1,104 @@
+"""A dataflow in the foreground: its end, and what Ctrl+C does."""
+
+import os
+import signal
+import threading
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import pytest
+
+from dora_systemd.verbs.start.run import attached_properties, follow_unit, life_line
+from tests.unit.fakes.manager import FakeManager, options
+
+UNIT = "dora-robot.service"
+
+
+class Life(FakeManager):
+    """A unit that goes through `states`, one at each look; `interrupts` Ctrl+C come at its start.
+
+    Its file descriptor is a pipe, as poll(2) wants one.
+    """
+
+    def __init__(self, states: list[dict[str, Any]], interrupts: int = 0) -> None:
+        super().__init__()
+        self.add(options())
+        self.states = states
+        self.interrupts = interrupts
+        self.pipe = os.pipe()
+
+    def fileno(self) -> int:
+        return self.pipe[0]
+
+    def changes(self, unit: str) -> list[Mapping[str, Any]]:
+        if len(self.calls) < self.interrupts:
+            threading.Timer(0.01, os.kill, (os.getpid(), signal.SIGINT)).start()
+        elif self.states:
+            self.units[unit] |= self.states.pop(0)
+        return [{"StatusText": "1/1 nodes running"}, {"NRestarts": 0}]
+
+
+class Lines:
+    """Log lines that never come; remembers whether they were read to the end."""
+
+    def __init__(self) -> None:
+        self.pipe = os.pipe()
+        self.is_finished = False
+
+    def fileno(self) -> int:
+        return self.pipe[0]
+
+    def print_new(self) -> None:
+        assert not self.is_finished
+
+    def finish(self) -> None:
+        self.is_finished = True
+
+
+@pytest.fixture
+def logs() -> Iterator[Lines]:
+    lines = Lines()
+    yield lines
+    for fd in lines.pipe:
+        os.close(fd)
+
+
+ENDED = {"ActiveState": "inactive"}
+FAILED = {"ActiveState": "failed", "Result": "exit-code", "ExecMainStatus": 1}
+KILLED = {"ActiveState": "failed", "Result": "signal", "ExecMainCode": 2, "ExecMainStatus": 9}
+RESTARTING = {"ActiveState": "inactive", "Job": [7, "/job/7"]}
+
+
+@pytest.mark.parametrize(
+    ("states", "status"),
+    [
+        ([ENDED], 0),
+        ([FAILED], 1),
+        ([KILLED], 137),
+        ([RESTARTING, {"Job": [0, "/"], "ActiveState": "active"}, ENDED], 0),
+        ([{"ActiveState": "failed", "Result": "timeout"}], 1),
+    ],
+)
+def test_exit_status(logs: Lines, states: list[dict[str, Any]], status: int) -> None:
+    stages: list[str] = []
+    assert follow_unit(Life(list(states)), UNIT, logs, stages.append) == status
+    assert logs.is_finished
+    assert set(stages) == {"1/1 nodes running"}
+
+
+def test_first_ctrl_c_stops_and_second_kills(logs: Lines) -> None:
+    before = signal.getsignal(signal.SIGINT)
+    manager = Life([ENDED], interrupts=2)
+    follow_unit(manager, UNIT, logs, None)
+    assert manager.calls == [("StopUnit", UNIT), ("kill", UNIT, signal.SIGKILL, "all")]
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_the_life_line_is_closed_with_the_block() -> None:
+    with life_line() as pipe:
+        kept = os.dup(pipe.read)
+        names = {name: value for name, _, value in attached_properties(pipe)}
+        assert names["StandardInputFileDescriptor"] == pipe.read
+        assert names["AddRef"] is True
+    assert os.read(kept, 1) == b""
+    os.close(kept)

@@ -1,0 +1,118 @@
+"""Selectors, nodes and runs, looked up in a journal of our own."""
+
+from collections.abc import Iterator
+
+import pytest
+
+from dora_systemd.decisions.logs.query import LogQuery
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.scope import Scope
+from dora_systemd.verbs.logs import LogRequest, find_query
+
+ROBOT = "550e8400-e29b-41d4-a716-446655440000"
+ARM = "550e9999-e29b-41d4-a716-446655440000"
+QUERY = LogQuery(Scope(is_user=False, uid=0))
+
+
+class FakeJournal:
+    def known_names(self) -> list[str]:
+        return ["arm", "robot", "550e"]
+
+    def known_uuids(self) -> list[str]:
+        return [ROBOT, ARM]
+
+    def known_nodes(self, name: str) -> list[str]:
+        return ["cam-left", "cam-right", "sink"] if name == "robot" else []
+
+    def name_of(self, uuid: str) -> str:
+        return {ROBOT: "robot", ARM: "arm"}[uuid]
+
+    def invocations(self, scope: Scope, name: str, uuid: str) -> Iterator[str]:
+        del scope, uuid
+        return iter(["i2", "i1"] if name == "robot" else [])
+
+
+def find(selector: str = "robot", nodes: tuple[str, ...] = (), run: str = "ALL") -> LogQuery:
+    return find_query(FakeJournal(), LogRequest(selector, nodes, run, QUERY))
+
+
+@pytest.mark.parametrize(
+    ("selector", "name", "uuid"),
+    [
+        ("robot", "robot", ""),
+        ("dora-robot.service", "robot", ""),
+        (ROBOT, "robot", ROBOT),
+        ("550e84", "robot", ROBOT),
+        ("550E99", "arm", ARM),
+        ("550e", "550e", ""),
+        ("", "", ""),
+    ],
+)
+def test_selector(selector: str, name: str, uuid: str) -> None:
+    query = find(selector)
+    assert (query.name, query.uuid) == (name, uuid)
+
+
+@pytest.mark.parametrize(
+    ("selector", "hint"),
+    [
+        ("robto", "did you mean robot?"),
+        ("zzz", "in the journal: arm, robot"),
+        *(("550e-", ""), ("5", ""), ("\n", ""), ("../x", ""), ("é", "")),
+    ],
+)
+def test_wrong_selector(selector: str, hint: str) -> None:
+    with pytest.raises(DoraSystemdError) as caught:
+        find(selector)
+    assert caught.value.code is ExitCode.NOT_FOUND
+    assert hint in caught.value.hint
+
+
+def test_ambiguous_uuid() -> None:
+    class WithoutThatName(FakeJournal):
+        def known_names(self) -> list[str]:
+            return ["arm", "robot"]
+
+    with pytest.raises(DoraSystemdError) as caught:
+        find_query(WithoutThatName(), LogRequest("550e", (), "ALL", QUERY))
+    assert caught.value.code is ExitCode.USAGE
+    assert caught.value.hint == f"one of {ROBOT}, {ARM}"
+
+
+@pytest.mark.parametrize(
+    ("patterns", "nodes"),
+    [
+        (("sink",), ("sink",)),
+        (("cam-*",), ("cam-left", "cam-right")),
+        (("*right", "sink", "sink"), ("cam-right", "sink")),
+        (("cam-[lr]*t",), ("cam-left", "cam-right")),
+    ],
+)
+def test_nodes(patterns: tuple[str, ...], nodes: tuple[str, ...]) -> None:
+    assert find(nodes=patterns).nodes == nodes
+
+
+def test_unknown_node_lists_the_known_ones() -> None:
+    with pytest.raises(DoraSystemdError) as caught:
+        find(nodes=("sink", "nope*"))
+    assert caught.value.code is ExitCode.NOT_FOUND
+    assert caught.value.hint == "nodes: cam-left, cam-right, sink"
+    with pytest.raises(DoraSystemdError) as caught:
+        find("arm", nodes=("x",))
+    assert caught.value.hint == "no node has written anything yet"
+
+
+def test_run() -> None:
+    assert find(run="CURRENT").invocation == "i2"
+    assert find(run="PREVIOUS").invocation == "i1"
+    assert find(run="0190-run").run == "0190-run"
+    with pytest.raises(DoraSystemdError) as caught:
+        find("arm", run="CURRENT")
+    assert caught.value.code is ExitCode.NOT_FOUND
+
+
+@pytest.mark.parametrize(("nodes", "run"), [(("a",), "ALL"), ((), "CURRENT")])
+def test_nodes_and_runs_are_those_of_one_dataflow(nodes: tuple[str, ...], run: str) -> None:
+    with pytest.raises(DoraSystemdError) as caught:
+        find("", nodes=nodes, run=run)
+    assert caught.value.code is ExitCode.USAGE

@@ -1,0 +1,206 @@
+"""`doractl set`: what systemd is asked, what is remembered, and that bad input changes nothing."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dora_systemd.adapters.host.unit_files import NODE_LIMITS_FILE, changed_files, remove_changes
+from dora_systemd.decisions.cell.limits import parse_node_limits
+from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.values import INFINITY
+from dora_systemd.verbs.facts.cells import Cell, read_cell
+from dora_systemd.verbs.set import set_limits
+from tests.unit.fakes.manager import FakeManager, ScopeIn, options
+
+NODES = {"camera": NodeStatus("running", 5, kind="python"), "ui": NodeStatus(kind="dynamic")}
+FILES = ("memory.max", "cpu.max", "pids.max", "memory.current")
+
+
+class Place:
+    """One dataflow with its cgroup, its unit's files and its node table, all below `root`."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.scope = ScopeIn(is_user=True, uid=1000, root=root / "run")
+        self.group = root / "cgroup/unit/node-camera"
+        self.group.mkdir(parents=True)
+        for name in FILES:
+            (self.group / name).write_text("1")
+        (root / "cgroup/cgroup.procs").write_text("")
+        self.offer(root / "cgroup", "cpu memory pids")
+        directory = self.scope.cell_directory("robot")
+        directory.mkdir(parents=True)
+        (directory / "status.json").write_text(CellStatus(nodes=NODES).to_json())
+        self.units = root / "units"
+        self.units.mkdir()
+        self.manager = FakeManager()
+        self.unit = self.manager.add(
+            options(),
+            ControlGroup="/unit",
+            FragmentPath=str(self.units / "dora-robot.service"),
+            Environment=["PATH=/bin"],
+        )
+
+    def offer(self, group: Path, controllers: str) -> None:
+        (group / "cgroup.controllers").write_text(controllers)
+
+    @property
+    def cell(self) -> Cell:
+        cell = read_cell(self.manager, self.unit)
+        assert cell is not None
+        return cell
+
+    @property
+    def drop_in(self) -> Path:
+        return self.units / "dora-robot.service.d" / NODE_LIMITS_FILE
+
+    def set(self, **flags: Any) -> tuple[str, ...]:
+        return set_limits(self.manager, self.scope, self.cell, flags)
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Place:
+    monkeypatch.setattr(
+        "dora_systemd.adapters.cgroup.groups.mount_point", lambda: tmp_path / "cgroup"
+    )
+    return Place(tmp_path)
+
+
+def test_limits_of_the_dataflow(place: Place) -> None:
+    assert place.set(memory_limit="6M", cpu_limit="infinity") == ()
+    properties = [("CPUQuotaPerSecUSec", "t", INFINITY), ("MemoryMax", "t", 6 << 20)]
+    assert place.manager.calls == [("set", place.unit, properties, False)]
+    assert not place.drop_in.exists()
+
+
+def test_limits_of_a_node_hold_now_and_later(place: Place) -> None:
+    assert place.set(node_limit=("camera:memory=2M,cpu=1.5",)) == ()
+    assert place.manager.calls == [("reload",)]
+    assert (place.group / "memory.max").read_text() == str(2 << 20)
+    assert (place.group / "cpu.max").read_text() == "150000 100000"
+    assert place.drop_in.read_text().splitlines()[1:] == [
+        "[Service]",
+        "Environment=DORA_SYSTEMD_NODE_LIMITS=camera:cpu=150%%,memory=2M",
+    ]
+
+
+def test_a_unit_file_keeps_its_changes_until_it_goes(place: Place) -> None:
+    place.manager.units[place.unit]["Transient"] = False
+    place.set(node_limit=("camera:memory=2M",))
+    fragment = place.units / "dora-robot.service"
+    (drop_in,) = changed_files(fragment)
+    assert drop_in == place.root / "units.control/dora-robot.service.d" / NODE_LIMITS_FILE
+    remove_changes(fragment)
+    assert not drop_in.parent.exists()
+    remove_changes(fragment)
+
+
+def test_changes_add_up(place: Place) -> None:
+    before = "DORA_SYSTEMD_NODE_LIMITS=camera:cpu=150%,memory=2M other:tasks=3"
+    place.manager.units[place.unit]["Environment"].append(before)
+    place.set(node_limit=("camera:memory=infinity,tasks=9",), tasks_limit="50")
+    assert [call[0] for call in place.manager.calls] == ["set", "reload"]
+    assert "camera:cpu=150%%,memory=infinity,tasks=9 other:tasks=3" in place.drop_in.read_text()
+    assert (place.group / "memory.max").read_text() == "max"
+
+
+def test_what_is_too_small_or_too_large_is_said(place: Place) -> None:
+    (place.group / "memory.current").write_text(str(5 << 20))
+    warnings = place.set(node_limit=("camera:memory=2M",), cpu_limit="99999")
+    assert "than this machine has" in warnings[0]
+    assert warnings[1].startswith("the limit memory=2M of the node camera is less than it uses")
+
+
+@pytest.mark.parametrize(
+    ("flags", "code", "words"),
+    [
+        ({}, ExitCode.USAGE, "none is given"),
+        ({"memory_limit": "0"}, ExitCode.USAGE, "'0'"),
+        ({"memory_limit": "6M", "cpu_limit": "-1"}, ExitCode.USAGE, "'-1'"),
+        ({"memory_limit": "6M", "node_limit": ("camera:cpu=x",)}, ExitCode.USAGE, "'x'"),
+        ({"memory_limit": "6M", "node_limit": ("nobody:cpu=1",)}, ExitCode.BAD_INPUT, "'nobody'"),
+        ({"node_limit": ("camera:cpu=1", "ui:cpu=1")}, ExitCode.BAD_INPUT, "dynamic"),
+        ({"memory_limit": "6M", "io_weight": "5"}, ExitCode.NO_SYSTEMD, "'io' cgroup controller"),
+    ],
+)
+def test_nothing_changes_if_anything_is_wrong(
+    place: Place, flags: dict[str, Any], code: ExitCode, words: str
+) -> None:
+    with pytest.raises(DoraSystemdError) as caught:
+        place.set(**flags)
+    assert (caught.value.code, words in caught.value.message) == (code, True)
+    assert place.manager.calls == []
+    assert not place.drop_in.exists()
+    assert (place.group / "cpu.max").read_text() == "1"
+
+
+@pytest.mark.parametrize("refuser", ["kernel", "systemd", "disk"])
+def test_nothing_changes_if_somebody_refuses(
+    place: Place, refuser: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flags = {"node_limit": ("camera:memory=2M,tasks=9",), "memory_limit": "6M"}
+    (place.group / "memory.max").write_text(str(1 << 20))
+    if refuser == "kernel":
+        (place.group / "pids.max").unlink()
+        (place.group / "pids.max").mkdir()
+    elif refuser == "systemd":
+
+        def refuse(*_: object) -> None:
+            raise DoraSystemdError("cannot change it: systemd says no")
+
+        monkeypatch.setattr(place.manager, "set_properties", refuse)
+    else:
+        (place.units / "dora-robot.service.d").write_text("in its way")
+    with pytest.raises(DoraSystemdError):
+        place.set(**flags)
+    assert place.manager.calls == []
+    assert not place.drop_in.is_file()
+    assert (place.group / "memory.max").read_text() == str(1 << 20)
+
+
+def test_what_was_changed_before_stays_when_systemd_refuses(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place.set(node_limit=("camera:memory=2M",))
+    before = place.drop_in.read_text()
+
+    def refuse(*_: object) -> None:
+        raise DoraSystemdError("cannot change it: systemd says no")
+
+    monkeypatch.setattr(place.manager, "set_properties", refuse)
+    with pytest.raises(DoraSystemdError):
+        place.set(node_limit=("camera:memory=3M",), memory_limit="6M")
+    assert place.drop_in.read_text() == before
+    assert (place.group / "memory.max").read_text() == str(2 << 20)
+
+
+def test_a_node_without_a_group_is_limited_at_its_next_start(place: Place) -> None:
+    for name in FILES:
+        (place.group / name).unlink()
+    place.group.rmdir()
+    place.set(node_limit=("camera:memory=2M",))
+    assert "camera:memory=2M" in place.drop_in.read_text()
+
+
+def test_root_is_needed_for_others(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.geteuid", lambda: 1000)
+    place.scope = ScopeIn(is_user=False, uid=1000, root=place.scope.root)
+    with pytest.raises(DoraSystemdError) as caught:
+        place.set(memory_limit="6M")
+    assert caught.value.code is ExitCode.NO_PERMISSION
+
+
+def test_the_runner_is_told() -> None:
+    from dora_systemd.adapters.dora.preparation import with_changes
+    from dora_systemd.decisions.cell.environment import node_environment
+
+    before = options(node_limits=(parse_node_limits("camera:cpu=1,memory=1G"),))
+    variables = {"DORA_SYSTEMD_NODE_LIMITS": "camera:memory=2G ui:tasks=9"}
+    assert with_changes(before, {}).node_limits == before.node_limits
+    assert with_changes(before, variables).node_limits == (
+        parse_node_limits("camera:cpu=1,memory=2G"),
+        parse_node_limits("ui:tasks=9"),
+    )
+    assert node_environment(variables) == {}

@@ -1,0 +1,107 @@
+"""setup and setup --remove on a root of their own."""
+
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.decisions.unit.setup_files import is_ours, setup_files
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.scope import Scope
+from dora_systemd.verbs.setup import (
+    plan_setup,
+    put_in_place,
+    refuse_if_needed,
+    take_away,
+    tell_systemd,
+)
+from tests.unit.checkout import CHECKOUT
+from tests.unit.fakes.manager import FakeManager
+
+SYSTEM, USER = Scope(is_user=False, uid=0), Scope(is_user=True, uid=1000)
+
+
+def tree(root: Path) -> dict[str, str]:
+    """Every file and link below `root` with its text or its target."""
+    found = (path for path in root.rglob("*") if path.is_symlink() or path.is_file())
+    return {
+        str(path.relative_to(root)): f"-> {path.readlink()}"
+        if path.is_symlink()
+        else path.read_text()
+        for path in found
+    }
+
+
+@pytest.mark.parametrize("scope", [SYSTEM, USER])
+def test_put_in_place_and_taken_away(scope: Scope, tmp_path: Path) -> None:
+    tmp_path /= "share"
+    (tmp_path / "lib").mkdir(parents=True)
+    (tmp_path / "other").write_text("x")
+    before = tree(tmp_path)
+    written = put_in_place(plan_setup(scope, tmp_path))
+    assert len(written) == len(tree(tmp_path)) - len(before)
+    # Again, and there is nothing to do.
+    assert put_in_place(plan_setup(scope, tmp_path)) == []
+    assert sorted(take_away(plan_setup(scope, tmp_path))) == sorted(written)
+    assert tree(tmp_path) == before
+    left = {path.name for path in tmp_path.rglob("*") if path.is_dir()}
+    assert left <= {"etc", "usr", "local", "lib", "share", "man"}
+    assert take_away(plan_setup(scope, tmp_path)) == []
+
+
+def test_the_links_lead_to_the_target(tmp_path: Path) -> None:
+    put_in_place(plan_setup(SYSTEM, tmp_path))
+    for place in ("system/multi-user.target.wants", "user/default.target.wants"):
+        link = tmp_path / "usr/local/lib/systemd" / place / "dora.target"
+        assert link.resolve() == (link.parent.parent / "dora.target").resolve()
+        assert link.exists()
+
+
+def test_everything_of_the_project_has_a_place() -> None:
+    manuals = [path.name for path in (CHECKOUT / "packaging/man").iterdir()]
+    sources = {file.source for file in setup_files(False, manuals)}
+    directories = {
+        "templates": CHECKOUT / "units/templates",
+        "completions": CHECKOUT / "packaging/completions",
+        "man": CHECKOUT / "packaging/man",
+    }
+    there = {(kind, path.name) for kind, where in directories.items() for path in where.iterdir()}
+    assert sources == there
+    assert all(is_ours((directories[kind] / name).read_text()) for kind, name in there)
+
+
+@pytest.mark.parametrize("is_link", [False, True])
+def test_foreign_files_stay(is_link: bool, tmp_path: Path) -> None:
+    path = tmp_path / "usr/local/lib/systemd/system/dora.slice"
+    if is_link:
+        path = tmp_path / "usr/local/lib/systemd/system/multi-user.target.wants/dora.target"
+    path.parent.mkdir(parents=True)
+    path.write_text("[Slice]\n")
+    with pytest.raises(DoraSystemdError, match="already exists") as caught:
+        plan_setup(SYSTEM, tmp_path)
+    assert caught.value.code is ExitCode.NAME_IN_USE
+    assert path.read_text() == "[Slice]\n"
+
+
+def test_an_older_version_is_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "usr/local/lib/systemd/system/dora.slice"
+    path.parent.mkdir(parents=True)
+    path.write_text("# of dora-systemd 0.0\n[Slice]\n")
+    assert path in put_in_place(plan_setup(SYSTEM, tmp_path))
+    assert "man:dora-systemd(7)" in path.read_text()
+
+
+def test_what_is_in_use_stays(tmp_path: Path) -> None:
+    manager = FakeManager()
+    manager.etc = tmp_path
+    refuse_if_needed(manager, SYSTEM)
+    manager.enable_unit_files(["dora-robot.service"])
+    with pytest.raises(DoraSystemdError, match="a boot starts robot") as caught:
+        refuse_if_needed(manager, SYSTEM)
+    assert caught.value.hint == "doractl --system disable robot"
+
+
+def test_without_systemd_the_files_are_enough() -> None:
+    def reach(_scope: Scope) -> FakeManager:
+        raise DoraSystemdError("cannot reach systemd", "", ExitCode.NO_SYSTEMD)
+
+    assert tell_systemd(reach, USER) == ()

@@ -1,0 +1,149 @@
+"""doractl up."""
+
+import errno
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.decisions.gateway.place import SERVICE_UNIT, SOCKET_UNIT
+from dora_systemd.decisions.unit.file import BOOT_TARGET
+from dora_systemd.decisions.views.findings import Finding, State
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.verbs import up
+from dora_systemd.verbs.gateway import read_gateway
+from dora_systemd.verbs.up import (
+    PORT_FILE,
+    check_machine,
+    open_port,
+    start_boot_target,
+)
+from tests.unit.fakes.manager import FakeManager, ScopeIn
+
+
+class Systemd(FakeManager):
+    """Reads the socket's port from the files, as systemd does when it is told to."""
+
+    def __init__(self, runtime: Path) -> None:
+        super().__init__()
+        self.etc = runtime.parent.parent.parent / "etc"
+        self.runtime = runtime
+
+    def reset_failed(self, unit: str) -> None:
+        self.calls.append(("reset", unit))
+
+    def reload(self) -> None:
+        super().reload()
+        path = self.runtime / SOCKET_UNIT
+        if path.exists():
+            drop_in = self.runtime / PORT_FILE
+            text = (drop_in if drop_in.exists() else path).read_text()
+            address = text.rpartition("ListenStream=")[2].split()[0]
+            self.add_socket(str(path), address)
+
+    def add_socket(self, path: str, address: str, active: str = "inactive") -> None:
+        self.units[SOCKET_UNIT] = {
+            "LoadState": "loaded",
+            "FragmentPath": path,
+            "ActiveState": active,
+            "Listen": [["Stream", address]],
+        }
+        self.after_job[SOCKET_UNIT] = {"ActiveState": "active"}
+
+
+@pytest.fixture
+def scope(tmp_path: Path) -> ScopeIn:
+    return ScopeIn(is_user=False, uid=0, root=tmp_path / "run")
+
+
+@pytest.fixture
+def systemd(scope: ScopeIn) -> Systemd:
+    return Systemd(scope.root / "systemd/system")
+
+
+@pytest.fixture
+def free_port() -> int:
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        port: int = one.getsockname()[1]
+        return port
+
+
+@pytest.fixture
+def used_port() -> Iterator[int]:
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        one.listen()
+        yield one.getsockname()[1]
+
+
+def test_units_are_written_where_there_are_none(
+    systemd: Systemd, scope: ScopeIn, free_port: int
+) -> None:
+    assert open_port(systemd, scope, free_port) == free_port
+    written = {str(p.relative_to(systemd.runtime)) for p in systemd.runtime.rglob("*.*")}
+    assert written >= {SOCKET_UNIT, SERVICE_UNIT, PORT_FILE}
+    assert f"{SERVICE_UNIT}.d/10-sandbox.conf" in written
+    assert read_gateway(systemd).is_up
+    # Again elsewhere: it moves.
+    systemd.calls.clear()
+    systemd.units[SOCKET_UNIT]["ActiveState"] = "active"
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        other = one.getsockname()[1]
+    assert open_port(systemd, scope, other) == other
+    assert systemd.calls[0] == ("StopUnit", SOCKET_UNIT)
+
+
+def test_a_users_gateway_has_no_sandbox_file(tmp_path: Path, free_port: int) -> None:
+    scope = ScopeIn(is_user=True, uid=1000, root=tmp_path / "run")
+    systemd = Systemd(scope.root / "systemd/user")
+    open_port(systemd, scope, free_port)
+    names = {path.name for path in systemd.runtime.rglob("*.*")}
+    assert names == {SOCKET_UNIT, SERVICE_UNIT, "50-port.conf", f"{SOCKET_UNIT}.d"}
+
+
+def test_packaged_units_stay(systemd: Systemd, scope: ScopeIn, free_port: int) -> None:
+    systemd.add_socket(f"/usr/lib/systemd/system/{SOCKET_UNIT}", f"127.0.0.1:{free_port}")
+    assert open_port(systemd, scope, None) == free_port
+    assert not list(systemd.runtime.rglob("*"))
+    assert ("reload",) not in systemd.calls
+
+
+def test_a_port_in_use(systemd: Systemd, scope: ScopeIn, used_port: int) -> None:
+    with pytest.raises(DoraSystemdError, match="it is in use by process ") as caught:
+        open_port(systemd, scope, used_port)
+    assert caught.value.code is ExitCode.NAME_IN_USE
+    assert f"doractl up --port {used_port + 1}" in caught.value.hint
+    assert "doractl start" in caught.value.hint
+    assert systemd.calls == []
+    assert not list(scope.root.rglob("*"))
+
+
+def test_a_port_that_is_not_for_everyone(
+    systemd: Systemd, scope: ScopeIn, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(up, "port_error", lambda _port: errno.EACCES)
+    with pytest.raises(DoraSystemdError, match="cannot open port 80") as caught:
+        open_port(systemd, scope, 80)
+    assert caught.value.code is ExitCode.NO_PERMISSION
+
+
+def test_problems_of_the_machine(monkeypatch: pytest.MonkeyPatch, scope: ScopeIn) -> None:
+    found = [Finding("linger", State.WARNING, "x"), Finding("dora", State.OK, "y")]
+    monkeypatch.setattr(up, "examine", lambda _reach, _scope: found)
+    check_machine(lambda _: FakeManager(), scope)
+    found.append(Finding("systemd", State.PROBLEM, "version 1 is too old", "upgrade"))
+    with pytest.raises(DoraSystemdError, match="cannot run dataflows here: systemd: version 1"):
+        check_machine(lambda _: FakeManager(), scope)
+
+
+@pytest.mark.parametrize(("active", "started"), [("inactive", ["robot"]), ("active", [])])
+def test_what_a_boot_starts(
+    active: str, started: list[str], systemd: Systemd, scope: ScopeIn
+) -> None:
+    assert start_boot_target(systemd, scope) == []
+    systemd.units[BOOT_TARGET] = {"LoadState": "loaded", "ActiveState": active}
+    systemd.enable_unit_files(["dora-robot.service"])
+    assert start_boot_target(systemd, scope) == started
