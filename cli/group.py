@@ -1,6 +1,7 @@
 """The verbs of doractl as a click group that imports a verb's module only when it is called."""
 
 from importlib import import_module
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import click
@@ -9,39 +10,48 @@ from dora_systemd import __version__
 from dora_systemd.cli.parameters import scope_options
 from dora_systemd.errors import DoraSystemdError, ExitCode
 
+TITLES = {
+    "run": "Start and stop",
+    "look": "Look",
+    "change": "Change what runs",
+    "machine": "This machine",
+}
+SECTIONS = tuple(TITLES)
+"""The folders of verbs/, in the order of --help."""
+
 
 class Verb(NamedTuple):
-    """Where a verb is (`command` in that module of dora_systemd.cli) and its line in --help."""
+    """A verb of doractl: the file `path`, whose docstring begins with its line in --help."""
 
-    module: str
-    summary: str
+    name: str
+    section: str
+    path: Path
+
+    @property
+    def command(self) -> click.Command:
+        """What click calls."""
+        name = f"dora_systemd.cli.verbs.{self.section}.{self.name}"
+        found: click.Command = import_module(name).command
+        return found
+
+    @property
+    def summary(self) -> str:
+        """Read from the file: --help would take long if it imported all of them."""
+        with self.path.open(encoding="utf-8") as lines:
+            return lines.readline().strip().strip('"')
 
 
-VERBS = {
-    "start": Verb("start", "Start a dataflow as a systemd service."),
-    "run": Verb("run", "Run a dataflow in the foreground."),
-    "list": Verb("list", "List dataflows, or the nodes of one."),
-    "top": Verb("top", "Show live resource usage of dataflows and nodes."),
-    "logs": Verb("logs", "Print what the nodes of a dataflow wrote."),
-    "why": Verb("why", "Explain what happened to a dataflow and why."),
-    "stop": Verb("stop", "Stop dataflows."),
-    "restart": Verb("restart", "Restart dataflows."),
-    "reset": Verb("reset", "Clear failures and reset restart counters."),
-    "node": Verb("node", "Restart or stop a single node."),
-    "reload": Verb("reload", "Apply changed files, restarting only the affected nodes."),
-    "set": Verb("set", "Change limits or hot reload of a running dataflow."),
-    "enable": Verb("enable", "Start dataflows at every boot."),
-    "disable": Verb("disable", "No longer start dataflows at boot."),
-    "show": Verb("show", "Print the unit of a dataflow."),
-    "export": Verb("export", "Print a unit file that works without doractl."),
-    "dora": Verb("dora", "Run the dora command against one dataflow."),
-    "up": Verb("up", "Open one port for all dataflows."),
-    "env": Verb("env", "Print variables that point the stock dora command at the gateway."),
-    "destroy": Verb("destroy", "Stop all dataflows and the gateway."),
-    "doctor": Verb("doctor", "Check this machine for problems."),
-    "setup": Verb("setup", "Install units, completions and manuals after pip install."),
-    "version": Verb("version", "Print the versions of doractl, Python, systemd and dora."),
-}
+def find_verbs() -> dict[str, Verb]:
+    """All verbs by name: a new one is a new file."""
+    root = Path(__file__).with_name("verbs")
+    return {
+        path.stem: Verb(path.stem, section, path)
+        for section in SECTIONS
+        for path in sorted(root.joinpath(section).glob("[a-z]*.py"))
+    }
+
+
+VERBS = find_verbs()
 ALIASES = {"ps": "list", "status": "list"}
 
 _EPILOG = """\b
@@ -64,10 +74,7 @@ class VerbGroup(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         del ctx
         verb = VERBS.get(ALIASES.get(cmd_name, cmd_name))
-        if verb is None:
-            return None
-        command: click.Command = import_module(f"dora_systemd.cli.{verb.module}").command
-        return command
+        return verb and verb.command
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -84,8 +91,11 @@ class VerbGroup(click.Group):
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """The verbs with their lines of the table: --help imports none of them."""
         del ctx
-        with formatter.section("Verbs"):
-            formatter.write_dl([(name, verb.summary) for name, verb in VERBS.items()])
+        width = max(map(len, VERBS))
+        for section in SECTIONS:
+            rows = [(name, one.summary) for name, one in VERBS.items() if one.section == section]
+            with formatter.section(TITLES[section]):
+                formatter.write_dl([(name.ljust(width), summary) for name, summary in rows])
 
 
 @click.group(

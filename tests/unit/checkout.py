@@ -6,12 +6,13 @@ CHECKOUT = Path(__file__).resolve().parents[2]
 
 
 def module_paths() -> dict[str, Path]:
-    """Every module of ours by name without "dora_systemd.", such as "values" and "cli.list"."""
+    """Every module of ours by name without "dora_systemd.", such as "values" and "cli.main"."""
     package = CHECKOUT / "dora_systemd"
     found = {path.relative_to(package).with_suffix(""): path for path in package.rglob("*.py")}
     own = {".".join(name.parts): path for name, path in found.items()}
-    verbs = {f"cli.{path.stem}": path for path in (CHECKOUT / "cli").glob("*.py")}
-    return {name: path for name, path in (own | verbs).items() if not name.endswith("__init__")}
+    command = {path.relative_to(CHECKOUT): path for path in (CHECKOUT / "cli").rglob("*.py")}
+    cli = {".".join(name.with_suffix("").parts): path for name, path in command.items()}
+    return {name: path for name, path in (own | cli).items() if not name.endswith("__init__")}
 
 
 def linked_package(place: Path) -> Path:

@@ -29,7 +29,7 @@ SHORT_LIVED = ("pydantic", "websockets", "watchfiles", "lxml", "rich")
 def requests(monkeypatch: pytest.MonkeyPatch) -> list[ListRequest]:
     """Lists nothing, and keeps what was asked for."""
     asked: list[ListRequest] = []
-    module: Any = import_module("dora_systemd.cli.list")
+    module: Any = import_module("dora_systemd.cli.verbs.look.list")
 
     def print_dataflows(request: ListRequest) -> int:
         asked.append(request)
@@ -198,7 +198,16 @@ def test_a_reader_that_went_away_is_no_error() -> None:
     assert done.stderr == b""
 
 
-@pytest.mark.parametrize("module", ["listing", "list", "stop", "restart", "show", "logs"])
+@pytest.mark.parametrize(
+    "module",
+    [
+        "listing",
+        *(
+            f"verbs.{one}"
+            for one in ("look.list", "run.stop", "run.restart", "look.show", "look.logs")
+        ),
+    ],
+)
 def test_light_verbs_stay_light(module: str) -> None:
     script = (
         f"import sys, dora_systemd.cli.{module}\n"

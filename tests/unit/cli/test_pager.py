@@ -2,7 +2,7 @@
 
 import pytest
 
-from dora_systemd.cli.logs import pager_of
+from dora_systemd.cli.verbs.look.logs import pager_of
 
 MORE = {"PAGER": "more", "HOME": "/root"}
 

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from dora_systemd.cli.group import SECTIONS
 from tests.unit.checkout import CHECKOUT, linked_package, module_paths
 
 LAYERS = (
@@ -174,8 +175,16 @@ def test_every_folder_with_modules_is_installed() -> None:
     names = {".".join(path.relative_to(CHECKOUT).parts) for path in packages()}
     project = tomllib.loads((CHECKOUT / "pyproject.toml").read_text())
     listed = set(project["tool"]["setuptools"]["packages"])
+    listed -= {name for name in listed if name.startswith("dora_systemd.cli.")}
     elsewhere = set(project["tool"]["setuptools"]["package-dir"]) - {"dora_systemd"}
     assert names == listed - elsewhere, "correct the list of packages in pyproject.toml"
+
+
+def test_every_section_of_verbs_is_installed() -> None:
+    project = tomllib.loads((CHECKOUT / "pyproject.toml").read_text())
+    installed = set(project["tool"]["setuptools"]["packages"])
+    assert {f"dora_systemd.cli.verbs.{one}" for one in SECTIONS} <= installed
+    assert {path.name for path in (CHECKOUT / "cli/verbs").glob("[a-z]*")} == set(SECTIONS)
 
 
 @pytest.mark.parametrize("package", packages()[1:], ids=lambda path: path.name)
@@ -212,9 +221,10 @@ def test_decisions_are_pure(name: str) -> None:
     assert not impure | clocks, f"{name} uses {', '.join(sorted(impure | clocks))}"
 
 
-@pytest.mark.parametrize("verb", ["list", "stop", "logs", "why"])
+@pytest.mark.parametrize("verb", ["look.list", "run.stop", "look.logs", "look.why"])
 def test_short_lived_verbs_load_little(verb: str, tmp_path: Path) -> None:
-    code = f"import sys, dora_systemd.cli.main, dora_systemd.cli.{verb}; print(*sys.modules)"
+    wanted = f"dora_systemd.cli.main, dora_systemd.cli.verbs.{verb}"
+    code = f"import sys, {wanted}; print(*sys.modules)"
     environment = {**os.environ, "PYTHONPATH": str(linked_package(tmp_path))}
     done = subprocess.run(
         [sys.executable, "-P", "-c", code],
@@ -233,7 +243,7 @@ STARTS_PROGRAMS = {
     "adapters.dora.engine": "dora's, in a cell",
     "adapters.journal.reader": "journalctl",
     "verbs.node": "dora, as the caller",
-    "cli.logs": "the caller's own pager",
+    "cli.verbs.look.logs": "the caller's own pager",
     "adapters.runner_socket.relay": "itself, as the user of the dataflow",
     "trust.terminals": "another user's program, on a terminal of its own",
 }

@@ -59,7 +59,7 @@ def all_verbs() -> dict[str, click.Command]:
 def test_every_verb_has_an_entry() -> None:
     headings = list(sections("doractl.1"))
     first, last = headings.index("VERBS") + 1, headings.index("ENVIRONMENT")
-    assert headings[first:last] == list(all_verbs())
+    assert sorted(headings[first:last]) == sorted(all_verbs())
 
 
 @pytest.mark.parametrize("verb", sorted(all_verbs()))

@@ -46,8 +46,8 @@ _TABLE = {
         trust.paths trust.programs trust.sight trust.sockets trust.terminals
     """,
     OWN: """
-        adapters.dora.preparation adapters.host.files cli.logs cli.main decisions.cell.launch
-        verbs.start.credentials verbs.start.limits
+        adapters.dora.preparation adapters.host.files cli.main cli.verbs.look.logs
+        decisions.cell.launch verbs.start.credentials verbs.start.limits
     """,
     KERNEL: """
         adapters.cgroup.groups adapters.host.machine adapters.host.process_table
@@ -59,7 +59,7 @@ _TABLE = {
         verbs.setup verbs.show verbs.start.enable verbs.up
     """,
     INSTALLED: """
-        gateway.page
+        cli.group gateway.page
     """,
     CELL: """
         adapters.dora.check adapters.dora.engine adapters.dora.websocket adapters.host.fd_store

@@ -22,7 +22,7 @@ TEXTS = (
     *sorted((CHECKOUT / "packaging/man").iterdir()),
     *sorted((CHECKOUT / "dora_systemd/gateway/static").glob("*.html")),
 )
-MODULES = sorted([*CHECKOUT.glob("cli/*.py"), *CHECKOUT.glob("dora_systemd/**/*.py")])
+MODULES = sorted([*CHECKOUT.glob("cli/**/*.py"), *CHECKOUT.glob("dora_systemd/**/*.py")])
 
 
 def strings(source: str) -> Iterator[str]:

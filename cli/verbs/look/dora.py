@@ -1,4 +1,4 @@
-"""doractl dora: the stock dora command against one dataflow."""
+"""Run the dora command against one dataflow."""
 
 import click
 

@@ -1,4 +1,4 @@
-"""doractl stop: end dataflows."""
+"""Stop dataflows."""
 
 import click
 

@@ -1,4 +1,4 @@
-"""doractl version: what takes part, and in which version."""
+"""Print the versions of doractl, Python, systemd and dora."""
 
 import click
 

@@ -1,4 +1,4 @@
-"""doractl enable: a dataflow that every boot starts."""
+"""Start dataflows at every boot."""
 
 import click
 

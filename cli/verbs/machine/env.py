@@ -1,4 +1,4 @@
-"""doractl env: point the stock dora command at the gateway, or at one dataflow."""
+"""Print variables that point the stock dora command at the gateway."""
 
 import click
 

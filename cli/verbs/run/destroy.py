@@ -1,4 +1,4 @@
-"""doractl destroy: stop everything."""
+"""Stop all dataflows and the gateway."""
 
 import click
 

@@ -1,4 +1,4 @@
-"""doractl show: the unit of a dataflow as text."""
+"""Print the unit of a dataflow."""
 
 import click
 

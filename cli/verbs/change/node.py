@@ -1,4 +1,4 @@
-"""doractl node: restart or stop single nodes."""
+"""Restart or stop a single node."""
 
 import click
 

@@ -1,4 +1,4 @@
-"""doractl set: other limits for a dataflow that runs."""
+"""Change limits or hot reload of a running dataflow."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""doractl top: what dataflows and their nodes use, again and again."""
+"""Show live resource usage of dataflows and nodes."""
 
 import json
 import sys

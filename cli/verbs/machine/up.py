@@ -1,4 +1,4 @@
-"""doractl up: the one front door."""
+"""Open one port for all dataflows."""
 
 import os
 

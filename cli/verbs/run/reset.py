@@ -1,4 +1,4 @@
-"""doractl reset: count restarts anew."""
+"""Clear failures and reset restart counters."""
 
 import click
 

@@ -1,4 +1,4 @@
-"""doractl disable: a dataflow that no boot starts any more."""
+"""No longer start dataflows at boot."""
 
 import click
 

@@ -1,4 +1,4 @@
-"""doractl setup: what a pip install does not put in place."""
+"""Install units, completions and manuals after pip install."""
 
 import click
 

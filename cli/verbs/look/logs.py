@@ -1,4 +1,4 @@
-"""doractl logs: what the nodes of a dataflow wrote, out of the journal."""
+"""Print what the nodes of a dataflow wrote."""
 
 import os
 import shutil

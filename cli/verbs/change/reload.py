@@ -1,4 +1,4 @@
-"""doractl reload: have a running dataflow take over what has changed."""
+"""Apply changed files, restarting only the affected nodes."""
 
 import click
 

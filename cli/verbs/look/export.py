@@ -1,4 +1,4 @@
-"""doractl export: the unit of a dataflow as a file for systemd alone."""
+"""Print a unit file that works without doractl."""
 
 import click
 

@@ -1,4 +1,4 @@
-"""doractl doctor: what on this machine hinders dataflows, and what helps."""
+"""Check this machine for problems."""
 
 from functools import partial
 

@@ -1,4 +1,4 @@
-"""doractl run: a dataflow in the foreground."""
+"""Run a dataflow in the foreground."""
 
 import os
 import sys

@@ -1,4 +1,4 @@
-"""doractl why: what became of a dataflow, and why, in one screen."""
+"""Explain what happened to a dataflow and why."""
 
 import shutil
 import sys

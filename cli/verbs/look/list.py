@@ -1,4 +1,4 @@
-"""doractl list: the dataflows of a manager, or the nodes of one of them."""
+"""List dataflows, or the nodes of one."""
 
 import click
 

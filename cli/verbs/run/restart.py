@@ -1,4 +1,4 @@
-"""doractl restart: end dataflows and start them again."""
+"""Restart dataflows."""
 
 import sys
 from collections.abc import Mapping

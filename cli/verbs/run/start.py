@@ -1,4 +1,4 @@
-"""doractl start: a dataflow becomes a systemd service."""
+"""Start a dataflow as a systemd service."""
 
 import os
 import sys
