@@ -40,7 +40,7 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import unit_name
 from dora_systemd.scope import RUNTIME_NAME, Scope
 from dora_systemd.trust.paths import exists
-from dora_systemd.verbs.facts.enabled import enabled_units, own_directories
+from dora_systemd.verbs.facts.enabled import enabled_units, lost_units, own_directories
 from dora_systemd.verbs.facts.slice import slice_group
 from dora_systemd.verbs.gateway import read_gateway
 from dora_systemd.verbs.start.account import DEFAULT_USER
@@ -101,8 +101,13 @@ def _boot(manager: Manager, scope: Scope) -> Iterator[Finding]:
         text = f"{BOOT_TARGET} is not set up; dataflows can be enabled without it"
         yield Finding("boot", State.NOTE, text, f"doractl {scope.flag} setup")
     directory = own_directories(manager, scope)[0]
+    lost = lost_units(manager, scope)
     for unit in sorted(enabled_units(manager, scope)):
-        yield from _enabled(directory / unit)
+        findings = list(_enabled(directory / unit))
+        yield from findings
+        if unit in lost and not findings:
+            text = f"{unit} is enabled and systemd does not know it"
+            yield Finding("boot", State.WARNING, text, f"systemctl {scope.flag} daemon-reload")
 
 
 def _ports(manager: Manager, scope: Scope) -> Iterator[Finding]:

@@ -8,7 +8,7 @@ from dora_systemd.adapters.bus.manager import JOB_DONE, Manager, Observer
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
-from dora_systemd.verbs.facts.enabled import enabled_units
+from dora_systemd.verbs.facts.enabled import enabled_units, recover_lost_units
 from dora_systemd.verbs.facts.reason import failure_reason, job_reason
 
 
@@ -45,6 +45,7 @@ def release_enabled(manager: Manager, scope: Scope, units: Sequence[str]) -> Non
                 boot = read_boot_unit(manager, scope, unit)
                 if boot.is_enabled:
                     release_transient(manager, boot)
+    recover_lost_units(manager, scope)
 
 
 def restart_cells(

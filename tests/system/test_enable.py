@@ -90,6 +90,61 @@ def test_exported_units_need_nothing_of_us(boots: Cell, project: Project) -> Non
     assert "already enabled" in boots.doractl("enable", boots.name).stdout
 
 
+@pytest.fixture
+def neighbour() -> Iterator[Cell]:
+    """Another dataflow: its start makes systemd note again where all units are."""
+    cell = Cell("neighbour")
+    yield cell
+    cell.end()
+
+
+SHORT = """
+from pathlib import Path
+from dora import Node
+for event in Node():
+    if Path("end").exists():
+        break
+"""
+ENDS = "nodes: [{id: only, path: short.py, inputs: {tick: dora/timer/millis/50}}]\n"
+
+
+@pytest.mark.parametrize("verb", ["restart", "enable", "start"])
+def test_it_is_not_lost_when_it_stops(
+    boots: Cell, neighbour: Cell, project: Project, verb: str
+) -> None:
+    flow = project.three_nodes()
+    boots.start(flow)
+    uuid = uuid_of(boots)
+    boots.doractl("enable", boots.name)
+    neighbour.start(flow)
+    boots.doractl("stop", boots.name)
+    assert boots.show("LoadState") == "loaded"
+    if verb == "start":
+        boots.start(flow)
+    else:
+        boots.doractl(verb, boots.name)
+    assert uuid_of(boots) == uuid
+
+
+@pytest.mark.parametrize("verb", ["restart", "disable", "start"])
+def test_it_is_not_lost_when_it_ends_by_itself(
+    boots: Cell, neighbour: Cell, project: Project, verb: str
+) -> None:
+    project.write("short.py", SHORT)
+    flow = project.write("short.yml", ENDS)
+    boots.start(flow)
+    boots.doractl("enable", boots.name)
+    neighbour.start(project.three_nodes())
+    project.write("end", "")
+    wait_for("its end", lambda: boots.show("ActiveState") == "inactive")
+    (project.root / "end").unlink()
+    if verb == "start":
+        boots.start(flow)
+    else:
+        boots.doractl(verb, boots.name)
+    assert (ETC / boots.unit).exists() == (verb != "disable")
+
+
 @pytest.mark.usefixtures("target")
 def test_a_running_dataflow_is_enabled_and_runs_on(boots: Cell, project: Project) -> None:
     boots.start(project.three_nodes(), "--env", f"SECRET={NASTY}")

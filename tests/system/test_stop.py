@@ -139,6 +139,8 @@ def test_show_is_what_systemctl_cat_prints(cell: Cell, project: Project) -> None
     assert [Path(path).name for path in files] == [cell.unit]
 
 
+# A node that knows no dora ends of SIGTERM, and the daemon says so if it is still there.
+@pytest.mark.warns("failed to receive reply from daemon", "Signal(15)")
 def test_verbs_that_need_a_running_dataflow(cell: Cell, project: Project) -> None:
     flow = project.write("dataflow.yml", "nodes: [{id: never, path: sleep, args: '100'}]")
     cell.start(flow, "--no-wait")

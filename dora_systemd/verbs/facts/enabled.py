@@ -6,11 +6,37 @@ from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.host.unit_files import wanted_units
 from dora_systemd.decisions.unit.directories import unit_directories
 from dora_systemd.scope import Scope
+from dora_systemd.trust.paths import exists
 
 
 def enabled_units(manager: Manager, scope: Scope) -> frozenset[str]:
     """The names of the units that a boot starts."""
     return wanted_units(own_directories(manager, scope)[0])
+
+
+def lost_units(manager: Manager, scope: Scope) -> frozenset[str]:
+    """The enabled units that systemd does not know, although their files are there.
+
+    systemd notes where the file of each unit name is. For a transient unit it notes the fragment,
+    and keeps the note when the unit has ended and the fragment is gone. Only a reload makes it look
+    for the enabled file (seen with systemd 257).
+    """
+    directory = own_directories(manager, scope)[0]
+    unknown = (
+        unit
+        for unit in enabled_units(manager, scope)
+        if manager.read(unit, ["LoadState"])["LoadState"] == "not-found"
+    )
+    return frozenset(unit for unit in unknown if exists(directory / unit))
+
+
+def recover_lost_units(manager: Manager, scope: Scope) -> None:
+    """Make systemd look for the files of the enabled units that it has lost, if there are any.
+
+    Raises DoraSystemdError.
+    """
+    if lost_units(manager, scope):
+        manager.reload()
 
 
 def own_directories(manager: Manager, scope: Scope) -> tuple[Path, Path]:

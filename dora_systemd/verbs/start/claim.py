@@ -42,6 +42,8 @@ def require_free_name(manager: Manager, scope: Scope, unit: str) -> BootUnit:
     boot = read_boot_unit(manager, scope, unit)
     if state["Transient"]:
         _forget(manager, boot)
+    elif boot.text is not None and state["LoadState"] == "not-found":
+        manager.reload()  # see lost_units()
     return boot
 
 

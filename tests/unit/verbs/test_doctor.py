@@ -1,5 +1,6 @@
 """doctor against a fake systemd, and without any."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -96,6 +97,19 @@ def test_what_ended_dataflows_have_left(manager: FakeManager, scope: Scope, tmp_
     assert [one.state for one in left] == [State.WARNING] * 2
     assert left[0].remedy == f"rm -r {scope.cell_directory('ghost')}"
     assert left[1].remedy.endswith("dora-ghost.service/cgroup.kill")
+
+
+def test_an_enabled_dataflow_that_systemd_has_lost(
+    manager: FakeManager, scope: Scope, tmp_path: Path
+) -> None:
+    plan = make_plan(scope)
+    flow = tmp_path / "robot.yml"
+    flow.touch()
+    plan = replace(plan, options=plan.options._replace(dataflow=str(flow)))
+    place(manager, plan, want_boot=True)
+    (finding,) = found(manager, scope).values()
+    assert finding.text == "dora-robot.service is enabled and systemd does not know it"
+    assert finding.remedy == "systemctl --system daemon-reload"
 
 
 def test_an_enabled_dataflow_whose_file_is_gone(manager: FakeManager, scope: Scope) -> None:

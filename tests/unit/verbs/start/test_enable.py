@@ -49,6 +49,14 @@ def path_of(manager: FakeManager) -> Path:
     return manager.etc / "systemd/system" / UNIT
 
 
+def test_a_lost_unit_is_looked_for_when_it_has_stopped(manager: FakeManager, scope: Scope) -> None:
+    cell = started(manager)
+    enable_cell(manager, scope, cell)
+    manager.after_job[UNIT] = {"LoadState": "not-found", "ActiveState": "inactive", "Transient": 0}
+    stop_cells(manager, scope, [cell])
+    assert manager.calls[-1] == ("reload",)
+
+
 def test_what_runs_goes_on(manager: FakeManager, scope: Scope) -> None:
     """No reload: it would keep the transient unit loaded when it has ended."""
     cell = started(manager)
