@@ -16,12 +16,20 @@ class StageLine:
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
         self._is_terminal = stream.isatty()
+        self._is_shown = False
 
     def __call__(self, text: str) -> None:
         if self._is_terminal:
             columns = shutil.get_terminal_size().columns
             shown = one_line(text)[: columns - 1]
             self._write(f"{_BACK_AND_CLEAR}{shown}")
+            self._is_shown = True
+
+    def wipe(self) -> None:
+        """Make room for other output; the next stage is shown below it."""
+        if self._is_shown:
+            self._write(_BACK_AND_CLEAR)
+            self._is_shown = False
 
     def __enter__(self) -> "StageLine":
         return self
@@ -32,8 +40,7 @@ class StageLine:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        if self._is_terminal:
-            self._write(_BACK_AND_CLEAR)
+        self.wipe()
 
     def _write(self, text: str) -> None:
         write_own(self._stream, text)

@@ -29,6 +29,8 @@ from dora_systemd.suggestions import did_you_mean
 from dora_systemd.values import quoted
 
 _CHUNK = 1 << 18
+_TURN = 1 << 14
+"""Bytes of records between two looks at what else has happened: a terminal may be slow."""
 _GLOB = re.compile(r"[*?\[]")
 _FIELDS = "MESSAGE,PRIORITY,SYSLOG_IDENTIFIER,MESSAGE_ID,UNIT,USER_UNIT"
 
@@ -190,7 +192,9 @@ class FollowedLog:
         self._terminal = terminal
         self._records = ExportReader()
         self._stack = ExitStack()
-        child = self._stack.enter_context(open_journalctl([*options, "--", *matches]))
+        # After the first Ctrl+C the nodes still have to say something.
+        journalctl = open_journalctl([*options, "--", *matches], outlives_interrupt=True)
+        child = self._stack.enter_context(journalctl)
         assert child.stdout
         self._fd = child.stdout.fileno()
         os.set_blocking(self._fd, False)
@@ -200,15 +204,16 @@ class FollowedLog:
         return self._fd
 
     def print_new(self) -> None:
-        """Write the lines that have come since the last look."""
-        while not self.has_ended:
-            try:
-                data = os.read(self._fd, _CHUNK)
-            except BlockingIOError:
-                return
-            if not data:
-                self.has_ended = True
-            self._print(data)
+        """Write some of the lines that have come: a flood of them must not keep the caller here."""
+        if self.has_ended:
+            return
+        try:
+            data = os.read(self._fd, _TURN)
+        except BlockingIOError:
+            return
+        if not data:
+            self.has_ended = True
+        self._print(data)
 
     def _print(self, data: bytes) -> None:
         lines: list[bytes] = []

@@ -1,7 +1,15 @@
 """doractl run: a dataflow that lives no longer than its terminal."""
 
+import fcntl
+import os
+import re
 import signal
+import struct
 import subprocess
+import termios
+import threading
+import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -46,6 +54,89 @@ def test_run_ends_with_ctrl_c(cell: Cell, project: Project) -> None:
     assert "got [" in out
     assert "stopped" in out.splitlines()[-1]
     assert cell.is_gone
+
+
+class Screen:
+    """A terminal of 80 columns with a command in its foreground, as a person has it."""
+
+    def __init__(self, command: list[str]) -> None:
+        self._ours, theirs = os.openpty()
+        fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("4H", 24, 80, 0, 0))
+        # In a session of its own, whose terminal this is.
+        own = ["setsid", "--ctty", "--wait", *command]
+        self.child = subprocess.Popen(own, stdin=theirs, stdout=theirs, stderr=theirs)
+        os.close(theirs)
+        self._pieces: list[bytes] = []
+        self._thread = threading.Thread(target=self._read, daemon=True)
+        self.pause = 0.0
+        self._thread.start()
+
+    def _read(self) -> None:
+        with suppress(OSError):  # the last end of the other side is closed
+            while data := os.read(self._ours, 1024):
+                self._pieces.append(data)
+                time.sleep(self.pause)
+
+    def press(self, key: bytes) -> None:
+        os.write(self._ours, key)
+
+    def end(self) -> int:
+        """The exit status, when all of the output is there."""
+        self.pause = 0.0
+        status = self.child.wait(bound(60))
+        self._thread.join(bound(10))
+        return status
+
+    def lines(self) -> list[str]:
+        """What stays on the screen."""
+        text = b"".join(self._pieces).decode().replace("\r\n", "\n")
+        lines = (line.rpartition("\r\x1b[K")[2] for line in text.split("\n"))
+        return [re.sub(r"\x1b\[[0-9;]*m", "", line) for line in lines if line]
+
+
+LAST_WORDS = """
+from dora import Node
+for event in Node():
+    if event["type"] == "STOP":
+        for number in range(4):
+            print("last", number, flush=True)
+"""
+FLOOD = """
+from dora import Node
+node = Node()
+node.next()
+while True:
+    print("x" * 60, flush=True)
+"""
+
+
+def run_on_screen(cell: Cell, project: Project, node: str, *words: str) -> Screen:
+    project.write("one.py", node)
+    flow = project.write("dataflow.yml", f"nodes: [{{id: one, path: one.py, {TICK}}}]\n")
+    screen = Screen(["doractl", "run", str(flow), "--name", cell.name, *words])
+    wait_for("it runs", lambda: cell.show("ActiveState") == "active")
+    return screen
+
+
+def test_run_on_a_terminal_is_clean_and_prints_to_the_end(cell: Cell, project: Project) -> None:
+    screen = run_on_screen(cell, project, LAST_WORDS)
+    screen.press(b"\x03")
+    assert screen.end() == 0
+    lines = screen.lines()
+    assert [line[-6:] for line in lines if "last" in line] == [f"last {n}" for n in range(4)]
+    when = re.compile(r"(\^C)?[A-Z][a-z]{2} \d\d \d\d:\d\d:\d\d ")
+    notes = ("doractl: ", "^C")
+    assert not [one for one in lines if not when.match(one) and not one.startswith(notes)], lines
+
+
+@pytest.mark.warns("Signal(9)", "Signal(15)", "was killed", "failed to receive", "suppressed")
+def test_run_hears_ctrl_c_in_a_flood(cell: Cell, project: Project) -> None:
+    screen = run_on_screen(cell, project, FLOOD, "--grace-duration", "1s")
+    screen.pause = 0.02
+    wait_for("it floods", lambda: len(screen.lines()) > 100)
+    screen.press(b"\x03")
+    wait_for("it stops", lambda: cell.show("ActiveState") != "active", 10)
+    screen.end()
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM, signal.SIGHUP])

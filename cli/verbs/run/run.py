@@ -51,12 +51,15 @@ def command(dataflow: str, name: str | None, **flags: Any) -> int:
     options = plan.options
     terminal = TerminalLines((), want_colors=sys.stdout.isatty())
     since = time.time_ns() // _MICROSECOND_NS
-    followed = FollowedLog(scope, options.name, options.uuid, since, _write, terminal)
-    with life_line() as pipe, closing(followed) as logs, StageLine(sys.stderr) as stage:
-        start_plan(bus, plan, [*properties.values(), *attached_properties(pipe)], stage, wait=False)
-        return follow_unit(bus, plan.unit, logs, stage)
+    with life_line() as pipe, StageLine(sys.stderr) as stage:
 
+        def write(data: bytes) -> None:
+            stage.wipe()
+            sys.stdout.buffer.write(data)
+            sys.stdout.buffer.flush()
 
-def _write(data: bytes) -> None:
-    sys.stdout.buffer.write(data)
-    sys.stdout.buffer.flush()
+        followed = FollowedLog(scope, options.name, options.uuid, since, write, terminal)
+        with closing(followed) as logs:
+            given = [*properties.values(), *attached_properties(pipe)]
+            start_plan(bus, plan, given, stage, wait=False)
+            return follow_unit(bus, plan.unit, logs, stage)

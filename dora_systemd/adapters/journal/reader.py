@@ -60,10 +60,14 @@ class LastEvent:
 
 @contextmanager
 def open_journalctl(
-    arguments: Sequence[str], want_colors: bool = False, stdout: int = subprocess.PIPE
+    arguments: Sequence[str],
+    want_colors: bool = False,
+    stdout: int = subprocess.PIPE,
+    outlives_interrupt: bool = False,
 ) -> "Iterator[subprocess.Popen[bytes]]":
     """A running journalctl; it ends with the block. stdout: a pipe, or the descriptor to use.
 
+    outlives_interrupt: Ctrl+C on the terminal does not reach it, see setpgid(2).
     Raises DoraSystemdError (NO_SYSTEMD) if there is no journalctl.
     """
     environment = {**os.environ, "SYSTEMD_COLORS": "1" if want_colors else "0", "LC_ALL": "C.UTF-8"}
@@ -74,6 +78,7 @@ def open_journalctl(
             stdout=stdout,
             stderr=subprocess.PIPE,
             env=environment,
+            process_group=0 if outlives_interrupt else None,
         )
     except OSError as error:
         message = f"cannot execute journalctl: {error.strerror}"

@@ -24,7 +24,7 @@ class LogSource(Protocol):
         """For poll(2): readable when there may be lines."""
 
     def print_new(self) -> None:
-        """Print the lines that have come since the last look."""
+        """Print some of the lines that have come since the last look."""
 
     def finish(self) -> None:
         """Print all lines up to the end of the unit, which has happened."""
@@ -75,10 +75,10 @@ def follow_unit(
             poll.register(source, select.POLLIN)
         while True:
             ready = {fd for fd, _ in poll.poll(_POLL_SECONDS * 1000)}
-            logs.print_new()
             if wakeup in ready:
                 interrupts += len(os.read(wakeup, 16))
                 _interrupt(manager, unit, interrupts)
+            logs.print_new()
             changed = manager.changes(unit)
             _tell(changed, on_stage)
             # A flood of lines is no reason to ask systemd again and again.
