@@ -47,6 +47,6 @@ def read_last_line(log: Path) -> str:
     return last[0] if last else "no output"
 
 
-def die_with_parent(command: Sequence[str]) -> list[str]:
-    """Killed by the kernel when the lab dies, however the lab dies."""
-    return ["setpriv", "--pdeathsig", "KILL", "--", *command]
+def die_with_parent(command: Sequence[str], by: str = "KILL") -> list[str]:
+    """The kernel sends it the signal `by` when the lab dies, however the lab dies."""
+    return ["setpriv", "--pdeathsig", by, "--", *command]

@@ -16,6 +16,7 @@ from typing import IO
 from lab.cache import find_cache
 from lab.definition import CHECKOUT
 from lab.errors import LabError, say
+from lab.process import die_with_parent
 from lab.venv import ensure_venv, venv_environment, write_package
 
 LAB_PYTHON = (3, 13)
@@ -131,7 +132,7 @@ class Running:
         self.output = output
         is_shown = output is sys.stdout
         self.process = subprocess.Popen(
-            step.command,
+            die_with_parent(step.command, "TERM"),
             env=step.env(),
             cwd=step.cwd,
             stdout=subprocess.PIPE if is_shown else output,

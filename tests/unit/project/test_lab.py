@@ -3,6 +3,7 @@
 import io
 import os
 import re
+import subprocess
 import sys
 import time
 from dataclasses import replace
@@ -165,6 +166,24 @@ def test_all_steps_run_and_the_worst_status_counts(capfd: pytest.CaptureFixture[
     assert "step 1: FAILED with exit status 1; 2 failed, 1 passed in 1.00s" in said
     assert "step 2: FAILED with exit status 143; done" in said
     assert re.fullmatch(r"===== 3 failed, 1 passed in \d+\.\d\ds =====", out.splitlines()[-1])
+
+
+STEPS = """
+import os, sys
+from lab.steps import Step, run_steps
+run_steps([Step("endless", ["sh", "-c", "echo begun; exec sleep 1000"], os.environ.copy)])
+"""
+
+
+def test_a_step_ends_with_the_command_that_has_begun_it() -> None:
+    environment = {**os.environ, "PYTHONPATH": str(definition.CHECKOUT / "tests")}
+    command = [sys.executable, "-c", STEPS]
+    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE) as child:
+        assert child.stdout
+        assert child.stdout.readline() == b"begun\n"
+        child.kill()
+        # The step holds the other end as well: this returns when that has ended, too.
+        assert child.stdout.read() == b""
 
 
 def test_bounds_are_in_seconds_of_an_idle_machine(monkeypatch: pytest.MonkeyPatch) -> None:
