@@ -12,6 +12,7 @@ from dora_systemd.adapters.bus.connection import MANAGER_OBJECT, SERVICE, connec
 from dora_systemd.adapters.bus.errors import explained
 from dora_systemd.adapters.bus.manager import JOB_DONE, Observer, Property, UnitState
 from dora_systemd.adapters.bus.wire import decoded, encoded
+from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 
 ROOT = MANAGER_OBJECT
@@ -80,8 +81,17 @@ class Bus:
     def run_jobs(
         self, method: str, units: Sequence[str], observer: Observer | None = None
     ) -> dict[str, str]:
-        jobs = {self.queue_job(method, unit): unit for unit in units}
-        return self._wait_for_jobs(jobs, observer)
+        jobs: dict[str, str] = {}
+        gone: list[str] = []
+        for unit in units:
+            try:
+                jobs[self.queue_job(method, unit)] = unit
+            except DoraSystemdError as error:
+                # It has ended by itself since it was chosen. That is no reason to leave the rest.
+                if method != "StopUnit" or error.code is not ExitCode.NOT_FOUND:
+                    raise
+                gone.append(unit)
+        return self._wait_for_jobs(jobs, observer) | dict.fromkeys(gone, JOB_DONE)
 
     def queue_job(self, method: str, unit: str) -> str:
         self._listen(unit)

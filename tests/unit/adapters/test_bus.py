@@ -125,6 +125,31 @@ def test_names_of_pystemds_errors() -> None:
         raise DBusBaseError
 
 
+class Departing(bus.Bus):
+    """Units of which some end before they can be stopped."""
+
+    def __init__(self, code: ExitCode) -> None:
+        self.code = code
+
+    def queue_job(self, method: str, unit: str) -> str:
+        if unit == "gone":
+            raise DoraSystemdError(f"cannot {method} {unit}", "", self.code)
+        return f"/job/{unit}"
+
+    def _wait_for_jobs(self, jobs: dict[str, str], observer: object) -> dict[str, str]:
+        del observer
+        return dict.fromkeys(jobs.values(), "failed")
+
+
+def test_a_unit_that_is_gone_is_stopped() -> None:
+    systemd = Departing(ExitCode.NOT_FOUND)
+    assert systemd.run_jobs("StopUnit", ["gone", "other"]) == {"gone": "done", "other": "failed"}
+    with pytest.raises(DoraSystemdError):
+        systemd.run_jobs("RestartUnit", ["gone"])
+    with pytest.raises(DoraSystemdError):
+        Departing(ExitCode.NO_PERMISSION).run_jobs("StopUnit", ["gone"])
+
+
 def test_other_errors_pass() -> None:
     with pytest.raises(ZeroDivisionError), bus_errors.explained("do it", SYSTEM):
         raise ZeroDivisionError

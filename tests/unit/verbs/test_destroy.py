@@ -10,6 +10,7 @@ import pytest
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.decisions.gateway.place import SERVICE_UNIT, SOCKET_UNIT
 from dora_systemd.decisions.unit.file import BOOT_TARGET
+from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import SLICE
 from dora_systemd.verbs import destroy as destroy_module
 from dora_systemd.verbs.destroy import Ended, processes_left, stop_all, stop_gateway, stop_slice
@@ -27,6 +28,7 @@ class Systemd(FakeManager):
         self.etc = etc
         self.looks: dict[str, int] = {}
         self.immortal: set[str] = set()
+        self.gone: set[str] = set()
 
     def read(self, unit: str, names: Sequence[str]) -> dict[str, Any]:
         if unit in self.looks and "ActiveState" in names:
@@ -36,6 +38,9 @@ class Systemd(FakeManager):
         return super().read(unit, names)
 
     def queue_job(self, method: str, unit: str) -> str:
+        if unit in self.gone:
+            del self.units[unit]
+            raise DoraSystemdError(f"cannot stop {unit}", "", ExitCode.NOT_FOUND)
         self.looks.setdefault(unit, 2)
         return super().queue_job(method, unit)
 
@@ -79,6 +84,14 @@ def test_everything_that_is_up_is_stopped(active: str, systemd: Systemd, scope: 
     systemd.add(options("robot"), TimeoutStopUSec=17_000_000)
     assert {one.name for one in destroy(systemd, scope)} == {"a", "robot"}
     assert systemd.calls == [("StopUnit", "dora-a.service"), ("StopUnit", ROBOT)]
+
+
+def test_one_that_ends_by_itself_meanwhile(systemd: Systemd, scope: ScopeIn) -> None:
+    systemd.add(options("a"), TimeoutStopUSec=17_000_000)
+    systemd.add(options("robot"), TimeoutStopUSec=17_000_000)
+    systemd.gone = {"dora-a.service"}
+    assert {one.name for one in destroy(systemd, scope)} == {"a", "robot"}
+    assert systemd.calls == [("StopUnit", ROBOT)]
 
 
 def test_what_does_not_end_is_killed(systemd: Systemd, scope: ScopeIn) -> None:
