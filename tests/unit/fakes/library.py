@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -146,8 +147,10 @@ def fake_systemd(patch: pytest.MonkeyPatch, manager: FakeManager) -> FakeSystemd
     """From now on every Bus leads to `manager`."""
     systemd = FakeSystemd(manager)
     install(patch, "pystemd.dbuslib", DBusAddress=systemd.open)
-    # It keeps what it has found, as Python keeps every module.
-    patch.delitem(sys.modules, "dora_systemd.adapters.bus.library", raising=False)
+    # It keeps what it has found, as Python keeps every module: what comes of the fake goes again.
+    ours = "dora_systemd.adapters.bus.library"
+    patch.setitem(sys.modules, ours, sys.modules.get(ours, ModuleType(ours)))
+    patch.delitem(sys.modules, ours)
     return systemd
 
 
