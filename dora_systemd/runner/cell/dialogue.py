@@ -6,17 +6,15 @@ from typing import Any
 
 from dora_systemd.adapters.dora import engine
 from dora_systemd.adapters.host import notify
-from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.dora import protocol
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Do, State
 from dora_systemd.decisions.life.stop_budget import stop_timeout
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.cell.failure import failed
+from dora_systemd.runner.cell.parts import CellDora, CellNodes, CellPipes
 from dora_systemd.runner.cell.pump import Pump, now_us
-from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.values import SECOND
 
 _LISTENING = "Listening on port "
@@ -32,7 +30,12 @@ class Dialogue:
     """Carries out each Do; every answer becomes an event of the pump."""
 
     def __init__(
-        self, options: RunnerOptions, pump: Pump, dora: Engine, nodes: Nodes, pipes: LogPipes
+        self,
+        options: RunnerOptions,
+        pump: Pump,
+        dora: CellDora,
+        nodes: CellNodes,
+        pipes: CellPipes,
     ) -> None:
         self._options = options
         self._pump = pump

@@ -10,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 
 from dora_systemd.adapters.host import files, notify
-from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.decisions.cell.status import CpuSample, add_sample
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
@@ -22,7 +21,7 @@ from dora_systemd.decisions.logs.events import END_EVENTS
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.failure import failed
-from dora_systemd.runner.nodes.nodes import Nodes
+from dora_systemd.runner.cell.parts import CellNodes, CellPipes
 from dora_systemd.values import SECOND
 
 
@@ -47,7 +46,7 @@ class Pump:
     """
 
     def __init__(
-        self, cell: Cell, uuid: str, paths: CellPaths, nodes: Nodes, pipes: LogPipes
+        self, cell: Cell, uuid: str, paths: CellPaths, nodes: CellNodes, pipes: CellPipes
     ) -> None:
         self.cell = cell
         self._uuid = uuid

@@ -6,14 +6,13 @@ from pathlib import PurePath
 from typing import Any
 
 from dora_systemd.adapters.dora.preparation import Prepared
-from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.decisions.cell.launch import has_pipes, kinds
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import HELD
 from dora_systemd.decisions.life.states import State
 from dora_systemd.decisions.reload.steps import How, Step
+from dora_systemd.runner.cell.parts import CellNodes, CellPipes
 from dora_systemd.runner.cell.pump import Pump
-from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.runner.reload.sources import Change
 from dora_systemd.runner.reload.swap import NotReady, Swapper
 
@@ -26,8 +25,8 @@ class Run:
     """One run of the dataflow, as far as reloads need it."""
 
     pump: Pump
-    nodes: Nodes
-    pipes: LogPipes
+    nodes: CellNodes
+    pipes: CellPipes
     swapper: Swapper
 
 

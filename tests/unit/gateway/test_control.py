@@ -3,7 +3,6 @@
 import asyncio
 import json
 import re
-from collections.abc import AsyncIterator, Iterable
 from typing import Any
 
 import pytest
@@ -36,6 +35,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.gateway.control.serve import HANDLERS, REFUSED, serve_control
 from dora_systemd.gateway.control.start import find_file
 from dora_systemd.scope import Scope
+from tests.unit.fakes.socket import FakeSocket
 
 UUID = "550e8400-e29b-41d4-a716-446655440000"
 RUN = "01a1fb9e-9464-7aee-adce-79cf1bfc2b24"
@@ -347,27 +347,6 @@ def test_which_files_are_looked_at() -> None:
     for other in others:
         assert not could_be(other, EXPANDED)
     assert not could_be(written, {"nodes": []})
-
-
-class FakeSocket:
-    """A dora command that sends these frames and goes."""
-
-    def __init__(self, frames: Iterable[str | bytes]) -> None:
-        self.frames = list(frames)
-        self.sent: list[Any] = []
-
-    async def recv(self) -> str | bytes:
-        return self.frames.pop(0)
-
-    async def send(self, message: Any) -> None:
-        self.sent.append(json.loads(message))
-
-    async def close(self, code: int = 1000, reason: str = "") -> None:
-        del code, reason
-
-    async def __aiter__(self) -> AsyncIterator[str | bytes]:
-        while self.frames:
-            yield await self.recv()
 
 
 def talk(*frames: str | bytes) -> list[Any]:

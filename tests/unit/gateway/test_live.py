@@ -3,7 +3,8 @@
 import asyncio
 import json
 from collections.abc import AsyncIterable, AsyncIterator, Awaitable, Callable
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
@@ -13,9 +14,11 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.gateway.live import talk as live_talk
 from dora_systemd.gateway.live.talk import MAX_TASKS, talk
 from dora_systemd.scope import Scope
+from tests.unit.fakes.library import FakeSystemd, fake_systemd
+from tests.unit.fakes.manager import UUID, FakeManager, options
 
 REQUEST = Request("/api/live", Scope(True, 1000))
-ACT = {"type": "act", "action": "stop", "dataflow": "u", "number": 1}
+ACT = {"type": "act", "action": "stop", "dataflow": UUID, "number": 1}
 
 
 class Browser:
@@ -72,10 +75,12 @@ def play(story: Story) -> Browser:
 
 
 @pytest.fixture(autouse=True)
-def behind(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Snapshots of nothing, very often."""
+def systemd(monkeypatch: pytest.MonkeyPatch) -> FakeSystemd:
+    """A systemd with the dataflow robot, which is looked at very often."""
     monkeypatch.setattr(live_talk, "INTERVAL_SECONDS", 0.01)
-    monkeypatch.setattr(live_talk, "_snapshot", lambda _scope: [{"name": "robot"}])
+    manager = FakeManager()
+    manager.add(options(), active="failed")
+    return fake_systemd(monkeypatch, manager)
 
 
 def test_greeting_and_snapshots() -> None:
@@ -85,14 +90,15 @@ def test_greeting_and_snapshots() -> None:
     got = play(story).got
     assert got[0]["type"] == "hello"
     assert {"version", "host", "scope"} <= got[0].keys()
-    assert got[1] == {"type": "snapshot", "dataflows": [{"name": "robot"}]}
+    assert got[1]["type"] == "snapshot"
+    assert [one["name"] for one in got[1]["dataflows"]] == ["robot"]
 
 
-def test_systemd_out_of_reach(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(_scope: Scope) -> list[Any]:
+def test_systemd_out_of_reach(systemd: FakeSystemd) -> None:
+    def fail(_pattern: str) -> list[Any]:
         raise DoraSystemdError("cannot reach systemd", "see systemctl")
 
-    monkeypatch.setattr(live_talk, "_snapshot", fail)
+    systemd.manager = cast(FakeManager, SimpleNamespace(list_units=fail))
 
     async def story(browser: Browser) -> None:
         first, second = await browser.wait_for("problem", 2)
@@ -112,22 +118,18 @@ def test_garbage_ends_nothing() -> None:
     play(story)
 
 
-def test_actions(monkeypatch: pytest.MonkeyPatch) -> None:
-    def act(_scope: Scope, message: PageMessage) -> str:
-        if message.node:
-            raise DoraSystemdError("cannot find it", "look")
-        return f"{message.action} {message.dataflow}"
-
-    monkeypatch.setattr(live_talk, "act", act)
-
+def test_actions(systemd: FakeSystemd) -> None:
     async def story(browser: Browser) -> None:
-        browser.say(**ACT)
-        browser.say(**ACT | {"node": "x", "number": 2})
+        browser.say(**ACT | {"action": "restart"})
+        await browser.wait_for("acted")
+        browser.say(**ACT | {"dataflow": "x", "number": 2})
         await browser.wait_for("acted", 2)
 
     found = {one["number"]: one for one in play(story).got if one["type"] == "acted"}
-    assert found[1]["text"] == "stop u"
-    assert (found[2]["problem"], found[2]["hint"]) == ("cannot find it", "look")
+    assert found[1]["text"] == f"Dataflow restarted: {UUID} (robot)"
+    assert found[2]["problem"] == "no dataflow named 'x'"
+    assert found[2]["hint"] == "known dataflows: robot"
+    assert ("RestartUnit", "dora-robot.service") in systemd.manager.calls
 
 
 def test_what_is_followed_takes_the_place_of_the_last(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -157,17 +159,17 @@ def test_what_is_followed_takes_the_place_of_the_last(monkeypatch: pytest.Monkey
     play(story)
 
 
-def test_not_too_much_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    async def wait(_page: Any, _message: PageMessage) -> None:
-        await asyncio.sleep(60)
-
-    monkeypatch.setattr(live_talk._Page, "_act", wait)
+def test_not_too_much_at_once(systemd: FakeSystemd) -> None:
+    systemd.is_slow = True
 
     async def story(browser: Browser) -> None:
         for _ in range(MAX_TASKS + 1):
-            browser.say(**ACT)
+            browser.say(**ACT | {"action": "restart"})
         (problem,) = await browser.wait_for("problem")
         assert problem["text"] == "cannot start another action: 8 are still running"
+        assert not await browser.wait_for("acted", 0)
+        systemd.finish()
+        await browser.wait_for("acted", MAX_TASKS)
 
     play(story)
 

@@ -2,8 +2,7 @@
 
 import asyncio
 import os
-from collections import deque
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Awaitable, Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -21,24 +20,9 @@ from dora_systemd.runner.cell.dialogue import Dialogue
 from dora_systemd.runner.cell.failure import Beside
 from dora_systemd.runner.cell.pump import Pump, is_deleted
 from dora_systemd.values import SECOND
+from tests.unit.fakes.loop import live
 
 OPTIONS = RunnerOptions("robot", "uuid", "/srv/flow.yml", "/srv", "/bin/dora")
-
-
-class ImpatientLoop(asyncio.SelectorEventLoop):
-    """Its clock jumps to the next timer when there is nothing else to do."""
-
-    _ready: deque[asyncio.Handle]
-    _scheduled: list[asyncio.TimerHandle]
-    _ahead = 0.0
-
-    def time(self) -> float:
-        return super().time() + self._ahead
-
-    def _run_once(self) -> None:
-        if not self._ready and self._scheduled:
-            self._ahead += max(0.0, self._scheduled[0].when() - self.time())
-        super()._run_once()  # type: ignore[misc]
 
 
 class Side:
@@ -102,14 +86,6 @@ class Bench:
     def reasons(self) -> list[str]:
         ends = [one for name, one in self.side.events if name == "dataflow-failed"]
         return [one["reason"] for one in ends]
-
-
-def live(work: Callable[[], Coroutine[Any, Any, None]]) -> None:
-    async def bounded() -> None:
-        await asyncio.wait_for(work(), 3600)  # at once, if nothing else can happen
-
-    with asyncio.Runner(loop_factory=ImpatientLoop) as runner:
-        runner.run(bounded())
 
 
 def refuse() -> None:

@@ -1,0 +1,42 @@
+"""An event loop whose time passes at once."""
+
+import asyncio
+from collections import deque
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+
+class ImpatientLoop(asyncio.SelectorEventLoop):
+    """Its clock stands still, and jumps to the next timer when there is nothing else to do.
+
+    So what runs on it must not wait for threads or other processes.
+    """
+
+    _ready: deque[asyncio.Handle]
+    _scheduled: list[asyncio.TimerHandle]
+    _ahead = 0.0
+
+    def time(self) -> float:
+        return self._ahead
+
+    def _run_once(self) -> None:
+        times = [one.when() for one in self._scheduled if not one.cancelled()]
+        if not self._ready and times:
+            self._ahead += max(0.0, min(times) - self.time())
+        super()._run_once()  # type: ignore[misc]
+
+
+def live(work: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    """Run `work` on such a loop, which fails at once if it waits for what cannot come."""
+
+    async def bounded() -> None:
+        await asyncio.wait_for(work(), 3600)
+
+    with asyncio.Runner(loop_factory=ImpatientLoop) as runner:
+        runner.run(bounded())
+
+
+async def settle() -> None:
+    """Let all go on that can go on without time."""
+    for _ in range(20):
+        await asyncio.sleep(0)

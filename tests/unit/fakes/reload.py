@@ -1,0 +1,80 @@
+"""A run whose nodes dora exchanges at once, for reloads of it."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from dora_systemd.adapters.dora.preparation import Prepared, prepare
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.status import NodeStatus
+from dora_systemd.decisions.life import events as life
+from dora_systemd.decisions.life.states import Cell, Do, State
+from dora_systemd.decisions.reload.steps import How, Step
+from dora_systemd.paths import CellPaths
+from dora_systemd.runner.cell.pump import Pump
+from dora_systemd.runner.reload.apply import Applier, Run
+from dora_systemd.runner.reload.sources import Change
+from dora_systemd.runner.reload.swap import Swapper
+from dora_systemd.values import SECOND
+from tests.unit.fakes.run import Calls, FakeDora, FakeNodes, FakePipes
+
+RUNNING = NodeStatus("running", 7, policy="on-failure")
+
+
+class ReloadBench:
+    """Nodes a and b that run; dora does what it is asked, unless a test has it refuse."""
+
+    def __init__(self, root: Path, state: State = State.RUNNING, **nodes: NodeStatus) -> None:
+        self.root = root
+        self.calls: Calls = []
+        self.nodes, self.pipes = FakeNodes(self.calls), FakePipes(self.calls)
+        self.dora = FakeDora(self.calls)
+        table = {"a": RUNNING, "b": RUNNING, **nodes}
+        cell = Cell(2 * SECOND, 0, table, state, run="run", ready_us=1)
+        self.pump = Pump(cell, "uuid", CellPaths(root), self.nodes, self.pipes)
+        self.pump.connect({do: lambda: None for do in Do})
+        self.run = Run(self.pump, self.nodes, self.pipes, Swapper(self.pump, self.dora))
+        for name, then in (
+            *((name, self.end) for name in ("RestartNode", "RemoveNode")),
+            *((name, self.spawn) for name in ("ReplaceNode", "AddNode")),
+            ("Reload", lambda: None),
+        ):
+            self.dora.then[name] = then
+        self.flow = root / "flow.yml"
+        self.options = RunnerOptions("robot", "uuid", str(self.flow), str(root), "/bin/true")
+        self.prepared = self.write("abc")
+
+    def write(self, nodes: str) -> Prepared:
+        """Save a dataflow of these nodes; each has a program of its own."""
+        for one in nodes:
+            (self.root / f"{one}.py").touch()
+        lines = [f"  - {{id: {one}, path: {one}.py}}\n" for one in nodes]
+        self.flow.write_text("nodes:\n" + "".join(lines))
+        return prepare(self.options, {})
+
+    @property
+    def node(self) -> str:
+        """The one that dora was asked about last."""
+        return str([call for call in self.calls if call[0] == "ask"][-1][2])
+
+    def end(self) -> None:
+        self.pump.push(life.NodeExited(1, self.node, "", False))
+
+    def spawn(self) -> None:
+        self.pump.push(life.NodeSpawned(2, self.node, 8))
+        self.pump.push(life.NodeReady(3, self.node))
+
+    def crash(self) -> None:
+        self.pump.push(life.NodeSpawned(2, self.node, 8))
+        self.pump.push(life.NodeExited(3, self.node, "exit code 1", False))
+
+    def applier(self, *steps: tuple[How, str], **more: Any) -> Applier:
+        found = tuple(Step(how, node, f"{self.root}/{node}.py") for how, node in steps)
+        return Applier(self.run, Change(self.prepared, found, **more), self.options)
+
+    @property
+    def asked(self) -> list[tuple[Any, ...]]:
+        return [call[1:] for call in self.calls if call[0] == "ask"]
+
+    def states(self) -> Mapping[str, str]:
+        return {name: one.state for name, one in self.pump.cell.nodes.items()}

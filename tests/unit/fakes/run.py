@@ -1,0 +1,215 @@
+"""What a run of the dataflow consists of: nodes, pipes and a dora that only note what is asked."""
+
+import asyncio
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from dora_systemd.adapters.dora.engine import Child
+from dora_systemd.decisions.cell.limits import NodeLimits
+from dora_systemd.decisions.cell.line_rates import RateLimits
+from dora_systemd.decisions.cell.status import CpuSample, LineCount
+from dora_systemd.decisions.descriptor.nodes import Node
+from dora_systemd.decisions.dora.protocol import LogRecord, Params, Reply
+from dora_systemd.decisions.life.states import Record
+from dora_systemd.decisions.logs.fields import Value
+from dora_systemd.decisions.resources.oom import Oom
+from dora_systemd.errors import DoraSystemdError
+
+Calls = list[tuple[Any, ...]]
+"""What the fakes of one run were asked to do, in its order."""
+
+
+class FakeResources:
+    """Limits that come close when `records` says so."""
+
+    def __init__(self) -> None:
+        self.records: list[Record] = []
+
+    def look(self, samples: tuple[CpuSample, ...], now: CpuSample) -> Sequence[Record]:
+        del samples, now
+        return self.records
+
+
+class FakeNodes:
+    """living: nodes and processes that are there. ooms: by node, and by "" for dora."""
+
+    def __init__(self, calls: Calls | None = None) -> None:
+        self.calls: Calls = [] if calls is None else calls
+        self.resources = FakeResources()
+        self.living: set[tuple[str, int]] = set()
+        self.ooms: dict[str, Oom] = {}
+
+    def listen(self, run: str) -> None:
+        self.calls.append(("listen", run))
+
+    def adopt(self, node: str, pid: int) -> None:
+        self.calls.append(("adopt", node, pid))
+
+    def clear(self, node: str, pid: int) -> None:
+        self.calls.append(("clear", node, pid))
+
+    def forget(self, node: str) -> None:
+        self.calls.append(("forget", node))
+
+    def has_process(self, node: str, pid: int) -> bool:
+        return (node, pid) in self.living
+
+    def find_oom(self, node: str) -> Oom | None:
+        return self.ooms.get(node)
+
+    def find_oom_of_dora(self) -> Oom | None:
+        return self.ooms.get("")
+
+    def let_go(self) -> None:
+        self.calls.append(("let go",))
+
+    async def wait_quiet(self, seconds: float) -> None:
+        del seconds
+        self.calls.append(("wait quiet",))
+
+    def drain(self, nodes: Iterable[str]) -> None:
+        self.calls.append(("drain", *nodes))
+
+    def kill(self) -> None:
+        self.calls.append(("kill",))
+
+    def sample(self, now_us: int) -> CpuSample:
+        return CpuSample(now_us, {"": 1000})
+
+    def add(self, node: Node, rates: RateLimits, limits: Iterable[NodeLimits]) -> None:
+        del rates, limits
+        self.calls.append(("make room", node.id))
+
+    def remove(self, node: str) -> None:
+        self.calls.append(("take room", node))
+
+    def limit(self, limits: Iterable[NodeLimits]) -> None:
+        self.calls.append(("limit", *(one.node for one in limits)))
+
+    @contextmanager
+    def exchanging(self, node: str) -> Iterator[None]:
+        self.calls.append(("begin", node))
+        try:
+            yield
+        finally:
+            self.calls.append(("end", node))
+
+
+class FakePipes:
+    """events: what was written. broken: life events that cannot be."""
+
+    def __init__(self, calls: Calls | None = None) -> None:
+        self.calls: Calls = [] if calls is None else calls
+        self.events: list[tuple[str, str | None, dict[str, Value]]] = []
+        self.broken: set[str] = set()
+        self.outputs: dict[str, Callable[[str], None] | None] = {}
+
+    def write_event(self, name: str, node: str | None = None, **details: Value) -> None:
+        if name in self.broken:
+            raise OSError(28, "No space left on device")
+        self.calls.append(("event", name))
+        self.events.append((name, node, details))
+
+    def line_counts(self) -> Mapping[str, LineCount]:
+        return {}
+
+    def add_output(self, label: str, fd: int, on_line: Callable[[str], None] | None = None) -> None:
+        del fd
+        self.outputs[label] = on_line
+
+    def mute(self, *labels: str) -> None:
+        self.calls.append(("mute", *labels))
+
+    def set_run(self, run_id: str) -> None:
+        self.calls.append(("run is", run_id))
+
+    def reasons(self, name: str) -> list[Value]:
+        """The reasons of all events `name`."""
+        return [details["reason"] for event, _, details in self.events if event == name]
+
+
+class FakeDora:
+    """A coordinator that gives each request the next of its `answers`, and is silent without one.
+
+    An answer is a result, or an error to raise; then: what happens meanwhile. silent: who hangs.
+    """
+
+    def __init__(self, calls: Calls | None = None) -> None:
+        self.calls: Calls = [] if calls is None else calls
+        self.asked: list[Params] = []
+        self.answers: defaultdict[str, deque[Any]] = defaultdict(deque)
+        self.then: dict[str, Callable[[], object]] = {}
+        self.refuses: dict[str, str] = {}
+        self.hear: Callable[[LogRecord], None] | None = None
+        self.closed, self.joined = asyncio.Event(), asyncio.Event()
+        self.port = 0
+        self.silent = ""
+        self.has_daemon = True
+        self.daemon: Callable[[Mapping[str, str]], Child] | None = None
+
+    def set_port(self, port: int) -> None:
+        self.port = port
+
+    def start_daemon(self, added: Mapping[str, str]) -> Child:
+        assert self.daemon is not None
+        return self.daemon(added)
+
+    async def wait_joined(self) -> None:
+        await self.joined.wait()
+
+    async def find_silent(self, seconds: float) -> str:
+        self.calls.append(("find silent", seconds))
+        return self.silent
+
+    async def ask(self, params: Params) -> Reply:
+        name = params if isinstance(params, str) else next(iter(params))
+        self.asked.append(params)
+        self.calls.append(("ask", name, *_node(params)))
+        if name in self.refuses:
+            return Reply("", None, self.refuses[name])
+        if self.answers[name]:
+            answer = self.answers[name].popleft()
+        elif name in self.then:
+            answer = {}
+        else:
+            return await self._hang()
+        if isinstance(answer, Exception):
+            raise answer
+        self.then.get(name, lambda: None)()
+        return Reply("", answer, "")
+
+    async def ask_apart(self, params: Params, seconds: float) -> Reply:
+        try:
+            async with asyncio.timeout(seconds):
+                return await self.ask(params)
+        except TimeoutError:
+            raise DoraSystemdError("cannot get an answer from dora: no reply in time") from None
+
+    async def start_run(self, descriptor: Mapping[str, Any], name: str) -> str:
+        reply = await self.ask({"Start": {"dataflow": descriptor, "name": name}})
+        return str(reply.result)
+
+    async def read_events(
+        self, run: str, on_start: Callable[[], None], on_record: Callable[[LogRecord], None]
+    ) -> None:
+        self.calls.append(("subscribe", run))
+        self.hear = on_record
+        on_start()
+        await self.closed.wait()
+
+    def dismiss_daemon(self) -> bool:
+        self.calls.append(("dismiss",))
+        return self.has_daemon
+
+    async def _hang(self) -> Reply:
+        await asyncio.Event().wait()
+        raise AssertionError
+
+
+def _node(params: Params) -> tuple[str, ...]:
+    """The node that a request is about, if it is about one."""
+    body = {} if isinstance(params, str) else next(iter(params.values()))
+    node = body.get("node_id") or (body.get("node") or {}).get("id")
+    return (node,) if node else ()

@@ -1,0 +1,220 @@
+"""What the gateway does for others: the buttons of the page, and stop and restart of dora."""
+
+import asyncio
+import json
+import os
+import signal
+import socket
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
+from dora_systemd.decisions.gateway.frames import Request
+from dora_systemd.decisions.gateway.page_messages import PageMessage
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.gateway.control.forward import forward
+from dora_systemd.gateway.control.serve import HANDLERS
+from dora_systemd.gateway.control.talk import Talk
+from dora_systemd.gateway.live.act import act, read_graph
+from dora_systemd.scope import Scope
+from tests.unit.fakes.library import FakeSystemd, fake_journalctl, fake_systemd
+from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
+from tests.unit.fakes.socket import FakeSocket
+
+UNIT = "dora-robot.service"
+NOBODY = "11111111-2222-4333-8444-555555555555"
+
+
+class Bench:
+    """A gateway for the scope of this user, whose systemd has the dataflow robot."""
+
+    def __init__(self, root: Path, patch: pytest.MonkeyPatch, active: str = "active") -> None:
+        self.manager = FakeManager()
+        self.manager.add(options(dataflow=str(root / "flow.yml")), active=active)
+        self.systemd: FakeSystemd = fake_systemd(patch, self.manager)
+        self.scope: Scope = ScopeIn(is_user=True, uid=os.getuid(), root=root)
+        self.notes: list[bytes] = []
+        patch.setattr(socket.socket, "sendto", lambda _, data, *__: self.notes.append(data))
+        (root / "flow.yml").write_text("nodes: [{id: a, path: a.py}]\n")
+
+    def act(self, action: str, dataflow: str = UUID, node: str = "") -> str:
+        return act(self.scope, PageMessage("act", dataflow, node, action))
+
+    def ask(self, variant: str, **body: Any) -> Any:
+        talk = Talk(FakeSocket([]), self.scope)
+        return asyncio.run(_answer(talk, Request("x", variant, body)))
+
+    @property
+    def jobs(self) -> list[str]:
+        return [call[0] for call in self.manager.calls if call[0].endswith("Unit")]
+
+
+async def _answer(talk: Talk, request: Request) -> Any:
+    return await HANDLERS[request.name](talk, request)
+
+
+@pytest.fixture
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bench:
+    return Bench(tmp_path, monkeypatch)
+
+
+def test_the_page_stops_a_dataflow_and_says_who_asked(bench: Bench) -> None:
+    assert bench.act("stop") == f"Dataflow stopped: {UUID} (robot)"
+    assert bench.manager.calls == [("StopUnit", UNIT)]
+    (note,) = bench.notes
+    assert b"stop-asked" in note
+    assert b"(status page)" in note
+
+
+def test_the_page_restarts_a_dataflow(bench: Bench) -> None:
+    assert bench.act("restart") == f"Dataflow restarted: {UUID} (robot)"
+    assert bench.jobs == ["RestartUnit"]
+    assert not bench.notes, "a restart is no stop"
+
+
+def test_a_restart_that_fails_is_told_with_where_to_look(bench: Bench) -> None:
+    bench.manager.job_results[UNIT] = "failed"
+    bench.manager.units[UNIT] |= {"StatusText": "failed: node a: exit code 3"}
+    with pytest.raises(DoraSystemdError, match="node a: exit code 3") as caught:
+        bench.act("restart")
+    assert caught.value.hint == "doractl why robot"
+
+
+def test_the_page_names_a_dataflow_that_is_gone(bench: Bench) -> None:
+    with pytest.raises(DoraSystemdError, match="no dataflow named") as caught:
+        bench.act("stop", NOBODY)
+    assert caught.value.code is ExitCode.NOT_FOUND
+    assert not bench.manager.calls
+
+
+@pytest.mark.parametrize("action", ["stop", "restart"])
+def test_a_node_of_a_dataflow_that_does_not_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, action: str
+) -> None:
+    bench = Bench(tmp_path, monkeypatch, active="failed")
+    with pytest.raises(DoraSystemdError, match="cannot use the dataflow robot: it is not running"):
+        bench.act(action, node="a")
+    assert not bench.manager.calls, "the dataflow is not stopped in place of its node"
+
+
+def test_the_drawing_of_a_dataflow_that_has_no_coordinator(bench: Bench) -> None:
+    assert read_graph(bench.scope, UUID)["nodes"] == [{"id": "a", "kind": "python"}]
+
+
+@pytest.mark.parametrize("name", ["Stop", "Restart"])
+def test_nobody_is_stopped_for_another_uuid(bench: Bench, name: str) -> None:
+    with pytest.raises(DoraSystemdError, match=f"^no dataflow with the UUID {NOBODY}$"):
+        bench.ask(name, dataflow_uuid=NOBODY)
+    assert not bench.manager.calls
+
+
+def test_a_stop_of_what_has_ended_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = Bench(tmp_path, monkeypatch, active="failed")
+    with pytest.raises(DoraSystemdError, match=r"^cannot stop robot: it does not run$") as caught:
+        bench.ask("StopByName", name="robot")
+    assert caught.value.code is ExitCode.NOT_RUNNING
+    assert not bench.notes
+
+
+def test_dora_stops_a_dataflow(bench: Bench) -> None:
+    answer = bench.ask("Stop", dataflow_uuid=UUID, force=True)["DataflowStopped"]
+    assert (answer["uuid"], answer["result"]["node_results"]) == (UUID, {})
+    assert bench.jobs == ["StopUnit"]
+    assert b"(dora stop)" in bench.notes[0]
+    assert ("kill", UNIT, signal.SIGKILL, "all") not in bench.manager.calls
+
+
+def test_a_stop_that_takes_too_long_ends_with_a_kill(bench: Bench) -> None:
+    bench.systemd.is_slow = True
+    bench.ask("StopByName", name="robot", force=True)
+    assert bench.manager.calls[-1] == ("kill", UNIT, signal.SIGKILL, "all")
+
+
+def test_the_next_life_of_a_unit_is_not_killed(bench: Bench) -> None:
+    bench.systemd.is_slow = True
+
+    def again() -> str:
+        bench.systemd.finish()
+        return "two"
+
+    bench.systemd.lives = [lambda: "one", again]
+    bench.ask("RestartByName", name="robot", grace_duration={"secs": 0, "nanos": 0})
+    assert bench.jobs == ["RestartUnit"]
+    assert not [call for call in bench.manager.calls if call[0] == "kill"]
+
+
+def test_a_dora_restart(bench: Bench) -> None:
+    answer = bench.ask("Restart", dataflow_uuid=UUID)
+    assert answer == {"DataflowRestarted": {"old_uuid": UUID, "new_uuid": UUID}}
+
+
+def test_a_dora_restart_that_fails(bench: Bench) -> None:
+    bench.manager.job_results[UNIT] = "failed"
+    bench.manager.units[UNIT] |= {"StatusText": "failed: x"}
+    with pytest.raises(DoraSystemdError, match="cannot restart") as caught:
+        bench.ask("RestartByName", name="robot")
+    assert caught.value.hint == "doractl --user why robot tells more"
+
+
+def _run(bench: Bench, run: str) -> None:
+    directory = bench.scope.cell_directory("robot")
+    directory.mkdir(parents=True)
+    table = CellStatus(run=run, nodes={"a": NodeStatus("running")})
+    (directory / "status.json").write_text(table.to_json())
+
+
+def test_what_only_a_coordinator_knows_waits_for_a_run(bench: Bench) -> None:
+    request = Request("x", "GetParams", {"dataflow_id": UUID, "node_id": "a"})
+    _run(bench, "")
+    with pytest.raises(DoraSystemdError, match="it is starting or stopping") as caught:
+        asyncio.run(forward(Talk(FakeSocket([]), bench.scope), request))
+    assert caught.value.code is ExitCode.NOT_RUNNING
+
+
+def test_a_node_that_is_not_there_is_not_restarted(bench: Bench) -> None:
+    _run(bench, "run")
+    with socket.socket(socket.AF_UNIX) as one:
+        one.bind(str(bench.scope.cell_directory("robot") / "runner.sock"))
+        one.listen()
+        with pytest.raises(DoraSystemdError, match="cannot find a node 'b'"):
+            bench.ask("RestartNode", dataflow_id=UUID, node_id="b")
+
+
+def entry(text: str, at_us: int, node: str = "a") -> bytes:
+    fields = {
+        "__REALTIME_TIMESTAMP": at_us,
+        "__SEQNUM": 7,
+        "DORA_NODE": node,
+        "DORA_STREAM": "stdout",
+        "MESSAGE": text,
+    }
+    return b"".join(f"{key}={value}\n".encode() for key, value in fields.items()) + b"\n"
+
+
+def test_logs_begin_with_the_oldest_line(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = fake_journalctl(monkeypatch, tmp_path, entry("new", 2) + entry("old", 1))
+    link = FakeSocket([])
+    talk = Talk(link, bench.scope)
+    request = Request("x", "Logs", {"uuid": UUID, "node": "a", "tail": 2})
+    assert asyncio.run(_answer(talk, request)) is None, "it has answered by itself"
+    lines = bytes(link.sent[0]["result"]["Logs"]).splitlines()
+    assert [json.loads(line)["msg"] for line in lines] == ["old", "new"]
+    assert talk.places == {UUID: {"a": (2, 7)}}, "what is followed goes on from there"
+    arguments = calls.read_text().split()
+    assert {"--lines=2", f"DORA_DATAFLOW={UUID}", "DORA_NODE=a"} <= {*arguments}
+
+
+def test_logs_of_a_node_that_is_not_there(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fake_journalctl(monkeypatch, tmp_path, b"")
+    _run(bench, "run")
+    with pytest.raises(DoraSystemdError, match="cannot find a node 'b' of") as caught:
+        bench.ask("Logs", uuid=UUID, node="b")
+    assert caught.value.hint == "nodes: a"

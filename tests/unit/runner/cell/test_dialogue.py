@@ -1,0 +1,265 @@
+"""What dora is asked and says: every answer becomes its event, and so does every silence."""
+
+import asyncio
+import os
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dora_systemd.adapters.dora import engine
+from dora_systemd.decisions.life import events as life
+from dora_systemd.decisions.life.states import Do, RunnerExit, State
+from dora_systemd.decisions.resources.oom import Oom, Owner
+from dora_systemd.errors import DoraSystemdError
+from tests.unit.fakes.dialogue import DESCRIPTOR, Bench
+from tests.unit.fakes.loop import live, settle
+
+ENDED = {"DataflowStopped": {"result": {"node_results": {"a": {"Ok": None}}}}}
+
+
+def test_a_descriptor_that_dora_takes(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        bench.dora.answers["Start"].append("run-1")
+        assert await bench.do(Do.SEND_START) == [life.RunStarted(0, "run-1")]
+        assert bench.dora.asked == [{"Start": {"dataflow": DESCRIPTOR, "name": "robot"}}]
+        run, push = bench.calls.index(("run is", "run-1")), ("push", "RunStarted")
+        assert run < bench.calls.index(push), "lines have the run before anything follows"
+
+    live(work)
+
+
+ASKED = [
+    (Do.SEND_START, "Start"),
+    (Do.ASK_SPAWN, "WaitForSpawn"),
+    (Do.ASK_RESULT, "Check"),
+    (Do.ASK_STOP, "Stop"),
+]
+
+
+@pytest.mark.parametrize(("do", "request_"), ASKED)
+def test_a_connection_that_breaks_is_told_in_its_own_words(
+    tmp_path: Path, do: Do, request_: str
+) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        bench.dora.answers[request_].append(DoraSystemdError("it closed the connection"))
+        assert await bench.do(do) == [life.Refused(0, "it closed the connection")]
+
+    live(work)
+
+
+@pytest.mark.parametrize(("do", "request_"), ASKED)
+def test_what_is_no_word_of_ours_is_told_with_what_was_asked(
+    tmp_path: Path, do: Do, request_: str
+) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        bench.dora.answers[request_].append(KeyError("uuid"))
+        assert await bench.do(do) == [life.Failed(0, do.value, "KeyError: 'uuid'")]
+
+    live(work)
+
+
+def test_the_end_of_a_child_comes_before_what_its_connection_suffers(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        bench.dora.answers["Start"].append(DoraSystemdError("it closed the connection"))
+        bench.actions[Do.SEND_START]()
+        await settle()
+        assert not bench.heard
+        await asyncio.sleep(1)
+        assert bench.heard
+
+    live(work)
+
+
+@pytest.mark.parametrize(
+    ("error", "heard"),
+    [
+        ("failed to spawn a", [life.Refused(0, "failed to spawn a")]),
+        ("unknown dataflow run", []),
+        ("", []),
+    ],
+)
+def test_nodes_that_cannot_be_executed(tmp_path: Path, error: str, heard: list[Any]) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        bench.dora.refuses = {"WaitForSpawn": error}
+        assert await bench.do(Do.ASK_SPAWN) == heard
+
+    live(work)
+
+
+def test_the_result_is_asked_for_until_it_is_there(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path, State.CLOSING)
+        bench.dora.answers["Check"].extend(
+            [{"DataflowSpawned": {}}, {"DataflowSpawned": {}}, ENDED]
+        )
+        assert await bench.do(Do.ASK_RESULT) == [life.ResultKnown(0, {"a": ""})]
+
+    live(work)
+
+
+def test_a_run_that_goes_on_is_asked_for_its_result_once(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path, State.WAITING)
+        bench.dora.answers["Check"].extend([{"DataflowSpawned": {}}, ENDED])
+        assert await bench.do(Do.ASK_RESULT) == []
+        assert len(bench.dora.asked) == 1
+
+    live(work)
+
+
+def test_a_stop(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        bench.dora.answers["Stop"].append({})
+        assert await bench.do(Do.ASK_STOP) == [life.StopAnswered(0)]
+        assert bench.calls[:2] == [("let go",), ("ask", "Stop")]
+        assert bench.dora.asked == [
+            {
+                "Stop": {
+                    "dataflow_uuid": "run",
+                    "grace_duration": {"secs": 2, "nanos": 0},
+                    "force": False,
+                }
+            }
+        ]
+
+    live(work)
+
+
+def test_a_stop_that_is_refused_is_an_answer(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        bench.dora.refuses = {"Stop": "no such run"}
+        assert await bench.do(Do.ASK_STOP) == [life.StopAnswered(0)]
+
+    live(work)
+
+
+@pytest.mark.parametrize("has_daemon", [True, False])
+def test_the_daemon_is_dismissed_when_its_nodes_have_said_all(
+    tmp_path: Path, has_daemon: bool
+) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path, State.LEAVING)
+        bench.dora.has_daemon = has_daemon
+        heard = await bench.do(Do.DISMISS_DAEMON)
+        assert bench.calls[:4] == [
+            ("let go",),
+            ("mute", "coordinator", "daemon"),
+            ("wait quiet",),
+            ("dismiss",),
+        ]
+        assert heard == ([] if has_daemon else [life.ChildExited(0, "daemon", "earlier")])
+
+    live(work)
+
+
+def test_pipes_and_exit(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        bench.actions[Do.OPEN_PIPES]()
+        assert bench.calls == [("listen", "run")]
+        bench.pump.cell = replace(bench.pump.cell, exit=RunnerExit.NODES_FAILED)
+        bench.actions[Do.EXIT]()
+        assert await bench.pump.end is RunnerExit.NODES_FAILED
+
+    live(work)
+
+
+def test_the_coordinator_tells_its_port_once(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path, State.BOOTING)
+        bench.dialogue.read_coordinator("INFO something")
+        assert not bench.heard
+        bench.dialogue.read_coordinator("Listening on port 4711")
+        assert (bench.dora.port, bench.heard) == (4711, [life.CoordinatorListening(0)])
+        bench.enter(State.JOINING)
+        bench.dialogue.read_coordinator("Listening on port 1")
+        assert bench.dora.port == 4711
+
+    live(work)
+
+
+@pytest.mark.parametrize("oom", [None, Oom(Owner.DATAFLOW, 1 << 30, 1 << 30)])
+def test_the_daemon_from_its_start_to_its_end(tmp_path: Path, oom: Oom | None) -> None:
+    given: list[Mapping[str, str]] = []
+    children: list[engine.Child] = []
+
+    async def work() -> None:
+        bench = Bench(tmp_path, State.JOINING)
+        bench.nodes.ooms = {} if oom is None else {"": oom}
+
+        def start(added: Mapping[str, str]) -> engine.Child:
+            given.append(added)
+            child = engine.spawn("daemon", ["/bin/sh", "-c", "exit 3"], {}, tmp_path)
+            children.append(child)
+            return child
+
+        bench.dora.daemon = start
+        bench.actions[Do.START_DAEMON]()
+        bench.dora.joined.set()
+        on_line = bench.pipes.outputs["daemon"]
+        assert on_line is not None
+        on_line("node `a` unresponsive for 5322ms (timeout: 5s), killing")
+        async with asyncio.timeout(20):
+            while len(bench.heard) < 3:
+                await asyncio.sleep(0.005)
+        how = "exit code 3" if oom is None else oom.text
+        hung = life.NodeHung(0, "a", "unresponsive for 5322ms (timeout: 5s)")
+        assert bench.heard[0] == hung
+        assert life.DaemonConnected(0) in bench.heard
+        assert life.ChildExited(0, "daemon", how, oom) in bench.heard
+        assert given == [{"ADDED": "1"}]
+        children[0].close(asyncio.get_running_loop(), 5)
+        os.close(children[0].output)
+
+    asyncio.run(work())
+
+
+@pytest.mark.parametrize(
+    ("state", "silent", "wanted"),
+    [
+        (State.RUNNING, "", []),
+        (
+            State.RUNNING,
+            "daemon",
+            [life.ConnectionLost(0, "daemon", "the dora daemon does not answer any more")],
+        ),
+        (State.STOPPING, "daemon", []),
+    ],
+)
+def test_the_watchdog_looks_after_dora(
+    tmp_path: Path, state: State, silent: str, wanted: list[life.Event]
+) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path, state)
+        bench.dora.silent = silent
+        bench.dialogue.spawn("feed the watchdog", bench.dialogue.feed_watchdog(10))
+        await asyncio.sleep(15)
+        assert bench.heard == wanted
+        assert (("find silent", 15.0) in bench.calls) is (state is State.RUNNING)
+        bench.dialogue.cancel()
+
+    live(work)
+
+
+def test_what_is_still_asked_is_given_up(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        await bench.do(Do.ASK_SPAWN)
+        bench.dialogue.spawn("take samples", bench.dialogue.take_samples(5))
+        await settle()
+        bench.dialogue.cancel()
+        await settle()
+        assert len(asyncio.all_tasks()) == 2, "this one and its bound"
+        assert not bench.heard
+
+    live(work)

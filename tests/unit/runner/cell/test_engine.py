@@ -1,0 +1,282 @@
+"""Coordinator and daemon as the runner starts, asks and ends them: with a dora that is a script."""
+
+import asyncio
+import json
+import os
+import signal
+import stat
+from collections.abc import Callable, Coroutine
+from pathlib import Path
+from typing import Any
+
+import pytest
+from websockets.asyncio.server import ServerConnection, serve
+
+from dora_systemd.adapters.dora import engine
+from dora_systemd.decisions.dora.protocol import LogRecord
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.paths import CellPaths
+from dora_systemd.runner.cell.engine import Engine
+from tests.unit.fakes.loop import settle
+
+SCRIPT = """#!/bin/sh
+env > "$1.env"
+echo "$*" > "$1.arguments"
+pwd -P > "$1.directory"
+echo ready
+exec sleep 1000
+"""
+RUN = "run-1"
+
+
+class Bench:
+    """An engine in `root`, whose dora notes how it was started and waits for signals."""
+
+    def __init__(self, root: Path) -> None:
+        self.paths = CellPaths(root)
+        dora = root / "dora"
+        dora.write_text(SCRIPT)
+        dora.chmod(0o755)
+        for path in (self.paths.daemon, self.paths.work):
+            path.mkdir()
+        self.children: list[engine.Child] = []
+        self.engine = Engine(str(dora), self.paths, {"PATH": "/usr/bin:/bin", "MODEL": "yolo"})
+
+    def coordinator(self) -> engine.Child:
+        return self._ready(self.engine.start_coordinator())
+
+    def daemon(self, port: int = 4711) -> engine.Child:
+        self.paths.coordinator.mkdir(exist_ok=True)
+        (self.paths.coordinator / ".dora-token").write_text("secret\n")
+        self.engine.set_port(port)
+        return self._ready(self.engine.start_daemon({"ADDED": "1"}))
+
+    def _ready(self, child: engine.Child) -> engine.Child:
+        self.children.append(child)
+        assert os.read(child.output, 100) == b"ready\n"
+        return child
+
+    def end(self) -> None:
+        self.engine.kill()
+        for child in self.children:
+            os.close(child.output)
+            child.popen.wait(20)  # a slow machine takes longer than the runner waits
+
+
+def live(root: Path, work: Callable[[Bench], Coroutine[Any, Any, None]]) -> None:
+    async def bounded() -> None:
+        bench = Bench(root)
+        try:
+            await asyncio.wait_for(work(bench), 20)
+        finally:
+            bench.end()
+
+    asyncio.run(bounded())
+
+
+def environment(directory: Path, name: str) -> dict[str, str]:
+    lines = (directory / f"{name}.env").read_text().splitlines()
+    return dict(line.split("=", 1) for line in lines)
+
+
+def test_the_coordinator_writes_its_token_in_a_directory_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NOT_FOR_DORA", "1")
+
+    async def work(bench: Bench) -> None:
+        assert bench.coordinator().label == "coordinator"
+        place = bench.paths.coordinator
+        given = environment(place, "coordinator")
+        assert given["XDG_CONFIG_HOME"] == given["TMPDIR"] == str(place)
+        assert given["MODEL"] == "yolo"
+        assert "NOT_FOR_DORA" not in given
+        assert (place / "coordinator.directory").read_text().strip() == str(place.resolve())
+        assert stat.S_IMODE(place.stat().st_mode) == 0o700
+
+    live(tmp_path, work)
+
+
+def test_a_coordinator_that_boots_already_is_not_started_again(tmp_path: Path) -> None:
+    async def work(bench: Bench) -> None:
+        early = engine.spawn("coordinator", ["/bin/sleep", "1000"], {}, tmp_path)
+        os.close(early.output)
+        assert bench.engine.start_coordinator(early) is early
+        assert not bench.paths.coordinator.exists()
+        bench.engine.kill()
+        assert early.popen.wait(20) == -signal.SIGKILL
+
+    live(tmp_path, work)
+
+
+def test_the_daemon_is_told_its_coordinator_and_the_token(tmp_path: Path) -> None:
+    async def work(bench: Bench) -> None:
+        bench.daemon(4711)
+        given = environment(bench.paths.daemon, "daemon")
+        assert (given["DORA_AUTH_TOKEN"], given["ADDED"]) == ("secret", "1")
+        assert given["MODEL"] == "yolo"
+        words = (bench.paths.daemon / "daemon.arguments").read_text().split()
+        assert words[words.index("--coordinator-port") + 1] == "4711"
+        access = json.loads(bench.paths.control.read_text())
+        listen = int(words[words.index("--local-listen-port") + 1])
+        assert access == {"port": 4711, "token": "secret", "local_listen_port": listen}
+        assert stat.S_IMODE(bench.paths.control.stat().st_mode) == 0o600
+
+    live(tmp_path, work)
+
+
+def test_a_coordinator_without_a_token_is_an_error(tmp_path: Path) -> None:
+    async def work(bench: Bench) -> None:
+        with pytest.raises(FileNotFoundError):
+            bench.engine.set_port(4711)
+
+    live(tmp_path, work)
+
+
+async def exits(child: engine.Child) -> tuple[str, str]:
+    ended: asyncio.Future[tuple[str, str]] = asyncio.get_running_loop().create_future()
+    engine.watch(asyncio.get_running_loop(), child, lambda *how: ended.set_result(how))
+    return await ended
+
+
+def test_the_daemon_is_asked_to_end_in_good_order(tmp_path: Path) -> None:
+    async def work(bench: Bench) -> None:
+        assert not bench.engine.dismiss_daemon(), "there is none"
+        daemon = bench.daemon()
+        assert bench.engine.dismiss_daemon()
+        assert await exits(daemon) == ("daemon", "signal SIGINT")
+        assert not bench.engine.dismiss_daemon(), "it has left"
+
+    live(tmp_path, work)
+
+
+def test_what_is_left_of_the_two_is_killed_and_reaped(tmp_path: Path) -> None:
+    async def work(bench: Bench) -> None:
+        coordinator, daemon = bench.coordinator(), bench.daemon()
+        bench.engine.kill()
+        ends = [child.popen.wait(20) for child in (coordinator, daemon)]
+        assert ends == [-signal.SIGKILL] * 2
+        for child in (coordinator, daemon):
+            with pytest.raises(OSError, match="Bad file descriptor"):
+                os.fstat(child.pidfd)
+        bench.engine.kill()
+
+    live(tmp_path, work)
+
+
+class Coordinator:
+    """Speaks for dora's: each request gets the next of `answers`, and none waits for ever."""
+
+    def __init__(self) -> None:
+        self.answers: dict[str, list[Any]] = {}
+        self.asked: list[str] = []
+        self.events: list[str] = []
+        self.silent: set[str] = set()
+
+    async def talk(self, socket: ServerConnection) -> None:
+        async for text in socket:
+            frame = json.loads(text)
+            params = frame["params"]
+            name = params if isinstance(params, str) else next(iter(params))
+            self.asked.append(name)
+            if name not in self.silent:
+                result = self.answers[name].pop(0)
+                await socket.send(json.dumps({"id": frame["id"], "result": result}))
+            if name == "LogSubscribe":
+                for message in self.events:
+                    payload = {"target": "daemon", "node_id": "a", "message": message}
+                    await socket.send(json.dumps({"event": "log", "payload": payload}))
+                return
+
+
+def with_coordinator(
+    root: Path, dora: Coordinator, work: Callable[[Engine], Coroutine[Any, Any, None]]
+) -> None:
+    async def both(bench: Bench) -> None:
+        async with serve(dora.talk, "127.0.0.1", 0) as server:
+            bench.daemon(next(iter(server.sockets)).getsockname()[1])
+            await work(bench.engine)
+            bench.engine.kill()
+
+    live(root, both)
+
+
+def test_the_daemon_is_waited_for(tmp_path: Path) -> None:
+    dora = Coordinator()
+    dora.answers["DaemonConnected"] = [{"DaemonConnected": one} for one in (False, False, True)]
+
+    async def work(engine: Engine) -> None:
+        await engine.wait_joined()
+        assert dora.asked == ["DaemonConnected"] * 3
+
+    with_coordinator(tmp_path, dora, work)
+
+
+@pytest.mark.parametrize(("age", "silent"), [(19_000, ""), (21_000, "daemon"), (None, "")])
+def test_a_daemon_that_was_not_heard_of_hangs(tmp_path: Path, age: int | None, silent: str) -> None:
+    dora = Coordinator()
+    dora.answers = {
+        "DaemonConnected": [{"DaemonConnected": True}],
+        "ConnectedMachines": [{"ConnectedDaemons": [{"last_heartbeat_ago_ms": age}]}],
+    }
+
+    async def work(engine: Engine) -> None:
+        await engine.wait_joined()
+        assert await engine.find_silent(10) == silent
+
+    with_coordinator(tmp_path, dora, work)
+
+
+def test_a_coordinator_that_does_not_answer_hangs(tmp_path: Path) -> None:
+    dora = Coordinator()
+    dora.answers["DaemonConnected"] = [{"DaemonConnected": True}]
+    dora.silent = {"ConnectedMachines"}
+
+    async def work(engine: Engine) -> None:
+        await engine.wait_joined()
+        assert await engine.find_silent(0.01) == "coordinator"
+
+    with_coordinator(tmp_path, dora, work)
+
+
+def test_a_run_and_its_events(tmp_path: Path) -> None:
+    dora = Coordinator()
+    dora.answers = {
+        "DaemonConnected": [{"DaemonConnected": True}],
+        "Start": [{"DataflowStartTriggered": {"uuid": RUN}}, {"Error": "no such node"}],
+        "LogSubscribe": [{"subscribed": True}, {"Error": "unknown run"}],
+    }
+    dora.events = ["node is ready", "hello"]
+    heard: list[LogRecord | None] = []
+
+    async def work(engine: Engine) -> None:
+        await engine.wait_joined()
+        assert await engine.start_run({"nodes": []}, "robot") == RUN
+        with pytest.raises(DoraSystemdError, match="no such node"):
+            await engine.start_run({"nodes": []}, "robot")
+        await engine.read_events(RUN, lambda: heard.append(None), heard.append)
+        first, *records = heard
+        assert first is None, "it is told that it has begun, before anything comes"
+        assert [one.message for one in records if one] == ["node is ready", "hello"]
+        with pytest.raises(DoraSystemdError, match="cannot read events of dora: unknown run"):
+            await engine.read_events(RUN, lambda: None, heard.append)
+
+    with_coordinator(tmp_path, dora, work)
+
+
+def test_a_long_request_does_not_keep_the_others(tmp_path: Path) -> None:
+    dora = Coordinator()
+    dora.answers["DaemonConnected"] = [{"DaemonConnected": True}] * 2
+    dora.silent = {"WaitForSpawn"}
+
+    async def work(engine: Engine) -> None:
+        await engine.wait_joined()
+        long = asyncio.create_task(engine.ask_apart({"WaitForSpawn": {}}, 3600))
+        while "WaitForSpawn" not in dora.asked:
+            await asyncio.sleep(0.001)
+        assert await engine.is_joined()
+        assert not long.done()
+        long.cancel()
+        await settle()
+
+    with_coordinator(tmp_path, dora, work)

@@ -1,0 +1,92 @@
+"""What dora tells of the nodes, and what is done about it before it becomes an event."""
+
+import asyncio
+from pathlib import Path
+
+from dora_systemd.decisions.dora.protocol import LogRecord
+from dora_systemd.decisions.life import events as life
+from dora_systemd.decisions.life.states import Do
+from dora_systemd.decisions.resources.oom import Oom, Owner
+from tests.unit.fakes.dialogue import Bench
+from tests.unit.fakes.loop import live
+from tests.unit.fakes.run import Calls
+
+
+def test_a_subscription_and_its_end(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        assert await bench.do(Do.SUBSCRIBE) == [life.Subscribed(0)]
+        assert ("subscribe", "run") in bench.calls
+        bench.dora.closed.set()
+        await asyncio.sleep(1)
+        assert bench.heard == [life.Subscribed(0), life.ConnectionLost(0)]
+
+    live(work)
+
+
+async def hear(bench: Bench, message: str, node: str = "a") -> Calls:
+    """What is done about a line of dora's about a node."""
+    await bench.do(Do.SUBSCRIBE)
+    bench.calls.clear()
+    bench.pump.heard.clear()
+    assert bench.dora.hear is not None
+    bench.dora.hear(LogRecord("INFO", "daemon", node, message))
+    return bench.calls
+
+
+EXITED = "handling node stop with exit status ExitCode(1) (restart: {}"
+
+
+def test_a_node_that_was_executed(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        done = await hear(bench, "spawned node with pid 8")
+        assert done == [("adopt", "a", 8), ("push", "NodeSpawned")]
+
+    live(work)
+
+
+def test_what_a_crashed_node_has_left_goes_before_the_next_one(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        done = await hear(bench, EXITED.format("true"))
+        assert done == [("clear", "a", 7), ("push", "NodeExited"), ("forget", "a")]
+        assert bench.heard == [life.NodeExited(0, "a", "exit code 1", True)]
+
+    live(work)
+
+
+def test_what_a_node_has_left_for_good_is_not_touched(tmp_path: Path) -> None:
+    async def work() -> None:
+        done = await hear(Bench(tmp_path), EXITED.format("false"))
+        assert done == [("push", "NodeExited"), ("forget", "a")]
+
+    live(work)
+
+
+def test_the_end_of_a_node_that_has_been_replaced(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        bench.nodes.living = {("a", 7)}
+        assert await hear(bench, EXITED.format("true")) == [("push", "NodeExited")]
+        assert bench.heard == [life.NodeExited(0, "a", "exit code 1", True, is_stale=True)]
+
+    live(work)
+
+
+def test_a_node_that_used_up_its_memory(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench, oom = Bench(tmp_path), Oom(Owner.NODE, 1 << 30, 1 << 30)
+        bench.nodes.ooms = {"a": oom}
+        await hear(bench, EXITED.format("false"))
+        assert bench.heard == [life.NodeExited(0, "a", oom.text, False, oom=oom)]
+
+    live(work)
+
+
+def test_a_line_that_means_nothing(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        assert await hear(bench, "hello") == []
+
+    live(work)

@@ -1,0 +1,204 @@
+"""One reload of single nodes: its steps, what dora is asked in which order, and the way back."""
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dora_systemd.adapters.dora.preparation import Prepared
+from dora_systemd.decisions.cell.status import HELD, NodeStatus
+from dora_systemd.decisions.life.states import State
+from dora_systemd.decisions.reload.steps import How
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.runner.reload.swap import NotReady
+from tests.unit.fakes.loop import live
+from tests.unit.fakes.reload import RUNNING
+from tests.unit.fakes.reload import ReloadBench as Bench
+
+STEPS = [
+    (How.SWAP, "a", [("RestartNode", "a"), ("ReplaceNode", "a")]),
+    (How.REWIRE, "a", [("RemoveNode", "a"), ("AddNode", "a")]),
+    (How.REMOVE, "a", [("RemoveNode", "a")]),
+    (How.ADD, "c", [("AddNode", "c")]),
+]
+
+
+@pytest.mark.parametrize(("how", "node", "asked"), STEPS)
+def test_what_dora_is_asked_for_a_step(
+    tmp_path: Path, how: How, node: str, asked: list[Any]
+) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        await bench.applier((how, node)).apply()
+        assert bench.asked == asked
+        assert (node in bench.states()) is (how is not How.REMOVE)
+        assert bench.pipes.events[-1][0] == "node-reloaded"
+
+    live(work)
+
+
+def test_one_step_follows_the_other(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        applier = bench.applier((How.REMOVE, "a"), (How.SWAP, "b"), (How.ADD, "c"))
+        await applier.apply()
+        assert [node for _, node in bench.asked] == ["a", "b", "b", "c"]
+        marks = [call for call in bench.calls if call[0] in ("begin", "end")]
+        assert marks == [(mark, node) for node in "abc" for mark in ("begin", "end")]
+        assert applier.done[0] == "the node a was removed: a.py"
+        assert applier.done[1].startswith("the node b was reloaded: b.py, ready after ")
+
+    live(work)
+
+
+def test_a_new_node_has_its_room_before_dora_starts_it(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        await bench.applier((How.ADD, "c")).apply()
+        room, ask = bench.calls.index(("make room", "c")), ("ask", "AddNode", "c")
+        assert room < bench.calls.index(ask)
+
+    live(work)
+
+
+def test_the_room_of_a_node_goes_when_it_has_ended(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        bench.dora.then["RemoveNode"] = lambda: asyncio.get_running_loop().call_later(1, bench.end)
+        await bench.applier((How.REMOVE, "a")).apply()
+        room = bench.calls.index(("take room", "a"))
+        assert room > bench.calls.index(("drain", "a")), "its last words were read"
+
+    live(work)
+
+
+@pytest.mark.parametrize(
+    "old",
+    [
+        NodeStatus("running", 7, policy="never"),
+        NodeStatus("running", 7, policy="always", restarts=3, max_restarts=3),
+        NodeStatus("failed", 0, policy=HELD),
+    ],
+)
+def test_what_dora_would_not_start_again_is_replaced_only(tmp_path: Path, old: NodeStatus) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path, a=old)
+        await bench.applier((How.SWAP, "a")).apply()
+        assert bench.asked == [("ReplaceNode", "a")]
+
+    live(work)
+
+
+def test_an_operator_reads_its_file_again(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        files = {"a": {"one": f"{tmp_path}/a.py", "two": "/other.py"}}
+        await bench.applier((How.OPERATOR, "a"), operators=files).apply()
+        assert bench.dora.asked == [
+            {"Reload": {"dataflow_id": "run", "node_id": "a", "operator_id": "one"}}
+        ]
+
+    live(work)
+
+
+@pytest.mark.parametrize(
+    ("then", "words"),
+    [("crash", "node a: exit code 1"), ("wait", "node a: not ready within 30s")],
+)
+def test_a_node_that_does_not_get_ready(tmp_path: Path, then: str, words: str) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        bench.dora.then["ReplaceNode"] = bench.crash if then == "crash" else lambda: None
+        applier = bench.applier((How.SWAP, "a"), (How.SWAP, "b"))
+        began = asyncio.get_running_loop().time()
+        with pytest.raises(NotReady) as caught:
+            await applier.apply()
+        assert str(caught.value) == words
+        assert applier.done == []
+        assert "b" not in {node for _, node in bench.asked}, "nothing follows"
+        waited = asyncio.get_running_loop().time() - began
+        assert round(waited) == (0 if then == "crash" else 30)
+
+    live(work)
+
+
+def test_what_dora_refuses_is_told(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        bench.dora.refuses = {"AddNode": "no room\n\nLocation: x"}
+        with pytest.raises(DoraSystemdError, match=r"^cannot do that in dora: no room$"):
+            await bench.applier((How.ADD, "c")).apply()
+
+    live(work)
+
+
+def test_the_way_back_begins_with_the_last_step(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        applier = bench.applier((How.REMOVE, "a"), (How.SWAP, "b"), (How.ADD, "c"))
+        bench.dora.then["AddNode"] = bench.crash
+        with pytest.raises(NotReady):
+            await applier.apply()
+        bench.calls.clear()
+        bench.dora.then["AddNode"] = bench.spawn
+        await applier.undo(bench.prepared)
+        assert bench.asked == [
+            ("RemoveNode", "c"),
+            ("ReplaceNode", "b"),
+            ("AddNode", "a"),
+        ]
+        assert bench.states() == {"a": "running", "b": "running"}
+
+    live(work)
+
+
+def test_the_way_back_goes_on_over_a_node_that_is_not_ready(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        applier = bench.applier((How.REMOVE, "a"), (How.SWAP, "b"))
+        bench.dora.then["ReplaceNode"] = bench.crash
+        with pytest.raises(NotReady):
+            await applier.apply()
+        await applier.undo(bench.prepared)
+        assert bench.asked[-1] == ("AddNode", "a")
+
+    live(work)
+
+
+@pytest.mark.parametrize(
+    ("state", "old", "reason"),
+    [
+        (State.RUNNING, RUNNING, ""),
+        (State.WAITING, RUNNING, "not all nodes were ready"),
+        (State.RUNNING, NodeStatus("finished"), "the node a had ended"),
+        (State.RUNNING, NodeStatus("failed"), "the node a had ended"),
+        (State.RUNNING, NodeStatus("failed", policy=HELD), ""),
+    ],
+)
+def test_what_dora_cannot_change_now(
+    tmp_path: Path, state: State, old: NodeStatus, reason: str
+) -> None:
+    async def work() -> None:
+        assert Bench(tmp_path, state, a=old).applier((How.SWAP, "a")).obstacle() == reason
+
+    live(work)
+
+
+def test_the_descriptor_that_is_sent_is_the_new_one(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        await bench.applier((How.SWAP, "a")).apply()
+        assert _sent(bench) == _definition(bench.prepared, "a")
+
+    live(work)
+
+
+def _sent(bench: Bench) -> Any:
+    params = bench.dora.asked[-1]
+    assert not isinstance(params, str)
+    return params["ReplaceNode"]["node"]
+
+
+def _definition(prepared: Prepared, node: str) -> Any:
+    return next(one for one in prepared.descriptor["nodes"] if one["id"] == node)
