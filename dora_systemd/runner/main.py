@@ -234,6 +234,7 @@ def listen(options: RunnerOptions, pump: Pump, dialogue: Dialogue, clock: StopCl
     if "WATCHDOG_USEC" in os.environ:
         seconds = int(os.environ["WATCHDOG_USEC"]) / 1_000_000 / 3
         dialogue.spawn("feed the watchdog", dialogue.feed_watchdog(seconds))
+        dialogue.spawn("watch dora", dialogue.watch_dora(seconds))
     timeout = options.start_timeout
     if pump.cell.is_trial:
         timeout = min(timeout, round(READY_SECONDS * SECOND))

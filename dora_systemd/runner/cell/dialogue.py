@@ -187,9 +187,19 @@ class Dialogue:
             self._pump.push(life.ChildExited(now_us(), "daemon", "earlier"))
 
     async def feed_watchdog(self, seconds: float) -> None:
-        """Every `seconds`: WATCHDOG=1, and see that neither coordinator nor daemon hangs.
+        """Send WATCHDOG=1 every `seconds`, and wait for nothing in between.
 
-        While it stops, systemd's TimeoutStopSec= is what bounds it.
+        On a machine without time to spare dora takes long to answer, and the watchdog is about this
+        process alone.
+        """
+        while True:
+            await asyncio.sleep(seconds)
+            notify.send_alive()
+
+    async def watch_dora(self, seconds: float) -> None:
+        """See every `seconds` that neither coordinator nor daemon hangs.
+
+        While the cell stops, TimeoutStopSec= bounds it.
         """
         while True:
             await asyncio.sleep(seconds)
@@ -198,7 +208,6 @@ class Dialogue:
                 if silent and self._pump.cell.state is State.RUNNING:
                     reason = f"the dora {silent} does not answer any more"
                     self._pump.push(life.ConnectionLost(now_us(), silent, reason))
-            notify.send_alive()
 
     async def take_samples(self, seconds: float) -> None:
         """Every `seconds`: CPU time used so far."""

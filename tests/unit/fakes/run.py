@@ -146,6 +146,7 @@ class FakeDora:
         self.closed, self.joined = asyncio.Event(), asyncio.Event()
         self.port = 0
         self.silent = ""
+        self.hangs = False
         self.has_daemon = True
         self.daemon: Callable[[Mapping[str, str]], Child] | None = None
 
@@ -161,6 +162,8 @@ class FakeDora:
 
     async def find_silent(self, seconds: float) -> str:
         self.calls.append(("find silent", seconds))
+        if self.hangs:
+            await asyncio.Event().wait()
         return self.silent
 
     async def ask(self, params: Params) -> Reply:

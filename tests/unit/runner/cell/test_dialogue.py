@@ -15,6 +15,7 @@ from dora_systemd.decisions.life.states import Do, RunnerExit, State
 from dora_systemd.decisions.resources.oom import Oom, Owner
 from dora_systemd.errors import DoraSystemdError
 from tests.unit.fakes.dialogue import DESCRIPTOR, Bench
+from tests.unit.fakes.libraries import hear_notifications
 from tests.unit.fakes.loop import live, settle
 
 ENDED = {"DataflowStopped": {"result": {"node_results": {"a": {"Ok": None}}}}}
@@ -236,16 +237,33 @@ def test_the_daemon_from_its_start_to_its_end(tmp_path: Path, oom: Oom | None) -
         (State.STOPPING, "daemon", []),
     ],
 )
-def test_the_watchdog_looks_after_dora(
+def test_dora_is_watched(
     tmp_path: Path, state: State, silent: str, wanted: list[life.Event]
 ) -> None:
     async def work() -> None:
         bench = Bench(tmp_path, state)
         bench.dora.silent = silent
-        bench.dialogue.spawn("feed the watchdog", bench.dialogue.feed_watchdog(10))
+        bench.dialogue.spawn("watch dora", bench.dialogue.watch_dora(10))
         await asyncio.sleep(15)
         assert bench.heard == wanted
         assert (("find silent", 15.0) in bench.calls) is (state is State.RUNNING)
+        bench.dialogue.cancel()
+
+    live(work)
+
+
+def test_the_watchdog_is_fed_while_dora_takes_its_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = hear_notifications(monkeypatch)
+
+    async def work() -> None:
+        bench = Bench(tmp_path, State.RUNNING)
+        bench.dora.hangs = True
+        bench.dialogue.spawn("feed the watchdog", bench.dialogue.feed_watchdog(10))
+        bench.dialogue.spawn("watch dora", bench.dialogue.watch_dora(10))
+        await asyncio.sleep(35)
+        assert told.count("WATCHDOG=1") == 3
         bench.dialogue.cancel()
 
     live(work)
