@@ -9,7 +9,7 @@ from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
 from dora_systemd.decisions.gateway.page_messages import PageMessage, graph_values
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
-from dora_systemd.trust.paths import read_file
+from dora_systemd.trust.files import read_file
 from dora_systemd.verbs.facts.cells import Cell, find_cell
 from dora_systemd.verbs.facts.list import read_status
 from dora_systemd.verbs.node import ask_coordinator, restart_node, stop_node

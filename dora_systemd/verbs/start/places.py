@@ -21,7 +21,7 @@ from dora_systemd.decisions.settings.kinds import Setting
 from dora_systemd.decisions.settings.resolve import Settings
 from dora_systemd.decisions.settings.table import DORA, VENV, WORKING_DIRECTORY
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.trust.paths import unreadable
+from dora_systemd.trust.files import unreadable
 from dora_systemd.trust.sight import OwnSight, Sight, cannot_reach
 
 _OWN = OwnSight()
