@@ -126,12 +126,12 @@ def exists(path: str | Path) -> bool:
         return False
 
 
-def user_name(uid: int) -> str:
-    """The name of a uid, or its number where it has none."""
+def user_name(uid: int, nameless: str = "uid ") -> str:
+    """The name of a uid; where it has none its number, behind `nameless`."""
     try:
         return pwd.getpwuid(uid).pw_name
     except (KeyError, OverflowError):
-        return f"uid {uid}"
+        return f"{nameless}{uid}"
 
 
 class _Walk:

@@ -1,12 +1,12 @@
 """Who asks for the end of a dataflow: systemd notes that it was asked, and not by whom."""
 
 import os
-import pwd
 from collections.abc import Iterable, Mapping
 
 from dora_systemd.adapters.journal.note import send_note
 from dora_systemd.decisions.logs.events import event_fields
 from dora_systemd.decisions.logs.fields import encode_entry
+from dora_systemd.trust.paths import user_name
 from dora_systemd.verbs.facts.cells import Cell
 
 
@@ -22,9 +22,6 @@ def note_stop(cells: Iterable[Cell], command: str = "doractl stop") -> None:
 
 def caller(uid: int, environ: Mapping[str, str]) -> str:
     """A user's name; root by sudo(8) is told with the one who called it."""
-    try:
-        name = pwd.getpwuid(uid).pw_name
-    except KeyError:
-        name = f"the user {uid}"
+    name = user_name(uid, nameless="the user ")
     behind = environ.get("SUDO_USER", "")
     return f"{name}, by sudo of {behind}" if uid == 0 and behind not in ("", "root") else name

@@ -6,7 +6,7 @@ from pathlib import Path
 from dora_systemd.adapters.cgroup.groups import read_number, read_numbers, read_text
 from dora_systemd.decisions.resources.oom import OomCounts
 from dora_systemd.decisions.resources.pressure import Load
-from dora_systemd.decisions.resources.usage import UNLIMITED
+from dora_systemd.values import INFINITY
 
 
 def read_oom(path: Path) -> OomCounts:
@@ -23,8 +23,8 @@ def read_load(path: Path) -> Load:
     What counts is what the kernel cannot drop: it fills every group up with files it has read.
     """
     limits = [read_number(path / name) for name in ("memory.max", "memory.high")]
-    limit = min((one for one in limits if one is not None), default=UNLIMITED)
-    if limit == UNLIMITED:
+    limit = min((one for one in limits if one is not None), default=INFINITY)
+    if limit == INFINITY:
         return Load()
     stat = read_numbers(path / "memory.stat")
     return Load(stat.get("anon", 0) + stat.get("shmem", 0), limit, _read_stalled(path))
