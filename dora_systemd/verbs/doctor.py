@@ -10,14 +10,14 @@ from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import DOWN, Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
-from dora_systemd.adapters.host.files import read_yaml
-from dora_systemd.adapters.host.process import (
+from dora_systemd.adapters.dora.command import (
     RECOMMENDED_DORA,
     dora_version,
     find_dora,
-    run_command,
     version_numbers,
 )
+from dora_systemd.adapters.host.files import read_yaml
+from dora_systemd.adapters.host.process import run_command
 from dora_systemd.adapters.host.process_table import (
     read_processes,
     socket_owners,
@@ -40,8 +40,8 @@ from dora_systemd.names import unit_name
 from dora_systemd.scope import RUNTIME_NAME, Scope
 from dora_systemd.trust.paths import exists
 from dora_systemd.trust.socket_table import listening_sockets
+from dora_systemd.verbs.facts.cells import slice_group
 from dora_systemd.verbs.facts.enabled import enabled_units, own_directories
-from dora_systemd.verbs.facts.slice import slice_group
 from dora_systemd.verbs.gateway import read_gateway
 from dora_systemd.verbs.start.account import DEFAULT_USER
 from dora_systemd.verbs.start.enable import boot_target

@@ -13,8 +13,7 @@ from dora_systemd.trust.files import read_file
 from dora_systemd.verbs.facts.cells import Cell, find_cell
 from dora_systemd.verbs.facts.list import read_status
 from dora_systemd.verbs.node import ask_coordinator, restart_node, stop_node
-from dora_systemd.verbs.stop import restart_cells, stop_cells
-from dora_systemd.verbs.stop_note import note_stop
+from dora_systemd.verbs.stop import note_stop, restart_cells, stop_cells
 
 _BY = "status page"
 

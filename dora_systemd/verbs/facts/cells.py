@@ -1,12 +1,15 @@
 """The dataflows of one systemd manager, and the selectors that name them."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from dora_systemd.adapters.bus.manager import UP, Manager, UnitState
+from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.decisions.cell.options import RunnerOptions, options_from_command
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import (
+    SLICE,
     UNIT_PREFIX,
     UNIT_SUFFIX,
     is_uuid_prefix,
@@ -60,6 +63,11 @@ def read_cell(manager: Manager, unit: str) -> Cell | None:
         return None
     found = UnitState(unit, state["LoadState"], state["ActiveState"], state["SubState"])
     return _cell(manager, found)
+
+
+def slice_group(manager: Manager) -> Path:
+    """The directory of dora.slice, below which units are unless a property puts them elsewhere."""
+    return cgroup.group_path(manager.control_group()) / SLICE
 
 
 def find_cell(manager: Manager, selector: str) -> Cell:

@@ -25,9 +25,14 @@ from dora_systemd.scope import Scope
 from dora_systemd.trust.cells import read_table
 from dora_systemd.values import INFINITY, SECOND
 from dora_systemd.verbs.facts.budget import restart_budget
-from dora_systemd.verbs.facts.cells import Cell, matching_cells, read_cells, select_cell
+from dora_systemd.verbs.facts.cells import (
+    Cell,
+    matching_cells,
+    read_cells,
+    select_cell,
+    slice_group,
+)
 from dora_systemd.verbs.facts.enabled import enabled_units
-from dora_systemd.verbs.facts.slice import slice_group
 
 _UP_SINCE = "ActiveEnterTimestampMonotonic"
 _STARTED = "InactiveExitTimestampMonotonic"

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from dora_systemd.adapters.bus.manager import JOB_DONE, ON_THE_WAY, Manager, Observer, Property
-from dora_systemd.adapters.host.process import version_numbers
+from dora_systemd.adapters.dora.command import version_numbers
 from dora_systemd.decisions.life.refusal import FAILED
 from dora_systemd.decisions.unit.versions import MIN_VERSION, transient_commands
 from dora_systemd.errors import DoraSystemdError, ExitCode

@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from dora_systemd.adapters.dora.command import find_dora
 from dora_systemd.adapters.host.files import decoded, parse_yaml
-from dora_systemd.adapters.host.process import find_dora
 from dora_systemd.decisions.descriptor.build_session import (
     BuildSession,
     parse_session,
