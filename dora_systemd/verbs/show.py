@@ -3,11 +3,9 @@
 from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import Manager
-from dora_systemd.decisions.unit.file import persistent_unit, plain_target
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
-from dora_systemd.verbs.start.enable import refuse_attached
 
 _PROPERTIES = ("FragmentPath", "DropInPaths")
 
@@ -32,6 +30,10 @@ def export_cell(manager: Manager, scope: Scope, cell: Cell) -> str:
 
     Raises DoraSystemdError.
     """
+    # What starting and enabling need is nothing to wait for in `show`.
+    from dora_systemd.decisions.unit.file import persistent_unit, plain_target
+    from dora_systemd.verbs.start.enable import refuse_attached
+
     refuse_attached(cell)
     texts = list(unit_files(manager, cell).values())
     return persistent_unit(texts, cell.options, scope.is_user, plain_target(scope.is_user))
