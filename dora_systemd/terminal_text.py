@@ -33,6 +33,14 @@ def one_line(text: str) -> str:
     return escaped(text.replace("\n", " ").replace("\t", " "))
 
 
+def short_line(text: str, most: int) -> str:
+    """Words of somebody else within a message: one line without needless blanks, `most` bytes."""
+    line = " ".join(one_line(text).split())
+    if len(line.encode()) <= most:
+        return line
+    return f"{line.encode()[: most - 3].decode(errors='ignore')}..."
+
+
 def without_sequences(text: str) -> str:
     """`text` without colours and other whole sequences: for who shows none."""
     return _SEQUENCES.sub("", text)

@@ -154,7 +154,7 @@ def unit_group() -> Path:
 def out_of_memory(unit: Path) -> str:
     """What there is to say if the kernel has killed the runner for want of memory, else ""."""
     from dora_systemd.adapters.cgroup import groups as cgroup
-    from dora_systemd.adapters.cgroup.memory import read_oom
+    from dora_systemd.adapters.cgroup.strain import read_oom
     from dora_systemd.decisions.resources.oom import largest
     from dora_systemd.values import format_rounded_size
 

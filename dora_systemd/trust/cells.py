@@ -9,7 +9,7 @@ from pathlib import Path
 from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.paths import CellPaths
-from dora_systemd.trust.paths import read_file
+from dora_systemd.trust.files import read_file
 from dora_systemd.values import shown
 
 MAX_TABLE = 2 * 1024 * 1024

@@ -26,24 +26,9 @@ from typing import NamedTuple
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import shown
 
-MAX_BYTES = 1024 * 1024
-"""Bytes of a file that we read: dora takes no descriptor above 1 MiB."""
-
 _MAX_LINKS = 40
 _STEP = os.O_PATH | os.O_NOFOLLOW | os.O_CLOEXEC
-# O_NONBLOCK: opening a FIFO would wait for a writer. O_NOCTTY: nor become our terminal.
-_READ = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
 _OTHERS_WRITE = stat.S_IWOTH
-_NO_FILE = "there is no such file"
-_REASONS = {
-    errno.ENOENT: (_NO_FILE, "correct the path"),
-    errno.ENOTDIR: (_NO_FILE, "correct the path"),
-    errno.ELOOP: ("its symbolic links form a loop", "correct the path"),
-    errno.ENAMETOOLONG: ("its name is too long", "correct the path"),
-    errno.ENXIO: ("it is not a regular file", "give a file"),
-    errno.EACCES: ("permission denied", "let the calling user read it"),
-    errno.EPERM: ("permission denied", "let the calling user read it"),
-}
 
 
 class Place(NamedTuple):
@@ -78,13 +63,6 @@ class Place(NamedTuple):
         if self.shared:
             return f"users other than its owner can write to {shown(self.shared)}"
         return ""
-
-
-class Text(NamedTuple):
-    """A file that was read, and the place of the descriptor that it was read from."""
-
-    data: bytes
-    place: Place
 
 
 @contextlib.contextmanager
@@ -123,27 +101,6 @@ def firm_part(path: str | Path, uid: int = 0, groups: Collection[int] = ()) -> s
     return firm
 
 
-def read_file(path: str | Path, max_bytes: int = MAX_BYTES) -> Text:
-    """The regular file at the absolute `path`, at most `max_bytes`.
-
-    Raises DoraSystemdError (BAD_INPUT) when there is no such file, it is anything but a regular
-    file, too large or unreadable, or behind a link that is not root's.
-    """
-    try:
-        with reached(path) as (found, place):
-            _check_regular(path, place)
-            # The same file again, now to be read: see proc_pid_fd(5).
-            fd = os.open(f"/proc/self/fd/{found}", _READ & ~os.O_NOFOLLOW)
-            with os.fdopen(fd, "rb") as file:
-                data = file.read(max_bytes + 1)
-    except (OSError, ValueError) as error:
-        raise unreadable(path, error) from error
-    if len(data) > max_bytes:
-        hint = "give a smaller file"
-        raise _refusal(path, f"it is larger than {max_bytes // 1024} KiB", hint)
-    return Text(data, place)
-
-
 def list_directory(path: str | Path, most: int) -> list[str]:
     """At most `most` of the names in the directory `path`, in order.
 
@@ -169,19 +126,12 @@ def exists(path: str | Path) -> bool:
         return False
 
 
-def unreadable(path: str | Path, error: OSError | ValueError) -> DoraSystemdError:
-    """The error for a file that cannot be read."""
-    known = _REASONS.get(getattr(error, "errno", 0) or 0)
-    reason, hint = known or (str(getattr(error, "strerror", None) or error), "")
-    return _refusal(path, reason, hint)
-
-
-def user_name(uid: int) -> str:
-    """The name of a uid, or its number where it has none."""
+def user_name(uid: int, nameless: str = "uid ") -> str:
+    """The name of a uid; where it has none its number, behind `nameless`."""
     try:
         return pwd.getpwuid(uid).pw_name
     except (KeyError, OverflowError):
-        return f"uid {uid}"
+        return f"{nameless}{uid}"
 
 
 class _Walk:
@@ -248,7 +198,7 @@ class _Walk:
             raise OSError(errno.ELOOP, os.strerror(errno.ELOOP))
         if self._cautious and (self._owners | {status.st_uid} != {0} or self._sharing()):
             reason = f"{shown(link)} is a symbolic link that users other than root can change"
-            raise _refusal(link, reason, "give the path that it leads to")
+            raise refusal(link, reason, "give the path that it leads to")
         target = os.readlink(name, dir_fd=self.fd)
         if target.startswith("/"):
             self._begin()
@@ -280,12 +230,6 @@ def _parts(path: str) -> list[str]:
     return [part for part in path.split("/") if part not in ("", ".")]
 
 
-def _check_regular(path: str | Path, place: Place) -> None:
-    if stat.S_ISDIR(place.mode):
-        raise _refusal(path, "it is a directory", "give the file in it")
-    if not stat.S_ISREG(place.mode):
-        raise _refusal(path, "it is not a regular file", "give a file")
-
-
-def _refusal(path: str | Path, reason: str, hint: str) -> DoraSystemdError:
+def refusal(path: str | Path, reason: str, hint: str) -> DoraSystemdError:
+    """The error for a file that is not read."""
     return DoraSystemdError(f"cannot read {shown(str(path))}: {reason}", hint, ExitCode.BAD_INPUT)

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Protocol
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.trust.paths import MAX_BYTES
+from dora_systemd.trust.files import MAX_BYTES
 from dora_systemd.trust.programs import Account, spawn
 from dora_systemd.values import shown
 

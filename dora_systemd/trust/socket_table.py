@@ -105,22 +105,26 @@ def read_owner(peer: Address, own: Address, tables: tuple[Path, ...] = TABLES) -
 
 def listener_uids(port: int, tables: tuple[Path, ...] = TABLES) -> frozenset[int]:
     """The users who listen on a TCP port, whatever the address."""
-    ending = b":%04X" % port
-    return frozenset(
-        int(fields[7])
-        for fields in _lines(tables, ending)
-        if fields[3] == _LISTENING and fields[1].endswith(ending)
-    )
+    return frozenset(int(fields[7]) for fields in _listeners(port, tables))
+
+
+def listening_sockets(port: int, tables: tuple[Path, ...] = TABLES) -> frozenset[int]:
+    """Inodes of the sockets that listen on a TCP port, whatever the address."""
+    return frozenset(int(fields[9]) for fields in _listeners(port, tables))
 
 
 def loopback_listeners(port: int, tables: tuple[Path, ...] = TABLES) -> frozenset[int]:
     """The users who get the connections to a TCP port of 127.0.0.1."""
     ends = {_entry((address, port)) for address in _REACHED}
-    return frozenset(
-        int(fields[7])
-        for fields in _lines(tables, b":%04X" % port)
-        if fields[3] == _LISTENING and fields[1] in ends
-    )
+    found = (fields for fields in _listeners(port, tables) if fields[1] in ends)
+    return frozenset(int(fields[7]) for fields in found)
+
+
+def _listeners(port: int, tables: tuple[Path, ...]) -> Iterator[list[bytes]]:
+    ending = b":%04X" % port
+    for fields in _lines(tables, ending):
+        if fields[3] == _LISTENING and fields[1].endswith(ending):
+            yield fields
 
 
 def _ask_kernel(peer: Address, own: Address) -> Owner:

@@ -16,6 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.terminal_text import short_line
 from dora_systemd.trust.paths import reached, user_name
 from dora_systemd.trust.socket_table import loopback_listeners
 from dora_systemd.values import shown
@@ -81,9 +82,8 @@ def require_listener(
 
 
 def plain(text: str) -> str:
-    """`text` of the other end for a terminal: one line, and what is no character escaped."""
-    cut = text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}..."
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in cut)
+    """`text` of the other end for a message."""
+    return short_line(text, _MAX_SHOWN)
 
 
 def _check_owner(path: Path, found: int, expected: int) -> None:

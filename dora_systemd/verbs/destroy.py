@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.bus.manager import DOWN, Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.host.process_table import read_processes
 from dora_systemd.adapters.host.unit_files import read_unit_file, remove_empty, remove_unit_file
@@ -19,7 +19,7 @@ from dora_systemd.decisions.unit.file import BOOT_TARGET
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import SLICE, name_from_unit
 from dora_systemd.scope import Scope
-from dora_systemd.values import SECOND
+from dora_systemd.values import INFINITY, SECOND
 from dora_systemd.verbs.facts.cells import Cell, read_cell, read_cells
 from dora_systemd.verbs.facts.reason import failure_reason
 from dora_systemd.verbs.facts.slice import slice_group
@@ -35,8 +35,6 @@ _POLL_SECONDS = 0.05
 _ROUNDS = 5
 """So often do we look for dataflows that somebody starts meanwhile."""
 
-_INFINITY = 2**64 - 1
-_DOWN = ("inactive", "failed")
 _GATEWAY = (SOCKET_UNIT, SERVICE_UNIT)
 
 
@@ -84,7 +82,7 @@ def stop_all(
 
 def stop_gateway(manager: Manager, scope: Scope) -> bool:
     """Close the port and take away what `up` has written; whether it was open."""
-    up = [unit for unit in _GATEWAY if _state(manager, unit) not in _DOWN]
+    up = [unit for unit in _GATEWAY if _state(manager, unit) not in DOWN]
     if up:
         manager.run_jobs("StopUnit", up)
     written = [path for path in written_files(manager, scope) if read_unit_file(path) is not None]
@@ -99,7 +97,7 @@ def stop_gateway(manager: Manager, scope: Scope) -> bool:
 def stop_slice(manager: Manager) -> list[str]:
     """Stop dora.target and dora.slice; the units of others that keep the slice."""
     facts = manager.read(SLICE, ["LoadState", "ActiveState", "RequiredBy"])
-    others = [unit for unit in facts["RequiredBy"] if _state(manager, unit) not in _DOWN]
+    others = [unit for unit in facts["RequiredBy"] if _state(manager, unit) not in DOWN]
     wanted = [BOOT_TARGET, *([] if others else [SLICE])]
     active = [unit for unit in wanted if _state(manager, unit) == "active"]
     if active:
@@ -150,7 +148,7 @@ def _stop(
     while pending:
         left = []
         for one in pending:
-            if (state := _state(manager, one.cell.unit)) in _DOWN:
+            if (state := _state(manager, one.cell.unit)) in DOWN:
                 yield one.cell, _ended(manager, one, state)
             elif now() < one.deadline:
                 left.append(one)
@@ -178,7 +176,7 @@ def _begin(manager: Manager, cell: Cell, want_kill: bool, now: float) -> _Stop:
         with suppress(DoraSystemdError):
             manager.kill(cell.unit, signal.SIGKILL)
         return _Stop(cell, now + _KILLED_SECONDS, True)
-    seconds = given / SECOND if given and given != _INFINITY else UNBOUNDED_SECONDS
+    seconds = given / SECOND if given and given != INFINITY else UNBOUNDED_SECONDS
     return _Stop(cell, now + seconds + _MARGIN_SECONDS, False)
 
 

@@ -8,18 +8,17 @@ import pwd
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.bus.manager import DOWN, Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
-from dora_systemd.adapters.host.files import read_yaml
-from dora_systemd.adapters.host.process import (
+from dora_systemd.adapters.dora.command import (
     RECOMMENDED_DORA,
     dora_version,
     find_dora,
-    run_command,
     version_numbers,
 )
+from dora_systemd.adapters.host.files import read_yaml
+from dora_systemd.adapters.host.process import run_command
 from dora_systemd.adapters.host.process_table import (
-    listening_sockets,
     read_processes,
     socket_owners,
 )
@@ -40,6 +39,7 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import unit_name
 from dora_systemd.scope import RUNTIME_NAME, Scope
 from dora_systemd.trust.paths import exists
+from dora_systemd.trust.socket_table import listening_sockets
 from dora_systemd.verbs.facts.enabled import enabled_units, lost_units, own_directories
 from dora_systemd.verbs.facts.slice import slice_group
 from dora_systemd.verbs.gateway import read_gateway
@@ -51,7 +51,6 @@ from dora_systemd.verbs.start.settings import settings_files
 
 _SECONDS = 20.0
 _BROKEN = ("bad-setting", "error")
-_DOWN = ("inactive", "failed")
 
 
 def examine(reach: Callable[[Scope], Manager], scope: Scope) -> list[Finding]:
@@ -175,7 +174,7 @@ def _unit_groups(manager: Manager) -> list[Path]:
 
 
 def _is_down(manager: Manager, unit: str) -> bool:
-    return manager.read(unit, ["ActiveState"])["ActiveState"] in _DOWN
+    return manager.read(unit, ["ActiveState"])["ActiveState"] in DOWN
 
 
 def _journal(scope: Scope) -> Iterator[Finding]:

@@ -14,7 +14,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Protocol
 
-from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.bus.manager import DOWN, Manager
 from dora_systemd.adapters.journal.reader import open_journalctl
 from dora_systemd.decisions.logs.query import (
     UNIT_ENDS,
@@ -162,7 +162,7 @@ def _wait_end(watch: Watch) -> None:
 def is_unit_up(manager: Manager, name: str) -> bool:
     """Whether the unit of a dataflow runs, or is about to."""
     state = manager.read(unit_name(name), ("ActiveState", "Job"))
-    return state["ActiveState"] not in ("inactive", "failed") or bool(state["Job"][0])
+    return state["ActiveState"] not in DOWN or bool(state["Job"][0])
 
 
 def first_step(query: LogQuery, cursor: Path) -> LogQuery:

@@ -1,12 +1,17 @@
-"""`doractl stop` and `doractl restart`: jobs of systemd, for several dataflows at once."""
+"""`doractl stop`, `restart` and `reset`: what systemd does for several dataflows at once."""
 
-from collections.abc import Sequence
+import os
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
 from dora_systemd.adapters.bus.manager import JOB_DONE, Manager, Observer
+from dora_systemd.adapters.journal.note import send_note
+from dora_systemd.decisions.logs.events import event_fields
+from dora_systemd.decisions.logs.fields import encode_entry
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
+from dora_systemd.trust.paths import user_name
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.enabled import enabled_units, recover_lost_units
 from dora_systemd.verbs.facts.reason import failure_reason, job_reason
@@ -62,6 +67,34 @@ def restart_cells(
     return [_restart_outcome(manager, cell, results[cell.unit]) for cell in cells]
 
 
+def reset_cells(manager: Manager, cells: Sequence[Cell]) -> list[Outcome]:
+    """Clear the restarts used up by each dataflow, and its failure; what runs goes on running.
+
+    A failed unit that nothing else holds is gone from systemd then, its logs stay.
+    """
+    return [_reset(manager, cell) for cell in cells]
+
+
+def note_stop(cells: Iterable[Cell], command: str = "doractl stop") -> None:
+    """Write the event stop-asked for those dataflows that run: systemd notes no caller.
+
+    command: by which it is asked.
+    """
+    by = f"{caller(os.getuid(), os.environ)} ({command})"
+    for cell in cells:
+        if cell.is_up:
+            fields = event_fields("stop-asked", dataflow=cell.name, by=by)
+            own = {"DORA_DATAFLOW": cell.uuid, "DORA_DATAFLOW_NAME": cell.name}
+            send_note(encode_entry({**fields, **own, "SYSLOG_IDENTIFIER": "doractl"}))
+
+
+def caller(uid: int, environ: Mapping[str, str]) -> str:
+    """A user's name; root by sudo(8) is told with the one who called it."""
+    name = user_name(uid, nameless="the user ")
+    behind = environ.get("SUDO_USER", "")
+    return f"{name}, by sudo of {behind}" if uid == 0 and behind not in ("", "root") else name
+
+
 def _stop_outcome(manager: Manager, cell: Cell, result: str | None) -> Outcome:
     if result is None:
         ended = "has failed" if cell.state.active == "failed" else "does not run"
@@ -80,3 +113,11 @@ def _restart_outcome(manager: Manager, cell: Cell, result: str) -> Outcome:
         return Outcome(cell, f"Dataflow restarted: {cell.uuid} ({cell.name})")
     reason = job_reason(manager, cell.unit, result)
     return Outcome(cell, "", f"cannot restart {cell.unit}: {reason}")
+
+
+def _reset(manager: Manager, cell: Cell) -> Outcome:
+    used = manager.read(cell.unit, ["NRestarts"])["NRestarts"]
+    manager.reset_failed(cell.unit)
+    return Outcome(
+        cell, f"Dataflow reset: {cell.uuid} ({cell.name}, restart counter reset, was {used})"
+    )

@@ -1,7 +1,6 @@
 """`doractl up`: opens the port behind which systemd starts the gateway."""
 
 import errno
-import pwd
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -9,7 +8,6 @@ from pathlib import Path
 from dora_systemd.adapters.bus.manager import JOB_DONE, Manager
 from dora_systemd.adapters.host.loopback import port_error
 from dora_systemd.adapters.host.process_table import (
-    listening_sockets,
     read_processes,
     socket_owners,
 )
@@ -23,7 +21,8 @@ from dora_systemd.decisions.views.findings import State
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import name_from_unit
 from dora_systemd.scope import Scope
-from dora_systemd.trust.socket_table import listener_uids
+from dora_systemd.trust.paths import user_name
+from dora_systemd.trust.socket_table import listener_uids, listening_sockets
 from dora_systemd.verbs.doctor import examine
 from dora_systemd.verbs.facts.enabled import enabled_units, own_directories
 from dora_systemd.verbs.gateway import read_gateway
@@ -124,12 +123,5 @@ def _holder(port: int) -> str:
     named: Sequence[Process] = [one for one in read_processes() if one.pid in owners]
     if named:
         return str(named[-1])
-    users = ", ".join(_user(uid) for uid in sorted(listener_uids(port)))
+    users = ", ".join(user_name(uid, nameless="the user ") for uid in sorted(listener_uids(port)))
     return f"a process of {users}" if users else "another process"
-
-
-def _user(uid: int) -> str:
-    try:
-        return pwd.getpwuid(uid).pw_name
-    except KeyError:
-        return f"the user {uid}"

@@ -5,7 +5,7 @@ import platform
 
 from dora_systemd import __version__
 from dora_systemd.adapters.bus.systemd import Bus
-from dora_systemd.adapters.host.process import dora_version, find_dora
+from dora_systemd.adapters.dora.command import dora_version, find_dora
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
 

@@ -16,7 +16,7 @@ from dora_systemd.verbs.destroy import (
 )
 from dora_systemd.verbs.facts.enabled import enabled_units
 from dora_systemd.verbs.gateway import read_gateway
-from dora_systemd.verbs.stop_note import note_stop
+from dora_systemd.verbs.stop import note_stop
 
 _EPILOG = """\b
 Examples:

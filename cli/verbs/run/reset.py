@@ -6,7 +6,7 @@ from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import current_scope, print_outcomes, scope_options
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.verbs.facts.cells import read_cells, select_cell
-from dora_systemd.verbs.reset import reset_cells
+from dora_systemd.verbs.stop import reset_cells
 
 _EPILOG = """\b
 Examples:

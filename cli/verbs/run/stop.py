@@ -7,8 +7,7 @@ from dora_systemd.cli.parameters import current_scope, print_outcomes, scope_opt
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell, matching_cells, not_found, read_cells, select_cell
-from dora_systemd.verbs.stop import stop_cells
-from dora_systemd.verbs.stop_note import note_stop
+from dora_systemd.verbs.stop import note_stop, stop_cells
 
 _EPILOG = """\b
 Examples:

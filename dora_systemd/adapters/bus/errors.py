@@ -1,13 +1,13 @@
 """What went wrong on D-Bus, in words."""
 
 import os
-import pwd
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
+from dora_systemd.trust.paths import user_name
 
 _REASONS = {
     "AccessDenied": ("permission denied", ExitCode.NO_PERMISSION),
@@ -84,10 +84,7 @@ def _connection_hint(scope: Scope) -> str:
         return "this machine was not booted with systemd"
     if not scope.is_user:
         return "see systemctl is-system-running"
-    try:
-        user = pwd.getpwuid(scope.uid).pw_name
-    except KeyError:
-        user = str(scope.uid)
+    user = user_name(scope.uid, nameless="")
     return f"log in as {user}, or let the manager run without: loginctl enable-linger {user}"
 
 

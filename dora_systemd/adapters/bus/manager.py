@@ -5,6 +5,12 @@ from typing import Any, NamedTuple, Protocol
 
 JOB_DONE = "done"
 
+SETTLED = ("active", "reloading", "refreshing")
+ON_THE_WAY = ("activating", "deactivating")
+UP = (*SETTLED, *ON_THE_WAY)
+DOWN = ("inactive", "failed")
+"""Words of ActiveState=, see systemctl(1)."""
+
 Property = tuple[str, str, Any]
 """Name, D-Bus signature and value of one unit property."""
 Observer = Callable[[Mapping[str, Any]], None]

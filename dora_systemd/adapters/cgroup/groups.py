@@ -15,10 +15,10 @@ from itertools import islice
 from pathlib import Path
 
 from dora_systemd.decisions.cell.limits import NodeLimits
-from dora_systemd.decisions.resources.usage import UNLIMITED, Usage
+from dora_systemd.decisions.resources.usage import Usage
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import is_node_id
-from dora_systemd.values import SECOND
+from dora_systemd.values import INFINITY, SECOND
 
 NODE_PREFIX = "node-"
 SUPERVISOR = "supervisor"
@@ -261,11 +261,11 @@ def read_text(path: Path) -> str:
 
 
 def read_number(path: Path) -> int | None:
-    """The number in a control file, UNLIMITED for "max", None where there is none."""
+    """The number in a control file, INFINITY for "max", None where there is none."""
     text = read_text(path).strip()
     if not text:
         return None
-    return UNLIMITED if text == "max" else int(text)
+    return INFINITY if text == "max" else int(text)
 
 
 def _read_share(path: Path) -> int | None:
@@ -273,7 +273,7 @@ def _read_share(path: Path) -> int | None:
     quota, _, period = read_text(path).strip().partition(" ")
     if not period:
         return None
-    return UNLIMITED if quota == "max" else int(quota) * SECOND // int(period)
+    return INFINITY if quota == "max" else int(quota) * SECOND // int(period)
 
 
 def _resident_bytes(pid: int) -> int:

@@ -1,11 +1,13 @@
-"""What a group had to wait for, read from its control files."""
+"""What a group had to wait for, and how its memory does, read from its control files."""
 
 import re
 from pathlib import Path
 
-from dora_systemd.adapters.cgroup.groups import read_numbers, read_text
-from dora_systemd.adapters.cgroup.memory import read_oom
+from dora_systemd.adapters.cgroup.groups import read_number, read_numbers, read_text
+from dora_systemd.decisions.resources.oom import OomCounts
+from dora_systemd.decisions.resources.pressure import Load
 from dora_systemd.decisions.resources.usage import RESOURCES, Strain
+from dora_systemd.values import INFINITY
 
 _TOTAL = re.compile(r"^(some|full) .*total=(\d+)$", re.M)
 
@@ -20,7 +22,34 @@ def read_strain(path: Path) -> Strain:
     )
 
 
+def read_oom(path: Path) -> OomCounts:
+    """How often the kernel has killed in a group, and how often its own limit was the reason."""
+    return OomCounts(
+        read_numbers(path / "memory.events").get("oom_kill", 0),
+        read_numbers(path / "memory.events.local").get("oom", 0),
+    )
+
+
+def read_load(path: Path) -> Load:
+    """How close a group is to its limit of memory; its throttling is for the caller to say.
+
+    What counts is what the kernel cannot drop: it fills every group up with files it has read.
+    """
+    limits = [read_number(path / name) for name in ("memory.max", "memory.high")]
+    limit = min((one for one in limits if one is not None), default=INFINITY)
+    if limit == INFINITY:
+        return Load()
+    stat = read_numbers(path / "memory.stat")
+    return Load(stat.get("anon", 0) + stat.get("shmem", 0), limit, _read_stalled(path))
+
+
 def _read_stalls(path: Path) -> tuple[int, int] | None:
     """Both totals of a pressure file, µs; None where the kernel does not watch that."""
     totals = {kind: int(total) for kind, total in _TOTAL.findall(read_text(path))}
     return (totals["some"], totals.get("full", 0)) if "some" in totals else None
+
+
+def _read_stalled(path: Path) -> float:
+    """avg10 of "some" in memory.pressure, see the kernel's "PSI" document; 0 where it is off."""
+    match = re.search(r"^some avg10=([0-9.]+)", read_text(path / "memory.pressure"))
+    return float(match[1]) if match else 0.0

@@ -8,7 +8,8 @@ import os
 from collections.abc import Callable, Mapping
 from typing import TypeVar
 
-from dora_systemd.adapters.host.process import Beside, dora_version, find_dora, run_dora
+from dora_systemd.adapters.dora.command import dora_version, find_dora, run_dora
+from dora_systemd.adapters.host.process import Beside
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.dora.errors import parse_dora_error
 from dora_systemd.errors import DoraSystemdError, ExitCode

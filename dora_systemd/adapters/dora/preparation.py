@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dora_systemd.adapters.host import files, process
+from dora_systemd.adapters.dora.command import run_dora
+from dora_systemd.adapters.host import files
 from dora_systemd.decisions.cell.hot_reload import CHANGE_VARIABLE, check_reload_nodes
 from dora_systemd.decisions.cell.launch import LaunchPlan, launch_descriptor
 from dora_systemd.decisions.cell.limits import (
@@ -96,7 +97,7 @@ def load_dataflow(options: RunnerOptions) -> Dataflow:
         return dataflow
     # Inside the cell: as root in somebody else's name nobody comes this way.
     account, directory = own_account(), str(path.parent)
-    done = process.run_dora(options.dora, ["expand", str(path)], account, os.environ, directory)
+    done = run_dora(options.dora, ["expand", str(path)], account, os.environ, directory)
     if done.status != 0:
         reason = parse_dora_error(done.stderr)
         raise DoraSystemdError(f"cannot expand {path}: {reason}", "", ExitCode.BAD_INPUT)

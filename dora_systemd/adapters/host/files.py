@@ -4,13 +4,12 @@ import contextlib
 import errno
 import json
 import os
-import stat
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.trust.paths import MAX_BYTES, unreadable
+from dora_systemd.trust.files import check_size, read_own_file
 from dora_systemd.values import shown
 
 MAX_DEPTH = 64
@@ -40,17 +39,12 @@ def read_text(path: Path) -> str:
     Raises DoraSystemdError (BAD_INPUT) when there is no such file, it is anything but a regular
     file (a FIFO would let us wait for ever), too large, unreadable or not UTF-8.
     """
-    try:
-        data = _read_bytes(path)
-    except (OSError, ValueError) as error:
-        raise unreadable(path, error) from error
-    return decoded(data, path)
+    return decoded(read_own_file(path), path)
 
 
 def decoded(data: bytes, path: Path) -> str:
     """The text that was read from `path`. Raises DoraSystemdError (BAD_INPUT) if not UTF-8."""
-    if len(data) > MAX_BYTES:
-        raise _too_large(path)
+    check_size(path, data)
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -122,33 +116,6 @@ def write_atomic(
         code = ExitCode.NO_PERMISSION if is_refused else ExitCode.FAILURE
         message = f"cannot write {shown(str(path))}: {error.strerror}"
         raise DoraSystemdError(message, _WRITE_HINTS.get(error.errno or 0, ""), code) from error
-
-
-def _read_bytes(path: Path) -> bytes:
-    # O_NONBLOCK: opening a FIFO would wait for a writer. No controlling terminal either.
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
-    try:
-        _check_regular(os.fstat(descriptor), path)
-        with os.fdopen(descriptor, "rb", closefd=False) as file:
-            data = file.read(MAX_BYTES + 1)
-    finally:
-        os.close(descriptor)
-    if len(data) > MAX_BYTES:
-        raise _too_large(path)
-    return data
-
-
-def _check_regular(status: os.stat_result, path: Path) -> None:
-    if stat.S_ISDIR(status.st_mode):
-        raise _refusal(path, "it is a directory", "give the file in it")
-    if not stat.S_ISREG(status.st_mode):
-        raise _refusal(path, "it is not a regular file", "give a file")
-    if status.st_size > MAX_BYTES:
-        raise _too_large(path)
-
-
-def _too_large(path: Path) -> DoraSystemdError:
-    return _refusal(path, f"it is larger than {MAX_BYTES // 1024} KiB", "give a smaller file")
 
 
 def _check_shape(text: str, path: Path) -> None:

@@ -1,34 +1,23 @@
-"""Child processes: find the dora command, run it once, read what it said."""
+"""Child processes: run one to its end, read what it said."""
 
 import contextlib
 import os
-import re
 import selectors
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Generic, TypeVar, cast
 
-from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.trust.programs import Account, fresh_environment, spawn
-from dora_systemd.trust.sight import OwnSight, Sight
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.trust.programs import Account, spawn
 
 T = TypeVar("T")
 
-OLDEST_DORA = (1, 0)
-"""Before 1.0 the control protocol was another one."""
-RECOMMENDED_DORA = (1, 1)
-
 OUTPUT_LIMIT = 4 * 1024 * 1024
 """Bytes kept of each stream of a child."""
-DORA_SECONDS = 60.0
-
 _CHUNK = 65536
-_INSTALL_HINT = "pip install dora-rs-cli, install the package dora-cli, or give --dora PATH"
 
 
 @dataclass(frozen=True)
@@ -93,89 +82,6 @@ class Beside(Generic[T]):
         if self._error is not None:
             raise self._error
         return cast(T, self._result)
-
-
-def run_dora(
-    dora: str,
-    arguments: Sequence[str],
-    account: Account | None,
-    environment: Mapping[str, str] | None = None,
-    directory: str | None = None,
-) -> Completed:
-    """Run a dora command that ends by itself, such as `dora validate`, without colours.
-
-    account: whose dora it is; None: as root only a dora that is root's.
-    """
-    own = os.environ if account is None else fresh_environment(account)
-    surroundings = {**(own if environment is None else environment)}
-    surroundings |= {"RUST_BACKTRACE": "0", "NO_COLOR": "1"}
-    return run_command((dora, *arguments), DORA_SECONDS, surroundings, directory, account)
-
-
-def find_dora(
-    given: str | None, venv: str | None, search_path: str, sight: Sight | None = None
-) -> str:
-    """Absolute path of the dora command: the one given, else of the venv, else on `search_path`.
-
-    Last comes that beside our own Python: pip has put both into one virtual environment, and what
-    is linked onto PATH is only doractl. sight: whose eyes look. Raises DoraSystemdError (NO_DORA).
-    """
-    sight = sight or OwnSight()
-    if given is not None:
-        found = _which(given, search_path.split(os.pathsep), sight)
-        if found is None:
-            raise DoraSystemdError(
-                f"cannot run the dora command {given}", _INSTALL_HINT, ExitCode.NO_DORA
-            )
-        return found
-    last = str(Path(sys.executable).parent)
-    places = [*([f"{venv}/bin"] if venv else []), *search_path.split(os.pathsep), last]
-    found = _which("dora", places, sight)
-    if found is None:
-        raise DoraSystemdError("cannot find the dora command", _INSTALL_HINT, ExitCode.NO_DORA)
-    return found
-
-
-def _which(name: str, places: Sequence[str], sight: Sight) -> str | None:
-    paths = [name] if "/" in name else [f"{place}/{name}" for place in places if place]
-    return next(filter(sight.is_program, (str(Path(one).absolute()) for one in paths)), None)
-
-
-def dora_version(
-    dora: str, account: Account | None = None, environment: Mapping[str, str] | None = None
-) -> str:
-    """The version of a dora command, as in "1.1.0". account, environment: as for run_dora.
-
-    Raises DoraSystemdError (NO_DORA) if it is none, or older than OLDEST_DORA.
-    """
-    done = run_dora(dora, ["--version"], account, environment)
-    version = parse_dora_version(done.stdout) if done.status == 0 else None
-    if version is None:
-        words = " ".join((done.stderr or done.stdout).split())[:200]
-        raise DoraSystemdError(
-            f"cannot use {dora} as dora command: {words or 'it tells no version'}",
-            _INSTALL_HINT,
-            ExitCode.NO_DORA,
-        )
-    if version_numbers(version) < OLDEST_DORA:
-        raise DoraSystemdError(
-            f"cannot use {dora}: it is dora {version}, 1.0 or newer is needed",
-            "pip install --upgrade dora-rs-cli",
-            ExitCode.NO_DORA,
-        )
-    return version
-
-
-def parse_dora_version(text: str) -> str | None:
-    """The version in "dora-cli 1.1.0", or None."""
-    match = re.match(r"dora(?:-cli)?\s+(\d+\.\d+\S*)", text)
-    return match[1] if match else None
-
-
-def version_numbers(version: str) -> tuple[int, ...]:
-    """The leading numbers of a version: (1, 1, 0) for "1.1.0-rc.1"."""
-    match = re.match(r"\d+(\.\d+)*", version)
-    return tuple(map(int, match[0].split("."))) if match else ()
 
 
 def read_streams(streams: Sequence[int], seconds: float) -> list[bytes]:

@@ -1,4 +1,4 @@
-"""The processes of this machine and who listens where, from proc(5).
+"""The processes of this machine and whose sockets are whose, from proc(5).
 
 What belongs to other users is there for root alone; everything is gone the moment it was read.
 """
@@ -13,7 +13,6 @@ from dora_systemd.decisions.views.diagnosis import Process
 
 PROC = Path("/proc")
 
-_LISTENING = "0A"
 _MOST_BYTES = 256 * 1024
 _SOCKET = re.compile(r"socket:\[(\d+)\]")
 
@@ -24,19 +23,7 @@ def read_processes() -> list[Process]:
     return sorted((one for one in found if one), key=lambda one: one.pid)
 
 
-def listening_sockets(port: int) -> frozenset[str]:
-    """Inodes of the sockets that listen on a TCP port, whatever the address."""
-    found = set()
-    for name in ("tcp", "tcp6"):
-        with contextlib.suppress(OSError):
-            for line in (PROC / "net" / name).read_text().splitlines()[1:]:
-                fields = line.split()
-                if fields[3] == _LISTENING and int(fields[1].rpartition(":")[2], 16) == port:
-                    found.add(fields[9])
-    return frozenset(found)
-
-
-def socket_owners(inodes: Collection[str]) -> frozenset[int]:
+def socket_owners(inodes: Collection[int]) -> frozenset[int]:
     """The processes that hold one of these sockets."""
     paths = PROC.glob("[0-9]*/fd")
     return frozenset(int(path.parent.name) for path in paths if _holds(path, inodes))
@@ -68,14 +55,14 @@ def _beginning(path: Path) -> bytes:
         return file.read(_MOST_BYTES)
 
 
-def _holds(directory: Path, inodes: Collection[str]) -> bool:
+def _holds(directory: Path, inodes: Collection[int]) -> bool:
     return any(inode in inodes for inode in _sockets(directory))
 
 
-def _sockets(directory: Path) -> Iterator[str]:
+def _sockets(directory: Path) -> Iterator[int]:
     with contextlib.suppress(OSError):
         for path in directory.iterdir():
             with contextlib.suppress(OSError):
                 match = _SOCKET.fullmatch(os.readlink(path))  # noqa: PTH115
                 if match:
-                    yield match[1]
+                    yield int(match[1])

@@ -10,7 +10,7 @@ from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.reload.watch_rules import DEFAULT_WATCH, WatchRules
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import settings_path
-from dora_systemd.trust.paths import read_file
+from dora_systemd.trust.files import read_file
 
 DEBOUNCE_MS = 400
 """Changes that follow each other faster belong together, up to this time."""

@@ -3,7 +3,7 @@
 import re
 from itertools import pairwise
 
-from dora_systemd.terminal_text import one_line, without_sequences
+from dora_systemd.terminal_text import short_line, without_sequences
 
 _NUMBERED = re.compile(r"\d+: +")
 _OS_ERROR = re.compile(r"\(os error \d+\)$")
@@ -24,7 +24,7 @@ def parse_dora_error(stderr: str) -> str:
     usage = [line for line in lines if line.startswith("error: ")][:1]
     last = [line for line in lines if line][-1:]
     reason = _innermost(_after(lines, "Caused by:")) or " ".join(headline or usage or last)
-    return _shortened(_CHOICES.sub("", reason))
+    return short_line(_CHOICES.sub("", reason), _MAX_LENGTH)
 
 
 def _after(lines: list[str], mark: str) -> list[str]:
@@ -48,8 +48,3 @@ def _innermost(causes: list[str]) -> str:
     blocks = [" ".join(causes[begin:end]) for begin, end in pairwise([*starts, len(causes)])]
     reasons = [_NUMBERED.sub("", block, count=1) for block in blocks] or [" ".join(causes)]
     return ": ".join(reasons[-2:]) if _OS_ERROR.search(reasons[-1]) else reasons[-1]
-
-
-def _shortened(text: str) -> str:
-    line = " ".join(one_line(text).split())
-    return line if len(line) <= _MAX_LENGTH else line[: _MAX_LENGTH - 3] + "..."

@@ -6,13 +6,13 @@ docs/websocket-control-plane.md lists part of them.
 
 import json
 import re
-import signal
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 from uuid import uuid4
 
 from dora_systemd.decisions.life import events as life
+from dora_systemd.decisions.life.causes import signal_name
 from dora_systemd.decisions.resources.oom import Oom
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.values import INFINITY, SECOND
@@ -221,14 +221,6 @@ def _exit_status(status: dict[str, Any]) -> str:
         return f"exit code {status['ExitCode']}"
     number = status.get("Signal")
     return f"signal {signal_name(number)}" if isinstance(number, int) else "unknown exit status"
-
-
-def signal_name(number: int) -> str:
-    """SIGKILL for 9; the number as text where it has no name."""
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return str(number)
 
 
 def first_line(text: str) -> str:

@@ -1,5 +1,6 @@
 """Why a dataflow has ended: the words of DORA_CAUSE in the journal and of `doractl why`."""
 
+import signal
 from enum import StrEnum
 
 
@@ -27,3 +28,11 @@ class Cause(StrEnum):
     STOPPED = "stopped"
     FINISHED = "finished"
     NONE = ""
+
+
+def signal_name(number: int) -> str:
+    """SIGKILL for 9; the number as text where it has no name."""
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return str(number)

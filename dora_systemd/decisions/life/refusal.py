@@ -7,6 +7,7 @@ is done with it but printing it.
 
 from dora_systemd.decisions.life.states import RunnerExit
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.terminal_text import short_line
 
 FAILED = "failed: "
 """How STATUS= begins once the runner knows why a dataflow failed."""
@@ -30,8 +31,8 @@ def refusal_exit(error: DoraSystemdError) -> RunnerExit:
 
 def format_refusal(error: DoraSystemdError) -> str:
     """STATUS= of a runner that refuses its dataflow."""
-    hint = f"{_HINT}{_plain(error.hint)}" if error.hint else ""
-    return f"{FAILED}{_plain(error.message)}{hint}"
+    hint = f"{_HINT}{short_line(error.hint, _LONGEST)}" if error.hint else ""
+    return f"{FAILED}{short_line(error.message, _LONGEST)}{hint}"
 
 
 def parse_refusal(text: str, status: int) -> DoraSystemdError | None:
@@ -42,13 +43,6 @@ def parse_refusal(text: str, status: int) -> DoraSystemdError | None:
     if status not in list(_CODES) or not text.startswith(FAILED):
         return None
     message, _, hint = text.removeprefix(FAILED).partition(_HINT)
-    return DoraSystemdError(_plain(message), _plain(hint), _CODES[RunnerExit(status)])
-
-
-def _plain(text: str) -> str:
-    """One short line without control characters."""
-    words = "".join(char if char.isprintable() else " " for char in text).split()
-    line = " ".join(words)
-    if len(line.encode()) <= _LONGEST:
-        return line
-    return f"{line.encode()[: _LONGEST - 3].decode(errors='ignore')}..."
+    return DoraSystemdError(
+        short_line(message, _LONGEST), short_line(hint, _LONGEST), _CODES[RunnerExit(status)]
+    )

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 RESOURCES = ("cpu", "memory", "io")
-UNLIMITED = 2**64 - 1
 """What systemd's properties say where cgroup files say "max", see systemd.resource-control(5)."""
 WORTH_SHOWING = 1.0
 """Percent of the time from which on a wait is shown to people."""
@@ -13,7 +12,7 @@ WORTH_SHOWING = 1.0
 class Usage(NamedTuple):
     """What one group uses. CPU in µs since the group was made, memory in bytes, None: not known.
 
-    memory_max is UNLIMITED where there is no limit; cpu_max, in µs per second, too. throttling:
+    memory_max is INFINITY where there is no limit; cpu_max, in µs per second, too. throttling:
     periods in which the group wanted to run, and those in which it had to wait for its cpu.max.
     """
 

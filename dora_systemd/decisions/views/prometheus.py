@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from dora_systemd.decisions.cell.status import ALIVE_NODE_STATES, NODE_STATES, WHOLE_CELL
-from dora_systemd.decisions.resources.usage import UNLIMITED, Strain, Usage
+from dora_systemd.decisions.resources.usage import Strain, Usage
 from dora_systemd.decisions.views.dataflows import FAILED, STOPPED, UP_WORDS, NodeRow
 from dora_systemd.decisions.views.snapshot import Observed
-from dora_systemd.values import SECOND
+from dora_systemd.values import INFINITY, SECOND
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 
@@ -169,7 +169,7 @@ def _cores(use: Usage) -> float | None:
 
 
 def _limit(value: int | None) -> int | None:
-    return None if value == UNLIMITED else value
+    return None if value == INFINITY else value
 
 
 def _format(family: Family, prefix: str, samples: Iterable[Sample]) -> Iterator[str]:

@@ -11,6 +11,7 @@ from collections.abc import AsyncIterator, Iterator, Sequence
 
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.adapters.journal.reader import JournalReader, end_journalctl, open_journalctl
+from dora_systemd.adapters.journal.stream import open_stream
 from dora_systemd.decisions.gateway.answers import (
     LOG_FIELDS,
     Record,
@@ -25,7 +26,6 @@ from dora_systemd.decisions.logs.query import end_matches, journal_timestamp, sc
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.gateway.control.state import find_name
 from dora_systemd.gateway.control.talk import Place, Result, Talk, find_if_loaded
-from dora_systemd.gateway.live.follow import open_stream
 from dora_systemd.scope import Scope
 from dora_systemd.suggestions import did_you_mean
 from dora_systemd.values import quoted

@@ -19,7 +19,8 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.gateway.control.state import spawned
 from dora_systemd.gateway.control.talk import Result, Talk
 from dora_systemd.scope import Scope
-from dora_systemd.trust.paths import list_directory, read_file
+from dora_systemd.trust.files import read_file
+from dora_systemd.trust.paths import list_directory
 from dora_systemd.values import shown
 from dora_systemd.verbs.start.check import run_beside
 from dora_systemd.verbs.start.launch import claim, start_claim

@@ -5,6 +5,7 @@ from contextlib import suppress
 from functools import lru_cache
 from typing import Any
 
+from dora_systemd.adapters.bus.manager import ON_THE_WAY, SETTLED
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.decisions.gateway.answers import (
@@ -32,8 +33,6 @@ _MOST_ENDED = 20
 """How many dataflows that have ended long ago dora list shows."""
 _FRESH_SECONDS = 5.0
 """For which the journal's answer about ended dataflows is good, at most."""
-_SEEN_UP = ("active", "reloading", "refreshing")
-_ON_THE_WAY = ("activating", "deactivating")
 
 
 def list_dataflows(scope: Scope) -> dict[str, Any]:
@@ -121,9 +120,9 @@ def spawned(scope: Scope, uuid: str) -> dict[str, Any] | None:
         return _over(scope, uuid)
     bus = Bus(scope)
     state = bus.read(cell.unit, ["ActiveState", "Job"])
-    if state["ActiveState"] in _SEEN_UP:
+    if state["ActiveState"] in SETTLED:
         return {"DataflowSpawned": {"uuid": uuid}}
-    if state["ActiveState"] in _ON_THE_WAY or state["Job"][0]:
+    if state["ActiveState"] in ON_THE_WAY or state["Job"][0]:
         return None
     if state["ActiveState"] != "failed":
         return _over(scope, uuid)

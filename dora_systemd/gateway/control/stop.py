@@ -14,8 +14,7 @@ from dora_systemd.gateway.control.talk import Talk, find_by_uuid
 from dora_systemd.scope import Scope
 from dora_systemd.values import SECOND
 from dora_systemd.verbs.facts.cells import Cell, find_cell
-from dora_systemd.verbs.stop import Outcome, restart_cells, stop_cells
-from dora_systemd.verbs.stop_note import note_stop
+from dora_systemd.verbs.stop import Outcome, note_stop, restart_cells, stop_cells
 
 _KILL_FACTOR = 1.5
 """dora sends SIGTERM after the grace duration, and SIGKILL after half as much again."""

@@ -9,12 +9,11 @@ from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
 from dora_systemd.decisions.gateway.page_messages import PageMessage, graph_values
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
-from dora_systemd.trust.paths import read_file
+from dora_systemd.trust.files import read_file
 from dora_systemd.verbs.facts.cells import Cell, find_cell
 from dora_systemd.verbs.facts.list import read_status
 from dora_systemd.verbs.node import ask_coordinator, restart_node, stop_node
-from dora_systemd.verbs.stop import restart_cells, stop_cells
-from dora_systemd.verbs.stop_note import note_stop
+from dora_systemd.verbs.stop import note_stop, restart_cells, stop_cells
 
 _BY = "status page"
 

@@ -3,11 +3,11 @@
 import asyncio
 from collections import deque
 from collections.abc import AsyncGenerator, AsyncIterator
-from contextlib import asynccontextmanager
-from typing import IO, Any
+from typing import Any
 
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.adapters.journal.reader import check_readable, end_journalctl, open_journalctl
+from dora_systemd.adapters.journal.stream import open_stream
 from dora_systemd.decisions.gateway.page_messages import LOG_FIELDS, PageMessage, line_values
 from dora_systemd.decisions.logs.fields import ExportReader
 from dora_systemd.decisions.logs.query import LogQuery, query_arguments
@@ -69,19 +69,6 @@ def _query(scope: Scope, message: PageMessage) -> LogQuery:
         want_unprintable=True,
         output="export",
     )
-
-
-@asynccontextmanager
-async def open_stream(pipe: IO[bytes]) -> AsyncIterator[asyncio.StreamReader]:
-    """What a child writes, for the event loop."""
-    loop = asyncio.get_running_loop()
-    stream = asyncio.StreamReader(_CHUNK, loop)
-    protocol = asyncio.StreamReaderProtocol(stream, loop=loop)
-    transport, _ = await loop.connect_read_pipe(lambda: protocol, pipe)
-    try:
-        yield stream
-    finally:
-        transport.close()
 
 
 async def _read_until(stream: asyncio.StreamReader, until: float) -> bytes:

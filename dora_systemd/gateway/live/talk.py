@@ -2,8 +2,6 @@
 
 import asyncio
 import json
-import os
-import pwd
 import socket as sockets
 from collections.abc import Coroutine
 from contextlib import aclosing, suppress
@@ -18,6 +16,7 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.gateway.live.act import act, read_graph
 from dora_systemd.gateway.live.follow import follow_lines
 from dora_systemd.scope import Scope
+from dora_systemd.trust.paths import user_name
 from dora_systemd.verbs.facts.snapshot import read_snapshot
 
 INTERVAL_SECONDS = 2.0
@@ -141,11 +140,7 @@ class _Page:
 
 
 def _greeting(scope: Scope) -> dict[str, str]:
-    whose = "system"
-    if scope.is_user:
-        whose = str(scope.uid)
-        with suppress(KeyError):
-            whose = pwd.getpwuid(os.getuid()).pw_name
+    whose = user_name(scope.uid, nameless="") if scope.is_user else "system"
     return {"version": __version__, "host": sockets.gethostname(), "scope": whose}
 
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from dora_systemd.adapters.cgroup import groups as cgroup
-from dora_systemd.adapters.cgroup.memory import read_load, read_oom
+from dora_systemd.adapters.cgroup.strain import read_load, read_oom
 from dora_systemd.decisions.cell.status import WHOLE_CELL, CpuSample, throttled_percent
 from dora_systemd.decisions.life.states import Record
 from dora_systemd.decisions.resources.oom import Oom, OomCounts, Owner, find_owner, largest

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from dora_systemd.adapters.bus.manager import Manager, UnitState
+from dora_systemd.adapters.bus.manager import UP, Manager, UnitState
 from dora_systemd.decisions.cell.options import RunnerOptions, options_from_command
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import (
@@ -17,7 +17,6 @@ from dora_systemd.names import (
 from dora_systemd.values import quoted
 
 _PATTERN = f"{UNIT_PREFIX}*{UNIT_SUFFIX}"
-_UP = frozenset({"active", "activating", "deactivating", "reloading", "refreshing"})
 
 
 class Cell(NamedTuple):
@@ -44,7 +43,7 @@ class Cell(NamedTuple):
     @property
     def is_up(self) -> bool:
         """Whether it runs, or is on its way up or down."""
-        return self.state.active in _UP
+        return self.state.active in UP
 
 
 def read_cells(manager: Manager) -> list[Cell]:

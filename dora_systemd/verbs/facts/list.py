@@ -18,14 +18,19 @@ from dora_systemd.decisions.cell.status import (
     cpu_percent,
     throttled_percent,
 )
-from dora_systemd.decisions.resources.usage import UNLIMITED, Usage
+from dora_systemd.decisions.resources.usage import Usage
 from dora_systemd.decisions.views.dataflows import DataflowRow, NodeRow, status_word
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
 from dora_systemd.trust.cells import read_table
-from dora_systemd.values import SECOND
+from dora_systemd.values import INFINITY, SECOND
 from dora_systemd.verbs.facts.budget import restart_budget
-from dora_systemd.verbs.facts.cells import Cell, matching_cells, read_cells, select_cell
+from dora_systemd.verbs.facts.cells import (
+    Cell,
+    matching_cells,
+    read_cells,
+    select_cell,
+)
 from dora_systemd.verbs.facts.enabled import enabled_units
 from dora_systemd.verbs.facts.slice import slice_group
 
@@ -214,7 +219,7 @@ def _numbers(
 
 
 def _limit(value: int | None) -> int | None:
-    return None if value == UNLIMITED else value
+    return None if value == INFINITY else value
 
 
 def _populated(groups: dict[str, Path]) -> int:

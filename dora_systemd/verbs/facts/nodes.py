@@ -13,7 +13,7 @@ from typing import Any
 from dora_systemd.adapters.host.files import decoded, parse_yaml
 from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.trust.paths import read_file, unreadable
+from dora_systemd.trust.files import read_file, unreadable
 from dora_systemd.trust.sight import Sight
 
 _MOST_FILES = 50

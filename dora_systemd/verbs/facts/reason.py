@@ -1,9 +1,9 @@
 """Why a unit did not start or did not last, in words, from what systemd remembers of it."""
 
-import signal
 from typing import Any
 
 from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.decisions.life.causes import signal_name
 from dora_systemd.decisions.life.refusal import FAILED, parse_refusal
 from dora_systemd.errors import DoraSystemdError
 
@@ -73,11 +73,3 @@ def _exit_words(unit: dict[str, Any]) -> str:
     if status:
         return f"signal {signal_name(status)}"
     return "ended" if unit["Result"] == "success" else str(unit["Result"])
-
-
-def signal_name(number: int) -> str:
-    """ "SIGKILL" for 9."""
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return str(number)

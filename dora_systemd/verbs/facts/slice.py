@@ -1,4 +1,4 @@
-"""Where the cgroup tree has the dataflows of one manager."""
+"""Where the cgroup tree has the dataflows of one manager; apart, because most verbs do without."""
 
 from pathlib import Path
 

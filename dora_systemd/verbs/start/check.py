@@ -11,13 +11,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import Manager, Property
-from dora_systemd.adapters.host.process import (
-    DORA_SECONDS,
-    Beside,
-    Completed,
-    read_streams,
-    run_command,
-)
+from dora_systemd.adapters.dora.command import DORA_SECONDS
+from dora_systemd.adapters.host.process import Beside, Completed, read_streams, run_command
 from dora_systemd.decisions.cell.options import check_command
 from dora_systemd.decisions.life.refusal import parse_refusal
 from dora_systemd.decisions.unit.properties import typed

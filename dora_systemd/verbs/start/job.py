@@ -6,8 +6,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
-from dora_systemd.adapters.bus.manager import JOB_DONE, Manager, Observer, Property
-from dora_systemd.adapters.host.process import version_numbers
+from dora_systemd.adapters.bus.manager import JOB_DONE, ON_THE_WAY, Manager, Observer, Property
+from dora_systemd.adapters.dora.command import version_numbers
 from dora_systemd.decisions.life.refusal import FAILED
 from dora_systemd.decisions.unit.versions import MIN_VERSION, transient_commands
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -16,7 +16,6 @@ from dora_systemd.verbs.facts.reason import job_reason, runners_refusal
 from dora_systemd.verbs.start.plan import Plan
 
 _POLL_SECONDS = 0.2
-_ON_THE_WAY = ("activating", "deactivating")
 
 StageObserver = Callable[[str], None]
 """Is told the unit's STATUS= while its start is waited for."""
@@ -130,7 +129,7 @@ def _wait_until_checked(manager: Manager, unit: str) -> None:
     """Return when the runner has said that it goes on, or has ended."""
     while True:
         state = manager.read(unit, ["ActiveState", "Job", "StatusText"])
-        is_on_the_way = state["ActiveState"] in _ON_THE_WAY or (state["Job"] or (0,))[0]
+        is_on_the_way = state["ActiveState"] in ON_THE_WAY or (state["Job"] or (0,))[0]
         goes_on = state["StatusText"] and not state["StatusText"].startswith(FAILED)
         if goes_on or not is_on_the_way:
             return

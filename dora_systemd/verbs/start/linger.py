@@ -1,10 +1,9 @@
 """Whether a user's manager runs without the user, as a boot needs it, see loginctl(1)."""
 
-import pwd
-
 from dora_systemd.adapters.host.process import run_command
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
+from dora_systemd.trust.paths import user_name
 
 _SECONDS = 20.0
 _LOGINCTL = ("loginctl", "--no-ask-password")
@@ -45,7 +44,4 @@ def ensure_linger(scope: Scope) -> str:
 
 
 def _user_name(scope: Scope) -> str:
-    try:
-        return pwd.getpwuid(scope.uid).pw_name
-    except KeyError:
-        return str(scope.uid)
+    return user_name(scope.uid, nameless="")

@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from dora_systemd.adapters.dora.command import find_dora
 from dora_systemd.adapters.host.files import decoded, parse_yaml
-from dora_systemd.adapters.host.process import find_dora
 from dora_systemd.decisions.descriptor.build_session import (
     BuildSession,
     parse_session,
@@ -21,7 +21,7 @@ from dora_systemd.decisions.settings.kinds import Setting
 from dora_systemd.decisions.settings.resolve import Settings
 from dora_systemd.decisions.settings.table import DORA, VENV, WORKING_DIRECTORY
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.trust.paths import unreadable
+from dora_systemd.trust.files import unreadable
 from dora_systemd.trust.sight import OwnSight, Sight, cannot_reach
 
 _OWN = OwnSight()

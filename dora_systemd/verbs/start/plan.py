@@ -38,7 +38,7 @@ from dora_systemd.decisions.settings.table import (
 )
 from dora_systemd.names import name_from_path, parse_name, unit_name
 from dora_systemd.scope import Scope
-from dora_systemd.trust.paths import read_file
+from dora_systemd.trust.files import read_file
 from dora_systemd.trust.sight import sight_of
 from dora_systemd.verbs.start.account import account_of, choose_user
 from dora_systemd.verbs.start.credentials import check_credentials, credential_files

@@ -8,12 +8,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from dora_systemd.adapters.bus.manager import Manager, Property
+from dora_systemd.adapters.bus.manager import DOWN, Manager, Property
 from dora_systemd.verbs.start.job import StageObserver
 
 _POLL_SECONDS = 0.5
 _CLD_EXITED = 1
-_ENDED = frozenset({"inactive", "failed"})
 _STATE = ("ActiveState", "Job", "ExecMainCode", "ExecMainStatus", "Result")
 
 
@@ -104,7 +103,7 @@ def _interrupt(manager: Manager, unit: str, count: int) -> None:
 def _exit_status(manager: Manager, unit: str) -> int | None:
     """The exit status of a unit that has ended; of a killed one 128 + the signal, as in a shell."""
     state = manager.read(unit, _STATE)
-    if state["ActiveState"] not in _ENDED or state["Job"][0]:
+    if state["ActiveState"] not in DOWN or state["Job"][0]:
         return None
     status: int = state["ExecMainStatus"]
     if state["ExecMainCode"] != _CLD_EXITED and status:

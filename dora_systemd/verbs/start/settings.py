@@ -10,7 +10,8 @@ from dora_systemd.decisions.settings.table import ENV_FILE, SETTINGS
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import settings_path
 from dora_systemd.scope import Scope
-from dora_systemd.trust.paths import Place, exists, read_file
+from dora_systemd.trust.files import read_file
+from dora_systemd.trust.paths import Place, exists
 from dora_systemd.values import shown
 
 SYSTEM_FILE = Path("/etc/dora-systemd/config.yml")

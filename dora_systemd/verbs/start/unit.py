@@ -3,7 +3,7 @@
 import sys
 
 from dora_systemd.adapters.bus.manager import Manager
-from dora_systemd.adapters.host.process import version_numbers
+from dora_systemd.adapters.dora.command import version_numbers
 from dora_systemd.decisions.properties.kinds import Property
 from dora_systemd.decisions.settings.reload_rules import reload_warnings
 from dora_systemd.decisions.settings.restart_policies import restart_warnings

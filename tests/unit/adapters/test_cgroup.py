@@ -7,8 +7,9 @@ import pytest
 
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.decisions.cell.limits import parse_node_limits
-from dora_systemd.decisions.resources.usage import UNLIMITED, Usage
+from dora_systemd.decisions.resources.usage import Usage
 from dora_systemd.errors import DoraSystemdError
+from dora_systemd.values import INFINITY
 
 
 @pytest.fixture
@@ -34,7 +35,7 @@ def test_usage_with_a_memory_controller(unit: Path) -> None:
     (unit / "cpu.max").write_text("150000 100000\n")
     for name, text in (("current", "4096\n"), ("peak", "8192\n"), ("max", "max\n")):
         (unit / f"memory.{name}").write_text(text)
-    assert cgroup.read_usage(unit) == Usage(1500, 4096, 8192, UNLIMITED, 1_500_000, (10, 3))
+    assert cgroup.read_usage(unit) == Usage(1500, 4096, 8192, INFINITY, 1_500_000, (10, 3))
 
 
 def test_usage_without_a_memory_controller(unit: Path) -> None:

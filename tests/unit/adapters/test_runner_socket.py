@@ -332,7 +332,7 @@ def test_an_answer_that_never_ends_and_one_in_drops(tmp_path: Path) -> None:
 
 
 def test_done_is_shown_without_what_a_terminal_obeys(tmp_path: Path) -> None:
-    assert done_of(tmp_path, {"done": ["a\x1b[31m\nä"]}) == ["a\\x1b[31m\\nä"]
+    assert done_of(tmp_path, {"done": ["a\x1b[31m\nä"]}) == ["a\\x1b[31m ä"]
 
 
 @pytest.mark.parametrize(

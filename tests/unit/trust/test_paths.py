@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.trust.paths import Place, exists, firm_part, reached, read_file
+from dora_systemd.trust.files import read_file
+from dora_systemd.trust.paths import Place, exists, firm_part, reached
 
 FILE = stat.S_IFREG | 0o644
 IS_ROOT = os.geteuid() == 0

@@ -66,7 +66,7 @@ def test_all_is_well(manager: FakeManager, scope: Scope) -> None:
 def test_its_own_gateway_is_no_stranger(
     manager: FakeManager, scope: Scope, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(doctor, "listening_sockets", lambda _port: frozenset({"7"}))
+    monkeypatch.setattr(doctor, "listening_sockets", lambda _port: frozenset({7}))
     monkeypatch.setattr(doctor, "socket_owners", lambda _sockets: frozenset())
     assert {"port 6013", "port 53290"} <= found(manager, scope).keys()
     facts = {"LoadState": "loaded", "ActiveState": "active"}

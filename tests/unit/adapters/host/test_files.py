@@ -19,7 +19,7 @@ from dora_systemd.adapters.host.files import (
     write_atomic,
 )
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.trust.paths import MAX_BYTES
+from dora_systemd.trust.files import MAX_BYTES
 
 
 @pytest.fixture

@@ -51,7 +51,7 @@ def test_a_refused_start_leaves_no_unit(wait: bool) -> None:
     manager.after_job[UNIT] = facts
     with pytest.raises(DoraSystemdError) as caught:
         start_plan(manager, make_plan(), [], None, wait)
-    assert caught.value.message == "cannot use /srv/robot.yml: why [2J"
+    assert caught.value.message == "cannot use /srv/robot.yml: why\\x1b[2J"
     assert (caught.value.hint, caught.value.code) == ("do this", ExitCode.BAD_INPUT)
     assert UNIT not in manager.units
 

@@ -13,10 +13,11 @@ from prometheus_client.openmetrics.parser import (
 from prometheus_client.parser import text_string_to_metric_families
 
 from dora_systemd.decisions.cell.status import LineCount
-from dora_systemd.decisions.resources.usage import UNLIMITED, Strain, Usage
+from dora_systemd.decisions.resources.usage import Strain, Usage
 from dora_systemd.decisions.views.dataflows import DataflowRow, NodeRow
 from dora_systemd.decisions.views.prometheus import STATES, format_metrics
 from dora_systemd.decisions.views.snapshot import Observed
+from dora_systemd.values import INFINITY
 
 SECOND = 1_000_000
 ROBOT = Observed(
@@ -37,7 +38,7 @@ ROBOT = Observed(
     unit_restarts=2,
     usage={
         "": Usage(2_500_000, 4096, 8192, 1 << 30, 1_500_000, (10, 3)),
-        "camera": Usage(1_000_000, 1024, None, UNLIMITED, UNLIMITED),
+        "camera": Usage(1_000_000, 1024, None, INFINITY, INFINITY),
     },
     strains={"": Strain({"cpu": (1_500_000, 0), "memory": (20, 10)}, 250_000, 4)},
     lines={"": LineCount(lost=7), "camera": LineCount(1000, 20)},

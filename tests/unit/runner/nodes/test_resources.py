@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from dora_systemd.adapters.cgroup.memory import read_load, read_oom
+from dora_systemd.adapters.cgroup.strain import read_load, read_oom
 from dora_systemd.decisions.cell.status import CpuSample
 from dora_systemd.decisions.resources.oom import Owner
 from dora_systemd.decisions.resources.pressure import CPU, MEMORY
