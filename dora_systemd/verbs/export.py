@@ -1,4 +1,4 @@
-"""`doractl export`: the unit of a dataflow as one unit file that needs nothing of doractl."""
+"""`doractl export`: the unit of a dataflow as one unit file that works without doractl."""
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.decisions.unit.file import persistent_unit, plain_target
@@ -9,7 +9,7 @@ from dora_systemd.verbs.start.enable import refuse_attached
 
 
 def export_cell(manager: Manager, scope: Scope, cell: Cell) -> str:
-    """The text of the unit file, with the drop-ins in it. Raises DoraSystemdError."""
+    """The text of the unit file, including drop-ins. Raises DoraSystemdError."""
     refuse_attached(cell)
     texts = list(unit_files(manager, cell).values())
     return persistent_unit(texts, cell.options, scope.is_user, plain_target(scope.is_user))

@@ -1,4 +1,4 @@
-"""`doractl reset`: systemd forgets failures and counts restarts anew."""
+"""`doractl reset`: clears failures and restart counters in systemd."""
 
 from collections.abc import Sequence
 
@@ -10,9 +10,9 @@ _FACTS = ("NRestarts",)
 
 
 def reset_cells(manager: Manager, cells: Sequence[Cell]) -> list[Outcome]:
-    """Clear the restarts used up by each dataflow, and its failure; what runs goes on running.
+    """Clear the restart counter and the failure of each dataflow; running ones keep running.
 
-    A failed unit that nothing else holds is gone from systemd then, its logs stay.
+    systemd then unloads a failed unit that nothing else references; its logs stay.
     """
     return [_reset(manager, cell) for cell in cells]
 

@@ -1,4 +1,4 @@
-"""Who asks for the end of a dataflow: systemd notes that it was asked, and not by whom."""
+"""Records in the journal who requested a stop; systemd records only that one was requested."""
 
 import os
 import pwd
@@ -11,7 +11,7 @@ from dora_systemd.verbs.facts.cells import Cell
 
 
 def note_stop(cells: Iterable[Cell], command: str = "doractl stop") -> None:
-    """Write the event stop-asked for those dataflows that run. command: by which it is asked."""
+    """Write the event stop-asked for the dataflows that are running. command: for the record."""
     by = f"{caller(os.getuid(), os.environ)} ({command})"
     for cell in cells:
         if cell.is_up:
@@ -21,7 +21,7 @@ def note_stop(cells: Iterable[Cell], command: str = "doractl stop") -> None:
 
 
 def caller(uid: int, environ: Mapping[str, str]) -> str:
-    """A user's name; root by sudo(8) is told with the one who called it."""
+    """The name of a user; for root by sudo(8), with the user who called sudo."""
     try:
         name = pwd.getpwuid(uid).pw_name
     except KeyError:

@@ -1,4 +1,4 @@
-"""Where the cgroup tree has the dataflows of one manager."""
+"""The place of dataflows in the cgroup tree."""
 
 from pathlib import Path
 
@@ -8,5 +8,5 @@ from dora_systemd.names import SLICE
 
 
 def slice_group(manager: Manager) -> Path:
-    """The directory of dora.slice, below which units are unless a property puts them elsewhere."""
+    """The directory of dora.slice, which has the units unless a property puts them elsewhere."""
     return cgroup.group_path(manager.control_group()) / SLICE
