@@ -1,4 +1,4 @@
-"""What the cgroup tree says of a group's memory: processes killed for want of it, and how close."""
+"""Reads memory counters of a cgroup: OOM kills, and how close the group is to its limit."""
 
 import re
 from pathlib import Path
@@ -10,7 +10,7 @@ from dora_systemd.decisions.resources.usage import UNLIMITED
 
 
 def read_oom(path: Path) -> OomCounts:
-    """How often the kernel has killed in a group, and how often its own limit was the reason."""
+    """The number of OOM kills in a group, and of those that its own limit caused."""
     return OomCounts(
         read_numbers(path / "memory.events").get("oom_kill", 0),
         read_numbers(path / "memory.events.local").get("oom", 0),
@@ -18,9 +18,9 @@ def read_oom(path: Path) -> OomCounts:
 
 
 def read_load(path: Path) -> Load:
-    """How close a group is to its limit of memory; its throttling is for the caller to say.
+    """How close a group is to its memory limit; the caller adds the throttling.
 
-    What counts is what the kernel cannot drop: it fills every group up with files it has read.
+    Only memory that the kernel cannot reclaim counts: file caches always grow up to the limit.
     """
     limits = [read_number(path / name) for name in ("memory.max", "memory.high")]
     limit = min((one for one in limits if one is not None), default=UNLIMITED)
@@ -31,6 +31,6 @@ def read_load(path: Path) -> Load:
 
 
 def _read_stalled(path: Path) -> float:
-    """avg10 of "some" in memory.pressure, see the kernel's "PSI" document; 0 where it is off."""
+    """avg10 of "some" in memory.pressure, see the kernel's "PSI" document; 0 without PSI."""
     match = re.search(r"^some avg10=([0-9.]+)", read_text(path / "memory.pressure"))
     return float(match[1]) if match else 0.0

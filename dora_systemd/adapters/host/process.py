@@ -1,4 +1,4 @@
-"""Child processes: find the dora command, run it once, read what it said."""
+"""Runs child processes to their end, and finds the dora command."""
 
 import contextlib
 import os
@@ -20,11 +20,11 @@ from dora_systemd.trust.sight import OwnSight, Sight
 T = TypeVar("T")
 
 OLDEST_DORA = (1, 0)
-"""Before 1.0 the control protocol was another one."""
+"""The oldest supported version: before 1.0 the control protocol was different."""
 RECOMMENDED_DORA = (1, 1)
 
 OUTPUT_LIMIT = 4 * 1024 * 1024
-"""Bytes kept of each stream of a child."""
+"""Maximum bytes kept of each output stream of a child."""
 DORA_SECONDS = 60.0
 
 _CHUNK = 65536
@@ -33,7 +33,7 @@ _INSTALL_HINT = "pip install dora-rs-cli, install the package dora-cli, or give 
 
 @dataclass(frozen=True)
 class Completed:
-    """How a child ended: exit status (minus the signal number when killed) and its two streams."""
+    """The result of a child: exit status (minus the signal number if killed) and output."""
 
     status: int
     stdout: str
@@ -47,10 +47,10 @@ def run_command(
     directory: str | None = None,
     account: Account | None = None,
 ) -> Completed:
-    """Run a child to its end, with no input; of each stream OUTPUT_LIMIT bytes are kept.
+    """Run a child until it exits, without input; keep OUTPUT_LIMIT bytes of each stream.
 
-    environment, account: as programs.spawn takes them. After `seconds` its whole process group is
-    killed. Raises DoraSystemdError when it cannot or must not be run, or took too long.
+    environment, account: as for programs.spawn. After `seconds`, its whole process group is killed.
+    Raises DoraSystemdError if it must not run, cannot run or takes too long.
     """
     try:
         child = spawn(command, account, environment, directory)
@@ -69,9 +69,9 @@ def run_command(
 
 
 class Beside(Generic[T]):
-    """A call in a thread of its own, for those that wait for children.
+    """Runs a function in a thread, for calls that wait for child processes.
 
-    No daemon thread: the child of one that nobody waits for any more is still waited for.
+    Not a daemon thread, so that a child is reaped even if nothing uses the result.
     """
 
     def __init__(self, call: Callable[[], T]) -> None:
@@ -88,7 +88,7 @@ class Beside(Generic[T]):
             self._error = error
 
     def result(self) -> T:
-        """What the call has returned, once it has. Raises what the call raised."""
+        """Wait for the function; its result. Raises what it raised."""
         self._thread.join()
         if self._error is not None:
             raise self._error
@@ -104,7 +104,7 @@ def run_dora(
 ) -> Completed:
     """Run a dora command that ends by itself, such as `dora validate`, without colours.
 
-    account: whose dora it is; None: as root only a dora that is root's.
+    account: the user to run it as; None: then root may only run a dora that belongs to root.
     """
     own = os.environ if account is None else fresh_environment(account)
     surroundings = {**(own if environment is None else environment)}
@@ -115,10 +115,11 @@ def run_dora(
 def find_dora(
     given: str | None, venv: str | None, search_path: str, sight: Sight | None = None
 ) -> str:
-    """Absolute path of the dora command: the one given, else of the venv, else on `search_path`.
+    """Absolute path of the dora command: `given`, else that of `venv`, else on `search_path`.
 
-    Last comes that beside our own Python: pip has put both into one virtual environment, and what
-    is linked onto PATH is only doractl. sight: whose eyes look. Raises DoraSystemdError (NO_DORA).
+    The last place is beside our own Python: pip puts both into one virtual environment, and often
+    only doractl is linked into PATH. sight: the permissions to look with. Raises DoraSystemdError
+    (NO_DORA).
     """
     sight = sight or OwnSight()
     if given is not None:
@@ -146,7 +147,7 @@ def dora_version(
 ) -> str:
     """The version of a dora command, as in "1.1.0". account, environment: as for run_dora.
 
-    Raises DoraSystemdError (NO_DORA) if it is none, or older than OLDEST_DORA.
+    Raises DoraSystemdError (NO_DORA) if it is not dora, or older than OLDEST_DORA.
     """
     done = run_dora(dora, ["--version"], account, environment)
     version = parse_dora_version(done.stdout) if done.status == 0 else None
@@ -179,7 +180,7 @@ def version_numbers(version: str) -> tuple[int, ...]:
 
 
 def read_streams(streams: Sequence[int], seconds: float) -> list[bytes]:
-    """What can be read from pipes until their end, which closes them. Raises DoraSystemdError."""
+    """Read pipes until their end, and close them. Raises DoraSystemdError after `seconds`."""
     try:
         return _collect(streams, time.monotonic() + seconds, "a check")
     finally:
@@ -188,7 +189,7 @@ def read_streams(streams: Sequence[int], seconds: float) -> list[bytes]:
 
 
 def _collect(streams: Sequence[int], deadline: float, command: str) -> list[bytes]:
-    """All streams until their end; what exceeds the limit is read and dropped."""
+    """Read all streams until their end; drop what exceeds the limit."""
     kept = {fd: bytearray() for fd in streams}
     with selectors.DefaultSelector() as selector:
         for stream in kept:
