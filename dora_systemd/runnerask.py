@@ -1,4 +1,4 @@
-"""The old name of dora_systemd.runner.reload.request: unit files on machines run it by this one."""
+"""The old name of dora_systemd.runner.reload.request, for unit files that still use it."""
 
 import sys
 

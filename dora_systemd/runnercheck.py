@@ -1,4 +1,4 @@
-"""The old name of dora_systemd.runner.check: a doractl that an upgrade overtakes runs this one."""
+"""The old name of dora_systemd.runner.check, for a doractl that an upgrade has replaced."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""The old name of dora_systemd.runner.stop_post: unit files on machines run it by this one."""
+"""The old name of dora_systemd.runner.stop_post, for unit files that still use it."""
 
 import sys
 

@@ -1,6 +1,6 @@
 """The old name of dora_systemd.runner.reload.settings_file.
 
-A runner goes on through an upgrade, and runs it by the name that it has loaded.
+A runner that was started before an upgrade has loaded this name, and still runs it.
 """
 
 import sys

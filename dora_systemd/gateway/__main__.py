@@ -1,7 +1,7 @@
 """The main process of dora-gateway.service: `python3 -m dora_systemd.gateway`.
 
-It is a front only. It has no state but a token, nothing depends on it, and it ends when nobody is
-there; systemd holds the port and starts it again, see systemd.socket(5).
+The gateway is a front end. Its only state is a token, nothing depends on it, and it exits when it
+is idle. systemd keeps the port open and starts it again, see systemd.socket(5).
 """
 
 import argparse
@@ -39,7 +39,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def parse_arguments(arguments: Sequence[str]) -> float:
-    """The seconds without a connection after which the gateway ends."""
+    """The idle time in seconds after which the gateway exits."""
     parser = argparse.ArgumentParser("dora-gateway", description="see dora-systemd(7)")
     parser.add_argument("--exit-idle-time", default="60s", metavar="DURATION")
     given = parser.parse_args(arguments).exit_idle_time
@@ -47,13 +47,13 @@ def parse_arguments(arguments: Sequence[str]) -> float:
 
 
 def find_scope() -> Scope:
-    """Whose gateway this is: a user's manager has its directories below /run/user."""
+    """The scope of this gateway: a user's manager has its directories below /run/user."""
     directory = os.environ.get("RUNTIME_DIRECTORY", "")
     return Scope(is_user=is_directory_of_user(directory), uid=os.getuid())
 
 
 def ensure_token(path: Path) -> str:
-    """The token of this gateway, made when there is none. Raises DoraSystemdError."""
+    """The token of this gateway, created if it is missing. Raises DoraSystemdError."""
     with suppress(DoraSystemdError):
         token = read_text(path).strip()
         if len(token) >= _MIN_TOKEN:

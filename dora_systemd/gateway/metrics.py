@@ -11,7 +11,7 @@ from dora_systemd.verbs.facts.snapshot import read_snapshot
 
 
 async def answer_metrics(request: Request) -> Answer:
-    """One reading. Raises DoraSystemdError where systemd is out of reach."""
+    """One snapshot. Raises DoraSystemdError if systemd is unreachable."""
     text = await asyncio.to_thread(_read, request.scope)
     return Answer(200, CONTENT_TYPE, text.encode("utf-8", "replace"))
 

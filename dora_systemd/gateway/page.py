@@ -1,4 +1,4 @@
-"""The status page: plain files, which ask for nothing from anywhere else."""
+"""The status page: static files that load nothing from other servers."""
 
 from functools import cache
 from pathlib import Path
@@ -28,7 +28,7 @@ HEADERS = {
 
 
 def page_routes() -> dict[str, Get]:
-    """A route for each file of the page."""
+    """One route for each file of the page."""
     names = sorted(path.name for path in DIRECTORY.iterdir() if path.suffix in TYPES)
     return {"/" if name == INDEX else f"{PREFIX}{name}": _answer_file for name in names}
 

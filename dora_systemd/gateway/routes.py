@@ -1,4 +1,4 @@
-"""What the gateway answers: one line for each path."""
+"""The paths that the gateway serves."""
 
 from dora_systemd.decisions.gateway.request import PLAIN, Answer, Get, Request, Talk
 from dora_systemd.gateway.control.serve import serve_control
@@ -10,7 +10,7 @@ HEALTH = "/health"
 
 
 async def answer_health(_request: Request) -> Answer:
-    """What dora's own coordinator says there."""
+    """The reply of dora's own coordinator."""
     return Answer(200, PLAIN, b"ok")
 
 
@@ -25,4 +25,4 @@ SOCKETS: dict[str, Talk] = {
 }
 
 OPEN_TO_ALL = frozenset({HEALTH})
-"""What every user of the machine may ask; it tells nothing."""
+"""Paths that every local user may read; they reveal nothing."""

@@ -1,7 +1,7 @@
 """The gateway's server: HTTP and WebSockets on the sockets that systemd has opened.
 
-Every connection passes the same gate (access.py) before a route sees it. The library takes GET
-requests and one request for each connection, which is all that is needed.
+access.py decides about every connection before a route gets it. The library supports only GET
+requests and one request for each connection, which is sufficient here.
 """
 
 import asyncio
@@ -37,10 +37,10 @@ from dora_systemd.trust.socket_table import peer_uid
 log = logging.getLogger(__name__)
 
 MAX_FRAME = 1024 * 1024
-"""Bytes; dora's own limit for its coordinator."""
+"""Maximum bytes of a frame; the limit of dora's own coordinator."""
 
 OPEN_SECONDS = 20.0
-"""For a request to arrive whole and be answered."""
+"""Timeout for a request to arrive completely and be answered."""
 _ANSWER_SECONDS = 15.0
 _BACKLOG = 1024
 _REASON_BYTES = 120
@@ -48,12 +48,12 @@ _REASON_BYTES = 120
 _ALWAYS = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
 
 _quiet = logging.getLogger("dora_systemd.websockets")
-# What strangers send is no event of ours, and the library writes tracebacks about it.
+# Malformed requests are not our errors, and the library logs a traceback for each of them.
 _quiet.setLevel(logging.CRITICAL + 1)
 
 
 class Gateway:
-    """Answers for one scope. token: what callers of other users must have."""
+    """Serves one scope. token: required from callers that are other users."""
 
     def __init__(self, scope: Scope, token: str) -> None:
         self._scope = scope
@@ -63,18 +63,18 @@ class Gateway:
         self._since = time.monotonic()
 
     async def run(self, sockets: Sequence[socket.socket], idle_seconds: float) -> None:
-        """Serve until nobody has been connected for that long; cancel to end it at once."""
+        """Serve until there was no connection for `idle_seconds`; cancel it to end at once."""
         while not await self._round(sockets, idle_seconds):
             log.debug("somebody came at the last moment")
 
     async def _round(self, sockets: Sequence[socket.socket], idle_seconds: float) -> bool:
-        """Listen until it is quiet, then no longer; whether nobody came between the two."""
+        """Listen until idle, then close; whether no connection came in between."""
         servers = [await self._listen(one) for one in sockets]
         try:
             while (left := self._idle_left(idle_seconds)) > 0:
                 await asyncio.sleep(left)
         finally:
-            # systemd keeps the sockets: who connects from here on starts the next gateway.
+            # systemd keeps the sockets: later connections start the next gateway.
             for server in servers:
                 server.close(close_connections=False)
         await asyncio.sleep(0)
@@ -98,7 +98,7 @@ class Gateway:
             compression=None,
             max_size=MAX_FRAME,
             open_timeout=OPEN_SECONDS,
-            # A dora command that waits for an answer reads nothing, and answers no ping.
+            # A dora command that waits for a reply does not read, so it answers no ping.
             ping_interval=None,
         )
 
@@ -159,7 +159,7 @@ class Gateway:
         refusal = refuse_address(caller)
         if refusal or _path(raw) in OPEN_TO_ALL or has_token(caller, self._token):
             return refusal
-        # Asked again, and not the last word: an address may be None once the other side has gone.
+        # Look up the user again; an address may be None once the client has disconnected.
         ends = (connection.remote_address, connection.local_address)
         if all(ends):
             peer, own = (tuple(end[:2]) for end in ends)
@@ -168,7 +168,7 @@ class Gateway:
         return refuse_user(caller, os.getuid(), self._token)
 
     async def _routed(self, raw: RawRequest) -> Answer | None:
-        # Any header may be there twice, which get() takes for an error.
+        # get() raises for a header that occurs twice.
         upgrade = ",".join(raw.headers.get_all("Upgrade")).lower()
         path, wants_socket = _path(raw), "websocket" in upgrade
         if getattr(raw, "method", "GET") != "GET":
@@ -181,7 +181,7 @@ class Gateway:
             return await GET[path](self._request(raw))
 
     async def _talk(self, connection: ServerConnection) -> None:
-        """A WebSocket connection from its beginning to its end."""
+        """Serve one WebSocket connection."""
         raw = connection.request
         assert raw is not None
         try:
@@ -200,7 +200,7 @@ class Gateway:
 
 
 def _uid_behind(transport: asyncio.BaseTransport) -> int | None:
-    """Whose the other end is; asked at once, as long as that has not gone."""
+    """The user at the other end; ask at once, before it disconnects."""
     ends = (transport.get_extra_info("peername"), transport.get_extra_info("sockname"))
     return peer_uid(ends[0][:2], ends[1][:2]) if all(ends) else None
 
@@ -227,5 +227,5 @@ def _response(answer: Answer) -> Response:
 
 
 def _short(text: str) -> str:
-    """As much as a closing frame takes."""
+    """`text`, cut to what a closing frame can have."""
     return text.encode()[:_REASON_BYTES].decode(errors="ignore")

@@ -1,7 +1,7 @@
 """The main process of a dataflow's unit: `python3 -m dora_systemd.runner`, started by systemd.
 
-Its exit status is RunnerExit in decisions/life/states.py. Here is what comes before the rest of
-it is imported, which takes longer than dora's coordinator takes to listen.
+Its exit status is RunnerExit in decisions/life/states.py. This module starts the coordinator before
+it imports the rest of the runner: the imports take longer than the coordinator takes to listen.
 """
 
 import contextlib
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
 
 def begin(argv: list[str]) -> "tuple[Child, DoraCheck] | None":
-    """The coordinator of the first run, and dora's checks beside it.
+    """Start the coordinator of the first run, and dora's checks in parallel.
 
-    None where that is not possible: who needs it says why.
+    Returns None if that fails: run_cell() tries again and reports the error.
     """
     directory = os.environ.get("RUNTIME_DIRECTORY")
     if directory:
@@ -54,5 +54,5 @@ def main(argv: list[str]) -> int:
 if __name__ == "__main__":
     status = main(sys.argv[1:])
     sys.stderr.flush()
-    # Not sys.exit: taking the interpreter apart is a third of what a stop waits for.
+    # Not sys.exit(): finalizing the interpreter takes a third of the time of a stop.
     os._exit(status)

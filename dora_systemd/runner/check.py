@@ -1,7 +1,7 @@
-"""What a runner would refuse: `python3 -m dora_systemd.runner.check`, with the runner's arguments.
+"""Reports what a runner would refuse: `python3 -m dora_systemd.runner.check`.
 
-`doractl start --dry-run` asks it. It prints the refusal and ends as the runner would; nothing is
-started but dora's own checks.
+`doractl start --dry-run` runs it with the runner's arguments. It prints the refusal and exits with
+the runner's exit status. It starts nothing but dora's own checks.
 """
 
 import os

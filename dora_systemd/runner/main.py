@@ -1,4 +1,9 @@
-"""The life of a cell: what the main process of a dataflow's unit does, see dora_systemd.runner."""
+"""The life of a cell: what the main process of a dataflow's unit does, see runner/__main__.py.
+
+run_cell() lives as long as the unit. It runs the dataflow once, and again whenever a reload asks
+for that: each run_once() has its own coordinator, daemon and pump. What outlasts a run (pipes,
+groups, reloader, sockets) is in Runs.
+"""
 
 import asyncio
 import contextlib
@@ -61,19 +66,19 @@ LOSSES_SECONDS = 10.0
 CANCEL_SECONDS = 0.5
 
 Begun = tuple[Child, DoraCheck]
-"""A coordinator that boots, and what dora is asked meanwhile."""
+"""A coordinator that is starting, and dora's checks that run in parallel."""
 
 
 async def run_cell(
     options: RunnerOptions, paths: CellPaths, begun: Begun | None = None
 ) -> RunnerExit:
-    """Live the life of one cell: one run of the dataflow after the other, until it has to end.
+    """Live the life of one cell: one run of the dataflow after another.
 
-    begun: what there is of the first run already.
+    begun: the parts of the first run that exist already. Raises what prevents a run.
     """
     loop = asyncio.get_running_loop()
     journal, clock = JournalSocket(), StopClock(options.grace)
-    # While systemd holds the pipes too, what is in them outlives a kill of this process.
+    # systemd holds the pipes too, so their content survives a kill of this process.
     fd_store.forget_inherited()
     origin = Origin(options.name, options.uuid)
     pipes = LogPipes(loop, journal, origin, fd_store.store, fd_store.forget)
@@ -94,7 +99,7 @@ async def run_cell(
 
 
 def tell_failure(pipes: LogPipes, error: DoraSystemdError, cause: Cause) -> None:
-    """Say why there is no run of the dataflow."""
+    """Record why there is no run of the dataflow, and show it in STATUS=."""
     pipes.write_event("dataflow-failed", reason=error.message, cause=cause)
     notify.send_status(format_refusal(error))
 
@@ -106,7 +111,7 @@ def furnish(
     clock: StopClock,
     begun: Begun | None,
 ) -> "Runs":
-    """Enter the unit's group, and make what all runs share. Raises OSError."""
+    """Enter the unit's cgroup, and create what all runs share. Raises OSError."""
     unit = enter_supervisor()
     make_directories(paths)
     environment = node_environment(os.environ)
@@ -119,10 +124,11 @@ def furnish(
 
 @dataclass(frozen=True)
 class Runs:
-    """What all runs of the dataflow share. unit: cgroup directory. environment: of the nodes.
+    """What all runs of the dataflow share.
 
-    check: dora's, of the first run. beside: their tasks. clock: of the stop that ends the last of
-    them. coordinator: that of the first run, if it is there already.
+    unit: cgroup directory. environment: that of the nodes. check: dora's, for the first run.
+    beside: tasks that outlast a run. clock: that of the stop that ends the last run. coordinator:
+    that of the first run, if it exists already.
     """
 
     paths: CellPaths
@@ -138,7 +144,7 @@ class Runs:
 
 
 async def live(cell: Runs, losses: LossWatch | None) -> RunnerExit:
-    """Run the dataflow, and again as long as reloads ask for it."""
+    """Run the dataflow, and again as often as reloads ask for it."""
     reach = partial(read_coordinator, cell.paths.control)
     beside = cell.beside
     beside.spawn("reload", cell.reloader.work())
@@ -162,7 +168,7 @@ async def live(cell: Runs, losses: LossWatch | None) -> RunnerExit:
 
 
 def goes_on(cell: Runs, last: Cell) -> bool:
-    """Whether another run follows: asked for, or the one before what has just failed."""
+    """Whether another run follows: a reload, or the version before a reload that has failed."""
     if last.reload:
         return True
     if not last.is_trial or last.ready_us or last.stop_by:
@@ -172,7 +178,7 @@ def goes_on(cell: Runs, last: Cell) -> bool:
 
 
 async def run_once(cell: Runs, is_again: bool) -> Cell:
-    """One run of the dataflow, with a dora of its own; how it ended. Raises DoraSystemdError."""
+    """One run of the dataflow with its own dora; the cell at the end. Raises DoraSystemdError."""
     started_us, options, reloader = now_us(), cell.reloader.options, cell.reloader
     dora = Engine(options.dora, cell.paths, cell.environment)
     try:
@@ -202,7 +208,7 @@ async def run_once(cell: Runs, is_again: bool) -> Cell:
             reloader.end()
             cell.nodes.close()
             if not pump.cell.reload:
-                # The loop runs on and the watchdog is fed.
+                # Wait without blocking the loop, so that the watchdog gets fed.
                 await cell.pipes.wait_empty(cell.clock.for_journal())
             dialogue.cancel()
         return pump.cell
@@ -211,24 +217,24 @@ async def run_once(cell: Runs, is_again: bool) -> Cell:
 
 
 def prepare_first(cell: Runs, options: RunnerOptions) -> Prepared:
-    """The dataflow of the first run. Raises DoraSystemdError for what is refused."""
+    """Read the dataflow for the first run. Raises DoraSystemdError if it is refused."""
     prepared = cell.check.beside(lambda: prepare(options, cell.environment))
     check_named_nodes(options, prepared.dataflow)
     return prepared
 
 
 async def tell_started(pump: Pump, reloader: Reloader) -> None:
-    """A run that has started once is no trial any more."""
+    """Tell the reloader when all nodes run: from then on the run is not a trial any more."""
     if await pump.wait(lambda cell: cell.state is State.RUNNING, None):
         reloader.has_started()
 
 
 def listen(options: RunnerOptions, pump: Pump, dialogue: Dialogue, clock: StopClock) -> None:
-    """Hear what asks the cell to stop, and do what is done from time to time."""
+    """Connect signals, timers and standard input to the pump."""
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         loop.add_signal_handler(number, partial(stop, pump, clock, number.name))
-    if clock.by:  # it came when the run before had ended already
+    if clock.by:  # the signal came between two runs
         loop.call_soon(stop, pump, clock, clock.by)
     dialogue.spawn("take samples", dialogue.take_samples(SAMPLE_SECONDS))
     if "WATCHDOG_USEC" in os.environ:
@@ -246,19 +252,19 @@ def listen(options: RunnerOptions, pump: Pump, dialogue: Dialogue, clock: StopCl
 
 
 def stop(pump: Pump, clock: StopClock, by: str) -> None:
-    """Ask the cell to stop."""
+    """Request a stop of the cell."""
     clock.begin(by)
     pump.push(life.StopAsked(now_us(), by))
 
 
 async def stop_at_eof(pump: Pump, clock: StopClock) -> None:
-    """Stop when who started the cell, attached, is gone."""
+    """Stop an attached dataflow when its terminal is gone."""
     await wait_eof(sys.stdin.fileno())
     stop(pump, clock, "terminal")
 
 
 def run_loop(cell: Coroutine[Any, Any, RunnerExit]) -> RunnerExit:
-    """As asyncio.run(), which would wait at the end for threads that nobody needs any more."""
+    """Run like asyncio.run(), but without waiting for threads at the end."""
     loop = asyncio.new_event_loop()
     try:
         return loop.run_until_complete(cell)

@@ -1,9 +1,9 @@
-"""What is left to say when the runner was killed.
+"""Writes the end of a dataflow to the journal after its runner was killed.
 
-ExecStopPost= of the unit: `python3 -m dora_systemd.runner.stop_post NAME UUID`. The runner's death
-leaves lines in the nodes' pipes, which systemd keeps open for us (adapters/host/fd_store.py), and
-no event says how the dataflow ended. After a runner that ended by itself there is nothing to do.
-It always ends with status 0: the unit's result is that of the runner.
+ExecStopPost= of the unit runs `python3 -m dora_systemd.runner.stop_post NAME UUID`. A killed runner
+leaves lines in the nodes' pipes, which systemd keeps open (adapters/host/fd_store.py), and no event
+about the end. If the runner exited by itself, there is nothing to do. The exit status is always 0,
+so that the unit keeps the result of the runner.
 """
 
 import contextlib
@@ -28,13 +28,13 @@ KILL_SECONDS = 2.0
 READ_SECONDS = 1.0
 KILLED_SECONDS = 0.005
 ALL_SECONDS = 8.0
-"""For everything: systemd allows as much as for a stop, so STOP_MARGIN in
-dora_systemd.decisions.life.stop_budget is the least, and Python has to start."""
+"""For all steps together. systemd allows as much as for a stop, at least STOP_MARGIN in
+dora_systemd.decisions.life.stop_budget; the start of Python is part of that."""
 STREAMS = {".out": "stdout", ".err": "stderr"}
 
 
 def main(argv: list[str]) -> int:
-    """Kill the nodes, write what they said last, and the event dataflow-failed."""
+    """Kill the nodes, and write their last lines and the event dataflow-failed."""
     deadline = time.monotonic() + ALL_SECONDS
     reason, directory = killed_by(os.environ), os.environ.get("RUNTIME_DIRECTORY", "")
     if not reason or len(argv) != 2 or not directory:
@@ -51,11 +51,11 @@ def main(argv: list[str]) -> int:
 
 
 def killed_by(environ: Mapping[str, str]) -> str:
-    """What ended the runner, "" if it ended by itself: EXIT_CODE in systemd.exec(5)."""
+    """How the runner was killed, "" if it exited by itself: EXIT_CODE in systemd.exec(5)."""
     if environ.get("EXIT_CODE", "") not in ("killed", "dumped"):
         return ""
     if environ.get("SERVICE_RESULT") == "success":
-        return ""  # SIGTERM before it could listen to it: stopped as soon as it was started
+        return ""  # SIGTERM before the runner had its handler: stopped right after the start
     if environ.get("SERVICE_RESULT") == "watchdog":
         return "the supervisor process hung and was killed by the watchdog"
     if environ.get("SERVICE_RESULT") == "timeout":
@@ -64,7 +64,7 @@ def killed_by(environ: Mapping[str, str]) -> str:
 
 
 def killed_cause(environ: Mapping[str, str]) -> Cause:
-    """What DORA_CAUSE says about a runner that was killed."""
+    """The DORA_CAUSE of a runner that was killed."""
     causes = {"watchdog": Cause.WATCHDOG, "timeout": Cause.TIMEOUT}
     return causes.get(environ.get("SERVICE_RESULT", ""), Cause.RUNNER_KILLED)
 
@@ -78,12 +78,12 @@ def write_last_words(
     cause: str = "",
     seconds: float = ALL_SECONDS,
 ) -> None:
-    """Write what is in the pipes below `directory`, and that the dataflow failed, in `seconds`.
+    """Write the content of the pipes below `directory`, and that the dataflow failed.
 
-    journal_socket: another one than journald's, for tests.
+    journal_socket: another socket than journald's, for tests. seconds: timeout for everything.
     """
     deadline = time.monotonic() + seconds
-    # Nearly always there is nothing to do: only then these imports cost their time.
+    # Imported late: they take long, and in most cases there is nothing to do.
     import asyncio
 
     from dora_systemd.adapters.journal.socket import JOURNAL_SOCKET, JournalSocket
@@ -120,9 +120,9 @@ def write_last_words(
 def read_logs_of_dora(
     loop: "AbstractEventLoop", pipes: "LogPipes", io: Path, seconds: float
 ) -> None:
-    """Write what dora's own log files have more than the runner has read, in `seconds`.
+    """Write what dora's log files have and the runner has not read, for at most `seconds`.
 
-    The daemon may still live, and writes what the nodes said last. Raises OSError.
+    The daemon may still run, and writes the last output of the nodes. Raises OSError.
     """
     from dora_systemd.adapters.logs.jsonl import PLACE_SUFFIX, resume_tail
 
@@ -152,7 +152,7 @@ def unit_group() -> Path:
 
 
 def out_of_memory(unit: Path) -> str:
-    """What there is to say if the kernel has killed the runner for want of memory, else ""."""
+    """The reason if the kernel has killed the runner because of memory, else ""."""
     from dora_systemd.adapters.cgroup import groups as cgroup
     from dora_systemd.adapters.cgroup.strain import read_oom
     from dora_systemd.decisions.resources.oom import largest
@@ -167,9 +167,9 @@ def out_of_memory(unit: Path) -> str:
 
 
 def kill_nodes(unit: Path, seconds: float) -> None:
-    """End every node of this unit: with KillMode=mixed they outlive the runner until now.
+    """Kill every node of this unit: with KillMode=mixed they are still running.
 
-    One that sleeps in the kernel does not die: after `seconds` it is left to systemd.
+    A process that sleeps in the kernel does not die; after `seconds` this leaves it to systemd.
     """
     from dora_systemd.adapters.cgroup import groups as cgroup
 

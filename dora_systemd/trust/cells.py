@@ -1,7 +1,7 @@
-"""What the nodes of a dataflow can write: the files below the RuntimeDirectory of its unit.
+"""Reads what the nodes of a dataflow can write: the files in the RuntimeDirectory of its unit.
 
-That directory belongs to the nodes' user. A node can put anything in the place of what its runner
-wrote, and all dataflows are in one list: whatever is there, the others must be shown.
+That directory belongs to the nodes' user, so a node can replace any file that the runner wrote
+there. `list` shows all dataflows together: a bad file of one must not hide the others.
 """
 
 from pathlib import Path
@@ -13,14 +13,14 @@ from dora_systemd.trust.files import read_file
 from dora_systemd.values import shown
 
 MAX_TABLE = 2 * 1024 * 1024
-"""Bytes of a node table; one of 2000 nodes has less."""
+"""Maximum bytes of a node table; one of 2000 nodes is smaller."""
 _NOT_THERE = (FileNotFoundError, NotADirectoryError, PermissionError)
 
 
 def read_cell_file(path: Path, max_bytes: int) -> bytes:
-    """A regular file of a cell, at most `max_bytes`, of the user whose RuntimeDirectory it is in.
+    """Read a regular file of a cell, at most `max_bytes`; its owner must own the directory.
 
-    Raises DoraSystemdError (BAD_INPUT), whose cause is the OSError where there was one.
+    Raises DoraSystemdError (BAD_INPUT), whose cause is the OSError, if there is one.
     """
     text = read_file(path, max_bytes)
     if text.place.borrowed:
@@ -31,9 +31,9 @@ def read_cell_file(path: Path, max_bytes: int) -> bytes:
 
 
 def read_table(directory: Path) -> CellStatus | None:
-    """The node table in a RuntimeDirectory; None before there is one, and for who may not read it.
+    """The node table in a RuntimeDirectory; None if it is missing or the caller may not read it.
 
-    Raises DoraSystemdError for anything that no runner writes.
+    Raises DoraSystemdError for content that no runner writes.
     """
     try:
         return CellStatus.from_json(read_cell_file(CellPaths(directory).status, MAX_TABLE))

@@ -1,15 +1,17 @@
-"""Paths that others may own: walked by descriptor, read within bounds, their owner never guessed.
+"""Opens paths that other users may own: walks by file descriptor, and bounds every read.
 
 The rules are those of systemd's own chase() with CHASE_SAFE:
 
-- A path is walked by descriptor, component by component. A symbolic link is followed only where
-  root alone can replace it.
-- Whoever owns a directory decides what is in it. So below a directory that is not root's, only
-  things of the same owner count as theirs; anything else was borrowed.
-- The owner is the owner of the descriptor that is read, never that of a path.
-- A read is bounded, and of a regular file. Nothing that a path can be makes it hang.
+- The walk opens one component after the other by descriptor. It follows a symbolic link only if
+  root alone can replace the link.
+- The owner of a directory controls its entries. So below a directory that root does not own, a file
+  counts as its owner's only if that user or root owns all directories above it. Otherwise it is
+  "borrowed": someone may have linked or moved it there.
+- The owner is read from the descriptor that is used, never from a path.
+- Only regular files are read, and only up to a limit. No path can make a read hang.
 
-A caller that is not root has no more rights than the files give: for it nothing is refused here.
+These rules protect root. For other callers the permissions of the files are enough, so nothing is
+refused.
 """
 
 import contextlib
@@ -32,10 +34,11 @@ _OTHERS_WRITE = stat.S_IWOTH
 
 
 class Place(NamedTuple):
-    """Where a walk has arrived.
+    """The end of a walk.
 
-    uid: owner of the thing. owners: of it and of all directories above it. shared: a directory
-    on the way, or at its end, whose entries more accounts than its owner can replace, or "".
+    uid: owner of the file or directory. owners: owners of it and of all directories above it.
+    shared: a directory on the way, or at the end, in which users other than its owner can replace
+    entries, or "".
     """
 
     path: str
@@ -46,18 +49,18 @@ class Place(NamedTuple):
 
     @property
     def is_roots(self) -> bool:
-        """Whether nobody but root can change it or put something else in its place."""
+        """Whether only root can change or replace it."""
         others_write = self.mode & (stat.S_IWOTH | stat.S_IWGRP)
         return self.owners == {0} and not self.shared and not others_write
 
     @property
     def is_open(self) -> bool:
-        """Whether anybody can put something into it, as into /tmp."""
+        """Whether it is a directory in which every user can create files, such as /tmp."""
         return stat.S_ISDIR(self.mode) and bool(self.mode & _OTHERS_WRITE)
 
     @property
     def borrowed(self) -> str:
-        """Why `uid` says nothing about who put the thing there, or ""."""
+        """Why `uid` need not be the user who put the file there, or ""."""
         if strangers := sorted(self.owners - {0, self.uid}):
             return f"{user_name(strangers[0])} owns a directory above it"
         if self.shared:
@@ -67,9 +70,9 @@ class Place(NamedTuple):
 
 @contextlib.contextmanager
 def reached(path: str | Path) -> Iterator[tuple[int, Place]]:
-    """A descriptor (O_PATH) of what is at the absolute `path`, and its place.
+    """Walk to the absolute `path`; a descriptor (O_PATH) and its place.
 
-    Raises OSError, and DoraSystemdError (BAD_INPUT) for a link that somebody else could change.
+    Raises OSError, and DoraSystemdError (BAD_INPUT) for a link that another user could change.
     """
     with contextlib.ExitStack() as held:
         walk = _Walk(held)
@@ -80,13 +83,14 @@ def reached(path: str | Path) -> Iterator[tuple[int, Place]]:
 
 
 def firm_part(path: str | Path, uid: int = 0, groups: Collection[int] = ()) -> str:
-    """The longest part of the absolute `path` in which nobody but root can replace anything.
+    """The longest part of the absolute `path` in which only root can replace anything.
 
-    It is what may be told to a program that walks paths as root and follows links, such as systemd
-    when it mounts: what follows in `path` may be a link to anywhere by then.
+    Only this part may be passed to a program that walks paths as root and follows links, such as
+    systemd when it mounts. The rest of `path` may have become a link to anywhere by then.
 
-    uid, groups: for whom it mounts. The part ends at a directory that is closed to that account,
-    whatever it says that it sees behind: mounted by itself, what is in there would be open to it.
+    uid, groups: the account for which systemd mounts. The part ends at a directory that this
+    account cannot enter, even if the account claims to see what is in it: a mount of its content
+    would give the account access.
     """
     firm = "/"
     with contextlib.ExitStack() as held, contextlib.suppress(OSError, DoraSystemdError):
@@ -102,7 +106,7 @@ def firm_part(path: str | Path, uid: int = 0, groups: Collection[int] = ()) -> s
 
 
 def list_directory(path: str | Path, most: int) -> list[str]:
-    """At most `most` of the names in the directory `path`, in order.
+    """At most `most` of the names in the directory `path`, sorted.
 
     Raises OSError, and DoraSystemdError as reached() does.
     """
@@ -116,7 +120,7 @@ def list_directory(path: str | Path, most: int) -> list[str]:
 
 
 def exists(path: str | Path) -> bool:
-    """Whether something is there; a link that may not be followed counts as something."""
+    """Whether something exists at `path`; a link that must not be followed counts as existing."""
     try:
         with reached(path):
             return True
@@ -135,7 +139,7 @@ def user_name(uid: int, nameless: str = "uid ") -> str:
 
 
 class _Walk:
-    """A walk from the root directory. Its descriptors are closed with `held`."""
+    """A walk from the root directory. Closing `held` closes its descriptors."""
 
     def __init__(self, held: contextlib.ExitStack) -> None:
         self._held = held
@@ -156,7 +160,7 @@ class _Walk:
         return fd
 
     def enter(self, name: str) -> list[str]:
-        """Go into `name`; what is to be walked first where that is a link."""
+        """Enter `name`. If that is a link, return the components to walk instead of it."""
         fd = self._open(name, self.fd)
         status = os.fstat(fd)
         if stat.S_ISLNK(status.st_mode):
@@ -168,9 +172,11 @@ class _Walk:
         return []
 
     def is_firm(self, name: str) -> bool:
-        """Whether root alone can put something else in the place of `name`. Raises OSError.
+        """Whether only root can replace the entry `name`. Raises OSError.
 
-        In a sticky directory its owner can, too. A group counts whoever is in it: ACLs show as one.
+        In a sticky directory the entry's owner can replace it too. A group with write permission
+        counts as other users, whoever its members are: the mask of an ACL shows as group
+        permission.
         """
         if self._status.st_uid != 0:
             return False
@@ -180,9 +186,9 @@ class _Walk:
         return owner == 0 and bool(self._status.st_mode & stat.S_ISVTX)
 
     def is_open_to(self, uid: int, groups: Collection[int]) -> bool:
-        """Whether an account may go through the directory that was reached, see inode(7).
+        """Whether an account may search the current directory, see inode(7).
 
-        An ACL that lets it in by name does not count: that closes more than need be.
+        An ACL entry for a named user does not count, which refuses more than necessary.
         """
         status, bit = self._status, stat.S_IXOTH
         if uid == status.st_uid:
@@ -205,7 +211,7 @@ class _Walk:
         return _parts(target)
 
     def _sharing(self) -> str:
-        """The directory that was reached, if more than its owner can replace what is in it."""
+        """The current directory, if users other than its owner can replace its entries, or ""."""
         mode, where = self._status.st_mode, self._where or "/"
         if not stat.S_ISDIR(mode) or mode & stat.S_ISVTX:
             return ""
@@ -213,7 +219,7 @@ class _Walk:
         return where if is_shared else ""
 
     def _has_members(self) -> bool:
-        """Whether the group is more than its owner's own: user private groups bear his name."""
+        """Whether others than the owner are members; a user private group has the user's name."""
         with contextlib.suppress(KeyError):
             group = grp.getgrgid(self._status.st_gid)
             owner = user_name(self._status.st_uid)
@@ -221,7 +227,7 @@ class _Walk:
         return True
 
     def place(self, path: str) -> Place:
-        """Where the walk has arrived."""
+        """The place of the current file or directory."""
         status, shared = self._status, self._shared or self._sharing()
         return Place(path, status.st_uid, status.st_mode, frozenset(self._owners), shared)
 

@@ -1,9 +1,9 @@
-"""Programs that somebody else may have written: nothing else starts a process for another user.
+"""Starts programs that another user may have written; no other module starts processes for others.
 
-- A program runs as the account whose it is, and with that account's environment: what stands in
-  root's is root's.
-- As root, without an account, only a program runs that nobody but root can change, all the way
-  up, and its interpreter likewise.
+- A program runs as the account that owns it, with that account's environment, so that no variable
+  of root's gets there.
+- As root, and without an account, only those programs run that root alone can change, including all
+  directories above them and their interpreters.
 """
 
 import os
@@ -22,14 +22,14 @@ from dora_systemd.values import shown
 DEFAULT_PATH = "/usr/local/bin:/usr/bin:/bin"
 _LANGUAGE = "C.UTF-8"
 _FIRST_LINE = 256
-"""Bytes of "#!INTERPRETER" that the kernel reads, see execve(2)."""
+"""Bytes of the line "#!INTERPRETER" that the kernel reads, see execve(2)."""
 
 Stream = int | IO[bytes]
 
 
 @dataclass(frozen=True)
 class Account:
-    """The user whom a program runs as, with all groups."""
+    """The user that a program runs as, with all groups."""
 
     uid: int
     gid: int
@@ -40,14 +40,14 @@ class Account:
 
 
 def account_from(entry: pwd.struct_passwd) -> Account:
-    """The account of an entry of passwd(5)."""
+    """The account of a passwd(5) entry."""
     groups = tuple(os.getgrouplist(entry.pw_name, entry.pw_gid))
     uid, gid = entry.pw_uid, entry.pw_gid
     return Account(uid, gid, groups, entry.pw_name, entry.pw_dir, entry.pw_shell)
 
 
 def account_of_uid(uid: int) -> Account:
-    """The account of a uid. Raises DoraSystemdError (NOT_FOUND) for one that is gone."""
+    """The account of a uid. Raises DoraSystemdError (NOT_FOUND) if the uid has no entry."""
     try:
         return account_from(pwd.getpwuid(uid))
     except (KeyError, OverflowError) as error:
@@ -57,13 +57,13 @@ def account_of_uid(uid: int) -> Account:
 
 
 def own_account() -> Account:
-    """The account that this process has already: in the cell of a dataflow, even if it is root."""
+    """The account of this process; in the cell of a dataflow that is enough, even for root."""
     uid = os.geteuid()
     return Account(uid, os.getegid(), tuple(os.getgroups()), user_name(uid))
 
 
 def fresh_environment(account: Account) -> dict[str, str]:
-    """What a program of the account finds, as after a login: nothing of the caller's."""
+    """The environment of the account's programs, as after a login, without the caller's."""
     return {
         "HOME": account.home,
         "USER": account.name,
@@ -83,11 +83,12 @@ def spawn(
     stdout: Stream = subprocess.PIPE,
     stderr: Stream = subprocess.PIPE,
 ) -> "subprocess.Popen[bytes]":
-    """Start a child in a session of its own, with no other descriptor than these three.
+    """Start a child process in a new session, with no file descriptors but these three.
 
-    account: whom it runs as; None: the caller, and as root root's own programs only. environment:
-    all of it; None: that of the account, or the caller's own where there is no account. Raises
-    OSError, and DoraSystemdError (NO_PERMISSION) for a program that root must not run.
+    account: the user that it runs as; None: the caller, and then root may run only root's own
+    programs. environment: the complete environment; None: that of the account, or the caller's if
+    there is no account. Raises OSError, and DoraSystemdError (NO_PERMISSION) for a program that
+    root must not run.
     """
     if account is None:
         check_program(command[0])
@@ -109,7 +110,7 @@ def spawn(
 
 
 def become(account: Account) -> None:
-    """This process is the account's from now on, for good. Raises OSError."""
+    """Change this process to the account for good. Raises OSError."""
     if account.uid != os.geteuid():
         os.setgroups(account.groups)
         os.setgid(account.gid)
@@ -117,15 +118,15 @@ def become(account: Account) -> None:
 
 
 def check_program(program: str) -> None:
-    """Raise DoraSystemdError (NO_PERMISSION) where root would run what others can change.
+    """Raise DoraSystemdError (NO_PERMISSION) if root would run a program that others can change.
 
-    program: a path, or a name that is looked up in PATH. One that is not there is not judged: who
-    runs it hears of that.
+    program: a path, or a name to look up in PATH. A missing program passes: starting it reports
+    that.
     """
     if os.geteuid() != 0:
         return
     found: str | None = program
-    for _ in range(3):  # a script, "env" in its first line, and what that finds
+    for _ in range(3):  # a script, "env" in its first line, and the program that env finds
         found = found if found and "/" in found else shutil.which(found or "")
         if found is None or not os.path.lexists(found):
             return
@@ -136,7 +137,7 @@ def check_program(program: str) -> None:
 
 
 def _interpreter(program: str) -> str | None:
-    """What runs a script, None for a binary. Raises DoraSystemdError for what is not root's."""
+    """A script's interpreter, None for a binary. Raises DoraSystemdError if it is not root's."""
     with reached(program) as (found, place):
         if not place.is_roots:
             owner = next((uid for uid in sorted(place.owners) if uid != 0), None)

@@ -1,7 +1,7 @@
-"""Paths that somebody else names, seen with his eyes: root's see behind doors closed to him.
+"""Checks paths that another user names with that user's permissions: root could see too much.
 
-A child that has become the account answers; it runs nothing but the few lines below. The account
-could trace it and make it lie, so its answers are believed no more than the account itself is.
+A child process takes on the account and answers; it runs only the few lines below. The account can
+trace the child and make it lie, so callers trust an answer no more than the account itself.
 """
 
 import contextlib
@@ -22,14 +22,15 @@ from dora_systemd.trust.programs import Account, spawn
 from dora_systemd.values import shown
 
 _SECONDS = 5.0
-"""For all answers together: what the account has mounted may hang, and it may stop the child."""
+"""Timeout in seconds for all answers together: a mount of the account may hang, and the account may
+stop the child."""
 _LONGEST = 4096
-"""Bytes of a path, see PATH_MAX in limits.h(0p): a longer one would not fit into the pipe."""
+"""Maximum bytes of a path, see PATH_MAX in limits.h(0p); a longer one may not fit into the pipe."""
 _MOST_DIGITS = 4
 _HEAD = 8
 _CHUNK = 65536
 
-# Requests and answers: a letter, the length in 7 digits, that many bytes.
+# Requests and answers: a letter, the length as 7 digits, and that many bytes.
 _EYES = """
 import os, stat, sys
 def read(path):
@@ -59,26 +60,26 @@ while head := sys.stdin.buffer.read(8):
 
 
 class Sight(Protocol):
-    """What somebody sees. All paths are absolute."""
+    """What an account sees of the file system. All paths are absolute."""
 
     def exists(self, path: str) -> bool:
-        """Whether something is there."""
+        """Whether something exists there."""
 
     def is_directory(self, path: str) -> bool:
-        """Whether a directory is there."""
+        """Whether it is a directory."""
 
     def is_program(self, path: str) -> bool:
-        """Whether it can be run."""
+        """Whether it is an executable program."""
 
     def real(self, path: str) -> str:
-        """Where the path leads, all links followed."""
+        """The path with all symbolic links resolved."""
 
     def read(self, path: str) -> bytes:
-        """The regular file, at most MAX_BYTES + 1 of it. Raises OSError."""
+        """The content of a regular file, at most MAX_BYTES + 1 bytes. Raises OSError."""
 
 
 class OwnSight:
-    """That of the caller."""
+    """The file system as the caller sees it."""
 
     def exists(self, path: str) -> bool:
         return self._mode(path) is not None
@@ -106,7 +107,7 @@ class OwnSight:
 
 
 class LentSight:
-    """That of an account. Raises DoraSystemdError where its child cannot be asked."""
+    """The file system as an account sees it. Raises DoraSystemdError if its child is silent."""
 
     def __init__(self, child: "subprocess.Popen[bytes]", account: Account) -> None:
         self._child = child
@@ -137,7 +138,7 @@ class LentSight:
         return False
 
     def _ask(self, letter: str, path: str) -> bytes:
-        """One question. Raises OSError with what the account met."""
+        """Send one request to the child. Raises the OSError that the account got."""
         assert self._child.stdin and self._child.stdout
         question = os.fsencode(path)
         if len(question) > _LONGEST:
@@ -177,9 +178,9 @@ class LentSight:
 
 @contextlib.contextmanager
 def sight_of(account: Account | None) -> Iterator[Sight]:
-    """How the account sees paths; None, or somebody who cannot become another: as the caller does.
+    """How the account sees paths; as the caller does for None, or if the caller is not root.
 
-    Raises DoraSystemdError (NO_PERMISSION) if the account cannot run our own Python.
+    Raises DoraSystemdError (NO_PERMISSION) if the account cannot execute our Python interpreter.
     """
     if account is None or account.uid == os.geteuid() or os.geteuid() != 0:
         yield OwnSight()
@@ -203,7 +204,7 @@ def sight_of(account: Account | None) -> Iterator[Sight]:
 
 
 def cannot_reach(user: str, path: str, is_own: bool = False) -> DoraSystemdError:
-    """The error for what the user of a dataflow cannot get at."""
+    """The error for a path that the user of a dataflow cannot access."""
     where = "put it where that user can read it, or choose another user with --uid"
     return DoraSystemdError(
         f"cannot start the dataflow as user {user}, who cannot reach {shown(path)}",

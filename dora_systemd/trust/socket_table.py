@@ -1,7 +1,7 @@
-"""The kernel's table of TCP sockets: whose is the other end of a connection within this machine?
+"""Finds the user at the other end of a local TCP connection, in the kernel's table of sockets.
 
-One socket is asked for by sock_diag(7); where the kernel has no such thing, the table is read from
-proc_net_tcp(5), which takes the longer the more connections there have been in the last minute.
+sock_diag(7) answers for one socket. If the kernel lacks it, proc_net_tcp(5) has the whole table,
+which takes longer the more connections there were in the last minute.
 """
 
 import contextlib
@@ -18,7 +18,7 @@ TABLES = (Path("/proc/net/tcp"), Path("/proc/net/tcp6"))
 Address = tuple[str, int]
 
 _REACHED = ("127.0.0.1", "0.0.0.0", "::", "::ffff:127.0.0.1")
-"""The addresses of listeners who get what is sent to 127.0.0.1."""
+"""Addresses of listeners that receive connections to 127.0.0.1."""
 
 _TRIES = 5
 _LISTENING = b"0A"
@@ -31,13 +31,14 @@ _NO_COOKIE = b"\xff" * 8
 _HEADER = struct.Struct("=IHHII")
 _QUESTION = struct.Struct("=BBBBI")
 _OWNER_PLACE = _HEADER.size + 4 + 48 + 12
-"""Of the fields uid and inode in an answer: behind a header, four bytes, the socket's identity (48
-bytes) and three numbers, see linux/inet_diag.h."""
+"""Offset of the fields uid and inode in an answer: after a header, four bytes, the socket's
+identity (48 bytes) and three numbers, see linux/inet_diag.h."""
 
 
 class Owner(NamedTuple):
-    """Whose a socket is. inode: 0 for one that its process has closed; the kernel says uid 0 then,
-    or did until Linux 6.16.
+    """The owner of a socket.
+
+    inode: 0 if its process has closed it. Kernels before Linux 6.16 then report uid 0.
     """
 
     uid: int
@@ -48,10 +49,10 @@ Lookup = Callable[[Address, Address], Owner | None]
 
 
 def peer_uid(peer: Address, own: Address, look: Lookup | None = None) -> int | None:
-    """The user whose socket is bound to `peer` and connected to `own`; None if nobody can tell.
+    """The uid that owns the socket bound to `peer` and connected to `own`; None if unknown.
 
-    A process that closes its socket while the kernel answers would be taken for root, and a long
-    table may lack a line at one reading: only what two answers agree on counts.
+    A process that closes its socket while the kernel answers would look like root, and one reading
+    of a long table may miss a line. So the result counts only if two answers agree.
     """
     look = look or find_owner
     before = None
@@ -67,13 +68,13 @@ def peer_uid(peer: Address, own: Address, look: Lookup | None = None) -> int | N
 def find_owner(peer: Address, own: Address) -> Owner | None:
     """The owner of the socket that is bound to `peer` and connected to `own`.
 
-    A reading of the table takes milliseconds, and who connects and vanishes again must not have
-    us read it each time.
+    Reading the table takes milliseconds. A client that connects and disconnects at once must not
+    cause a reading each time.
     """
     try:
         return _ask_kernel(peer, own)
     except FileNotFoundError:
-        # No such socket, or nobody in the kernel who knows about TCP.
+        # No such socket, or a kernel that does not support TCP here.
         if _kernel_knows():
             return None
     except (OSError, struct.error):
@@ -83,7 +84,7 @@ def find_owner(peer: Address, own: Address) -> Owner | None:
 
 @cache
 def _kernel_knows() -> bool:
-    """Whether the kernel tells of a socket that is there."""
+    """Whether the kernel answers for a socket that exists."""
     try:
         with socket.create_server(("127.0.0.1", 0)) as one:
             return _ask_kernel(one.getsockname(), ("0.0.0.0", 0)).inode != 0
@@ -92,7 +93,7 @@ def _kernel_knows() -> bool:
 
 
 def read_owner(peer: Address, own: Address, tables: tuple[Path, ...] = TABLES) -> Owner | None:
-    """The same from the tables in /proc."""
+    """Find the owner in the tables of /proc."""
     try:
         ends = [_entry(peer), _entry(own)]
     except (OSError, struct.error):
@@ -114,7 +115,7 @@ def listening_sockets(port: int, tables: tuple[Path, ...] = TABLES) -> frozenset
 
 
 def loopback_listeners(port: int, tables: tuple[Path, ...] = TABLES) -> frozenset[int]:
-    """The users who get the connections to a TCP port of 127.0.0.1."""
+    """The users that receive connections to a TCP port of 127.0.0.1."""
     ends = {_entry((address, port)) for address in _REACHED}
     found = (fields for fields in _listeners(port, tables) if fields[1] in ends)
     return frozenset(int(fields[7]) for fields in found)
@@ -128,7 +129,10 @@ def _listeners(port: int, tables: tuple[Path, ...]) -> Iterator[list[bytes]]:
 
 
 def _ask_kernel(peer: Address, own: Address) -> Owner:
-    """Raises OSError where the kernel does not answer such questions, or knows no such socket."""
+    """Ask the kernel by sock_diag(7).
+
+    Raises OSError if it does not support that or has no such socket.
+    """
     family, source, target = _family(peer), _packed(peer), _packed(own)
     identity = struct.pack("!HH16s16sI8s", peer[1], own[1], source, target, 0, _NO_COOKIE)
     question = _QUESTION.pack(family, socket.IPPROTO_TCP, 0, 0, _ANY_STATE) + identity
@@ -144,7 +148,7 @@ def _ask_kernel(peer: Address, own: Address) -> Owner:
 
 
 def _lines(tables: tuple[Path, ...], needle: bytes) -> Iterator[list[bytes]]:
-    """The fields of the lines that have `needle` in them; never a whole table in memory."""
+    """The fields of the lines that contain `needle`; reads the tables line by line."""
     for table in tables:
         with contextlib.suppress(OSError), table.open("rb") as file:
             for line in file:
@@ -153,7 +157,7 @@ def _lines(tables: tuple[Path, ...], needle: bytes) -> Iterator[list[bytes]]:
 
 
 def _entry(address: Address) -> bytes:
-    """An address as in the table: words of 32 bits in this machine's order, and the port."""
+    """An address as in the table: 32-bit words in this machine's byte order, and the port."""
     packed = _packed(address)
     words = struct.unpack(f"={len(packed) // 4}I", packed)
     return b"%s:%04X" % (b"".join(b"%08X" % word for word in words), address[1])

@@ -1,10 +1,9 @@
-"""Sockets that others own: whose the other end is, before anything is sent to it.
+"""Connects to sockets that other users own, and checks the other end before it sends anything.
 
-The RuntimeDirectory of a unit is systemd's work: root alone can give it to somebody, so its owner
-is whom the unit runs as. What lies in it is that user's to replace. A socket there counts if it is
-owned by the same user, no link, and listened to by a process of that user: then whatever is said
-to it is said to nobody but the owner of the dataflow. A port of 127.0.0.1 is anybody's; it counts
-if its listener has that uid.
+Only root can give a RuntimeDirectory to a user, so the owner of the directory is the user of the
+unit. That user can replace everything in it. A Unix socket there counts if that user owns it, it is
+not a link, and a process of that user listens: then only the owner of the dataflow receives what is
+sent. Any user can listen on a port of 127.0.0.1, so the listener must have that uid.
 """
 
 import contextlib
@@ -31,16 +30,16 @@ Peer = Callable[[socket.socket], int]
 
 
 def peer_of(stream: socket.socket) -> int:
-    """The uid of who listens at the other end, as it was when it began to."""
+    """The uid of the listener, as it was at listen(2)."""
     found = stream.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
     return int(_CREDENTIALS.unpack(found)[1])
 
 
 def connect_unix(path: Path, seconds: float, peer: Peer = peer_of) -> socket.socket:
-    """A connection to the socket at the absolute `path`, of the user who owns its directory.
+    """Connect to the socket at the absolute `path`, which belongs to the owner of its directory.
 
-    seconds: timeout of each operation on it. Raises OSError, and DoraSystemdError (NO_PERMISSION)
-    for a socket, or a listener, of anybody else.
+    seconds: timeout of each operation. Raises OSError, and DoraSystemdError (NO_PERMISSION) if
+    another user owns the socket or listens.
     """
     with contextlib.ExitStack() as held:
         directory, place = held.enter_context(reached(path.parent))
@@ -56,7 +55,7 @@ def connect_unix(path: Path, seconds: float, peer: Peer = peer_of) -> socket.soc
         undo = held.enter_context(contextlib.ExitStack())
         undo.callback(stream.close)
         stream.settimeout(seconds)
-        # The very socket that was looked at, whatever its name leads to by now.
+        # Connect to the file that was checked, even if its name leads elsewhere by now.
         stream.connect(f"/proc/self/fd/{fd}")
         _check_owner(path, peer(stream), place.uid)
         undo.pop_all()
@@ -68,7 +67,7 @@ def require_listener(
 ) -> None:
     """Return if only `uid` listens on a port of 127.0.0.1.
 
-    Raises DoraSystemdError: NOT_RUNNING if nobody does, NO_PERMISSION if somebody else does.
+    Raises DoraSystemdError: NOT_RUNNING if there is no listener, NO_PERMISSION for another user's.
     """
     found = listeners(port)
     what = f"cannot use port {port} of 127.0.0.1"

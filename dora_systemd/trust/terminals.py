@@ -1,8 +1,8 @@
-"""A program of somebody else that speaks to root's terminal: it gets one of its own instead.
+"""Runs another user's program on a pseudoterminal instead of root's terminal.
 
-Whoever has a terminal can put words into its input, TIOCSTI in ioctl_tty(2), which root's shell
-then runs, and can go on reading from it when root believes the program has ended. So it is in a
-session of its own, on a pseudoterminal, and we carry over what either side writes.
+A process with a terminal open can insert input into it, TIOCSTI in ioctl_tty(2), which root's shell
+would run. It could also keep reading from it after root believes that the program has ended. So the
+program gets its own session and pseudoterminal, and run_apart() copies between the two.
 """
 
 import contextlib
@@ -22,15 +22,15 @@ from dora_systemd.trust.programs import Account, become
 
 _CHUNK = 65536
 _MOST_LATE = 64
-"""Chunks that are still shown after the program has ended: what it left behind may go on."""
+"""Chunks to show after the program has ended: its children may keep writing."""
 _STREAMS = range(3)
 _BY_SIGNAL = 128
 
 
 def run_apart(command: Sequence[str], environment: Mapping[str, str], account: Account) -> int:
-    """Run a program as `account` to its end; its exit status, 128 + the signal that killed it.
+    """Run a program as `account` until it exits; its exit status, or 128 + signal.
 
-    Its streams are the caller's, but for those that are a terminal. Raises OSError.
+    Its standard streams are the caller's, except for those that are a terminal. Raises OSError.
     """
     ours, theirs = os.openpty()
     child = os.fork()
@@ -66,7 +66,7 @@ def _become_program(
 
 @contextlib.contextmanager
 def _carried(child: int, ours: int, screen: int | None) -> Iterator[None]:
-    """Our own terminal as dumb as a wire, its size and our signals handed on."""
+    """Set our terminal to raw mode, and pass on its size and our signals."""
 
     def hand_on(number: int, _frame: FrameType | None) -> None:
         if number == signal.SIGWINCH:
@@ -97,7 +97,7 @@ def _copy_size(screen: int | None, ours: int) -> None:
 
 
 def _carry(child: int, ours: int, screen: int | None) -> None:
-    """Hand on what is typed and what is written until the program has ended."""
+    """Copy input and output until the program has ended."""
     end = os.pidfd_open(child)
     sources = [end, ours, *([0] if os.isatty(0) else [])]
     try:
@@ -114,7 +114,7 @@ def _carry(child: int, ours: int, screen: int | None) -> None:
 
 
 def _copy(source: int, target: int | None) -> bool:
-    """One chunk; False at the end, which a pseudoterminal tells by an error."""
+    """Copy one chunk; False at the end, which a pseudoterminal reports as an error."""
     try:
         data = left = os.read(source, _CHUNK)
         while left and target is not None:

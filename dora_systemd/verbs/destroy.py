@@ -1,6 +1,6 @@
-"""`doractl destroy`: stops everything of one scope, and looks whether anything is left.
+"""`doractl destroy`: stops everything in one scope, and reports what is left.
 
-Every step has its deadline. Units that are not ours are not touched, even in our slice.
+Every step has a timeout. Units of others are not touched, even in our slice.
 """
 
 import signal
@@ -27,20 +27,20 @@ from dora_systemd.verbs.stop import release_enabled
 from dora_systemd.verbs.up import written_files
 
 UNBOUNDED_SECONDS = 90.0
-"""For a dataflow whose TimeoutStopSec= is infinity: systemd's own default."""
+"""Timeout for a dataflow with TimeoutStopSec=infinity: systemd's own default."""
 
 _MARGIN_SECONDS = 5.0
 _KILLED_SECONDS = 10.0
 _POLL_SECONDS = 0.05
 _ROUNDS = 5
-"""So often do we look for dataflows that somebody starts meanwhile."""
+"""Maximum searches for dataflows that were started meanwhile."""
 
 _GATEWAY = (SOCKET_UNIT, SERVICE_UNIT)
 
 
 @dataclass(frozen=True)
 class Ended:
-    """One dataflow that was to stop. note: what there is to say; problem: why it has not."""
+    """One dataflow that was stopped. note: what else to report; problem: why it did not stop."""
 
     name: str
     note: str = ""
@@ -49,7 +49,7 @@ class Ended:
 
 @dataclass(frozen=True)
 class _Stop:
-    """A stop on its way. deadline: in seconds of the monotonic clock."""
+    """A stop in progress. deadline: seconds of the monotonic clock."""
 
     cell: Cell
     deadline: float
@@ -57,17 +57,17 @@ class _Stop:
 
 
 def running_cells(manager: Manager) -> list[Cell]:
-    """The dataflows that there are to stop."""
+    """The dataflows to stop."""
     return [cell for cell in read_cells(manager) if cell.is_up]
 
 
 def stop_all(
     manager: Manager, scope: Scope, want_kill: bool, now: Callable[[], float] = time.monotonic
 ) -> Iterator[Ended]:
-    """Stop all dataflows at the same time; each as soon as it has ended.
+    """Stop all dataflows in parallel; yields each as soon as it has ended.
 
-    want_kill: without a word to the nodes. Otherwise each has the time that its unit gives it
-    (TimeoutStopSec=), and is killed then.
+    want_kill: kill the nodes at once. Otherwise each dataflow has the TimeoutStopSec= of its unit,
+    and is killed then.
     """
     given_up: set[str] = set()
     for _ in range(_ROUNDS):
@@ -95,7 +95,7 @@ def stop_gateway(manager: Manager, scope: Scope) -> bool:
 
 
 def stop_slice(manager: Manager) -> list[str]:
-    """Stop dora.target and dora.slice; the units of others that keep the slice."""
+    """Stop dora.target and dora.slice; the units of others that keep the slice active."""
     facts = manager.read(SLICE, ["LoadState", "ActiveState", "RequiredBy"])
     others = [unit for unit in facts["RequiredBy"] if _state(manager, unit) not in DOWN]
     wanted = [BOOT_TARGET, *([] if others else [SLICE])]
@@ -108,9 +108,9 @@ def stop_slice(manager: Manager) -> list[str]:
 def processes_left(
     manager: Manager, others: Sequence[str], now: Callable[[], float] = time.monotonic
 ) -> list[str]:
-    """What still runs in dora.slice, as "process 12 (command)"; not that of the units `others`.
+    """What is still running in dora.slice, as "process 12 (command)", without the units `others`.
 
-    It is killed once more: systemd leaves processes behind where SendSIGKILL= is off.
+    Kills these processes once more: with SendSIGKILL=no systemd leaves some behind.
     """
     deadline = now() + _KILLED_SECONDS
     while (groups := _populated(manager, others)) and now() < deadline:
@@ -123,7 +123,7 @@ def processes_left(
 
 
 def _populated(manager: Manager, others: Sequence[str]) -> list[Path]:
-    """The groups of units in dora.slice that have a process."""
+    """The cgroups of units in dora.slice that have a process."""
     return [
         path
         for path in sorted(slice_group(manager).glob("*.*"))
@@ -132,7 +132,7 @@ def _populated(manager: Manager, others: Sequence[str]) -> list[Path]:
 
 
 def _is_ours(manager: Manager, unit: str) -> bool:
-    """Whether it is a dataflow, and not only named like one."""
+    """Whether the unit is a dataflow of ours, and does not only have such a name."""
     return name_from_unit(unit) is not None and read_cell(manager, unit) is not None
 
 
@@ -163,7 +163,7 @@ def _stop(
 
 
 def _begin(manager: Manager, cell: Cell, want_kill: bool, now: float) -> _Stop:
-    """Also one that restarts or starts: the job takes the place of what systemd was about to do."""
+    """Stop a dataflow in any state: the job replaces a start or restart that is queued."""
     given = manager.read(cell.unit, ["TimeoutStopUSec"])["TimeoutStopUSec"]
     try:
         manager.queue_job("StopUnit", cell.unit)

@@ -1,6 +1,6 @@
-"""`doractl doctor`: looks at everything that a dataflow needs; every check is one function.
+"""`doractl doctor`: checks everything that a dataflow needs, with one function for each check.
 
-Without systemd the checks that ask it are left out: there is nothing to ask.
+Checks that need systemd are left out if it cannot be reached.
 """
 
 import os
@@ -69,7 +69,7 @@ def examine(reach: Callable[[Scope], Manager], scope: Scope) -> list[Finding]:
 def _guarded(
     check: Callable[[Manager, Scope], Iterator[Finding]], manager: Manager, scope: Scope
 ) -> list[Finding]:
-    """What a check finds; one that cannot be done is a finding itself."""
+    """The findings of a check; a check that fails is a finding itself."""
     topic = check.__name__.removeprefix("_")
     try:
         return list(check(manager, scope))
@@ -132,7 +132,7 @@ def _units(manager: Manager, scope: Scope) -> Iterator[Finding]:
 
 
 def _enabled(path: Path) -> Iterator[Finding]:
-    """Whether what a boot starts can be started."""
+    """Check that the dataflows that are started at boot can start."""
     try:
         text = read_unit_file(path)
     except DoraSystemdError as error:
@@ -229,7 +229,7 @@ def _user(scope: Scope) -> Iterator[Finding]:
 
 
 def _settings(scope: Scope) -> Iterator[Finding]:
-    """The files that count for every dataflow; the one beside a dataflow is for start to check."""
+    """Check the settings files for all dataflows; `start` checks the one beside a dataflow."""
     del scope
     for path in settings_files(Path("/dataflow.yml"), os.environ)[1:]:
         if path.exists():

@@ -1,4 +1,4 @@
-"""`doractl env`: how a stock dora command finds the gateway, or one dataflow."""
+"""`doractl env`: variables by which a dora command finds the gateway, or one dataflow."""
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.decisions.dora.variables import coordinator_variables
@@ -9,10 +9,10 @@ from dora_systemd.verbs.node import dora_environment, reached_coordinator
 
 
 def read_variables(manager: Manager, scope: Scope, selector: str | None) -> dict[str, str]:
-    """The variables by name; `selector`: of that dataflow, not of the gateway.
+    """The variables by name; with `selector` those of that dataflow instead of the gateway.
 
-    Raises DoraSystemdError: NOT_RUNNING, NOT_FOUND, NO_PERMISSION when it is another user's, or
-    USAGE for one with a network of its own.
+    Raises DoraSystemdError: NOT_RUNNING, NOT_FOUND, NO_PERMISSION for another user's dataflow, or
+    USAGE for one with a private network.
     """
     if selector is None:
         port = require_gateway(manager, scope)

@@ -1,7 +1,14 @@
-"""`doractl logs --until-end`: the records of a dataflow until it has ended.
+"""`doractl logs --until-end`: print the records of a dataflow until it has ended.
 
-journalctl(1) selects and formats in all its forms, but cannot tell that nothing more will come. So
-it is called again and again, each time for what is new, and one more time after the end.
+journalctl(1) selects and formats the records, but `journalctl --follow` never ends. So follow_steps
+calls journalctl once for each step: first for the existing records, then for those after the
+cursor, and once more after the end. A cursor file connects the steps, --cursor-file= in
+journalctl(1).
+
+UnitWatch, a `journalctl --follow` that prints only message IDs, tells when to take the next step.
+It starts before the first step, so no record is missed between the two. systemd logs the end of a
+unit on restarts too; so the ActiveState and the job of the unit decide whether more will come. The
+order matters: is_up() comes before the last step, or records written in between would be missing.
 """
 
 import os
@@ -28,30 +35,30 @@ from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
 
 STEP_SECONDS = 0.2
-"""Between two calls of journalctl: opening all files of a journal takes tens of milliseconds."""
+"""At least this long between two steps: journalctl needs tens of ms to open all journal files."""
 POLL_SECONDS = 2.0
-"""systemd is asked that often in silence: its own word about the end may have got lost."""
+"""Without new records, ask systemd this often: the record of the unit's end can be missing."""
 END_SECONDS = 3.0
 FIRST_LINES = 10
-"""What journalctl --follow begins with."""
+"""The default of journalctl --follow."""
 
 _CHUNK = 1 << 18
 
 
 class Watch(Protocol):
-    """What is asked of UnitWatch."""
+    """The part of UnitWatch that follow_steps uses."""
 
     def wait(self, seconds: float) -> bool:
-        """Return when there is something new, or after `seconds`; whether there is."""
+        """Wait for a new record, at most `seconds`; whether there is one."""
 
     def take_end(self) -> bool:
-        """Whether the unit has ended since the last call."""
+        """Whether systemd has logged an end of the unit since the last call."""
 
 
 class UnitWatch:
-    """Hears of every new record of a unit and of its end.
+    """Watches the journal for new records of a unit and of its end.
 
-    since_us: CLOCK_REALTIME from which on, µs.
+    since_us: CLOCK_REALTIME in µs; earlier records do not count.
     """
 
     def __init__(self, scope: Scope, name: str, since_us: int) -> None:
@@ -92,12 +99,12 @@ class UnitWatch:
         return ended
 
     def close(self) -> None:
-        """End the journalctl behind it."""
+        """Terminate the journalctl process."""
         self._stack.close()
 
 
 def check_until_end(selector: str, is_reverse: bool) -> None:
-    """Raise DoraSystemdError (USAGE) for what cannot be followed to an end."""
+    """Raise DoraSystemdError (USAGE) for options that --until-end cannot have."""
     if not selector:
         hint = "say which dataflow: doractl logs NAME --until-end"
         raise DoraSystemdError("cannot wait for the end of all dataflows", hint, ExitCode.USAGE)
@@ -107,11 +114,11 @@ def check_until_end(selector: str, is_reverse: bool) -> None:
 
 
 def follow_to_end(query: LogQuery, print_query: Callable[[LogQuery], object]) -> None:
-    """Print the records of a query, one part of them after the other, until its unit has ended.
+    """Print the records of a query, step by step, until its unit has ended.
 
     Raises DoraSystemdError.
     """
-    # Only this way of reading logs asks systemd.
+    # Imported here: other uses of `doractl logs` do not talk to systemd.
     from dora_systemd.adapters.bus.systemd import Bus
 
     start_us = time.time_ns() // 1000
@@ -131,10 +138,10 @@ def _steps(query: LogQuery, cursor: Path, start_us: int) -> Iterator[LogQuery]:
 
 
 def follow_steps(print_step: Callable[[], object], watch: Watch, is_up: Callable[[], bool]) -> None:
-    """Call `print_step` as there are new records, the last time when all are there.
+    """Call `print_step` whenever there are new records, and once after the end.
 
-    is_up: whether the unit runs or is going to. It has ended when it does not, not when systemd
-    says that it has: a restart ends it, too.
+    is_up: whether the unit runs or is about to. A record of its end alone does not count, because
+    a restart writes one too.
     """
     has_more = is_up()
     while True:
@@ -153,27 +160,27 @@ def follow_steps(print_step: Callable[[], object], watch: Watch, is_up: Callable
 
 
 def _wait_end(watch: Watch) -> None:
-    """Return when systemd has said that the unit has ended, if it does so soon."""
+    """Wait for systemd's record of the unit's end, at most END_SECONDS."""
     deadline = time.monotonic() + END_SECONDS
     while not watch.take_end() and time.monotonic() < deadline:
         watch.wait(STEP_SECONDS)
 
 
 def is_unit_up(manager: Manager, name: str) -> bool:
-    """Whether the unit of a dataflow runs, or is about to."""
+    """Whether the unit of a dataflow runs or has a queued job."""
     state = manager.read(unit_name(name), ("ActiveState", "Job"))
     return state["ActiveState"] not in DOWN or bool(state["Job"][0])
 
 
 def first_step(query: LogQuery, cursor: Path) -> LogQuery:
-    """The query for what is there already; `cursor`: a file that is not there yet."""
+    """The query for the existing records. cursor: a file that does not exist yet."""
     is_bare = query.tail is None and not query.since
     tail = FIRST_LINES if is_bare else query.tail
     return replace(query, is_follow=False, tail=tail, cursor_file=str(cursor))
 
 
 def next_step(query: LogQuery, cursor: Path, start_us: int) -> LogQuery:
-    """The query for what has come since the step before it, or since `start_us` if nothing had."""
+    """The query for the records after the cursor, or since `start_us` (µs) without a cursor."""
     has_cursor = cursor.exists() and cursor.stat().st_size
     since = "" if has_cursor else journal_timestamp(start_us)
     return replace(query, is_follow=False, tail=None, since=since, cursor_file=str(cursor))

@@ -1,4 +1,4 @@
-"""What systemd knows of the gateway, and its token."""
+"""The state of the gateway as systemd knows it, and its token."""
 
 from dataclasses import dataclass
 
@@ -14,14 +14,14 @@ _READY_SECONDS = 30.0
 
 @dataclass(frozen=True)
 class Gateway:
-    """Whether its port is open. port: None where no unit of it is there."""
+    """Whether the gateway's port is open. port: None if it has no unit."""
 
     is_up: bool
     port: int | None
 
 
 def read_gateway(manager: Manager) -> Gateway:
-    """Whether the port is open, and which one it is."""
+    """Whether the port is open, and its number."""
     facts = manager.read(SOCKET_UNIT, ["LoadState", "ActiveState"])
     if facts["LoadState"] != "loaded":
         return Gateway(False, None)
@@ -30,7 +30,7 @@ def read_gateway(manager: Manager) -> Gateway:
 
 
 def require_gateway(manager: Manager, scope: Scope) -> int:
-    """Its port. Raises DoraSystemdError (NOT_RUNNING) unless it is up."""
+    """The port. Raises DoraSystemdError (NOT_RUNNING) if the gateway is not up."""
     gateway = read_gateway(manager)
     if not gateway.is_up or gateway.port is None:
         hint = f"doractl {scope.flag} up"
@@ -39,7 +39,7 @@ def require_gateway(manager: Manager, scope: Scope) -> int:
 
 
 def check_answer(scope: Scope, port: int) -> None:
-    """Return when the gateway answers. Raises DoraSystemdError when it does not."""
+    """Return once the gateway answers. Raises DoraSystemdError if it does not."""
     if not answers_health(port, _READY_SECONDS):
         which = "--user-unit" if scope.is_user else "--unit"
         raise DoraSystemdError(
@@ -49,11 +49,11 @@ def check_answer(scope: Scope, port: int) -> None:
 
 
 def read_token(scope: Scope, port: int) -> str:
-    """The gateway's token. Raises DoraSystemdError (NO_PERMISSION) for other users."""
+    """The gateway's token. Raises DoraSystemdError (NO_PERMISSION) for another user's gateway."""
     path = token_path(scope)
     try:
         if not path.exists():
-            # It makes one when it is started for the first time, by whoever asks it anything.
+            # The gateway creates the token when the first connection starts it.
             check_answer(scope, port)
         return path.read_text().strip()
     except PermissionError as error:

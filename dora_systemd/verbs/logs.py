@@ -1,4 +1,4 @@
-"""What `doractl logs` and `doractl run` do: records of a dataflow out of the journal."""
+"""`doractl logs` and `doractl run`: read the records of a dataflow from the journal."""
 
 import os
 import re
@@ -38,7 +38,7 @@ Write = Callable[[bytes], object]
 
 
 class Journal(Protocol):
-    """What is asked of dora_systemd.adapters.journal.reader.JournalReader."""
+    """The part of dora_systemd.adapters.journal.reader.JournalReader that this module uses."""
 
     def known_names(self) -> list[str]:
         """Names of dataflows."""
@@ -53,15 +53,15 @@ class Journal(Protocol):
         """The name of a dataflow."""
 
     def invocations(self, scope: Scope, name: str, uuid: str) -> Iterator[str]:
-        """Lives of its unit, newest first."""
+        """Invocations of its unit, newest first."""
 
 
 @dataclass(frozen=True)
 class LogRequest:
-    """What somebody asks for: a query in which names and patterns are not looked up yet.
+    """A request for logs: a query whose names and patterns are not resolved yet.
 
-    selector: "" for all dataflows of the scope. nodes: names or patterns as in glob(7).
-    run: CURRENT, PREVIOUS, ALL, or dora's id of a run.
+    selector: "" for all dataflows of the scope. nodes: names or patterns as in glob(7). run:
+    CURRENT, PREVIOUS, ALL, or dora's id of a run.
     """
 
     selector: str
@@ -71,9 +71,9 @@ class LogRequest:
 
 
 def find_query(journal: Journal, request: LogRequest) -> LogQuery:
-    """The query with name, nodes and run looked up in the journal.
+    """The query, with name, nodes and run resolved by the journal.
 
-    Raises DoraSystemdError: NOT_FOUND for a dataflow, node or run that never wrote a record.
+    Raises DoraSystemdError: NOT_FOUND for a dataflow, node or run without any record.
     """
     query = request.query
     if request.selector:
@@ -148,9 +148,9 @@ def _select_run(journal: Journal, query: LogQuery, run: str) -> LogQuery:
 def read_logs(
     query: LogQuery, terminal: TerminalLines | ShownLines | None = None
 ) -> Iterator[bytes]:
-    """The output of journalctl for a query, in chunks; rewritten for a terminal if one is given.
+    """The output of journalctl for a query, in chunks; formatted by `terminal` if given.
 
-    Raises DoraSystemdError: USAGE for a time or pattern that journalctl does not understand.
+    Raises DoraSystemdError: USAGE for a time or pattern that journalctl does not accept.
     """
     with open_journalctl(query_arguments(query), want_colors=terminal is not None) as child:
         assert child.stdout
@@ -160,7 +160,7 @@ def read_logs(
 
 
 def pass_logs(query: LogQuery, fd: int) -> int:
-    """Have journalctl write the records of a query to `fd` itself; its exit status.
+    """Let journalctl write the records of a query directly to `fd`; its exit status.
 
     Raises DoraSystemdError as read_logs does.
     """
@@ -169,9 +169,9 @@ def pass_logs(query: LogQuery, fd: int) -> int:
 
 
 class FollowedLog:
-    """The records of one life of a dataflow while it runs, up to the end of its unit.
+    """The records of one invocation of a dataflow's unit, while it runs and up to its end.
 
-    since_us: CLOCK_REALTIME at which the unit was started, µs. write: takes the lines.
+    since_us: CLOCK_REALTIME µs of the start of the unit. write: called with the lines.
     """
 
     def __init__(
@@ -226,7 +226,7 @@ class FollowedLog:
             self._write(b"".join(lines))
 
     def finish(self, seconds: float = 3.0) -> None:
-        """Write all lines up to the end of the unit, which has happened; wait at most `seconds`."""
+        """Write the remaining lines of a unit that has ended; wait at most `seconds`."""
         deadline = time.monotonic() + seconds
         poll = select.poll()
         poll.register(self._fd, select.POLLIN)
@@ -235,5 +235,5 @@ class FollowedLog:
             self.print_new()
 
     def close(self) -> None:
-        """End the journalctl behind it."""
+        """Terminate the journalctl process."""
         self._stack.close()

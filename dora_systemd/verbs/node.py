@@ -1,4 +1,4 @@
-"""What goes to the coordinator of one dataflow: single nodes, and the stock dora command."""
+"""Requests to the coordinator of one dataflow: for single nodes, and for the dora command."""
 
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -24,22 +24,22 @@ from dora_systemd.verbs.facts.cells import Cell, not_found
 from dora_systemd.verbs.facts.list import read_status
 
 _NO_USER = 2**32 - 1
-"""UID of a unit without User=: it runs as who the manager is."""
+"""UID of a unit without User=: it runs as the manager's own user."""
 
 Ask = Callable[[Scope, Cell, Params], Reply]
 
 
 def read_coordinator(scope: Scope, cell: Cell) -> Coordinator:
-    """The coordinator of a running dataflow, as its runner tells: to be checked before it is used.
+    """The coordinator as the runner reports it; check it before connecting.
 
-    Raises DoraSystemdError: NOT_RUNNING, or NO_PERMISSION when it is another user's.
+    Raises DoraSystemdError: NOT_RUNNING, or NO_PERMISSION for another user's dataflow.
     """
     require_running(cell)
     return runner_socket.ask_coordinator(_socket(scope, cell))
 
 
 def reached_coordinator(scope: Scope, manager: Manager, cell: Cell) -> Coordinator:
-    """The same, if its port leads to it: from here, and to nobody but the dataflow's user.
+    """The coordinator, checked: only the dataflow's user listens on its port, in this network.
 
     Raises DoraSystemdError.
     """
@@ -66,19 +66,20 @@ def require_running(cell: Cell) -> None:
 
 
 def ask_coordinator(scope: Scope, cell: Cell, params: Params) -> Reply:
-    """One request to the cell's coordinator, and its answer. Raises DoraSystemdError."""
-    # WebSockets are slow to import, and no other verb needs them.
+    """Send one request to the cell's coordinator; the reply. Raises DoraSystemdError."""
+    # Imported late: WebSockets are slow to import, and no other verb needs them.
     from dora_systemd.adapters.dora import control
 
     return control.request(*runner_socket.relay(_socket(scope, cell)), params)
 
 
 def restart_node(scope: Scope, cell: Cell, node: str, ask: Ask = ask_coordinator) -> None:
-    """End one node and start it again, while the others run on.
+    """Restart one node; the others keep running.
 
-    dora's RestartNode ends every node downstream of one whose restart policy is "never". Such a
-    node is replaced by a copy of itself, which nobody downstream notices; dora starts the copy
-    before the old one ends, and does not tell that one to stop before its grace duration is over.
+    dora's RestartNode also ends all nodes downstream of a node with restart policy "never". So
+    ReplaceNode replaces such a node by a copy of itself, which the nodes downstream do not notice.
+    dora starts the copy before the old process ends, and ends the old one only after its grace
+    duration.
     """
     status = _checked_status(scope, cell, node)
     info = _answer(cell, ask(scope, cell, {"Info": {"dataflow_uuid": status.run}}))
@@ -93,16 +94,16 @@ def restart_node(scope: Scope, cell: Cell, node: str, ask: Ask = ask_coordinator
 
 
 def stop_node(scope: Scope, cell: Cell, node: str, ask: Ask = ask_coordinator) -> None:
-    """End one node for good; its neighbours see their input closed."""
+    """Stop one node for good; its neighbours see a closed input."""
     status = _checked_status(scope, cell, node)
     _answer(cell, ask(scope, cell, node_params("StopNode", status.run, node)))
 
 
 def exec_dora(scope: Scope, manager: Manager, cell: Cell, arguments: Sequence[str]) -> int:
-    """Become the dora command, told to speak to the coordinator of this dataflow.
+    """Execute the dora command, connected to the coordinator of this dataflow.
 
-    Root runs it as the dataflow's user, who may have written it, and on a terminal of its own:
-    this is its exit status. Raises DoraSystemdError.
+    As root, it runs as the dataflow's user, who may have written it, on a separate terminal; then
+    this returns its exit status. Raises DoraSystemdError.
     """
     uid, is_private = _unit_facts(manager, cell)
     account = account_of_uid(uid) if os.geteuid() == 0 and not scope.is_user else None
@@ -127,8 +128,8 @@ def _terminal() -> dict[str, str]:
 
 
 def _relayed(scope: Scope, cell: Cell, uid: int, account: Account | None) -> Coordinator:
-    """A port that leads into the dataflow's own network as long as this process lives."""
-    # asyncio is slow to import, and only a private network needs it.
+    """A port that leads into the dataflow's private network as long as this process runs."""
+    # Imported late: asyncio is slow to import, and only a private network needs it.
     from dora_systemd.adapters.runner_socket.relay import open_port
 
     coordinator = read_coordinator(scope, cell)
@@ -137,7 +138,7 @@ def _relayed(scope: Scope, cell: Cell, uid: int, account: Account | None) -> Coo
 
 
 def _unit_facts(manager: Manager, cell: Cell) -> tuple[int, bool]:
-    """The uid that the unit runs as, and whether its network is one of its own."""
+    """The uid of the unit, and whether it has a private network."""
     facts = manager.read(cell.unit, ["UID", "PrivateNetwork"])
     return os.getuid() if facts["UID"] == _NO_USER else facts["UID"], facts["PrivateNetwork"]
 
@@ -152,7 +153,7 @@ def _settle(account: Account | None) -> None:
 
 
 def dora_environment(coordinator: Coordinator) -> dict[str, str]:
-    """The variables with which the dora command finds a coordinator and its daemon."""
+    """The variables by which the dora command finds a coordinator and its daemon."""
     return coordinator_variables(coordinator.port, coordinator.token, coordinator.local_listen_port)
 
 
@@ -163,7 +164,7 @@ def _checked_status(scope: Scope, cell: Cell, node: str) -> CellStatus:
 
 
 def require_node(scope: Scope, cell: Cell, node: str) -> CellStatus:
-    """The live table that `node` is in. Raises DoraSystemdError (NOT_FOUND) if it is not."""
+    """The live table, which contains `node`. Raises DoraSystemdError (NOT_FOUND) otherwise."""
     status = read_status(scope, cell)
     if node not in status.nodes:
         raise DoraSystemdError(
@@ -184,7 +185,7 @@ def _answer(cell: Cell, reply: Reply) -> dict[str, Any]:
 
 
 def _nodes(cell: Cell, info: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The nodes of dora's answer to Info: whoever owns the dataflow may have written it."""
+    """The nodes in dora's reply to Info, which the owner of the dataflow could have forged."""
     try:
         nodes = info["DataflowInfo"]["descriptor"]["nodes"]
         if all(isinstance(one, dict) for one in nodes):

@@ -23,9 +23,9 @@ Ask = Callable[[Path, Mapping[str, Any]], dict[str, Any]]
 
 
 def reload_cell(scope: Scope, cell: Cell, node: str | None, ask: Ask = order) -> list[str]:
-    """What was done, in words: nothing if no file has changed and no node is named.
+    """Have the runner reload; what was done. Empty if no file has changed and no node is named.
 
-    Raises DoraSystemdError; then the old version runs on.
+    Raises DoraSystemdError; then the old version keeps running.
     """
     require_running(cell)
     if node is not None:
@@ -37,7 +37,7 @@ def reload_cell(scope: Scope, cell: Cell, node: str | None, ask: Ask = order) ->
 def switch_hot_reload(
     manager: Manager, scope: Scope, cell: Cell, is_on: bool, ask: Ask = order
 ) -> None:
-    """Watch the files of a dataflow from now on, or no longer; also after a restart of its unit.
+    """Switch hot reload on or off for a dataflow; this outlasts restarts of its unit.
 
     Raises DoraSystemdError.
     """

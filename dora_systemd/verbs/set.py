@@ -1,7 +1,8 @@
-"""`doractl set`: limits of a dataflow and of its nodes, changed while it runs and remembered.
+"""`doractl set`: changes limits of a running dataflow and its nodes, and makes them persistent.
 
-systemd keeps the dataflow's own, as with `systemctl set-property`. The nodes' are in a drop-in of
-ours beside systemd's: those of a transient unit go with it, those of a unit file when that goes.
+systemd stores the limits of the dataflow, as for `systemctl set-property`. The limits of nodes are
+in a drop-in of ours beside systemd's. Drop-ins of a transient unit disappear with it, those of a
+unit file when the file is removed.
 """
 
 import os
@@ -55,7 +56,7 @@ def set_limits(
 ) -> tuple[str, ...]:
     """Change limits of a dataflow; warnings. flags: raw values by name of LIVE_SETTINGS.
 
-    Raises DoraSystemdError; as long as anything is wrong, nothing is changed.
+    Raises DoraSystemdError; then nothing is changed.
     """
     settings = resolve_settings(flags, {}, (), LIVE_SETTINGS)
     properties, nodes = settings_properties(settings), settings[NODE_LIMIT]
@@ -72,9 +73,9 @@ def set_limits(
         check_controllers(needed, available, scope.is_user)
     unit = manager.read(cell.unit, _PROPERTIES)
     warnings = _warnings(settings, nodes, unit)
-    # systemd keeps those of a transient unit beside it, whatever it is told.
+    # systemd stores drop-ins of a transient unit in /run in any case.
     is_fleeting = Path(unit["FragmentPath"]).is_relative_to("/run")
-    # The kernel refuses most easily, systemd after it; what has been done by then is taken back.
+    # The kernel is the most likely to refuse, then systemd. `undo` reverts the steps before that.
     with ExitStack() as undo:
         _limit_groups(unit, nodes, undo)
         if nodes:
@@ -90,7 +91,7 @@ def set_limits(
 def _unit_file_warnings(
     manager: Manager, scope: Scope, cell: Cell, unit: Mapping[str, Any]
 ) -> list[str]:
-    """A dataflow that was enabled while it ran has a unit file beside its transient unit."""
+    """Warnings for a dataflow that was enabled while running: it also has a unit file."""
     if not unit["Transient"] or cell.unit not in enabled_units(manager, scope):
         return []
     name = cell.name
@@ -104,7 +105,7 @@ def _check_nodes(scope: Scope, cell: Cell, limits: tuple[NodeLimits, ...]) -> No
     if not kinds:
         written = written_dataflow(cell.options.dataflow).nodes
         if any(node.kind in UNEXPANDED for node in written):
-            return  # what is in them only its runner finds out, who refuses the next start then
+            return  # only the runner expands these nodes, and would refuse them at the next start
         kinds = {node.id: str(node.kind) for node in written}
     check_nodes(limits, kinds, [node for node, kind in kinds.items() if kind == "dynamic"])
 
@@ -122,7 +123,7 @@ def _warnings(
 
 
 def _remember(unit: Mapping[str, Any], nodes: tuple[NodeLimits, ...], undo: ExitStack) -> None:
-    """Write the drop-in: when systemd has read it, the next start of the runner is told of it."""
+    """Write the drop-in. Once systemd has loaded it, the next runner gets the limits."""
     before = dict(entry.split("=", 1) for entry in unit["Environment"] or ())
     changes = merge_node_limits(parse_changes(before.get(CHANGES_VARIABLE, "")), nodes)
     text = format_unit(typed(Environment=(f"{CHANGES_VARIABLE}={format_changes(changes)}",)))
@@ -145,6 +146,6 @@ def _limit_groups(unit: Mapping[str, Any], nodes: tuple[NodeLimits, ...], undo: 
         return
     groups = cgroup.node_groups(cgroup.group_path(unit["ControlGroup"]))
     for one in nodes:
-        if group := groups.get(one.node):  # else its next start finds the limit in the drop-in
+        if group := groups.get(one.node):  # else its next start reads the drop-in
             undo.callback(cgroup.restore_group, group, cgroup.read_files(group, one.files()))
             cgroup.limit_group(group, one)

@@ -1,4 +1,4 @@
-"""`doractl setup`: what the Debian package has and a pip install lacks, put there or taken away."""
+"""`doractl setup`: installs or removes the files that the Debian package has and pip lacks."""
 
 import contextlib
 import os
@@ -37,12 +37,12 @@ _PACKAGE = Path(__file__).parents[1]
 _CHECKOUT = {"templates": "units/templates", "completions": "packaging/completions"}
 _SECONDS = 60.0
 _STANDARD = ("etc", "lib", "share", "man", "local")
-"""Directories that every machine has."""
+"""Directories that exist on every machine, and are not removed."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """One file: where it belongs, its text, and what is there now."""
+    """One file: its path, its text, and its current content."""
 
     file: SetupFile
     path: Path
@@ -51,19 +51,19 @@ class Step:
 
     @property
     def is_done(self) -> bool:
-        """Whether it is in place already."""
+        """Whether the file is in place."""
         return self.present == (self.file.link or self.text)
 
 
 def plan_setup(scope: Scope, root: Path | None = None) -> list[Step]:
-    """Every file with what is in its place now. Raises DoraSystemdError for a foreign one."""
+    """Every file with its current content. Raises DoraSystemdError for a foreign file."""
     manuals = [path.name for path in _directory("man").iterdir()]
     place = root or data_root(scope)
     return [_step(file, place / file.place) for file in setup_files(scope.is_user, manuals)]
 
 
 def put_in_place(steps: Sequence[Step]) -> list[Path]:
-    """Write what is not there yet; the paths. Raises DoraSystemdError."""
+    """Write the missing files; their paths. Raises DoraSystemdError."""
     missing = [step for step in steps if not step.is_done]
     for step in missing:
         if step.file.link:
@@ -74,7 +74,7 @@ def put_in_place(steps: Sequence[Step]) -> list[Path]:
 
 
 def take_away(steps: Sequence[Step]) -> list[Path]:
-    """Remove what is there of ours, and the directories that are empty then; the paths."""
+    """Remove our files, and directories that become empty; the paths."""
     there = [step for step in steps if step.present is not None]
     for step in there:
         remove_unit_file(step.path)
@@ -84,7 +84,7 @@ def take_away(steps: Sequence[Step]) -> list[Path]:
 
 
 def data_root(scope: Scope) -> Path:
-    """Where all of it goes. Raises DoraSystemdError for a user without a home directory."""
+    """The root of all files. Raises DoraSystemdError for a user without a home directory."""
     if not scope.is_user:
         return Path(SYSTEM_ROOT)
     given = os.environ.get("XDG_DATA_HOME", "")
@@ -98,13 +98,13 @@ def data_root(scope: Scope) -> Path:
 
 
 def packaged_unit(scope: Scope) -> str:
-    """The file that shows that a package has done all this, or ""."""
+    """The file that shows that a package has installed all this, or ""."""
     path = Path(PACKAGED_UNIT.replace("/system/", "/user/") if scope.is_user else PACKAGED_UNIT)
     return str(path) if path.exists() else ""
 
 
 def refuse_if_needed(manager: Manager, scope: Scope) -> None:
-    """Raise DoraSystemdError while a boot starts dataflows by way of dora.target."""
+    """Raise DoraSystemdError while dora.target starts dataflows at boot."""
     links = own_directories(manager, scope)[0].glob(f"{BOOT_TARGET}.wants/*")
     names = sorted(filter(None, (name_from_unit(link.name) for link in links)))
     if names:
@@ -116,10 +116,9 @@ def refuse_if_needed(manager: Manager, scope: Scope) -> None:
 
 
 def tell_systemd(reach: Callable[[Scope], Manager], scope: Scope) -> tuple[str, ...]:
-    """Have systemd read what has changed; warnings about what did not work.
+    """Have systemd load the changes; warnings about what failed.
 
-    reach: opens the connection. Without systemd, as in an image that is being built, the next boot
-    reads it.
+    reach: opens the connection. Without systemd, as in an image build, the next boot loads them.
     """
     with contextlib.suppress(DoraSystemdError):
         reach(scope).reload()
@@ -151,13 +150,13 @@ def _step(file: SetupFile, path: Path) -> Step:
 
 
 def text_of(file: SetupFile) -> str:
-    """What belongs into a file; units run the Python that this is."""
+    """The text of a file; units run the Python interpreter of this process."""
     text = read_text(_directory(file.source[0]) / file.source[1])
     return with_interpreter(text, sys.executable)
 
 
 def _directory(kind: str) -> Path:
-    """Where the files of one kind are: in the installed package, or in a checkout."""
+    """The directory of the files of one kind, in the installed package or in a checkout."""
     installed = _PACKAGE / kind
     return (
         installed

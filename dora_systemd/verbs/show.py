@@ -11,9 +11,9 @@ _PROPERTIES = ("FragmentPath", "DropInPaths")
 
 
 def unit_files(manager: Manager, cell: Cell) -> dict[str, str]:
-    """Texts of the unit's files by path, drop-ins after the unit itself, as in systemctl cat.
+    """Texts of the unit's files by path, drop-ins after the unit file, as in systemctl cat.
 
-    A transient unit has a file as well: systemd writes it below /run.
+    A transient unit has a file too: systemd writes it below /run.
     """
     places = manager.read(cell.unit, _PROPERTIES)
     paths = [path for path in (places["FragmentPath"], *places["DropInPaths"]) if path]
@@ -21,7 +21,7 @@ def unit_files(manager: Manager, cell: Cell) -> dict[str, str]:
 
 
 def format_unit_files(files: dict[str, str]) -> str:
-    """The files one after another, each below a comment with its path."""
+    """The files in sequence, each after a comment with its path."""
     return "\n".join(f"# {path}\n{text.rstrip()}\n" for path, text in files.items())
 
 

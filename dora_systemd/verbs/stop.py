@@ -19,7 +19,7 @@ from dora_systemd.verbs.facts.reason import failure_reason, job_reason
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one dataflow: `problem` is "" when it is as was asked for."""
+    """The result for one dataflow: `problem` is "" for success."""
 
     cell: Cell
     text: str
@@ -27,9 +27,9 @@ class Outcome:
 
 
 def stop_cells(manager: Manager, scope: Scope, cells: Sequence[Cell]) -> list[Outcome]:
-    """Stop dataflows, all at the same time, and wait until the last one has ended.
+    """Stop dataflows in parallel, and wait until the last one has ended.
 
-    Each has its own grace duration, after which systemd kills what is left of it.
+    Each has its own grace duration; after that systemd kills what is left.
     """
     up = [cell.unit for cell in cells if cell.is_up]
     results = manager.run_jobs("StopUnit", up) if up else {}
@@ -39,13 +39,13 @@ def stop_cells(manager: Manager, scope: Scope, cells: Sequence[Cell]) -> list[Ou
 
 
 def release_enabled(manager: Manager, scope: Scope, units: Sequence[str]) -> None:
-    """What was enabled while it ran is that unit file from its next start on."""
+    """For dataflows that were enabled while running: let the unit file take effect."""
     for unit in sorted(enabled_units(manager, scope).intersection(units)):
         state = manager.read(unit, ["Transient", "ActiveState"])
         if state["Transient"] and state["ActiveState"] == "inactive":
             from dora_systemd.verbs.start.enable import read_boot_unit, release_transient
 
-            # One that something else holds says the same as its file.
+            # If something references the transient unit, it stays: its text equals the file's.
             with suppress(DoraSystemdError):
                 boot = read_boot_unit(manager, scope, unit)
                 if boot.is_enabled:
@@ -56,12 +56,12 @@ def release_enabled(manager: Manager, scope: Scope, units: Sequence[str]) -> Non
 def restart_cells(
     manager: Manager, cells: Sequence[Cell], observer: Observer | None = None
 ) -> list[Outcome]:
-    """Stop and start dataflows, all at the same time, and wait until their nodes are ready.
+    """Stop and start dataflows in parallel, and wait until their nodes are ready.
 
-    Who asks for a restart begins anew: it counts for none of those that systemd may do itself.
+    A requested restart resets the counter of automatic restarts.
     """
     for cell in cells:
-        manager.hold(cell.unit)  # a failed transient unit would be gone with its failure
+        manager.hold(cell.unit)  # keep a failed transient unit and its failure
         manager.reset_failed(cell.unit)
     results = manager.run_jobs("RestartUnit", [cell.unit for cell in cells], observer)
     return [_restart_outcome(manager, cell, results[cell.unit]) for cell in cells]

@@ -1,4 +1,4 @@
-"""`doractl top`: looks at the dataflows, each compared with the one before it."""
+"""`doractl top`: takes snapshots of the dataflows, each compared with the one before it."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -16,10 +16,10 @@ _Seen = tuple[Reading, Mapping[str, Strain]]
 
 
 class Top:
-    """Looks at some dataflows of a manager, or at all that run.
+    """Takes snapshots of some dataflows of a manager, or of all running ones.
 
-    Raises DoraSystemdError: NOT_FOUND for a selector that fits nothing, USAGE for one that fits
-    several, NOT_RUNNING for a dataflow that is not up.
+    Raises DoraSystemdError: NOT_FOUND for a selector without a match, USAGE for one with several,
+    NOT_RUNNING for a dataflow that is not up.
     """
 
     def __init__(self, manager: Manager, scope: Scope, selectors: Sequence[str] = ()) -> None:
@@ -33,7 +33,7 @@ class Top:
         self._units = frozenset(cell.unit for cell in chosen)
 
     def look(self) -> Look:
-        """All that runs now; what the numbers are counted from is the last look."""
+        """A snapshot of what is running; rates are since the last snapshot."""
         wanted = filter(self._want, read_cells(self._manager))
         seen = {cell.unit: self._see(cell) for cell in wanted}
         entries = [_entry(now, self._before.get(unit)) for unit, now in seen.items()]

@@ -1,4 +1,4 @@
-"""`doractl up`: opens the port behind which systemd starts the gateway."""
+"""`doractl up`: opens the port on which systemd starts the gateway."""
 
 import errno
 from collections.abc import Callable, Sequence
@@ -32,7 +32,7 @@ PORT_FILE = f"{SOCKET_UNIT}.d/50-port.conf"
 
 
 def check_machine(reach: Callable[[Scope], Manager], scope: Scope) -> None:
-    """Raise DoraSystemdError for the first thing that `doractl doctor` calls a problem."""
+    """Raise DoraSystemdError for the first problem that `doractl doctor` finds."""
     for one in examine(reach, scope):
         if one.state is State.PROBLEM:
             is_said = one.text.startswith("cannot ")
@@ -41,9 +41,9 @@ def check_machine(reach: Callable[[Scope], Manager], scope: Scope) -> None:
 
 
 def open_port(manager: Manager, scope: Scope, port: int | None) -> int:
-    """Have systemd listen on `port`, or where the unit says; the port.
+    """Have systemd listen on `port`, or that of the unit; the port.
 
-    Raises DoraSystemdError; nothing is changed where the port cannot be had.
+    Raises DoraSystemdError; nothing is changed if the port is not available.
     """
     now = read_gateway(manager)
     port_file = written_files(manager, scope)[0]
@@ -69,7 +69,7 @@ def open_port(manager: Manager, scope: Scope, port: int | None) -> int:
 
 
 def start_boot_target(manager: Manager, scope: Scope) -> list[str]:
-    """Start what a boot starts, unless that has been done; the names of these dataflows."""
+    """Start the dataflows of a boot if the boot has not done so; their names."""
     state = manager.read(BOOT_TARGET, ["LoadState", "ActiveState"])
     if state["LoadState"] != "loaded" or state["ActiveState"] == "active":
         return []
@@ -78,13 +78,13 @@ def start_boot_target(manager: Manager, scope: Scope) -> list[str]:
 
 
 def written_files(manager: Manager, scope: Scope) -> list[Path]:
-    """Where `up` puts what it has to write, in the directory that a reboot empties."""
+    """The files that `up` writes, in the directory that a reboot empties."""
     place = own_directories(manager, scope)[1]
     return [place / PORT_FILE, *(place / file.place for file in gateway_files(scope.is_user))]
 
 
 def _write_units(manager: Manager, scope: Scope, port: int | None) -> bool:
-    """Make the files true; whether anything has changed."""
+    """Write or remove the files; whether anything has changed."""
     port_file, *units = written_files(manager, scope)
     texts: dict[Path, str | None] = {}
     facts = manager.read(SOCKET_UNIT, ["LoadState", "FragmentPath"])
@@ -103,7 +103,7 @@ def _write_units(manager: Manager, scope: Scope, port: int | None) -> bool:
 
 
 def _check_port(port: int) -> None:
-    """Raise DoraSystemdError if nobody can listen there, with who does."""
+    """Raise DoraSystemdError if the port is in use, with the user of it."""
     number = port_error(port)
     if number in (errno.EACCES, errno.EPERM):
         hint = "only root may open ports below 1024: doractl up --port 53291"
@@ -118,7 +118,7 @@ def _check_port(port: int) -> None:
 
 
 def _holder(port: int) -> str:
-    """Who listens there, as far as the kernel tells this user."""
+    """The listener on a port, as far as this user may see it."""
     owners = socket_owners(listening_sockets(port))
     named: Sequence[Process] = [one for one in read_processes() if one.pid in owners]
     if named:

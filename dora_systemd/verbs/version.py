@@ -1,4 +1,4 @@
-"""`doractl version`: the versions of all that takes part."""
+"""`doractl version`: the versions of doractl, Python, systemd and dora."""
 
 import os
 import platform
@@ -11,7 +11,7 @@ from dora_systemd.scope import Scope
 
 
 def read_versions(scope: Scope) -> dict[str, str | None]:
-    """Versions by name; None for what is not there or cannot be reached."""
+    """Versions by name; None for a program that is missing or unreachable."""
     return {
         "doractl": __version__,
         "python": platform.python_version(),

@@ -1,4 +1,4 @@
-"""`doractl why`: gathers what systemd, the journal and the runner's table know of a dataflow."""
+"""`doractl why`: collects what systemd, the journal and the runner know about a dataflow."""
 
 from collections.abc import Iterable
 from itertools import islice
@@ -35,9 +35,9 @@ _LINES_READ = 4 * LINES
 
 
 def explain(manager: Manager, scope: Scope, selector: str, journal: JournalReader) -> Report:
-    """What became of the dataflow that `selector` means, and why.
+    """What happened to the dataflow that `selector` means, and why.
 
-    Raises DoraSystemdError: NOT_FOUND, USAGE where several fit.
+    Raises DoraSystemdError: NOT_FOUND, USAGE if several match.
     """
     cell, subject = _select(manager, scope, selector)
     lives = read_lives(journal, scope, subject)
@@ -66,7 +66,7 @@ def _select(manager: Manager, scope: Scope, selector: str) -> tuple[Cell | None,
 
 
 def _with_file(manager: Manager, scope: Scope, uuid: str, name: str) -> tuple[Cell | None, Subject]:
-    """An ended dataflow; an enabled one has a unit file though systemd has not read it."""
+    """An ended dataflow; an enabled one has a unit file even if systemd has not loaded it."""
     try:
         cell = find_cell(manager, name)
     except DoraSystemdError:
@@ -100,13 +100,13 @@ def _now_boot() -> str:
 
 
 def read_lives(journal: JournalReader, scope: Scope, subject: Subject) -> list[Life]:
-    """What the journal has of the dataflow, oldest life first; nothing of others of its name."""
+    """The lives of the dataflow in the journal, oldest first, without others of the same name."""
     matches = story_matches(scope, subject.name, subject.uuid)
     records = islice(journal.newest(matches, None, is_whole=True), _MOST_RECORDS)
     found = [one for one in map(parse_happening, records) if one is not None]
     lives = find_lives(reversed(found))
     own = [place for place, life in enumerate(lives) if _is_of(life, subject.uuid)]
-    # A life in which nothing of ours could begin has no UUID: it is of the one that is loaded.
+    # A life that failed before our code ran has no UUID: it belongs to the loaded dataflow.
     begin = own[0] if own else -1
     return lives[begin:] if subject.is_loaded else lives[begin : own[-1] + 1 if own else 0]
 
@@ -123,7 +123,7 @@ def _shutdowns(journal: JournalReader) -> list[int]:
 def _last_words(
     journal: JournalReader, scope: Scope, subject: Subject, verdict: Verdict
 ) -> tuple[Word, ...]:
-    """The last lines of the node that began it, before it ended; of all nodes where none did."""
+    """The last lines of the node that failed first, up to its end; else those of all nodes."""
     if not (verdict.is_failure or verdict.node) or not verdict.invocation:
         return ()
     matches = [

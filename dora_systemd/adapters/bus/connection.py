@@ -1,4 +1,4 @@
-"""The way to systemd: its message bus or its private socket, and how long each may be silent."""
+"""Connects to systemd by the message bus or its private socket, with a timeout for each."""
 
 import _thread
 import os
@@ -17,23 +17,23 @@ MANAGER_OBJECT = b"/org/freedesktop/systemd1"
 SYSTEM_BUS = Path("/run/dbus/system_bus_socket")
 
 READ_SECONDS = 5.0
-"""For an answer to who only reads."""
+"""Timeout for an answer on a connection that only reads."""
 CALL_SECONDS = 25.0
-"""For any other answer, as systemctl has it: systemd may be reading all its units again."""
+"""Timeout for any other answer, as in systemctl: systemd may be reloading all units."""
 _BUS_SECONDS = 1.0
-"""For the first word of the message bus, where there is another way."""
+"""Timeout for the first message from the message bus, if there is another way."""
 _TIMEOUT = "SYSTEMD_BUS_TIMEOUT"
-"""The only way to tell sd-bus through pystemd: read at the first call of a connection."""
+"""The only way to set the timeout of sd-bus through pystemd: read at a connection's first call."""
 _environment = _thread.allocate_lock()  # threading takes a while to load
 
 
 def connect(scope: Scope, for_reading: bool) -> Any:
-    """A connection of pystemd to the manager of `scope`. Raises DoraSystemdError (NO_SYSTEMD)."""
+    """A pystemd connection to the manager of `scope`. Raises DoraSystemdError (NO_SYSTEMD)."""
     address, private = _address(scope), _private_socket(scope)
     seconds = READ_SECONDS if for_reading else CALL_SECONDS
-    # The system's private socket is for root alone. It is the second choice, as systemd takes some
-    # milliseconds for each connection to it; and only on the bus can systemd tell that a client has
-    # gone, which hold() needs.
+    # Only root may use the system manager's private socket. It is the second choice: systemd takes
+    # some milliseconds for each connection to it, and it is only on the bus that systemd notices
+    # when a client disconnects, which hold() needs.
     has_other_way = address != private and Path(private).exists()
     if for_reading and has_other_way and (scope.is_user or os.geteuid() == 0):
         with suppress(DoraSystemdError):
@@ -43,17 +43,17 @@ def connect(scope: Scope, for_reading: bool) -> Any:
 
 
 def _open(scope: Scope, address: str, seconds: float, patience: float) -> Any:
-    """A connection with `seconds` for each answer, whose other side speaks within `patience`."""
-    # What only explains itself or asks for a version need not find pystemd.
+    """A connection with `seconds` for each answer, and `patience` seconds for the first message."""
+    # Imported late: commands such as --help and version work without pystemd.
     from dora_systemd.adapters.bus.library import dbuslib
 
-    # A manager's private socket takes no part in the bus: there is nobody to say hello to.
+    # A manager's private socket is not a bus, so there is no Hello call.
     is_private = address.endswith("/private")
     with connection_error(scope):
         bus = dbuslib.DBusAddress(f"unix:path={address}".encode(), peer_to_peer=is_private)
         with _deadline(seconds):
-            bus.open()  # says hello, its first call
-        # sd-bus itself would wait 90 s for the first word.
+            bus.open()  # calls Hello
+        # sd-bus itself would wait 90 s for the first message.
         poll = select.poll()
         poll.register(bus.get_fd(), select.POLLIN)
         if not poll.poll(patience * 1000):
@@ -67,7 +67,7 @@ def _open(scope: Scope, address: str, seconds: float, patience: float) -> Any:
 
 @contextmanager
 def _deadline(seconds: float) -> Iterator[None]:
-    """The time that the connection whose first call is made here has for each answer."""
+    """Set the timeout for answers on the connection whose first call is made in this block."""
     with _environment:
         before = os.environ.get(_TIMEOUT)
         os.environ[_TIMEOUT] = before or f"{seconds:g}s"
@@ -79,7 +79,7 @@ def _deadline(seconds: float) -> Iterator[None]:
 
 
 def _address(scope: Scope) -> str:
-    """The message bus, else the manager's private socket: a user may have no bus of his own."""
+    """The message bus, else the manager's private socket, because a user may have no bus."""
     bus = scope.runtime_root / "bus" if scope.is_user else SYSTEM_BUS
     private = Path(_private_socket(scope))
     return str(private) if not bus.exists() and private.exists() else str(bus)

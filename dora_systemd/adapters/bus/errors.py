@@ -1,4 +1,4 @@
-"""What went wrong on D-Bus, in words."""
+"""Turns D-Bus errors into errors for users."""
 
 import os
 from collections.abc import Iterator
@@ -37,7 +37,7 @@ def explained(action: str, scope: Scope) -> Iterator[None]:
 
 
 def bus_error(action: str, scope: Scope, name: str, message: str) -> DoraSystemdError:
-    """The error of a D-Bus error name (last part) and the text that came with it."""
+    """The error for a D-Bus error name (its last part) and message."""
     reason, code = _REASONS.get(name, (message or name, ExitCode.FAILURE))
     hint = _HINTS.get(code, "")
     if code is ExitCode.NO_PERMISSION and scope.is_user:
@@ -55,7 +55,7 @@ _HINTS = {
 
 @contextmanager
 def connection_error(scope: Scope) -> Iterator[None]:
-    """Say why a manager cannot be reached at all, and what helps."""
+    """Explain why a manager cannot be reached at all, with a hint."""
     try:
         yield
     except Exception as error:
@@ -70,7 +70,7 @@ def connection_error(scope: Scope) -> Iterator[None]:
 
 
 def silent_bus(scope: Scope, is_private: bool) -> DoraSystemdError:
-    """The error for a manager, or a message bus before it, that says nothing."""
+    """The error for a manager or message bus that does not answer."""
     flag = "--user " if scope.is_user else ""
     silent, verb = (
         ("systemd", "is-system-running") if is_private else ("the message bus", "status dbus")
@@ -89,7 +89,7 @@ def _connection_hint(scope: Scope) -> str:
 
 
 def error_name(error: Exception) -> str:
-    """The last part of the D-Bus name; pystemd makes a class of the names that it knows."""
+    """The last part of the D-Bus error name; pystemd has a class for each name that it knows."""
     name = getattr(error, "err_name", "")
     text = name.decode(errors="replace") if isinstance(name, bytes) else str(name)
     return text.rpartition(".")[2] or type(error).__name__.removeprefix("DBus").removesuffix(

@@ -1,9 +1,10 @@
-"""pystemd.dbuslib without pystemd/__init__.py; the only module that imports pystemd.
+"""Imports pystemd.dbuslib without pystemd/__init__.py; no other module imports pystemd.
 
-That imports lxml and the signatures of all unit properties, which takes longer than the whole of
-`doractl list`. A package that holds nothing but its path stands in while the import runs, and so
-does a function for pprint's, which dbuslib has for debugging and which imports the compiler. This
-is a module, as Python runs one once and lets other threads wait: the gateway has many.
+pystemd/__init__.py imports lxml and the signatures of all unit properties, which takes longer than
+all of `doractl list`. During the import, an empty package with the same path takes its place. A
+function takes the place of pprint's, which dbuslib only needs for debugging, because pprint imports
+the compiler. All this happens in a module because Python runs a module once and lets other threads
+wait: the gateway has several.
 """
 
 import sys
@@ -24,7 +25,7 @@ def _load() -> ModuleType:
         raise DoraSystemdError("cannot find the Python module pystemd", hint, ExitCode.NO_SYSTEMD)
     package = ModuleType("pystemd")
     package.__path__ = list(spec.submodule_search_locations or ())
-    # Whoever has pprint already keeps it.
+    # If pprint is loaded already, it stays.
     stand_ins = {"pprint": _late_pprint(), "pystemd": package}
     absent = [name for name in stand_ins if name not in sys.modules]
     sys.modules.update({name: stand_ins[name] for name in absent})

@@ -1,4 +1,4 @@
-"""What the use cases ask of systemd; `systemd` does it in real life, a fake in unit tests."""
+"""The interface to systemd for the verbs: Bus in systemd.py implements it, and a fake in tests."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
@@ -14,11 +14,11 @@ DOWN = ("inactive", "failed")
 Property = tuple[str, str, Any]
 """Name, D-Bus signature and value of one unit property."""
 Observer = Callable[[Mapping[str, Any]], None]
-"""Is told the properties of a unit that changed while something waits."""
+"""Called with the changed properties of a unit during a wait."""
 
 
 class UnitState(NamedTuple):
-    """One unit as ListUnits gives it: the words of `systemctl list-units`."""
+    """One unit as ListUnits reports it, in the terms of `systemctl list-units`."""
 
     unit: str
     load: str
@@ -27,57 +27,60 @@ class UnitState(NamedTuple):
 
 
 class Manager(Protocol):
-    """One systemd manager. Every method raises DoraSystemdError; the jobs end with JobRemoved's
-    word: done, canceled, timeout, failed, dependency, skipped."""
+    """One systemd manager.
+
+    Every method raises DoraSystemdError. The result of a job is that of JobRemoved: done, canceled,
+    timeout, failed, dependency, skipped.
+    """
 
     def list_units(self, pattern: str) -> list[UnitState]:
-        """The loaded units that match a shell pattern."""
+        """The loaded units that match a glob pattern."""
 
     def read(self, unit: str, names: Sequence[str]) -> dict[str, Any]:
-        """Properties of a unit; one that systemd does not know has the LoadState "not-found"."""
+        """Properties of a unit; if systemd does not find the unit, its LoadState is "not-found"."""
 
     def start_transient(
         self, unit: str, properties: Sequence[Property], observer: Observer | None, wait: bool
     ) -> str:
-        """Make and start a unit; the result of its start job, JOB_DONE at once unless `wait`."""
+        """Create and start a unit; the result of the job. Without `wait`, JOB_DONE at once."""
 
     def run_jobs(
         self, method: str, units: Sequence[str], observer: Observer | None = None
     ) -> dict[str, str]:
-        """StartUnit, StopUnit or RestartUnit for all units at once; the result of each job."""
+        """StartUnit, StopUnit or RestartUnit for all units in parallel; the result of each job."""
 
     def queue_job(self, method: str, unit: str) -> str:
-        """The same for one unit, without waiting; the object path of the job."""
+        """Queue a job for one unit without waiting; the object path of the job."""
 
     def kill(self, unit: str, signal: int, whom: str = "all") -> None:
         """Send `signal` to the processes of a unit: main, control or all."""
 
     def reset_failed(self, unit: str) -> None:
-        """Forget that a unit has failed; a transient one is gone then."""
+        """Clear the failed state of a unit; systemd then unloads a transient one."""
 
     def set_properties(self, unit: str, properties: Sequence[Property], runtime: bool) -> None:
-        """Change properties of a running unit."""
+        """Change properties of a loaded unit; runtime: only until the next boot."""
 
     def fileno(self) -> int:
         """For poll(2): readable when properties of a unit that was started may have changed."""
 
     def changes(self, unit: str) -> list[Mapping[str, Any]]:
-        """What has changed of a unit's properties since the last look; does not wait."""
+        """The properties of a unit that changed since the last call; does not wait."""
 
     def hold(self, unit: str) -> None:
-        """Keep systemd from forgetting the unit, until this client leaves the bus."""
+        """Keep systemd from unloading the unit until this client disconnects."""
 
     def control_group(self) -> str:
-        """The manager's own cgroup, below which its units are; "" is the root."""
+        """The manager's own cgroup, which contains its units; "" is the root."""
 
     def reload(self) -> None:
-        """Have the files of all units read again, as `systemctl daemon-reload`."""
+        """Load all unit files again, like `systemctl daemon-reload`."""
 
     def unit_path(self) -> list[str]:
-        """The directories of unit files, the most important first, as `systemctl show` has it."""
+        """The directories of unit files, highest precedence first: UnitPath in `systemctl show`."""
 
     def enable_unit_files(self, names: Sequence[str]) -> bool:
-        """Link units or files as their [Install] sections say; whether they have one."""
+        """Create the links of the [Install] sections; whether there is such a section."""
 
     def disable_unit_files(self, units: Sequence[str]) -> None:
         """Remove all links to these units."""

@@ -1,7 +1,15 @@
-"""systemd over D-Bus: the only module that talks to it.
+"""Talks to systemd over D-Bus; the methods of Bus are the only calls to it.
 
-The interfaces are those of org.freedesktop.systemd1(5). Only pystemd's low level is used, on a
-connection that is told every signature: nothing is introspected, and no XML is parsed.
+The interfaces are those of org.freedesktop.systemd1(5). Bus uses the low level of pystemd and
+passes the signature of every argument itself. So it needs no introspection and parses no XML.
+
+Properties belong to an interface: _UNIT_PROPERTIES lists those that are read from the Unit
+interface; all others are read from the interface of the unit's type. A Unit property that is
+missing there gives an error of systemd's.
+
+To wait for a job, Bus subscribes to JobRemoved before it queues the job: in the other order the
+signal of a short job could arrive before the subscription, and get lost. Signals can get lost
+anyway when the message bus restarts, so the wait also reads the state of the units once a second.
 """
 
 import select
@@ -39,10 +47,10 @@ _UNIT_PROPERTIES = frozenset(
 
 
 class Bus:
-    """A connection to the manager of `scope`: the Manager of `manager`, which documents it.
+    """A connection to the manager of `scope`. Manager in manager.py documents the methods.
 
-    for_reading: nothing is going to be changed. Such a connection gives systemd READ_SECONDS for
-    each answer, and goes around a message bus that does not answer.
+    for_reading: the caller changes nothing. Then each answer may take READ_SECONDS, and the private
+    socket of systemd takes the place of a message bus that does not answer; see connection.py.
     """
 
     def __init__(self, scope: Scope, for_reading: bool = False) -> None:
@@ -51,7 +59,7 @@ class Bus:
         self._matches: dict[bytes, Callable[..., None]] = {}
 
     def __del__(self) -> None:
-        # pystemd keeps the connection, two descriptors, until it is told. A gateway has many.
+        # pystemd closes its two file descriptors only on request; the gateway opens many.
         if hasattr(self, "_bus"):
             self._bus.close()
 
@@ -163,7 +171,7 @@ class Bus:
         return decoded(reply.body)
 
     def _listen(self, unit: str) -> None:
-        """Hear the end of jobs and the changed properties of `unit` from now on."""
+        """Subscribe to the end of jobs and to the changed properties of `unit`."""
         path = _unit_path(unit)
         if not self._matches:
             self._call("listen to systemd", ROOT, MANAGER, "Subscribe")
@@ -172,8 +180,9 @@ class Bus:
             self._match(path, PROPERTIES, b"PropertiesChanged")
 
     def _match(self, path: bytes, interface: bytes, member: bytes) -> None:
-        # pystemd keeps only a bare pointer to the callback, and needs a function of its own each
-        # time. It does nothing: process() returns every message as well.
+        # pystemd keeps a pointer to the callback without a reference, and needs another function
+        # for each match: _matches keeps them alive. The callback does nothing, because process()
+        # returns every message as well.
         def ignore(_message: Any, error: Any = None, userdata: Any = None) -> None:
             del error, userdata
 
@@ -182,9 +191,9 @@ class Bus:
             self._bus.match_signal(None, path, interface, member, ignore)
 
     def _signals(self) -> Iterator[tuple[str, Any]]:
-        """Member and body of what has arrived.
+        """Member and body of the signals that have arrived; does not wait.
 
-        process() says nothing about steps that brought no message, hence the few empty tries.
+        process() can return no message although more are queued, so it gets a few empty tries.
         """
         empty = 0
         while empty < 3:
@@ -198,7 +207,7 @@ class Bus:
             yield member, decoded(message.body)
 
     def _wait_for_jobs(self, jobs: dict[str, str], observer: Observer | None) -> dict[str, str]:
-        """The results by unit. `jobs`: object paths of queued jobs and their units."""
+        """Wait for jobs, and return the results by unit. jobs: object path -> unit."""
         results: dict[str, str] = {}
         while len(results) < len(jobs):
             heard = False
@@ -208,7 +217,7 @@ class Bus:
                     results[jobs[body[1]]] = body[3]
                 if member == "PropertiesChanged" and observer:
                     observer(body[1])
-            # A signal can be lost with a restart of the message bus: the units are asked too.
+            # No signal for a second: it may be lost, so read the state of the units as well.
             if not heard and not self._sleep(_IDLE_SECONDS):
                 left = [unit for unit in jobs.values() if unit not in results]
                 results |= {unit: word for unit in left if (word := self._job_result(unit))}

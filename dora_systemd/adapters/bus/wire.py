@@ -1,4 +1,4 @@
-"""Values to and from the form in which pystemd's call_method() takes and gives them."""
+"""Converts values to and from the form that pystemd's call_method() uses."""
 
 import os
 from typing import Any
@@ -10,9 +10,9 @@ _CLOSE = (-1, None)
 
 
 def encoded(signature: str, value: Any) -> list[tuple[int, Any]]:
-    """`value` as the sequence of basic types and containers that call_method() takes.
+    """`value` as the sequence of basic types and containers for call_method().
 
-    A variant's value is a pair: its own signature and its value.
+    A variant's value is a pair of its signature and its value.
     """
     kind = signature[0]
     if kind == "a":
@@ -28,7 +28,7 @@ def encoded(signature: str, value: Any) -> list[tuple[int, Any]]:
 
 
 def _text(value: str) -> bytes:
-    """UTF-8 without NUL, which would end the string silently in C: D-Bus knows no other text."""
+    """UTF-8 without NUL: D-Bus allows no NUL, and C would silently cut the string there."""
     try:
         encoded_text = value.encode()
     except UnicodeEncodeError:
@@ -52,7 +52,7 @@ def _split(signature: str) -> list[str]:
 
 
 def decoded(value: Any) -> Any:
-    """A body that pystemd gave, with text instead of bytes and lists instead of tuples."""
+    """The body of a message of pystemd, with str for bytes and lists for tuples."""
     if isinstance(value, bytes):
         return os.fsdecode(value)
     if isinstance(value, dict):

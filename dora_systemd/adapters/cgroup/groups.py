@@ -1,7 +1,7 @@
-"""The cgroup tree: numbers read from it, and what the runner does in its own delegated part.
+"""The cgroup tree: reads its numbers, and changes the part that is delegated to the runner.
 
-Everything here follows the kernel's "Control Group v2" document. A group is named as systemd and
-/proc/PID/cgroup name it: by its path from the root of the hierarchy, "/dora.slice/dora-x.service".
+The source is the kernel's "Control Group v2" document. A group has the name that systemd and
+/proc/PID/cgroup use: its path from the root of the hierarchy, "/dora.slice/dora-x.service".
 """
 
 import contextlib
@@ -24,9 +24,9 @@ NODE_PREFIX = "node-"
 SUPERVISOR = "supervisor"
 """The group of the runner and of dora's own processes, below that of the unit."""
 MAX_GROUPS = 300
-"""Groups that are looked at where nobody says which: the nodes' user can make any number."""
+"""Maximum groups to read if their names are not known: the nodes' user can create any number."""
 MAX_PROCESSES = 5000
-"""Processes that are counted one by one where there is no memory controller."""
+"""Maximum processes to count one by one without a memory controller."""
 _MAX_ENTRIES = 10_000
 MOUNTS = (Path("/sys/fs/cgroup"), Path("/sys/fs/cgroup/unified"))
 
@@ -35,9 +35,9 @@ _ABSENT = (errno.ENOENT, errno.ENODEV, errno.EOPNOTSUPP, errno.ENOTSUP)
 
 @cache
 def mount_point() -> Path:
-    """Where the cgroup2 hierarchy is mounted; hybrid systems have it one level deeper.
+    """The mount point of the cgroup2 hierarchy; on hybrid systems it is one level deeper.
 
-    Raises DoraSystemdError (NO_SYSTEMD) when there is none.
+    Raises DoraSystemdError (NO_SYSTEMD) if there is none.
     """
     for place in MOUNTS:
         if (place / "cgroup.procs").exists():
@@ -50,7 +50,7 @@ def mount_point() -> Path:
 
 
 def group_path(group: str) -> Path:
-    """The directory of `group` ("/a/b", as systemd's ControlGroup= property gives it)."""
+    """The directory of `group`, which is like "/a/b", as in systemd's ControlGroup= property."""
     return mount_point() / group.lstrip("/")
 
 
@@ -74,9 +74,9 @@ def node_groups(path: Path) -> dict[str, Path]:
 
 
 def shown_groups(path: Path, nodes: Iterable[str] = ()) -> dict[str, Path]:
-    """The groups of `nodes` that are there, or MAX_GROUPS of those that may be of nodes.
+    """The existing groups of `nodes`, or up to MAX_GROUPS groups that may be nodes'.
 
-    For a look from outside: the nodes' user can make groups there, of any name and number.
+    For readers outside the cell: the nodes' user can create groups of any name and number.
     """
     names = [f"{NODE_PREFIX}{node}" for node in nodes]
     with contextlib.suppress(OSError):
@@ -94,9 +94,9 @@ def _is_node_group(name: str) -> bool:
 
 
 def read_usage(path: Path) -> Usage:
-    """CPU and memory of one group with all below it; zero for a group that has just gone.
+    """CPU and memory of a group and all groups below it; zero if it no longer exists.
 
-    Without a memory controller the memory is the sum of the processes' resident sets.
+    Without a memory controller, memory is the sum of the processes' resident sets.
     """
     current, cpu = read_number(path / "memory.current"), read_cpu(path)
     if current is None:
@@ -112,14 +112,14 @@ def read_usage(path: Path) -> Usage:
 
 
 def read_cpu(path: Path) -> Usage:
-    """CPU time and throttling of a group alone; there even without a cpu controller."""
+    """CPU time and throttling of a group; exists even without a cpu controller."""
     numbers = read_numbers(path / "cpu.stat")
     throttling = numbers.get("nr_periods", 0), numbers.get("nr_throttled", 0)
     return Usage(numbers.get("usage_usec", 0), throttling=throttling)
 
 
 def read_numbers(path: Path) -> dict[str, int]:
-    """The numbers of a control file with one KEY NUMBER in a line; {} where there is none."""
+    """The numbers of a control file with lines KEY NUMBER; {} if it does not exist."""
     pairs = (line.partition(" ") for line in read_text(path).splitlines())
     return {key: int(value) for key, _, value in pairs}
 
@@ -134,42 +134,42 @@ def _pids(groups: Iterable[Path]) -> Iterator[int]:
 
 
 def is_populated(path: Path) -> bool:
-    """Whether any process is in the group or below it."""
+    """Whether the group or one below it has a process."""
     return "populated 1" in read_text(path / "cgroup.events").splitlines()
 
 
 def make_group(path: Path) -> None:
-    """Make one group; one that is there already is fine. Raises OSError."""
+    """Create one group unless it exists. Raises OSError."""
     path.mkdir(exist_ok=True)
 
 
 def remove_group(path: Path) -> None:
-    """Remove a group that has no process; one that is gone or still busy is left as it is."""
+    """Remove a group without processes; ignore one that is busy or missing."""
     with contextlib.suppress(OSError):
         path.rmdir()
 
 
 def read_controllers(path: Path) -> frozenset[str]:
-    """The controllers that a group has been given, which it can give to those below it."""
+    """The controllers of a group, which it can enable for groups below it."""
     return frozenset(read_text(path / "cgroup.controllers").split())
 
 
 def enable_controllers(path: Path) -> None:
-    """Give the groups below `path` every controller that `path` itself has been given.
+    """Enable every controller of `path` for the groups below it.
 
-    What the kernel does not offer (no controllers at all, in some containers) is passed over.
+    Ignores what the kernel does not offer: some containers have no controllers at all.
     """
     for name in sorted(read_controllers(path)):
         _write(path / "cgroup.subtree_control", f"+{name}")
 
 
 def kill_as_one(path: Path) -> None:
-    """Have the kernel kill all of a group when one of its processes uses too much memory."""
+    """Have the kernel's OOM killer kill all processes of the group together: memory.oom.group."""
     _write(path / "memory.oom.group", "1")
 
 
 def limit_group(path: Path, limits: NodeLimits) -> None:
-    """Limit a node's group. Raises DoraSystemdError for a limit that does not take hold."""
+    """Set the limits of a node's group. Raises DoraSystemdError if one does not take effect."""
     for file, text in limits.files().items():
         try:
             is_limited = _write(path / file, text)
@@ -190,7 +190,7 @@ def read_files(path: Path, names: Iterable[str]) -> dict[str, str]:
 
 
 def restore_group(path: Path, texts: Mapping[str, str]) -> None:
-    """Write back what read_files has read, as far as the kernel lets us."""
+    """Write back what read_files() has read, as far as the kernel accepts it."""
     for name, text in texts.items():
         with contextlib.suppress(OSError):
             _write(path / name, text.strip())
@@ -206,9 +206,9 @@ def move_process(path: Path, pid: int) -> None:
 
 
 def kill_group(path: Path) -> None:
-    """SIGKILL to everything in the group and below it at once; nothing can fork away.
+    """Kill everything in the group and below it at once, so that no process can fork away.
 
-    cgroup.kill exists since Linux 5.14; before, every process gets its signal by pid.
+    cgroup.kill exists since Linux 5.14; on older kernels each process gets a signal by its pid.
     """
     if not _write(path / "cgroup.kill", "1"):
         for pid in pids(path):
@@ -217,10 +217,10 @@ def kill_group(path: Path) -> None:
 
 
 def freeze_group(path: Path, is_frozen: bool) -> bool:
-    """Stop every process of the group, or let them go on; whether the kernel was told.
+    """Freeze or thaw every process of the group; whether the kernel accepted that.
 
-    SIGKILL ends what is frozen; other signals wait until it goes on. cgroup.freeze in the kernel's
-    document, since Linux 5.2.
+    SIGKILL ends frozen processes; other signals wait until they are thawed. cgroup.freeze exists
+    since Linux 5.2.
     """
     with contextlib.suppress(OSError):
         return _write(path / "cgroup.freeze", str(int(is_frozen)))
@@ -228,7 +228,7 @@ def freeze_group(path: Path, is_frozen: bool) -> bool:
 
 
 def _tree(path: Path) -> Iterator[Path]:
-    """The group and all below it; no recursion, as the nodes' user can nest them very deeply."""
+    """The group and all groups below it; not recursive, as users can nest them deeply."""
     left = deque([path])
     while left:
         yield (group := left.popleft())
@@ -237,7 +237,7 @@ def _tree(path: Path) -> Iterator[Path]:
 
 
 def _write(path: Path, text: str) -> bool:
-    """Write to a control file; False where the kernel has no such file or controller."""
+    """Write to a control file; False if the kernel has no such file or controller."""
     try:
         control = os.open(path, os.O_WRONLY | os.O_CLOEXEC)
         try:
@@ -252,9 +252,9 @@ def _write(path: Path, text: str) -> bool:
 
 
 def read_text(path: Path) -> str:
-    """The text of a control file; "" where there is none, or no group any more."""
-    # A group may vanish between any two looks at it: that is the same as an empty one.
-    # There are many of them, and a text file's machinery takes longer than the kernel does.
+    """The text of a control file; "" if the file or the group does not exist."""
+    # A group can disappear at any moment, which counts as empty. FileIO: there are many of these
+    # files, and Python's text layer takes longer than the kernel.
     with contextlib.suppress(OSError), io.FileIO(path) as file:
         return file.readall().decode()
     return ""
@@ -269,7 +269,7 @@ def read_number(path: Path) -> int | None:
 
 
 def _read_share(path: Path) -> int | None:
-    """cpu.max as µs per second."""
+    """The quota of cpu.max as µs per second."""
     quota, _, period = read_text(path).strip().partition(" ")
     if not period:
         return None
@@ -277,6 +277,6 @@ def _read_share(path: Path) -> int | None:
 
 
 def _resident_bytes(pid: int) -> int:
-    """The second number of /proc/PID/statm, see proc_pid_statm(5); in pages there."""
+    """The resident set in bytes: the second number of /proc/PID/statm, see proc_pid_statm(5)."""
     numbers = read_text(Path(f"/proc/{pid}/statm")).split()
     return int(numbers[1]) * os.sysconf("SC_PAGE_SIZE") if len(numbers) > 1 else 0

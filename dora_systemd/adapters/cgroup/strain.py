@@ -13,7 +13,7 @@ _TOTAL = re.compile(r"^(some|full) .*total=(\d+)$", re.M)
 
 
 def read_strain(path: Path) -> Strain:
-    """The counters of one group with all below it; zeros for one that has just gone."""
+    """The counters of a group and all groups below it; zeros if it no longer exists."""
     stalls = {name: _read_stalls(path / f"{name}.pressure") for name in RESOURCES}
     return Strain(
         stalled={name: stall for name, stall in stalls.items() if stall is not None},
@@ -44,7 +44,7 @@ def read_load(path: Path) -> Load:
 
 
 def _read_stalls(path: Path) -> tuple[int, int] | None:
-    """Both totals of a pressure file, µs; None where the kernel does not watch that."""
+    """Both totals of a pressure file in µs; None if the kernel does not measure them."""
     totals = {kind: int(total) for kind, total in _TOTAL.findall(read_text(path))}
     return (totals["some"], totals.get("full", 0)) if "some" in totals else None
 

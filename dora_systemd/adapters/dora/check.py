@@ -1,7 +1,7 @@
-"""What dora itself has to say against a dataflow, asked inside the cell and beside other things.
+"""Runs dora's own checks of a dataflow inside the cell, in parallel to its start.
 
-doractl runs no dora: that may be the user's own, or a program that stands in for it. Here it is the
-user who runs it, in the sandbox, with the environment of the nodes.
+doractl does not run dora: that may be the user's own version, or another program in its place. Here
+the user runs it, in the sandbox, with the environment of the nodes.
 """
 
 import os
@@ -20,9 +20,9 @@ T = TypeVar("T")
 
 
 class DoraCheck:
-    """Begins when it is made. Two programs are asked, both at the same time.
+    """Starts the checks when it is created. They run in parallel because each starts a process.
 
-    environment: of the nodes.
+    environment: that of the nodes.
     """
 
     def __init__(self, options: RunnerOptions, environment: Mapping[str, str]) -> None:
@@ -31,7 +31,7 @@ class DoraCheck:
         self._refusal = Beside(lambda: refusal_of_dora(options, environment))
 
     def beside(self, call: Callable[[], T]) -> T:
-        """The result of `call`, which is made meanwhile. What dora refuses counts first."""
+        """Call `call` while the checks run; its result. Errors of the checks take precedence."""
         try:
             done = call()
         except DoraSystemdError:
@@ -41,9 +41,9 @@ class DoraCheck:
         return done
 
     def result(self) -> None:
-        """Wait until both have answered. Raises DoraSystemdError for what is refused.
+        """Wait for all checks. Raises DoraSystemdError for what is refused.
 
-        Whose answer comes first in the code is whose refusal counts.
+        If several fail, the first refusal in the order of the code is reported.
         """
         options = self._options
         check_access(options)
@@ -57,9 +57,9 @@ class DoraCheck:
 
 
 def refusal_of_dora(options: RunnerOptions, environment: Mapping[str, str]) -> str:
-    """What `dora validate` says against the dataflow of `options`, or "".
+    """The error of `dora validate` for the dataflow of `options`, or "".
 
-    environment: of the nodes.
+    environment: that of the nodes.
     """
     arguments = ["validate", options.dataflow]
     directory = options.working_directory
@@ -70,9 +70,9 @@ def refusal_of_dora(options: RunnerOptions, environment: Mapping[str, str]) -> s
 
 
 def check_access(options: RunnerOptions) -> None:
-    """Raise DoraSystemdError (NO_PERMISSION) for the first path that this user cannot reach.
+    """Raise DoraSystemdError (NO_PERMISSION) for the first path that this user cannot access.
 
-    Of a dora that is not there (NO_DORA); a dataflow that is not there says so itself.
+    A missing dora is NO_DORA; reading a missing dataflow reports that itself.
     """
     places = (options.working_directory, options.dora)
     wanted = [(options.dataflow, os.R_OK), *((one, os.X_OK) for one in places)]

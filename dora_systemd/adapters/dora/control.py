@@ -25,11 +25,11 @@ if TYPE_CHECKING:
     from dora_systemd.adapters.dora.websocket import WebSocket
 
 MAX_BYTES = 64 * 1024 * 1024
-"""Of a message over a relay: what is there may be hostile. A picture of a topic is smaller."""
+"""Maximum bytes of a message over a relay, where the peer may be hostile."""
 
 _OPTIONS: dict[str, Any] = {
-    # A coordinator answers no ping while a request is pending, and a proxy has no business between
-    # two processes of one machine.
+    # A coordinator answers no ping while a request is pending. No proxy may come between two
+    # processes of one machine.
     "ping_interval": None,
     "compression": None,
     "max_size": MAX_BYTES,
@@ -37,7 +37,7 @@ _OPTIONS: dict[str, Any] = {
 }
 OPEN_SECONDS = 4.0
 REQUEST_SECONDS = 35.0
-"""Just above the 30 s after which the coordinator itself gives up on its daemon."""
+"""Just above the 30 s after which the coordinator gives up on its daemon."""
 
 
 _RELAY = "ws://127.0.0.1/api/control"
@@ -52,7 +52,7 @@ def _headers(token: str) -> dict[str, str]:
 
 
 class Connection:
-    """A connection for requests, answered one after the other, or for the events of one run."""
+    """A connection for requests, which are answered in turn, or for the events of one run."""
 
     def __init__(self, socket: "WebSocket") -> None:
         self._socket = socket
@@ -69,7 +69,7 @@ class Connection:
 
     @classmethod
     async def over(cls, stream: "sockets.socket", token: str) -> "Connection":
-        """Connect over a relay of a cell's runner. Raises DoraSystemdError."""
+        """Connect through a relay of a cell's runner. Raises DoraSystemdError."""
         from dora_systemd.adapters.dora.websocket import WebSocket, WebSocketException
 
         try:
@@ -94,32 +94,32 @@ class Connection:
             raise _silent(params, error) from error
 
     async def read_events(self, on_record: Callable[[LogRecord], None]) -> None:
-        """Give every event to on_record, until the connection is closed by either side."""
+        """Pass every event to on_record until either side closes the connection."""
         async for text in self.frames():
             if isinstance(frame := parse_frame(text), LogRecord):
                 on_record(frame)
 
     async def frames(self) -> AsyncIterator[str | bytes]:
-        """Every message as it comes, until the connection is closed by either side."""
+        """Every message, until either side closes the connection."""
         with suppress(OSError):
             while True:
                 yield await self._socket.recv()
 
     async def close(self) -> None:
-        """Close at once: the peer may be dead or hang."""
+        """Close at once, because the peer may be dead or hang."""
         self.abort()
 
     def abort(self) -> None:
-        """The same for who cannot wait."""
+        """Close at once, without waiting."""
         self._socket.abort()
 
 
 def request(
     stream: "sockets.socket", token: str, params: Params, seconds: float = REQUEST_SECONDS
 ) -> Reply:
-    """One request over a relay of a cell's runner, without asyncio; the connection is closed.
+    """Send one request through a relay of a cell's runner, without asyncio, and close.
 
-    The answer may take `seconds`, whatever comes before it. Raises DoraSystemdError.
+    The reply may take `seconds`, including other messages before it. Raises DoraSystemdError.
     """
     from websockets.exceptions import WebSocketException
     from websockets.sync.client import unix_connect
@@ -149,9 +149,9 @@ def request(
 
 
 def read_coordinator(path: Path) -> Coordinator:
-    """What the runner has noted in the control.json at `path`.
+    """The coordinator in the control.json at `path`, which the runner has written.
 
-    Raises DoraSystemdError (NOT_RUNNING) as long as there is none.
+    Raises DoraSystemdError (NOT_RUNNING) if there is no such file yet.
     """
     try:
         return parse_coordinator(json.loads(path.read_text()))

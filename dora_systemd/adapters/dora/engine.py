@@ -1,4 +1,4 @@
-"""The dora coordinator and the dora daemon of one cell, as child processes."""
+"""Starts the dora coordinator and the dora daemon of one cell as child processes."""
 
 import contextlib
 import os
@@ -15,19 +15,19 @@ if TYPE_CHECKING:
 
 
 def coordinator_command(dora: str) -> list[str]:
-    """A coordinator on a free loopback port, with a token of its own making, storing nothing."""
+    """A coordinator on a free loopback port that creates its own token and stores nothing."""
     flags = ("--interface", "127.0.0.1", "--port", "0", "--store", "memory", "--auth")
     return [dora, "coordinator", *flags]
 
 
 def coordinator_environment(environment: Mapping[str, str], directory: Path) -> dict[str, str]:
-    """It writes its token to $XDG_CONFIG_HOME too: never over the one of the user's own dora."""
+    """$XDG_CONFIG_HOME for the token: the token of the user's own dora must not be overwritten."""
     own = {"XDG_CONFIG_HOME": str(directory), "TMPDIR": str(directory), "RUST_BACKTRACE": "0"}
     return {**environment, **own, "NO_COLOR": "1"}
 
 
 def daemon_command(dora: str, port: int, local_listen_port: int) -> list[str]:
-    """A daemon that finds its coordinator and nobody else: cells must not discover each other."""
+    """A daemon that only connects to its coordinator: cells must not discover each other."""
     ports = ("--coordinator-addr", "127.0.0.1", "--coordinator-port", str(port))
     return [
         dora,
@@ -40,7 +40,7 @@ def daemon_command(dora: str, port: int, local_listen_port: int) -> list[str]:
 
 
 def free_port() -> int:
-    """A TCP port of the loopback interface that nobody listens on now."""
+    """A TCP port of the loopback interface that is free at the moment."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
@@ -48,7 +48,7 @@ def free_port() -> int:
 
 @dataclass(frozen=True)
 class Child:
-    """One running child. output: the read end of its stdout and stderr."""
+    """One child process. output: the read end of its stdout and stderr."""
 
     label: str
     popen: "subprocess.Popen[bytes]"
@@ -56,12 +56,12 @@ class Child:
     output: int
 
     def send_signal(self, number: signal.Signals) -> None:
-        """Signal it, and never another process that got its pid."""
+        """Send it a signal, but never to another process that has reused its pid."""
         with contextlib.suppress(ProcessLookupError):
             signal.pidfd_send_signal(self.pidfd, number)
 
     def close(self, loop: "asyncio.AbstractEventLoop", seconds: float) -> None:
-        """Reap it, if it ends within `seconds`, and give back its descriptor."""
+        """Reap the child if it exits within `seconds`, and close its file descriptor."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.popen.wait(seconds)
         loop.remove_reader(self.pidfd)
@@ -93,7 +93,7 @@ def spawn(
 def watch(
     loop: "asyncio.AbstractEventLoop", child: Child, on_exit: Callable[[str, str], None]
 ) -> None:
-    """Call on_exit(label, how) once, when the child has ended."""
+    """Call on_exit(label, how) once, after the child has exited."""
 
     def ended() -> None:
         loop.remove_reader(child.pidfd)
@@ -103,7 +103,7 @@ def watch(
 
 
 def format_exit(status: int) -> str:
-    """A status of subprocess as systemd would say it: "exit code 1", "signal SIGKILL"."""
+    """An exit status of subprocess in systemd's terms: "exit code 1", "signal SIGKILL"."""
     if status >= 0:
         return f"exit code {status}"
     try:

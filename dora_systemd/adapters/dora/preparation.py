@@ -1,4 +1,4 @@
-"""From a descriptor on disk to what is sent to dora: what the runner does at every start."""
+"""Turns a descriptor on disk into what dora gets: the runner does this at every start."""
 
 import os
 from collections.abc import Mapping
@@ -38,7 +38,7 @@ PACKAGE = Path(__file__).parents[2]
 class Prepared:
     """A dataflow that can be started.
 
-    dataflow: with its modules expanded. descriptor: what is sent to dora.
+    dataflow: with modules expanded. descriptor: what dora gets.
     """
 
     dataflow: Dataflow
@@ -47,9 +47,9 @@ class Prepared:
 
 
 def prepare(options: RunnerOptions, environment: Mapping[str, str]) -> Prepared:
-    """Read the dataflow of `options` and rewrite it. environment: of the nodes.
+    """Read and rewrite the dataflow of `options`. environment: that of the nodes.
 
-    Raises DoraSystemdError when it cannot be read or a node of it cannot be run.
+    Raises DoraSystemdError if it is not readable or a node of it cannot run.
     """
     dataflow = load_dataflow(options)
     _check_limited(options, dataflow)
@@ -64,9 +64,9 @@ def prepare(options: RunnerOptions, environment: Mapping[str, str]) -> Prepared:
 
 
 def check_named_nodes(options: RunnerOptions, dataflow: Dataflow) -> None:
-    """Raise DoraSystemdError (BAD_INPUT) where the options name a node that is not there.
+    """Raise DoraSystemdError (BAD_INPUT) if the options name a node that does not exist.
 
-    dataflow: with its modules expanded.
+    dataflow: with modules expanded.
     """
     _check_limited(options, dataflow)
     ids = [node.id for node in dataflow.nodes]
@@ -82,7 +82,7 @@ def _check_limited(options: RunnerOptions, dataflow: Dataflow) -> None:
 
 
 def with_changes(options: RunnerOptions, environment: Mapping[str, str]) -> RunnerOptions:
-    """The options with what `doractl set` has changed since the unit was made."""
+    """The options, with the changes that `doractl set` has made since the unit was created."""
     changes = parse_changes(environment.get(CHANGES_VARIABLE, ""))
     limits = merge_node_limits(options.node_limits, changes)
     is_on = parse_bool(environment.get(CHANGE_VARIABLE) or format_bool(options.hot_reload))
@@ -90,12 +90,12 @@ def with_changes(options: RunnerOptions, environment: Mapping[str, str]) -> Runn
 
 
 def load_dataflow(options: RunnerOptions) -> Dataflow:
-    """The dataflow of `options`, its modules expanded. Raises DoraSystemdError."""
+    """The dataflow of `options` with modules expanded. Raises DoraSystemdError."""
     path = Path(options.dataflow)
     dataflow = parse_dataflow(files.read_yaml(path), str(path))
     if not any(node.kind in UNEXPANDED for node in dataflow.nodes):
         return dataflow
-    # Inside the cell: as root in somebody else's name nobody comes this way.
+    # This runs inside the cell, so as its user, and never as root for another user.
     account, directory = own_account(), str(path.parent)
     done = run_dora(options.dora, ["expand", str(path)], account, os.environ, directory)
     if done.status != 0:

@@ -1,7 +1,7 @@
-"""A WebSocket client over asyncio's streams, for loopback. The protocol is that of websockets.
+"""A WebSocket client over asyncio's streams, for loopback, on the protocol layer of websockets.
 
-Its own asyncio client imports OpenSSL and a proxy's ways, a fifth of the memory of a runner; what
-is used here is the layer below, which does no input and output itself:
+The asyncio client of websockets imports OpenSSL and proxy support, a fifth of the memory of a
+runner. This module uses the layer below, which does no I/O:
 https://websockets.readthedocs.io/en/stable/howto/sansio.html
 """
 
@@ -21,7 +21,10 @@ CHUNK = 1 << 16
 
 
 class WebSocket:
-    """One connection. Frames may be as large as a descriptor; the own cell's have no limit."""
+    """One connection.
+
+    There is no limit on frames of the own cell: they may be as large as descriptors.
+    """
 
     def __init__(
         self,
@@ -43,10 +46,9 @@ class WebSocket:
         stream: sockets.socket | None = None,
         max_size: int | None = None,
     ) -> "WebSocket":
-        """Connect to a ws:// URL. Raises OSError, also without an answer in time, and
-        WebSocketException.
+        """Connect to a ws:// URL. Raises OSError, also for a timeout, and WebSocketException.
 
-        stream: a connection that is there already. max_size: bytes of a message.
+        stream: an existing connection. max_size: maximum bytes of a message.
         """
         uri = parse_uri(url)
         async with asyncio.timeout(OPEN_SECONDS):
@@ -73,13 +75,13 @@ class WebSocket:
             await self._receive()
 
     async def send(self, text: str) -> None:
-        """Send a message. Raises OSError, and WebSocketException once it is closed."""
+        """Send a message. Raises OSError, and WebSocketException if the connection is closed."""
         self._protocol.send_text(text.encode())
         self._flush()
         await self._writer.drain()
 
     async def recv(self) -> str | bytes:
-        """The next message. Raises OSError, ConnectionError if it is closed by either side."""
+        """The next message. Raises OSError; ConnectionError if either side has closed."""
         while not self._messages:
             if self._protocol.state is not State.OPEN:
                 raise ConnectionError("it closed the connection")
@@ -87,7 +89,7 @@ class WebSocket:
         return self._messages.popleft()
 
     def abort(self) -> None:
-        """Close at once: the peer may be dead or hang."""
+        """Close at once, because the peer may be dead or hang."""
         self._writer.transport.abort()
 
     async def _receive(self) -> None:
@@ -96,7 +98,7 @@ class WebSocket:
             self._protocol.receive_data(data)
         else:
             self._protocol.receive_eof()
-        self._flush()  # what the protocol answers by itself, such as a pong
+        self._flush()  # replies of the protocol layer itself, such as a pong
         for event in self._protocol.events_received():
             if isinstance(event, Frame):
                 self._take(event)

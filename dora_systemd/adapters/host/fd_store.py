@@ -1,6 +1,6 @@
-"""systemd's file descriptor store: what outlives the runner.
+"""systemd's file descriptor store: keeps descriptors when the runner dies.
 
-While systemd holds a pipe open, what is in it stays there. See FDSTORE=1 in sd_notify(3) and
+While systemd holds a pipe open, its content is not lost. See FDSTORE=1 in sd_notify(3) and
 FileDescriptorStoreMax= in systemd.service(5).
 """
 
@@ -9,20 +9,20 @@ import os
 import socket
 
 PREFIX = "dora-log-"
-"""What we keep is named after its node, so that it can go with it."""
+"""Prefix of the names of pipes; the rest is the node, so that they can be removed by node."""
 LIFE = "dora-life"
-"""One such descriptor for each life of the runner since the last quiet window."""
+"""Name of a descriptor that stands for one life of the runner since the last quiet window."""
 _MOST_LIVES = 64
 _FIRST = 3  # SD_LISTEN_FDS_START, see sd_listen_fds(3)
 
 
 def store(fd: int, node: str) -> None:
-    """Have systemd keep `fd` open too; without systemd, or a store, nothing happens."""
+    """Have systemd keep `fd` open too; does nothing without systemd, or without a store."""
     _send(f"FDSTORE=1\nFDNAME={PREFIX}{node}\nFDPOLL=0", [fd])
 
 
 def forget(node: str) -> None:
-    """Have systemd close what it keeps of a node that is gone for good."""
+    """Have systemd close the pipes of a node that does not come back."""
     _forget(PREFIX + node)
 
 
@@ -31,10 +31,10 @@ def _forget(name: str) -> None:
 
 
 def lives() -> int:
-    """How many lives came before this one with no quiet window between them, _MOST_LIVES at most.
+    """Number of earlier lives since the last quiet window, at most _MOST_LIVES.
 
-    systemd keeps the count from one restart to the next, and forgets it when the unit is stopped.
-    `systemd-analyze fdstore` shows it.
+    systemd keeps these descriptors over restarts, and closes them when the unit is stopped.
+    `systemd-analyze fdstore` shows them.
     """
     if os.environ.get("LISTEN_PID", "") != str(os.getpid()):
         return 0
@@ -42,22 +42,22 @@ def lives() -> int:
 
 
 def count_life() -> None:
-    """This life is one more."""
+    """Count this life."""
     if lives() < _MOST_LIVES:
-        # Of its own: systemd keeps what it has already only once.
+        # A new file each time: systemd stores the same file only once.
         fd = os.memfd_create(LIFE, os.MFD_CLOEXEC)
         _send(f"FDSTORE=1\nFDNAME={LIFE}\nFDPOLL=0", [fd])
         os.close(fd)
 
 
 def forget_lives() -> None:
-    """This life is the first one."""
+    """Restart the count, with this life as the first."""
     _forget(LIFE)
     count_life()
 
 
 def forget_inherited() -> None:
-    """Close what an earlier life of this process left in the store, and take it out of it."""
+    """Close the pipes that an earlier life left in the store, and remove them from it."""
     if os.environ.pop("LISTEN_PID", "") != str(os.getpid()):
         return
     names = os.environ.pop("LISTEN_FDNAMES", "").split(":")

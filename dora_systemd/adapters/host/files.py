@@ -1,4 +1,4 @@
-"""Files: YAML and JSON in, atomic writes out. Nothing that a path can be makes a read hang."""
+"""Reads YAML and JSON, and writes files atomically. No path can make a read hang."""
 
 import contextlib
 import errno
@@ -13,10 +13,10 @@ from dora_systemd.trust.files import check_size, read_own_file
 from dora_systemd.values import shown
 
 MAX_DEPTH = 64
-"""Levels of nesting: libyaml's composer recurses in C and crashes on some 100,000 of them."""
+"""Maximum nesting: libyaml's composer recurses in C and crashes on some 100,000 levels."""
 
 MAX_VALUES = 100_000
-"""Values in a YAML file; a small file can hold enough of them to take seconds."""
+"""Maximum values in a YAML file: a small file can have enough of them to take seconds."""
 
 _WRITE_HINTS = {
     errno.EACCES: "use sudo, or choose a place that is yours",
@@ -28,16 +28,16 @@ _WRITE_HINTS = {
 
 
 def absolute_path(text: str) -> str:
-    """The path as systemd wants it: absolute and without "..", links before which are followed."""
+    """The path as systemd requires it: absolute, with ".." and links before it resolved."""
     path = Path(text).absolute()
     return "/" + str(path.resolve() if ".." in path.parts else path).lstrip("/")
 
 
 def read_text(path: Path) -> str:
-    """The text of the regular file `path`, at most MAX_BYTES of UTF-8.
+    """Read the regular file `path`, at most MAX_BYTES of UTF-8.
 
-    Raises DoraSystemdError (BAD_INPUT) when there is no such file, it is anything but a regular
-    file (a FIFO would let us wait for ever), too large, unreadable or not UTF-8.
+    Raises DoraSystemdError (BAD_INPUT) if there is no such file, if it is not a regular file (a
+    FIFO would block), or is too large, unreadable or not UTF-8.
     """
     return decoded(read_own_file(path), path)
 
@@ -55,16 +55,16 @@ def decoded(data: bytes, path: Path) -> str:
 def read_yaml(path: Path, allow_empty: bool = False) -> object:
     """The document in the YAML file `path`, as dora reads it: YAML 1.2, no merge keys, no dates.
 
-    Raises DoraSystemdError (BAD_INPUT) as read_text does, and with the line number when it is not
-    YAML, holds several documents, is nested too deeply or has a key twice, and when it is empty
-    unless `allow_empty` (then it is None). The same anchor is the same object everywhere, however
-    often it is used: walk the result with a limit.
+    Raises DoraSystemdError (BAD_INPUT) as read_text does, and with the line number if the file is
+    not YAML, has several documents, is nested too deeply or repeats a key; also if it is empty,
+    unless `allow_empty` (then the result is None). All uses of an anchor give the same object,
+    however often it is used: limit any walk over the result.
     """
     return parse_yaml(read_text(path), path, allow_empty)
 
 
 def parse_yaml(text: str, path: Path, allow_empty: bool = False) -> object:
-    """The document in `text`, as read_yaml reads it from `path`, which errors name."""
+    """The document in `text`, parsed as read_yaml does. path: for errors."""
     import yaml
 
     try:
@@ -80,7 +80,7 @@ def parse_yaml(text: str, path: Path, allow_empty: bool = False) -> object:
 
 
 def read_json(path: Path) -> Any:
-    """The JSON value in `path`; raises DoraSystemdError (BAD_INPUT) as read_text does."""
+    """The JSON value in `path`. Raises DoraSystemdError (BAD_INPUT) as read_text does."""
     text = read_text(path)
     try:
         return json.loads(text)
@@ -91,12 +91,12 @@ def read_json(path: Path) -> Any:
 def write_atomic(
     path: Path, data: str | bytes, mode: int = 0o644, is_durable: bool = False
 ) -> None:
-    """Replaces `path` by `data` in one step: readers see the old file or the new one, whole.
+    """Replace `path` by `data` in one step: readers get the complete old or new file.
 
-    `mode` holds from the first byte on, whatever the umask. is_durable: the same is true after a
-    power cut. Nothing is left behind on failure, which raises DoraSystemdError.
+    `mode` applies from the first byte on, whatever the umask is. is_durable: this holds after a
+    power failure as well. On failure raises DoraSystemdError and leaves no temporary file.
     """
-    from tempfile import mkstemp  # imports every compressor, and most commands write nothing
+    from tempfile import mkstemp  # it imports every compressor, and most commands write nothing
 
     content = data.encode() if isinstance(data, str) else data
     temporary = ""
@@ -119,7 +119,7 @@ def write_atomic(
 
 
 def _check_shape(text: str, path: Path) -> None:
-    """Events are read one by one without recursion, unlike nodes."""
+    """Check the limits on parser events, which need no recursion, unlike nodes."""
     import yaml
 
     depth = 0

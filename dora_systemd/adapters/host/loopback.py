@@ -1,4 +1,4 @@
-"""TCP ports of 127.0.0.1: is one free, and does somebody answer there."""
+"""TCP ports of 127.0.0.1: whether one is free, and whether the gateway answers."""
 
 import contextlib
 import socket
@@ -10,9 +10,9 @@ _CHUNK = 65536
 
 
 def port_error(port: int) -> int:
-    """Why nobody could listen there, as an errno; 0 if one could."""
+    """The errno of listening on the port; 0 if it is free."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as trial:
-        # As systemd does it: what lingers of former connections is no hindrance.
+        # As systemd does: remains of closed connections do not block the port.
         trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             trial.bind((_HOST, port))
@@ -23,7 +23,7 @@ def port_error(port: int) -> int:
 
 
 def answers_health(port: int, seconds: float) -> bool:
-    """Whether GET /health is answered with 200 within that time."""
+    """Whether GET /health returns 200 within `seconds`."""
     deadline = time.monotonic() + seconds
     while (left := deadline - time.monotonic()) > 0:
         with contextlib.suppress(OSError):

@@ -9,7 +9,7 @@ _KIB = 1024
 
 
 def read_machine() -> Machine:
-    """Memory, processors and numbers for tasks. Raises OSError without /proc."""
+    """Bytes of memory, number of processors and maximum tasks. Raises OSError without /proc."""
     lines = Path("/proc/meminfo").read_text().splitlines()
     total = next(int(line.split()[1]) for line in lines if line.startswith("MemTotal:"))
     tasks = int(Path("/proc/sys/kernel/pid_max").read_text())

@@ -1,4 +1,4 @@
-"""What a main process tells its manager and is given by it: sd_notify(3), sd_listen_fds(3)."""
+"""Messages to the service manager, and sockets from it: sd_notify(3), sd_listen_fds(3)."""
 
 import os
 import socket
@@ -6,7 +6,7 @@ import time
 
 
 def send_ready() -> None:
-    """READY=1: the start job is done."""
+    """READY=1: the start job is complete."""
     _notify("READY=1")
 
 
@@ -16,12 +16,12 @@ def send_status(text: str) -> None:
 
 
 def send_reloading() -> None:
-    """RELOADING=1: until READY=1 comes again."""
+    """RELOADING=1: until the next READY=1."""
     _notify(f"RELOADING=1\nMONOTONIC_USEC={time.monotonic_ns() // 1000}")
 
 
 def send_stopping() -> None:
-    """STOPPING=1: the end has begun."""
+    """STOPPING=1: the shutdown has begun."""
     _notify("STOPPING=1")
 
 
@@ -38,7 +38,7 @@ def activated_sockets() -> list[socket.socket]:
 
 
 def _notify(text: str) -> None:
-    """Nobody listens where systemd has not started us, and its library may be missing there."""
+    """Send a message; without NOTIFY_SOCKET do nothing: systemd's library may be missing."""
     if "NOTIFY_SOCKET" in os.environ:
         from systemd.daemon import notify
 

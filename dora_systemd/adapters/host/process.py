@@ -22,7 +22,7 @@ _CHUNK = 65536
 
 @dataclass(frozen=True)
 class Completed:
-    """How a child ended: exit status (minus the signal number when killed) and its two streams."""
+    """The result of a child: exit status (minus the signal number if killed) and output."""
 
     status: int
     stdout: str
@@ -36,10 +36,10 @@ def run_command(
     directory: str | None = None,
     account: Account | None = None,
 ) -> Completed:
-    """Run a child to its end, with no input; of each stream OUTPUT_LIMIT bytes are kept.
+    """Run a child until it exits, without input; keep OUTPUT_LIMIT bytes of each stream.
 
-    environment, account: as programs.spawn takes them. After `seconds` its whole process group is
-    killed. Raises DoraSystemdError when it cannot or must not be run, or took too long.
+    environment, account: as for programs.spawn. After `seconds`, its whole process group is killed.
+    Raises DoraSystemdError if it must not run, cannot run or takes too long.
     """
     try:
         child = spawn(command, account, environment, directory)
@@ -58,9 +58,9 @@ def run_command(
 
 
 class Beside(Generic[T]):
-    """A call in a thread of its own, for those that wait for children.
+    """Runs a function in a thread, for calls that wait for child processes.
 
-    No daemon thread: the child of one that nobody waits for any more is still waited for.
+    Not a daemon thread, so that a child is reaped even if nothing uses the result.
     """
 
     def __init__(self, call: Callable[[], T]) -> None:
@@ -77,7 +77,7 @@ class Beside(Generic[T]):
             self._error = error
 
     def result(self) -> T:
-        """What the call has returned, once it has. Raises what the call raised."""
+        """Wait for the function; its result. Raises what it raised."""
         self._thread.join()
         if self._error is not None:
             raise self._error
@@ -85,7 +85,7 @@ class Beside(Generic[T]):
 
 
 def read_streams(streams: Sequence[int], seconds: float) -> list[bytes]:
-    """What can be read from pipes until their end, which closes them. Raises DoraSystemdError."""
+    """Read pipes until their end, and close them. Raises DoraSystemdError after `seconds`."""
     try:
         return _collect(streams, time.monotonic() + seconds, "a check")
     finally:
@@ -94,7 +94,7 @@ def read_streams(streams: Sequence[int], seconds: float) -> list[bytes]:
 
 
 def _collect(streams: Sequence[int], deadline: float, command: str) -> list[bytes]:
-    """All streams until their end; what exceeds the limit is read and dropped."""
+    """Read all streams until their end; drop what exceeds the limit."""
     kept = {fd: bytearray() for fd in streams}
     with selectors.DefaultSelector() as selector:
         for stream in kept:

@@ -1,6 +1,6 @@
 """The processes of this machine and whose sockets are whose, from proc(5).
 
-What belongs to other users is there for root alone; everything is gone the moment it was read.
+Only root sees all details of other users' processes. Every entry may be out of date at once.
 """
 
 import contextlib
@@ -18,7 +18,7 @@ _SOCKET = re.compile(r"socket:\[(\d+)\]")
 
 
 def read_processes() -> list[Process]:
-    """All processes that can be read, without kernel threads."""
+    """All readable processes, without kernel threads."""
     found = (_read_process(path) for path in PROC.glob("[0-9]*"))
     return sorted((one for one in found if one), key=lambda one: one.pid)
 
@@ -32,7 +32,7 @@ def socket_owners(inodes: Collection[int]) -> frozenset[int]:
 def _read_process(path: Path) -> Process | None:
     try:
         command = _beginning(path / "cmdline").decode(errors="replace").split("\0")[:-1]
-        # The name may hold blanks and parentheses; what follows it does not.
+        # The name may contain blanks and parentheses; the fields after it do not.
         parent = int((path / "stat").read_text(errors="replace").rpartition(")")[2].split()[1])
         group = (path / "cgroup").read_text().rpartition("0::")[2].strip()
     except (OSError, IndexError, ValueError):
@@ -50,7 +50,7 @@ def _is_node(path: Path) -> bool:
 
 
 def _beginning(path: Path) -> bytes:
-    """As much as is needed: a process can have megabytes of arguments, and there are many."""
+    """The beginning of a file: arguments can have megabytes, and there are many processes."""
     with path.open("rb") as file:
         return file.read(_MOST_BYTES)
 

@@ -1,4 +1,4 @@
-"""Unit files on disk: read, written so that a power cut leaves the old one or the new one."""
+"""Reads and writes unit files; after a power failure either the old or the new one exists."""
 
 import contextlib
 import errno
@@ -13,10 +13,10 @@ _REFUSED = {errno.EACCES, errno.EPERM, errno.EROFS}
 
 
 def read_unit_file(path: Path) -> str | None:
-    """The text of `path`, None where nothing is.
+    """Read `path`; None if it does not exist.
 
-    Raises DoraSystemdError: NAME_IN_USE for a link (as systemctl mask makes) or anything else that
-    is no regular file, BAD_INPUT for what cannot be read.
+    Raises DoraSystemdError: NAME_IN_USE for a link (as by systemctl mask) or anything that is not a
+    regular file, BAD_INPUT for an unreadable file.
     """
     try:
         mode = path.lstat().st_mode
@@ -30,7 +30,7 @@ def read_unit_file(path: Path) -> str | None:
 
 
 def write_link(path: Path, target: str) -> None:
-    """Make the symbolic link `path`, unless it is there. Raises DoraSystemdError."""
+    """Create the symbolic link `path` unless it exists. Raises DoraSystemdError."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         if not path.is_symlink():
@@ -40,15 +40,15 @@ def write_link(path: Path, target: str) -> None:
 
 
 def remove_empty(directory: Path) -> None:
-    """Take a directory away if nothing is in it."""
+    """Remove a directory if it is empty."""
     with contextlib.suppress(OSError):
         directory.rmdir()
 
 
 def write_unit_file(path: Path, text: str) -> None:
-    """Put `text` at `path` and onto the disk; missing directories are made.
+    """Write `text` to `path` and sync it to the disk; creates missing directories.
 
-    Raises DoraSystemdError; then `path` is as it was, unless the disk is broken.
+    Raises DoraSystemdError; then `path` is unchanged, unless the disk is broken.
     """
     made = [one for one in path.parents if not one.exists()]
     try:
@@ -56,7 +56,7 @@ def write_unit_file(path: Path, text: str) -> None:
     except OSError as error:
         raise _failure("write", path, error) from error
     write_atomic(path, text, is_durable=True)
-    # The file is on the disk; whether its name is, too, is the business of its directory.
+    # The content is on the disk by now; syncing the directories makes the names durable.
     for directory in (path.parent, *(one.parent for one in made)):
         _sync_directory(directory, path)
 
@@ -73,7 +73,7 @@ def _sync_directory(directory: Path, path: Path) -> None:
 
 
 def remove_unit_file(path: Path) -> None:
-    """Take `path` away, if it is there. Raises DoraSystemdError."""
+    """Remove `path` if it exists. Raises DoraSystemdError."""
     try:
         path.unlink(missing_ok=True)
     except OSError as error:
@@ -83,11 +83,11 @@ def remove_unit_file(path: Path) -> None:
 NODE_LIMITS_FILE = "60-node-limits.conf"
 HOT_RELOAD_FILE = "60-hot-reload.conf"
 _CHANGES = ("50-*.conf", NODE_LIMITS_FILE, HOT_RELOAD_FILE)
-"""systemd's own drop-ins for changed properties, and ours for limits of nodes."""
+"""systemd's own drop-ins for changed properties, and ours for node limits and hot reload."""
 
 
 def drop_in_directory(fragment: Path, is_transient: bool) -> Path:
-    """Where drop-ins for what was changed belong: those of a transient unit go with it."""
+    """The directory of drop-ins for changes: those of a transient unit disappear with it."""
     place = fragment.parent
     if not is_transient:
         place = place.with_name(f"{place.name}.control")
@@ -95,26 +95,26 @@ def drop_in_directory(fragment: Path, is_transient: bool) -> Path:
 
 
 def changed_files(fragment: Path) -> list[Path]:
-    """The drop-ins with which `doractl set` or systemctl set-property has changed a unit file."""
+    """The drop-ins by which `doractl set` or systemctl set-property have changed a unit file."""
     place = drop_in_directory(fragment, is_transient=False)
     return sorted(path for pattern in _CHANGES for path in place.glob(pattern))
 
 
 def remove_changes(fragment: Path) -> None:
-    """Take these drop-ins away. Raises DoraSystemdError."""
+    """Remove the drop-ins of changes. Raises DoraSystemdError."""
     for path in changed_files(fragment):
         remove_unit_file(path)
-    with contextlib.suppress(OSError):  # there may be others, or none
+    with contextlib.suppress(OSError):  # there may be other drop-ins, or no directory
         drop_in_directory(fragment, is_transient=False).rmdir()
 
 
 def wanted_units(directory: Path) -> frozenset[str]:
-    """The units that the targets of `directory` start: the links in its .wants directories."""
+    """The units that targets in `directory` start: the links in its .wants directories."""
     return frozenset(path.name for path in directory.glob("*.wants/dora-*.service"))
 
 
 def foreign_file(path: Path) -> DoraSystemdError:
-    """The error for a file in our place that somebody else has put there."""
+    """The error for a foreign file at one of our paths."""
     return DoraSystemdError(
         f"cannot use {path}: it already exists and is not doractl's",
         "look at it; then move it away, or take another name",

@@ -1,4 +1,4 @@
-"""Changes of files below a directory, by inotify(7). The only importer of watchfiles."""
+"""Watches the files below a directory, by inotify(7). Only this module imports watchfiles."""
 
 import asyncio
 import errno
@@ -13,13 +13,13 @@ from dora_systemd.names import settings_path
 from dora_systemd.trust.files import read_file
 
 DEBOUNCE_MS = 400
-"""Changes that follow each other faster belong together, up to this time."""
+"""Maximum time to collect changes that follow each other quickly."""
 _STEP_MS = 100
 _GONE_SECONDS = 0.25
 
 
 def watch_rules(options: RunnerOptions) -> WatchRules:
-    """Which files of a dataflow mean a reload; the .gitignore files are read now."""
+    """The rules for files that cause a reload; reads the .gitignore files now."""
     root, given = options.working_directory, options.reload
     own = frozenset({options.dataflow, settings_path(options.dataflow)})
     watched = given.watch or DEFAULT_WATCH
@@ -27,12 +27,12 @@ def watch_rules(options: RunnerOptions) -> WatchRules:
 
 
 async def changed_files(rules: WatchRules) -> AsyncIterator[frozenset[str]]:
-    """The files that `rules` has and that were written, made, renamed or deleted, burst by burst.
+    """Files that match `rules` and were written, created, renamed or deleted, in batches.
 
-    Directories are watched, not files: editors save by renaming. What ignored directories hold
-    costs nothing. Raises DoraSystemdError when the kernel gives no more watches.
+    Watches directories, not files, because editors save by renaming. Ignored directories cost
+    nothing. Raises DoraSystemdError if the kernel refuses more watches.
     """
-    # A large tree takes seconds to walk, and the loop of the runner feeds the watchdog.
+    # In a thread: a large tree takes seconds, and the loop of the runner feeds the watchdog.
     seen = await asyncio.to_thread(_stamps, rules)
     while True:
         await _wait_root(rules.root)
@@ -41,7 +41,7 @@ async def changed_files(rules: WatchRules) -> AsyncIterator[frozenset[str]]:
             if files:
                 seen.update((path, change_time(path)) for path in files)
                 yield files
-        # Directories came or went. What changed while they were not watched is found by its time.
+        # Directories came or went. Changes before the new watches are found by their time.
         now = await asyncio.to_thread(_stamps, rules)
         missed = frozenset(path for path in {*seen, *now} if seen.get(path) != now.get(path))
         seen = now
@@ -54,7 +54,7 @@ def _stamps(rules: WatchRules) -> dict[str, int]:
 
 
 def watched_files(rules: WatchRules) -> Iterator[tuple[str, int]]:
-    """The files that `rules` has now, with their times of change in ns."""
+    """The files that match `rules` now, with their times of change in ns."""
     for directory in watched_directories(rules):
         for entry in _entries(directory):
             if rules.has(entry.path) and not entry.is_dir(follow_symlinks=False):
@@ -62,7 +62,7 @@ def watched_files(rules: WatchRules) -> Iterator[tuple[str, int]]:
 
 
 def watched_directories(rules: WatchRules) -> list[str]:
-    """The directories in which there may be such files, the top one first."""
+    """The directories that can contain such files, the top one first."""
     apart = {str(Path(one).parent) for one in rules.files}
     found = [rules.root, *sorted(one for one in apart if not rules.has_directory(one))]
     for directory in found:
@@ -73,11 +73,11 @@ def watched_directories(rules: WatchRules) -> list[str]:
 
 
 def read_gitignores(root: str) -> dict[str, tuple[str, ...]]:
-    """The lines of each .gitignore below `root`, by relative directory, as WatchRules has them."""
+    """The lines of each .gitignore below `root` by relative directory, for WatchRules."""
     found: dict[str, tuple[str, ...]] = {}
     for directory in watched_directories(WatchRules(root)):
         try:
-            # A link is not followed, as git does not follow it: see NOTES in gitignore(5).
+            # Do not follow links, because git does not: see NOTES in gitignore(5).
             data = read_file(Path(directory, ".gitignore")).data
         except DoraSystemdError:
             continue
@@ -87,7 +87,7 @@ def read_gitignores(root: str) -> dict[str, tuple[str, ...]]:
 
 
 def change_time(path: str) -> int:
-    """When a file was written or put in its place, in ns since the epoch; 0: it is not there."""
+    """When a file was written or moved there, in ns since the epoch; 0 if it does not exist."""
     try:
         return Path(path).stat().st_ctime_ns
     except OSError:
@@ -95,8 +95,8 @@ def change_time(path: str) -> int:
 
 
 async def _bursts(rules: WatchRules) -> AsyncIterator[frozenset[str]]:
-    """Paths of files that change, until a directory comes or goes."""
-    # Only who asks for a reload pays for it.
+    """Paths of changed files, until a directory is created or deleted."""
+    # Imported late: only hot reload needs it.
     from watchfiles import Change, awatch
 
     directories = await asyncio.to_thread(watched_directories, rules)
@@ -115,7 +115,7 @@ async def _bursts(rules: WatchRules) -> AsyncIterator[frozenset[str]]:
             ):
                 return
     except FileNotFoundError:
-        return  # a directory went while the watches were being set
+        return  # a directory disappeared while the watches were added
     except OSError as error:
         if error.errno == errno.ENOSPC or "limit" in str(error).lower():
             raise DoraSystemdError(
@@ -124,7 +124,7 @@ async def _bursts(rules: WatchRules) -> AsyncIterator[frozenset[str]]:
                 ExitCode.FAILURE,
             ) from error
         raise DoraSystemdError(f"cannot watch {rules.root}: {error}") from error
-    except RuntimeError as error:  # watchfiles's own, when the kernel gives no inotify instance
+    except RuntimeError as error:  # from watchfiles: the kernel has no inotify instance left
         hint = "raise sysctl fs.inotify.max_user_instances"
         raise DoraSystemdError(f"cannot watch {rules.root}: {error}", hint) from error
 
@@ -134,7 +134,7 @@ def _is_new_directory(path: str, rules: WatchRules) -> bool:
 
 
 async def _wait_root(root: str) -> None:
-    """Wait for a root that was moved away to come back: there is nothing to watch meanwhile."""
+    """Wait until a root that was moved away is back."""
     while not Path(root).is_dir():
         await asyncio.sleep(_GONE_SECONDS)
 

@@ -1,8 +1,8 @@
-"""YAML as dora reads it. Imported by `files` alone, and only when there is YAML to read.
+"""Reads YAML as dora does. Only `files` imports it, and only when there is YAML to read.
 
-PyYAML follows YAML 1.1: `on` would be true, `010` eight, `1:30` ninety, `2024-01-01` a date. dora's
-reader follows the core schema of YAML 1.2 (chapter 10.3), and so does this one, or a node would
-get other values from us than from dora.
+PyYAML follows YAML 1.1, where `on` is true, `010` is 8, `1:30` is 90 and `2024-01-01` a date.
+dora's parser follows the core schema of YAML 1.2 (chapter 10.3). This loader does too; else nodes
+would get other values from us than from dora.
 """
 
 import re
@@ -27,12 +27,12 @@ _CORE = (
 
 
 class _Loader(_BASE):  # type: ignore[misc]
-    """The core schema, no merge keys, and no key twice in one mapping."""
+    """The core schema, without merge keys and without repeated keys in a mapping."""
 
     yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012
 
     def flatten_mapping(self, node: Any) -> None:
-        """dora knows no `<<`, and merging anchors of anchors grows without limit."""
+        """Do nothing: dora has no `<<`, and nested merges would grow without limit."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Hashable, Any]:
         """The mapping of `node`; raises a ConstructorError with the line of a repeated key."""
@@ -48,7 +48,7 @@ class _Loader(_BASE):  # type: ignore[misc]
 
 
 def loader_class() -> Any:
-    """The loader class for yaml.load(), on libyaml where PyYAML was built with it."""
+    """The loader class for yaml.load(), based on libyaml if PyYAML was built with it."""
     for tag, pattern, first in _CORE:
         _Loader.add_implicit_resolver(_TAG + tag, re.compile(f"(?:{pattern})$"), first)
     for tag, construct in _constructors().items():

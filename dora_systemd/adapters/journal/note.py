@@ -1,6 +1,6 @@
-"""One record for the journal from a process that writes no other, without what `socket` loads.
+"""Sends one record to the journal from a process that writes no others; loads less than `socket`.
 
-journald itself adds whose process it was, see _UID in systemd.journal-fields(7).
+journald adds the user of the process, see _UID in systemd.journal-fields(7).
 """
 
 import socket
@@ -10,7 +10,7 @@ JOURNAL_SOCKET = "/run/systemd/journal/socket"
 
 
 def send_note(entry: bytes, path: str = JOURNAL_SOCKET) -> None:
-    """Send an entry in the native protocol; one that journald does not take is dropped."""
+    """Send an entry in the native protocol; drop it if journald does not take it."""
     with (
         suppress(OSError),
         socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as sock,

@@ -1,7 +1,7 @@
-"""Reading the journal: journalctl(1) as a child process.
+"""Reads the journal with journalctl(1) as a child process.
 
-It is on every machine that has a journal, of the journal's own version, and prints 100,000
-records in the time in which Python's binding reads 5,000.
+Every machine with a journal has journalctl, in the journal's own version. It prints 100,000 records
+in the time in which the Python binding reads 5,000.
 """
 
 import json
@@ -24,19 +24,19 @@ PERSISTENT = Path("/var/log/journal")
 VOLATILE = Path("/run/log/journal")
 _JOIN = "join the group systemd-journal or adm (usermod -aG) and log in again"
 _NOTICE = "to turn off this notice."
-"""How the hint to users who see their own records only ends."""
+"""The end of the hint to users who can only see their own records."""
 
 _LIFE_EVENTS = ("starting", "started", "stopping", "finished", "stopped", "failed")
 _LIFE_FIELDS = ("DORA_DATAFLOW", "DORA_EVENT", "DORA_EXIT", "DORA_REASON")
 
 MAX_LINE = 1024 * 1024
-"""Bytes of a record, or of a value, that is read."""
+"""Maximum bytes of a record, or of a value."""
 MAX_BYTES = 32 * 1024 * 1024
-"""Bytes that are read for one question."""
+"""Maximum bytes that one call reads."""
 FIRST_SECONDS = 20.0
-"""Until journalctl has found the first record: it may have to open large files on a slow disk."""
+"""Timeout for the first record: journalctl may have to open large files on a slow disk."""
 READ_SECONDS = 2.0
-"""From then on."""
+"""Timeout after the first record."""
 _CHUNK = 1 << 18
 _MOST_FORGED = 100
 _MOST_DETAIL = 300
@@ -44,11 +44,11 @@ _MOST_DETAIL = 300
 
 @dataclass(frozen=True)
 class LastEvent:
-    """The last life event that the journal has of a dataflow.
+    """The last life event of a dataflow in the journal.
 
-    event: such as "dataflow-failed"; a "dataflow-started" of a dataflow that systemd does not
-    know any more means that its runner was killed, or the machine lost power.
-    at_us: CLOCK_REALTIME, µs. detail: exit status or reason, or "".
+    event: such as "dataflow-failed"; a "dataflow-started" of a dataflow that systemd has unloaded
+    means that its runner was killed, or that the machine lost power. at_us: CLOCK_REALTIME, µs.
+    detail: exit status or reason, or "".
     """
 
     name: str
@@ -65,7 +65,7 @@ def open_journalctl(
     stdout: int = subprocess.PIPE,
     outlives_interrupt: bool = False,
 ) -> "Iterator[subprocess.Popen[bytes]]":
-    """A running journalctl; it ends with the block. stdout: a pipe, or the descriptor to use.
+    """A running journalctl, which the block ends. stdout: a pipe, or the descriptor to use.
 
     outlives_interrupt: Ctrl+C on the terminal does not reach it, see setpgid(2).
     Raises DoraSystemdError (NO_SYSTEMD) if there is no journalctl.
@@ -93,7 +93,7 @@ def open_journalctl(
 def end_journalctl(child: "subprocess.Popen[bytes]") -> int:
     """The exit status of a journalctl whose output has been read to its end.
 
-    Raises DoraSystemdError for what it complained about.
+    Raises DoraSystemdError for its error message.
     """
     complaint = child.stderr.read().decode("utf-8", "replace").strip() if child.stderr else ""
     status = child.wait()
@@ -116,10 +116,10 @@ def _complaint_error(complaint: str) -> DoraSystemdError:
 
 
 class JournalReader:
-    """The questions that are asked of the journal."""
+    """Queries of the journal."""
 
     def unique(self, field: str) -> list[str]:
-        """All values that `field` has anywhere in the journal, sorted."""
+        """All values of `field` in the journal, sorted."""
         with open_journalctl([f"--field={field}", "--quiet"]) as child:
             assert child.stdout
             lines = list(_lines(child))
@@ -127,20 +127,20 @@ class JournalReader:
         return sorted(line.decode("utf-8", "replace").rstrip("\n") for line in lines)
 
     def known_names(self) -> list[str]:
-        """The names of all dataflows that ever wrote a record, of all scopes."""
+        """The names of all dataflows with a record, of all scopes."""
         return list(filter(is_name, self.unique("DORA_DATAFLOW_NAME")))
 
     def known_uuids(self) -> list[str]:
-        """The UUIDs of all dataflows that ever wrote a record, of all scopes."""
+        """The UUIDs of all dataflows with a record, of all scopes."""
         return list(filter(is_uuid, self.unique("DORA_DATAFLOW")))
 
     def known_nodes(self, name: str) -> list[str]:
-        """The nodes of the dataflows called `name` that ever wrote a record."""
+        """The nodes of the dataflows called `name` with a record."""
         found = (one.partition("/") for one in self.unique("SYSLOG_IDENTIFIER"))
         return [node for dataflow, _, node in found if dataflow == name and is_node_id(node)]
 
     def count_own(self, since_us: int, until_us: int) -> int:
-        """How many records of this very process there are; CLOCK_REALTIME, µs, both included."""
+        """Number of records of this process between two times, inclusive; CLOCK_REALTIME µs."""
         times = (("since", since_us), ("until", until_us))
         options = [f"--{name}={journal_timestamp(us)}" for name, us in times]
         options += ["--quiet", "--boot", "--output=cat", "--output-fields=_PID"]
@@ -151,7 +151,7 @@ class JournalReader:
         return count
 
     def name_of(self, uuid: str) -> str:
-        """The name of the dataflow `uuid`, "" if it never wrote a record."""
+        """The name of the dataflow `uuid`, "" if it has no record."""
         records = self.newest([f"DORA_DATAFLOW={uuid}"], _MOST_FORGED)
         return next(filter(None, map(_trusted_name, records)), "")
 
@@ -162,9 +162,9 @@ class JournalReader:
         until_us: int = 0,
         is_whole: bool = False,
     ) -> Iterator[dict[str, Any]]:
-        """The records that fit, newest first, as journalctl's JSON has them.
+        """The matching records, newest first, as journalctl's JSON has them.
 
-        until_us: CLOCK_REALTIME µs of the newest one, 0 for now. is_whole: long fields, too.
+        until_us: CLOCK_REALTIME µs of the newest one, 0 for now. is_whole: include long fields.
         """
         options = [] if limit is None else [f"--lines={limit}"]
         options += [f"--until={journal_timestamp(until_us)}"] if until_us else []
@@ -187,12 +187,12 @@ class JournalReader:
         return list(found.values())
 
     def starts(self, scope: Scope, uuid: str, limit: int) -> list[int]:
-        """When the newest lives of a dataflow began, CLOCK_REALTIME µs, newest first."""
+        """Start times of the newest runs of a dataflow's unit, CLOCK_REALTIME µs, newest first."""
         matches = [*scope_matches(scope), f"DORA_DATAFLOW={uuid}", "DORA_EVENT=dataflow-starting"]
         return [int(one["__REALTIME_TIMESTAMP"]) for one in self.newest(matches, limit)]
 
     def invocations(self, scope: Scope, name: str, uuid: str) -> Iterator[str]:
-        """systemd's ids of the lives of a dataflow's unit, newest first."""
+        """systemd's invocation ids of a dataflow's unit, newest first."""
         matches = [*scope_matches(scope, name), "DORA_EVENT=dataflow-starting"]
         if uuid:
             matches.append(f"DORA_DATAFLOW={uuid}")
@@ -205,10 +205,10 @@ class JournalReader:
 
 
 def _lines(child: "subprocess.Popen[bytes]") -> Iterator[bytes]:
-    """What a journalctl prints, as far as it is worth reading.
+    """The lines that a journalctl prints, within limits.
 
-    Whoever may write to the journal, and every node may, can fill it with records of 32 MiB each:
-    lines that are too long are left out, and all ends after so many bytes or so much time.
+    Every node can write to the journal, and fill it with records of 32 MiB each. So this leaves out
+    lines that are too long, and ends after MAX_BYTES or the timeout.
     """
     assert child.stdout
     fd, rest, left, deadline = child.stdout.fileno(), b"", MAX_BYTES, None
@@ -226,7 +226,7 @@ def _lines(child: "subprocess.Popen[bytes]") -> Iterator[bytes]:
             if len(rest) + len(line) <= MAX_LINE:
                 yield rest + line + b"\n"
             rest = b""
-        # Of a line that is too long no more is kept than shows that.
+        # Keep just enough of a long line to see that it is too long.
         rest = (rest + last)[: MAX_LINE + 1]
     child.kill()
 
@@ -236,11 +236,11 @@ def _seconds_until(deadline: float | None) -> float:
 
 
 def _trusted_name(record: dict[str, Any]) -> str:
-    """Whose record it is, "" for one that was written in the name of another dataflow."""
+    """The dataflow of a record; "" if the record was forged in the name of another dataflow."""
     name = record.get("DORA_DATAFLOW_NAME")
     if not isinstance(name, str) or not is_name(name):
         return ""
-    # These journald vouches for; a user's own services have the second one.
+    # journald sets these fields itself; a user's own services have the second one.
     units = (record.get("_SYSTEMD_UNIT"), record.get("_SYSTEMD_USER_UNIT"))
     return name if unit_name(name) in units else ""
 
@@ -256,7 +256,7 @@ def _last_event(record: dict[str, Any]) -> LastEvent | None:
 
 
 def _system_files(top: Path) -> list[Path]:
-    """The system's journal; in a directory that is closed to this user it is taken to be there."""
+    """The system journal files; if the directory is not readable, assume that they exist."""
     try:
         files = [directory / "system.journal" for directory in top.iterdir()]
     except OSError:
@@ -265,12 +265,12 @@ def _system_files(top: Path) -> list[Path]:
 
 
 def is_volatile() -> bool:
-    """Whether the journal does not outlive a boot, see Storage= in journald.conf(5)."""
+    """Whether the journal is lost at a reboot, see Storage= in journald.conf(5)."""
     return not _system_files(PERSISTENT)
 
 
 def check_readable(scope: Scope) -> None:
-    """Raise DoraSystemdError if this user may not read what dataflows of `scope` write."""
+    """Raise DoraSystemdError if this user may not read the records of dataflows of `scope`."""
     files = [*_system_files(PERSISTENT), *_system_files(VOLATILE)]
     if any(os.access(path, os.R_OK) for path in files):
         return

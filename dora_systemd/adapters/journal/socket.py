@@ -1,4 +1,4 @@
-"""The way into journald: its datagram socket, native protocol.
+"""Sends entries to journald's datagram socket, in its native protocol.
 
 https://systemd.io/JOURNAL_NATIVE_PROTOCOL/
 """
@@ -16,10 +16,10 @@ from collections.abc import Callable
 
 JOURNAL_SOCKET = "/run/systemd/journal/socket"
 
-# journald takes entries of all senders from one queue, in order. What one flood may have waiting
-# there (with the kernel's overhead about 1.3 kB an entry) is what a quiet node's line waits for:
-# some 50 entries, 1.4 ms. With less the runner wakes up more often, and takes processor time from
-# journald, which is the limit; with more nothing gets faster.
+# journald takes the entries of all senders from one queue, in order. So a line of a quiet node
+# waits for what one flood has in that queue: some 50 entries (about 1.3 kB each in the kernel) or
+# 1.4 ms with this size. A smaller buffer makes the runner wake up more often, which takes CPU time
+# from journald, the bottleneck; a larger one is not faster.
 BULK_BUFFER = 1 << 16
 EXPRESS_BUFFER = 1 << 20
 RETRY_SECONDS = 0.05
@@ -31,10 +31,10 @@ _SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_WRITE | fcntl.F_
 
 
 class JournalSocket:
-    """Entries to journald, never blocking: what is not taken stays with the caller.
+    """Sends entries to journald without blocking; the caller keeps those that are refused.
 
-    path: the socket, another one in tests.
-    bulk: bytes that entries sent with `send_bulk` may occupy in the kernel at one time.
+    path: the socket; tests use another one. bulk: maximum bytes in the kernel of entries sent by
+    send_bulk().
     """
 
     def __init__(self, path: str = JOURNAL_SOCKET, bulk: int = BULK_BUFFER) -> None:
@@ -43,53 +43,55 @@ class JournalSocket:
         self._bulk = _Channel(path, bulk)
 
     def send(self, entry: bytes) -> bool:
-        """Send one entry; False: not taken, journald is busy or away, see `call_when_ready`."""
+        """Send one entry; False: refused, journald is busy or restarting, see call_when_ready()."""
         return self._express.send(entry)
 
     def send_bulk(self, entry: bytes) -> bool:
-        """The same for an entry of a flood: it leaves room in journald's queue for others."""
+        """Send one entry of a flood, which leaves room in journald's queue for other entries."""
         return self._bulk.send(entry)
 
     @property
     def sent(self) -> int:
-        """How many entries journald has been given so far."""
+        """Number of entries that journald has taken so far."""
         return self._express.sent + self._bulk.sent
 
     def call_when_ready(
         self, loop: asyncio.AbstractEventLoop, callback: Callable[[], None]
     ) -> None:
-        """Call `callback` when an entry that was refused may be sent again.
+        """Call `callback` once a refused entry may be sent again.
 
-        It comes once for each of the two ways that refused; asking again replaces what was asked.
+        It is called once for each of the two channels that refused. A new callback replaces the
+        last one.
         """
         for channel in (self._express, self._bulk):
             if channel.refused:
                 channel.call_when_ready(loop, callback)
 
     def wait_ready(self, seconds: float) -> None:
-        """Block until a refused entry may be sent again, at most `seconds`: for the very end."""
+        """Block until a refused entry may be sent again, at most `seconds`. Only for the end."""
         for channel in (self._express, self._bulk):
             if channel.refused:
                 channel.wait_ready(seconds)
 
     def wait_read(self, seconds: float) -> None:
-        """Block until journald has read all that was sent, at most `seconds`: before exiting.
+        """Block until journald has read everything, at most `seconds`. Call this before exiting.
 
-        It learns the unit of an entry from its sender's pid, and not from a process that is gone.
+        journald finds the unit of an entry by the sender's pid, which fails after the process is
+        gone.
         """
         deadline = time.monotonic() + seconds
         while time.monotonic() < deadline and (self._express.unread or self._bulk.unread):
             time.sleep(UNREAD_SECONDS)
-        time.sleep(UNREAD_SECONDS)  # for the entry that it has just read
+        time.sleep(UNREAD_SECONDS)  # for the entry that journald has just read
 
     def close(self) -> None:
-        """Close the sockets and forget the callbacks."""
+        """Close the sockets, and drop the callbacks."""
         self._express.close()
         self._bulk.close()
 
 
 class _Channel:
-    """One socket connected to journald, made again when journald came back."""
+    """One socket connected to journald; reconnects after journald has restarted."""
 
     def __init__(self, path: str, buffer: int) -> None:
         self._path = path
@@ -98,7 +100,7 @@ class _Channel:
         self._waiter: tuple[asyncio.AbstractEventLoop, Callable[[], None]] | None = None
         self._cancel: Callable[[], object] | None = None
         self.sent = 0
-        # Stays set until the waiter has been called: other entries may get through before.
+        # Set until the callback: other entries may get through before that.
         self.refused = False
 
     def send(self, entry: bytes) -> bool:
@@ -129,7 +131,7 @@ class _Channel:
             return self._send_memfd(self._socket, entry)
         was_connected = self._socket is not None
         self._disconnect()
-        # Restarted: its new socket may be there already.
+        # journald has restarted, and may have its new socket already.
         return was_connected and self._send_again(entry)
 
     def _send_again(self, entry: bytes) -> bool:
@@ -140,7 +142,7 @@ class _Channel:
         return True
 
     def _send_memfd(self, sock: socket.socket, entry: bytes) -> bool:
-        """Hand over a big entry as a sealed file, as sd_journal_send(3) does."""
+        """Send a large entry as a sealed file, as sd_journal_send(3) does."""
         fd = os.memfd_create("dora-journal-entry", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         try:
             with os.fdopen(os.dup(fd), "wb") as file:
@@ -157,7 +159,7 @@ class _Channel:
 
     @property
     def unread(self) -> int:
-        """Bytes that are still in the socket's queue: SIOCOUTQ in unix(7) and tcp(7)."""
+        """Bytes still in the socket's queue: SIOCOUTQ in unix(7) and tcp(7)."""
         if self._socket is None:
             return 0
         return int.from_bytes(fcntl.ioctl(self._socket, termios.TIOCOUTQ, bytes(4)), sys.byteorder)

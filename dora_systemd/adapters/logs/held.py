@@ -1,9 +1,9 @@
-"""What the runner has taken out of a pipe and journald has not yet, in a file of the cell.
+"""Keeps the bytes that the runner has read from a pipe and journald does not have, in a file.
 
-The file lies in memory, in the RuntimeDirectory, and outlives a runner that is killed: the process
-of ExecStopPost= finds there what was on its way. The kernel moves the bytes from the pipe into the
-file in one call, splice(2), so that they are always in one of the two. A kill between an entry and
-the note of it gives that entry twice.
+The file is in the RuntimeDirectory, which is in memory, and outlives a runner that is killed: the
+process of ExecStopPost= sends its content to journald. splice(2) moves the bytes from the pipe to
+the file in one system call, so they are always in one of the two. A kill after an entry was sent,
+and before that was noted, sends the entry twice.
 """
 
 import contextlib
@@ -12,31 +12,31 @@ import struct
 from pathlib import Path
 
 SUFFIX = ".held"
-# How many bytes are noted, and how many of the lines in them journald has.
+# The header: number of bytes, and number of the lines among them that journald has.
 _HEAD = struct.Struct("=QQ")
 _TO_THE_END = (1 << 64) - 1
 _MOST_DONE = 1 << 20
-"""Bytes that journald has, before the file begins anew although a line has not ended."""
+"""Bytes that journald has taken, after which a new file begins even in the middle of a line."""
 
 
 class HeldLines:
-    """The bytes of one pipe that are on their way.
+    """The bytes of one pipe that journald does not have yet.
 
-    It is a second line of defence: where its file cannot be written, nothing else fails.
+    Only a kill of the runner needs the file, so a failure to write it affects nothing else.
     """
 
     def __init__(self, pipe: Path) -> None:
         self._path = held_path(pipe)
         self._size = 0
         self._lines = 0
-        # Its file holds less than is on its way, so it holds nothing.
+        # The file would lack some of these bytes, so it stays empty.
         self._is_broken = False
         self._fd = self._make(self._path, b"")
 
     def take(self, fd: int, size: int) -> bytes:
-        """Read up to `size` bytes of the pipe `fd`, noted as on their way; b"" if it is empty.
+        """Read up to `size` bytes from the pipe `fd` and keep them; b"" at the end of the file.
 
-        Raises BlockingIOError.
+        Raises BlockingIOError if the pipe is empty.
         """
         if not self._is_broken:
             try:
@@ -54,7 +54,7 @@ class HeldLines:
         return os.pread(self._fd, count, place)
 
     def add(self, data: bytes) -> None:
-        """Note `data`, which was not in the pipe, as the next on its way."""
+        """Keep `data`, which did not come from the pipe, after the other bytes."""
         if not self._is_broken:
             try:
                 self._size += os.pwrite(self._fd, data, _HEAD.size + self._size)
@@ -69,7 +69,7 @@ class HeldLines:
                 os.pwrite(self._fd, _HEAD.pack(_TO_THE_END, lines), 0)
 
     def restart(self, rest: bytes) -> bool:
-        """Journald has all but `rest`, a line that has not ended. Whether lines count anew."""
+        """journald has all but the unterminated line `rest`; whether lines count from 0 again."""
         if not rest:
             self._empty()
             return True
@@ -82,9 +82,9 @@ class HeldLines:
         return True
 
     def close(self) -> None:
-        """Close the file; what is in it stays."""
+        """Close the file, and leave it in place."""
         os.close(self._fd)
-        self._fd = -1  # what is noted from now on must not land in another file
+        self._fd = -1  # later calls must not write to another file with this number
 
     def _empty(self) -> None:
         with contextlib.suppress(OSError):
@@ -93,7 +93,7 @@ class HeldLines:
         self.sent(0)
 
     def _replace(self, rest: bytes) -> None:
-        """Another file in its place, at once: a kill finds the one or the other."""
+        """Replace the file atomically: after a kill there is the old or the new one."""
         path = self._path.with_suffix(f"{SUFFIX}-new")
         fd = self._make(path, rest)
         path.replace(self._path)
@@ -118,11 +118,11 @@ def held_path(pipe: Path) -> Path:
 
 
 def read_held(pipe: Path) -> tuple[bytes, int]:
-    """What was on its way when the runner was killed, and how many lines of that journald has."""
+    """The bytes kept when the runner was killed, and how many of their lines journald has."""
     try:
         content = held_path(pipe).read_bytes()
         size, lines = _HEAD.unpack_from(content)
     except (OSError, struct.error):
         return b"", 0
-    # The size is that of earlier versions, which may still run while they are replaced.
+    # Older versions write a real size, and may still be running after an upgrade.
     return content[_HEAD.size : _HEAD.size + size], lines

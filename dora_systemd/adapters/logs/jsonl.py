@@ -1,8 +1,8 @@
-"""dora's own log file of a node, followed: for nodes whose output dora's daemon must read itself.
+"""Follows dora's own log file of a node, for nodes whose output dora's daemon reads itself.
 
-The daemon appends to log_<node>.jsonl, over restarts too, and may rotate it: then it is renamed
-to log_<node>.1.jsonl, that one to .2, and so on. Rotations are found by inode, so nothing is
-read twice or passed over as long as dora keeps one file more than was written between two looks.
+The daemon appends to log_<node>.jsonl, over restarts too. It may rotate the file: then it becomes
+log_<node>.1.jsonl, that one .2, and so on. The inodes show a rotation. No line is read twice or
+missed as long as dora keeps one file more than it fills between two reads.
 """
 
 import asyncio
@@ -15,10 +15,10 @@ from dora_systemd.decisions.logs.fields import Value
 from dora_systemd.decisions.logs.lines import LineSplitter, jsonl_fields
 
 POLL_SECONDS = 0.05
-# What is read before the loop's other work gets its turn, in bytes.
+# Bytes to read before the loop does other work.
 CHUNK = 1 << 16
 MAX_ROTATED = 1000
-# A line of at most 1 MiB grows up to sixfold when it is escaped.
+# Escaping makes a line of at most 1 MiB up to six times longer.
 LINE_LIMIT = 8 << 20
 
 PLACE_SUFFIX = ".place"
@@ -29,11 +29,11 @@ Put = Callable[[dict[str, Value]], None]
 class JsonlTail:
     """Follows one file from its beginning.
 
-    path: log_<node>.jsonl, which may not exist yet. put: takes the journal fields of each line.
-    is_busy: while it says so nothing is read, the lines stay in the file.
-    place: where to note how far the journal has the lines; see resume_tail().
-    watch: is told at each look how many bytes are there that were not read.
-    lost_files: how often dora deleted a rotated file before it was read.
+    path: log_<node>.jsonl, which may not exist yet. put: called with the journal fields of each
+    line. is_busy: while true nothing is read, and the lines stay in the file. place: a file that
+    notes up to where the journal has the lines; see resume_tail(). watch: called at each read with
+    the number of unread bytes. lost_files: how often dora deleted a rotated file before it was
+    read.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class JsonlTail:
         self._place = _Place(place, path) if place is not None else None
 
     def start(self) -> None:
-        """Begin to look, every POLL_SECONDS."""
+        """Start reading every POLL_SECONDS."""
         self._note_place()
         is_busy = self._is_busy()
         has_more = not is_busy and self._read_chunk() > 0
@@ -66,14 +66,14 @@ class JsonlTail:
         self._timer = self._loop.call_later(0 if has_more else POLL_SECONDS, self.start)
 
     def drain(self) -> bool:
-        """Take all that is there now, and no more of a flood; whether there was anything."""
+        """Read what is there now, but not endlessly; whether there was anything."""
         left = whole = self.backlog()
         while left > 0 and (size := self._read_chunk()):
             left -= size
         return left < whole
 
     def close(self) -> None:
-        """Take what is there and stop to look."""
+        """Read what is there, and stop."""
         if self._timer is not None:
             self._timer.cancel()
         while self._read_chunk():
@@ -86,13 +86,13 @@ class JsonlTail:
 
     @property
     def loss(self) -> str:
-        """Why lines are lost, "" if none are. How many nobody knows: dora does not count them."""
+        """Why lines are lost, or "". Their number is unknown, because dora does not count them."""
         if not self.lost_files:
             return ""
         return f"dora deleted {self.lost_files} of its log files before they were read"
 
     def backlog(self) -> int:
-        """How many bytes dora has written that were not read."""
+        """Number of unread bytes that dora has written."""
         own, total = None, 0
         if self._fd >= 0:
             own, place = os.fstat(self._fd), os.lseek(self._fd, 0, os.SEEK_CUR)
@@ -106,7 +106,7 @@ class JsonlTail:
         return total
 
     def resume(self, inode: int, offset: int) -> None:
-        """Begin with byte `offset` of the file `inode`, if it is still there."""
+        """Begin with byte `offset` of the file `inode`, if that still exists."""
         for path in self._chain():
             if _inode(path) == inode and self._open(path):
                 os.lseek(self._fd, offset, os.SEEK_SET)
@@ -117,7 +117,7 @@ class JsonlTail:
             self._place.note(os.fstat(self._fd).st_ino, offset)
 
     def _read_chunk(self) -> int:
-        """Read on, in the next file if this one is at its end; how many bytes there were."""
+        """Read on, in the next file at the end of this one; number of bytes read."""
         data = self._read() or (self._go_on() and self._read()) or b""
         for line in self._lines.feed(data):
             self._put(jsonl_fields(line))
@@ -131,7 +131,7 @@ class JsonlTail:
         return os.read(self._fd, CHUNK)
 
     def _go_on(self) -> bool:
-        """Open the file that comes after the one that has been read; whether there is one."""
+        """Open the file after the one that has been read; whether there is one."""
         chain = self._chain()
         if self._fd < 0:
             return bool(chain) and self._open(chain[-1])
@@ -145,7 +145,7 @@ class JsonlTail:
         place = inodes.index(own)
         if place == 0:
             return False
-        # Written between our last look and the renaming?
+        # dora may have written this between our last read and the rotation.
         if rest := self._read():
             os.lseek(self._fd, -len(rest), os.SEEK_CUR)
             return True
@@ -165,7 +165,7 @@ class JsonlTail:
         try:
             fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
         except OSError:
-            return False  # renamed meanwhile: found at the next look
+            return False  # renamed meanwhile: the next read finds it
         self._shut()
         self._fd = fd
         return True
@@ -177,7 +177,7 @@ class JsonlTail:
 
 
 class _Place:
-    """Inode and offset in a file that outlives this process, with the path of what they are in."""
+    """Inode and offset in a file that outlives this process, with the path of the log file."""
 
     def __init__(self, path: Path, log: Path) -> None:
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
@@ -188,7 +188,7 @@ class _Place:
         if self._noted != (inode, offset):
             self._noted = (inode, offset)
             with contextlib.suppress(OSError):
-                # One call and always of one length: there is no half of it.
+                # One write of constant length, so it is never half done.
                 os.pwrite(self._fd, b"%020d %020d %s" % (inode, offset, bytes(self._log)), 0)
 
     def close(self) -> None:
@@ -196,9 +196,9 @@ class _Place:
 
 
 def resume_tail(loop: asyncio.AbstractEventLoop, place: Path, put: Put) -> JsonlTail | None:
-    """What follows the file that another process followed, from the place that it noted.
+    """Follow the file of a process that was killed, from the position that it noted.
 
-    None if it had read nothing.
+    None if that process had read nothing.
     """
     words = place.read_bytes().split(b" ", 2)
     if len(words) != 3:

@@ -1,8 +1,13 @@
-"""The nodes' output pipes, read into the journal.
+"""Reads the nodes' output pipes and writes the lines to the journal.
 
-Nothing is ever dropped, unless the node has a limit: when journald does not take an entry, the
-entries of the chunk just read wait in memory (at most CHUNK bytes of a pipe), the pipe is not
-read, and the node itself blocks in writing once its pipe is full. fifo(7), pipe(7)
+Each node has two FIFOs, fifo(7). The event loop reads CHUNK bytes of one as soon as it is readable,
+and LogQueue sends the entries. If journald refuses an entry, the queue keeps what was just read and
+LogPipes stops reading that node's pipes. The pipe fills up, pipe(7), and the node blocks in
+write(2). So a line gets lost only to a limit of the node, or if journald does not recover before
+close() gives up. An event reports both.
+
+All calls come from the event loop's thread, and only settle() and close() may block. To read a pipe
+that the queue has paused would break the bound on memory: only drain() does, up to DRAIN_LIMIT.
 """
 
 import asyncio
@@ -23,16 +28,15 @@ from dora_systemd.decisions.logs.fields import Value, encode_entry
 from dora_systemd.decisions.logs.lines import LineEncoder, LineSplitter, Origin, dora_log_fields
 from dora_systemd.paths import CellPaths
 
-# Children that a dead node left behind may go on writing: drain() must still end.
+# Bytes: a child process that outlives its node may keep writing, and drain() must still return.
 DRAIN_LIMIT = 4 * PIPE_SIZE
 
 
 class LogPipes:
-    """The output of all nodes of a cell, and the cell's life events, into the journal.
+    """Writes the output of all nodes of a cell, and the cell's life events, to the journal.
 
-    journal: where entries go. origin: of what is of no node. keep: gets each descriptor whose
-    content shall outlive this process, and its node; release: a node that is gone for good. All
-    methods belong to `loop`'s thread and return at once.
+    origin: of entries that belong to no node. keep: called with each pipe that must survive this
+    process, and its node; release: called with a node that does not come back.
     """
 
     def __init__(
@@ -65,21 +69,21 @@ class LogPipes:
         self._paths[node_id] = paths
 
     def limit(self, node_id: str, limit: RateLimit) -> None:
-        """Keep only so many of a node's lines from now on; an event counts the others."""
+        """Limit the rate of a node's lines from now on; an event counts the suppressed ones."""
         self._source(node_id).limit(limit)
 
     def open(self, node_id: str) -> None:
-        """Begin to read a node's FIFOs: who waits to open one for writing goes on. OSError."""
+        """Start reading a node's FIFOs, which unblocks its launcher's open(2). Raises OSError."""
         if self._source(node_id).pipes:
             return
         for stream, path in fifos(node_id, self._paths[node_id]).items():
-            # Read and write: no end of file between two lives of the node.
+            # With the write end open here too, there is no end of file between two processes.
             fd = os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
             self._keep(fd, node_id)
             self.adopt(node_id, stream, fd, HeldLines(path))
 
     def forget(self, node_id: str) -> None:
-        """The node is gone for good: take its last words, close its pipes and remove them."""
+        """Drain, close and remove the pipes of a node that does not come back."""
         self.drain(node_id)
         source = self._sources.pop(node_id)
         if source.pipes:
@@ -91,9 +95,9 @@ class LogPipes:
                 held_path(path).unlink(missing_ok=True)
 
     def adopt(self, node_id: str, stream: str, fd: int, held: HeldLines | None = None) -> None:
-        """Begin to read `fd`, a pipe that is open already, as "stdout" or "stderr" of a node.
+        """Start reading `fd`, an open pipe, as stream "stdout" or "stderr" of a node.
 
-        held: where to note what has been read of it and is not in the journal.
+        held: keeps bytes that have been read and are not in the journal yet.
         """
         source = self._source(node_id)
         os.set_blocking(fd, False)
@@ -103,9 +107,9 @@ class LogPipes:
             self._loop.add_reader(fd, self._read_pipe, node_id, pipe)
 
     def replay(self, node_id: str, path: Path) -> None:
-        """Write what another process had read of the FIFO at `path`, and could not write any more.
+        """Write what a killed runner had read from the FIFO at `path` and not sent to journald.
 
-        It comes before what is in the pipe, which was adopted last.
+        Call this right after adopt() of that pipe: these lines are older than those in the pipe.
         """
         pipe = self._source(node_id).pipes[-1]
         data, done = read_held(path)
@@ -113,30 +117,30 @@ class LogPipes:
         self._queue.put(node_id, lambda: list(map(pipe.encoder.entry, lines)))
 
     def set_pid(self, node_id: str, pid: int) -> None:
-        """The node's lines come from process `pid` from now on; 0: from its next one."""
+        """Attribute the node's lines to process `pid` from now on; 0: to its next process."""
         self._source(node_id).renew(pid=pid)
 
     def _learn_pid(self, source: Source) -> None:
-        """Dora tells the pid tens of milliseconds after the launcher has noted it."""
+        """Read the pid file of the launcher: dora's event comes tens of milliseconds later."""
         node_id = source.origin.node
         if node_id in self._paths:
             with contextlib.suppress(OSError, ValueError):
                 source.renew(pid=int(self._paths[node_id].node_pid(node_id).read_text()))
 
     def set_run(self, run_id: str) -> None:
-        """All lines and events belong to dora's run `run_id` from now on."""
+        """Attribute all lines and events to dora's run `run_id` from now on."""
         self._origin = replace(self._origin, run=run_id)
         for source in self._sources.values():
             source.renew(run=run_id)
 
     def drain(self, node_id: str) -> None:
-        """Take all that is in a node's pipes now, and an unterminated line, before what follows.
+        """Queue what is in the pipes of a node that has ended, and its unterminated last line.
 
-        For a node that has ended: its last words then come before the event that says so.
+        Call it before write_event("node-exited", ...), so that the journal has this order too.
         """
         source = self._source(node_id)
         for pipe in source.pipes:
-            # A full pipe again, and journald has not come back: the lines are safe where they are.
+            # Above the limit while journald takes nothing: the lines are safe in the pipe.
             while source.drained < DRAIN_LIMIT and (data := pipe.read()):
                 source.drained += len(data)
                 self._put(node_id, pipe, data, is_flood=True)
@@ -146,7 +150,7 @@ class LogPipes:
             source.drained = 0
 
     def write_event(self, name: str, node: str | None = None, **details: Value) -> None:
-        """Write life event `name` (see decisions/logs/events.py), after all lines put before it."""
+        """Write life event `name` of decisions/logs/events.py after the lines queued before it."""
         if name == "lines-lost" and isinstance(lost := details["count"], int):
             self._lost += lost
         fields = event_fields(name, dataflow=self._origin.name, node=node or "", **details)
@@ -156,9 +160,9 @@ class LogPipes:
             self._queue.put_event(self._entry(fields, node))
 
     def write_fields(self, fields: dict[str, Value], node: str) -> None:
-        """Write a node's line that came another way than by a pipe; nothing bounds how many wait.
+        """Write a line of a node that has no pipe here. The queue does not bound these lines.
 
-        Who writes them looks at is_busy() before it reads on.
+        The caller must stop reading its source while is_busy() is true.
         """
         source, stream = self._source(node), str(fields.get("DORA_STREAM", "stdout"))
         if source.admit(stream, 1, self._loop.time()):
@@ -172,30 +176,29 @@ class LogPipes:
         return encode_entry({**origin.fields(), **fields})
 
     def line_counts(self) -> dict[str, LineCount]:
-        """What became of the lines so far, by node; of those that are lost nobody knows whose."""
+        """Lines written, suppressed and lost, by node; lost ones have no node: WHOLE_CELL."""
         whole = {WHOLE_CELL: LineCount(lost=self._lost)}
         return whole | {node: source.line_count for node, source in self._sources.items()}
 
     def is_busy(self, node: str) -> bool:
-        """Whether journald has not taken the node's records so far: what can wait should."""
+        """Whether entries of the node still wait for journald."""
         return self._queue.waiting(node) > 0
 
     def add_output(self, label: str, fd: int, on_line: Callable[[str], None] | None = None) -> None:
-        """Read what coordinator or daemon prints; warnings and errors become records of `label`.
+        """Read what coordinator or daemon prints, and close `fd` at the end of the file.
 
-        on_line is given every line as it is, without its newline. Reading ends with the pipe;
-        `fd` is closed then.
+        Warnings and errors become records of `label`; on_line gets every line, without newline.
         """
         os.set_blocking(fd, False)
         self._outputs[fd] = LineSplitter()
         self._loop.add_reader(fd, self._read_output, label, fd, on_line)
 
     def mute(self, *labels: str) -> None:
-        """Make no more records of what these children print, but of all others."""
+        """Write no records of what these children print; replaces the labels given before."""
         self._muted = frozenset(labels)
 
     def settle(self, seconds: float = 7.0) -> None:
-        """Drain all pipes and block until journald has taken it all, at most `seconds`."""
+        """Drain all pipes and block until journald has taken everything, at most `seconds`."""
         for node_id in self._sources:
             self.drain(node_id)
         deadline = time.monotonic() + seconds
@@ -204,16 +207,12 @@ class LogPipes:
             self._queue.flush()
 
     async def wait_empty(self, left: Callable[[], float]) -> None:
-        """Return when journald has taken all so far, or no second is `left`; the loop runs on."""
+        """Wait until the queue is empty or left() gives 0 seconds; the loop keeps running."""
         while not self._queue.is_empty and left() > 0:
             await asyncio.sleep(0.01)
 
     def close(self, seconds: float = 7.0) -> None:
-        """Drain all pipes, wait up to `seconds` until journald has taken it all, and close.
-
-        Lines that it has not taken by then are counted in a last event, lines-lost, if it can be
-        written at all.
-        """
+        """Settle for up to `seconds` and close; an event lines-lost counts what is left."""
         self.settle(seconds)
         if lost := self._queue.give_up():
             self.write_event("lines-lost", count=lost, reason="journald did not take them")
@@ -261,7 +260,7 @@ class LogPipes:
         self._watch_limit(source, pipe.stream)
 
     def _watch_limit(self, source: Source, stream: str) -> None:
-        """See that what is suppressed from now on is told at the end of the stream's window."""
+        """Schedule one lines-suppressed event for the end of the stream's window."""
         limiter = source.limiter
         if limiter is not None and limiter.suppressed and source.report is None:
             tell = self._tell_suppressed

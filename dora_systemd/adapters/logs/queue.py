@@ -1,8 +1,15 @@
-"""The order in which entries go to journald when it does not take them at once.
+"""Orders the entries that journald does not take at once.
 
-Per node first in, first out; an event of the whole dataflow comes after all that was put before
-it. Nodes take turns, so a flood does not keep the others waiting. Entries are made when it is
-their turn: what waits is what came out of the pipes. Pure but for the journal that it is given.
+Each node has a lane, first in, first out. While a lane waits, `pause` keeps the node's pipes from
+being read, so lines do not pile up here; records that the runner writes itself are bounded by
+MAX_RECORDS. An event of the whole dataflow waits for every lane that was not empty when the event
+was put. Lanes take turns: each flush begins with another one, and lanes of a flood use send_bulk,
+which leaves room in journald's queue for the others.
+
+An item is a function that makes its entries, and the queue calls it when it is the item's turn.
+So a waiting item costs the bytes read from the pipe, and not the larger journal entries. Calling
+such a function out of order, or twice, would break this: it feeds a line splitter.
+The queue has no I/O of its own except through the given Journal, and belongs to one thread.
 """
 
 import asyncio
@@ -11,34 +18,34 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
-# Lines cannot pile up, their pipes are not read meanwhile; records made by the runner could.
+# Lines cannot pile up because `pause` stops reading their pipes; records of the runner could.
 MAX_RECORDS = 20_000
 
 MakeEntries = Callable[[], list[bytes]]
 Note = Callable[[int], object]
-"""Is told how many entries of an item wait, when some of them or all have been taken."""
+"""Called with the number of entries of an item still waiting, when a send pauses or completes."""
 
 
 class Journal(Protocol):
-    """What is needed of dora_systemd.adapters.journal.socket.JournalSocket."""
+    """The part of dora_systemd.adapters.journal.socket.JournalSocket that LogQueue uses."""
 
     def send(self, entry: bytes) -> bool:
-        """Send one entry, False if it was not taken."""
+        """Send one entry; False if journald did not take it."""
 
     def send_bulk(self, entry: bytes) -> bool:
-        """Send one entry of a flood, False if it was not taken."""
+        """Send one entry of a flood; False if journald did not take it."""
 
     def call_when_ready(
         self, loop: asyncio.AbstractEventLoop, callback: Callable[[], None]
     ) -> None:
-        """Call `callback` when a refused entry may be sent again."""
+        """Call `callback` once a refused entry may be sent again."""
 
     def wait_ready(self, seconds: float) -> None:
-        """Block until then, at most `seconds`."""
+        """Block until a refused entry may be sent again, at most `seconds`."""
 
 
 def _ignore(left: int) -> None:
-    """For what nobody asks about."""
+    """The Note of items without one."""
 
 
 @dataclass
@@ -46,22 +53,22 @@ class _Lane:
     """The entries of one node that journald has not taken yet."""
 
     items: deque[tuple[MakeEntries, Note]] = field(default_factory=deque)
-    # The entries of the item whose turn it is, last one first.
+    # Entries of the current item in reverse order, because pop() at the end is cheap.
     entries: list[bytes] = field(default_factory=list)
     note: Note = _ignore
     is_flood: bool = False
-    # How many of the items are records, see put_record.
+    # Records put since the lane was last empty, see put_record.
     records: int = 0
 
     @property
     def waiting(self) -> int:
-        """How many items wait, a begun one included."""
+        """Number of waiting items, including the current one."""
         return len(self.items) + bool(self.entries)
 
 
 @dataclass
 class _Event:
-    """An event of the whole dataflow, and the nodes whose earlier entries come before it."""
+    """An event of the whole dataflow. behind: nodes whose earlier entries must be sent first."""
 
     entry: bytes
     behind: set[str]
@@ -70,7 +77,7 @@ class _Event:
 class LogQueue:
     """Entries on their way to journald.
 
-    pause, resume: called with a node when its lines are not wanted for now, and wanted again.
+    pause, resume: called with a node whose pipes must not be read, or may be read again.
     """
 
     def __init__(
@@ -92,7 +99,7 @@ class LogQueue:
     def put(
         self, node: str, make_entries: MakeEntries, is_flood: bool = False, note: Note = _ignore
     ) -> None:
-        """Send the entries of a node after its earlier ones, now or as soon as possible."""
+        """Send the entries of a node after its earlier ones, now or as soon as journald can."""
         lane = self._lanes.setdefault(node, _Lane())
         was_waiting = lane.waiting
         lane.items.append((make_entries, note))
@@ -104,7 +111,7 @@ class LogQueue:
             self._journal.call_when_ready(self._loop, self.flush)
 
     def put_record(self, node: str, entry: bytes) -> None:
-        """The same for an entry that no pipe holds back: above MAX_RECORDS it is only counted."""
+        """Send one entry that no paused pipe holds back; above MAX_RECORDS count it as lost."""
         lane = self._lanes.setdefault(node, _Lane())
         if lane.records >= MAX_RECORDS:
             self._lost += 1
@@ -113,7 +120,7 @@ class LogQueue:
         self.put(node, lambda: [entry])
 
     def put_event(self, entry: bytes) -> None:
-        """Send an entry after all that were put before it, of whatever node."""
+        """Send an entry after all entries of all nodes that were put before it."""
         if len(self._events) >= MAX_RECORDS:
             self._lost += 1
             return
@@ -123,17 +130,17 @@ class LogQueue:
             self._journal.call_when_ready(self._loop, self.flush)
 
     def waiting(self, node: str) -> int:
-        """How many items of a node wait."""
+        """Number of waiting items of a node."""
         lane = self._lanes.get(node)
         return lane.waiting if lane else 0
 
     @property
     def is_empty(self) -> bool:
-        """Whether journald has been given everything."""
+        """Whether journald has taken everything."""
         return not self._events and not any(lane.waiting for lane in self._lanes.values())
 
     def flush(self) -> None:
-        """Go on where journald stopped to take entries."""
+        """Continue where journald refused an entry; the callback of call_when_ready."""
         stopped = [node for node, lane in self._lanes.items() if lane.waiting]
         shift = self._turn % max(len(stopped), 1)
         self._turn += 1
@@ -145,7 +152,7 @@ class LogQueue:
             self._journal.call_when_ready(self._loop, self.flush)
 
     def give_up(self) -> int:
-        """Forget what waits; how many entries that were, with those counted before."""
+        """Discard what waits; returns the number of these entries plus take_lost()."""
         waiting = len(self._events)
         for lane in self._lanes.values():
             waiting += len(lane.entries) + sum(
@@ -156,7 +163,7 @@ class LogQueue:
         return waiting + self.take_lost()
 
     def take_lost(self) -> int:
-        """How many records were not taken since the last call, see `put_record`."""
+        """Number of records that put_record() and put_event() dropped since the last call."""
         lost, self._lost = self._lost, 0
         return lost
 

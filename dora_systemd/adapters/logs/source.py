@@ -1,4 +1,4 @@
-"""What comes out of one node: its pipes, the lines in them, and how many of these may pass."""
+"""The output of one node: its pipes, their lines, and the node's rate limit."""
 
 import asyncio
 import os
@@ -13,19 +13,19 @@ from dora_systemd.decisions.logs.limiter import LineLimiter
 from dora_systemd.decisions.logs.lines import LineEncoder, LineSplitter, Origin
 from dora_systemd.paths import CellPaths
 
-# Linux's default, and enough: in a bigger pipe bursts pass faster, but at the end of the cell
-# journald has to take what is in all pipes before the unit may end. See pipe(7).
+# Linux's default. A larger pipe would take bursts faster, but at the end of the cell journald must
+# take the content of all pipes before the unit can end. See pipe(7).
 PIPE_SIZE = 1 << 16
-# What is read of one pipe before the others get their turn: about 1 ms of lines.
+# Bytes to read from one pipe before the others get their turn: about 1 ms of lines.
 CHUNK = 1 << 13
-# A pipe that gives more bytes than this in so many seconds is a flood: it yields to the others.
+# A pipe with more bytes than this in so many seconds counts as a flood, and yields to others.
 FLOOD_BYTES = 1 << 14
 FLOOD_SECONDS = 0.1
 
 
 @dataclass
 class Pipe:
-    """One stream of a node. fd: not blocking. since, taken: of is_flood()."""
+    """One stream of a node. fd: non-blocking. since, taken: for is_flood()."""
 
     fd: int
     stream: str
@@ -33,41 +33,41 @@ class Pipe:
     splitter: LineSplitter = field(default_factory=LineSplitter)
     since: float = 0.0
     taken: int = 0
-    # Where what is on its way is noted; how many batches that is, and lines of earlier ones.
+    # Keeps the bytes that journald does not have; number of such batches; lines of earlier ones.
     held: HeldLines | None = None
     batches: int = 0
     noted: int = 0
-    # Whether the last line has not ended.
+    # Whether the last line is unterminated.
     is_open: bool = False
-    # Lines that journald has taken.
+    # Number of lines that journald has taken.
     written: int = 0
 
     def read(self) -> bytes:
-        """What is in the pipe, CHUNK bytes at most."""
+        """Read at most CHUNK bytes; b"" if the pipe is empty."""
         try:
             return os.read(self.fd, CHUNK) if self.held is None else self.held.take(self.fd, CHUNK)
         except BlockingIOError:
             return b""
 
     def close(self) -> None:
-        """Close it, and what is noted of it."""
+        """Close the pipe, and the file of held bytes."""
         os.close(self.fd)
         if self.held is not None:
             self.held.close()
 
     def is_flood(self, size: int, now: float) -> bool:
-        """Whether the pipe, which has just given `size` bytes, floods; `now` in seconds."""
+        """Whether the pipe floods, after a read of `size` bytes; `now` in seconds."""
         if now - self.since > FLOOD_SECONDS:
             self.since, self.taken = now, 0
         self.taken += size
         return self.taken > FLOOD_BYTES
 
     def lines(self, data: bytes) -> list[bytes]:
-        """The lines that `data` completes; no data: the line that nothing will."""
+        """The lines that `data` completes; without data: the unterminated line."""
         return self.splitter.feed(data) if data else self.splitter.flush()
 
     def take(self, data: bytes) -> None:
-        """A batch with `data`, just read, is to come; none: nothing ends the line."""
+        """Announce a batch with `data`, just read; no data: the end of an unterminated line."""
         self.batches += 1
         if data:
             self.is_open = data[-1:] != b"\n"
@@ -77,12 +77,12 @@ class Pipe:
                 self.held.add(b"\n")
 
     def note_part(self, lines: int) -> None:
-        """Journald has so many lines of the batch whose turn it is."""
+        """Note that journald has the first `lines` lines of the current batch."""
         if self.held is not None:
             self.held.sent(self.noted + lines)
 
     def note_all(self, lines: int) -> None:
-        """Journald has all of it, which is `lines`."""
+        """Note that journald has the whole current batch of `lines` lines."""
         self.batches -= 1
         self.noted += lines
         if self.held is None:
@@ -95,31 +95,31 @@ class Pipe:
 
 @dataclass
 class Source:
-    """A node, its pipes, and its limit if it has one."""
+    """A node, its pipes, and its rate limit if it has one."""
 
     origin: Origin
     pipes: list[Pipe] = field(default_factory=list)
-    # Bytes that drain() took since journald last had everything.
+    # Bytes that drain() has read since journald last had everything.
     drained: int = 0
     limiter: LineLimiter | None = None
-    # When what the limiter took is told.
+    # The timer of the event about suppressed lines.
     report: asyncio.TimerHandle | None = None
-    # Lines that did not come by a pipe, and those that the limiter took and that were told.
+    # Lines that did not come from a pipe, and suppressed lines that were reported.
     written: int = 0
     suppressed: int = 0
 
     def limit(self, limit: RateLimit) -> None:
-        """Keep only so many of its lines from now on."""
+        """Limit the rate of its lines from now on."""
         self.limiter = LineLimiter(limit)
 
     @property
     def line_count(self) -> LineCount:
-        """What became of its lines so far."""
+        """Lines written and suppressed so far."""
         piped = sum(pipe.written for pipe in self.pipes)
         return LineCount(self.written + piped, self.suppressed)
 
     def renew(self, **changes: Any) -> None:
-        """Change the origin, of this node's next lines too."""
+        """Change the origin of the node's later lines."""
         self.origin = replace(self.origin, **changes)
         for pipe in self.pipes:
             pipe.encoder = LineEncoder(self.origin, pipe.stream)
@@ -133,15 +133,15 @@ class Source:
         return LineBatch(pipe, data, lines, self.admit(pipe.stream, len(lines), now))
 
     def admit(self, stream: str, count: int, now: float) -> int:
-        """How many of `count` lines that have come at `now`, in seconds, may pass."""
+        """How many of `count` lines that have arrived at `now` (seconds) may pass."""
         return count if self.limiter is None else self.limiter.admit(stream, count, now)
 
 
 class LineBatch:
-    """Entries on their way. They are made late, because what waits for journald should be small.
+    """The entries of one read. They are made late, because raw bytes take less memory.
 
-    data: what was read of `pipe`. lines, passed: of a node with a limit, whose lines had to be
-    looked at already: those of `data`, and how many of them are sent.
+    data: what was read from `pipe`. lines, passed: for a node with a rate limit, which had to count
+    the lines at once: the lines of `data`, and how many of them may pass.
     """
 
     def __init__(
@@ -155,7 +155,7 @@ class LineBatch:
         self._count = 0
 
     def entries(self) -> list[bytes]:
-        """Make them."""
+        """Make the entries."""
         lines = self._pipe.lines(self._data) if self._lines is None else self._lines
         self._count = len(lines)
         if self._lines is None:
@@ -163,7 +163,7 @@ class LineBatch:
         return list(map(self._encoder.entry, lines[: self._passed]))
 
     def note(self, left: int) -> None:
-        """Journald has taken all but the last `left` entries."""
+        """Note that journald has taken all but the last `left` entries."""
         if left:
             self._pipe.note_part(self._passed - left)
         else:

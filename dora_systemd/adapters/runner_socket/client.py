@@ -1,12 +1,13 @@
-"""What the runner is asked: one request, one answer, both a line of JSON. See listener.py.
+"""Requests to the runner over its socket: one request, one answer, each a line of JSON.
 
-Nobody but root and the user of the dataflow gets into that directory: see unix(7). To root that
-user may be hostile, and have put anything there: `trust.sockets` looks whose it is, an answer has a
-deadline, a size and a shape, and its words are shown without what a terminal would obey.
+listener.py is the other side. Only root and the user of the dataflow can access the directory of
+the socket, see unix(7). To root that user may be hostile, and can put anything there. So
+trust.sockets checks the owner, an answer has a timeout, a maximum size and a schema, and its texts
+are shown without control characters.
 
-The request {"verb": "relay"} is answered with the coordinator's token, and from then on the
-connection is one to the coordinator: so whatever network the dataflow has, and whoever listens on
-the ports of this machine, it is the dataflow that is spoken to.
+The answer to {"verb": "relay"} has the coordinator's token, and then the connection is one to the
+coordinator. So it reaches the right dataflow whatever its network is, and whoever else listens on
+ports of this machine.
 """
 
 import contextlib
@@ -29,17 +30,17 @@ RELAY_SECONDS = 4.0
 
 
 def ask(path: Path, request: Request, seconds: float = ANSWER_SECONDS) -> dict[str, Any]:
-    """The answer of the runner at `path`. Raises DoraSystemdError, what it refuses included."""
+    """The answer of the runner at `path`. Raises DoraSystemdError, also for a refusal."""
     with _reaching(path), connect_unix(path, seconds) as stream:
         return _exchange(stream, path, request, seconds)
 
 
 def order(path: Path, request: Request) -> dict[str, Any]:
-    """The same for what may take long, of a runner that answers now. Raises DoraSystemdError.
+    """Send a request that may take long, to a runner that responds now. Raises DoraSystemdError.
 
-    A runner that is stopped, or that is silent on purpose, is found out in RELAY_SECONDS.
+    A runner that is stopped, or does not answer on purpose, fails after RELAY_SECONDS.
     """
-    # A refusal is an answer, too: a coordinator that is not up yet hinders no reload.
+    # A refusal counts as a response: a reload does not need a coordinator.
     refused = contextlib.suppress(DoraSystemdError)
     with _reaching(path), connect_unix(path, RELAY_SECONDS) as stream, refused:
         _exchange(stream, path, {"verb": "coordinator"}, RELAY_SECONDS)
@@ -47,7 +48,7 @@ def order(path: Path, request: Request) -> dict[str, Any]:
 
 
 def ask_coordinator(path: Path) -> Coordinator:
-    """Where the coordinator of the runner at `path` listens. Raises DoraSystemdError."""
+    """The address of the coordinator of the runner at `path`. Raises DoraSystemdError."""
     reply = ask(path, {"verb": "coordinator"}, RELAY_SECONDS)
     with _reaching(path):
         return parse_coordinator(reply)
@@ -68,13 +69,13 @@ def relay(path: Path) -> tuple[socket.socket, str]:
 
 
 def require_access(path: Path) -> None:
-    """Return if there is a runner at `path` that may be asked. Raises DoraSystemdError."""
+    """Return if the caller may use the runner at `path`. Raises DoraSystemdError."""
     with _reaching(path):
         connect_unix(path, RELAY_SECONDS).close()
 
 
 def done_of(path: Path, reply: Request) -> list[str]:
-    """What the runner at `path` says it has done, for people. Raises DoraSystemdError."""
+    """What the runner at `path` reports to have done, for people. Raises DoraSystemdError."""
     done = reply.get("done")
     if not isinstance(done, list) or not all(isinstance(one, str) for one in done):
         raise _unreadable(path)
@@ -82,7 +83,7 @@ def done_of(path: Path, reply: Request) -> list[str]:
 
 
 def parse_line(line: bytes) -> dict[str, Any] | None:
-    """A request or an answer; None for what is no JSON, and empty for what is no object."""
+    """A request or an answer; None if it is not JSON, and empty if it is not an object."""
     try:
         request = json.loads(line)
     except (ValueError, RecursionError):
@@ -105,7 +106,7 @@ def _exchange(
 
 
 def _read_line(stream: socket.socket, deadline: float) -> bytes:
-    """One line, and all of it in time. Raises OSError, ValueError for one without an end."""
+    """Read one line before `deadline`. Raises OSError, ValueError for a line without an end."""
     line = b""
     while not line.endswith(b"\n"):
         stream.settimeout(max(deadline - time.monotonic(), 0.001))

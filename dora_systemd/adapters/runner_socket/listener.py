@@ -1,6 +1,6 @@
-"""The runner's own socket in the RuntimeDirectory: who may reach it is said in client.py.
+"""The runner's socket in the RuntimeDirectory; client.py says who can access it.
 
-A request to be relayed becomes a connection to the coordinator, whatever network the cell has.
+A relay request turns the connection into one to the coordinator, whatever network the cell has.
 """
 
 import asyncio
@@ -19,11 +19,12 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 
 Answer = Callable[[Request], Awaitable[dict[str, Any]]]
 Reach = Callable[[], Coordinator]
-"""Where the coordinator is. Raises DoraSystemdError (NOT_RUNNING) as long as it is nowhere."""
+"""The address of the coordinator. Raises DoraSystemdError (NOT_RUNNING) if it does not listen yet.
+"""
 
 
 async def serve(path: Path, answer: Answer, reach: Reach) -> None:
-    """Answer requests at `path` for ever. An error is {"error": ..., "hint": ..., "code": ...}."""
+    """Answer requests at `path` forever. An error is {"error": ..., "hint": ..., "code": ...}."""
 
     async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         with contextlib.suppress(OSError, ValueError):
@@ -45,7 +46,7 @@ async def serve(path: Path, answer: Answer, reach: Reach) -> None:
 
 @contextlib.contextmanager
 def _short(path: Path) -> Iterator[str]:
-    """The address of a socket has 107 bytes, see unix(7); a dataflow's name may have 200."""
+    """A short path for the socket: an address has 107 bytes, see unix(7), and a name up to 200."""
     directory = os.open(path.parent, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         yield f"/proc/self/fd/{directory}/{path.name}"
@@ -63,7 +64,7 @@ async def _answer(request: Request | None, answer: Answer, reach: Reach) -> dict
     except DoraSystemdError as error:
         return _refusal(error)
     except Exception as error:
-        # A request that we do not understand ends nothing but itself.
+        # A malformed request only ends its own connection.
         what = f"cannot do that: {type(error).__name__}: {error}"
         return _refusal(DoraSystemdError(what, "please report it"))
 

@@ -1,8 +1,8 @@
-"""A port of 127.0.0.1 that leads to the coordinator of a dataflow whose network is its own.
+"""A port of 127.0.0.1 that leads to the coordinator of a dataflow with a private network.
 
-The stock dora command speaks to ports only. A child process listens for as long as the command
-lives: it knows by a pipe that the command and all that it started has inherited. Only the callers'
-own users get through, and the coordinator asks each of them for its token.
+The dora command can only use ports. A child process listens as long as the command runs: it detects
+the end by a pipe that the command and its children have inherited. Only the given users can
+connect, and the coordinator requires its token.
 """
 
 import asyncio
@@ -22,10 +22,10 @@ _LOOPBACK = "127.0.0.1"
 
 
 def open_port(path: Path, uids: Collection[int], become: Callable[[], None]) -> int:
-    """The port; it is closed when this process and those that it becomes or starts have ended.
+    """Open the port; it closes when this process, and what it executes or starts, has ended.
 
-    path: of the runner's socket. uids: who may connect. become: called in the child, to be no
-    more than the user of the dataflow. Raises OSError.
+    path: of the runner's socket. uids: users that may connect. become: called in the child, to take
+    on the user of the dataflow. Raises OSError.
     """
     listener = socket.create_server((_LOOPBACK, 0))
     port: int = listener.getsockname()[1]
@@ -44,7 +44,7 @@ def open_port(path: Path, uids: Collection[int], become: Callable[[], None]) -> 
 
 
 def _settle(become: Callable[[], None]) -> None:
-    """Out of the terminal's reach, Ctrl+C is for the command; and without its streams."""
+    """Detach from the terminal, because Ctrl+C is for the command, and from its streams."""
     os.setpgid(0, 0)
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     null = os.open(os.devnull, os.O_RDWR)
@@ -62,7 +62,7 @@ async def _serve(listener: socket.socket, life: int, path: Path, uids: frozenset
                     Ends(reader, writer), Ends(*await asyncio.open_connection(sock=stream))
                 )
         except (DoraSystemdError, OSError):
-            pass  # the caller sees its connection closed, and says so
+            pass  # the caller sees a closed connection, and reports it
         finally:
             writer.close()
 

@@ -1,4 +1,4 @@
-"""Two connections become one: bytes are passed both ways."""
+"""Connects two connections: passes bytes both ways."""
 
 import asyncio
 import contextlib
@@ -15,9 +15,9 @@ class Ends(NamedTuple):
 
 
 async def splice(one: Ends, other: Ends) -> None:
-    """Pass bytes between the two until either has no more; then both are closed.
+    """Pass bytes between the two until one of them ends; then close both.
 
-    Never more than a chunk and a buffer of them is held: who does not read makes the other wait.
+    Holds at most a chunk and a buffer: an end that does not read makes the other one wait.
     """
     ways = ((one.reader, other.writer), (other.reader, one.writer))
     tasks = [asyncio.ensure_future(_pass(*way)) for way in ways]

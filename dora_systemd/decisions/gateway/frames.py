@@ -1,17 +1,20 @@
-"""The frames of dora's control protocol as a coordinator has them, see also ../dora/protocol.py.
+"""Frames of dora's control protocol, seen from the coordinator's side. Pure.
 
-What the dora command 1.1.0 does on its one WebSocket, /api/control of DORA_COORDINATOR_ADDR and
-DORA_COORDINATOR_PORT, measured by a proxy before a bare coordinator:
+The gateway parses requests of the dora command here, and formats the replies. The runner is a
+client of the same protocol: ../dora/protocol.py. No document specifies all of it. This is what the
+dora command 1.1.0 does on its one WebSocket, /api/control, measured with a proxy in front of a
+coordinator; another version of dora may break it, so refused_version() accepts dora 1 only.
 
-- Its first request is Hello; then one request after the other, each with `id`, and it waits for
-  each reply without a limit. A reply is {"id", "result"}; what failed is {"result": {"Error":
-  text}}, and the text is printed as it is; "error" in place of "result" is for a malformed frame.
-- Without --node or a UUID it looks for names in List among those that are "Running" only.
-- LogSubscribe is answered {"subscribed": true}; from then on the lines come as frames without an
-  id, {"event": "log", "payload"}. TopicSubscribe gives a subscription_id, and binary frames that
-  begin with its 16 bytes.
-- It takes messages of up to 64 MiB in frames of up to 16 MiB, and drops the connection above; a
-  bare coordinator's frames end at 1 MiB, so that its Logs fail above some 2,000 lines.
+- The first request is Hello. The others follow one at a time, each with an `id`, and the command
+  waits for each reply without a timeout.
+- A reply is {"id", "result"}. A failure is {"result": {"Error": text}}, and the command prints the
+  text as it is. A malformed frame gets "error" in place of "result".
+- Without --node or a UUID the command looks up names in List, only among "Running" dataflows.
+- The reply to LogSubscribe is {"subscribed": true}. The lines follow in frames without an id,
+  {"event": "log", "payload"}. TopicSubscribe returns a subscription_id, and binary frames follow
+  that begin with its 16 bytes.
+- The command accepts messages of up to 64 MiB in frames of up to 16 MiB, and closes the connection
+  above that. A coordinator's own frames end at 1 MiB, so its Logs fail above some 2,000 lines.
 """
 
 import json
@@ -26,13 +29,13 @@ from dora_systemd.terminal_text import escaped
 from dora_systemd.values import SECOND, quoted
 
 NO_ID = "00000000-0000-0000-0000-000000000000"
-"""The id of a reply to a frame that has none."""
+"""The id of a reply to a frame without one."""
 
 LOGS_LIMIT = 15 << 20
-"""Bytes of one answer to Logs: each becomes up to 4 characters of a message of at most 64 MiB."""
+"""Bytes of log in one answer: each takes up to 4 characters of a message of at most 64 MiB."""
 _PART = 1 << 16
 _NUL = re.compile(r"(?<!\\)(?:\\\\)*\\u0000")
-"""As json writes it, and no backslash before "u0000" that is meant as one."""
+"""NUL as JSON escapes it; an escaped backslash in front of the text "u0000" does not match."""
 _MICROSECOND_NS = 1000
 
 
@@ -46,11 +49,11 @@ class Request:
 
     @property
     def params(self) -> str | dict[str, Any]:
-        """As a coordinator takes it."""
+        """The request as a coordinator expects it in `params`."""
         return {self.name: dict(self.body)} if self.body else self.name
 
     def text(self, key: str) -> str:
-        """A field that must be there. Raises DoraSystemdError (BAD_INPUT)."""
+        """A required text field. Raises DoraSystemdError (BAD_INPUT)."""
         value = self.body.get(key)
         if isinstance(value, str) and value:
             return value
@@ -60,14 +63,14 @@ class Request:
 
     @property
     def dataflow(self) -> str:
-        """The UUID of the dataflow that it is about. Raises DoraSystemdError."""
+        """The UUID of the request's dataflow. Raises DoraSystemdError."""
         return parse_uuid(
             self.text("dataflow_id" if "dataflow_id" in self.body else "dataflow_uuid")
         )
 
     @property
     def grace(self) -> int | None:
-        """Its grace duration in µs, None where it has none."""
+        """The grace duration in µs, or None."""
         given = self.body.get("grace_duration")
         if not isinstance(given, dict):
             return None
@@ -78,14 +81,14 @@ class Request:
 
     @property
     def tail(self) -> int | None:
-        """How many lines are asked for, None for all."""
+        """The requested number of lines, None for all."""
         given = self.body.get("tail")
         return given if isinstance(given, int) and given >= 0 else None
 
 
 @dataclass(frozen=True)
 class Malformed:
-    """A frame that is no request."""
+    """A frame that is not a request. reason: for the reply."""
 
     id: str
     reason: str
@@ -97,7 +100,7 @@ def parse_request(text: str | bytes) -> Request | Malformed:
         return Malformed(NO_ID, "cannot read a binary frame: requests are text")
     try:
         frame = json.loads(text)
-        # Half a surrogate pair is no text to anybody else: a coordinator would not answer at all.
+        # encode() refuses half a surrogate pair, to which a coordinator would not reply at all.
         text = json.dumps(frame, ensure_ascii=False)
         text.encode()
     except (ValueError, RecursionError) as error:
@@ -105,7 +108,7 @@ def parse_request(text: str | bytes) -> Request | Malformed:
     if not isinstance(frame, dict) or not isinstance(frame.get("id"), str):
         return Malformed(NO_ID, "cannot read the request: it has no id")
     if _NUL.search(text):
-        # No path, no name and no argument of a program can have one: what takes it would fail.
+        # Paths, names and arguments of programs cannot contain NUL: refuse it once, here.
         return Malformed(frame["id"], "cannot read the request: it has a NUL character")
     return _parse_params(frame["id"], frame.get("params"))
 
@@ -121,28 +124,28 @@ def _parse_params(ident: str, params: Any) -> Request | Malformed:
 
 
 def format_result(ident: str, result: Any) -> str:
-    """The frame of an answer."""
+    """The frame of a reply."""
     return json.dumps({"id": ident, "result": result})
 
 
 def format_malformed(frame: Malformed) -> str:
-    """The frame of the answer to one that cannot be read."""
+    """The frame of the reply to a malformed frame."""
     return json.dumps({"id": frame.id, "error": frame.reason})
 
 
 def format_event(payload: Mapping[str, Any]) -> str:
-    """The frame of one line of a log that is followed."""
+    """The frame of one line for a LogSubscribe."""
     return json.dumps({"event": "log", "payload": payload})
 
 
 def error_result(error: DoraSystemdError) -> dict[str, str]:
-    """What failed, as the dora command prints it, with the hint as its own are."""
+    """The result for an error: the dora command prints it, with the hint in dora's own form."""
     text = error.message + (f"\n\n  hint: {error.hint}" if error.hint else "")
     return {"Error": escaped(text)}
 
 
 def logs_parts(ident: str, lines: list[bytes]) -> Iterator[str]:
-    """The answer to Logs in parts of one message: dora sends bytes as an array of numbers."""
+    """The reply to Logs in parts of one message: in dora's JSON, bytes are an array of numbers."""
     yield f'{{"id":{json.dumps(ident)},"result":{{"Logs":['
     separator = ""
     for part in _joined(lines):
@@ -163,12 +166,12 @@ def _joined(lines: list[bytes]) -> Iterator[bytes]:
 
 
 def renamed(value: Any, old: str, new: str) -> Any:
-    """`value` with the UUID `new` wherever it has `old`."""
+    """`value` with every UUID `old` replaced by `new`."""
     return json.loads(json.dumps(value).replace(old, new)) if old else value
 
 
 def refused_version(version: object) -> str | None:
-    """Why a dora command of that version is turned away, or None."""
+    """Why the gateway refuses a dora command of that version, or None."""
     text = version if isinstance(version, str) else ""
     if text.partition(".")[0] == "1":
         return None

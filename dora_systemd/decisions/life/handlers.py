@@ -1,4 +1,15 @@
-"""What the runner's state machine does about an event: the entries of TABLE in table.py."""
+"""The handlers of the runner's state machine: the entries of TABLE in table.py.
+
+A handler takes the cell and an event and returns the new cell and the actions to perform, in this
+order. It is pure: no I/O and no clock, because the time is in the event. `pump.py` performs the
+actions, and each answer of dora is another event.
+
+to() changes the state and always adds a Deadline, which replaces the one before: each state has
+its own timeout. A handler that returns `cell, ()` leaves the current deadline running. So
+started() need not set one: the 30 s of STARTING cover the run id and the subscription.
+A handler must accept every cell of the states that TABLE lists it for. It must not assume which
+events came before: dora's events and the ends of its processes arrive in any order.
+"""
 
 from dataclasses import replace
 
@@ -14,54 +25,54 @@ from dora_systemd.values import SECOND, format_duration
 
 _NOT_READY = ("starting", "restarting")
 CASCADE_TIMEOUT = 5 * SECOND
-"""Dora ends a dataflow within milliseconds when a node failed before it was ready."""
+"""µs; dora ends a dataflow within milliseconds after a node failed before it was ready."""
 
 
 def ignore(cell: Cell, event: life.Event) -> Step:
-    """Nothing that matters in this state."""
+    """The event has no effect in this state."""
     return cell, ()
 
 
 def listening(cell: Cell, event: life.Event) -> Step:
-    """The coordinator is there: the daemon comes next."""
+    """The coordinator listens: start the daemon."""
     return to(cell, State.JOINING, Do.START_DAEMON, after=ENGINE_TIMEOUT)
 
 
 def joined(cell: Cell, event: life.Event) -> Step:
-    """Both are there: dora is sent the descriptor."""
+    """The daemon has registered: send the descriptor."""
     return to(cell, State.STARTING, Do.SEND_START, after=ENGINE_TIMEOUT)
 
 
 def started(cell: Cell, event: life.Event) -> Step:
-    """Dora has accepted it."""
+    """Dora has accepted the descriptor: subscribe to the events of the run."""
     assert isinstance(event, life.RunStarted)
     return replace(cell, run=event.run), (Do.SUBSCRIBE,)
 
 
 def subscribed(cell: Cell, event: life.Event) -> Step:
-    """From here on nothing that happens to a node is missed."""
-    # The launchers wait for OPEN_PIPES, so no node can end before its events are heard; the kinds
-    # that dora starts itself can, hence ASK_RESULT.
+    """The subscription is active: no event of a node gets lost from here on."""
+    # Launchers wait for OPEN_PIPES, so their nodes cannot end before this. Nodes that dora starts
+    # without a launcher can, and no event would say so: ASK_RESULT asks whether the run has ended.
     return to(cell, State.WAITING, Do.OPEN_PIPES, Do.ASK_SPAWN, Do.ASK_RESULT)
 
 
 def barrier_opened(cell: Cell, event: life.Event) -> Step:
-    """Messages flow, unless a node has failed before it was ready."""
-    # It also opens when a node has failed before it was ready. Then dora ends the others, and the
-    # start has failed, unless nothing comes of it.
+    """Dora opened its start barrier: the dataflow runs, unless a node failed before."""
+    # Dora also opens the barrier after a node failed before it was ready, and then ends the other
+    # nodes: RunFinished follows. If it does not follow within CASCADE_TIMEOUT, the dataflow runs.
     if any(node.state == "failed" for node in cell.nodes.values()):
         return cell, (Deadline(CASCADE_TIMEOUT),)
     return run(cell, event)
 
 
 def run(cell: Cell, event: life.Event) -> Step:
-    """The dataflow runs."""
+    """Mark all nodes as ready and the dataflow as running."""
     cell = replace(cell, nodes=table.all_ready(cell.nodes, event.at_us), ready_us=event.at_us)
     return to(cell, State.RUNNING, Record("dataflow-started"))
 
 
 def start_timed_out(cell: Cell, event: life.Event) -> Step:
-    """Nodes that are late end it."""
+    """The start fails and names the nodes that are not ready."""
     assert isinstance(event, life.StartTimedOut)
     late = [ident for ident, node in cell.nodes.items() if node.state in _NOT_READY]
     reason = f"{_nodes(late)} not ready within {format_duration(event.after)}"
@@ -71,7 +82,7 @@ def start_timed_out(cell: Cell, event: life.Event) -> Step:
 def _fail_start(cell: Cell, reason: str) -> Step:
     if not cell.is_trial:
         return fail(cell, reason, RunnerExit.FAILED)
-    # Another run follows, so this one ends in good order.
+    # A reload started this run, and the version before it follows: stop the nodes properly.
     cell = replace(cell, failure=reason, exit=RunnerExit.FAILED)
     return to(cell, State.STOPPING, Do.ASK_STOP, after=stop_timeout(cell.grace))
 
@@ -81,7 +92,7 @@ def _nodes(idents: list[str]) -> str:
 
 
 def node_event(cell: Cell, event: life.Event) -> Step:
-    """Something happened to a node."""
+    """Update the live table for an event of a node, and record what it means."""
     is_open = cell.ready_us > 0
     stops = _is_stopping(cell)
     nodes, record = table.update(cell.nodes, event, is_stopping=stops, is_open=is_open)
@@ -94,14 +105,14 @@ def _is_stopping(cell: Cell) -> bool:
 
 
 def stop_early(cell: Cell, event: life.Event) -> Step:
-    """No node is there yet, or none that dora could be asked to stop."""
+    """Stop before the launchers go on: end at once, and EXIT kills what there is."""
     assert isinstance(event, life.StopAsked)
     cell = replace(cell, stop_by=event.by)
     return to(cell, State.ENDED, _stopping(event), Record("dataflow-stopped"), Do.EXIT)
 
 
 def stop(cell: Cell, event: life.Event) -> Step:
-    """Dora ends the nodes, if there are any."""
+    """Have dora stop the nodes, if any of them runs."""
     assert isinstance(event, life.StopAsked)
     return _wind_down(replace(cell, stop_by=event.by), _stopping(event))
 
@@ -111,11 +122,11 @@ def _stopping(event: life.StopAsked) -> Record:
 
 
 def node_event_stopping(cell: Cell, event: life.Event) -> Step:
-    """The last of them was waited for."""
+    """A node event while stopping: dismiss the daemon after the last node has exited."""
     cell, actions = node_event(cell, event)
     if table.has_process(cell.nodes):
         return cell, actions
-    # Dora's Stop does not return while a node waits out a restart delay; nothing runs any more.
+    # Do not wait for the answer to Stop: dora sends none while a node is in its restart delay.
     return _leave(cell, *actions)
 
 
@@ -124,12 +135,12 @@ def _leave(cell: Cell, *actions: Action) -> Step:
 
 
 def leave_now(cell: Cell, event: life.Event) -> Step:
-    """There is nothing left to wait for."""
+    """Dismiss the daemon: there is nothing else to wait for."""
     return _leave(cell)
 
 
 def reload(cell: Cell, event: life.Event) -> Step:
-    """End as for a stop, and without a word: who asked for it starts the next life."""
+    """Wind down as for a stop, but record no event: the reloader starts the next run."""
     return _wind_down(replace(cell, reload=True))
 
 
@@ -140,7 +151,10 @@ def _wind_down(cell: Cell, *actions: Action) -> Step:
 
 
 def stop_again(cell: Cell, event: life.Event) -> Step:
-    """Asked twice, it does not wait any longer; a reload gives way to a stop."""
+    """A stop while stopping: a second request skips the grace period, any other replaces a reload.
+
+    stop_by is empty while a reload or a failed trial stops the nodes; then a stop takes over.
+    """
     assert isinstance(event, life.StopAsked)
     if cell.stop_by:
         return _leave(cell)
@@ -148,25 +162,29 @@ def stop_again(cell: Cell, event: life.Event) -> Step:
 
 
 def stop_leaving(cell: Cell, event: life.Event) -> Step:
-    """A stop is in a hurry, and it is what this end is called."""
+    """Stop while the daemon leaves: end at once, and record the end as a stop."""
     assert isinstance(event, life.StopAsked)
     return end(replace(cell, stop_by=event.by, reload=False), event)
 
 
 def reshape(cell: Cell, event: life.Event) -> Step:
-    """A reload changes which nodes there are."""
+    """A reload adds, replaces or removes a node."""
     return replace(cell, nodes=table.reshape(cell.nodes, event)), ()
 
 
 def note_reload(cell: Cell, event: life.Event) -> Step:
-    """What a reload has left to say, for the status line."""
+    """Set the notice of the last reload, which the status line shows."""
     assert isinstance(event, life.ReloadNoted)
     cell = replace(cell, notice=event.notice)
     return cell if event.downstream is None else replace(cell, downstream=event.downstream), ()
 
 
 def node_event_waiting(cell: Cell, event: life.Event) -> Step:
-    """A node that is to wait for a reload does not do so when the start can fail instead."""
+    """A node exited before the start barrier: fail the start, or keep a held node waiting.
+
+    A node with the policy HELD waits for a reload after it failed. That is no help while the start
+    can still fail: on the first run, and in a trial, where the version before can come back.
+    """
     after, actions = node_event(cell, event)
     if isinstance(event, life.NodeExited) and (cell.is_trial or not cell.is_again):
         node = after.nodes[event.node]
@@ -179,12 +197,12 @@ def node_event_waiting(cell: Cell, event: life.Event) -> Step:
 
 
 def run_finished(cell: Cell, event: life.Event) -> Step:
-    """No node is left: dora knows how they ended."""
+    """All nodes have exited: ask dora for the result."""
     return to(cell, State.CLOSING, Do.ASK_RESULT, after=ENGINE_TIMEOUT)
 
 
 def result(cell: Cell, event: life.Event) -> Step:
-    """How they ended decides how the dataflow did."""
+    """The results of the nodes decide between a finished and a failed dataflow."""
     assert isinstance(event, life.ResultKnown)
     cell = replace(cell, nodes=table.apply_results(cell.nodes, event.results, event.at_us))
     if not event.results:
@@ -205,15 +223,15 @@ def _known_exit(cell: Cell, node: str, how: str) -> str:
 
 
 def stop_while_closing(cell: Cell, event: life.Event) -> Step:
-    """It ends by itself already."""
+    """Stop while the result is pending: the run has ended, so only note the request."""
     assert isinstance(event, life.StopAsked)
     return replace(cell, stop_by=event.by), ()
 
 
 def end(cell: Cell, event: life.Event) -> Step:
-    """Nothing runs any more: this is how it ended."""
+    """Nothing runs any more: record the end and exit."""
     if cell.stop_by:
-        # Who asked for the end gets a clean one, whatever a node did on its way out.
+        # A requested stop always counts as clean, whatever exit status the nodes had.
         cell = replace(cell, failure="", exit=RunnerExit.OK)
         return to(cell, State.ENDED, Record("dataflow-stopped"), Do.EXIT)
     if cell.reload:
@@ -224,6 +242,6 @@ def end(cell: Cell, event: life.Event) -> Step:
 
 
 def daemon_left(cell: Cell, event: life.Event) -> Step:
-    """The last that there was to wait for."""
+    """The daemon has exited, which is the last thing to wait for."""
     assert isinstance(event, life.ChildExited)
     return end(cell, event) if event.child == "daemon" else (cell, ())

@@ -1,6 +1,15 @@
-"""Kinds whose values are lists of structures: files, mounts, devices, addresses, CPUs, commands.
+"""Property kinds whose values are lists of structures: files, mounts, devices, addresses, commands.
 
-An empty text is an empty list, which resets what was there, as an empty line does in a unit file.
+A PropertyKind of kinds.py has a D-Bus signature and two functions. `parse` turns the text of
+`--property KEY=VALUE` into the value that StartTransientUnit takes, a tuple of tuples that matches
+the signature; `format` turns that value into the texts of a unit file. Both must agree: `doractl
+enable` writes files for what `doractl start` sends. The signatures are those of
+org.freedesktop.systemd1(5), the texts those of systemd.exec(5), systemd.service(5) and
+systemd.resource-control(5). CPUs are a bit mask and have their kind here too.
+
+An empty text is an empty list, which resets the property, as an empty value does in a unit file.
+A wrong order of a structure's members would not fail here: systemd would refuse it, or take one
+member for another. Parsers raise ValueError or DoraSystemdError; assignments.py adds the key.
 """
 
 import ipaddress
@@ -13,8 +22,11 @@ from dora_systemd.values import INFINITY, format_duration, parse_duration, parse
 
 Pair = tuple[str, str]
 Device = tuple[str, int]
+"""Path of the device, and the amount."""
 Address = tuple[int, bytes, int]
+"""Address family, address in network byte order, and length of the prefix in bits."""
 Bind = tuple[str, str, bool, int]
+"""Source, target, whether a missing source is ignored, and flags of mount(2)."""
 Command = tuple[str, tuple[str, ...], tuple[str, ...]]
 """Path, argv, and flags such as "no-env-expand", as ExecStartEx has them on D-Bus."""
 
@@ -32,7 +44,7 @@ _COMMAND_FLAGS = {
     "+": "privileged",
     "!": "no-setuid",
 }
-"""The prefixes of a command line in systemd.service(5) and what they are called on D-Bus."""
+"""Prefixes of a command line in systemd.service(5), and their names on D-Bus."""
 
 _NETWORKS = {
     "any": ("0.0.0.0/0", "::/0"),
@@ -43,10 +55,10 @@ _NETWORKS = {
 
 
 def format_command(command: Command) -> str:
-    """The command line of `command` in a unit file, see systemd.service(5)."""
+    """The command line of `command` for a unit file, see systemd.service(5)."""
     path, argv, flags = command
     prefixes = "".join(char for char, name in _COMMAND_FLAGS.items() if name in flags)
-    renamed = argv[:1] != (path,)
+    renamed = argv[:1] != (path,)  # "@": the second word is argv[0]
     words = [path, *argv] if renamed else argv
     return prefixes + "@" * renamed + " ".join(quote_word(word) for word in words)
 
@@ -77,7 +89,7 @@ def _format_environment_files(value: Sequence[tuple[str, bool]]) -> Sequence[str
 
 
 def _parse_pair(text: str, separator: str) -> tuple[Pair, ...]:
-    """Two words, the second one possibly empty."""
+    """Two words; the second one may be empty."""
     first, _, second = plain_text(text).partition(separator)
     return ((first, second.strip()),) if first else ()
 
@@ -116,13 +128,13 @@ def _parse_bind(word: str) -> Bind:
 
 def _format_bind(bind: Bind) -> str:
     source, target, is_optional, flags = bind
-    # Each for itself: systemd takes a ":" within quotes for a part of the path.
+    # Quote each path alone: systemd takes a ":" within quotes for a part of the path.
     paths = f"{quote_word('-' * is_optional + source)}:{quote_word(target)}"
     return paths + ("" if flags else ":norbind")
 
 
 def _bandwidth(text: str) -> int:
-    """Bytes or operations per second; the factors are powers of 1000 here."""
+    """Bytes or operations per second; K, M, G and T are powers of 1000 here, not of 1024."""
     factor = _DECIMAL_FACTORS.get(text[-1:], 1)
     amount = parse_size(text[:-1] if factor > 1 else text)
     return amount if amount == INFINITY else min(amount * factor, INFINITY)
@@ -153,7 +165,7 @@ def _format_addresses(value: Sequence[Address]) -> Sequence[str]:
 
 
 def _parse_cpus(text: str) -> bytes:
-    """A set such as "0-3,8" as a mask, the lowest byte first."""
+    """A set such as "0-3,8" as a bit mask, lowest byte first."""
     mask = 0
     for word in text.replace(",", " ").split():
         first, dash, last = word.partition("-")
@@ -207,7 +219,7 @@ ENVIRONMENT_FILES = PropertyKind(
 CREDENTIALS = PropertyKind(
     "a(ss)",
     "ID:PATH",
-    # An ID alone is inherited under that name.
+    # An ID without a path names a credential that the manager passes on, systemd.exec(5).
     lambda text: tuple((name, path or name) for name, path in _parse_pair(text, ":")),
     lambda value: _format_pairs(value, ":"),
 )

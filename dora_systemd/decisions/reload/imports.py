@@ -1,7 +1,15 @@
-"""Which files of a project a Python program is made of, found by its import statements.
+"""Finds the files of a project that a Python program consists of, by its import statements.
 
-What is imported by name only at run time (importlib, plug-ins) is not found; a node's `watch`
-patterns are for that. See the reference of the import system, docs of Python.
+Hot reload restarts a node when one of these files changes. program_files() parses the script,
+follows each import statement to files that exist, and goes on with their imports. It runs no code
+of the project, and reads files only through the given `read`, which decides what belongs to the
+project. The rules of the search are those of Python's import system:
+https://docs.python.org/3/reference/import.html
+
+The result can have too many files, which costs a restart: `from a import b` counts a file a/b.py
+although b may be a name in a, and a module counts in every directory that has it, although Python
+takes the first. It has too few where a program imports by a computed name (importlib, plug-ins) or
+changes sys.path: the node's `watch` patterns are for these.
 """
 
 import ast
@@ -16,8 +24,8 @@ Read = Callable[[str], str | None]
 def program_files(script: str, read: Read, places: Iterable[str] = ()) -> frozenset[str]:
     """The absolute paths of `script` and of all modules of the project that it imports.
 
-    As Python does, modules are looked for in the directory of the script, and then in `places`
-    (PYTHONPATH, say); those that are not there come from elsewhere: they are not the project's.
+    places: directories to search besides that of the script, such as those of PYTHONPATH. Modules
+    that are in none of them, such as the standard library's, do not belong to the project.
     """
     roots = [PurePath(script).parent, *map(PurePath, places)]
     found: set[str] = set()
@@ -35,7 +43,7 @@ def _imported(path: PurePath, source: str, roots: Sequence[PurePath]) -> Iterato
     try:
         tree = ast.parse(source)
     except (SyntaxError, ValueError):
-        return
+        return  # the file itself still counts, so a corrected version is noticed
     for statement in ast.walk(tree):
         if isinstance(statement, ast.Import):
             for alias in statement.names:
@@ -53,7 +61,7 @@ def _parent(path: PurePath, level: int) -> PurePath:
 
 
 def _candidates(bases: Iterable[PurePath], names: list[str]) -> Iterator[str]:
-    """Where `names` may be: each package on the way is executed, too."""
+    """The files that an import of `names` may execute, with those of the packages above it."""
     for base in bases:
         for length in range(1, len(names) + 1):
             place = base.joinpath(*names[:length])
@@ -64,7 +72,7 @@ def _candidates(bases: Iterable[PurePath], names: list[str]) -> Iterator[str]:
 
 
 def syntax_error(path: str, source: str) -> str:
-    """What is wrong with a Python file, as "line 3: invalid syntax", or "" if it compiles."""
+    """The error in a Python file, such as "line 3: invalid syntax", or "" if it compiles."""
     try:
         compile(source, path, "exec", dont_inherit=True)
     except SyntaxError as error:

@@ -1,8 +1,8 @@
-"""What only the coordinator of a dataflow can answer, and the topics that are passed through.
+"""Forwards requests that only a dataflow's coordinator can answer, and passes topics through.
 
-A dataflow has one UUID here for all its life, and in its cell another one for each run: requests
-get the one of the run, answers the one of the dataflow. Frames of topics are passed as they are:
-they begin with the id of a subscription, which every coordinator draws by itself.
+Here a dataflow has one UUID as long as it exists; in its cell each run has another one. Requests
+get the UUID of the run, answers that of the dataflow. Frames of topics pass unchanged: they begin
+with the id of a subscription, which each coordinator chooses itself.
 """
 
 import asyncio
@@ -28,14 +28,14 @@ _GOING_AWAY = 1001
 
 
 async def forward(talk: Talk, request: Request) -> Result:
-    """Ask the dataflow's own coordinator. Raises DoraSystemdError."""
+    """Send the request to the dataflow's own coordinator. Raises DoraSystemdError."""
     cell, run = await asyncio.to_thread(_running, talk.scope, request.dataflow)
     reply = await _ask(talk.scope, cell, renamed(request.params, cell.uuid, run))
     return _answer(reply, run, cell.uuid)
 
 
 async def restart_one_node(talk: Talk, request: Request) -> Result:
-    """RestartNode, without the loss of the nodes downstream. Raises DoraSystemdError."""
+    """RestartNode, without ending the nodes downstream. Raises DoraSystemdError."""
     if request.grace is not None:
         return await forward(talk, request)
     node = request.text("node_id")
@@ -45,7 +45,7 @@ async def restart_one_node(talk: Talk, request: Request) -> Result:
 
 
 async def describe(talk: Talk, request: Request) -> Result:
-    """Info: what runs, the programs of nodes as they are written. Raises DoraSystemdError."""
+    """Info about a run, with the nodes' programs as written. Raises DoraSystemdError."""
     uuid = request.dataflow
     with suppress(DoraSystemdError):
         return await _describe_running(talk.scope, uuid)
@@ -65,7 +65,7 @@ async def _describe_running(scope: Scope, uuid: str) -> dict[str, Any]:
 
 
 async def subscribe_topics(talk: Talk, request: Request) -> Result:
-    """TopicSubscribe, on a connection to the dataflow of its own. Raises DoraSystemdError."""
+    """TopicSubscribe, on its own connection to the dataflow. Raises DoraSystemdError."""
     cell, run = await asyncio.to_thread(_running, talk.scope, request.dataflow)
     connection = await _open(talk.scope, cell)
     try:
@@ -80,7 +80,7 @@ async def subscribe_topics(talk: Talk, request: Request) -> Result:
 
 
 def _subscription(reply: Reply) -> str:
-    """The id of a subscription that was made. Raises DoraSystemdError with dora's own words."""
+    """The id of the new subscription. Raises DoraSystemdError with dora's message."""
     made = reply.result.get("TopicSubscribed") if isinstance(reply.result, dict) else None
     if isinstance(made, dict) and isinstance(made.get("subscription_id"), str):
         return str(made["subscription_id"])
@@ -108,7 +108,7 @@ async def _pass_frames(talk: Talk, ident: str, connection: Connection) -> None:
 
 
 def _running(scope: Scope, uuid: str) -> tuple[Cell, str]:
-    """A dataflow that runs, and dora's id of its run. Raises DoraSystemdError."""
+    """A running dataflow, and dora's id of its run. Raises DoraSystemdError."""
     cell = find_by_uuid(scope, uuid)
     require_running(cell)
     run = read_status(scope, cell).run

@@ -1,7 +1,8 @@
-"""Logs and LogSubscribe of dora's protocol, out of the journal.
+"""Logs and LogSubscribe of dora's protocol, from the journal.
 
-The dora command asks Logs for each node, sorts and filters by itself, and then subscribes. So that
-no line is missing or doubled between the two, a connection remembers up to where it has sent.
+The dora command requests Logs for each node, sorts and filters them itself, and then subscribes.
+The connection remembers the last record that it sent, so that no line is missing or doubled between
+the two requests.
 """
 
 import asyncio
@@ -38,7 +39,7 @@ _EXPORT = ("--output=export", "--quiet", "--all", f"--output-fields={','.join(LO
 _LINES = ("DORA_STREAM=stdout", "DORA_STREAM=stderr")
 _CUT_NOTE = "earlier lines are skipped here; all lines: doractl logs {name} --node {node}"
 _SETTLE_SECONDS = 0.3
-"""After the end of a unit, until systemd starts it anew, if it does."""
+"""Time after the end of a unit for systemd to start it again, if it does."""
 
 
 async def send_logs(talk: Talk, request: Request) -> Result:
@@ -85,7 +86,7 @@ def _uuid_of(scope: Scope, request: Request) -> str:
 
 
 def _check_node(scope: Scope, uuid: str, name: str, node: str) -> None:
-    """A node that has written nothing is no mistake, one that is not there is."""
+    """Refuse an unknown node; a known node without records is fine."""
     cell = find_if_loaded(scope, uuid)
     known = [*JournalReader().known_nodes(name), *(read_status(scope, cell).nodes if cell else ())]
     if node in known:
@@ -109,7 +110,7 @@ def _records(arguments: Sequence[str]) -> Iterator[Record]:
 async def subscribe_logs(talk: Talk, request: Request) -> Result:
     """LogSubscribe: lines and life events from now on. Raises DoraSystemdError (NOT_FOUND).
 
-    Of a dataflow that this connection has started, from its start on.
+    For a dataflow that this connection has started: from its start on.
     """
     uuid = request.dataflow
     name = await asyncio.to_thread(find_name, talk.scope, uuid)
@@ -122,7 +123,7 @@ async def subscribe_logs(talk: Talk, request: Request) -> Result:
 class Follower:
     """Sends what a dataflow writes, until it has ended for good.
 
-    since_us: CLOCK_REALTIME. level: dora's word, see is_wanted.
+    since_us: CLOCK_REALTIME µs. level: dora's name of a level, see is_wanted.
     """
 
     def __init__(self, talk: Talk, uuid: str, name: str, since_us: int, level: object) -> None:
@@ -131,7 +132,7 @@ class Follower:
         self._places = talk.places.get(uuid, {})
 
     async def run(self) -> None:
-        """Send until there is nothing more to come, then close a connection that only follows."""
+        """Send everything, then close a connection that has no other purpose."""
         scope = self._talk.scope
         first = min([self._since, *self._places.values()])[0]
         matches = [*scope_matches(scope, self._name), f"DORA_DATAFLOW={self._uuid}"]

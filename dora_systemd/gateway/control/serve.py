@@ -1,8 +1,8 @@
-"""/api/control of the gateway: dora's control protocol, so that the stock dora command works here.
+"""/api/control of the gateway: dora's control protocol, for the dora command.
 
-It looks like one coordinator that has all dataflows of a scope. What systemd, the journal and the
-node tables know is answered from there, the rest by the coordinator of the dataflow that is meant,
-and what would go around the supervisor is refused.
+To the dora command it is one coordinator with all dataflows of a scope. The gateway answers from
+systemd, the journal and the node tables where they suffice, and forwards other requests to the
+coordinator of the dataflow. It refuses requests that would bypass the supervisor.
 """
 
 import asyncio
@@ -37,17 +37,17 @@ Task = asyncio.Task[None]
 
 _LOOPBACK = "127.0.0.1"
 _AT_ONCE = 8
-"""Requests of one connection that are answered at the same time."""
+"""Requests of one connection that run in parallel."""
 _LONGEST = 500
 _BY_FILE = "edit its file, then run: doractl reload NAME"
 _OWN = "doractl dora NAME -- {} asks the coordinator of one dataflow"
 
 
 async def serve_control(socket: Socket, request: HttpRequest) -> None:
-    """Answer one dora command until it goes; what it has asked for then is still done.
+    """Serve one dora command until it disconnects; requests in progress still complete.
 
-    One request does not wait for the one before it, which a coordinator's would: a start may take
-    long, and that nobody waits for it any more is seen by reading on.
+    Requests run in parallel, unlike in a coordinator: a start can take long, and only a further
+    read shows that the command has disconnected.
     """
     talk, pending = Talk(socket, request.scope), set[Task]()
     try:
@@ -64,7 +64,7 @@ async def serve_control(socket: Socket, request: HttpRequest) -> None:
 
 
 def _forget(task: Task) -> None:
-    """There is nobody any more to whom the error, of the connection, could be told."""
+    """Take the error of a closed connection: there is nowhere to report it."""
     if not task.cancelled():
         task.exception()
 
@@ -91,7 +91,7 @@ async def _result(talk: Talk, request: Request) -> Result:
     except DoraSystemdError as error:
         return error_result(error)
     except Exception as error:
-        # What is sent can be wrong in more ways than are checked; once gone, nobody gets this.
+        # No check covers all wrong requests; without a reply the dora command would wait forever.
         log.info("cannot answer %s: %s: %s", request.name, type(error).__name__, error)
         return error_result(DoraSystemdError(f"cannot do {request.name}: {error}"[:_LONGEST]))
 
@@ -106,7 +106,7 @@ async def _same_machine(_talk: Talk, _request: Request) -> Result:
 
 
 async def _daemon_connected(_talk: Talk, _request: Request) -> Result:
-    return {"DaemonConnected": True}  # systemd is there, and starts one for each dataflow
+    return {"DaemonConnected": True}  # systemd starts a daemon for each dataflow
 
 
 def _about_all(ask: Callable[[Scope], Mapping[str, Any]]) -> Handler:
@@ -171,4 +171,4 @@ REFUSED: dict[str, tuple[str, str]] = {
         ("cannot change a supervised dataflow except through its file", _BY_FILE),
     ),
 }
-"""Message and hint for what is not offered here."""
+"""Message and hint for requests that the gateway does not support."""

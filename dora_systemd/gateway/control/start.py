@@ -1,4 +1,4 @@
-"""Start of dora's protocol: the file that was meant becomes a supervised unit, as by doractl."""
+"""Start of dora's protocol: finds the file of the descriptor, and starts it as doractl does."""
 
 import asyncio
 import os
@@ -34,14 +34,14 @@ _POLL_SECONDS = 0.1
 
 @dataclass(frozen=True)
 class Match:
-    """A file that gives what was sent, when it is started with these flags."""
+    """A file that yields the descriptor that was sent, if it is started with these flags."""
 
     path: Path
     flags: Mapping[str, object]
 
 
 async def start(talk: Talk, request: Request) -> dict[str, Any]:
-    """Start: answered when systemd has been told to. Raises DoraSystemdError."""
+    """Start: replies once systemd has queued the job. Raises DoraSystemdError."""
     began = time.time_ns() // 1000
     uuid = await asyncio.to_thread(_start, talk.scope, request)
     talk.started[uuid] = began
@@ -49,7 +49,7 @@ async def start(talk: Talk, request: Request) -> dict[str, Any]:
 
 
 async def wait_for_spawn(talk: Talk, request: Request) -> Result:
-    """WaitForSpawn: answered when all nodes are ready. Raises DoraSystemdError."""
+    """WaitForSpawn: replies once all nodes are ready. Raises DoraSystemdError."""
     while (answer := await asyncio.to_thread(spawned, talk.scope, request.dataflow)) is None:
         if talk.is_over:
             return None
@@ -71,7 +71,7 @@ def _start(scope: Scope, request: Request) -> str:
 
 
 def find_file(scope: Scope, request: Request) -> Match:
-    """The one file that is meant. Raises DoraSystemdError when there is none, or several."""
+    """The one matching file. Raises DoraSystemdError if there is none, or several."""
     directory, sent = Path(request.text("local_working_dir")), request.body.get("dataflow")
     if not isinstance(sent, dict):
         raise DoraSystemdError("cannot start: no dataflow was sent", "", ExitCode.BAD_INPUT)
@@ -117,7 +117,7 @@ def _text(path: Path) -> str:
 
 
 def _match(scope: Scope, path: Path, request: Request, sent: Mapping[str, Any]) -> Match | None:
-    # What dora makes of the file only dora knows: that of its user, in a unit like the dataflow's.
+    # Only dora can expand the file: run the user's dora, in a unit like that of the dataflow.
     plan = make_plan(scope, StartRequest(str(path), None, {}, os.environ))
     done = run_beside(lambda: Bus(scope), plan, [plan.options.dora, "expand", str(path)])
     if done.status:
@@ -132,6 +132,6 @@ def _match(scope: Scope, path: Path, request: Request, sent: Mapping[str, Any]) 
 
 
 def _session(path: Path) -> object:
-    """The id that the dora command sends for this file."""
+    """The session id that the dora command sends for this file."""
     document = _read(Path(session_path(str(path))))
     return document.get("session_id") if isinstance(document, dict) else None

@@ -1,4 +1,4 @@
-"""What dora's requests ask about dataflows, from systemd, the journal and the node tables."""
+"""Answers dora's requests about dataflows from systemd, the journal and the node tables."""
 
 import time
 from contextlib import suppress
@@ -30,20 +30,20 @@ from dora_systemd.verbs.follow import is_unit_up
 from dora_systemd.verbs.why import explain
 
 _MOST_ENDED = 20
-"""How many dataflows that have ended long ago dora list shows."""
+"""Maximum number of dataflows that ended earlier in `dora list`."""
 _FRESH_SECONDS = 5.0
 """For which the journal's answer about ended dataflows is good, at most."""
 
 
 def list_dataflows(scope: Scope) -> dict[str, Any]:
-    """What runs, what has failed, and what ended last."""
+    """What is running, what has failed, and what ended last."""
     rows = tuple(map(_row, read_cells(Bus(scope))))
     return dataflow_list([*rows, *_ended(scope, rows, int(time.monotonic() / _FRESH_SECONDS))])
 
 
 @lru_cache(maxsize=1)
 def _ended(scope: Scope, rows: tuple[DataflowRow, ...], _period: int) -> tuple[DataflowRow, ...]:
-    """The newest that ended; the journal is not asked again while systemd says the same."""
+    """The dataflows that ended last; reads the journal again only if systemd reports changes."""
     return tuple(ended_rows(scope, rows)[:_MOST_ENDED])
 
 
@@ -53,24 +53,25 @@ def _row(cell: Cell) -> DataflowRow:
 
 
 def list_nodes(scope: Scope) -> dict[str, Any]:
-    """All nodes of all dataflows that run, with what they use."""
+    """All nodes of all running dataflows, with their resource usage."""
     return node_list(read_rows(Bus(scope), scope))
 
 
 def list_daemons(scope: Scope) -> dict[str, Any]:
-    """The daemons of what runs."""
+    """The daemons of all running dataflows."""
     return daemon_list(cell.uuid for cell in read_cells(Bus(scope)) if cell.is_up)
 
 
 def written_descriptor(cell: Cell) -> dict[str, Any]:
-    """The descriptor as its file has it, modules as they are. Raises DoraSystemdError."""
+    """The descriptor as its file has it, with modules unexpanded. Raises DoraSystemdError."""
     return dict(written_dataflow(cell.options.dataflow).raw)
 
 
 def ended_descriptor(scope: Scope, uuid: str) -> tuple[str, dict[str, Any]]:
-    """Name and descriptor of a dataflow that has no coordinator (any more).
+    """Name and descriptor of a dataflow without a coordinator.
 
-    Of one that systemd has forgotten the journal knows the nodes. Raises DoraSystemdError.
+    If systemd has forgotten the dataflow, the nodes are those in the journal. Raises
+    DoraSystemdError.
     """
     cell = find_if_loaded(scope, uuid)
     if cell is not None:
@@ -81,7 +82,7 @@ def ended_descriptor(scope: Scope, uuid: str) -> tuple[str, dict[str, Any]]:
 
 
 def find_name(scope: Scope, uuid: str) -> str:
-    """The name of a dataflow that runs or ever ran. Raises DoraSystemdError (NOT_FOUND)."""
+    """The name of a dataflow that is running or ever ran. Raises DoraSystemdError (NOT_FOUND)."""
     cell = find_if_loaded(scope, uuid)
     name = cell.name if cell else JournalReader().name_of(uuid)
     return name or find_by_uuid(scope, uuid).name
@@ -96,7 +97,7 @@ def check(scope: Scope, uuid: str) -> dict[str, Any]:
 
 
 def ended_result(scope: Scope, uuid: str) -> dict[str, Any]:
-    """How a dataflow has ended, with its node's last words. Raises DoraSystemdError."""
+    """How a dataflow has ended, with the last lines of the node. Raises DoraSystemdError."""
     report = explain(Bus(scope), scope, uuid, JournalReader())
     failed = report.verdict.status == FAILED
     failures = {report.verdict.node or report.subject.name: _account(report)} if failed else {}
@@ -111,7 +112,7 @@ def _account(report: Report) -> str:
 
 
 def spawned(scope: Scope, uuid: str) -> dict[str, Any] | None:
-    """The answer to WaitForSpawn, None while all nodes are not ready yet.
+    """The reply to WaitForSpawn, None while nodes are not ready.
 
     Raises DoraSystemdError for a start that failed.
     """
@@ -133,7 +134,7 @@ def spawned(scope: Scope, uuid: str) -> dict[str, Any] | None:
 
 
 def _over(scope: Scope, uuid: str) -> dict[str, Any]:
-    """The dora command knows by these words that a dataflow has ended as soon as it had started."""
+    """The reply that tells the dora command that the dataflow ended right after its start."""
     word = explain(Bus(scope), scope, uuid, JournalReader()).verdict.status
     if word == FINISHED:
         return {"Error": f"unknown dataflow {uuid}: it has finished already"}

@@ -1,4 +1,4 @@
-"""Stop and Restart of dora's protocol: jobs of systemd, with dora's grace duration on top."""
+"""Stop and Restart of dora's protocol: jobs of systemd, bounded by dora's grace duration."""
 
 import asyncio
 import signal
@@ -17,9 +17,9 @@ from dora_systemd.verbs.facts.cells import Cell, find_cell
 from dora_systemd.verbs.stop import Outcome, note_stop, restart_cells, stop_cells
 
 _KILL_FACTOR = 1.5
-"""dora sends SIGTERM after the grace duration, and SIGKILL after half as much again."""
+"""dora sends SIGTERM after the grace duration, and SIGKILL after 1.5 times that."""
 _FORCE_SECONDS = 0.2
-"""For systemd to know that it is to be stopped: a kill before that would count as a failure."""
+"""Time for systemd to begin the stop: a kill before that would count as a failure."""
 
 
 async def stop_uuid(talk: Talk, request: Request) -> dict[str, Any]:
@@ -60,7 +60,7 @@ async def _stop(scope: Scope, cell: Cell, request: Request) -> dict[str, Any]:
     if outcome.problem:
         raise DoraSystemdError(outcome.problem)
     if request.body.get("force"):
-        return stopped(cell.uuid, 0, {})  # it has ended as it was asked to
+        return stopped(cell.uuid, 0, {})  # the stop was requested, so this counts as success
     return await asyncio.to_thread(ended_result, scope, cell.uuid)
 
 
@@ -74,7 +74,7 @@ async def _restart(scope: Scope, cell: Cell, request: Request) -> dict[str, Any]
 async def _within(
     scope: Scope, cell: Cell, request: Request, act: Callable[[], Outcome]
 ) -> Outcome:
-    """Do it, and kill what is left of this life of the unit when the request's patience is over."""
+    """Run `act`, and kill this run of the unit after the grace duration of the request."""
     task = asyncio.ensure_future(asyncio.to_thread(act))
     seconds = _patience(request)
     if seconds is not None and cell.is_up:

@@ -1,4 +1,4 @@
-"""One conversation with a dora command: what is remembered while its connection is open."""
+"""The state of one connection of a dora command, kept while the connection is open."""
 
 import asyncio
 from collections.abc import Coroutine, Mapping
@@ -14,22 +14,21 @@ from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell, read_cells
 
 Place = tuple[int, int]
-"""Where in the journal a record is: CLOCK_REALTIME in µs, and its number."""
+"""The position of a record in the journal: CLOCK_REALTIME in µs, and a sequence number."""
 
 Task = Coroutine[Any, Any, None]
 
 _MOST_TASKS = 16
-"""As dora's own coordinator has it for topics; each log that is followed is a journalctl."""
+"""The limit of dora's own coordinator for topics; here each followed log is a journalctl too."""
 
 
 @dataclass
 class Talk:
-    """The state of one connection; it ends with it, and nothing else has any.
+    """The state of one connection. No other connection shares it.
 
-    started: by UUID, when this connection has started a dataflow, CLOCK_REALTIME µs.
-    places: by UUID and node, up to where its log has been sent.
-    topics: by id of the subscription, the connection that they come from.
-    is_over: the other side has gone.
+    started: CLOCK_REALTIME µs by UUID, for dataflows that this connection has started. places: by
+    UUID and node, up to where the log has been sent. topics: by subscription id, the connection
+    that delivers it. is_over: the client has disconnected.
     """
 
     socket: Socket
@@ -42,9 +41,9 @@ class Talk:
     _running: set["asyncio.Task[None]"] = field(default_factory=set)
 
     def after_reply(self, task: Task) -> None:
-        """Run `task` once the request at hand has been answered, as long as there is somebody.
+        """Run `task` after the reply to the current request, while the client is connected.
 
-        Raises DoraSystemdError for one too many.
+        Raises DoraSystemdError if there are too many tasks.
         """
         if len(self._running) >= _MOST_TASKS:
             task.close()
@@ -52,7 +51,7 @@ class Talk:
         self._next.append(task)
 
     def begin_tasks(self) -> None:
-        """The request at hand has been answered."""
+        """Start the tasks: the current request has been answered."""
         for one in self._next:
             task = asyncio.ensure_future(one)
             self._running.add(task)
@@ -60,7 +59,7 @@ class Talk:
         self._next.clear()
 
     async def end(self) -> None:
-        """The other side has gone: end all that was done for it."""
+        """The client has disconnected: end all of its tasks."""
         self.is_over = True
         for one in self._next:
             one.close()
@@ -71,7 +70,7 @@ class Talk:
 
 
 def find_by_uuid(scope: Scope, uuid: str) -> Cell:
-    """The dataflow that systemd knows by this UUID. Raises DoraSystemdError (NOT_FOUND)."""
+    """The dataflow with this UUID that systemd has loaded. Raises DoraSystemdError (NOT_FOUND)."""
     for cell in read_cells(Bus(scope, for_reading=True)):
         if cell.uuid == uuid:
             return cell
@@ -83,11 +82,11 @@ def find_by_uuid(scope: Scope, uuid: str) -> Cell:
 
 
 def find_if_loaded(scope: Scope, uuid: str) -> Cell | None:
-    """The same, or None for one that systemd has forgotten."""
+    """The dataflow with this UUID, or None if systemd has not loaded it."""
     with suppress(DoraSystemdError):
         return find_by_uuid(scope, uuid)
     return None
 
 
 Result = str | Mapping[str, Any] | None
-"""What is answered; None: the handler has answered by itself."""
+"""The result to send; None: the handler has replied itself."""

@@ -1,4 +1,4 @@
-"""What the buttons of the status page do, and where its drawing of a dataflow comes from."""
+"""The actions of the status page's buttons, and the data of its graph of a dataflow."""
 
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ _BY = "status page"
 
 
 def act(scope: Scope, message: PageMessage) -> str:
-    """Stop or restart a dataflow, or one node of it, and say what was done.
+    """Stop or restart a dataflow, or one of its nodes; what was done, for the page.
 
     Raises DoraSystemdError as the verbs of doractl do.
     """
@@ -40,9 +40,9 @@ def act(scope: Scope, message: PageMessage) -> str:
 
 
 def read_graph(scope: Scope, uuid: str) -> dict[str, Any]:
-    """Nodes and edges of a dataflow. Raises DoraSystemdError where its descriptor is out of reach.
+    """Nodes and edges of a dataflow. Raises DoraSystemdError if there is no readable descriptor.
 
-    Dora's own copy is what runs, modules and all; the file may have changed since.
+    dora's own copy is what runs, with modules expanded; the file may have changed since the start.
     """
     cell = find_cell(Bus(scope), uuid)
     return graph_values(parse_dataflow(_read_descriptor(scope, cell), cell.options.dataflow))
@@ -56,7 +56,7 @@ def _read_descriptor(scope: Scope, cell: Cell) -> object:
             if isinstance(reply.result, dict) and not reply.error:
                 return reply.result["DataflowInfo"]["descriptor"]
         except (DoraSystemdError, KeyError, TypeError):
-            # It may just be ending.
+            # the dataflow may be ending at this moment
             pass
     path = Path(cell.options.dataflow)
     return parse_yaml(read_file(path).data.decode("utf-8-sig", "replace"), path)

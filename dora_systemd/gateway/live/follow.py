@@ -1,4 +1,4 @@
-"""What nodes write, for a page: a little at a time, and never more than it can show."""
+"""Streams the lines of nodes to a page in batches, and limits their number."""
 
 import asyncio
 from collections import deque
@@ -15,9 +15,9 @@ from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import find_cell
 
 FIRST_LINES = 200
-"""How far back a page sees when it begins to follow."""
+"""Number of older lines that a page gets first."""
 MAX_LINES = 400
-"""Of one message: a node may write more in that time than anybody reads."""
+"""Maximum lines in one message: a node can write more than anyone can read."""
 PAUSE_SECONDS = 0.2
 _CHUNK = 1 << 17
 
@@ -27,9 +27,9 @@ Lines = list[dict[str, Any]]
 async def follow_lines(
     scope: Scope, message: PageMessage
 ) -> AsyncGenerator[tuple[Lines, int], None]:
-    """Lines as they come, and how many of those before them were too many to be sent.
+    """New lines in batches, and how many lines before each batch were left out.
 
-    Raises DoraSystemdError when the dataflow is not there or the journal is closed to us.
+    Raises DoraSystemdError if the dataflow does not exist or the journal is not readable.
     """
     query = await asyncio.to_thread(_query, scope, message)
     arguments = [f"--output-fields={LOG_FIELDS}", *query_arguments(query)]
@@ -42,7 +42,7 @@ async def follow_lines(
 
 
 async def _batches(stream: asyncio.StreamReader) -> AsyncIterator[tuple[Lines, int]]:
-    """What comes in PAUSE_SECONDS as one, as long as anything comes."""
+    """Batches of the lines of PAUSE_SECONDS each, until the stream ends."""
     newest: deque[dict[str, bytes]] = deque(maxlen=MAX_LINES)
     reader = ExportReader()
     while data := await stream.read(_CHUNK):
@@ -72,7 +72,7 @@ def _query(scope: Scope, message: PageMessage) -> LogQuery:
 
 
 async def _read_until(stream: asyncio.StreamReader, until: float) -> bytes:
-    """What comes up to that time of the loop, nothing when nothing does."""
+    """The bytes that arrive up to that time of the loop, or b""."""
     try:
         async with asyncio.timeout_at(until):
             return await stream.read(_CHUNK)

@@ -1,4 +1,4 @@
-"""/api/live: what the status page is told and asks for, in the words of page_messages.py."""
+"""/api/live: the WebSocket of the status page; page_messages.py defines its messages."""
 
 import asyncio
 import json
@@ -21,18 +21,18 @@ from dora_systemd.verbs.facts.snapshot import read_snapshot
 
 INTERVAL_SECONDS = 2.0
 SEND_SECONDS = 10.0
-"""A page that takes nothing for so long is given up, instead of being written to without end."""
+"""Close the connection of a page that accepts no data for this long; others would queue forever."""
 MAX_TASKS = 8
-"""Questions and actions of one page at a time."""
+"""Maximum parallel questions and actions of one page."""
 
 
 async def talk(socket: Socket, request: Request) -> None:
-    """One page from its beginning to its end."""
+    """Serve one page until it disconnects."""
     page = _Page(socket, request.scope)
     jobs = {asyncio.ensure_future(page.show()), asyncio.ensure_future(page.listen())}
     try:
         done, _ = await asyncio.wait(jobs, return_when=asyncio.FIRST_COMPLETED)
-        with suppress(TimeoutError):  # given up
+        with suppress(TimeoutError):  # the page takes no data
             for job in done:
                 job.result()
     finally:
@@ -46,7 +46,7 @@ async def _end(tasks: set["asyncio.Task[None]"]) -> None:
 
 
 class _Page:
-    """A page in somebody's browser."""
+    """One page in a browser."""
 
     def __init__(self, socket: Socket, scope: Scope) -> None:
         self._socket = socket
@@ -56,7 +56,7 @@ class _Page:
         self.tasks: set[asyncio.Task[None]] = set()
 
     async def show(self) -> None:
-        """Send snapshots for ever."""
+        """Send snapshots, forever."""
         await self._send(type="hello", **_greeting(self._scope))
         while True:
             self._is_due.clear()
@@ -65,7 +65,7 @@ class _Page:
                 await asyncio.wait_for(self._is_due.wait(), INTERVAL_SECONDS)
 
     async def listen(self) -> None:
-        """Do what the page asks for, until it goes."""
+        """Handle the messages of the page until it disconnects."""
         async for text in self._socket:
             try:
                 self._take(parse_message(text))
@@ -97,7 +97,7 @@ class _Page:
     def _done(self, task: "asyncio.Task[None]") -> None:
         self.tasks.discard(task)
         if not task.cancelled():
-            # A page that has gone; listen() learns the same.
+            # The page has disconnected; listen() notices that too.
             task.exception()
 
     async def _send_snapshot(self) -> None:

@@ -1,4 +1,4 @@
-"""How a cell begins: its group and its coordinator. Imports nothing that takes time."""
+"""Starts a cell: its cgroup and its coordinator. Imports only what loads quickly."""
 
 import sys
 from collections.abc import Mapping
@@ -12,15 +12,15 @@ OPENSSL = ("ssl", "_ssl", "_hashlib")
 
 
 def leave_out_openssl() -> None:
-    """Let the standard library do without OpenSSL, as it does where Python is built without.
+    """Make the standard library work without OpenSSL, as in a Python built without it.
 
-    A cell speaks over loopback and Unix sockets only, and OpenSSL would be a fifth of its memory.
+    A cell uses only loopback and Unix sockets, and OpenSSL would take a fifth of its memory.
     """
     sys.modules.update(dict.fromkeys(OPENSSL))  # type: ignore[arg-type]
 
 
 def let_openssl_in() -> None:
-    """Undo it, for a library that asks for it by name."""
+    """Undo leave_out_openssl(), for a library that imports ssl."""
     for name in OPENSSL:
         if name in sys.modules and sys.modules[name] is None:
             del sys.modules[name]
@@ -29,7 +29,7 @@ def let_openssl_in() -> None:
 def enter_supervisor() -> Path:
     """The cgroup directory of the unit, with this process in its group `supervisor`.
 
-    DelegateSubgroup= puts it there; systemd before 254 does not have that. Raises OSError.
+    DelegateSubgroup= does this, but systemd before 254 does not have it. Raises OSError.
     """
     own = cgroup.group_path(cgroup.own_group())
     if own.name == cgroup.SUPERVISOR:

@@ -1,4 +1,4 @@
-"""The one clock of a stop, which is handed down to all that takes time at the end."""
+"""The clock of a stop: every step at the end asks it how long it may take."""
 
 import time
 from collections.abc import Callable
@@ -8,14 +8,14 @@ from dora_systemd.values import INFINITY, SECOND
 
 STOP_SECONDS = 7.0
 BACKLOG_SECONDS = 60.0
-"""How long journald may take for what the nodes have left to say, when somebody waits for a stop,
-and when nobody does."""
+"""Timeouts for journald to take what the nodes have written: when a stop was requested, and when
+none was."""
 
 
 class StopClock:
-    """Runs from the first stop on. grace: of the dataflow, µs.
+    """Starts with the first stop request. grace: of the dataflow, µs.
 
-    by: who asked for the stop, or "".
+    by: what requested the stop, or "".
     """
 
     def __init__(self, grace: int, now: Callable[[], float] = time.monotonic) -> None:
@@ -25,19 +25,19 @@ class StopClock:
         self.by = ""
 
     def begin(self, by: str) -> None:
-        """The cell is asked to stop; only the first time counts."""
+        """Start the clock; only the first call counts."""
         if not self.by:
             self._began, self.by = self._now(), by
 
     def left(self, most: float) -> float:
-        """Seconds that something may take which would take `most`."""
+        """Seconds left for a step that may take at most `most` seconds."""
         timeout = runner_timeout(self._grace)
         if self.by and timeout != INFINITY:
             most = min(most, self._began + timeout / SECOND - self._now())
         return max(most, 0.0)
 
     def for_journal(self) -> Callable[[], float]:
-        """How long journald may still take, from now on: less as soon as a stop is asked for."""
+        """A function for the seconds that journald may still take; a stop request shortens them."""
         begin = self._now()
 
         def left() -> float:

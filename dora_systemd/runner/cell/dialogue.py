@@ -1,4 +1,8 @@
-"""What the runner asks dora and hears from it: the actions of dora_systemd.decisions.life.table."""
+"""Talks to dora for the runner: carries out the actions of decisions/life/table.py.
+
+Each action is a request to the coordinator, or a signal to one of dora's processes. Its answer
+becomes an event of the pump, and so does every exception.
+"""
 
 import asyncio
 from collections.abc import Callable, Coroutine, Mapping
@@ -19,8 +23,8 @@ from dora_systemd.values import SECOND
 
 _LISTENING = "Listening on port "
 _SETTLE_SECONDS = 0.02
-"""`systemctl kill` signals all of the cell at once: let our own signal be heard before the news
-that a child died of it."""
+"""`systemctl kill` signals all processes of the cell at once. The pump must see the runner's own
+signal before the exit of a child that the same signal has killed."""
 _AGAIN_SECONDS = 0.02
 _QUIET_SECONDS = 0.1
 _LONG_SECONDS = 3600.0 * 24 * 365
@@ -48,7 +52,10 @@ class Dialogue:
     def actions(
         self, descriptor: Mapping[str, Any], variables: Mapping[str, str]
     ) -> dict[Do, Callable[[], None]]:
-        """What each Do does. variables: what the daemon's environment has besides the nodes'."""
+        """The function for each Do.
+
+        variables: what the daemon's environment has besides the nodes'.
+        """
         return {
             Do.START_DAEMON: lambda: self._start_daemon(variables),
             Do.SEND_START: lambda: self._ask(Do.SEND_START, self._send_start(descriptor)),
@@ -65,9 +72,9 @@ class Dialogue:
         self.spawn(what.value, work)
 
     def spawn(self, what: str, work: Coroutine[Any, Any, None]) -> None:
-        """Run `work` beside all else; what it cannot do ends the cell.
+        """Run `work` as a task; an exception in it ends the cell.
 
-        what: what it does, as after "could not".
+        what: what it does, as in "could not ...".
         """
         task = self._loop.create_task(self._guard(what, work))
         self._tasks.add(task)
@@ -82,17 +89,17 @@ class Dialogue:
         except Exception as error:
             event = failed(what, error)
         if event is not None:
-            # While a child is dying, its end says more than what its connection suffers.
+            # If a child is exiting, let ChildExited come first: it explains a lost connection.
             await asyncio.sleep(_SETTLE_SECONDS)
             self._pump.push(event)
 
     def cancel(self) -> None:
-        """Give up all that is still asked."""
+        """Cancel all pending requests."""
         for task in self._tasks:
             task.cancel()
 
     def watch(self, child: engine.Child, on_line: Callable[[str], None] | None = None) -> None:
-        """Read a child's output and hear of its end."""
+        """Read the output of a child process, and report its exit."""
         self._pipes.add_output(child.label, child.output, on_line)
         engine.watch(self._loop, child, self._child_exited)
 
@@ -102,7 +109,7 @@ class Dialogue:
         self._loop.call_later(_SETTLE_SECONDS, self._pump.push, event)
 
     def read_coordinator(self, line: str) -> None:
-        """A line that the coordinator printed: one of them tells its port."""
+        """Handle a line that the coordinator printed; one of them has its port."""
         if line.startswith(_LISTENING) and self._pump.cell.state is State.BOOTING:
             self._engine.set_port(int(line.removeprefix(_LISTENING)))
             self._pump.push(life.CoordinatorListening(now_us()))
@@ -130,7 +137,7 @@ class Dialogue:
             self._pump.push(life.Subscribed(now_us()))
 
         await self._engine.read_events(self._pump.cell.run, subscribed, self._hear)
-        await asyncio.sleep(2 * _SETTLE_SECONDS)  # after the coordinator's own end, if it is that
+        await asyncio.sleep(2 * _SETTLE_SECONDS)  # let ChildExited of the coordinator come first
         self._pump.push(life.ConnectionLost(now_us()))
 
     def _hear(self, record: protocol.LogRecord) -> None:
@@ -162,26 +169,26 @@ class Dialogue:
             if results is not None:
                 return self._pump.push(life.ResultKnown(now_us(), results))
             if self._pump.cell.state is not State.CLOSING:
-                return None  # it runs: that was the question
+                return None  # the run goes on, which answers ASK_RESULT in WAITING
             await asyncio.sleep(_AGAIN_SECONDS)
 
     async def _ask_stop(self) -> None:
         self._nodes.let_go()
         cell = self._pump.cell
         seconds = stop_timeout(cell.grace) / SECOND
-        # A refusal means that nothing of the run is left; a Stop without an answer is known to
-        # happen, and the deadline of the state is for that.
+        # A refusal means that dora has ended the run already. Stop sometimes gets no answer at all:
+        # the deadline of the state covers that.
         await self._engine.ask_apart(protocol.stop_params(cell.run, cell.grace), seconds)
         self._pump.push(life.StopAnswered(now_us()))
 
     def _dismiss_daemon(self) -> None:
         self._nodes.let_go()
-        # What the two say about each other's end is no news.
+        # Their messages about each other's exit would be noise.
         self._pipes.mute("coordinator", "daemon")
         self._ask(Do.DISMISS_DAEMON, self._dismiss_when_quiet())
 
     async def _dismiss_when_quiet(self) -> None:
-        # The daemon writes what its nodes said last after the news that they have ended.
+        # The daemon writes the last output of its nodes after it has reported their exit.
         await self._nodes.wait_quiet(_QUIET_SECONDS)
         if not self._engine.dismiss_daemon():
             self._pump.push(life.ChildExited(now_us(), "daemon", "earlier"))
@@ -210,7 +217,7 @@ class Dialogue:
                     self._pump.push(life.ConnectionLost(now_us(), silent, reason))
 
     async def take_samples(self, seconds: float) -> None:
-        """Every `seconds`: CPU time used so far."""
+        """Every `seconds`: sample the CPU time used so far."""
         while True:
             self._pump.sample()
             await asyncio.sleep(seconds)

@@ -1,4 +1,4 @@
-"""The runner's side of dora: its two children and the connections to the coordinator."""
+"""The runner's side of dora: its two processes, and the connections to the coordinator."""
 
 import asyncio
 import json
@@ -15,21 +15,23 @@ from dora_systemd.runner.cell.begin import start_coordinator
 from dora_systemd.values import SECOND
 
 POLL_SECONDS = 0.002
-"""Between two questions whether the daemon has registered: dora tells it by no event."""
+"""Poll interval while the daemon registers: dora sends no event for that."""
 
 KILL_SECONDS = 0.5
-"""What SIGKILL may take; what sleeps in the kernel and takes longer is left to systemd."""
+"""Time for SIGKILL to take effect; systemd deals with a process that sleeps in the kernel longer.
+"""
 
 SILENCE = 20
-"""Seconds without a word of the daemon after which it hangs; it sends a heartbeat every 5."""
+"""Seconds without a heartbeat of the daemon, after which it counts as hung; it sends one every 5 s.
+"""
 
 OnRecord = Callable[[protocol.LogRecord], None]
 
 
 class Engine:
-    """Coordinator and daemon of a cell, and how they are asked.
+    """The coordinator and daemon of a cell, and requests to them.
 
-    environment: of the nodes, without what is systemd's.
+    environment: that of the nodes, without systemd's own variables.
     """
 
     def __init__(self, dora: str, paths: CellPaths, environment: Mapping[str, str]) -> None:
@@ -43,18 +45,18 @@ class Engine:
         self._token = ""
 
     def start_coordinator(self, early: engine.Child | None = None) -> engine.Child:
-        """Start the coordinator, unless `early` is there; it prints its port. Raises OSError."""
+        """Start the coordinator, unless `early` is one; it prints its port. Raises OSError."""
         child = early or start_coordinator(self._dora, self._paths, self._environment)
         self._children[child.label] = child
         return child
 
     def set_port(self, port: int) -> None:
-        """The coordinator listens on `port`; its token is in its directory by now. OSError."""
+        """Set the port of the coordinator, which has written its token by now. Raises OSError."""
         self._port = port
         self._token = (self._paths.coordinator / ".dora-token").read_text().strip()
 
     def start_daemon(self, added: Mapping[str, str]) -> engine.Child:
-        """Start the daemon with `added` variables, and say where the cell is reached. OSError."""
+        """Start the daemon with `added` variables, and write the control file. Raises OSError."""
         listen = engine.free_port()
         access = {"port": self._port, "token": self._token, "local_listen_port": listen}
         files.write_atomic(self._paths.control, json.dumps(access), 0o600)
@@ -65,7 +67,7 @@ class Engine:
         return daemon
 
     async def wait_joined(self) -> None:
-        """Return once the daemon has registered with the coordinator."""
+        """Connect to the coordinator, and return once the daemon has registered."""
         self._requests = await self.connect()
         while not await self.is_joined():
             await asyncio.sleep(POLL_SECONDS)
@@ -76,10 +78,10 @@ class Engine:
         return bool(protocol.result_of(reply, "DaemonConnected"))
 
     async def find_silent(self, seconds: float) -> str:
-        """The one of the two that hangs, or "": they were heard of just now.
+        """The process that hangs, "coordinator" or "daemon", or "" if both respond.
 
-        seconds: how long the coordinator may take to answer. It does not ask the daemon: that would
-        keep it from answering anybody else for 30 s.
+        seconds: timeout for the coordinator's answer. The request does not involve the daemon: dora
+        would then keep the coordinator from answering anything else for 30 s.
         """
         try:
             async with asyncio.timeout(seconds):
@@ -89,13 +91,13 @@ class Engine:
         return "" if protocol.parse_heartbeat(reply) <= SILENCE * SECOND else "daemon"
 
     async def ask(self, params: protocol.Params) -> protocol.Reply:
-        """One request that dora answers at once."""
+        """Send a request that dora answers at once."""
         assert self._requests is not None
         async with self._lock:
             return await self._requests.request(params)
 
     async def ask_apart(self, params: protocol.Params, seconds: float) -> protocol.Reply:
-        """One request that may take long, on its own connection: each one answers in turn."""
+        """Send a request that may take long, on its own connection, because each is serial."""
         connection = await self.connect()
         try:
             return await connection.request(params, seconds)
@@ -103,7 +105,7 @@ class Engine:
             await connection.close()
 
     async def connect(self) -> control.Connection:
-        """A new connection."""
+        """Open a new connection to the coordinator."""
         return await control.Connection.open(self._port, self._token)
 
     async def start_run(self, descriptor: Mapping[str, Any], name: str) -> str:
@@ -115,7 +117,7 @@ class Engine:
     async def read_events(
         self, run: str, on_start: Callable[[], None], on_record: OnRecord
     ) -> None:
-        """Subscribe to the events of a run, tell on_start, and give them on until the end."""
+        """Subscribe to a run, call on_start, and pass its events to on_record until the end."""
         connection = await self.connect()
         try:
             reply = await connection.request(protocol.subscribe_params(run))
@@ -127,17 +129,17 @@ class Engine:
             connection.abort()
 
     def dismiss_daemon(self) -> bool:
-        """Let the daemon end in good order; False when it already has."""
+        """Have the daemon exit properly; False if it has exited already."""
         daemon = self._children.get("daemon")
         if daemon is None or daemon.popen.returncode is not None:
             return False
-        # SIGTERM would kill it where it stands; on SIGINT it cleans up, in half the time that
-        # the protocol's Destroy takes.
+        # SIGTERM would kill the daemon at once. On SIGINT it cleans up, in half the time of the
+        # protocol's Destroy.
         daemon.send_signal(signal.SIGINT)
         return True
 
     def kill(self) -> None:
-        """SIGKILL to what is left of the two, and reap; the connection goes, too."""
+        """Kill and reap coordinator and daemon, and close the connection."""
         if self._requests is not None:
             self._requests.abort()
         for child in self._children.values():

@@ -1,4 +1,4 @@
-"""What becomes of an exception in the runner: an event that ends the cell, never a deaf runner."""
+"""Turns every exception in the runner into an event that ends the cell, so none gets lost."""
 
 import asyncio
 import contextlib
@@ -15,12 +15,12 @@ Push = Callable[[life.Event], None]
 
 
 def failed(what: str, error: Exception) -> life.Failed:
-    """The event. The traceback goes to the journal, for who has to mend it."""
+    """The event for an exception. Prints the traceback to the journal, at debug level."""
     at_us = time.time_ns() // 1000
     if isinstance(error, DoraSystemdError):
         return life.Failed(at_us, what, error.message)
     lines = "".join(traceback.format_exception(error)).splitlines()
-    # A dead journald must not keep anybody from being told.
+    # Report the failure even if journald does not read standard error.
     with contextlib.suppress(OSError, ValueError):
         print("\n".join(f"<7>{line}" for line in lines), file=sys.stderr, flush=True)
     return life.Failed(at_us, what, words(error))
@@ -32,9 +32,9 @@ def words(error: Exception) -> str:
 
 
 class Beside:
-    """What runs beside all runs of the dataflow. An exception there ends the run that there is.
+    """Tasks that outlast the runs of the dataflow. An exception in one ends the current run.
 
-    push: takes the events of that run; between two runs the next one is told.
+    push: takes the events of that run; between two runs the next run gets the event.
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
@@ -45,20 +45,20 @@ class Beside:
         loop.set_exception_handler(self._callback_raised)
 
     def attach(self, push: Push) -> None:
-        """A run begins."""
+        """A run begins: send events to its `push`."""
         self._push = push
         if self._failure is not None:
             push(self._failure)
 
     def spawn(self, what: str, work: Coroutine[Any, Any, None]) -> None:
-        """Run `work` until cancel(). what: what it does, as after "could not"."""
+        """Run `work` until cancel(). what: what it does, as in "could not ..."."""
         self._tasks.append(self._loop.create_task(self._guard(what, work)))
 
     async def _guard(self, what: str, work: Coroutine[Any, Any, None]) -> None:
         try:
             await work
         except Exception as error:
-            # It is missing in the runs that follow, too.
+            # The later runs would lack this task too.
             self._failure = failed(what, error)
             self._tell(self._failure)
 
@@ -67,7 +67,7 @@ class Beside:
             self._push(failure)
 
     def _callback_raised(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-        """What a reader, a timer or a signal handler raises would be lost otherwise."""
+        """Handle an exception of a reader, a timer or a signal handler; asyncio only logs them."""
         error = context.get("exception")
         callback = getattr(context.get("handle"), "_callback", None)
         if callback is None or not isinstance(error, Exception):
@@ -77,6 +77,6 @@ class Beside:
         self._tell(failed(f"finish {name}", error))
 
     def cancel(self) -> None:
-        """Give up all of it."""
+        """Cancel all tasks."""
         for task in self._tasks:
             task.cancel()

@@ -1,9 +1,9 @@
-"""The pause before a restart: it grows with each one, and is short again after a quiet window.
+"""Delays a restart: the delay grows with each restart, until a quiet window resets it.
 
-RestartSteps= of systemd.service(5) counts all restarts since the unit was started: two losses
-with months between them would be no exception. So RestartSec= is the shortest pause, and the runner
-waits for the rest of a longer one before it does anything else. How many lives there were is known
-to systemd, see lives() in dora_systemd.adapters.host.fd_store.
+RestartSteps= of systemd.service(5) counts all restarts since the unit was started, so two failures
+months apart would lengthen the delay. Therefore RestartSec= is the shortest delay, and the runner
+waits for the rest before it does anything else. systemd keeps the number of restarts, see lives()
+in dora_systemd.adapters.host.fd_store.
 """
 
 import contextlib
@@ -19,7 +19,7 @@ _ASK_SECONDS = 5.0
 
 
 def pause(options: RunnerOptions, paths: CellPaths) -> None:
-    """Wait as long as this restart has to; SIGTERM ends the process meanwhile. Raises OSError."""
+    """Wait for the rest of the delay; SIGTERM ends the process meanwhile. Raises OSError."""
     policy = options.restart
     if policy.policy == "no":
         return
@@ -33,7 +33,7 @@ def pause(options: RunnerOptions, paths: CellPaths) -> None:
 
 
 def counted_restarts(name: str, is_user: bool, otherwise: int) -> int:
-    """NRestarts=, which begins anew when somebody resets or restarts the unit."""
+    """NRestarts= of the unit, which a reset or a restart of the unit sets to 0."""
     from dora_systemd.adapters.host import process
     from dora_systemd.errors import DoraSystemdError
 
@@ -45,7 +45,7 @@ def counted_restarts(name: str, is_user: bool, otherwise: int) -> int:
 
 
 def show(uuid: str, paths: CellPaths, seconds: float) -> None:
-    """Say in `systemctl status` and `list` what this waits for."""
+    """Show the remaining delay in `systemctl status` and `list`."""
     from dora_systemd.adapters.host import files, notify
     from dora_systemd.decisions.cell.status import CellStatus
 
@@ -58,8 +58,8 @@ def show(uuid: str, paths: CellPaths, seconds: float) -> None:
 
 
 async def forget_restarts(options: RunnerOptions) -> None:
-    """After a quiet window the next pause is the shortest one."""
-    import asyncio  # takes longer than all else that is needed before the coordinator is started
+    """Reset the delay after a quiet window."""
+    import asyncio  # imported late: it takes longer than everything before the coordinator
 
     if options.restart.policy != "no" and options.restart.window != INFINITY:
         await asyncio.sleep(options.restart.window / SECOND)

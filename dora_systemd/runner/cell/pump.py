@@ -1,4 +1,15 @@
-"""The runner's event pump: events in, the table of decisions/life/, actions out."""
+"""The runner's event pump: it takes events through the table of decisions/life/.
+
+The pump holds the Cell, the whole state of one run. push() passes an event to step(), stores the
+new cell, publishes it (STATUS=, READY=1, the status file that `list` reads), and then performs the
+actions of the step, in their order. A Do calls what connect() was given, mostly a method of
+Dialogue; a Record writes a life event; a Deadline replaces the timer.
+
+The pump relies on the event loop's thread: everything here runs in it and must not block. Actions
+can push events, so push() queues them while it handles another one. Two things would break the
+pump: a change of `cell` outside _step(), and an exception that gets past _guard(). The first
+loses an event's effect; after the second the cell would wait for an event that never comes.
+"""
 
 import asyncio
 import contextlib
@@ -31,7 +42,7 @@ def now_us() -> int:
 
 
 def is_deleted(directory: Path) -> bool:
-    """Whether a directory is gone. One that is mounted here stays, but nothing leads to it."""
+    """Whether a directory is gone: a mounted one still exists here, but with no links."""
     try:
         return directory.stat().st_nlink == 0
     except OSError:
@@ -39,10 +50,10 @@ def is_deleted(directory: Path) -> bool:
 
 
 class Pump:
-    """Holds the cell, moves it by events, and shows what it has become.
+    """Holds the cell, changes it by events, and publishes its state.
 
-    uuid: of the dataflow. What Do means is given by connect(), before the first event.
-    end: how the cell has ended, whatever became of the action EXIT.
+    uuid: of the dataflow. Call connect() before the first push().
+    end: resolves to the exit status, even if the action EXIT fails.
     """
 
     def __init__(
@@ -66,19 +77,19 @@ class Pump:
         self._waiting: list[tuple[Callable[[Cell], bool], asyncio.Future[None]]] = []
 
     def connect(self, actions: Mapping[Do, Callable[[], None]]) -> None:
-        """Say what each Do does."""
+        """Set what each Do does, and start the deadline of the state BOOTING."""
         self._actions = actions
-        self._set_deadline(ENGINE_TIMEOUT)  # until the coordinator listens
+        self._set_deadline(ENGINE_TIMEOUT)
         self._publish()
 
     def push(self, event: life.Event) -> None:
-        """Take one event through the table, then those that its actions cause.
+        """Take one event through the table, then the events that its actions push.
 
-        Raises nothing: what an action raises is the next event, which ends the cell.
+        Raises nothing: an exception of an action becomes the event Failed, which ends the cell.
         """
         self._queue.append(event)
         if self._is_busy:
-            return  # caused by an action: the loop below takes it when that event is done
+            return  # an action pushed it: the loop below takes it after the current event
         self._is_busy = True
         try:
             while self._queue:
@@ -98,7 +109,7 @@ class Pump:
             with self._guard(_name(action)):
                 self._perform(action)
         if self.cell.state is State.ENDED and not self.end.done():
-            self.end.set_result(self.cell.exit)  # EXIT could not do it
+            self.end.set_result(self.cell.exit)  # the action EXIT failed
 
     def _step(self, event: life.Event) -> tuple[Action, ...]:
         try:
@@ -106,7 +117,7 @@ class Pump:
             return actions
         except Exception as error:
             failure = failed(f"handle the event {type(event).__name__}", error)
-        if isinstance(event, life.Failed):  # not even that: this must end all the same
+        if isinstance(event, life.Failed):  # its handler failed too: end without the table
             self.cell = replace(self.cell, state=State.ENDED, exit=RunnerExit.FAILED)
         else:
             self.push(failure)
@@ -135,14 +146,14 @@ class Pump:
 
     def _prepare(self, record: Record) -> None:
         if record.event in END_EVENTS:
-            self._nodes.kill()  # no word of theirs after the last of ours
+            self._nodes.kill()  # so that no line of a node follows the last event
         elif record.node:
             self._nodes.drain([record.node])
         elif record.event == "dataflow-stopping":
             notify.send_stopping()
 
     async def wait(self, is_so: Callable[[Cell], bool], seconds: float | None) -> bool:
-        """Return True as soon as `is_so` holds of the cell, or False after so many seconds."""
+        """Wait until `is_so` holds for the cell; False if it does not within `seconds`."""
         if is_so(self.cell):
             return True
         future: asyncio.Future[None] = self._loop.create_future()
@@ -171,16 +182,16 @@ class Pump:
         if text != self._text:
             self._text = text
             notify.send_status(text)
-        # The table first: who waited for READY=1 may read it at once.
+        # The table comes first: a client that waited for READY=1 may read it at once.
         self._write_table()
         if self.cell.state is State.RUNNING and not self._is_ready:
             self._is_ready = True
             notify.send_ready()
 
     def sample(self) -> None:
-        """Note CPU time used so far, so that `list` can tell CPU% without waiting.
+        """Add a sample of the CPU time used, so that `list` can show CPU% without waiting.
 
-        Says so when CPU time or memory gets short, once the nodes run.
+        While the nodes run, also write events about CPU and memory pressure.
         """
         sample = self._nodes.sample(time.monotonic_ns() // 1000)
         if self.cell.state is State.RUNNING:
@@ -194,13 +205,13 @@ class Pump:
         try:
             files.write_atomic(self._paths.status, table.to_json(), 0o600)
         except DoraSystemdError as error:
-            # Nothing that happens may be lost for it: it is only for `list`.
+            # Only `list` needs the table: the event that is being handled must go on.
             self._report_unwritten(error)
 
     def _report_unwritten(self, error: DoraSystemdError) -> None:
-        """Say once that the table is old; without its directory the cell cannot go on.
+        """Warn once that the table is out of date; end the cell if its directory is gone.
 
-        The pipes of the nodes are there: dora could start none of them again.
+        The directory also has the nodes' pipes: without them dora cannot restart any node.
         """
         if self._is_unwritten:
             return
@@ -213,7 +224,7 @@ class Pump:
 
 
 def _name(action: Action) -> str:
-    """What the action does, as after "could not"."""
+    """What the action does, as in "could not ..."."""
     match action:
         case Do():
             return action.value

@@ -1,4 +1,4 @@
-"""The rooms of a cell: its directories, and what the daemon's environment says of them."""
+"""The directories of a cell, and the variables of the daemon that depend on them."""
 
 import os
 from pathlib import Path
@@ -9,7 +9,7 @@ from dora_systemd.paths import CellPaths
 
 
 def daemon_variables(prepared: Prepared, paths: CellPaths, unit: Path) -> dict[str, str]:
-    """What the daemon's environment has besides the nodes'; launcher.sh takes it out again."""
+    """Variables of the daemon that nodes do not get; launcher.sh removes them."""
     libexec = str(PACKAGE / "libexec")
     own = {"DORA_QUIET": "1", "RUST_BACKTRACE": "0"}
     added = {key: text for key, text in own.items() if key not in os.environ}
@@ -28,6 +28,6 @@ def daemon_variables(prepared: Prepared, paths: CellPaths, unit: Path) -> dict[s
 
 
 def make_directories(paths: CellPaths) -> None:
-    """The rooms of the RuntimeDirectory. Raises OSError."""
+    """Create the directories below the RuntimeDirectory. Raises OSError."""
     for path in (paths.daemon, paths.work, paths.io):
         path.mkdir(mode=0o700, exist_ok=True)

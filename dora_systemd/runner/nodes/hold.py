@@ -1,4 +1,8 @@
-"""Nodes that have to wait for the journal though dora reads their output: their group is frozen."""
+"""Freezes nodes whose output dora's daemon reads, while the journal is behind.
+
+A node with pipes blocks in write(2) instead. The kernel freezes a group by cgroup.freeze, see
+cgroups(7).
+"""
 
 import time
 from collections.abc import Iterator
@@ -10,7 +14,7 @@ from dora_systemd.decisions.cell.log_backlog import Marks
 
 
 class Hold:
-    """Freezes `group`, of one node, while too much of what dora wrote of it is unread."""
+    """Freezes the cgroup of one node while too many bytes of its output are unread."""
 
     def __init__(self, group: Path, marks: Marks) -> None:
         self._group = group
@@ -21,9 +25,9 @@ class Hold:
         self._is_over = False
 
     def look(self, backlog: int) -> None:
-        """So many bytes are unread now.
+        """Freeze or thaw the group for this many unread bytes.
 
-        Where the kernel does not let us freeze, the node runs on, and what is lost is told.
+        If the kernel does not allow freezing, the node keeps running and lost lines are counted.
         """
         now = time.monotonic()
         is_held = self._marks.is_held(self._is_held, now - self._since, backlog)
@@ -34,7 +38,7 @@ class Hold:
 
     @contextmanager
     def paused(self) -> Iterator[None]:
-        """Let the node go meanwhile: it is to hear that another one takes its place."""
+        """Thaw the node meanwhile: it must get dora's message that another process replaces it."""
         self._is_paused = True
         self.look(0)
         try:
@@ -43,6 +47,6 @@ class Hold:
             self._is_paused = False
 
     def end(self) -> None:
-        """Let the node go, for good: it is to hear that it shall stop."""
+        """Thaw the node for good: it must get dora's request to stop."""
         self._is_over = True
         self.look(0)

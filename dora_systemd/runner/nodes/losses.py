@@ -1,8 +1,8 @@
-"""Counts what journald throws away: in user scope its rate limit cannot be lifted.
+"""Counts the entries that journald drops in user scope, where its rate limit cannot be lifted.
 
-All services of a user share one limit (RateLimitBurst= in journald.conf(5)), journald's own notice
-of what it suppressed is in the system's journal, which the user may not read. So what was sent is
-compared with what is there.
+All services of a user share one limit, RateLimitBurst= in journald.conf(5). journald reports what
+it drops in the system journal, which the user may not read. So LossWatch compares the number of
+entries sent with the number stored.
 """
 
 import asyncio
@@ -15,11 +15,11 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import scope_of
 
 CHECK_SECONDS = 30.0
-"""RateLimitIntervalSec= of journald by default."""
+"""The default of RateLimitIntervalSec= of journald."""
 
-# Fewer entries than this cannot have hit a limit: not worth a look.
+# Fewer entries than this cannot exceed a rate limit, so they are not counted.
 WORTH = 1000
-# What may be on its way between the two ends, see BULK_BUFFER of JournalSocket.
+# Entries that may be in the socket at that moment, see BULK_BUFFER of JournalSocket.
 ON_ITS_WAY = 512
 _SETTLE_SECONDS = 0.2
 
@@ -27,10 +27,10 @@ Count = Callable[[int, int], int]
 
 
 class LossWatch:
-    """Compares entries sent with entries stored.
+    """Compares the numbers of entries sent and stored.
 
-    sent: how many entries journald has been given so far. count: how many of them it has stored
-    in [since, until], CLOCK_REALTIME µs; may take its time. report: is told of each new loss.
+    sent: how many entries journald has taken so far. count: how many it has stored in [since,
+    until], CLOCK_REALTIME µs; may block. report: called with the number of newly lost entries.
     """
 
     def __init__(
@@ -49,17 +49,17 @@ class LossWatch:
         self._seen = self._base
         self._stored = 0
         self._lost = 0
-        # Whether the last look found a difference that was not reported yet.
+        # Whether the last check found a difference that is not reported yet.
         self._is_open = False
 
     async def run(self) -> None:
-        """Look every CHECK_SECONDS, for ever."""
+        """Check every CHECK_SECONDS, forever."""
         while True:
             await asyncio.sleep(CHECK_SECONDS)
             await self.check()
 
     async def check(self, tolerance: int = ON_ITS_WAY) -> None:
-        """Look now; a difference up to `tolerance` entries is left to the next look."""
+        """Check now; a difference of up to `tolerance` entries waits for the next check."""
         sent = self._sent()
         if sent - self._seen < WORTH and not self._is_open:
             return
@@ -69,7 +69,7 @@ class LossWatch:
         self._tell(sent - self._base - self._stored, tolerance)
 
     async def finish(self) -> None:
-        """The last look, when everything has been sent: every single entry counts."""
+        """The last check, after everything has been sent: without a tolerance."""
         if self._sent() - self._base < WORTH:
             return
         await asyncio.sleep(_SETTLE_SECONDS)
@@ -84,7 +84,7 @@ class LossWatch:
 
 
 def losses_of_user(journal: JournalSocket, pipes: LogPipes) -> LossWatch | None:
-    """The watch over what this user's services share, or None if the user cannot read a journal."""
+    """A LossWatch for the services of this user, or None if the user cannot read a journal."""
     from dora_systemd.adapters.journal.reader import JournalReader, check_readable
 
     def report(count: int) -> None:

@@ -1,4 +1,4 @@
-"""The runner's side of the nodes: their groups and their output."""
+"""The runner's side of the nodes: their cgroups, pipes and dora's log files of them."""
 
 import asyncio
 import contextlib
@@ -39,11 +39,11 @@ class Nodes:
         self.resources = Resources(unit)
 
     def prepare(self, dataflow: Dataflow, rates: RateLimits, limits: Iterable[NodeLimits]) -> None:
-        """Make a group for every node, with its limits, and pipes for those that have them.
+        """Create a group for every node, with its limits, and pipes for the nodes that use them.
 
-        What there is of nodes that are no longer in the dataflow goes. rates: how many lines of
-        each node are kept. Raises OSError, and DoraSystemdError for a limit that does not take
-        hold.
+        Removes groups and pipes of nodes that are no longer in the dataflow. rates: limits on the
+        lines of each node. Raises OSError, and DoraSystemdError for a limit that does not take
+        effect.
         """
         cgroup.enable_controllers(self._unit)
         piped = {node.id for node in dataflow.nodes if has_pipes(node)}
@@ -70,9 +70,9 @@ class Nodes:
             self._holds[node.id] = Hold(self._group(node.id), marks_of(node.raw))
 
     def add(self, node: Node, rates: RateLimits, limits: Iterable[NodeLimits]) -> None:
-        """The same for one node of a dataflow that runs. Raises as prepare() does.
+        """Prepare one node that is added to a running dataflow. Raises as prepare() does.
 
-        One without pipes has been there before: dora's file of it goes on.
+        A node without pipes existed before, and dora continues its log file.
         """
         tail = self._tails.get(node.id)
         self._make(node, rates)
@@ -83,12 +83,12 @@ class Nodes:
             self._pipes.open(node.id)
 
     def limit(self, limits: Iterable[NodeLimits]) -> None:
-        """Other limits for nodes that run. Raises DoraSystemdError for one that does not hold."""
+        """Change limits of running nodes. Raises DoraSystemdError if one does not take effect."""
         for one in limits:
             cgroup.limit_group(self._group(one.node), one)
 
     def remove(self, node: str) -> None:
-        """The node has ended and does not come back. Raises OSError."""
+        """Remove the group and pipes of a node that has ended for good. Raises OSError."""
         if hold := self._holds.pop(node, None):
             hold.end()
         cgroup.kill_group(self._group(node))
@@ -96,14 +96,14 @@ class Nodes:
             self._pipes.forget(node)
         self._piped.discard(node)
         self._launched.discard(node)
-        with contextlib.suppress(OSError):  # what is dying holds it for a moment
+        with contextlib.suppress(OSError):  # a dying process keeps the group for a moment
             cgroup.remove_group(self._group(node))
 
     def _group(self, node: str) -> Path:
         return self._unit / f"{cgroup.NODE_PREFIX}{node}"
 
     def listen(self, run: str) -> None:
-        """Begin to read what the nodes of `run` say: launchers that wait for a reader go on."""
+        """Start reading the output of the nodes of `run`, which lets the launchers go on."""
         raise_file_limit()
         for node in self._piped:
             self._pipes.open(node)
@@ -118,69 +118,70 @@ class Nodes:
             tail.start()
 
     def adopt(self, node: str, pid: int) -> None:
-        """Dora has executed `node`: name its lines, and move it if the launcher has not."""
+        """Dora has executed `node`: name its lines, and move it unless its launcher has done so."""
         self._pipes.set_pid(node, pid)
         if node not in self._launched:
             for process in _with_descendants(pid):
-                with contextlib.suppress(OSError):  # it may be gone already
+                with contextlib.suppress(OSError):  # the process may have exited already
                     cgroup.move_process(self._group(node), process)
 
     def clear(self, node: str, pid: int) -> None:
-        """Kill what `pid`, which crashed, has left of the node, before dora executes the next one.
+        """Kill what the crashed process `pid` has left of the node, before its next process starts.
 
-        It would count against the limits of the next one, and may hold what that needs.
+        Remaining processes would count against the limits of the next one, and may hold its
+        resources.
         """
         if node not in self._launched:
             return
         with contextlib.suppress(OSError, ValueError):
-            if int(self._paths.node_pid(node).read_text()) == pid:  # the next one is not there yet
+            if int(self._paths.node_pid(node).read_text()) == pid:  # else the next one runs
                 cgroup.kill_group(self._group(node))
 
     def let_go(self) -> None:
-        """The nodes are to end: from now on none of them waits for the journal."""
+        """The nodes are about to end: stop freezing them."""
         for hold in self._holds.values():
             hold.end()
 
     def exchanging(self, node: str) -> AbstractContextManager[None]:
-        """Meanwhile `node` does not wait for the journal, because it is to end."""
+        """Do not freeze `node` meanwhile, because dora is going to end it."""
         hold = self._holds.get(node)
         return nullcontext() if hold is None else hold.paused()
 
     def forget(self, node: str) -> None:
-        """The node's process has ended: what it says next comes from another one."""
+        """The node's process has ended: later lines come from its next process."""
         self._pipes.set_pid(node, 0)
 
     def has_process(self, node: str, pid: int) -> bool:
-        """Whether `pid` lives and is one of the node's. Zombies do not count.
+        """Whether `pid` is a live process of the node. Zombies do not count.
 
-        Until its launcher has moved it, it is where the daemon is.
+        A new process is in the daemon's group until its launcher moves it.
         """
         return any(
             pid in cgroup.pids(one) for one in (self._group(node), self._unit / cgroup.SUPERVISOR)
         )
 
     def find_oom(self, node: str) -> Oom | None:
-        """What the kernel has just killed `node` for, if it was for want of memory."""
+        """How the kernel has just killed a process of `node` because of memory, or None."""
         return self.resources.explain(self._group(node))
 
     def find_oom_of_dora(self) -> Oom | None:
-        """The same for dora's coordinator and daemon."""
+        """How the kernel has just killed dora's own processes because of memory, or None."""
         return self.resources.explain(self._unit / cgroup.SUPERVISOR)
 
     def kill(self) -> None:
-        """End every node at once, and take its last words from the pipes."""
+        """Kill every node, and queue what is left in the pipes."""
         for group in cgroup.node_groups(self._unit).values():
             cgroup.kill_group(group)
         self.drain((*self._piped, *self._tails))
 
     def close(self) -> None:
-        """End every node, and stop to listen."""
+        """Kill every node, and stop reading."""
         self.kill()
         for node, tail in self._tails.items():
             if tail is None:
                 continue
             tail.close()
-            self._pipes.drain(node)  # what the limit took of the very last lines
+            self._pipes.drain(node)  # report last lines that the rate limit suppressed
             if tail.loss:
                 self._pipes.write_event("lines-lost", node, count="Some", reason=tail.loss)
         self.let_go()
@@ -188,14 +189,14 @@ class Nodes:
         self._tails.clear()
 
     def drain(self, nodes: Iterable[str]) -> None:
-        """Write what `nodes` have said so far before whatever is written next."""
+        """Queue what `nodes` have written so far, before whatever is written next."""
         for node in nodes:
             if (tail := self._tails.get(node)) is not None:
                 tail.drain()
             self._pipes.drain(node)
 
     async def wait_quiet(self, seconds: float) -> None:
-        """Return when dora has written nothing more about its nodes' output for `seconds`."""
+        """Return once dora has written nothing to the nodes' log files for `seconds`."""
         tails = [tail for tail in self._tails.values() if tail is not None]
         while sum(tail.drain() for tail in tails):
             await asyncio.sleep(seconds)
@@ -212,9 +213,10 @@ class Nodes:
 
 
 def raise_file_limit() -> None:
-    """Let this process have as many open files as it may: it needs four for each node.
+    """Raise this process's soft limit of open files to the hard one: it needs four for each node.
 
-    Not before coordinator and daemon run: theirs is dora's business, the daemon raises its own.
+    Call this after the coordinator and the daemon have started: they should inherit the old limit,
+    and the daemon raises its own.
     """
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
@@ -223,7 +225,7 @@ def raise_file_limit() -> None:
 def _with_descendants(pid: int) -> list[int]:
     found = [pid]
     for known in found:
-        # Each of them may end at any moment, its whole directory with it.
+        # Each process may exit at any moment, and its whole directory disappears.
         with contextlib.suppress(OSError):
             for task in Path(f"/proc/{known}/task").iterdir():
                 found += map(int, (task / "children").read_text().split())
@@ -231,7 +233,7 @@ def _with_descendants(pid: int) -> list[int]:
 
 
 async def wait_eof(fd: int) -> None:
-    """Return at the end of file of `fd`, whatever comes before it."""
+    """Read `fd` until the end of file, and discard the input."""
     loop = asyncio.get_running_loop()
     done = asyncio.Event()
 

@@ -1,4 +1,4 @@
-"""What the runner reads of memory and CPU limits: who was killed by them, and who comes close."""
+"""Watches memory and CPU limits: what the kernel killed, and which limits are close."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +12,7 @@ from dora_systemd.decisions.resources.pressure import Alarms, Load, look
 
 
 class Resources:
-    """Counters of the unit's groups, remembered from one look to the next."""
+    """Counters of the unit's cgroups, kept from one sample to the next."""
 
     def __init__(self, unit: Path) -> None:
         self._unit = unit
@@ -20,7 +20,7 @@ class Resources:
         self._alarms: Alarms = {}
 
     def explain(self, group: Path) -> Oom | None:
-        """Why something in a group has just ended, if it was for want of memory."""
+        """Why a process in a group has just ended, if memory was the reason."""
         node = self._seen.get(group, OomCounts()), read_oom(group)
         if node[1] == node[0]:
             return None
@@ -37,12 +37,12 @@ class Resources:
         limit = cgroup.read_usage(limited).memory_max or 0
         groups = cgroup.node_groups(self._unit)
         held = {node: cgroup.read_usage(path).memory or 0 for node, path in groups.items()}
-        # What the victim had is gone by now.
+        # The victim's memory has been freed by now: use its peak.
         held |= {node: peak for node, path in groups.items() if path == group}
         return Oom(owner, peak, limit, *largest(held))
 
     def look(self, samples: tuple[CpuSample, ...], now: CpuSample) -> list[Record]:
-        """What is to be said about limits that come close. samples: those before `now`."""
+        """Events about limits that are close. samples: those before `now`."""
         groups = {WHOLE_CELL: self._unit, **cgroup.node_groups(self._unit)}
         loads = {key: _load(path, key, samples, now) for key, path in groups.items()}
         self._alarms, reports = look(self._alarms, loads, now.at_us)
@@ -51,7 +51,7 @@ class Resources:
 
 def _load(path: Path, key: str, samples: tuple[CpuSample, ...], now: CpuSample) -> Load:
     load = read_load(path)
-    # A group without a limit of CPU time is never throttled.
+    # A group without a CPU limit is never throttled.
     if not any(now.throttling.get(key, ())):
         return load
     return replace(load, throttled=throttled_percent(samples, now, key))

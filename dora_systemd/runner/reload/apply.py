@@ -1,4 +1,4 @@
-"""One reload of single nodes: its steps, one after the other, and the way back."""
+"""Carries out one reload of single nodes step by step, and can undo it."""
 
 import time
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ _BACK = {How.ADD: How.REMOVE, How.REMOVE: How.ADD}
 
 @dataclass(frozen=True)
 class Run:
-    """One run of the dataflow, as far as reloads need it."""
+    """The parts of one run of the dataflow that reloads use."""
 
     pump: Pump
     nodes: CellNodes
@@ -31,7 +31,7 @@ class Run:
 
 
 class Applier:
-    """Carries out `change` in `run`. done: what was done, in words."""
+    """Carries out `change` in `run`. done: what was done, for people."""
 
     def __init__(self, run: Run, change: Change, options: RunnerOptions) -> None:
         self._run = run
@@ -59,7 +59,7 @@ class Applier:
         return "" if has_own_pipes else f"dora itself reads the output of the node {step.node}"
 
     async def apply(self) -> None:
-        """All steps. Raises DoraSystemdError when dora refuses one, and NotReady."""
+        """Carry out all steps. Raises DoraSystemdError when dora refuses one, and NotReady."""
         for step in self._change.steps:
             started = time.monotonic()
             self._begun.append(step)
@@ -68,14 +68,14 @@ class Applier:
             self._tell(step, time.monotonic() - started)
 
     async def undo(self, before: Prepared) -> None:
-        """Take back the steps so far. Raises DoraSystemdError."""
+        """Undo the steps taken so far. Raises DoraSystemdError."""
         for step in reversed(self._begun):
             back = Step(_BACK.get(step.how, step.how), step.node, step.file)
             try:
                 with self._run.nodes.exchanging(step.node):
                     await self._take(back, before)
             except NotReady:
-                continue  # as it was
+                continue  # the node failed before the reload too, or its program is at fault
 
     async def _take(self, step: Step, prepared: Prepared) -> None:
         swapper = self._run.swapper

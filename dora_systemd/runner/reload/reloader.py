@@ -1,7 +1,7 @@
-"""Reloads: the runner watches files, decides what they mean, and has dora take it over.
+"""Reloads: the runner watches files, decides what their changes mean, and has dora apply them.
 
-It outlives the runs of the dataflow: when only all of it can follow a change, the run ends and the
-next one begins, in the same unit and with the same process.
+The Reloader outlasts the runs of the dataflow. If a change concerns the dataflow as a whole, the
+run ends and the next one begins, in the same unit and the same process.
 """
 
 import asyncio
@@ -28,17 +28,17 @@ from dora_systemd.runner.reload.swap import NotReady
 from dora_systemd.values import quoted
 
 PAUSE_SECONDS = 1.0
-"""Between the beginnings of two reloads."""
+"""Minimum time between the beginnings of two reloads."""
 
 Answer = dict[str, Any]
 
 
 class Reloader:
-    """All that reloads need. options: of the runner. environment: of the nodes. settings: the
-    settings file beside the dataflow.
+    """Watches files and reloads. options: of the runner. environment: of the nodes.
 
-    current: what runs. before: what ran before a reload of the whole dataflow that has yet to show
-    that it works, or None. notice: what the last reload has left to say.
+    settings: the settings file beside the dataflow. current: the version that runs. before: the
+    version before a reload of the whole dataflow whose nodes are not all ready yet, or None.
+    notice: what the last reload reports, as long as it is true.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class Reloader:
         self._run: Run | None = None
         self._outcome: asyncio.Future[str] | None = None
         self._untold: DoraSystemdError | None = None
-        # What of the dataflow has been read when: all of it at the beginning, then file by file.
+        # Times of reading, in ns: of the whole dataflow at first, then of single files.
         self._read_ns = 0
         self._taken: dict[str, int] = {}
         self.current: Prepared | None = None
@@ -64,7 +64,7 @@ class Reloader:
         self.notice = ""
 
     def begin(self, run: Run, prepared: Prepared, read_ns: int) -> None:
-        """A run of the dataflow begins. read_ns: since when its files are read, CLOCK_REALTIME."""
+        """A run of the dataflow begins. read_ns: its files were read after this, CLOCK_REALTIME."""
         self._run, self.current, self._read_ns = run, prepared, read_ns
         self._begun.set()
         if self._untold is not None:
@@ -76,12 +76,12 @@ class Reloader:
         self._begun.clear()
 
     def has_started(self) -> None:
-        """All nodes of the run are ready: what it replaced is history."""
+        """All nodes of the run are ready: the version before is not needed any more."""
         self.before = None
         self._settle("")
 
     def go_back(self, reason: str) -> bool:
-        """A run failed before it had started: whether the version before can run instead."""
+        """Switch back if a run failed before it had started; whether there is a version before."""
         self._settle(reason)
         if self.before is None:
             return False
@@ -94,11 +94,11 @@ class Reloader:
             self._outcome.set_result(outcome)
 
     async def work(self) -> None:
-        """Reload what has changed, again and again."""
+        """Reload changed files, again and again."""
         try:
             self._settings.keep()
         except DoraSystemdError as error:
-            self._refuse(error)  # of that file; all others can be reloaded
+            self._refuse(error)  # of this file only: the others can be reloaded
         self._watch(self.options.hot_reload)
         while True:
             await self._wake.wait()
@@ -111,7 +111,7 @@ class Reloader:
             except DoraSystemdError as error:
                 self._refuse(error)
             except Exception as error:
-                # Whatever it is: what runs goes on, and the next save has another chance.
+                # Whatever it is, the dataflow keeps running, and the next change can succeed.
                 what = f"cannot reload: {type(error).__name__}: {error}"
                 self._refuse(DoraSystemdError(what, "please report it"))
             await pause
@@ -135,7 +135,7 @@ class Reloader:
             self._refuse(DoraSystemdError(what, "please report it"))
 
     def _refuse(self, error: DoraSystemdError) -> None:
-        """The old one runs on: say so where the operator looks, as soon as there is a run."""
+        """Report that the old version keeps running, in the notice as soon as there is a run."""
         self._untold = error if self._run is None else None
         self.notice = f"not reloaded: {error.message.removeprefix('cannot use ')}"
         if self._run is not None:
@@ -144,7 +144,7 @@ class Reloader:
             self._run.pipes.write_event("reload-failed", reason=error.message + hint)
 
     async def _reload(self, changed: Collection[str], node: str = "") -> list[str]:
-        """What was done about the files `changed`, and about `node` in any case."""
+        """Apply the changed files, and reload `node` in any case; what was done."""
         async with self._lock:
             run, current = self._run, self.current
             if run is None or current is None:
@@ -166,7 +166,7 @@ class Reloader:
         return done
 
     async def _take_settings(self, run: Run) -> list[str]:
-        """Other limits of nodes hold at once; what else has changed waits for the next start."""
+        """Apply changed node limits at once; other settings wait for the next start."""
         change = await asyncio.to_thread(self._settings.change)
         check_nodes(change.limits, run.pump.cell.nodes, ())
         run.nodes.limit(change.limits)
@@ -197,7 +197,7 @@ class Reloader:
         return await self._restart(run, change, reason)
 
     async def _undo(self, applier: Applier, change: Change, error: NotReady) -> DoraSystemdError:
-        """Bring back the descriptor before; of a program there is no version before."""
+        """Go back to the old descriptor; an old version of a program file no longer exists."""
         if change.prepared is self.current:
             return DoraSystemdError(f"cannot use what was saved: {error}")
         assert self.current is not None
@@ -208,7 +208,7 @@ class Reloader:
         return DoraSystemdError(message)
 
     async def _restart(self, run: Run, change: Change, reason: str) -> list[str]:
-        """End this run, and have the next one begin with what is new."""
+        """End this run, and let the next one begin with the new version."""
         begun = time.monotonic()
         self.before = self.current if change.prepared is not self.current else None
         self.current = change.prepared
@@ -222,7 +222,7 @@ class Reloader:
         return [f"the dataflow was reloaded: {words}"]
 
     async def answer(self, request: Mapping[str, Any]) -> Answer:
-        """A request of doractl: {"verb": "reload"} or {"verb": "hot-reload", "on": true}.
+        """Answer a request of doractl: {"verb": "reload"} or {"verb": "hot-reload", "on": true}.
 
         Raises DoraSystemdError.
         """
@@ -251,20 +251,20 @@ class Reloader:
             reload = self.options.reload._replace(is_on=is_on)
             self.options = self.options._replace(reload=reload)
             self._sources = Sources(self.options, self._environment)
-            # Only how nodes that fail are treated differs: each gets it with its next reload.
+            # This changes only how dora treats nodes that fail: each gets it with its next reload.
             if self.current is not None:
                 self.current = self._sources.replan(self.current)
             self._watch(is_on)
         return {"done": []}
 
     def close(self) -> None:
-        """Watch no more."""
+        """Stop watching."""
         if self._watcher is not None:
             self._watcher.cancel()
 
 
 def _with_node(change: Change, node: str, dataflow: str) -> Change:
-    """The change, with `node` reloaded whatever has changed."""
+    """The change, with a reload of `node` added if it is missing."""
     if not node or any(step.node == node for step in change.steps):
         return change
     operators = change.operators.get(node, {})
@@ -279,6 +279,6 @@ def _files(change: Change) -> list[str]:
 
 
 def _names(change: Change, changed: Collection[str]) -> list[str]:
-    """The last parts of those files that mean anything; all of them if it is the whole dataflow."""
+    """The names of the files that matter; of all changed files for a whole reload."""
     found = _files(change) if change.steps else sorted(changed)
     return [PurePath(path).name for path in found]

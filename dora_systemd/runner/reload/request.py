@@ -1,6 +1,6 @@
-"""What `systemctl reload` runs in the unit: it has the runner reload what has changed.
+"""The command of `systemctl reload`: asks the runner of the unit to reload what has changed.
 
-ExecReload= in systemd.service(5): its exit status says whether the reload is good.
+ExecReload= in systemd.service(5) runs it; its exit status is the result of the reload.
 """
 
 import os
@@ -13,7 +13,7 @@ from dora_systemd.paths import CellPaths
 
 
 def main() -> int:
-    """Ask the runner of this unit; 0, or the exit status of doractl for what went wrong."""
+    """Ask the runner of this unit; 0, or the exit status of doractl for the error."""
     directory = os.environ.get("RUNTIME_DIRECTORY", "")
     try:
         path = CellPaths(Path(directory)).socket

@@ -1,8 +1,8 @@
-"""The settings file beside a dataflow, when it changes while the dataflow runs.
+"""Compares versions of the settings file beside a dataflow while the dataflow runs.
 
-Reading settings takes a library that the runner does without, so a child of it does that,
-`python3 -m dora_systemd.runner.reload.settings_file BEFORE AFTER PATH`: two versions of the file
-at PATH.
+Reading settings needs a library that the runner does not load. So the runner starts a child
+process, `python3 -m dora_systemd.runner.reload.settings_file BEFORE AFTER PATH`, with two versions
+of the file at PATH.
 """
 
 import json
@@ -20,9 +20,9 @@ _SECONDS = 120.0
 
 
 class SettingsFile:
-    """The file at `path`; `copy` is where the version that is in use is kept.
+    """The file at `path`; `copy` is where the version in use is kept.
 
-    Each version is read once: it may be saved again at any moment.
+    Each version is read once, because an editor may save the file again at any moment.
     """
 
     def __init__(self, path: str, copy: Path) -> None:
@@ -31,25 +31,25 @@ class SettingsFile:
         self._taken = copy.with_name(f"{copy.name}.read")
 
     def keep(self) -> None:
-        """The file as it is now is in use. Raises DoraSystemdError."""
+        """Keep the file as the version in use. Raises DoraSystemdError."""
         self.take()
         self.accept()
 
     def take(self) -> None:
-        """Read the file as it is now. Raises DoraSystemdError."""
+        """Read the file. Raises DoraSystemdError."""
         self._taken.unlink(missing_ok=True)
         if Path(self.path).exists():
             files.write_atomic(self._taken, files.read_text(Path(self.path)), 0o600)
 
     def accept(self) -> None:
-        """What was taken last is in use."""
+        """Make the version read last the one in use."""
         if self._taken.exists():
             self._taken.replace(self._copy)
         else:
             self._copy.unlink(missing_ok=True)
 
     def change(self) -> SettingsChange:
-        """Take the file: what has changed. Raises DoraSystemdError when it cannot be used."""
+        """Read the file, and compare it. Raises DoraSystemdError if it is not valid."""
         self.take()
         versions = (str(self._copy), str(self._taken))
         command = [sys.executable, "-E", "-P", "-m", __name__, *versions, self.path]
@@ -62,7 +62,7 @@ class SettingsFile:
 
 
 def main(before: str, after: str, name: str) -> int:
-    """Print what is different as JSON. name: what errors call both."""
+    """Print the differences as JSON. name: the path of the file, for errors."""
     from dora_systemd.decisions.settings.changes import settings_change
     from dora_systemd.decisions.settings.resolve import resolve_settings
 

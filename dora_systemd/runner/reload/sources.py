@@ -1,4 +1,4 @@
-"""The runner's look at the files of its dataflow: what has changed, and what that means."""
+"""Reads the files of a dataflow, and finds what has changed and what that means."""
 
 import json
 from collections.abc import Iterable, Mapping
@@ -21,7 +21,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 
 @dataclass(frozen=True)
 class Change:
-    """What changed files mean. whole: why the dataflow as a whole has to start again, or ""."""
+    """What changed files mean. whole: why the whole dataflow has to start again, or ""."""
 
     prepared: Prepared
     steps: tuple[Step, ...] = ()
@@ -30,24 +30,24 @@ class Change:
 
     @property
     def is_empty(self) -> bool:
-        """Whether nothing has to be done."""
+        """Whether there is nothing to do."""
         return not self.steps and not self.whole
 
 
 class Sources:
-    """Looks at files, for a runner with these options. environment: of the nodes."""
+    """Reads files for a runner with these options. environment: that of the nodes."""
 
     def __init__(self, options: RunnerOptions, environment: Mapping[str, str]) -> None:
         self._options = options
         self._environment = environment
 
     def look(self, current: Prepared, changed: Iterable[str]) -> Change:
-        """What the files `changed` mean for what runs, which is `current`.
+        """What the files `changed` mean for the running version `current`.
 
-        It takes its time: not for the thread of the loop. Raises DoraSystemdError when a file
-        cannot be used as it is now; then nothing should be changed.
+        Blocks: do not call it in the loop's thread. Raises DoraSystemdError if a file is not valid;
+        then nothing should be changed.
         """
-        # What is gone cannot be loaded; it may come back in a moment, as in a git checkout.
+        # A deleted file cannot be loaded. It may be back in a moment, as with git checkout.
         paths = frozenset(path for path in changed if change_time(path))
         dataflow = self._options.dataflow
         prepared = self.prepare() if dataflow in paths else current
@@ -74,13 +74,13 @@ class Sources:
         return prepared
 
     def replan(self, current: Prepared) -> Prepared:
-        """What `current` is with these options. No file is read: who edits it has not said so."""
+        """`current` with these options. Reads no file: it may be in the middle of an edit."""
         plan = replace(current.plan, options=self._options)
         descriptor = launch_descriptor(current.dataflow, plan)
         return Prepared(current.dataflow, plan, descriptor)
 
     def files(self, current: Prepared) -> set[str]:
-        """The files that the dataflow is made of, absolute."""
+        """The files that the dataflow consists of, as absolute paths."""
         nodes = self._nodes(current, sources(current.dataflow, current.plan)).values()
         return {self._options.dataflow, *(path for node in nodes for path in node.files)}
 
@@ -110,7 +110,7 @@ class Sources:
 
 
 def _stubborn(steps: Iterable[Step], operators: Mapping[str, Mapping[str, str]]) -> str:
-    """Why dora cannot take over what changed of an operator; it reads the operator's file only."""
+    """Why dora cannot apply a change of an operator, or "": it reloads the operator's file only."""
     for step in steps:
         if step.how is How.OPERATOR and step.file not in operators[step.node].values():
             return f"the operators of the node {step.node} import {Path(step.file).name}"
@@ -118,7 +118,7 @@ def _stubborn(steps: Iterable[Step], operators: Mapping[str, Mapping[str, str]])
 
 
 def check_programs(paths: Iterable[str]) -> None:
-    """Raise DoraSystemdError (BAD_INPUT) for one that cannot be read, or does not compile."""
+    """Raise DoraSystemdError (BAD_INPUT) for a program that is unreadable or does not compile."""
     for path in paths:
         try:
             text = Path(path).read_text(errors="replace")

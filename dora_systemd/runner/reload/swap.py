@@ -1,8 +1,15 @@
-"""How the runner replaces single nodes of a dataflow that runs.
+"""Replaces single nodes of a dataflow while it runs.
 
-dora's RestartNode does not start what it has ended before the node's restart delay is over, and
-its ReplaceNode starts the new node while the old one still runs. One after the other they do what
-is wanted: the old one ends as it should, and the new one starts at once.
+dora has two requests for this, and neither is enough. RestartNode ends the old process, but starts
+the new one only after the node's restart delay. ReplaceNode starts the new process while the old
+one still runs. The Swapper sends one after the other: RestartNode ends the old process within its
+grace period, and ReplaceNode starts the new one at once. The setting that starts the new process
+first needs only ReplaceNode. Other inputs or outputs need RemoveNode and AddNode.
+
+The Swapper sends requests, and the pump hears of their effect: exits and readiness arrive as
+events of the run. So each method first pushes the event that marks the node as reloading in the
+live table, and only then asks dora. In the other order the old state "running" would satisfy the
+wait for the new process.
 """
 
 from collections.abc import Callable, Mapping
@@ -20,27 +27,28 @@ from dora_systemd.runner.cell.pump import Pump, now_us
 from dora_systemd.values import SECOND, format_duration
 
 READY_SECONDS = 30.0
-"""How long a reloaded node may take to be ready, before it counts as failed."""
+"""How long dora may take to answer, and then a reloaded node to be ready, before it fails."""
 
 _READY = ("ready", "running", "dynamic")
 _SETTLED = (*_READY, "failed", "finished")
 
 
 class NotReady(Exception):
-    """The new node has failed, or takes too long; it says how."""
+    """The new node has failed or is not ready in time; the message says which."""
 
 
 class Swapper:
-    """Asks dora to change nodes of the run of `pump`, and waits until it has."""
+    """Has dora change nodes of the run of `pump`, and waits for the effect."""
 
     def __init__(self, pump: Pump, dora: CellDora) -> None:
         self._pump = pump
         self._engine = dora
 
     async def swap(self, definition: Mapping[str, Any], kind: str, starts_first: bool) -> None:
-        """Put a new node in the place of one. Raises DoraSystemdError and NotReady.
+        """Replace a node that keeps its inputs and outputs. Raises DoraSystemdError and NotReady.
 
-        definition: what dora is sent. kind: as in the live table.
+        definition: the node as dora gets it. kind: as in the live table. starts_first: whether the
+        new process starts while the old one runs.
         """
         node = str(definition["id"])
         old = self._pump.cell.nodes[node]
@@ -51,7 +59,7 @@ class Swapper:
         await self._wait_ready(node)
 
     async def rewire(self, definition: Mapping[str, Any], kind: str) -> None:
-        """The same for a node with other inputs or outputs. Raises the same."""
+        """Replace a node whose inputs or outputs change. Raises DoraSystemdError and NotReady."""
         node = str(definition["id"])
         self._push(life.NodeReloading(now_us(), node, _status(definition, kind)))
         await self._end(node, "RemoveNode")
@@ -59,7 +67,7 @@ class Swapper:
         await self._wait_ready(node)
 
     async def add(self, definition: Mapping[str, Any], kind: str) -> None:
-        """Add a node, whose pipes are open. Raises DoraSystemdError and NotReady."""
+        """Add a node, whose pipes must be open. Raises DoraSystemdError and NotReady."""
         node = str(definition["id"])
         self._push(life.NodeAdded(now_us(), node, _status(definition, kind)))
         await self._ask(protocol.add_params(self._run, definition))
@@ -67,13 +75,13 @@ class Swapper:
             await self._wait_ready(node)
 
     async def remove(self, node: str) -> None:
-        """Take a node out. Raises DoraSystemdError."""
+        """Remove a node from the run. Raises DoraSystemdError."""
         self._push(life.NodeReloading(now_us(), node))
         await self._end(node, "RemoveNode")
         self._push(life.NodeRemoved(now_us(), node))
 
     async def reload_operator(self, node: str, operator: str) -> None:
-        """Have a Python operator read its file again. Raises DoraSystemdError."""
+        """Have a Python operator load its file again. Raises DoraSystemdError."""
         await self._ask(protocol.reload_params(self._run, node, operator))
 
     @property
@@ -102,7 +110,7 @@ class Swapper:
 
 
 def _is_restartable(node: NodeStatus) -> bool:
-    """Whether dora starts the node again after RestartNode, which counts as a restart."""
+    """Whether dora would start the node again: only then RestartNode is sent, as a restart."""
     return node.policy != "never" and not 0 < node.max_restarts <= node.restarts
 
 

@@ -1,4 +1,4 @@
-"""What is left of a dataflow's restarts, from systemd and the journal."""
+"""Counts the restarts that a dataflow has left, from systemd and the journal."""
 
 import time
 from collections.abc import Mapping
@@ -21,11 +21,10 @@ _MOST_STARTS = 1000
 def restart_budget(
     manager: Manager, scope: Scope, cell: Cell, status: CellStatus
 ) -> Mapping[str, int | None] | None:
-    """The restarts of a dataflow's unit, or None where systemd restarts nothing or without limit.
+    """The restarts of a unit, or None if systemd restarts it never, or without a limit.
 
-    status: what its runner says.
-    used, max: restarts. next_us, resets_us: µs until the next one, and until they are counted
-    anew; None: there is none to come.
+    status: from its runner. used, max: numbers of restarts. next_us, resets_us: µs until the next
+    restart, and until the counter is reset; None: neither will happen.
     """
     facts = manager.read(cell.unit, _PROPERTIES)
     window = facts["StartLimitIntervalUSec"]
@@ -51,7 +50,7 @@ def _starts(scope: Scope, cell: Cell, restarts: int) -> list[int]:
     """The starts that NRestarts= counts, and the one before them; CLOCK_REALTIME µs."""
     if not restarts:
         return []
-    # Only who has restarted pays for the journal.
+    # Imported only after a restart, because the journal is slow.
     from dora_systemd.adapters.journal.reader import JournalReader
 
     try:
@@ -62,7 +61,7 @@ def _starts(scope: Scope, cell: Cell, restarts: int) -> list[int]:
 
 
 def _next(manager: Manager, cell: Cell, status: CellStatus) -> int | None:
-    """systemd waits for the shortest delay, and the runner for what is left of a longer one."""
+    """The delay in µs: systemd waits for the shortest one, the runner for the rest."""
     if status_word(cell.state.active, cell.state.sub, status.stage) != RESTARTING:
         return None
     if not cell.state.sub.startswith("auto-restart"):

@@ -1,4 +1,4 @@
-"""The dataflows of one systemd manager, and the selectors that name them."""
+"""Finds the dataflows of one systemd manager, and those that a selector names."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -20,24 +20,24 @@ _PATTERN = f"{UNIT_PREFIX}*{UNIT_SUFFIX}"
 
 
 class Cell(NamedTuple):
-    """One dataflow that systemd knows: the state of its unit, and what its runner was told."""
+    """One dataflow that systemd has loaded: the state of its unit, and its runner's options."""
 
     state: UnitState
     options: RunnerOptions
 
     @property
     def name(self) -> str:
-        """The dataflow's name."""
+        """The name of the dataflow."""
         return self.options.name
 
     @property
     def uuid(self) -> str:
-        """The dataflow's UUID, the same over restarts."""
+        """The UUID of the dataflow, which restarts keep."""
         return self.options.uuid
 
     @property
     def unit(self) -> str:
-        """The unit's name."""
+        """The name of the unit."""
         return self.state.unit
 
     @property
@@ -47,14 +47,14 @@ class Cell(NamedTuple):
 
 
 def read_cells(manager: Manager) -> list[Cell]:
-    """All dataflows that systemd knows, by name; units of that name that are not ours are not."""
+    """All dataflows that systemd has loaded, by name, without foreign units of such names."""
     states = [one for one in manager.list_units(_PATTERN) if one.load == "loaded"]
     cells = (_cell(manager, state) for state in states if name_from_unit(state.unit))
     return sorted((cell for cell in cells if cell), key=lambda cell: cell.name)
 
 
 def read_cell(manager: Manager, unit: str) -> Cell | None:
-    """The dataflow of one unit, or None when that is not there or no unit of ours."""
+    """The dataflow of one unit, or None if it does not exist or is not ours."""
     state = manager.read(unit, ["LoadState", "ActiveState", "SubState"])
     if state["LoadState"] != "loaded":
         return None
@@ -63,7 +63,7 @@ def read_cell(manager: Manager, unit: str) -> Cell | None:
 
 
 def find_cell(manager: Manager, selector: str) -> Cell:
-    """As select_cell, also for a dataflow that has a unit file and that systemd has not loaded."""
+    """As select_cell, but also finds a dataflow whose unit file systemd has not loaded."""
     cells = read_cells(manager)
     if not matching_cells(cells, selector):
         unit = _named_unit(selector)
@@ -74,9 +74,9 @@ def find_cell(manager: Manager, selector: str) -> Cell:
 
 
 def select_cell(cells: Sequence[Cell], selector: str) -> Cell:
-    """The one dataflow that `selector` (name, unit, UUID, beginning of a UUID) means.
+    """The one dataflow that `selector` means: name, unit, UUID, or beginning of a UUID.
 
-    Raises DoraSystemdError: NOT_FOUND with the nearest names, USAGE when several fit.
+    Raises DoraSystemdError: NOT_FOUND with the nearest names, USAGE if several match.
     """
     found = matching_cells(cells, selector)
     if len(found) > 1:
@@ -92,7 +92,7 @@ def select_cell(cells: Sequence[Cell], selector: str) -> Cell:
 
 
 def matching_cells(cells: Sequence[Cell], selector: str) -> list[Cell]:
-    """The dataflows that `selector` fits; a name or a unit before any UUID."""
+    """The dataflows that match `selector`; a name or a unit takes precedence over UUIDs."""
     named = [cell for cell in cells if selector in (cell.name, cell.unit)]
     if named or not is_uuid_prefix(selector):
         return named
@@ -100,7 +100,7 @@ def matching_cells(cells: Sequence[Cell], selector: str) -> list[Cell]:
 
 
 def not_found(selector: str, names: Sequence[str]) -> DoraSystemdError:
-    """The error for a selector that fits nothing, with the nearest of `names` as hint."""
+    """The error for a selector without a match, with the nearest of `names` as hint."""
     from difflib import get_close_matches
 
     near = get_close_matches(selector, names, n=3, cutoff=0.5)
@@ -115,7 +115,7 @@ def not_found(selector: str, names: Sequence[str]) -> DoraSystemdError:
 
 
 def _named_unit(selector: str) -> str:
-    """The unit that `selector` would name, "" for what can be no name."""
+    """The unit that `selector` would name, "" if it is not a valid name."""
     try:
         return selector if name_from_unit(selector) else unit_name(parse_name(selector))
     except DoraSystemdError:

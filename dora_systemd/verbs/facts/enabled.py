@@ -1,4 +1,4 @@
-"""Which dataflows a boot starts: for `list`, so it imports nothing that costs time."""
+"""Finds the dataflows that are started at boot. `list` uses it: imports only what loads quickly."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from dora_systemd.trust.paths import exists
 
 
 def enabled_units(manager: Manager, scope: Scope) -> frozenset[str]:
-    """The names of the units that a boot starts."""
+    """The names of the units that are started at boot."""
     return wanted_units(own_directories(manager, scope)[0])
 
 
@@ -40,7 +40,7 @@ def recover_lost_units(manager: Manager, scope: Scope) -> None:
 
 
 def own_directories(manager: Manager, scope: Scope) -> tuple[Path, Path]:
-    """Where the admin's (or the user's) unit files are, and those that a reboot ends."""
+    """The directory of the admin's (or user's) unit files, and the one that a reboot empties."""
     root = str(scope.runtime_root)
     lasting, fleeting = unit_directories(manager.unit_path(), scope.is_user, root)
     return Path(lasting), Path(fleeting)

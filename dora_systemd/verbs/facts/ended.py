@@ -1,4 +1,4 @@
-"""Dataflows that have ended and that systemd has forgotten: only the journal knows them."""
+"""Finds dataflows that have ended and that systemd has unloaded, in the journal."""
 
 import contextlib
 from collections.abc import Sequence
@@ -14,27 +14,27 @@ _NO_END = "its end is not recorded: it was killed, or the machine went down"
 
 
 def ended_rows(scope: Scope, rows: Sequence[DataflowRow]) -> list[DataflowRow]:
-    """The ended dataflows that `rows` does not hold, newest first."""
+    """The ended dataflows that are not in `rows`, newest first."""
     known = {row.uuid for row in rows}
     return [ended_row(event) for event in _last_events(scope) if event.uuid not in known]
 
 
 def select_ended(scope: Scope, selector: str) -> DataflowRow | None:
-    """The ended dataflow that `selector` means, the newest one where several do; or None."""
+    """The newest ended dataflow that `selector` means, or None."""
     fits = (event for event in _last_events(scope) if is_meant(event, selector))
     event = next(fits, None)
     return None if event is None else ended_row(event)
 
 
 def is_meant(event: LastEvent, selector: str) -> bool:
-    """Whether `selector` is the dataflow's name, its unit, its UUID or the beginning of that."""
+    """Whether `selector` is the dataflow's name, unit, UUID or the beginning of its UUID."""
     if selector in (event.name, unit_name(event.name)):
         return True
     return is_uuid_prefix(selector) and event.uuid.startswith(selector.lower())
 
 
 def ended_row(event: LastEvent) -> DataflowRow:
-    """The line of `list --all` for a dataflow of which only the last life event is known."""
+    """The row of `list --all` for a dataflow of which only the last life event is known."""
     word = _WORDS.get(event.event)
     return DataflowRow(
         uuid=event.uuid,
@@ -47,7 +47,7 @@ def ended_row(event: LastEvent) -> DataflowRow:
 
 
 def _last_events(scope: Scope) -> list[LastEvent]:
-    # Whoever may not read the journal is still shown what systemd knows.
+    # Without access to the journal, the rows from systemd are still shown.
     with contextlib.suppress(DoraSystemdError):
         return JournalReader().last_events(scope)
     return []

@@ -1,4 +1,4 @@
-"""What the nodes of a dataflow wrote last, for whoever waits for it and sees it fail."""
+"""The last lines of a dataflow's nodes, to show after it has failed."""
 
 import contextlib
 
@@ -11,7 +11,7 @@ LINES = 10
 
 
 def last_words(scope: Scope, uuid: str) -> list[str]:
-    """The last lines of all nodes, oldest first, each with its node; [] without access to them."""
+    """The last lines of all nodes, oldest first, with their node; [] if they are not readable."""
     matches = [*scope_matches(scope), f"DORA_DATAFLOW={uuid}"]
     with contextlib.suppress(DoraSystemdError):
         records = list(JournalReader().newest(matches, LINES))

@@ -1,6 +1,6 @@
-"""`doractl list`: what runs and what it uses, from systemd, the cgroups and the node table.
+"""`doractl list`: dataflows and their resource usage, from systemd, cgroups and node tables.
 
-Nothing of ours has to be alive for it: the node table is only read.
+It needs no running process of ours: it only reads the node tables.
 """
 
 import time
@@ -41,11 +41,11 @@ _MICROSECOND_NS = 1000
 
 
 class Reading(NamedTuple):
-    """One look at a dataflow: what systemd and its runner say, and what its groups have used.
+    """One reading of a dataflow: its state from systemd and its runner, and usage of its groups.
 
-    unit: properties of its unit. problem: why its node table says nothing, or "". groups, usage:
-    by node, WHOLE_CELL is the unit's own; empty for a dataflow that is not up. at_us: when,
-    CLOCK_MONOTONIC.
+    unit: properties of its unit. problem: why its node table is not usable, or "". groups, usage:
+    by node, with the unit's own as WHOLE_CELL; empty for a dataflow that is not running. at_us:
+    time of the reading, CLOCK_MONOTONIC.
     """
 
     cell: Cell
@@ -58,7 +58,7 @@ class Reading(NamedTuple):
 
     @property
     def sample(self) -> CpuSample:
-        """What counts as CPU time and throttling of this look."""
+        """The CPU time and throttling of this reading."""
         return CpuSample(
             self.at_us,
             {key: one.cpu_us for key, one in self.usage.items()},
@@ -69,9 +69,10 @@ class Reading(NamedTuple):
 def read_dataflow(
     manager: Manager, scope: Scope, cell: Cell, slice_path: Path | None = None
 ) -> Reading:
-    """Look at one dataflow.
+    """Read one dataflow.
 
-    slice_path: where the groups of dataflows usually are, for no more than the table of `list` has.
+    slice_path: where the groups of dataflows usually are; given if only the table of `list` is
+    wanted.
     """
     status, problem = look_at_table(scope, cell) if cell.is_up else (CellStatus(), "")
     path = slice_path / cell.unit if slice_path else None
@@ -80,8 +81,8 @@ def read_dataflow(
     if not cell.is_up or not (path or unit["ControlGroup"]):
         return Reading(cell, unit, status, problem)
     path = path or cgroup.group_path(unit["ControlGroup"])
-    # Without the runner's table the groups are all that is known of the nodes, and even those
-    # their user can make. With it, those that it names are enough.
+    # Without a node table the groups are all that is known of the nodes, and the dataflow's user
+    # can create groups too. With a table, the groups of its nodes are enough.
     nodes = cgroup.shown_groups(path, status.nodes) if not slice_path or not status.nodes else {}
     groups = {WHOLE_CELL: path, **nodes}
     usage = {key: cgroup.read_usage(group) for key, group in groups.items()}
@@ -89,11 +90,11 @@ def read_dataflow(
 
 
 def _few(cell: Cell, status: CellStatus, path: Path | None) -> list[str]:
-    """The properties that a line of the table cannot do without: each costs as much as a file."""
+    """The properties that a row of the table needs: reading each one costs as much as a file."""
     names = ["NRestarts"]
     if cell.is_up:
         names += [_UP_SINCE] if path else [_UP_SINCE, "ControlGroup"]
-        # Once it is up that is younger, and the runner has samples.
+        # Not needed for a running unit whose runner has samples, which are younger.
         names += [] if cell.state.active == "active" and status.samples else [_STARTED]
     return names
 
@@ -101,7 +102,8 @@ def _few(cell: Cell, status: CellStatus, path: Path | None) -> list[str]:
 def row_of(reading: Reading, before: Reading | None = None) -> DataflowRow:
     """All that `list` knows of one dataflow.
 
-    before: an earlier look at the same run, where CPU and throttling begin; else the runner's own.
+    before: an earlier reading of the same run, the base for CPU and throttling; without it, the
+    samples of the runner.
     """
     cell, unit, status = reading.cell, reading.unit, reading.status
     facts = {
@@ -121,12 +123,12 @@ def row_of(reading: Reading, before: Reading | None = None) -> DataflowRow:
 
 
 def dataflow_row(manager: Manager, scope: Scope, cell: Cell) -> DataflowRow:
-    """The line of one dataflow."""
+    """The row of one dataflow."""
     return row_of(read_dataflow(manager, scope, cell))
 
 
 def read_rows(manager: Manager, scope: Scope, with_details: bool = True) -> list[DataflowRow]:
-    """All dataflows that systemd knows. with_details: for more than the table."""
+    """All dataflows that systemd has loaded. with_details: for more than the table."""
     cells = read_cells(manager)
     slice_path = None if with_details or not cells else slice_group(manager)
     rows = [row_of(read_dataflow(manager, scope, cell, slice_path)) for cell in cells]
@@ -134,13 +136,13 @@ def read_rows(manager: Manager, scope: Scope, with_details: bool = True) -> list
 
 
 def mark_enabled(manager: Manager, scope: Scope, rows: Sequence[DataflowRow]) -> list[DataflowRow]:
-    """The rows, with a mark on those that a boot starts."""
+    """The rows, with a mark on those that are started at boot."""
     enabled = enabled_units(manager, scope)
     return [row._replace(enabled=row.unit in enabled) for row in rows]
 
 
 def find_row(manager: Manager, scope: Scope, selector: str) -> DataflowRow:
-    """All that is known of the dataflow that `selector` means, ended ones in the journal too.
+    """All that is known of the dataflow that `selector` means, including ended ones.
 
     Raises DoraSystemdError as select_cell does.
     """
@@ -159,15 +161,15 @@ def find_row(manager: Manager, scope: Scope, selector: str) -> DataflowRow:
 
 
 def read_status(scope: Scope, cell: Cell) -> CellStatus:
-    """The runner's node table; an empty one where there is none that can be believed."""
+    """The runner's node table; an empty one if it is missing or not usable."""
     return look_at_table(scope, cell)[0]
 
 
 def look_at_table(scope: Scope, cell: Cell) -> tuple[CellStatus, str]:
     """The runner's node table, and what is wrong with it, or "".
 
-    It is empty then, and where it is missing or another user's: the nodes' user can break his own
-    table, but not the list of all.
+    A table that is invalid, missing or another user's counts as empty: the nodes' user can break
+    only the own row, not the list.
     """
     try:
         return read_table(scope.cell_directory(cell.name)) or CellStatus(), ""
@@ -176,7 +178,7 @@ def look_at_table(scope: Scope, cell: Cell) -> tuple[CellStatus, str]:
 
 
 def _life(unit: Mapping[str, Any]) -> dict[str, Any]:
-    """Times of the present run; the monotonic ones do not care when the clock is set."""
+    """Times of the current run; the monotonic ones do not depend on the setting of the clock."""
     since, started = unit[_UP_SINCE], unit.get(_STARTED, 0)
     if since < started:
         return {"uptime": _monotonic_us() - started}
@@ -206,7 +208,7 @@ def _usage(reading: Reading, known: tuple[CpuSample, ...]) -> dict[str, Any]:
 def _numbers(
     use: Usage, samples: tuple[CpuSample, ...], now: CpuSample, key: str
 ) -> dict[str, Any]:
-    """What a group uses and may use, as rows have it."""
+    """Usage and limits of a group, as rows have them."""
     share = _limit(use.cpu_max)
     return {
         "cpu_percent": cpu_percent(samples, now, key),

@@ -1,7 +1,7 @@
-"""What a descriptor says before dora has seen it: its nodes, and the paths that they name.
+"""The nodes of a descriptor and the paths that they name, before dora has expanded it.
 
-No dora is asked: it would have to run as the user, and only knows what the files say. What cannot
-be read is left out, and the cell says so at its start.
+This does not run dora, which would have to run as the user and only reads the same files. It leaves
+out unreadable files: the runner reports them at the start.
 """
 
 import errno
@@ -17,17 +17,17 @@ from dora_systemd.trust.files import read_file, unreadable
 from dora_systemd.trust.sight import Sight
 
 _MOST_FILES = 50
-"""Files of modules that are read; they may name each other in a circle."""
+"""Maximum number of module files; they can refer to each other in a circle."""
 
 
 def written_dataflow(path: str) -> Dataflow:
-    """The dataflow in the file `path`, its modules as they are written. Raises DoraSystemdError."""
+    """The dataflow in the file `path`, with modules unexpanded. Raises DoraSystemdError."""
     text = decoded(read_file(path).data, Path(path))
     return parse_dataflow(parse_yaml(text, Path(path)), path)
 
 
 def named_places(dataflow: Dataflow, sight: Sight) -> Iterator[Path]:
-    """The directories of programs that are named by absolute paths, and of modules."""
+    """The directories of modules, and of programs with absolute paths."""
     for node in dataflow.nodes:
         yield from _places(node.raw)
     queue = [
@@ -49,7 +49,7 @@ def _nodes_of(path: Path, sight: Sight) -> Iterator[dict[str, Any]]:
     try:
         data = sight.read(str(path))
     except OSError as error:
-        if error.errno == errno.ENXIO:  # dora would wait for ever for somebody to write
+        if error.errno == errno.ENXIO:  # a FIFO: dora would wait for a writer forever
             raise unreadable(path, error) from error
         return
     with suppress(DoraSystemdError):

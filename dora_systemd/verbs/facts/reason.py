@@ -1,4 +1,4 @@
-"""Why a unit did not start or did not last, in words, from what systemd remembers of it."""
+"""Explains why a unit did not start or has failed, from its properties."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ from dora_systemd.errors import DoraSystemdError
 
 _PROPERTIES = ("Result", "StatusText", "ExecMainCode", "ExecMainStatus")
 _CLD_EXITED = 1
-"""ExecMainCode of a process that ended by itself, see waitid(2)."""
+"""ExecMainCode of a process that exited, see waitid(2)."""
 
 _REFUSED = {
     201: "the nice value was refused",
@@ -18,7 +18,7 @@ _REFUSED = {
     243: "a credential could not be read",
     214: "realtime scheduling was refused, see LimitRTPRIO= in systemd.exec(5)",
 }
-"""What systemd could not do before the runner: exit statuses of systemd.exec(5)."""
+"""Failures of systemd before it executed the runner: exit statuses of systemd.exec(5)."""
 
 _WORDS = {
     "protocol": "its supervisor process ended without a message",
@@ -32,7 +32,7 @@ _WORDS = {
 
 
 def job_reason(manager: Manager, unit: str, result: str) -> str:
-    """Why a job that starts `unit` did not end well; `result`: JobRemoved's word."""
+    """Why a start job of `unit` failed; `result`: that of JobRemoved."""
     if result == "canceled":
         return "it was stopped while it started"
     if result == "dependency":
@@ -41,25 +41,25 @@ def job_reason(manager: Manager, unit: str, result: str) -> str:
 
 
 def runners_refusal(manager: Manager, unit: str) -> DoraSystemdError | None:
-    """What the runner of `unit` refused at its start, None if it did not end so."""
+    """The error with which the runner of `unit` refused to start, or None."""
     text = str(manager.read(unit, ["StatusText"])["StatusText"])
     return parse_refusal(text, exit_status(manager, unit) or 0)
 
 
 def exit_status(manager: Manager, unit: str) -> int | None:
-    """The exit status of the main process of `unit`, None if it did not end by itself."""
+    """The exit status of the main process of `unit`, None if a signal killed it."""
     facts = manager.read(unit, ["ExecMainCode", "ExecMainStatus"])
     return int(facts["ExecMainStatus"]) if facts["ExecMainCode"] == _CLD_EXITED else None
 
 
 def failure_reason(manager: Manager, unit: str) -> str:
-    """One line about the end of `unit`: the runner's own last words, else systemd's result."""
+    """One line about the end of `unit`: the runner's last STATUS=, else systemd's result."""
     facts = manager.read(unit, _PROPERTIES)
     special = _WORDS.get(facts["Result"], "")
     last_words = str(facts["StatusText"]).removeprefix(FAILED)
     if not last_words:
         return special or _exit_words(facts)
-    # A verdict of the runner says more than its exit status.
+    # The runner's own message says more than its exit status.
     is_verdict = last_words != facts["StatusText"]
     cause = special or ("" if is_verdict else _exit_words(facts))
     return f"{last_words} ({cause})" if cause else last_words

@@ -8,5 +8,5 @@ from dora_systemd.names import SLICE
 
 
 def slice_group(manager: Manager) -> Path:
-    """The directory of dora.slice, below which units are unless a property puts them elsewhere."""
+    """The directory of dora.slice, which has the units unless a property puts them elsewhere."""
     return cgroup.group_path(manager.control_group()) / SLICE

@@ -1,4 +1,4 @@
-"""All dataflows of a manager at one moment, for who compares several of them."""
+"""Reads all dataflows of a manager at one moment, for top, metrics and the page."""
 
 from collections.abc import Mapping
 
@@ -12,12 +12,12 @@ from dora_systemd.verbs.facts.list import Reading, read_dataflow, row_of
 
 
 def read_snapshot(manager: Manager, scope: Scope) -> list[Observed]:
-    """Every dataflow that systemd knows, those that have failed as well."""
+    """All dataflows that systemd has loaded, including failed ones."""
     return [observe(read_dataflow(manager, scope, cell)) for cell in read_cells(manager)]
 
 
 def observe(reading: Reading) -> Observed:
-    """What a look at a dataflow shows of it, with what its groups had to wait for."""
+    """What a reading shows of a dataflow, with its pressure stall information."""
     restarts = reading.unit["NRestarts"]
     return Observed(
         row_of(reading),
@@ -30,5 +30,5 @@ def observe(reading: Reading) -> Observed:
 
 
 def read_strains(reading: Reading) -> Mapping[str, Strain]:
-    """What each group of a dataflow had to wait for."""
+    """The pressure stall information of each group of a dataflow."""
     return {key: read_strain(path) for key, path in reading.groups.items()}

@@ -1,4 +1,4 @@
-"""Whom the nodes of a dataflow run as."""
+"""Chooses the user that the nodes of a dataflow run as."""
 
 import os
 import pwd
@@ -11,16 +11,16 @@ from dora_systemd.trust.programs import Account, account_from
 from dora_systemd.values import quoted, shown
 
 DEFAULT_USER = "dora"
-"""Runs the dataflows whose files are root's; the package makes that user."""
+"""Runs the dataflows whose files belong to root; the package creates this user."""
 
 
 def choose_user(
     scope: Scope, wanted: str | None, dataflow: Place, directory: str
 ) -> pwd.struct_passwd | None:
-    """The user for User=, or None where the manager's own user runs everything.
+    """The user for User=, or None if everything runs as the manager's own user.
 
-    Default: the owner of the dataflow file that was read, DEFAULT_USER if that is root. directory:
-    where its programs are. Raises DoraSystemdError.
+    Default: the owner of the dataflow file that was read, or DEFAULT_USER if that is root.
+    directory: that of the programs. Raises DoraSystemdError.
     """
     if scope.is_user:
         if wanted is not None:
@@ -32,24 +32,24 @@ def choose_user(
         return None
     if wanted is not None:
         return _entry(wanted)
-    # That it is there is checked later, with that user's eyes.
+    # A missing directory is reported later, by a check with that user's permissions.
     with suppress(FileNotFoundError, NotADirectoryError), reached(directory) as (_, place):
         check_identity(dataflow, place)
     return _default_entry() if dataflow.uid == 0 else _owner_entry(dataflow.uid, dataflow.path)
 
 
 def account_of(user: pwd.struct_passwd | None) -> Account | None:
-    """What a child needs to become `user`; None for no change, which is all that others can do."""
+    """The account to run children as; None: no change, as for all callers other than root."""
     if user is None or os.geteuid() != 0:
         return None
     return account_from(user)
 
 
 def check_identity(dataflow: Place, directory: Place) -> None:
-    """Raise DoraSystemdError (BAD_INPUT) where the owner of `dataflow` may not have meant it.
+    """Raise DoraSystemdError (BAD_INPUT) if the owner of `dataflow` may not want this.
 
-    What runs is in `directory`: who lends somebody's file to programs of his own must not get them
-    run as that user.
+    The programs come from `directory`. Nobody must get own programs run as another user by placing
+    that user's dataflow file beside them.
     """
     reason = dataflow.borrowed or directory.borrowed
     if directory.uid not in (0, dataflow.uid):

@@ -1,7 +1,8 @@
-"""A dataflow is checked without being started, and dora is asked something about it.
+"""Checks a dataflow without starting it, and runs dora commands about it.
 
-As root that happens in a unit of its own, which is like that of the dataflow: same user, sandbox
-and environment. So root runs no dora that might be somebody else's. Anybody else asks for himself.
+As root this happens in a unit of its own, with the user, sandbox and environment of the dataflow's
+unit, so that root does not run a dora that another user can change. For other callers it happens
+directly.
 """
 
 import os
@@ -24,12 +25,12 @@ from dora_systemd.verbs.start.plan import Plan
 from dora_systemd.verbs.start.unit import plan_properties
 
 _FORBIDDEN = 200
-"""Exit statuses from here on are systemd's own, see systemd.exec(5)."""
+"""Exit statuses from this one on are systemd's own, see systemd.exec(5)."""
 _OF_RUNNERS = (
     *("Exec", "Restart", "StartLimit", "RuntimeDirectory", "Watchdog", "FileDescriptorStore"),
     *("Delegate", "LogExtraFields", "Type", "Timeout", "OOMPolicy", "Notify"),
 )
-"""How the keys begin that mean something for a runner only."""
+"""Prefixes of the properties that only apply to a runner."""
 
 
 def check_plan(connect: Callable[[], Manager], plan: Plan) -> None:
@@ -43,7 +44,7 @@ def check_plan(connect: Callable[[], Manager], plan: Plan) -> None:
 
 
 def run_beside(connect: Callable[[], Manager], plan: Plan, command: Sequence[str]) -> Completed:
-    """Run a command as the runner of `plan` would. Raises DoraSystemdError if that cannot be."""
+    """Run a command as the runner of `plan` would. Raises DoraSystemdError if that fails."""
     if os.geteuid() != 0:
         environment = {**os.environ, **plan.environment}
         account, directory = own_account(), str(Path(plan.options.dataflow).parent)
@@ -70,7 +71,7 @@ def _run_unit(manager: Manager, plan: Plan, command: Sequence[str]) -> Completed
 def _properties(
     manager: Manager, plan: Plan, command: Sequence[str], streams: Sequence[int]
 ) -> list[Property]:
-    """Those of the dataflow's unit, for a command; the unit is gone when this client is."""
+    """The dataflow's unit properties, for a command; the unit disappears with this client."""
     properties, _ = plan_properties(plan, manager)
     kept = {key: one for key, one in properties.items() if not key.startswith(_OF_RUNNERS)}
     kept |= typed(
@@ -80,12 +81,13 @@ def _properties(
     for key in ("StandardOutput", "StandardError"):
         del kept[key]
     if binds := kept.pop("BindPaths", None):
-        # The directory of the cell is there when it runs, and not ours if one of that name does.
+        # The directory of the cell exists only while the cell runs, and may then be that of another
+        # dataflow with this name.
         cell = str(plan.scope.cell_directory(plan.options.name))
         others = tuple(one for one in binds.value if one[0] != cell)
         kept |= {"BindPaths": binds._replace(value=others)} if others else {}
     stdout, stderr = streams
-    # systemd 252 cannot read ExecStartEx back at a reload, and "$$" is "$" in all of them.
+    # systemd 252 cannot read ExecStartEx back at a reload, so use ExecStart, with "$" as "$$".
     words = tuple(word.replace("$", "$$") for word in command)
     return [
         *kept.values(),

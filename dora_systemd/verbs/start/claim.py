@@ -1,4 +1,4 @@
-"""Whether a name is free for a dataflow that is to be started, and what is made of an ended one."""
+"""Checks that the name of a new dataflow is free, and cleans up after an ended one."""
 
 from dataclasses import replace
 
@@ -24,10 +24,10 @@ from dora_systemd.verbs.start.plan import Plan
 
 
 def require_free_name(manager: Manager, scope: Scope, unit: str) -> BootUnit:
-    """Make sure that nothing runs as `unit`: an ended transient unit of that name is forgotten.
+    """Make sure that `unit` is not running; systemd unloads an ended transient unit.
 
-    What is returned is its unit file, if it has one. Raises DoraSystemdError (NAME_IN_USE), which
-    says what runs there.
+    Returns the unit file, if there is one. Raises DoraSystemdError (NAME_IN_USE), which says what
+    is running.
     """
     cell = read_cell(manager, unit)
     if cell is not None and cell.is_up:
@@ -48,7 +48,7 @@ def require_free_name(manager: Manager, scope: Scope, unit: str) -> BootUnit:
 
 
 def refuse_unit_file(boot: BootUnit) -> None:
-    """Raise DoraSystemdError (NAME_IN_USE) where a boot starts a dataflow of that name."""
+    """Raise DoraSystemdError (NAME_IN_USE) if a dataflow of that name is started at boot."""
     if boot.is_enabled:
         raise DoraSystemdError(
             f"cannot use the name of {boot.unit}: it is enabled",
@@ -58,7 +58,7 @@ def refuse_unit_file(boot: BootUnit) -> None:
 
 
 def with_known_uuid(plan: Plan, boot: BootUnit) -> Plan:
-    """The plan, with the UUID that the enabled dataflow has if it is of the same file."""
+    """The plan, with the UUID of the enabled dataflow if that is from the same file."""
     known = boot.options
     if not boot.is_enabled or known is None or known.dataflow != plan.options.dataflow:
         return plan
@@ -68,9 +68,9 @@ def with_known_uuid(plan: Plan, boot: BootUnit) -> Plan:
 def place_unit_file(
     manager: Manager, plan: Plan, properties: Properties, boot: BootUnit, want_boot: bool
 ) -> bool:
-    """Whether the plan is to be started from a unit file, which is there then.
+    """Whether to start the plan from a unit file, which then exists.
 
-    want_boot: write it, whatever is there. Raises DoraSystemdError (NAME_IN_USE) if the dataflow is
+    want_boot: write the file in any case. Raises DoraSystemdError (NAME_IN_USE) if the dataflow is
     enabled with other settings.
     """
     scope = plan.scope

@@ -1,4 +1,4 @@
-"""The files that credentials are read from: checked before systemd has to read them."""
+"""Checks the files of credentials before systemd reads them."""
 
 import os
 import stat
@@ -20,11 +20,11 @@ def credential_files(settings: Settings) -> dict[str, str]:
 
 
 def check_credentials(scope: Scope, files: Mapping[str, str]) -> None:
-    """Raise DoraSystemdError for the first file that systemd could not read, and for too much.
+    """Raise DoraSystemdError for a file that systemd could not read, or if all are too large.
 
-    In system scope root reads them, whoever calls: what others cannot see is not judged here. And
-    it does so at every start, by a path that is followed anew: a link that somebody has put there
-    by then would give the nodes any file of root's. So nobody but root may be able to.
+    In system scope root reads the files, so one that only the caller cannot read is fine. systemd
+    reads them at every start, and follows the path each time: if others could replace a part of the
+    path by a link, nodes would get any file that root can read. So only root may be able to.
     """
     is_reader = scope.is_user or os.geteuid() == 0
     total = 0

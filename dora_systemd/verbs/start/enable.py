@@ -1,8 +1,8 @@
-"""`doractl enable` and `doractl disable`: the unit file that a boot finds.
+"""`doractl enable` and `doractl disable`: the unit file that starts a dataflow at boot.
 
-A dataflow that runs goes on untouched. Its transient unit hides the file: systemd looks into
-/run/systemd/transient first. Nobody may take that fragment away under a unit that is loaded:
-systemd would delete the file in /etc in its place as soon as it forgets the unit.
+A running dataflow is not affected. Its transient unit takes precedence over the file, because
+systemd looks into /run/systemd/transient first. Never remove that fragment while the unit is
+loaded: systemd would delete the file in /etc instead when it unloads the unit.
 """
 
 import time
@@ -39,10 +39,10 @@ _RETRY_SECONDS = 0.02
 
 @dataclass(frozen=True)
 class BootUnit:
-    """The unit file of one dataflow, as far as there is one.
+    """The unit file of one dataflow, if there is one.
 
-    path: where it is or would be. runtime: the same in the directory that a reboot empties.
-    text, options: of the file at `path`, None without one. is_wanted: a target starts the unit.
+    path: where it is or would be. runtime: its path in the directory that a reboot empties. text,
+    options: of the file at `path`, None without a file. is_wanted: a target starts the unit.
     """
 
     unit: str
@@ -54,12 +54,12 @@ class BootUnit:
 
     @property
     def is_enabled(self) -> bool:
-        """Whether a boot starts it."""
+        """Whether the dataflow is started at boot."""
         return self.is_wanted and self.text is not None
 
 
 def read_boot_unit(manager: Manager, scope: Scope, unit: str) -> BootUnit:
-    """What there is of `unit` on disk. Raises DoraSystemdError (NAME_IN_USE) for foreign files."""
+    """The files of `unit`. Raises DoraSystemdError (NAME_IN_USE) for foreign files."""
     lasting, fleeting = own_directories(manager, scope)
     path = lasting / unit
     text = read_unit_file(path)
@@ -70,14 +70,14 @@ def read_boot_unit(manager: Manager, scope: Scope, unit: str) -> BootUnit:
 
 
 def boot_target(manager: Manager, scope: Scope) -> str:
-    """The target that starts dataflows: our own where it is set up and itself part of the boot."""
+    """The target that starts dataflows: our own if it is installed and part of the boot itself."""
     facts = manager.read(BOOT_TARGET, ["LoadState", "WantedBy"])
     is_there = facts["LoadState"] == "loaded" and facts["WantedBy"]
     return BOOT_TARGET if is_there else plain_target(scope.is_user)
 
 
 def enable_cell(manager: Manager, scope: Scope, cell: Cell) -> tuple[BootUnit, bool]:
-    """Have every boot start this dataflow; its unit file, and whether that is news.
+    """Start this dataflow at every boot; its unit file, and whether that is a change.
 
     Raises DoraSystemdError; then nothing has changed.
     """
@@ -88,7 +88,7 @@ def enable_cell(manager: Manager, scope: Scope, cell: Cell) -> tuple[BootUnit, b
     facts = manager.read(cell.unit, ["FragmentPath", "DropInPaths", "Transient"])
     fragment = Path(facts["FragmentPath"])
     if facts["Transient"] or fragment == boot.runtime:
-        # What doractl set has changed is in drop-ins that are gone after a reboot.
+        # Changes by doractl set are in drop-ins that a reboot removes: include them.
         drop_ins = [one for one in map(Path, facts["DropInPaths"]) if one.is_relative_to("/run")]
         texts = [read_unit_file(path) or "" for path in (fragment, *drop_ins)]
         target = boot_target(manager, scope)
@@ -103,7 +103,7 @@ def enable_cell(manager: Manager, scope: Scope, cell: Cell) -> tuple[BootUnit, b
 
 
 def refuse_attached(cell: Cell) -> None:
-    """Raise DoraSystemdError for a dataflow of `doractl run`, which cannot outlive it."""
+    """Raise DoraSystemdError for a dataflow of `doractl run`, which ends with that command."""
     if cell.options.attached:
         raise DoraSystemdError(
             f"cannot make a unit file of {cell.name}: it ends with the doractl run that it "
@@ -114,7 +114,7 @@ def refuse_attached(cell: Cell) -> None:
 
 
 def install_unit_file(manager: Manager, boot: BootUnit, text: str) -> None:
-    """Write the unit file and link it; on failure all is as it was. Raises DoraSystemdError."""
+    """Write the unit file and link it; undo both on failure. Raises DoraSystemdError."""
     write_unit_file(boot.path, text)
     try:
         _link(manager, str(boot.path), boot.unit)
@@ -127,15 +127,16 @@ def install_unit_file(manager: Manager, boot: BootUnit, text: str) -> None:
 
 
 def _no_link(unit: str) -> DoraSystemdError:
-    """What systemd calls a missing unit: it could not make the directory of the link."""
+    """systemd says "not found" if it cannot create the directory of the link."""
     hint = f"is there room on the disk? see systemctl enable {unit}"
     return DoraSystemdError(f"cannot enable {unit}: systemd made no link to it", hint)
 
 
 def disable_cell(manager: Manager, scope: Scope, cell: Cell) -> bool:
-    """The opposite of enable_cell: links and unit file go; False if there was nothing to do.
+    """Undo enable_cell: remove the links and the unit file; False if there was nothing to do.
 
-    What runs from the file runs on: until the next boot its text is in the runtime directory.
+    A dataflow that runs from the file keeps running: its text is in the runtime directory until the
+    next boot.
     """
     boot = read_boot_unit(manager, scope, cell.unit)
     if not boot.is_wanted and boot.text is None:
@@ -153,7 +154,7 @@ def disable_cell(manager: Manager, scope: Scope, cell: Cell) -> bool:
 
 
 def drop_unit_files(manager: Manager, boot: BootUnit) -> None:
-    """Take away unit files that no boot uses: of a dataflow that was disabled, and does not run."""
+    """Remove unit files that are not needed: of a disabled dataflow that is not running."""
     if boot.text is not None or boot.runtime.exists():
         for path in (boot.path, boot.runtime):
             remove_unit_file(path)
@@ -162,9 +163,10 @@ def drop_unit_files(manager: Manager, boot: BootUnit) -> None:
 
 
 def release_transient(manager: Manager, boot: BootUnit) -> None:
-    """Have systemd forget a transient unit that has ended, so that the enabled file counts.
+    """Have systemd unload an ended transient unit, so that the enabled file takes effect.
 
-    systemd forgets, with its fragment, what no target wants any more: for a moment none does.
+    systemd unloads it, with its fragment, only while no target wants it: drop the link for a
+    moment.
     """
     manager.disable_unit_files([boot.unit])
     try:
@@ -176,7 +178,7 @@ def release_transient(manager: Manager, boot: BootUnit) -> None:
 
 
 def wait_until_forgotten(manager: Manager, unit: str) -> None:
-    """Wait until a transient unit is gone: systemd unloads it some time after nothing holds it."""
+    """Wait until a transient unit is gone: systemd unloads it a moment after the last reference."""
     deadline = time.monotonic() + _FORGET_SECONDS
     while manager.read(unit, ["Transient"])["Transient"]:
         if time.monotonic() > deadline:

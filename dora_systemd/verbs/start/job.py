@@ -1,4 +1,4 @@
-"""`doractl start`: a checked plan becomes a transient unit, and its start is waited for."""
+"""`doractl start`: starts the transient unit of a checked plan, and waits for it."""
 
 import select
 from collections.abc import Callable, Mapping, Sequence
@@ -18,12 +18,12 @@ from dora_systemd.verbs.start.plan import Plan
 _POLL_SECONDS = 0.2
 
 StageObserver = Callable[[str], None]
-"""Is told the unit's STATUS= while its start is waited for."""
+"""Called with the unit's STATUS= during the start."""
 
 
 @dataclass(frozen=True)
 class Started:
-    """A dataflow that has been started. is_ready: its nodes are, too."""
+    """A dataflow that has been started. is_ready: whether its nodes are ready."""
 
     uuid: str
     name: str
@@ -38,10 +38,10 @@ def start_plan(
     on_stage: StageObserver | None,
     wait: bool,
 ) -> Started:
-    """Start the transient unit of a plan and wait until its nodes are ready, unless told not to.
+    """Start the transient unit of a plan; if `wait`, wait until its nodes are ready.
 
-    Raises DoraSystemdError when the start fails, with the reason; the unit is left as failed then.
-    What its runner refuses was never started: nothing is left of that.
+    Raises DoraSystemdError with the reason when the start fails; the unit stays as failed. If the
+    runner refuses the dataflow, no unit is left.
     """
     number = next(iter(version_numbers(manager.version())), MIN_VERSION)
     told = transient_commands(properties, number)
@@ -57,7 +57,7 @@ def start_plan(
 def start_unit_file(
     manager: Manager, plan: Plan, on_stage: StageObserver | None, wait: bool
 ) -> Started:
-    """The same for a plan whose unit is a file that systemd has read."""
+    """Start the unit file of a plan, which systemd has loaded; as start_plan()."""
 
     def start(observe: Observer) -> str:
         if wait:
@@ -87,7 +87,7 @@ def _started(
         raise _interruption(plan.options.name) from error
     has_failed = result != JOB_DONE or _has_failed(manager, plan.unit)
     if has_failed and (refusal := runners_refusal(manager, plan.unit)):
-        # It never ran: its name is as free as before.
+        # It never ran, so do not keep its name in use.
         with suppress(DoraSystemdError):
             manager.reset_failed(plan.unit)
         raise refusal
@@ -98,9 +98,9 @@ def _started(
 
 
 def format_started(started: Started, watched: Sequence[str] = ()) -> str:
-    """What `doractl start` prints, in the manner of dora's own start.
+    """The output of `doractl start`, similar to that of dora's own start.
 
-    watched: patterns of the files that mean a reload, none without hot reload.
+    watched: patterns of the files that cause a reload, empty without hot reload.
     """
     done = "started" if started.is_ready else "starting"
     name = started.name
@@ -126,7 +126,7 @@ def _interruption(name: str) -> DoraSystemdError:
 
 
 def _wait_until_checked(manager: Manager, unit: str) -> None:
-    """Return when the runner has said that it goes on, or has ended."""
+    """Return once the runner has accepted the dataflow, or has ended."""
     while True:
         state = manager.read(unit, ["ActiveState", "Job", "StatusText"])
         is_on_the_way = state["ActiveState"] in ON_THE_WAY or (state["Job"] or (0,))[0]
@@ -138,7 +138,7 @@ def _wait_until_checked(manager: Manager, unit: str) -> None:
 
 
 def _has_failed(manager: Manager, unit: str) -> bool:
-    """A dataflow may end the moment it has started; one that ended well has started well."""
+    """Whether the start failed; a dataflow that finishes right after its start has not failed."""
     return bool(manager.read(unit, ["ActiveState"])["ActiveState"] == "failed")
 
 

@@ -1,4 +1,4 @@
-"""From what was asked for to a unit that starts: the steps that every way of starting shares."""
+"""The steps from a request to a started unit that all ways of starting share."""
 
 from dataclasses import dataclass
 
@@ -23,15 +23,15 @@ class Claim:
 
 
 def claim(manager: Manager, scope: Scope, request: StartRequest, want_boot: bool = False) -> Claim:
-    """Check what is asked for and prepare its unit. want_boot: as a unit file that a boot starts.
+    """Check the request and prepare its unit. want_boot: as a unit file that is started at boot.
 
-    Raises DoraSystemdError; nothing is changed then.
+    Raises DoraSystemdError; then nothing has changed.
     """
     boot = require_free_name(manager, scope, unit_name(request_name(request)))
     plan = with_known_uuid(make_plan(scope, request), boot)
     properties, warnings = plan_properties(plan, manager)
     if want_boot:
-        # Its unit file is there before its runner can refuse it.
+        # Check first: the unit file is written before a runner could refuse the dataflow.
         check_plan(lambda: manager, plan)
     has_file = place_unit_file(manager, plan, properties, boot, want_boot)
     return Claim(plan, None if has_file else properties, tuple(warnings))
@@ -40,7 +40,7 @@ def claim(manager: Manager, scope: Scope, request: StartRequest, want_boot: bool
 def start_claim(
     manager: Manager, claim: Claim, on_stage: StageObserver | None, wait: bool
 ) -> Started:
-    """Start it; raises DoraSystemdError as start_plan does."""
+    """Start the unit. Raises DoraSystemdError as start_plan does."""
     if claim.properties is None:
         return start_unit_file(manager, claim.plan, on_stage, wait)
     return start_plan(manager, claim.plan, list(claim.properties.values()), on_stage, wait)

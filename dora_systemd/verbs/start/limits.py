@@ -1,4 +1,4 @@
-"""Whether the limits of a dataflow can be kept on this machine."""
+"""Checks that this machine can enforce the limits of a dataflow."""
 
 from pathlib import Path
 
@@ -17,9 +17,9 @@ from dora_systemd.verbs.start.plan import Plan
 
 
 def check_limits(manager: Manager, plan: Plan, properties: Properties) -> tuple[str, ...]:
-    """Warnings about limits that go too far, and about devices that are not there.
+    """Warnings about limits above the machine's size, and about missing devices.
 
-    Raises DoraSystemdError (NO_SYSTEMD) for a limit that nothing would hold up.
+    Raises DoraSystemdError (NO_SYSTEMD) for a limit that nothing would enforce.
     """
     nodes = plan.options.node_limits
     needed = needed_controllers(properties, nodes)
@@ -32,7 +32,7 @@ def check_limits(manager: Manager, plan: Plan, properties: Properties) -> tuple[
 
 
 def _powerless(plan: Plan) -> list[str]:
-    """What a user's manager takes and cannot do."""
+    """Limits that a user's manager accepts but cannot enforce."""
     if not plan.scope.is_user:
         return []
     nice = plan.settings[NICE]

@@ -1,4 +1,4 @@
-"""Whether a user's manager runs without the user, as a boot needs it, see loginctl(1)."""
+"""Lingering: whether a user's manager runs without a session, from boot on, see loginctl(1)."""
 
 from dora_systemd.adapters.host.process import run_command
 from dora_systemd.errors import DoraSystemdError
@@ -10,7 +10,7 @@ _LOGINCTL = ("loginctl", "--no-ask-password")
 
 
 def is_lingering(scope: Scope) -> bool | None:
-    """Whether the manager of the scope's user is started at boot; None: logind does not say."""
+    """Whether the manager of the scope's user starts at boot; None if logind does not answer."""
     command = (*_LOGINCTL, "show-user", "--property=Linger", "--value", str(scope.uid))
     try:
         answer = run_command(command, _SECONDS).stdout.strip()
@@ -20,14 +20,14 @@ def is_lingering(scope: Scope) -> bool | None:
 
 
 def linger_command(scope: Scope) -> str:
-    """What root has to run so that it is."""
+    """The command by which root enables lingering."""
     return f"loginctl enable-linger {_user_name(scope)}"
 
 
 def ensure_linger(scope: Scope) -> str:
-    """Have the user's manager started at boot; what there is to say about it, or "".
+    """Enable lingering for the user; a message about that, or "".
 
-    polkit lets users do that for themselves on most machines.
+    On most machines polkit lets users do that for themselves.
     """
     if not scope.is_user or is_lingering(scope):
         return ""

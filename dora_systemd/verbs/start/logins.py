@@ -1,8 +1,8 @@
-"""Who else can log in: unless a dataflow has a network of its own, dora's ports are theirs as well.
+"""Warns about other users of the machine: they can reach dora's ports on the host's network.
 
-Nodes and daemon of dora 1.1 speak TCP on 127.0.0.1 and ask nobody who he is. A filter by user
-needs rules of a firewall for the whole machine; those of a unit (IPAddressDeny=, SocketBindDeny=)
-know addresses and ports, and no users. So a network namespace is what helps.
+Nodes and daemon of dora 1.1 use TCP on 127.0.0.1 without authentication. Only firewall rules for
+the whole machine could filter by user; those of a unit (IPAddressDeny=, SocketBindDeny=) filter
+addresses and ports. So a dataflow needs a private network namespace to be protected.
 """
 
 from collections.abc import Iterator
@@ -25,7 +25,7 @@ _SHOWN = 3
 
 
 def login_users(passwd: str) -> list[str]:
-    """The names of those who can log in. passwd: the text of passwd(5); others are not counted."""
+    """The names of users who can log in. passwd: text of passwd(5); other sources do not count."""
     rows = [line.split(":") for line in passwd.splitlines()]
     return [
         row[0]
@@ -38,9 +38,9 @@ def login_users(passwd: str) -> list[str]:
 
 
 def start_notes(plan: Plan, passwd: Path = PASSWD) -> Iterator[str]:
-    """What whoever starts a dataflow should know about the others of this machine, if anything.
+    """Warnings about other users, for someone who starts a dataflow.
 
-    Who asks for the host's network by name knows.
+    There is no warning if the settings name the host's network explicitly.
     """
     network, is_given = plan.settings[NETWORK], plan.settings.source(NETWORK) != "default"
     if plan.scope.is_user or plan.user is None or network == "private":
@@ -57,7 +57,7 @@ def start_notes(plan: Plan, passwd: Path = PASSWD) -> Iterator[str]:
 
 
 def judge_logins(scope: Scope, passwd: Path = PASSWD) -> Iterator[Finding]:
-    """What `doractl doctor` says of them."""
+    """The findings of `doractl doctor` about other users."""
     users = _logins(passwd)
     if not scope.is_user and len(users) > 1:
         text = f"{_names(users)} can log in, and reach what nodes of any dataflow exchange"

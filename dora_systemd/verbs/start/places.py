@@ -1,8 +1,8 @@
-"""Where the things of a dataflow are, as the user sees them that it will run as.
+"""Finds the files of a dataflow with the permissions of the user that it will run as.
 
-What somebody else's settings name is looked at with his eyes only: whether it is there is nothing
-that root may tell him. What root's own command line names is looked at by root as well, to say more
-clearly what is wrong.
+Paths from another user's settings are only checked with that user's permissions: root must not
+reveal whether a file exists. Paths on root's own command line are also checked as root, which gives
+clearer errors.
 """
 
 import pwd
@@ -28,7 +28,7 @@ _OWN = OwnSight()
 
 
 class Look:
-    """sight: of `user`, who is None where the caller runs it himself."""
+    """sight: that of `user`, which is None if the caller runs the dataflow as itself."""
 
     def __init__(self, sight: Sight, settings: Settings, user: pwd.struct_passwd | None) -> None:
         self.sight = sight
@@ -36,7 +36,7 @@ class Look:
         self._user = user
 
     def find_venv(self, dataflow: str, environment: Mapping[str, str]) -> str | None:
-        """--venv, else the caller's VIRTUAL_ENV, else .venv beside the dataflow, else none."""
+        """--venv, else the caller's VIRTUAL_ENV, else .venv beside the dataflow, else None."""
         given = self._settings[VENV]
         if given is not None:
             return self._checked_venv(str(Path(given).absolute()))
@@ -57,7 +57,7 @@ class Look:
         return self.sight.exists(f"{venv}/bin/python")
 
     def check_reach(self, dataflow: str, directory: str) -> None:
-        """Raise DoraSystemdError for a working directory, or files, that the user cannot reach."""
+        """Raise DoraSystemdError for a working directory, or files, that the user cannot access."""
         if not self.sight.is_directory(directory):
             self._blame(WORKING_DIRECTORY, directory, _OWN.is_directory(directory))
             raise DoraSystemdError(
@@ -81,7 +81,7 @@ class Look:
             raise
 
     def _blame(self, setting: Setting[Any], path: str, is_there: bool) -> None:
-        """Say who cannot reach what the command line names and root can see."""
+        """Raise DoraSystemdError for a path that root can see and the user cannot."""
         if self._user is not None and is_there and not self._is_named_in_file(setting):
             raise cannot_reach(self._user.pw_name, path)
 
@@ -89,14 +89,14 @@ class Look:
         return self._settings.source(setting).startswith("/")
 
     def read_lent(self, file: str) -> str:
-        """An environment file that the user's own settings name, read as the user."""
+        """Read an environment file of the user's own settings, with that user's permissions."""
         try:
             return decoded(self.sight.read(file), Path(file))
         except OSError as error:
             raise unreadable(file, error) from error
 
     def read_session(self, dataflow: str) -> BuildSession:
-        """What `dora build` has left, if anything. Raises DoraSystemdError."""
+        """The session that `dora build` has saved, if any. Raises DoraSystemdError."""
         path = Path(session_path(dataflow))
         try:
             text = decoded(self.sight.read(str(path)), path)

@@ -1,7 +1,6 @@
-"""What `doractl start` is going to do, found out before systemd hears of it.
+"""Makes the plan of a start: reads and checks everything before systemd gets a request.
 
-What dora and the programs of the dataflow have to say is found out in the cell:
-see adapters/dora/check.py.
+What dora and the nodes' programs would report is checked in the cell, see adapters/dora/check.py.
 """
 
 import os
@@ -51,7 +50,7 @@ DEFAULT_FILE = "dataflow.yml"
 
 @dataclass(frozen=True)
 class StartRequest:
-    """What was asked for. flags: raw values by setting name, see resolve_settings.
+    """A request to start a dataflow. flags: raw values by setting name, see resolve_settings.
 
     environment: the caller's variables. attached: the dataflow ends with the caller.
     """
@@ -79,19 +78,19 @@ class Plan:
 
     @property
     def unit(self) -> str:
-        """The unit's name."""
+        """The name of the unit."""
         return unit_name(self.options.name)
 
 
 def request_name(request: StartRequest) -> str:
-    """The name that the dataflow gets. Raises DoraSystemdError (USAGE)."""
+    """The name of the dataflow. Raises DoraSystemdError (USAGE)."""
     if request.name is not None:
         return parse_name(request.name)
     return name_from_path(str(Path(request.dataflow).absolute()))
 
 
 def make_plan(scope: Scope, request: StartRequest) -> Plan:
-    """Read and check everything that needs no dora; nothing is changed anywhere.
+    """Read and check everything that does not need dora; changes nothing.
 
     Raises DoraSystemdError.
     """
@@ -110,7 +109,7 @@ def make_plan(scope: Scope, request: StartRequest) -> Plan:
 
 @dataclass(frozen=True)
 class _Found:
-    """What was read, and whom it is for."""
+    """What was read, and for which user."""
 
     scope: Scope
     request: StartRequest
@@ -152,7 +151,7 @@ def _make_plan(found: _Found, directory: str, look: Look) -> Plan:
         options, "", environment["PATH"], look.sight.exists, look.read_session(path)
     )
     if not any(node.kind in UNEXPANDED for node in found.dataflow.nodes):
-        # The runner does it again; what can be refused without a unit needs none.
+        # The runner repeats this, but an error here needs no unit.
         check_named_nodes(options, found.dataflow)
         launch_descriptor(found.dataflow, launch)
     prepared = Prepared(found.dataflow, launch, {})
@@ -161,7 +160,7 @@ def _make_plan(found: _Found, directory: str, look: Look) -> Plan:
 
 
 def _variables(settings: Settings, look: Look) -> dict[str, str]:
-    """What --env and --env-file set; --env wins, and a later file."""
+    """The variables of --env and --env-file; --env has precedence, then the last file."""
     variables: dict[str, str] = {}
     for file in settings[ENV_FILE]:
         text = look.read_lent(file) if file in settings.lent else read_text(Path(file))

@@ -17,7 +17,7 @@ _STATE = ("ActiveState", "Job", "ExecMainCode", "ExecMainStatus", "Result")
 
 
 class LogSource(Protocol):
-    """Where the lines of the dataflow come from."""
+    """The source of the dataflow's lines."""
 
     def fileno(self) -> int:
         """For poll(2): readable when there may be lines."""
@@ -26,12 +26,12 @@ class LogSource(Protocol):
         """Print some of the lines that have come since the last look."""
 
     def finish(self) -> None:
-        """Print all lines up to the end of the unit, which has happened."""
+        """Print the remaining lines of a unit that has ended."""
 
 
 @dataclass(frozen=True)
 class Pipe:
-    """The pipe whose read end is the runner's standard input: its end of file means stop."""
+    """A pipe whose read end is the runner's standard input; its end of file requests a stop."""
 
     read: int
     write: int
@@ -39,7 +39,7 @@ class Pipe:
 
 @contextmanager
 def life_line() -> Iterator[Pipe]:
-    """A pipe that only this process holds open: however it dies, the dataflow learns of it."""
+    """A pipe whose write end only this process has: however it dies, the dataflow stops."""
     read, write = os.pipe2(os.O_CLOEXEC)
     try:
         yield Pipe(read, write)
@@ -49,9 +49,10 @@ def life_line() -> Iterator[Pipe]:
 
 
 def attached_properties(pipe: Pipe) -> list[Property]:
-    """What an attached unit has on top, see systemd.service(5) and org.freedesktop.systemd1(5).
+    """The additional properties of an attached unit.
 
-    It is not kept when it failed, but until we have read how it ended.
+    See systemd.service(5) and org.freedesktop.systemd1(5). systemd unloads the unit even if it
+    failed, but not before this client has read the result.
     """
     return [
         ("StandardInputFileDescriptor", "h", pipe.read),
@@ -65,7 +66,7 @@ def follow_unit(
 ) -> int:
     """Print the logs of a started unit until it has ended; its exit status.
 
-    The first Ctrl+C stops it gracefully, the second kills it.
+    The first Ctrl+C stops the dataflow gracefully, the second kills it.
     """
     interrupts = 0
     with _interrupts() as wakeup:
@@ -80,7 +81,7 @@ def follow_unit(
             logs.print_new()
             changed = manager.changes(unit)
             _tell(changed, on_stage)
-            # A flood of lines is no reason to ask systemd again and again.
+            # Many lines must not cause as many requests to systemd.
             status = None if ready and not changed else _exit_status(manager, unit)
             if status is not None:
                 logs.finish()
@@ -101,20 +102,20 @@ def _interrupt(manager: Manager, unit: str, count: int) -> None:
 
 
 def _exit_status(manager: Manager, unit: str) -> int | None:
-    """The exit status of a unit that has ended; of a killed one 128 + the signal, as in a shell."""
+    """The exit status of a unit that has ended, or 128 + signal, as in a shell."""
     state = manager.read(unit, _STATE)
     if state["ActiveState"] not in DOWN or state["Job"][0]:
         return None
     status: int = state["ExecMainStatus"]
     if state["ExecMainCode"] != _CLD_EXITED and status:
         return 128 + status
-    # Killed in time or never executed: the main process itself has no exit status to tell.
+    # A timeout, or a failure before the runner was executed: there is no exit status.
     return status or int(state["Result"] != "success")
 
 
 @contextmanager
 def _interrupts() -> Iterator[int]:
-    """A descriptor that receives a byte for every SIGINT, which interrupts nothing else."""
+    """A file descriptor that receives a byte for each SIGINT; nothing else is interrupted."""
     read, write = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
     before = signal.signal(signal.SIGINT, lambda *_: None)
     wakeup = signal.set_wakeup_fd(write)

@@ -1,4 +1,4 @@
-"""The sandbox of a plan: which paths have to stay open, and what a scope cannot keep."""
+"""The sandbox of a plan: the paths that must stay accessible, and what a scope cannot enforce."""
 
 import pwd
 import sys
@@ -26,7 +26,7 @@ _MAX_USER_NAMESPACES = Path("/proc/sys/user/max_user_namespaces")
 _IDENTITY = 65536
 _CAPABILITIES = ("AmbientCapabilities", "CapabilityBoundingSet")
 _UV_PLACES = (".cache/uv", ".local/share/uv")
-"""What uv writes below the home directory, see `uv cache dir` and `uv python dir`."""
+"""Where uv writes below the home directory, see `uv cache dir` and `uv python dir`."""
 
 
 def make_sandbox(
@@ -36,9 +36,9 @@ def make_sandbox(
     prepared: Prepared,
     sight: Sight | None = None,
 ) -> Sandbox:
-    """The sandbox that the settings ask for. Raises DoraSystemdError for a path that is not there.
+    """The sandbox of the settings. Raises DoraSystemdError for a path that does not exist.
 
-    user: of the nodes, None in user scope. sight: of that user; None: the caller's.
+    user: of the nodes, None in user scope. sight: that of this user; None: the caller's.
     """
     sight = sight or OwnSight()
     options = prepared.plan.options
@@ -52,7 +52,7 @@ def make_sandbox(
         is_root=user is not None and user.pw_uid == 0,
         has_devices=bool(settings[DEVICE]) or _names(settings, "DeviceAllow"),
         is_realtime=settings[REALTIME] is not None,
-        # In a user namespace capabilities would count for nothing.
+        # In a user namespace the given capabilities would have no effect.
         has_identity=_has_identity(user) and not _names(settings, *_CAPABILITIES),
         needed=needed,
         writable=writable,
@@ -62,9 +62,10 @@ def make_sandbox(
 
 
 def _firm(paths: Sequence[str], user: pwd.struct_passwd | None) -> dict[str, str]:
-    """Of each path what systemd may mount for `user`, whose own word on what is there is no proof.
+    """For each path, the part that systemd may mount for `user`.
 
-    A program of that user can trace the child that is asked, and have it say anything.
+    The user's own view proves nothing: a program of that user can trace the child that checks the
+    paths, and forge its answers.
     """
     account = None if user is None else account_from(user)
     uid, groups = (0, ()) if account is None else (account.uid, (account.gid, *account.groups))
@@ -72,7 +73,7 @@ def _firm(paths: Sequence[str], user: pwd.struct_passwd | None) -> dict[str, str
 
 
 def sandbox_warnings(sandbox: Sandbox) -> Iterator[str]:
-    """What a user's manager takes and cannot keep, and what the name of a path keeps open."""
+    """Warnings about what a user's manager cannot enforce, and about paths that stay accessible."""
     for path in odd_paths(sandbox):
         yield f"the sandbox cannot hide what is around {shown(path)}, whose name no mount can have"
     for place, path in {place: path for path, place in loose_paths(sandbox)}.items():
@@ -90,16 +91,16 @@ def sandbox_warnings(sandbox: Sandbox) -> Iterator[str]:
 
 
 def _has_identity(user: pwd.struct_passwd | None) -> bool:
-    """Whether `user` can be in a user namespace with the first 65536 ids, and there can be one.
+    """Whether `user` fits into a user namespace with the first 65536 ids, and the machine has one.
 
-    A directory service gives higher ones.
+    Directory services assign higher ids.
     """
     is_known = user is None or max(user.pw_uid, user.pw_gid) < _IDENTITY
     return is_known and _offers_identity()
 
 
 def _offers_identity() -> bool:
-    """Whether this machine can make one: a kernel may refuse any, a container may have fewer ids.
+    """Whether this machine can create one: kernels may refuse, and containers may have fewer ids.
 
     See namespaces(7) and user_namespaces(7).
     """
@@ -116,7 +117,7 @@ def _maps_identity(path: Path) -> bool:
 
 
 def _names(settings: Settings, *keys: str) -> bool:
-    """Whether one of these properties is given."""
+    """Whether the settings contain one of these properties."""
     return any(one.partition("=")[0] in keys for one in settings[PROPERTY])
 
 
@@ -136,13 +137,13 @@ def _existing(paths: Iterator[Path], sight: Sight) -> Iterator[str]:
 
 
 def _needed(prepared: Prepared, sight: Sight) -> Iterator[Path]:
-    """Where the dataflow, its programs and their interpreters are, and we ourselves."""
+    """The paths of the dataflow, its programs, their interpreters, and this package."""
     options = prepared.plan.options
     yield Path(options.dataflow).parent
     yield Path(options.working_directory)
     yield from (Path(sys.prefix), Path(sys.base_prefix), PACKAGE.parent)
     for program in (options.dora, python_of(prepared.plan)):
-        # A virtual environment has links to the Python that it is made from.
+        # A virtual environment links to the Python that it was created from.
         yield from (_prefix(Path(program)), _prefix(Path(sight.real(program))))
     yield from named_places(prepared.dataflow, sight)
     session = prepared.plan.session

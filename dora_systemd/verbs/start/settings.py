@@ -1,4 +1,4 @@
-"""The settings of a dataflow that is to be started: which files there are, and whom to believe."""
+"""Reads the settings of a dataflow that is to be started, and checks whose files to trust."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -20,7 +20,7 @@ USER_FILE = Path("dora-systemd/config.yml")
 
 @dataclass(frozen=True)
 class _Read:
-    """A settings file that was read, and where from."""
+    """A settings file that was read, and its place."""
 
     path: Path
     place: Place
@@ -28,7 +28,7 @@ class _Read:
 
     @property
     def is_roots(self) -> bool:
-        """Whether root wrote it and put it there."""
+        """Whether only root can have written and placed the file."""
         return self.place.uid == 0 and not self.place.borrowed
 
     def words(self) -> Mapping[object, object]:
@@ -37,7 +37,7 @@ class _Read:
 
 
 def settings_files(dataflow: Path, environment: Mapping[str, str]) -> list[Path]:
-    """The settings files that may exist, the most important first, see design."""
+    """The settings files that may exist, highest precedence first."""
     home = environment.get("HOME", "")
     config = environment.get("XDG_CONFIG_HOME", "") or (f"{home}/.config" if home else "")
     beside = Path(settings_path(str(dataflow)))
@@ -50,8 +50,8 @@ def read_settings(
 ) -> Settings:
     """The settings from flags, variables and files. Raises DoraSystemdError.
 
-    dataflow: its absolute path. In system scope somebody else's file is believed only in what is
-    his to say, and the environment files that it names are `lent`.
+    dataflow: its absolute path. In system scope, another user's file may only contain what that
+    user may decide, and the environment files that it names are `lent`: read as that user.
     """
     found = [_read(path) for path in settings_files(dataflow, environment) if exists(path)]
     documents = [(str(one.path), one.document) for one in found]
@@ -74,7 +74,7 @@ def _read(path: Path) -> _Read:
 
 
 def _check_trust(read: _Read) -> None:
-    """Somebody else's file must not have root read, run or give something."""
+    """Refuse keys by which another user's file could make root read, run or grant something."""
     only = {setting.name: setting for setting in SETTINGS if setting.root_only}
     dangerous = [only[key] for key in read.words() if key in only]
     if dangerous:

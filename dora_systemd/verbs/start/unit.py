@@ -1,4 +1,4 @@
-"""The unit of a plan: its properties for systemd, and the same as text for people."""
+"""The unit of a plan: its properties for systemd, and its text for people."""
 
 import sys
 
@@ -18,9 +18,9 @@ from dora_systemd.verbs.start.watch import watch_warnings
 
 
 def plan_properties(plan: Plan, manager: Manager) -> tuple[dict[str, Property], tuple[str, ...]]:
-    """All properties of the unit that this systemd takes, by slot, and warnings.
+    """All properties of the unit that this systemd supports, by slot, and warnings.
 
-    They are about the properties that it does not take and limits beyond the machine's own. Raises
+    The warnings are about unsupported properties, and limits above the machine's size. Raises
     DoraSystemdError.
     """
     number = next(iter(version_numbers(manager.version())), MIN_VERSION)
@@ -31,9 +31,9 @@ def plan_properties(plan: Plan, manager: Manager) -> tuple[dict[str, Property], 
 
 
 def format_plan(plan: Plan, target: str | None = None) -> str:
-    """The unit as the text of a unit file, with its name and what it is made from on top.
+    """The unit as the text of a unit file, below comments with its name and sources.
 
-    target: what would start it at boot.
+    target: the one that would start it at boot.
     """
     head = f"# {plan.unit}\n# source: {plan.options.dataflow}\n"
     text = format_unit(_properties(plan))

@@ -1,4 +1,4 @@
-"""What `doractl start --hot-reload` says about the files that are going to be watched."""
+"""`doractl start --hot-reload`: the output about the files to watch."""
 
 import os
 from collections.abc import Iterator
@@ -8,7 +8,7 @@ from dora_systemd.verbs.start.plan import Plan
 
 
 def watched_patterns(plan: Plan) -> tuple[str, ...]:
-    """The patterns of the files that mean a reload, none if hot reload is off."""
+    """The patterns of the files that cause a reload, empty without hot reload."""
     from dora_systemd.decisions.reload.watch_rules import DEFAULT_WATCH
 
     if not plan.options.hot_reload:
@@ -17,13 +17,14 @@ def watched_patterns(plan: Plan) -> tuple[str, ...]:
 
 
 def watch_warnings(plan: Plan) -> Iterator[str]:
-    """One for each pattern that was given and fits no file.
+    """A warning for each given pattern that matches no file.
 
-    Only the owner of the files walks through them: as root, doractl would open somebody else's.
+    Only the owner of the files gets these: as root, doractl would search another user's
+    directories.
     """
     if not plan.options.hot_reload or not plan.options.reload.watch or _is_anothers(plan):
         return
-    # Only who gives patterns pays for a walk through the files.
+    # Imported late: only given patterns need a search.
     from dora_systemd.adapters.host.watch import watch_rules, watched_files
     from dora_systemd.decisions.reload.watch_rules import unmatched_patterns
 
