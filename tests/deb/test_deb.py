@@ -110,7 +110,7 @@ def test_units() -> None:
 
 def test_catalog() -> None:
     listed = sh("journalctl --list-catalog c8e3833d172d44c5a32de08c980c4d67").stdout
-    assert "runs" in listed
+    assert "is running" in listed
 
 
 @pytest.mark.parametrize("page", MANUALS)
