@@ -1,1 +1,1 @@
-"""The doractl command: one file per verb, no decision in any of them."""
+"""The doractl command: one file for each verb; the verbs below dora_systemd/ do the work."""

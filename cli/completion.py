@@ -1,8 +1,8 @@
-"""What the shells ask for at the Tab key: options and verbs from click, and what runs.
+"""Shell completion: options and verbs from click, and the names of dataflows and nodes.
 
-The scripts in packaging/completions set _DORACTL_COMPLETE and speak click's own protocol, see
-https://click.palletsprojects.com/shell-completion. Nothing here may print or fail: a key was
-pressed in the middle of somebody's line.
+The scripts in packaging/completions set _DORACTL_COMPLETE and use click's own protocol, see
+https://click.palletsprojects.com/shell-completion. This code must not print or fail, because the
+user is in the middle of a command line.
 """
 
 from collections.abc import Callable, Iterable
@@ -23,14 +23,14 @@ from dora_systemd.names import is_uuid_prefix
 VARIABLE = "_DORACTL_COMPLETE"
 
 _OF_THE_PAST = ("logs", "why")
-"""Verbs that find dataflows which only the journal knows."""
+"""Verbs that also accept dataflows that only the journal knows."""
 
 _RUNNING_ONLY = ("stop", "dora", "env", "top")
-"""Verbs that have nothing to do with a dataflow that has failed."""
+"""Verbs that do not accept failed dataflows."""
 
 
 class Live(click.types.StringParamType):
-    """The type of an argument whose values are what there is now."""
+    """The type of an argument whose values are existing names."""
 
     def __init__(self, values: Callable[[click.Context, str], Iterable[str]]) -> None:
         self.values = values
@@ -48,7 +48,7 @@ class Live(click.types.StringParamType):
 
 
 def dataflow_names(ctx: click.Context, incomplete: str) -> list[str]:
-    """The dataflows that systemd knows and, for logs, the journal; by UUID if that is begun."""
+    """The dataflows of systemd and, for logs, of the journal; UUIDs if the word looks like one."""
     from dora_systemd.verbs.facts.cells import read_cells
 
     verb = ctx.command.name or ""
@@ -63,12 +63,12 @@ def dataflow_names(ctx: click.Context, incomplete: str) -> list[str]:
 
 
 def node_names(ctx: click.Context, incomplete: str) -> list[str]:
-    """The nodes of the dataflow that the line names already."""
+    """The nodes of the dataflow that is on the command line."""
     from dora_systemd.verbs.facts.cells import read_cells, select_cell
     from dora_systemd.verbs.facts.list import dataflow_row
 
     del incomplete
-    # Behind an option without its value click leaves the arguments where they are.
+    # After an option without its value, click leaves the arguments in ctx.args.
     selector = ctx.params.get("selector") or next(iter(ctx.args), "")
     if ctx.command.name == "logs":
         return JournalReader().known_nodes(selector)
@@ -77,7 +77,7 @@ def node_names(ctx: click.Context, incomplete: str) -> list[str]:
     return [one.node for one in row.nodes]
 
 
-# By name of the parameter, whichever verb it belongs to.
+# By name of the parameter, for all verbs.
 TYPES: dict[str, Any] = {
     "selector": Live(dataflow_names),
     "selectors": Live(dataflow_names),
@@ -97,7 +97,7 @@ TYPES: dict[str, Any] = {
 
 
 class CompletingGroup(VerbGroup):
-    """doractl's verbs, whose parameters know what could stand in their place."""
+    """The verbs of doractl, with completion for their parameters."""
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         command = super().get_command(ctx, cmd_name)
@@ -106,7 +106,7 @@ class CompletingGroup(VerbGroup):
         return command and _set_types(command)
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """Verbs from the table, which imports none of them, and the options beside them."""
+        """Complete verbs from the table, without importing them, and options."""
         verbs = [
             CompletionItem(name, help=verb.summary)
             for name, verb in VERBS.items()
@@ -116,7 +116,7 @@ class CompletingGroup(VerbGroup):
 
 
 def complete(instruction: str) -> int:
-    """Print what fits, as `instruction` says: bash_complete, zsh_complete or fish_complete."""
+    """Print completions for `instruction`: bash_complete, zsh_complete or fish_complete."""
     group = CompletingGroup("doractl", params=doractl.params)
     with suppress(DoraSystemdError):
         return shell_complete(group, {}, "doractl", VARIABLE, instruction)

@@ -1,7 +1,7 @@
-"""The edge: all that doractl writes goes through it, so that no text of others reaches a terminal.
+"""Escapes all output of doractl, so that foreign text cannot control a terminal.
 
-Names of files, what nodes wrote and what systemd says about them get into tables and messages in
-many places. One stream that shows control characters escaped cannot be forgotten in any of them.
+File names, lines of nodes and messages of systemd get into tables and messages in many places. One
+stream for all output cannot be forgotten in any of them.
 """
 
 import io
@@ -15,23 +15,23 @@ class Edge(io.TextIOWrapper):
     """A stream that writes text as terminal_text.escaped() shows it."""
 
     def write(self, text: str) -> int:
-        """Write `text`, with what would command a terminal escaped."""
+        """Write `text` with control characters escaped."""
         return super().write(escaped(text))
 
     def write_own(self, text: str) -> None:
-        """Write `text` as it is."""
+        """Write `text` unchanged."""
         super().write(text)
 
 
 def put_in_place() -> None:
-    """Have standard output and error go through the edge from now on."""
+    """Replace standard output and error by escaping streams."""
     sys.stdout, sys.stderr = (_edge(one) for one in (sys.stdout, sys.stderr))
 
 
 def _edge(stream: TextIO) -> TextIO:
-    if not isinstance(stream, io.TextIOWrapper):  # none at all, or a test's
+    if not isinstance(stream, io.TextIOWrapper):  # no stream, or that of a test
         return stream
-    # Names of files need not be in the terminal's encoding.
+    # File names need not be valid in the terminal's encoding.
     return Edge(
         stream.buffer,
         encoding=stream.encoding,
@@ -41,7 +41,7 @@ def _edge(stream: TextIO) -> TextIO:
 
 
 def write_own(stream: TextIO, text: str) -> None:
-    """Write a text of ours, with control sequences of ours in it."""
+    """Write a text of our own that contains control sequences."""
     if isinstance(stream, Edge):
         stream.write_own(text)
     else:
@@ -49,7 +49,7 @@ def write_own(stream: TextIO, text: str) -> None:
 
 
 def write_exactly(text: str) -> None:
-    """Print what a program is to read: as it is in a pipe or a file, for a terminal as all else."""
+    """Print text for programs: unchanged to a pipe or a file, escaped to a terminal."""
     if sys.stdout.isatty():
         sys.stdout.write(text)
     else:

@@ -1,4 +1,4 @@
-"""The verbs of doractl as a click group that imports a verb's module only when it is called."""
+"""The verbs of doractl as a click group that imports only the verb that runs."""
 
 from importlib import import_module
 from pathlib import Path
@@ -17,11 +17,11 @@ TITLES = {
     "machine": "This machine",
 }
 SECTIONS = tuple(TITLES)
-"""The folders of verbs/, in the order of --help."""
+"""The directories of verbs/, in the order of --help."""
 
 
 class Verb(NamedTuple):
-    """A verb of doractl: the file `path`, whose docstring begins with its line in --help."""
+    """A verb of doractl: the file `path`. Its docstring begins with the line in --help."""
 
     name: str
     section: str
@@ -29,20 +29,20 @@ class Verb(NamedTuple):
 
     @property
     def command(self) -> click.Command:
-        """What click calls."""
+        """The click command."""
         name = f"dora_systemd.cli.verbs.{self.section}.{self.name}"
         found: click.Command = import_module(name).command
         return found
 
     @property
     def summary(self) -> str:
-        """Read from the file: --help would take long if it imported all of them."""
+        """The first line of the docstring, read from the file: imports would slow down --help."""
         with self.path.open(encoding="utf-8") as lines:
             return lines.readline().strip().strip('"')
 
 
 def find_verbs() -> dict[str, Verb]:
-    """All verbs by name: a new one is a new file."""
+    """All verbs by name. A new file is a new verb."""
     root = Path(__file__).with_name("verbs")
     return {
         path.stem: Verb(path.stem, section, path)
@@ -65,7 +65,7 @@ Examples:
 
 
 class VerbGroup(click.Group):
-    """A group that imports a verb's module only when that verb is called."""
+    """A group that imports a verb's module only when it runs."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         del ctx
@@ -89,7 +89,7 @@ class VerbGroup(click.Group):
         raise DoraSystemdError(f"unknown command {name!r}", hint, ExitCode.USAGE)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """The verbs with their lines of the table: --help imports none of them."""
+        """List the verbs and their summaries without importing them."""
         del ctx
         width = max(map(len, VERBS))
         for section in SECTIONS:
@@ -117,7 +117,7 @@ def doractl(ctx: click.Context) -> None:
 
 
 def run_verb(arguments: list[str]) -> int:
-    """Run a command line and return its exit status; DoraSystemdError for a wrong one, too."""
+    """Run a command line; its exit status. Raises DoraSystemdError for a wrong one, too."""
     try:
         result = doractl.main(arguments, prog_name="doractl", standalone_mode=False)
     except click.ClickException as error:
@@ -125,13 +125,13 @@ def run_verb(arguments: list[str]) -> int:
     except click.Abort:
         return ExitCode.INTERRUPTED
     except SystemExit as error:
-        # The only one of click's own here: nobody reads our output any more.
+        # Here click exits by itself only if the reader of the output is gone.
         raise BrokenPipeError from error
     return result if isinstance(result, int) else ExitCode.OK
 
 
 def _usage_error(error: click.ClickException) -> DoraSystemdError:
-    """One of click's own errors in the words of all others."""
+    """An error of click in the form of all other errors."""
     text = error.format_message().rstrip(".")
     context: Any = getattr(error, "ctx", None)
     command = context.command_path if context else "doractl"

@@ -1,4 +1,4 @@
-"""What `doractl list` prints; without click, see main."""
+"""The output of `doractl list`; works without click, see main."""
 
 import json
 
@@ -17,7 +17,7 @@ from dora_systemd.verbs.facts.list import find_row, read_rows
 
 
 def print_dataflows(request: ListRequest) -> int:
-    """Print what is asked for; NOT_RUNNING if a single dataflow was asked for and is not up."""
+    """Print the list; NOT_RUNNING if a single dataflow was requested and is not up."""
     scope = scope_of(request.is_user)
     bus = Bus(scope, for_reading=True)
     if request.selector is None:
@@ -29,7 +29,7 @@ def print_dataflows(request: ListRequest) -> int:
 
 
 def is_json(request: ListRequest) -> bool:
-    """Whether JSON was asked for."""
+    """Whether the output is JSON."""
     return request.output == "json"
 
 
@@ -37,7 +37,7 @@ def _rows(bus: Bus, scope: Scope, request: ListRequest) -> list[DataflowRow]:
     rows = read_rows(bus, scope, with_details=is_json(request))
     if not request.want_all:
         return [row for row in rows if is_up_word(row)]
-    # The journal is read only for those that systemd has forgotten.
+    # Only dataflows that systemd has unloaded need the journal.
     from dora_systemd.verbs.facts.ended import ended_rows
 
     return [*rows, *ended_rows(scope, rows)]

@@ -1,4 +1,4 @@
-"""The command doractl: where it begins, and the one place where its errors are printed."""
+"""The entry point of doractl, and the only place that prints its errors."""
 
 import errno
 import os
@@ -13,16 +13,16 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 
 
 def main() -> None:
-    """Run doractl and end the process with its exit status, see ExitCode."""
+    """Run doractl, and exit with its status, see ExitCode."""
     put_in_place()
     _leave(run(sys.argv[1:]))
 
 
 def _leave(status: int) -> NoReturn:
-    """End without taking the interpreter apart, which is a tenth of what a short command needs."""
+    """Exit without finalizing the interpreter, a tenth of the time of a short command."""
     threading = sys.modules.get("threading")
     if threading and threading.active_count() > 1:
-        sys.exit(status)  # it waits for them
+        sys.exit(status)  # it waits for the threads
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError):
             if stream:
@@ -31,7 +31,7 @@ def _leave(status: int) -> NoReturn:
 
 
 def run(arguments: list[str]) -> int:
-    """Run doractl and return its exit status; errors have been printed, in two lines."""
+    """Run doractl; the exit status. Errors have been printed, in two lines."""
     try:
         status = _dispatch(arguments)
         if sys.stdout:
@@ -39,7 +39,7 @@ def run(arguments: list[str]) -> int:
     except DoraSystemdError as error:
         return _report(error)
     except BrokenPipeError:
-        # Whoever read our output has gone.
+        # The reader of our output is gone.
         _give_up_output()
         return _SIGPIPE_STATUS
     except OSError as error:
@@ -65,14 +65,14 @@ _OUTPUT_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 
 def _give_up_output() -> None:
-    """Nothing that is still buffered may be written at exit, where it would fail again."""
+    """Discard buffered output: writing it at exit would fail again."""
     if sys.stdout:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _dispatch(arguments: list[str]) -> int:
-    """What is asked for again and again runs without click, which takes longer than the rest."""
-    # A shell that wants to complete a line calls us without any argument.
+    """Frequent commands run without click, whose import takes longer than they do."""
+    # For completion, the shell runs doractl without arguments.
     if not arguments and (instruction := os.environ.get("_DORACTL_COMPLETE")):
         from dora_systemd.cli.completion import complete
 

@@ -1,4 +1,4 @@
-"""Options and arguments that several verbs have in common."""
+"""Options and arguments that several verbs share."""
 
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -9,7 +9,7 @@ from dora_systemd.errors import ExitCode
 from dora_systemd.scope import Scope, scope_of
 
 if TYPE_CHECKING:
-    # Verbs that print no outcomes need not wait for it.
+    # Imported late: only some verbs print outcomes.
     from dora_systemd.verbs.stop import Outcome
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -18,9 +18,9 @@ _SCOPE_KEY = "dora_systemd.is_user"
 
 
 def scope_options(function: F) -> F:
-    """`--system` and `--user`, which stand before or after the verb; the last one wins."""
+    """`--system` and `--user`, before or after the verb; the last one counts."""
     return click.option(
-        # A name of its own: one of the settings is called "user".
+        # Its own name, because one of the settings is called "user".
         "--user/--system",
         "wants_user",
         default=None,
@@ -31,7 +31,7 @@ def scope_options(function: F) -> F:
 
 
 def current_scope() -> Scope:
-    """The scope that the command line asks for."""
+    """The scope of the command line."""
     return scope_of(click.get_current_context().meta.get(_SCOPE_KEY))
 
 

@@ -1,4 +1,4 @@
-"""The plain forms of `doractl list`, read without click; all other command lines are click's."""
+"""Parses the common forms of `doractl list` without click; click parses all other command lines."""
 
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ _VALUES = ("json", "table")
 
 
 class ListRequest(NamedTuple):
-    """What `doractl list` was asked for. is_user: None where no scope was given."""
+    """A `doractl list` command. is_user: None without --user and --system."""
 
     selector: str | None = None
     want_all: bool = False
@@ -27,7 +27,7 @@ class ListRequest(NamedTuple):
 def parse_quick_list(arguments: list[str]) -> ListRequest | None:
     """The request in `list [--all] [--user|--system] [-o json|table] [SELECTOR]`, else None.
 
-    None also for every wrong command line: click says what is wrong with it.
+    None also for every wrong command line: click reports the error.
     """
     if not arguments or arguments[0] not in LIST_VERBS:
         return None

@@ -1,4 +1,4 @@
-"""A whole terminal that is drawn anew again and again, and left as it was found.
+"""Redraws the whole terminal, and restores it at the end.
 
 The sequences are those of xterm, see console_codes(4); the settings those of termios(3).
 """
@@ -26,18 +26,18 @@ _ENDINGS = (signal.SIGTERM, signal.SIGHUP)
 
 
 class Screen:
-    """The terminal of this process, from the beginning of the `with` block to its end.
+    """The terminal of this process, during the `with` block.
 
-    Also when a signal ends or stops the process it is left as it was.
+    It is also restored when a signal terminates or stops the process.
     """
 
     def __init__(self, stream: TextIO = sys.stdout) -> None:
         stream.flush()
-        # Not the stream itself: a handler of a signal may not write where another call is writing.
+        # Not the stream: a signal handler must not write to it during another write.
         self._terminal = stream.fileno()
         self._keys = sys.stdin.fileno()
         self._is_entered = False
-        # A signal, such as that the window has another size, ends the wait for a key.
+        # A signal, for example for a new window size, interrupts wait_key().
         self._woken, self._wake = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
 
     def __enter__(self) -> "Screen":
@@ -64,7 +64,7 @@ class Screen:
         os.close(self._wake)
 
     def show(self, lines: Iterable[str], bold: Iterable[int] = ()) -> None:
-        """Draw `lines`, as many and as much of them as there is room for; `bold`: their numbers."""
+        """Draw as many and as much of `lines` as there is room for. bold: indices of bold lines."""
         columns, rows = shutil.get_terminal_size()
         shown = list(lines)
         if len(shown) > rows:
@@ -74,13 +74,13 @@ class Screen:
         self._write(f"{_HOME}{(_CLEAR_LINE + chr(13) + chr(10)).join(drawn)}{_CLEAR_BELOW}")
 
     def wait_key(self, seconds: float) -> str:
-        """The key that is pressed within so many seconds, "" for none or after a signal."""
+        """The key pressed within `seconds`; "" without a key or after a signal."""
         ready, _, _ = select.select([self._keys, self._woken], [], [], max(seconds, 0.0))
         if self._woken in ready:
             os.read(self._woken, 512)
         if self._keys not in ready:
             return ""
-        # Nothing to read is a terminal that has gone.
+        # No data means that the terminal is gone.
         return os.read(self._keys, 32).decode("ascii", "replace")[:1] or "q"
 
     def _take(self) -> None:

@@ -1,4 +1,4 @@
-"""The options of `start` and `run`: one for each setting that has a flag, made from its table."""
+"""The options of `start` and `run`: one for each setting with a flag, from the settings table."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
@@ -13,12 +13,12 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def setting_options(function: F) -> F:
-    """All flags of the settings. Their raw values arrive as keyword arguments by setting name."""
+    """All flags of settings. Their raw values become keyword arguments with the setting's name."""
     return _options(SETTINGS, function)
 
 
 def live_options(function: F) -> F:
-    """The flags of those that can be changed while a dataflow runs."""
+    """The flags of settings that can be changed while a dataflow is running."""
     return _options(LIVE_SETTINGS, function)
 
 

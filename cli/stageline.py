@@ -1,4 +1,4 @@
-"""One line on a terminal that is rewritten while something is waited for; none in a pipe."""
+"""One status line on a terminal that is rewritten during a wait; no output to a pipe."""
 
 import shutil
 from types import TracebackType
@@ -11,7 +11,7 @@ _BACK_AND_CLEAR = "\r\x1b[K"
 
 
 class StageLine:
-    """Shows the text it is called with, until the end of the `with` block wipes it away."""
+    """Shows the text of the last call, until the `with` block ends and erases it."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream

@@ -1,4 +1,4 @@
-"""The one error class, and what the exit status of doractl and of the runner means."""
+"""The one error class, and the exit statuses of doractl."""
 
 from enum import IntEnum
 
@@ -20,11 +20,10 @@ class ExitCode(IntEnum):
 
 
 class DoraSystemdError(Exception):
-    """Something the user asked for that cannot be done.
+    """A request of the user that cannot be done.
 
-    message: one line that starts with "cannot" and names the file, key or unit.
-    hint: what to do about it, or "".
-    code: the exit status of the command that ends with it.
+    message: one line that names the file, key or unit. hint: what to do about it, or "". code: the
+    exit status of doractl.
     """
 
     def __init__(self, message: str, hint: str = "", code: ExitCode = ExitCode.FAILURE) -> None:

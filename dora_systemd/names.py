@@ -1,4 +1,4 @@
-"""Names of dataflows, their units and UUIDs: nothing that gets past here is another unit."""
+"""Names of dataflows, their units and UUIDs; checked so that no name can mean another unit."""
 
 import re
 from pathlib import PurePath
@@ -10,17 +10,18 @@ UNIT_PREFIX = "dora-"
 UNIT_SUFFIX = ".service"
 SLICE = "dora.slice"
 RESERVED_NAMES = frozenset({"gateway"})
-"""dora-gateway.service is our own front, see design."""
+"""dora-gateway.service is the gateway."""
 
 MAX_NAME = 200
-"""Characters of a name: unit names end at 255 (systemd.unit(5)), and node names follow in paths."""
+"""Maximum characters of a name: unit names have at most 255 (systemd.unit(5))."""
 
 _NAME = re.compile(rf"[A-Za-z0-9][A-Za-z0-9._-]{{0,{MAX_NAME - 1}}}")
 MAX_NODE_ID = 200
-"""Characters of an id: "node-ID" names a cgroup and "ID.out" a pipe, and names end at 255 bytes."""
+"""Maximum characters: "node-ID" is a cgroup and "ID.out" a pipe, with names of at most 255 bytes.
+"""
 
 NODE_ID = re.compile(r"(?!\.)[A-Za-z0-9_.-]+")
-"""Dora's own rule for the id of a node."""
+"""dora's own rule for node ids."""
 
 _UNIT_TYPES = (
     *("service", "socket", "device", "mount", "automount", "swap"),
@@ -36,7 +37,7 @@ _HINT = (
 
 
 def is_name(text: str) -> bool:
-    """Whether a dataflow can be called so."""
+    """Whether it is a valid name for a dataflow."""
     try:
         return parse_name(text) == text
     except DoraSystemdError:
@@ -44,7 +45,7 @@ def is_name(text: str) -> bool:
 
 
 def parse_name(text: str) -> str:
-    """The name of a dataflow, unchanged; raises DoraSystemdError (USAGE) on any other text."""
+    """Return a valid name unchanged. Raises DoraSystemdError (USAGE) for any other text."""
     if not _NAME.fullmatch(text):
         raise DoraSystemdError(f"cannot use {quoted(text)} as a name", _HINT, ExitCode.USAGE)
     if text.endswith(_UNIT_SUFFIXES):
@@ -60,16 +61,16 @@ PLAIN_STEM = "dataflow"
 
 
 def settings_path(dataflow: str) -> str:
-    """The settings file beside a dataflow file, which may be missing."""
+    """The settings file beside a dataflow file, which may not exist."""
     path = PurePath(dataflow)
     return str(path.with_name(f"{path.stem}.systemd.yml"))
 
 
 def name_from_path(path: str) -> str:
-    """The name that a dataflow file gives: its stem, every character a name lacks becoming "-".
+    """The name from a dataflow file: its stem, with "-" for every character that is not valid.
 
-    A file called "dataflow" says nothing: the directory of an absolute path names it then.
-    Raises DoraSystemdError (USAGE) where nothing usable is left.
+    For a file called "dataflow", the name is that of its directory, if the path has one. Raises
+    DoraSystemdError (USAGE) if nothing is left.
     """
     given = PurePath(path)
     plain = given.parent.name if given.stem == PLAIN_STEM and given.parent.name else given.stem
@@ -83,12 +84,12 @@ def name_from_path(path: str) -> str:
 
 
 def unit_name(name: str) -> str:
-    """The systemd unit of the dataflow `name`, which parse_name has accepted."""
+    """The systemd unit of the dataflow `name`, which must be valid."""
     return f"{UNIT_PREFIX}{name}{UNIT_SUFFIX}"
 
 
 def name_from_unit(unit: str) -> str | None:
-    """The dataflow of `unit`, or None if that is no unit of ours."""
+    """The dataflow of `unit`, or None if it is not a unit of ours."""
     if not (unit.startswith(UNIT_PREFIX) and unit.endswith(UNIT_SUFFIX)):
         return None
     try:
@@ -98,17 +99,17 @@ def name_from_unit(unit: str) -> str | None:
 
 
 def is_node_id(text: str) -> bool:
-    """Whether dora lets a node be called so, and a cgroup can."""
+    """Whether it is a valid node id for dora and for a cgroup."""
     return len(text) <= MAX_NODE_ID and NODE_ID.fullmatch(text) is not None
 
 
 def is_uuid(text: str) -> bool:
-    """Whether it is a UUID, in lower case and with dashes."""
+    """Whether it is a UUID in lower case with dashes."""
     return _UUID.fullmatch(text) is not None
 
 
 def parse_uuid(text: str) -> str:
-    """The UUID in lower case with dashes; raises DoraSystemdError (USAGE) on any other text."""
+    """The UUID in lower case with dashes. Raises DoraSystemdError (USAGE) for any other text."""
     uuid = text.lower()
     if not _UUID.fullmatch(uuid):
         hint = "a UUID is 32 hexadecimal digits as 8-4-4-4-12"
@@ -117,9 +118,9 @@ def parse_uuid(text: str) -> str:
 
 
 def is_uuid_prefix(text: str) -> bool:
-    """Whether some UUID begins with `text`: 4 to 36 hexadecimal digits and dashes in their places.
+    """Whether `text` can be the beginning of a UUID: 4 to 36 hexadecimal digits and dashes.
 
-    Fewer than 4 characters would let a slip of the finger stop somebody's robot.
+    With fewer than 4 characters, a typing error could stop the wrong dataflow.
     """
     if not _MIN_PREFIX <= len(text) <= 36:
         return False

@@ -1,32 +1,32 @@
-"""The files of one cell: what lies where in the RuntimeDirectory of its unit."""
+"""The files of one cell, in the RuntimeDirectory of its unit."""
 
 from pathlib import Path
 from typing import NamedTuple
 
 
 class CellPaths(NamedTuple):
-    """The RuntimeDirectory `root` (mode 0700, see RuntimeDirectory= in systemd.exec(5)) by name."""
+    """Paths in the RuntimeDirectory `root` (mode 0700), see systemd.exec(5)."""
 
     root: Path
 
     @property
     def is_of_user(self) -> bool:
-        """Whether it belongs to a unit of a user's manager: below XDG_RUNTIME_DIR."""
+        """Whether the directory is of a user's manager, so below XDG_RUNTIME_DIR."""
         return self.root.is_relative_to("/run/user")
 
     @property
     def status(self) -> Path:
-        """The live node table, replaced atomically by the runner."""
+        """The live node table, which the runner replaces atomically."""
         return self.root / "status.json"
 
     @property
     def control(self) -> Path:
-        """Port and token of the cell's coordinator, mode 0600: a note of the runner to itself."""
+        """Port and token of the cell's coordinator, mode 0600; only the runner reads it."""
         return self.root / "control.json"
 
     @property
     def socket(self) -> Path:
-        """Where the runner answers doractl, and relays to the coordinator."""
+        """The socket where the runner answers doractl, and relays to the coordinator."""
         return self.root / "runner.sock"
 
     @property
@@ -36,7 +36,7 @@ class CellPaths(NamedTuple):
 
     @property
     def coordinator(self) -> Path:
-        """Working directory of the coordinator, which writes its token and its log there."""
+        """Working directory of the coordinator, which writes its token and log there."""
         return self.root / "coordinator"
 
     @property
@@ -46,7 +46,7 @@ class CellPaths(NamedTuple):
 
     @property
     def work(self) -> Path:
-        """Dora's working directory of the dataflow: its `out/` lands here, not in the project."""
+        """dora's working directory of the dataflow: keeps its `out/` out of the project."""
         return self.root / "work"
 
     @property
@@ -55,17 +55,17 @@ class CellPaths(NamedTuple):
         return self.root / "io"
 
     def node_stdout(self, node: str) -> Path:
-        """The FIFO that is the standard output of `node`."""
+        """The FIFO for the standard output of `node`."""
         return self.io / f"{node}.out"
 
     def node_stderr(self, node: str) -> Path:
-        """The FIFO that is the standard error of `node`."""
+        """The FIFO for the standard error of `node`."""
         return self.io / f"{node}.err"
 
     def node_place(self, node: str) -> Path:
-        """How far dora's own log file of `node` is in the journal."""
+        """The position up to which dora's log file of `node` is in the journal."""
         return self.io / f"{node}.place"
 
     def node_pid(self, node: str) -> Path:
-        """Where the launcher of `node` notes its pid, before anything else it does."""
+        """The file where the launcher of `node` first writes its pid."""
         return self.io / f"{node}.pid"

@@ -1,4 +1,4 @@
-"""System scope or user scope: which manager, which directories."""
+"""System scope or user scope: selects the manager and its directories."""
 
 import os
 from pathlib import Path
@@ -8,14 +8,14 @@ RUNTIME_NAME = "dora-systemd"
 
 
 class Scope(NamedTuple):
-    """One systemd manager: the system's, or the one of user `uid`."""
+    """One systemd manager: the system's, or that of user `uid`."""
 
     is_user: bool
     uid: int
 
     @property
     def runtime_root(self) -> Path:
-        """Where the manager puts RuntimeDirectory=, see systemd.exec(5)."""
+        """The parent of all RuntimeDirectory= of the manager, see systemd.exec(5)."""
         return Path(f"/run/user/{self.uid}") if self.is_user else Path("/run")
 
     def cell_directory(self, name: str) -> Path:
@@ -29,6 +29,6 @@ class Scope(NamedTuple):
 
 
 def scope_of(is_user: bool | None) -> Scope:
-    """The scope asked for, by default the system's for root and the user's otherwise."""
+    """The requested scope; the default is the system's for root, else the user's."""
     uid = os.getuid()
     return Scope(is_user=uid != 0 if is_user is None else is_user, uid=uid)

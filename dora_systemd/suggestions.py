@@ -1,4 +1,4 @@
-"""What somebody may have meant by a word that we do not know."""
+"""Suggests similar words for unknown ones."""
 
 from collections.abc import Iterable
 
@@ -7,9 +7,9 @@ from dora_systemd.values import quoted
 
 
 def missing_node(problem: str, node: str, nodes: Iterable[str]) -> DoraSystemdError:
-    """The error (BAD_INPUT) for a setting of a node that is none of `nodes`.
+    """The error (BAD_INPUT) for a setting of a node that is not in `nodes`.
 
-    problem: such as "cannot limit", what stands before "the node".
+    problem: the text before "the node", such as "cannot limit".
     """
     known = list(nodes)
     message = f"{problem} the node {quoted(node)}: no such node"
@@ -18,8 +18,8 @@ def missing_node(problem: str, node: str, nodes: Iterable[str]) -> DoraSystemdEr
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """A hint with up to three of the `known` words that are like `word`, or ""."""
-    # Only somebody who made a mistake pays for this import.
+    """A hint with up to three of the `known` words that are similar to `word`, or ""."""
+    # Imported late: only needed after an error.
     import difflib
 
     by_lower = {one.lower().replace("-", "_"): one for one in known}

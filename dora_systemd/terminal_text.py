@@ -1,15 +1,15 @@
-"""What somebody else wrote must not command the terminal: one rule for every place. Pure.
+"""Makes foreign text safe for terminals: escapes everything that a terminal would interpret. Pure.
 
-A terminal obeys the control characters of ECMA-48 in their 7-bit and in their 8-bit form, see
-console_codes(4): OSC 52 writes the clipboard, others change its title or what was printed above.
-Bidirectional controls show a line in another order than it has. All of them are shown escaped.
+Terminals interpret the control characters of ECMA-48 in their 7-bit and 8-bit form, see
+console_codes(4): OSC 52 writes the clipboard, others change the title or earlier output.
+Bidirectional controls change the order of a line. All of them are shown escaped.
 """
 
 import re
 
-# C0 but tab and newline, DEL, C1; bidirectional controls; separators that some take for line ends;
-# halves of surrogate pairs, which are bytes of file names that are no UTF-8; language tags, which
-# nobody sees.
+# C0 without tab and newline, DEL, C1; bidirectional controls; separators that some programs take
+# for line ends; surrogates, which stand for bytes of file names that are not UTF-8; language tags,
+# which are invisible.
 _COMMANDS = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069"
     "\ud800-\udfff\ufeff\U000e0000-\U000e007f]"
@@ -29,7 +29,7 @@ def escaped(text: str) -> str:
 
 
 def one_line(text: str) -> str:
-    """The same in one line: tabs and newlines are blanks."""
+    """`text` escaped in one line: tabs and newlines become blanks."""
     return escaped(text.replace("\n", " ").replace("\t", " "))
 
 
@@ -42,14 +42,14 @@ def short_line(text: str, most: int) -> str:
 
 
 def without_sequences(text: str) -> str:
-    """`text` without colours and other whole sequences: for who shows none."""
+    """`text` without colours and other complete sequences, for output without colours."""
     return _SEQUENCES.sub("", text)
 
 
 def shown_log(data: bytes) -> bytes:
-    """Lines of a log, as a terminal may be given them: their colours pass, up to the end of each.
+    """Lines of a log for a terminal: colours pass, and end with each line.
 
-    Bytes that are no UTF-8 are shown escaped; so is all else that would command the terminal.
+    Escapes bytes that are not UTF-8, and everything else that a terminal would interpret.
     """
     text = data.decode("utf-8", "backslashreplace")
     if not _COMMANDS.search(text):
@@ -70,5 +70,5 @@ def _escape(match: re.Match[str]) -> str:
     code = ord(match[0])
     if code < 0x7F:
         return f"\\x{code:02x}"
-    # JSON may have these as they are, and reads them like this, too.
+    # JSON allows these characters, and also this form of them.
     return f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"

@@ -1,8 +1,8 @@
-"""Sizes, durations, CPU shares and booleans: text to value and back, as systemd spells them.
+"""Parses and formats sizes, durations, CPU shares and booleans as systemd does.
 
-Every `parse_` function raises DoraSystemdError (ExitCode.USAGE) on anything it does not know. The
-message names the text, the hint alone says what was expected: whoever knows the key or the file
-says so in a message of its own and keeps the hint.
+Every `parse_` function raises DoraSystemdError (ExitCode.USAGE) for unknown text. The message has
+the text, and the hint has what was expected: a caller that knows the key or file can make its own
+message, and keep the hint.
 """
 
 import re
@@ -10,10 +10,10 @@ import re
 from dora_systemd.errors import DoraSystemdError, ExitCode
 
 INFINITY = 2**64 - 1
-"""What "infinity" is on D-Bus: UINT64_MAX, for sizes, durations and CPU shares alike."""
+""""infinity" on D-Bus: UINT64_MAX, for sizes, durations and CPU shares."""
 
 SECOND = 1_000_000
-"""Microseconds of a second."""
+"""Microseconds per second."""
 
 _SIZE = re.compile(r"([0-9]+)(?:\.([0-9]+))?\s*([KMGTPE]?)B?")
 _SIZE_FACTORS = {suffix: 1024**power for power, suffix in enumerate(" KMGTPE") if power} | {"": 1}
@@ -44,19 +44,19 @@ _BOOLEANS = {
     **dict.fromkeys(("0", "no", "n", "false", "f", "off"), False),
 }
 
-# Longer numbers overflow 64 bits anyway, and Python refuses to convert very long ones.
+# Longer numbers exceed 64 bits, and Python refuses to convert very long ones.
 _MAX_DIGITS = 40
 _MAX_SHOWN = 60
 
 
 def quoted(text: str) -> str:
-    """`text` for a message: in quotes, on one line, odd characters escaped, 60 at most."""
+    """`text` for a message: quoted, on one line, escaped, and cut at 60 characters."""
     cut = text if len(text) <= _MAX_SHOWN else text[: _MAX_SHOWN - 3] + "..."
     return repr(cut)
 
 
 def shown(text: str) -> str:
-    """`text` for a message, without quotes as long as it is plain: for paths and names of files."""
+    """`text` for a message, with quotes only if necessary: for paths and file names."""
     return text if text.isprintable() and text.strip() == text and text else quoted(text)
 
 
@@ -72,7 +72,7 @@ def parse_size(text: str) -> int:
 
 
 def format_size(size: int) -> str:
-    """The shortest exact text of `size` bytes: parse_size gives the same number back."""
+    """The shortest exact text of `size` bytes; parse_size returns the same number."""
     if size == INFINITY:
         return "infinity"
     for suffix in "EPTGMK":
@@ -109,7 +109,7 @@ def parse_duration(text: str) -> int:
 
 
 def format_duration(duration: int) -> str:
-    """The exact text of `duration` µs, such as "1min 30s": parse_duration gives the number back."""
+    """The exact text of `duration` µs, such as "1min 30s"; the inverse of parse_duration."""
     if duration in (0, INFINITY):
         return "infinity" if duration else "0"
     parts, rest = [], duration
@@ -120,9 +120,9 @@ def format_duration(duration: int) -> str:
 
 
 def parse_cpu(text: str) -> int:
-    """Microseconds of CPU time per second, from cores ("2.0") or a share of one core ("150%").
+    """Microseconds of CPU time per second, from cores ("2.0") or a percentage of one core ("150%").
 
-    The result is more than nothing and a multiple of 0.01 % of a core, the step of CPUQuota= in
+    The result is above 0 and a multiple of 0.01 % of a core, the step of CPUQuota= in
     systemd.resource-control(5).
     """
     if text.strip() == "infinity":
@@ -136,7 +136,7 @@ def parse_cpu(text: str) -> int:
 
 
 def format_cpu(share: int) -> str:
-    """`share` µs of CPU per second as CPUQuota= takes it: "150%", two decimals at most."""
+    """`share` µs of CPU per second as CPUQuota= takes it: "150%", with at most two decimals."""
     if share == INFINITY:
         return "infinity"
     whole, hundredths = divmod(share // _CPU_STEP, 100)
@@ -157,7 +157,7 @@ def format_bool(value: bool) -> str:
 
 
 def _scaled(whole: str, fraction: str | None, factor: int) -> int | None:
-    """`whole.fraction` times `factor`, cut to an integer; None if it does not fit 64 bits."""
+    """`whole.fraction` times `factor`, cut to an integer; None if it exceeds 64 bits."""
     digits = fraction or ""
     if len(whole) + len(digits) > _MAX_DIGITS:
         return None

@@ -17,7 +17,7 @@ from dora_systemd.errors import ExitCode
 from dora_systemd.verbs.logs import LogRequest, find_query, pass_logs, read_logs
 
 Lines = TerminalLines | ShownLines | None
-"""What makes lines for a terminal, None for a pipe."""
+"""Formats lines for a terminal; None for a pipe."""
 
 _EPILOG = """\b
 Examples:
@@ -121,7 +121,7 @@ def command(
     scope = current_scope()
     check_readable(scope)
     if until_end:
-        # What this way of reading logs needs is no business of the others.
+        # Imported late: only --until-end needs it.
         from dora_systemd.verbs.follow import check_until_end, follow_to_end
 
         check_until_end(selector, options["is_reverse"])
@@ -141,7 +141,7 @@ def command(
 
 
 def _print(query: LogQuery, lines: Lines) -> int:
-    """Print the records of a query, rewritten for a terminal or as journalctl does."""
+    """Print the records of a query, formatted for a terminal, or by journalctl itself."""
     if not sys.stdout.isatty():
         return pass_logs(query, sys.stdout.fileno())
     _write(read_logs(query, lines), sys.stdout.fileno())
@@ -149,7 +149,7 @@ def _print(query: LogQuery, lines: Lines) -> int:
 
 
 def _exit_status(status: int) -> int:
-    """journalctl's own: 1 if --grep found nothing; killed by SIGPIPE counts as in a shell."""
+    """The exit status of journalctl: 1 if --grep found nothing; 128 + signal if it was killed."""
     return status if status >= 0 else 128 - status
 
 
@@ -163,8 +163,9 @@ def _write(chunks: Iterator[bytes], fd: int) -> None:
 def pager_of(environ: Mapping[str, str]) -> tuple[str, dict[str, str]]:
     """The pager and its environment.
 
-    Who may call doractl as root may not do all else as root: under sudo it is less, without its
-    commands that start others. $SYSTEMD_PAGERSECURE decides otherwise, as in systemctl(1).
+    Users who may run doractl as root may not be allowed to run everything as root. So under sudo it
+    is less, without its commands that start programs. $SYSTEMD_PAGERSECURE overrides this, as in
+    systemctl(1).
     """
     is_lent = any(environ.get(name) for name in ("SUDO_UID", "PKEXEC_UID", "DOAS_USER"))
     word = environ.get("SYSTEMD_PAGERSECURE", "").lower()
@@ -177,7 +178,7 @@ def pager_of(environ: Mapping[str, str]) -> tuple[str, dict[str, str]]:
 
 
 def _page(chunks: Iterator[bytes]) -> None:
-    """Through the pager that journalctl(1) would use, with the options that it would give it."""
+    """Print to the pager that journalctl(1) would use, with the same options."""
     pager, environment = pager_of(os.environ)
     if not shutil.which(pager.split()[0]) or pager == "cat":
         _write(chunks, sys.stdout.fileno())
@@ -187,6 +188,6 @@ def _page(chunks: Iterator[bytes]) -> None:
         try:
             _write(chunks, child.stdin.fileno())
         except BrokenPipeError:
-            pass  # left before the end
+            pass  # the user quit the pager
         finally:
             child.stdin.close()

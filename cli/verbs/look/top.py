@@ -21,7 +21,7 @@ Examples:
 """
 
 _FIRST_SECONDS = 0.5
-"""Between the two samples of one reading."""
+"""Time between the two samples of one reading."""
 
 _KEYS = {sort[0]: sort for sort in SORTS}
 
@@ -67,7 +67,7 @@ def command(
         else:
             _show(top, interval, sort)
     except KeyboardInterrupt:
-        # The way to leave it, as in top(1).
+        # Ctrl+C quits, as in top(1).
         pass
     return ExitCode.OK
 

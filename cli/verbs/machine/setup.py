@@ -52,7 +52,7 @@ def command(want_removal: bool) -> None:
 
 
 def _check_use(scope: Scope) -> None:
-    """Nothing is in use where there is no systemd to ask."""
+    """Refuse removal while a boot needs the files; without systemd nothing does."""
     try:
         refuse_if_needed(Bus(scope), scope)
     except DoraSystemdError as error:

@@ -48,7 +48,7 @@ def command(force: bool) -> int:
 
 
 def _stop_dataflows(bus: Bus, scope: Scope, force: bool) -> bool:
-    """Whether all have stopped."""
+    """Print the results; whether all dataflows have stopped."""
     cells = running_cells(bus)
     if not cells:
         click.echo("No dataflow is running.")
@@ -66,7 +66,7 @@ def _stop_dataflows(bus: Bus, scope: Scope, force: bool) -> bool:
 
 
 def _print_left(bus: Bus, scope: Scope, others: list[str]) -> bool:
-    """Say what is left; whether nothing of ours is."""
+    """Print what is left; whether nothing of ours is."""
     if others:
         click.echo(f"Not touched in dora.slice, not managed by doractl: {', '.join(others)}")
     left = processes_left(bus, others)

@@ -81,7 +81,7 @@ def command(
     print_warnings(claimed.warnings)
     print_warnings([note for note in [ensure_linger(scope) if want_boot else ""] if note])
     started = _start(bus, claimed, not no_wait)
-    # Of something that runs: a refusal is one line and a hint.
+    # Only after the start: a refusal must be one line and a hint.
     print_warnings([*start_notes(claimed.plan)])
     if output == "json":
         print_json({**vars(started), "dataflow": claimed.plan.options.dataflow})
@@ -100,7 +100,7 @@ def _start(bus: Bus, claimed: Claim, wait: bool) -> Started:
 
 
 def _print_last_words(plan: Plan) -> None:
-    # Only a failure pays for the way to the journal.
+    # Imported late: only needed after a failure.
     from dora_systemd.verbs.facts.last_words import last_words
 
     for line in last_words(plan.scope, plan.options.uuid):

@@ -52,9 +52,9 @@ def _stop(bus: Bus, scope: Scope, cells: list[Cell]) -> int:
 
 
 def _print_ended(scope: Scope, selectors: list[str], cells: list[Cell]) -> None:
-    """Say which ones have ended long ago; raise DoraSystemdError for the others."""
+    """Report dataflows that ended earlier. Raises DoraSystemdError for the others."""
     for selector in selectors:
-        # Only the journal knows; it is not read for dataflows that systemd knows.
+        # Only the journal knows these, and it is slow: dataflows that systemd knows do not need it.
         from dora_systemd.verbs.facts.ended import select_ended
 
         row = select_ended(scope, selector)

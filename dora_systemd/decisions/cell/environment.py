@@ -1,4 +1,4 @@
-"""Environment variables of a dataflow: `KEY=VALUE` from flags and files, checked before systemd."""
+"""Environment variables of a dataflow: parses `KEY=VALUE` from flags and files, and checks them."""
 
 import re
 from collections.abc import Mapping
@@ -9,7 +9,8 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import quoted, shown
 
 MAX_ENTRY = 128 * 1024 - 1
-"""Bytes of one `KEY=VALUE`: execve(2) refuses a longer one (MAX_ARG_STRLEN) with its final NUL."""
+"""Maximum bytes of one `KEY=VALUE`: execve(2) refuses a longer one (MAX_ARG_STRLEN) with its NUL.
+"""
 
 _KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _CONTROL = re.compile(r"[\x00-\x08\x0a-\x1f\x7f]")
@@ -21,19 +22,19 @@ MANAGER_VARIABLES = frozenset(
         *("MEMORY_PRESSURE_WATCH", "MEMORY_PRESSURE_WRITE", CHANGES_VARIABLE, CHANGE_VARIABLE),
     }
 )
-"""What systemd means for the runner alone, see systemd.exec(5). A node that speaks sd_notify must
-not speak for the cell; and Environment= would win over what the manager itself sets: a
-NOTIFY_SOCKET from a flag would let the start job wait for ever."""
+"""Variables that systemd sets for the runner only, see systemd.exec(5). A node that uses sd_notify
+must not send messages for the cell. Environment= would also override the manager's own values: with
+a NOTIFY_SOCKET from a flag the start job would wait forever."""
 
 _RESERVED = MANAGER_VARIABLES | {"CREDENTIALS_DIRECTORY"}
-"""What only systemd sets; the last one is for the nodes, who find their secrets by it."""
+"""Variables that only systemd sets; nodes get the last one, to find their credentials."""
 
-# One word of an environment file: quoted parts, escaped characters and plain ones, in any order.
+# One word of an environment file: quoted parts, escaped and plain characters, in any order.
 _QUOTED = re.compile(r"""'(?P<single>[^']*)'|"(?P<double>(?:[^"\\]|\\.)*)"|\\(?P<char>.)""", re.S)
 
 
 def node_environment(environment: Mapping[str, str]) -> dict[str, str]:
-    """The runner's environment without what is systemd's."""
+    """The runner's environment without the variables that systemd sets."""
     return {key: text for key, text in environment.items() if key not in MANAGER_VARIABLES}
 
 
@@ -51,7 +52,7 @@ def parse_assignment(text: str) -> tuple[str, str]:
 
 
 def checked_variable(key: str, value: str) -> tuple[str, str]:
-    """`key` and `value` unchanged; raises as parse_assignment does. The value is never shown."""
+    """Return `key` and `value`, or raise as parse_assignment does. No error shows the value."""
     if not _KEY.fullmatch(key):
         raise _refusal(key, "a name is letters, digits and '_', and begins with no digit")
     if key in _RESERVED:
@@ -76,7 +77,7 @@ def parse_environment_file(text: str, source: str) -> dict[str, str]:
             parse_assignment(key.strip() + equals + (unquoted := _unquoted(value.strip())))
             variables[key.strip()] = unquoted
         except DoraSystemdError as error:
-            # The line itself may hold a secret.
+            # The line may contain a secret.
             message = f"cannot read line {number} of {shown(source)} as KEY=VALUE"
             raise DoraSystemdError(message, error.hint, ExitCode.BAD_INPUT) from error
     return variables
@@ -85,10 +86,10 @@ def parse_environment_file(text: str, source: str) -> dict[str, str]:
 def unit_environment(
     search_path: str, venv: str | None, variables: Mapping[str, str]
 ) -> dict[str, str]:
-    """The environment of a unit: the caller's PATH, its virtual environment first, and `variables`.
+    """The environment of a unit: PATH with the virtual environment first, and `variables`.
 
-    Relative entries of PATH are left out: they would mean another place than they do for the
-    caller. `variables` win.
+    PATH is that of the caller without relative entries, which would mean other directories.
+    `variables` take precedence.
     """
     entries = [entry for entry in search_path.split(":") if _is_usable(entry)]
     if venv is None:
@@ -98,12 +99,12 @@ def unit_environment(
 
 
 def environment_entries(variables: Mapping[str, str]) -> tuple[str, ...]:
-    """The variables as Environment= has them on D-Bus: one "KEY=VALUE" each."""
+    """The variables as Environment= on D-Bus: a "KEY=VALUE" each."""
     return tuple(f"{key}={value}" for key, value in variables.items())
 
 
 def _logical_lines(text: str) -> list[tuple[int, str]]:
-    """The lines that are neither empty nor comments, with their numbers, continued ones joined."""
+    """Lines with their numbers, continued ones joined, without empty lines and comments."""
     lines: list[tuple[int, str]] = []
     joined = False
     for number, line in enumerate(text.split("\n"), 1):
@@ -120,7 +121,7 @@ def _logical_lines(text: str) -> list[tuple[int, str]]:
 
 
 def _unquoted(value: str) -> str:
-    """`value` as a shell would read it: quotes removed, backslash taking the next one literally."""
+    """`value` as a shell reads it: without quotes; a backslash makes the next character literal."""
     if re.search("[\"']", _QUOTED.sub("", value)):
         raise _refusal("", "a quote is not closed: a value is one line of text")
 
@@ -139,7 +140,7 @@ def _is_usable(entry: str) -> bool:
 
 
 def _is_unicode(text: str) -> bool:
-    """Whether `text` is no remains of bytes that were not UTF-8, which D-Bus cannot carry."""
+    """Whether `text` has no surrogates from bytes that are not UTF-8: D-Bus cannot send these."""
     return not any("\ud800" <= char <= "\udfff" for char in text)
 
 

@@ -1,6 +1,6 @@
-"""What a runner is told about reloads: which files it watches, and how it replaces a node.
+"""The runner's options for hot reload: the files to watch, and how to replace a node.
 
-It is part of the runner's command line, which `list` reads: nothing here costs time.
+They are part of the runner's command line, which `list` parses: imports only what loads quickly.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,16 +13,18 @@ START_FIRST = "start-first"
 REPLACE_WORDS = ("stop-first", START_FIRST)
 
 CHANGE_VARIABLE = "DORA_SYSTEMD_HOT_RELOAD"
-"""Tells the runner what `doractl set --hot-reload` has changed since the unit was made."""
+"""Passes changes by `doractl set --hot-reload` since the unit was created to the runner."""
 
 ARGUMENTS = ("watch", "ignore", "node-watch", "replace")
 """Repeatable options of the runner."""
 
 
 class HotReload(NamedTuple):
-    """is_on: whether files are watched at all. watch, ignore: patterns as in gitignore(5), none
-    for the usual ones. node_watch: more of them, of single nodes. replace: one of REPLACE_WORDS by
-    node, "" for all others.
+    """Options of hot reload.
+
+    is_on: whether files are watched at all. watch, ignore: patterns as in gitignore(5), empty for
+    the defaults. node_watch: additional patterns of single nodes. replace: by node, one of
+    REPLACE_WORDS; the key "" is for all other nodes.
     """
 
     is_on: bool = False
@@ -32,7 +34,7 @@ class HotReload(NamedTuple):
     replace: tuple[tuple[str, str], ...] = ()
 
     def starts_first(self, node: str) -> bool:
-        """Whether the successor of `node` starts before it ends."""
+        """Whether the new process of `node` starts before the old one ends."""
         words = dict(self.replace)
         return words.get(node, words.get("", "")) == START_FIRST
 
@@ -45,9 +47,9 @@ DEFAULT_RELOAD = HotReload()
 
 
 class SettingsChange(NamedTuple):
-    """What has changed in a settings file.
+    """Changes of a settings file.
 
-    limits: those of nodes. others: keys that take effect with the next start.
+    limits: those of nodes. others: keys that take effect at the next start.
     """
 
     limits: tuple[NodeLimits, ...]
@@ -55,7 +57,7 @@ class SettingsChange(NamedTuple):
 
 
 def format_reload(reload: HotReload) -> list[tuple[str, str]]:
-    """The options of the runner and their values; whether it is on is a flag of its own."""
+    """The options of the runner and their values; is_on is a separate flag."""
     nodes = [("node-watch", f"{node}={pattern}") for node, pattern in reload.node_watch]
     words = [("replace", f"{node}={word}") for node, word in reload.replace]
     watch = [("watch", one) for one in reload.watch]
@@ -63,7 +65,7 @@ def format_reload(reload: HotReload) -> list[tuple[str, str]]:
 
 
 def parse_reload(is_on: bool, given: Mapping[str, Sequence[str]]) -> HotReload:
-    """The exact inverse of format_reload; `given` has the values of ARGUMENTS."""
+    """The exact inverse of format_reload. given: the values of ARGUMENTS."""
     return HotReload(
         is_on,
         tuple(given["watch"]),
@@ -74,13 +76,13 @@ def parse_reload(is_on: bool, given: Mapping[str, Sequence[str]]) -> HotReload:
 
 
 def _pair(text: str) -> tuple[str, str]:
-    # Ids of nodes have no "=".
+    # Node ids contain no "=".
     node, _, value = text.partition("=")
     return node, value
 
 
 def check_reload_nodes(reload: HotReload, nodes: Sequence[str]) -> None:
-    """Raise DoraSystemdError (BAD_INPUT) for a node that is none of `nodes`."""
+    """Raise DoraSystemdError (BAD_INPUT) for a node that is not in `nodes`."""
     for node in (*dict(reload.node_watch), *filter(None, dict(reload.replace))):
         if node not in nodes:
             raise missing_node("cannot watch files of", node, nodes)

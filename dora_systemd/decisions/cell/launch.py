@@ -1,7 +1,7 @@
-"""The descriptor as it is sent to dora: every node's program replaced by our launcher.
+"""Rewrites the descriptor for dora: our launcher replaces every node's program.
 
-What a node runs is decided here as dora's daemon would decide it, because the daemon only sees the
-launcher. Kinds that dora has to start itself are left as they are.
+dora's daemon only sees the launcher. So this module decides what a node executes, in the same way
+as the daemon would. Nodes that dora must start itself stay unchanged.
 """
 
 import shlex
@@ -21,17 +21,17 @@ from dora_systemd.values import SECOND, quoted
 
 LAUNCHED = frozenset({NodeKind.PYTHON, NodeKind.EXECUTABLE, NodeKind.SHELL})
 PROGRAM_KEYS = ("path", "args", "build", "git", "branch", "tag", "rev")
-"""The keys of a node that say what it runs: dora is told something else."""
+"""Keys of a node that define its program; dora gets other values."""
 DEFAULT_OPERATOR = "op"
-"""dora's id of the operator of a node that has one only."""
+"""dora's id of the operator in a node with a single operator."""
 
 
 @dataclass(frozen=True)
 class LaunchPlan:
-    """What the descriptor is rewritten with.
+    """The values to rewrite the descriptor with.
 
-    launcher: absolute path of launcher.sh. search_path: PATH of the nodes.
-    exists: whether a file of that absolute path is there.
+    launcher: absolute path of launcher.sh. search_path: PATH of the nodes. exists: whether a file
+    with that absolute path exists.
     """
 
     options: RunnerOptions
@@ -42,11 +42,11 @@ class LaunchPlan:
 
 
 def launch_descriptor(dataflow: Dataflow, plan: LaunchPlan) -> dict[str, Any]:
-    """The descriptor to send. Raises DoraSystemdError (BAD_INPUT) for a node that cannot run."""
+    """The descriptor for dora. Raises DoraSystemdError (BAD_INPUT) for a node that cannot run."""
     document = dict(dataflow.raw)
     document["nodes"] = [_launch_node(node, dataflow.source, plan) for node in dataflow.nodes]
     if plan.options.env_keys and dataflow.env:
-        # As with `dora start --env`: above the dataflow's env, below a node's own.
+        # As for `dora start --env`: overrides the dataflow's env, but not that of a node.
         document["env"] = {
             key: value for key, value in dataflow.env.items() if key not in plan.options.env_keys
         }
@@ -60,17 +60,17 @@ def launch_descriptor(dataflow: Dataflow, plan: LaunchPlan) -> dict[str, Any]:
 
 
 def is_launched(node: Node) -> bool:
-    """Whether our launcher starts the node. path_sha256 is checked by dora on the real file."""
+    """Whether our launcher starts the node. With path_sha256 it does not: dora checks the file."""
     return node.kind in LAUNCHED and node.raw.get("path_sha256") is None
 
 
 def has_pipes(node: Node) -> bool:
-    """Whether the node's output comes through our pipes and not through dora's log files."""
+    """Whether the node's output goes through our pipes, and not through dora's log files."""
     return not node.keeps_output and (is_launched(node) or node.kind is NodeKind.OPERATOR)
 
 
 def kinds(dataflow: Dataflow, plan: LaunchPlan) -> dict[str, str]:
-    """How each node is started, as the live table names it."""
+    """How each node is started, in the terms of the live table."""
     return {node.id: _kind(node, plan) for node in dataflow.nodes}
 
 
@@ -99,19 +99,19 @@ def _launch_node(node: Node, source: str, plan: LaunchPlan) -> dict[str, Any]:
 
 
 def _restart_keys(node: Node, options: RunnerOptions) -> dict[str, Any]:
-    """What the node's restarts become: the settings' word for it, its own, or the dataflow's."""
+    """The restart keys of the node: from the settings for it, its own, or the dataflow's."""
     for ident, policy in options.node_restarts:
         if ident == node.id:
             return policy.dora_keys()
     if node.restart_policy:
         return _restart_bounds(node)
-    # Of nodes made of operators, and those that others start, dora restarts none.
+    # dora does not restart nodes made of operators, nor dynamic nodes.
     is_restarted = node.kind not in (NodeKind.OPERATOR, NodeKind.DYNAMIC)
     return options.restart.dora_keys() if is_restarted and options.restart.policy != "no" else {}
 
 
 def _restart_bounds(node: Node) -> dict[str, Any]:
-    """Bounds for the delays of a node that dora restarts, where the descriptor has none."""
+    """Limits for the restart delays of a node, for those keys that the descriptor lacks."""
     if node.restart_policy not in ("on-failure", "always"):
         return {}
     shortest, longest = DEFAULT.delay / SECOND, DEFAULT.max_delay / SECOND
@@ -154,7 +154,7 @@ def _split(node: Node, source: str) -> list[str]:
 
 
 def sources(dataflow: Dataflow, plan: LaunchPlan) -> dict[str, dict[str, str]]:
-    """The files that each node is started from, absolute, by the operator's id or ""."""
+    """The files that each node is started from, absolute, by operator id or ""."""
     return {node.id: dict(_node_sources(node, dataflow.source, plan)) for node in dataflow.nodes}
 
 
@@ -196,7 +196,7 @@ def _env_python(node: Node, plan: LaunchPlan) -> str | None:
 
 
 def python_of(plan: LaunchPlan) -> str:
-    """The interpreter of the nodes: of --venv, else the first on PATH; as dora looks for it."""
+    """The interpreter of the nodes, as dora finds it: that of --venv, else the first on PATH."""
     if plan.options.venv is not None:
         return str(PurePath(plan.options.venv, "bin", "python"))
     places = [place for place in plan.search_path.split(":") if place]
@@ -205,7 +205,7 @@ def python_of(plan: LaunchPlan) -> str:
 
 
 def _with_absolute_operators(raw: dict[str, Any], directory: str) -> dict[str, Any]:
-    """Dora looks for the files of operators in its own working directory, which is not theirs."""
+    """Make paths of operators absolute: dora would resolve them in its own working directory."""
     if isinstance(raw.get("operator"), Mapping):
         raw["operator"] = _absolute_operator(raw["operator"], directory)
     if isinstance(raw.get("operators"), list):

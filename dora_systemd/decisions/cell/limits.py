@@ -1,7 +1,7 @@
-"""Limits of resources: what can be limited for a node, how it is written, and where it takes hold.
+"""Resource limits: what can be limited for a node, how it is written, and its control file.
 
 The control files are those of the kernel's "Control Group v2" document. The runner's command line
-holds limits of nodes, so this module imports nothing that costs time.
+contains limits of nodes, so this module imports only what loads quickly.
 """
 
 import re
@@ -21,7 +21,7 @@ from dora_systemd.values import (
 )
 
 SMALLEST_MEMORY = 1024 * 1024
-"""Bytes. Less is a forgotten letter: no program runs in it."""
+"""Bytes. A smaller value is a missing suffix: no program runs in so little memory."""
 
 SMALLEST_CPU = SECOND // 100
 """µs of CPU per second."""
@@ -29,13 +29,13 @@ SMALLEST_CPU = SECOND // 100
 HIGHEST_WEIGHT = 10_000
 
 _PERIOD = 100_000
-"""µs: the kernel's own period of cpu.max."""
+"""µs: the kernel's default period of cpu.max."""
 
 _NUMBER = re.compile(r"[0-9]{1,18}")
 
 
 def parse_memory(text: str) -> int:
-    """Bytes of memory, 1M at least; INFINITY for no limit. Raises DoraSystemdError (USAGE)."""
+    """Bytes of memory, at least 1M; INFINITY for no limit. Raises DoraSystemdError (USAGE)."""
     size = parse_size(text)
     if size < SMALLEST_MEMORY:
         hint = "write at least 1M, such as 512M or 4G; or infinity for no limit"
@@ -44,7 +44,7 @@ def parse_memory(text: str) -> int:
 
 
 def parse_share(text: str) -> int:
-    """µs of CPU per second, a hundredth of a core at least. Raises DoraSystemdError (USAGE)."""
+    """µs of CPU per second, at least a hundredth of a core. Raises DoraSystemdError (USAGE)."""
     share = parse_cpu(text)
     if share < SMALLEST_CPU:
         hint = "write at least 0.01 cores, such as 1.5; or infinity for no limit"
@@ -60,7 +60,7 @@ def parse_tasks(text: str) -> int:
 
 
 def parse_weight(text: str) -> int:
-    """A share in relation to others, from 1 to 10000. Raises DoraSystemdError (USAGE)."""
+    """A weight relative to others, from 1 to 10000. Raises DoraSystemdError (USAGE)."""
     hint = f"write a number from 1 to {HIGHEST_WEIGHT}; other units have 100"
     return _parse_number(text, 1, HIGHEST_WEIGHT, "a weight", hint)
 
@@ -90,11 +90,11 @@ def _weight_file(weight: int) -> str:
 
 
 class Limit(NamedTuple):
-    """Something that can be limited, for a dataflow and for a node.
+    """A resource that can be limited, for a dataflow and for a node.
 
-    word: its name in `--node-limit NODE:WORD=VALUE`. key: of the setting, in settings files.
-    property: of the unit, see systemd.resource-control(5). controller, file: of cgroup v2.
-    parse, format: text to value and back. file_text: what is written to the file.
+    word: its name in `--node-limit NODE:WORD=VALUE`. key: the setting, in settings files. property:
+    of the unit, see systemd.resource-control(5). controller, file: of cgroup v2. parse, format:
+    text to value and back. file_text: the text for the control file.
     """
 
     word: str
@@ -108,7 +108,7 @@ class Limit(NamedTuple):
 
 
 def _memory(word: str, key: str, unit_property: str, file: str) -> Limit:
-    # Of swap none at all makes sense, unlike of memory.
+    # A limit of 0 is useful for swap, unlike for memory.
     parse = parse_size if word == "swap" else parse_memory
     return Limit(word, key, unit_property, "memory", file, parse, format_size, _plain_file)
 
@@ -145,11 +145,11 @@ class NodeLimits(NamedTuple):
     limits: tuple[tuple[str, int], ...]
 
     def files(self) -> dict[str, str]:
-        """What is to be written to which control file of the node's group."""
+        """The text for each control file of the node's group."""
         return {BY_WORD[word].file: BY_WORD[word].file_text(value) for word, value in self.limits}
 
     def controllers(self) -> dict[str, str]:
-        """The controllers that are needed, each with the file that one of the limits is in."""
+        """The required controllers, each with the control file of one of the limits."""
         return {BY_WORD[word].controller: BY_WORD[word].file for word, _ in self.limits}
 
 
@@ -182,7 +182,7 @@ def format_node_limits(limits: NodeLimits) -> str:
 
 
 def merge_node_limits(*sources: Iterable[NodeLimits]) -> tuple[NodeLimits, ...]:
-    """The limits of several sources, each one more important than those before it."""
+    """The limits of several sources; later ones take precedence."""
     merged: dict[str, dict[str, int]] = {}
     for source in sources:
         for one in source:
@@ -191,23 +191,23 @@ def merge_node_limits(*sources: Iterable[NodeLimits]) -> tuple[NodeLimits, ...]:
 
 
 CHANGES_VARIABLE = "DORA_SYSTEMD_NODE_LIMITS"
-"""With which `doractl set` tells the next runner what has been changed, in Environment=."""
+"""Passes changes by `doractl set` to the next runner, in Environment=."""
 
 
 def parse_changes(text: str) -> tuple[NodeLimits, ...]:
-    """What is in CHANGES_VARIABLE. Raises DoraSystemdError (USAGE)."""
+    """Parse CHANGES_VARIABLE. Raises DoraSystemdError (USAGE)."""
     return tuple(map(parse_node_limits, text.split()))
 
 
 def format_changes(limits: Iterable[NodeLimits]) -> str:
-    """The inverse of parse_changes: the ids of nodes have no blanks."""
+    """The inverse of parse_changes; node ids contain no blanks."""
     return " ".join(map(format_node_limits, limits))
 
 
 def check_nodes(limits: Iterable[NodeLimits], nodes: Iterable[str], dynamic: Iterable[str]) -> None:
-    """Raise DoraSystemdError (BAD_INPUT) for limits of a node that is not there or out of reach.
+    """Raise DoraSystemdError (BAD_INPUT) for limits of an unknown or dynamic node.
 
-    nodes: all ids. dynamic: those that nobody starts, whose processes are anywhere.
+    nodes: all ids. dynamic: nodes that dora does not start; their processes are in other cgroups.
     """
     known, free = list(nodes), frozenset(dynamic)
     for one in limits:

@@ -1,6 +1,6 @@
-"""How many lines a node may write in how much time, and what is beyond that. Pure: no clock.
+"""Rate limits for log lines of nodes. Pure: no clock.
 
-Off unless somebody asks for it: a limit of ours takes lines away, however exactly it counts them.
+The default is no limit, because a limit drops lines, even though it counts them.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -11,7 +11,7 @@ from dora_systemd.suggestions import missing_node
 from dora_systemd.values import INFINITY, SECOND, format_duration, parse_duration, quoted
 
 SHORTEST = SECOND // 10
-"""µs. A window that takes lines away is reported at its end: not more than ten times a second."""
+"""µs. A window with dropped lines ends with an event: at most ten per second."""
 
 _HINT = "write LINES/TIME such as 1000/1s, with at least one line and 100ms; or infinity"
 
@@ -26,7 +26,7 @@ class RateLimit(NamedTuple):
 
 
 RateLimits = Mapping[str, RateLimit | None]
-"""By node, ALL_NODES for those that are not named; None: no limit."""
+"""By node, with ALL_NODES for the others; None: no limit."""
 
 UNLIMITED: RateLimits = {}
 
@@ -48,7 +48,7 @@ def parse_rate(text: str) -> RateLimit | None:
 
 
 def format_rate(limit: RateLimit | None) -> str:
-    """The text that parse_rate gives `limit` for."""
+    """The text from which parse_rate makes `limit`."""
     if limit is None:
         return "infinity"
     return f"{limit.lines}/{format_duration(limit.interval)}"
@@ -61,7 +61,7 @@ def parse_rates(texts: Iterable[str]) -> dict[str, RateLimit | None]:
 
 
 def format_rates(limits: RateLimits) -> list[str]:
-    """The texts that parse_rates gives `limits` for."""
+    """The texts from which parse_rates makes `limits`."""
     return [
         f"{node}={format_rate(limit)}" if node else format_rate(limit)
         for node, limit in limits.items()
@@ -69,14 +69,14 @@ def format_rates(limits: RateLimits) -> list[str]:
 
 
 def rate_of(limits: RateLimits, node: str) -> RateLimit | None:
-    """The limit of one node, None if there is none."""
+    """The limit of one node, or None."""
     return limits[node] if node in limits else limits.get(ALL_NODES)
 
 
 def merge_rates(nodes: Mapping[str, RateLimits], given: RateLimits) -> RateLimits:
-    """The limits of `given`, and below them those that a settings file has for single nodes.
+    """The limits of `given`, which take precedence over those that a settings file has for nodes.
 
-    Raises DoraSystemdError (BAD_INPUT) for one that names a node again.
+    Raises DoraSystemdError (BAD_INPUT) if both name the same node.
     """
     limits: dict[str, RateLimit | None] = {}
     for node, own in nodes.items():
@@ -95,7 +95,7 @@ def _refusal(text: str) -> DoraSystemdError:
 
 
 def check_rates(limits: RateLimits, nodes: Sequence[str]) -> None:
-    """Raise DoraSystemdError (BAD_INPUT) for a limit of a node that is none of `nodes`."""
+    """Raise DoraSystemdError (BAD_INPUT) for a limit of a node that is not in `nodes`."""
     for node in limits:
         if node != ALL_NODES and node not in nodes:
             raise missing_node("cannot limit the lines of", node, nodes)

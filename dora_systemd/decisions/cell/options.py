@@ -1,7 +1,7 @@
-"""What a runner is told to run, and the command line that stores it in ExecStart= of the unit.
+"""The options of a runner, and the command line that stores them in ExecStart= of the unit.
 
-There is no registry: `list` learns UUID and path of a dataflow from this command line. So this
-module imports nothing that costs time.
+There is no registry: `list` reads UUID and path of a dataflow from this command line. So this
+module imports only what loads quickly.
 """
 
 from collections.abc import Sequence
@@ -37,8 +37,8 @@ CHECK_MODULE = "dora_systemd.runner.check"
 _STOP_POST = str(PurePath(__file__).parents[2] / "stoppost.sh")
 
 _PYTHON_FLAGS = ("-E", "-P", "-m", RUNNER_MODULE)
-"""Without the environment's PYTHON* and without the working directory on sys.path: modules of the
-project can never stand in for the runner's."""
+"""Ignore PYTHON* variables, and keep the working directory out of sys.path: a module of the project
+must never replace one of the runner's."""
 
 _TEXTS = ("working-directory", "dora", "venv", "restart", "start-timeout")
 _FLAGS = ("uv", "debug", "allow-shell-nodes", "attached", "hot-reload")
@@ -47,26 +47,26 @@ _REQUIRED = ("name", "uuid", "working-directory", "dora")
 
 
 class RunnerOptions(NamedTuple):
-    """Everything that one runner needs to know; fixed for the life of its unit.
+    """All options of one runner; they do not change while its unit exists.
 
     name, uuid: of the dataflow.
     dataflow: absolute path of the descriptor.
-    working_directory: absolute; where relative node paths are and where the nodes run.
+    working_directory: absolute; nodes run there, and relative paths of nodes start there.
     dora: absolute path of the dora executable.
     venv: absolute path of the nodes' virtual environment, or None for the interpreter on PATH.
     uv: run Python nodes by uv, as `dora start --uv`.
-    debug: let topics be inspected, as `dora start --debug`.
-    allow_shell_nodes: let nodes with `path: shell` run.
-    grace: µs that a node has to end by itself once it was told to stop.
-    attached: the end of standard input means stop (`doractl run`).
+    debug: make topics inspectable, as `dora start --debug`.
+    allow_shell_nodes: allow nodes with `path: shell`.
+    grace: µs for a node to exit after the stop request.
+    attached: the end of standard input requests a stop (`doractl run`).
     exit_when_nodes_finish: overrides the descriptor's key of that name, unless None.
-    env_keys: names of the variables that win over the descriptor's own `env:`.
-    log_rates: how many lines of which node are kept, see dora_systemd.decisions.cell.line_rates.
+    env_keys: names of the variables that override the descriptor's `env:`.
+    log_rates: rate limits of log lines, see dora_systemd.decisions.cell.line_rates.
     node_limits: limits of single nodes.
-    restart: policy of nodes for which the descriptor has none.
+    restart: policy of nodes without one in the descriptor.
     node_restarts: policies of single nodes.
-    start_timeout: µs in which all nodes have to be ready, or INFINITY.
-    reload: which files mean a reload, and how nodes are replaced.
+    start_timeout: µs for all nodes to become ready, or INFINITY.
+    reload: files that cause a reload, and how nodes are replaced.
     """
 
     name: str
@@ -99,7 +99,7 @@ class RunnerOptions(NamedTuple):
 
 
 def format_runner_argv(options: RunnerOptions) -> list[str]:
-    """The arguments of `python3 -m dora_systemd.runner`, one readable GNU option each."""
+    """The arguments of `python3 -m dora_systemd.runner`, with readable long options."""
     pairs = [
         ("name", options.name),
         ("uuid", options.uuid),
@@ -129,7 +129,7 @@ def format_runner_argv(options: RunnerOptions) -> list[str]:
 def parse_runner_argv(argv: Sequence[str]) -> RunnerOptions:
     """The exact inverse of format_runner_argv.
 
-    Raises DoraSystemdError (USAGE) on an unknown, repeated or missing option and on a bad value.
+    Raises DoraSystemdError (USAGE) for an unknown, repeated or missing option, and for a bad value.
     """
     dataflow, given = argv[-1] if argv else "", argv[:-1]
     if not dataflow.startswith("/"):
@@ -148,31 +148,31 @@ def parse_runner_argv(argv: Sequence[str]) -> RunnerOptions:
 
 
 def runner_command(python: str, options: RunnerOptions) -> list[str]:
-    """ExecStart= of the unit: `python` is the absolute path of the interpreter of dora-systemd."""
+    """ExecStart= of the unit. python: absolute path of the interpreter of dora-systemd."""
     return [python, *_PYTHON_FLAGS, *format_runner_argv(options)]
 
 
 def post_command(python: str, options: RunnerOptions) -> list[str]:
-    """ExecStopPost= of the unit: what is left to say when the runner was killed.
+    """ExecStopPost= of the unit, which writes the end to the journal if the runner was killed.
 
-    After a runner that ended by itself no Python is started, which a restart would wait for.
+    It starts no Python if the runner exited by itself, because a restart would wait for that.
     """
     command = [python, *_PYTHON_FLAGS[:-1], POST_MODULE, options.name, options.uuid]
     return ["/bin/sh", _STOP_POST, *command]
 
 
 def reload_command(python: str) -> list[str]:
-    """ExecReload= of the unit: what `systemctl reload` runs."""
+    """ExecReload= of the unit, for `systemctl reload`."""
     return [python, *_PYTHON_FLAGS[:-1], RELOAD_MODULE]
 
 
 def check_command(python: str, options: RunnerOptions) -> list[str]:
-    """What finds out whether a runner with these options would refuse them."""
+    """The command that checks whether a runner with these options would refuse to start."""
     return [python, *_PYTHON_FLAGS[:-1], CHECK_MODULE, *format_runner_argv(options)]
 
 
 def options_from_command(command: Sequence[str]) -> RunnerOptions:
-    """The options in the ExecStart= that runner_command made; DoraSystemdError for any other."""
+    """The options in an ExecStart= of runner_command; raises DoraSystemdError for any other."""
     if RUNNER_MODULE not in command:
         raise _refusal(f"{quoted(' '.join(command))} is not a runner of dora-systemd")
     return parse_runner_argv(command[list(command).index(RUNNER_MODULE) + 1 :])
@@ -216,7 +216,7 @@ def _options(dataflow: str, values: dict[str, str], lists: dict[str, list[str]])
 
 
 def _node_restart(text: str) -> tuple[str, RestartPolicy]:
-    # Times have no colon, ids of nodes may have one.
+    # Times contain no colon, but node ids may contain one.
     node, _, policy = text.rpartition(":")
     return node, parse_policy(policy)
 

@@ -1,7 +1,7 @@
-"""Restart policies: what starts again, how often, how soon; and how systemd and dora are told.
+"""Restart policies: what is restarted, how often and when, in the terms of systemd and dora.
 
-One owner for each kind of failure: of a node dora, of the dataflow as a whole systemd. Both get the
-same policy. See systemd.service(5), systemd.unit(5) and dora's descriptor.
+dora restarts nodes, and systemd restarts the dataflow. Both get the same policy. See
+systemd.service(5), systemd.unit(5) and dora's descriptor.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -21,16 +21,16 @@ POLICIES = ("no", "on-failure", "always")
 _DORA_POLICIES = {"no": "never", "on-failure": "on-failure", "always": "always"}
 
 MIN_DELAY = SECOND // 2
-"""µs. Dora's default is none: a node that cannot start was restarted 37 times a second."""
+"""µs. dora's default is 0, and restarted a node that cannot start 37 times a second."""
 
 MAX_RESTARTS = 1_000_000
 
 
 class RestartPolicy(NamedTuple):
-    """What starts again by itself, and how. Times in µs.
+    """An automatic restart policy. Times in µs.
 
-    policy: one of POLICIES. max_restarts: in one window, or INFINITY. delay: before the first one;
-    it doubles with each, up to max_delay.
+    policy: one of POLICIES. max_restarts: in one window, or INFINITY. delay: before the first
+    restart; it doubles with each restart, up to max_delay.
     """
 
     policy: str = "no"
@@ -40,7 +40,7 @@ class RestartPolicy(NamedTuple):
     max_delay: int = 30 * SECOND
 
     def dora_keys(self) -> dict[str, Any]:
-        """The keys of a node in dora's descriptor; 0 is no limit there, and times are seconds."""
+        """The keys of a node in dora's descriptor, where 0 is no limit, and times are seconds."""
         if self.policy == "no":
             return {"restart_policy": "never"}
         is_endless = self.max_restarts == INFINITY
@@ -54,7 +54,7 @@ class RestartPolicy(NamedTuple):
         }
 
     def delay_before(self, restart: int) -> int:
-        """Before a restart, counted from 1 since the last quiet window: it doubles each time."""
+        """The delay before a restart, counted from 1 since the last quiet window, in µs."""
         return min(self.delay << min(max(restart - 1, 0), 64), self.max_delay)
 
 
@@ -66,14 +66,14 @@ HELD_KEYS: Mapping[str, Any] = {
     "restart_delay": HELD_SECONDS,
     "max_restart_delay": HELD_SECONDS,
 }
-"""A node that fails, and waits: dora starts a new one in its place at any time, but none in the
-place of one that it has given up."""
+"""The keys of a node that waits after a failure. dora can replace such a node at any time, but
+never one that it has given up."""
 
 _KEYS = ("policy", "max", "window", "delay", "max-delay")
 
 
 def format_policy(policy: RestartPolicy) -> str:
-    """The policy as the runner's command line has it: `on-failure,max=5,window=10min,...`."""
+    """The policy in the runner's command line, such as `on-failure,max=5,window=10min,...`."""
     maximum = "infinity" if policy.max_restarts == INFINITY else str(policy.max_restarts)
     times = (format_duration(one) for one in (policy.window, policy.delay, policy.max_delay))
     pairs = zip(_KEYS[1:], (maximum, *times), strict=True)
@@ -108,7 +108,7 @@ def parse_count(text: str) -> int:
 
 
 def parse_delay(text: str) -> int:
-    """µs before a restart, MIN_DELAY at least. Raises DoraSystemdError (USAGE)."""
+    """µs before a restart, at least MIN_DELAY. Raises DoraSystemdError (USAGE)."""
     delay = parse_duration(text)
     if not MIN_DELAY <= delay < INFINITY:
         message = f"cannot use {quoted(text)} as the delay of a restart"
@@ -118,7 +118,7 @@ def parse_delay(text: str) -> int:
 
 
 def with_values(base: RestartPolicy, values: Mapping[str, Any]) -> RestartPolicy:
-    """`base` with some of its fields changed; the longest delay is never below the first."""
+    """`base` with some fields changed; the maximum delay is at least the first delay."""
     changed = base._replace(**values)
     return changed._replace(max_delay=max(changed.max_delay, changed.delay))
 
@@ -133,7 +133,7 @@ def check_restart_nodes(
 
 
 def budget_words(budget: Mapping[str, int | None]) -> str:
-    """As "3/5 restarts used, next try in 40s, resets in 8min"; times to the second."""
+    """Such as "3/5 restarts used, next try in 40s, resets in 8min"; times in whole seconds."""
     parts = [f"{budget['used']}/{budget['max']} restarts used"]
     for key, words in (("next_us", "next try in"), ("resets_us", "resets in")):
         left = budget[key]
@@ -143,7 +143,7 @@ def budget_words(budget: Mapping[str, int | None]) -> str:
 
 
 class Budget(NamedTuple):
-    """What is left of the restarts of a unit. used: in this window. resets_in: µs, or None."""
+    """The remaining restarts of a unit. used: in this window. resets_in: µs, or None."""
 
     used: int
     resets_in: int | None
@@ -156,7 +156,7 @@ def unit_budget(
 
     starts: CLOCK_REALTIME µs of the starts of the unit, oldest first. counted: NRestarts=, which
     `doractl reset` clears. systemd's window begins with a start and lasts `window` µs; the next
-    start after its end begins another one.
+    start after its end begins another window.
     """
     begin, used = None, 0
     for start in starts:

@@ -1,4 +1,4 @@
-"""The live table of one cell: what its runner writes to status.json and what `list` reads there."""
+"""The live table of one cell: the runner writes it to status.json, and `list` reads it."""
 
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -22,34 +22,33 @@ NODE_STATES = (
     "dynamic",
 )
 HELD = "held"
-"""Policy of a node that, when it has failed, waits for a reload."""
+"""Policy of a node that waits for a reload after it has failed."""
 ALIVE_NODE_STATES = frozenset({"ready", "running", "dynamic"})
 WHOLE_CELL = ""
-"""The key of a CPU sample that stands for the unit's whole cgroup."""
+"""The key of a CPU sample for the unit's whole cgroup."""
 SAMPLES_KEPT = 2
 SHORTEST_WINDOW_US = 1_000_000
 
 MAX_NODES = 2000
-"""Nodes of a table that is believed."""
+"""Maximum nodes of a valid table."""
 _MAX_SAMPLES = 8
 _MAX_TEXT = 1000
-"""Characters that are kept of a text."""
+"""Maximum characters of a text; the rest is cut."""
 _MAX_NUMBER = 2**63 - 1
 _MAX_TIME = 253_370_764_800_000_000
-"""The year 9999, CLOCK_REALTIME in µs: the last one that a date can be made of."""
+"""The year 9999, CLOCK_REALTIME in µs: the last year that a date can have."""
 _UNREADABLE = (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError)
 
 
 class NodeStatus(NamedTuple):
     """One node as the runner sees it.
 
-    state: one of NODE_STATES. pid: 0 when no process is known. restarts: how often dora restarted
-    it in this run. since_us: CLOCK_REALTIME µs of the last change of state. exit: how its last
-    process ended, "" or a text such as "exit code 1" or "signal SIGKILL". kind: how dora
-    starts it (python, executable, shell, uv, operator, ros2, dynamic, url). policy: dora's word
-    for what it restarts, "never" where it says none, or HELD. max_restarts: how often in one
-    window, 0 without limit. hung: what dora's health check said of the process before it ended it,
-    or "".
+    state: one of NODE_STATES. pid: 0 if no process is known. restarts: number of restarts by dora
+    in this run. since_us: CLOCK_REALTIME µs of the last change of state. exit: how its last process
+    ended: "" or a text such as "exit code 1" or "signal SIGKILL". kind: how dora starts it (python,
+    executable, shell, uv, operator, ros2, dynamic, url). policy: dora's restart policy, "never" if
+    it has none, or HELD. max_restarts: in one window, 0 without limit. hung: the message of dora's
+    health check before it ended the process, or "".
     """
 
     state: str = "starting"
@@ -64,14 +63,14 @@ class NodeStatus(NamedTuple):
 
     @property
     def is_alive(self) -> bool:
-        """Whether it counts as one of the "2/3 nodes" that are there."""
+        """Whether it counts as alive in "2/3 nodes"."""
         return self.state in ALIVE_NODE_STATES
 
 
 class CpuSample(NamedTuple):
-    """CPU time used up to the moment `at_us` (CLOCK_MONOTONIC µs), in µs, by node id.
+    """CPU time used until `at_us` (CLOCK_MONOTONIC µs), in µs, by node id.
 
-    throttling: periods in which the node wanted to run and in which it had to wait for its limit.
+    throttling: periods in which the node was runnable, and periods in which its limit throttled it.
     The key WHOLE_CELL is the unit's whole cgroup.
     """
 
@@ -81,7 +80,7 @@ class CpuSample(NamedTuple):
 
 
 class LineCount(NamedTuple):
-    """Lines that journald was given, that a limit took away, and that are lost, since the start."""
+    """Numbers of lines written, suppressed by a limit, and lost, since the start."""
 
     written: int = 0
     suppressed: int = 0
@@ -89,12 +88,11 @@ class LineCount(NamedTuple):
 
 
 class CellStatus(NamedTuple):
-    """What status.json holds.
+    """The content of status.json.
 
     run: dora's own id of this run, or "". stage: one of STAGES. text: the unit's STATUS=.
-    started_us, ready_us: CLOCK_REALTIME µs, 0 when that has not happened.
-    samples: the last SAMPLES_KEPT CPU samples, oldest first. lines: by node, and the lost ones of
-    WHOLE_CELL.
+    started_us, ready_us: CLOCK_REALTIME µs, 0 if that has not happened. samples: the last
+    SAMPLES_KEPT CPU samples, oldest first. lines: by node; lost ones count for WHOLE_CELL.
     """
 
     uuid: str = ""
@@ -109,7 +107,7 @@ class CellStatus(NamedTuple):
 
     @property
     def alive_count(self) -> int:
-        """How many nodes are there, dynamic ones included."""
+        """Number of nodes that are alive, including dynamic ones."""
         return sum(node.is_alive for node in self.nodes.values())
 
     @property
@@ -130,9 +128,9 @@ class CellStatus(NamedTuple):
 
     @classmethod
     def from_json(cls, text: str | bytes) -> "CellStatus":
-        """Inverse of to_json, of a text that the nodes' user may have written instead of a runner.
+        """Inverse of to_json, for a text that the nodes' user could have written.
 
-        Unknown keys are left aside: the runner may be a newer version. Raises DoraSystemdError for
+        Ignores unknown keys, because the runner may be a newer version. Raises DoraSystemdError for
         everything that no runner writes.
         """
         try:
@@ -146,15 +144,15 @@ class CellStatus(NamedTuple):
 
 
 def add_sample(samples: tuple[CpuSample, ...], sample: CpuSample) -> tuple[CpuSample, ...]:
-    """`samples` with a newer one, the oldest dropped."""
+    """`samples` with a newer one added and the oldest dropped."""
     return (*samples, sample)[-SAMPLES_KEPT:]
 
 
 def cpu_percent(samples: tuple[CpuSample, ...], now: CpuSample, key: str = WHOLE_CELL) -> float:
-    """CPU use of `key` up to `now` in percent of one processor, as top(1) counts.
+    """CPU usage of `key` up to `now` in percent of one processor, as top(1) counts.
 
     The window begins at the newest sample that is at least a second old. A key that a sample lacks
-    had used nothing then; a count that went down belongs to a new group.
+    had used nothing then; a smaller counter belongs to a new group.
     """
     base = _window_start(samples, now)
     window = now.at_us - base.at_us
@@ -165,7 +163,7 @@ def cpu_percent(samples: tuple[CpuSample, ...], now: CpuSample, key: str = WHOLE
 def throttled_percent(
     samples: tuple[CpuSample, ...], now: CpuSample, key: str = WHOLE_CELL
 ) -> float:
-    """Of the time in which `key` wanted to run, the share in which its CPU limit made it wait.
+    """The percentage of time in which the CPU limit throttled `key`, of the time it was runnable.
 
     The window is that of cpu_percent.
     """
@@ -181,7 +179,7 @@ def _window_start(samples: tuple[CpuSample, ...], now: CpuSample) -> CpuSample:
 
 
 class _Wrong(ValueError):
-    """What is wrong with a table; other errors have words of Python's."""
+    """An error in a table, with a text for users; other exceptions have Python's text."""
 
 
 def _reason(error: Exception) -> str:

@@ -1,4 +1,4 @@
-"""What `dora build` left for `dora start`: out/<stem>.dora-session.yaml beside the dataflow."""
+"""The session that `dora build` saves for `dora start`: out/<stem>.dora-session.yaml."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -7,10 +7,10 @@ from pathlib import PurePath
 
 @dataclass(frozen=True)
 class BuildSession:
-    """Where the last `dora build` put things, by node id, as absolute paths.
+    """The results of the last `dora build`, by node id, as absolute paths.
 
-    directories: where a node runs; for one from git that is its clone.
-    envs: virtual environments that `dora build --uv` makes; without --uv they are not there.
+    directories: where a node runs; for one from git that is its clone. envs: virtual environments
+    of `dora build --uv`; without --uv they do not exist.
     """
 
     directories: Mapping[str, str] = field(default_factory=dict)
@@ -18,13 +18,13 @@ class BuildSession:
 
 
 def session_path(dataflow: str) -> PurePath:
-    """The session file that belongs to the descriptor at `dataflow`."""
+    """The session file of the descriptor at `dataflow`."""
     path = PurePath(dataflow)
     return path.parent / "out" / f"{path.stem}.dora-session.yaml"
 
 
 def parse_session(document: object) -> BuildSession:
-    """The session in a loaded YAML document; one that dora did not write counts as none."""
+    """The session in a loaded YAML document; empty if dora did not write it."""
     build = document.get("local_build") if isinstance(document, dict) else None
     if not isinstance(build, dict):
         return BuildSession()

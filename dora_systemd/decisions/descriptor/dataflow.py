@@ -1,8 +1,7 @@
-"""The part of a dataflow descriptor that we read. All else in it is dora's business, kept as is.
+"""The part of a dataflow descriptor that dora-systemd reads. Other keys pass to dora unchanged.
 
-The checks give the mistakes that dora reports in ten lines, or not at all, one line each: `nodes:
-[]` would run for ever, and an input from nowhere is found by `dora validate` only. dora has the
-last word on everything else.
+The checks report errors in one line for which dora prints ten lines, or nothing: `nodes: []` would
+run forever, and only `dora validate` finds an input without a source. dora checks everything else.
 """
 
 from collections.abc import Mapping
@@ -21,14 +20,14 @@ from dora_systemd.decisions.descriptor.nodes import (
 from dora_systemd.values import quoted
 
 MAX_JSON = 1024 * 1024 - 4096
-"""Bytes of a descriptor as JSON: dora refuses a control frame above 1 MiB, all of it included."""
+"""Maximum bytes of a descriptor as JSON: dora refuses control frames above 1 MiB in total."""
 
 _DORA_SOURCES = "dora/"
 
 
 @dataclass(frozen=True)
 class Dataflow:
-    """A descriptor: `source` names its file in messages, `raw` is the whole mapping."""
+    """A descriptor. source: the name of its file in messages. raw: the complete mapping."""
 
     source: str
     nodes: tuple[Node, ...]
@@ -37,16 +36,16 @@ class Dataflow:
     raw: Mapping[str, object] = field(repr=False)
 
     def node(self, node_id: str) -> Node | None:
-        """The node of that id, or None."""
+        """The node with that id, or None."""
         return next((node for node in self.nodes if node.id == node_id), None)
 
 
 def parse_dataflow(document: object, source: str) -> Dataflow:
-    """The dataflow in an already loaded YAML or JSON document; `source` names it in errors.
+    """The dataflow in a loaded YAML or JSON document. source: its name in errors.
 
-    Raises DoraSystemdError (BAD_INPUT) with file and node when there is no node, an id is double
-    or one that dora refuses, an input comes from nowhere, something has a type that dora cannot
-    read, or all of it is more than one control frame of dora can carry (1 MiB as JSON).
+    Raises DoraSystemdError (BAD_INPUT) with file and node if there is no node, an id is repeated or
+    not valid in dora, an input has no source, a value has a type that dora cannot read, or the
+    document does not fit into one control frame of dora (1 MiB as JSON).
     """
     if not isinstance(document, dict):
         hint = "a dataflow is a mapping with the key 'nodes'"
@@ -100,7 +99,7 @@ def _missing(source: str, nodes: Mapping[str, Node]) -> str:
     if not slash:
         return "which names no output"
     if origin not in nodes:
-        # An expanded module's nodes are called MODULE.NODE.
+        # The nodes of an expanded module have names MODULE.NODE.
         is_inside = nodes.get(origin.partition(".")[0])
         return "" if is_inside and is_inside.kind in UNEXPANDED else "a node that does not exist"
     node = nodes[origin]

@@ -1,4 +1,4 @@
-"""Is a loaded document JSON of a bearable size? Asked without walking all of a huge one."""
+"""Checks that a loaded document is JSON of a limited size, without walking all of a huge one."""
 
 import math
 from collections.abc import Iterator
@@ -7,16 +7,16 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import shown
 
 MAX_DEPTH = 64
-"""Levels of nesting: no dataflow needs more, and Python's own recursion ends at some hundreds."""
+"""Maximum nesting: no dataflow needs more, and Python's recursion ends at some hundreds."""
 
 _MAX_NUMBER = 2**64
 
 
 def check_json(document: object, source: str, max_bytes: int) -> None:
-    """Raises DoraSystemdError (BAD_INPUT) unless `document` is a JSON value of at most `max_bytes`.
+    """Raise DoraSystemdError (BAD_INPUT) unless `document` is a JSON value of at most `max_bytes`.
 
-    An anchor of YAML that explodes, or one that holds itself, is one small object in memory and
-    without end when written out: the walk stops as soon as the limit is passed.
+    YAML anchors can multiply, or contain themselves: small in memory, and endless as text. So the
+    walk stops as soon as the limit is exceeded.
     """
     size = 0
     waiting = [(document, 1)]

@@ -1,4 +1,4 @@
-"""The nodes of a descriptor, as far as we read them; the whole is in the module dataflow."""
+"""The nodes of a descriptor; the module dataflow has the descriptor as a whole."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,7 +13,7 @@ _BACKOFF_KEYS = ("max_restarts", "restart_delay", "max_restart_delay", "restart_
 
 
 class NodeKind(StrEnum):
-    """What dora starts for a node; the names are those of the live node table."""
+    """What dora starts for a node; the names are those of the live table."""
 
     PYTHON = "python"
     EXECUTABLE = "executable"
@@ -40,7 +40,7 @@ UNEXPANDED = frozenset({NodeKind.MODULE, NodeKind.HUB})
 
 @dataclass(frozen=True)
 class Input:
-    """One input: its name as an error shows it, and its source, NODE/OUTPUT or dora's own."""
+    """One input: its name in errors, and its source: NODE/OUTPUT or one of dora's own."""
 
     name: str
     source: str
@@ -50,15 +50,15 @@ class Input:
 class Node:
     """One node of a descriptor.
 
-    path, args: as written, "" where there are none.
-    env: its own variables, values as YAML has them.
-    inputs, outputs: those of its operators too, outputs of one of several as "operator/output".
-    restart_policy: "never", "on-failure" or "always"; "" where the descriptor says nothing.
+    path, args: as written, or "".
+    env: its own variables, with values as in YAML.
+    inputs, outputs: including those of its operators; with several operators as "operator/output".
+    restart_policy: "never", "on-failure" or "always"; "" if the descriptor has none.
     backoff: the other restart keys that are set, such as restart_delay.
-    build, git: the command and the repository that `dora build` uses, or "".
+    build, git: the command and the repository for `dora build`, or "".
     keeps_output: whether dora itself reads its output (`send_stdout_as`, `send_logs_as`).
     working_directory: of `deploy:`, or "".
-    raw: the whole mapping.
+    raw: the complete mapping.
     """
 
     id: str
@@ -78,7 +78,7 @@ class Node:
 
 
 def parse_node(node: object, place: int, source: str) -> Node:
-    """The node that stands at `place` (from 0) of the list; raises as parse_dataflow does."""
+    """The node at index `place` of the list; raises as parse_dataflow does."""
     if not isinstance(node, dict):
         hint = "a node is a mapping with at least 'id' and 'path'"
         raise dataflow_refusal(source, f"node {place + 1} is {described(node)}", hint)
@@ -139,7 +139,7 @@ def _kind_of(node: Mapping[str, object], source: str, what: str) -> NodeKind:
 def _operators(
     node: Mapping[str, object], source: str, what: str
 ) -> Iterator[tuple[str, Mapping[str, object]]]:
-    """The parts of a node that have inputs and outputs, with the prefix of these."""
+    """The parts of a node that have inputs and outputs, with the prefix of their names."""
     yield "", node
     yield "", mapping_of(node.get("operator"), source, f"{what}: 'operator'")
     for operator in _sequence(node.get("operators"), source, f"{what}: 'operators'"):
@@ -162,14 +162,17 @@ def _outputs(node: Mapping[str, object], source: str, what: str) -> Iterator[str
 
 
 def text_of(value: object) -> str:
-    """Text as dora reads it: it takes numbers and booleans for text where it expects that."""
+    """Text as dora reads it: dora accepts numbers and booleans as text."""
     if value is None or isinstance(value, dict | list):
         return ""
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def mapping_of(value: object, source: str, what: str) -> Mapping[str, object]:
-    """A mapping, empty where nothing is written; raises for all else, naming it `what`."""
+    """A mapping, empty if nothing is written; raises for anything else.
+
+    what: its name in the error.
+    """
     if value is not None and not isinstance(value, dict):
         hint = "write a mapping, KEY: VALUE"
         raise dataflow_refusal(source, f"{what} is {described(value)}", hint)
@@ -183,7 +186,7 @@ def _sequence(value: object, source: str, what: str) -> Sequence[object]:
 
 
 def described(value: object) -> str:
-    """What `value` is, in words of YAML."""
+    """The type of `value` in the terms of YAML."""
     if isinstance(value, str):
         return f"the text {quoted(value)}"
     words = {dict: "a mapping", list: "a list", bool: "true or false", type(None): "nothing"}
@@ -191,5 +194,5 @@ def described(value: object) -> str:
 
 
 def dataflow_refusal(source: str, reason: str, hint: str) -> DoraSystemdError:
-    """The error (BAD_INPUT) that says why the descriptor `source` cannot be used."""
+    """The error (BAD_INPUT) for a descriptor `source` that cannot be used."""
     return DoraSystemdError(f"cannot use {shown(source)}: {reason}", hint, ExitCode.BAD_INPUT)

@@ -1,17 +1,17 @@
-"""Which nodes get nothing any more when one of them is gone."""
+"""Finds the nodes that get no more input when a node is gone."""
 
 from collections.abc import Mapping
 
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 
 Downstream = Mapping[str, tuple[str, ...]]
-"""Node id -> the nodes that live on what it sends, near ones first."""
+"""Node id -> the nodes that depend on its outputs, nearest first."""
 
 _FAILURES = ("node-crashed", "node-oom")
 
 
 def downstream_of(dataflow: Dataflow) -> Downstream:
-    """The nodes that each node feeds, directly or through others; circles end where they began."""
+    """The nodes downstream of each node, directly or indirectly; a circle ends at its start."""
     takers: dict[str, list[str]] = {node.id: [] for node in dataflow.nodes}
     for node in dataflow.nodes:
         for origin in {one.source.partition("/")[0] for one in node.inputs}:
@@ -21,7 +21,7 @@ def downstream_of(dataflow: Dataflow) -> Downstream:
 
 def _reached(start: str, takers: Mapping[str, list[str]]) -> tuple[str, ...]:
     found = [start]
-    for node in found:  # grows on the way
+    for node in found:  # the list grows during the loop
         found += [one for one in takers.get(node, ()) if one not in found]
     return tuple(found[1:])
 
@@ -29,7 +29,7 @@ def _reached(start: str, takers: Mapping[str, list[str]]) -> tuple[str, ...]:
 def with_downstream(
     record: tuple[str, str, Mapping[str, str]], downstream: Downstream
 ) -> tuple[str, str, Mapping[str, str]]:
-    """Name, node and details of a life event; those of a failed node say whom it starves."""
+    """Name, node and details of a life event; adds the nodes downstream of a failed node."""
     event, node, details = record
     fed = downstream.get(node)
     if event not in _FAILURES or not fed:

@@ -1,19 +1,19 @@
-"""Where the coordinator of a cell listens, as the runner notes it and tells it; pure."""
+"""The address and token of a cell's coordinator, as the runner writes and reports them. Pure."""
 
 import re
 from dataclasses import asdict, dataclass
 from typing import Any
 
 _TOKEN = re.compile(r"[0-9A-Za-z._~+/=-]{1,512}")
-"""What a header of HTTP can have: RFC 6750, section 2.1."""
+"""The characters of a token in an HTTP header: RFC 6750, section 2.1."""
 
 
 @dataclass(frozen=True)
 class Coordinator:
     """Ports of 127.0.0.1 and a token.
 
-    port: the coordinator's; token: what it asks for. local_listen_port: the daemon's for dynamic
-    nodes; None where those cannot reach it.
+    port, token: of the coordinator. local_listen_port: the daemon's port for dynamic nodes; None if
+    they cannot reach it.
     """
 
     port: int
@@ -21,12 +21,12 @@ class Coordinator:
     local_listen_port: int | None
 
     def raw(self) -> dict[str, Any]:
-        """For JSON; parse_coordinator reads it."""
+        """The values for JSON; parse_coordinator reads them."""
         return asdict(self)
 
 
 def parse_coordinator(raw: object) -> Coordinator:
-    """The coordinator that was told of. Raises ValueError for what can be none."""
+    """Parse the address of a coordinator. Raises ValueError if it is not valid."""
     if not isinstance(raw, dict):
         raise ValueError("not an object")
     port, listen = (_port(raw.get(key)) for key in ("port", "local_listen_port"))
@@ -34,7 +34,7 @@ def parse_coordinator(raw: object) -> Coordinator:
 
 
 def parse_token(raw: object) -> str:
-    """The token of a coordinator. Raises ValueError for what can be none."""
+    """Parse the token of a coordinator. Raises ValueError if it is not valid."""
     if not isinstance(raw, str) or not _TOKEN.fullmatch(raw):
         raise ValueError("not a token")
     return raw

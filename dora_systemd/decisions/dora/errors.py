@@ -1,4 +1,4 @@
-"""What dora prints when something fails, in one line."""
+"""Extracts the reason from dora's error output."""
 
 import re
 from itertools import pairwise
@@ -13,11 +13,11 @@ _MAX_LENGTH = 300
 
 
 def parse_dora_error(stderr: str) -> str:
-    """The reason in dora's error output: the innermost of its causes, on one line.
+    """The reason in dora's error output on one line: the innermost cause.
 
     dora (eyre) prints a headline after "[ERROR]", hints, "Caused by:" with one cause or numbered
-    ones, then where in its source and sometimes a backtrace. Without causes it is the headline,
-    without any of it the line of a wrong command line or the last one; "" for no output at all.
+    causes, then its source location and sometimes a backtrace. Without causes the reason is the
+    headline, or the line about a wrong command line, or the last line; "" without any output.
     """
     lines = [line.strip() for line in without_sequences(stderr).splitlines()]
     headline = _after(lines, "[ERROR]")[:1]
@@ -28,7 +28,7 @@ def parse_dora_error(stderr: str) -> str:
 
 
 def _after(lines: list[str], mark: str) -> list[str]:
-    """The lines after `mark` up to the end of that paragraph of the report; [] without mark."""
+    """The lines after `mark` up to the end of that paragraph; [] without `mark`."""
     if mark not in lines:
         return []
     block: list[str] = []
@@ -40,9 +40,9 @@ def _after(lines: list[str], mark: str) -> list[str]:
 
 
 def _innermost(causes: list[str]) -> str:
-    """The last numbered cause with its continued lines, or all of an unnumbered one.
+    """The last numbered cause with its continuation lines, or the whole of an unnumbered one.
 
-    An error of the operating system says what happened and not to what: that is one cause before.
+    An error of the operating system does not name its object: the cause before it does.
     """
     starts = [place for place, line in enumerate(causes) if _NUMBERED.match(line)]
     blocks = [" ".join(causes[begin:end]) for begin, end in pairwise([*starts, len(causes)])]

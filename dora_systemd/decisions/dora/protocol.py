@@ -1,7 +1,7 @@
-"""Dora's control protocol: frames to values and back. No socket, no clock.
+"""dora's control protocol as its client uses it: frames to values and back. No socket, no clock.
 
-The frames are those of dora 1.0 and 1.1 on `/api/control`; dora's
-docs/websocket-control-plane.md lists part of them.
+The frames are those of dora 1.0 and 1.1 on `/api/control`; dora's docs/websocket-control-plane.md
+documents some of them.
 """
 
 import json
@@ -22,7 +22,7 @@ Params = str | Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Reply:
-    """The answer to request `id`. error: "" or dora's text; result: what came otherwise."""
+    """The reply to request `id`. error: "" or dora's text. result: that of a good reply."""
 
     id: str
     result: Any
@@ -31,7 +31,7 @@ class Reply:
 
 @dataclass(frozen=True)
 class LogRecord:
-    """One line of dora's event stream. node: "" when it concerns the whole dataflow."""
+    """One line of dora's event stream. node: "" if it is about the whole dataflow."""
 
     level: str
     target: str
@@ -46,7 +46,7 @@ def encode_request(params: Params) -> tuple[str, str]:
 
 
 def parse_frame(text: str | bytes) -> Reply | LogRecord | None:
-    """A frame of the coordinator; None for what is of no use to us."""
+    """A frame of the coordinator; None if it is not relevant."""
     try:
         frame = json.loads(text)
     except (ValueError, RecursionError):
@@ -66,7 +66,7 @@ def _log_record(payload: Mapping[str, Any]) -> LogRecord:
 
 
 def _reply(frame: Mapping[str, Any]) -> Reply:
-    # A malformed request is answered by "error", one that failed by {"result": {"Error": ...}}.
+    # A malformed request gets "error", one that failed gets {"result": {"Error": ...}}.
     result, error = frame.get("result"), frame.get("error")
     if isinstance(result, dict) and "Error" in result:
         error = result["Error"]
@@ -75,9 +75,9 @@ def _reply(frame: Mapping[str, Any]) -> Reply:
 
 
 def result_of(reply: Reply, key: str) -> Any:
-    """The value under `key` in a good reply.
+    """The value of `key` in a good reply.
 
-    Raises DoraSystemdError for an error reply and for a reply of another kind.
+    Raises DoraSystemdError for an error, and for a reply of another kind.
     """
     if reply.error:
         raise DoraSystemdError(f"cannot do this in dora: {first_line(reply.error)}")
@@ -90,7 +90,7 @@ def result_of(reply: Reply, key: str) -> Any:
 
 
 def start_params(descriptor: Mapping[str, Any], name: str, work: str) -> Params:
-    """Start a run. work: absolute directory for dora's `out/` and, by default, for the nodes."""
+    """Start a run. work: absolute directory of dora's `out/`, and the nodes' default directory."""
     return {
         "Start": {
             "build_id": None,
@@ -105,56 +105,56 @@ def start_params(descriptor: Mapping[str, Any], name: str, work: str) -> Params:
 
 
 def stop_params(run: str, grace: int) -> Params:
-    """Stop a run. grace: µs until dora sends SIGTERM; SIGKILL follows after half as much again."""
+    """Stop a run. grace: µs until dora sends SIGTERM; SIGKILL follows after 1.5 times that."""
     return {
         "Stop": {"dataflow_uuid": run, "grace_duration": duration(grace), "force": False},
     }
 
 
 def duration(microseconds: int) -> Mapping[str, int]:
-    """Microseconds as Rust's serde writes a Duration."""
+    """Microseconds as a Duration of Rust's serde."""
     seconds, rest = divmod(microseconds, SECOND)
     return {"secs": seconds, "nanos": rest * 1000}
 
 
 def subscribe_params(run: str) -> Params:
-    """The life events of a run. Debug is the level of `spawned node with pid`."""
+    """Subscribe to the life events of a run. `spawned node with pid` has the level Debug."""
     return {"LogSubscribe": {"dataflow_id": run, "level": "Debug"}}
 
 
 def wait_spawn_params(run: str) -> Params:
-    """Answered when all nodes were executed, or with the reason why one could not be."""
+    """Wait until dora has executed all nodes; the reply may be why it could not execute one."""
     return {"WaitForSpawn": {"dataflow_id": run}}
 
 
 def check_params(run: str) -> Params:
-    """Has the run ended, and how?"""
+    """Ask whether the run has ended, and how."""
     return {"Check": {"dataflow_uuid": run}}
 
 
 def node_params(method: str, run: str, node: str, grace: int | None = None) -> Params:
-    """RestartNode, StopNode or RemoveNode. grace: µs as above; None: dora's own."""
+    """RestartNode, StopNode or RemoveNode. grace: µs as for stop_params; None: dora's default."""
     limit = None if grace is None else duration(grace)
     return {method: {"dataflow_id": run, "node_id": node, "grace_duration": limit}}
 
 
 OVERLAP = SECOND
-"""µs for which a node and its replacement run at the same time, at most."""
+"""µs for which a node and its replacement run in parallel, at most."""
 
 
 def replace_params(run: str, definition: Mapping[str, Any]) -> Params:
-    """Start `definition` in place of the node of that id, which then has OVERLAP to end."""
+    """Start `definition` in place of the node with that id, which then has OVERLAP µs to exit."""
     overlap = duration(OVERLAP)
     return {"ReplaceNode": {"dataflow_id": run, "node": definition, "grace_duration": overlap}}
 
 
 def add_params(run: str, definition: Mapping[str, Any]) -> Params:
-    """Add a node to a dataflow that runs."""
+    """Add a node to a running dataflow."""
     return {"AddNode": {"dataflow_id": run, "node": definition}}
 
 
 def reload_params(run: str, node: str, operator: str) -> Params:
-    """Have a Python operator read its file again."""
+    """Have a Python operator load its file again."""
     return {"Reload": {"dataflow_id": run, "node_id": node, "operator_id": operator}}
 
 
@@ -164,9 +164,9 @@ HELLO: Params = {"Hello": {"dora_version": "1.0.0"}}
 
 
 def parse_heartbeat(reply: Reply) -> int:
-    """µs since the coordinator last heard of its daemon, as CONNECTED_DAEMONS is answered.
+    """µs since the last heartbeat of the daemon, from the reply to CONNECTED_DAEMONS.
 
-    INFINITY when it has none any more, 0 when the answer does not tell.
+    INFINITY if no daemon is connected, 0 if the reply does not tell.
     """
     daemons = _mapping(reply.result).get("ConnectedDaemons")
     if not isinstance(daemons, list):
@@ -176,10 +176,10 @@ def parse_heartbeat(reply: Reply) -> int:
 
 
 def parse_results(reply: Reply) -> dict[str, str] | None:
-    """The reply to Check or Stop: None while it runs, else node id -> "" or why it failed.
+    """The reply to Check or Stop: None during the run, else node id -> "" or the error.
 
-    An empty mapping means that dora does not know, never success: that is what a coordinator says
-    whose daemon is gone.
+    An empty mapping means that dora does not know, and never success: a coordinator without its
+    daemon replies like that.
     """
     result = _mapping(reply.result)
     if "DataflowSpawned" in result:
@@ -191,9 +191,9 @@ def parse_results(reply: Reply) -> dict[str, str] | None:
 
 
 def parse_spawn_failure(reply: Reply) -> str:
-    """The reply to WaitForSpawn: "" or why a node could not be executed.
+    """The reply to WaitForSpawn: "", or why a node could not be executed.
 
-    A run that dora does not know any more was executed and has ended: its life events tell how.
+    A run that dora no longer knows was executed and has ended: its life events tell how.
     """
     return "" if _ENDED_ALREADY.match(reply.error) else first_line(reply.error)
 
@@ -224,7 +224,7 @@ def _exit_status(status: dict[str, Any]) -> str:
 
 
 def first_line(text: str) -> str:
-    """An error of dora without what follows it: its location and its backtrace."""
+    """An error of dora without the location and backtrace after it."""
     head = re.split(r"\n\s*\n?(?:Location|Stack backtrace|Suggestion)\b", text, maxsplit=1)[0]
     return " ".join(head.split())
 
@@ -238,9 +238,9 @@ _CASCADED = re.compile(r"marking `(.+)` as cascading error caused by `(.+)`")
 
 
 def parse_life_event(record: LogRecord, at_us: int) -> life.Event | None:
-    """The life event that a line of dora's own stands for; None for all others.
+    """The life event that a line of dora's own means; None for other lines.
 
-    What nodes print cannot forge one: those lines carry the level "stdout" or a target of theirs.
+    Nodes cannot forge one: lines that they print have the level "stdout" or another target.
     """
     if record.target == "coordinator":
         return life.RunFinished(at_us) if record.message == "dataflow finished" else None
@@ -276,15 +276,15 @@ _UNRESPONSIVE = re.compile(r"node `([^`]+)` (unresponsive for \d+ms \(timeout: [
 
 
 def parse_daemon_line(line: str, at_us: int) -> life.Event | None:
-    """What a line that the daemon printed says about a node; dora tells hangs nowhere else."""
+    """The event of a line printed by the daemon: dora reports hung nodes only there."""
     match = _UNRESPONSIVE.search(line)
     return life.NodeHung(at_us, match[1], match[2]) if match else None
 
 
 def with_facts(event: life.NodeExited, is_stale: bool, oom: Oom | None) -> life.NodeExited:
-    """The event with what only the runner can tell.
+    """The event with facts that only the runner knows.
 
-    is_stale: whether the node's process lives on. oom: the want of memory that ended it.
+    is_stale: whether the node's current process is alive. oom: the OOM kill that ended it.
     """
     how = event.exit if oom is None or not event.exit else oom.text
     return replace(event, exit=how, is_stale=is_stale, oom=oom if event.exit else None)

@@ -1,4 +1,4 @@
-"""The variables with which the dora command finds a coordinator, as lines for a shell; pure."""
+"""The variables by which the dora command finds a coordinator, as lines for a shell. Pure."""
 
 import shlex
 from collections.abc import Iterable, Mapping
@@ -9,10 +9,10 @@ VARIABLES = (
     "DORA_AUTH_TOKEN",
     "DORA_DAEMON_LOCAL_LISTEN_PORT",
 )
-"""What dora 1.1 reads, and all that `doractl env` sets; the last one is for dynamic nodes."""
+"""The variables that dora 1.1 reads and `doractl env` sets; the last one is for dynamic nodes."""
 
 SHELLS = {"sh": ("export {0}={1}", "unset {0}"), "fish": ("set -gx {0} {1}", "set -e {0}")}
-"""Lines that set and unset a variable. sh: bash and zsh as well."""
+"""Commands that set and unset a variable. sh: also for bash and zsh."""
 
 
 def coordinator_variables(
@@ -33,5 +33,5 @@ def format_exports(shell: str, values: Mapping[str, str]) -> str:
 
 
 def format_unsets(shell: str, names: Iterable[str] = VARIABLES) -> str:
-    """Lines that unset them."""
+    """Commands that unset them."""
     return "\n".join(SHELLS[shell][1].format(name) for name in names)

@@ -1,7 +1,8 @@
-"""Who may ask the gateway: pure, the facts come from the kernel and from the request.
+"""Access control of the gateway. Pure: the facts come from the kernel and from the request.
 
-Loopback is no permission: every user of the machine can connect, and every page in a browser on it.
-A browser gives itself away by Origin:, and a name that was bent to this machine by Host:.
+Every user of the machine, and every page in a browser on it, can connect to loopback. So a
+connection alone grants nothing. The Origin: header shows a request of a browser's page, and the
+Host: header shows a foreign name that resolves to this machine.
 """
 
 import hmac
@@ -11,13 +12,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 MAX_CONNECTIONS = 256
-"""Of root and of the gateway's own user; dora's own limit for its coordinator."""
+"""Maximum connections of root and of the gateway's own user; as in dora's coordinator."""
 MAX_STRANGERS = 32
-"""Connections of all others together: they are refused, or have a token."""
+"""Maximum connections of all other users together."""
 MAX_OF_STRANGER = 16
-"""Connections of one of them."""
+"""Maximum connections of one other user."""
 STRANGER_SECONDS = 2.0
-"""For the headers of a stranger's request to arrive."""
+"""Timeout for the headers of another user's request."""
 
 _HOST = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:[0-9]{1,5})?", re.IGNORECASE)
 _BEARER = "bearer "
@@ -25,9 +26,9 @@ _BEARER = "bearer "
 
 @dataclass(frozen=True)
 class Caller:
-    """What is known of a request. The headers have all their values, as they may come repeatedly.
+    """The facts of a request. Headers have all their values, because they may be repeated.
 
-    uid: whose the other end of the connection is, None where the kernel does not tell.
+    uid: the user at the other end of the connection, None if the kernel does not tell.
     """
 
     uid: int | None
@@ -38,16 +39,16 @@ class Caller:
 
 @dataclass(frozen=True)
 class Refusal:
-    """An HTTP status and one line about it."""
+    """An HTTP status, and one line about the reason."""
 
     status: int
     text: str
 
 
 class Door:
-    """Counts who is in. Whatever others do, there is room for root and for the gateway's owner.
+    """Counts connections, and always keeps room for root and for the gateway's owner.
 
-    uid: of the other end of a connection, None where the kernel does not tell.
+    uid: the user at the other end of a connection, None if the kernel does not tell.
     """
 
     def __init__(self, own_uid: int) -> None:
@@ -55,11 +56,11 @@ class Door:
         self._inside: Counter[int | None] = Counter()
 
     def is_stranger(self, uid: int | None) -> bool:
-        """Whether it is neither root nor the user whose gateway this is."""
+        """Whether it is neither root nor the gateway's own user."""
         return uid not in self._known
 
     def enter(self, uid: int | None) -> bool:
-        """Let a connection in, if there is room for it."""
+        """Count a connection if there is room for it; whether there is."""
         of_all = sum(n for one, n in self._inside.items() if self._is_like(one, uid))
         has_room = of_all < (MAX_STRANGERS if self.is_stranger(uid) else MAX_CONNECTIONS)
         if self.is_stranger(uid):
@@ -71,17 +72,17 @@ class Door:
         return self.is_stranger(one) == self.is_stranger(other)
 
     def leave(self, uid: int | None) -> None:
-        """A connection that was let in has ended."""
+        """Count the end of a connection that was let in."""
         self._inside[uid] -= 1
         if not self._inside[uid]:
             del self._inside[uid]
 
 
 def refuse_address(caller: Caller) -> Refusal | None:
-    """Keep out other sites' pages: the way here must be this machine's own name.
+    """Refuse pages of other sites: the request must use one of this machine's own names.
 
-    The port may be another one, as a tunnel has it (ssh -L 8080:127.0.0.1:53290); a page's origin
-    must be exactly what it was called by.
+    The port may differ, as in a tunnel (ssh -L 8080:127.0.0.1:53290). The origin of a page must be
+    exactly the address that it was loaded from.
     """
     if len(caller.hosts) != 1 or not _HOST.fullmatch(caller.hosts[0]):
         return Refusal(403, "the gateway answers to 127.0.0.1 and localhost only")
@@ -92,7 +93,7 @@ def refuse_address(caller: Caller) -> Refusal | None:
 
 
 def refuse_user(caller: Caller, own_uid: int, token: str) -> Refusal | None:
-    """Let in root, the user whose gateway this is, and whoever has the token."""
+    """Let in root, the gateway's own user, and anyone who has the token."""
     if caller.uid in (0, own_uid) or has_token(caller, token):
         return None
     return Refusal(401, "only root, its own user and holders of its token may use this gateway")

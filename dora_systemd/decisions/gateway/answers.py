@@ -1,7 +1,7 @@
-"""What systemd, the journal and the node tables know, in the form of dora's answers. Pure.
+"""Formats facts from systemd, the journal and the node tables as answers of dora. Pure.
 
-The forms are those that dora's coordinator 1.1.0 sends: sizes in MB of 1,000,000 bytes, states of
-nodes in four words, times of results as the 64 bits of NTP.
+The formats are those of dora's coordinator 1.1.0: sizes in MB of 1,000,000 bytes, four states of
+nodes, times of results as 64-bit NTP timestamps.
 """
 
 import json
@@ -17,13 +17,13 @@ from dora_systemd.decisions.views.dataflows import FAILED, UP_WORDS, DataflowRow
 from dora_systemd.values import SECOND
 
 Record = Mapping[str, bytes]
-"""An entry of the journal, as its export format has it."""
+"""An entry of the journal in the export format."""
 
 LOG_FIELDS = (
     *("MESSAGE", "PRIORITY", "MESSAGE_ID", "UNIT", "USER_UNIT"),
     *("DORA_NODE", "DORA_LEVEL", "DORA_TARGET", "DORA_STREAM"),
 )
-"""The fields of a record that are made use of."""
+"""The fields of a record that this module uses."""
 
 _OWN_TARGET = "dora-systemd"
 _MEGABYTE = 1_000_000
@@ -37,7 +37,7 @@ _SYSTEMD_FIELDS = ("UNIT", "USER_UNIT")
 
 
 def dataflow_list(rows: Iterable[DataflowRow]) -> dict[str, Any]:
-    """The answer to List."""
+    """The reply to List."""
     return {
         "DataflowList": [
             {"id": {"uuid": row.uuid, "name": row.name}, "status": _status(row.status)}
@@ -53,7 +53,7 @@ def _status(word: str) -> str:
 
 
 def node_list(rows: Iterable[DataflowRow]) -> dict[str, Any]:
-    """The answer to GetNodeInfo."""
+    """The reply to GetNodeInfo."""
     return {"NodeInfoList": [_node_info(row, node) for row in rows for node in row.nodes]}
 
 
@@ -83,7 +83,7 @@ def _node_state(state: str) -> str:
 
 
 def daemon_list(uuids: Iterable[str]) -> dict[str, Any]:
-    """The answer to ConnectedMachines: each dataflow has a daemon of its own."""
+    """The reply to ConnectedMachines: each dataflow has its own daemon."""
     daemons = [{"daemon_id": _daemon_id(one), "last_heartbeat_ago_ms": 0} for one in uuids]
     return {"ConnectedDaemons": daemons}
 
@@ -93,7 +93,7 @@ def _daemon_id(uuid: str) -> dict[str, Any]:
 
 
 def stopped(uuid: str, at_us: int, failures: Mapping[str, str]) -> dict[str, Any]:
-    """DataflowStopped. at_us: CLOCK_REALTIME µs. failures: how nodes ended that ended badly."""
+    """DataflowStopped. at_us: CLOCK_REALTIME µs. failures: node -> how it failed."""
     stamp = {"time": _ntp(at_us), "id": list(bytes.fromhex(uuid.replace("-", "")))}
     results = {
         node: {
@@ -125,16 +125,16 @@ def _exit_status(text: str) -> Any:
 
 
 def bare_descriptor(nodes: Iterable[str]) -> dict[str, Any]:
-    """All that is known of the descriptor of a dataflow whose unit is gone: its nodes."""
+    """A descriptor with nodes only, which is all that is known after the unit is gone."""
     return {"nodes": [{"id": node, "path": ""} for node in nodes]}
 
 
 def restored_descriptor(
     running: Mapping[str, Any], written: Sequence[Mapping[str, Any]], keys: Sequence[str]
 ) -> dict[str, Any]:
-    """What a coordinator runs, with each node's `keys` as they are written in its file.
+    """The descriptor of a run, with each node's `keys` as its file has them.
 
-    Of nodes that are in the file of a module, the program is as our launcher was told it: absolute.
+    For nodes from a module's file, the program is the one that our launcher gets: an absolute path.
     """
     by_id = {node.get("id"): node for node in written}
     nodes = [_restored(node, by_id.get(node.get("id"), {}), keys) for node in running["nodes"]]
@@ -151,7 +151,7 @@ def _restored(
 
 
 def _program(node: Mapping[str, Any]) -> dict[str, str]:
-    """Path and arguments of a node, out of what it tells our launcher; {} for any other."""
+    """Path and arguments of a node, from the arguments of our launcher; {} for any other node."""
     try:
         launcher, *words = shlex.split(str(node.get("args")))
     except ValueError:
@@ -168,7 +168,7 @@ def _program(node: Mapping[str, Any]) -> dict[str, str]:
 
 
 def log_line(record: Record) -> bytes:
-    """A line of a node as it is in dora's log files, log_<node>.jsonl, but for empty keys."""
+    """A line of a node as in dora's log file log_<node>.jsonl, except for empty keys."""
     line = {
         "ts": _timestamp(record),
         "level": _level(record),
@@ -201,7 +201,7 @@ def log_payload(record: Record, uuid: str) -> dict[str, Any]:
 
 
 def is_wanted(record: Record, level: object) -> bool:
-    """Whether who follows at `level`, a word of dora's, is sent the record; plain lines always."""
+    """Whether a subscriber at `level`, a name of dora's, gets the record; plain lines always."""
     own, asked = _level(record), str(level).lower()
     if own == "stdout" or asked not in _LEVELS:
         return True
@@ -209,7 +209,7 @@ def is_wanted(record: Record, level: object) -> bool:
 
 
 def is_from_systemd(record: Record) -> bool:
-    """Whether systemd says that the unit has ended."""
+    """Whether the record is systemd's, about the end of the unit."""
     return any(name in record for name in _SYSTEMD_FIELDS)
 
 

@@ -1,9 +1,10 @@
-"""Which file a Start request is of: it carries a descriptor and a directory, but no file name.
+"""Finds the file of a Start request, which has a descriptor and a directory, but no file name.
 
-The dora command sends what `dora expand FILE` prints: modules expanded, timers and defaults in one
-form, $VARIABLES of its own environment replaced. On top come `--env` in the dataflow's `env`,
-`--debug` in `debug` and `--exit-when-nodes-finish`; here they become the same flags of doractl.
-Its session_id is that of out/<stem>.dora-session.yaml beside the file. All this with dora 1.1.0.
+The dora command sends what `dora expand FILE` prints: modules are expanded, timers and defaults
+normalized, and $VARIABLES replaced from its own environment. `--env` is added to the dataflow's
+`env`, `--debug` to `debug`, and `--exit-when-nodes-finish`; here they become the same flags of
+doractl. session_id is that of out/<stem>.dora-session.yaml beside the file. This was measured with
+dora 1.1.0.
 """
 
 from collections.abc import Mapping
@@ -16,7 +17,7 @@ _DEFAULTS: Mapping[str, Any] = {"restart_policy": "never", "max_restarts": 0}
 
 
 def could_be(written: object, sent: Descriptor) -> bool:
-    """Whether a file that says `written` may be what was sent: it has the same nodes."""
+    """Whether a file with the document `written` can be the one sent: it has the same nodes."""
     if not isinstance(written, dict):
         return False
     names: list[str] = []
@@ -31,10 +32,10 @@ def could_be(written: object, sent: Descriptor) -> bool:
 def sent_flags(
     sent: Descriptor, expanded: Descriptor, want_uv: bool, has_variables: bool
 ) -> dict[str, object] | None:
-    """The flags with which the file gives what was sent; None when it is another dataflow.
+    """The flags with which the file yields what was sent; None for another dataflow.
 
-    expanded: what `dora expand` makes of the file. has_variables: the file has a "$", which the
-    sender may have replaced by something else than we do.
+    expanded: the result of `dora expand` for the file. has_variables: the file contains a "$",
+    which the sender may have replaced by another value than we do.
     """
     rest = {key: value for key, value in sent.items() if key not in _FROM_FLAGS}
     own = {key: value for key, value in expanded.items() if key not in _FROM_FLAGS}
@@ -75,7 +76,7 @@ def _same(one: Any, other: Any, has_variables: bool, key: str = "") -> bool:
 
 
 def _plain(mapping: Mapping[str, Any]) -> dict[str, Any]:
-    """Without what says nothing: another version of dora may leave it out, or put it in."""
+    """Remove empty values: another version of dora may leave them out or add them."""
     return {
         key: value
         for key, value in mapping.items()

@@ -1,8 +1,8 @@
-"""What the status page and the gateway say to each other on /api/live: JSON objects. Pure.
+"""The messages between the status page and the gateway on /api/live: JSON objects. Pure.
 
 The page sends, each with its `type`:
-  follow    {dataflow, node, number}          what a node writes from now on, "" for all of them;
-                                              takes the place of what was followed before
+  follow    {dataflow, node, number}          stream the lines of a node, "" for all nodes; ends
+                                              the stream before it
   unfollow  {}
   graph     {dataflow}
   act       {action, dataflow, node, number}  action: "stop" or "restart"; node "": the dataflow
@@ -32,7 +32,7 @@ TYPES = ("follow", "unfollow", "graph", "act")
 ACTIONS = ("stop", "restart")
 LOG_FIELDS = "MESSAGE,PRIORITY,DORA_NODE,DORA_EVENT,SYSLOG_IDENTIFIER"
 MAX_TEXT = 4000
-"""Characters of one line that a page is sent."""
+"""Maximum characters of one line for a page."""
 
 _DEFAULT_PRIORITY = 6
 _PRIORITIES = frozenset(b"%d" % number for number in range(8))
@@ -40,7 +40,7 @@ _PRIORITIES = frozenset(b"%d" % number for number in range(8))
 
 @dataclass(frozen=True)
 class PageMessage:
-    """Something that a page asks for."""
+    """A request of a page."""
 
     type: str
     dataflow: str = ""
@@ -50,7 +50,7 @@ class PageMessage:
 
 
 def parse_message(text: str | bytes) -> PageMessage:
-    """What a page asks for; raises DoraSystemdError (USAGE) for what is no message at all."""
+    """Parse a request of a page. Raises DoraSystemdError (USAGE) if it is not valid."""
     try:
         raw = json.loads(text)
         message = PageMessage(
@@ -80,7 +80,7 @@ def _refusal() -> DoraSystemdError:
 
 
 def line_values(record: Mapping[str, bytes]) -> dict[str, Any]:
-    """A record of the journal as a line of the page."""
+    """A record of the journal as a line for the page."""
     node = _decoded(record.get("DORA_NODE", b""))
     priority = record.get("PRIORITY", b"")
     return {
@@ -97,13 +97,13 @@ def _decoded(data: bytes) -> str:
 
 
 def _printable(text: str) -> str:
-    """Without colours and other orders to a terminal; what is left of them can be seen."""
+    """Remove colours and other terminal sequences; show remaining control characters escaped."""
     text = without_sequences(text)
     return escaped(text if len(text) <= MAX_TEXT else f"{text[:MAX_TEXT]}…")
 
 
 def graph_values(dataflow: Dataflow) -> dict[str, Any]:
-    """Nodes and edges of a descriptor; dora's own sources, such as timers, are nodes as well."""
+    """Nodes and edges of a descriptor; dora's own sources, such as timers, count as nodes."""
     nodes = [{"id": node.id, "kind": str(node.kind)} for node in dataflow.nodes]
     edges = [
         _edge(node.id, given.name, given.source) for node in dataflow.nodes for given in node.inputs

@@ -1,4 +1,4 @@
-"""Which port `doractl up` opens: from the option and from dora's own variables; pure."""
+"""The port that `doractl up` opens, from its option and dora's own variables. Pure."""
 
 from collections.abc import Mapping
 
@@ -13,10 +13,9 @@ _REMOTE_HINT = "the gateway is for this machine; from another one: ssh -L PORT:1
 
 
 def wanted_port(option: int | None, environ: Mapping[str, str]) -> int | None:
-    """The port asked for, None where nobody asks for one.
+    """The requested port, or None.
 
-    Raises DoraSystemdError (BAD_INPUT) for variables that mean something else than a port of
-    127.0.0.1.
+    Raises DoraSystemdError (BAD_INPUT) for variables that do not mean a port of 127.0.0.1.
     """
     address = environ.get(ADDRESS_VARIABLE, "")
     host, _, port = address.partition(":") if address.count(":") < 2 else (address, "", "")

@@ -1,4 +1,4 @@
-"""What the gateway's routes are given and what they give back."""
+"""Requests to, and answers from, the gateway's routes."""
 
 from collections.abc import AsyncIterable, AsyncIterator, Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
@@ -12,10 +12,10 @@ PLAIN = "text/plain; charset=utf-8"
 
 @dataclass(frozen=True)
 class Request:
-    """A request of somebody who may ask.
+    """A request with access granted.
 
-    path: without the query. headers: by name in lower case, the last value of each.
-    scope: whose dataflows the gateway is for.
+    path: without the query. headers: by name in lower case, with the last value of each. scope:
+    that of the gateway's dataflows.
     """
 
     path: str
@@ -26,7 +26,7 @@ class Request:
 
 @dataclass(frozen=True)
 class Answer:
-    """An HTTP response. headers: those beside Content-Type and Content-Length."""
+    """An HTTP response. headers: in addition to Content-Type and Content-Length."""
 
     status: int
     content_type: str
@@ -35,22 +35,22 @@ class Answer:
 
 
 class Socket(Protocol):
-    """A WebSocket connection, as the server of websockets has it.
+    """A WebSocket connection, as the server of websockets provides it.
 
-    A route may let its ConnectionClosed pass: the other side has gone.
+    A route need not catch its ConnectionClosed: the other end has disconnected.
     """
 
     async def recv(self) -> str | bytes:
         """The next message."""
 
     async def send(self, message: str | bytes | AsyncIterable[str]) -> None:
-        """Send a message, whole or in parts; waits while the other side is slow."""
+        """Send a message, whole or in parts; waits while the receiver is slow."""
 
     async def close(self, code: int = 1000, reason: str = "") -> None:
-        """Say goodbye."""
+        """Send a closing frame."""
 
     def __aiter__(self) -> AsyncIterator[str | bytes]:
-        """The messages until the other side closes."""
+        """The messages, until the other end closes."""
 
 
 Get = Callable[[Request], Awaitable[Answer]]
@@ -58,5 +58,5 @@ Talk = Callable[[Socket, Request], Awaitable[None]]
 
 
 def text_answer(status: int, text: str, **headers: str) -> Answer:
-    """An answer of one line, which curl may well write to a terminal."""
+    """An answer of one line; curl may print it to a terminal."""
     return Answer(status, PLAIN, f"{escaped(text)}\n".encode(), headers)

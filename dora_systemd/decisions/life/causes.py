@@ -1,11 +1,11 @@
-"""Why a dataflow has ended: the words of DORA_CAUSE in the journal and of `doractl why`."""
+"""Why a dataflow has ended: the values of DORA_CAUSE in the journal and in `doractl why`."""
 
 import signal
 from enum import StrEnum
 
 
 class Cause(StrEnum):
-    """One reason for an end; those up to OUT_OF_MEMORY are in the event dataflow-failed."""
+    """One reason for an end; those up to OUT_OF_MEMORY occur in the event dataflow-failed."""
 
     NODE_FAILED = "node-failed"
     START_TIMEOUT = "start-timeout"

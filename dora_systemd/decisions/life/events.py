@@ -1,4 +1,4 @@
-"""What can happen to a cell: the events of the runner's state machine. Time arrives inside them."""
+"""The events of the runner's state machine: what can happen to a cell. They contain the time."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -11,36 +11,36 @@ from dora_systemd.decisions.resources.oom import Oom
 
 @dataclass(frozen=True)
 class Event:
-    """Base of all. at_us: CLOCK_REALTIME µs at which the runner learned of it."""
+    """Base of all events. at_us: CLOCK_REALTIME µs at which the runner learned of it."""
 
     at_us: int
 
 
 @dataclass(frozen=True)
 class CoordinatorListening(Event):
-    """The coordinator printed its port and wrote its token."""
+    """The coordinator has printed its port and written its token."""
 
 
 @dataclass(frozen=True)
 class DaemonConnected(Event):
-    """The coordinator says that its daemon has registered, and the descriptor is expanded."""
+    """The daemon has registered with the coordinator, and the descriptor is expanded."""
 
 
 @dataclass(frozen=True)
 class RunStarted(Event):
-    """The coordinator accepted the descriptor. run: dora's own id of this run."""
+    """The coordinator has accepted the descriptor. run: dora's own id of this run."""
 
     run: str
 
 
 @dataclass(frozen=True)
 class Subscribed(Event):
-    """From here on life events of the run arrive."""
+    """From here on, life events of the run arrive."""
 
 
 @dataclass(frozen=True)
 class Refused(Event):
-    """The dataflow could not be started, or cannot go on. reason: one line."""
+    """The dataflow cannot start or continue. reason: one line."""
 
     reason: str
     cause: Cause = Cause.REFUSED
@@ -48,9 +48,9 @@ class Refused(Event):
 
 @dataclass(frozen=True)
 class Failed(Event):
-    """Something of the runner raised. what: what it could not do. error: the exception, in words.
+    """Code of the runner raised. what: what it could not do. error: the exception as text.
 
-    It can be an action of the table, a task beside it, or a callback of the loop.
+    The code can be an action of the table, a task, or a callback of the loop.
     """
 
     what: str
@@ -59,7 +59,7 @@ class Failed(Event):
 
 @dataclass(frozen=True)
 class NodeSpawned(Event):
-    """Dora executed a node for the first time or again."""
+    """dora has executed a node, for the first time or again."""
 
     node: str
     pid: int
@@ -74,17 +74,17 @@ class NodeReady(Event):
 
 @dataclass(frozen=True)
 class AllReady(Event):
-    """Dora opened its start barrier: messages flow."""
+    """dora has opened its start barrier: messages flow."""
 
 
 @dataclass(frozen=True)
 class NodeExited(Event):
-    """A process of the node ended.
+    """A process of the node has exited.
 
     exit: "" for success, else "exit code 1" or "signal SIGKILL".
     will_restart: dora is going to execute it again.
-    is_stale: the process that ended had already been replaced by one that lives.
-    oom: what the kernel killed it for, if it was for want of memory.
+    is_stale: a newer process of the node is already running.
+    oom: the OOM kill, if the kernel killed it because of memory.
     """
 
     node: str
@@ -96,7 +96,7 @@ class NodeExited(Event):
 
 @dataclass(frozen=True)
 class NodeCascaded(Event):
-    """Dora ended the node because `by` failed before it was ready."""
+    """dora has ended the node because `by` failed before it was ready."""
 
     node: str
     by: str
@@ -104,7 +104,7 @@ class NodeCascaded(Event):
 
 @dataclass(frozen=True)
 class NodeHung(Event):
-    """Dora's health check ends the node. reason: such as "unresponsive for 5322ms"."""
+    """dora's health check ends the node. reason: such as "unresponsive for 5322ms"."""
 
     node: str
     reason: str
@@ -112,26 +112,29 @@ class NodeHung(Event):
 
 @dataclass(frozen=True)
 class StartTimedOut(Event):
-    """The nodes had `after` µs to be ready."""
+    """Not all nodes were ready within `after` µs."""
 
     after: int
 
 
 @dataclass(frozen=True)
 class RunFinished(Event):
-    """Dora says that no node of the run is left."""
+    """dora reports that all nodes of the run have exited."""
 
 
 @dataclass(frozen=True)
 class ResultKnown(Event):
-    """Dora's verdict on an ended run. results: node id -> "" or why it failed; empty: unknown."""
+    """dora's results of an ended run. results: node id -> "" or why it failed; empty: unknown."""
 
     results: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class ChildExited(Event):
-    """The coordinator or the daemon is gone. child: which of the two. exit: how. oom: as above."""
+    """A child process has exited.
+
+    child: "coordinator" or "daemon". exit: how. oom: as in NodeExited.
+    """
 
     child: str
     exit: str
@@ -140,7 +143,7 @@ class ChildExited(Event):
 
 @dataclass(frozen=True)
 class ConnectionLost(Event):
-    """The coordinator closed a control connection that we did not close, or `child` is silent."""
+    """The coordinator has closed a control connection, or `child` does not respond."""
 
     child: str = "coordinator"
     reason: str = "the dora coordinator closed the control connection"
@@ -148,21 +151,21 @@ class ConnectionLost(Event):
 
 @dataclass(frozen=True)
 class StopAsked(Event):
-    """SIGTERM, SIGINT or, when attached, the end of standard input. by: which of them."""
+    """A stop request. by: SIGTERM, SIGINT or, if attached, the end of standard input."""
 
     by: str
 
 
 @dataclass(frozen=True)
 class StopAnswered(Event):
-    """Dora's reply to our Stop: every node has ended."""
+    """dora's reply to our Stop: every node has ended."""
 
 
 @dataclass(frozen=True)
 class NodeReloading(Event):
-    """The node is about to be ended, and another one to be started in its place.
+    """The runner is about to end the node, and to start another process in its place.
 
-    status: what that one is before anything happened, or None when there is none.
+    status: the initial status of the new process, or None if there will be none.
     """
 
     node: str
@@ -171,7 +174,7 @@ class NodeReloading(Event):
 
 @dataclass(frozen=True)
 class NodeAdded(Event):
-    """The node is new in the descriptor. status: how it is, before anything of it happened."""
+    """The node is new in the descriptor. status: its initial status."""
 
     node: str
     status: NodeStatus
@@ -186,9 +189,9 @@ class NodeRemoved(Event):
 
 @dataclass(frozen=True)
 class ReloadNoted(Event):
-    """What came of the last reload. notice: what to say about it as long as it holds, or "".
+    """The result of the last reload. notice: what to show as long as it is true, or "".
 
-    downstream: who gets nothing any more when a node is gone, if that is another now.
+    downstream: the nodes that depend on each node, if that has changed.
     """
 
     notice: str
@@ -202,7 +205,7 @@ class ReloadAsked(Event):
 
 @dataclass(frozen=True)
 class DeadlinePassed(Event):
-    """What the current state waits for took too long."""
+    """The current state has lasted too long."""
 
 
 EVENTS: tuple[type[Event], ...] = (

@@ -1,4 +1,4 @@
-"""How a cell fails: entries of TABLE in table.py, and what all of its entries are made of."""
+"""How a cell fails: entries of TABLE in table.py, and helpers that all handlers use."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -13,7 +13,7 @@ Step = tuple[Cell, tuple[Action, ...]]
 Handler = Callable[[Cell, life.Event], Step]
 
 ENGINE_TIMEOUT = 30 * SECOND
-"""What dora itself allows its parts to answer each other."""
+"""µs; dora's own timeout for answers between its parts."""
 
 
 def to(cell: Cell, state: State, *actions: Action, after: int | None = None) -> Step:
@@ -22,28 +22,28 @@ def to(cell: Cell, state: State, *actions: Action, after: int | None = None) -> 
 
 
 def refused(cell: Cell, event: life.Event) -> Step:
-    """Dora does not want it, or does not understand us."""
+    """dora refuses the dataflow, or a request of the runner."""
     assert isinstance(event, life.Refused)
     return fail(because(cell, event.cause), event.reason, RunnerExit.FAILED)
 
 
 def because(cell: Cell, cause: Cause, nodes: Iterable[str] = ()) -> Cell:
-    """Note why the cell is about to fail, and which nodes it is about."""
+    """Set why the cell is about to fail, and the nodes that caused it."""
     return replace(cell, cause=cause, culprits=tuple(nodes))
 
 
 def broken(cell: Cell, event: life.Event) -> Step:
-    """The runner could not do its part: whatever is left to do, the cell ends now."""
+    """An exception in the runner: end the cell now, whatever is left to do."""
     assert isinstance(event, life.Failed)
     cell = replace(cell, reload=False)
     if cell.failure:
-        return fail(cell, cell.failure, cell.exit)  # that came first
+        return fail(cell, cell.failure, cell.exit)  # the first failure counts
     reason = f"the runner could not {event.what}: {event.error}"
     return fail(because(cell, Cause.RUNNER_BROKEN), reason, RunnerExit.FAILED)
 
 
 def fail(cell: Cell, reason: str, code: RunnerExit) -> Step:
-    """End at once, and say why."""
+    """End at once, and record the reason."""
     cell = replace(cell, failure=reason, exit=code)
     is_trial = cell.is_trial and not cell.ready_us and not cell.stop_by
     name = "reload-failed" if is_trial else "dataflow-failed"
@@ -53,7 +53,7 @@ def fail(cell: Cell, reason: str, code: RunnerExit) -> Step:
 
 
 def child_exited(cell: Cell, event: life.Event) -> Step:
-    """Without coordinator or daemon there is no dataflow."""
+    """A dataflow cannot run without coordinator or daemon."""
     assert isinstance(event, life.ChildExited)
     reason = f"the dora {event.child} is gone ({event.exit})"
     cell, actions = _lose(cell, event.child, reason, event.exit)
@@ -61,7 +61,7 @@ def child_exited(cell: Cell, event: life.Event) -> Step:
 
 
 def connection_lost(cell: Cell, event: life.Event) -> Step:
-    """The same, learned another way."""
+    """A lost connection means the same as an exited child."""
     assert isinstance(event, life.ConnectionLost)
     return _lose(cell, event.child, event.reason, "")
 
@@ -73,13 +73,13 @@ def _lose(cell: Cell, child: str, reason: str, how: str) -> Step:
 
 
 def engine_deadline(cell: Cell, event: life.Event) -> Step:  # noqa: ARG001 - as all handlers
-    """Dora does not answer."""
+    """dora does not answer in time."""
     reason = f"dora did not answer within {ENGINE_TIMEOUT // SECOND} s while {cell.state.value}"
     return fail(because(cell, Cause.NO_ANSWER), reason, RunnerExit.ENGINE_LOST)
 
 
 def oom_of_all(event: life.Event) -> tuple[Action, ...]:
-    """What there is to say about the dataflow when its own limit has killed something of it."""
+    """The event about the dataflow, if its own memory limit caused the kill."""
     if not isinstance(event, life.NodeExited | life.ChildExited) or event.oom is None:
         return ()
     if event.oom.owner is not Owner.DATAFLOW:

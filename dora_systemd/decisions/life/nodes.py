@@ -1,4 +1,4 @@
-"""The live table of nodes: what each life event makes of it. Values in, values out."""
+"""The live table of nodes: how each life event changes it. Pure."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -8,14 +8,14 @@ from dora_systemd.decisions.life import events as life
 
 Nodes = Mapping[str, NodeStatus]
 RecordParts = tuple[str, str, Mapping[str, str]]
-"""Name, node and details of the life event that goes to the journal."""
+"""Name, node and details of the life event for the journal."""
 
 KILLED = "signal SIGKILL"
 _WITH_PROCESS = frozenset({"starting", "ready", "running"})
 
 
 def has_process(nodes: Nodes) -> bool:
-    """Whether dora still has a process of any node, as far as the events tell."""
+    """Whether dora has a process of any node, according to the events so far."""
     return any(
         node.state in _WITH_PROCESS or (node.state == "reloading" and node.pid)
         for node in nodes.values()
@@ -23,7 +23,7 @@ def has_process(nodes: Nodes) -> bool:
 
 
 def all_ready(nodes: Nodes, at_us: int) -> Nodes:
-    """The table when dora opened its start barrier."""
+    """The table after dora has opened its start barrier."""
     return {
         ident: node._replace(state="running", since_us=at_us) if node.state == "ready" else node
         for ident, node in nodes.items()
@@ -33,9 +33,9 @@ def all_ready(nodes: Nodes, at_us: int) -> Nodes:
 def update(
     nodes: Nodes, event: life.Event, *, is_stopping: bool, is_open: bool
 ) -> tuple[Nodes, RecordParts | None]:
-    """The table after a node's event, and what the journal is to say about it.
+    """The table after a node's event, and the record for the journal.
 
-    is_open: dora's start barrier is, so a node that is ready runs, even if it is the only one.
+    is_open: whether dora's start barrier is open; then a ready node runs, even if it is alone.
     """
     match event:
         case life.NodeSpawned():
@@ -54,7 +54,7 @@ def update(
 
 
 def reshape(nodes: Nodes, event: life.Event) -> Nodes:
-    """The table while a reload changes which nodes there are."""
+    """The table after a reload has changed the nodes."""
     match event:
         case life.NodeReloading():
             return _reloading(nodes, event)
@@ -73,7 +73,7 @@ def _set(nodes: Nodes, ident: str, at_us: int, **changes: str | int) -> Nodes:
 
 
 def _reloading(nodes: Nodes, event: life.NodeReloading) -> Nodes:
-    """Its successor has restarts of its own."""
+    """The new process has its own restart counter."""
     old = nodes.get(event.node, NodeStatus())
     status = (event.status or old)._replace(state="reloading", pid=old.pid, since_us=event.at_us)
     return {**nodes, event.node: status}
@@ -102,14 +102,14 @@ def _exited(
         nodes = {**nodes, event.node: old._replace(pid=0)}
         return nodes, ("node-exited", event.node, {"exit": event.exit} if event.exit else {})
     if event.will_restart and old.policy == HELD:
-        # Not by itself: dora has been told to wait, so that a reload can start it again.
+        # The long delay in dora keeps this node down until a reload starts it again.
         event = replace(event, will_restart=False)
-    if old.hung and event.exit:  # the signal that ended it says nothing
+    if old.hung and event.exit:  # the signal of the health check explains nothing
         event = replace(event, exit=f"hung, {old.hung}")
     name, details = _words_of(event, is_stopping)
     if event.is_stale and not event.will_restart:
-        return nodes, None  # it was replaced: its successor is what counts
-    if event.is_stale:  # dora said so only after it had executed the next one
+        return nodes, None  # a newer process has replaced it
+    if event.is_stale:  # dora reported the exit after it had executed the next one
         nodes = {**nodes, event.node: old._replace(restarts=old.restarts + 1)}
         return nodes, (name, event.node, details)
     nodes = _set(
@@ -126,7 +126,7 @@ def _exited(
 
 
 def _words_of(event: life.NodeExited, is_stopping: bool) -> tuple[str, Mapping[str, str]]:
-    """Name and details of what the journal says about the end of a node."""
+    """Name and details of the record about the end of a node."""
     if event.oom is not None:
         return "node-oom", event.oom.node_details()
     name = "node-crashed" if event.exit and not is_stopping else "node-exited"
@@ -142,7 +142,7 @@ def _state_after(event: life.NodeExited, is_stopping: bool) -> str:
 
 
 def spent(nodes: Nodes) -> dict[str, str]:
-    """Nodes that are gone for good although dora restarts them: their restarts are used up."""
+    """Nodes that have failed for good because their restarts are used up."""
     return {
         ident: f"{node.exit or 'ended'} after {_restarts(node.restarts)}"
         for ident, node in nodes.items()
@@ -163,11 +163,11 @@ def _restarts(count: int) -> str:
 
 
 def apply_results(nodes: Nodes, results: Mapping[str, str], at_us: int) -> Nodes:
-    """The table with dora's verdict: it knows causes that no event tells."""
+    """The table with dora's results, which have causes that no event has."""
     for ident, how in results.items():
         if ident in nodes and (how or nodes[ident].state not in ("failed", "stopped")):
             state = "failed" if how else "finished"
-            # Of a kill for want of memory dora knows no more than the signal.
+            # For an OOM kill, dora only knows the signal.
             words = (nodes[ident].exit or how) if how == KILLED else how
             nodes = _set(nodes, ident, at_us, state=state, exit=words, pid=0)
     return nodes

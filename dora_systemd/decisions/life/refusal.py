@@ -1,8 +1,7 @@
-"""How a runner's refusal reaches who started it: its exit status, and STATUS= of its unit.
+"""Passes a runner's refusal to doractl: by its exit status, and by STATUS= of its unit.
 
-NotifyAccess=main lets nobody but the runner set that line, and the runner refuses before there are
-nodes. A user may still have a runner that lies: so the text is made plain and short, and nothing
-is done with it but printing it.
+With NotifyAccess=main only the runner can set STATUS=, and it refuses before nodes run. But a user
+may have another program in the runner's place, so the text is cleaned and cut, and is only printed.
 """
 
 from dora_systemd.decisions.life.states import RunnerExit
@@ -10,11 +9,11 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.terminal_text import short_line
 
 FAILED = "failed: "
-"""How STATUS= begins once the runner knows why a dataflow failed."""
+"""Prefix of STATUS= for the reason why a dataflow failed."""
 
 _HINT = "; hint: "
 _LONGEST = 1500
-"""Bytes of each of the two: systemd takes 4096 bytes in a notification."""
+"""Maximum bytes of message and hint each: systemd accepts 4096 bytes in a notification."""
 _CODES = {
     RunnerExit.BAD_DATAFLOW: ExitCode.BAD_INPUT,
     RunnerExit.NO_ACCESS: ExitCode.NO_PERMISSION,
@@ -23,7 +22,7 @@ _CODES = {
 
 
 def refusal_exit(error: DoraSystemdError) -> RunnerExit:
-    """The runner's exit status for what it refuses."""
+    """The runner's exit status for an error."""
     return next(
         (status for status, code in _CODES.items() if code is error.code), RunnerExit.BAD_DATAFLOW
     )

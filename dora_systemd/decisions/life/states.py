@@ -1,4 +1,4 @@
-"""What the runner knows of its cell, and what it can do: the values of the table in table.py."""
+"""The state of a cell and the actions of the runner: the values in table.py."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,7 +10,7 @@ from dora_systemd.decisions.life.causes import Cause
 
 
 class RunnerExit(IntEnum):
-    """Exit status of the runner, so what systemd shows as ExecMainStatus; see sysexits(3head)."""
+    """Exit status of the runner, which systemd shows as ExecMainStatus; see sysexits(3head)."""
 
     OK = 0
     FAILED = 1
@@ -22,7 +22,7 @@ class RunnerExit(IntEnum):
 
 
 class State(Enum):
-    """Where a cell is in its life."""
+    """The state of a cell."""
 
     BOOTING = "booting"
     JOINING = "joining"
@@ -60,7 +60,7 @@ class Record:
 
 @dataclass(frozen=True)
 class Deadline:
-    """Action: DeadlinePassed comes in `after` µs, unless the state has changed; None: never."""
+    """Action: push DeadlinePassed in `after` µs, or never (None); replaces any other Deadline."""
 
     after: int | None
 
@@ -73,12 +73,11 @@ class Cell:
     """All that the runner knows of its cell.
 
     grace: µs. run: dora's id of the run, or "". nodes: the live table. started_us, ready_us:
-    CLOCK_REALTIME µs. stop_by: who asked to stop, or "". failure: why the cell fails, or "".
-    exit: what the runner will exit with. cause, culprits: of the failure, and the nodes that it is
-    about. downstream: who gets nothing any more when a node is gone.
-    is_again: whether a reload has started it again in place.
-    is_trial: whether the version before can come back. reload: whether it ends to be started again.
-    notice: what the last reload has left to say.
+    CLOCK_REALTIME µs. stop_by: what requested the stop, or "". failure: why the cell fails, or "".
+    exit: the future exit status of the runner. cause, culprits: of the failure, and the nodes that
+    caused it. downstream: the nodes that depend on each node. is_again: whether a reload has
+    started this run. is_trial: whether the version before can come back. reload: whether the run
+    ends for the next one. notice: the result of the last reload.
     """
 
     grace: int

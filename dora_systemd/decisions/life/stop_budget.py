@@ -8,14 +8,14 @@ dora ends the nodes  its answer   the daemon   journald takes  the runner has   
 from dora_systemd.values import INFINITY, SECOND
 
 STOP_MARGIN = 10 * SECOND
-"""What TimeoutStopSec= allows beyond 1.5 grace durations, dora's own last resort."""
+"""What TimeoutStopSec= allows beyond 1.5 grace durations, when dora kills the nodes."""
 RESERVE = SECOND
-"""The runner is gone so long before systemd kills it: systemd's clock began to run first."""
+"""The runner exits this long before systemd kills it, because systemd's timer started first."""
 LEAVE_TIMEOUT = 2 * SECOND
 
 
 def stop_timeout(grace: int) -> int:
-    """Until a Stop without an answer is given up: dora kills after 1.5 times the grace."""
+    """Timeout of dora's Stop: dora kills after 1.5 times the grace duration."""
     return grace + grace // 2 + 2 * SECOND
 
 
@@ -25,5 +25,5 @@ def unit_timeout(grace: int) -> int:
 
 
 def runner_timeout(grace: int) -> int:
-    """Until the runner has exited."""
+    """The time for the runner to exit."""
     return INFINITY if grace == INFINITY else unit_timeout(grace) - RESERVE

@@ -16,12 +16,12 @@ from dora_systemd.decisions.life.states import Cell, State
 
 
 def step(cell: Cell, event: life.Event) -> Step:
-    """The cell after `event`, and what the runner has to do about it, in this order."""
+    """The cell after `event`, and the actions of the runner, in this order."""
     return TABLE[cell.state][type(event)](cell, event)
 
 
 def _row(**handlers: Handler) -> dict[type[life.Event], Handler]:
-    """One line of the table: what is not named does nothing in that state."""
+    """One line of the table: events that are not named have no effect in that state."""
     assert handlers.keys() <= {event.__name__ for event in life.EVENTS}
     return {event: handlers.get(event.__name__, handle.ignore) for event in life.EVENTS}
 
@@ -92,7 +92,7 @@ TABLE: Mapping[State, Mapping[type[life.Event], Handler]] = {
     State.LEAVING: _row(
         **_NODES,
         ChildExited=handle.daemon_left,
-        # How it ended is known by now: it stays so.
+        # The result is known by now, and stays.
         **dict.fromkeys(("DeadlinePassed", "Failed"), handle.end),
         StopAsked=handle.stop_leaving,
     ),

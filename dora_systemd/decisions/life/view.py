@@ -1,4 +1,4 @@
-"""What a cell shows of itself: STATUS= of its unit and the table in status.json."""
+"""How a cell is shown: STATUS= of its unit, and the table in status.json."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -25,7 +25,7 @@ _FIXED = {
     State.LEAVING: "stopping the dora daemon",
 }
 _NAMED = 5
-"""How many nodes a status line names."""
+"""Maximum nodes that a status line names."""
 
 
 def format_status(cell: Cell) -> str:
@@ -90,7 +90,7 @@ def cell_status(
     samples: tuple[CpuSample, ...],
     lines: Mapping[str, LineCount],
 ) -> CellStatus:
-    """The table that status.json holds."""
+    """The table for status.json."""
     return CellStatus(
         uuid=uuid,
         run=cell.run,
@@ -113,9 +113,9 @@ def _policy(raw: Mapping[str, Any]) -> str:
 def initial_nodes(
     kinds: Mapping[str, str], descriptor: Mapping[str, Any], at_us: int
 ) -> dict[str, NodeStatus]:
-    """The table before anything happened.
+    """The initial table.
 
-    kinds: node id -> how dora starts it. descriptor: what dora is sent.
+    kinds: node id -> how dora starts it. descriptor: as sent to dora.
     """
     raw = {node["id"]: node for node in descriptor["nodes"]}
     return {

@@ -1,7 +1,7 @@
-"""The life events of a dataflow: one table, name -> what is stored in the journal.
+"""The life events of a dataflow: name -> what the journal gets.
 
-units/templates/dora-systemd.catalog explains each MESSAGE_ID to `journalctl -x`; a test holds
-the two together. A MESSAGE_ID is for ever, never reuse one: https://systemd.io/CATALOG
+units/templates/dora-systemd.catalog explains each MESSAGE_ID to `journalctl -x`; a test compares
+the two. Never change or reuse a MESSAGE_ID: https://systemd.io/CATALOG
 """
 
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from dora_systemd.decisions.logs.lines import ERR, INFO, NOTICE, WARNING
 
 @dataclass(frozen=True)
 class EventKind:
-    """One kind of event; `text` may name the details `{dataflow}`, `{node}` and `{count}`."""
+    """One kind of event. text: may contain `{dataflow}`, `{node}` and `{count}`."""
 
     message_id: str
     priority: int
@@ -90,10 +90,10 @@ EVENTS = {
     ),
 }
 
-# An end of the dataflow: each life of it ends with one of these, unless the runner was killed.
+# Each life of a dataflow ends with one of these, unless the runner was killed.
 END_EVENTS = ("dataflow-finished", "dataflow-stopped", "dataflow-failed")
 
-# Details that only go into the text: the fields for them come from the origin of the record.
+# Details for the text only: the origin of the record has the fields for them.
 _TEXT_ONLY = ("dataflow", "node")
 
 
@@ -106,8 +106,8 @@ def event_fields(name: str, **details: Value) -> dict[str, Value]:
     """The journal fields of event `name`; the caller adds those of the origin.
 
     Each detail becomes DORA_<DETAIL>, except `dataflow` and `node`, which only complete the text.
-    `exit` (such as "exit code 1") and `reason` are put at the end of the text.
-    Raises KeyError for an event that the table does not have.
+    The text ends with `exit` (such as "exit code 1") and `reason`. Raises KeyError for an unknown
+    event.
     """
     kind = EVENTS[name]
     text = kind.text.format_map(_Unnamed(details))

@@ -1,7 +1,7 @@
-"""One journal entry as bytes: the native protocol's fields, names made legal.
+"""Encodes journal entries in the native protocol, and decodes the export format.
 
-The same form is read back from `journalctl -o export`.
-https://systemd.io/JOURNAL_NATIVE_PROTOCOL/ and systemd.journal-fields(7)
+journalctl -o export prints the same form. https://systemd.io/JOURNAL_NATIVE_PROTOCOL/ and
+systemd.journal-fields(7)
 """
 
 import re
@@ -16,7 +16,7 @@ Value = str | bytes | int
 def legal_name(name: str, prefix: str = "") -> str:
     """The journal field name for `name`: upper case, [A-Z0-9_], at most 64 characters.
 
-    journald drops fields whose name starts with an underscore (they are its own) or a digit.
+    journald drops fields whose name begins with an underscore, which are its own, or with a digit.
     """
     legal = _ILLEGAL.sub("_", name.upper())
     if prefix:
@@ -28,7 +28,7 @@ def legal_name(name: str, prefix: str = "") -> str:
 
 
 def encode_field(name: str, value: Value) -> bytes:
-    """One field; a value with a newline takes the form with a 64-bit little-endian length."""
+    """One field; a value with a newline needs the form with a 64-bit little-endian length."""
     data = value if isinstance(value, bytes) else str(value).encode("utf-8", "surrogateescape")
     key = name.encode("ascii")
     if b"\n" in data:
@@ -37,13 +37,13 @@ def encode_field(name: str, value: Value) -> bytes:
 
 
 def encode_entry(fields: Mapping[str, Value] | Iterable[tuple[str, Value]]) -> bytes:
-    """A whole entry, ready for one datagram to /run/systemd/journal/socket."""
+    """A complete entry, for one datagram to /run/systemd/journal/socket."""
     pairs = fields.items() if isinstance(fields, Mapping) else fields
     return b"".join(encode_field(name, value) for name, value in pairs)
 
 
 class ExportReader:
-    """Entries out of the Journal Export Format, fed with bytes as they come.
+    """Decodes entries in the Journal Export Format from chunks of bytes.
 
     https://systemd.io/JOURNAL_EXPORT_FORMATS/#journal-export-format
     """
@@ -53,7 +53,7 @@ class ExportReader:
         self._entry: dict[str, bytes] = {}
 
     def feed(self, data: bytes) -> list[dict[str, bytes]]:
-        """The entries that are complete with `data`; of a repeated field the last one counts."""
+        """The entries that `data` completes; the last value of a repeated field counts."""
         self._data += data
         entries = []
         position = 0
@@ -72,7 +72,7 @@ class ExportReader:
         return entries
 
     def _field(self, start: int, end: int) -> int | None:
-        """Take the field that starts at `start`; where the next one starts, None if it is cut."""
+        """Decode the field at `start`; the start of the next one, None if it is incomplete."""
         name, equals, value = self._data[start:end].partition(b"=")
         after = end + 1
         if not equals:

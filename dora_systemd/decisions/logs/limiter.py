@@ -16,10 +16,9 @@ class _Window:
 class LineLimiter:
     """Counts the lines of one node.
 
-    Each stream has a window of its own: a flood on standard output does not take a traceback on
-    standard error away. A window begins with a stream's first line after the one before it.
-
-    suppressed: how many lines were refused since take_suppressed().
+    Each stream has its own window, so that a flood on standard output does not suppress a traceback
+    on standard error. A window begins with the first line after the last window. suppressed: number
+    of refused lines since take_suppressed().
     """
 
     limit: RateLimit
@@ -27,7 +26,7 @@ class LineLimiter:
     _windows: dict[str, _Window] = field(default_factory=dict)
 
     def admit(self, stream: str, count: int, now: float) -> int:
-        """How many of the `count` lines that have come at `now`, in seconds, may pass."""
+        """How many of the `count` lines that have arrived at `now` (seconds) may pass."""
         window = self._windows.get(stream)
         if window is None or now >= window.end:
             window = _Window(now + self.limit.interval / SECOND, self.limit.lines)
@@ -38,10 +37,10 @@ class LineLimiter:
         return passed
 
     def end(self, stream: str) -> float:
-        """When the window of a stream that has written is over, in seconds."""
+        """The end of the current window of a stream, in seconds."""
         return self._windows[stream].end
 
     def take_suppressed(self) -> int:
-        """How many lines were refused since the last call."""
+        """Number of refused lines since the last call."""
         count, self.suppressed = self.suppressed, 0
         return count

@@ -1,7 +1,7 @@
-"""A node's bytes -> lines -> journal fields. Pure: no file, no clock.
+"""Turns a node's bytes into lines, and lines into journal fields. Pure: no file, no clock.
 
-The fields of the common plain line are fixed per node, so they are encoded once
-(`LineEncoder`) and a line costs one concatenation; tens of thousands a second pass here.
+The fields of a plain line are the same for all lines of a node. LineEncoder encodes them once, so
+each line costs one concatenation: this handles tens of thousands of lines per second.
 """
 
 import json
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from dora_systemd.decisions.logs.fields import Value, encode_entry, legal_name
 
 LINE_LIMIT = 1 << 20
-# How dora marks a line above 1 MiB, which it cuts.
+# dora's mark at the end of a line that it has cut at 1 MiB.
 TRUNCATED = "... [truncated]"
 MAX_FIELDS = 200  # journald refuses entries of more than 1024 fields, its own included
 
@@ -27,14 +27,14 @@ _TARGET = re.compile(r"(?:^|: )(?P<target>dora_[a-z0-9_]+(?:::[a-z0-9_]+)*): ")
 
 
 class Piece(bytes):
-    """A part of a line that no newline ended: the line goes on, or its writer ended, there."""
+    """A part of a line without a newline: the line continues, or its writer ended there."""
 
 
 class LineSplitter:
-    """Bytes in, lines out. Lines above `limit` bytes come as several `Piece`s and the rest.
+    """Splits bytes into lines. A line above `limit` bytes yields several `Piece`s and the rest.
 
-    A newline is taken off, and one carriage return before it, as dora does. No other byte means
-    anything, NUL included.
+    Removes the newline, and one carriage return before it, as dora does. All other bytes pass
+    unchanged, even NUL.
     """
 
     def __init__(self, limit: int = LINE_LIMIT) -> None:
@@ -56,7 +56,7 @@ class LineSplitter:
 
     @property
     def rest(self) -> bytes:
-        """What came after the last newline."""
+        """The bytes after the last newline."""
         return self._rest
 
     def _cut(self, line: bytes) -> list[bytes]:
@@ -66,14 +66,14 @@ class LineSplitter:
         return pieces
 
     def flush(self) -> list[bytes]:
-        """What came after the last newline, as a `Piece`: call it when the writer has ended."""
+        """The bytes after the last newline, as a `Piece`: call this after the writer has ended."""
         rest, self._rest = self._rest, b""
         return [Piece(rest)] if rest else []
 
 
 @dataclass(frozen=True)
 class Origin:
-    """Whose lines these are; `pid` 0 and `run` "" mean not known yet."""
+    """The source of lines; `pid` 0 and `run` "" mean not known yet."""
 
     name: str
     uuid: str
@@ -83,11 +83,11 @@ class Origin:
 
     @property
     def identifier(self) -> str:
-        """What `journalctl -t` takes: <name>/<node>, <name> for the dataflow itself."""
+        """SYSLOG_IDENTIFIER, for `journalctl -t`: <name>/<node>, or <name> of the dataflow."""
         return f"{self.name}/{self.node}" if self.node else self.name
 
     def fields(self) -> dict[str, Value]:
-        """The fields that every record of this origin carries."""
+        """The fields that every record of this origin has."""
         fields: dict[str, Value] = {
             "SYSLOG_IDENTIFIER": self.identifier,
             "DORA_DATAFLOW": self.uuid,
@@ -100,7 +100,7 @@ class Origin:
 
 
 class LineEncoder:
-    """The lines of one stream of one node as journal entries."""
+    """Encodes the lines of one stream of one node as journal entries."""
 
     def __init__(self, origin: Origin, stream: str) -> None:
         self._constant = encode_entry({**origin.fields(), "DORA_STREAM": stream})
@@ -117,7 +117,7 @@ class LineEncoder:
 
 
 def line_fields(line: bytes, stream: str) -> dict[str, Value]:
-    """The fields that come from the line itself: level and message, more for dora's JSON form."""
+    """The fields from the line itself: level and message, and more for dora's JSON form."""
     fields = json_fields(line) if line[:1] == b"{" else None
     return fields or {"PRIORITY": PLAIN_PRIORITY.get(stream, INFO), "MESSAGE": line}
 
@@ -187,14 +187,14 @@ def _text(value: object) -> str:
     if value is None:
         return ""
     text = value if isinstance(value, str) else json.dumps(value)
-    # JSON may hold half of a surrogate pair, which UTF-8 cannot: escape it instead of failing.
+    # JSON may contain half of a surrogate pair, which UTF-8 cannot encode: escape it.
     return text.encode("utf-8", "backslashreplace").decode()
 
 
 def dora_log_fields(line: bytes) -> dict[str, Value] | None:
-    """A WARN or ERROR line that coordinator or daemon printed; None for all that they print else.
+    """The fields of a WARN or ERROR line of coordinator or daemon; None for their other lines.
 
-    Their INFO lines hold the descriptor with its `env:` values and must not be stored.
+    Their INFO lines contain the descriptor with its `env:` values, which must not be stored.
     """
     match = _TRACING.match(_ANSI.sub("", line.decode("utf-8", "replace")))
     if match is None or match["level"] not in ("WARN", "ERROR"):

@@ -1,7 +1,7 @@
-"""What to read of the journal, as arguments of journalctl(1).
+"""The arguments of journalctl(1) for a query.
 
-journalctl finds, filters and formats faster and better than any code of ours could; what is ours
-is to say exactly which records are those of a dataflow.
+journalctl finds, filters and formats records quickly. This module selects exactly the records of a
+dataflow.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from dora_systemd.scope import Scope
 OUTPUTS = ("short", "short-precise", "json", "cat", "export")
 RUNS = ("CURRENT", "PREVIOUS", "ALL")
 
-# dora's words and those of syslog(3), to the highest PRIORITY that is shown.
+# Levels of dora and of syslog(3), with the highest PRIORITY to show.
 LEVELS = {
     **{"emerg": 0, "alert": 1, "crit": 2, "err": 3, "error": 3, "warning": 4, "warn": 4},
     **{"notice": 5, "info": 6, "debug": 7, "trace": 7, "stdout": 7},
@@ -27,12 +27,11 @@ _UNITS = ("ms", "s", "min", "m", "h", "d", "w")
 
 @dataclass(frozen=True)
 class LogQuery:
-    """Which records, in which order and form. "" and None: not restricted.
+    """The records to show, their order and form. "" and None: no restriction.
 
-    invocation: of systemd, one life of the unit. run: dora's id of one run.
-    since, until: as in systemd.time(7), or a bare duration, which means so long ago.
-    tail: the last so many records.
-    cursor_file: begin behind the record that it names, write the last one's place there.
+    invocation: of systemd, one life of the unit. run: dora's id of one run. since, until: as in
+    systemd.time(7), or a duration, which means that long ago. tail: number of last records.
+    cursor_file: begin after the record in this file, and write the last one to it.
     """
 
     scope: Scope
@@ -64,19 +63,19 @@ def parse_level(text: str) -> str:
 
 
 def journal_time(text: str) -> str:
-    """A point in time for journalctl; `5m`, as dora takes it, becomes `-5m`."""
+    """A point in time for journalctl; dora's `5m` becomes `-5m`."""
     number = text.rstrip("abcdefghijklmnopqrstuvwxyz")
     is_duration = number.replace(".", "", 1).isdigit() and text[len(number) :] in _UNITS
     return f"-{text}" if is_duration else text
 
 
 def journal_timestamp(us: int) -> str:
-    """A CLOCK_REALTIME in µs as journalctl takes it."""
+    """A CLOCK_REALTIME in µs, for journalctl."""
     return f"@{us // 1_000_000}.{us % 1_000_000:06d}"
 
 
 def scope_matches(scope: Scope, name: str = "") -> list[str]:
-    """Fields that journald itself vouches for: no other user's process can make such records."""
+    """Matches for fields that journald itself sets: other users' processes cannot forge them."""
     unit = unit_name(name) if name else ""
     if scope.is_user:
         where = f"_SYSTEMD_USER_UNIT={unit}" if unit else f"_SYSTEMD_USER_SLICE={SLICE}"
@@ -86,7 +85,7 @@ def scope_matches(scope: Scope, name: str = "") -> list[str]:
 
 def query_matches(query: LogQuery) -> list[str]:
     """The matches of a query, see "Matches" in journalctl(1)."""
-    # Each further match costs journalctl time: the unit says the name already.
+    # Each match costs journalctl time, and the unit implies the dataflow's name.
     base = scope_matches(query.scope, query.name)
     for field, value in (
         ("DORA_DATAFLOW", query.uuid),
@@ -102,7 +101,7 @@ def query_matches(query: LogQuery) -> list[str]:
 
 
 def end_matches(scope: Scope, name: str) -> list[str]:
-    """The records in which systemd says that the unit has ended, after all that its processes said.
+    """Matches for systemd's records of the unit's end, which follow all records of its processes.
 
     7ad2... SD_MESSAGE_UNIT_SUCCESS and d9b3... SD_MESSAGE_UNIT_FAILURE_RESULT, see sd-messages.h.
     """
@@ -114,7 +113,7 @@ def end_matches(scope: Scope, name: str) -> list[str]:
 
 
 def story_matches(scope: Scope, name: str, uuid: str) -> list[str]:
-    """What happened to a dataflow: our life events, what systemd says of its unit, who asked."""
+    """Matches for life events, systemd's records of the unit, and stop requests."""
     own = [*scope_matches(scope, name), f"DORA_DATAFLOW={uuid}"]
     events = [f"MESSAGE_ID={kind.message_id}" for kind in EVENTS.values()]
     unit = unit_name(name)
@@ -128,7 +127,7 @@ def _with_level(base: list[str], level: str) -> list[str]:
     if level in ("", "trace", "stdout"):
         return base
     if level == "debug":
-        # Both debug and trace are PRIORITY 7.
+        # dora's levels debug and trace are both PRIORITY 7.
         return [*_with_level(base, "info"), "+", *base, "PRIORITY=7", "DORA_LEVEL=debug"]
     return base + [f"PRIORITY={number}" for number in range(LEVELS[level] + 1)]
 

@@ -1,7 +1,7 @@
-"""Lines of the journal as people read them on a terminal: aligned, each node in its colour.
+"""Formats lines of the journal for a terminal: aligned, with a colour for each node.
 
-journalctl's `short` lines are rewritten many at a time: a terminal is often asked to show
-hundreds of thousands.
+It rewrites journalctl's `short` output in chunks, because there can be hundreds of thousands of
+lines.
 """
 
 import re
@@ -12,30 +12,30 @@ from collections.abc import Iterable, Mapping
 from dora_systemd.terminal_text import one_line, shown_log
 
 # The beginning of a line of `journalctl -o short`, with or without journalctl's own colours, or
-# what it puts before the second and later lines of a message.
+# what it prints before the second and later lines of a message.
 _PREFIX = re.compile(
     rb"^(?:(?P<time>[A-Z][a-z]{2} [ \d]\d \d\d:\d\d:\d\d(?:\.\d+)?) \S+ (?:\x1b\[[0-9;:]*m)*"
     rb"(?P<dataflow>[A-Za-z0-9][A-Za-z0-9._-]*)(?:/(?P<node>[^\s\[]+))?(?:\[\d+\])?"
     rb"(?:\x1b\[[0-9;:]*m)*: |(?P<indent> {20,}))",
     re.M,
 )
-# Readable on dark and on light ground, none of journalctl's own red and yellow.
+# Readable on dark and light backgrounds, without journalctl's own red and yellow.
 _COLORS = (32, 34, 35, 36, 92, 94, 95, 96)
-# Of a message by PRIORITY, as journalctl has them.
+# Colours of messages by PRIORITY, as in journalctl.
 _MESSAGE_COLORS = {b"3": b"\x1b[0;1;31m", b"4": b"\x1b[0;1;38:5:185m", b"7": b"\x1b[0;38:5:245m"}
 MAX_WIDTH = 24
 
 
 def color_of(node: str) -> int:
-    """The ANSI colour of a node: the same in every call, on every machine."""
+    """The ANSI colour of a node: always the same, on every machine."""
     return _COLORS[zlib.crc32(node.encode("utf-8", "replace")) % len(_COLORS)]
 
 
 class TerminalLines:
-    """Rewrites journalctl's short lines; makes such lines of records.
+    """Rewrites journalctl's short lines; formats records as such lines.
 
-    nodes: known names, for the width of their column. want_dataflow: more than one is shown.
-    want_colors: whether the reader is a terminal.
+    nodes: known names, for the width of their column. want_dataflow: show the name of the dataflow.
+    want_colors: whether the output is a terminal.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class TerminalLines:
         return _PREFIX.sub(self._rewrite, shown_log(data[:end]))
 
     def record(self, record: Mapping[str, bytes]) -> bytes:
-        """The line, or lines, of one record of the Journal Export Format."""
+        """The lines of one record of the Journal Export Format."""
         seconds = int(record.get("__REALTIME_TIMESTAMP", b"0")) // 1_000_000
         when = time.strftime("%b %d %H:%M:%S", time.localtime(seconds)).encode()
         start = self._start(when, *record.get("SYSLOG_IDENTIFIER", b"").partition(b"/")[::2])
@@ -98,7 +98,7 @@ class TerminalLines:
 
 
 class ShownLines:
-    """Lines of journalctl's other forms, for a terminal: as they are, but for what commands it."""
+    """Passes lines of journalctl's other formats to a terminal, with control characters escaped."""
 
     def __init__(self) -> None:
         self._rest = b""

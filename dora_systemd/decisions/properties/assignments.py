@@ -1,4 +1,4 @@
-"""Properties of one unit: read from assignments as `--property` takes them, and put together."""
+"""Parses and joins properties of one unit, from assignments as for `--property`."""
 
 from collections.abc import Mapping
 
@@ -9,11 +9,9 @@ from dora_systemd.suggestions import did_you_mean
 from dora_systemd.values import quoted, shown
 
 Properties = Mapping[str, Property]
-"""Properties by slot: the key of the unit file, with "~" behind it for a filter that leaves out.
-
-What is set later under a slot replaces what was there or, for lists, is joined to it. Two slots can
-have the same name on D-Bus: ConditionPathExists and ConditionHost are both Conditions.
-"""
+"""Properties by slot: the key of the unit file, with "~" after it for a filter that excludes. A
+later value of a slot replaces the earlier one or, for lists, is appended. Two slots can have the
+same name on D-Bus: ConditionPathExists and ConditionHost are both Conditions."""
 
 _DOUBLE_KEYS = {"TimeoutSec": ("TimeoutStartSec", "TimeoutStopSec")}
 
@@ -43,8 +41,8 @@ _UNSUPPORTED = frozenset(
 def parse_property(assignment: str) -> dict[str, Property]:
     """The properties that KEY=VALUE sets, by slot: one, or two for a resource limit.
 
-    Keys and values are those of systemd-run(1) --property. Raises DoraSystemdError (USAGE) for what
-    is no property of a service, what dora-systemd needs for itself, and a bad value.
+    Keys and values are those of systemd-run(1) --property. Raises DoraSystemdError (USAGE) for a
+    key that services do not have or that dora-systemd sets itself, and for a bad value.
     """
     key, equals, text = assignment.partition("=")
     if not equals:
@@ -69,7 +67,7 @@ def parse_line(key: str, text: str) -> dict[str, Property]:
 
 
 def with_properties(properties: Properties, changes: Properties) -> dict[str, Property]:
-    """`properties` and then `changes`: scalars replace, lists are joined, empty lists reset."""
+    """`properties`, then `changes`: scalars replace, lists are appended, empty lists reset."""
     result = dict(properties)
     for slot, new in changes.items():
         old = result.get(slot)
@@ -80,9 +78,10 @@ def with_properties(properties: Properties, changes: Properties) -> dict[str, Pr
 
 
 def format_property(slot: str, properties: Properties) -> list[str]:
-    """The lines of a unit file that say the same as the property in `slot`.
+    """The lines of a unit file for the property in `slot`.
 
-    A soft resource limit is said with its hard one; what no unit file can say is a comment.
+    A soft resource limit is part of its hard one. A value that a unit file cannot express becomes a
+    comment.
     """
     name, _, value = properties[slot]
     row = TABLE.get(slot.removesuffix("~"))

@@ -1,6 +1,6 @@
-"""The kinds of values that unit properties have: text of `--property` to D-Bus and to unit files.
+"""Kinds of unit property values: from text of `--property` to D-Bus and to unit files.
 
-Types are those of org.freedesktop.systemd1(5), texts those that systemd-run(1) takes.
+Types are those of org.freedesktop.systemd1(5), texts those of systemd-run(1).
 """
 
 import re
@@ -23,7 +23,7 @@ from dora_systemd.values import (
 )
 
 SCALE = 2**32 - 1
-"""100 % in the properties called ...Scale, which systemd relates to the machine's size."""
+"""100 % in the properties called ...Scale, which are relative to the machine's size."""
 
 _NUMBER = re.compile(r"[-+]?[0-9]{1,20}")
 _PERCENT = re.compile(r"([0-9]{1,3})(?:\.([0-9]{1,2}))?%")
@@ -33,9 +33,8 @@ _CONTROL = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
 class Property(NamedTuple):
     """One property as StartTransientUnit takes it; the bus adapter unpacks it as a tuple.
 
-    name: on D-Bus, such as "TimeoutStopUSec".
-    signature: of D-Bus, such as "t".
-    value: made of what the signature says: int, bool, str, and sequences for arrays and structs.
+    name: on D-Bus, such as "TimeoutStopUSec". signature: of D-Bus, such as "t". value: as the
+    signature requires: int, bool, str, and sequences for arrays and structs.
     """
 
     name: str
@@ -45,11 +44,10 @@ class Property(NamedTuple):
 
 @dataclass(frozen=True)
 class PropertyKind:
-    """How a value is read and written.
+    """How a value is parsed and formatted.
 
-    expected: in words, for hints.
-    parse: text to value; raises ValueError or DoraSystemdError.
-    format: value to the texts behind "KEY=", one per line of the unit file.
+    expected: a description for hints. parse: text to value; raises ValueError or DoraSystemdError.
+    format: value to the texts after "KEY=", one for each line of the unit file.
     """
 
     signature: str
@@ -59,16 +57,16 @@ class PropertyKind:
 
 
 def plain_text(text: str) -> str:
-    """`text` without blanks around it; raises ValueError for what no unit file can hold."""
+    """`text` without surrounding blanks. Raises ValueError if a unit file cannot contain it."""
     stripped = text.strip()
-    # A backslash at the end of a line joins the next one to it.
+    # A backslash at the end of a line would continue it.
     if _CONTROL.search(text) or stripped.endswith("\\"):
         raise ValueError("control characters")
     return stripped
 
 
 def number_kind(signature: str, lowest: int, highest: int) -> PropertyKind:
-    """Whole numbers between two bounds, both included."""
+    """Integers between two bounds, inclusive."""
 
     def parse(text: str) -> int:
         if not _NUMBER.fullmatch(text.strip()) or not lowest <= int(text) <= highest:
@@ -80,7 +78,7 @@ def number_kind(signature: str, lowest: int, highest: int) -> PropertyKind:
 
 
 def choice_kind(*choices: str) -> PropertyKind:
-    """One of some words; where "yes" and "no" are among them, so are the other booleans."""
+    """One of some words; if "yes" and "no" are among them, all boolean words are valid."""
     kind = named_kind("s", {choice: choice for choice in choices})
 
     def parse(text: str) -> str:
@@ -93,7 +91,7 @@ def choice_kind(*choices: str) -> PropertyKind:
 
 
 def prefixed_path_kind(prefix: str) -> PropertyKind:
-    """An absolute path behind `prefix`, which is not part of the value."""
+    """An absolute path after `prefix`, which is not part of the value."""
 
     def parse(text: str) -> str:
         path = plain_text(text).removeprefix(prefix)
@@ -108,7 +106,7 @@ def prefixed_path_kind(prefix: str) -> PropertyKind:
 
 
 def named_kind(signature: str, numbers: Mapping[str, Any], is_open: bool = False) -> PropertyKind:
-    """A word that stands for a value; with `is_open` a number may stand for itself as well."""
+    """A name for a value; with `is_open`, numbers are valid as well."""
 
     def parse(text: str) -> Any:
         word = text.strip()
@@ -126,7 +124,7 @@ def named_kind(signature: str, numbers: Mapping[str, Any], is_open: bool = False
 
 
 def _parse_share(text: str) -> int:
-    """A percentage as a part of SCALE, rounded so that 0.01 % steps come back as they were."""
+    """A percentage as a part of SCALE, rounded so that steps of 0.01 % convert back exactly."""
     match = _PERCENT.fullmatch(text.strip())
     hundredths = int(match[1]) * 100 + int((match[2] or "0").ljust(2, "0")) if match else -1
     if not 0 <= hundredths <= 10000:
@@ -214,7 +212,7 @@ CPU_QUOTA = PropertyKind(
     "t",
     "a share of one CPU such as 150%, or infinity",
     lambda text: parse_cpu(text) if text.strip() else INFINITY,
-    # Empty is how a unit file says that there is no quota.
+    # In a unit file, an empty value means no quota.
     lambda value: ["" if value == INFINITY else format_cpu(value)],
 )
 WEIGHT = PropertyKind(

@@ -1,6 +1,6 @@
-"""Kinds whose values are lists of words: names, environments, filters, conditions, fields.
+"""Property kinds whose values are lists of words: names, environments, filters, conditions.
 
-An empty text is an empty list, which resets what was there, as an empty line does in a unit file.
+An empty text is an empty list, which resets the property, as an empty value does in a unit file.
 """
 
 import re
@@ -16,7 +16,7 @@ _FIELD = re.compile(r"[A-Z0-9][A-Z0-9_]{0,63}=")
 
 
 def parse_words(text: str) -> tuple[str, ...]:
-    """The words of a list, quotes resolved; ValueError for what no unit file can hold."""
+    """The words of a list, unquoted. Raises ValueError if a unit file cannot contain them."""
     return tuple(plain_text(word) for word in split_words(plain_text(text)))
 
 
@@ -26,7 +26,7 @@ def format_words(words: Sequence[str]) -> Sequence[str]:
 
 
 def lines(texts: Sequence[str]) -> Sequence[str]:
-    """One line for each text, or the empty one that resets the list."""
+    """One line for each text, or an empty line, which resets the list."""
     return list(texts) or [""]
 
 
@@ -38,7 +38,7 @@ def _parse_filter(text: str) -> tuple[bool, tuple[str, ...]]:
     given = plain_text(text)
     words = parse_words(given.removeprefix("~"))
     if words and words[0].startswith("~"):
-        raise ValueError("only one ~ may stand in front")  # in quotes it would be read as the first
+        raise ValueError("only one ~ may stand in front")  # a unit file would take it for the first
     return not given.startswith("~"), words
 
 
@@ -58,7 +58,7 @@ def _format_profile(value: tuple[bool, str]) -> Sequence[str]:
 
 
 def _parse_fields(text: str) -> tuple[bytes, ...]:
-    """One field as systemd-run takes it, or several in quotes as unit files have them."""
+    """One field as for systemd-run, or several quoted ones as in unit files."""
     field = plain_text(text)
     fields = parse_words(field) if field.startswith('"') else (field,) if field else ()
     if not all(_FIELD.match(one) for one in fields):
@@ -103,7 +103,7 @@ def _format_conditions(value: Sequence[Condition]) -> Sequence[str]:
 
 def _parse_search_path(text: str) -> tuple[str, ...]:
     paths = tuple(path for word in parse_words(text) for path in word.split(":") if path)
-    # Quotes in a path would have to be quoted again in the unit; nobody has such a directory.
+    # Quotes in a path would need another level of quoting; no real directory has them.
     if any(not path.startswith("/") or set(path) & set("\"'\\ \t\n") for path in paths):
         raise ValueError(text)
     return paths

@@ -1,4 +1,4 @@
-"""Kinds whose words stand for numbers: signals, exit statuses, capabilities, levels, classes."""
+"""Property kinds whose words mean numbers: signals, exit statuses, capabilities, levels."""
 
 import errno
 import signal
@@ -48,7 +48,7 @@ _EXIT_WORDS = {"SUCCESS": 0, "FAILURE": 1}
 
 
 def parse_signal(text: str) -> int:
-    """The number of a signal given as SIGTERM, TERM, 15 or RTMIN+3; ValueError for no signal."""
+    """The number of a signal such as SIGTERM, TERM, 15 or RTMIN+3. Raises ValueError."""
     word = text.strip().upper().removeprefix("SIG")
     base, plus, offset = word.partition("+")
     if base == "RTMIN" and (not plus or (offset.isascii() and offset.isdigit())):
@@ -86,7 +86,7 @@ def _format_statuses(value: tuple[Sequence[int], Sequence[int]]) -> Sequence[str
 
 
 def _mask_parser(bits: Mapping[str, int], everything: int) -> Callable[[str], int]:
-    """Words to the sum of their bits; "~" in front takes them out of `everything`."""
+    """Converts words to the sum of their bits; "~" in front removes them from `everything`."""
 
     def parse(text: str) -> int:
         words = text.strip().removeprefix("~").split()
@@ -104,7 +104,7 @@ def _mask_words(bits: Mapping[str, int], mask: int) -> str:
 
 
 def _format_capabilities(mask: int) -> Sequence[str]:
-    # Kernels have capabilities that this list does not, so a mask of nearly all is best inverted.
+    # Kernels may have more capabilities than this list, so format a nearly full mask inverted.
     if mask >> len(_CAPABILITY_NAMES):
         return [f"~{_mask_words(_CAPABILITIES, ~mask)}".strip()]
     return [_mask_words(_CAPABILITIES, mask)]
@@ -114,7 +114,7 @@ def _parse_namespaces(text: str) -> int:
     if text.strip() in ("yes", "true", "on", "1"):
         return 0
     everything = sum(_NAMESPACES.values())
-    # An empty line of a unit file resets it.
+    # An empty value in a unit file resets it.
     if text.strip() in ("", "no", "false", "off", "0"):
         return everything
     return _mask_parser(_NAMESPACES, everything)(text)

@@ -1,14 +1,14 @@
-"""What a dataflow is kept from: a level and a few choices become unit properties.
+"""The sandbox of a dataflow: turns a level and a few options into unit properties.
 
-Every property is one of systemd.exec(5) or systemd.resource-control(5). What each costs is in the
-table SANDBOX of dora-systemd(7).
+Every property is one of systemd.exec(5) or systemd.resource-control(5). The table SANDBOX of
+dora-systemd(7) lists what each of them restricts.
 
-systemd mounts as root, at every start and restart: BindPaths= follows the links that it finds, and
-ReadWritePaths= is a mount, too, with a moment between the look and the mount. A link in a directory
-of the nodes' user would have it mount what lies below another user's closed home, past the
-permissions of that home. To check again does not help. So no path is mounted that has a component
-which anybody but root can replace, but the part of it before that: a whole home for a project in
-it. Where that part is a place to be hidden, such as /tmp, the place stays open.
+systemd mounts as root, at every start and restart. BindPaths= follows links, and ReadWritePaths= is
+a mount too, with a delay between check and mount. A link in a directory of the nodes' user could
+make it mount something below another user's closed home, past the permissions of that home.
+Checking again does not help. So if others than root can replace a component of a path, only the
+part before that component is mounted: a whole home for a project in it. If that part would have to
+be hidden, such as /tmp, it stays accessible.
 """
 
 import re
@@ -26,11 +26,11 @@ NETWORKS = ("host", "loopback", "private")
 DEFAULT_LEVEL = "default"
 DEFAULT_NETWORK = "host"
 
-# Filters of system calls and flags of processes: the kernel lets every user set them.
+# Filters of system calls and process flags, which the kernel allows every user to set.
 _CALLS = (
     "NoNewPrivileges=yes",
-    # To make the one that is left needs a capability that nodes do not have. systemd 257 writes a
-    # transient unit with none left as an empty line, which it reads back as all.
+    # Allow uts: to create one needs a capability that nodes lack. systemd 257 writes a transient
+    # unit without any type as an empty line, and reads that back as all types.
     "RestrictNamespaces=uts",
     "RestrictSUIDSGID=yes",
     "LockPersonality=yes",
@@ -39,8 +39,8 @@ _CALLS = (
     "SystemCallErrorNumber=EPERM",
     "RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6 AF_NETLINK",
 )
-# What is done with mounts, capabilities and BPF needs the system's manager. A user's manager would
-# need user namespaces, and would fail where the kernel or a container does not let it have them.
+# Mounts, capabilities and BPF need the system manager. A user's manager would need user namespaces,
+# and fail if the kernel or a container does not allow them.
 _FILES = (
     "ProtectSystem=strict",
     "ProtectKernelTunables=yes",
@@ -50,7 +50,7 @@ _FILES = (
     "ProtectHostname=yes",
     "ProtectProc=invisible",
 )
-# No ProtectControlGroups=: the runner makes a group for each node.
+# Not ProtectControlGroups=: the runner creates a cgroup for each node.
 _STRICT_CALLS = ("MemoryDenyWriteExecute=yes", "UMask=0077", "SystemCallFilter=~@privileged")
 _STRICT_FILES = ("ProcSubset=pid", "PrivateIPC=yes")
 
@@ -61,15 +61,14 @@ _MOUNTABLE = re.compile(r"[^\s\x00-\x1f\x7f\"'\\:]+")
 
 @dataclass(frozen=True)
 class Sandbox:
-    """The choices.
+    """The options of a sandbox.
 
-    level: one of LEVELS. network: one of NETWORKS. is_user: of a user's manager.
-    is_root: the nodes run as root. has_devices: some are allowed by name.
-    is_realtime: the nodes are scheduled so. has_identity: the user can be
-    in a namespace with the first 65536 ids.
-    needed: absolute paths that are read, such as the project. writable: those that are written.
-    firm: by path of these two, the part of it that only root can replace; else all of it.
-    directory: the RuntimeDirectory of the unit, the only one of its kind that nodes see; "": all.
+    level: one of LEVELS. network: one of NETWORKS. is_user: of a user's manager. is_root: the nodes
+    run as root. has_devices: some devices are allowed by name. is_realtime: the nodes have realtime
+    scheduling. has_identity: the user fits into a namespace with the first 65536 ids. needed:
+    absolute paths to read, such as the project. writable: paths to write. firm: by path of these
+    two, the part that only root can replace; without an entry all of it. directory: the
+    RuntimeDirectory of the unit, the only one that nodes see; "": all are visible.
     """
 
     level: str = DEFAULT_LEVEL
@@ -86,11 +85,11 @@ class Sandbox:
 
     @property
     def has_mounts(self) -> bool:
-        """Whether anything is hidden at all."""
+        """Whether the sandbox hides anything."""
         return self.level != "none" and not self.is_user
 
     def mounted(self, paths: Iterable[str]) -> list[str]:
-        """What systemd is told of these paths."""
+        """The paths as they are passed to systemd."""
         return list(dict.fromkeys(self.firm.get(path, path) for path in paths))
 
 
@@ -103,7 +102,7 @@ def sandbox_properties(sandbox: Sandbox) -> dict[str, Property]:
 
 
 def odd_paths(sandbox: Sandbox) -> list[str]:
-    """The paths that keep whole places of the machine open: systemd cannot mount them alone."""
+    """Paths that keep a whole directory accessible, because systemd cannot mount them alone."""
     if not sandbox.has_mounts:
         return []
     paths = _unmountable(sandbox.mounted((*sandbox.needed, *sandbox.writable)))
@@ -111,7 +110,7 @@ def odd_paths(sandbox: Sandbox) -> list[str]:
 
 
 def loose_paths(sandbox: Sandbox) -> Iterator[tuple[str, str]]:
-    """Paths that somebody else than root can replace, and the place that stays open for each."""
+    """Paths that others than root can replace, and the directory that stays accessible for each."""
     if sandbox.has_mounts:
         for path in dict.fromkeys((*sandbox.needed, *sandbox.writable)):
             firm = sandbox.firm.get(path, path)
@@ -121,7 +120,7 @@ def loose_paths(sandbox: Sandbox) -> Iterator[tuple[str, str]]:
 
 
 def widened_paths(sandbox: Sandbox) -> Iterator[tuple[str, str]]:
-    """Paths that are to be written, and the larger part of the machine that is written for each."""
+    """Paths to write, and the larger directory that becomes writable for each."""
     if sandbox.has_mounts:
         loose = dict(loose_paths(sandbox))
         for path in sandbox.writable:
@@ -141,7 +140,7 @@ def _assignments(sandbox: Sandbox) -> list[str]:
     found += _CALLS
     found += _STRICT_CALLS if is_strict else ()
     if not sandbox.is_realtime:
-        # A process of a realtime dataflow may order its own threads.
+        # A realtime dataflow may change the scheduling of its threads.
         found += ["RestrictRealtime=yes"]
         found += ["SystemCallFilter=~@resources"] if is_strict else []
     if not sandbox.is_user:
@@ -159,22 +158,23 @@ def _network(sandbox: Sandbox) -> list[str]:
 
 
 def _devices(sandbox: Sandbox) -> str:
-    # PrivateDevices= hides all but /dev/null and its like, also those that are allowed.
+    # PrivateDevices= hides all devices but /dev/null and similar ones, even allowed devices.
     return "DevicePolicy=closed" if sandbox.has_devices else "PrivateDevices=yes"
 
 
 def _privileges(sandbox: Sandbox) -> list[str]:
     if sandbox.is_root:
-        # Who asks for root wants every file; in a user namespace it would be root of its own only.
+        # Nodes as root need access to all files; in a user namespace they would be root only there.
         return ["CapabilityBoundingSet=CAP_DAC_OVERRIDE CAP_DAC_READ_SEARCH"]
     return ["CapabilityBoundingSet=", *_users(sandbox)]
 
 
 def _users(sandbox: Sandbox) -> list[str]:
-    """A user namespace: else ptrace(2) and /proc show a dataflow all others of the same user.
+    """A user namespace, so that ptrace(2) and /proc only show the dataflow's own processes.
 
-    ProtectProc= hides what cannot be traced, which also spares dora's daemon most of its work: it
-    reads all processes that it sees, every two seconds. With "identity" files keep their owners.
+    Otherwise they show all processes of the same user. ProtectProc= hides what cannot be traced,
+    which also saves CPU time of dora's daemon: it reads all visible processes every two seconds.
+    With "identity" files keep their owners.
     """
     if sandbox.level == "strict":
         return ["PrivateUsers=yes"]
@@ -182,14 +182,14 @@ def _users(sandbox: Sandbox) -> list[str]:
 
 
 def _path_properties(sandbox: Sandbox) -> dict[str, Property]:
-    """What is hidden and what stays: private directories, and mounts of what is needed in them."""
+    """The hidden directories, and mounts of the needed paths in them."""
     if not sandbox.has_mounts:
         return {}
     needed, writable = sandbox.mounted(sandbox.needed), sandbox.mounted(sandbox.writable)
     hides_tmp = _can_hide(_TEMPORARY, (*needed, *writable))
     hides_home = sandbox.level == "strict" and _can_hide(_HOMES, (*needed, *writable))
     hidden = (*(_TEMPORARY if hides_tmp else ()), *(_HOMES if hides_home else ()))
-    # Without temporary directories of their own the nodes write to the machine's.
+    # Without private temporary directories, nodes write to the machine's.
     shared = () if hides_tmp else _TEMPORARY
     bound = [path for path in writable if _is_below(path, hidden)]
     written = [path for path in writable if path not in bound]
@@ -206,26 +206,26 @@ def _path_properties(sandbox: Sandbox) -> dict[str, Property]:
 
 
 def _empty_but(directory: str) -> dict[str, Property]:
-    """Nothing beside the cell's own directory: others of the same user have their tokens there."""
+    """Hide other cells' directories: those of the same user contain their tokens."""
     return parse_property(f"TemporaryFileSystem={directory.rpartition('/')[0]}:ro")
 
 
 def _can_hide(places: Iterable[str], paths: Sequence[str]) -> bool:
-    """Whether nobody wants a whole place, and all that is needed in it can be mounted."""
+    """Whether no path is a whole place, and all needed paths in the places can be mounted."""
     wants_whole = any(_is_below(place, paths) for place in places)
     return not wants_whole and not any(_is_below(one, places) for one in _unmountable(paths))
 
 
 def _unmountable(paths: Iterable[str]) -> list[str]:
-    """The paths that systemd 257 writes into a transient unit in a way that it reads otherwise.
+    """Paths that systemd 257 writes into a transient unit and reads back differently.
 
-    The unit would be without that mount, or with another, from the next daemon-reload on.
+    After the next daemon-reload the unit would lack that mount, or have another one.
     """
     return [path for path in paths if not _MOUNTABLE.fullmatch(path)]
 
 
 def _is_below(path: str, places: Iterable[str]) -> bool:
-    """Whether `path` is one of `places` or in one of them."""
+    """Whether `path` is one of `places` or below one of them."""
     return any(f"{path}/".startswith(f"{place.rstrip('/')}/") for place in places)
 
 

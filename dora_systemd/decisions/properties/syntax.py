@@ -1,4 +1,4 @@
-"""The text of unit files: words, quotes, escapes and specifiers, as in systemd.syntax(7)."""
+"""The syntax of unit files: words, quotes, escapes and specifiers, as in systemd.syntax(7)."""
 
 import re
 
@@ -9,7 +9,7 @@ _ESCAPES = {
     **{"\\": "\\", '"': '"', "'": "'"},
 }
 _NUMERIC = re.compile(r"x([0-9a-fA-F]{2})|u([0-9a-fA-F]{4})|U([0-9a-fA-F]{8})|([0-7]{3})")
-# Behind a pair of backslashes there is no escape.
+# The first branch skips pairs of backslashes, after which there is no escape.
 _BYTES = re.compile(r"\\\\|(?:\\[23][0-7]{2}|\\x[89a-fA-F][0-9a-fA-F])+")
 _BYTE = re.compile(r"\\x(..)|\\(...)")
 _PLAIN_WORD = re.compile(r"[A-Za-z0-9_@%=:,./+~^!?*\[\]-]+")
@@ -17,10 +17,10 @@ _NEEDS_ESCAPE = re.compile(r'[\\"\x00-\x1f\x7f]')
 
 
 def split_words(text: str, separators: str = SPACE) -> list[str]:
-    """The words of `text`, quotes and C escapes resolved, split at any of `separators`.
+    """The words of `text`, split at any of `separators`, with quotes and C escapes resolved.
 
-    Raises ValueError for an unfinished quote or escape. Adjacent blanks count as one separator;
-    any other separator keeps the empty words around it.
+    Raises ValueError for an unfinished quote or escape. Adjacent blanks are one separator; between
+    any other separators there are empty words.
     """
     words: list[str] = []
     word: str | None = None
@@ -38,7 +38,7 @@ def split_words(text: str, separators: str = SPACE) -> list[str]:
             word, quote = word or "", char
         elif char in separators:
             words += [] if word is None and char in SPACE else [word or ""]
-            # "a:" has an empty word at its end, "a " has none.
+            # "a:" ends with an empty word, "a " does not.
             word = None if char in SPACE else ""
         else:
             word = (word or "") + char
@@ -49,12 +49,12 @@ def split_words(text: str, separators: str = SPACE) -> list[str]:
 
 
 def escape_specifiers(text: str) -> str:
-    """`text` with % doubled, or systemd.unit(5) would take what follows it for a specifier."""
+    """`text` with % doubled, because systemd.unit(5) expands specifiers."""
     return text.replace("%", "%%")
 
 
 def quote_word(text: str) -> str:
-    """`text` as one word of a list in a unit file, quoted and escaped where it needs that."""
+    """`text` as one word of a list in a unit file, quoted and escaped if necessary."""
     escaped = escape_specifiers(text)
     if _PLAIN_WORD.fullmatch(escaped):
         return escaped
@@ -62,7 +62,7 @@ def quote_word(text: str) -> str:
 
 
 def _characters(match: re.Match[str]) -> str:
-    """Escapes of single bytes as the UTF-8 that they are: how systemd writes all but ASCII."""
+    """Decodes escaped bytes as UTF-8: systemd writes all non-ASCII characters like this."""
     pairs = _BYTE.findall(match[0])
     data = bytes(
         int(hexadecimal, 16) if hexadecimal else int(octal, 8) for hexadecimal, octal in pairs
@@ -74,7 +74,7 @@ def _characters(match: re.Match[str]) -> str:
 
 
 def _unescaped(text: str, place: int) -> tuple[str, int]:
-    """The character that the escape at `place` stands for, and how long the escape is."""
+    """The character of the escape at `place`, and the length of the escape."""
     letter = text[place + 1 : place + 2]
     if not letter:
         raise ValueError("a backslash ends it")
@@ -85,7 +85,7 @@ def _unescaped(text: str, place: int) -> tuple[str, int]:
         if not 0 < code < 0x110000 or 0xD800 <= code < 0xE000:
             raise ValueError("an escape stands for no character")
         return chr(code), 1 + len(match[0])
-    # Without a meaning of its own an escaped character stands for itself, as in paths.
+    # Any other escaped character means itself, as in paths.
     return _ESCAPES.get(letter, letter), 2
 
 

@@ -17,9 +17,9 @@ SERVICE = "Service"
 
 @dataclass(frozen=True)
 class Row:
-    """One key of a unit file: its section, and the D-Bus names and kinds that its values have.
+    """One key of a unit file: its section, and the D-Bus names and kinds of its values.
 
-    The first kind that accepts a text is the one that is sent.
+    The first kind that accepts a text determines the property.
     """
 
     key: str
@@ -136,7 +136,7 @@ _KINDS: dict[str, PropertyKind] = {
     "MemoryPressureWatch": choice_kind("no", "yes", "auto", "skip"),
     "ExecSearchPath": lists.SEARCH_PATH,
     "Environment": lists.ENVIRONMENT,
-    # Ours, but they have to be written as unit text too.
+    # Set by dora-systemd itself; in the table because they need a text in unit files.
     "Type": kinds.TEXT,
     "NotifyAccess": kinds.TEXT,
     "KillMode": kinds.TEXT,
@@ -229,7 +229,7 @@ _PLAIN: Sequence[tuple[str, PropertyKind, Sequence[str]]] = (
     *((SERVICE, kind, (key,)) for key, kind in _KINDS.items()),
     *((UNIT, kind, (key,)) for key, kind in _UNIT_KINDS.items()),
 )
-"""Keys whose name on D-Bus is the same, by section and kind."""
+"""Keys with the same name on D-Bus, by section and kind."""
 
 _ODD: dict[str, Sequence[tuple[str, PropertyKind]]] = {
     "TasksMax": [("TasksMaxScale", kinds.SHARE), ("TasksMax", kinds.COUNT_LIMIT)],
@@ -240,7 +240,7 @@ _ODD: dict[str, Sequence[tuple[str, PropertyKind]]] = {
         ("CPUAffinityFromNUMA", kinds.named_kind("b", {"numa": True})),
         ("CPUAffinity", structs.CPUS),
     ],
-    # Once booleans; what they learned later has a name of its own on D-Bus.
+    # Booleans at first; for later values there is a second property on D-Bus.
     "PrivateTmp": [("PrivateTmp", kinds.BOOL), ("PrivateTmpEx", choice_kind("disconnected"))],
     "PrivateUsers": [
         ("PrivateUsers", kinds.BOOL),
@@ -287,4 +287,4 @@ TABLE = {row.key: row for row in _rows()}
 """Every row by its key."""
 
 RLIMITS = frozenset(f"Limit{name}" for name in _RLIMIT_KINDS)
-"""Keys that are two properties, the hard limit LimitX and the soft one LimitXSoft."""
+"""Keys that are two properties: the hard limit LimitX and the soft limit LimitXSoft."""

@@ -1,4 +1,4 @@
-"""What has to start again when files change: the least that makes every change take effect."""
+"""Decides what must restart after files have changed: as little as possible."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -14,10 +14,10 @@ _EDGES = ("inputs", "outputs", "operator", "operators", "ros2")
 
 @dataclass(frozen=True)
 class NodeSources:
-    """What one node is made of.
+    """The files of one node.
 
-    files: absolute paths of its program and the modules that it imports. text: all that its
-    definition says, where names of configuration files may be. rules: its own `watch` patterns.
+    files: absolute paths of its program and the modules that it imports. text: its whole
+    definition, which may contain names of configuration files. rules: its own `watch` patterns.
     """
 
     files: frozenset[str] = frozenset()
@@ -31,9 +31,9 @@ class NodeSources:
 
 @dataclass(frozen=True)
 class Touched:
-    """Nodes that changed files belong to, each with the first of these files.
+    """Nodes affected by changed files, each with the first of these files.
 
-    descriptor: whether the dataflow file itself is among the changed ones.
+    descriptor: whether the dataflow file itself has changed.
     """
 
     nodes: Mapping[str, str] = field(default_factory=dict)
@@ -41,10 +41,10 @@ class Touched:
 
 
 def touched(changed: Iterable[str], dataflow: str, nodes: Mapping[str, NodeSources]) -> Touched:
-    """Whom the files `changed` concern.
+    """The nodes that the files `changed` affect.
 
-    A file of programs concerns the nodes that are made of it. Any other concerns the nodes that
-    watch or mention it; if there is none, all: it may be read by each.
+    A file of a program affects the nodes with that program. Any other file affects the nodes that
+    watch or mention it; if there are none, it affects all nodes, because each may read it.
     """
     found: dict[str, str] = {}
     paths = sorted(changed)
@@ -68,10 +68,10 @@ def _owners(path: str, nodes: Mapping[str, NodeSources]) -> list[str]:
 
 @dataclass(frozen=True)
 class Difference:
-    """What is new in a descriptor: ids of nodes.
+    """The differences of a descriptor, as node ids.
 
-    replaced: of which anything but inputs and outputs has changed. rewired: of which those have,
-    and nobody reads from them. whole: why only the dataflow as a whole can follow, or "".
+    replaced: nodes with changes other than inputs and outputs. rewired: nodes with other inputs or
+    outputs, and no readers. whole: why the dataflow as a whole must restart, or "".
     """
 
     replaced: tuple[str, ...] = ()
@@ -82,16 +82,16 @@ class Difference:
 
     @property
     def is_empty(self) -> bool:
-        """Whether nothing that dora sees has changed."""
+        """Whether nothing has changed for dora."""
         return self == Difference()
 
 
 def difference(old: Mapping[str, Any], new: Mapping[str, Any]) -> Difference:
-    """What has changed between two expanded descriptors.
+    """The differences between two expanded descriptors.
 
-    dora adds, removes and replaces nodes of a dataflow that runs. It keeps the edges of a replaced
-    node: one with other edges has to go and come again, which ends who reads from it. What is not
-    in `nodes` dora reads at the start only.
+    dora can add, remove and replace nodes of a running dataflow. A replaced node keeps its edges; a
+    node with other edges must be removed and added, which would end the nodes that read from it.
+    dora reads keys other than `nodes` only at the start.
     """
     if _without_nodes(old) != _without_nodes(new):
         return Difference(whole="keys of the dataflow itself have changed")
@@ -114,7 +114,7 @@ def difference(old: Mapping[str, Any], new: Mapping[str, Any]) -> Difference:
 
 
 def has_readers(node: str, nodes: Iterable[Mapping[str, Any]]) -> bool:
-    """Whether an input of another one of `nodes` names this one, in one of its many forms."""
+    """Whether another one of `nodes` has an input from this node, in any of its notations."""
     source = json.dumps(f"{node}/")[:-1]
     return any(source in json.dumps(one) for one in nodes if one.get("id") != node)
 

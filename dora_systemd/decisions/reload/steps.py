@@ -1,4 +1,4 @@
-"""In which steps dora takes over a changed dataflow while it runs."""
+"""Plans the steps by which dora applies a changed descriptor to a running dataflow."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from dora_systemd.decisions.reload.changes import Difference, Touched
 
 
 class How(Enum):
-    """What becomes of a node."""
+    """What happens to a node."""
 
     REMOVE = "removed"
     REWIRE = "reconnected"
@@ -19,7 +19,7 @@ class How(Enum):
 
 @dataclass(frozen=True)
 class Step:
-    """One node, and why: the absolute path of a changed file."""
+    """One node, and the reason: the absolute path of a changed file."""
 
     how: How
     node: str
@@ -29,7 +29,7 @@ class Step:
 def plan_steps(
     found: Touched, change: Difference, kinds: Mapping[str, str], dataflow: str
 ) -> tuple[Step, ...]:
-    """The steps in their order; of each node one. Dynamic nodes are their owner's business.
+    """The steps in order, one for each node, without dynamic nodes, which dora does not start.
 
     kinds: how each node is started, see launch.kinds(). dataflow: path of its file.
     """

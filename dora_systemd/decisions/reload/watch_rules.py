@@ -1,7 +1,7 @@
-"""Which files of a project mean a reload when they change.
+"""Decides which files of a project cause a reload when they change.
 
-Patterns are those of gitignore(5): `*.py` is any file of that kind, `config/*` all that is in the
-directory config of the top.
+Patterns are those of gitignore(5): `*.py` matches any such file, `config/*` everything in the
+directory config at the top.
 """
 
 from collections.abc import Iterable, Mapping
@@ -19,14 +19,14 @@ DEFAULT_WATCH = (
     *("*.py", "*.yml", "*.yaml"),
     *("*.toml", "*.json", "*.ini", "*.cfg", "*.conf", ".env"),
 )
-"""Programs, dataflows and configuration, as the reference page of dora says."""
+"""Programs, dataflows and configuration, as in dora's reference page."""
 
 ALWAYS_IGNORED = (
-    # Version control, environments, caches and what builds make.
+    # Version control, environments, caches and build results.
     *(".git/", ".hg/", ".svn/", "__pycache__/", "venv/", ".venv/", ".dora/", "node_modules/"),
     *("site-packages/", ".tox/", ".nox/", ".*_cache/", ".hypothesis/", "*.egg-info/"),
     *("build/", "dist/", "target/", "out/"),
-    # Logs, temporary files, and what editors write beside the file that is being edited.
+    # Logs, temporary files, and files that editors create beside the edited file.
     *("*.log", "*.jsonl", "log/", "logs/", "tmp/", "*.tmp", "*.temp", "*.part", "*.bak", "*~"),
     *(".#*", "#*#", "*.sw?", "4913", "*.pyc"),
     # Data.
@@ -38,9 +38,9 @@ ALWAYS_IGNORED = (
 class WatchRules:
     """The rules of one dataflow.
 
-    root: absolute directory that patterns are relative to. watched: patterns of files.
-    ignored: patterns that win. gitignores: by directory relative to root, lines of .gitignore.
-    files: absolute paths that are watched in any case.
+    root: absolute directory that patterns are relative to. watched: patterns of files. ignored:
+    patterns that take precedence. gitignores: by directory relative to root, lines of .gitignore.
+    files: absolute paths that are always watched.
     """
 
     root: str
@@ -50,23 +50,23 @@ class WatchRules:
     files: frozenset[str] = frozenset()
 
     def has(self, path: str) -> bool:
-        """Whether a change of the file `path`, absolute, means a reload."""
+        """Whether a change of the file `path` (absolute) causes a reload."""
         relative = self._relative(path)
         return path in self.files or (
             bool(relative) and self._watched(relative) and not self.is_ignored(path)
         )
 
     def has_directory(self, path: str) -> bool:
-        """Whether there may be such files in the directory `path`, absolute."""
+        """Whether the directory `path` (absolute) may contain such files."""
         return path == self.root or not self.is_ignored(f"{path}/")
 
     def is_ignored(self, path: str) -> bool:
-        """Whether `path`, absolute, is left alone; one that ends in / is a directory."""
+        """Whether `path` (absolute) is ignored; a path that ends with / is a directory."""
         relative = self._relative(path)
         return not relative or self._ignores(relative) or self._gitignores(relative)
 
     def _relative(self, path: str) -> str:
-        """The path below root as patterns see it; "" for what is not below it."""
+        """The path relative to root, for patterns; "" if it is not below root."""
         prefix = self.root.rstrip("/") + "/"
         return path.removeprefix(prefix) if path.startswith(prefix) else ""
 
@@ -88,7 +88,7 @@ _SPECS: dict[tuple[str, ...], "GitIgnoreSpec"] = {}
 
 
 def _spec(patterns: tuple[str, ...]) -> "GitIgnoreSpec":
-    # Compiled once; imported only where something is watched.
+    # Compiled once. Imported late: only hot reload needs it.
     if patterns not in _SPECS:
         from pathspec import GitIgnoreSpec
 
@@ -97,7 +97,7 @@ def _spec(patterns: tuple[str, ...]) -> "GitIgnoreSpec":
 
 
 def parse_patterns(texts: Iterable[str]) -> tuple[str, ...]:
-    """The patterns in comma lists. Raises DoraSystemdError (USAGE)."""
+    """The patterns in comma-separated lists. Raises DoraSystemdError (USAGE)."""
     patterns = [one.strip() for text in texts for one in text.split(",") if one.strip()]
     for pattern in patterns:
         if not pattern.isprintable() or ".." in PurePath(pattern).parts or pattern == "!":
@@ -107,9 +107,9 @@ def parse_patterns(texts: Iterable[str]) -> tuple[str, ...]:
 
 
 def relative_patterns(patterns: Iterable[str], root: str) -> tuple[str, ...]:
-    """Patterns as seen from `root`; an absolute path has to be in it.
+    """Patterns relative to `root`.
 
-    Raises DoraSystemdError (USAGE) for one that is not.
+    Raises DoraSystemdError (USAGE) for an absolute pattern that is not below `root`.
     """
     return tuple(_relative_pattern(pattern, root.rstrip("/")) for pattern in patterns)
 
@@ -125,7 +125,7 @@ def _relative_pattern(pattern: str, root: str) -> str:
 
 
 def unmatched_patterns(rules: WatchRules, paths: Iterable[str]) -> tuple[str, ...]:
-    """Those patterns of `rules` that fit none of `paths`, for a warning that names them."""
+    """The patterns of `rules` that match none of `paths`, for a warning."""
     known = [path for path in paths if not rules.is_ignored(path)]
     return tuple(
         pattern

@@ -1,4 +1,4 @@
-"""Who ran out of memory when the kernel has killed a node: the node, the dataflow or the machine.
+"""Finds whose memory limit was exceeded when the kernel has killed a node.
 
 The counters are those of memory.events and memory.events.local in the kernel's "Control Group v2"
 document.
@@ -12,7 +12,7 @@ from dora_systemd.values import format_rounded_size
 
 
 class Owner(Enum):
-    """Whose memory was used up."""
+    """Whose memory was used up: the node's, the dataflow's or the machine's."""
 
     NODE = "node"
     DATAFLOW = "dataflow"
@@ -21,10 +21,10 @@ class Owner(Enum):
 
 @dataclass(frozen=True)
 class OomCounts:
-    """Counters of one group, which only grow.
+    """Counters of one group, which only increase.
 
-    kills: processes in it or below it that the kernel has killed for want of memory. refusals: how
-    often the limit of this group itself left no memory.
+    kills: OOM kills in the group and below it. refusals: how often the limit of this group itself
+    was the reason.
     """
 
     kills: int = 0
@@ -33,10 +33,10 @@ class OomCounts:
 
 @dataclass(frozen=True)
 class Oom:
-    """A node that was killed for want of memory. Sizes in bytes.
+    """The OOM kill of a node. Sizes in bytes.
 
-    peak: the most that the node ever held. limit: of the owner, 0 for the machine. most: the node
-    that held most, and how much that was.
+    peak: the node's maximum. limit: of the owner, 0 for the machine. most: the node with the
+    highest usage, and its size.
     """
 
     owner: Owner
@@ -47,7 +47,7 @@ class Oom:
 
     @property
     def text(self) -> str:
-        """How the node ended, for the table of nodes."""
+        """How the node ended, for the live table."""
         peak, limit = format_rounded_size(self.peak), format_rounded_size(self.limit)
         if self.owner is Owner.NODE:
             return f"out of memory, peak {peak}, limit {limit}"
@@ -74,7 +74,7 @@ class Oom:
 def find_owner(
     node: tuple[OomCounts, OomCounts], unit: tuple[OomCounts, OomCounts]
 ) -> Owner | None:
-    """Whose memory was used up between two looks at node and unit; None: nothing was killed."""
+    """Whose memory was used up between two readings of node and unit; None: no OOM kill."""
     if node[1].kills <= node[0].kills:
         return None
     if node[1].refusals > node[0].refusals:
@@ -83,5 +83,5 @@ def find_owner(
 
 
 def largest(held: Mapping[str, int]) -> tuple[str, int]:
-    """The node that holds most memory, and how much; "" where there is none."""
+    """The node with the highest usage, and its size; "" if there is none."""
     return max(held.items(), key=lambda item: item[1], default=("", 0))

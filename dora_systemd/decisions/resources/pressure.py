@@ -1,7 +1,8 @@
-"""When to say that memory or CPU time gets short, before something is killed. Pure: no clock.
+"""Decides when to report that memory or CPU time runs out, before a kill. Pure: no clock.
 
-Each group with a limit is looked at every few seconds. It is reported once, and again only when it
-was well for a while in between and the last report is old enough, so nothing floods the journal.
+The runner samples each group with a limit every few seconds. An alarm is reported once; again only
+after the group was well for a while, and QUIET has passed since the last report. So the journal is
+not flooded.
 """
 
 from collections.abc import Mapping
@@ -12,26 +13,26 @@ from dora_systemd.values import SECOND, format_rounded_size
 
 MEMORY, CPU = "memory-pressure", "cpu-throttled"
 FULL, NOT_FULL = 0.9, 0.8
-"""Shares of the limit that are taken by what cannot be dropped: alarm from, well again below."""
+"""Shares of the limit used by memory that cannot be reclaimed: alarm above, well again below."""
 STALLED, NOT_STALLED = 20.0, 5.0
-"""Percent of the last 10 s in which something waited for memory."""
+"""Percent of the last 10 s in which some process waited for memory."""
 THROTTLED, NOT_THROTTLED = 50.0, 25.0
-"""Percent of the time in which something had to wait for the CPU limit."""
+"""Percent of the time in which the CPU limit throttled the group."""
 BAD_LOOKS = {MEMORY: 1, CPU: 3}
-"""Looks in a row that make an alarm: a program that starts uses all the CPU it gets."""
+"""Consecutive bad samples for an alarm: a starting program uses all the CPU time it can get."""
 GOOD_LOOKS = 6
-"""Looks in a row after which all is well again."""
+"""Consecutive good samples after which a group is well again."""
 QUIET = 300 * SECOND
-"""µs between two reports about the same."""
+"""µs between two reports of the same kind."""
 
 
 @dataclass(frozen=True)
 class Load:
-    """One look at a group.
+    """One sample of a group.
 
-    held: bytes that the kernel cannot drop. limit: bytes, or None. stalled: percent of the last
-    10 s in which something waited for memory. throttled: percent of the time since the last look
-    in which something waited for the CPU limit, None without one.
+    held: bytes that the kernel cannot reclaim. limit: bytes, or None. stalled: percent of the last
+    10 s in which some process waited for memory. throttled: percent of the time since the last
+    sample in which the CPU limit throttled the group, None without one.
     """
 
     held: int = 0
@@ -42,9 +43,10 @@ class Load:
 
 @dataclass(frozen=True)
 class Alarm:
-    """What is known about one thing that may get short.
+    """The state of one alarm.
 
-    bad, good: looks in a row. is_on: reported, and not well again since. reported_us: when, or 0.
+    bad, good: consecutive samples. is_on: reported, and not well again since. reported_us: time, or
+    0.
     """
 
     bad: int = 0
@@ -61,8 +63,8 @@ Alarms = Mapping[tuple[str, str], Alarm]
 
 
 def look(alarms: Alarms, loads: Mapping[str, Load], now_us: int) -> tuple[Alarms, list[Report]]:
-    """The alarms after one look at all groups, and what is to be reported."""
-    after = dict(alarms)  # who is without a limit for a while has been reported all the same
+    """The alarms after one sample of all groups, and the new reports."""
+    after = dict(alarms)  # keep alarms of groups without a limit at the moment
     reports = []
     for key, load in loads.items():
         for event, is_bad, is_good in _judged(load):
@@ -76,7 +78,7 @@ def look(alarms: Alarms, loads: Mapping[str, Load], now_us: int) -> tuple[Alarms
 
 
 def _judged(load: Load) -> list[tuple[str, bool, bool]]:
-    """For each thing that is limited: the event, whether it is bad, and whether it is well."""
+    """For each limit: the event, whether it is bad, and whether it is well."""
     judged = []
     if load.limit is not None:
         is_bad = load.held >= FULL * load.limit or load.stalled >= STALLED

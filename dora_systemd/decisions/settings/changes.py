@@ -1,4 +1,4 @@
-"""What is different between two versions of a settings file."""
+"""The differences between two versions of a settings file."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -14,7 +14,7 @@ _USUAL_WEIGHT = 100
 
 
 def settings_change(before: Settings, after: Settings) -> SettingsChange:
-    """What of `after`, made of the one file, is not as in `before`."""
+    """The settings in `after`, made from one file only, that differ from `before`."""
     old, new = (_by_node(settings) for settings in (before, after))
     changed = [_changed(node, old.get(node, {}), new.get(node, {})) for node in {**old, **new}]
     own = {key for key in before.values if before.values[key] != after.values[key]}
@@ -33,7 +33,7 @@ def _by_node(settings: Settings) -> dict[str, dict[str, int]]:
 
 
 def _changed(node: str, old: Mapping[str, int], new: Mapping[str, int]) -> NodeLimits:
-    """What is no longer there is lifted."""
+    """The new limits; a limit that is missing now is removed."""
     gone = {word: _USUAL_WEIGHT if "weight" in word else INFINITY for word in old.keys() - new}
     return node_limits(node, {**{w: v for w, v in new.items() if old.get(w) != v}, **gone})
 

@@ -1,4 +1,4 @@
-"""Secrets of the nodes: names and files, which systemd hands over, see systemd.exec(5)."""
+"""Credentials of the nodes: names and files for LoadCredential=, see systemd.exec(5)."""
 
 import re
 from collections.abc import Mapping
@@ -10,13 +10,13 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import quoted
 
 MAX_SIZE = 1024 * 1024
-"""Bytes of all credentials of a unit together: systemd takes no more."""
+"""Maximum bytes of all credentials of a unit together; the limit of systemd."""
 
 _NAME = re.compile(r"(?!\.{1,2}\Z)[!-.0-9;-~]{1,255}")
 
 
 def parse_credentials(value: Any, base: Base) -> Mapping[str, str]:
-    """File by name, from a mapping or from texts NAME=FILE. Raises DoraSystemdError (USAGE)."""
+    """Files by name, from a mapping or from texts NAME=FILE. Raises DoraSystemdError (USAGE)."""
     if isinstance(value, Mapping):
         return dict(_pair(scalar_text(name), file, base) for name, file in value.items())
     return dict(_parse_one(scalar_text(one), base) for one in texts_of(value))
@@ -43,7 +43,7 @@ def _pair(name: str, file: Any, base: Base) -> tuple[str, str]:
         raise DoraSystemdError(f"cannot name a credential {quoted(name)}", hint, ExitCode.USAGE)
     path = PATH.parse(file, base)
     if path.endswith("\\"):
-        # In a unit file it would join the next line to this one.
+        # In a unit file the backslash would continue the line.
         hint = "give the file another name"
         raise DoraSystemdError(f"cannot use {quoted(path)} as credential", hint, ExitCode.USAGE)
     return name, path

@@ -1,4 +1,4 @@
-"""What a setting is, and the kinds of values that settings have."""
+"""Defines settings, and the kinds of their values."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -23,20 +23,20 @@ from dora_systemd.values import (
 T = TypeVar("T")
 Scalar = str | int | float | bool
 Base = PurePath | None
-"""The directory that relative paths start from, or None to leave them alone."""
+"""The directory that relative paths start from, or None to keep them relative."""
 
 
 @dataclass(frozen=True)
 class Kind(Generic[T]):
     """One kind of value.
 
-    schema: what a settings file may hold, as a type for pydantic.
+    schema: what a settings file may contain, as a type for pydantic.
     expected: the same in words, for messages.
-    parse: from a flag's or variable's text, a sequence of such texts, or a settings file's value.
-    format: the text that parse gives the same value for, or one text each for repeatable kinds.
+    parse: from the text of a flag or variable, a sequence of texts, or a settings file's value.
+    format: the text from which parse makes the same value; several texts for repeatable kinds.
     is_flag: `--x` and `--no-x` without a value.
     is_repeatable: the flag may be given more than once.
-    merge: the value of a less and of a more important source in one; None: the latter alone holds.
+    merge: joins the values of two sources, higher precedence last; None: only the latter counts.
     """
 
     schema: Any
@@ -56,10 +56,10 @@ class Setting(Generic[T]):
     help: one sentence, for --help and the manual.
     flags: its options, the long one first; a kind with is_flag has `--no-...` as well.
     variable: the environment variable, or "".
-    per_node: may stand below `nodes: NODE:` of a settings file too.
-    property: the systemd property it becomes as it is, as in a unit file, or "".
-    root_only: whoever sets it has root read, run or give something: in system scope a settings
-        file may hold it only if root alone can have written it.
+    per_node: also valid below `nodes: NODE:` in a settings file.
+    property: the systemd property with the same value, as in a unit file, or "".
+    root_only: the setting makes root read, run or grant something. In system scope it is only valid
+    in a settings file that root alone can have written.
     """
 
     name: str
@@ -75,7 +75,7 @@ class Setting(Generic[T]):
 
 
 def scalar_text(value: Scalar) -> str:
-    """A scalar of YAML as the text that its author sees: true, 1, 0.5, text."""
+    """A YAML scalar as the author sees it: true, 1, 0.5, text."""
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
@@ -94,13 +94,13 @@ def _parse_path(value: Scalar, base: Base) -> str:
 
 
 def _parse_program(value: Scalar, base: Base) -> str:
-    """A path, or a bare name that is looked up in PATH."""
+    """A path, or a program name to look up in PATH."""
     text = _parse_text(value, None)
     return _parse_path(text, base) if "/" in text else text
 
 
 def texts_of(value: Any) -> Sequence[Any]:
-    """What a repeatable flag or a settings file gives: many values, or one that stands alone."""
+    """The values of a repeatable flag or a settings file: a list, or a single value."""
     return value if isinstance(value, list | tuple) else [value]
 
 
@@ -116,7 +116,7 @@ def _parse_environment(value: Any, base: Base) -> Mapping[str, str]:
 
 
 def _parse_properties(value: Any, base: Base) -> tuple[str, ...]:
-    """Assignments KEY=VALUE; the values themselves are read by the table of properties."""
+    """Assignments KEY=VALUE; the table of properties parses the values."""
     del base
     if isinstance(value, Mapping):
         return tuple(

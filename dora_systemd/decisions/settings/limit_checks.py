@@ -1,4 +1,4 @@
-"""Whether limits can be kept: the controllers that they need, and the size of the machine."""
+"""Checks that limits can be enforced: required controllers, and the size of the machine."""
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -25,12 +25,12 @@ _CONTROLLERS = {
     **dict.fromkeys(("IOReadBandwidthMax", "IOWriteBandwidthMax"), "io"),
     **dict.fromkeys(("IOReadIOPSMax", "IOWriteIOPSMax"), "io"),
 }
-"""Keys of a unit that do nothing without a controller, see systemd.resource-control(5)."""
+"""Keys of a unit that need a controller, see systemd.resource-control(5)."""
 
 
 @dataclass(frozen=True)
 class Machine:
-    """What there is to share: memory in bytes, processors, and numbers for tasks."""
+    """The machine's size: memory in bytes, number of processors, and maximum tasks."""
 
     memory: int
     cores: int
@@ -38,7 +38,7 @@ class Machine:
 
 
 def settings_node_limits(settings: Settings) -> tuple[NodeLimits, ...]:
-    """The limits of all nodes: those of settings files, over them those of `node_limit`."""
+    """The limits of all nodes: those of settings files, overridden by `node_limit`."""
     given = settings[NODE_LIMIT]
     return merge_node_limits(_of_files(settings), given)
 
@@ -50,7 +50,7 @@ def _of_files(settings: Settings) -> Iterator[NodeLimits]:
 
 
 def needed_controllers(properties: Properties, nodes: Iterable[NodeLimits]) -> dict[str, str]:
-    """The controllers that limits need, each with one of the limits in words."""
+    """The controllers that limits need, each with one of these limits in words."""
     needed = {
         _CONTROLLERS[slot]: f"{slot}="
         for slot, one in properties.items()
@@ -64,9 +64,9 @@ def needed_controllers(properties: Properties, nodes: Iterable[NodeLimits]) -> d
 
 
 def check_controllers(needed: Mapping[str, str], available: Collection[str], is_user: bool) -> None:
-    """Raise DoraSystemdError (NO_SYSTEMD) unless all controllers are there: no limit is pretended.
+    """Raise DoraSystemdError (NO_SYSTEMD) unless all required controllers exist.
 
-    available: the controllers that the manager of the unit has itself.
+    available: the controllers of the unit's manager.
     """
     for controller, what in needed.items():
         if controller not in available:
@@ -81,7 +81,7 @@ def check_controllers(needed: Mapping[str, str], available: Collection[str], is_
 def size_warnings(
     limits: Mapping[str, int | None], nodes: Iterable[NodeLimits], machine: Machine
 ) -> tuple[str, ...]:
-    """One warning for each limit that is more than there is. limits: of the dataflow, by word."""
+    """A warning for each limit above the machine's size. limits: of the dataflow, by word."""
     own = {word: value for word, value in limits.items() if value is not None}
     found = list(_too_large("the dataflow", own, machine))
     for one in nodes:
@@ -97,7 +97,7 @@ def use_warnings(
     whole: int | None,
     held: Mapping[str, int | None],
 ) -> tuple[str, ...]:
-    """One warning for each limit of memory that is less than what is in use now.
+    """A warning for each memory limit below the current usage.
 
     limits: of the dataflow, by word. whole, held: bytes in use by it and by each node.
     """

@@ -56,7 +56,7 @@ def _limit_setting(key: str) -> Setting[int | None]:
         metavar="WEIGHT" if is_weight else _METAVARS[limit.controller],
         per_node=True,
         property=limit.property,
-        # A share is taken from all others on the machine.
+        # A higher weight takes resources from all others on the machine.
         root_only=is_weight,
     )
 
@@ -75,7 +75,7 @@ def _parse_nice(value: Any, base: Base) -> int:
 
 
 def _parse_realtime(value: Any, base: Base) -> str:
-    """POLICY:PRIORITY, of which POLICY may be left out, see sched(7)."""
+    """POLICY:PRIORITY, or PRIORITY, see sched(7)."""
     del base
     text = scalar_text(value).strip()
     match = _REALTIME.fullmatch(text)
@@ -87,7 +87,7 @@ def _parse_realtime(value: Any, base: Base) -> str:
 
 
 def _parse_devices(value: Any, base: Base) -> tuple[str, ...]:
-    """Devices as DeviceAllow= has them: a path or a group, and what is allowed."""
+    """Devices as for DeviceAllow=: a path or a group, and the permissions."""
     del base
     return tuple(_parse_device(text) for text in _texts(value))
 
@@ -170,6 +170,6 @@ LIVE_SETTINGS: tuple[Setting[Any], ...] = (
     *(CPU_LIMIT, MEMORY_LIMIT, MEMORY_HIGH, SWAP_LIMIT, TASKS_LIMIT, CPU_WEIGHT, IO_WEIGHT),
     NODE_LIMIT,
 )
-"""What can be changed while the dataflow runs."""
+"""Settings that can be changed while the dataflow is running."""
 
 LIMIT_SETTINGS: tuple[Setting[Any], ...] = (*LIVE_SETTINGS, NICE, REALTIME, DEVICE)

@@ -1,4 +1,4 @@
-"""The limits on log lines that the settings of a dataflow ask for."""
+"""The rate limits of log lines from settings."""
 
 from dora_systemd.decisions.cell.line_rates import RateLimits, merge_rates
 from dora_systemd.decisions.settings.resolve import Settings
@@ -6,7 +6,7 @@ from dora_systemd.decisions.settings.table import LOG_RATE_LIMIT
 
 
 def log_rates(settings: Settings) -> RateLimits:
-    """Those that were given by name or for all, below them those of `nodes:` in files.
+    """The limits of `log_rate`, which take precedence over those of `nodes:` in files.
 
     Raises DoraSystemdError (BAD_INPUT).
     """

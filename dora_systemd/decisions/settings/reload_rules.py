@@ -1,4 +1,4 @@
-"""From settings to what the runner is told about reloads."""
+"""Turns settings into the runner's options for hot reload."""
 
 from collections.abc import Iterator
 
@@ -15,7 +15,7 @@ from dora_systemd.decisions.settings.resolve import DEFAULT_SOURCE, Settings
 
 
 def hot_reload(settings: Settings, root: str) -> HotReload:
-    """The settings of reloads; patterns are relative to `root`, the working directory.
+    """The options for hot reload; patterns are relative to `root`, the working directory.
 
     Raises DoraSystemdError (USAGE) for an absolute pattern outside of it.
     """
@@ -39,7 +39,7 @@ def _replace_words(settings: Settings) -> Iterator[tuple[str, str]]:
 
 
 def reload_warnings(settings: Settings) -> Iterator[str]:
-    """One for each setting of hot reload that is given although it is off."""
+    """A warning for each hot reload setting that has no effect because it is off."""
     if settings[HOT_RELOAD]:
         return
     for setting in RELOAD_SETTINGS:

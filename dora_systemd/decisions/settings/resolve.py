@@ -1,4 +1,4 @@
-"""Where the value of each setting comes from: flag, variable, settings file or its default."""
+"""Resolves the value of each setting: from flags, variables, settings files or its default."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,22 +14,21 @@ from dora_systemd.values import shown
 
 T = TypeVar("T")
 Given = tuple[str, Any]
-"""A source as messages name it, and the value that it gives."""
+"""A source's name for messages, and its value."""
 
 DEFAULT_SOURCE = "default"
 
 MAX_JSON = 1024 * 1024
-"""Bytes of a settings file once its anchors are written out."""
+"""Maximum bytes of a settings file with anchors expanded."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """Every setting's value and where it comes from; `settings[VENV]` has the type of VENV.
+    """The values of all settings and their sources; `settings[VENV]` has the type of VENV.
 
-    sources: a flag, a variable's name, a file's path or DEFAULT_SOURCE by name of the setting.
-    nodes: by node id, the per-node values by name of the setting.
-    table: the settings that there are.
-    lent: environment files that only somebody else than root names, in system scope.
+    sources: by name of the setting: a flag, a variable's name, a file's path or DEFAULT_SOURCE.
+    nodes: by node id, the per-node values by name of the setting. table: the existing settings.
+    lent: in system scope, environment files that only others than root name.
     """
 
     values: Mapping[str, Any]
@@ -42,7 +41,7 @@ class Settings:
         return cast(T, self.values[setting.name])
 
     def source(self, setting: Setting[Any]) -> str:
-        """Where the value of `setting` comes from, for messages and `show`."""
+        """The source of the value of `setting`, for messages and `show`."""
         return self.sources[setting.name]
 
 
@@ -52,13 +51,13 @@ def resolve_settings(
     files: Sequence[tuple[str, object]],
     table: Sequence[Setting[Any]] = SETTINGS,
 ) -> Settings:
-    """Every setting from flag, DORA_* variable, files (the most important first) or its default.
+    """Every setting from flags, DORA_* variables, files (highest precedence first) or its default.
 
     flags: raw values by name of the setting: a text, a sequence of texts, a boolean, or None and ()
     for a flag that was not given. environment: the caller's variables. files: pairs of the file's
-    absolute path and the document in it, None if empty; relative paths in it start beside it.
-    Variables of `env` merge key by key; lists of files and of properties are joined, the most
-    important last. Raises DoraSystemdError: USAGE for flags and variables, BAD_INPUT for files.
+    absolute path and its document, None if empty; relative paths in it start beside the file.
+    Variables of `env` merge key by key; lists of files and of properties are joined, highest
+    precedence last. Raises DoraSystemdError: USAGE for flags and variables, BAD_INPUT for files.
     """
     documents = [(source, check_document(source, document, table)) for source, document in files]
     values: dict[str, Any] = {}
@@ -76,12 +75,12 @@ def resolve_settings(
 def check_document(
     source: str, document: object, table: Sequence[Setting[Any]] = SETTINGS
 ) -> Mapping[str, Any]:
-    """The settings file `document` without the keys that are empty.
+    """The settings file `document` without empty keys.
 
-    Raises DoraSystemdError (BAD_INPUT) with file and key when it is not a mapping, a key is unknown
-    or a value is of another type than its setting has.
+    Raises DoraSystemdError (BAD_INPUT) with file and key if it is not a mapping, a key is unknown,
+    or a value has the wrong type.
     """
-    # Only a command that meets a settings file pays for pydantic.
+    # Imported late: only settings files need pydantic.
     from dora_systemd.decisions.settings.schema import settings_model, validation_error
 
     if document is None:
@@ -105,7 +104,7 @@ def _from_flag(setting: Setting[Any], flags: Mapping[str, object]) -> Iterator[G
 
 
 def _from_variable(setting: Setting[Any], environment: Mapping[str, str]) -> Iterator[Given]:
-    # An empty variable is how shells say that it is not set.
+    # For shells, an empty variable usually means unset.
     value = environment.get(setting.variable, "") if setting.variable else ""
     if value:
         yield setting.variable, _parsed(setting, value, setting.variable, ExitCode.USAGE)
@@ -135,7 +134,7 @@ def _parsed(
 
 
 def _merged(setting: Setting[Any], given: Sequence[Given]) -> Given:
-    """The value of all sources together, the most important last, and where it comes from."""
+    """The joined value of all sources, highest precedence last, and its source."""
     if not given:
         return DEFAULT_SOURCE, setting.default
     merge = setting.kind.merge
@@ -148,7 +147,7 @@ def _merged(setting: Setting[Any], given: Sequence[Given]) -> Given:
 def _resolve_nodes(
     documents: Sequence[tuple[str, Mapping[str, Any]]], table: Sequence[Setting[Any]]
 ) -> dict[str, dict[str, Any]]:
-    """The per-node values of all files, the most important file first in `documents`."""
+    """The per-node values of all files; `documents` has the highest precedence first."""
     settings = {setting.name: setting for setting in table if setting.per_node}
     nodes: dict[str, dict[str, Any]] = {}
     for source, document in reversed(documents):

@@ -1,4 +1,4 @@
-"""From settings to restart policies, and to what systemd is told of them."""
+"""Turns settings into restart policies, for the runner and for systemd."""
 
 from collections.abc import Iterator, Mapping
 
@@ -23,13 +23,13 @@ _FIELDS: Mapping[str, str] = {
 
 
 def restart_policy(settings: Settings) -> RestartPolicy:
-    """The policy of the dataflow, and of its nodes that state none."""
+    """The policy of the dataflow, and of its nodes without one."""
     values = {_FIELDS[one.name]: settings[one] for one in RESTART_SETTINGS if one.name in _FIELDS}
     return with_values(DEFAULT, values)
 
 
 def node_policies(settings: Settings) -> tuple[tuple[str, RestartPolicy], ...]:
-    """The policies of the nodes that settings files name, on top of the dataflow's."""
+    """The policies of nodes in settings files, based on that of the dataflow."""
     base = restart_policy(settings)
     found = []
     for node, given in settings.nodes.items():
@@ -40,7 +40,7 @@ def node_policies(settings: Settings) -> tuple[tuple[str, RestartPolicy], ...]:
 
 
 def restart_warnings(settings: Settings) -> Iterator[str]:
-    """One for each setting of restarts that is given although nothing restarts."""
+    """A warning for each restart setting that has no effect because nothing restarts."""
     policies = [settings[RESTART_POLICY], *(policy.policy for _, policy in node_policies(settings))]
     if any(policy != "no" for policy in policies):
         return

@@ -1,4 +1,4 @@
-"""The settings that say what a dataflow may reach."""
+"""The settings of the sandbox."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -1,4 +1,4 @@
-"""The schema of settings files, made from the table of settings. The only importer of pydantic."""
+"""The schema of settings files, from the table of settings. Only this module imports pydantic."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -11,14 +11,14 @@ from dora_systemd.suggestions import did_you_mean
 from dora_systemd.values import quoted, shown
 
 NODES = "nodes"
-"""The key below which a settings file has per-node settings: `nodes: NODE: KEY: VALUE`."""
+"""The key of per-node settings in a settings file: `nodes: NODE: KEY: VALUE`."""
 
-# strict: a list is no text and a text no boolean; the kinds read texts themselves.
+# strict: pydantic must not convert between lists, texts and booleans; the kinds parse texts.
 _CONFIG = ConfigDict(extra="forbid", strict=True)
 
 
 def settings_model(table: Sequence[Setting[Any]]) -> type[BaseModel]:
-    """The model of a settings file: every key optional, unknown keys refused."""
+    """The model of a settings file: every key is optional, unknown keys are errors."""
     fields = _fields(table)
     of_nodes = [setting for setting in table if setting.per_node]
     if of_nodes:
@@ -31,7 +31,7 @@ def settings_model(table: Sequence[Setting[Any]]) -> type[BaseModel]:
 def validation_error(
     source: str, error: ValueError, table: Sequence[Setting[Any]]
 ) -> DoraSystemdError:
-    """The first of the mistakes that pydantic found in the file `source`, in one line."""
+    """The first error that pydantic found in the file `source`, in one line."""
     if not isinstance(error, ValidationError):
         message = f"cannot use {shown(source)}: it is not a settings file"
         return DoraSystemdError(message, str(error), ExitCode.BAD_INPUT)

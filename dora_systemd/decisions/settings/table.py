@@ -1,7 +1,7 @@
 """The settings of a dataflow, one declaration each.
 
-Flags, settings-file keys, environment variables and manual entries derive from this table or are
-checked against it. A new setting is one more assignment.
+Flags, keys of settings files, environment variables and manual entries are derived from this table
+or checked against it. A new setting is one more assignment.
 """
 
 from collections.abc import Mapping
@@ -141,8 +141,8 @@ LOG_RATE_LIMIT = Setting[RateLimits](
     per_node=True,
 )
 
-# All of the above, in that order, so that a setting is declared in one place only, and then those
-# of other modules.
+# All settings above, in this order, so that a setting is declared in one place only; then those of
+# other modules.
 SETTINGS: tuple[Setting[Any], ...] = (
     *(value for value in list(globals().values()) if isinstance(value, Setting)),
     *LIMIT_SETTINGS,

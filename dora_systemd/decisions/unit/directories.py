@@ -1,4 +1,4 @@
-"""Where unit files belong. `list` needs this, so it imports nothing that costs time."""
+"""The directories of unit files. `list` needs this module: it imports only what loads quickly."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -9,7 +9,7 @@ _HINT = "systemctl show --property UnitPath; is SYSTEMD_UNIT_PATH set for system
 
 
 class UnitDirectories(NamedTuple):
-    """Where unit files of the admin (or the user) are, and those that a reboot ends."""
+    """The directory of the admin's (or user's) unit files, and the one that a reboot empties."""
 
     persistent: str
     runtime: str
@@ -20,7 +20,7 @@ def unit_directories(
 ) -> UnitDirectories:
     """The two directories of a manager, from its property UnitPath.
 
-    runtime_root: what is below it is gone after a reboot. Raises DoraSystemdError.
+    runtime_root: a reboot empties everything below it. Raises DoraSystemdError.
     """
     ending = "/systemd/user" if is_user else "/systemd/system"
     fleeting = ("/run/", f"{runtime_root}/")

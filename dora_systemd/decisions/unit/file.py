@@ -1,4 +1,4 @@
-"""Unit files that outlive a run: their text, whose they are, and where they belong.
+"""Persistent unit files: their text, and whether they are ours.
 
 The text is that of systemd.unit(5), made from what `properties` gives or from what systemd itself
 wrote for a transient unit: both say the same of the same dataflow.
@@ -16,7 +16,7 @@ from dora_systemd.decisions.properties.table import TABLE
 from dora_systemd.errors import DoraSystemdError
 
 BOOT_TARGET = "dora.target"
-"""Starts the enabled dataflows at boot where it is set up; nothing waits for it."""
+"""Starts the enabled dataflows at boot, if it is installed; no other unit waits for it."""
 
 HEADER = "# Written by doractl(1). To change something: systemctl edit, see dora-systemd(7).\n"
 
@@ -25,22 +25,22 @@ _SPECIFIER = re.compile(r"%[a-zA-Z]")
 _ORDERS = ("After=default.target", "After=multi-user.target")
 _MOUNTABLE = re.compile(r"[^\x00-\x1f\x7f\"'\\]+")
 _TRANSIENT = "# This is a transient unit file"
-# How systemd 257 writes a bind mount into such a file. It quotes nothing there, and would itself
-# read other paths from a line with blanks.
+# A bind mount as systemd 257 writes it into such a file. systemd quotes nothing there, and would
+# itself read other paths from a line with blanks.
 _TRANSIENT_BIND = re.compile(r"(Bind(?:ReadOnly)?Paths)=(-?)(/[^:]*):(/[^:]*):(rbind|norbind)")
 
 
 def plain_target(is_user: bool) -> str:
-    """The target that every boot (or every start of a user's manager) reaches."""
+    """The target that every boot (or start of a user's manager) reaches."""
     return "default.target" if is_user else "multi-user.target"
 
 
 def persistent_unit(
     texts: Sequence[str], options: RunnerOptions, is_user: bool, target: str
 ) -> str:
-    """One unit file that says what `texts` (a fragment and its drop-ins) say, hung below `target`.
+    """One unit file equivalent to `texts` (a fragment and its drop-ins), wanted by `target`.
 
-    A plain target is not kept waiting for the dataflow: it comes first.
+    A plain target does not wait for the dataflow: the dataflow starts after it.
     """
     sections = _sections(texts)
     unit = sections.setdefault("Unit", [])
@@ -52,12 +52,12 @@ def persistent_unit(
 
 
 def without_install(text: str) -> str:
-    """The same unit as a file that nothing starts by itself."""
+    """The unit file without its [Install] section."""
     return _format(_sections([text]))
 
 
 def runner_of(text: str) -> RunnerOptions | None:
-    """What the runner is told in the unit file `text`; None for a file that is none of ours."""
+    """The runner's options in the unit file `text`; None if it is not one of ours."""
     lines = _sections([text]).get("Service", ())
     commands = [line.partition("=")[2] for line in lines if re.match(r"ExecStart\s*=\s*\S", line)]
     if len(commands) != 1:
@@ -71,9 +71,9 @@ def runner_of(text: str) -> RunnerOptions | None:
 
 
 def says_the_same(text: str, other: str) -> bool:
-    """Whether two unit files start the same dataflow in the same way, whichever target starts it.
+    """Whether two unit files start the same dataflow in the same way, by whatever target.
 
-    False as well where one of them holds what only its admin can have written there.
+    Also False if one of them has lines that only its admin can have written.
     """
     first = _properties(text)
     return first is not None and first == _properties(other)
@@ -97,14 +97,14 @@ def _properties(text: str) -> dict[str, Property] | None:
 
 
 def _ordered(one: Property) -> Property:
-    """The property, networks in one order: systemd keeps those as a set."""
+    """The property with sorted networks, because systemd keeps them as a set."""
     return one._replace(value=tuple(sorted(one.value))) if one.signature == "a(iayu)" else one
 
 
 def _mounts(options: RunnerOptions) -> list[str]:
-    """What has to be mounted first. Paths that this line cannot hold are mounted by then, or not.
+    """RequiresMountsFor= for the paths of the dataflow, without those that the line cannot contain.
 
-    systemd.unit(5) knows quotes there, but no escapes.
+    systemd.unit(5) supports quotes there, but no escapes.
     """
     paths = (posixpath.dirname(options.dataflow), options.working_directory)
     clean = dict.fromkeys(posixpath.normpath(path).replace("%", "%%") for path in paths)
@@ -118,7 +118,7 @@ def _format(sections: Mapping[str, Sequence[str]]) -> str:
 
 
 def _sections(texts: Sequence[str]) -> dict[str, list[str]]:
-    """The lines of all texts by section, without comments; what is for another file is left out."""
+    """The lines of all texts by section, without comments and lines that belong to another file."""
     sections: dict[str, list[str]] = {"Unit": [], "Service": []}
     for text in texts:
         name = ""
@@ -133,7 +133,7 @@ def _sections(texts: Sequence[str]) -> dict[str, list[str]]:
 
 
 def _quoted_bind(line: str) -> str:
-    """The bind mount of a transient unit so that systemd reads what it has mounted."""
+    """The bind mount of a transient unit, quoted so that systemd reads the same paths again."""
     found = _TRANSIENT_BIND.fullmatch(line.replace("%%", "%"))
     if not found:
         return line
@@ -144,9 +144,9 @@ def _quoted_bind(line: str) -> str:
 
 
 def _logical_lines(text: str) -> Iterator[str]:
-    """Lines without comments; those that end in a backslash are joined to the next."""
+    """Lines without comments; a backslash at the end joins the next line."""
     pending = ""
-    # Not splitlines: only a newline ends a line here.
+    # Not splitlines(): only a newline ends a line here.
     for raw in text.split("\n"):
         line = raw.strip(" \t\r")
         if (not line and not pending) or line.startswith(("#", ";")):

@@ -1,6 +1,6 @@
-"""The unit of a dataflow: one small builder per concern, all of them pure.
+"""Builds the unit of a dataflow with one small pure function for each concern.
 
-Keys are those of unit files; the values are typed as StartTransientUnit wants them.
+Keys are those of unit files; the values have the types of StartTransientUnit.
 """
 
 from collections.abc import Mapping
@@ -37,20 +37,18 @@ from dora_systemd.values import INFINITY, SECOND, quoted
 WATCHDOG = 30 * SECOND
 
 START_MARGIN = 10 * SECOND
-"""What TimeoutStartSec= allows beyond the pause before a restart and --start-timeout, which are
-the runner's."""
+"""What TimeoutStartSec= allows in addition to the delay before a restart and --start-timeout, which
+the runner measures itself."""
 
 
 @dataclass(frozen=True)
 class UnitContext:
-    """What the unit takes from its caller besides the runner's options.
+    """What the unit needs besides the runner's options.
 
-    python: absolute path of the interpreter that runs dora-systemd itself.
-    is_user: whether the unit is one of a user's manager.
-    user: User= in system scope; None runs everything as root.
-    environment: all of Environment=, see unit_environment.
-    credentials: absolute path by name.
-    sandbox: what the dataflow is kept from; None for nothing.
+    python: absolute path of the interpreter that runs dora-systemd itself. is_user: whether the
+    unit is one of a user's manager. user: User= in system scope; None runs everything as root.
+    environment: all of Environment=, see unit_environment. credentials: absolute path by name.
+    sandbox: None for no sandbox.
     """
 
     python: str
@@ -64,7 +62,7 @@ class UnitContext:
 def unit_properties(
     options: RunnerOptions, context: UnitContext, settings: Settings
 ) -> dict[str, Property]:
-    """Every property of the unit by key: ours, those of settings, and --property, the last word.
+    """Every property of the unit by key: ours, those of settings, and --property, which overrides.
 
     Raises DoraSystemdError (USAGE) for a property that cannot be set, and for a user other than the
     caller in user scope.
@@ -102,19 +100,19 @@ def format_unit(properties: Properties) -> str:
 
 
 def identity_properties(options: RunnerOptions) -> dict[str, Property]:
-    """What the unit is called, and its place in the tree of slices."""
+    """The description of the unit, and its slice."""
     return typed(Description=f"dora dataflow {options.name}", Slice=SLICE)
 
 
 def service_properties(options: RunnerOptions, context: UnitContext) -> dict[str, Property]:
     """The runner as the main process of a Type=notify service, see systemd.service(5).
 
-    "no-env-expand" is ":" in a unit file: a "$" in a path is a "$".
+    "no-env-expand" is ":" in a unit file: a "$" in a path stays as it is.
     """
     argv = tuple(runner_command(context.python, options))
     post = tuple(post_command(context.python, options))
     reload = tuple(reload_command(context.python))
-    # The runner names the nodes that are late; systemd ends one that cannot even do that.
+    # The runner reports late nodes itself; systemd's timeout is for a runner that hangs.
     is_endless = options.start_timeout == INFINITY
     pause = 0 if options.restart.policy == "no" else options.restart.max_delay
     most = pause + options.start_timeout + START_MARGIN
@@ -125,19 +123,19 @@ def service_properties(options: RunnerOptions, context: UnitContext) -> dict[str
         ExecStart=((argv[0], argv, ("no-env-expand",)),),
         ExecStopPost=((post[0], post, ("ignore-failure", "no-env-expand")),),
         ExecReload=((reload[0], reload, ("no-env-expand",)),),
-        # Two pipes a node: what is in them is kept when the runner is killed.
+        # Two pipes for each node, so that their content survives a kill of the runner.
         FileDescriptorStoreMax=4096,
-        # Never the project: its modules must not be found before the runner's.
+        # Never the project: Python could find its modules before the runner's.
         WorkingDirectory="/",
         TimeoutStartSec=start_timeout,
         WatchdogSec=WATCHDOG,
-        # One node out of memory is not the end of the others; the runner says what happened.
+        # An OOM kill of one node must not end the others; the runner reports it.
         OOMPolicy="continue",
     )
 
 
 def stop_properties(options: RunnerOptions) -> dict[str, Property]:
-    """SIGTERM for the runner alone, which tells dora; then SIGKILL for all, see systemd.kill(5).
+    """SIGTERM for the runner only, which tells dora; then SIGKILL for all, see systemd.kill(5).
 
     dora kills a node at 1.5 times its grace duration.
     """
@@ -145,13 +143,13 @@ def stop_properties(options: RunnerOptions) -> dict[str, Property]:
 
 
 def restart_properties(options: RunnerOptions) -> dict[str, Property]:
-    """What systemd starts again, see systemd.service(5) and StartLimitBurst= in systemd.unit(5).
+    """Automatic restarts, see systemd.service(5) and StartLimitBurst= in systemd.unit(5).
 
-    The first start counts as one: "3 restarts" are four starts.
+    The first start counts too: "3 restarts" are four starts.
     """
     policy = options.restart
-    # Of nodes that dora gave up, and of a bad dataflow, another start makes nothing better. Who
-    # runs it attached wants its end to be the end.
+    # A restart does not help nodes that dora gave up, or a dataflow that is refused. An attached
+    # dataflow that has finished stays finished.
     refused = (RunnerExit.BAD_DATAFLOW, RunnerExit.NO_ACCESS, RunnerExit.NO_DORA)
     final = (RunnerExit.NODES_FAILED, *refused, *([0] if options.attached else []))
     common = typed(RestartPreventExitStatus=(tuple(sorted(map(int, final))), ()))
@@ -160,8 +158,8 @@ def restart_properties(options: RunnerOptions) -> dict[str, Property]:
     is_endless = policy.max_restarts == INFINITY
     return common | typed(
         Restart=policy.policy,
-        # The runner itself waits longer, see runner/cell/pause.py: RestartSteps= would never
-        # forget what was long ago.
+        # The runner waits for the rest of a longer delay, see runner/cell/pause.py: RestartSteps=
+        # would count restarts forever.
         RestartSec=policy.delay,
         StartLimitIntervalSec=0 if is_endless else policy.window,
         StartLimitBurst=1 if is_endless else policy.max_restarts + 1,
@@ -169,9 +167,9 @@ def restart_properties(options: RunnerOptions) -> dict[str, Property]:
 
 
 def cgroup_properties() -> dict[str, Property]:
-    """A delegated tree with numbers and without limits, see systemd.resource-control(5).
+    """A delegated cgroup with accounting and without limits, see systemd.resource-control(5).
 
-    TasksMax: systemd's default would be an implicit limit.
+    TasksMax=infinity: systemd's default would be an implicit limit.
     """
     return typed(
         Delegate=True,
@@ -187,14 +185,14 @@ def cgroup_properties() -> dict[str, Property]:
 def memory_lock_properties() -> dict[str, Property]:
     """No limit on locked memory, see systemd.exec(5).
 
-    Dora's nodes lock 8 MiB of shared memory each for messages; with systemd's default of 8 MiB in
-    all they fall back to copying. A user's manager gives as much as it has been given itself.
+    Each node of dora locks 8 MiB of shared memory for messages. With systemd's default of 8 MiB in
+    total nodes fall back to copying. A user's manager can only grant its own limit.
     """
     return parse_property("LimitMEMLOCK=infinity")
 
 
 def directory_properties(options: RunnerOptions) -> dict[str, Property]:
-    """The cell's own directory below /run, which goes when the unit ends, see systemd.exec(5)."""
+    """The cell's own directory below /run, removed when the unit ends, see systemd.exec(5)."""
     return typed(
         RuntimeDirectory=(f"{RUNTIME_NAME}/{options.name}",),
         RuntimeDirectoryMode=0o700,
@@ -202,14 +200,14 @@ def directory_properties(options: RunnerOptions) -> dict[str, Property]:
 
 
 def environment_properties(context: UnitContext) -> dict[str, Property]:
-    """Environment= as unit_environment made it; the values are literal, "$" and "%" too."""
+    """Environment= from unit_environment; the values are literal, including "$" and "%"."""
     for key, value in context.environment.items():
         checked_variable(key, value)
     return typed(Environment=environment_entries(context.environment))
 
 
 def user_properties(context: UnitContext) -> dict[str, Property]:
-    """User= of system scope; a user's manager runs everything as that user."""
+    """User= in system scope; a user's manager runs everything as that user."""
     if context.user is None:
         return {}
     if context.is_user:
@@ -219,19 +217,20 @@ def user_properties(context: UnitContext) -> dict[str, Property]:
 
 
 def log_properties(options: RunnerOptions, context: UnitContext) -> dict[str, Property]:
-    """The journal; the last two have no effect in a user's manager, see systemd.exec(5)."""
+    """The journal. The last two have no effect in a user's manager, see systemd.exec(5)."""
     common = typed(StandardOutput="journal", StandardError="journal", SyslogIdentifier=options.name)
     if context.is_user:
         return common
     fields = (f"DORA_DATAFLOW={options.uuid}", f"DORA_DATAFLOW_NAME={options.name}")
     extra = tuple(field.encode() for field in fields)
-    # No limit: systemd 257 does not pass 0 on to journald, which then applies its own.
+    # A limit that is never reached: systemd 257 does not pass 0 on to journald, which then applies
+    # its own.
     limits = typed(LogRateLimitIntervalSec=SECOND, LogRateLimitBurst=500_000_000)
     return common | typed(LogExtraFields=extra) | limits
 
 
 def settings_properties(settings: Settings) -> dict[str, Property]:
-    """The properties of those settings that are one, such as MemoryMax=, and have a value."""
+    """The properties of settings with a `property` and a value, such as MemoryMax=."""
     properties: dict[str, Property] = {}
     for setting in settings.table:
         value = settings[setting]
@@ -264,7 +263,7 @@ def _given_property(assignment: str, settings: Settings) -> dict[str, Property]:
 
 
 def typed(**values: Any) -> dict[str, Property]:
-    """Properties by key of the unit file, from values of the types they have on D-Bus."""
+    """Properties by key of the unit file, from values with their types on D-Bus."""
     properties = {}
     for key, value in values.items():
         name, kind = TABLE[key].choices[-1]

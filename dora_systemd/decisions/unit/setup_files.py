@@ -1,7 +1,7 @@
-"""What `doractl setup` puts where: the files that the Debian package has, for a pip install.
+"""The files that `doractl setup` installs: those of the Debian package, for a pip install.
 
-System-wide they go where systemd, man and the shells look for what the admin has installed; for a
-user below the user's own data directory, see file-hierarchy(7).
+System-wide they go to the directories where systemd, man and the shells search for local files; for
+a user, below the user's data directory, see file-hierarchy(7).
 """
 
 from collections.abc import Iterable, Sequence
@@ -11,14 +11,14 @@ from dora_systemd.decisions.properties.syntax import quote_word
 
 SYSTEM_ROOT = "/"
 PACKAGED_UNIT = "/usr/lib/systemd/system/dora.slice"
-"""There if a package has put everything in place."""
+"""Exists if a package has installed all files."""
 
 _MARKS = ("dora-systemd", "doractl(1)", "dora dataflows")
-"""One of them is in every file of ours, of any version."""
+"""Every file of ours, of any version, contains one of these."""
 
 
 class SetupFile(NamedTuple):
-    """A file of the project and its place below the root: either its text or, with `link`, a link.
+    """A file of the project, and its path below the root: with a text or, with `link`, as a link.
 
     source: its kind (a directory of the project) and its name.
     """
@@ -32,13 +32,13 @@ _UNITS = ("dora.slice", "dora.target", "dora-gateway.socket", "dora-gateway.serv
 SANDBOX = SetupFile(
     ("templates", "dora-gateway-sandbox.conf"), "dora-gateway.service.d/10-sandbox.conf"
 )
-"""What only the system's manager can do; its place is below the directory of units."""
+"""Only works in the system manager; its path is below the directory of units."""
 PACKAGED_PYTHON = "/usr/bin/python3"
 _BASH = SetupFile(("completions", "doractl"), "share/bash-completion/completions/doractl")
 _ZSH = SetupFile(("completions", "_doractl"), "share/zsh/site-functions/_doractl")
 _FISH = SetupFile(("completions", "doractl.fish"), "share/fish/vendor_completions.d/doractl.fish")
 _LOCAL = "usr/local"
-# Below /usr/local fish looks only where XDG_DATA_DIRS says so, which nothing sets on a server.
+# Below /usr/local, fish only searches directories of XDG_DATA_DIRS, which servers do not set.
 _FISH_OF_ALL = _FISH._replace(place="etc/fish/completions/doractl.fish")
 _SYSTEM_ONLY = (
     SetupFile(("templates", "dora-systemd.catalog"), "lib/systemd/catalog/dora-systemd.catalog"),
@@ -49,12 +49,12 @@ _SYSTEM_ONLY = (
 
 
 def setup_files(is_user: bool, manuals: Iterable[str]) -> list[SetupFile]:
-    """All files of one scope. manuals: names of the manual pages that there are."""
+    """All files of one scope. manuals: names of the existing manual pages."""
     common = [_BASH]
     common += [SetupFile(("man", one), f"share/man/man{one[-1]}/{one}") for one in sorted(manuals)]
     if is_user:
         files = [*_units("share/systemd/user", "default.target"), *common, _FISH]
-        # All of a user's are below one directory, which is called share itself.
+        # A user's files are all below one directory, which is itself called share.
         return [one._replace(place=one.place.removeprefix("share/")) for one in files]
     users = _units("lib/systemd/user", "default.target")
     system = _units("lib/systemd/system", "multi-user.target")
@@ -63,18 +63,18 @@ def setup_files(is_user: bool, manuals: Iterable[str]) -> list[SetupFile]:
 
 
 def gateway_files(is_user: bool) -> list[SetupFile]:
-    """What the gateway needs, with places below a directory of units."""
+    """The files that the gateway needs, with paths below a directory of units."""
     units = [SetupFile(("templates", unit), unit) for unit in _UNITS if "gateway" in unit]
     return units if is_user else [*units, SANDBOX]
 
 
 def with_interpreter(text: str, python: str) -> str:
-    """A unit file of ours for another Python than that of the package."""
+    """A unit file of ours for another Python interpreter than the package's."""
     return text.replace(f"ExecStart={PACKAGED_PYTHON} ", f"ExecStart={quote_word(python)} ")
 
 
 def is_ours(text: str) -> bool:
-    """Whether a file that is in the way is one of ours, perhaps of another version."""
+    """Whether an existing file is one of ours, possibly of another version."""
     return any(mark in text for mark in _MARKS)
 
 

@@ -1,4 +1,4 @@
-"""What older versions of systemd lack: dropped from a unit in a pass of its own, with warnings."""
+"""Drops properties that older versions of systemd lack, with warnings."""
 
 import re
 from collections.abc import Iterable, Mapping
@@ -10,10 +10,10 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import quoted
 
 Told = tuple[str, str, Any]
-"""A property as it goes over D-Bus: name, signature and value."""
+"""A property on D-Bus: name, signature and value."""
 
 MIN_VERSION = 252
-"""Debian 12's: the first with all that a cell cannot do without."""
+"""The version in Debian 12: the first one with everything that a cell needs."""
 
 _ADDED: Mapping[int, tuple[str, ...]] = {
     253: ("MemoryZSwapMax", "LogFilterPatterns"),
@@ -31,29 +31,28 @@ _ADDED: Mapping[int, tuple[str, ...]] = {
         *("PrivateUsersEx", "PrivatePIDs", "ManagedOOMMemoryPressureDurationUSec"),
     ),
 }
-"""Names on D-Bus by the version that has them first: HISTORY in org.freedesktop.systemd1(5)."""
+"""Names on D-Bus by the first version that has them: HISTORY in org.freedesktop.systemd1(5)."""
 
 _SINCE = {name: version for version, names in _ADDED.items() for name in names}
 
 _KEEPS_COMMANDS = 257
-"""The first version seen to write the command lines of a transient unit so that it can read them.
-
-252 writes ExecStartEx=, which it does not know, and "\\$" for a "$": at the next daemon-reload of
-anybody the unit has no command line, or another one."""
+r"""The first version tested that can read the command lines of transient units back. 252 writes
+ExecStartEx=, which it does not know, and "\\$" for a "$": after the next daemon-reload the unit has
+no command line, or a different one."""
 
 _PLAIN_FLAGS = frozenset({"ignore-failure", "no-env-expand"})
 
-# The runner makes the group and moves into it where systemd does not.
+# The runner creates the group and moves into it if systemd does not.
 _REPLACED = frozenset({"DelegateSubgroup"})
 
-# The sandbox has it where it can, which dora-systemd(7) says.
+# The sandbox uses it if possible, as dora-systemd(7) says; no warning if not.
 _WELCOME = {"PrivateUsers": "identity"}
 
 
 def drop_unsupported(
     properties: Properties, systemd_version: int
 ) -> tuple[dict[str, Property], tuple[str, ...]]:
-    """The properties that this systemd knows, and one warning for each other one that matters.
+    """The properties that this systemd supports, and a warning for each other one that matters.
 
     Raises DoraSystemdError (NO_SYSTEMD) below version 252.
     """
@@ -73,15 +72,15 @@ def drop_unsupported(
 
 
 def lacking(systemd_version: int) -> list[str]:
-    """Names on D-Bus of the properties that this systemd does not know."""
+    """Names on D-Bus of the properties that this systemd does not support."""
     later = (names for version, names in _ADDED.items() if version > systemd_version)
     return [name for names in later for name in names]
 
 
 def transient_commands(properties: Iterable[Told], systemd_version: int) -> list[Told]:
-    """The properties of a transient unit, with command lines that outlive a daemon-reload.
+    """The properties of a transient unit, with command lines that survive a daemon-reload.
 
-    Raises DoraSystemdError (USAGE) for those that do not with this version.
+    Raises DoraSystemdError (USAGE) for command lines that do not, with this version.
     """
     if systemd_version >= _KEEPS_COMMANDS:
         return [*properties]
@@ -89,7 +88,7 @@ def transient_commands(properties: Iterable[Told], systemd_version: int) -> list
 
 
 def _plain_commands(one: Told, systemd_version: int) -> Told:
-    """ExecStart for ExecStartEx: without a "$" they are the same."""
+    """ExecStart instead of ExecStartEx: without a "$" they are equivalent."""
     name, signature, commands = one
     if signature != "a(sasas)":
         return one
@@ -104,5 +103,5 @@ def _plain_commands(one: Told, systemd_version: int) -> Told:
 
 
 def _since(one: Property) -> int:
-    """The first version of systemd that takes this property."""
+    """The first version of systemd that supports this property."""
     return _SINCE.get(one.name.removesuffix("Scale"), MIN_VERSION)

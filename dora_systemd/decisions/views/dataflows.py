@@ -1,4 +1,4 @@
-"""What systemd and the runner say about a dataflow, in the words and tables of `doractl list`."""
+"""Formats dataflows for `doractl list`, from facts of systemd and the runner."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -26,16 +26,16 @@ _BY_STAGE = {"degraded": DEGRADED, "stopping": STOPPING}
 
 UNKNOWN = "-"
 UNREADABLE = "?"
-"""For the nodes of a dataflow whose node table is not what its runner writes."""
+"""For the nodes of a dataflow whose node table is not valid."""
 SHORTEST_PREFIX = 8
 
 
 class NodeRow(NamedTuple):
-    """One line of `list SELECTOR`. Sizes in bytes, cpu in percent of one processor, None: unknown.
+    """One row of `list SELECTOR`. Sizes in bytes, cpu in percent of one processor, None: unknown.
 
     cpu_limit, memory_limit: the group's own, or None. throttled: the percentage of the time in
-    which it had to wait for its CPU limit, None without one. since: of its last change of state,
-    CLOCK_REALTIME µs, 0: not known.
+    which its CPU limit throttled it, None without one. since: time of its last change of state,
+    CLOCK_REALTIME µs, 0: unknown.
     """
 
     node: str
@@ -54,10 +54,10 @@ class NodeRow(NamedTuple):
 
 
 class DataflowRow(NamedTuple):
-    """One line of `list`. uptime in µs; started, ended in CLOCK_REALTIME µs, 0: not known.
+    """One row of `list`. uptime in µs; started, ended in CLOCK_REALTIME µs, 0: unknown.
 
-    The numbers are those of NodeRow, for the whole dataflow.
-    enabled: whether a boot starts it. problem: why its node table is not believed, or "".
+    Other fields are as in NodeRow, for the whole dataflow. enabled: whether it is started at boot.
+    problem: why its node table is not valid, or "".
     """
 
     uuid: str
@@ -85,10 +85,10 @@ class DataflowRow(NamedTuple):
 
 
 def status_word(active: str, sub: str, stage: str = "") -> str:
-    """The word for a dataflow.
+    """The status of a dataflow in one word.
 
-    active, sub: ActiveState and SubState of its unit, see org.freedesktop.systemd1(5).
-    stage: the runner's own, or "" where that cannot be read.
+    active, sub: ActiveState and SubState of its unit, see org.freedesktop.systemd1(5). stage: the
+    runner's own, or "" if that is not readable.
     """
     if sub.startswith("auto-restart") or (active == "activating" and stage == "restarting"):
         return RESTARTING
@@ -97,7 +97,7 @@ def status_word(active: str, sub: str, stage: str = "") -> str:
 
 
 def format_uptime(duration: int | None) -> str:
-    """`duration` µs as "00:05:32", with "1d " in front from the first day on."""
+    """`duration` µs as "00:05:32", from one day on with "1d " in front."""
     if duration is None:
         return UNKNOWN
     minutes, seconds = divmod(duration // SECOND, 60)
@@ -113,18 +113,18 @@ def format_percent(percent: float | None) -> str:
 
 
 def format_memory(size: int | None, limit: int | None = None) -> str:
-    """Bytes for a table, as in "256M", or "256M/4G" where there is a limit."""
+    """Bytes for a table, as in "256M", or "256M/4G" with a limit."""
     text = UNKNOWN if size is None else format_rounded_size(size)
     return text if limit is None else f"{text}/{format_rounded_size(limit)}"
 
 
 def format_count(count: int | None) -> str:
-    """A number, or the sign for an unknown one."""
+    """A number, or the sign for unknown."""
     return UNKNOWN if count is None else str(count)
 
 
 def shortest_prefixes(uuids: Sequence[str]) -> dict[str, str]:
-    """The shortest beginning of each UUID, SHORTEST_PREFIX at least, that no other one has."""
+    """The shortest unique prefix of each UUID, at least SHORTEST_PREFIX characters."""
     return {uuid: _prefix(uuid, [one for one in uuids if one != uuid]) for uuid in uuids}
 
 
@@ -138,7 +138,7 @@ _RIGHT_ALIGNED = frozenset({"CPU%", "THROTTLED%", "MEM", "PEAK", "RESTARTS", "PI
 
 
 def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Columns two blanks apart, numbers to the right, no blank at the end of a line."""
+    """Columns with two blanks between them, numbers right-aligned, without trailing blanks."""
     lines = [header, *rows]
     widths = [max(len(line[column]) for line in lines) for column in range(len(header))]
     return "\n".join(_line(header, line, widths) for line in lines)
@@ -182,7 +182,7 @@ def _node_count(row: DataflowRow) -> str:
 
 
 def format_nodes(rows: Sequence[NodeRow]) -> str:
-    """The node table of `doractl list SELECTOR`; THROTTLED% is there if any node has a limit."""
+    """The node table of `doractl list SELECTOR`; with THROTTLED% if any node has a CPU limit."""
     cells = [_node_cells(row) for row in rows]
     is_limited = any(row.cpu_limit is not None for row in rows)
     header = [title for title in cells[0] if is_limited or title != _THROTTLED]
@@ -216,7 +216,7 @@ _WITH_REASON = (FAILED, DEGRADED, RESTARTING)
 
 
 def format_dataflow(row: DataflowRow) -> str:
-    """`doractl list SELECTOR`: the dataflow line by line, then the table of its nodes."""
+    """The output of `doractl list SELECTOR`: the dataflow's values, then the table of its nodes."""
     facts = (
         ("Dataflow", row.uuid),
         ("Name", row.name),
@@ -253,19 +253,19 @@ def _memory_words(row: DataflowRow) -> str:
 
 
 def local_time(moment: int) -> str:
-    """CLOCK_REALTIME µs as "2026-01-15 13:00:00", in the local time zone; 0 is not known."""
+    """CLOCK_REALTIME µs as "2026-01-15 13:00:00" in the local time zone; 0 is unknown."""
     if not moment:
         return UNKNOWN
     return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(moment / SECOND))
 
 
 def is_up_word(row: DataflowRow) -> bool:
-    """Whether the dataflow runs, or is on its way up or down."""
+    """Whether the dataflow is running, starting or stopping."""
     return row.status in UP_WORDS
 
 
 def row_values(row: DataflowRow) -> dict[str, Any]:
-    """The row for JSON: exact numbers, their units in the keys, null for what is not known."""
+    """The row for JSON: exact numbers with units in the keys, null for unknown."""
     return {**_json_values(row), "nodes": [_json_values(node) for node in row.nodes]}
 
 

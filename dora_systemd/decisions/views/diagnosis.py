@@ -1,4 +1,4 @@
-"""What the facts that `doractl doctor` has gathered mean; pure, see verbs/doctor.py."""
+"""Turns facts into findings of `doractl doctor`. Pure; verbs/doctor.py collects the facts."""
 
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -10,13 +10,13 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.values import format_duration, parse_duration
 
 CONTROLLERS = {"cpu": "CPU", "memory": "memory", "pids": "tasks", "io": "I/O"}
-"""What limits need, see systemd.resource-control(5)."""
+"""Controllers that limits need, see systemd.resource-control(5)."""
 
 DORA_PORTS = {
     6013: "the dora command of 1.0 and newer",
     53290: "the dora command before 1.0",
 }
-"""Where a coordinator is looked for, and by whom, when nobody says where."""
+"""Default ports of a coordinator, and the dora versions that use them."""
 
 _CELL = re.compile(r"/dora-[^/]+\.service(/|$)")
 _ENGINES = ("coordinator", "daemon")
@@ -26,7 +26,7 @@ _RATE_DEFAULTS = {"RateLimitIntervalSec": "30s", "RateLimitBurst": "10000"}
 
 @dataclass(frozen=True)
 class Process:
-    """One process. group: its cgroup. is_node: dora's daemon has started it, or a parent of it."""
+    """One process. group: its cgroup. is_node: started by dora's daemon, or by such a process."""
 
     pid: int
     parent: int
@@ -36,7 +36,7 @@ class Process:
 
     @property
     def engine(self) -> str:
-        """ "coordinator" or "daemon" for dora's own, else ""."""
+        """ "coordinator" or "daemon" for dora's own processes, else ""."""
         words = list(self.command[:4])
         programs = (n for n, word in enumerate(words[:3]) if word.rpartition("/")[2] == "dora")
         verbs = (words[n + 1] for n in programs if n + 1 < len(words))
@@ -44,7 +44,7 @@ class Process:
 
     @property
     def is_in_cell(self) -> bool:
-        """Whether it belongs to a dataflow of ours, in whichever manager."""
+        """Whether it belongs to a dataflow of ours, in any manager."""
         return bool(_CELL.search(self.group))
 
     def __str__(self) -> str:
@@ -54,7 +54,7 @@ class Process:
 
 
 def judge_systemd(version: str) -> Finding:
-    """Whether systemd of this version has all that the properties of a dataflow may need."""
+    """Whether this version of systemd supports all properties that a dataflow may need."""
     match = re.match(r"\d+", version)
     number = int(match[0]) if match else MIN_VERSION
     if number < MIN_VERSION:
@@ -69,7 +69,7 @@ def judge_systemd(version: str) -> Finding:
 
 
 def judge_controllers(available: Collection[str], is_user: bool) -> Finding:
-    """Whether limits would be kept."""
+    """Whether limits would be enforced."""
     missing = [what for name, what in CONTROLLERS.items() if name not in available]
     if not missing:
         return Finding("cgroup", State.OK, f"v2, with {', '.join(CONTROLLERS)}")
@@ -77,13 +77,13 @@ def judge_controllers(available: Collection[str], is_user: bool) -> Finding:
     remedy = "the kernel or the container does not provide it"
     if is_user:
         remedy = "as root: systemctl edit user@.service, [Service] Delegate=cpu memory pids io"
-    # What a user's manager gets is the admin's choice; without I/O is what distributions choose.
+    # The admin decides what a user's manager gets; without I/O is the default of distributions.
     state = State.NOTE if is_user and missing == [CONTROLLERS["io"]] else State.WARNING
     return Finding("cgroup", state, text, remedy)
 
 
 def judge_rate(config: str, is_user: bool) -> Finding:
-    """What journald lets through, by journald.conf(5). config: that file and its drop-ins."""
+    """The rate limit of journald, see journald.conf(5). config: that file and its drop-ins."""
     values = dict(_RATE_DEFAULTS)
     for key, value in re.findall(r"^\s*(RateLimit\w+)\s*=\s*(\S*)", config, flags=re.M):
         values[key] = value or _RATE_DEFAULTS.get(key, "")
@@ -99,7 +99,7 @@ def judge_rate(config: str, is_user: bool) -> Finding:
 
 
 def judge_port(port: int, owners: Sequence[Process], is_used: bool) -> Finding:
-    """Who answers the dora command that is called without doractl."""
+    """What a dora command without doractl would connect to."""
     topic = f"port {port}"
     if not is_used:
         return Finding(topic, State.OK, "free")
@@ -114,7 +114,7 @@ def judge_port(port: int, owners: Sequence[Process], is_used: bool) -> Finding:
 
 
 def judge_processes(processes: Sequence[Process]) -> Iterator[Finding]:
-    """What bare dora has left behind, or still runs."""
+    """Processes of dora that run outside of our units."""
     table = {one.pid: one for one in processes}
     free = [one for one in processes if not one.is_in_cell]
     for one in free:
@@ -131,7 +131,7 @@ def judge_processes(processes: Sequence[Process]) -> Iterator[Finding]:
 
 
 def _is_orphan(process: Process, table: Mapping[int, Process]) -> bool:
-    """Whether no daemon of dora is above it; a node's own children are told with it."""
+    """Whether no daemon of dora is among its parents; a node's children are part of the node."""
     parent = table.get(process.parent)
     if parent is not None and parent.is_node and not parent.engine:
         return False

@@ -1,4 +1,4 @@
-"""What `doractl doctor` finds: one line each about the state of a thing, and what helps."""
+"""The findings of `doractl doctor`: one line each, with a remedy."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from enum import StrEnum
 
 
 class State(StrEnum):
-    """How bad it is. Only a problem keeps dataflows from working."""
+    """The severity. Only a problem keeps dataflows from working."""
 
     OK = "ok"
     NOTE = "note"
@@ -16,7 +16,7 @@ class State(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked at. remedy: a command or a sentence, "" where all is well."""
+    """One finding. remedy: a command or a sentence, "" if everything is fine."""
 
     topic: str
     state: State
@@ -25,12 +25,12 @@ class Finding:
 
 
 def has_problem(findings: Sequence[Finding]) -> bool:
-    """Whether anything keeps dataflows from working."""
+    """Whether a finding keeps dataflows from working."""
     return any(one.state is State.PROBLEM for one in findings)
 
 
 def format_findings(findings: Sequence[Finding]) -> str:
-    """One line for each, with the remedy on a line of its own behind it."""
+    """A line for each finding, and the remedy on the next line."""
     width = max(len(one.topic) for one in findings)
     lines = []
     for one in findings:

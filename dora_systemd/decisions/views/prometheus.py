@@ -1,4 +1,4 @@
-"""What Prometheus is told of dataflows and nodes: a snapshot in its text format. Pure.
+"""Formats a snapshot of dataflows and nodes for Prometheus. Pure.
 
 https://prometheus.io/docs/instrumenting/exposition_formats and .../docs/practices/naming
 """
@@ -23,7 +23,7 @@ Sample = tuple[Labels, float | int]
 
 @dataclass(frozen=True)
 class Family:
-    """One metric. kind: "counter" or "gauge"; value: of one group, None where there is none."""
+    """One metric. kind: "counter" or "gauge". value: of one group, None if it has none."""
 
     name: str
     kind: str
@@ -31,7 +31,7 @@ class Family:
     value: Callable[[Usage, Strain], float | int | None] = lambda _use, _strain: None
 
 
-# For dataflows (dora_dataflow_...) and for nodes (dora_node_...) alike.
+# For dataflows (dora_dataflow_...) and for nodes (dora_node_...).
 GROUP_FAMILIES = (
     Family("cpu_seconds_total", "counter", "CPU time used.", lambda use, _: use.cpu_us / SECOND),
     Family("cpu_limit_cores", "gauge", "CPU limit, in cores.", lambda use, _: _cores(use)),
@@ -173,7 +173,7 @@ def _limit(value: int | None) -> int | None:
 
 
 def _format(family: Family, prefix: str, samples: Iterable[Sample]) -> Iterator[str]:
-    """The lines of one metric; none where nobody has it."""
+    """The lines of one metric; no lines without a sample."""
     name = f"{prefix}{family.name}"
     lines = [f"{name}{{{_format_labels(labels)}}} {value}" for labels, value in samples]
     if lines:
@@ -187,5 +187,5 @@ def _format_labels(labels: Labels) -> str:
 
 
 def _escaped(text: str) -> str:
-    """Backslash, quote and newline, as the format wants it."""
+    """Escape backslash, quote and newline as the format requires."""
     return text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")

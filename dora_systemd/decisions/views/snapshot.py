@@ -1,6 +1,6 @@
-"""One dataflow at one moment, with the counters of its groups: what is measured, not what follows.
+"""A snapshot of one dataflow with the counters of its groups.
 
-Whoever wants shares of time takes two of them: `doractl top`, a page in a browser, Prometheus.
+Two snapshots give percentages of time: for `doractl top`, the page in a browser, and Prometheus.
 """
 
 from collections.abc import Mapping
@@ -14,10 +14,10 @@ from dora_systemd.decisions.views.dataflows import DataflowRow, row_values
 
 @dataclass(frozen=True)
 class Observed:
-    """A dataflow. at_us: when its counters were read, CLOCK_MONOTONIC.
+    """A dataflow. at_us: time of its counters, CLOCK_MONOTONIC.
 
-    row: its line in `list`. unit_restarts: how often systemd has started it again by itself.
-    usage, strains, lines: by node, WHOLE_CELL is all of it; nothing for one that is not up.
+    row: its row in `list`. unit_restarts: number of automatic restarts by systemd. usage, strains,
+    lines: by node, WHOLE_CELL is the whole dataflow; empty if it is not up.
     """
 
     row: DataflowRow
@@ -29,7 +29,7 @@ class Observed:
 
 
 def observed_values(one: Observed) -> dict[str, Any]:
-    """The same for JSON; counters of time in µs."""
+    """The snapshot for JSON; time counters in µs."""
     groups = {key: _counters(use, one.strains.get(key, Strain())) for key, use in one.usage.items()}
     return {**row_values(one.row), "at_us": one.at_us, "groups": groups}
 

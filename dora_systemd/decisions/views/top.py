@@ -1,4 +1,4 @@
-"""What `doractl top` shows of one look at the dataflows. Pure: no clock, no terminal."""
+"""Formats one snapshot for `doractl top`. Pure: no clock, no terminal."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -24,12 +24,12 @@ HEADER = ("NAME", "STATE", "UPTIME", "CPU%", "MEM", "PEAK", "RESTARTS", "WAITS F
 NOTHING = "No dataflow is running."
 
 Waits = Mapping[str, float]
-"""By resource, the percentage of the time in which something waited for it."""
+"""By resource, the percentage of the time in which some process waited for it."""
 
 
 @dataclass(frozen=True)
 class TopEntry:
-    """A dataflow with its nodes. waits: by node, WHOLE_CELL is all of it."""
+    """A dataflow with its nodes. waits: by node, WHOLE_CELL is the whole dataflow."""
 
     row: DataflowRow
     waits: Mapping[str, Waits] = field(default_factory=dict)
@@ -37,14 +37,14 @@ class TopEntry:
 
 @dataclass(frozen=True)
 class Look:
-    """All that one look shows. at_us: CLOCK_REALTIME."""
+    """The content of one screen. at_us: CLOCK_REALTIME."""
 
     at_us: int
     entries: Sequence[TopEntry] = ()
 
 
 def sort_entries(entries: Sequence[TopEntry], by: str) -> list[TopEntry]:
-    """Entries by one of SORTS: those that use most first, or by name."""
+    """Entries by one of SORTS: highest usage first, or by name."""
     if by == "name":
         return sorted(entries, key=lambda entry: entry.row.name)
     return sorted(entries, key=lambda entry: (-_amount(entry.row, by), entry.row.name))
@@ -55,7 +55,7 @@ def _amount(row: DataflowRow | NodeRow, by: str) -> float:
 
 
 def format_top(look: Look, by: str) -> str:
-    """The table: a line for each dataflow, and below it one for each of its nodes."""
+    """The table: a row for each dataflow, followed by a row for each of its nodes."""
     if not look.entries:
         return NOTHING
     lines = [line for one in sort_entries(look.entries, by) for line in _lines(one, look, by)]
@@ -96,7 +96,7 @@ def _numbers(
 
 
 def format_summary(look: Look) -> str:
-    """How many there are and what they use together, in one line."""
+    """Number of dataflows and their total usage, in one line."""
     rows = [entry.row for entry in look.entries]
     nodes = sum(row.nodes_alive for row in rows)
     cpu = sum(row.cpu_percent or 0.0 for row in rows)
@@ -112,7 +112,7 @@ def _counted(count: int, what: str) -> str:
 
 
 def look_values(look: Look, by: str) -> dict[str, Any]:
-    """The look for JSON: rows as `doractl list` has them, with the waits in percent of the time."""
+    """The values for JSON: rows as in `doractl list`, and the waits in percent of the time."""
     return {
         "at_us": look.at_us,
         "dataflows": [_entry_values(one) for one in sort_entries(look.entries, by)],

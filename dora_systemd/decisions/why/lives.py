@@ -1,6 +1,6 @@
-"""What the journal has about the lives of one dataflow: our life events, and systemd's records.
+"""Groups journal records into lives of one dataflow: our life events, and systemd's records.
 
-Records are journalctl's JSON; each field may be missing, or be anything. One life is one
+Records are journalctl's JSON; each field may be missing, or have any value. One life is one
 invocation of the unit, see INVOCATION_ID in systemd.journal-fields(7).
 """
 
@@ -19,7 +19,7 @@ UNIT_MESSAGES = {
     "98e322203f7a4ed290d09fe03c09fe15": "process-exited",
     "5eb03494b6584870a536b337290809b3": "unit-restart",
 }
-"""What systemd itself says about a unit: SD_MESSAGE_UNIT_* by MESSAGE_ID."""
+"""systemd's own records about a unit: SD_MESSAGE_UNIT_* by MESSAGE_ID."""
 
 SHUTDOWN_MESSAGE = "98268866d1d54a499c4e98921d93bc40"
 """SD_MESSAGE_SHUTDOWN, by systemd-logind."""
@@ -28,7 +28,7 @@ START_LIMIT_FUNCTION = "unit_test_start_limit"
 """CODE_FUNC of systemd's "Start request repeated too quickly.", which has no MESSAGE_ID."""
 
 _MAX_TEXT = 4000
-"""Characters of a field: its writer may be a node."""
+"""Maximum characters of a field: a node may have written it."""
 _BEGINNINGS = ("unit-starting", "dataflow-starting")
 _SYSTEMD_FIELDS = ("EXIT_CODE", "EXIT_STATUS", "COMMAND", "UNIT_RESULT", "N_RESTARTS")
 
@@ -49,31 +49,31 @@ class Happening:
     details: Mapping[str, str] = field(default_factory=dict)
 
     def detail(self, key: str) -> str:
-        """A detail, "" where it is not recorded."""
+        """A detail, "" if it is not recorded."""
         return self.details.get(key, "")
 
 
 @dataclass(frozen=True)
 class Life:
-    """One invocation of the unit, or of what is known about it; oldest first."""
+    """One invocation of the unit, as far as it is recorded; oldest record first."""
 
     happenings: tuple[Happening, ...] = ()
 
     def all(self, *names: str) -> list[Happening]:
-        """The happenings of these names."""
+        """The records with these names."""
         return [one for one in self.happenings if one.name in names]
 
     def last(self, *names: str) -> Happening | None:
-        """The last one of these names."""
+        """The last record with one of these names."""
         return next(reversed(self.all(*names)), None)
 
     def first(self, *names: str) -> Happening | None:
-        """The first one of these names."""
+        """The first record with one of these names."""
         return next(iter(self.all(*names)), None)
 
     @property
     def began_us(self) -> int:
-        """CLOCK_REALTIME µs of its beginning, 0 where that is not among the records."""
+        """CLOCK_REALTIME µs of its beginning, 0 if that is not recorded."""
         begin = self.first(*_BEGINNINGS)
         return begin.at_us if begin else 0
 
@@ -84,12 +84,12 @@ class Life:
 
     @property
     def invocation(self) -> str:
-        """systemd's id of this life, or ""."""
+        """systemd's invocation id, or ""."""
         return next((one.invocation for one in self.happenings if one.invocation), "")
 
 
 def plain_text(value: Any) -> str:
-    """The value of a journal field: bytes come as numbers, a repeated field as a list."""
+    """The value of a journal field: bytes are a list of numbers, a repeated field is a list."""
     if isinstance(value, list):
         if value and all(isinstance(one, int) and 0 <= one < 256 for one in value):
             return bytes(value).decode("utf-8", "replace")
@@ -98,7 +98,7 @@ def plain_text(value: Any) -> str:
 
 
 def parse_happening(record: Mapping[str, Any]) -> Happening | None:
-    """The happening that a record is, or None for any other record."""
+    """The happening of a record, or None if the record is about something else."""
     texts = {str(key): plain_text(value)[:_MAX_TEXT] for key, value in record.items()}
     name = texts.get("DORA_EVENT") or UNIT_MESSAGES.get(texts.get("MESSAGE_ID", ""), "")
     if texts.get("CODE_FUNC") == START_LIMIT_FUNCTION:
@@ -125,7 +125,7 @@ def _number(text: str) -> int:
 
 
 def find_lives(happenings: Iterable[Happening]) -> list[Life]:
-    """The lives that happenings, oldest first, tell of; those of no unit belong to the one then."""
+    """The lives in happenings, oldest first; those without an invocation belong to the last one."""
     found: dict[str, list[Happening]] = {}
     current = ""
     for one in happenings:
@@ -136,7 +136,7 @@ def find_lives(happenings: Iterable[Happening]) -> list[Life]:
 
 
 def with_restarts(lives: Sequence[Life]) -> list[Life]:
-    """The last life, and those before it that systemd itself made lead to it."""
+    """The last life, and those before it that led to it by automatic restarts of systemd."""
     chain = list(lives[-1:])
     for life in reversed(lives[:-1]):
         if life.last("unit-restart") is None:

@@ -1,6 +1,6 @@
-"""What became of a dataflow, and why: the verdict of `doractl why`. Values in, values out.
+"""Finds what happened to a dataflow, and why: the verdict of `doractl why`. Pure.
 
-Where nothing is recorded, the verdict says so; it never guesses.
+If the cause is not recorded, the verdict says so; it never guesses.
 """
 
 import re
@@ -34,7 +34,7 @@ UNKNOWN_PERSON = "a request to systemd (by whom is not recorded)"
 
 @dataclass(frozen=True)
 class _Finding:
-    """The part of a verdict that tells an end."""
+    """The part of a verdict that explains an end."""
 
     cause: Cause
     summary: str
@@ -45,14 +45,14 @@ class _Finding:
 
 
 def examine(lives: Sequence[Life], facts: Facts, shutdowns: Sequence[int] = ()) -> Verdict:
-    """The verdict on the last of `lives`, oldest first.
+    """The verdict on the last of `lives`, which are oldest first.
 
-    shutdowns: CLOCK_REALTIME µs at which the machine was told to go down.
+    shutdowns: CLOCK_REALTIME µs of shutdown requests for the machine.
     """
     chain = with_restarts(lives)
     life = chain[-1] if chain else Life()
     if facts.status == RESTARTING and len(chain) > 1 and _only_begins(life):
-        life = chain[-2]  # its runner waits before it does anything
+        life = chain[-2]  # the runner of the last life still waits for its restart delay
     status = facts.status if facts.status in UP_WORDS else ended_word(life, facts.status)
     if status in UP_WORDS and status != RESTARTING:
         found = _present(life, facts)
@@ -85,7 +85,7 @@ def _only_begins(life: Life) -> bool:
 
 
 def _before(lives: Sequence[Life], facts: Facts, shutdowns: Sequence[int]) -> tuple[str, int]:
-    """How the life ended that somebody, or a boot, began anew."""
+    """How the life before a start or boot ended."""
     if not lives:
         return "", 0
     end = _end(lives[-1], facts, shutdowns)
@@ -93,7 +93,7 @@ def _before(lives: Sequence[Life], facts: Facts, shutdowns: Sequence[int]) -> tu
 
 
 def ended_word(life: Life, known: str = "") -> str:
-    """How a life that is over ended. known: what systemd says, "" if it has forgotten the unit."""
+    """How a life ended. known: systemd's status, "" if it has unloaded the unit."""
     end = life.last(*_ENDS)
     if end is None:
         return FAILED if life.happenings else known or STOPPED
@@ -104,10 +104,10 @@ def ended_word(life: Life, known: str = "") -> str:
 
 
 def _present(life: Life, facts: Facts) -> _Finding:
-    """How a dataflow that runs is: what has gone for good, else what was restarted last."""
+    """The state of a running dataflow: the node that failed for good, else the last restart."""
     gone = [one for one in final_crashes(life) if one.node in facts.failed]
     if gone:
-        # The table of nodes has counted their restarts.
+        # The live table has the number of restarts.
         first, how = gone[0].node, facts.failed[gone[0].node]
         return replace(_crash(gone[0]), summary=f"node {first}: {how}")
     waiting = [one for one in final_crashes(life) if one.node in facts.restarting]
@@ -117,7 +117,7 @@ def _present(life: Life, facts: Facts) -> _Finding:
 
 
 def final_crashes(life: Life) -> list[Happening]:
-    """The last crash of each node, the earliest first: the others may only follow from that."""
+    """The last crash of each node, earliest first: the others may be consequences of it."""
     last = {one.node: one for one in life.all(*_CRASHES)}
     return sorted(last.values(), key=lambda one: one.at_us)
 
@@ -159,7 +159,7 @@ def _failure(life: Life, end: Happening) -> _Finding:
 
 
 def _with_tail(found: _Finding, reason: str) -> str:
-    """The runner's own words for that node, which say how many restarts it had."""
+    """The runner's own text for that node, which has the number of restarts."""
     parts = [one for one in reason.split(", node ") if one.removeprefix("node ")]
     own = [one for one in parts if one.removeprefix("node ").startswith(f"{found.node}: ")]
     _, after, count = own[0].rpartition(" after ") if own else ("", "", "")
@@ -170,14 +170,14 @@ def _cause_of(life: Life, end: Happening) -> Cause:
     word = end.detail("cause")
     if word and word in list(Cause):
         return Cause(word)
-    lost = life.last(*_LOSSES)  # a record without the word: of an older version
+    lost = life.last(*_LOSSES)  # records of older versions do not have the cause
     if lost is not None:
         return _LOSSES[lost.name]
     return Cause.NODE_FAILED if final_crashes(life) else Cause.UNIT_FAILED
 
 
 def _unit_failure(life: Life, end: Happening) -> _Finding:
-    """The runner said nothing: what systemd says is all there is."""
+    """Without an event of the runner, systemd's result is all that is known."""
     result = end.detail("unit_result")
     if result in _RESULTS:
         cause, words = _RESULTS[result]
@@ -191,7 +191,7 @@ def _exit_words(exit: Happening) -> str:
     status = exit.detail("exit_status") or "unknown"
     if exit.detail("exit_code") != "exited":
         return f"the supervisor process was killed (signal {status})"
-    named = _STATUS.search(exit.text)  # as "217/USER"
+    named = _STATUS.search(exit.text)  # such as "217/USER"
     return (
         f"systemd could not start the supervisor process: exit code {named[1] if named else status}"
     )
@@ -208,7 +208,7 @@ def _without_end(life: Life, facts: Facts) -> _Finding:
 
 
 def stopped_by(life: Life, shutdowns: Sequence[int]) -> str:
-    """Who or what wanted the end, as far as it is on record."""
+    """What requested the end, if it is recorded."""
     asked = life.last("stop-asked")
     if asked is not None and asked.detail("by"):
         return asked.detail("by")
@@ -230,7 +230,7 @@ def _starved(found: _Finding, life: Life) -> tuple[str, ...]:
 
 
 def restarts_of(chain: Sequence[Life]) -> list[Restart]:
-    """The restarts that led to the end of the last life of a chain, oldest first."""
+    """The restarts before the end of the last life of a chain, oldest first."""
     found = []
     for life in chain:
         exits: dict[str, str] = {}

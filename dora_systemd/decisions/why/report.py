@@ -1,4 +1,4 @@
-"""The verdict of `doractl why` as one screen of text, or as values for JSON."""
+"""Formats the verdict of `doractl why`: as one screen of text, or as values for JSON."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -15,10 +15,10 @@ from dora_systemd.terminal_text import one_line
 from dora_systemd.values import SECOND, format_duration, format_rounded_size
 
 _TOLD = ("event", "node", "nodes", "dataflow", "dataflow_name", "downstream", "cause", "reason")
-"""Details of an event that have a key of their own in JSON."""
+"""Details of an event that have their own keys in JSON."""
 
 LINES = 20
-"""How many of the last lines are shown."""
+"""Maximum number of last lines to show."""
 _TIMELINE = 7
 _SIZE = re.compile("[1-9][0-9]{0,18}")
 _TITLE_WIDTH = 10
@@ -51,7 +51,7 @@ _MEMORY_REMEDIES = {
     "dataflow": "doractl set {name} --memory-limit SIZE, or limit single nodes (--node-limit)",
     "machine": "the machine is short of memory: limit single nodes (--node-limit NODE:memory=SIZE)",
 }
-"""By whose memory was used up, where that is not the node's."""
+"""By the owner of the exceeded memory limit, unless it is the node."""
 _SIGNAL_REMEDIES = {
     "SIGKILL": "find out who killed {node}: journalctl -k, or somebody's kill -9",
     **dict.fromkeys(
@@ -67,7 +67,7 @@ _AWAY = "{node} stays down until doractl restart {name}; the other nodes keep ru
 
 @dataclass(frozen=True)
 class Subject:
-    """Whom a verdict is about. file: its descriptor, "" where that is not known any more."""
+    """The dataflow of a verdict. file: its descriptor, "" if that is not known any more."""
 
     uuid: str
     name: str
@@ -79,7 +79,7 @@ class Subject:
 
 @dataclass(frozen=True)
 class Word:
-    """One line that a node wrote; at_us: CLOCK_REALTIME µs."""
+    """One line of a node. at_us: CLOCK_REALTIME µs."""
 
     at_us: int
     node: str
@@ -88,7 +88,7 @@ class Word:
 
 @dataclass(frozen=True)
 class Report:
-    """All that `doractl why` says. words: the last lines, of verdict.node or of all nodes."""
+    """The output of `doractl why`. words: the last lines, of verdict.node or of all nodes."""
 
     subject: Subject
     verdict: Verdict
@@ -97,7 +97,7 @@ class Report:
 
 
 def remedies(report: Report) -> list[str]:
-    """What to do, each in one line."""
+    """What to do, one line each."""
     verdict, subject = report.verdict, report.subject
     texts = [_remedy(verdict)]
     if verdict.is_passing:
@@ -137,7 +137,7 @@ def _remedy(verdict: Verdict) -> str:
 def format_report(report: Report, width: int | None = None, want_colors: bool = False) -> str:
     """The report as at most 45 lines, each cut at `width` characters if that is given."""
     blocks = [_head(report), _timeline(report), _words(report), _todo(report)]
-    # What nodes wrote must not command the terminal, nor make a line of its own here.
+    # Texts of nodes must not control the terminal, or add lines to the report.
     lines = [one_line(line) for block in blocks if block for line in (*block, "")][:-1]
     cut = [line if width is None else _cut(line, width) for line in lines]
     return "\n".join(_colored(cut, report.verdict)) if want_colors else "\n".join(cut)
@@ -177,7 +177,7 @@ def _head(report: Report) -> list[str]:
 
 
 def _budget_words(report: Report) -> str:
-    """What is left of systemd's restarts, as long as there may be one."""
+    """The remaining restarts by systemd, while there may be one."""
     budget = report.budget
     is_due = budget and (budget["used"] or report.verdict.status == RESTARTING)
     return budget_words(budget) if budget and is_due else ""
@@ -193,7 +193,7 @@ def _when(verdict: Verdict) -> str:
 
 
 def _span(duration: int) -> str:
-    """µs in the roughness that helps: seconds from the second on."""
+    """A duration in µs as text, in whole seconds from one second on."""
     unit = SECOND if duration >= SECOND else 1000
     return format_duration(duration // unit * unit)
 
@@ -257,7 +257,7 @@ def _todo(report: Report) -> list[str]:
 
 
 def report_values(report: Report) -> dict[str, Any]:
-    """The report for JSON: exact numbers, their units in the keys."""
+    """The report for JSON: exact numbers, with units in the keys."""
     verdict, subject = report.verdict, report.subject
     return {
         "uuid": subject.uuid,

@@ -1,4 +1,4 @@
-"""What a node that dies says about the sandbox, and what helps."""
+"""Recognizes failures of nodes that the sandbox causes, and suggests a remedy."""
 
 from collections.abc import Iterable, Sequence
 
@@ -21,10 +21,10 @@ _SIGNS: Sequence[tuple[tuple[str, ...], str]] = (
         f"the sandbox may have refused that; try --sandbox none, {_MORE}",
     ),
 )
-"""Parts of lines as the C library, Python and Rust write them, the plainest signs first."""
+"""Parts of lines of the C library, Python and Rust, the clearest signs first."""
 
 
 def sandbox_remedy(lines: Iterable[str]) -> str:
-    """What helps a node whose last lines are these, or "" when they do not point at the sandbox."""
+    """The remedy for a node with these last lines, or "" if they do not point to the sandbox."""
     text = "\n".join(lines)
     return next((help_ for signs, help_ in _SIGNS if any(one in text for one in signs)), "")

@@ -1,4 +1,4 @@
-"""What `doractl why` is told of a dataflow, and what it says about it."""
+"""The facts that `doractl why` uses, and its verdict."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,10 +10,11 @@ from dora_systemd.decisions.why.lives import Happening
 
 @dataclass(frozen=True)
 class Facts:
-    """What systemd and the runner know of a dataflow now, beside what the journal has.
+    """The current state from systemd and the runner, in addition to the journal.
 
-    status: a word of `list`. text: STATUS=. failed: nodes that are gone for good, restarting:
-    those that wait. result, exit_words: of the unit, in words. now_boot: the id of this boot.
+    status: a word of `list`. text: STATUS=. failed: nodes that have failed for good. restarting:
+    nodes that wait for a restart. result, exit_words: of the unit, in words. now_boot: id of this
+    boot.
     """
 
     status: str = ""
@@ -25,7 +26,7 @@ class Facts:
 
 @dataclass(frozen=True)
 class Restart:
-    """One restart. owner: "dora" of a node, "systemd" of the whole. reason: what made it."""
+    """One restart. owner: "dora" for a node, "systemd" for the dataflow. reason: its cause."""
 
     at_us: int
     owner: str
@@ -35,14 +36,13 @@ class Restart:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of a dataflow.
+    """What happened to a dataflow.
 
-    status: a word of `list`. summary: what ended and how. now: STATUS= of one that is up.
-    node: the one that began it, or "".
-    at_us: when that was, began_us: when that life began; CLOCK_REALTIME µs, 0: not known.
-    invocation: systemd's id of that life. details: what else is known of the end.
-    is_given_up: systemd's limit of starts is used up. is_passing: dora starts the node again by
-    itself. starved: nodes downstream. before: how the life before these ended, and when.
+    status: a word of `list`. summary: what ended and how. now: STATUS= of a running one. node: the
+    node that failed first, or "". at_us: time of that; began_us: beginning of that life;
+    CLOCK_REALTIME µs, 0: unknown. invocation: systemd's id of that life. details: other facts about
+    the end. is_given_up: systemd's start limit is reached. is_passing: dora restarts the node.
+    starved: nodes downstream. before: how the life before these ended, and when.
     """
 
     status: str
@@ -65,12 +65,12 @@ class Verdict:
 
     @property
     def is_up(self) -> bool:
-        """Whether it runs, or is on its way."""
+        """Whether it is running, starting or stopping."""
         return self.status in UP_WORDS
 
     @property
     def is_failure(self) -> bool:
-        """Whether something went wrong that was not mended by itself."""
+        """Whether something failed that no restart has fixed."""
         if self.status in (FAILED, RESTARTING):
             return True
         return self.is_up and bool(self.node) and not self.is_passing
