@@ -78,8 +78,8 @@ def restart_node(scope: Scope, cell: Cell, node: str, ask: Ask = ask_coordinator
 
     dora's RestartNode also ends all nodes downstream of a node with restart policy "never". So
     ReplaceNode replaces such a node by a copy of itself, which the nodes downstream do not notice.
-    dora starts the copy before the old process ends, and ends the old one only after its grace
-    duration.
+    dora starts the copy before the old process ends, and tells the old one to stop only after its
+    grace duration.
     """
     status = _checked_status(scope, cell, node)
     info = _answer(cell, ask(scope, cell, {"Info": {"dataflow_uuid": status.run}}))

@@ -57,7 +57,7 @@ def forget_lives() -> None:
 
 
 def forget_inherited() -> None:
-    """Close the pipes that an earlier life left in the store, and remove them from it."""
+    """Close what an earlier life left in the store, and remove its pipes from the store."""
     if os.environ.pop("LISTEN_PID", "") != str(os.getpid()):
         return
     names = os.environ.pop("LISTEN_FDNAMES", "").split(":")

@@ -76,7 +76,7 @@ def rate_of(limits: RateLimits, node: str) -> RateLimit | None:
 def merge_rates(nodes: Mapping[str, RateLimits], given: RateLimits) -> RateLimits:
     """The limits of `given`, which take precedence over those that a settings file has for nodes.
 
-    Raises DoraSystemdError (BAD_INPUT) if both name the same node.
+    Raises DoraSystemdError (BAD_INPUT) for a limit in `nodes` that has the form NODE=LIMIT itself.
     """
     limits: dict[str, RateLimit | None] = {}
     for node, own in nodes.items():

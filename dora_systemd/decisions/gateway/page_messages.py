@@ -7,16 +7,16 @@ The page sends, each with its `type`:
   graph     {dataflow}
   act       {action, dataflow, node, number}  action: "stop" or "restart"; node "": the dataflow
 
-It gets:
-  hello     {version, host, scope}            first of all
-  snapshot  {dataflows}                       again and again; each as in snapshot.observed_values
+It receives:
+  hello     {version, host, scope}            first
+  snapshot  {dataflows}                       repeatedly; each as in snapshot.observed_values
   graph     {dataflow, nodes, edges, problem}
   lines     {number, lines, skipped}          lines: {at_us, node, text, priority, event};
-                                              skipped: so many before these were too many
-  acted     {number, text, problem, hint}     how an action ended
-  problem   {text, hint}                      what hinders all of it for now
+                                              skipped: number of lines left out before these
+  acted     {number, text, problem, hint}     the result of an action
+  problem   {text, hint}                      why nothing works at the moment
 
-`dataflow` is a UUID, `number` is the page's own and comes back with what belongs to it.
+`dataflow` is a UUID. The page chooses `number`, and answers to its message repeat it.
 """
 
 import json

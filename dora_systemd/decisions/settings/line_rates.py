@@ -6,7 +6,7 @@ from dora_systemd.decisions.settings.table import LOG_RATE_LIMIT
 
 
 def log_rates(settings: Settings) -> RateLimits:
-    """The limits of `log_rate`, which take precedence over those of `nodes:` in files.
+    """The limits of `log_rate_limit`, which take precedence over those of `nodes:` in files.
 
     Raises DoraSystemdError (BAD_INPUT).
     """

@@ -1,7 +1,7 @@
 """Persistent unit files: their text, and whether they are ours.
 
-The text is that of systemd.unit(5), made from what `properties` gives or from what systemd itself
-wrote for a transient unit: both say the same of the same dataflow.
+The text is that of systemd.unit(5), made from `properties` or from the files that systemd itself
+wrote for a transient unit: both are equivalent for the same dataflow.
 """
 
 import posixpath

@@ -75,7 +75,7 @@ class Applier:
                 with self._run.nodes.exchanging(step.node):
                     await self._take(back, before)
             except NotReady:
-                continue  # the node failed before the reload too, or its program is at fault
+                continue  # it has its old definition again, which may have failed before too
 
     async def _take(self, step: Step, prepared: Prepared) -> None:
         swapper = self._run.swapper
