@@ -10,7 +10,7 @@ import re
 from dora_systemd.errors import DoraSystemdError, ExitCode
 
 INFINITY = 2**64 - 1
-""""infinity" on D-Bus: UINT64_MAX, for sizes, durations and CPU shares."""
+""""infinity" on D-Bus, "max" in cgroup files: UINT64_MAX, for sizes, durations and CPU shares."""
 
 SECOND = 1_000_000
 """Microseconds per second."""

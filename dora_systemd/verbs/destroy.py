@@ -16,7 +16,7 @@ from dora_systemd.adapters.host.process_table import read_processes
 from dora_systemd.adapters.host.unit_files import read_unit_file, remove_empty, remove_unit_file
 from dora_systemd.decisions.gateway.place import SERVICE_UNIT, SOCKET_UNIT
 from dora_systemd.decisions.unit.file import BOOT_TARGET
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import SLICE, name_from_unit
 from dora_systemd.scope import Scope
 from dora_systemd.values import INFINITY, SECOND
@@ -165,12 +165,7 @@ def _stop(
 def _begin(manager: Manager, cell: Cell, want_kill: bool, now: float) -> _Stop:
     """Stop a dataflow in any state: the job replaces a start or restart that is queued."""
     given = manager.read(cell.unit, ["TimeoutStopUSec"])["TimeoutStopUSec"]
-    try:
-        manager.queue_job("StopUnit", cell.unit)
-    except DoraSystemdError as error:
-        # It has ended by itself; the next look at its state says so.
-        if error.code is not ExitCode.NOT_FOUND:
-            raise
+    manager.queue_job("StopUnit", cell.unit)
     if want_kill:
         # There may be no process, as between two restarts.
         with suppress(DoraSystemdError):

@@ -13,7 +13,7 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import user_name
 from dora_systemd.verbs.facts.cells import Cell
-from dora_systemd.verbs.facts.enabled import enabled_units, recover_lost_units
+from dora_systemd.verbs.facts.enabled import enabled_units
 from dora_systemd.verbs.facts.reason import failure_reason, job_reason
 
 
@@ -40,8 +40,10 @@ def stop_cells(manager: Manager, scope: Scope, cells: Sequence[Cell]) -> list[Ou
 
 def release_enabled(manager: Manager, scope: Scope, units: Sequence[str]) -> None:
     """For dataflows that were enabled while running: let the unit file take effect."""
+    is_one_lost = False
     for unit in sorted(enabled_units(manager, scope).intersection(units)):
-        state = manager.read(unit, ["Transient", "ActiveState"])
+        state = manager.read(unit, ["LoadState", "Transient", "ActiveState"])
+        is_one_lost |= state["LoadState"] == "not-found"
         if state["Transient"] and state["ActiveState"] == "inactive":
             from dora_systemd.verbs.start.enable import read_boot_unit, release_transient
 
@@ -50,7 +52,8 @@ def release_enabled(manager: Manager, scope: Scope, units: Sequence[str]) -> Non
                 boot = read_boot_unit(manager, scope, unit)
                 if boot.is_enabled:
                     release_transient(manager, boot)
-    recover_lost_units(manager, scope)
+    if is_one_lost:
+        manager.reload()  # see lost_units()
 
 
 def restart_cells(

@@ -9,8 +9,7 @@ import click
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import current_scope, print_outcomes, scope_options
 from dora_systemd.cli.stageline import StageLine
-from dora_systemd.verbs.facts.cells import find_cell
-from dora_systemd.verbs.facts.enabled import recover_lost_units
+from dora_systemd.verbs.facts.enabled import find_enabled_cell
 from dora_systemd.verbs.stop import restart_cells
 
 _EPILOG = """\b
@@ -31,8 +30,7 @@ def command(selectors: tuple[str, ...]) -> int:
     """
     scope = current_scope()
     bus = Bus(scope)
-    recover_lost_units(bus, scope)
-    chosen = dict.fromkeys(find_cell(bus, one) for one in selectors)
+    chosen = dict.fromkeys(find_enabled_cell(bus, scope, one) for one in selectors)
     with StageLine(sys.stderr) as stage:
         outcomes = restart_cells(bus, list(chosen), lambda changes: _show(stage, changes))
     return print_outcomes(outcomes)

@@ -50,7 +50,10 @@ class Manager(Protocol):
         """StartUnit, StopUnit or RestartUnit for all units in parallel; the result of each job."""
 
     def queue_job(self, method: str, unit: str) -> str:
-        """Queue a job for one unit without waiting; the object path of the job."""
+        """Queue a job for one unit without waiting; the object path of the job.
+
+        "" if the unit is to be stopped, and systemd does not know it any more.
+        """
 
     def kill(self, unit: str, signal: int, whom: str = "all") -> None:
         """Send `signal` to the processes of a unit: main, control or all."""

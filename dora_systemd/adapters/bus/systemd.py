@@ -89,22 +89,21 @@ class Bus:
     def run_jobs(
         self, method: str, units: Sequence[str], observer: Observer | None = None
     ) -> dict[str, str]:
-        jobs: dict[str, str] = {}
-        gone: list[str] = []
-        for unit in units:
-            try:
-                jobs[self.queue_job(method, unit)] = unit
-            except DoraSystemdError as error:
-                # It has ended by itself since it was chosen. That is no reason to leave the rest.
-                if method != "StopUnit" or error.code is not ExitCode.NOT_FOUND:
-                    raise
-                gone.append(unit)
+        queued = [(self.queue_job(method, unit), unit) for unit in units]
+        jobs = {job: unit for job, unit in queued if job}
+        gone = [unit for job, unit in queued if not job]
         return self._wait_for_jobs(jobs, observer) | dict.fromkeys(gone, JOB_DONE)
 
     def queue_job(self, method: str, unit: str) -> str:
         self._listen(unit)
         action = f"{method.removesuffix('Unit').lower()} {unit}"
-        job: str = self._call(action, ROOT, MANAGER, method, ("s", unit), ("s", "replace"))
+        try:
+            job: str = self._call(action, ROOT, MANAGER, method, ("s", unit), ("s", "replace"))
+        except DoraSystemdError as error:
+            # A unit that has ended by itself since it was chosen needs no job to stop.
+            if method != "StopUnit" or error.code is not ExitCode.NOT_FOUND:
+                raise
+            return ""
         return job
 
     def kill(self, unit: str, signal: int, whom: str = "all") -> None:

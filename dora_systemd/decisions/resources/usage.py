@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 RESOURCES = ("cpu", "memory", "io")
-"""What systemd's properties say where cgroup files say "max", see systemd.resource-control(5)."""
 WORTH_SHOWING = 1.0
 """Percent of the time from which on a wait is shown."""
 

@@ -1,6 +1,7 @@
 """D-Bus without a bus: how values are sent, and what its errors become."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -131,9 +132,16 @@ class Departing(bus.Bus):
     def __init__(self, code: ExitCode) -> None:
         self.code = code
 
-    def queue_job(self, method: str, unit: str) -> str:
+    def _listen(self, unit: str) -> None:
+        del unit
+
+    def _call(
+        self, action: str, path: bytes, interface: bytes, method: str, *arguments: Any
+    ) -> str:
+        del path, interface, method
+        unit = arguments[0][1]
         if unit == "gone":
-            raise DoraSystemdError(f"cannot {method} {unit}", "", self.code)
+            raise DoraSystemdError(f"cannot {action}", "", self.code)
         return f"/job/{unit}"
 
     def _wait_for_jobs(self, jobs: dict[str, str], observer: object) -> dict[str, str]:

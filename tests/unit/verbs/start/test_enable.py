@@ -10,7 +10,7 @@ from dora_systemd.decisions.unit.properties import UnitContext, format_unit, uni
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell, find_cell
-from dora_systemd.verbs.facts.enabled import enabled_units
+from dora_systemd.verbs.facts.enabled import enabled_units, find_enabled_cell
 from dora_systemd.verbs.facts.list import find_row
 from dora_systemd.verbs.show import export_cell
 from dora_systemd.verbs.start import linger
@@ -55,6 +55,17 @@ def test_a_lost_unit_is_looked_for_when_it_has_stopped(manager: FakeManager, sco
     manager.after_job[UNIT] = {"LoadState": "not-found", "ActiveState": "inactive", "Transient": 0}
     stop_cells(manager, scope, [cell])
     assert manager.calls[-1] == ("reload",)
+
+
+def test_only_a_lost_unit_is_looked_for_in_the_files(manager: FakeManager, scope: Scope) -> None:
+    enable_cell(manager, scope, started(manager))
+    manager.calls.clear()
+    assert find_enabled_cell(manager, scope, "robot").unit == UNIT
+    del manager.units[UNIT]
+    assert manager.calls == []
+    with pytest.raises(DoraSystemdError, match="no dataflow named"):
+        find_enabled_cell(manager, scope, "robot")  # this systemd does not read files
+    assert manager.calls == [("reload",)]
 
 
 def test_what_runs_goes_on(manager: FakeManager, scope: Scope) -> None:
