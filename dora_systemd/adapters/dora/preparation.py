@@ -55,10 +55,11 @@ def prepare(options: RunnerOptions, environment: Mapping[str, str]) -> Prepared:
     _check_limited(options, dataflow)
     plan = LaunchPlan(
         options,
-        str(PACKAGE / "launcher.sh"),
+        str(PACKAGE / "launcher.pl"),
         environment.get("PATH") or os.defpath,
         os.path.exists,
         _load_session(options),
+        environment,
     )
     return Prepared(dataflow, plan, launch_descriptor(dataflow, plan))
 

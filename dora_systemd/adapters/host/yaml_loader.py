@@ -24,12 +24,28 @@ _CORE = (
         list("-+.0123456789"),
     ),
 )
+_TEXT_KEYS = {
+    *("id", "name", "description", "path", "path_sha256", "args", "build", "git", "branch", "tag"),
+    *("rev", "send_stdout_as", "send_logs_as", "min_log_level", "max_log_size"),
+}
+"""Keys of a node that dora reads as text, whatever it looks like: `args: 1.50` is "1.50"."""
 
 
 class _Loader(_BASE):  # type: ignore[misc]
     """The core schema, without merge keys and without repeated keys in a mapping."""
 
     yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012
+
+    def get_single_node(self) -> Any:
+        """The document; in a list `nodes`, plain numbers and booleans stay text where dora does."""
+        document = super().get_single_node()
+        for node in _items(_values(document).get("nodes")):
+            values = _values(node)
+            outputs = _items(values.get("outputs"))
+            for text in (*(values[key] for key in _TEXT_KEYS & values.keys()), *outputs):
+                if isinstance(text, yaml.ScalarNode) and text.tag != f"{_TAG}null":
+                    text.tag = f"{_TAG}str"
+        return document
 
     def flatten_mapping(self, node: Any) -> None:
         """Do nothing: dora has no `<<`, and nested merges would grow without limit."""
@@ -45,6 +61,16 @@ class _Loader(_BASE):  # type: ignore[misc]
             seen |= {key} if isinstance(key, Hashable) else set()
         mapping: dict[Hashable, Any] = super().construct_mapping(node, deep)
         return mapping
+
+
+def _values(node: Any) -> dict[str, Any]:
+    """The values of a mapping by plain key; none for any other node."""
+    pairs = node.value if isinstance(node, yaml.MappingNode) else ()
+    return {key.value: value for key, value in pairs if isinstance(key, yaml.ScalarNode)}
+
+
+def _items(node: Any) -> list[Any]:
+    return node.value if isinstance(node, yaml.SequenceNode) else []
 
 
 def loader_class() -> Any:

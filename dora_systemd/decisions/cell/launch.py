@@ -13,8 +13,10 @@ from typing import Any
 from dora_systemd.decisions.cell.log_backlog import with_bounds
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.restarts import DEFAULT, HELD_KEYS
+from dora_systemd.decisions.descriptor.arguments import split_arguments
 from dora_systemd.decisions.descriptor.build_session import BuildSession
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
+from dora_systemd.decisions.descriptor.expansion import expanded
 from dora_systemd.decisions.descriptor.nodes import Node, NodeKind
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import SECOND, quoted
@@ -22,6 +24,8 @@ from dora_systemd.values import SECOND, quoted
 LAUNCHED = frozenset({NodeKind.PYTHON, NodeKind.EXECUTABLE, NodeKind.SHELL})
 PROGRAM_KEYS = ("path", "args", "build", "git", "branch", "tag", "rev")
 """Keys of a node that define its program; dora gets other values."""
+PERL = "/usr/bin/perl"
+"""The interpreter of launcher.pl."""
 DEFAULT_OPERATOR = "op"
 """dora's id of the operator in a node with a single operator."""
 
@@ -30,8 +34,8 @@ DEFAULT_OPERATOR = "op"
 class LaunchPlan:
     """The values to rewrite the descriptor with.
 
-    launcher: absolute path of launcher.sh. search_path: PATH of the nodes. exists: whether a file
-    with that absolute path exists.
+    launcher: absolute path of launcher.pl. search_path: PATH of the nodes. exists: whether a file
+    with that absolute path exists. environment: for variables in `env:`.
     """
 
     options: RunnerOptions
@@ -39,17 +43,17 @@ class LaunchPlan:
     search_path: str
     exists: Callable[[str], bool]
     session: BuildSession = field(default_factory=BuildSession)
+    environment: Mapping[str, str] = field(default_factory=dict)
 
 
 def launch_descriptor(dataflow: Dataflow, plan: LaunchPlan) -> dict[str, Any]:
     """The descriptor for dora. Raises DoraSystemdError (BAD_INPUT) for a node that cannot run."""
     document = dict(dataflow.raw)
     document["nodes"] = [_launch_node(node, dataflow.source, plan) for node in dataflow.nodes]
-    if plan.options.env_keys and dataflow.env:
+    if dataflow.env:
         # As for `dora start --env`: overrides the dataflow's env, but not that of a node.
-        document["env"] = {
-            key: value for key, value in dataflow.env.items() if key not in plan.options.env_keys
-        }
+        kept = {key: dataflow.env[key] for key in dataflow.env if key not in plan.options.env_keys}
+        document["env"] = expanded(kept, plan.environment)
     if plan.options.debug:
         given = document.get("debug")
         debug = given if isinstance(given, Mapping) else {}
@@ -81,6 +85,8 @@ def _kind(node: Node, plan: LaunchPlan) -> str:
 
 def _launch_node(node: Node, source: str, plan: LaunchPlan) -> dict[str, Any]:
     raw = {**node.raw, **_restart_keys(node, plan.options)}
+    if node.env:
+        raw["env"] = expanded(node.env, plan.environment)
     if plan.options.hot_reload and raw.get("restart_policy", "never") == "never":
         raw |= HELD_KEYS if is_launched(node) else {}
     if node.keeps_output or not (is_launched(node) or node.kind is NodeKind.OPERATOR):
@@ -95,7 +101,7 @@ def _launch_node(node: Node, source: str, plan: LaunchPlan) -> dict[str, Any]:
     kept = {key: value for key, value in raw.items() if key not in PROGRAM_KEYS}
     if isinstance(kept.get("deploy"), Mapping):
         kept["deploy"] = {**kept["deploy"], "working_dir": None}
-    return {**kept, "path": "/bin/sh", "args": shlex.join(words)}
+    return {**kept, "path": PERL, "args": shlex.join(words)}
 
 
 def _restart_keys(node: Node, options: RunnerOptions) -> dict[str, Any]:
@@ -148,7 +154,7 @@ def _command(node: Node, directory: str, source: str, plan: LaunchPlan) -> list[
 
 def _split(node: Node, source: str) -> list[str]:
     try:
-        return shlex.split(node.args)
+        return split_arguments(node.args)
     except ValueError as error:
         raise _refusal(source, node, f"its args: {error}", "quote args as in a shell") from error
 

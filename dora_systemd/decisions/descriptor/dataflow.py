@@ -4,8 +4,8 @@ The checks report errors in one line for which dora prints ten lines, or nothing
 run forever, and only `dora validate` finds an input without a source. dora checks everything else.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 
 from dora_systemd.decisions.descriptor.json_size import check_json
 from dora_systemd.decisions.descriptor.nodes import (
@@ -55,11 +55,11 @@ def parse_dataflow(document: object, source: str) -> Dataflow:
     if not nodes or not isinstance(nodes, list):
         reason = "it has no nodes" if not nodes else f"'nodes' is {described(nodes)}"
         raise dataflow_refusal(source, reason, "list at least one node below 'nodes:'")
-    parsed = tuple(parse_node(node, place, source) for place, node in enumerate(nodes))
+    parsed = [parse_node(node, place, source) for place, node in enumerate(nodes)]
     exits = document.get("exit_when_nodes_finish")
     dataflow = Dataflow(
         source=source,
-        nodes=parsed,
+        nodes=tuple(_with_kept_output(node, parsed) for node in parsed),
         env=mapping_of(document.get("env"), source, "'env'"),
         exit_when_nodes_finish=exits if isinstance(exits, bool) else None,
         raw=document,
@@ -67,6 +67,13 @@ def parse_dataflow(document: object, source: str) -> Dataflow:
     _check_ids(dataflow)
     _check_wiring(dataflow)
     return dataflow
+
+
+def _with_kept_output(node: Node, nodes: Iterable[Node]) -> Node:
+    """The node; dora must read its output if an input is dora/logs, dora/logs/LEVEL[/NODE]."""
+    sources = (given.source.split("/", 3) for one in nodes for given in one.inputs)
+    is_read = any(one[:2] == ["dora", "logs"] and one[3:] in ([], [node.id]) for one in sources)
+    return replace(node, keeps_output=True) if is_read else node
 
 
 def _check_ids(dataflow: Dataflow) -> None:

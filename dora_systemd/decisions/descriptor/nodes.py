@@ -9,6 +9,8 @@ from dora_systemd.names import MAX_NODE_ID, NODE_ID
 from dora_systemd.values import quoted, shown
 
 _RESERVED_IDS = frozenset({"dora"})
+_OUTPUT_KEYS = ("send_stdout_as", "send_logs_as", "min_log_level")
+"""Keys for what dora's daemon does with what it reads of a node's stdout and stderr."""
 _BACKOFF_KEYS = ("max_restarts", "restart_delay", "max_restart_delay", "restart_window")
 
 
@@ -56,7 +58,8 @@ class Node:
     restart_policy: "never", "on-failure" or "always"; "" if the descriptor has none.
     backoff: the other restart keys that are set, such as restart_delay.
     build, git: the command and the repository for `dora build`, or "".
-    keeps_output: whether dora itself reads its output (`send_stdout_as`, `send_logs_as`).
+    keeps_output: whether dora must read its output: for outputs made of it (`send_stdout_as`,
+    `send_logs_as`), for `min_log_level`, and for an input from `dora/logs`.
     working_directory: of `deploy:`, or "".
     raw: the complete mapping.
     """
@@ -96,7 +99,11 @@ def parse_node(node: object, place: int, source: str) -> Node:
         backoff={key: node[key] for key in _BACKOFF_KEYS if node.get(key) is not None},
         build=text_of(node.get("build")),
         git=text_of(node.get("git")),
-        keeps_output=any(node.get(key) is not None for key in ("send_stdout_as", "send_logs_as")),
+        keeps_output=any(
+            part.get(key) is not None
+            for _, part in _operators(node, source, what)
+            for key in _OUTPUT_KEYS
+        ),
         working_directory=text_of(mapping_of(node.get("deploy"), source, what).get("working_dir")),
         raw=node,
     )

@@ -157,7 +157,7 @@ def _program(node: Mapping[str, Any]) -> dict[str, str]:
     except ValueError:
         return {}
     command = words[3:]
-    if not launcher.endswith("/launcher.sh") or not command:
+    if not launcher.endswith(("/launcher.pl", "/launcher.sh")) or not command:
         return {}
     if command[:2] == ["/bin/sh", "-c"]:
         return {"path": "shell", "args": " ".join(command[2:])}

@@ -9,9 +9,10 @@ from dora_systemd.paths import CellPaths
 
 
 def daemon_variables(prepared: Prepared, paths: CellPaths, unit: Path) -> dict[str, str]:
-    """Variables of the daemon that nodes do not get; launcher.sh removes them."""
+    """Variables of the daemon that nodes do not get; launcher.pl removes them."""
     libexec = str(PACKAGE / "libexec")
-    own = {"DORA_QUIET": "1", "RUST_BACKTRACE": "0"}
+    # Perl, which runs the launcher, would complain about every unknown LANG.
+    own = {"DORA_QUIET": "1", "RUST_BACKTRACE": "0", "PERL_BADLANG": "0"}
     added = {key: text for key, text in own.items() if key not in os.environ}
     kept = [node.id for node in prepared.dataflow.nodes if not has_pipes(node)]
     return {

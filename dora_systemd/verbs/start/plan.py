@@ -16,6 +16,7 @@ from dora_systemd.decisions.cell.environment import parse_environment_file, unit
 from dora_systemd.decisions.cell.launch import LaunchPlan, launch_descriptor
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
+from dora_systemd.decisions.descriptor.expansion import called_variables
 from dora_systemd.decisions.descriptor.nodes import UNEXPANDED
 from dora_systemd.decisions.properties.sandbox import Sandbox
 from dora_systemd.decisions.settings.limit_checks import settings_node_limits
@@ -104,18 +105,23 @@ def make_plan(scope: Scope, request: StartRequest) -> Plan:
     user = choose_user(scope, settings[USER], written.place, str(directory))
     with sight_of(account_of(user)) as sight:
         look = Look(sight, settings, user)
-        return _make_plan(_Found(scope, request, dataflow, settings, user), str(directory), look)
+        # Root's variables are not for the file of another user, which could read them out.
+        is_own = scope.is_user or written.place.uid == os.geteuid()
+        caller = request.environment if is_own else {}
+        found = _Found(scope, request, dataflow, settings, user, caller)
+        return _make_plan(found, str(directory), look)
 
 
 @dataclass(frozen=True)
 class _Found:
-    """What was read, and for which user."""
+    """What was read, and for which user. caller: variables of the caller that the file may use."""
 
     scope: Scope
     request: StartRequest
     dataflow: Dataflow
     settings: Settings
     user: pwd.struct_passwd | None
+    caller: Mapping[str, str]
 
 
 def _make_plan(found: _Found, directory: str, look: Look) -> Plan:
@@ -145,7 +151,8 @@ def _make_plan(found: _Found, directory: str, look: Look) -> Plan:
         start_timeout=settings[START_TIMEOUT],
         reload=hot_reload(settings, directory),
     )
-    environment = unit_environment(search_path, venv, variables)
+    called = called_variables(found.dataflow, found.caller)
+    environment = unit_environment(search_path, venv, {**called, **variables})
     check_credentials(found.scope, credential_files(settings))
     launch = LaunchPlan(
         options, "", environment["PATH"], look.sight.exists, look.read_session(path)

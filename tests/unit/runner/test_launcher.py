@@ -1,5 +1,6 @@
-"""launcher.sh and what stands in for python and uv: real shell scripts, with a pretended cgroup."""
+"""launcher.pl and what stands in for python and uv: real scripts, with a pretended cgroup."""
 
+import ast
 import os
 import subprocess
 from pathlib import Path
@@ -39,7 +40,7 @@ def launch(environment: dict[str, str], *words: str) -> subprocess.CompletedProc
 
 
 def launcher(environment: dict[str, str], *words: str) -> subprocess.CompletedProcess[str]:
-    return launch(environment, "/bin/sh", str(PACKAGE / "launcher.sh"), *words)
+    return launch(environment, "/usr/bin/perl", str(PACKAGE / "launcher.pl"), *words)
 
 
 def test_the_node_gets_group_pipes_directory_and_environment(
@@ -57,6 +58,42 @@ def test_the_node_gets_group_pipes_directory_and_environment(
     assert "PATH=/usr/bin:/bin" in said
     left = [line for line in said if line.startswith(("DORA_", "RUST_"))]
     assert left == [f"DORA_ZENOH_CONFIG_OVERLAY={PACKAGE}/zenoh.json5"]
+
+
+ODD = {
+    **{"node": "camera", "directory": "/d", "output": "o", "last": "l", "IFS": "x", "OPTIND": "7"},
+    **{"my.var": "1", "MY-VAR": "2", "a b": "3", "OLDPWD": "/old", "PWD": "/here", "_": "me"},
+    **{"LC_ALL": "xx_YY", "LINES": "a\nb", "UTF": "ü", "EMPTY": "", "PERL5LIB": "/nowhere"},
+}
+
+
+def test_no_other_variable_is_touched(environment: dict[str, str], tmp_path: Path) -> None:
+    environment |= {**ODD, "PERL_BADLANG": "0", "ZENOH_CONFIG": "z"}
+    environment["DORA_SYSTEMD_UNSET"] += " PERL_BADLANG"
+    script = "import posix; print({k.decode(): v.decode() for k, v in posix.environ.items()})"
+    words = ("/usr/bin/python3", "-I", "-S", "-c", script)
+    done = launcher(environment, "kept", str(tmp_path), "keep", *words)
+    assert done.stderr == ""
+    given = {key: text for key, text in environment.items() if key in ODD}
+    assert ast.literal_eval(done.stdout) == {
+        **given,
+        "PATH": "/usr/bin:/bin",
+        "MODEL": "yolo",
+        "ZENOH_CONFIG": "z",
+    }
+
+
+def test_signals_are_as_they_were(environment: dict[str, str], tmp_path: Path) -> None:
+    words = ("/usr/bin/grep", "Sig", "/proc/self/status")
+    here = launch(environment, *words).stdout
+    assert launcher(environment, "kept", str(tmp_path), "keep", *words).stdout == here
+
+
+def test_the_old_name_goes_on(environment: dict[str, str], tmp_path: Path) -> None:
+    """Of a dataflow that runs while the package is upgraded."""
+    old = ("/bin/sh", str(PACKAGE / "launcher.sh"))
+    done = launch(environment, *old, "kept", str(tmp_path), "keep", "/bin/echo", "a b", "$x")
+    assert done.stdout == "a b $x\n"
 
 
 @pytest.mark.parametrize("key", ["ZENOH_CONFIG", "DORA_ZENOH_CONFIG_OVERLAY"])

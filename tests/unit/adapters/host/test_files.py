@@ -59,6 +59,17 @@ def test_yaml_as_dora_reads_it(yaml: Any, text: str, value: object) -> None:
     assert yaml(text) == value
 
 
+def test_texts_of_nodes_stay_as_written(yaml: Any) -> None:
+    node = "{id: 1.10, path: true, args: 1.50, outputs: [007, x], env: {A: 1.50}, build: ~}"
+    assert yaml(f"nodes: [{node}]\nargs: 1.50") == {
+        "nodes": [
+            {"id": "1.10", "path": "true", "args": "1.50", "outputs": ["007", "x"]}
+            | {"env": {"A": 1.5}, "build": None}
+        ],
+        "args": 1.5,
+    }
+
+
 @pytest.mark.parametrize(
     ("text", "reason"),
     [

@@ -51,7 +51,7 @@ def launch(node: dict[str, Any], given: LaunchPlan | None = None) -> dict[str, A
 
 def words(node: dict[str, Any], given: LaunchPlan | None = None) -> list[str]:
     launched = launch(node, given)
-    assert launched["path"] == "/bin/sh"
+    assert launched["path"] == "/usr/bin/perl"
     return shlex.split(launched["args"])
 
 

@@ -267,3 +267,20 @@ def test_any_output_becomes_one_short_line(stderr: str) -> None:
     reason = parse_dora_error(stderr)
     assert one_line(reason) == reason
     assert len(reason) <= 300
+
+
+def kept(*sources: str) -> list[str]:
+    """The nodes whose output dora must read when a node has inputs from `sources`."""
+    inputs = {f"i{place}": source for place, source in enumerate(sources)}
+    taker = {"id": "taker", "path": "t.py", "inputs": inputs}
+    return [node.id for node in flow(CAMERA, taker).nodes if node.keeps_output]
+
+
+def test_whose_output_dora_must_read() -> None:
+    assert kept("camera/image", "dora/timer/secs/1") == []
+    assert kept("dora/logs") == kept("dora/logs/info") == ["camera", "taker"]
+    assert kept("dora/logs/info/camera") == ["camera"]
+    operator = {"python": "o.py", "outputs": ["words"], "send_stdout_as": "words"}
+    for node in ({"operator": operator}, {"operators": [{"id": "a", **operator}]}):
+        assert flow({"id": "one", **node}).nodes[0].keeps_output
+    assert flow({"id": "one", "path": "o.py", "min_log_level": "info"}).nodes[0].keeps_output

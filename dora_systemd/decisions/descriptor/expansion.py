@@ -1,0 +1,57 @@
+"""Variables in values of `env:`, such as ${HOME}, which the dora command replaces in its own way.
+
+The dora command replaces them when it reads the file. Here dora reads the descriptor in the unit,
+which has an environment of its own, so doractl gives it the caller's values, and the runner
+replaces them: dora's coordinator and its daemon would each do it once more (seen with dora 1.1).
+"""
+
+import re
+from collections.abc import Iterator, Mapping
+
+from dora_systemd.decisions.descriptor.dataflow import Dataflow
+
+_NAME = "[A-Za-z_][A-Za-z0-9_]*"
+_REFERENCE = re.compile(rf"\$\$|\$\{{({_NAME})(?::-([^}}]*))?\}}|\$({_NAME})")
+
+_DOLLAR = "$$$$"
+"""A "$" that coordinator and daemon have both halved."""
+
+_OF_THE_UNIT = {
+    *("HOME", "USER", "LOGNAME", "SHELL", "PATH", "PWD", "VIRTUAL_ENV", "TMPDIR"),
+    *("XDG_RUNTIME_DIR", "INVOCATION_ID", "JOURNAL_STREAM", "NOTIFY_SOCKET", "RUNTIME_DIRECTORY"),
+}
+"""Variables that systemd sets or that describe the nodes' user, see systemd.exec(5)."""
+
+
+def called_variables(dataflow: Dataflow, caller: Mapping[str, str]) -> dict[str, str]:
+    """The variables of the caller that values of `env:` name, except those of the unit itself."""
+    named = dict.fromkeys(name for text in _texts(dataflow) for name in _names(text))
+    return {name: caller[name] for name in named if name in caller and name not in _OF_THE_UNIT}
+
+
+def expanded(env: Mapping[str, object], environment: Mapping[str, str]) -> dict[str, object]:
+    """The values of `env:` as they must be sent, so that nodes get what `dora run` gives them.
+
+    A variable that is not set stays, for dora to report.
+    """
+
+    def replaced(match: re.Match[str]) -> str:
+        name = match[1] or match[3]
+        value = environment.get(name, match[2]) if name else "$"
+        return match[0] if value is None else value.replace("$", _DOLLAR)
+
+    return {
+        key: _REFERENCE.sub(replaced, value) if isinstance(value, str) else value
+        for key, value in env.items()
+    }
+
+
+def _texts(dataflow: Dataflow) -> Iterator[str]:
+    for env in (dataflow.env, *(node.env for node in dataflow.nodes)):
+        yield from (value for value in env.values() if isinstance(value, str))
+
+
+def _names(text: str) -> Iterator[str]:
+    for braced, _, plain in _REFERENCE.findall(text):
+        if braced or plain:
+            yield braced or plain

@@ -1,0 +1,48 @@
+#!/usr/bin/perl
+# Dora's daemon executes this instead of a node's program. The process becomes the node later, so it
+# can enter the node's group and open the node's pipes first, without a race. The node then gets the
+# environment that dora made for it, without the variables that are only for dora's daemon.
+#
+# launcher.pl NODE DIRECTORY pipe|keep COMMAND [ARGUMENT...]
+#   pipe: stdout and stderr become the node's FIFOs; opening them waits for the runner.
+#   keep: dora itself reads the output (send_stdout_as, send_logs_as).
+# Environment: DORA_SYSTEMD_CELL (RuntimeDirectory), DORA_SYSTEMD_GROUP (cgroup of the unit),
+# DORA_SYSTEMD_LIBEXEC (first entry of PATH), DORA_SYSTEMD_UNSET (names).
+#
+# Perl, because a shell drops variables with names such as "my.var" and sets others (PWD, OLDPWD),
+# and because Python takes six times as long and ignores signals. No modules: "use strict" would
+# double the time.
+
+my ($node, $directory, $output, @command) = @ARGV;
+my ($cell, $group, $libexec, $unset) =
+    delete @ENV{map "DORA_SYSTEMD_$_", qw(CELL GROUP LIBEXEC UNSET)};
+delete @ENV{split(' ', $unset), map "DORA_SYSTEMD_$_", qw(DIRECTORY PYTHON KEEP)};
+
+sub fail {
+    my ($status, $what) = @_;
+    print STDERR "launcher of $node: $what: $!\n";
+    exit $status;
+}
+
+sub note {
+    my ($path, $text) = @_;
+    my $file;
+    (open $file, '>', $path and print $file $text and close $file) or fail(126, $path);
+}
+
+note("$cell/io/$node.pid", "$$\n");
+if ($output eq 'pipe') {
+    open STDOUT, '>', "$cell/io/$node.out" or fail(126, "$node.out");
+    open STDERR, '>', "$cell/io/$node.err" or fail(126, "$node.err");
+}
+note("$group/node-$node/cgroup.procs", "0\n");
+chdir $directory or fail(126, $directory);
+$ENV{PATH} =~ s/^\Q$libexec\E://;
+# A zenoh configuration of the user's takes precedence. Dora refuses two, and a file that it cannot
+# read.
+(my $zenoh = $0) =~ s{[^/]*$}{zenoh.json5};
+unless (exists $ENV{ZENOH_CONFIG} or exists $ENV{DORA_ZENOH_CONFIG_OVERLAY} or not -r $zenoh) {
+    $ENV{DORA_ZENOH_CONFIG_OVERLAY} = $zenoh;
+}
+exec { $command[0] } @command;
+fail($! == 2 ? 127 : 126, $command[0]);  # ENOENT, as in a shell

@@ -1,0 +1,36 @@
+"""Variables in values of `env:`."""
+
+import pytest
+
+from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
+from dora_systemd.decisions.descriptor.expansion import called_variables, expanded
+
+
+def test_what_is_named_and_set() -> None:
+    node = {"id": "a", "path": "a.py", "args": "$ARGS", "env": {"M": "x${MODEL}y", "N": 5}}
+    env = {
+        "A": "$KEY/$_k.$MISSING",
+        "H": "$HOME",
+        "D": "$$PRICE ${",
+        "W": "${WITH:-default}",
+        "X": "${MODEL",
+    }
+    dataflow = parse_dataflow({"nodes": [node], "env": env}, "f")
+    caller = dict.fromkeys(("MODEL", "KEY", "_k", "HOME", "PRICE", "WITH", "ARGS", "OTHER"), "v")
+    assert called_variables(dataflow, caller) == dict.fromkeys(("KEY", "_k", "WITH", "MODEL"), "v")
+
+
+@pytest.mark.parametrize(
+    ("text", "sent"),
+    [
+        ("plain", "plain"),
+        ("$A/${A}", "a/a"),
+        ("${NONE:-d} ${A:-d}", "d a"),
+        ("${NONE} $NONE", "${NONE} $NONE"),
+        ("$$ a$$b $$A", "$$$$ a$$$$b $$$$A"),
+        ("$P", "$$$$x"),
+        ("5$ $5 ${", "5$ $5 ${"),
+    ],
+)
+def test_what_is_sent(text: str, sent: str) -> None:
+    assert expanded({"K": text, "N": 5}, {"A": "a", "P": "$x"}) == {"K": sent, "N": 5}
