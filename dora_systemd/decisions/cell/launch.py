@@ -89,10 +89,10 @@ def _launch_node(node: Node, source: str, plan: LaunchPlan) -> dict[str, Any]:
         raw["env"] = expanded(node.env, plan.environment)
     if plan.options.hot_reload and raw.get("restart_policy", "never") == "never":
         raw |= HELD_KEYS if is_launched(node) else {}
-    if node.keeps_output or not (is_launched(node) or node.kind is NodeKind.OPERATOR):
-        raw = with_bounds(raw)
     if node.kind is NodeKind.OPERATOR:
-        return _with_absolute_operators(raw, plan.options.working_directory)
+        return _launch_operators(node, raw, plan.options.working_directory)
+    if not has_pipes(node):
+        raw = with_bounds(raw)
     if not is_launched(node):
         return raw
     output = "keep" if node.keeps_output else "pipe"
@@ -210,12 +210,23 @@ def python_of(plan: LaunchPlan) -> str:
     return next(filter(plan.exists, found), "python3")
 
 
+def _launch_operators(node: Node, raw: dict[str, Any], directory: str) -> dict[str, Any]:
+    """Dora takes the limits of log files from the operators of such a node only."""
+    raw = _with_absolute_operators(raw, directory)
+    return raw if has_pipes(node) else _for_operators(raw, with_bounds)
+
+
 def _with_absolute_operators(raw: dict[str, Any], directory: str) -> dict[str, Any]:
     """Make paths of operators absolute: dora would resolve them in its own working directory."""
+    return _for_operators(raw, lambda operator: _absolute_operator(operator, directory))
+
+
+def _for_operators(raw: dict[str, Any], change: Callable[[Any], Any]) -> dict[str, Any]:
+    """The node, with a change to each of its operators."""
     if isinstance(raw.get("operator"), Mapping):
-        raw["operator"] = _absolute_operator(raw["operator"], directory)
+        raw["operator"] = change(raw["operator"])
     if isinstance(raw.get("operators"), list):
-        raw["operators"] = [_absolute_operator(one, directory) for one in raw["operators"]]
+        raw["operators"] = [change(one) for one in raw["operators"]]
     return raw
 
 
