@@ -21,7 +21,6 @@ from websockets.http11 import Response
 
 from dora_systemd.decisions.gateway.access import (
     STRANGER_SECONDS,
-    Caller,
     Door,
     Refusal,
     has_token,
@@ -107,8 +106,9 @@ class Gateway:
 
         class Counted(ServerConnection):
             def connection_made(self, transport: asyncio.BaseTransport) -> None:
-                gateway._came()
-                self._uid = _uid_behind(transport)
+                gateway._count += 1
+                ends = map(transport.get_extra_info, ("peername", "sockname"))
+                self._uid = _uid_behind(*ends)
                 self._is_in = gateway._door.enter(self._uid)
                 super().connection_made(transport)
                 if not self._is_in:
@@ -119,7 +119,8 @@ class Gateway:
             def connection_lost(self, exc: Exception | None) -> None:
                 if self._is_in:
                     gateway._door.leave(self._uid)
-                gateway._went()
+                gateway._count -= 1
+                gateway._since = time.monotonic()
                 super().connection_lost(exc)
 
             def _end_if_silent(self) -> None:
@@ -127,13 +128,6 @@ class Gateway:
                     self.transport.abort()
 
         return Counted
-
-    def _came(self) -> None:
-        self._count += 1
-
-    def _went(self) -> None:
-        self._count -= 1
-        self._since = time.monotonic()
 
     async def _answer(self, connection: ServerConnection, raw: RawRequest) -> Response | None:
         """The response to an HTTP request; None lets a WebSocket connection begin."""
@@ -150,22 +144,14 @@ class Gateway:
         return None if answer is None else _response(answer)
 
     async def _refusal(self, connection: ServerConnection, raw: RawRequest) -> Refusal | None:
-        caller = Caller(
-            None,
-            raw.headers.get_all("Host"),
-            raw.headers.get_all("Origin"),
-            raw.headers.get_all("Authorization"),
-        )
-        refusal = refuse_address(caller)
-        if refusal or _path(raw) in OPEN_TO_ALL or has_token(caller, self._token):
+        values = raw.headers.get_all
+        refusal = refuse_address(values("Host"), values("Origin"))
+        is_open = _path(raw) in OPEN_TO_ALL
+        if refusal or is_open or has_token(values("Authorization"), self._token):
             return refusal
-        # Look up the user again; an address may be None once the client has disconnected.
-        ends = (connection.remote_address, connection.local_address)
-        if all(ends):
-            peer, own = (tuple(end[:2]) for end in ends)
-            uid = peer_uid(peer, own)
-            caller = Caller(uid, caller.hosts, caller.origins, caller.authorizations)
-        return refuse_user(caller, os.getuid(), self._token)
+        # Look up the user again: the client may have disconnected.
+        uid = _uid_behind(connection.remote_address, connection.local_address)
+        return refuse_user(uid, os.getuid())
 
     async def _routed(self, raw: RawRequest) -> Answer | None:
         # get() raises for a header that occurs twice.
@@ -178,14 +164,15 @@ class Gateway:
         if path not in GET or wants_socket:
             return text_answer(404, "there is nothing here")
         async with asyncio.timeout(_ANSWER_SECONDS):
-            return await GET[path](self._request(raw))
+            return await GET[path](Request(path, self._scope))
 
     async def _talk(self, connection: ServerConnection) -> None:
         """Serve one WebSocket connection."""
         raw = connection.request
         assert raw is not None
+        path = _path(raw)
         try:
-            await SOCKETS[_path(raw)](connection, self._request(raw))
+            await SOCKETS[path](connection, Request(path, self._scope))
         except ConnectionClosed:
             return
         except DoraSystemdError as error:
@@ -194,15 +181,10 @@ class Gateway:
             log.error("cannot continue with %.200s: %s: %s", raw.path, type(error).__name__, error)
             await connection.close(1011, "internal error in the gateway, see its journal")
 
-    def _request(self, raw: RawRequest) -> Request:
-        headers = {name.lower(): value for name, value in raw.headers.raw_items()}
-        return Request(_path(raw), self._scope, raw.path.partition("?")[2], headers)
 
-
-def _uid_behind(transport: asyncio.BaseTransport) -> int | None:
-    """The user at the other end; ask at once, before it disconnects."""
-    ends = (transport.get_extra_info("peername"), transport.get_extra_info("sockname"))
-    return peer_uid(ends[0][:2], ends[1][:2]) if all(ends) else None
+def _uid_behind(peer: Any, own: Any) -> int | None:
+    """The user at the other end; an address is None once the client has disconnected."""
+    return peer_uid(peer[:2], own[:2]) if peer and own else None
 
 
 def _path(raw: RawRequest) -> str:
