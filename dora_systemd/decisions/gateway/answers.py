@@ -28,8 +28,10 @@ LOG_FIELDS = (
 _OWN_TARGET = "dora-systemd"
 _MEGABYTE = 1_000_000
 _NTP_BITS = 32
-_NODE_STATES = {"failed": "failed", "finished": "stopped", "stopped": "stopped"}
-_RESTARTING = frozenset({"restarting", "reloading"})
+_NODE_STATES = {
+    **{"failed": "failed", "finished": "stopped", "stopped": "stopped"},
+    **{"restarting": "restarting", "reloading": "restarting"},
+}
 _LEVELS = ("off", "error", "warn", "info", "debug", "trace")
 _BY_PRIORITY = {ERR: "error", WARNING: "warn", DEBUG: "debug"}
 _EXIT = re.compile(r"(?:exit code (?P<code>\d+)|signal (?P<signal>SIG[A-Z0-9]+))")
@@ -71,15 +73,11 @@ def _node_info(row: DataflowRow, node: NodeRow) -> dict[str, Any]:
             "disk_write_mb_s": None,
             "restart_count": node.restarts or 0,
             "broken_inputs": [],
-            "status": _node_state(node.state),
+            "status": _NODE_STATES.get(node.state, "running"),
             "pending_messages": 0,
         },
         "network": None,
     }
-
-
-def _node_state(state: str) -> str:
-    return "restarting" if state in _RESTARTING else _NODE_STATES.get(state, "running")
 
 
 def daemon_list(uuids: Iterable[str]) -> dict[str, Any]:

@@ -113,7 +113,5 @@ def graph_values(dataflow: Dataflow) -> dict[str, Any]:
 
 
 def _edge(node: str, name: str, source: str) -> dict[str, str]:
-    origin, _, output = ("dora", "", "") if source.startswith("dora/") else source.partition("/")
-    if origin == "dora":
-        origin = source
+    origin, _, output = (source, "", "") if source.startswith("dora/") else source.partition("/")
     return {"from": origin, "output": output, "to": node, "input": name}

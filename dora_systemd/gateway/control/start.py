@@ -28,6 +28,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.trust.files import read_file
 from dora_systemd.trust.paths import list_directory
 from dora_systemd.values import shown
+from dora_systemd.verbs.facts.nodes import written_dataflow
 from dora_systemd.verbs.start.launch import claim, start_claim
 from dora_systemd.verbs.start.plan import StartRequest
 
@@ -62,7 +63,7 @@ def _start(scope: Scope, request: Request) -> str:
         raise DoraSystemdError("cannot start: no dataflow was sent", "", ExitCode.BAD_INPUT)
     name = request.body.get("name")
     path = find_file(Path(request.text("local_working_dir")), request.text("session_id"))
-    flags = sent_flags(request, _read(path))
+    flags = sent_flags(request, written_dataflow(str(path)).raw)
     wanted = StartRequest(str(path), name if isinstance(name, str) else None, flags, os.environ)
     bus = Bus(scope)
     return start_claim(bus, claim(bus, scope, wanted), None, wait=False).uuid
@@ -99,12 +100,8 @@ def _no_file(message: str) -> DoraSystemdError:
 
 def _session(path: Path) -> object:
     """The session id that the dora command sends for this file."""
+    kept = Path(session_path(str(path)))
     with suppress(DoraSystemdError):
-        return _read(Path(session_path(str(path)))).get("session_id")
+        document = parse_yaml(decoded(read_file(kept).data, kept), kept)
+        return document.get("session_id") if isinstance(document, dict) else None
     return None
-
-
-def _read(path: Path) -> dict[str, Any]:
-    """The mapping in a YAML file; empty if it holds anything else. Raises DoraSystemdError."""
-    document = parse_yaml(decoded(read_file(path).data, path), path)
-    return document if isinstance(document, dict) else {}
