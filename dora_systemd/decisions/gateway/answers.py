@@ -12,7 +12,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
-from dora_systemd.decisions.logs.lines import DEBUG, ERR, INFO, WARNING
 from dora_systemd.decisions.views.dataflows import FAILED, UP_WORDS, DataflowRow, NodeRow
 from dora_systemd.values import SECOND
 
@@ -33,7 +32,10 @@ _NODE_STATES = {
     **{"restarting": "restarting", "reloading": "restarting"},
 }
 _LEVELS = ("off", "error", "warn", "info", "debug", "trace")
-_BY_PRIORITY = {ERR: "error", WARNING: "warn", DEBUG: "debug"}
+_BY_PRIORITY = {
+    **dict.fromkeys((b"0", b"1", b"2", b"3"), "error"),
+    **{b"4": "warn", b"7": "debug"},
+}
 _EXIT = re.compile(r"(?:exit code (?P<code>\d+)|signal (?P<signal>SIG[A-Z0-9]+))")
 _SYSTEMD_FIELDS = ("UNIT", "USER_UNIT")
 
@@ -217,9 +219,7 @@ def _level(record: Record) -> str:
         return level
     if "DORA_STREAM" in record:
         return "stdout"
-    priority = _text(record, "PRIORITY")
-    number = int(priority) if len(priority) == 1 and priority.isdecimal() else INFO
-    return _BY_PRIORITY.get(max(number, ERR), "info")
+    return _BY_PRIORITY.get(record.get("PRIORITY", b""), "info")
 
 
 def _text(record: Record, name: str) -> str:

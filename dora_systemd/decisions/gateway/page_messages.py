@@ -53,25 +53,15 @@ def parse_message(text: str | bytes) -> PageMessage:
     """Parse a request of a page. Raises DoraSystemdError (USAGE) if it is not valid."""
     try:
         raw = json.loads(text)
-        message = PageMessage(
-            type=_text(raw, "type"),
-            dataflow=_text(raw, "dataflow"),
-            node=_text(raw, "node"),
-            action=_text(raw, "action"),
-            number=int(raw.get("number", 0)),
-        )
+        texts = {key: raw.get(key, "") for key in ("type", "dataflow", "node", "action")}
+        message = PageMessage(**texts, number=int(raw.get("number", 0)))
     except (ValueError, TypeError, AttributeError, RecursionError, OverflowError) as error:
         raise _refusal() from error
-    if message.type not in TYPES or (message.type == "act" and message.action not in ACTIONS):
+    is_text = all(isinstance(one, str) for one in texts.values())
+    is_known = message.type != "act" or message.action in ACTIONS
+    if not is_text or message.type not in TYPES or not is_known:
         raise _refusal()
     return message
-
-
-def _text(raw: Mapping[str, Any], key: str) -> str:
-    value = raw.get(key, "")
-    if not isinstance(value, str):
-        raise TypeError(key)
-    return value
 
 
 def _refusal() -> DoraSystemdError:
