@@ -22,7 +22,6 @@ from websockets.http11 import Response
 from dora_systemd.decisions.gateway.access import (
     STRANGER_SECONDS,
     Door,
-    Refusal,
     has_token,
     refuse_address,
     refuse_user,
@@ -132,8 +131,7 @@ class Gateway:
     async def _answer(self, connection: ServerConnection, raw: RawRequest) -> Response | None:
         """The response to an HTTP request; None lets a WebSocket connection begin."""
         try:
-            refusal = await self._refusal(connection, raw)
-            answer = _refused(refusal) if refusal else await self._routed(raw)
+            answer = self._refusal(connection, raw) or await self._routed(raw)
         except TimeoutError:
             answer = text_answer(504, "no answer in time")
         except DoraSystemdError as error:
@@ -143,13 +141,13 @@ class Gateway:
             answer = text_answer(500, "internal error in the gateway, see its journal")
         return None if answer is None else _response(answer)
 
-    async def _refusal(self, connection: ServerConnection, raw: RawRequest) -> Refusal | None:
+    def _refusal(self, connection: ServerConnection, raw: RawRequest) -> Answer | None:
         values = raw.headers.get_all
         refusal = refuse_address(values("Host"), values("Origin"))
         is_open = _path(raw) in OPEN_TO_ALL
         if refusal or is_open or has_token(values("Authorization"), self._token):
             return refusal
-        # Look up the user again: the client may have disconnected.
+        # Look up the user again; an address is None once the client has disconnected.
         uid = _uid_behind(connection.remote_address, connection.local_address)
         return refuse_user(uid, os.getuid())
 
@@ -189,11 +187,6 @@ def _uid_behind(peer: Any, own: Any) -> int | None:
 
 def _path(raw: RawRequest) -> str:
     return raw.path.partition("?")[0]
-
-
-def _refused(refusal: Refusal) -> Answer:
-    more = {"WWW-Authenticate": "Bearer"} if refusal.status == HTTPStatus.UNAUTHORIZED else {}
-    return text_answer(refusal.status, refusal.text, **more)
 
 
 def _response(answer: Answer) -> Response:

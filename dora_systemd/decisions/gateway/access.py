@@ -9,7 +9,8 @@ import hmac
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+
+from dora_systemd.decisions.gateway.request import Answer, text_answer
 
 MAX_CONNECTIONS = 256
 """Maximum connections of root and of the gateway's own user; as in dora's coordinator."""
@@ -22,14 +23,6 @@ STRANGER_SECONDS = 2.0
 
 _HOST = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:[0-9]{1,5})?", re.IGNORECASE)
 _BEARER = "bearer "
-
-
-@dataclass(frozen=True)
-class Refusal:
-    """An HTTP status, and one line about the reason."""
-
-    status: int
-    text: str
 
 
 class Door:
@@ -61,7 +54,7 @@ class Door:
         self._inside -= Counter([uid])
 
 
-def refuse_address(hosts: Sequence[str], origins: Sequence[str] = ()) -> Refusal | None:
+def refuse_address(hosts: Sequence[str], origins: Sequence[str] = ()) -> Answer | None:
     """Refuse pages of other sites: the request must use one of this machine's own names.
 
     hosts, origins: all values of these headers, because they may be repeated. The port may differ,
@@ -69,21 +62,22 @@ def refuse_address(hosts: Sequence[str], origins: Sequence[str] = ()) -> Refusal
     that it was loaded from.
     """
     if len(hosts) != 1 or not _HOST.fullmatch(hosts[0]):
-        return Refusal(403, "the gateway answers to 127.0.0.1 and localhost only")
+        return text_answer(403, "the gateway answers to 127.0.0.1 and localhost only")
     own = f"http://{hosts[0]}".lower()
     if any(origin.lower() != own for origin in origins):
-        return Refusal(403, "pages of other origins may not use the gateway")
+        return text_answer(403, "pages of other origins may not use the gateway")
     return None
 
 
-def refuse_user(uid: int | None, own_uid: int) -> Refusal | None:
+def refuse_user(uid: int | None, own_uid: int) -> Answer | None:
     """Let in root and the gateway's own user, if no token lets the caller in.
 
     uid: the user at the other end of the connection, None if the kernel does not tell.
     """
     if uid in (0, own_uid):
         return None
-    return Refusal(401, "only root, its own user and holders of its token may use this gateway")
+    text = "only root, its own user and holders of its token may use this gateway"
+    return text_answer(401, text, **{"WWW-Authenticate": "Bearer"})
 
 
 def has_token(authorizations: Sequence[str], token: str) -> bool:

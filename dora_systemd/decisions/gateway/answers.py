@@ -172,29 +172,29 @@ def log_line(record: Record) -> bytes:
     line = {
         "ts": _timestamp(record),
         "level": _level(record),
-        "node": _text(record, "DORA_NODE"),
-        "msg": _text(record, "MESSAGE"),
+        "node": record_text(record, "DORA_NODE"),
+        "msg": record_text(record, "MESSAGE"),
     }
     if "DORA_TARGET" in record:
-        line["target"] = _text(record, "DORA_TARGET")
+        line["target"] = record_text(record, "DORA_TARGET")
     return json.dumps(line, separators=(",", ":")).encode() + b"\n"
 
 
 def log_payload(record: Record, uuid: str) -> dict[str, Any]:
     """A record of the journal as an event of dora's log stream. uuid: of the dataflow."""
     level = _level(record)
-    target = _text(record, "DORA_TARGET") or ("" if "DORA_STREAM" in record else _OWN_TARGET)
+    target = record_text(record, "DORA_TARGET") or ("" if "DORA_STREAM" in record else _OWN_TARGET)
     return {
         "build_id": None,
         "dataflow_id": uuid,
-        "node_id": _text(record, "DORA_NODE") or None,
+        "node_id": record_text(record, "DORA_NODE") or None,
         "daemon_id": None,
         "level": level if level == "stdout" else level.upper(),
         "target": target or None,
         "module_path": None,
         "file": None,
         "line": None,
-        "message": _text(record, "MESSAGE"),
+        "message": record_text(record, "MESSAGE"),
         "timestamp": _timestamp(record),
         "fields": None,
     }
@@ -214,7 +214,7 @@ def is_from_systemd(record: Record) -> bool:
 
 
 def _level(record: Record) -> str:
-    level = _text(record, "DORA_LEVEL")
+    level = record_text(record, "DORA_LEVEL")
     if level in _LEVELS:
         return level
     if "DORA_STREAM" in record:
@@ -222,7 +222,8 @@ def _level(record: Record) -> str:
     return _BY_PRIORITY.get(record.get("PRIORITY", b""), "info")
 
 
-def _text(record: Record, name: str) -> str:
+def record_text(record: Record, name: str) -> str:
+    """The field `name` of the record as text, "" without it."""
     return record.get(name, b"").decode("utf-8", "replace")
 
 

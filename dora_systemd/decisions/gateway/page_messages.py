@@ -20,11 +20,11 @@ It receives:
 """
 
 import json
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
+from dora_systemd.decisions.gateway.answers import Record, record_text
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.terminal_text import escaped, without_sequences
 
@@ -69,21 +69,17 @@ def _refusal() -> DoraSystemdError:
     return DoraSystemdError("cannot read what the page sent", hint, ExitCode.USAGE)
 
 
-def line_values(record: Mapping[str, bytes]) -> dict[str, Any]:
+def line_values(record: Record) -> dict[str, Any]:
     """A record of the journal as a line for the page."""
-    node = _decoded(record.get("DORA_NODE", b""))
+    identifier = record_text(record, "SYSLOG_IDENTIFIER")
     priority = record.get("PRIORITY", b"")
     return {
         "at_us": int(record.get("__REALTIME_TIMESTAMP", b"0")),
-        "node": node or _decoded(record.get("SYSLOG_IDENTIFIER", b"")).partition("/")[2],
-        "text": _printable(_decoded(record.get("MESSAGE", b""))),
+        "node": record_text(record, "DORA_NODE") or identifier.partition("/")[2],
+        "text": _printable(record_text(record, "MESSAGE")),
         "priority": int(priority) if priority in _PRIORITIES else _DEFAULT_PRIORITY,
-        "event": _decoded(record.get("DORA_EVENT", b"")),
+        "event": record_text(record, "DORA_EVENT"),
     }
-
-
-def _decoded(data: bytes) -> str:
-    return data.decode("utf-8", "replace")
 
 
 def _printable(text: str) -> str:

@@ -20,6 +20,7 @@ from dora_systemd.decisions.gateway.answers import (
     is_wanted,
     log_line,
     log_payload,
+    record_text,
 )
 from dora_systemd.decisions.gateway.frames import LOGS_LIMIT, Request, format_event, logs_parts
 from dora_systemd.decisions.logs.fields import ExportReader
@@ -158,8 +159,7 @@ class Follower:
                     await self._talk.socket.send(format_event(payload))
 
     def _is_new(self, record: Record) -> bool:
-        node = record.get("DORA_NODE", b"").decode("utf-8", "replace")
-        return _place(record) > self._places.get(node, self._since)
+        return _place(record) > self._places.get(record_text(record, "DORA_NODE"), self._since)
 
     async def _has_ended(self) -> bool:
         await asyncio.sleep(_SETTLE_SECONDS)
