@@ -42,6 +42,7 @@ OPEN_SECONDS = 20.0
 _ANSWER_SECONDS = 15.0
 _BACKLOG = 1024
 _REASON_BYTES = 120
+"""Just below what a closing frame can have."""
 
 _ALWAYS = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
 
@@ -174,7 +175,8 @@ class Gateway:
         except ConnectionClosed:
             return
         except DoraSystemdError as error:
-            await connection.close(1011, _short(error.message))
+            reason = error.message.encode()[:_REASON_BYTES].decode(errors="ignore")
+            await connection.close(1011, reason)
         except Exception as error:
             log.error("cannot continue with %.200s: %s: %s", raw.path, type(error).__name__, error)
             await connection.close(1011, "internal error in the gateway, see its journal")
@@ -199,8 +201,3 @@ def _response(answer: Answer) -> Response:
         **answer.headers,
     }
     return Response(status.value, status.phrase, Headers(fields), answer.body)
-
-
-def _short(text: str) -> str:
-    """`text`, cut to what a closing frame can have."""
-    return text.encode()[:_REASON_BYTES].decode(errors="ignore")

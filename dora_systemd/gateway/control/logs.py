@@ -152,7 +152,8 @@ class Follower:
         while data := await stream.read(_CHUNK):
             for record in records.feed(data):
                 if is_from_systemd(record):
-                    if await self._has_ended():
+                    await asyncio.sleep(_SETTLE_SECONDS)
+                    if not await self._is_up():
                         return
                 elif self._is_new(record) and is_wanted(record, self._level):
                     payload = log_payload(record, self._uuid)
@@ -160,10 +161,6 @@ class Follower:
 
     def _is_new(self, record: Record) -> bool:
         return _place(record) > self._places.get(record_text(record, "DORA_NODE"), self._since)
-
-    async def _has_ended(self) -> bool:
-        await asyncio.sleep(_SETTLE_SECONDS)
-        return not await self._is_up()
 
     async def _is_up(self) -> bool:
         return await asyncio.to_thread(
