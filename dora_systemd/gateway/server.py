@@ -21,9 +21,7 @@ from websockets.http11 import Response
 
 from dora_systemd.decisions.gateway.access import (
     STRANGER_SECONDS,
-    Caller,
     Door,
-    Refusal,
     has_token,
     refuse_address,
     refuse_user,
@@ -44,6 +42,7 @@ OPEN_SECONDS = 20.0
 _ANSWER_SECONDS = 15.0
 _BACKLOG = 1024
 _REASON_BYTES = 120
+"""Just below what a closing frame can have."""
 
 _ALWAYS = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
 
@@ -107,8 +106,9 @@ class Gateway:
 
         class Counted(ServerConnection):
             def connection_made(self, transport: asyncio.BaseTransport) -> None:
-                gateway._came()
-                self._uid = _uid_behind(transport)
+                gateway._count += 1
+                ends = map(transport.get_extra_info, ("peername", "sockname"))
+                self._uid = _uid_behind(*ends)
                 self._is_in = gateway._door.enter(self._uid)
                 super().connection_made(transport)
                 if not self._is_in:
@@ -119,7 +119,8 @@ class Gateway:
             def connection_lost(self, exc: Exception | None) -> None:
                 if self._is_in:
                     gateway._door.leave(self._uid)
-                gateway._went()
+                gateway._count -= 1
+                gateway._since = time.monotonic()
                 super().connection_lost(exc)
 
             def _end_if_silent(self) -> None:
@@ -128,18 +129,10 @@ class Gateway:
 
         return Counted
 
-    def _came(self) -> None:
-        self._count += 1
-
-    def _went(self) -> None:
-        self._count -= 1
-        self._since = time.monotonic()
-
     async def _answer(self, connection: ServerConnection, raw: RawRequest) -> Response | None:
         """The response to an HTTP request; None lets a WebSocket connection begin."""
         try:
-            refusal = await self._refusal(connection, raw)
-            answer = _refused(refusal) if refusal else await self._routed(raw)
+            answer = self._refusal(connection, raw) or await self._routed(raw)
         except TimeoutError:
             answer = text_answer(504, "no answer in time")
         except DoraSystemdError as error:
@@ -149,23 +142,15 @@ class Gateway:
             answer = text_answer(500, "internal error in the gateway, see its journal")
         return None if answer is None else _response(answer)
 
-    async def _refusal(self, connection: ServerConnection, raw: RawRequest) -> Refusal | None:
-        caller = Caller(
-            None,
-            raw.headers.get_all("Host"),
-            raw.headers.get_all("Origin"),
-            raw.headers.get_all("Authorization"),
-        )
-        refusal = refuse_address(caller)
-        if refusal or _path(raw) in OPEN_TO_ALL or has_token(caller, self._token):
+    def _refusal(self, connection: ServerConnection, raw: RawRequest) -> Answer | None:
+        values = raw.headers.get_all
+        refusal = refuse_address(values("Host"), values("Origin"))
+        is_open = _path(raw) in OPEN_TO_ALL
+        if refusal or is_open or has_token(values("Authorization"), self._token):
             return refusal
-        # Look up the user again; an address may be None once the client has disconnected.
-        ends = (connection.remote_address, connection.local_address)
-        if all(ends):
-            peer, own = (tuple(end[:2]) for end in ends)
-            uid = peer_uid(peer, own)
-            caller = Caller(uid, caller.hosts, caller.origins, caller.authorizations)
-        return refuse_user(caller, os.getuid(), self._token)
+        # Look up the user again; an address is None once the client has disconnected.
+        uid = _uid_behind(connection.remote_address, connection.local_address)
+        return refuse_user(uid, os.getuid())
 
     async def _routed(self, raw: RawRequest) -> Answer | None:
         # get() raises for a header that occurs twice.
@@ -178,40 +163,32 @@ class Gateway:
         if path not in GET or wants_socket:
             return text_answer(404, "there is nothing here")
         async with asyncio.timeout(_ANSWER_SECONDS):
-            return await GET[path](self._request(raw))
+            return await GET[path](Request(path, self._scope))
 
     async def _talk(self, connection: ServerConnection) -> None:
         """Serve one WebSocket connection."""
         raw = connection.request
         assert raw is not None
+        path = _path(raw)
         try:
-            await SOCKETS[_path(raw)](connection, self._request(raw))
+            await SOCKETS[path](connection, Request(path, self._scope))
         except ConnectionClosed:
             return
         except DoraSystemdError as error:
-            await connection.close(1011, _short(error.message))
+            reason = error.message.encode()[:_REASON_BYTES].decode(errors="ignore")
+            await connection.close(1011, reason)
         except Exception as error:
             log.error("cannot continue with %.200s: %s: %s", raw.path, type(error).__name__, error)
             await connection.close(1011, "internal error in the gateway, see its journal")
 
-    def _request(self, raw: RawRequest) -> Request:
-        headers = {name.lower(): value for name, value in raw.headers.raw_items()}
-        return Request(_path(raw), self._scope, raw.path.partition("?")[2], headers)
 
-
-def _uid_behind(transport: asyncio.BaseTransport) -> int | None:
-    """The user at the other end; ask at once, before it disconnects."""
-    ends = (transport.get_extra_info("peername"), transport.get_extra_info("sockname"))
-    return peer_uid(ends[0][:2], ends[1][:2]) if all(ends) else None
+def _uid_behind(peer: Any, own: Any) -> int | None:
+    """The user at the other end; an address is None once the client has disconnected."""
+    return peer_uid(peer[:2], own[:2]) if peer and own else None
 
 
 def _path(raw: RawRequest) -> str:
     return raw.path.partition("?")[0]
-
-
-def _refused(refusal: Refusal) -> Answer:
-    more = {"WWW-Authenticate": "Bearer"} if refusal.status == HTTPStatus.UNAUTHORIZED else {}
-    return text_answer(refusal.status, refusal.text, **more)
 
 
 def _response(answer: Answer) -> Response:
@@ -224,8 +201,3 @@ def _response(answer: Answer) -> Response:
         **answer.headers,
     }
     return Response(status.value, status.phrase, Headers(fields), answer.body)
-
-
-def _short(text: str) -> str:
-    """`text`, cut to what a closing frame can have."""
-    return text.encode()[:_REASON_BYTES].decode(errors="ignore")

@@ -105,7 +105,7 @@ def test_her_dora_never_runs_as_root(cell: Cell, mallory: Home) -> None:
 def test_a_gateway_runs_no_dora_of_hers(cell: Cell, mallory: Home) -> None:
     """A1: nor does root's gateway, when it is asked about a node of hers."""
     from dora_systemd.adapters.bus.systemd import Bus
-    from dora_systemd.gateway.control.state import written_descriptor
+    from dora_systemd.gateway.control.state import ended_descriptor
     from dora_systemd.verbs.facts.cells import read_cell
 
     proof = mallory.spy()
@@ -114,7 +114,7 @@ def test_a_gateway_runs_no_dora_of_hers(cell: Cell, mallory: Home) -> None:
     cell.start(flow)
     found = read_cell(Bus(cell.scope), cell.unit)
     assert found is not None
-    written_descriptor(found)
+    assert ended_descriptor(cell.scope, found.uuid)[0] == cell.name
     assert "uid 0" not in proof.read_text()
 
 

@@ -9,7 +9,8 @@ import hmac
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+
+from dora_systemd.decisions.gateway.request import Answer, text_answer
 
 MAX_CONNECTIONS = 256
 """Maximum connections of root and of the gateway's own user; as in dora's coordinator."""
@@ -22,27 +23,6 @@ STRANGER_SECONDS = 2.0
 
 _HOST = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:[0-9]{1,5})?", re.IGNORECASE)
 _BEARER = "bearer "
-
-
-@dataclass(frozen=True)
-class Caller:
-    """The facts of a request. Headers have all their values, because they may be repeated.
-
-    uid: the user at the other end of the connection, None if the kernel does not tell.
-    """
-
-    uid: int | None
-    hosts: Sequence[str] = ()
-    origins: Sequence[str] = ()
-    authorizations: Sequence[str] = ()
-
-
-@dataclass(frozen=True)
-class Refusal:
-    """An HTTP status, and one line about the reason."""
-
-    status: int
-    text: str
 
 
 class Door:
@@ -61,49 +41,50 @@ class Door:
 
     def enter(self, uid: int | None) -> bool:
         """Count a connection if there is room for it; whether there is."""
-        of_all = sum(n for one, n in self._inside.items() if self._is_like(one, uid))
-        has_room = of_all < (MAX_STRANGERS if self.is_stranger(uid) else MAX_CONNECTIONS)
-        if self.is_stranger(uid):
+        is_stranger = self.is_stranger(uid)
+        of_all = sum(n for one, n in self._inside.items() if self.is_stranger(one) == is_stranger)
+        has_room = of_all < (MAX_STRANGERS if is_stranger else MAX_CONNECTIONS)
+        if is_stranger:
             has_room = has_room and self._inside[uid] < MAX_OF_STRANGER
         self._inside[uid] += has_room
         return has_room
 
-    def _is_like(self, one: int | None, other: int | None) -> bool:
-        return self.is_stranger(one) == self.is_stranger(other)
-
     def leave(self, uid: int | None) -> None:
         """Count the end of a connection that was let in."""
-        self._inside[uid] -= 1
-        if not self._inside[uid]:
-            del self._inside[uid]
+        self._inside -= Counter([uid])
 
 
-def refuse_address(caller: Caller) -> Refusal | None:
+def refuse_address(hosts: Sequence[str], origins: Sequence[str] = ()) -> Answer | None:
     """Refuse pages of other sites: the request must use one of this machine's own names.
 
-    The port may differ, as in a tunnel (ssh -L 8080:127.0.0.1:53290). The origin of a page must be
-    exactly the address that it was loaded from.
+    hosts, origins: all values of these headers, because they may be repeated. The port may differ,
+    as in a tunnel (ssh -L 8080:127.0.0.1:53290). The origin of a page must be exactly the address
+    that it was loaded from.
     """
-    if len(caller.hosts) != 1 or not _HOST.fullmatch(caller.hosts[0]):
-        return Refusal(403, "the gateway answers to 127.0.0.1 and localhost only")
-    own = f"http://{caller.hosts[0]}".lower()
-    if any(origin.lower() != own for origin in caller.origins):
-        return Refusal(403, "pages of other origins may not use the gateway")
+    if len(hosts) != 1 or not _HOST.fullmatch(hosts[0]):
+        return text_answer(403, "the gateway answers to 127.0.0.1 and localhost only")
+    own = f"http://{hosts[0]}".lower()
+    if any(origin.lower() != own for origin in origins):
+        return text_answer(403, "pages of other origins may not use the gateway")
     return None
 
 
-def refuse_user(caller: Caller, own_uid: int, token: str) -> Refusal | None:
-    """Let in root, the gateway's own user, and anyone who has the token."""
-    if caller.uid in (0, own_uid) or has_token(caller, token):
+def refuse_user(uid: int | None, own_uid: int) -> Answer | None:
+    """Let in root and the gateway's own user, if no token lets the caller in.
+
+    uid: the user at the other end of the connection, None if the kernel does not tell.
+    """
+    if uid in (0, own_uid):
         return None
-    return Refusal(401, "only root, its own user and holders of its token may use this gateway")
+    text = "only root, its own user and holders of its token may use this gateway"
+    return text_answer(401, text, **{"WWW-Authenticate": "Bearer"})
 
 
-def has_token(caller: Caller, token: str) -> bool:
-    """Whether the request has this token, compared in constant time."""
-    if len(caller.authorizations) != 1 or not token:
+def has_token(authorizations: Sequence[str], token: str) -> bool:
+    """Whether the only value of this header is this token, compared in constant time."""
+    if len(authorizations) != 1 or not token:
         return False
-    scheme, given = caller.authorizations[0][: len(_BEARER)], caller.authorizations[0][7:]
+    scheme, given = authorizations[0][: len(_BEARER)], authorizations[0][len(_BEARER) :]
     return scheme.lower() == _BEARER and hmac.compare_digest(
         given.strip().encode("utf-8", "replace"), token.encode()
     )

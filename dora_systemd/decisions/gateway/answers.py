@@ -12,7 +12,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
-from dora_systemd.decisions.logs.lines import DEBUG, ERR, INFO, WARNING
 from dora_systemd.decisions.views.dataflows import FAILED, UP_WORDS, DataflowRow, NodeRow
 from dora_systemd.values import SECOND
 
@@ -28,10 +27,15 @@ LOG_FIELDS = (
 _OWN_TARGET = "dora-systemd"
 _MEGABYTE = 1_000_000
 _NTP_BITS = 32
-_NODE_STATES = {"failed": "failed", "finished": "stopped", "stopped": "stopped"}
-_RESTARTING = frozenset({"restarting", "reloading"})
+_NODE_STATES = {
+    **{"failed": "failed", "finished": "stopped", "stopped": "stopped"},
+    **{"restarting": "restarting", "reloading": "restarting"},
+}
 _LEVELS = ("off", "error", "warn", "info", "debug", "trace")
-_BY_PRIORITY = {ERR: "error", WARNING: "warn", DEBUG: "debug"}
+_BY_PRIORITY = {
+    **dict.fromkeys((b"0", b"1", b"2", b"3"), "error"),
+    **{b"4": "warn", b"7": "debug"},
+}
 _EXIT = re.compile(r"(?:exit code (?P<code>\d+)|signal (?P<signal>SIG[A-Z0-9]+))")
 _SYSTEMD_FIELDS = ("UNIT", "USER_UNIT")
 
@@ -71,15 +75,11 @@ def _node_info(row: DataflowRow, node: NodeRow) -> dict[str, Any]:
             "disk_write_mb_s": None,
             "restart_count": node.restarts or 0,
             "broken_inputs": [],
-            "status": _node_state(node.state),
+            "status": _NODE_STATES.get(node.state, "running"),
             "pending_messages": 0,
         },
         "network": None,
     }
-
-
-def _node_state(state: str) -> str:
-    return "restarting" if state in _RESTARTING else _NODE_STATES.get(state, "running")
 
 
 def daemon_list(uuids: Iterable[str]) -> dict[str, Any]:
@@ -172,29 +172,29 @@ def log_line(record: Record) -> bytes:
     line = {
         "ts": _timestamp(record),
         "level": _level(record),
-        "node": _text(record, "DORA_NODE"),
-        "msg": _text(record, "MESSAGE"),
+        "node": record_text(record, "DORA_NODE"),
+        "msg": record_text(record, "MESSAGE"),
     }
     if "DORA_TARGET" in record:
-        line["target"] = _text(record, "DORA_TARGET")
+        line["target"] = record_text(record, "DORA_TARGET")
     return json.dumps(line, separators=(",", ":")).encode() + b"\n"
 
 
 def log_payload(record: Record, uuid: str) -> dict[str, Any]:
     """A record of the journal as an event of dora's log stream. uuid: of the dataflow."""
     level = _level(record)
-    target = _text(record, "DORA_TARGET") or ("" if "DORA_STREAM" in record else _OWN_TARGET)
+    target = record_text(record, "DORA_TARGET") or ("" if "DORA_STREAM" in record else _OWN_TARGET)
     return {
         "build_id": None,
         "dataflow_id": uuid,
-        "node_id": _text(record, "DORA_NODE") or None,
+        "node_id": record_text(record, "DORA_NODE") or None,
         "daemon_id": None,
         "level": level if level == "stdout" else level.upper(),
         "target": target or None,
         "module_path": None,
         "file": None,
         "line": None,
-        "message": _text(record, "MESSAGE"),
+        "message": record_text(record, "MESSAGE"),
         "timestamp": _timestamp(record),
         "fields": None,
     }
@@ -214,17 +214,16 @@ def is_from_systemd(record: Record) -> bool:
 
 
 def _level(record: Record) -> str:
-    level = _text(record, "DORA_LEVEL")
+    level = record_text(record, "DORA_LEVEL")
     if level in _LEVELS:
         return level
     if "DORA_STREAM" in record:
         return "stdout"
-    priority = _text(record, "PRIORITY")
-    number = int(priority) if len(priority) == 1 and priority.isdecimal() else INFO
-    return _BY_PRIORITY.get(max(number, ERR), "info")
+    return _BY_PRIORITY.get(record.get("PRIORITY", b""), "info")
 
 
-def _text(record: Record, name: str) -> str:
+def record_text(record: Record, name: str) -> str:
+    """The field `name` of the record as text, "" without it."""
     return record.get(name, b"").decode("utf-8", "replace")
 
 

@@ -147,22 +147,10 @@ def error_result(error: DoraSystemdError) -> dict[str, str]:
 def logs_parts(ident: str, lines: list[bytes]) -> Iterator[str]:
     """The reply to Logs in parts of one message: in dora's JSON, bytes are an array of numbers."""
     yield f'{{"id":{json.dumps(ident)},"result":{{"Logs":['
-    separator = ""
-    for part in _joined(lines):
-        yield separator + ",".join(map(str, part))
-        separator = ","
+    data = b"".join(lines)
+    for start in range(0, len(data), _PART):
+        yield ("," if start else "") + ",".join(map(str, data[start : start + _PART]))
     yield "]}}"
-
-
-def _joined(lines: list[bytes]) -> Iterator[bytes]:
-    part = bytearray()
-    for line in lines:
-        part += line
-        if len(part) >= _PART:
-            yield bytes(part)
-            part.clear()
-    if part:
-        yield bytes(part)
 
 
 def renamed(value: Any, old: str, new: str) -> Any:

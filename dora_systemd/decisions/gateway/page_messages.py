@@ -20,11 +20,11 @@ It receives:
 """
 
 import json
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
+from dora_systemd.decisions.gateway.answers import Record, record_text
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.terminal_text import escaped, without_sequences
 
@@ -53,25 +53,15 @@ def parse_message(text: str | bytes) -> PageMessage:
     """Parse a request of a page. Raises DoraSystemdError (USAGE) if it is not valid."""
     try:
         raw = json.loads(text)
-        message = PageMessage(
-            type=_text(raw, "type"),
-            dataflow=_text(raw, "dataflow"),
-            node=_text(raw, "node"),
-            action=_text(raw, "action"),
-            number=int(raw.get("number", 0)),
-        )
+        texts = {key: raw.get(key, "") for key in ("type", "dataflow", "node", "action")}
+        message = PageMessage(**texts, number=int(raw.get("number", 0)))
     except (ValueError, TypeError, AttributeError, RecursionError, OverflowError) as error:
         raise _refusal() from error
-    if message.type not in TYPES or (message.type == "act" and message.action not in ACTIONS):
+    is_text = all(isinstance(one, str) for one in texts.values())
+    is_known = message.type != "act" or message.action in ACTIONS
+    if not is_text or message.type not in TYPES or not is_known:
         raise _refusal()
     return message
-
-
-def _text(raw: Mapping[str, Any], key: str) -> str:
-    value = raw.get(key, "")
-    if not isinstance(value, str):
-        raise TypeError(key)
-    return value
 
 
 def _refusal() -> DoraSystemdError:
@@ -79,21 +69,17 @@ def _refusal() -> DoraSystemdError:
     return DoraSystemdError("cannot read what the page sent", hint, ExitCode.USAGE)
 
 
-def line_values(record: Mapping[str, bytes]) -> dict[str, Any]:
+def line_values(record: Record) -> dict[str, Any]:
     """A record of the journal as a line for the page."""
-    node = _decoded(record.get("DORA_NODE", b""))
+    identifier = record_text(record, "SYSLOG_IDENTIFIER")
     priority = record.get("PRIORITY", b"")
     return {
         "at_us": int(record.get("__REALTIME_TIMESTAMP", b"0")),
-        "node": node or _decoded(record.get("SYSLOG_IDENTIFIER", b"")).partition("/")[2],
-        "text": _printable(_decoded(record.get("MESSAGE", b""))),
+        "node": record_text(record, "DORA_NODE") or identifier.partition("/")[2],
+        "text": _printable(record_text(record, "MESSAGE")),
         "priority": int(priority) if priority in _PRIORITIES else _DEFAULT_PRIORITY,
-        "event": _decoded(record.get("DORA_EVENT", b"")),
+        "event": record_text(record, "DORA_EVENT"),
     }
-
-
-def _decoded(data: bytes) -> str:
-    return data.decode("utf-8", "replace")
 
 
 def _printable(text: str) -> str:
@@ -113,7 +99,5 @@ def graph_values(dataflow: Dataflow) -> dict[str, Any]:
 
 
 def _edge(node: str, name: str, source: str) -> dict[str, str]:
-    origin, _, output = ("dora", "", "") if source.startswith("dora/") else source.partition("/")
-    if origin == "dora":
-        origin = source
+    origin, _, output = (source, "", "") if source.startswith("dora/") else source.partition("/")
     return {"from": origin, "output": output, "to": node, "input": name}

@@ -14,14 +14,11 @@ PLAIN = "text/plain; charset=utf-8"
 class Request:
     """A request with access granted.
 
-    path: without the query. headers: by name in lower case, with the last value of each. scope:
-    that of the gateway's dataflows.
+    path: without the query. scope: that of the gateway's dataflows.
     """
 
     path: str
     scope: Scope
-    query: str = ""
-    headers: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -39,9 +36,6 @@ class Socket(Protocol):
 
     A route need not catch its ConnectionClosed: the other end has disconnected.
     """
-
-    async def recv(self) -> str | bytes:
-        """The next message."""
 
     async def send(self, message: str | bytes | AsyncIterable[str]) -> None:
         """Send a message, whole or in parts; waits while the receiver is slow."""

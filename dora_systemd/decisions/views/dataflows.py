@@ -112,6 +112,12 @@ def format_percent(percent: float | None) -> str:
     return UNKNOWN if percent is None else f"{percent:.1f}"
 
 
+def format_cpu(row: DataflowRow | NodeRow) -> str:
+    """Percent of one processor, as in "12.5", or "12.5/50" with a limit."""
+    text = format_percent(row.cpu_percent)
+    return text if row.cpu_limit is None else f"{text}/{row.cpu_limit:g}"
+
+
 def format_memory(size: int | None, limit: int | None = None) -> str:
     """Bytes for a table, as in "256M", or "256M/4G" with a limit."""
     text = UNKNOWN if size is None else format_rounded_size(size)
@@ -167,7 +173,7 @@ def _dataflow_cells(row: DataflowRow, prefix: str) -> tuple[str, ...]:
         row.name,
         row.status,
         format_uptime(row.uptime),
-        _node_count(row),
+        node_count(row) or UNKNOWN,
         format_percent(row.cpu_percent),
         format_memory(row.memory, row.memory_limit),
         format_count(row.restarts),
@@ -175,10 +181,11 @@ def _dataflow_cells(row: DataflowRow, prefix: str) -> tuple[str, ...]:
     )
 
 
-def _node_count(row: DataflowRow) -> str:
+def node_count(row: DataflowRow) -> str:
+    """The number of running and of all nodes, as in "2/3", or "" if the dataflow has none."""
     if row.problem:
         return UNREADABLE
-    return f"{row.nodes_alive}/{row.nodes_total}" if row.nodes_total else UNKNOWN
+    return f"{row.nodes_alive}/{row.nodes_total}" if row.nodes_total else ""
 
 
 def format_nodes(rows: Sequence[NodeRow]) -> str:
@@ -193,12 +200,11 @@ _THROTTLED = "THROTTLED%"
 
 
 def _node_cells(row: NodeRow) -> dict[str, str]:
-    cpu = format_percent(row.cpu_percent)
     return {
         "NODE": row.node,
         "STATE": row.state.capitalize(),
         "PID": str(row.pid) if row.pid else UNKNOWN,
-        "CPU%": cpu if row.cpu_limit is None else f"{cpu}/{row.cpu_limit:g}",
+        "CPU%": format_cpu(row),
         _THROTTLED: format_percent(row.throttled),
         "MEM": format_memory(row.memory, row.memory_limit),
         "PEAK": format_memory(row.memory_peak),

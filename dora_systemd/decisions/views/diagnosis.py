@@ -104,11 +104,8 @@ def judge_port(port: int, owners: Sequence[Process], is_used: bool) -> Finding:
     if not is_used:
         return Finding(topic, State.OK, "free")
     if not owners:
-        text, remedy = (
-            "used by a process of another user",
-            "run doractl doctor as root to see which",
-        )
-        return Finding(topic, State.NOTE, text, remedy)
+        text = "used by a process of another user"
+        return Finding(topic, State.NOTE, text, "run doractl doctor as root to see which")
     text = f"used by {owners[0]}: {DORA_PORTS[port]} talks to that"
     return Finding(topic, State.NOTE, text, "doractl dora NAME -- talks to a dataflow of doractl")
 

@@ -23,74 +23,64 @@ Sample = tuple[Labels, float | int]
 
 @dataclass(frozen=True)
 class Family:
-    """One metric. kind: "counter" or "gauge". value: of one group, None if it has none."""
+    """One metric. value: of one group, None if it has none."""
 
     name: str
-    kind: str
     help: str
     value: Callable[[Usage, Strain], float | int | None] = lambda _use, _strain: None
+
+    @property
+    def kind(self) -> str:
+        """The type that Prometheus expects of a metric with this name."""
+        return "counter" if self.name.endswith("_total") else "gauge"
 
 
 # For dataflows (dora_dataflow_...) and for nodes (dora_node_...).
 GROUP_FAMILIES = (
-    Family("cpu_seconds_total", "counter", "CPU time used.", lambda use, _: use.cpu_us / SECOND),
-    Family("cpu_limit_cores", "gauge", "CPU limit, in cores.", lambda use, _: _cores(use)),
+    Family("cpu_seconds_total", "CPU time used.", lambda use, _: use.cpu_us / SECOND),
+    Family("cpu_limit_cores", "CPU limit, in cores.", lambda use, _: _cores(use)),
     Family(
         "cpu_periods_total",
-        "counter",
         "CPU quota periods in which it was runnable.",
         lambda use, _: use.throttling[0],
     ),
     Family(
         "cpu_throttled_periods_total",
-        "counter",
         "CPU quota periods in which its CPU limit throttled it.",
         lambda use, _: use.throttling[1],
     ),
     Family(
         "cpu_throttled_seconds_total",
-        "counter",
         "Time for which its CPU limit throttled it.",
         lambda _, strain: strain.throttled / SECOND,
     ),
-    Family("memory_bytes", "gauge", "Memory used.", lambda use, _: use.memory),
+    Family("memory_bytes", "Memory used.", lambda use, _: use.memory),
     Family(
-        "memory_peak_bytes",
-        "gauge",
-        "Peak memory used since its start.",
-        lambda use, _: use.memory_peak,
+        "memory_peak_bytes", "Peak memory used since its start.", lambda use, _: use.memory_peak
     ),
-    Family(
-        "memory_limit_bytes",
-        "gauge",
-        "Memory limit.",
-        lambda use, _: _limit(use.memory_max),
-    ),
+    Family("memory_limit_bytes", "Memory limit.", lambda use, _: _limit(use.memory_max)),
     Family(
         "oom_kills_total",
-        "counter",
         "Processes killed by the kernel, out of memory.",
         lambda _, strain: strain.oom_kills,
     ),
 )
 PRESSURE = Family(
-    "pressure_seconds_total",
-    "counter",
-    "Time in which some, or all, of its processes waited for a resource.",
+    "pressure_seconds_total", "Time in which some, or all, of its processes waited for a resource."
 )
-STATE = Family("state", "gauge", "1 for the current state, 0 for all others.")
-RESTARTS = Family("restarts_total", "counter", "Automatic restarts.")
-START = Family("start_time_seconds", "gauge", "When all nodes were ready, in Unix time.")
-NODE_START = Family("start_time_seconds", "gauge", "When it became ready, in Unix time.")
-INFO = Family("info", "gauge", "UUID and unit of a dataflow; the value is always 1.")
-NODES = Family("nodes", "gauge", "Nodes that the dataflow has.")
-ALIVE = Family("nodes_alive", "gauge", "Nodes that are running.")
-LINES = Family("log_lines_total", "counter", "Lines sent to journald.")
+STATE = Family("state", "1 for the current state, 0 for all others.")
+RESTARTS = Family("restarts_total", "Automatic restarts.")
+START = Family("start_time_seconds", "When all nodes were ready, in Unix time.")
+NODE_START = Family("start_time_seconds", "When it became ready, in Unix time.")
+INFO = Family("info", "UUID and unit of a dataflow; the value is always 1.")
+NODES = Family("nodes", "Nodes that the dataflow has.")
+ALIVE = Family("nodes_alive", "Nodes that are running.")
+LINES = Family("log_lines_total", "Lines sent to journald.")
 SUPPRESSED = Family(
-    "log_lines_suppressed_total", "counter", "Lines that log_rate_limit kept out of the journal."
+    "log_lines_suppressed_total", "Lines that log_rate_limit kept out of the journal."
 )
-LOST = Family("log_lines_lost_total", "counter", "Lines of its nodes that are not in the journal.")
-BUILD = Family("dora_systemd_build_info", "gauge", "Version of dora-systemd; always 1.")
+LOST = Family("log_lines_lost_total", "Lines of its nodes that are not in the journal.")
+BUILD = Family("dora_systemd_build_info", "Version of dora-systemd; always 1.")
 
 
 def format_metrics(observed: Sequence[Observed], version: str) -> str:

@@ -8,14 +8,14 @@ from dora_systemd.decisions.cell.status import ALIVE_NODE_STATES, WHOLE_CELL
 from dora_systemd.decisions.resources.usage import format_waits
 from dora_systemd.decisions.views.dataflows import (
     UNKNOWN,
-    UNREADABLE,
     DataflowRow,
     NodeRow,
     format_count,
+    format_cpu,
     format_memory,
-    format_percent,
     format_table,
     format_uptime,
+    node_count,
     row_values,
 )
 
@@ -65,8 +65,7 @@ def format_top(look: Look, by: str) -> str:
 def _lines(entry: TopEntry, look: Look, by: str) -> list[tuple[str, ...]]:
     row = entry.row
     nodes = row.nodes if by == "name" else sorted(row.nodes, key=lambda one: -_amount(one, by))
-    count = UNREADABLE if row.problem else f"{row.nodes_alive}/{row.nodes_total}"
-    state = f"{row.status} {count}" if row.nodes_total or row.problem else row.status
+    state = f"{row.status} {node_count(row)}".rstrip()
     first = (row.name, state, format_uptime(row.uptime), *_numbers(row, entry.waits, WHOLE_CELL))
     return [first, *(_node_line(node, entry, look) for node in nodes)]
 
@@ -82,12 +81,11 @@ def _node_line(node: NodeRow, entry: TopEntry, look: Look) -> tuple[str, ...]:
 def _numbers(
     row: DataflowRow | NodeRow, waits: Mapping[str, Waits], key: str
 ) -> tuple[str, str, str, str, str]:
-    cpu = format_percent(row.cpu_percent)
     shares = dict(waits.get(key, {}))
     if row.throttled:
         shares["cpu limit"] = row.throttled
     return (
-        cpu if row.cpu_limit is None else f"{cpu}/{row.cpu_limit:g}",
+        format_cpu(row),
         format_memory(row.memory, row.memory_limit),
         format_memory(row.memory_peak),
         format_count(row.restarts),

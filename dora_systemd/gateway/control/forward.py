@@ -16,12 +16,13 @@ from dora_systemd.decisions.dora.protocol import Params, Reply
 from dora_systemd.decisions.gateway.answers import restored_descriptor
 from dora_systemd.decisions.gateway.frames import Request, renamed
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.gateway.control.state import ended_descriptor, written_descriptor
+from dora_systemd.gateway.control.state import ended_descriptor
 from dora_systemd.gateway.control.talk import Result, Talk, find_by_uuid
 from dora_systemd.paths import CellPaths
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.list import read_status
+from dora_systemd.verbs.facts.nodes import written_dataflow
 from dora_systemd.verbs.node import require_running, restart_node
 
 _GOING_AWAY = 1001
@@ -59,8 +60,8 @@ async def _describe_running(scope: Scope, uuid: str) -> dict[str, Any]:
     if reply.error or not isinstance(reply.result, dict):
         raise DoraSystemdError(reply.error or "cannot understand dora")
     running = reply.result["DataflowInfo"]["descriptor"]
-    written = await asyncio.to_thread(written_descriptor, cell)
-    descriptor = restored_descriptor(running, written["nodes"], PROGRAM_KEYS)
+    written = await asyncio.to_thread(written_dataflow, cell.options.dataflow)
+    descriptor = restored_descriptor(running, [node.raw for node in written.nodes], PROGRAM_KEYS)
     return {"DataflowInfo": {"uuid": uuid, "name": cell.name, "descriptor": descriptor}}
 
 

@@ -20,6 +20,7 @@ from dora_systemd.decisions.gateway.answers import (
     is_wanted,
     log_line,
     log_payload,
+    record_text,
 )
 from dora_systemd.decisions.gateway.frames import LOGS_LIMIT, Request, format_event, logs_parts
 from dora_systemd.decisions.logs.fields import ExportReader
@@ -151,19 +152,15 @@ class Follower:
         while data := await stream.read(_CHUNK):
             for record in records.feed(data):
                 if is_from_systemd(record):
-                    if await self._has_ended():
+                    await asyncio.sleep(_SETTLE_SECONDS)
+                    if not await self._is_up():
                         return
                 elif self._is_new(record) and is_wanted(record, self._level):
                     payload = log_payload(record, self._uuid)
                     await self._talk.socket.send(format_event(payload))
 
     def _is_new(self, record: Record) -> bool:
-        node = record.get("DORA_NODE", b"").decode("utf-8", "replace")
-        return _place(record) > self._places.get(node, self._since)
-
-    async def _has_ended(self) -> bool:
-        await asyncio.sleep(_SETTLE_SECONDS)
-        return not await self._is_up()
+        return _place(record) > self._places.get(record_text(record, "DORA_NODE"), self._since)
 
     async def _is_up(self) -> bool:
         return await asyncio.to_thread(

@@ -7,8 +7,7 @@ coordinator of the dataflow. It refuses requests that would bypass the superviso
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable, Mapping
-from typing import Any
+from collections.abc import Awaitable, Callable
 
 from dora_systemd.decisions.gateway.frames import (
     Malformed,
@@ -27,7 +26,6 @@ from dora_systemd.gateway.control import logs, state
 from dora_systemd.gateway.control import start as starting
 from dora_systemd.gateway.control import stop as stopping
 from dora_systemd.gateway.control.talk import Result, Talk
-from dora_systemd.scope import Scope
 
 log = logging.getLogger(__name__)
 
@@ -40,7 +38,7 @@ _AT_ONCE = 8
 """Requests of one connection that run in parallel."""
 _LONGEST = 500
 _BY_FILE = "edit its file, then run: doractl reload NAME"
-_OWN = "doractl dora NAME -- {} asks the coordinator of one dataflow"
+_OWN = "doractl dora NAME -- trace list asks the coordinator of one dataflow"
 
 
 async def serve_control(socket: Socket, request: HttpRequest) -> None:
@@ -109,32 +107,19 @@ async def _daemon_connected(_talk: Talk, _request: Request) -> Result:
     return {"DaemonConnected": True}  # systemd starts a daemon for each dataflow
 
 
-def _about_all(ask: Callable[[Scope], Mapping[str, Any]]) -> Handler:
-    async def handler(talk: Talk, _request: Request) -> Result:
-        return await asyncio.to_thread(ask, talk.scope)
-
-    return handler
-
-
-async def _check(talk: Talk, request: Request) -> Result:
-    return await asyncio.to_thread(state.check, talk.scope, request.dataflow)
-
-
 HANDLERS: dict[str, Handler] = {
     "Hello": _hello,
     "CliAndDefaultDaemonOnSameMachine": _same_machine,
     "DaemonConnected": _daemon_connected,
-    "ConnectedMachines": _about_all(state.list_daemons),
-    "List": _about_all(state.list_dataflows),
-    "GetNodeInfo": _about_all(state.list_nodes),
-    "Check": _check,
+    "ConnectedMachines": lambda talk, _: asyncio.to_thread(state.list_daemons, talk.scope),
+    "List": lambda talk, _: asyncio.to_thread(state.list_dataflows, talk.scope),
+    "GetNodeInfo": lambda talk, _: asyncio.to_thread(state.list_nodes, talk.scope),
+    "Check": lambda talk, request: asyncio.to_thread(state.check, talk.scope, request.dataflow),
     "Info": cell.describe,
     "Start": starting.start,
     "WaitForSpawn": starting.wait_for_spawn,
-    "Stop": stopping.stop_uuid,
-    "StopByName": stopping.stop_name,
-    "Restart": stopping.restart_uuid,
-    "RestartByName": stopping.restart_name,
+    **dict.fromkeys(("Stop", "StopByName"), stopping.stop),
+    **dict.fromkeys(("Restart", "RestartByName"), stopping.restart),
     "Logs": logs.send_logs,
     "LogSubscribe": logs.subscribe_logs,
     "RestartNode": cell.restart_one_node,
@@ -164,7 +149,7 @@ REFUSED: dict[str, tuple[str, str]] = {
     ),
     **dict.fromkeys(
         ("GetTraces", "GetTraceSpans"),
-        ("cannot show traces of all dataflows", _OWN.format("trace list")),
+        ("cannot show traces of all dataflows", _OWN),
     ),
     **dict.fromkeys(
         ("AddNode", "RemoveNode", "ReplaceNode", "AddMapping", "RemoveMapping"),

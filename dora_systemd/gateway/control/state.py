@@ -62,11 +62,6 @@ def list_daemons(scope: Scope) -> dict[str, Any]:
     return daemon_list(cell.uuid for cell in read_cells(Bus(scope)) if cell.is_up)
 
 
-def written_descriptor(cell: Cell) -> dict[str, Any]:
-    """The descriptor as its file has it, with modules unexpanded. Raises DoraSystemdError."""
-    return dict(written_dataflow(cell.options.dataflow).raw)
-
-
 def ended_descriptor(scope: Scope, uuid: str) -> tuple[str, dict[str, Any]]:
     """Name and descriptor of a dataflow without a coordinator.
 
@@ -76,7 +71,7 @@ def ended_descriptor(scope: Scope, uuid: str) -> tuple[str, dict[str, Any]]:
     cell = find_if_loaded(scope, uuid)
     if cell is not None:
         with suppress(DoraSystemdError):
-            return cell.name, written_descriptor(cell)
+            return cell.name, dict(written_dataflow(cell.options.dataflow).raw)
     name = find_name(scope, uuid)
     return name, bare_descriptor(JournalReader().known_nodes(name))
 

@@ -22,33 +22,9 @@ _FORCE_SECONDS = 0.2
 """Time for systemd to begin the stop: a kill before that would count as a failure."""
 
 
-async def stop_uuid(talk: Talk, request: Request) -> dict[str, Any]:
-    """Stop. Raises DoraSystemdError."""
-    cell = await asyncio.to_thread(find_by_uuid, talk.scope, request.dataflow)
-    return await _stop(talk.scope, cell, request)
-
-
-async def stop_name(talk: Talk, request: Request) -> dict[str, Any]:
-    """StopByName. Raises DoraSystemdError."""
-    return await _stop(talk.scope, await _named(talk.scope, request), request)
-
-
-async def restart_uuid(talk: Talk, request: Request) -> dict[str, Any]:
-    """Restart. Raises DoraSystemdError."""
-    cell = await asyncio.to_thread(find_by_uuid, talk.scope, request.dataflow)
-    return await _restart(talk.scope, cell, request)
-
-
-async def restart_name(talk: Talk, request: Request) -> dict[str, Any]:
-    """RestartByName. Raises DoraSystemdError."""
-    return await _restart(talk.scope, await _named(talk.scope, request), request)
-
-
-async def _named(scope: Scope, request: Request) -> Cell:
-    return await asyncio.to_thread(lambda: find_cell(Bus(scope), request.text("name")))
-
-
-async def _stop(scope: Scope, cell: Cell, request: Request) -> dict[str, Any]:
+async def stop(talk: Talk, request: Request) -> dict[str, Any]:
+    """Stop and StopByName. Raises DoraSystemdError."""
+    scope, cell = talk.scope, await _find(talk, request)
     if not cell.is_up:
         raise DoraSystemdError(
             f"cannot stop {cell.name}: it does not run",
@@ -64,11 +40,19 @@ async def _stop(scope: Scope, cell: Cell, request: Request) -> dict[str, Any]:
     return await asyncio.to_thread(ended_result, scope, cell.uuid)
 
 
-async def _restart(scope: Scope, cell: Cell, request: Request) -> dict[str, Any]:
+async def restart(talk: Talk, request: Request) -> dict[str, Any]:
+    """Restart and RestartByName. Raises DoraSystemdError."""
+    scope, cell = talk.scope, await _find(talk, request)
     outcome = await _within(scope, cell, request, lambda: restart_cells(Bus(scope), [cell])[0])
     if outcome.problem:
         raise DoraSystemdError(outcome.problem, f"doractl {scope.flag} why {cell.name} tells more")
     return {"DataflowRestarted": {"old_uuid": cell.uuid, "new_uuid": cell.uuid}}
+
+
+async def _find(talk: Talk, request: Request) -> Cell:
+    if request.name.endswith("ByName"):
+        return await asyncio.to_thread(lambda: find_cell(Bus(talk.scope), request.text("name")))
+    return await asyncio.to_thread(find_by_uuid, talk.scope, request.dataflow)
 
 
 async def _within(

@@ -1,17 +1,16 @@
 """The actions of the status page's buttons, and the data of its graph of a dataflow."""
 
-from pathlib import Path
+from contextlib import suppress
 from typing import Any
 
 from dora_systemd.adapters.bus.systemd import Bus
-from dora_systemd.adapters.host.files import parse_yaml
 from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
 from dora_systemd.decisions.gateway.page_messages import PageMessage, graph_values
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
-from dora_systemd.trust.files import read_file
 from dora_systemd.verbs.facts.cells import Cell, find_cell
 from dora_systemd.verbs.facts.list import read_status
+from dora_systemd.verbs.facts.nodes import written_dataflow
 from dora_systemd.verbs.node import ask_coordinator, restart_node, stop_node
 from dora_systemd.verbs.stop import note_stop, restart_cells, stop_cells
 
@@ -45,18 +44,18 @@ def read_graph(scope: Scope, uuid: str) -> dict[str, Any]:
     dora's own copy is what runs, with modules expanded; the file may have changed since the start.
     """
     cell = find_cell(Bus(scope), uuid)
-    return graph_values(parse_dataflow(_read_descriptor(scope, cell), cell.options.dataflow))
+    path = cell.options.dataflow
+    running = _running_descriptor(scope, cell)
+    return graph_values(parse_dataflow(running, path) if running else written_dataflow(path))
 
 
-def _read_descriptor(scope: Scope, cell: Cell) -> object:
+def _running_descriptor(scope: Scope, cell: Cell) -> object:
+    """dora's copy, or None if no run has one."""
     run = read_status(scope, cell).run if cell.is_up else ""
-    if run:
-        try:
+    # The dataflow may be ending at this moment.
+    with suppress(DoraSystemdError, KeyError, TypeError):
+        if run:
             reply = ask_coordinator(scope, cell, {"Info": {"dataflow_uuid": run}})
             if isinstance(reply.result, dict) and not reply.error:
                 return reply.result["DataflowInfo"]["descriptor"]
-        except (DoraSystemdError, KeyError, TypeError):
-            # the dataflow may be ending at this moment
-            pass
-    path = Path(cell.options.dataflow)
-    return parse_yaml(read_file(path).data.decode("utf-8-sig", "replace"), path)
+    return None

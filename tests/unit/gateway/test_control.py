@@ -3,6 +3,7 @@
 import asyncio
 import json
 import re
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -19,6 +20,7 @@ from dora_systemd.decisions.gateway.answers import (
     restored_descriptor,
     stopped,
 )
+from dora_systemd.decisions.gateway.flags import sent_flags
 from dora_systemd.decisions.gateway.frames import (
     Malformed,
     Request,
@@ -28,7 +30,6 @@ from dora_systemd.decisions.gateway.frames import (
     refused_version,
     renamed,
 )
-from dora_systemd.decisions.gateway.match import could_be, sent_flags
 from dora_systemd.decisions.gateway.request import Request as HttpRequest
 from dora_systemd.decisions.views.dataflows import DataflowRow, NodeRow
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -271,82 +272,98 @@ def test_a_program_that_is_in_no_file(command: str, path: str, args: str) -> Non
 
 @pytest.mark.parametrize("directory", ["/nowhere", "nowhere"])
 def test_a_directory_that_is_none(directory: str) -> None:
-    body = {"Start": {"dataflow": {"nodes": []}, "local_working_dir": directory}}
-    request = parse_request(json.dumps({"id": UUID, "method": "control", "params": body}))
-    assert isinstance(request, Request)
     with pytest.raises(DoraSystemdError, match=r"^cannot (look for the dataflow|start) in"):
-        find_file(Scope(is_user=True, uid=1000), request)
+        find_file(Path(directory), "one")
 
 
-# What `dora expand` prints of a file, and what the dora command sends with it.
-EXPANDED: dict[str, Any] = {
-    "nodes": [
-        {
-            "id": "a",
-            "name": None,
-            "path": "a.py",
-            "env": {"HERE": "/root"},
-            "outputs": ["x"],
-            "inputs": {"tick": "dora/timer/secs/2"},
-            "restart_policy": "never",
-            "max_restarts": 0,
-            "deploy": None,
-        },
-        {"id": "m.inner", "path": "m/inner.py", "env": None, "inputs": {"x": "a/x"}},
+def keep_session(directory: Path, stem: str, text: str) -> None:
+    """What the dora command does before it sends a Start."""
+    (directory / "out").mkdir(exist_ok=True)
+    (directory / "out" / f"{stem}.dora-session.yaml").write_text(text)
+
+
+def test_the_session_names_the_file(tmp_path: Path) -> None:
+    for name in ("flow.yml", "twin.yml", "other.yml", "a.b.yaml", "flow.txt"):
+        (tmp_path / name).write_text("nodes: []\n")
+    keep_session(tmp_path, "flow", "session_id: one\n")
+    keep_session(tmp_path, "twin", "session_id: two\n")
+    keep_session(tmp_path, "a.b", "session_id: three\n")
+    assert find_file(tmp_path, "one") == tmp_path / "flow.yml"
+    assert find_file(tmp_path, "two") == tmp_path / "twin.yml"
+    assert find_file(tmp_path, "three") == tmp_path / "a.b.yaml"
+
+
+@pytest.mark.parametrize(
+    ("files", "session", "reason"),
+    [
+        ((), "session_id: one\n", "no file in /.* has its session"),
+        (("flow.txt",), "session_id: one\n", "no file in /.* has its session"),
+        (("flow.yml",), "session_id: two\n", "no file in /.* has its session"),
+        (("flow.yml",), "[one]\n", "no file in /.* has its session"),
+        (("flow.yml",), "session_id: [\n", "no file in /.* has its session"),
+        (("flow.yml", "flow.yaml"), "session_id: one\n", "flow.yaml, flow.yml have one session"),
     ],
-    "deploy": None,
+)
+def test_a_session_that_names_no_file(
+    tmp_path: Path, files: tuple[str, ...], session: str, reason: str
+) -> None:
+    for name in files:
+        (tmp_path / name).write_text("nodes: []\n")
+    keep_session(tmp_path, "flow", session)
+    expected = f"^cannot tell which file this dataflow is from: {reason}$"
+    with pytest.raises(DoraSystemdError, match=expected) as caught:
+        find_file(tmp_path, "one")
+    assert caught.value.hint == "doractl start FILE takes the file itself"
+
+
+@pytest.mark.parametrize(
+    ("given", "problem"),
+    [
+        ({"write_events_to": "/tmp/x"}, "cannot write the events"),
+        ({"dataflow": []}, "no dataflow was sent"),
+        ({"session_id": None}, "it has no session_id"),
+        ({"local_working_dir": ""}, "it has no local_working_dir"),
+    ],
+)
+def test_a_start_that_is_refused(given: dict[str, Any], problem: str) -> None:
+    body = {"dataflow": {}, "local_working_dir": "/nowhere", "session_id": "one", **given}
+    (answer,) = talk(frame({"Start": body}))
+    assert problem in answer["result"]["Error"]
+
+
+# A file, and what the dora command sends for it.
+WRITTEN: dict[str, Any] = {"env": {"KEPT": "1", "HERE": "$HOME"}, "nodes": [{"id": "a"}]}
+SENT: dict[str, Any] = {
+    "nodes": [{"id": "a", "env": None, "inputs": {"x": "a/x"}}],
     "debug": {"enable_debug_inspection": False},
-    "env": {"KEPT": "1"},
+    "exit_when_nodes_finish": None,
+    "env": {"KEPT": 1, "HERE": "/root"},
 }
 
 
-def flags(sent: dict[str, Any], uv: bool = False, variables: bool = False) -> Any:
-    return sent_flags(json.loads(json.dumps(sent)), EXPANDED, uv, variables)
+def flags(uv: bool = False, **sent: Any) -> Any:
+    body = json.loads(json.dumps({"dataflow": SENT | sent, "uv": uv}))
+    return sent_flags(Request("x", "Start", body), WRITTEN)
 
 
-def changed_node(**keys: Any) -> dict[str, Any]:
-    first, *rest = EXPANDED["nodes"]
-    return {**EXPANDED, "nodes": [{**first, **keys}, *rest]}
-
-
-def test_what_was_sent_is_the_file() -> None:
-    assert flags(EXPANDED) == {}
-    bare = {key: value for key, value in EXPANDED.items() if value is not None}
-    assert flags(bare) == {}
-    assert flags({**EXPANDED, "env": {"KEPT": "2", "N": 5, "B": True}}) == {
+def test_what_was_sent_becomes_flags() -> None:
+    here = {"env": ("HERE=/root",)}  # the sender's value
+    assert flags() == here
+    assert flags(env={"KEPT": 2, "HERE": "$HOME", "N": 5, "B": True}) == {
         "env": ("KEPT=2", "N=5", "B=true")
     }
-    assert flags({**EXPANDED, "debug": {"enable_debug_inspection": True}}) == {"debug": True}
-    assert flags({**EXPANDED, "exit_when_nodes_finish": False}) == {"exit_when_nodes_finish": False}
-    assert flags(EXPANDED, uv=True) == {"uv": True}
+    assert flags(env=None) == {}
+    assert flags(debug={"enable_debug_inspection": True}) == {**here, "debug": True}
+    for ends in (True, False):
+        expected = {**here, "exit_when_nodes_finish": ends}
+        assert flags(exit_when_nodes_finish=ends) == expected
+    assert flags(uv=True) == {**here, "uv": True}
 
 
-def test_what_was_sent_is_another_file() -> None:
-    for other in (
-        changed_node(path="b.py"),
-        changed_node(restart_policy="always"),
-        changed_node(outputs=["x", "y"]),
-        changed_node(inputs={}),
-        changed_node(env={"HERE": "/home"}),
-        changed_node(args="-v"),
-        {**EXPANDED, "nodes": EXPANDED["nodes"][:1]},
-        {**EXPANDED, "env": {}},
-        {**EXPANDED, "health_check_interval": 2.0},
-    ):
-        assert flags(other) is None, other
-    # The file says HERE: $HOME, and the sender's is another one.
-    assert flags(changed_node(env={"HERE": "/home"}), variables=True) == {}
-    assert flags(changed_node(env={"THERE": "/home"}), variables=True) is None
-
-
-def test_which_files_are_looked_at() -> None:
-    written = {"nodes": [{"id": "a"}, {"id": "m", "module": "m.yml"}]}
-    assert could_be(written, EXPANDED)
-    assert could_be(EXPANDED, EXPANDED)
-    others: list[Any] = [None, [], {}, {"nodes": 5}, {"nodes": [{"id": "a"}]}]
-    for other in others:
-        assert not could_be(other, EXPANDED)
-    assert not could_be(written, {"nodes": []})
+def test_what_the_file_says_is_no_flag() -> None:
+    written = {"exit_when_nodes_finish": True, "env": ["no mapping"]}
+    body = {"dataflow": {**written, "env": {"A": "b"}}}
+    assert sent_flags(Request("x", "Start", body), written) == {"env": ("A=b",)}
 
 
 def talk(*frames: str | bytes) -> list[Any]:

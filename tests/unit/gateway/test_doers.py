@@ -6,6 +6,7 @@ import os
 import signal
 import socket
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,11 +15,13 @@ from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
 from dora_systemd.decisions.gateway.frames import Request
 from dora_systemd.decisions.gateway.page_messages import PageMessage
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.gateway.control import start as starting
 from dora_systemd.gateway.control.forward import forward
 from dora_systemd.gateway.control.serve import HANDLERS
 from dora_systemd.gateway.control.talk import Talk
 from dora_systemd.gateway.live.act import act, read_graph
 from dora_systemd.scope import Scope
+from dora_systemd.verbs.start.plan import StartRequest
 from tests.unit.fakes.library import FakeSystemd, fake_journalctl, fake_systemd
 from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
 from tests.unit.fakes.socket import FakeSocket
@@ -101,6 +104,23 @@ def test_a_node_of_a_dataflow_that_does_not_run(
 
 def test_the_drawing_of_a_dataflow_that_has_no_coordinator(bench: Bench) -> None:
     assert read_graph(bench.scope, UUID)["nodes"] == [{"id": "a", "kind": "python"}]
+
+
+def test_dora_starts_the_file_of_its_session(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "flow.dora-session.yaml").write_text("session_id: one\n")
+    asked: list[StartRequest] = []
+    monkeypatch.setattr(starting, "claim", lambda _bus, _scope, wanted: asked.append(wanted))
+    monkeypatch.setattr(starting, "start_claim", lambda *_, **__: SimpleNamespace(uuid=UUID))
+    sent = {"nodes": [{"id": "a"}], "env": {"A": "b"}}
+    body = {"dataflow": sent, "local_working_dir": str(tmp_path), "session_id": "one"}
+    answer = bench.ask("Start", **body, name="robot", uv=True)
+    assert answer == {"DataflowStartTriggered": {"uuid": UUID}}
+    (wanted,) = asked
+    assert (wanted.dataflow, wanted.name) == (str(tmp_path / "flow.yml"), "robot")
+    assert wanted.flags == {"env": ("A=b",), "uv": True}
 
 
 @pytest.mark.parametrize("name", ["Stop", "Restart"])
