@@ -30,7 +30,7 @@ def read_regular(path: str | bytes | os.PathLike[str], most: int) -> bytes:
 
 
 def answer(letter: bytes, path: bytes, most: int) -> bytes:
-    """The answer to one question of a Sight; b"" is no, as is OSError. Raises OSError, ValueError."""
+    """The answer to one question of a Sight; b"" is "no". Raises OSError and ValueError."""
     if letter == b"l":
         return os.path.realpath(path)
     if letter == b"r":

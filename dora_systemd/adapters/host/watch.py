@@ -3,7 +3,7 @@
 import asyncio
 import errno
 import os
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator
 from pathlib import Path
 
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -33,7 +33,7 @@ async def changed_files(rules: WatchRules) -> AsyncIterator[frozenset[str]]:
     nothing. Raises DoraSystemdError if the kernel refuses more watches.
     """
     # In a thread: a large tree takes seconds, and the loop of the runner feeds the watchdog.
-    seen = await asyncio.to_thread(_stamps, rules)
+    seen = await asyncio.to_thread(watched_files, rules)
     while True:
         await _wait_root(rules.root)
         async for paths in _bursts(rules):
@@ -42,23 +42,21 @@ async def changed_files(rules: WatchRules) -> AsyncIterator[frozenset[str]]:
                 seen.update((path, change_time(path)) for path in files)
                 yield files
         # Directories came or went. Changes before the new watches are found by their time.
-        now = await asyncio.to_thread(_stamps, rules)
+        now = await asyncio.to_thread(watched_files, rules)
         missed = frozenset(path for path in {*seen, *now} if seen.get(path) != now.get(path))
         seen = now
         if missed:
             yield missed
 
 
-def _stamps(rules: WatchRules) -> dict[str, int]:
-    return dict(watched_files(rules))
-
-
-def watched_files(rules: WatchRules) -> Iterator[tuple[str, int]]:
+def watched_files(rules: WatchRules) -> dict[str, int]:
     """The files that match `rules` now, with their times of change in ns."""
-    for directory in watched_directories(rules):
-        for entry in _entries(directory):
-            if rules.has(entry.path) and not entry.is_dir(follow_symlinks=False):
-                yield entry.path, change_time(entry.path)
+    return {
+        entry.path: change_time(entry.path)
+        for directory in watched_directories(rules)
+        for entry in _entries(directory)
+        if rules.has(entry.path) and not entry.is_dir(follow_symlinks=False)
+    }
 
 
 def watched_directories(rules: WatchRules) -> list[str]:
