@@ -6,6 +6,7 @@ directory config at the top.
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import PurePath
 from typing import TYPE_CHECKING
 
@@ -84,16 +85,12 @@ class WatchRules:
         return False
 
 
-_SPECS: dict[tuple[str, ...], "GitIgnoreSpec"] = {}
-
-
+@cache
 def _spec(patterns: tuple[str, ...]) -> "GitIgnoreSpec":
-    # Compiled once. Imported late: only hot reload needs it.
-    if patterns not in _SPECS:
-        from pathspec import GitIgnoreSpec
+    # Imported late: only hot reload needs it.
+    from pathspec import GitIgnoreSpec
 
-        _SPECS[patterns] = GitIgnoreSpec.from_lines(patterns)
-    return _SPECS[patterns]
+    return GitIgnoreSpec.from_lines(patterns)
 
 
 def parse_patterns(texts: Iterable[str]) -> tuple[str, ...]:
