@@ -23,11 +23,10 @@ MAX_NODE_ID = 200
 NODE_ID = re.compile(r"(?!\.)[A-Za-z0-9_.-]+")
 """dora's own rule for node ids."""
 
-_UNIT_TYPES = (
-    *("service", "socket", "device", "mount", "automount", "swap"),
-    *("target", "path", "timer", "slice", "scope"),
+_UNIT_SUFFIXES = (
+    *(".service", ".socket", ".device", ".mount", ".automount", ".swap"),
+    *(".target", ".path", ".timer", ".slice", ".scope"),
 )
-_UNIT_SUFFIXES = tuple(f".{unit_type}" for unit_type in _UNIT_TYPES)
 _UUID = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}")
 _ZERO_UUID = "00000000-0000-0000-0000-000000000000"
 _MIN_PREFIX = 4

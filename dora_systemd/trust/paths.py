@@ -29,7 +29,8 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import shown
 
 _MAX_LINKS = 40
-_STEP = os.O_PATH | os.O_NOFOLLOW | os.O_CLOEXEC
+STEP = os.O_PATH | os.O_NOFOLLOW | os.O_CLOEXEC
+"""Flags to open one component of a path, which may be anything."""
 _OTHERS_WRITE = stat.S_IWOTH
 
 
@@ -155,7 +156,7 @@ class _Walk:
         self._where = ""
 
     def _open(self, name: str, parent: int | None) -> int:
-        fd = os.open(name, _STEP, dir_fd=parent)
+        fd = os.open(name, STEP, dir_fd=parent)
         self._held.callback(os.close, fd)
         return fd
 

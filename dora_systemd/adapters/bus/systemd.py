@@ -74,7 +74,7 @@ class Bus:
         self, unit: str, properties: Sequence[Property], observer: Observer | None, wait: bool
     ) -> str:
         self._listen(unit)
-        arguments = (("s", unit), ("s", "fail"), _typed(properties), ("a(sa(sv))", []))
+        arguments = (("s", unit), ("s", "fail"), _typed(properties), ("a(sa(sv))", ()))
         job = self._call(f"start {unit}", "StartTransientUnit", *arguments)
         return self._wait_for_jobs({job: unit}, observer)[unit] if wait else JOB_DONE
 
