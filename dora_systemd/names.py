@@ -106,11 +106,10 @@ def is_uuid(text: str) -> bool:
 
 def parse_uuid(text: str) -> str:
     """The UUID in lower case with dashes. Raises DoraSystemdError (USAGE) for any other text."""
-    uuid = text.lower()
-    if not is_uuid(uuid):
-        hint = "a UUID is 32 hexadecimal digits as 8-4-4-4-12"
-        raise DoraSystemdError(f"cannot read {quoted(text)} as a UUID", hint, ExitCode.USAGE)
-    return uuid
+    if is_uuid(text.lower()):
+        return text.lower()
+    hint = "a UUID is 32 hexadecimal digits as 8-4-4-4-12"
+    raise DoraSystemdError(f"cannot read {quoted(text)} as a UUID", hint, ExitCode.USAGE)
 
 
 def is_uuid_prefix(text: str) -> bool:

@@ -31,7 +31,6 @@ from dora_systemd.values import shown
 _MAX_LINKS = 40
 STEP = os.O_PATH | os.O_NOFOLLOW | os.O_CLOEXEC
 """Flags to open one component of a path, which may be anything."""
-_OTHERS_WRITE = stat.S_IWOTH
 
 
 class Place(NamedTuple):
@@ -57,7 +56,7 @@ class Place(NamedTuple):
     @property
     def is_open(self) -> bool:
         """Whether it is a directory in which every user can create files, such as /tmp."""
-        return stat.S_ISDIR(self.mode) and bool(self.mode & _OTHERS_WRITE)
+        return stat.S_ISDIR(self.mode) and bool(self.mode & stat.S_IWOTH)
 
     @property
     def borrowed(self) -> str:
@@ -216,7 +215,7 @@ class _Walk:
         mode, where = self._status.st_mode, self._where or "/"
         if not stat.S_ISDIR(mode) or mode & stat.S_ISVTX:
             return ""
-        is_shared = mode & _OTHERS_WRITE or (mode & stat.S_IWGRP and self._has_members())
+        is_shared = mode & stat.S_IWOTH or (mode & stat.S_IWGRP and self._has_members())
         return where if is_shared else ""
 
     def _has_members(self) -> bool:

@@ -91,7 +91,8 @@ class LentSight(Sight):
             head = self._receive(_HEAD, deadline)
             data = self._receive(min(int(head[1:]), MAX_BYTES + 1), deadline)
         except (BrokenPipeError, ValueError) as error:
-            raise self._silence(path) from error
+            message = f"cannot look at {shown(path)} as user {self._account.name}: no answer"
+            raise DoraSystemdError(message, "see whether a mount of that user hangs") from error
         finally:
             self._left -= time.monotonic() - begun
         if head[:1] != b"+":
@@ -110,10 +111,6 @@ class LentSight(Sight):
                 raise BrokenPipeError
             received += chunk
         return received
-
-    def _silence(self, path: str) -> DoraSystemdError:
-        message = f"cannot look at {shown(path)} as user {self._account.name}: no answer"
-        return DoraSystemdError(message, "see whether a mount of that user hangs")
 
 
 @contextlib.contextmanager
@@ -144,11 +141,8 @@ def sight_of(account: Account | None) -> Iterator[Sight]:
         child.wait()
 
 
-def cannot_reach(user: str, path: str, is_own: bool = False) -> DoraSystemdError:
+def cannot_reach(user: str, path: str) -> DoraSystemdError:
     """The error for a path that the user of a dataflow cannot access."""
-    where = "put it where that user can read it, or choose another user with --uid"
-    return DoraSystemdError(
-        f"cannot start the dataflow as user {user}, who cannot reach {shown(path)}",
-        "correct its permissions" if is_own else where,
-        ExitCode.NO_PERMISSION,
-    )
+    message = f"cannot start the dataflow as user {user}, who cannot reach {shown(path)}"
+    hint = "put it where that user can read it, or choose another user with --uid"
+    return DoraSystemdError(message, hint, ExitCode.NO_PERMISSION)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.reload.watch_rules import DEFAULT_WATCH, WatchRules
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import settings_path
 from dora_systemd.trust.files import read_file
 
@@ -116,11 +116,9 @@ async def _bursts(rules: WatchRules) -> AsyncIterator[frozenset[str]]:
         return  # a directory disappeared while the watches were added
     except OSError as error:
         if error.errno == errno.ENOSPC or "limit" in str(error).lower():
-            raise DoraSystemdError(
-                f"cannot watch {rules.root}: the kernel gives no more inotify watches",
-                "raise sysctl fs.inotify.max_user_watches, or exclude files with --ignore",
-                ExitCode.FAILURE,
-            ) from error
+            message = f"cannot watch {rules.root}: the kernel gives no more inotify watches"
+            hint = "raise sysctl fs.inotify.max_user_watches, or exclude files with --ignore"
+            raise DoraSystemdError(message, hint) from error
         raise DoraSystemdError(f"cannot watch {rules.root}: {error}") from error
     except RuntimeError as error:  # from watchfiles: the kernel has no inotify instance left
         hint = "raise sysctl fs.inotify.max_user_instances"
