@@ -110,13 +110,8 @@ def list_directory(path: str | Path, most: int) -> list[str]:
 
     Raises OSError, and DoraSystemdError as reached() does.
     """
-    with reached(path) as (found, _):
-        fd = os.open(f"/proc/self/fd/{found}", os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        try:
-            with os.scandir(fd) as entries:
-                return sorted(entry.name for entry in islice(entries, most))
-        finally:
-            os.close(fd)
+    with reached(path) as (found, _), os.scandir(f"/proc/self/fd/{found}") as entries:
+        return sorted(entry.name for entry in islice(entries, most))
 
 
 def exists(path: str | Path) -> bool:

@@ -79,7 +79,7 @@ def spawn(
     stdin: int = subprocess.DEVNULL,
     stderr: int = subprocess.PIPE,
 ) -> "subprocess.Popen[bytes]":
-    """Start a child process in a new session, with no file descriptors but these three.
+    """Start a child process in a new session, with no file descriptors but its streams.
 
     account: the user that it runs as; None: the caller, and then root may run only root's own
     programs. environment: the complete environment; None: that of the account, or the caller's if

@@ -48,9 +48,7 @@ def _translated(explain: Callable[[Exception], DoraSystemdError]) -> Iterator[No
 def bus_error(action: str, scope: Scope, name: str, message: str) -> DoraSystemdError:
     """The error for a D-Bus error name (its last part) and message."""
     reason, code = _REASONS.get(name, (message or name, ExitCode.FAILURE))
-    hint = _HINTS.get(code, "")
-    if code is ExitCode.NO_PERMISSION and scope.is_user:
-        hint = ""
+    hint = "" if code is ExitCode.NO_PERMISSION and scope.is_user else _HINTS.get(code, "")
     return DoraSystemdError(f"cannot {action}: {reason}", hint, code)
 
 

@@ -244,11 +244,9 @@ def _write(path: Path, text: str) -> bool:
 
 
 def _put(path: Path, text: str) -> None:
-    control = os.open(path, os.O_WRONLY | os.O_CLOEXEC)
-    try:
-        os.write(control, text.encode())
-    finally:
-        os.close(control)
+    # Without O_CREAT, which a mode of FileIO would add: it hides that the file does not exist.
+    with io.FileIO(os.open(path, os.O_WRONLY | os.O_CLOEXEC), "w") as control:
+        control.write(text.encode())
 
 
 def read_text(path: Path) -> str:

@@ -108,9 +108,8 @@ async def _bursts(rules: WatchRules) -> AsyncIterator[frozenset[str]]:
         ):
             yield frozenset(path for _, path in changes)
             gone = {path for change, path in changes if change is Change.deleted}
-            if gone.intersection(directories) or any(
-                _is_new_directory(p, rules) for _, p in changes
-            ):
+            there = (path for _, path in changes if Path(path).is_dir())
+            if gone.intersection(directories) or any(map(rules.has_directory, there)):
                 return
     except FileNotFoundError:
         return  # a directory disappeared while the watches were added
@@ -123,10 +122,6 @@ async def _bursts(rules: WatchRules) -> AsyncIterator[frozenset[str]]:
     except RuntimeError as error:  # from watchfiles: the kernel has no inotify instance left
         hint = "raise sysctl fs.inotify.max_user_instances"
         raise DoraSystemdError(f"cannot watch {rules.root}: {error}", hint) from error
-
-
-def _is_new_directory(path: str, rules: WatchRules) -> bool:
-    return Path(path).is_dir() and rules.has_directory(path)
 
 
 async def _wait_root(root: str) -> None:
