@@ -134,11 +134,9 @@ def sight_of(account: Account | None) -> Iterator[Sight]:
         yield LentSight(child, account)
     finally:
         child.kill()
-        for stream in (child.stdin, child.stdout):
-            with contextlib.suppress(OSError):
-                if stream:
-                    stream.close()
-        child.wait()
+        # Closes its streams, of which the first may still have bytes for it, and waits for it.
+        with contextlib.suppress(OSError), child:
+            pass
 
 
 def cannot_reach(user: str, path: str) -> DoraSystemdError:

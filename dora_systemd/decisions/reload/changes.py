@@ -24,10 +24,6 @@ class NodeSources:
     text: str = ""
     rules: WatchRules | None = None
 
-    def names(self, path: str) -> bool:
-        """Whether the definition mentions the file `path`."""
-        return PurePath(path).name in self.text
-
 
 @dataclass(frozen=True)
 class Touched:
@@ -63,7 +59,8 @@ def _owners(path: str, nodes: Mapping[str, NodeSources]) -> list[str]:
     ]
     if owners or path.endswith(".py"):
         return owners
-    return [node for node, sources in nodes.items() if sources.names(path)] or list(nodes)
+    name = PurePath(path).name
+    return [node for node, sources in nodes.items() if name in sources.text] or list(nodes)
 
 
 @dataclass(frozen=True)
