@@ -23,13 +23,12 @@ MAX_NODE_ID = 200
 NODE_ID = re.compile(r"(?!\.)[A-Za-z0-9_.-]+")
 """dora's own rule for node ids."""
 
-_UNIT_TYPES = (
-    *("service", "socket", "device", "mount", "automount", "swap"),
-    *("target", "path", "timer", "slice", "scope"),
+_UNIT_SUFFIXES = (
+    *(".service", ".socket", ".device", ".mount", ".automount", ".swap"),
+    *(".target", ".path", ".timer", ".slice", ".scope"),
 )
-_UNIT_SUFFIXES = tuple(f".{unit_type}" for unit_type in _UNIT_TYPES)
 _UUID = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}")
-_UUID_DASHES = (8, 13, 18, 23)
+_ZERO_UUID = "00000000-0000-0000-0000-000000000000"
 _MIN_PREFIX = 4
 _HINT = (
     f"a name is 1 to {MAX_NAME} letters, digits, '.', '_' or '-', and begins with a letter or digit"
@@ -46,13 +45,14 @@ def is_name(text: str) -> bool:
 
 def parse_name(text: str) -> str:
     """Return a valid name unchanged. Raises DoraSystemdError (USAGE) for any other text."""
+    hint = ""
     if not _NAME.fullmatch(text):
-        raise DoraSystemdError(f"cannot use {quoted(text)} as a name", _HINT, ExitCode.USAGE)
-    if text.endswith(_UNIT_SUFFIXES):
+        hint = _HINT
+    elif text.endswith(_UNIT_SUFFIXES):
         hint = "leave the unit suffix out: the unit is dora-NAME.service"
-        raise DoraSystemdError(f"cannot use {quoted(text)} as a name", hint, ExitCode.USAGE)
-    if text in RESERVED_NAMES:
+    elif text in RESERVED_NAMES:
         hint = f"dora-{text}.service is part of dora-systemd: choose another name"
+    if hint:
         raise DoraSystemdError(f"cannot use {quoted(text)} as a name", hint, ExitCode.USAGE)
     return text
 
@@ -90,12 +90,8 @@ def unit_name(name: str) -> str:
 
 def name_from_unit(unit: str) -> str | None:
     """The dataflow of `unit`, or None if it is not a unit of ours."""
-    if not (unit.startswith(UNIT_PREFIX) and unit.endswith(UNIT_SUFFIX)):
-        return None
-    try:
-        return parse_name(unit.removeprefix(UNIT_PREFIX).removesuffix(UNIT_SUFFIX))
-    except DoraSystemdError:
-        return None
+    name = unit.removeprefix(UNIT_PREFIX).removesuffix(UNIT_SUFFIX)
+    return name if unit == unit_name(name) and is_name(name) else None
 
 
 def is_node_id(text: str) -> bool:
@@ -110,11 +106,10 @@ def is_uuid(text: str) -> bool:
 
 def parse_uuid(text: str) -> str:
     """The UUID in lower case with dashes. Raises DoraSystemdError (USAGE) for any other text."""
-    uuid = text.lower()
-    if not _UUID.fullmatch(uuid):
-        hint = "a UUID is 32 hexadecimal digits as 8-4-4-4-12"
-        raise DoraSystemdError(f"cannot read {quoted(text)} as a UUID", hint, ExitCode.USAGE)
-    return uuid
+    if is_uuid(text.lower()):
+        return text.lower()
+    hint = "a UUID is 32 hexadecimal digits as 8-4-4-4-12"
+    raise DoraSystemdError(f"cannot read {quoted(text)} as a UUID", hint, ExitCode.USAGE)
 
 
 def is_uuid_prefix(text: str) -> bool:
@@ -122,9 +117,4 @@ def is_uuid_prefix(text: str) -> bool:
 
     With fewer than 4 characters, a typing error could stop the wrong dataflow.
     """
-    if not _MIN_PREFIX <= len(text) <= 36:
-        return False
-    return all(
-        char == "-" if place in _UUID_DASHES else char in "0123456789abcdef"
-        for place, char in enumerate(text.lower())
-    )
+    return len(text) >= _MIN_PREFIX and is_uuid(text.lower() + _ZERO_UUID[len(text) :])

@@ -29,8 +29,8 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import shown
 
 _MAX_LINKS = 40
-_STEP = os.O_PATH | os.O_NOFOLLOW | os.O_CLOEXEC
-_OTHERS_WRITE = stat.S_IWOTH
+STEP = os.O_PATH | os.O_NOFOLLOW | os.O_CLOEXEC
+"""Flags to open one component of a path, which may be anything."""
 
 
 class Place(NamedTuple):
@@ -56,7 +56,7 @@ class Place(NamedTuple):
     @property
     def is_open(self) -> bool:
         """Whether it is a directory in which every user can create files, such as /tmp."""
-        return stat.S_ISDIR(self.mode) and bool(self.mode & _OTHERS_WRITE)
+        return stat.S_ISDIR(self.mode) and bool(self.mode & stat.S_IWOTH)
 
     @property
     def borrowed(self) -> str:
@@ -110,13 +110,8 @@ def list_directory(path: str | Path, most: int) -> list[str]:
 
     Raises OSError, and DoraSystemdError as reached() does.
     """
-    with reached(path) as (found, _):
-        fd = os.open(f"/proc/self/fd/{found}", os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        try:
-            with os.scandir(fd) as entries:
-                return sorted(entry.name for entry in islice(entries, most))
-        finally:
-            os.close(fd)
+    with reached(path) as (found, _), os.scandir(f"/proc/self/fd/{found}") as entries:
+        return sorted(entry.name for entry in islice(entries, most))
 
 
 def exists(path: str | Path) -> bool:
@@ -155,7 +150,7 @@ class _Walk:
         self._where = ""
 
     def _open(self, name: str, parent: int | None) -> int:
-        fd = os.open(name, _STEP, dir_fd=parent)
+        fd = os.open(name, STEP, dir_fd=parent)
         self._held.callback(os.close, fd)
         return fd
 
@@ -215,7 +210,7 @@ class _Walk:
         mode, where = self._status.st_mode, self._where or "/"
         if not stat.S_ISDIR(mode) or mode & stat.S_ISVTX:
             return ""
-        is_shared = mode & _OTHERS_WRITE or (mode & stat.S_IWGRP and self._has_members())
+        is_shared = mode & stat.S_IWOTH or (mode & stat.S_IWGRP and self._has_members())
         return where if is_shared else ""
 
     def _has_members(self) -> bool:

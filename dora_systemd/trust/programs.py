@@ -13,7 +13,6 @@ import subprocess
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.paths import reached, user_name
@@ -23,8 +22,6 @@ DEFAULT_PATH = "/usr/local/bin:/usr/bin:/bin"
 _LANGUAGE = "C.UTF-8"
 _FIRST_LINE = 256
 """Bytes of the line "#!INTERPRETER" that the kernel reads, see execve(2)."""
-
-Stream = int | IO[bytes]
 
 
 @dataclass(frozen=True)
@@ -79,11 +76,10 @@ def spawn(
     account: Account | None,
     environment: Mapping[str, str] | None = None,
     directory: str | None = None,
-    stdin: Stream = subprocess.DEVNULL,
-    stdout: Stream = subprocess.PIPE,
-    stderr: Stream = subprocess.PIPE,
+    stdin: int = subprocess.DEVNULL,
+    stderr: int = subprocess.PIPE,
 ) -> "subprocess.Popen[bytes]":
-    """Start a child process in a new session, with no file descriptors but these three.
+    """Start a child process in a new session, with no file descriptors but its streams.
 
     account: the user that it runs as; None: the caller, and then root may run only root's own
     programs. environment: the complete environment; None: that of the account, or the caller's if
@@ -98,7 +94,7 @@ def spawn(
     return subprocess.Popen(
         command,
         stdin=stdin,
-        stdout=stdout,
+        stdout=subprocess.PIPE,
         stderr=stderr,
         env=environment,
         cwd=directory,

@@ -1,6 +1,7 @@
 """Checks paths that another user names with that user's permissions: root could see too much.
 
-A child process takes on the account and answers; it runs only the few lines below. The account can
+A child process takes on the account and answers; it runs only the few lines of eyes.py. The account
+can
 trace the child and make it lie, so callers trust an answer no more than the account itself.
 """
 
@@ -8,15 +9,14 @@ import contextlib
 import errno
 import os
 import select
-import stat
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Protocol
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.trust import eyes
 from dora_systemd.trust.files import MAX_BYTES
 from dora_systemd.trust.programs import Account, spawn
 from dora_systemd.values import shown
@@ -30,114 +30,54 @@ _MOST_DIGITS = 4
 _HEAD = 8
 _CHUNK = 65536
 
-# Requests and answers: a letter, the length as 7 digits, and that many bytes.
-_EYES = """
-import os, stat, sys
-def read(path):
-    fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY)
-    if not stat.S_ISREG(os.fstat(fd).st_mode):
-        os.close(fd)
-        raise OSError(6, "")
-    with os.fdopen(fd, "rb") as file:
-        return file.read(LIMIT + 1)
-def answer(letter, path):
-    if letter == b"e":
-        return b"1" if os.path.exists(path) else b""
-    if letter == b"d":
-        return b"1" if os.path.isdir(path) else b""
-    if letter == b"x":
-        return b"1" if os.path.isfile(path) and os.access(path, os.X_OK) else b""
-    return os.path.realpath(path) if letter == b"l" else read(path)
-while head := sys.stdin.buffer.read(8):
-    path = sys.stdin.buffer.read(int(head[1:]))
-    try:
-        kind, data = b"+", answer(head[:1], path)
-    except (OSError, ValueError) as error:
-        kind, data = b"-", b"%d" % (getattr(error, "errno", 0) or 22)
-    sys.stdout.buffer.write(b"%s%07d%s" % (kind, len(data), data))
-    sys.stdout.buffer.flush()
-""".replace("LIMIT", str(MAX_BYTES))
 
-
-class Sight(Protocol):
-    """What an account sees of the file system. All paths are absolute."""
+class Sight:
+    """What an account sees of the file system: here the caller. All paths are absolute."""
 
     def exists(self, path: str) -> bool:
         """Whether something exists there."""
+        return self._is(b"e", path)
 
     def is_directory(self, path: str) -> bool:
         """Whether it is a directory."""
+        return self._is(b"d", path)
 
     def is_program(self, path: str) -> bool:
         """Whether it is an executable program."""
+        return self._is(b"x", path)
 
     def real(self, path: str) -> str:
         """The path with all symbolic links resolved."""
+        with contextlib.suppress(OSError):
+            found = os.fsdecode(self._ask(b"l", path))
+            return found if found.startswith("/") else path
+        return path
 
     def read(self, path: str) -> bytes:
         """The content of a regular file, at most MAX_BYTES + 1 bytes. Raises OSError."""
+        return self._ask(b"r", path)
 
-
-class OwnSight:
-    """The file system as the caller sees it."""
-
-    def exists(self, path: str) -> bool:
-        return self._mode(path) is not None
-
-    def is_directory(self, path: str) -> bool:
-        return stat.S_ISDIR(self._mode(path) or 0)
-
-    def is_program(self, path: str) -> bool:
-        return stat.S_ISREG(self._mode(path) or 0) and os.access(path, os.X_OK)
-
-    def real(self, path: str) -> str:
-        return os.path.realpath(path)
-
-    def read(self, path: str) -> bytes:
-        fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
-        with os.fdopen(fd, "rb") as file:
-            if not stat.S_ISREG(os.fstat(fd).st_mode):
-                raise OSError(errno.ENXIO, os.strerror(errno.ENXIO))
-            return file.read(MAX_BYTES + 1)
-
-    def _mode(self, path: str) -> int | None:
+    def _is(self, letter: bytes, path: str) -> bool:
         with contextlib.suppress(OSError, ValueError):
-            return Path(path).stat().st_mode
-        return None
+            return bool(self._ask(letter, path))
+        return False
+
+    def _ask(self, letter: bytes, path: str) -> bytes:
+        return eyes.answer(letter, os.fsencode(path), MAX_BYTES + 1)
 
 
-class LentSight:
-    """The file system as an account sees it. Raises DoraSystemdError if its child is silent."""
+class LentSight(Sight):
+    """The file system as another account sees it.
+
+    Raises DoraSystemdError if its child is silent.
+    """
 
     def __init__(self, child: "subprocess.Popen[bytes]", account: Account) -> None:
         self._child = child
         self._account = account
         self._left = _SECONDS
 
-    def exists(self, path: str) -> bool:
-        return self._is("e", path)
-
-    def is_directory(self, path: str) -> bool:
-        return self._is("d", path)
-
-    def is_program(self, path: str) -> bool:
-        return self._is("x", path)
-
-    def real(self, path: str) -> str:
-        with contextlib.suppress(OSError):
-            found = os.fsdecode(self._ask("l", path))
-            return found if found.startswith("/") else path
-        return path
-
-    def read(self, path: str) -> bytes:
-        return self._ask("r", path)
-
-    def _is(self, letter: str, path: str) -> bool:
-        with contextlib.suppress(OSError):
-            return bool(self._ask(letter, path))
-        return False
-
-    def _ask(self, letter: str, path: str) -> bytes:
+    def _ask(self, letter: bytes, path: str) -> bytes:
         """Send one request to the child. Raises the OSError that the account got."""
         assert self._child.stdin and self._child.stdout
         question = os.fsencode(path)
@@ -146,12 +86,13 @@ class LentSight:
         begun = time.monotonic()
         deadline = begun + self._left
         try:
-            self._child.stdin.write(b"%s%07d%s" % (letter.encode(), len(question), question))
+            self._child.stdin.write(b"%s%07d%s" % (letter, len(question), question))
             self._child.stdin.flush()
             head = self._receive(_HEAD, deadline)
             data = self._receive(min(int(head[1:]), MAX_BYTES + 1), deadline)
         except (BrokenPipeError, ValueError) as error:
-            raise self._silence(path) from error
+            message = f"cannot look at {shown(path)} as user {self._account.name}: no answer"
+            raise DoraSystemdError(message, "see whether a mount of that user hangs") from error
         finally:
             self._left -= time.monotonic() - begun
         if head[:1] != b"+":
@@ -171,10 +112,6 @@ class LentSight:
             received += chunk
         return received
 
-    def _silence(self, path: str) -> DoraSystemdError:
-        message = f"cannot look at {shown(path)} as user {self._account.name}: no answer"
-        return DoraSystemdError(message, "see whether a mount of that user hangs")
-
 
 @contextlib.contextmanager
 def sight_of(account: Account | None) -> Iterator[Sight]:
@@ -183,9 +120,10 @@ def sight_of(account: Account | None) -> Iterator[Sight]:
     Raises DoraSystemdError (NO_PERMISSION) if the account cannot execute our Python interpreter.
     """
     if account is None or account.uid == os.geteuid() or os.geteuid() != 0:
-        yield OwnSight()
+        yield Sight()
         return
-    command = (sys.executable, "-I", "-S", "-c", _EYES)
+    text = Path(eyes.__file__).read_text(encoding="utf-8")
+    command = (sys.executable, "-I", "-S", "-c", text, str(MAX_BYTES + 1))
     try:
         child = spawn(
             command, account, directory="/", stdin=subprocess.PIPE, stderr=subprocess.DEVNULL
@@ -196,18 +134,13 @@ def sight_of(account: Account | None) -> Iterator[Sight]:
         yield LentSight(child, account)
     finally:
         child.kill()
-        for stream in (child.stdin, child.stdout):
-            with contextlib.suppress(OSError):
-                if stream:
-                    stream.close()
-        child.wait()
+        # Closes its streams, of which the first may still have bytes for it, and waits for it.
+        with contextlib.suppress(OSError), child:
+            pass
 
 
-def cannot_reach(user: str, path: str, is_own: bool = False) -> DoraSystemdError:
+def cannot_reach(user: str, path: str) -> DoraSystemdError:
     """The error for a path that the user of a dataflow cannot access."""
-    where = "put it where that user can read it, or choose another user with --uid"
-    return DoraSystemdError(
-        f"cannot start the dataflow as user {user}, who cannot reach {shown(path)}",
-        "correct its permissions" if is_own else where,
-        ExitCode.NO_PERMISSION,
-    )
+    message = f"cannot start the dataflow as user {user}, who cannot reach {shown(path)}"
+    hint = "put it where that user can read it, or choose another user with --uid"
+    return DoraSystemdError(message, hint, ExitCode.NO_PERMISSION)

@@ -58,8 +58,7 @@ def peer_uid(peer: Address, own: Address, look: Lookup | None = None) -> int | N
     before = None
     for _ in range(_TRIES):
         found = look(peer, own)
-        found = found if found and found.inode else None
-        if found is not None and found == before:
+        if found and found.inode and found == before:
             return found.uid
         before = found
     return None

@@ -16,11 +16,10 @@ from pathlib import Path
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.terminal_text import short_line
-from dora_systemd.trust.paths import reached, user_name
+from dora_systemd.trust.paths import STEP, reached, user_name
 from dora_systemd.trust.socket_table import loopback_listeners
 from dora_systemd.values import shown
 
-_STEP = os.O_PATH | os.O_NOFOLLOW | os.O_CLOEXEC
 _CREDENTIALS = struct.Struct("=iII")
 """pid, uid and gid, see SO_PEERCRED in unix(7)."""
 
@@ -45,7 +44,7 @@ def connect_unix(path: Path, seconds: float, peer: Peer = peer_of) -> socket.soc
         directory, place = held.enter_context(reached(path.parent))
         if place.borrowed:
             raise _refusal(path, place.borrowed)
-        fd = os.open(path.name, _STEP, dir_fd=directory)
+        fd = os.open(path.name, STEP, dir_fd=directory)
         held.callback(os.close, fd)
         status = os.fstat(fd)
         if not stat.S_ISSOCK(status.st_mode):

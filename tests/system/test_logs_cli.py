@@ -14,6 +14,7 @@ from dora_systemd.decisions.logs.events import EVENTS
 from dora_systemd.errors import ExitCode
 from tests.lab.pace import bound
 from tests.system.cells import Cell, Project, run, sync_journal, wait_for
+from tests.system.terminal import read_to_end
 
 TALK = """
 import sys
@@ -152,12 +153,7 @@ def test_terminal(talking: Cell) -> None:
     command = ["doractl", talking.scope.flag, "logs", talking.name, "--no-pager", "--tail", "40"]
     child = subprocess.Popen(command, stdout=slave)
     os.close(slave)
-    data = b""
-    try:
-        while chunk := os.read(master, 65536):
-            data += chunk
-    except OSError:
-        pass  # how a terminal ends
+    data = read_to_end(master)
     assert child.wait() == 0
     os.close(master)
     lines = data.decode().splitlines()

@@ -1,21 +1,15 @@
 """doractl run: a dataflow that lives no longer than its terminal."""
 
-import fcntl
-import os
 import re
 import signal
-import struct
 import subprocess
-import termios
-import threading
-import time
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
 from tests.lab.pace import bound
 from tests.system.cells import Cell, Project, is_alive, wait_for
+from tests.system.terminal import Screen
 
 TICK = "inputs: {tick: dora/timer/millis/50}"
 STUBBORN = """
@@ -54,44 +48,6 @@ def test_run_ends_with_ctrl_c(cell: Cell, project: Project) -> None:
     assert "got [" in out
     assert "stopped" in out.splitlines()[-1]
     assert cell.is_gone
-
-
-class Screen:
-    """A terminal of 80 columns with a command in its foreground, as a person has it."""
-
-    def __init__(self, command: list[str]) -> None:
-        self._ours, theirs = os.openpty()
-        fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("4H", 24, 80, 0, 0))
-        # In a session of its own, whose terminal this is.
-        own = ["setsid", "--ctty", "--wait", *command]
-        self.child = subprocess.Popen(own, stdin=theirs, stdout=theirs, stderr=theirs)
-        os.close(theirs)
-        self._pieces: list[bytes] = []
-        self._thread = threading.Thread(target=self._read, daemon=True)
-        self.pause = 0.0
-        self._thread.start()
-
-    def _read(self) -> None:
-        with suppress(OSError):  # the last end of the other side is closed
-            while data := os.read(self._ours, 1024):
-                self._pieces.append(data)
-                time.sleep(self.pause)
-
-    def press(self, key: bytes) -> None:
-        os.write(self._ours, key)
-
-    def end(self) -> int:
-        """The exit status, when all of the output is there."""
-        self.pause = 0.0
-        status = self.child.wait(bound(60))
-        self._thread.join(bound(10))
-        return status
-
-    def lines(self) -> list[str]:
-        """What stays on the screen."""
-        text = b"".join(self._pieces).decode().replace("\r\n", "\n")
-        lines = (line.rpartition("\r\x1b[K")[2] for line in text.split("\n"))
-        return [re.sub(r"\x1b\[[0-9;]*m", "", line) for line in lines if line]
 
 
 LAST_WORDS = """

@@ -2,18 +2,14 @@
 
 import json
 import os
-import pty
 import re
-import select
 import subprocess
-import time
-from collections.abc import Callable
 
 import pytest
 
 from dora_systemd.errors import ExitCode
-from tests.lab.pace import bound
 from tests.system.cells import Cell, Project, run
+from tests.system.terminal import on_terminal, read_until
 
 BUSY = """
 import threading
@@ -68,10 +64,8 @@ def test_objects_go_on(cell: Cell, project: Project) -> None:
 @pytest.mark.parametrize("key", [b"q", b"\x03"])
 def test_live(key: bytes, cell: Cell, project: Project) -> None:
     cell.start(project.three_nodes())
-    pid, fd = pty.fork()
-    if not pid:
-        os.environ |= {"LINES": "20", "COLUMNS": "120"}
-        os.execvp("doractl", ["doractl", cell.scope.flag, "top", "--interval", "0.2"])
+    command = ["doractl", cell.scope.flag, "top", "--interval", "0.2"]
+    pid, fd = on_terminal(command, LINES="20", COLUMNS="120")
     seen = read_until(fd, lambda text: text.count("doractl top") > 3 and "  sink" in text)
     assert seen.startswith("\x1b[?1049h")
     assert re.search(rf"{cell.name} +Running 3/3", seen)
@@ -79,15 +73,6 @@ def test_live(key: bytes, cell: Cell, project: Project) -> None:
     end = read_until(fd, lambda text: "\x1b[?1049l" in text)
     assert end.endswith("\x1b[?25h\x1b[?1049l")
     assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
-
-
-def read_until(fd: int, is_done: Callable[[str], bool]) -> str:
-    """The output of a terminal up to where `is_done` says of all of it that it is enough."""
-    deadline, seen = time.monotonic() + bound(30), b""
-    while not is_done(seen.decode()):
-        assert select.select([fd], [], [], deadline - time.monotonic())[0], seen
-        seen += os.read(fd, 65536)
-    return seen.decode()
 
 
 def test_what_is_not_there(cell: Cell, project: Project) -> None:

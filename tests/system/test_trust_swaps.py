@@ -18,7 +18,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.verbs.start.plan import Plan, StartRequest, make_plan
 from dora_systemd.verbs.start.unit import format_plan
 from tests.system.cells import run, wait_for
-from tests.system.test_trust_start import FLOW, Home
+from tests.system.homes import FLOW, Home
 
 pytestmark = pytest.mark.lab
 

@@ -1,47 +1,54 @@
 """Turns D-Bus errors into errors for users."""
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import user_name
 
+_DENIED = ("permission denied", ExitCode.NO_PERMISSION)
+_SILENT = ("systemd does not answer", ExitCode.NO_SYSTEMD)
+_AWAY = ("systemd is not on the message bus", ExitCode.NO_SYSTEMD)
 _REASONS = {
-    "AccessDenied": ("permission denied", ExitCode.NO_PERMISSION),
-    "InteractiveAuthorizationRequired": ("permission denied", ExitCode.NO_PERMISSION),
-    "AuthFailed": ("permission denied", ExitCode.NO_PERMISSION),
+    **dict.fromkeys(("AccessDenied", "InteractiveAuthorizationRequired", "AuthFailed"), _DENIED),
     "UnitExists": ("a unit of that name already exists", ExitCode.NAME_IN_USE),
     "NoSuchUnit": ("there is no such unit", ExitCode.NOT_FOUND),
-    "ConnectionRefused": ("systemd does not answer", ExitCode.NO_SYSTEMD),
     "Disconnected": ("systemd hung up", ExitCode.NO_SYSTEMD),
-    "NoReply": ("systemd does not answer", ExitCode.NO_SYSTEMD),
-    "Timeout": ("systemd does not answer", ExitCode.NO_SYSTEMD),
-    "TimedOut": ("systemd does not answer", ExitCode.NO_SYSTEMD),
-    "ServiceUnknown": ("systemd is not on the message bus", ExitCode.NO_SYSTEMD),
-    "NameHasNoOwner": ("systemd is not on the message bus", ExitCode.NO_SYSTEMD),
+    **dict.fromkeys(("ConnectionRefused", "NoReply", "Timeout", "TimedOut"), _SILENT),
+    **dict.fromkeys(("ServiceUnknown", "NameHasNoOwner"), _AWAY),
 }
 
 
-@contextmanager
-def explained(action: str, scope: Scope) -> Iterator[None]:
+def explained(action: str, scope: Scope) -> AbstractContextManager[None]:
     """Turn pystemd's errors into DoraSystemdError "cannot `action`: reason"."""
+    return _translated(
+        lambda error: bus_error(action, scope, error_name(error), _text(error, "err_message"))
+    )
+
+
+def connection_error(scope: Scope) -> AbstractContextManager[None]:
+    """Explain why a manager cannot be reached at all, with a hint."""
+    return _translated(lambda error: _unreachable(scope, error))
+
+
+@contextmanager
+def _translated(explain: Callable[[Exception], DoraSystemdError]) -> Iterator[None]:
+    """Raise `explain(error)` for an error of pystemd, which is not imported here: that is slow."""
     try:
         yield
     except Exception as error:
-        if not _is_bus_error(error):
+        if not any(kind.__name__ == "DBusBaseError" for kind in type(error).__mro__):
             raise
-        raise bus_error(action, scope, error_name(error), _message(error)) from error
+        raise explain(error) from error
 
 
 def bus_error(action: str, scope: Scope, name: str, message: str) -> DoraSystemdError:
     """The error for a D-Bus error name (its last part) and message."""
     reason, code = _REASONS.get(name, (message or name, ExitCode.FAILURE))
-    hint = _HINTS.get(code, "")
-    if code is ExitCode.NO_PERMISSION and scope.is_user:
-        hint = ""
+    hint = "" if code is ExitCode.NO_PERMISSION and scope.is_user else _HINTS.get(code, "")
     return DoraSystemdError(f"cannot {action}: {reason}", hint, code)
 
 
@@ -53,20 +60,11 @@ _HINTS = {
 }
 
 
-@contextmanager
-def connection_error(scope: Scope) -> Iterator[None]:
-    """Explain why a manager cannot be reached at all, with a hint."""
-    try:
-        yield
-    except Exception as error:
-        if not _is_bus_error(error):
-            raise
-        manager = "systemd of this user" if scope.is_user else "systemd"
-        reason = os.strerror(-getattr(error, "errno", 0))
-        message = f"cannot reach the {manager}" if scope.is_user else f"cannot reach {manager}"
-        raise DoraSystemdError(
-            f"{message}: {reason}", _connection_hint(scope), ExitCode.NO_SYSTEMD
-        ) from error
+def _unreachable(scope: Scope, error: Exception) -> DoraSystemdError:
+    manager = "the systemd of this user" if scope.is_user else "systemd"
+    reason = os.strerror(-getattr(error, "errno", 0))
+    message = f"cannot reach {manager}: {reason}"
+    return DoraSystemdError(message, _connection_hint(scope), ExitCode.NO_SYSTEMD)
 
 
 def silent_bus(scope: Scope, is_private: bool) -> DoraSystemdError:
@@ -90,17 +88,10 @@ def _connection_hint(scope: Scope) -> str:
 
 def error_name(error: Exception) -> str:
     """The last part of the D-Bus error name; pystemd has a class for each name that it knows."""
-    name = getattr(error, "err_name", "")
-    text = name.decode(errors="replace") if isinstance(name, bytes) else str(name)
-    return text.rpartition(".")[2] or type(error).__name__.removeprefix("DBus").removesuffix(
-        "Error"
-    )
+    own = type(error).__name__.removeprefix("DBus").removesuffix("Error")
+    return _text(error, "err_name").rpartition(".")[2] or own
 
 
-def _message(error: Exception) -> str:
-    text = getattr(error, "err_message", "")
+def _text(error: Exception, name: str) -> str:
+    text = getattr(error, name, "")
     return text.decode(errors="replace") if isinstance(text, bytes) else str(text)
-
-
-def _is_bus_error(error: Exception) -> bool:
-    return any(kind.__name__ == "DBusBaseError" for kind in type(error).__mro__)

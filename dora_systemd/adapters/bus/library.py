@@ -11,7 +11,6 @@ import sys
 from importlib import import_module
 from importlib.util import find_spec
 from types import ModuleType
-from typing import Any
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
 
@@ -37,12 +36,8 @@ def _load() -> ModuleType:
 
 
 def _late_pprint() -> ModuleType:
-    def pformat(*arguments: Any, **options: Any) -> str:
-        text: str = import_module("pprint").pformat(*arguments, **options)
-        return text
-
     module = ModuleType("pprint")
-    module.__dict__["pformat"] = pformat
+    vars(module)["pformat"] = lambda *words: import_module("pprint").pformat(*words)
     return module
 
 

@@ -64,10 +64,8 @@ class Bus:
             self._bus.close()
 
     def list_units(self, pattern: str) -> list[UnitState]:
-        rows = self._call(
-            "list units", ROOT, MANAGER, "ListUnitsByPatterns", ("as", []), ("as", [pattern])
-        )
-        return [UnitState(row[0], row[2], row[3], row[4]) for row in rows or ()]
+        rows = self._call("list units", "ListUnitsByPatterns", ("as", []), ("as", [pattern]))
+        return [UnitState(row[0], *row[2:5]) for row in rows or ()]
 
     def read(self, unit: str, names: Sequence[str]) -> dict[str, Any]:
         return {name: self._read_one(unit, name) for name in names}
@@ -76,14 +74,8 @@ class Bus:
         self, unit: str, properties: Sequence[Property], observer: Observer | None, wait: bool
     ) -> str:
         self._listen(unit)
-        typed = [(name, (signature, value)) for name, signature, value in properties]
-        arguments: tuple[tuple[str, Any], ...] = (
-            ("s", unit),
-            ("s", "fail"),
-            ("a(sv)", typed),
-            ("a(sa(sv))", []),
-        )
-        job = self._call(f"start {unit}", ROOT, MANAGER, "StartTransientUnit", *arguments)
+        arguments = (("s", unit), ("s", "fail"), _typed(properties), ("a(sa(sv))", ()))
+        job = self._call(f"start {unit}", "StartTransientUnit", *arguments)
         return self._wait_for_jobs({job: unit}, observer)[unit] if wait else JOB_DONE
 
     def run_jobs(
@@ -98,71 +90,68 @@ class Bus:
         self._listen(unit)
         action = f"{method.removesuffix('Unit').lower()} {unit}"
         try:
-            job: str = self._call(action, ROOT, MANAGER, method, ("s", unit), ("s", "replace"))
+            return str(self._call(action, method, ("s", unit), ("s", "replace")))
         except DoraSystemdError as error:
             # A unit that has ended by itself since it was chosen needs no job to stop.
             if method != "StopUnit" or error.code is not ExitCode.NOT_FOUND:
                 raise
             return ""
-        return job
 
     def kill(self, unit: str, signal: int, whom: str = "all") -> None:
-        arguments = (("s", unit), ("s", whom), ("i", signal))
-        self._call(f"kill {unit}", ROOT, MANAGER, "KillUnit", *arguments)
+        self._call(f"kill {unit}", "KillUnit", ("s", unit), ("s", whom), ("i", signal))
 
     def reset_failed(self, unit: str) -> None:
-        self._call(f"reset {unit}", ROOT, MANAGER, "ResetFailedUnit", ("s", unit))
+        self._call(f"reset {unit}", "ResetFailedUnit", ("s", unit))
 
     def hold(self, unit: str) -> None:
-        self._call(f"hold {unit}", ROOT, MANAGER, "RefUnit", ("s", unit))
+        self._call(f"hold {unit}", "RefUnit", ("s", unit))
 
     def set_properties(self, unit: str, properties: Sequence[Property], runtime: bool) -> None:
-        typed = [(name, (signature, value)) for name, signature, value in properties]
-        arguments = (("s", unit), ("b", runtime), ("a(sv)", typed))
-        self._call(f"change {unit}", ROOT, MANAGER, "SetUnitProperties", *arguments)
+        arguments = (("s", unit), ("b", runtime), _typed(properties))
+        self._call(f"change {unit}", "SetUnitProperties", *arguments)
 
     def changes(self, unit: str) -> list[Mapping[str, Any]]:
         self._listen(unit)
         return [body[1] for member, body in self._signals() if member == "PropertiesChanged"]
 
     def control_group(self) -> str:
-        group: str = self._get("read systemd's cgroup", ROOT, MANAGER, "ControlGroup")
-        return group
+        return str(self._get("read systemd's cgroup", "ControlGroup"))
 
     def reload(self) -> None:
-        self._call("reload systemd", ROOT, MANAGER, "Reload")
+        self._call("reload systemd", "Reload")
 
     def unit_path(self) -> list[str]:
-        paths: list[str] = self._get("read where units are", ROOT, MANAGER, "UnitPath")
-        return paths
+        return list(self._get("read where units are", "UnitPath"))
 
     def enable_unit_files(self, names: Sequence[str]) -> bool:
         arguments = (("as", names), ("b", False), ("b", True))
-        reply = self._call(f"enable {names[0]}", ROOT, MANAGER, "EnableUnitFiles", *arguments)
-        return bool(reply[0])
+        return bool(self._call(f"enable {names[0]}", "EnableUnitFiles", *arguments)[0])
 
     def disable_unit_files(self, units: Sequence[str]) -> None:
-        arguments = (("as", units), ("b", False))
-        self._call(f"disable {units[0]}", ROOT, MANAGER, "DisableUnitFiles", *arguments)
+        self._call(f"disable {units[0]}", "DisableUnitFiles", ("as", units), ("b", False))
 
     def version(self) -> str:
-        text: str = self._get("read systemd's version", ROOT, MANAGER, "Version")
-        return text
+        return str(self._get("read systemd's version", "Version"))
 
     def fileno(self) -> int:
-        number: int = self._bus.get_fd()
-        return number
+        return int(self._bus.get_fd())
 
     def _read_one(self, unit: str, name: str) -> Any:
         own = BY_TYPE.get(unit.rpartition(".")[2], UNIT)
         interface = UNIT if name in _UNIT_PROPERTIES else own
-        return self._get(f"read {name} of {unit}", _unit_path(unit), interface, name)
+        return self._get(f"read {name} of {unit}", name, _unit_path(unit), interface)
 
-    def _get(self, action: str, path: bytes, interface: bytes, name: str) -> Any:
-        return self._call(action, path, PROPERTIES, "Get", ("s", interface.decode()), ("s", name))
+    def _get(self, action: str, name: str, path: bytes = ROOT, interface: bytes = MANAGER) -> Any:
+        arguments = (("s", interface.decode()), ("s", name))
+        return self._call(action, "Get", *arguments, path=path, interface=PROPERTIES)
 
     def _call(
-        self, action: str, path: bytes, interface: bytes, method: str, *arguments: tuple[str, Any]
+        self,
+        action: str,
+        method: str,
+        *arguments: tuple[str, Any],
+        path: bytes = ROOT,
+        interface: bytes = MANAGER,
     ) -> Any:
         words = [word for signature, value in arguments for word in encoded(signature, value)]
         with explained(action, self.scope):
@@ -173,7 +162,7 @@ class Bus:
         """Subscribe to the end of jobs and to the changed properties of `unit`."""
         path = _unit_path(unit)
         if not self._matches:
-            self._call("listen to systemd", ROOT, MANAGER, "Subscribe")
+            self._call("listen to systemd", "Subscribe")
             self._match(ROOT, MANAGER, b"JobRemoved")
         if path not in self._matches:
             self._match(path, PROPERTIES, b"PropertiesChanged")
@@ -232,6 +221,10 @@ class Bus:
         poll = select.poll()
         poll.register(self.fileno(), select.POLLIN)
         return bool(poll.poll(seconds * 1000))
+
+
+def _typed(properties: Sequence[Property]) -> tuple[str, Any]:
+    return "a(sv)", [(name, (signature, value)) for name, signature, value in properties]
 
 
 def _unit_path(unit: str) -> bytes:

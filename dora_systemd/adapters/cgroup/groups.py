@@ -64,13 +64,7 @@ def own_group() -> str:
 
 def node_groups(path: Path) -> dict[str, Path]:
     """Directories of the node groups below a unit's `path`, by node id."""
-    with contextlib.suppress(OSError):
-        return {
-            one.name.removeprefix(NODE_PREFIX): one
-            for one in sorted(path.iterdir())
-            if one.name.startswith(NODE_PREFIX) and one.is_dir()
-        }
-    return {}
+    return _by_node(path, sorted(one for one in _names(path) if one.startswith(NODE_PREFIX)))
 
 
 def shown_groups(path: Path, nodes: Iterable[str] = ()) -> dict[str, Path]:
@@ -78,13 +72,20 @@ def shown_groups(path: Path, nodes: Iterable[str] = ()) -> dict[str, Path]:
 
     For readers outside the cell: the nodes' user can create groups of any name and number.
     """
-    names = [f"{NODE_PREFIX}{node}" for node in nodes]
+    if names := [f"{NODE_PREFIX}{node}" for node in nodes]:
+        return _by_node(path, names)
+    found = filter(_is_node_group, islice(_names(path), _MAX_ENTRIES))
+    return _by_node(path, sorted(found)[:MAX_GROUPS])
+
+
+def _names(path: Path) -> Iterator[str]:
+    with contextlib.suppress(OSError), os.scandir(path) as entries:
+        yield from (one.name for one in entries)
+
+
+def _by_node(path: Path, names: Iterable[str]) -> dict[str, Path]:
+    groups = (path / name for name in names)
     with contextlib.suppress(OSError):
-        if not names:
-            with os.scandir(path) as entries:
-                found = [one.name for one in islice(entries, _MAX_ENTRIES)]
-            names = sorted(filter(_is_node_group, found))[:MAX_GROUPS]
-        groups = (path / name for name in names)
         return {one.name.removeprefix(NODE_PREFIX): one for one in groups if one.is_dir()}
     return {}
 
@@ -98,13 +99,12 @@ def read_usage(path: Path) -> Usage:
 
     Without a memory controller, memory is the sum of the processes' resident sets.
     """
-    current, cpu = read_number(path / "memory.current"), read_cpu(path)
-    if current is None:
+    memory = read_number(path / "memory.current")
+    if memory is None:
         some = islice(_pids(islice(_tree(path), MAX_GROUPS)), MAX_PROCESSES)
         memory = sum(map(_resident_bytes, some))
-        return cpu._replace(memory=memory, cpu_max=_read_share(path / "cpu.max"))
-    return cpu._replace(
-        memory=current,
+    return read_cpu(path)._replace(
+        memory=memory,
         memory_peak=read_number(path / "memory.peak"),
         memory_max=read_number(path / "memory.max"),
         cpu_max=_read_share(path / "cpu.max"),
@@ -198,11 +198,7 @@ def restore_group(path: Path, texts: Mapping[str, str]) -> None:
 
 def move_process(path: Path, pid: int) -> None:
     """Move process `pid` (0: this one) into the group. Raises OSError."""
-    control = os.open(path / "cgroup.procs", os.O_WRONLY | os.O_CLOEXEC)
-    try:
-        os.write(control, str(pid).encode())
-    finally:
-        os.close(control)
+    _put(path / "cgroup.procs", str(pid))
 
 
 def kill_group(path: Path) -> None:
@@ -239,16 +235,18 @@ def _tree(path: Path) -> Iterator[Path]:
 def _write(path: Path, text: str) -> bool:
     """Write to a control file; False if the kernel has no such file or controller."""
     try:
-        control = os.open(path, os.O_WRONLY | os.O_CLOEXEC)
-        try:
-            os.write(control, text.encode())
-        finally:
-            os.close(control)
+        _put(path, text)
     except OSError as error:
         if error.errno in _ABSENT:
             return False
         raise
     return True
+
+
+def _put(path: Path, text: str) -> None:
+    # Without O_CREAT, which a mode of FileIO would add: it hides that the file does not exist.
+    with io.FileIO(os.open(path, os.O_WRONLY | os.O_CLOEXEC), "w") as control:
+        control.write(text.encode())
 
 
 def read_text(path: Path) -> str:

@@ -9,7 +9,7 @@ from dora_systemd.decisions.resources.pressure import Load
 from dora_systemd.decisions.resources.usage import RESOURCES, Strain
 from dora_systemd.values import INFINITY
 
-_TOTAL = re.compile(r"^(some|full) .*total=(\d+)$", re.M)
+_PRESSURE = re.compile(r"^(some|full) avg10=([0-9.]+) .*total=(\d+)$", re.M)
 
 
 def read_strain(path: Path) -> Strain:
@@ -45,11 +45,11 @@ def read_load(path: Path) -> Load:
 
 def _read_stalls(path: Path) -> tuple[int, int] | None:
     """Both totals of a pressure file in µs; None if the kernel does not measure them."""
-    totals = {kind: int(total) for kind, total in _TOTAL.findall(read_text(path))}
+    totals = {kind: int(total) for kind, _, total in _PRESSURE.findall(read_text(path))}
     return (totals["some"], totals.get("full", 0)) if "some" in totals else None
 
 
 def _read_stalled(path: Path) -> float:
     """avg10 of "some" in memory.pressure, see the kernel's "PSI" document; 0 where it is off."""
-    match = re.search(r"^some avg10=([0-9.]+)", read_text(path / "memory.pressure"))
-    return float(match[1]) if match else 0.0
+    match = _PRESSURE.search(read_text(path / "memory.pressure"))
+    return float(match[2]) if match else 0.0

@@ -9,7 +9,7 @@ from pathlib import Path
 from dora_systemd.adapters.host.process import Completed, run_command
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.programs import Account, fresh_environment
-from dora_systemd.trust.sight import OwnSight, Sight
+from dora_systemd.trust.sight import Sight
 
 OLDEST_DORA = (1, 0)
 """Before 1.0 the control protocol was another one."""
@@ -45,7 +45,7 @@ def find_dora(
     Last comes that beside our own Python: pip has put both into one virtual environment, and what
     is linked onto PATH is only doractl. sight: whose eyes look. Raises DoraSystemdError (NO_DORA).
     """
-    sight = sight or OwnSight()
+    sight = sight or Sight()
     if given is not None:
         found = _which(given, search_path.split(os.pathsep), sight)
         if found is None:

@@ -1,15 +1,13 @@
-"""Reads YAML and JSON, and writes files atomically. No path can make a read hang."""
+"""Reads text and YAML, and writes files atomically. No path can make a read hang."""
 
 import contextlib
 import errno
-import json
 import os
-from functools import cache
 from pathlib import Path
-from typing import Any
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.files import check_size, read_own_file
+from dora_systemd.trust.paths import refusal
 from dora_systemd.values import shown
 
 MAX_DEPTH = 64
@@ -18,9 +16,10 @@ MAX_DEPTH = 64
 MAX_VALUES = 100_000
 """Maximum values in a YAML file: a small file can have enough of them to take seconds."""
 
+REFUSED = (errno.EACCES, errno.EPERM, errno.EROFS)
+"""Errors of writing where the caller may not write."""
 _WRITE_HINTS = {
-    errno.EACCES: "use sudo, or choose a place that is yours",
-    errno.EPERM: "use sudo, or choose a place that is yours",
+    **dict.fromkeys((errno.EACCES, errno.EPERM), "use sudo, or choose a place that is yours"),
     errno.EROFS: "the file system is mounted read-only",
     errno.ENOSPC: "the disk is full, see df",
     errno.EDQUOT: "the quota is used up, see quota",
@@ -49,7 +48,7 @@ def decoded(data: bytes, path: Path) -> str:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
-        raise _refusal(path, f"line {line} is not UTF-8", "save it as UTF-8 text") from error
+        raise refusal(path, f"line {line} is not UTF-8", "save it as UTF-8 text") from error
 
 
 def read_yaml(path: Path, allow_empty: bool = False) -> object:
@@ -67,25 +66,18 @@ def parse_yaml(text: str, path: Path, allow_empty: bool = False) -> object:
     """The document in `text`, parsed as read_yaml does. path: for errors."""
     import yaml
 
+    from dora_systemd.adapters.host.yaml_loader import Loader
+
     try:
         _check_shape(text, path)
-        document = yaml.load(text, Loader=_loader())
+        document = yaml.load(text, Loader=Loader)
     except yaml.YAMLError as error:
-        raise _refusal(path, _yaml_reason(error), "correct the YAML there") from error
+        raise refusal(path, _yaml_reason(error), "correct the YAML there") from error
     except (ValueError, OverflowError, RecursionError) as error:
-        raise _refusal(path, "it is not YAML that can be read", "correct the YAML") from error
+        raise refusal(path, "it is not YAML that can be read", "correct the YAML") from error
     if document is None and not allow_empty:
-        raise _refusal(path, "it is empty", "write something into it")
+        raise refusal(path, "it is empty", "write something into it")
     return document
-
-
-def read_json(path: Path) -> Any:
-    """The JSON value in `path`. Raises DoraSystemdError (BAD_INPUT) as read_text does."""
-    text = read_text(path)
-    try:
-        return json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise _refusal(path, "it is not JSON", "") from error
 
 
 def write_atomic(
@@ -112,8 +104,7 @@ def write_atomic(
     except OSError as error:
         with contextlib.suppress(OSError):
             Path(temporary).unlink()
-        is_refused = error.errno in (errno.EACCES, errno.EPERM, errno.EROFS)
-        code = ExitCode.NO_PERMISSION if is_refused else ExitCode.FAILURE
+        code = ExitCode.NO_PERMISSION if error.errno in REFUSED else ExitCode.FAILURE
         message = f"cannot write {shown(str(path))}: {error.strerror}"
         raise DoraSystemdError(message, _WRITE_HINTS.get(error.errno or 0, ""), code) from error
 
@@ -122,28 +113,19 @@ def _check_shape(text: str, path: Path) -> None:
     """Check the limits on parser events, which need no recursion, unlike nodes."""
     import yaml
 
+    from dora_systemd.adapters.host.yaml_loader import Loader
+
     depth = 0
-    for count, event in enumerate(yaml.parse(text, Loader=_loader())):
+    for count, event in enumerate(yaml.parse(text, Loader=Loader)):
         depth += isinstance(event, yaml.CollectionStartEvent)
         depth -= isinstance(event, yaml.CollectionEndEvent)
         if depth > MAX_DEPTH or count > MAX_VALUES:
             what = f"nested more than {MAX_DEPTH} levels deep"
             reason = what if depth > MAX_DEPTH else f"more than {MAX_VALUES} values"
-            raise _refusal(path, f"it is {reason}", "make it simpler")
-
-
-@cache
-def _loader() -> Any:
-    from dora_systemd.adapters.host.yaml_loader import loader_class
-
-    return loader_class()
+            raise refusal(path, f"it is {reason}", "make it simpler")
 
 
 def _yaml_reason(error: Exception) -> str:
     mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
     problem = getattr(error, "problem", None) or getattr(error, "reason", None) or "not YAML"
     return f"line {mark.line + 1}: {problem}" if mark else f"not YAML: {problem}"
-
-
-def _refusal(path: Path, reason: str, hint: str) -> DoraSystemdError:
-    return DoraSystemdError(f"cannot read {shown(str(path))}: {reason}", hint, ExitCode.BAD_INPUT)

@@ -35,6 +35,5 @@ def answers_health(port: int, seconds: float) -> bool:
 
 def _ask(port: int, seconds: float) -> bytes:
     with socket.create_connection((_HOST, port), timeout=seconds) as connection:
-        host = f"{_HOST}:{port}"
-        connection.sendall(f"GET /health HTTP/1.1\r\nHost: {host}\r\n\r\n".encode())
+        connection.sendall(f"GET /health HTTP/1.1\r\nHost: {_HOST}:{port}\r\n\r\n".encode())
         return connection.recv(_CHUNK)

@@ -6,7 +6,7 @@ Only root sees all details of other users' processes. Every entry may be out of 
 import contextlib
 import os
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from pathlib import Path
 
 from dora_systemd.decisions.views.diagnosis import Process
@@ -56,13 +56,10 @@ def _beginning(path: Path) -> bytes:
 
 
 def _holds(directory: Path, inodes: Collection[int]) -> bool:
-    return any(inode in inodes for inode in _sockets(directory))
-
-
-def _sockets(directory: Path) -> Iterator[int]:
     with contextlib.suppress(OSError):
         for path in directory.iterdir():
             with contextlib.suppress(OSError):
                 match = _SOCKET.fullmatch(os.readlink(path))  # noqa: PTH115
-                if match:
-                    yield int(match[1])
+                if match and int(match[1]) in inodes:
+                    return True
+    return False

@@ -1,15 +1,13 @@
 """Reads and writes unit files; after a power failure either the old or the new one exists."""
 
 import contextlib
-import errno
 import os
 import stat
+from collections.abc import Iterator
 from pathlib import Path
 
-from dora_systemd.adapters.host.files import read_text, write_atomic
+from dora_systemd.adapters.host.files import REFUSED, read_text, write_atomic
 from dora_systemd.errors import DoraSystemdError, ExitCode
-
-_REFUSED = {errno.EACCES, errno.EPERM, errno.EROFS}
 
 
 def read_unit_file(path: Path) -> str | None:
@@ -18,12 +16,11 @@ def read_unit_file(path: Path) -> str | None:
     Raises DoraSystemdError: NAME_IN_USE for a link (as by systemctl mask) or anything that is not a
     regular file, BAD_INPUT for an unreadable file.
     """
-    try:
+    mode = None
+    with _told("read", path), contextlib.suppress(FileNotFoundError):
         mode = path.lstat().st_mode
-    except FileNotFoundError:
+    if mode is None:
         return None
-    except OSError as error:
-        raise _failure("read", path, error) from error
     if not stat.S_ISREG(mode):
         raise foreign_file(path)
     return read_text(path)
@@ -31,12 +28,10 @@ def read_unit_file(path: Path) -> str | None:
 
 def write_link(path: Path, target: str) -> None:
     """Create the symbolic link `path` unless it exists. Raises DoraSystemdError."""
-    try:
+    with _told("write", path):
         path.parent.mkdir(parents=True, exist_ok=True)
         if not path.is_symlink():
             path.symlink_to(target)
-    except OSError as error:
-        raise _failure("write", path, error) from error
 
 
 def remove_empty(directory: Path) -> None:
@@ -51,33 +46,26 @@ def write_unit_file(path: Path, text: str) -> None:
     Raises DoraSystemdError; then `path` is unchanged, unless the disk is broken.
     """
     made = [one for one in path.parents if not one.exists()]
-    try:
+    with _told("write", path):
         path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise _failure("write", path, error) from error
-    write_atomic(path, text, is_durable=True)
-    # The content is on the disk by now; syncing the directories makes the names durable.
-    for directory in (path.parent, *(one.parent for one in made)):
-        _sync_directory(directory, path)
+        write_atomic(path, text, is_durable=True)
+        # The content is on the disk by now; syncing the directories makes the names durable.
+        for directory in (path.parent, *(one.parent for one in made)):
+            _sync_directory(directory)
 
 
-def _sync_directory(directory: Path, path: Path) -> None:
+def _sync_directory(directory: Path) -> None:
+    descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
-        descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
-    except OSError as error:
-        raise _failure("write", path, error) from error
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def remove_unit_file(path: Path) -> None:
     """Remove `path` if it exists. Raises DoraSystemdError."""
-    try:
+    with _told("remove", path):
         path.unlink(missing_ok=True)
-    except OSError as error:
-        raise _failure("remove", path, error) from error
 
 
 NODE_LIMITS_FILE = "60-node-limits.conf"
@@ -104,8 +92,7 @@ def remove_changes(fragment: Path) -> None:
     """Remove the drop-ins of changes. Raises DoraSystemdError."""
     for path in changed_files(fragment):
         remove_unit_file(path)
-    with contextlib.suppress(OSError):  # there may be other drop-ins, or no directory
-        drop_in_directory(fragment, is_transient=False).rmdir()
+    remove_empty(drop_in_directory(fragment, is_transient=False))  # may have other drop-ins
 
 
 def wanted_units(directory: Path) -> frozenset[str]:
@@ -122,8 +109,13 @@ def foreign_file(path: Path) -> DoraSystemdError:
     )
 
 
-def _failure(what: str, path: Path, error: OSError) -> DoraSystemdError:
-    is_refused = error.errno in _REFUSED
-    hint = "use sudo, or --user for a dataflow of your own" if is_refused else ""
-    code = ExitCode.NO_PERMISSION if is_refused else ExitCode.FAILURE
-    return DoraSystemdError(f"cannot {what} {path}: {error.strerror}", hint, code)
+@contextlib.contextmanager
+def _told(what: str, path: Path) -> Iterator[None]:
+    """Turn OSError into DoraSystemdError "cannot `what` `path`"."""
+    try:
+        yield
+    except OSError as error:
+        is_refused = error.errno in REFUSED
+        hint = "use sudo, or --user for a dataflow of your own" if is_refused else ""
+        code = ExitCode.NO_PERMISSION if is_refused else ExitCode.FAILURE
+        raise DoraSystemdError(f"cannot {what} {path}: {error.strerror}", hint, code) from error

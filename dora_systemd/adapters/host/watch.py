@@ -3,12 +3,12 @@
 import asyncio
 import errno
 import os
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator
 from pathlib import Path
 
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.reload.watch_rules import DEFAULT_WATCH, WatchRules
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import settings_path
 from dora_systemd.trust.files import read_file
 
@@ -33,7 +33,7 @@ async def changed_files(rules: WatchRules) -> AsyncIterator[frozenset[str]]:
     nothing. Raises DoraSystemdError if the kernel refuses more watches.
     """
     # In a thread: a large tree takes seconds, and the loop of the runner feeds the watchdog.
-    seen = await asyncio.to_thread(_stamps, rules)
+    seen = await asyncio.to_thread(watched_files, rules)
     while True:
         await _wait_root(rules.root)
         async for paths in _bursts(rules):
@@ -42,23 +42,21 @@ async def changed_files(rules: WatchRules) -> AsyncIterator[frozenset[str]]:
                 seen.update((path, change_time(path)) for path in files)
                 yield files
         # Directories came or went. Changes before the new watches are found by their time.
-        now = await asyncio.to_thread(_stamps, rules)
+        now = await asyncio.to_thread(watched_files, rules)
         missed = frozenset(path for path in {*seen, *now} if seen.get(path) != now.get(path))
         seen = now
         if missed:
             yield missed
 
 
-def _stamps(rules: WatchRules) -> dict[str, int]:
-    return dict(watched_files(rules))
-
-
-def watched_files(rules: WatchRules) -> Iterator[tuple[str, int]]:
+def watched_files(rules: WatchRules) -> dict[str, int]:
     """The files that match `rules` now, with their times of change in ns."""
-    for directory in watched_directories(rules):
-        for entry in _entries(directory):
-            if rules.has(entry.path) and not entry.is_dir(follow_symlinks=False):
-                yield entry.path, change_time(entry.path)
+    return {
+        entry.path: change_time(entry.path)
+        for directory in watched_directories(rules)
+        for entry in _entries(directory)
+        if rules.has(entry.path) and not entry.is_dir(follow_symlinks=False)
+    }
 
 
 def watched_directories(rules: WatchRules) -> list[str]:
@@ -110,27 +108,20 @@ async def _bursts(rules: WatchRules) -> AsyncIterator[frozenset[str]]:
         ):
             yield frozenset(path for _, path in changes)
             gone = {path for change, path in changes if change is Change.deleted}
-            if gone.intersection(directories) or any(
-                _is_new_directory(p, rules) for _, p in changes
-            ):
+            there = (path for _, path in changes if Path(path).is_dir())
+            if gone.intersection(directories) or any(map(rules.has_directory, there)):
                 return
     except FileNotFoundError:
         return  # a directory disappeared while the watches were added
     except OSError as error:
         if error.errno == errno.ENOSPC or "limit" in str(error).lower():
-            raise DoraSystemdError(
-                f"cannot watch {rules.root}: the kernel gives no more inotify watches",
-                "raise sysctl fs.inotify.max_user_watches, or exclude files with --ignore",
-                ExitCode.FAILURE,
-            ) from error
+            message = f"cannot watch {rules.root}: the kernel gives no more inotify watches"
+            hint = "raise sysctl fs.inotify.max_user_watches, or exclude files with --ignore"
+            raise DoraSystemdError(message, hint) from error
         raise DoraSystemdError(f"cannot watch {rules.root}: {error}") from error
     except RuntimeError as error:  # from watchfiles: the kernel has no inotify instance left
         hint = "raise sysctl fs.inotify.max_user_instances"
         raise DoraSystemdError(f"cannot watch {rules.root}: {error}", hint) from error
-
-
-def _is_new_directory(path: str, rules: WatchRules) -> bool:
-    return Path(path).is_dir() and rules.has_directory(path)
 
 
 async def _wait_root(root: str) -> None:

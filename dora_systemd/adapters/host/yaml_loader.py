@@ -6,7 +6,7 @@ would get other values from us than from dora.
 """
 
 import re
-from collections.abc import Callable, Hashable
+from collections.abc import Hashable
 from typing import Any
 
 import yaml
@@ -31,7 +31,7 @@ _TEXT_KEYS = {
 """Keys of a node that dora reads as text, whatever it looks like: `args: 1.50` is "1.50"."""
 
 
-class _Loader(_BASE):  # type: ignore[misc]
+class Loader(_BASE):  # type: ignore[misc]
     """The core schema, without merge keys and without repeated keys in a mapping."""
 
     yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012
@@ -73,22 +73,17 @@ def _items(node: Any) -> list[Any]:
     return node.value if isinstance(node, yaml.SequenceNode) else []
 
 
-def loader_class() -> Any:
-    """The loader class for yaml.load(), based on libyaml if PyYAML was built with it."""
-    for tag, pattern, first in _CORE:
-        _Loader.add_implicit_resolver(_TAG + tag, re.compile(f"(?:{pattern})$"), first)
-    for tag, construct in _constructors().items():
-        _Loader.add_constructor(_TAG + tag, construct)
-    return _Loader
-
-
-def _constructors() -> dict[str, Callable[[Any, Any], Any]]:
-    return {
-        "int": lambda loader, node: _integer(loader.construct_scalar(node)),
-        "bool": lambda loader, node: loader.construct_scalar(node).lower() == "true",
-    }
-
-
-def _integer(text: str) -> int:
+def _integer(loader: Any, node: Any) -> int:
+    text = loader.construct_scalar(node)
     base = _BASES.get(text[:2])
     return int(text[2:], base) if base else int(text)
+
+
+def _boolean(loader: Any, node: Any) -> bool:
+    return bool(loader.construct_scalar(node).lower() == "true")
+
+
+for _tag, _pattern, _first in _CORE:
+    Loader.add_implicit_resolver(_TAG + _tag, re.compile(f"(?:{_pattern})$"), _first)
+Loader.add_constructor(_TAG + "int", _integer)
+Loader.add_constructor(_TAG + "bool", _boolean)

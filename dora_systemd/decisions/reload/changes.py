@@ -24,10 +24,6 @@ class NodeSources:
     text: str = ""
     rules: WatchRules | None = None
 
-    def names(self, path: str) -> bool:
-        """Whether the definition mentions the file `path`."""
-        return PurePath(path).name in self.text
-
 
 @dataclass(frozen=True)
 class Touched:
@@ -63,7 +59,8 @@ def _owners(path: str, nodes: Mapping[str, NodeSources]) -> list[str]:
     ]
     if owners or path.endswith(".py"):
         return owners
-    return [node for node, sources in nodes.items() if sources.names(path)] or list(nodes)
+    name = PurePath(path).name
+    return [node for node, sources in nodes.items() if name in sources.text] or list(nodes)
 
 
 @dataclass(frozen=True)
@@ -103,7 +100,7 @@ def difference(old: Mapping[str, Any], new: Mapping[str, Any]) -> Difference:
             return Difference(whole=f"inputs or outputs of the node {node} have changed")
     added = tuple(node for node in after if node not in before)
     for node in (*added, *changed):
-        if _has_operators(after[node]):
+        if after[node].get("operator") or after[node].get("operators"):
             return Difference(whole=f"the node {node} is made of operators")
     return Difference(
         replaced=tuple(node for node in changed if node not in rewired),
@@ -125,10 +122,6 @@ def _without_nodes(descriptor: Mapping[str, Any]) -> dict[str, Any]:
 
 def _edges(node: Mapping[str, Any]) -> list[Any]:
     return [node.get(key) for key in _EDGES]
-
-
-def _has_operators(node: Mapping[str, Any]) -> bool:
-    return bool(node.get("operator") or node.get("operators"))
 
 
 def _by_id(nodes: Sequence[Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:

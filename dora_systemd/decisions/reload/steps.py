@@ -1,6 +1,6 @@
 """Plans the steps by which dora applies a changed descriptor to a running dataflow."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 
@@ -33,21 +33,11 @@ def plan_steps(
 
     kinds: how each node is started, see launch.kinds(). dataflow: path of its file.
     """
-    return tuple(_steps(found, change, kinds, dataflow))
-
-
-def _steps(
-    found: Touched, change: Difference, kinds: Mapping[str, str], dataflow: str
-) -> Iterator[Step]:
-    for node in change.removed:
-        yield Step(How.REMOVE, node, dataflow)
-    for node in change.rewired:
-        yield Step(How.REWIRE, node, dataflow)
-    for node in change.replaced:
-        yield Step(How.SWAP, node, dataflow)
-    done = {*change.removed, *change.rewired, *change.replaced}
+    changed = {How.REMOVE: change.removed, How.REWIRE: change.rewired, How.SWAP: change.replaced}
+    steps = [Step(how, node, dataflow) for how, nodes in changed.items() for node in nodes]
+    done = {step.node for step in steps}
     for node, file in found.nodes.items():
         if node not in done and kinds.get(node) != "dynamic":
-            yield Step(How.OPERATOR if kinds.get(node) == "operator" else How.SWAP, node, file)
-    for node in change.added:
-        yield Step(How.ADD, node, dataflow)
+            how = How.OPERATOR if kinds.get(node) == "operator" else How.SWAP
+            steps.append(Step(how, node, file))
+    return (*steps, *(Step(How.ADD, node, dataflow) for node in change.added))

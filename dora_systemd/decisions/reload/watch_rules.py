@@ -6,6 +6,7 @@ directory config at the top.
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import PurePath
 from typing import TYPE_CHECKING
 
@@ -51,10 +52,8 @@ class WatchRules:
 
     def has(self, path: str) -> bool:
         """Whether a change of the file `path` (absolute) causes a reload."""
-        relative = self._relative(path)
-        return path in self.files or (
-            bool(relative) and self._watched(relative) and not self.is_ignored(path)
-        )
+        is_watched = _spec(self.watched).match_file(self._relative(path))
+        return path in self.files or (is_watched and not self.is_ignored(path))
 
     def has_directory(self, path: str) -> bool:
         """Whether the directory `path` (absolute) may contain such files."""
@@ -62,19 +61,13 @@ class WatchRules:
 
     def is_ignored(self, path: str) -> bool:
         """Whether `path` (absolute) is ignored; a path that ends with / is a directory."""
-        relative = self._relative(path)
-        return not relative or self._ignores(relative) or self._gitignores(relative)
+        relative, ignored = self._relative(path), _spec((*ALWAYS_IGNORED, *self.ignored))
+        return not relative or ignored.match_file(relative) or self._gitignores(relative)
 
     def _relative(self, path: str) -> str:
         """The path relative to root, for patterns; "" if it is not below root."""
         prefix = self.root.rstrip("/") + "/"
         return path.removeprefix(prefix) if path.startswith(prefix) else ""
-
-    def _watched(self, relative: str) -> bool:
-        return _spec(self.watched).match_file(relative)
-
-    def _ignores(self, relative: str) -> bool:
-        return _spec((*ALWAYS_IGNORED, *self.ignored)).match_file(relative)
 
     def _gitignores(self, relative: str) -> bool:
         for directory, lines in self.gitignores.items():
@@ -84,16 +77,12 @@ class WatchRules:
         return False
 
 
-_SPECS: dict[tuple[str, ...], "GitIgnoreSpec"] = {}
-
-
+@cache
 def _spec(patterns: tuple[str, ...]) -> "GitIgnoreSpec":
-    # Compiled once. Imported late: only hot reload needs it.
-    if patterns not in _SPECS:
-        from pathspec import GitIgnoreSpec
+    # Imported late: only hot reload needs it.
+    from pathspec import GitIgnoreSpec
 
-        _SPECS[patterns] = GitIgnoreSpec.from_lines(patterns)
-    return _SPECS[patterns]
+    return GitIgnoreSpec.from_lines(patterns)
 
 
 def parse_patterns(texts: Iterable[str]) -> tuple[str, ...]:

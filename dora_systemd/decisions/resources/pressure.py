@@ -101,17 +101,15 @@ def _is_due(alarm: Alarm, event: str, now_us: int) -> bool:
 
 
 def _report(event: str, key: str, load: Load) -> Report:
-    whose = "its nodes together" if key == WHOLE_CELL else f"node {key}"
+    is_whole = key == WHOLE_CELL
+    whose = "its nodes together" if is_whole else f"node {key}"
     if event == CPU:
         share = f"{load.throttled or 0.0:.0f}"
         reason = f"{whose} had to wait for the limit {share}% of the time"
         return (event, key, {"reason": reason, "throttled": share})
     held, limit = format_rounded_size(load.held), format_rounded_size(load.limit or 0)
     stalled = f"{load.stalled:.0f}"
-    reason = (
-        f"{whose} hold {held} of {limit}"
-        if key == WHOLE_CELL
-        else f"{whose} holds {held} of {limit}"
-    )
+    holds = "hold" if is_whole else "holds"
+    reason = f"{whose} {holds} {held} of {limit}, waiting {stalled}% of the time"
     details = {"held": str(load.held), "limit": str(load.limit), "stalled": stalled}
-    return (event, key, {"reason": f"{reason}, waiting {stalled}% of the time", **details})
+    return (event, key, {"reason": reason, **details})

@@ -22,9 +22,9 @@ from dora_systemd.decisions.settings.resolve import Settings
 from dora_systemd.decisions.settings.table import DORA, VENV, WORKING_DIRECTORY
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.files import unreadable
-from dora_systemd.trust.sight import OwnSight, Sight, cannot_reach
+from dora_systemd.trust.sight import Sight, cannot_reach
 
-_OWN = OwnSight()
+_OWN = Sight()
 
 
 class Look:

@@ -18,7 +18,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import firm_part
 from dora_systemd.trust.programs import account_from
-from dora_systemd.trust.sight import OwnSight, Sight
+from dora_systemd.trust.sight import Sight
 from dora_systemd.values import shown
 from dora_systemd.verbs.facts.nodes import named_places
 
@@ -40,7 +40,7 @@ def make_sandbox(
 
     user: of the nodes, None in user scope. sight: that of this user; None: the caller's.
     """
-    sight = sight or OwnSight()
+    sight = sight or Sight()
     options = prepared.plan.options
     given = [_checked(path, sight) for path in settings[WRITABLE]]
     needed = tuple(dict.fromkeys(_existing(_needed(prepared, sight), sight)))

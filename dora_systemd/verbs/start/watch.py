@@ -29,8 +29,7 @@ def watch_warnings(plan: Plan) -> Iterator[str]:
     from dora_systemd.decisions.reload.watch_rules import unmatched_patterns
 
     rules = watch_rules(plan.options)
-    found = [path for path, _ in watched_files(rules)]
-    for pattern in unmatched_patterns(rules, found):
+    for pattern in unmatched_patterns(rules, watched_files(rules)):
         yield f"no file below {rules.root} fits --watch {quoted(pattern)}"
 
 

@@ -135,10 +135,8 @@ class Departing(bus.Bus):
     def _listen(self, unit: str) -> None:
         del unit
 
-    def _call(
-        self, action: str, path: bytes, interface: bytes, method: str, *arguments: Any
-    ) -> str:
-        del path, interface, method
+    def _call(self, action: str, method: str, *arguments: Any, **more: Any) -> str:
+        del method, more
         unit = arguments[0][1]
         if unit == "gone":
             raise DoraSystemdError(f"cannot {action}", "", self.code)

@@ -43,7 +43,7 @@ OTHERWISE = (
 
 _TABLE = {
     DOOR: """
-        trust.files trust.paths trust.programs trust.sight trust.sockets trust.terminals
+        trust.eyes trust.paths trust.programs trust.sight trust.sockets trust.terminals
     """,
     OWN: """
         adapters.dora.preparation adapters.host.files cli.main cli.verbs.look.logs

@@ -67,23 +67,17 @@ def test_without_a_table(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("look", [find_owner, read_owner])
 @pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
-def test_with_this_kernel(host: str, look: Lookup) -> None:
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with socket.socket(family) as listener:
-        try:
-            listener.bind((host, 0))
-        except OSError:
-            pytest.skip(f"no {host} on this machine")
-        listener.listen()
-        with socket.create_connection(listener.getsockname()[:2]) as one:
-            peer, own = ends(one)
-            assert peer_uid(peer, own, look) == os.getuid()
-            assert look(peer, own) == read_owner(peer, own)
-            assert os.getuid() in listener_uids(own[1])
-            other, _ = listener.accept()
-        # Closed by its process, but not by the other side: the kernel still has it.
-        assert peer_uid(peer, own, look) is None
-        other.close()
+def test_with_this_kernel(host: str, look: Lookup, tcp_listener: socket.socket) -> None:
+    del host
+    with socket.create_connection(tcp_listener.getsockname()[:2]) as one:
+        peer, own = ends(one)
+        assert peer_uid(peer, own, look) == os.getuid()
+        assert look(peer, own) == read_owner(peer, own)
+        assert os.getuid() in listener_uids(own[1])
+        other, _ = tcp_listener.accept()
+    # Closed by its process, but not by the other side: the kernel still has it.
+    assert peer_uid(peer, own, look) is None
+    other.close()
 
 
 def ends(connection: socket.socket) -> tuple[Address, Address]:

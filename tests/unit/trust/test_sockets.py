@@ -110,18 +110,11 @@ def test_nobody_there(path: Path) -> None:
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0", "::", "::1", "127.0.0.2"])
-def test_who_gets_what_is_sent_to_a_port(host: str) -> None:
+def test_who_gets_what_is_sent_to_a_port(host: str, tcp_listener: socket.socket) -> None:
     """A listener on another address is none of ours, and cannot shut us out either."""
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with socket.socket(family) as one:
-        try:
-            one.bind((host, 0))
-        except OSError:
-            pytest.skip(f"no {host} on this machine")
-        one.listen()
-        port = one.getsockname()[1]
-        expected = frozenset() if host in ("::1", "127.0.0.2") else {os.getuid()}
-        assert loopback_listeners(port) == expected
+    port = tcp_listener.getsockname()[1]
+    expected = frozenset() if host in ("::1", "127.0.0.2") else {os.getuid()}
+    assert loopback_listeners(port) == expected
 
 
 def test_a_port_must_be_the_units() -> None:

@@ -62,11 +62,6 @@ class Clock:
 
 
 @pytest.fixture
-def scope(tmp_path: Path) -> ScopeIn:
-    return ScopeIn(is_user=False, uid=0, root=tmp_path / "run")
-
-
-@pytest.fixture
 def systemd(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Systemd:
     monkeypatch.setattr(destroy_module, "_POLL_SECONDS", 0)
     return Systemd(tmp_path / "etc")

@@ -21,15 +21,8 @@ from tests.unit.verbs.start.test_claim import make_plan, place
 
 
 @pytest.fixture
-def scope(tmp_path: Path) -> Scope:
-    return ScopeIn(is_user=False, uid=0, root=tmp_path / "run")
-
-
-@pytest.fixture
-def manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FakeManager:
+def manager(manager: FakeManager, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FakeManager:
     """A machine where all is well."""
-    manager = FakeManager()
-    manager.etc = tmp_path / "etc"
     manager.units["dora.target"] = {"LoadState": "loaded", "WantedBy": ["multi-user.target"]}
     (tmp_path / "cgroup").mkdir()
     (tmp_path / "cgroup/cgroup.controllers").write_text("cpu io memory pids\n")

@@ -53,11 +53,6 @@ class Systemd(FakeManager):
 
 
 @pytest.fixture
-def scope(tmp_path: Path) -> ScopeIn:
-    return ScopeIn(is_user=False, uid=0, root=tmp_path / "run")
-
-
-@pytest.fixture
 def systemd(scope: ScopeIn) -> Systemd:
     return Systemd(scope.root / "systemd/system")
 

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from dora_systemd.adapters.host.files import (
     MAX_DEPTH,
     MAX_VALUES,
-    read_json,
     read_text,
     read_yaml,
     write_atomic,
@@ -171,16 +170,6 @@ def test_the_largest_file_is_read(tmp_path: Path) -> None:
     path = tmp_path / "x"
     path.write_bytes(b"x" * MAX_BYTES)
     assert len(read_text(path)) == MAX_BYTES
-
-
-def test_json(tmp_path: Path) -> None:
-    path = tmp_path / "x.json"
-    path.write_text('{"a": [1]}')
-    assert read_json(path) == {"a": [1]}
-    for bad in ("", "{", "[" * 100_000):
-        path.write_text(bad)
-        with pytest.raises(DoraSystemdError, match="it is not JSON"):
-            read_json(path)
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])

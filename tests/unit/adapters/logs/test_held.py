@@ -88,9 +88,7 @@ def test_a_kill_at_any_time(steps: list[tuple[str, int]]) -> None:
         assert len(lines) == expected.count(b" text\n")
 
 
-def test_parts_of_a_huge_line(tmp_path: Path) -> None:
-    fifo = tmp_path / "a.out"
-    os.mkfifo(fifo)
+def test_parts_of_a_huge_line(fifo: Path) -> None:
     journal = SlowJournal()
     runner = Runner(fifo, journal)
     runner.pipes.adopt("a", "stdout", runner.fd, HeldLines(fifo))
@@ -112,19 +110,15 @@ def test_no_file_and_a_torn_one(tmp_path: Path) -> None:
     assert read_held(fifo) == (b"", 0)
 
 
-def test_a_kill_as_soon_as_it_is_read(tmp_path: Path) -> None:
-    fifo = tmp_path / "a.out"
-    os.mkfifo(fifo)
+def test_a_kill_as_soon_as_it_is_read(fifo: Path) -> None:
     fd = os.open(fifo, os.O_RDWR | os.O_NONBLOCK)
     os.write(fd, b"one\ntwo")
     assert HeldLines(fifo).take(fd, 1000) == b"one\ntwo"
     assert read_held(fifo) == (b"one\ntwo", 0)
 
 
-def test_the_file_does_not_grow(tmp_path: Path) -> None:
+def test_the_file_does_not_grow(fifo: Path) -> None:
     """Lines that end in the next chunk only, again and again."""
-    fifo = tmp_path / "a.out"
-    os.mkfifo(fifo)
     journal = SlowJournal()
     journal.room = 1 << 30
     runner = Runner(fifo, journal)
@@ -136,12 +130,10 @@ def test_the_file_does_not_grow(tmp_path: Path) -> None:
     runner.kill()
     assert len(messages(journal)) == 1000
     assert replayed(fifo) == [b"rest"]
-    assert [path.name for path in tmp_path.iterdir() if path.suffix != ".out"] == ["a.out.held"]
+    assert [path.name for path in fifo.parent.iterdir() if path.suffix != ".out"] == ["a.out.held"]
 
 
-def test_a_full_disk_is_no_reason_to_stop(tmp_path: Path) -> None:
-    fifo = tmp_path / "a.out"
-    os.mkfifo(fifo)
+def test_a_full_disk_is_no_reason_to_stop(fifo: Path) -> None:
     fd = os.open(fifo, os.O_RDWR | os.O_NONBLOCK)
     held = HeldLines(fifo)
     os.close(held._fd)

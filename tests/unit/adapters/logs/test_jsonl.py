@@ -2,7 +2,6 @@
 
 import asyncio
 import json
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -35,13 +34,6 @@ class Dora:
             newer = self.path.with_name(f"log_a.{number - 1}.jsonl") if number > 1 else self.path
             if newer.exists():
                 newer.rename(self.path.with_name(f"log_a.{number}.jsonl"))
-
-
-@pytest.fixture
-def loop() -> Iterator[asyncio.AbstractEventLoop]:
-    loop = asyncio.new_event_loop()
-    yield loop
-    loop.close()
 
 
 def tail(loop: asyncio.AbstractEventLoop, dora: Dora) -> tuple[JsonlTail, list[str]]:

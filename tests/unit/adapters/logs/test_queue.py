@@ -1,7 +1,7 @@
 """The order of entries when journald takes them late."""
 
 import asyncio
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import pytest
 from hypothesis import given
@@ -49,13 +49,6 @@ class Case:
 
     def put(self, node: str, entries: list[bytes]) -> None:
         self.queue.put(node, lambda: entries)
-
-
-@pytest.fixture
-def loop() -> Iterator[asyncio.AbstractEventLoop]:
-    loop = asyncio.new_event_loop()
-    yield loop
-    loop.close()
 
 
 @pytest.fixture

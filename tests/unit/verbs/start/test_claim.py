@@ -18,21 +18,14 @@ from dora_systemd.verbs.start.claim import (
 )
 from dora_systemd.verbs.start.plan import Plan
 from dora_systemd.verbs.start.unit import plan_properties
-from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
+from tests.unit.fakes.manager import UUID, FakeManager, options
 
 UNIT = "dora-robot.service"
 OTHER = "11111111-e29b-41d4-a716-446655440000"
 
 
 @pytest.fixture
-def scope(tmp_path: Path) -> Scope:
-    return ScopeIn(is_user=False, uid=0, root=tmp_path / "run")
-
-
-@pytest.fixture
-def manager(tmp_path: Path) -> FakeManager:
-    manager = FakeManager()
-    manager.etc = tmp_path / "etc"
+def manager(manager: FakeManager) -> FakeManager:
     manager.units["dora.target"] = {"LoadState": "loaded", "WantedBy": ["multi-user.target"]}
     return manager
 

@@ -22,18 +22,6 @@ from tests.unit.fakes.manager import FakeManager, ScopeIn, options
 UNIT = "dora-robot.service"
 
 
-@pytest.fixture
-def scope(tmp_path: Path) -> Scope:
-    return ScopeIn(is_user=False, uid=0, root=tmp_path / "run")
-
-
-@pytest.fixture
-def manager(tmp_path: Path) -> FakeManager:
-    manager = FakeManager()
-    manager.etc = tmp_path / "etc"
-    return manager
-
-
 def started(manager: FakeManager) -> Cell:
     """A running transient unit, with the fragment that systemd has for it."""
     context = UnitContext("/usr/bin/python3", False, "dora", {"A": "x 100% $B"})

@@ -15,7 +15,7 @@ from dora_systemd.decisions.settings.table import ENV_FILE, SETTINGS, UV
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import Place, reached
-from dora_systemd.trust.sight import LentSight, OwnSight, sight_of
+from dora_systemd.trust.sight import LentSight, Sight, sight_of
 from dora_systemd.verbs.facts.nodes import named_places
 from dora_systemd.verbs.start.account import account_of, choose_user
 from dora_systemd.verbs.start.check import check_plan
@@ -312,4 +312,4 @@ def test_a_module_that_is_no_file_is_refused(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "module.yml")
     flow = parse_dataflow({"nodes": [{"id": "a", "module": "module.yml"}]}, str(tmp_path / "f.yml"))
     with pytest.raises(DoraSystemdError, match="it is not a regular file"):
-        list(named_places(flow, OwnSight()))
+        list(named_places(flow, Sight()))

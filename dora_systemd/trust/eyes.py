@@ -1,0 +1,63 @@
+"""Looks at paths for a Sight; imports the standard library only.
+
+sight.py uses answer() for the caller. For another user, it has a child process of that user run the
+text of this file: that user may not be able to read our package.
+"""
+
+import errno
+import os
+import stat
+import sys
+
+
+def check_regular(mode: int) -> None:
+    """Raise OSError unless `mode` is that of a regular file."""
+    if not stat.S_ISREG(mode):
+        number = errno.EISDIR if stat.S_ISDIR(mode) else errno.ENXIO
+        raise OSError(number, os.strerror(number))
+
+
+def read_regular(path: str | bytes | os.PathLike[str], most: int) -> bytes:
+    """The content of a regular file, at most `most` bytes. Raises OSError."""
+    # O_NONBLOCK: opening a FIFO would wait for a writer. O_NOCTTY: nor become our terminal.
+    fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
+    try:
+        check_regular(os.fstat(fd).st_mode)
+        with os.fdopen(fd, "rb", closefd=False) as file:
+            return file.read(most)
+    finally:
+        os.close(fd)
+
+
+def answer(letter: bytes, path: bytes, most: int) -> bytes:
+    """The answer to one question of a Sight; b"" is "no". Raises OSError and ValueError."""
+    if letter == b"l":
+        return os.path.realpath(path)
+    if letter == b"r":
+        return read_regular(path, most)
+    mode = os.stat(path).st_mode  # noqa: PTH116 - a Path has no bytes
+    is_so = {
+        b"e": True,
+        b"d": stat.S_ISDIR(mode),
+        b"x": stat.S_ISREG(mode) and os.access(path, os.X_OK),
+    }
+    return b"1" if is_so[letter] else b""
+
+
+def main(most: int) -> None:
+    """Answer questions until the end of standard input.
+
+    Questions and answers are a letter, the length as 7 digits, and that many bytes.
+    """
+    while head := sys.stdin.buffer.read(8):
+        path = sys.stdin.buffer.read(int(head[1:]))
+        try:
+            kind, data = b"+", answer(head[:1], path, most)
+        except (OSError, ValueError) as error:
+            kind, data = b"-", b"%d" % (getattr(error, "errno", 0) or errno.EINVAL)
+        sys.stdout.buffer.write(b"%s%07d%s" % (kind, len(data), data))
+        sys.stdout.buffer.flush()
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]))
