@@ -3,6 +3,7 @@
 import errno
 import signal
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from dora_systemd.decisions.properties.kinds import PropertyKind, word_kind, word_of
 
@@ -44,29 +45,10 @@ _FACILITIES = (
     "authpriv",
     "ftp",
 )
-_EXIT_WORDS = {"SUCCESS": 0, "FAILURE": 1}
-
-
-def parse_signal(text: str) -> int:
-    """The number of a signal such as SIGTERM, TERM, 15 or RTMIN+3. Raises ValueError."""
-    word = text.strip().upper().removeprefix("SIG")
-    base, plus, offset = word.partition("+")
-    if base == "RTMIN" and (not plus or (offset.isascii() and offset.isdigit())):
-        number = signal.SIGRTMIN + int(offset[:4] or 0)
-    elif word.isascii() and word.isdigit():
-        number = int(word[:4])
-    else:
-        number = getattr(signal.Signals, f"SIG{word}", 0)
-    if not 1 <= number <= signal.SIGRTMAX:
-        raise ValueError("not a signal")
-    return int(number)
-
-
-def format_signal(number: int) -> str:
-    """The name of a signal as systemd writes it, such as SIGTERM or SIGRTMIN+3."""
-    if number > signal.SIGRTMIN:
-        return f"SIGRTMIN+{number - signal.SIGRTMIN}"
-    return signal.Signals(number).name
+_SIGNALS = {
+    **{f"SIGRTMIN+{number}": signal.SIGRTMIN + number for number in range(1, 31)},
+    **signal.Signals.__members__,
+}
 
 
 def _parse_statuses(text: str) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -74,15 +56,15 @@ def _parse_statuses(text: str) -> tuple[tuple[int, ...], tuple[int, ...]]:
     statuses: list[int] = []
     signals: list[int] = []
     for word in text.split():
-        status = _EXIT_WORDS.get(word, int(word) if word.isascii() and word.isdigit() else -1)
-        if status > 255:
-            raise ValueError("not an exit status")
-        (statuses if status >= 0 else signals).append(status if status >= 0 else parse_signal(word))
+        try:
+            statuses.append(_STATUS.parse(word))
+        except ValueError:
+            signals.append(SIGNAL.parse(word))
     return tuple(statuses), tuple(signals)
 
 
 def _format_statuses(value: tuple[Sequence[int], Sequence[int]]) -> Sequence[str]:
-    return [" ".join([*map(str, value[0]), *map(format_signal, value[1])])]
+    return [" ".join([*map(str, value[0]), *(SIGNAL.format(number)[0] for number in value[1])])]
 
 
 def _numbered(words: Sequence[str]) -> dict[str, int]:
@@ -118,9 +100,14 @@ def _mask_kind(
     return PropertyKind(signature, expected, parse, format_)
 
 
-SIGNAL = PropertyKind(
-    "i", "a signal such as SIGINT", parse_signal, lambda value: [format_signal(value)]
+_SIGNAL = word_kind(
+    "i",
+    _SIGNALS | {name.removeprefix("SIG"): number for name, number in _SIGNALS.items()},
+    range(1, signal.SIGRTMAX + 1),
+    "a signal such as SIGINT",
 )
+SIGNAL = replace(_SIGNAL, parse=lambda text: int(_SIGNAL.parse(text.upper())))
+_STATUS = word_kind("i", {"SUCCESS": 0, "FAILURE": 1}, range(256))
 STATUSES = PropertyKind(
     "(aiai)", "exit statuses and signals such as 75 SIGKILL", _parse_statuses, _format_statuses
 )

@@ -9,10 +9,14 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 
 from dora_systemd.decisions.cell.options import RunnerOptions, options_from_command
-from dora_systemd.decisions.properties.assignments import parse_line, with_properties
+from dora_systemd.decisions.properties.assignments import (
+    format_property,
+    parse_line,
+    typed,
+    with_properties,
+)
 from dora_systemd.decisions.properties.kinds import Property
 from dora_systemd.decisions.properties.structs import MS_REC
-from dora_systemd.decisions.properties.table import TABLE
 from dora_systemd.errors import DoraSystemdError
 
 BOOT_TARGET = "dora.target"
@@ -62,9 +66,8 @@ def runner_of(text: str) -> RunnerOptions | None:
     commands = [line.partition("=")[2] for line in lines if re.match(r"ExecStart\s*=\s*\S", line)]
     if len(commands) != 1:
         return None
-    kind = TABLE["ExecStart"].choices[0][1]
     try:
-        ((_, argv, _),) = kind.parse(commands[0])
+        ((_, argv, _),) = parse_line("ExecStart", commands[0])["ExecStart"].value
         return options_from_command([word.replace("%%", "%") for word in argv])
     except (DoraSystemdError, ValueError):
         return None
@@ -139,8 +142,8 @@ def _quoted_bind(line: str) -> str:
         return line
     key, optional, source, target, option = found.groups()
     bind = (source, target, bool(optional), MS_REC if option == "rbind" else 0)
-    (text,) = TABLE[key].choices[0][1].format((bind,))
-    return f"{key}={text}"
+    (quoted,) = format_property(key, typed(**{key: (bind,)}))
+    return quoted
 
 
 def _logical_lines(text: str) -> Iterator[str]:
