@@ -29,13 +29,11 @@ _REFUSED = {
     "StandardInput": "its end is the end of `doractl run`",
     "SetCredential": "everybody could read it in the unit, unlike LoadCredential=ID:PATH",
 }
-_UNSUPPORTED = frozenset(
-    {
-        *("OpenFile", "NFTSet", "MountImages", "ExtensionImages", "RootImageOptions", "RootHash"),
-        *("RootHashSignature", "SocketBindAllow", "SocketBindDeny", "SetCredentialEncrypted"),
-        *("StandardInputText", "StandardInputData", "TTYRows", "TTYColumns", "CoredumpFilter"),
-        *("NonBlocking", "TimeoutCleanSec", "ReloadSignal", "DebugInvocation", "JobTimeoutSec"),
-    }
+_UNSUPPORTED = (
+    *("OpenFile", "NFTSet", "MountImages", "ExtensionImages", "RootImageOptions", "RootHash"),
+    *("RootHashSignature", "SocketBindAllow", "SocketBindDeny", "SetCredentialEncrypted"),
+    *("StandardInputText", "StandardInputData", "TTYRows", "TTYColumns", "CoredumpFilter"),
+    *("NonBlocking", "TimeoutCleanSec", "ReloadSignal", "DebugInvocation", "JobTimeoutSec"),
 )
 
 
@@ -61,10 +59,11 @@ def parse_line(key: str, text: str) -> dict[str, Property]:
     The text has no specifiers. Raises KeyError for a key that is not in the table, DoraSystemdError
     (USAGE) for a bad value.
     """
-    if key in RLIMITS:
-        soft, colon, hard = text.partition(":")
-        return {**_parse_one(f"{key}Soft", soft), **_parse_one(key, hard if colon else soft)}
-    return _parse_one(key, text)
+    if key not in RLIMITS:
+        return _parse_one(key, text)
+    soft, colon, hard = text.partition(":")
+    limit = _parse_one(key, soft)[key]._replace(name=f"{key}Soft")
+    return {limit.name: limit, **_parse_one(key, hard if colon else soft)}
 
 
 def typed(**values: Any) -> dict[str, Property]:
@@ -100,10 +99,10 @@ def format_property(slot: str, properties: Properties) -> list[str]:
     """
     name, _, value = properties[slot]
     key = slot.removesuffix("~")
+    if key.endswith("Soft") and key.removesuffix("Soft") in RLIMITS:
+        return []
     if key not in TABLE:
         return [f"# {name} is set by doractl"]
-    if key.removesuffix("Soft") in RLIMITS and key not in RLIMITS:
-        return []
     kind = dict(TABLE[key].choices)[name]
     texts = kind.format(value)
     soft = properties.get(f"{key}Soft")
@@ -142,7 +141,7 @@ def _bad_value(row: Row, text: str, reason: Exception | None) -> DoraSystemdErro
     if row.key == "Environment":
         # The value may be a secret; the error names the variable.
         return _refusal(row.key, reason.hint if isinstance(reason, DoraSystemdError) else hint)
-    return _refusal(f"{row.key.removesuffix('Soft')} to {quoted(text)}", hint)
+    return _refusal(f"{row.key} to {quoted(text)}", hint)
 
 
 def _refusal(what: str, hint: str) -> DoraSystemdError:

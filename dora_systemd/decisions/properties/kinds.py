@@ -117,18 +117,17 @@ def choice_kind(*choices: str) -> PropertyKind:
     return replace(kind, parse=parse)
 
 
-def prefixed_path_kind(prefix: str) -> PropertyKind:
-    """An absolute path after `prefix`, which is not part of the value."""
+def file_kind(mode: str) -> PropertyKind:
+    """MODE:/PATH, and only the path in the value."""
 
     def parse(text: str) -> str:
-        path = plain_text(text)
-        if not path.startswith(f"{prefix}/"):
+        given, _, path = plain_text(text).partition(":")
+        if given != mode or not path.startswith("/"):
             raise ValueError("no such path")
-        return path.removeprefix(prefix)
+        return path
 
-    return PropertyKind(
-        "s", f"{prefix}/PATH", parse, lambda value: [prefix + escape_specifiers(value)]
-    )
+    expected = f"{mode}:/PATH"
+    return PropertyKind("s", expected, parse, lambda value: [f"{mode}:{escape_specifiers(value)}"])
 
 
 def _parse_share(text: str) -> int:
@@ -179,23 +178,20 @@ DURATION = PropertyKind(
     parse_duration,
     lambda value: [format_duration(value)],
 )
-NANOSECONDS = PropertyKind(
-    "t",
-    "nanoseconds, or a time span such as 50us",
-    lambda text: _parse_time(text, 1000),
-    COUNT_LIMIT.format,
+NANOSECONDS = replace(
+    COUNT_LIMIT,
+    expected="nanoseconds, or a time span such as 50us",
+    parse=lambda text: _parse_time(text, 1000),
 )
-SECONDS = PropertyKind(
-    "t",
-    "a time span such as 30s, or infinity",
-    lambda text: _in_seconds(parse_duration(text)),
-    COUNT_LIMIT.format,
+SECONDS = replace(
+    COUNT_LIMIT,
+    expected="a time span such as 30s, or infinity",
+    parse=lambda text: _in_seconds(parse_duration(text)),
 )
-MICROSECONDS = PropertyKind(
-    "t",
-    "a time span such as 100ms, or infinity",
-    lambda text: _parse_time(text, 1),
-    lambda value: [format_duration(value)],
+MICROSECONDS = replace(
+    DURATION,
+    expected="a time span such as 100ms, or infinity",
+    parse=lambda text: _parse_time(text, 1),
 )
 CPU_QUOTA = PropertyKind(
     "t",

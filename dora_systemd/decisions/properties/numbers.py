@@ -42,8 +42,7 @@ _EVERY_NAMESPACE = sum(_NAMESPACES.values())
 _LEVELS = ("emerg", "alert", "crit", "err", "warning", "notice", "info", "debug")
 _FACILITIES = (
     *("kern", "user", "mail", "daemon", "auth", "syslog", "lpr", "news", "uucp", "cron"),
-    "authpriv",
-    "ftp",
+    *("authpriv", "ftp"),
 )
 _SIGNALS = {
     **{f"SIGRTMIN+{number}": signal.SIGRTMIN + number for number in range(1, 31)},

@@ -141,7 +141,9 @@ def _assignments(sandbox: Sandbox) -> list[str]:
         found += ["RestrictRealtime=yes"]
         found += ["SystemCallFilter=~@resources"] if is_strict else []
     if not sandbox.is_user:
-        found += [*_FILES, _devices(sandbox), *_privileges(sandbox)]
+        # PrivateDevices= hides all devices but /dev/null and similar ones, even allowed devices.
+        devices = "DevicePolicy=closed" if sandbox.has_devices else "PrivateDevices=yes"
+        found += [*_FILES, devices, *_privileges(sandbox)]
         found += _STRICT_FILES if is_strict else ()
     return found
 
@@ -154,28 +156,20 @@ def _network(sandbox: Sandbox) -> list[str]:
     return []
 
 
-def _devices(sandbox: Sandbox) -> str:
-    # PrivateDevices= hides all devices but /dev/null and similar ones, even allowed devices.
-    return "DevicePolicy=closed" if sandbox.has_devices else "PrivateDevices=yes"
-
-
 def _privileges(sandbox: Sandbox) -> list[str]:
+    """No capabilities, and a user namespace, unless the nodes run as root.
+
+    In a namespace ptrace(2) and /proc only show the dataflow's own processes. Otherwise they show
+    all processes of the same user. ProtectProc= hides what cannot be traced, which also saves CPU
+    time of dora's daemon: it reads all visible processes every two seconds. With "identity" files
+    keep their owners.
+    """
     if sandbox.is_root:
         # Nodes as root need access to all files; in a user namespace they would be root only there.
         return ["CapabilityBoundingSet=CAP_DAC_OVERRIDE CAP_DAC_READ_SEARCH"]
-    return ["CapabilityBoundingSet=", *_users(sandbox)]
-
-
-def _users(sandbox: Sandbox) -> list[str]:
-    """A user namespace, so that ptrace(2) and /proc only show the dataflow's own processes.
-
-    Otherwise they show all processes of the same user. ProtectProc= hides what cannot be traced,
-    which also saves CPU time of dora's daemon: it reads all visible processes every two seconds.
-    With "identity" files keep their owners.
-    """
     if sandbox.level == "strict":
-        return ["PrivateUsers=yes"]
-    return ["PrivateUsers=identity"] if sandbox.has_identity else []
+        return ["CapabilityBoundingSet=", "PrivateUsers=yes"]
+    return ["CapabilityBoundingSet=", *(["PrivateUsers=identity"] if sandbox.has_identity else [])]
 
 
 def _path_properties(sandbox: Sandbox) -> dict[str, Property]:

@@ -13,16 +13,12 @@ member for another. Parsers raise ValueError or DoraSystemdError; assignments.py
 """
 
 import ipaddress
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 
-from dora_systemd.decisions.properties.kinds import (
-    COUNT_LIMIT,
-    DURATION,
-    WEIGHT,
-    PropertyKind,
-    plain_text,
-)
+from dora_systemd.decisions.properties import kinds
+from dora_systemd.decisions.properties.kinds import PropertyKind, plain_text
 from dora_systemd.decisions.properties.lists import items_kind, marked, words_kind
 from dora_systemd.decisions.properties.syntax import escape_specifiers, quote_word, split_words
 from dora_systemd.values import INFINITY, parse_size
@@ -40,6 +36,7 @@ Command = tuple[str, tuple[str, ...], tuple[str, ...]]
 MS_REC = 1 << 14
 """The flag of mount(2) that makes a bind mount recursive."""
 
+_RANGE = re.compile("([0-9]{1,9})(?:-([0-9]{1,9}))?")
 _MAX_CPUS = 8192
 _FAMILIES = {4: 2, 6: 10}
 """AF_INET and AF_INET6 of Linux, see address_families(7)."""
@@ -134,13 +131,11 @@ def _bandwidth(text: str) -> int:
 
 
 def _parse_addresses(text: str) -> tuple[Address, ...]:
-    networks = [net for word in text.split() for net in _NETWORKS.get(word, (word,))]
-    return tuple(_address(ipaddress.ip_network(net, strict=False)) for net in networks)
-
-
-def _address(network: ipaddress.IPv4Network | ipaddress.IPv6Network) -> Address:
-    family = _FAMILIES[network.version]
-    return family, network.network_address.packed, network.prefixlen
+    words = [network for word in text.split() for network in _NETWORKS.get(word, (word,))]
+    networks = [ipaddress.ip_network(word, strict=False) for word in words]
+    return tuple(
+        (_FAMILIES[one.version], one.network_address.packed, one.prefixlen) for one in networks
+    )
 
 
 def _format_addresses(value: Sequence[Address]) -> Sequence[str]:
@@ -151,12 +146,10 @@ def _parse_cpus(text: str) -> bytes:
     """A set such as "0-3,8" as a bit mask, lowest byte first."""
     mask = 0
     for word in text.replace(",", " ").split():
-        first, dash, last = word.partition("-")
-        if not all(one.isascii() and one.isdigit() for one in (first, last if dash else first)):
-            raise ValueError("not a set")
-        low, high = int(first[:9]), int((last if dash else first)[:9])
+        found = _RANGE.fullmatch(word)
+        low, high = (int(found[1]), int(found[2] or found[1])) if found else (1, 0)
         if not low <= high < _MAX_CPUS:
-            raise ValueError("not in range")
+            raise ValueError("not a set of numbers")
         mask |= (1 << (high + 1)) - (1 << low)
     return mask.to_bytes((mask.bit_length() + 7) // 8, "little")
 
@@ -214,10 +207,10 @@ BINDS = words_kind(
     "a(ssbt)", "SOURCE[:TARGET[:norbind]] with absolute paths", _parse_bind, _format_bind
 )
 BANDWIDTHS = _device_kind(
-    replace(COUNT_LIMIT, parse=_bandwidth), "a device and a rate, such as /dev/sda 5M"
+    replace(kinds.COUNT_LIMIT, parse=_bandwidth), "a device and a rate, such as /dev/sda 5M"
 )
-WEIGHTS = _device_kind(WEIGHT, "a device and a weight, such as /dev/sda 200")
-LATENCIES = _device_kind(DURATION, "a device and a time, such as /dev/sda 25ms")
+WEIGHTS = _device_kind(kinds.WEIGHT, "a device and a weight, such as /dev/sda 200")
+LATENCIES = _device_kind(kinds.DURATION, "a device and a time, such as /dev/sda 25ms")
 ADDRESSES = PropertyKind(
     "a(iayu)",
     "networks such as 10.0.0.0/8, or any, localhost, link-local, multicast",

@@ -18,6 +18,7 @@ from dora_systemd.decisions.life.stop_budget import unit_timeout
 from dora_systemd.decisions.properties.assignments import (
     Properties,
     format_property,
+    parse_line,
     typed,
     with_assignments,
     with_properties,
@@ -29,6 +30,7 @@ from dora_systemd.decisions.settings.credentials import credential_properties
 from dora_systemd.decisions.settings.limits import REALTIME
 from dora_systemd.decisions.settings.resolve import Settings
 from dora_systemd.decisions.settings.table import PROPERTY
+from dora_systemd.decisions.unit.file import format_sections
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import SLICE
 from dora_systemd.scope import RUNTIME_NAME
@@ -81,8 +83,9 @@ def unit_properties(
         **realtime_properties(settings),
     }
     properties = with_properties(own, settings_properties(settings))
+    assignments = settings[PROPERTY]
     try:
-        return with_assignments(properties, settings[PROPERTY])
+        return with_assignments(properties, assignments)
     except DoraSystemdError as error:
         message = f"{error.message} ({settings.source(PROPERTY)})"
         raise DoraSystemdError(message, error.hint, error.code) from error
@@ -95,8 +98,7 @@ def format_unit(properties: Properties) -> str:
         row = TABLE.get(slot.removesuffix("~"))
         section = row.section if row else "Service"
         sections[section] += format_property(slot, properties)
-    texts = ["\n".join([f"[{name}]", *body]) for name, body in sections.items() if body]
-    return "\n\n".join(texts) + "\n"
+    return format_sections(sections)
 
 
 def service_properties(options: RunnerOptions, context: UnitContext) -> dict[str, Property]:
@@ -177,9 +179,7 @@ def cgroup_properties() -> dict[str, Property]:
         TasksAccounting=True,
         IOAccounting=True,
         TasksMax=INFINITY,
-        LimitMEMLOCKSoft=INFINITY,
-        LimitMEMLOCK=INFINITY,
-    )
+    ) | parse_line("LimitMEMLOCK", "infinity")
 
 
 def directory_properties(options: RunnerOptions) -> dict[str, Property]:

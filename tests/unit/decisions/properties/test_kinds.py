@@ -131,6 +131,7 @@ def test_timeout_sec_is_two_properties() -> None:
         ("Foo=5", "cannot set property Foo: services have no such property", "directives"),
         ("MemoryMaxx=5", "services have no such property", "did you mean MemoryMax"),
         ("memorymax=5", "services have no such property", "did you mean MemoryMax?"),
+        ("LimitCORESoft=5", "services have no such property", "LimitCORE"),
         ("MemoryMaxScale=5", "services have no such property", "MemoryMax"),
         ("Nice=100", "cannot set property Nice to '100'", "between -20 and 19"),
         ("Restart=yes", "cannot set property Restart to 'yes'", "on-failure"),
