@@ -3,7 +3,7 @@
 Keys are those of unit files; the values have the types of StartTransientUnit.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from dora_systemd.decisions.cell.environment import checked_variable, environment_entries
@@ -25,6 +25,7 @@ from dora_systemd.decisions.properties.assignments import (
 )
 from dora_systemd.decisions.properties.kinds import Property
 from dora_systemd.decisions.properties.sandbox import Sandbox, sandbox_properties
+from dora_systemd.decisions.properties.structs import Command
 from dora_systemd.decisions.properties.table import TABLE
 from dora_systemd.decisions.settings.credentials import credential_properties
 from dora_systemd.decisions.settings.limits import REALTIME
@@ -102,13 +103,7 @@ def format_unit(properties: Properties) -> str:
 
 
 def service_properties(options: RunnerOptions, context: UnitContext) -> dict[str, Property]:
-    """The runner as the main process of a Type=notify service, see systemd.service(5).
-
-    "no-env-expand" is ":" in a unit file: a "$" in a path stays as it is.
-    """
-    argv = tuple(runner_command(context.python, options))
-    post = tuple(post_command(context.python, options))
-    reload = tuple(reload_command(context.python))
+    """The runner as the main process of a Type=notify service, see systemd.service(5)."""
     pause = 0 if options.restart.policy == "no" else options.restart.max_delay
     # The runner reports late nodes itself; systemd's timeout is for a runner that hangs.
     most = min(pause + options.start_timeout + START_MARGIN, INFINITY)
@@ -117,9 +112,9 @@ def service_properties(options: RunnerOptions, context: UnitContext) -> dict[str
         Slice=SLICE,
         Type="notify",
         NotifyAccess="main",
-        ExecStart=((argv[0], argv, ("no-env-expand",)),),
-        ExecStopPost=((post[0], post, ("ignore-failure", "no-env-expand")),),
-        ExecReload=((reload[0], reload, ("no-env-expand",)),),
+        ExecStart=_command(runner_command(context.python, options)),
+        ExecStopPost=_command(post_command(context.python, options), "ignore-failure"),
+        ExecReload=_command(reload_command(context.python)),
         # Two pipes for each node, so that their content survives a kill of the runner.
         FileDescriptorStoreMax=4096,
         # Never the project: Python could find its modules before the runner's.
@@ -129,6 +124,11 @@ def service_properties(options: RunnerOptions, context: UnitContext) -> dict[str
         # An OOM kill of one node must not end the others; the runner reports it.
         OOMPolicy="continue",
     )
+
+
+def _command(argv: Sequence[str], *flags: str) -> Sequence[Command]:
+    # ":" in a unit file: a "$" in a path stays as it is.
+    return ((argv[0], tuple(argv), (*flags, "no-env-expand")),)
 
 
 def stop_properties(options: RunnerOptions) -> dict[str, Property]:
