@@ -104,11 +104,11 @@ def format_property(slot: str, properties: Properties) -> list[str]:
     if key not in TABLE:
         return [f"# {name} is set by doractl"]
     kind = dict(TABLE[key].choices)[name]
-    texts = kind.format(value)
+    text = kind.format(value)
     soft = properties.get(f"{key}Soft")
     if soft and soft.value != value:
-        texts = [f"{kind.format(soft.value)[0]}:{texts[0]}"]
-    return [f"{key}={text}" for text in texts]
+        text = f"{kind.format(soft.value)}:{text}"
+    return [f"{key}={line}" for line in text.split("\n")]
 
 
 def _check_key(key: str) -> None:

@@ -4,7 +4,7 @@ Types are those of org.freedesktop.systemd1(5), texts those of systemd-run(1).
 """
 
 import re
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -48,13 +48,13 @@ class PropertyKind:
     """How a value is parsed and formatted.
 
     expected: a description for hints. parse: text to value; raises ValueError or DoraSystemdError.
-    format: value to the texts after "KEY=", one for each line of the unit file.
+    format: value to the text after "KEY="; after a newline, that of one more line with this key.
     """
 
     signature: str
     expected: str
     parse: Callable[[str], Any]
-    format: Callable[[Any], Sequence[str]]
+    format: Callable[[Any], str]
 
 
 def plain_text(text: str) -> str:
@@ -86,11 +86,10 @@ def word_kind(
             raise ValueError("not a valid word or number")
         return int(word)
 
-    def format_(value: Any) -> Sequence[str]:
-        return [word_of(value, words, str(value))]
-
     known = "one of " + ", ".join(word for word in words if word)
-    return PropertyKind(signature, expected or known, parse, format_)
+    return PropertyKind(
+        signature, expected or known, parse, lambda value: word_of(value, words, str(value))
+    )
 
 
 def word_of(value: Any, words: Mapping[str, Any], other: str) -> str:
@@ -127,7 +126,7 @@ def file_kind(mode: str) -> PropertyKind:
         return path
 
     expected = f"{mode}:/PATH"
-    return PropertyKind("s", expected, parse, lambda value: [f"{mode}:{escape_specifiers(value)}"])
+    return PropertyKind("s", expected, parse, lambda value: f"{mode}:{escape_specifiers(value)}")
 
 
 def _parse_share(text: str) -> int:
@@ -139,8 +138,8 @@ def _parse_share(text: str) -> int:
     return (hundredths * SCALE + 5000) // 10000
 
 
-def _format_share(value: int) -> Sequence[str]:
-    return [f"{round(value * 10000 / SCALE) / 100:g}%"]
+def _format_share(value: int) -> str:
+    return f"{round(value * 10000 / SCALE) / 100:g}%"
 
 
 def _parse_time(text: str, factor: int) -> int:
@@ -160,23 +159,20 @@ def _in_seconds(duration: int) -> int:
     return duration if duration == INFINITY else -(-duration // SECOND)
 
 
-BOOL = PropertyKind("b", "yes or no", parse_bool, lambda value: [format_bool(value)])
-TEXT = PropertyKind("s", "one line of text", plain_text, lambda value: [escape_specifiers(value)])
+BOOL = PropertyKind("b", "yes or no", parse_bool, format_bool)
+TEXT = PropertyKind("s", "one line of text", plain_text, escape_specifiers)
 SIZE_LIMIT = PropertyKind(
     "t",
     "a size such as 512M, or infinity",
     lambda text: parse_size(text) if text.strip() else INFINITY,
-    lambda value: [format_size(value)],
+    format_size,
 )
 COUNT_LIMIT = word_kind(
     "t", {"infinity": INFINITY, "": INFINITY}, range(10**19), "a number, or infinity"
 )
 SHARE = PropertyKind("u", "a percentage such as 50%", _parse_share, _format_share)
 DURATION = PropertyKind(
-    "t",
-    "a time span such as 500ms, 10s or 1min 30s, or infinity",
-    parse_duration,
-    lambda value: [format_duration(value)],
+    "t", "a time span such as 500ms, 10s or 1min 30s, or infinity", parse_duration, format_duration
 )
 NANOSECONDS = replace(
     COUNT_LIMIT,
@@ -198,8 +194,8 @@ CPU_QUOTA = PropertyKind(
     "a share of one CPU such as 150%, or infinity",
     lambda text: parse_cpu(text) if text.strip() else INFINITY,
     # In a unit file, an empty value means no quota.
-    lambda value: ["" if value == INFINITY else format_cpu(value)],
+    lambda value: "" if value == INFINITY else format_cpu(value),
 )
 WEIGHT = word_kind("t", {}, range(1, 10001), "a weight between 1 and 10000")
 CPU_WEIGHT = word_kind("t", {"idle": 0}, range(1, 10001), "a weight between 1 and 10000, or idle")
-MODE = PropertyKind("u", "an octal mode such as 0755", _parse_mode, lambda value: [f"{value:04o}"])
+MODE = PropertyKind("u", "an octal mode such as 0755", _parse_mode, "{:04o}".format)

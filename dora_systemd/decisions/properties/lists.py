@@ -24,10 +24,9 @@ def words_kind(
     def parse_words(text: str) -> tuple[Any, ...]:
         return tuple(parse(plain_text(word)) for word in split_words(plain_text(text)))
 
-    def format_words(words: Sequence[Any]) -> Sequence[str]:
-        return [" ".join(map(format_, words))]
-
-    return PropertyKind(signature, expected, parse_words, format_words)
+    return PropertyKind(
+        signature, expected, parse_words, lambda words: " ".join(map(format_, words))
+    )
 
 
 def items_kind(
@@ -39,10 +38,9 @@ def items_kind(
         item = plain_text(text)
         return (parse(item),) if item else ()
 
-    def format_items(items: Sequence[Any]) -> Sequence[str]:
-        return [format_(item) for item in items] or [""]
-
-    return PropertyKind(signature, expected, parse_items, format_items)
+    return PropertyKind(
+        signature, expected, parse_items, lambda items: "\n".join(map(format_, items))
+    )
 
 
 def condition_kind(name: str) -> PropertyKind:
@@ -77,9 +75,9 @@ def _parse_filter(text: str) -> tuple[bool, tuple[str, ...]]:
     return not is_denied, words
 
 
-def _format_filter(value: tuple[bool, Sequence[str]]) -> Sequence[str]:
+def _format_filter(value: tuple[bool, Sequence[str]]) -> str:
     is_allowed, words = value
-    return ["~" * (not is_allowed) + WORDS.format(words)[0]]
+    return "~" * (not is_allowed) + WORDS.format(words)
 
 
 def _parse_fields(text: str) -> tuple[bytes, ...]:
@@ -104,13 +102,13 @@ SEARCH_PATH = PropertyKind(
     "as",
     "absolute paths with colons between them",
     _parse_search_path,
-    lambda value: [escape_specifiers(":".join(value))],
+    lambda value: escape_specifiers(":".join(value)),
 )
 ENVIRONMENT = PropertyKind(
     "as",
     "assignments KEY=VALUE, in quotes where they hold blanks",
     _parse_environment,
-    lambda value: [quote_word(entry) for entry in value] or [""],
+    lambda value: "\n".join(map(quote_word, value)),
 )
 FILTER = PropertyKind(
     "(bas)", "names, or ~ and the names to leave out", _parse_filter, _format_filter
@@ -119,13 +117,13 @@ PROFILE = PropertyKind(
     "(bs)",
     "the name of a profile",
     lambda text: marked("-", plain_text(text)),
-    lambda value: ["-" * value[0] + escape_specifiers(value[1])],
+    lambda value: "-" * value[0] + escape_specifiers(value[1]),
 )
 FIELDS = PropertyKind(
     "aay",
     "a journal field FIELD=VALUE",
     _parse_fields,
-    lambda value: [quote_word(field.decode()) for field in value] or [""],
+    lambda value: "\n".join(quote_word(field.decode()) for field in value),
 )
 PATTERNS = items_kind(
     "a(bs)",

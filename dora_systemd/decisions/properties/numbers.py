@@ -62,8 +62,8 @@ def _parse_statuses(text: str) -> tuple[tuple[int, ...], tuple[int, ...]]:
     return tuple(statuses), tuple(signals)
 
 
-def _format_statuses(value: tuple[Sequence[int], Sequence[int]]) -> Sequence[str]:
-    return [" ".join([*map(str, value[0]), *(SIGNAL.format(number)[0] for number in value[1])])]
+def _format_statuses(value: tuple[Sequence[int], Sequence[int]]) -> str:
+    return " ".join([*map(str, value[0]), *map(SIGNAL.format, value[1])])
 
 
 def _numbered(words: Sequence[str]) -> dict[str, int]:
@@ -90,11 +90,11 @@ def _mask_kind(
         mask = sum(known[name] for name in names)
         return everything & ~mask if given.startswith("~") else mask
 
-    def format_(mask: int) -> Sequence[str]:
+    def format_(mask: int) -> str:
         # Kernels may have more capabilities than this list, so format a nearly full mask inverted.
         is_inverted = mask > sum(bits.values())
         names = " ".join(name for name, bit in bits.items() if bool(mask & bit) != is_inverted)
-        return [word_of(mask, words, "~" * is_inverted + names)]
+        return word_of(mask, words, "~" * is_inverted + names)
 
     return PropertyKind(signature, expected, parse, format_)
 

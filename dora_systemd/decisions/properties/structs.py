@@ -138,8 +138,8 @@ def _parse_addresses(text: str) -> tuple[Address, ...]:
     )
 
 
-def _format_addresses(value: Sequence[Address]) -> Sequence[str]:
-    return [" ".join(f"{ipaddress.ip_address(packed)}/{bits}" for _, packed, bits in value)]
+def _format_addresses(value: Sequence[Address]) -> str:
+    return " ".join(f"{ipaddress.ip_address(packed)}/{bits}" for _, packed, bits in value)
 
 
 def _parse_cpus(text: str) -> bytes:
@@ -154,9 +154,9 @@ def _parse_cpus(text: str) -> bytes:
     return mask.to_bytes((mask.bit_length() + 7) // 8, "little")
 
 
-def _format_cpus(value: bytes) -> Sequence[str]:
+def _format_cpus(value: bytes) -> str:
     mask = int.from_bytes(value, "little")
-    return [" ".join(str(bit) for bit in range(mask.bit_length()) if mask >> bit & 1)]
+    return " ".join(str(bit) for bit in range(mask.bit_length()) if mask >> bit & 1)
 
 
 def _pair_kind(separator: str, expected: str) -> PropertyKind:
@@ -175,7 +175,7 @@ def _device_kind(amount: PropertyKind, expected: str) -> PropertyKind:
 
     def format_device(device: Device) -> str:
         path, value = device
-        return f"{escape_specifiers(path)} {amount.format(value)[0]}"
+        return f"{escape_specifiers(path)} {amount.format(value)}"
 
     return items_kind("a(st)", expected, parse_device, format_device)
 
@@ -184,7 +184,7 @@ COMMAND = PropertyKind(
     "a(sasas)",
     "a command line with an absolute path, such as /usr/bin/touch /run/x",
     _parse_command,
-    lambda value: [_format_command(command) for command in value] or [""],
+    lambda value: "\n".join(map(_format_command, value)),
 )
 ENVIRONMENT_FILES = items_kind(
     "a(sb)",
