@@ -32,6 +32,7 @@ from dora_systemd.decisions.cell.limits import (
     parse_changes,
 )
 from dora_systemd.decisions.descriptor.nodes import UNEXPANDED
+from dora_systemd.decisions.properties.assignments import typed
 from dora_systemd.decisions.settings.limit_checks import (
     check_controllers,
     needed_controllers,
@@ -40,7 +41,7 @@ from dora_systemd.decisions.settings.limit_checks import (
 )
 from dora_systemd.decisions.settings.limits import LIVE_SETTINGS, NODE_LIMIT
 from dora_systemd.decisions.settings.resolve import Settings, resolve_settings
-from dora_systemd.decisions.unit.properties import format_unit, settings_properties, typed
+from dora_systemd.decisions.unit.properties import format_unit, settings_properties
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell

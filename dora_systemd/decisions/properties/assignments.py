@@ -1,6 +1,7 @@
 """Parses and joins properties of one unit, from assignments as for `--property`."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 from dora_systemd.decisions.properties.kinds import Property
 from dora_systemd.decisions.properties.table import RLIMITS, TABLE, Row
@@ -28,13 +29,11 @@ _REFUSED = {
     "StandardInput": "its end is the end of `doractl run`",
     "SetCredential": "everybody could read it in the unit, unlike LoadCredential=ID:PATH",
 }
-_UNSUPPORTED = frozenset(
-    {
-        *("OpenFile", "NFTSet", "MountImages", "ExtensionImages", "RootImageOptions", "RootHash"),
-        *("RootHashSignature", "SocketBindAllow", "SocketBindDeny", "SetCredentialEncrypted"),
-        *("StandardInputText", "StandardInputData", "TTYRows", "TTYColumns", "CoredumpFilter"),
-        *("NonBlocking", "TimeoutCleanSec", "ReloadSignal", "DebugInvocation", "JobTimeoutSec"),
-    }
+_UNSUPPORTED = (
+    *("OpenFile", "NFTSet", "MountImages", "ExtensionImages", "RootImageOptions", "RootHash"),
+    *("RootHashSignature", "SocketBindAllow", "SocketBindDeny", "SetCredentialEncrypted"),
+    *("StandardInputText", "StandardInputData", "TTYRows", "TTYColumns", "CoredumpFilter"),
+    *("NonBlocking", "TimeoutCleanSec", "ReloadSignal", "DebugInvocation", "JobTimeoutSec"),
 )
 
 
@@ -46,12 +45,12 @@ def parse_property(assignment: str) -> dict[str, Property]:
     """
     key, equals, text = assignment.partition("=")
     if not equals:
-        message = f"cannot set property {quoted(assignment)}: it has no value"
-        raise DoraSystemdError(message, "write KEY=VALUE, such as Nice=5", ExitCode.USAGE)
-    keys = _DOUBLE_KEYS.get(key, (key,))
-    for one in keys:
+        raise _refusal(f"{quoted(assignment)}: it has no value", "write KEY=VALUE, such as Nice=5")
+    properties: dict[str, Property] = {}
+    for one in _DOUBLE_KEYS.get(key, (key,)):
         _check_key(one)
-    return {slot: one for each in keys for slot, one in parse_line(each, text).items()}
+        properties |= parse_line(one, text)
+    return properties
 
 
 def parse_line(key: str, text: str) -> dict[str, Property]:
@@ -60,10 +59,25 @@ def parse_line(key: str, text: str) -> dict[str, Property]:
     The text has no specifiers. Raises KeyError for a key that is not in the table, DoraSystemdError
     (USAGE) for a bad value.
     """
-    if key in RLIMITS:
-        soft, hard = _split_limit(text)
-        return {**_parse_one(f"{key}Soft", soft), **_parse_one(key, hard)}
-    return _parse_one(key, text)
+    if key not in RLIMITS:
+        return _parse_one(key, text)
+    soft, colon, hard = text.partition(":")
+    limit = _parse_one(key, soft)[key]._replace(name=f"{key}Soft")
+    return {limit.name: limit, **_parse_one(key, hard if colon else soft)}
+
+
+def typed(**values: Any) -> dict[str, Property]:
+    """Properties by key of the unit file, from values with their types on D-Bus."""
+    rows = {key: TABLE[key].choices[-1] for key in values}
+    return {key: Property(rows[key][0], rows[key][1].signature, values[key]) for key in values}
+
+
+def with_assignments(properties: Properties, assignments: Iterable[str]) -> dict[str, Property]:
+    """`properties`, then each KEY=VALUE. Raises DoraSystemdError as parse_property does."""
+    result = dict(properties)
+    for assignment in assignments:
+        result = with_properties(result, parse_property(assignment))
+    return result
 
 
 def with_properties(properties: Properties, changes: Properties) -> dict[str, Property]:
@@ -84,29 +98,28 @@ def format_property(slot: str, properties: Properties) -> list[str]:
     comment.
     """
     name, _, value = properties[slot]
-    row = TABLE.get(slot.removesuffix("~"))
-    kind = dict(row.choices).get(name) if row else None
-    if row is None or kind is None:
-        return [f"# {name} is set by doractl"]
-    if slot.removesuffix("Soft") in RLIMITS and slot not in RLIMITS:
+    key = slot.removesuffix("~")
+    if key.endswith("Soft") and key.removesuffix("Soft") in RLIMITS:
         return []
-    texts = kind.format(value)
-    soft = properties.get(f"{slot}Soft")
+    if key not in TABLE:
+        return [f"# {name} is set by doractl"]
+    kind = dict(TABLE[key].choices)[name]
+    text = kind.format(value)
+    soft = properties.get(f"{key}Soft")
     if soft and soft.value != value:
-        texts = [f"{kind.format(soft.value)[0]}:{texts[0]}"]
-    return [f"{row.key}={text}" for text in texts]
+        text = f"{kind.format(soft.value)}:{text}"
+    return [f"{key}={line}" for line in text.split("\n")]
 
 
 def _check_key(key: str) -> None:
-    message = f"cannot set property {shown(key)}"
     if key in _REFUSED:
-        raise DoraSystemdError(f"{message}: {_REFUSED[key]}", "leave it out", ExitCode.USAGE)
+        raise _refusal(f"{shown(key)}: {_REFUSED[key]}", "leave it out")
     if key in _UNSUPPORTED:
         hint = "write it into a drop-in instead: systemctl edit dora-NAME.service"
-        raise DoraSystemdError(f"{message} from here", hint, ExitCode.USAGE)
+        raise _refusal(f"{shown(key)} from here", hint)
     if key not in TABLE:
         hint = did_you_mean(key, TABLE.keys() - _REFUSED.keys()) or "see systemd.directives(7)"
-        raise DoraSystemdError(f"{message}: services have no such property", hint, ExitCode.USAGE)
+        raise _refusal(f"{shown(key)}: services have no such property", hint)
 
 
 def _parse_one(key: str, text: str) -> dict[str, Property]:
@@ -124,19 +137,15 @@ def _parse_one(key: str, text: str) -> dict[str, Property]:
 
 
 def _bad_value(row: Row, text: str, reason: Exception | None) -> DoraSystemdError:
-    expected = " or ".join(kind.expected for _, kind in row.choices)
+    hint = "write " + " or ".join(kind.expected for _, kind in row.choices)
     if row.key == "Environment":
         # The value may be a secret; the error names the variable.
-        hint = reason.hint if isinstance(reason, DoraSystemdError) else f"write {expected}"
-        return DoraSystemdError("cannot set property Environment", hint, ExitCode.USAGE)
-    message = f"cannot set property {row.key.removesuffix('Soft')} to {quoted(text)}"
-    return DoraSystemdError(message, f"write {expected}", ExitCode.USAGE)
+        return _refusal(row.key, reason.hint if isinstance(reason, DoraSystemdError) else hint)
+    return _refusal(f"{row.key} to {quoted(text)}", hint)
 
 
-def _split_limit(text: str) -> tuple[str, str]:
-    """Soft and hard limit of SOFT:HARD; one number is both."""
-    soft, colon, hard = text.partition(":")
-    return soft, hard if colon else soft
+def _refusal(what: str, hint: str) -> DoraSystemdError:
+    return DoraSystemdError(f"cannot set property {what}", hint, ExitCode.USAGE)
 
 
 def _joined(old: Property, new: Property) -> Property:

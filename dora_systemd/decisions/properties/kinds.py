@@ -4,7 +4,7 @@ Types are those of org.freedesktop.systemd1(5), texts those of systemd-run(1).
 """
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -25,8 +25,9 @@ from dora_systemd.values import (
 SCALE = 2**32 - 1
 """100 % in the properties called ...Scale, which are relative to the machine's size."""
 
-_NUMBER = re.compile(r"[-+]?[0-9]{1,20}")
-_PERCENT = re.compile(r"([0-9]{1,3})(?:\.([0-9]{1,2}))?%")
+_SIGNED = re.compile(r"[-+]?[0-9]{1,20}")
+_DIGITS = re.compile(r"[0-9]{1,19}")
+_PERCENT = re.compile(r"([0-9]{1,3}(?:\.[0-9]{1,2})?)%")
 _CONTROL = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
 
 
@@ -47,13 +48,13 @@ class PropertyKind:
     """How a value is parsed and formatted.
 
     expected: a description for hints. parse: text to value; raises ValueError or DoraSystemdError.
-    format: value to the texts after "KEY=", one for each line of the unit file.
+    format: value to the text after "KEY="; after a newline, that of one more line with this key.
     """
 
     signature: str
     expected: str
     parse: Callable[[str], Any]
-    format: Callable[[Any], Sequence[str]]
+    format: Callable[[Any], str]
 
 
 def plain_text(text: str) -> str:
@@ -65,99 +66,87 @@ def plain_text(text: str) -> str:
     return stripped
 
 
+def word_kind(
+    signature: str,
+    words: Mapping[str, Any],
+    numbers: Container[int] = (),
+    expected: str = "",
+    pattern: re.Pattern[str] = _DIGITS,
+) -> PropertyKind:
+    """Words for values, the first one of each value in unit files; `numbers` are valid as well.
+
+    pattern: how a number is written. In LimitNICE= a sign has another meaning.
+    """
+
+    def parse(text: str) -> Any:
+        word = text.strip()
+        if word in words:
+            return words[word]
+        if not pattern.fullmatch(word) or int(word) not in numbers:
+            raise ValueError("not a valid word or number")
+        return int(word)
+
+    known = "one of " + ", ".join(word for word in words if word)
+    return PropertyKind(
+        signature, expected or known, parse, lambda value: word_of(value, words, str(value))
+    )
+
+
+def word_of(value: Any, words: Mapping[str, Any], other: str) -> str:
+    """The first word for `value`, or `other`."""
+    return next((word for word, one in words.items() if one == value), other)
+
+
 def number_kind(signature: str, lowest: int, highest: int) -> PropertyKind:
     """Integers between two bounds, inclusive."""
-
-    def parse(text: str) -> int:
-        if not _NUMBER.fullmatch(text.strip()) or not lowest <= int(text) <= highest:
-            raise ValueError("not in range")
-        return int(text)
-
     expected = f"a whole number between {lowest} and {highest}"
-    return PropertyKind(signature, expected, parse, lambda value: [str(value)])
+    return word_kind(signature, {}, range(lowest, highest + 1), expected, _SIGNED)
 
 
 def choice_kind(*choices: str) -> PropertyKind:
     """One of some words; if "yes" and "no" are among them, all boolean words are valid."""
-    kind = named_kind("s", {choice: choice for choice in choices})
+    kind = word_kind("s", {choice: choice for choice in choices})
+    if not {"yes", "no"} <= {*choices}:
+        return kind
 
     def parse(text: str) -> str:
         word = text.strip()
-        if word not in choices and {"yes", "no"} <= set(choices):
-            return format_bool(parse_bool(word))
-        return str(kind.parse(word))
+        return word if word in choices else format_bool(parse_bool(word))
 
     return replace(kind, parse=parse)
 
 
-def prefixed_path_kind(prefix: str) -> PropertyKind:
-    """An absolute path after `prefix`, which is not part of the value."""
+def file_kind(mode: str) -> PropertyKind:
+    """MODE:/PATH, and only the path in the value."""
 
     def parse(text: str) -> str:
-        path = plain_text(text).removeprefix(prefix)
-        if not text.strip().startswith(prefix) or not path.startswith("/"):
+        given, _, path = plain_text(text).partition(":")
+        if given != mode or not path.startswith("/"):
             raise ValueError("no such path")
         return path
 
-    def format_(value: str) -> Sequence[str]:
-        return [prefix + escape_specifiers(value)]
-
-    return PropertyKind("s", f"{prefix}/PATH", parse, format_)
-
-
-def named_kind(signature: str, numbers: Mapping[str, Any], is_open: bool = False) -> PropertyKind:
-    """A name for a value; with `is_open`, numbers are valid as well."""
-
-    def parse(text: str) -> Any:
-        word = text.strip()
-        if is_open and word.isascii() and word.isdigit() and int(word[:9]) in numbers.values():
-            return int(word[:9])
-        if word not in numbers:
-            raise ValueError("unknown word")
-        return numbers[word]
-
-    def format_(value: Any) -> Sequence[str]:
-        return [next((word for word, one in numbers.items() if one == value), str(value))]
-
-    expected = "one of " + ", ".join(word for word in numbers if word)
-    return PropertyKind(signature, expected, parse, format_)
+    expected = f"{mode}:/PATH"
+    return PropertyKind("s", expected, parse, lambda value: f"{mode}:{escape_specifiers(value)}")
 
 
 def _parse_share(text: str) -> int:
     """A percentage as a part of SCALE, rounded so that steps of 0.01 % convert back exactly."""
     match = _PERCENT.fullmatch(text.strip())
-    hundredths = int(match[1]) * 100 + int((match[2] or "0").ljust(2, "0")) if match else -1
+    hundredths = round(float(match[1]) * 100) if match else -1
     if not 0 <= hundredths <= 10000:
         raise ValueError("not a percentage")
     return (hundredths * SCALE + 5000) // 10000
 
 
-def _format_share(value: int) -> Sequence[str]:
-    whole, hundredths = divmod((value * 10000 + SCALE // 2) // SCALE, 100)
-    return [f"{whole}.{hundredths:02}".rstrip("0").rstrip(".") + "%"]
+def _format_share(value: int) -> str:
+    return f"{round(value * 10000 / SCALE) / 100:g}%"
 
 
-def _parse_limit(text: str) -> int:
-    return parse_size(text) if text.strip() else INFINITY
-
-
-def _parse_count(text: str) -> int:
-    if text.strip() in ("", "infinity"):
-        return INFINITY
-    return _parse_natural(text)
-
-
-def _parse_natural(text: str) -> int:
-    if not text.strip().isascii() or not text.strip().isdigit() or len(text) > 19:
-        raise ValueError("not a number")
-    return int(text)
-
-
-def _parse_weight(text: str) -> int:
-    value = _parse_natural(text)
-    if not 1 <= value <= 10000:
-        raise ValueError("not in range")
-    return value
+def _parse_time(text: str, factor: int) -> int:
+    """A bare number as it is, a time span in µs times `factor`."""
+    if _DIGITS.fullmatch(text.strip()):
+        return int(text)
+    return min(factor * parse_duration(text), INFINITY)
 
 
 def _parse_mode(text: str) -> int:
@@ -170,58 +159,43 @@ def _in_seconds(duration: int) -> int:
     return duration if duration == INFINITY else -(-duration // SECOND)
 
 
-def _format_count(value: int) -> Sequence[str]:
-    return ["infinity" if value == INFINITY else str(value)]
-
-
-BOOL = PropertyKind("b", "yes or no", parse_bool, lambda value: [format_bool(value)])
-TEXT = PropertyKind("s", "one line of text", plain_text, lambda value: [escape_specifiers(value)])
+BOOL = PropertyKind("b", "yes or no", parse_bool, format_bool)
+TEXT = PropertyKind("s", "one line of text", plain_text, escape_specifiers)
 SIZE_LIMIT = PropertyKind(
     "t",
     "a size such as 512M, or infinity",
-    _parse_limit,
-    lambda value: [format_size(value)],
+    lambda text: parse_size(text) if text.strip() else INFINITY,
+    format_size,
 )
-COUNT_LIMIT = PropertyKind("t", "a number, or infinity", _parse_count, _format_count)
+COUNT_LIMIT = word_kind(
+    "t", {"infinity": INFINITY, "": INFINITY}, range(10**19), "a number, or infinity"
+)
 SHARE = PropertyKind("u", "a percentage such as 50%", _parse_share, _format_share)
 DURATION = PropertyKind(
-    "t",
-    "a time span such as 500ms, 10s or 1min 30s, or infinity",
-    parse_duration,
-    lambda value: [format_duration(value)],
+    "t", "a time span such as 500ms, 10s or 1min 30s, or infinity", parse_duration, format_duration
 )
-NANOSECONDS = PropertyKind(
-    "t",
-    "nanoseconds, or a time span such as 50us",
-    lambda text: _parse_natural(text) if text.strip().isdigit() else 1000 * parse_duration(text),
-    lambda value: [str(value)],
+NANOSECONDS = replace(
+    COUNT_LIMIT,
+    expected="nanoseconds, or a time span such as 50us",
+    parse=lambda text: _parse_time(text, 1000),
 )
-SECONDS = PropertyKind(
-    "t",
-    "a time span such as 30s, or infinity",
-    lambda text: _in_seconds(parse_duration(text)),
-    _format_count,
+SECONDS = replace(
+    COUNT_LIMIT,
+    expected="a time span such as 30s, or infinity",
+    parse=lambda text: _in_seconds(parse_duration(text)),
 )
-MICROSECONDS = PropertyKind(
-    "t",
-    "a time span such as 100ms, or infinity",
-    lambda text: _parse_natural(text) if text.strip().isdigit() else parse_duration(text),
-    lambda value: ["0"] if value == 0 else [format_duration(value)],
+MICROSECONDS = replace(
+    DURATION,
+    expected="a time span such as 100ms, or infinity",
+    parse=lambda text: _parse_time(text, 1),
 )
 CPU_QUOTA = PropertyKind(
     "t",
     "a share of one CPU such as 150%, or infinity",
     lambda text: parse_cpu(text) if text.strip() else INFINITY,
     # In a unit file, an empty value means no quota.
-    lambda value: ["" if value == INFINITY else format_cpu(value)],
+    lambda value: "" if value == INFINITY else format_cpu(value),
 )
-WEIGHT = PropertyKind(
-    "t", "a weight between 1 and 10000", _parse_weight, lambda value: [str(value)]
-)
-CPU_WEIGHT = PropertyKind(
-    "t",
-    "a weight between 1 and 10000, or idle",
-    lambda text: 0 if text.strip() == "idle" else _parse_weight(text),
-    lambda value: [str(value) if value else "idle"],
-)
-MODE = PropertyKind("u", "an octal mode such as 0755", _parse_mode, lambda value: [f"{value:04o}"])
+WEIGHT = word_kind("t", {}, range(1, 10001), "a weight between 1 and 10000")
+CPU_WEIGHT = word_kind("t", {"idle": 0}, range(1, 10001), "a weight between 1 and 10000, or idle")
+MODE = PropertyKind("u", "an octal mode such as 0755", _parse_mode, "{:04o}".format)

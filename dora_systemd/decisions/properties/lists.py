@@ -4,7 +4,8 @@ An empty text is an empty list, which resets the property, as an empty value doe
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 from dora_systemd.decisions.cell.environment import parse_assignment
 from dora_systemd.decisions.properties.kinds import PropertyKind, plain_text
@@ -15,19 +16,51 @@ Condition = tuple[str, bool, bool, str]
 _FIELD = re.compile(r"[A-Z0-9][A-Z0-9_]{0,63}=")
 
 
-def parse_words(text: str) -> tuple[str, ...]:
-    """The words of a list, unquoted. Raises ValueError if a unit file cannot contain them."""
-    return tuple(plain_text(word) for word in split_words(plain_text(text)))
+def words_kind(
+    signature: str, expected: str, parse: Callable[[str], Any], format_: Callable[[Any], str]
+) -> PropertyKind:
+    """Quoted words on one line; `parse` and `format_` are for one of them."""
+
+    def parse_words(text: str) -> tuple[Any, ...]:
+        return tuple(parse(plain_text(word)) for word in split_words(plain_text(text)))
+
+    return PropertyKind(
+        signature, expected, parse_words, lambda words: " ".join(map(format_, words))
+    )
 
 
-def format_words(words: Sequence[str]) -> Sequence[str]:
-    """All words on one line."""
-    return [" ".join(quote_word(word) for word in words)]
+def items_kind(
+    signature: str, expected: str, parse: Callable[[str], Any], format_: Callable[[Any], str]
+) -> PropertyKind:
+    """Lines with one item each; `parse` and `format_` are for one of them."""
+
+    def parse_items(text: str) -> tuple[Any, ...]:
+        item = plain_text(text)
+        return (parse(item),) if item else ()
+
+    return PropertyKind(
+        signature, expected, parse_items, lambda items: "\n".join(map(format_, items))
+    )
 
 
-def lines(texts: Sequence[str]) -> Sequence[str]:
-    """One line for each text, or an empty line, which resets the list."""
-    return list(texts) or [""]
+def condition_kind(name: str) -> PropertyKind:
+    """`Condition...=` and `Assert...=` of systemd.unit(5); "|" triggers and "!" negates."""
+
+    def parse(text: str) -> Condition:
+        is_trigger, rest = marked("|", text)
+        return name, is_trigger, *marked("!", rest)
+
+    return items_kind("a(sbbs)", "a condition, such as !/run/stop", parse, _format_condition)
+
+
+def marked(mark: str, text: str) -> tuple[bool, str]:
+    """Whether `text` begins with `mark`, and the rest."""
+    return text.startswith(mark), text.removeprefix(mark)
+
+
+def _format_condition(condition: Condition) -> str:
+    _, is_trigger, is_negated, parameter = condition
+    return "|" * is_trigger + "!" * is_negated + escape_specifiers(parameter)
 
 
 def _parse_environment(text: str) -> tuple[str, ...]:
@@ -35,98 +68,66 @@ def _parse_environment(text: str) -> tuple[str, ...]:
 
 
 def _parse_filter(text: str) -> tuple[bool, tuple[str, ...]]:
-    given = plain_text(text)
-    words = parse_words(given.removeprefix("~"))
+    is_denied, names = marked("~", plain_text(text))
+    words = WORDS.parse(names)
     if words and words[0].startswith("~"):
         raise ValueError("only one ~ may stand in front")  # a unit file would take it for the first
-    return not given.startswith("~"), words
+    return not is_denied, words
 
 
-def _format_filter(value: tuple[bool, Sequence[str]]) -> Sequence[str]:
+def _format_filter(value: tuple[bool, Sequence[str]]) -> str:
     is_allowed, words = value
-    return [("" if is_allowed else "~") + format_words(words)[0]]
-
-
-def _parse_profile(text: str) -> tuple[bool, str]:
-    name = plain_text(text)
-    return name.startswith("-"), name.removeprefix("-")
-
-
-def _format_profile(value: tuple[bool, str]) -> Sequence[str]:
-    is_optional, name = value
-    return [("-" if is_optional else "") + escape_specifiers(name)]
+    return "~" * (not is_allowed) + WORDS.format(words)
 
 
 def _parse_fields(text: str) -> tuple[bytes, ...]:
     """One field as for systemd-run, or several quoted ones as in unit files."""
     field = plain_text(text)
-    fields = parse_words(field) if field.startswith('"') else (field,) if field else ()
+    fields = WORDS.parse(field) if field.startswith('"') else (field,) if field else ()
     if not all(_FIELD.match(one) for one in fields):
         raise ValueError("not a field")
     return tuple(one.encode() for one in fields)
 
 
-def _format_fields(value: Sequence[bytes]) -> Sequence[str]:
-    return lines([quote_word(field.decode()) for field in value])
-
-
-def _parse_pattern(text: str) -> tuple[tuple[bool, str], ...]:
-    pattern = plain_text(text)
-    return ((not pattern.startswith("~"), pattern.removeprefix("~")),) if pattern else ()
-
-
-def _format_patterns(value: Sequence[tuple[bool, str]]) -> Sequence[str]:
-    return lines([("" if is_kept else "~") + escape_specifiers(text) for is_kept, text in value])
-
-
-def condition_kind(name: str) -> PropertyKind:
-    """`Condition...=` and `Assert...=` of systemd.unit(5); "|" triggers and "!" negates."""
-
-    def parse(text: str) -> tuple[Condition, ...]:
-        condition = plain_text(text)
-        rest = condition.removeprefix("|")
-        parameter = rest.removeprefix("!")
-        is_trigger, is_negated = rest != condition, parameter != rest
-        return ((name, is_trigger, is_negated, parameter),) if condition else ()
-
-    return PropertyKind("a(sbbs)", "a condition, such as !/run/stop", parse, _format_conditions)
-
-
-def _format_conditions(value: Sequence[Condition]) -> Sequence[str]:
-    return lines(
-        [
-            "|" * is_trigger + "!" * is_negated + escape_specifiers(parameter)
-            for _, is_trigger, is_negated, parameter in value
-        ]
-    )
-
-
 def _parse_search_path(text: str) -> tuple[str, ...]:
-    paths = tuple(path for word in parse_words(text) for path in word.split(":") if path)
+    paths = tuple(path for word in WORDS.parse(text) for path in word.split(":") if path)
     # Quotes in a path would need another level of quoting; no real directory has them.
     if any(not path.startswith("/") or set(path) & set("\"'\\ \t\n") for path in paths):
         raise ValueError(text)
     return paths
 
 
-WORDS = PropertyKind("as", "words separated by blanks", parse_words, format_words)
+WORDS = words_kind("as", "words separated by blanks", str, quote_word)
 SEARCH_PATH = PropertyKind(
     "as",
     "absolute paths with colons between them",
     _parse_search_path,
-    lambda value: [escape_specifiers(":".join(value))],
+    lambda value: escape_specifiers(":".join(value)),
 )
 ENVIRONMENT = PropertyKind(
     "as",
     "assignments KEY=VALUE, in quotes where they hold blanks",
     _parse_environment,
-    lambda value: lines([quote_word(entry) for entry in value]),
+    lambda value: "\n".join(map(quote_word, value)),
 )
 FILTER = PropertyKind(
     "(bas)", "names, or ~ and the names to leave out", _parse_filter, _format_filter
 )
-PROFILE = PropertyKind("(bs)", "the name of a profile", _parse_profile, _format_profile)
-FIELDS = PropertyKind("aay", "a journal field FIELD=VALUE", _parse_fields, _format_fields)
-PATTERNS = PropertyKind(
-    "a(bs)", "a pattern, or ~ and one that drops lines", _parse_pattern, _format_patterns
+PROFILE = PropertyKind(
+    "(bs)",
+    "the name of a profile",
+    lambda text: marked("-", plain_text(text)),
+    lambda value: "-" * value[0] + escape_specifiers(value[1]),
+)
+FIELDS = PropertyKind(
+    "aay",
+    "a journal field FIELD=VALUE",
+    _parse_fields,
+    lambda value: "\n".join(quote_word(field.decode()) for field in value),
+)
+PATTERNS = items_kind(
+    "a(bs)",
+    "a pattern, or ~ and one that drops lines",
+    lambda text: (not text.startswith("~"), text.removeprefix("~")),
+    lambda one: "~" * (not one[0]) + escape_specifiers(one[1]),
 )

@@ -2,10 +2,10 @@
 
 import errno
 import signal
-from collections.abc import Callable, Mapping, Sequence
-from functools import reduce
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
-from dora_systemd.decisions.properties.kinds import PropertyKind, named_kind
+from dora_systemd.decisions.properties.kinds import PropertyKind, word_kind, word_of
 
 _CAPABILITY_NAMES = (
     *("chown", "dac_override", "dac_read_search", "fowner", "fsetid", "kill", "setgid", "setuid"),
@@ -38,35 +38,16 @@ _SECURE_BITS = {
     "noroot": 1 << 0,
     "noroot-locked": 1 << 1,
 }
+_EVERY_NAMESPACE = sum(_NAMESPACES.values())
 _LEVELS = ("emerg", "alert", "crit", "err", "warning", "notice", "info", "debug")
 _FACILITIES = (
     *("kern", "user", "mail", "daemon", "auth", "syslog", "lpr", "news", "uucp", "cron"),
-    "authpriv",
-    "ftp",
+    *("authpriv", "ftp"),
 )
-_EXIT_WORDS = {"SUCCESS": 0, "FAILURE": 1}
-
-
-def parse_signal(text: str) -> int:
-    """The number of a signal such as SIGTERM, TERM, 15 or RTMIN+3. Raises ValueError."""
-    word = text.strip().upper().removeprefix("SIG")
-    base, plus, offset = word.partition("+")
-    if base == "RTMIN" and (not plus or (offset.isascii() and offset.isdigit())):
-        number = signal.SIGRTMIN + int(offset[:4] or 0)
-    elif word.isascii() and word.isdigit():
-        number = int(word[:4])
-    else:
-        number = getattr(signal.Signals, f"SIG{word}", 0)
-    if not 1 <= number <= signal.SIGRTMAX:
-        raise ValueError("not a signal")
-    return int(number)
-
-
-def format_signal(number: int) -> str:
-    """The name of a signal as systemd writes it, such as SIGTERM or SIGRTMIN+3."""
-    if number > signal.SIGRTMIN:
-        return f"SIGRTMIN+{number - signal.SIGRTMIN}"
-    return signal.Signals(number).name
+_SIGNALS = {
+    **{f"SIGRTMIN+{number}": signal.SIGRTMIN + number for number in range(1, 31)},
+    **signal.Signals.__members__,
+}
 
 
 def _parse_statuses(text: str) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -74,96 +55,87 @@ def _parse_statuses(text: str) -> tuple[tuple[int, ...], tuple[int, ...]]:
     statuses: list[int] = []
     signals: list[int] = []
     for word in text.split():
-        status = _EXIT_WORDS.get(word, int(word) if word.isascii() and word.isdigit() else -1)
-        if status > 255:
-            raise ValueError("not an exit status")
-        (statuses if status >= 0 else signals).append(status if status >= 0 else parse_signal(word))
+        try:
+            statuses.append(_STATUS.parse(word))
+        except ValueError:
+            signals.append(SIGNAL.parse(word))
     return tuple(statuses), tuple(signals)
 
 
-def _format_statuses(value: tuple[Sequence[int], Sequence[int]]) -> Sequence[str]:
-    return [" ".join([*map(str, value[0]), *map(format_signal, value[1])])]
+def _format_statuses(value: tuple[Sequence[int], Sequence[int]]) -> str:
+    return " ".join([*map(str, value[0]), *map(SIGNAL.format, value[1])])
 
 
-def _mask_parser(bits: Mapping[str, int], everything: int) -> Callable[[str], int]:
-    """Converts words to the sum of their bits; "~" in front removes them from `everything`."""
+def _numbered(words: Sequence[str]) -> dict[str, int]:
+    return {word: number for number, word in enumerate(words)}
+
+
+def _mask_kind(
+    signature: str,
+    expected: str,
+    bits: Mapping[str, int],
+    everything: int = 0,
+    words: Mapping[str, int] = {},
+) -> PropertyKind:
+    """The sum of named bits; "~" in front removes them from `everything`. words: whole masks."""
+    known = {name.lower(): bit for name, bit in bits.items()}
 
     def parse(text: str) -> int:
-        words = text.strip().removeprefix("~").split()
-        known = {name.lower(): bit for name, bit in bits.items()}
-        if any(word.lower() not in known for word in words):
+        given = text.strip()
+        names = set(given.removeprefix("~").lower().split())
+        if given in words:
+            return words[given]
+        if not names <= known.keys():
             raise ValueError("unknown word")
-        mask = reduce(int.__or__, (known[word.lower()] for word in words), 0)
-        return everything & ~mask if text.strip().startswith("~") else mask
+        mask = sum(known[name] for name in names)
+        return everything & ~mask if given.startswith("~") else mask
 
-    return parse
+    def format_(mask: int) -> str:
+        # Kernels may have more capabilities than this list, so format a nearly full mask inverted.
+        is_inverted = mask > sum(bits.values())
+        names = " ".join(name for name, bit in bits.items() if bool(mask & bit) != is_inverted)
+        return word_of(mask, words, "~" * is_inverted + names)
 
-
-def _mask_words(bits: Mapping[str, int], mask: int) -> str:
-    return " ".join(name for name, bit in bits.items() if mask & bit)
-
-
-def _format_capabilities(mask: int) -> Sequence[str]:
-    # Kernels may have more capabilities than this list, so format a nearly full mask inverted.
-    if mask >> len(_CAPABILITY_NAMES):
-        return [f"~{_mask_words(_CAPABILITIES, ~mask)}".strip()]
-    return [_mask_words(_CAPABILITIES, mask)]
+    return PropertyKind(signature, expected, parse, format_)
 
 
-def _parse_namespaces(text: str) -> int:
-    if text.strip() in ("yes", "true", "on", "1"):
-        return 0
-    everything = sum(_NAMESPACES.values())
-    # An empty value in a unit file resets it.
-    if text.strip() in ("", "no", "false", "off", "0"):
-        return everything
-    return _mask_parser(_NAMESPACES, everything)(text)
-
-
-def _format_namespaces(mask: int) -> Sequence[str]:
-    everything = sum(_NAMESPACES.values())
-    words = {0: "yes", everything: "no"}
-    return [words.get(mask) or _mask_words(_NAMESPACES, mask)]
-
-
-SIGNAL = PropertyKind(
-    "i", "a signal such as SIGINT", parse_signal, lambda value: [format_signal(value)]
+_SIGNAL = word_kind(
+    "i",
+    _SIGNALS | {name.removeprefix("SIG"): number for name, number in _SIGNALS.items()},
+    range(1, signal.SIGRTMAX + 1),
+    "a signal such as SIGINT",
 )
+SIGNAL = replace(_SIGNAL, parse=lambda text: int(_SIGNAL.parse(text.upper())))
+_STATUS = word_kind("i", {"SUCCESS": 0, "FAILURE": 1}, range(256))
 STATUSES = PropertyKind(
     "(aiai)", "exit statuses and signals such as 75 SIGKILL", _parse_statuses, _format_statuses
 )
-CAPABILITIES = PropertyKind(
+CAPABILITIES = _mask_kind(
     "t",
     "capabilities such as CAP_NET_RAW CAP_SYS_NICE, or ~ and those to leave out",
-    _mask_parser(_CAPABILITIES, 2**64 - 1),
-    _format_capabilities,
+    _CAPABILITIES,
+    2**64 - 1,
 )
-NAMESPACES = PropertyKind(
+NAMESPACES = _mask_kind(
     "t",
     "yes, no, or namespaces among " + ", ".join(_NAMESPACES),
-    _parse_namespaces,
-    _format_namespaces,
+    _NAMESPACES,
+    _EVERY_NAMESPACE,
+    # An empty value in a unit file resets it.
+    dict.fromkeys(("no", "false", "off", "0", ""), _EVERY_NAMESPACE)
+    | dict.fromkeys(("yes", "true", "on", "1"), 0),
 )
-SECURE_BITS = PropertyKind(
-    "i",
-    "words among " + ", ".join(_SECURE_BITS),
-    _mask_parser(_SECURE_BITS, 0),
-    lambda value: [_mask_words(_SECURE_BITS, value)],
+SECURE_BITS = _mask_kind("i", "words among " + ", ".join(_SECURE_BITS), _SECURE_BITS)
+LOG_LEVEL = word_kind("i", _numbered(_LEVELS), range(8))
+FACILITY = word_kind(
+    "i", _numbered(_FACILITIES) | {f"local{number}": 16 + number for number in range(8)}
 )
-LOG_LEVEL = named_kind("i", {name: number for number, name in enumerate(_LEVELS)}, is_open=True)
-FACILITY = named_kind(
-    "i",
-    {name: number for number, name in enumerate(_FACILITIES)}
-    | {f"local{number}": 16 + number for number in range(8)},
-)
-CPU_POLICY = named_kind("i", {"other": 0, "fifo": 1, "rr": 2, "batch": 3, "idle": 5})
-IO_CLASS = named_kind("i", {"none": 0, "realtime": 1, "best-effort": 2, "idle": 3}, is_open=True)
-NUMA_POLICY = named_kind(
-    "i", {"default": 0, "preferred": 1, "bind": 2, "interleave": 3, "local": 4}
-)
-MOUNT_FLAGS = named_kind("t", {"": 0, "shared": 1 << 20, "slave": 1 << 19, "private": 1 << 18})
-ERROR_NUMBER = named_kind(
+CPU_POLICY = word_kind("i", {"other": 0, "fifo": 1, "rr": 2, "batch": 3, "idle": 5})
+IO_CLASS = word_kind("i", _numbered(("none", "realtime", "best-effort", "idle")), range(4))
+NUMA_POLICY = word_kind("i", _numbered(("default", "preferred", "bind", "interleave", "local")))
+MOUNT_FLAGS = word_kind("t", {"": 0, "shared": 1 << 20, "slave": 1 << 19, "private": 1 << 18})
+ERROR_NUMBER = word_kind(
     "i",
     {name: number for number, name in sorted(errno.errorcode.items())} | {"kill": 0x7FFFFFFE},
-    is_open=True,
+    errno.errorcode,
 )

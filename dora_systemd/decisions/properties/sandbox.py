@@ -15,7 +15,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from dora_systemd.decisions.properties.assignments import parse_property, with_properties
+from dora_systemd.decisions.properties.assignments import typed, with_assignments
 from dora_systemd.decisions.properties.kinds import Property
 from dora_systemd.decisions.properties.structs import MS_REC
 from dora_systemd.values import format_bool
@@ -95,10 +95,7 @@ class Sandbox:
 
 def sandbox_properties(sandbox: Sandbox) -> dict[str, Property]:
     """The properties by key of the unit file."""
-    properties: dict[str, Property] = {}
-    for assignment in _assignments(sandbox):
-        properties = with_properties(properties, parse_property(assignment))
-    return properties | _path_properties(sandbox)
+    return with_assignments({}, _assignments(sandbox)) | _path_properties(sandbox)
 
 
 def odd_paths(sandbox: Sandbox) -> list[str]:
@@ -144,7 +141,9 @@ def _assignments(sandbox: Sandbox) -> list[str]:
         found += ["RestrictRealtime=yes"]
         found += ["SystemCallFilter=~@resources"] if is_strict else []
     if not sandbox.is_user:
-        found += [*_FILES, _devices(sandbox), *_privileges(sandbox)]
+        # PrivateDevices= hides all devices but /dev/null and similar ones, even allowed devices.
+        devices = "DevicePolicy=closed" if sandbox.has_devices else "PrivateDevices=yes"
+        found += [*_FILES, devices, *_privileges(sandbox)]
         found += _STRICT_FILES if is_strict else ()
     return found
 
@@ -157,28 +156,20 @@ def _network(sandbox: Sandbox) -> list[str]:
     return []
 
 
-def _devices(sandbox: Sandbox) -> str:
-    # PrivateDevices= hides all devices but /dev/null and similar ones, even allowed devices.
-    return "DevicePolicy=closed" if sandbox.has_devices else "PrivateDevices=yes"
-
-
 def _privileges(sandbox: Sandbox) -> list[str]:
+    """No capabilities, and a user namespace, unless the nodes run as root.
+
+    In a namespace ptrace(2) and /proc only show the dataflow's own processes. Otherwise they show
+    all processes of the same user. ProtectProc= hides what cannot be traced, which also saves CPU
+    time of dora's daemon: it reads all visible processes every two seconds. With "identity" files
+    keep their owners.
+    """
     if sandbox.is_root:
         # Nodes as root need access to all files; in a user namespace they would be root only there.
         return ["CapabilityBoundingSet=CAP_DAC_OVERRIDE CAP_DAC_READ_SEARCH"]
-    return ["CapabilityBoundingSet=", *_users(sandbox)]
-
-
-def _users(sandbox: Sandbox) -> list[str]:
-    """A user namespace, so that ptrace(2) and /proc only show the dataflow's own processes.
-
-    Otherwise they show all processes of the same user. ProtectProc= hides what cannot be traced,
-    which also saves CPU time of dora's daemon: it reads all visible processes every two seconds.
-    With "identity" files keep their owners.
-    """
     if sandbox.level == "strict":
-        return ["PrivateUsers=yes"]
-    return ["PrivateUsers=identity"] if sandbox.has_identity else []
+        return ["CapabilityBoundingSet=", "PrivateUsers=yes"]
+    return ["CapabilityBoundingSet=", *(["PrivateUsers=identity"] if sandbox.has_identity else [])]
 
 
 def _path_properties(sandbox: Sandbox) -> dict[str, Property]:
@@ -195,19 +186,18 @@ def _path_properties(sandbox: Sandbox) -> dict[str, Property]:
     written = [path for path in writable if path not in bound]
     read = [path for path in needed if _is_below(path, hidden)]
     own = [sandbox.directory] if sandbox.directory else []
-    return {
-        **parse_property(f"ProtectHome={'tmpfs' if hides_home else 'read-only'}"),
-        **parse_property(f"PrivateTmp={format_bool(hides_tmp)}"),
-        **(_empty_but(sandbox.directory) if own else {}),
-        **_words("ReadWritePaths", (*shared, *written)),
-        **_binds("BindPaths", [*bound, *own]),
-        **_binds("BindReadOnlyPaths", [path for path in read if not _is_below(path, bound)]),
-    }
-
-
-def _empty_but(directory: str) -> dict[str, Property]:
-    """Hide other cells' directories: those of the same user contain their tokens."""
-    return parse_property(f"TemporaryFileSystem={directory.rpartition('/')[0]}:ro")
+    texts = [
+        f"ProtectHome={'tmpfs' if hides_home else 'read-only'}",
+        f"PrivateTmp={format_bool(hides_tmp)}",
+        # Hide other cells' directories: those of the same user contain their tokens.
+        *(f"TemporaryFileSystem={directory.rpartition('/')[0]}:ro" for directory in own),
+    ]
+    lists = typed(
+        ReadWritePaths=tuple(dict.fromkeys((*shared, *written))),
+        BindPaths=_binds([*bound, *own]),
+        BindReadOnlyPaths=_binds([path for path in read if not _is_below(path, bound)]),
+    )
+    return with_assignments({}, texts) | {key: one for key, one in lists.items() if one.value}
 
 
 def _can_hide(places: Iterable[str], paths: Sequence[str]) -> bool:
@@ -229,12 +219,6 @@ def _is_below(path: str, places: Iterable[str]) -> bool:
     return any(f"{path}/".startswith(f"{place.rstrip('/')}/") for place in places)
 
 
-def _words(key: str, paths: Iterable[str]) -> dict[str, Property]:
-    words = tuple(dict.fromkeys(paths))
-    return {key: Property(key, "as", words)} if words else {}
-
-
-def _binds(key: str, paths: Sequence[str]) -> dict[str, Property]:
+def _binds(paths: Sequence[str]) -> tuple[tuple[str, str, bool, int], ...]:
     outer = [one for one in dict.fromkeys(paths) if not _is_below(one, {*paths} - {one})]
-    binds = tuple((path, path, False, MS_REC) for path in outer)
-    return {key: Property(key, "a(ssbt)", binds)} if binds else {}
+    return tuple((path, path, False, MS_REC) for path in outer)

@@ -13,12 +13,15 @@ member for another. Parsers raise ValueError or DoraSystemdError; assignments.py
 """
 
 import ipaddress
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Sequence
+from dataclasses import replace
 
+from dora_systemd.decisions.properties import kinds
 from dora_systemd.decisions.properties.kinds import PropertyKind, plain_text
-from dora_systemd.decisions.properties.lists import lines
+from dora_systemd.decisions.properties.lists import items_kind, marked, words_kind
 from dora_systemd.decisions.properties.syntax import escape_specifiers, quote_word, split_words
-from dora_systemd.values import INFINITY, format_duration, parse_duration, parse_size
+from dora_systemd.values import INFINITY, parse_size
 
 Pair = tuple[str, str]
 Device = tuple[str, int]
@@ -33,6 +36,7 @@ Command = tuple[str, tuple[str, ...], tuple[str, ...]]
 MS_REC = 1 << 14
 """The flag of mount(2) that makes a bind mount recursive."""
 
+_RANGE = re.compile("([0-9]{1,9})(?:-([0-9]{1,9}))?")
 _MAX_CPUS = 8192
 _FAMILIES = {4: 2, 6: 10}
 """AF_INET and AF_INET6 of Linux, see address_families(7)."""
@@ -54,7 +58,7 @@ _NETWORKS = {
 }
 
 
-def format_command(command: Command) -> str:
+def _format_command(command: Command) -> str:
     """The command line of `command` for a unit file, see systemd.service(5)."""
     path, argv, flags = command
     prefixes = "".join(char for char, name in _COMMAND_FLAGS.items() if name in flags)
@@ -64,66 +68,52 @@ def format_command(command: Command) -> str:
 
 
 def _parse_command(text: str) -> tuple[Command, ...]:
-    rest = text.strip().lstrip("-:+!@")
-    prefixes = text.strip()[: len(text.strip()) - len(rest)]
-    words = split_words(rest)
-    if not text.strip():
+    command = text.strip()
+    rest = command.lstrip("-:+!@")
+    prefixes, words = command.removesuffix(rest), split_words(rest)
+    if not command:
         return ()
     argv = words[1:] if "@" in prefixes else words
-    if not argv or not words[0].startswith("/") or len(set(prefixes)) < len(prefixes):
+    is_path = bool(argv) and words[0].startswith("/")
+    if not is_path or len(set(prefixes)) < len(prefixes) or "\0" in command:
         raise ValueError("not a command line")
     flags = tuple(name for char, name in _COMMAND_FLAGS.items() if char in prefixes)
-    for word in words:
-        if "\0" in word:
-            raise ValueError("not a command line")
     return ((plain_text(words[0]), tuple(argv), flags),)
 
 
-def _parse_environment_file(text: str) -> tuple[tuple[str, bool], ...]:
-    path = plain_text(text)
-    return ((path.removeprefix("-"), path.startswith("-")),) if path else ()
-
-
-def _format_environment_files(value: Sequence[tuple[str, bool]]) -> Sequence[str]:
-    return lines(["-" * is_optional + escape_specifiers(path) for path, is_optional in value])
-
-
-def _parse_pair(text: str, separator: str) -> tuple[Pair, ...]:
+def _pair_of(text: str, separator: str) -> Pair:
     """Two words; the second one may be empty."""
-    first, _, second = plain_text(text).partition(separator)
-    return ((first, second.strip()),) if first else ()
+    first, _, second = text.partition(separator)
+    if not first:
+        raise ValueError("the first word is missing")
+    return first, second.strip()
 
 
-def _format_pairs(value: Sequence[Pair], separator: str) -> Sequence[str]:
-    return lines(
-        [escape_specifiers(f"{one}{separator}{two}" if two else one) for one, two in value]
-    )
+def _joined(pair: Pair, separator: str) -> str:
+    first, second = pair
+    return f"{first}{separator}{second}" if second else first
 
 
-def _parse_mounts(text: str) -> tuple[Pair, ...]:
-    words = split_words(plain_text(text))
-    pairs = [(plain_text(path), options) for path, _, options in (w.partition(":") for w in words)]
-    if not all(path.startswith("/") for path, _ in pairs):
+def _parse_credential(text: str) -> Pair:
+    name, path = _pair_of(text, ":")
+    # An ID without a path names a credential that the manager passes on, systemd.exec(5).
+    return name, path or name
+
+
+def _parse_mount(word: str) -> Pair:
+    path, _, options = word.partition(":")
+    if not path.startswith("/"):
         raise ValueError("not a path")
-    return tuple(pairs)
-
-
-def _format_mounts(value: Sequence[Pair]) -> Sequence[str]:
-    words = [f"{path}:{options}" if options else path for path, options in value]
-    return [" ".join(quote_word(word) for word in words)]
-
-
-def _parse_binds(text: str) -> tuple[Bind, ...]:
-    return tuple(_parse_bind(word) for word in split_words(plain_text(text)))
+    return path, options
 
 
 def _parse_bind(word: str) -> Bind:
-    source, *rest = plain_text(word).split(":")
+    source, *rest = word.split(":")
     target, option = [*rest, "", ""][:2]
-    path = source.removeprefix("-")
+    is_optional, path = marked("-", source)
     if len(rest) > 2 or not path.startswith("/") or option not in ("", "rbind", "norbind"):
         raise ValueError("not a bind mount")
-    return path, target or path, source != path, 0 if option == "norbind" else MS_REC
+    return path, target or path, is_optional, 0 if option == "norbind" else MS_REC
 
 
 def _format_bind(bind: Bind) -> str:
@@ -140,103 +130,87 @@ def _bandwidth(text: str) -> int:
     return amount if amount == INFINITY else min(amount * factor, INFINITY)
 
 
-def _weight(text: str) -> int:
-    if not text.isascii() or not text.isdigit() or not 1 <= int(text[:9]) <= 10000:
-        raise ValueError("not a weight")
-    return int(text[:9])
-
-
-def _format_amount(amount: int) -> str:
-    return "infinity" if amount == INFINITY else str(amount)
-
-
 def _parse_addresses(text: str) -> tuple[Address, ...]:
-    networks = [net for word in text.split() for net in _NETWORKS.get(word, (word,))]
-    return tuple(_address(ipaddress.ip_network(net, strict=False)) for net in networks)
+    words = [network for word in text.split() for network in _NETWORKS.get(word, (word,))]
+    networks = [ipaddress.ip_network(word, strict=False) for word in words]
+    return tuple(
+        (_FAMILIES[one.version], one.network_address.packed, one.prefixlen) for one in networks
+    )
 
 
-def _address(network: ipaddress.IPv4Network | ipaddress.IPv6Network) -> Address:
-    family = _FAMILIES[network.version]
-    return family, network.network_address.packed, network.prefixlen
-
-
-def _format_addresses(value: Sequence[Address]) -> Sequence[str]:
-    return [" ".join(f"{ipaddress.ip_address(packed)}/{bits}" for _, packed, bits in value)]
+def _format_addresses(value: Sequence[Address]) -> str:
+    return " ".join(f"{ipaddress.ip_address(packed)}/{bits}" for _, packed, bits in value)
 
 
 def _parse_cpus(text: str) -> bytes:
     """A set such as "0-3,8" as a bit mask, lowest byte first."""
     mask = 0
     for word in text.replace(",", " ").split():
-        first, dash, last = word.partition("-")
-        if not all(one.isascii() and one.isdigit() for one in (first, last if dash else first)):
-            raise ValueError("not a set")
-        low, high = int(first[:9]), int((last if dash else first)[:9])
+        found = _RANGE.fullmatch(word)
+        low, high = (int(found[1]), int(found[2] or found[1])) if found else (1, 0)
         if not low <= high < _MAX_CPUS:
-            raise ValueError("not in range")
+            raise ValueError("not a set of numbers")
         mask |= (1 << (high + 1)) - (1 << low)
     return mask.to_bytes((mask.bit_length() + 7) // 8, "little")
 
 
-def _format_cpus(value: bytes) -> Sequence[str]:
+def _format_cpus(value: bytes) -> str:
     mask = int.from_bytes(value, "little")
-    return [" ".join(str(bit) for bit in range(mask.bit_length()) if mask >> bit & 1)]
-
-
-def _device_kind(
-    expected: str, parse: Callable[[str], int], format_: Callable[[int], str]
-) -> PropertyKind:
-    def parse_devices(text: str) -> tuple[Device, ...]:
-        return tuple((path, parse(amount)) for path, amount in _parse_pair(text, " "))
-
-    def format_devices(value: Sequence[Device]) -> Sequence[str]:
-        return lines([f"{escape_specifiers(path)} {format_(amount)}" for path, amount in value])
-
-    return PropertyKind("a(st)", expected, parse_devices, format_devices)
+    return " ".join(str(bit) for bit in range(mask.bit_length()) if mask >> bit & 1)
 
 
 def _pair_kind(separator: str, expected: str) -> PropertyKind:
-    return PropertyKind(
+    return items_kind(
         "a(ss)",
         expected,
-        lambda text: _parse_pair(text, separator),
-        lambda value: _format_pairs(value, separator),
+        lambda text: _pair_of(text, separator),
+        lambda pair: escape_specifiers(_joined(pair, separator)),
     )
+
+
+def _device_kind(amount: PropertyKind, expected: str) -> PropertyKind:
+    def parse_device(text: str) -> Device:
+        path, value = _pair_of(text, " ")
+        return path, amount.parse(value)
+
+    def format_device(device: Device) -> str:
+        path, value = device
+        return f"{escape_specifiers(path)} {amount.format(value)}"
+
+    return items_kind("a(st)", expected, parse_device, format_device)
 
 
 COMMAND = PropertyKind(
     "a(sasas)",
     "a command line with an absolute path, such as /usr/bin/touch /run/x",
     _parse_command,
-    lambda value: lines([format_command(command) for command in value]),
+    lambda value: "\n".join(map(_format_command, value)),
 )
-ENVIRONMENT_FILES = PropertyKind(
+ENVIRONMENT_FILES = items_kind(
     "a(sb)",
     "a path, or - and one that may be absent",
-    _parse_environment_file,
-    _format_environment_files,
+    lambda text: marked("-", text)[::-1],
+    lambda file: "-" * file[1] + escape_specifiers(file[0]),
 )
-CREDENTIALS = PropertyKind(
-    "a(ss)",
-    "ID:PATH",
-    # An ID without a path names a credential that the manager passes on, systemd.exec(5).
-    lambda text: tuple((name, path or name) for name, path in _parse_pair(text, ":")),
-    lambda value: _format_pairs(value, ":"),
+CREDENTIALS = items_kind(
+    "a(ss)", "ID:PATH", _parse_credential, lambda pair: escape_specifiers(":".join(pair))
 )
 DEVICES = _pair_kind(" ", "a device and what is allowed, such as /dev/video0 rw")
 PROGRAMS = _pair_kind(":", "a type and a path, such as egress:/sys/fs/bpf/x")
-MOUNTS = PropertyKind("a(ss)", "paths, each with :OPTIONS or not", _parse_mounts, _format_mounts)
-BINDS = PropertyKind(
-    "a(ssbt)",
-    "SOURCE[:TARGET[:norbind]] with absolute paths",
-    _parse_binds,
-    lambda value: [" ".join(_format_bind(bind) for bind in value)],
+MOUNTS = words_kind(
+    "a(ss)",
+    "paths, each with :OPTIONS or not",
+    _parse_mount,
+    lambda pair: quote_word(_joined(pair, ":")),
 )
-BANDWIDTHS = _device_kind("a device and a rate, such as /dev/sda 5M", _bandwidth, _format_amount)
-WEIGHTS = _device_kind("a device and a weight, such as /dev/sda 200", _weight, str)
-LATENCIES = _device_kind(
-    "a device and a time, such as /dev/sda 25ms", parse_duration, format_duration
+BINDS = words_kind(
+    "a(ssbt)", "SOURCE[:TARGET[:norbind]] with absolute paths", _parse_bind, _format_bind
 )
+BANDWIDTHS = _device_kind(
+    replace(kinds.COUNT_LIMIT, parse=_bandwidth), "a device and a rate, such as /dev/sda 5M"
+)
+WEIGHTS = _device_kind(kinds.WEIGHT, "a device and a weight, such as /dev/sda 200")
+LATENCIES = _device_kind(kinds.DURATION, "a device and a time, such as /dev/sda 25ms")
 ADDRESSES = PropertyKind(
     "a(iayu)",
     "networks such as 10.0.0.0/8, or any, localhost, link-local, multicast",

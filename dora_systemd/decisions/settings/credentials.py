@@ -4,6 +4,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
+from dora_systemd.decisions.properties.assignments import typed
 from dora_systemd.decisions.properties.kinds import Property
 from dora_systemd.decisions.settings.kinds import PATH, Base, Kind, Setting, scalar_text, texts_of
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -24,9 +25,7 @@ def parse_credentials(value: Any, base: Base) -> Mapping[str, str]:
 
 def credential_properties(files: Mapping[str, str]) -> dict[str, Property]:
     """LoadCredential= of systemd.exec(5). files: absolute path by name."""
-    if not files:
-        return {}
-    return {"LoadCredential": Property("LoadCredential", "a(ss)", tuple(files.items()))}
+    return typed(LoadCredential=tuple(files.items())) if files else {}
 
 
 def _parse_one(text: str, base: Base) -> tuple[str, str]:

@@ -6,13 +6,17 @@ wrote for a transient unit: both are equivalent for the same dataflow.
 
 import posixpath
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 from dora_systemd.decisions.cell.options import RunnerOptions, options_from_command
-from dora_systemd.decisions.properties.assignments import parse_line, with_properties
+from dora_systemd.decisions.properties.assignments import (
+    format_property,
+    parse_line,
+    typed,
+    with_properties,
+)
 from dora_systemd.decisions.properties.kinds import Property
 from dora_systemd.decisions.properties.structs import MS_REC
-from dora_systemd.decisions.properties.table import TABLE
 from dora_systemd.errors import DoraSystemdError
 
 BOOT_TARGET = "dora.target"
@@ -21,6 +25,9 @@ BOOT_TARGET = "dora.target"
 HEADER = "# Written by doractl(1). To change something: systemctl edit, see dora-systemd(7).\n"
 
 _SECTION = re.compile(r"\[([^\]]+)\]")
+_BLANKS = " \t\r"
+_COMMENT = re.compile(rf"^[{_BLANKS}]*[#;].*\n?", re.MULTILINE)
+_CONTINUED = re.compile(rf"\\[{_BLANKS}]*(?:\n[{_BLANKS}]*|\Z)")
 _SPECIFIER = re.compile(r"%[a-zA-Z]")
 _ORDERS = ("After=default.target", "After=multi-user.target")
 _MOUNTABLE = re.compile(r"[^\x00-\x1f\x7f\"'\\]+")
@@ -28,6 +35,12 @@ _TRANSIENT = "# This is a transient unit file"
 # A bind mount as systemd 257 writes it into such a file. systemd quotes nothing there, and would
 # itself read other paths from a line with blanks.
 _TRANSIENT_BIND = re.compile(r"(Bind(?:ReadOnly)?Paths)=(-?)(/[^:]*):(/[^:]*):(rbind|norbind)")
+
+
+def format_sections(sections: Mapping[str, Sequence[str]]) -> str:
+    """The text of a unit file, from its lines by section."""
+    parts = ["\n".join((f"[{name}]", *lines)) for name, lines in sections.items() if lines]
+    return "\n\n".join(parts) + "\n"
 
 
 def plain_target(is_user: bool) -> str:
@@ -48,12 +61,12 @@ def persistent_unit(
     boot += [] if is_user else _mounts(options)
     unit += [line for line in boot if line not in unit]
     sections["Install"] = [f"WantedBy={target}"]
-    return _format(sections)
+    return HEADER + format_sections(sections)
 
 
 def without_install(text: str) -> str:
     """The unit file without its [Install] section."""
-    return _format(_sections([text]))
+    return HEADER + format_sections(_sections([text]))
 
 
 def runner_of(text: str) -> RunnerOptions | None:
@@ -62,9 +75,8 @@ def runner_of(text: str) -> RunnerOptions | None:
     commands = [line.partition("=")[2] for line in lines if re.match(r"ExecStart\s*=\s*\S", line)]
     if len(commands) != 1:
         return None
-    kind = TABLE["ExecStart"].choices[0][1]
     try:
-        ((_, argv, _),) = kind.parse(commands[0])
+        ((_, argv, _),) = parse_line("ExecStart", commands[0])["ExecStart"].value
         return options_from_command([word.replace("%%", "%") for word in argv])
     except (DoraSystemdError, ValueError):
         return None
@@ -112,11 +124,6 @@ def _mounts(options: RunnerOptions) -> list[str]:
     return [f"RequiresMountsFor={' '.join(words)}"] if words else []
 
 
-def _format(sections: Mapping[str, Sequence[str]]) -> str:
-    parts = ["\n".join((f"[{name}]", *lines)) for name, lines in sections.items() if lines]
-    return HEADER + "\n\n".join(parts) + "\n"
-
-
 def _sections(texts: Sequence[str]) -> dict[str, list[str]]:
     """The lines of all texts by section, without comments and lines that belong to another file."""
     sections: dict[str, list[str]] = {"Unit": [], "Service": []}
@@ -139,22 +146,12 @@ def _quoted_bind(line: str) -> str:
         return line
     key, optional, source, target, option = found.groups()
     bind = (source, target, bool(optional), MS_REC if option == "rbind" else 0)
-    (text,) = TABLE[key].choices[0][1].format((bind,))
-    return f"{key}={text}"
+    (quoted,) = format_property(key, typed(**{key: (bind,)}))
+    return quoted
 
 
-def _logical_lines(text: str) -> Iterator[str]:
+def _logical_lines(text: str) -> list[str]:
     """Lines without comments; a backslash at the end joins the next line."""
-    pending = ""
+    joined = _CONTINUED.sub(" ", _COMMENT.sub("", text))
     # Not splitlines(): only a newline ends a line here.
-    for raw in text.split("\n"):
-        line = raw.strip(" \t\r")
-        if (not line and not pending) or line.startswith(("#", ";")):
-            continue
-        if line.endswith("\\"):
-            pending += line[:-1] + " "
-            continue
-        yield pending + line
-        pending = ""
-    if pending:
-        yield pending.rstrip()
+    return [line for raw in joined.split("\n") if (line := raw.strip(_BLANKS))]

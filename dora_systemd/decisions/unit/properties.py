@@ -3,9 +3,8 @@
 Keys are those of unit files; the values have the types of StartTransientUnit.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 from dora_systemd.decisions.cell.environment import checked_variable, environment_entries
 from dora_systemd.decisions.cell.options import (
@@ -19,16 +18,20 @@ from dora_systemd.decisions.life.stop_budget import unit_timeout
 from dora_systemd.decisions.properties.assignments import (
     Properties,
     format_property,
-    parse_property,
+    parse_line,
+    typed,
+    with_assignments,
     with_properties,
 )
 from dora_systemd.decisions.properties.kinds import Property
 from dora_systemd.decisions.properties.sandbox import Sandbox, sandbox_properties
+from dora_systemd.decisions.properties.structs import Command
 from dora_systemd.decisions.properties.table import TABLE
 from dora_systemd.decisions.settings.credentials import credential_properties
 from dora_systemd.decisions.settings.limits import REALTIME
 from dora_systemd.decisions.settings.resolve import Settings
 from dora_systemd.decisions.settings.table import PROPERTY
+from dora_systemd.decisions.unit.file import format_sections
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import SLICE
 from dora_systemd.scope import RUNTIME_NAME
@@ -68,12 +71,10 @@ def unit_properties(
     caller in user scope.
     """
     own = {
-        **identity_properties(options),
         **service_properties(options, context),
         **stop_properties(options),
         **restart_properties(options),
         **cgroup_properties(),
-        **memory_lock_properties(),
         **directory_properties(options),
         **environment_properties(context),
         **credential_properties(context.credentials),
@@ -83,9 +84,12 @@ def unit_properties(
         **realtime_properties(settings),
     }
     properties = with_properties(own, settings_properties(settings))
-    for assignment in settings[PROPERTY]:
-        properties = with_properties(properties, _given_property(assignment, settings))
-    return properties
+    assignments = settings[PROPERTY]
+    try:
+        return with_assignments(properties, assignments)
+    except DoraSystemdError as error:
+        message = f"{error.message} ({settings.source(PROPERTY)})"
+        raise DoraSystemdError(message, error.hint, error.code) from error
 
 
 def format_unit(properties: Properties) -> str:
@@ -95,43 +99,36 @@ def format_unit(properties: Properties) -> str:
         row = TABLE.get(slot.removesuffix("~"))
         section = row.section if row else "Service"
         sections[section] += format_property(slot, properties)
-    texts = ["\n".join([f"[{name}]", *body]) for name, body in sections.items() if body]
-    return "\n\n".join(texts) + "\n"
-
-
-def identity_properties(options: RunnerOptions) -> dict[str, Property]:
-    """The description of the unit, and its slice."""
-    return typed(Description=f"dora dataflow {options.name}", Slice=SLICE)
+    return format_sections(sections)
 
 
 def service_properties(options: RunnerOptions, context: UnitContext) -> dict[str, Property]:
-    """The runner as the main process of a Type=notify service, see systemd.service(5).
-
-    "no-env-expand" is ":" in a unit file: a "$" in a path stays as it is.
-    """
-    argv = tuple(runner_command(context.python, options))
-    post = tuple(post_command(context.python, options))
-    reload = tuple(reload_command(context.python))
-    # The runner reports late nodes itself; systemd's timeout is for a runner that hangs.
-    is_endless = options.start_timeout == INFINITY
+    """The runner as the main process of a Type=notify service, see systemd.service(5)."""
     pause = 0 if options.restart.policy == "no" else options.restart.max_delay
-    most = pause + options.start_timeout + START_MARGIN
-    start_timeout = INFINITY if is_endless else most
+    # The runner reports late nodes itself; systemd's timeout is for a runner that hangs.
+    most = min(pause + options.start_timeout + START_MARGIN, INFINITY)
     return typed(
+        Description=f"dora dataflow {options.name}",
+        Slice=SLICE,
         Type="notify",
         NotifyAccess="main",
-        ExecStart=((argv[0], argv, ("no-env-expand",)),),
-        ExecStopPost=((post[0], post, ("ignore-failure", "no-env-expand")),),
-        ExecReload=((reload[0], reload, ("no-env-expand",)),),
+        ExecStart=_command(runner_command(context.python, options)),
+        ExecStopPost=_command(post_command(context.python, options), "ignore-failure"),
+        ExecReload=_command(reload_command(context.python)),
         # Two pipes for each node, so that their content survives a kill of the runner.
         FileDescriptorStoreMax=4096,
         # Never the project: Python could find its modules before the runner's.
         WorkingDirectory="/",
-        TimeoutStartSec=start_timeout,
+        TimeoutStartSec=most,
         WatchdogSec=WATCHDOG,
         # An OOM kill of one node must not end the others; the runner reports it.
         OOMPolicy="continue",
     )
+
+
+def _command(argv: Sequence[str], *flags: str) -> Sequence[Command]:
+    # ":" in a unit file: a "$" in a path stays as it is.
+    return ((argv[0], tuple(argv), (*flags, "no-env-expand")),)
 
 
 def stop_properties(options: RunnerOptions) -> dict[str, Property]:
@@ -169,7 +166,10 @@ def restart_properties(options: RunnerOptions) -> dict[str, Property]:
 def cgroup_properties() -> dict[str, Property]:
     """A delegated cgroup with accounting and without limits, see systemd.resource-control(5).
 
-    TasksMax=infinity: systemd's default would be an implicit limit.
+    TasksMax=infinity: systemd's default would be an implicit limit. LimitMEMLOCK=infinity, see
+    systemd.exec(5): each node of dora locks 8 MiB of shared memory for messages. With systemd's
+    default of 8 MiB in total nodes fall back to copying. A user's manager can only grant its own
+    limit.
     """
     return typed(
         Delegate=True,
@@ -179,16 +179,7 @@ def cgroup_properties() -> dict[str, Property]:
         TasksAccounting=True,
         IOAccounting=True,
         TasksMax=INFINITY,
-    )
-
-
-def memory_lock_properties() -> dict[str, Property]:
-    """No limit on locked memory, see systemd.exec(5).
-
-    Each node of dora locks 8 MiB of shared memory for messages. With systemd's default of 8 MiB in
-    total nodes fall back to copying. A user's manager can only grant its own limit.
-    """
-    return parse_property("LimitMEMLOCK=infinity")
+    ) | parse_line("LimitMEMLOCK", "infinity")
 
 
 def directory_properties(options: RunnerOptions) -> dict[str, Property]:
@@ -222,24 +213,20 @@ def log_properties(options: RunnerOptions, context: UnitContext) -> dict[str, Pr
     if context.is_user:
         return common
     fields = (f"DORA_DATAFLOW={options.uuid}", f"DORA_DATAFLOW_NAME={options.name}")
-    extra = tuple(field.encode() for field in fields)
-    # A limit that is never reached: systemd 257 does not pass 0 on to journald, which then applies
-    # its own.
-    limits = typed(LogRateLimitIntervalSec=SECOND, LogRateLimitBurst=500_000_000)
-    return common | typed(LogExtraFields=extra) | limits
+    return common | typed(
+        LogExtraFields=tuple(field.encode() for field in fields),
+        # A limit that is never reached: systemd 257 does not pass 0 on to journald, which then
+        # applies its own.
+        LogRateLimitIntervalSec=SECOND,
+        LogRateLimitBurst=500_000_000,
+    )
 
 
 def settings_properties(settings: Settings) -> dict[str, Property]:
     """The properties of settings with a `property` and a value, such as MemoryMax=."""
-    properties: dict[str, Property] = {}
-    for setting in settings.table:
-        value = settings[setting]
-        if setting.property and value != setting.default:
-            texts = setting.kind.format(value)
-            for text in texts:
-                given = parse_property(f"{setting.property}={text}")
-                properties = with_properties(properties, given)
-    return properties
+    given = [one for one in settings.table if one.property and settings[one] != one.default]
+    texts = (f"{one.property}={text}" for one in given for text in one.kind.format(settings[one]))
+    return with_assignments({}, texts)
 
 
 def realtime_properties(settings: Settings) -> dict[str, Property]:
@@ -248,24 +235,5 @@ def realtime_properties(settings: Settings) -> dict[str, Property]:
     if given is None:
         return {}
     policy, _, priority = given.partition(":")
-    return {
-        **parse_property(f"CPUSchedulingPolicy={policy}"),
-        **parse_property(f"CPUSchedulingPriority={priority}"),
-    }
-
-
-def _given_property(assignment: str, settings: Settings) -> dict[str, Property]:
-    try:
-        return parse_property(assignment)
-    except DoraSystemdError as error:
-        message = f"{error.message} ({settings.source(PROPERTY)})"
-        raise DoraSystemdError(message, error.hint, error.code) from error
-
-
-def typed(**values: Any) -> dict[str, Property]:
-    """Properties by key of the unit file, from values with their types on D-Bus."""
-    properties = {}
-    for key, value in values.items():
-        name, kind = TABLE[key].choices[-1]
-        properties[key] = Property(name, kind.signature, value)
-    return properties
+    texts = (f"CPUSchedulingPolicy={policy}", f"CPUSchedulingPriority={priority}")
+    return with_assignments({}, texts)

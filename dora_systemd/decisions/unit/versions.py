@@ -42,11 +42,13 @@ no command line, or a different one."""
 
 _PLAIN_FLAGS = frozenset({"ignore-failure", "no-env-expand"})
 
-# The runner creates the group and moves into it if systemd does not.
-_REPLACED = frozenset({"DelegateSubgroup"})
-
-# The sandbox uses it if possible, as dora-systemd(7) says; no warning if not.
-_WELCOME = {"PrivateUsers": "identity"}
+_SILENT = {
+    # The runner creates the group and moves into it if systemd does not.
+    "DelegateSubgroup": "supervisor",
+    # The sandbox uses it if possible, as dora-systemd(7) says.
+    "PrivateUsers": "identity",
+}
+"""Values of ours that are left out without a warning."""
 
 
 def drop_unsupported(
@@ -66,15 +68,14 @@ def drop_unsupported(
         f"{slot.removesuffix('~')}= is left out: systemd {systemd_version} lacks it, "
         f"version {_since(one)} has it"
         for slot, one in dropped.items()
-        if slot not in _REPLACED and one.value != _WELCOME.get(slot)
+        if one.value != _SILENT.get(slot)
     )
     return kept, warnings
 
 
 def lacking(systemd_version: int) -> list[str]:
     """Names on D-Bus of the properties that this systemd does not support."""
-    later = (names for version, names in _ADDED.items() if version > systemd_version)
-    return [name for names in later for name in names]
+    return [name for name, version in _SINCE.items() if version > systemd_version]
 
 
 def transient_commands(properties: Iterable[Told], systemd_version: int) -> list[Told]:

@@ -16,7 +16,7 @@ from dora_systemd.adapters.dora.command import DORA_SECONDS
 from dora_systemd.adapters.host.process import Beside, Completed, read_streams, run_command
 from dora_systemd.decisions.cell.options import check_command
 from dora_systemd.decisions.life.refusal import parse_refusal
-from dora_systemd.decisions.unit.properties import typed
+from dora_systemd.decisions.properties.assignments import typed
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.trust.programs import own_account
 from dora_systemd.values import SECOND, shown

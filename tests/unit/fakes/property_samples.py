@@ -122,7 +122,7 @@ def settable_keys() -> list[str]:
             if error.hint == "leave it out":
                 continue
         keys.append(key)
-    return [key for key in keys if not (key.startswith("Limit") and key.endswith("Soft"))]
+    return keys
 
 
 def sample(key: str) -> str:
