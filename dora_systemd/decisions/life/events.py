@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from dora_systemd.decisions.cell.exits import Exit
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.descriptor.wiring import Downstream
 from dora_systemd.decisions.life.causes import Cause
@@ -81,14 +82,13 @@ class AllReady(Event):
 class NodeExited(Event):
     """A process of the node has exited.
 
-    exit: "" for success, else "exit code 1" or "signal SIGKILL".
     will_restart: dora is going to execute it again.
     is_stale: a newer process of the node is already running.
     oom: the OOM kill, if the kernel killed it because of memory.
     """
 
     node: str
-    exit: str
+    exit: Exit
     will_restart: bool
     is_stale: bool = False
     oom: Oom | None = None
@@ -124,20 +124,20 @@ class RunFinished(Event):
 
 @dataclass(frozen=True)
 class ResultKnown(Event):
-    """dora's results of an ended run. results: node id -> "" or why it failed; empty: unknown."""
+    """dora's results of an ended run. results: by node id; empty: unknown."""
 
-    results: Mapping[str, str] = field(default_factory=dict)
+    results: Mapping[str, Exit] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class ChildExited(Event):
     """A child process has exited.
 
-    child: "coordinator" or "daemon". exit: how. oom: as in NodeExited.
+    child: "coordinator" or "daemon". oom: as in NodeExited.
     """
 
     child: str
-    exit: str
+    exit: Exit
     oom: Oom | None = None
 
 

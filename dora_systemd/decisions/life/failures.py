@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 
+from dora_systemd.decisions.cell.exits import Exit
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.life.states import Action, Cell, Deadline, Do, Record, RunnerExit, State
@@ -63,13 +64,13 @@ def child_exited(cell: Cell, event: life.Event) -> Step:
 def connection_lost(cell: Cell, event: life.Event) -> Step:
     """A lost connection means the same as an exited child."""
     assert isinstance(event, life.ConnectionLost)
-    return _lose(cell, event.child, event.reason, "")
+    return _lose(cell, event.child, event.reason, Exit())
 
 
-def _lose(cell: Cell, child: str, reason: str, how: str) -> Step:
+def _lose(cell: Cell, child: str, reason: str, exit: Exit) -> Step:
     cell = because(cell, Cause(f"{child}-lost"))
     cell, actions = fail(cell, reason, RunnerExit.ENGINE_LOST)
-    return cell, (Record(f"{child}-lost", "", {"exit": how} if how else {}), *actions)
+    return cell, (Record(f"{child}-lost", "", exit.details()), *actions)
 
 
 def engine_deadline(cell: Cell, event: life.Event) -> Step:  # noqa: ARG001 - as all handlers

@@ -208,7 +208,11 @@ def result(cell: Cell, event: life.Event) -> Step:
     if not event.results:
         lost = because(cell, Cause.NO_ANSWER)
         return fail(lost, "dora lost the dataflow", RunnerExit.ENGINE_LOST)
-    failed = {node: _known_exit(cell, node, how) for node, how in event.results.items() if how}
+    failed = {
+        node: str(cell.nodes[node].exit if node in cell.nodes else how)
+        for node, how in event.results.items()
+        if how.is_failure
+    }
     spent = table.spent(cell.nodes)
     if failed or spent:
         reason = ", ".join(f"node {node}: {how}" for node, how in {**failed, **spent}.items())
@@ -216,10 +220,6 @@ def result(cell: Cell, event: life.Event) -> Step:
         cell = because(cell, Cause.NODE_FAILED, {**failed, **spent})
         cell = replace(cell, failure=reason, exit=code)
     return _leave(cell)
-
-
-def _known_exit(cell: Cell, node: str, how: str) -> str:
-    return cell.nodes[node].exit if node in cell.nodes else how
 
 
 def stop_while_closing(cell: Cell, event: life.Event) -> Step:

@@ -2,7 +2,9 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from signal import SIGKILL
 
+from dora_systemd.decisions.cell.exits import Exit, ExitKind
 from dora_systemd.decisions.cell.status import HELD, NodeStatus
 from dora_systemd.decisions.life import events as life
 
@@ -10,7 +12,7 @@ Nodes = Mapping[str, NodeStatus]
 RecordParts = tuple[str, str, Mapping[str, str]]
 """Name, node and details of the life event for the journal."""
 
-KILLED = "signal SIGKILL"
+_KILLED = Exit(ExitKind.SIGNAL, SIGKILL)
 _WITH_PROCESS = frozenset({"starting", "ready", "running"})
 
 
@@ -46,7 +48,7 @@ def update(
         case life.NodeExited():
             return _exited(nodes, event, is_stopping)
         case life.NodeCascaded():
-            exit = f"node {event.by} failed before the start"
+            exit = Exit(by=event.by)
             return _set(nodes, event.node, event.at_us, state="failed", exit=exit), None
         case life.NodeHung():
             return _hung(nodes, event)
@@ -65,7 +67,7 @@ def reshape(nodes: Nodes, event: life.Event) -> Nodes:
     return nodes
 
 
-def _set(nodes: Nodes, ident: str, at_us: int, **changes: str | int) -> Nodes:
+def _set(nodes: Nodes, ident: str, at_us: int, **changes: str | int | Exit) -> Nodes:
     old = nodes.get(ident, NodeStatus())
     if changes.get("state") != old.state:
         changes["since_us"] = at_us
@@ -100,12 +102,12 @@ def _exited(
     old = nodes.get(event.node, NodeStatus())
     if old.state == "reloading" and not is_stopping and not event.is_stale:
         nodes = {**nodes, event.node: old._replace(pid=0)}
-        return nodes, ("node-exited", event.node, {"exit": event.exit} if event.exit else {})
+        return nodes, ("node-exited", event.node, event.exit.details())
     if event.will_restart and old.policy == HELD:
         # The long delay in dora keeps this node down until a reload starts it again.
         event = replace(event, will_restart=False)
-    if old.hung and event.exit:  # the signal of the health check explains nothing
-        event = replace(event, exit=f"hung, {old.hung}")
+    if old.hung and event.exit.is_failure:  # the signal of the health check explains nothing
+        event = replace(event, exit=Exit(ExitKind.HUNG, words=old.hung))
     name, details = _words_of(event, is_stopping)
     if event.is_stale and not event.will_restart:
         return nodes, None  # a newer process has replaced it
@@ -129,8 +131,8 @@ def _words_of(event: life.NodeExited, is_stopping: bool) -> tuple[str, Mapping[s
     """Name and details of the record about the end of a node."""
     if event.oom is not None:
         return "node-oom", event.oom.node_details()
-    name = "node-crashed" if event.exit and not is_stopping else "node-exited"
-    return name, {"exit": event.exit} if event.exit else {}
+    name = "node-crashed" if event.exit.is_failure and not is_stopping else "node-exited"
+    return name, event.exit.details()
 
 
 def _state_after(event: life.NodeExited, is_stopping: bool) -> str:
@@ -138,22 +140,21 @@ def _state_after(event: life.NodeExited, is_stopping: bool) -> str:
         return "stopped"
     if event.will_restart:
         return "restarting"
-    return "failed" if event.exit else "finished"
+    return "failed" if event.exit.is_failure else "finished"
 
 
 def spent(nodes: Nodes) -> dict[str, str]:
     """Nodes that have failed for good because their restarts are used up."""
     return {
-        ident: f"{node.exit or 'ended'} after {_restarts(node.restarts)}"
+        ident: f"{str(node.exit) or 'ended'} after {_restarts(node.restarts)}"
         for ident, node in nodes.items()
         if _is_spent(node)
     }
 
 
 def _is_spent(node: NodeStatus) -> bool:
-    is_cascaded = node.exit.startswith("node ") or " because node " in node.exit
     if node.state == "failed":
-        return node.policy not in ("never", HELD) and not is_cascaded
+        return node.policy not in ("never", HELD) and not node.exit.by
     is_used_up = 0 < node.max_restarts <= node.restarts
     return node.state == "finished" and node.policy == "always" and is_used_up
 
@@ -162,12 +163,13 @@ def _restarts(count: int) -> str:
     return "1 restart" if count == 1 else f"{count} restarts"
 
 
-def apply_results(nodes: Nodes, results: Mapping[str, str], at_us: int) -> Nodes:
+def apply_results(nodes: Nodes, results: Mapping[str, Exit], at_us: int) -> Nodes:
     """The table with dora's results, which have causes that no event has."""
     for ident, how in results.items():
-        if ident in nodes and (how or nodes[ident].state not in ("failed", "stopped")):
-            state = "failed" if how else "finished"
+        if ident in nodes and (how.is_failure or nodes[ident].state not in ("failed", "stopped")):
+            state = "failed" if how.is_failure else "finished"
             # For an OOM kill, dora only knows the signal.
-            words = (nodes[ident].exit or how) if how == KILLED else how
-            nodes = _set(nodes, ident, at_us, state=state, exit=words, pid=0)
+            is_known = how == _KILLED and nodes[ident].exit.is_failure
+            exit = nodes[ident].exit if is_known else how
+            nodes = _set(nodes, ident, at_us, state=state, exit=exit, pid=0)
     return nodes

@@ -61,7 +61,7 @@ def _format_running(cell: Cell) -> str:
 
 
 def _with_exit(ident: str, node: NodeStatus) -> str:
-    return f"{ident} ({node.exit})" if node.exit else ident
+    return f"{ident} ({node.exit})" if node.exit.is_failure else ident
 
 
 def _names(texts: list[str]) -> str:

@@ -7,6 +7,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from dora_systemd.decisions.cell.exits import ExitKind, parse_exit
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.views.dataflows import (
     FAILED,
@@ -123,12 +124,13 @@ def final_crashes(life: Life) -> list[Happening]:
 
 
 def _crash(crash: Happening) -> _Finding:
-    how = crash.detail("exit") or "ended, how is not recorded"
+    exit = parse_exit(crash.detail("exit"))
     cause = Cause.NODE_FAILED
     if crash.name == "node-oom":
         cause = Cause.NODE_OUT_OF_MEMORY
-    elif how.startswith("hung"):
+    elif exit.kind is ExitKind.HUNG:
         cause = Cause.NODE_HUNG
+    how = str(exit) or "ended, how is not recorded"
     return _Finding(cause, f"node {crash.node}: {how}", crash, crash.node)
 
 

@@ -1,10 +1,12 @@
 """Formats the verdict of `doractl why`: as one screen of text, or as values for JSON."""
 
 import re
+import signal
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from dora_systemd.decisions.cell.exits import ExitKind, parse_exit
 from dora_systemd.decisions.cell.restarts import budget_words
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.views.dataflows import RESTARTING, UNKNOWN, local_time
@@ -52,10 +54,10 @@ _MEMORY_REMEDIES = {
     "machine": "the machine is short of memory: limit single nodes (--node-limit NODE:memory=SIZE)",
 }
 """By the owner of the exceeded memory limit, unless it is the node."""
-_SIGNAL_REMEDIES = {
-    "SIGKILL": "find out who killed {node}: journalctl -k, or somebody's kill -9",
+_SIGNAL_REMEDIES: Mapping[int, str] = {
+    signal.SIGKILL: "find out who killed {node}: journalctl -k, or somebody's kill -9",
     **dict.fromkeys(
-        ("SIGSEGV", "SIGABRT", "SIGBUS", "SIGILL", "SIGFPE"),
+        (signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS, signal.SIGILL, signal.SIGFPE),
         "fix {node}; coredumpctl info {pid} shows where it crashed",
     ),
 }
@@ -128,9 +130,9 @@ def _remedy(verdict: Verdict) -> str:
     if verdict.cause is Cause.NODE_OUT_OF_MEMORY:
         owner = verdict.details.get("owner", "")
         return _MEMORY_REMEDIES.get(owner, _REMEDIES[verdict.cause])
-    signal = verdict.details.get("exit", "").removeprefix("signal ")
-    if verdict.cause is Cause.NODE_FAILED and signal in _SIGNAL_REMEDIES:
-        return _SIGNAL_REMEDIES[signal]
+    exit = parse_exit(verdict.details.get("exit", ""))
+    if verdict.cause is Cause.NODE_FAILED and exit.kind is ExitKind.SIGNAL:
+        return _SIGNAL_REMEDIES.get(exit.number, _REMEDIES[verdict.cause])
     return _REMEDIES.get(verdict.cause, "")
 
 

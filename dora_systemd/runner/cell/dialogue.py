@@ -10,6 +10,7 @@ from typing import Any
 
 from dora_systemd.adapters.dora import engine
 from dora_systemd.adapters.host import notify
+from dora_systemd.decisions.cell.exits import Exit
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.dora import protocol
 from dora_systemd.decisions.life import events as life
@@ -103,9 +104,11 @@ class Dialogue:
         self._pipes.add_output(child.label, child.output, on_line)
         engine.watch(self._loop, child, self._child_exited)
 
-    def _child_exited(self, label: str, how: str) -> None:
+    def _child_exited(self, label: str, exit: Exit) -> None:
         oom = self._nodes.find_oom_of_dora()
-        event = life.ChildExited(now_us(), label, how if oom is None else oom.text, oom)
+        event = life.ChildExited(
+            now_us(), label, exit if oom is None else Exit(words=oom.text), oom
+        )
         self._loop.call_later(_SETTLE_SECONDS, self._pump.push, event)
 
     def read_coordinator(self, line: str) -> None:
@@ -148,7 +151,7 @@ class Dialogue:
             node = self._pump.cell.nodes.get(event.node)
             is_stale = node is not None and self._nodes.has_process(event.node, node.pid)
             event = protocol.with_facts(event, is_stale, self._nodes.find_oom(event.node))
-            if node is not None and event.exit and event.will_restart and not is_stale:
+            if node is not None and event.exit.is_failure and event.will_restart and not is_stale:
                 self._nodes.clear(event.node, node.pid)
         if event is not None:
             self._pump.push(event)
@@ -191,7 +194,7 @@ class Dialogue:
         # The daemon writes the last output of its nodes after it has reported their exit.
         await self._nodes.wait_quiet(_QUIET_SECONDS)
         if not self._engine.dismiss_daemon():
-            self._pump.push(life.ChildExited(now_us(), "daemon", "earlier"))
+            self._pump.push(life.ChildExited(now_us(), "daemon", Exit(words="earlier")))
 
     async def feed_watchdog(self, seconds: float) -> None:
         """Send WATCHDOG=1 every `seconds`, and wait for nothing in between.

@@ -106,7 +106,7 @@ class Swapper:
         state = self._pump.cell.nodes[node]
         if state.state not in _READY:
             late = f"not ready within {format_duration(int(READY_SECONDS * SECOND))}"
-            raise NotReady(f"node {node}: {state.exit or late}")
+            raise NotReady(f"node {node}: {str(state.exit) or late}")
 
 
 def _is_restartable(node: NodeStatus) -> bool:

@@ -1,5 +1,6 @@
 """The live table while reloads change which nodes there are."""
 
+from dora_systemd.decisions.cell.exits import Exit, exit_of
 from dora_systemd.decisions.cell.status import HELD, NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.nodes import has_process, reshape, update
@@ -23,7 +24,7 @@ def test_a_swap_is_no_crash_and_no_restart() -> None:
     assert updated(
         RUNNING,
         life.NodeReloading(1, "a", fresh),
-        life.NodeExited(2, "a", "", True),
+        life.NodeExited(2, "a", Exit(), True),
         life.NodeSpawned(3, "a", 8),
         life.NodeReady(4, "a"),
     ) == ["reloading", "reloading node-exited", "starting", "running node-ready"]
@@ -34,14 +35,14 @@ def test_the_old_one_may_end_after_its_successor_has_begun() -> None:
         RUNNING,
         life.NodeReloading(1, "a"),
         life.NodeSpawned(2, "a", 8),
-        life.NodeExited(3, "a", "signal SIGTERM", False, is_stale=True),
+        life.NodeExited(3, "a", exit_of(-15), False, is_stale=True),
         life.NodeReady(4, "a"),
     ) == ["reloading", "starting", "starting", "running node-ready"]
 
 
 def test_a_node_that_is_held_fails_and_is_not_restarted() -> None:
     nodes, record = update(
-        RUNNING, life.NodeExited(1, "a", "exit code 1", True), is_stopping=False, is_open=True
+        RUNNING, life.NodeExited(1, "a", exit_of(1), True), is_stopping=False, is_open=True
     )
     assert record is not None
     assert (nodes["a"].state, nodes["a"].restarts, record[0]) == ("failed", 2, "node-crashed")

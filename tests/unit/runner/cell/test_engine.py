@@ -13,6 +13,7 @@ import pytest
 from websockets.asyncio.server import ServerConnection, serve
 
 from dora_systemd.adapters.dora import engine
+from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.dora.protocol import LogRecord
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
@@ -144,7 +145,7 @@ def test_the_daemon_is_asked_to_end_in_good_order(tmp_path: Path) -> None:
         assert not bench.engine.dismiss_daemon(), "there is none"
         daemon = bench.daemon()
         assert bench.engine.dismiss_daemon()
-        assert await exits(daemon) == ("daemon", "signal SIGINT")
+        assert await exits(daemon) == ("daemon", exit_of(-2))
         assert not bench.engine.dismiss_daemon(), "it has left"
 
     live(tmp_path, work)
