@@ -208,30 +208,5 @@ class DeadlinePassed(Event):
     """The current state has lasted too long."""
 
 
-EVENTS: tuple[type[Event], ...] = (
-    CoordinatorListening,
-    DaemonConnected,
-    RunStarted,
-    Subscribed,
-    Refused,
-    Failed,
-    NodeSpawned,
-    NodeReady,
-    AllReady,
-    NodeExited,
-    NodeCascaded,
-    NodeHung,
-    StartTimedOut,
-    RunFinished,
-    ResultKnown,
-    ChildExited,
-    ConnectionLost,
-    StopAsked,
-    StopAnswered,
-    NodeReloading,
-    NodeAdded,
-    NodeRemoved,
-    ReloadNoted,
-    ReloadAsked,
-    DeadlinePassed,
-)
+EVENTS = tuple(Event.__subclasses__())
+"""All of them, in this order."""

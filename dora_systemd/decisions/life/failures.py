@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from typing import Any
 
 from dora_systemd.decisions.cell.exits import Exit
 from dora_systemd.decisions.life import events as life
@@ -11,7 +12,8 @@ from dora_systemd.decisions.resources.oom import Owner
 from dora_systemd.values import SECOND
 
 Step = tuple[Cell, tuple[Action, ...]]
-Handler = Callable[[Cell, life.Event], Step]
+Handler = Callable[[Cell, Any], Step]
+"""Any: each takes the events that TABLE lists it for."""
 
 ENGINE_TIMEOUT = 30 * SECOND
 """µs; dora's own timeout for answers between its parts."""
@@ -22,9 +24,8 @@ def to(cell: Cell, state: State, *actions: Action, after: int | None = None) -> 
     return replace(cell, state=state), (*actions, Deadline(after))
 
 
-def refused(cell: Cell, event: life.Event) -> Step:
+def refused(cell: Cell, event: life.Refused) -> Step:
     """dora refuses the dataflow, or a request of the runner."""
-    assert isinstance(event, life.Refused)
     return fail(because(cell, event.cause), event.reason, RunnerExit.FAILED)
 
 
@@ -33,9 +34,8 @@ def because(cell: Cell, cause: Cause, nodes: Iterable[str] = ()) -> Cell:
     return replace(cell, cause=cause, culprits=tuple(nodes))
 
 
-def broken(cell: Cell, event: life.Event) -> Step:
+def broken(cell: Cell, event: life.Failed) -> Step:
     """An exception in the runner: end the cell now, whatever is left to do."""
-    assert isinstance(event, life.Failed)
     cell = replace(cell, reload=False)
     if cell.failure:
         return fail(cell, cell.failure, cell.exit)  # the first failure counts
@@ -53,17 +53,15 @@ def fail(cell: Cell, reason: str, code: RunnerExit) -> Step:
     return to(cell, State.ENDED, Record(name, "", known), Do.EXIT)
 
 
-def child_exited(cell: Cell, event: life.Event) -> Step:
+def child_exited(cell: Cell, event: life.ChildExited) -> Step:
     """A dataflow cannot run without coordinator or daemon."""
-    assert isinstance(event, life.ChildExited)
     reason = f"the dora {event.child} is gone ({event.exit})"
     cell, actions = _lose(cell, event.child, reason, event.exit)
     return cell, (*oom_of_all(event), *actions)
 
 
-def connection_lost(cell: Cell, event: life.Event) -> Step:
+def connection_lost(cell: Cell, event: life.ConnectionLost) -> Step:
     """A lost connection means the same as an exited child."""
-    assert isinstance(event, life.ConnectionLost)
     return _lose(cell, event.child, event.reason, Exit())
 
 

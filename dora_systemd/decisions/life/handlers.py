@@ -14,7 +14,6 @@ events came before: dora's events and the ends of its processes arrive in any or
 from dataclasses import replace
 
 from dora_systemd.decisions.cell.status import HELD
-from dora_systemd.decisions.descriptor.wiring import with_downstream
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life import nodes as table
 from dora_systemd.decisions.life.causes import Cause
@@ -43,9 +42,8 @@ def joined(cell: Cell, event: life.Event) -> Step:
     return to(cell, State.STARTING, Do.SEND_START, after=ENGINE_TIMEOUT)
 
 
-def started(cell: Cell, event: life.Event) -> Step:
+def started(cell: Cell, event: life.RunStarted) -> Step:
     """Dora has accepted the descriptor: subscribe to the events of the run."""
-    assert isinstance(event, life.RunStarted)
     return replace(cell, run=event.run), (Do.SUBSCRIBE,)
 
 
@@ -71,9 +69,8 @@ def run(cell: Cell, event: life.Event) -> Step:
     return to(cell, State.RUNNING, Record("dataflow-started"))
 
 
-def start_timed_out(cell: Cell, event: life.Event) -> Step:
+def start_timed_out(cell: Cell, event: life.StartTimedOut) -> Step:
     """The start fails and names the nodes that are not ready."""
-    assert isinstance(event, life.StartTimedOut)
     late = [ident for ident, node in cell.nodes.items() if node.state in _NOT_READY]
     reason = f"{_nodes(late)} not ready within {format_duration(event.after)}"
     return _fail_start(because(cell, Cause.START_TIMEOUT, late), reason)
@@ -96,7 +93,7 @@ def node_event(cell: Cell, event: life.Event) -> Step:
     is_open = cell.ready_us > 0
     stops = _is_stopping(cell)
     nodes, record = table.update(cell.nodes, event, is_stopping=stops, is_open=is_open)
-    actions = () if record is None else (Record(*with_downstream(record, cell.downstream)),)
+    actions = () if record is None else (table.with_downstream(record, cell.downstream),)
     return replace(cell, nodes=nodes), (*oom_of_all(event), *actions)
 
 
@@ -104,16 +101,14 @@ def _is_stopping(cell: Cell) -> bool:
     return bool(cell.stop_by) or cell.reload or (cell.is_trial and bool(cell.failure))
 
 
-def stop_early(cell: Cell, event: life.Event) -> Step:
+def stop_early(cell: Cell, event: life.StopAsked) -> Step:
     """Stop before the launchers go on: end at once, and EXIT kills what there is."""
-    assert isinstance(event, life.StopAsked)
     cell = replace(cell, stop_by=event.by)
     return to(cell, State.ENDED, _stopping(event), Record("dataflow-stopped"), Do.EXIT)
 
 
-def stop(cell: Cell, event: life.Event) -> Step:
+def stop(cell: Cell, event: life.StopAsked) -> Step:
     """Have dora stop the nodes, if any of them runs."""
-    assert isinstance(event, life.StopAsked)
     return _wind_down(replace(cell, stop_by=event.by), _stopping(event))
 
 
@@ -150,20 +145,18 @@ def _wind_down(cell: Cell, *actions: Action) -> Step:
     return to(cell, State.STOPPING, *actions, Do.ASK_STOP, after=stop_timeout(cell.grace))
 
 
-def stop_again(cell: Cell, event: life.Event) -> Step:
+def stop_again(cell: Cell, event: life.StopAsked) -> Step:
     """A stop while stopping: a second request skips the grace period, any other replaces a reload.
 
     stop_by is empty while a reload or a failed trial stops the nodes; then a stop takes over.
     """
-    assert isinstance(event, life.StopAsked)
     if cell.stop_by:
         return _leave(cell)
     return replace(cell, stop_by=event.by, reload=False), (_stopping(event),)
 
 
-def stop_leaving(cell: Cell, event: life.Event) -> Step:
+def stop_leaving(cell: Cell, event: life.StopAsked) -> Step:
     """Stop while the daemon leaves: end at once, and record the end as a stop."""
-    assert isinstance(event, life.StopAsked)
     return end(replace(cell, stop_by=event.by, reload=False), event)
 
 
@@ -172,21 +165,20 @@ def reshape(cell: Cell, event: life.Event) -> Step:
     return replace(cell, nodes=table.reshape(cell.nodes, event)), ()
 
 
-def note_reload(cell: Cell, event: life.Event) -> Step:
+def note_reload(cell: Cell, event: life.ReloadNoted) -> Step:
     """Set the notice of the last reload, which the status line shows."""
-    assert isinstance(event, life.ReloadNoted)
     cell = replace(cell, notice=event.notice)
     return cell if event.downstream is None else replace(cell, downstream=event.downstream), ()
 
 
-def node_event_waiting(cell: Cell, event: life.Event) -> Step:
+def node_event_waiting(cell: Cell, event: life.NodeExited) -> Step:
     """A node exited before the start barrier: fail the start, or keep a held node waiting.
 
     A node with the policy HELD waits for a reload after it failed. That is no help while the start
     can still fail: on the first run, and in a trial, where the version before can come back.
     """
     after, actions = node_event(cell, event)
-    if isinstance(event, life.NodeExited) and (cell.is_trial or not cell.is_again):
+    if cell.is_trial or not cell.is_again:
         node = after.nodes[event.node]
         if node.state == "failed" and node.policy == HELD:
             reason = f"node {event.node}: {node.exit} before it was ready"
@@ -201,9 +193,8 @@ def run_finished(cell: Cell, event: life.Event) -> Step:
     return to(cell, State.CLOSING, Do.ASK_RESULT, after=ENGINE_TIMEOUT)
 
 
-def result(cell: Cell, event: life.Event) -> Step:
+def result(cell: Cell, event: life.ResultKnown) -> Step:
     """The results of the nodes decide between a finished and a failed dataflow."""
-    assert isinstance(event, life.ResultKnown)
     cell = replace(cell, nodes=table.apply_results(cell.nodes, event.results, event.at_us))
     if not event.results:
         lost = because(cell, Cause.NO_ANSWER)
@@ -222,9 +213,8 @@ def result(cell: Cell, event: life.Event) -> Step:
     return _leave(cell)
 
 
-def stop_while_closing(cell: Cell, event: life.Event) -> Step:
+def stop_while_closing(cell: Cell, event: life.StopAsked) -> Step:
     """Stop while the result is pending: the run has ended, so only note the request."""
-    assert isinstance(event, life.StopAsked)
     return replace(cell, stop_by=event.by), ()
 
 
@@ -241,7 +231,6 @@ def end(cell: Cell, event: life.Event) -> Step:
     return to(cell, State.ENDED, Record("dataflow-finished"), Do.EXIT)
 
 
-def daemon_left(cell: Cell, event: life.Event) -> Step:
+def daemon_left(cell: Cell, event: life.ChildExited) -> Step:
     """The daemon has exited, which is the last thing to wait for."""
-    assert isinstance(event, life.ChildExited)
     return end(cell, event) if event.child == "daemon" else (cell, ())

@@ -34,7 +34,6 @@ _RELOADS: dict[str, Handler] = {
     "ReloadNoted": handle.note_reload,
     "ReloadAsked": handle.reload,
 }
-_NODES_STOPPING: dict[str, Handler] = dict.fromkeys(_NODES, handle.node_event_stopping)
 _LOST: dict[str, Handler] = {
     "ChildExited": failures.child_exited,
     "ConnectionLost": failures.connection_lost,
@@ -56,17 +55,9 @@ _ALIVE: dict[str, Handler] = {
     "StopAsked": handle.stop,
 }
 _STOPPING: dict[str, Handler] = {
-    **_NODES_STOPPING,
-    **dict.fromkeys(
-        (
-            "StopAnswered",
-            "RunFinished",
-            "DeadlinePassed",
-            "ChildExited",
-            "ConnectionLost",
-        ),
-        handle.leave_now,
-    ),
+    **dict.fromkeys(_NODES, handle.node_event_stopping),
+    **dict.fromkeys(("StopAnswered", "RunFinished", "DeadlinePassed"), handle.leave_now),
+    **dict.fromkeys(("ChildExited", "ConnectionLost"), handle.leave_now),
     "Failed": failures.broken,
     "StopAsked": handle.stop_again,
 }

@@ -3,7 +3,8 @@
 from dora_systemd.decisions.cell.exits import Exit, exit_of
 from dora_systemd.decisions.cell.status import HELD, NodeStatus
 from dora_systemd.decisions.life import events as life
-from dora_systemd.decisions.life.nodes import has_process, reshape, update
+from dora_systemd.decisions.life.nodes import has_process, reshape, update, with_downstream
+from dora_systemd.decisions.life.states import Record
 
 RUNNING = {"a": NodeStatus("running", 7, restarts=2, policy=HELD)}
 
@@ -15,7 +16,7 @@ def updated(nodes: dict[str, NodeStatus], *events: life.Event) -> list[str]:
     for event in events:
         after, record = update(table, event, is_stopping=False, is_open=True)
         table = dict(reshape(after, event))
-        found.append(f"{table['a'].state} {record[0] if record else ''}".strip())
+        found.append(f"{table['a'].state} {record.event if record else ''}".strip())
     return found
 
 
@@ -45,7 +46,7 @@ def test_a_node_that_is_held_fails_and_is_not_restarted() -> None:
         RUNNING, life.NodeExited(1, "a", exit_of(1), True), is_stopping=False, is_open=True
     )
     assert record is not None
-    assert (nodes["a"].state, nodes["a"].restarts, record[0]) == ("failed", 2, "node-crashed")
+    assert (nodes["a"].state, nodes["a"].restarts, record.event) == ("failed", 2, "node-crashed")
 
 
 def test_processes_of_a_node_that_reloads() -> None:
@@ -58,3 +59,11 @@ def test_nodes_come_and_go() -> None:
     more = reshape(RUNNING, life.NodeAdded(1, "b", NodeStatus()))
     assert set(more) == {"a", "b"}
     assert set(reshape(more, life.NodeRemoved(1, "a"))) == {"b"}
+
+
+def test_only_failures_name_whom_they_starve() -> None:
+    fed = {"a": ("b", "c"), "c": ()}
+    crash = Record("node-crashed", "a", {"exit": "exit code 1"})
+    assert with_downstream(crash, fed).details == {"exit": "exit code 1", "downstream": "b c"}
+    for event, node in (("node-exited", "a"), ("node-crashed", "c"), ("node-oom", "x")):
+        assert with_downstream(Record(event, node), fed) == Record(event, node)
