@@ -9,13 +9,7 @@ from dataclasses import dataclass, replace
 
 from dora_systemd.decisions.cell.exits import ExitKind, parse_exit
 from dora_systemd.decisions.life.causes import Cause
-from dora_systemd.decisions.views.dataflows import (
-    FAILED,
-    FINISHED,
-    RESTARTING,
-    STOPPED,
-    UP_WORDS,
-)
+from dora_systemd.decisions.views.dataflows import FAILED, FINISHED, RESTARTING, STOPPED, UP_WORDS
 from dora_systemd.decisions.why.lives import Happening, Life, with_restarts
 from dora_systemd.decisions.why.verdict import Facts, Restart, Verdict
 

@@ -10,7 +10,6 @@ from dora_systemd.decisions.cell.exits import ExitKind, parse_exit
 from dora_systemd.decisions.cell.restarts import budget_words
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.views.dataflows import RESTARTING, UNKNOWN, local_time
-from dora_systemd.decisions.why.lives import Happening
 from dora_systemd.decisions.why.sandbox_signs import sandbox_remedy
 from dora_systemd.decisions.why.verdict import Restart, Verdict
 from dora_systemd.terminal_text import one_line
@@ -151,12 +150,11 @@ def _cut(line: str, width: int) -> str:
 
 def _colored(lines: list[str], verdict: Verdict) -> list[str]:
     color = _RED if verdict.is_failure else _GREEN
-    titles = [f"{_BOLD}{one}{_PLAIN}" if _is_title(one) else one for one in lines[1:]]
+    titles = [
+        f"{_BOLD}{line}{_PLAIN}" if line.endswith(":") and not line.startswith(" ") else line
+        for line in lines[1:]
+    ]
     return [f"{color}{_BOLD}{lines[0]}{_PLAIN}", *titles]
-
-
-def _is_title(line: str) -> bool:
-    return line.endswith(":") and not line.startswith(" ")
 
 
 def _head(report: Report) -> list[str]:
@@ -202,8 +200,8 @@ def _span(duration: int) -> str:
 
 def _memory_words(details: Mapping[str, str]) -> str:
     sizes = [
-        f"{words} {format_rounded_size(int(details[key]))}"
-        for key, words in (("peak", "peak"), ("limit", "limit"), ("held", "held"))
+        f"{key} {format_rounded_size(int(details[key]))}"
+        for key in ("peak", "limit", "held")
         if _SIZE.fullmatch(details.get(key, ""))
     ]
     owner = {"dataflow": " of the dataflow", "machine": "; the machine had no memory left"}
@@ -221,18 +219,11 @@ def _restart_words(restarts: Sequence[Restart]) -> str:
 
 def _timeline(report: Report) -> list[str]:
     news = report.verdict.timeline
-    if not news:
-        return []
-    shown = list(news)
-    if len(news) > _TIMELINE:
-        shown = [*news[:2], None, *news[2 - _TIMELINE :]]  # type: ignore[list-item]
-    left = len(news) - _TIMELINE
-    lines = [f"  ... {left} more ..." if one is None else _news(one) for one in shown]
-    return ["What happened:", *lines]
-
-
-def _news(one: Happening) -> str:
-    return f"  {_clock(one.at_us)}  {one.text or one.name}"
+    lines = [f"  {_clock(one.at_us)}  {one.text or one.name}" for one in news]
+    left = len(lines) - _TIMELINE
+    if left > 0:
+        lines[2 : 2 - _TIMELINE] = [f"  ... {left} more ..."]
+    return ["What happened:", *lines] if lines else []
 
 
 def _clock(moment: int) -> str:
