@@ -10,6 +10,7 @@ from typing import Any
 
 from dora_systemd.adapters.dora import engine
 from dora_systemd.adapters.host import notify
+from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.decisions.cell.exits import Exit
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.dora import protocol
@@ -17,9 +18,10 @@ from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Do, State
 from dora_systemd.decisions.life.stop_budget import stop_timeout
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.runner.cell.failure import failed
-from dora_systemd.runner.cell.parts import CellDora, CellNodes, CellPipes
+from dora_systemd.runner.cell.engine import Engine
+from dora_systemd.runner.cell.failure import Tasks, failed
 from dora_systemd.runner.cell.pump import Pump, now_us
+from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.values import SECOND
 
 _LISTENING = "Listening on port "
@@ -31,24 +33,19 @@ _QUIET_SECONDS = 0.1
 _LONG_SECONDS = 3600.0 * 24 * 365
 
 
-class Dialogue:
+class Dialogue(Tasks):
     """Carries out each Do; every answer becomes an event of the pump."""
 
     def __init__(
-        self,
-        options: RunnerOptions,
-        pump: Pump,
-        dora: CellDora,
-        nodes: CellNodes,
-        pipes: CellPipes,
+        self, options: RunnerOptions, pump: Pump, dora: Engine, nodes: Nodes, pipes: LogPipes
     ) -> None:
+        super().__init__()
         self._options = options
         self._pump = pump
         self._engine = dora
         self._nodes = nodes
         self._pipes = pipes
         self._loop = asyncio.get_running_loop()
-        self._tasks: set[asyncio.Task[None]] = set()
 
     def actions(
         self, descriptor: Mapping[str, Any], variables: Mapping[str, str]
@@ -72,32 +69,16 @@ class Dialogue:
     def _ask(self, what: Do, work: Coroutine[Any, Any, None]) -> None:
         self.spawn(what.value, work)
 
-    def spawn(self, what: str, work: Coroutine[Any, Any, None]) -> None:
-        """Run `work` as a task; an exception in it ends the cell.
-
-        what: what it does, as in "could not ...".
-        """
-        task = self._loop.create_task(self._guard(what, work))
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
-
-    async def _guard(self, what: str, work: Coroutine[Any, Any, None]) -> None:
-        event: life.Event | None = None
-        try:
-            await work
-        except DoraSystemdError as error:
+    async def raised(self, what: str, error: Exception) -> None:
+        """Have the exception of a task end the cell."""
+        event: life.Event
+        if isinstance(error, DoraSystemdError):
             event = life.Refused(now_us(), error.message)
-        except Exception as error:
+        else:
             event = failed(what, error)
-        if event is not None:
-            # If a child is exiting, let ChildExited come first: it explains a lost connection.
-            await asyncio.sleep(_SETTLE_SECONDS)
-            self._pump.push(event)
-
-    def cancel(self) -> None:
-        """Cancel all pending requests."""
-        for task in self._tasks:
-            task.cancel()
+        # If a child is exiting, let ChildExited come first: it explains a lost connection.
+        await asyncio.sleep(_SETTLE_SECONDS)
+        self._pump.push(event)
 
     def watch(self, child: engine.Child, on_line: Callable[[str], None] | None = None) -> None:
         """Read the output of a child process, and report its exit."""

@@ -22,7 +22,7 @@ from dora_systemd.decisions.life.states import Cell
 from dora_systemd.decisions.life.stop_budget import stop_timeout
 from dora_systemd.decisions.life.view import initial_nodes
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.runner.cell.parts import CellDora
+from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.cell.pump import Pump, now_us
 from dora_systemd.values import SECOND, format_duration
 
@@ -40,7 +40,7 @@ class NotReady(Exception):
 class Swapper:
     """Has dora change nodes of the run of `pump`, and waits for the effect."""
 
-    def __init__(self, pump: Pump, dora: CellDora) -> None:
+    def __init__(self, pump: Pump, dora: Engine) -> None:
         self._pump = pump
         self._engine = dora
 
