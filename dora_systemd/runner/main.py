@@ -12,7 +12,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Coroutine
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -50,7 +50,7 @@ from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.cell.failure import Beside, words
 from dora_systemd.runner.cell.pause import forget_restarts
 from dora_systemd.runner.cell.pump import Pump, now_us
-from dora_systemd.runner.cell.rooms import daemon_variables, make_directories
+from dora_systemd.runner.cell.rooms import daemon_variables
 from dora_systemd.runner.nodes.losses import LossWatch, losses_of_user
 from dora_systemd.runner.nodes.nodes import Nodes, wait_eof
 from dora_systemd.runner.reload.apply import Run
@@ -113,7 +113,8 @@ def furnish(
 ) -> "Runs":
     """Enter the unit's cgroup, and create what all runs share. Raises OSError."""
     unit = enter_supervisor()
-    make_directories(paths)
+    for path in (paths.daemon, paths.work, paths.io):
+        path.mkdir(mode=0o700, exist_ok=True)
     environment = node_environment(os.environ)
     settings = SettingsFile(settings_path(options.dataflow), paths.settings)
     reloader = Reloader(options, environment, settings)
@@ -188,10 +189,14 @@ async def run_once(runs: Runs, is_again: bool) -> Cell:
         table = initial_nodes(
             kinds(prepared.dataflow, prepared.plan), prepared.descriptor, started_us
         )
-        first = Cell(options.grace, started_us, table, is_again=is_again, notice=reloader.notice)
-        fed = downstream_of(prepared.dataflow)
-        first = replace(first, is_trial=reloader.before is not None, downstream=fed)
-        pump = Pump(first, options.uuid, runs.paths, runs.nodes, runs.pipes)
+        cell = Cell(
+            *(options.grace, started_us, table),
+            downstream=downstream_of(prepared.dataflow),
+            is_again=is_again,
+            is_trial=reloader.before is not None,
+            notice=reloader.notice,
+        )
+        pump = Pump(cell, options.uuid, runs.paths, runs.nodes, runs.pipes)
         dialogue = Dialogue(options, pump, dora, runs.nodes, runs.pipes)
         variables = daemon_variables(prepared, runs.paths, runs.unit)
         pump.connect(dialogue.actions(prepared.descriptor, variables))

@@ -1,4 +1,4 @@
-"""The directories of a cell, and the variables of the daemon that depend on them."""
+"""The variables of the daemon, which depend on the directories of the cell."""
 
 import os
 from pathlib import Path
@@ -25,9 +25,3 @@ def daemon_variables(prepared: Prepared, paths: CellPaths, unit: Path) -> dict[s
         "DORA_SYSTEMD_KEEP": " ".join(kept),
         "PATH": f"{libexec}:{prepared.plan.search_path}",
     }
-
-
-def make_directories(paths: CellPaths) -> None:
-    """Create the directories below the RuntimeDirectory. Raises OSError."""
-    for path in (paths.daemon, paths.work, paths.io):
-        path.mkdir(mode=0o700, exist_ok=True)

@@ -52,7 +52,7 @@ class Swapper:
         """
         node = str(definition["id"])
         old = self._pump.cell.nodes[node]
-        self._push(life.NodeReloading(now_us(), node, _status(definition, kind)))
+        self._pump.push(life.NodeReloading(now_us(), node, _status(definition, kind)))
         if old.pid and not starts_first and _is_restartable(old):
             await self._end(node, "RestartNode")
         await self._ask(protocol.replace_params(self._run, definition))
@@ -61,7 +61,7 @@ class Swapper:
     async def rewire(self, definition: Mapping[str, Any], kind: str) -> None:
         """Replace a node whose inputs or outputs change. Raises DoraSystemdError and NotReady."""
         node = str(definition["id"])
-        self._push(life.NodeReloading(now_us(), node, _status(definition, kind)))
+        self._pump.push(life.NodeReloading(now_us(), node, _status(definition, kind)))
         await self._end(node, "RemoveNode")
         await self._ask(protocol.add_params(self._run, definition))
         await self._wait_ready(node)
@@ -69,16 +69,16 @@ class Swapper:
     async def add(self, definition: Mapping[str, Any], kind: str) -> None:
         """Add a node, whose pipes must be open. Raises DoraSystemdError and NotReady."""
         node = str(definition["id"])
-        self._push(life.NodeAdded(now_us(), node, _status(definition, kind)))
+        self._pump.push(life.NodeAdded(now_us(), node, _status(definition, kind)))
         await self._ask(protocol.add_params(self._run, definition))
         if kind != "dynamic":
             await self._wait_ready(node)
 
     async def remove(self, node: str) -> None:
         """Remove a node from the run. Raises DoraSystemdError."""
-        self._push(life.NodeReloading(now_us(), node))
+        self._pump.push(life.NodeReloading(now_us(), node))
         await self._end(node, "RemoveNode")
-        self._push(life.NodeRemoved(now_us(), node))
+        self._pump.push(life.NodeRemoved(now_us(), node))
 
     async def reload_operator(self, node: str, operator: str) -> None:
         """Have a Python operator load its file again. Raises DoraSystemdError."""
@@ -87,9 +87,6 @@ class Swapper:
     @property
     def _run(self) -> str:
         return self._pump.cell.run
-
-    def _push(self, event: life.Event) -> None:
-        self._pump.push(event)
 
     async def _ask(self, params: protocol.Params) -> None:
         reply = await self._engine.ask_apart(params, READY_SECONDS)

@@ -116,7 +116,7 @@ class FakePipes(LogPipes):
         self.calls.append(("event", name))
         self.events.append((name, node, details))
 
-    def line_counts(self) -> Mapping[str, LineCount]:
+    def line_counts(self) -> dict[str, LineCount]:
         return {}
 
     def add_output(self, label: str, fd: int, on_line: Callable[[str], None] | None = None) -> None:

@@ -13,7 +13,7 @@ import pytest
 from websockets.asyncio.server import ServerConnection, serve
 
 from dora_systemd.adapters.dora import engine
-from dora_systemd.decisions.cell.exits import exit_of
+from dora_systemd.decisions.cell.exits import Exit, exit_of
 from dora_systemd.decisions.dora.protocol import LogRecord
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
@@ -134,8 +134,8 @@ def test_a_coordinator_without_a_token_is_an_error(tmp_path: Path) -> None:
     live(tmp_path, work)
 
 
-async def exits(child: engine.Child) -> tuple[str, str]:
-    ended: asyncio.Future[tuple[str, str]] = asyncio.get_running_loop().create_future()
+async def exits(child: engine.Child) -> tuple[str, Exit]:
+    ended: asyncio.Future[tuple[str, Exit]] = asyncio.get_running_loop().create_future()
     engine.watch(asyncio.get_running_loop(), child, lambda *how: ended.set_result(how))
     return await ended
 
