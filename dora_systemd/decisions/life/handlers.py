@@ -17,7 +17,7 @@ from dora_systemd.decisions.cell.status import HELD
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life import nodes as table
 from dora_systemd.decisions.life.causes import Cause
-from dora_systemd.decisions.life.failures import ENGINE_TIMEOUT, Step, because, fail, oom_of_all, to
+from dora_systemd.decisions.life.failures import ENGINE_TIMEOUT, Next, because, fail, oom_of_all, to
 from dora_systemd.decisions.life.states import Action, Cell, Deadline, Do, Record, RunnerExit, State
 from dora_systemd.decisions.life.stop_budget import LEAVE_TIMEOUT, stop_timeout
 from dora_systemd.values import SECOND, format_duration
@@ -27,34 +27,34 @@ CASCADE_TIMEOUT = 5 * SECOND
 """µs; dora ends a dataflow within milliseconds after a node failed before it was ready."""
 
 
-def ignore(cell: Cell, event: life.Event) -> Step:
+def ignore(cell: Cell, event: life.Event) -> Next:
     """The event has no effect in this state."""
     return cell, ()
 
 
-def listening(cell: Cell, event: life.Event) -> Step:
+def listening(cell: Cell, event: life.Event) -> Next:
     """The coordinator listens: start the daemon."""
     return to(cell, State.JOINING, Do.START_DAEMON, after=ENGINE_TIMEOUT)
 
 
-def joined(cell: Cell, event: life.Event) -> Step:
+def joined(cell: Cell, event: life.Event) -> Next:
     """The daemon has registered: send the descriptor."""
     return to(cell, State.STARTING, Do.SEND_START, after=ENGINE_TIMEOUT)
 
 
-def started(cell: Cell, event: life.RunStarted) -> Step:
+def started(cell: Cell, event: life.RunStarted) -> Next:
     """Dora has accepted the descriptor: subscribe to the events of the run."""
     return replace(cell, run=event.run), (Do.SUBSCRIBE,)
 
 
-def subscribed(cell: Cell, event: life.Event) -> Step:
+def subscribed(cell: Cell, event: life.Event) -> Next:
     """The subscription is active: no event of a node gets lost from here on."""
     # Launchers wait for OPEN_PIPES, so their nodes cannot end before this. Nodes that dora starts
     # without a launcher can, and no event would say so: ASK_RESULT asks whether the run has ended.
     return to(cell, State.WAITING, Do.OPEN_PIPES, Do.ASK_SPAWN, Do.ASK_RESULT)
 
 
-def barrier_opened(cell: Cell, event: life.Event) -> Step:
+def barrier_opened(cell: Cell, event: life.Event) -> Next:
     """Dora opened its start barrier: the dataflow runs, unless a node failed before."""
     # Dora also opens the barrier after a node failed before it was ready, and then ends the other
     # nodes: RunFinished follows. If it does not follow within CASCADE_TIMEOUT, the dataflow runs.
@@ -63,20 +63,20 @@ def barrier_opened(cell: Cell, event: life.Event) -> Step:
     return run(cell, event)
 
 
-def run(cell: Cell, event: life.Event) -> Step:
+def run(cell: Cell, event: life.Event) -> Next:
     """Mark all nodes as ready and the dataflow as running."""
     cell = replace(cell, nodes=table.all_ready(cell.nodes, event.at_us), ready_us=event.at_us)
     return to(cell, State.RUNNING, Record("dataflow-started"))
 
 
-def start_timed_out(cell: Cell, event: life.StartTimedOut) -> Step:
+def start_timed_out(cell: Cell, event: life.StartTimedOut) -> Next:
     """The start fails and names the nodes that are not ready."""
     late = [ident for ident, node in cell.nodes.items() if node.state in _NOT_READY]
     reason = f"{_nodes(late)} not ready within {format_duration(event.after)}"
     return _fail_start(because(cell, Cause.START_TIMEOUT, late), reason)
 
 
-def _fail_start(cell: Cell, reason: str) -> Step:
+def _fail_start(cell: Cell, reason: str) -> Next:
     if not cell.is_trial:
         return fail(cell, reason, RunnerExit.FAILED)
     # A reload started this run, and the version before it follows: stop the nodes properly.
@@ -88,7 +88,7 @@ def _nodes(idents: list[str]) -> str:
     return f"node {idents[0]} was" if len(idents) == 1 else f"nodes {', '.join(idents)} were"
 
 
-def node_event(cell: Cell, event: life.Event) -> Step:
+def node_event(cell: Cell, event: life.Event) -> Next:
     """Update the live table for an event of a node, and record what it means."""
     is_open = cell.ready_us > 0
     stops = _is_stopping(cell)
@@ -101,13 +101,13 @@ def _is_stopping(cell: Cell) -> bool:
     return bool(cell.stop_by) or cell.reload or (cell.is_trial and bool(cell.failure))
 
 
-def stop_early(cell: Cell, event: life.StopAsked) -> Step:
+def stop_early(cell: Cell, event: life.StopAsked) -> Next:
     """Stop before the launchers go on: end at once, and EXIT kills what there is."""
     cell = replace(cell, stop_by=event.by)
     return to(cell, State.ENDED, _stopping(event), Record("dataflow-stopped"), Do.EXIT)
 
 
-def stop(cell: Cell, event: life.StopAsked) -> Step:
+def stop(cell: Cell, event: life.StopAsked) -> Next:
     """Have dora stop the nodes, if any of them runs."""
     return _wind_down(replace(cell, stop_by=event.by), _stopping(event))
 
@@ -116,7 +116,7 @@ def _stopping(event: life.StopAsked) -> Record:
     return Record("dataflow-stopping", "", {"by": event.by})
 
 
-def node_event_stopping(cell: Cell, event: life.Event) -> Step:
+def node_event_stopping(cell: Cell, event: life.Event) -> Next:
     """A node event while stopping: dismiss the daemon after the last node has exited."""
     cell, actions = node_event(cell, event)
     if table.has_process(cell.nodes):
@@ -125,27 +125,27 @@ def node_event_stopping(cell: Cell, event: life.Event) -> Step:
     return _leave(cell, *actions)
 
 
-def _leave(cell: Cell, *actions: Action) -> Step:
+def _leave(cell: Cell, *actions: Action) -> Next:
     return to(cell, State.LEAVING, *actions, Do.DISMISS_DAEMON, after=LEAVE_TIMEOUT)
 
 
-def leave_now(cell: Cell, event: life.Event) -> Step:
+def leave_now(cell: Cell, event: life.Event) -> Next:
     """Dismiss the daemon: there is nothing else to wait for."""
     return _leave(cell)
 
 
-def reload(cell: Cell, event: life.Event) -> Step:
+def reload(cell: Cell, event: life.Event) -> Next:
     """Wind down as for a stop, but record no event: the reloader starts the next run."""
     return _wind_down(replace(cell, reload=True))
 
 
-def _wind_down(cell: Cell, *actions: Action) -> Step:
+def _wind_down(cell: Cell, *actions: Action) -> Next:
     if not table.has_process(cell.nodes):
         return _leave(cell, *actions)
     return to(cell, State.STOPPING, *actions, Do.ASK_STOP, after=stop_timeout(cell.grace))
 
 
-def stop_again(cell: Cell, event: life.StopAsked) -> Step:
+def stop_again(cell: Cell, event: life.StopAsked) -> Next:
     """A stop while stopping: a second request skips the grace period, any other replaces a reload.
 
     stop_by is empty while a reload or a failed trial stops the nodes; then a stop takes over.
@@ -155,23 +155,23 @@ def stop_again(cell: Cell, event: life.StopAsked) -> Step:
     return replace(cell, stop_by=event.by, reload=False), (_stopping(event),)
 
 
-def stop_leaving(cell: Cell, event: life.StopAsked) -> Step:
+def stop_leaving(cell: Cell, event: life.StopAsked) -> Next:
     """Stop while the daemon leaves: end at once, and record the end as a stop."""
     return end(replace(cell, stop_by=event.by, reload=False), event)
 
 
-def reshape(cell: Cell, event: life.Event) -> Step:
+def reshape(cell: Cell, event: life.Event) -> Next:
     """A reload adds, replaces or removes a node."""
     return replace(cell, nodes=table.reshape(cell.nodes, event)), ()
 
 
-def note_reload(cell: Cell, event: life.ReloadNoted) -> Step:
+def note_reload(cell: Cell, event: life.ReloadNoted) -> Next:
     """Set the notice of the last reload, which the status line shows."""
     cell = replace(cell, notice=event.notice)
     return cell if event.downstream is None else replace(cell, downstream=event.downstream), ()
 
 
-def node_event_waiting(cell: Cell, event: life.NodeExited) -> Step:
+def node_event_waiting(cell: Cell, event: life.NodeExited) -> Next:
     """A node exited before the start barrier: fail the start, or keep a held node waiting.
 
     A node with the policy HELD waits for a reload after it failed. That is no help while the start
@@ -188,12 +188,12 @@ def node_event_waiting(cell: Cell, event: life.NodeExited) -> Step:
     return after, actions
 
 
-def run_finished(cell: Cell, event: life.Event) -> Step:
+def run_finished(cell: Cell, event: life.Event) -> Next:
     """All nodes have exited: ask dora for the result."""
     return to(cell, State.CLOSING, Do.ASK_RESULT, after=ENGINE_TIMEOUT)
 
 
-def result(cell: Cell, event: life.ResultKnown) -> Step:
+def result(cell: Cell, event: life.ResultKnown) -> Next:
     """The results of the nodes decide between a finished and a failed dataflow."""
     cell = replace(cell, nodes=table.apply_results(cell.nodes, event.results, event.at_us))
     if not event.results:
@@ -213,12 +213,12 @@ def result(cell: Cell, event: life.ResultKnown) -> Step:
     return _leave(cell)
 
 
-def stop_while_closing(cell: Cell, event: life.StopAsked) -> Step:
+def stop_while_closing(cell: Cell, event: life.StopAsked) -> Next:
     """Stop while the result is pending: the run has ended, so only note the request."""
     return replace(cell, stop_by=event.by), ()
 
 
-def end(cell: Cell, event: life.Event) -> Step:
+def end(cell: Cell, event: life.Event) -> Next:
     """Nothing runs any more: record the end and exit."""
     if cell.stop_by:
         # A requested stop always counts as clean, whatever exit status the nodes had.
@@ -231,6 +231,6 @@ def end(cell: Cell, event: life.Event) -> Step:
     return to(cell, State.ENDED, Record("dataflow-finished"), Do.EXIT)
 
 
-def daemon_left(cell: Cell, event: life.ChildExited) -> Step:
+def daemon_left(cell: Cell, event: life.ChildExited) -> Next:
     """The daemon has exited, which is the last thing to wait for."""
     return end(cell, event) if event.child == "daemon" else (cell, ())

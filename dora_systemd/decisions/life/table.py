@@ -11,11 +11,11 @@ from collections.abc import Mapping
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life import failures
 from dora_systemd.decisions.life import handlers as handle
-from dora_systemd.decisions.life.failures import Handler, Step
+from dora_systemd.decisions.life.failures import Handler, Next
 from dora_systemd.decisions.life.states import Cell, State
 
 
-def step(cell: Cell, event: life.Event) -> Step:
+def step(cell: Cell, event: life.Event) -> Next:
     """The cell after `event`, and the actions of the runner, in this order."""
     return TABLE[cell.state][type(event)](cell, event)
 

@@ -42,7 +42,8 @@ def examine(lives: Sequence[Life], facts: Facts, shutdowns: Sequence[int] = ()) 
     """
     chain = with_restarts(lives)
     life = chain[-1] if chain else Life()
-    if facts.status == RESTARTING and len(chain) > 1 and _only_begins(life):
+    only_begins = all(one.name == "unit-starting" for one in life.happenings)
+    if facts.status == RESTARTING and len(chain) > 1 and only_begins:
         life = chain[-2]  # the runner of the last life still waits for its restart delay
     status = facts.status if facts.status in UP_WORDS else ended_word(life, facts.status)
     if status in UP_WORDS and status != RESTARTING:
@@ -53,6 +54,7 @@ def examine(lives: Sequence[Life], facts: Facts, shutdowns: Sequence[int] = ()) 
         status = STOPPED if found.cause is Cause.STOPPED else FINISHED
     earlier = lives[: len(lives) - len(chain)]
     before = _end(earlier[-1], facts, shutdowns) if earlier else _found(Cause.NONE, "")
+    happenings = (one for each in chain for one in each.happenings)
     return replace(
         found,
         status=status,
@@ -62,14 +64,10 @@ def examine(lives: Sequence[Life], facts: Facts, shutdowns: Sequence[int] = ()) 
         is_given_up=life.last("start-limit") is not None,
         starved=_starved(found, life),
         restarts=tuple(restarts_of(chain)),
-        timeline=tuple(one for each in chain for one in each.happenings if _is_news(one)),
+        timeline=tuple(one for one in happenings if one.name not in _NO_NEWS),
         before=before.summary,
         before_us=before.at_us,
     )
-
-
-def _only_begins(life: Life) -> bool:
-    return all(one.name == "unit-starting" for one in life.happenings)
 
 
 def ended_word(life: Life, known: str = "") -> str:
@@ -231,7 +229,3 @@ _NO_NEWS = (
     *("unit-stopped", "unit-succeeded", "unit-failed", "process-exited", "dataflow-stopping"),
     *("cpu-throttled", "lines-suppressed"),
 )
-
-
-def _is_news(one: Happening) -> bool:
-    return one.name not in _NO_NEWS

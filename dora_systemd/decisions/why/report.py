@@ -100,12 +100,10 @@ class Report:
 def remedies(report: Report) -> list[str]:
     """What to do, one line each."""
     verdict, subject = report.verdict, report.subject
-    texts = [_remedy(verdict)]
-    if verdict.is_passing:
-        texts = [_AGAIN]
-    elif verdict.node and verdict.is_up and verdict.status != RESTARTING:
-        texts.append(_AWAY)
     hint = sandbox_remedy(one.text for one in report.words) if verdict.node else ""
+    texts = [hint, _AGAIN if verdict.is_passing else _remedy(verdict)]
+    if verdict.node and verdict.is_up and verdict.status != RESTARTING and not verdict.is_passing:
+        texts.append(_AWAY)
     if verdict.is_given_up:
         texts.append(_GIVEN_UP)
     elif verdict.status == RESTARTING:
@@ -118,7 +116,7 @@ def remedies(report: Report) -> list[str]:
         "flag": subject.flag,
         "pid": verdict.details.get("node_pid", "PID"),
     }
-    filled = [*([hint] if hint else []), *(text.format(**values) for text in texts if text)]
+    filled = [text.format(**values) for text in texts if text]
     if subject.is_loaded:
         return filled
     again = f"doractl start {values['file']} --name {subject.name}"
