@@ -12,7 +12,6 @@ import signal
 import sys
 import traceback
 from collections.abc import Coroutine
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -46,11 +45,10 @@ from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.begin import enter_supervisor
 from dora_systemd.runner.cell.clock import StopClock
 from dora_systemd.runner.cell.dialogue import Dialogue
-from dora_systemd.runner.cell.engine import Engine
+from dora_systemd.runner.cell.engine import Engine, daemon_variables
 from dora_systemd.runner.cell.failure import Beside, words
 from dora_systemd.runner.cell.pause import forget_restarts
 from dora_systemd.runner.cell.pump import Pump, now_us
-from dora_systemd.runner.cell.rooms import daemon_variables
 from dora_systemd.runner.nodes.losses import LossWatch, losses_of_user
 from dora_systemd.runner.nodes.nodes import Nodes, wait_eof
 from dora_systemd.runner.reload.apply import Run
@@ -84,7 +82,7 @@ async def run_cell(
     pipes = LogPipes(loop, journal, origin, fd_store.store, fd_store.forget)
     try:
         pipes.write_event("dataflow-starting")
-        runs = furnish(options, paths, pipes, clock, begun)
+        runs = Runs(options, paths, pipes, clock, begun)
         return await live(runs, losses_of_user(journal, pipes) if paths.is_of_user else None)
     except DoraSystemdError as error:
         tell_failure(pipes, error, Cause.BAD_DATAFLOW)
@@ -104,44 +102,33 @@ def tell_failure(pipes: LogPipes, error: DoraSystemdError, cause: Cause) -> None
     notify.send_status(format_refusal(error))
 
 
-def furnish(
-    options: RunnerOptions,
-    paths: CellPaths,
-    pipes: LogPipes,
-    clock: StopClock,
-    begun: Begun | None,
-) -> "Runs":
-    """Enter the unit's cgroup, and create what all runs share. Raises OSError."""
-    unit = enter_supervisor()
-    for path in (paths.daemon, paths.work, paths.io):
-        path.mkdir(mode=0o700, exist_ok=True)
-    environment = node_environment(os.environ)
-    settings = SettingsFile(settings_path(options.dataflow), paths.settings)
-    reloader = Reloader(options, environment, settings)
-    nodes, beside = Nodes(unit, paths, pipes), Beside(asyncio.get_running_loop())
-    coordinator, check = begun or (None, DoraCheck(options, environment))
-    return Runs(paths, unit, environment, pipes, nodes, reloader, check, beside, clock, coordinator)
-
-
-@dataclass(frozen=True)
 class Runs:
-    """What all runs of the dataflow share.
+    """What all runs of the dataflow share. Raises OSError if the unit's cgroup is not ours.
 
     unit: cgroup directory. environment: that of the nodes. check: dora's, for the first run.
     beside: tasks that outlast a run. clock: that of the stop that ends the last run. coordinator:
     that of the first run, if it exists already.
     """
 
-    paths: CellPaths
-    unit: Path
-    environment: dict[str, str]
-    pipes: LogPipes
-    nodes: Nodes
-    reloader: Reloader
-    check: DoraCheck
-    beside: Beside
-    clock: StopClock
-    coordinator: Child | None = None
+    def __init__(
+        self,
+        options: RunnerOptions,
+        paths: CellPaths,
+        pipes: LogPipes,
+        clock: StopClock,
+        begun: Begun | None,
+    ) -> None:
+        self.paths, self.pipes, self.clock = paths, pipes, clock
+        self.unit = enter_supervisor()
+        for path in (paths.daemon, paths.work, paths.io):
+            path.mkdir(mode=0o700, exist_ok=True)
+        self.environment = node_environment(os.environ)
+        settings = SettingsFile(settings_path(options.dataflow), paths.settings)
+        self.reloader = Reloader(options, self.environment, settings)
+        self.nodes = Nodes(self.unit, paths, pipes)
+        self.beside = Beside(asyncio.get_running_loop())
+        self.coordinator = begun[0] if begun else None
+        self.check = begun[1] if begun else DoraCheck(options, self.environment)
 
 
 async def live(runs: Runs, losses: LossWatch | None) -> RunnerExit:

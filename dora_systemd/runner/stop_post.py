@@ -41,15 +41,21 @@ dora_systemd.decisions.life.stop_budget; the start of Python is part of that."""
 STREAMS = {".out": "stdout", ".err": "stderr"}
 
 
+_RESULTS = {
+    "watchdog": (Cause.WATCHDOG, "the supervisor process hung and was killed by the watchdog"),
+    "timeout": (Cause.TIMEOUT, "it did not start or stop in time and was killed"),
+}
+"""By SERVICE_RESULT of systemd."""
+
+
 def main(argv: list[str]) -> int:
     """Kill the nodes, and write their last lines and the event dataflow-failed."""
     deadline = time.monotonic() + ALL_SECONDS
-    reason, directory = killed_by(os.environ), os.environ.get("RUNTIME_DIRECTORY", "")
+    (cause, reason), directory = killed_by(os.environ), os.environ.get("RUNTIME_DIRECTORY", "")
     if not reason or len(argv) != 2 or not directory:
         return 0
     unit = unit_group()
-    cause, memory = killed_cause(os.environ), out_of_memory(unit)
-    if memory:
+    if memory := out_of_memory(unit):
         cause, reason = Cause.OUT_OF_MEMORY, memory
     with contextlib.suppress(OSError):
         kill_nodes(unit, KILL_SECONDS)
@@ -58,23 +64,14 @@ def main(argv: list[str]) -> int:
     return 0
 
 
-def killed_by(environ: Mapping[str, str]) -> str:
-    """How the runner was killed, "" if it exited by itself: EXIT_CODE in systemd.exec(5)."""
-    if environ.get("EXIT_CODE", "") not in ("killed", "dumped"):
-        return ""
-    if environ.get("SERVICE_RESULT") == "success":
-        return ""  # SIGTERM before the runner had its handler: stopped right after the start
-    if environ.get("SERVICE_RESULT") == "watchdog":
-        return "the supervisor process hung and was killed by the watchdog"
-    if environ.get("SERVICE_RESULT") == "timeout":
-        return "it did not start or stop in time and was killed"
-    return f"the supervisor process was killed (SIG{environ.get('EXIT_STATUS', '')})"
-
-
-def killed_cause(environ: Mapping[str, str]) -> Cause:
-    """The DORA_CAUSE of a runner that was killed."""
-    causes = {"watchdog": Cause.WATCHDOG, "timeout": Cause.TIMEOUT}
-    return causes.get(environ.get("SERVICE_RESULT", ""), Cause.RUNNER_KILLED)
+def killed_by(environ: Mapping[str, str]) -> tuple[Cause, str]:
+    """How the runner was killed, see EXIT_CODE in systemd.exec(5); "" if it exited by itself."""
+    result = environ.get("SERVICE_RESULT", "")
+    # Success: SIGTERM before the runner had its handler: stopped right after the start.
+    if environ.get("EXIT_CODE", "") not in ("killed", "dumped") or result == "success":
+        return Cause.RUNNER_KILLED, ""
+    killed = f"the supervisor process was killed (SIG{environ.get('EXIT_STATUS', '')})"
+    return _RESULTS.get(result, (Cause.RUNNER_KILLED, killed))
 
 
 def write_last_words(

@@ -154,7 +154,7 @@ class Reloader:
             changed = [path for path in changed if path != self._settings.path]
             change = await asyncio.to_thread(self._sources.look, current, changed)
             change = _with_node(change, node, self.options.dataflow)
-            if not change.is_empty:
+            if change.steps or change.whole:
                 run.pipes.write_event("files-changed", files=", ".join(_names(change, changed)))
                 done += await self._apply(run, change)
             self._taken |= taken
@@ -256,8 +256,7 @@ class Reloader:
 
     def close(self) -> None:
         """Stop watching."""
-        if self._watcher is not None:
-            self._watcher.cancel()
+        self._watch(False)
 
 
 def _with_node(change: Change, node: str, dataflow: str) -> Change:
