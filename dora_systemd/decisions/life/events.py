@@ -12,17 +12,18 @@ from dora_systemd.decisions.resources.oom import Oom
 
 @dataclass(frozen=True)
 class Event:
-    """Base of all events. at_us: CLOCK_REALTIME µs at which the runner learned of it."""
+    """Base of all events. at_us: CLOCK_REALTIME µs at which the runner learned of it.
+
+    An event with nothing else inherits all of it, and needs no dataclass of its own.
+    """
 
     at_us: int
 
 
-@dataclass(frozen=True)
 class CoordinatorListening(Event):
     """The coordinator has printed its port and written its token."""
 
 
-@dataclass(frozen=True)
 class DaemonConnected(Event):
     """The daemon has registered with the coordinator, and the descriptor is expanded."""
 
@@ -34,7 +35,6 @@ class RunStarted(Event):
     run: str
 
 
-@dataclass(frozen=True)
 class Subscribed(Event):
     """From here on, life events of the run arrive."""
 
@@ -73,7 +73,6 @@ class NodeReady(Event):
     node: str
 
 
-@dataclass(frozen=True)
 class AllReady(Event):
     """dora has opened its start barrier: messages flow."""
 
@@ -117,7 +116,6 @@ class StartTimedOut(Event):
     after: int
 
 
-@dataclass(frozen=True)
 class RunFinished(Event):
     """dora reports that all nodes of the run have exited."""
 
@@ -156,7 +154,6 @@ class StopAsked(Event):
     by: str
 
 
-@dataclass(frozen=True)
 class StopAnswered(Event):
     """dora's reply to our Stop: every node has ended."""
 
@@ -198,12 +195,10 @@ class ReloadNoted(Event):
     downstream: Downstream | None = None
 
 
-@dataclass(frozen=True)
 class ReloadAsked(Event):
     """The dataflow as a whole has to start again."""
 
 
-@dataclass(frozen=True)
 class DeadlinePassed(Event):
     """The current state has lasted too long."""
 

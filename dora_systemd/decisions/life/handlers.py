@@ -160,11 +160,6 @@ def stop_leaving(cell: Cell, event: life.StopAsked) -> Next:
     return end(replace(cell, stop_by=event.by, reload=False), event)
 
 
-def reshape(cell: Cell, event: life.Event) -> Next:
-    """A reload adds, replaces or removes a node."""
-    return replace(cell, nodes=table.reshape(cell.nodes, event)), ()
-
-
 def note_reload(cell: Cell, event: life.ReloadNoted) -> Next:
     """Set the notice of the last reload, which the status line shows."""
     cell = replace(cell, notice=event.notice)

@@ -35,38 +35,31 @@ def all_ready(nodes: NodeTable, at_us: int) -> NodeTable:
 
 
 def update(nodes: NodeTable, event: life.Event, *, is_stopping: bool, is_open: bool) -> Update:
-    """The table after a node's event, and the record for the journal.
+    """The table after an event, and the record for the journal.
 
     is_open: whether dora's start barrier is open; then a ready node runs, even if it is alone.
     """
+    record: Record | None = None
     match event:
         case life.NodeSpawned():
-            return _spawned(nodes, event)
+            nodes, record = _spawned(nodes, event)
         case life.NodeReady():
             state = "running" if is_open else "ready"
-            return _set(nodes, event.node, event.at_us, state=state), Record(
-                "node-ready", event.node
-            )
+            nodes = _set(nodes, event.node, event.at_us, state=state)
+            record = Record("node-ready", event.node)
         case life.NodeExited():
-            return _exited(nodes, event, is_stopping)
+            nodes, record = _exited(nodes, event, is_stopping)
         case life.NodeCascaded():
-            exit = Exit(by=event.by)
-            return _set(nodes, event.node, event.at_us, state="failed", exit=exit), None
+            nodes = _set(nodes, event.node, event.at_us, state="failed", exit=Exit(by=event.by))
         case life.NodeHung():
-            return _hung(nodes, event)
-    return nodes, None
-
-
-def reshape(nodes: NodeTable, event: life.Event) -> NodeTable:
-    """The table after a reload has changed the nodes."""
-    match event:
+            nodes, record = _hung(nodes, event)
         case life.NodeReloading():
-            return _reloading(nodes, event)
+            nodes = _reloading(nodes, event)
         case life.NodeAdded():
-            return {**nodes, event.node: event.status}
+            nodes = {**nodes, event.node: event.status}
         case life.NodeRemoved():
-            return {ident: node for ident, node in nodes.items() if ident != event.node}
-    return nodes
+            nodes = {ident: node for ident, node in nodes.items() if ident != event.node}
+    return nodes, record
 
 
 def _set(nodes: NodeTable, ident: str, at_us: int, **changes: str | int | Exit) -> NodeTable:

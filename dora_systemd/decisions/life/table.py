@@ -30,7 +30,7 @@ _NODES: dict[str, Handler] = dict.fromkeys(
     ("NodeSpawned", "NodeReady", "NodeExited", "NodeCascaded", "NodeHung"), handle.node_event
 )
 _RELOADS: dict[str, Handler] = {
-    **dict.fromkeys(("NodeReloading", "NodeAdded", "NodeRemoved"), handle.reshape),
+    **dict.fromkeys(("NodeReloading", "NodeAdded", "NodeRemoved"), handle.node_event),
     "ReloadNoted": handle.note_reload,
     "ReloadAsked": handle.reload,
 }

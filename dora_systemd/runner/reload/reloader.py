@@ -97,8 +97,10 @@ class Reloader:
 
     async def work(self) -> None:
         """Reload changed files, again and again."""
-        with self._refusing("cannot reload"):  # this file only: the others can be reloaded
+        try:
             self._settings.keep()
+        except DoraSystemdError as error:
+            self._refuse(error)  # of this file only: the others can be reloaded
         self._watch(self.options.hot_reload)
         while True:
             await self._wake.wait()

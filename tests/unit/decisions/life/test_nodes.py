@@ -3,19 +3,24 @@
 from dora_systemd.decisions.cell.exits import Exit, exit_of
 from dora_systemd.decisions.cell.status import HELD, NodeStatus
 from dora_systemd.decisions.life import events as life
-from dora_systemd.decisions.life.nodes import has_process, reshape, update, with_downstream
+from dora_systemd.decisions.life.nodes import NodeTable, has_process, update, with_downstream
 from dora_systemd.decisions.life.states import Record
 
 RUNNING = {"a": NodeStatus("running", 7, restarts=2, policy=HELD)}
 
 
+def reshape(nodes: NodeTable, event: life.Event) -> NodeTable:
+    after, record = update(nodes, event, is_stopping=False, is_open=True)
+    assert record is None
+    return after
+
+
 def updated(nodes: dict[str, NodeStatus], *events: life.Event) -> list[str]:
     """States of `a` after each event, and what the journal was told."""
     found = []
-    table = dict(nodes)
+    table: NodeTable = nodes
     for event in events:
-        after, record = update(table, event, is_stopping=False, is_open=True)
-        table = dict(reshape(after, event))
+        table, record = update(table, event, is_stopping=False, is_open=True)
         found.append(f"{table['a'].state} {record.event if record else ''}".strip())
     return found
 
