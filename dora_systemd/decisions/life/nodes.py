@@ -15,13 +15,13 @@ Update = tuple[NodeTable, Record | None]
 """The table after an event, and the life event for the journal."""
 
 _KILLED = Exit(ExitKind.SIGNAL, SIGKILL)
-_WITH_PROCESS = frozenset({"starting", "ready", "running"})
+WITH_PROCESS = frozenset({"starting", "ready", "running"})
 
 
 def has_process(nodes: NodeTable) -> bool:
     """Whether dora has a process of any node, according to the events so far."""
     return any(
-        node.state in _WITH_PROCESS or (node.state == "reloading" and node.pid)
+        node.state in WITH_PROCESS or (node.state == "reloading" and node.pid)
         for node in nodes.values()
     )
 

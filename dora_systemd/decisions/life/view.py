@@ -5,6 +5,8 @@ from typing import Any
 
 from dora_systemd.decisions.cell.restarts import HELD_SECONDS
 from dora_systemd.decisions.cell.status import HELD, CellStatus, CpuSample, LineCount, NodeStatus
+from dora_systemd.decisions.life.nodes import WITH_PROCESS
+from dora_systemd.decisions.life.refusal import FAILED
 from dora_systemd.decisions.life.states import Cell, State
 
 _SHOWN = {
@@ -26,13 +28,13 @@ _NAMED = 5
 def format_status(cell: Cell) -> str:
     """One line for STATUS=, see sd_notify(3)."""
     if cell.failure:
-        return f"failed: {cell.failure}"
+        return f"{FAILED}{cell.failure}"
     if text := _SHOWN[cell.state][1]:
         return text
     if cell.state is State.ENDED:
         return "stopped" if cell.stop_by else "finished"
     if cell.state is State.STOPPING:
-        return f"stopping, {_plural(_count(cell, 'starting', 'ready', 'running'))} left"
+        return f"stopping, {_plural(_count(cell, *WITH_PROCESS))} left"
     return _format_waiting(cell) if cell.state is State.WAITING else _format_running(cell)
 
 
@@ -45,7 +47,8 @@ def _format_waiting(cell: Cell) -> str:
 
 
 def _format_running(cell: Cell) -> str:
-    parts = [f"{_count(cell, 'running', 'ready', 'dynamic')}/{len(cell.nodes)} nodes running"]
+    alive = sum(node.is_alive for node in cell.nodes.values())
+    parts = [f"{alive}/{len(cell.nodes)} nodes running"]
     for state in ("starting", "restarting", "reloading", "finished", "failed"):
         nodes = {ident: node for ident, node in cell.nodes.items() if node.state == state}
         if nodes:

@@ -14,7 +14,8 @@ from dora_systemd.decisions.why.lives import Happening, Life, with_restarts
 from dora_systemd.decisions.why.verdict import Facts, Restart, Verdict
 
 _CRASHES = ("node-crashed", "node-oom")
-_LOSSES = {"daemon-lost": Cause.DAEMON_LOST, "coordinator-lost": Cause.COORDINATOR_LOST}
+_LOSSES = (Cause.DAEMON_LOST, Cause.COORDINATOR_LOST)
+"""Their events have the same names."""
 _END_WORDS = {"dataflow-finished": FINISHED, "dataflow-stopped": STOPPED, "dataflow-failed": FAILED}
 _ENDS = (*_END_WORDS, "unit-succeeded", "unit-failed")
 _RESULTS = {
@@ -134,7 +135,7 @@ def _failure(life: Life, end: Happening) -> Verdict:
         return replace(found, summary=_with_tail(found, reason))
     node = named[0] if named else ""
     lost = life.last(*_LOSSES)
-    return _found(cause, reason, lost if cause in _LOSSES.values() and lost else end, node)
+    return _found(cause, reason, lost if cause in _LOSSES and lost else end, node)
 
 
 def _with_tail(found: Verdict, reason: str) -> str:
@@ -151,7 +152,7 @@ def _cause_of(life: Life, end: Happening) -> Cause:
         return Cause(word)
     lost = life.last(*_LOSSES)  # records of older versions do not have the cause
     if lost is not None:
-        return _LOSSES[lost.name]
+        return Cause(lost.name)
     return Cause.NODE_FAILED if final_crashes(life) else Cause.UNIT_FAILED
 
 

@@ -29,9 +29,6 @@ from dora_systemd.values import SECOND, format_duration
 READY_SECONDS = 30.0
 """How long dora may take to answer, and then a reloaded node to be ready, before it fails."""
 
-_READY = ("ready", "running", "dynamic")
-_SETTLED = (*_READY, "failed", "finished")
-
 
 class NotReady(Exception):
     """The new node has failed or is not ready in time; the message says which."""
@@ -99,11 +96,15 @@ class Swapper:
         await self._pump.wait(_of(node, lambda one: not one.pid), stop_timeout(grace) / SECOND)
 
     async def _wait_ready(self, node: str) -> None:
-        await self._pump.wait(_of(node, lambda one: one.state in _SETTLED), READY_SECONDS)
+        await self._pump.wait(_of(node, _is_settled), READY_SECONDS)
         state = self._pump.cell.nodes[node]
-        if state.state not in _READY:
+        if not state.is_alive:
             late = f"not ready within {format_duration(int(READY_SECONDS * SECOND))}"
             raise NotReady(f"node {node}: {str(state.exit) or late}")
+
+
+def _is_settled(node: NodeStatus) -> bool:
+    return node.is_alive or node.state in ("failed", "finished")
 
 
 def _is_restartable(node: NodeStatus) -> bool:
