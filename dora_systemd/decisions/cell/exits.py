@@ -46,12 +46,12 @@ class Exit(NamedTuple):
         how = f"{self.kind.value}{numbers.get(self.kind, '')}{self.words}"
         if not self.by:
             return how
-        return f"{how} because node {self.by} failed" if how else f"node {self.by}{_EARLY}"
+        return f"{how}{_BECAUSE}{self.by}{_FAILED}" if how else f"{_NODE}{self.by}{_EARLY}"
 
 
-_EARLY = " failed before the start"
-_CAUSED = re.compile(rf"(.+) because node (.+) failed|node (.+){_EARLY}")
-_NUMBERED = re.compile(r"(exit code |signal )(-?[0-9]{1,10}|SIG[A-Z0-9]+)")
+_BECAUSE, _FAILED = " because node ", " failed"
+_NODE, _EARLY = "node ", " failed before the start"
+_NUMBERED = re.compile(r"(exit code |signal )(-?(?:0|[1-9][0-9]{0,9})|SIG[A-Z0-9]+)")
 
 
 def _signal_name(number: int) -> str:
@@ -72,8 +72,18 @@ def exit_of(status: int) -> Exit:
 
 def parse_exit(text: str) -> Exit:
     """The end that `text` describes. A text of another version becomes the `words`."""
-    if caused := _CAUSED.fullmatch(text):
-        return parse_exit(caused[1] or "")._replace(by=caused[2] or caused[3])
+    # The owner of a dataflow can write it: no recursion, and no pattern that tries again.
+    how, _, node = text.rpartition(_BECAUSE)
+    if how and (by := node.removesuffix(_FAILED)) not in ("", node):
+        return _parse_own(how)._replace(by=by)
+    by = text[len(_NODE) : -len(_EARLY)]
+    if by and text == f"{_NODE}{by}{_EARLY}":
+        return Exit(by=by)
+    return _parse_own(text)
+
+
+def _parse_own(text: str) -> Exit:
+    """The same for a text that names no other node."""
     if text.startswith(ExitKind.HUNG.value):
         return Exit(ExitKind.HUNG, words=text.removeprefix(ExitKind.HUNG.value))
     if numbered := _NUMBERED.match(text):

@@ -1,6 +1,8 @@
 """How a process ended: each text becomes a value, and the same text again."""
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from dora_systemd.decisions.cell.exits import Exit, ExitKind, exit_of, find_exit, parse_exit
 
@@ -22,6 +24,13 @@ TEXTS = {
     "failed to spawn: x": Exit(words="failed to spawn: x"),
     "signal SIGNONE": Exit(words="signal SIGNONE"),
     "exit code SIGKILL": Exit(words="exit code SIGKILL"),
+    "signal 9": Exit(words="signal 9"),
+    "exit code 05": Exit(ExitKind.CODE, 0, "5"),
+    "exit code 1 because node a failed because node b failed": Exit(
+        ExitKind.CODE, 1, " because node a failed", "b"
+    ),
+    "node failed before the start": Exit(words="node failed before the start"),
+    " because node a failed": Exit(words=" because node a failed"),
     "an end of a later version": Exit(words="an end of a later version"),
 }
 
@@ -31,6 +40,16 @@ def test_text_and_value(text: str, exit: Exit) -> None:
     assert (parse_exit(text), str(exit)) == (exit, text)
     assert exit.is_failure == bool(text)
     assert exit.details() == ({"exit": text} if text else {})
+
+
+@given(st.text() | st.lists(st.sampled_from([*TEXTS, " because node ", " failed"])).map("".join))
+def test_any_text_stays_what_it_is(text: str) -> None:
+    assert str(parse_exit(text)) == text.replace("exit code -0", "exit code 0")
+
+
+def test_a_text_that_repeats_itself_is_no_work() -> None:
+    text = "x" + " because node a failed" * 10_000
+    assert parse_exit(text).by == "a"
 
 
 def test_children() -> None:
