@@ -1,6 +1,7 @@
 """The runner's state machine: every pair of state and event, and whole lives as tables."""
 
 from dataclasses import replace
+from typing import get_type_hints
 
 import pytest
 
@@ -381,3 +382,10 @@ def test_a_failed_node_names_itself_and_whom_it_starves() -> None:
     crash, _, failure = said
     assert crash.details == {"exit": "exit code 1", "downstream": "b"}
     assert (failure.details["cause"], failure.details["nodes"]) == ("node-failed", "a")
+
+
+def test_each_handler_takes_the_events_of_its_entries() -> None:
+    for state, row in TABLE.items():
+        for event, handler in row.items():
+            taken = get_type_hints(handler)["event"]
+            assert issubclass(event, taken), f"{handler.__name__} for {event} in {state}"
