@@ -12,7 +12,6 @@ import signal
 import sys
 import traceback
 from collections.abc import Coroutine
-from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -46,11 +45,10 @@ from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.begin import enter_supervisor
 from dora_systemd.runner.cell.clock import StopClock
 from dora_systemd.runner.cell.dialogue import Dialogue
-from dora_systemd.runner.cell.engine import Engine
+from dora_systemd.runner.cell.engine import Engine, daemon_variables
 from dora_systemd.runner.cell.failure import Beside, words
 from dora_systemd.runner.cell.pause import forget_restarts
 from dora_systemd.runner.cell.pump import Pump, now_us
-from dora_systemd.runner.cell.rooms import daemon_variables, make_directories
 from dora_systemd.runner.nodes.losses import LossWatch, losses_of_user
 from dora_systemd.runner.nodes.nodes import Nodes, wait_eof
 from dora_systemd.runner.reload.apply import Run
@@ -84,8 +82,8 @@ async def run_cell(
     pipes = LogPipes(loop, journal, origin, fd_store.store, fd_store.forget)
     try:
         pipes.write_event("dataflow-starting")
-        cell = furnish(options, paths, pipes, clock, begun)
-        return await live(cell, losses_of_user(journal, pipes) if paths.is_of_user else None)
+        runs = Runs(options, paths, pipes, clock, begun)
+        return await live(runs, losses_of_user(journal, pipes) if paths.is_of_user else None)
     except DoraSystemdError as error:
         tell_failure(pipes, error, Cause.BAD_DATAFLOW)
         raise
@@ -104,121 +102,115 @@ def tell_failure(pipes: LogPipes, error: DoraSystemdError, cause: Cause) -> None
     notify.send_status(format_refusal(error))
 
 
-def furnish(
-    options: RunnerOptions,
-    paths: CellPaths,
-    pipes: LogPipes,
-    clock: StopClock,
-    begun: Begun | None,
-) -> "Runs":
-    """Enter the unit's cgroup, and create what all runs share. Raises OSError."""
-    unit = enter_supervisor()
-    make_directories(paths)
-    environment = node_environment(os.environ)
-    settings = SettingsFile(settings_path(options.dataflow), paths.settings)
-    reloader = Reloader(options, environment, settings)
-    nodes, beside = Nodes(unit, paths, pipes), Beside(asyncio.get_running_loop())
-    coordinator, check = begun or (None, DoraCheck(options, environment))
-    return Runs(paths, unit, environment, pipes, nodes, reloader, check, beside, clock, coordinator)
-
-
-@dataclass(frozen=True)
 class Runs:
-    """What all runs of the dataflow share.
+    """What all runs of the dataflow share. Raises OSError if the unit's cgroup is not ours.
 
     unit: cgroup directory. environment: that of the nodes. check: dora's, for the first run.
     beside: tasks that outlast a run. clock: that of the stop that ends the last run. coordinator:
     that of the first run, if it exists already.
     """
 
-    paths: CellPaths
-    unit: Path
-    environment: dict[str, str]
-    pipes: LogPipes
-    nodes: Nodes
-    reloader: Reloader
-    check: DoraCheck
-    beside: Beside
-    clock: StopClock
-    coordinator: Child | None = None
+    def __init__(
+        self,
+        options: RunnerOptions,
+        paths: CellPaths,
+        pipes: LogPipes,
+        clock: StopClock,
+        begun: Begun | None,
+    ) -> None:
+        self.paths, self.pipes, self.clock = paths, pipes, clock
+        self.unit = enter_supervisor()
+        for path in (paths.daemon, paths.work, paths.io):
+            path.mkdir(mode=0o700, exist_ok=True)
+        self.environment = node_environment(os.environ)
+        settings = SettingsFile(settings_path(options.dataflow), paths.settings)
+        self.reloader = Reloader(options, self.environment, settings)
+        self.nodes = Nodes(self.unit, paths, pipes)
+        self.beside = Beside(asyncio.get_running_loop())
+        self.coordinator = begun[0] if begun else None
+        self.check = begun[1] if begun else DoraCheck(options, self.environment)
 
 
-async def live(cell: Runs, losses: LossWatch | None) -> RunnerExit:
+async def live(runs: Runs, losses: LossWatch | None) -> RunnerExit:
     """Run the dataflow, and again as often as reloads ask for it."""
-    reach = partial(read_coordinator, cell.paths.control)
-    beside = cell.beside
-    beside.spawn("reload", cell.reloader.work())
-    beside.spawn("forget restarts", forget_restarts(cell.reloader.options))
-    beside.spawn("serve its socket", serve(cell.paths.socket, cell.reloader.answer, reach))
+    reach = partial(read_coordinator, runs.paths.control)
+    beside = runs.beside
+    beside.spawn("reload", runs.reloader.work())
+    beside.spawn("forget restarts", forget_restarts(runs.reloader.options))
+    beside.spawn("serve its socket", serve(runs.paths.socket, runs.reloader.answer, reach))
     if losses is not None:
         beside.spawn("count what journald throws away", losses.run())
     try:
-        last = await run_once(cell, is_again=False)
-        while goes_on(cell, last):
+        last = await run_once(runs, is_again=False)
+        while goes_on(runs, last):
             notify.send_reloading()
-            last = await run_once(cell, is_again=True)
+            last = await run_once(runs, is_again=True)
         if losses is not None:
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(cell.clock.left(LOSSES_SECONDS)):
+                async with asyncio.timeout(runs.clock.left(LOSSES_SECONDS)):
                     await losses.finish()
         return last.exit
     finally:
-        cell.reloader.close()
+        runs.reloader.close()
         beside.cancel()
 
 
-def goes_on(cell: Runs, last: Cell) -> bool:
+def goes_on(runs: Runs, last: Cell) -> bool:
     """Whether another run follows: a reload, or the version before a reload that has failed."""
     if last.reload:
         return True
     if not last.is_trial or last.ready_us or last.stop_by:
-        cell.reloader.go_back(last.failure or "it was stopped")
+        runs.reloader.go_back(last.failure or "it was stopped")
         return False
-    return cell.reloader.go_back(last.failure)
+    return runs.reloader.go_back(last.failure)
 
 
-async def run_once(cell: Runs, is_again: bool) -> Cell:
+async def run_once(runs: Runs, is_again: bool) -> Cell:
     """One run of the dataflow with its own dora; the cell at the end. Raises DoraSystemdError."""
-    started_us, options, reloader = now_us(), cell.reloader.options, cell.reloader
-    dora = Engine(options.dora, cell.paths, cell.environment)
+    started_us, options, reloader = now_us(), runs.reloader.options, runs.reloader
+    dora = Engine(options.dora, runs.paths, runs.environment)
     try:
-        coordinator = dora.start_coordinator(None if is_again else cell.coordinator)
-        prepared = reloader.current or prepare_first(cell, options)
-        cell.nodes.prepare(prepared.dataflow, options.log_rates, options.node_limits)
+        coordinator = dora.start_coordinator(None if is_again else runs.coordinator)
+        prepared = reloader.current or prepare_first(runs, options)
+        runs.nodes.prepare(prepared.dataflow, options.log_rates, options.node_limits)
         table = initial_nodes(
             kinds(prepared.dataflow, prepared.plan), prepared.descriptor, started_us
         )
-        first = Cell(options.grace, started_us, table, is_again=is_again, notice=reloader.notice)
-        fed = downstream_of(prepared.dataflow)
-        first = replace(first, is_trial=reloader.before is not None, downstream=fed)
-        pump = Pump(first, options.uuid, cell.paths, cell.nodes, cell.pipes)
-        dialogue = Dialogue(options, pump, dora, cell.nodes, cell.pipes)
-        variables = daemon_variables(prepared, cell.paths, cell.unit)
+        cell = Cell(
+            *(options.grace, started_us, table),
+            downstream=downstream_of(prepared.dataflow),
+            is_again=is_again,
+            is_trial=reloader.before is not None,
+            notice=reloader.notice,
+        )
+        pump = Pump(cell, options.uuid, runs.paths, runs.nodes, runs.pipes)
+        dialogue = Dialogue(options, pump, dora, runs.nodes, runs.pipes)
+        variables = daemon_variables(prepared, runs.paths, runs.unit)
         pump.connect(dialogue.actions(prepared.descriptor, variables))
-        cell.pipes.mute()
-        listen(options, pump, dialogue, cell.clock)
+        runs.pipes.mute()
+        listen(options, pump, dialogue, runs.clock)
         dialogue.watch(coordinator, dialogue.read_coordinator)
-        run = Run(pump, cell.nodes, cell.pipes, Swapper(pump, dora))
+        run = Run(pump, runs.nodes, runs.pipes, Swapper(pump, dora))
         reloader.begin(run, prepared, started_us * 1000)
         dialogue.spawn("tell that it has started", tell_started(pump, reloader))
-        cell.beside.attach(pump.push)
+        runs.beside.attach(pump.push)
         try:
             await pump.end
         finally:
             reloader.end()
-            cell.nodes.close()
+            runs.nodes.close()
             if not pump.cell.reload:
                 # Wait without blocking the loop, so that the watchdog gets fed.
-                await cell.pipes.wait_empty(cell.clock.for_journal())
+                await runs.pipes.wait_empty(runs.clock.for_journal())
             dialogue.cancel()
         return pump.cell
     finally:
         dora.kill()
 
 
-def prepare_first(cell: Runs, options: RunnerOptions) -> Prepared:
+def prepare_first(runs: Runs, options: RunnerOptions) -> Prepared:
     """Read the dataflow for the first run. Raises DoraSystemdError if it is refused."""
-    prepared = cell.check.beside(lambda: prepare(options, cell.environment))
+    prepared = runs.check.beside(lambda: prepare(options, runs.environment))
     check_named_nodes(options, prepared.dataflow)
     return prepared
 

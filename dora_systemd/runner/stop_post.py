@@ -15,7 +15,15 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dora_systemd.adapters.cgroup import groups as cgroup
+from dora_systemd.adapters.cgroup.strain import read_oom
+from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.decisions.life.causes import Cause
+from dora_systemd.decisions.logs.lines import Origin
+from dora_systemd.decisions.resources.oom import largest
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.paths import CellPaths
+from dora_systemd.values import format_rounded_size
 
 if TYPE_CHECKING:
     from asyncio import AbstractEventLoop
@@ -33,15 +41,21 @@ dora_systemd.decisions.life.stop_budget; the start of Python is part of that."""
 STREAMS = {".out": "stdout", ".err": "stderr"}
 
 
+_RESULTS = {
+    "watchdog": (Cause.WATCHDOG, "the supervisor process hung and was killed by the watchdog"),
+    "timeout": (Cause.TIMEOUT, "it did not start or stop in time and was killed"),
+}
+"""By SERVICE_RESULT of systemd."""
+
+
 def main(argv: list[str]) -> int:
     """Kill the nodes, and write their last lines and the event dataflow-failed."""
     deadline = time.monotonic() + ALL_SECONDS
-    reason, directory = killed_by(os.environ), os.environ.get("RUNTIME_DIRECTORY", "")
+    (cause, reason), directory = killed_by(os.environ), os.environ.get("RUNTIME_DIRECTORY", "")
     if not reason or len(argv) != 2 or not directory:
         return 0
     unit = unit_group()
-    cause, memory = killed_cause(os.environ), out_of_memory(unit)
-    if memory:
+    if memory := out_of_memory(unit):
         cause, reason = Cause.OUT_OF_MEMORY, memory
     with contextlib.suppress(OSError):
         kill_nodes(unit, KILL_SECONDS)
@@ -50,23 +64,14 @@ def main(argv: list[str]) -> int:
     return 0
 
 
-def killed_by(environ: Mapping[str, str]) -> str:
-    """How the runner was killed, "" if it exited by itself: EXIT_CODE in systemd.exec(5)."""
-    if environ.get("EXIT_CODE", "") not in ("killed", "dumped"):
-        return ""
-    if environ.get("SERVICE_RESULT") == "success":
-        return ""  # SIGTERM before the runner had its handler: stopped right after the start
-    if environ.get("SERVICE_RESULT") == "watchdog":
-        return "the supervisor process hung and was killed by the watchdog"
-    if environ.get("SERVICE_RESULT") == "timeout":
-        return "it did not start or stop in time and was killed"
-    return f"the supervisor process was killed (SIG{environ.get('EXIT_STATUS', '')})"
-
-
-def killed_cause(environ: Mapping[str, str]) -> Cause:
-    """The DORA_CAUSE of a runner that was killed."""
-    causes = {"watchdog": Cause.WATCHDOG, "timeout": Cause.TIMEOUT}
-    return causes.get(environ.get("SERVICE_RESULT", ""), Cause.RUNNER_KILLED)
+def killed_by(environ: Mapping[str, str]) -> tuple[Cause, str]:
+    """How the runner was killed, see EXIT_CODE in systemd.exec(5); "" if it exited by itself."""
+    result = environ.get("SERVICE_RESULT", "")
+    # Success: SIGTERM before the runner had its handler: stopped right after the start.
+    if environ.get("EXIT_CODE", "") not in ("killed", "dumped") or result == "success":
+        return Cause.RUNNER_KILLED, ""
+    killed = f"the supervisor process was killed (SIG{environ.get('EXIT_STATUS', '')})"
+    return _RESULTS.get(result, (Cause.RUNNER_KILLED, killed))
 
 
 def write_last_words(
@@ -83,15 +88,11 @@ def write_last_words(
     journal_socket: another socket than journald's, for tests. seconds: timeout for everything.
     """
     deadline = time.monotonic() + seconds
-    # Imported late: they take long, and in most cases there is nothing to do.
+    # Imported late: they take long, and the nodes are killed before that.
     import asyncio
 
     from dora_systemd.adapters.journal.socket import JOURNAL_SOCKET, JournalSocket
     from dora_systemd.adapters.logs.pipes import LogPipes
-    from dora_systemd.decisions.cell.status import CellStatus
-    from dora_systemd.decisions.logs.lines import Origin
-    from dora_systemd.errors import DoraSystemdError
-    from dora_systemd.paths import CellPaths
 
     paths = CellPaths(directory)
     loop = asyncio.new_event_loop()
@@ -126,12 +127,12 @@ def read_logs_of_dora(
     """
     from dora_systemd.adapters.logs.jsonl import PLACE_SUFFIX, resume_tail
 
-    places = [path for path in sorted(io.iterdir()) if path.suffix == PLACE_SUFFIX]
-    found = {
-        path.stem: resume_tail(loop, path, partial(pipes.write_fields, node=path.stem))
-        for path in places
-    }
-    tails = {node: tail for node, tail in found.items() if tail is not None}
+    tails = {}
+    for path in sorted(io.iterdir()):
+        if path.suffix == PLACE_SUFFIX:
+            tail = resume_tail(loop, path, partial(pipes.write_fields, node=path.stem))
+            if tail is not None:
+                tails[path.stem] = tail
     deadline = time.monotonic() + seconds
     while sum(tail.drain() for tail in tails.values()) and time.monotonic() < deadline:
         time.sleep(QUIET_SECONDS)
@@ -143,8 +144,6 @@ def read_logs_of_dora(
 
 def unit_group() -> Path:
     """The cgroup directory of this unit."""
-    from dora_systemd.adapters.cgroup import groups as cgroup
-
     unit = cgroup.group_path(cgroup.own_group())
     while unit.suffix != ".service" and unit != unit.parent:
         unit = unit.parent
@@ -153,11 +152,6 @@ def unit_group() -> Path:
 
 def out_of_memory(unit: Path) -> str:
     """The reason if the kernel has killed the runner because of memory, else ""."""
-    from dora_systemd.adapters.cgroup import groups as cgroup
-    from dora_systemd.adapters.cgroup.strain import read_oom
-    from dora_systemd.decisions.resources.oom import largest
-    from dora_systemd.values import format_rounded_size
-
     if not read_oom(unit / cgroup.SUPERVISOR).kills:
         return ""
     groups = cgroup.node_groups(unit)
@@ -171,8 +165,6 @@ def kill_nodes(unit: Path, seconds: float) -> None:
 
     A process that sleeps in the kernel does not die; after `seconds` this leaves it to systemd.
     """
-    from dora_systemd.adapters.cgroup import groups as cgroup
-
     groups = list(cgroup.node_groups(unit).values())
     for group in groups:
         cgroup.kill_group(group)

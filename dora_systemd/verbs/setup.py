@@ -19,6 +19,7 @@ from dora_systemd.adapters.host.unit_files import (
     write_link,
     write_unit_file,
 )
+from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.unit.file import BOOT_TARGET
 from dora_systemd.decisions.unit.setup_files import (
     PACKAGED_UNIT,
@@ -133,7 +134,7 @@ def _run(command: Sequence[str]) -> str:
         done = run_command(command, _SECONDS)
     except DoraSystemdError as error:
         return error.message
-    reason = (done.stderr.strip().splitlines() or [f"exit code {done.status}"])[-1]
+    reason = (done.stderr.strip().splitlines() or [str(exit_of(done.status))])[-1]
     return f"{' '.join(command)}: {reason}" if done.status else ""
 
 

@@ -86,7 +86,7 @@ def _facts(manager: Manager, scope: Scope, cell: Cell) -> Facts:
     return Facts(
         status_word(cell.state.active, cell.state.sub, status.stage),
         problem or str(manager.read(cell.unit, ["StatusText"])["StatusText"]),
-        {key: spent.get(key, node.exit) for key, node in nodes if node.state == "failed"},
+        {key: spent.get(key, str(node.exit)) for key, node in nodes if node.state == "failed"},
         tuple(key for key, node in nodes if node.state == "restarting"),
         _now_boot(),
     )

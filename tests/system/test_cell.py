@@ -214,7 +214,7 @@ def test_a_crash_leaves_the_dataflow_degraded(cell: Cell, project: Project) -> N
     cell.start(flow)
     wait_for("it is degraded", lambda: cell.status.stage == "degraded")
     assert cell.show("StatusText") == "2/3 nodes running; failed: sink (exit code 3)"
-    assert cell.status.nodes["sink"].exit == "exit code 3"
+    assert str(cell.status.nodes["sink"].exit) == "exit code 3"
     assert cell.show("ActiveState") == "active"
     assert "last words" in cell.messages("sink")
     cell.systemctl("stop")

@@ -60,7 +60,8 @@ def test_a_limit_of_the_unit_kills_the_leaking_node_alone(cell: Cell, project: P
     cell.start(flow, "--property", "MemoryMax=700M", "--property", "MemorySwapMax=0")
     wait_for("it is degraded", lambda: cell.status.stage == "degraded", 300)
     assert re.fullmatch(
-        r"out of memory, peak \S+M, limit of the dataflow 700M", cell.status.nodes["sink"].exit
+        r"out of memory, peak \S+M, limit of the dataflow 700M",
+        str(cell.status.nodes["sink"].exit),
     )
     assert cell.status.nodes["source"].state == "running"
     (whole,) = cell.journal("DORA_EVENT=dataflow-oom")

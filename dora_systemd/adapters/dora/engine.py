@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dora_systemd.decisions.cell.exits import Exit, exit_of
+
 if TYPE_CHECKING:
     import asyncio
 
@@ -91,22 +93,12 @@ def spawn(
 
 
 def watch(
-    loop: "asyncio.AbstractEventLoop", child: Child, on_exit: Callable[[str, str], None]
+    loop: "asyncio.AbstractEventLoop", child: Child, on_exit: Callable[[str, Exit], None]
 ) -> None:
-    """Call on_exit(label, how) once, after the child has exited."""
+    """Call on_exit(label, exit) once, after the child has exited."""
 
     def ended() -> None:
         loop.remove_reader(child.pidfd)
-        on_exit(child.label, format_exit(child.popen.wait()))
+        on_exit(child.label, exit_of(child.popen.wait()))
 
     loop.add_reader(child.pidfd, ended)
-
-
-def format_exit(status: int) -> str:
-    """An exit status of subprocess in systemd's terms: "exit code 1", "signal SIGKILL"."""
-    if status >= 0:
-        return f"exit code {status}"
-    try:
-        return f"signal {signal.Signals(-status).name}"
-    except ValueError:
-        return f"signal {-status}"

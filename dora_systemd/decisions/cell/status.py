@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
+from dora_systemd.decisions.cell.exits import Exit, parse_exit
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import is_node_id
 
@@ -45,17 +46,16 @@ class NodeStatus(NamedTuple):
 
     state: one of NODE_STATES. pid: 0 if no process is known. restarts: number of restarts by dora
     in this run. since_us: CLOCK_REALTIME µs of the last change of state. exit: how its last process
-    ended: "" or a text such as "exit code 1" or "signal SIGKILL". kind: how dora starts it (python,
-    executable, shell, uv, operator, ros2, dynamic, url). policy: dora's restart policy, "never" if
-    it has none, or HELD. max_restarts: in one window, 0 without limit. hung: the message of dora's
-    health check before it ended the process, or "".
+    ended. kind: how dora starts it (python, executable, shell, uv, operator, ros2, dynamic, url).
+    policy: dora's restart policy, "never" if it has none, or HELD. max_restarts: in one window, 0
+    without limit. hung: the message of dora's health check before it ended the process, or "".
     """
 
     state: str = "starting"
     pid: int = 0
     restarts: int = 0
     since_us: int = 0
-    exit: str = ""
+    exit: Exit = Exit()
     kind: str = ""
     policy: str = "never"
     max_restarts: int = 0
@@ -118,7 +118,9 @@ class CellStatus(NamedTuple):
     def to_json(self) -> str:
         """The text of status.json."""
         values = self._asdict()
-        values["nodes"] = {key: node._asdict() for key, node in self.nodes.items()}
+        values["nodes"] = {
+            key: {**node._asdict(), "exit": str(node.exit)} for key, node in self.nodes.items()
+        }
         values["samples"] = [
             {**one._asdict(), "cpu_us": {**one.cpu_us}, "throttling": {**one.throttling}}
             for one in self.samples
@@ -220,7 +222,7 @@ def _parse_node(raw: Any) -> NodeStatus:
         pid=_number(known, "pid"),
         restarts=_number(known, "restarts"),
         since_us=_number(known, "since_us", _MAX_TIME),
-        exit=_text(known, "exit"),
+        exit=parse_exit(_text(known, "exit")),
         kind=_text(known, "kind"),
         policy=_text(known, "policy", "never"),
         max_restarts=_number(known, "max_restarts"),

@@ -7,8 +7,6 @@ from dora_systemd.decisions.descriptor.dataflow import Dataflow
 Downstream = Mapping[str, tuple[str, ...]]
 """Node id -> the nodes that depend on its outputs, nearest first."""
 
-_FAILURES = ("node-crashed", "node-oom")
-
 
 def downstream_of(dataflow: Dataflow) -> Downstream:
     """The nodes downstream of each node, directly or indirectly; a circle ends at its start."""
@@ -24,14 +22,3 @@ def _reached(start: str, takers: Mapping[str, list[str]]) -> tuple[str, ...]:
     for node in found:  # the list grows during the loop
         found += [one for one in takers.get(node, ()) if one not in found]
     return tuple(found[1:])
-
-
-def with_downstream(
-    record: tuple[str, str, Mapping[str, str]], downstream: Downstream
-) -> tuple[str, str, Mapping[str, str]]:
-    """Name, node and details of a life event; adds the nodes downstream of a failed node."""
-    event, node, details = record
-    fed = downstream.get(node)
-    if event not in _FAILURES or not fed:
-        return record
-    return event, node, {**details, "downstream": " ".join(fed)}

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 from uuid import uuid4
 
+from dora_systemd.decisions.cell.exits import Exit, ExitKind
 from dora_systemd.decisions.life import events as life
-from dora_systemd.decisions.life.causes import signal_name
 from dora_systemd.decisions.resources.oom import Oom
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.values import INFINITY, SECOND
@@ -175,8 +175,8 @@ def parse_heartbeat(reply: Reply) -> int:
     return min((int(age) * 1000 for age in ages), default=INFINITY)
 
 
-def parse_results(reply: Reply) -> dict[str, str] | None:
-    """The reply to Check or Stop: None during the run, else node id -> "" or the error.
+def parse_results(reply: Reply) -> dict[str, Exit] | None:
+    """The reply to Check or Stop: None during the run, else how each node ended.
 
     An empty mapping means that dora does not know, and never success: a coordinator without its
     daemon replies like that.
@@ -202,25 +202,27 @@ def _mapping(value: Any) -> dict[str, Any]:
     return value if isinstance(value, dict) else {}
 
 
-def _failure(verdict: Any) -> str:
+def _failure(verdict: Any) -> Exit:
     if "Err" not in _mapping(verdict):
-        return ""
+        return Exit()
     error = _mapping(verdict["Err"])
     cause = _mapping(error.get("cause"))
     if "FailedToSpawn" in cause:
-        return f"failed to spawn: {first_line(str(cause['FailedToSpawn']))}"
-    ended = _exit_status(_mapping(error.get("exit_status")))
+        return Exit(words=f"failed to spawn: {first_line(str(cause['FailedToSpawn']))}")
+    ended = _exit(*next(iter(_mapping(error.get("exit_status")).items()), ("", None)))
     if "Cascading" in cause:
-        by = _mapping(cause["Cascading"]).get("caused_by_node")
-        return f"{ended} because node {by} failed"
-    return f"{ended} after the grace duration" if error.get("cause") == "GraceDuration" else ended
+        return ended._replace(by=str(_mapping(cause["Cascading"]).get("caused_by_node")))
+    if error.get("cause") == "GraceDuration":
+        return ended._replace(words=f"{ended.words} after the grace duration")
+    return ended
 
 
-def _exit_status(status: dict[str, Any]) -> str:
-    if "ExitCode" in status:
-        return f"exit code {status['ExitCode']}"
-    number = status.get("Signal")
-    return f"signal {signal_name(number)}" if isinstance(number, int) else "unknown exit status"
+def _exit(kind: str, number: Any) -> Exit:
+    """An exit status as dora writes it; kind: ExitCode, Signal or a word without a number."""
+    kinds = {"ExitCode": ExitKind.CODE, "Signal": ExitKind.SIGNAL}
+    if kind in kinds and isinstance(number, int):
+        return Exit(kinds[kind], number)
+    return Exit() if kind == "Success" else Exit(words="unknown exit status")
 
 
 def first_line(text: str) -> str:
@@ -257,19 +259,11 @@ def _node_event(record: LogRecord, at_us: int) -> life.Event | None:
     if spawned := _SPAWNED.fullmatch(record.message):
         return life.NodeSpawned(at_us, record.node, int(spawned[1]))
     if exited := _EXITED.match(record.message):
-        how = _exit_text(exited[1], exited[2])
+        how = _exit(exited[1], int(exited[2]) if exited[2] else None)
         return life.NodeExited(at_us, record.node, how, exited[3] == "true")
     if cascaded := _CASCADED.match(record.message):
         return life.NodeCascaded(at_us, cascaded[1], cascaded[2])
     return None
-
-
-def _exit_text(kind: str, number: str | None) -> str:
-    if kind == "Success":
-        return ""
-    if kind == "Signal" and number:
-        return f"signal {signal_name(int(number))}"
-    return f"exit code {number}" if kind == "ExitCode" and number else "unknown exit status"
 
 
 _UNRESPONSIVE = re.compile(r"node `([^`]+)` (unresponsive for \d+ms \(timeout: [^)]*\)), killing")
@@ -286,5 +280,6 @@ def with_facts(event: life.NodeExited, is_stale: bool, oom: Oom | None) -> life.
 
     is_stale: whether the node's current process is alive. oom: the OOM kill that ended it.
     """
-    how = event.exit if oom is None or not event.exit else oom.text
-    return replace(event, exit=how, is_stale=is_stale, oom=oom if event.exit else None)
+    oom = oom if event.exit.is_failure else None
+    how = event.exit if oom is None else Exit(words=oom.text)
+    return replace(event, exit=how, is_stale=is_stale, oom=oom)

@@ -5,13 +5,12 @@ nodes, times of results as 64-bit NTP timestamps.
 """
 
 import json
-import re
 import shlex
-import signal
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
+from dora_systemd.decisions.cell.exits import ExitKind, find_exit
 from dora_systemd.decisions.views.dataflows import FAILED, UP_WORDS, DataflowRow, NodeRow
 from dora_systemd.values import SECOND
 
@@ -36,7 +35,7 @@ _BY_PRIORITY = {
     **dict.fromkeys((b"0", b"1", b"2", b"3"), "error"),
     **{b"4": "warn", b"7": "debug"},
 }
-_EXIT = re.compile(r"(?:exit code (?P<code>\d+)|signal (?P<signal>SIG[A-Z0-9]+))")
+_EXITS = {ExitKind.CODE: "ExitCode", ExitKind.SIGNAL: "Signal"}
 _SYSTEMD_FIELDS = ("UNIT", "USER_UNIT")
 
 
@@ -115,13 +114,8 @@ def _ntp(at_us: int) -> int:
 
 
 def _exit_status(text: str) -> Any:
-    found = _EXIT.search(text)
-    if found is None:
-        return "Unknown"
-    if found["code"]:
-        return {"ExitCode": int(found["code"])}
-    number = getattr(signal, found["signal"], None)
-    return {"Signal": int(number)} if number is not None else "Unknown"
+    exit = find_exit(text)
+    return {_EXITS[exit.kind]: exit.number} if exit.kind in _EXITS else "Unknown"
 
 
 def bare_descriptor(nodes: Iterable[str]) -> dict[str, Any]:

@@ -1,6 +1,5 @@
 """Why a dataflow has ended: the values of DORA_CAUSE in the journal and in `doractl why`."""
 
-import signal
 from enum import StrEnum
 
 
@@ -28,11 +27,3 @@ class Cause(StrEnum):
     STOPPED = "stopped"
     FINISHED = "finished"
     NONE = ""
-
-
-def signal_name(number: int) -> str:
-    """SIGKILL for 9; the number as text where it has no name."""
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return str(number)

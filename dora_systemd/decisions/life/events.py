@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from dora_systemd.decisions.cell.exits import Exit
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.descriptor.wiring import Downstream
 from dora_systemd.decisions.life.causes import Cause
@@ -11,17 +12,18 @@ from dora_systemd.decisions.resources.oom import Oom
 
 @dataclass(frozen=True)
 class Event:
-    """Base of all events. at_us: CLOCK_REALTIME µs at which the runner learned of it."""
+    """Base of all events. at_us: CLOCK_REALTIME µs at which the runner learned of it.
+
+    An event with nothing else inherits all of it, and needs no dataclass of its own.
+    """
 
     at_us: int
 
 
-@dataclass(frozen=True)
 class CoordinatorListening(Event):
     """The coordinator has printed its port and written its token."""
 
 
-@dataclass(frozen=True)
 class DaemonConnected(Event):
     """The daemon has registered with the coordinator, and the descriptor is expanded."""
 
@@ -33,7 +35,6 @@ class RunStarted(Event):
     run: str
 
 
-@dataclass(frozen=True)
 class Subscribed(Event):
     """From here on, life events of the run arrive."""
 
@@ -72,7 +73,6 @@ class NodeReady(Event):
     node: str
 
 
-@dataclass(frozen=True)
 class AllReady(Event):
     """dora has opened its start barrier: messages flow."""
 
@@ -81,14 +81,13 @@ class AllReady(Event):
 class NodeExited(Event):
     """A process of the node has exited.
 
-    exit: "" for success, else "exit code 1" or "signal SIGKILL".
     will_restart: dora is going to execute it again.
     is_stale: a newer process of the node is already running.
     oom: the OOM kill, if the kernel killed it because of memory.
     """
 
     node: str
-    exit: str
+    exit: Exit
     will_restart: bool
     is_stale: bool = False
     oom: Oom | None = None
@@ -117,27 +116,26 @@ class StartTimedOut(Event):
     after: int
 
 
-@dataclass(frozen=True)
 class RunFinished(Event):
     """dora reports that all nodes of the run have exited."""
 
 
 @dataclass(frozen=True)
 class ResultKnown(Event):
-    """dora's results of an ended run. results: node id -> "" or why it failed; empty: unknown."""
+    """dora's results of an ended run. results: by node id; empty: unknown."""
 
-    results: Mapping[str, str] = field(default_factory=dict)
+    results: Mapping[str, Exit] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class ChildExited(Event):
     """A child process has exited.
 
-    child: "coordinator" or "daemon". exit: how. oom: as in NodeExited.
+    child: "coordinator" or "daemon". oom: as in NodeExited.
     """
 
     child: str
-    exit: str
+    exit: Exit
     oom: Oom | None = None
 
 
@@ -156,7 +154,6 @@ class StopAsked(Event):
     by: str
 
 
-@dataclass(frozen=True)
 class StopAnswered(Event):
     """dora's reply to our Stop: every node has ended."""
 
@@ -198,40 +195,13 @@ class ReloadNoted(Event):
     downstream: Downstream | None = None
 
 
-@dataclass(frozen=True)
 class ReloadAsked(Event):
     """The dataflow as a whole has to start again."""
 
 
-@dataclass(frozen=True)
 class DeadlinePassed(Event):
     """The current state has lasted too long."""
 
 
-EVENTS: tuple[type[Event], ...] = (
-    CoordinatorListening,
-    DaemonConnected,
-    RunStarted,
-    Subscribed,
-    Refused,
-    Failed,
-    NodeSpawned,
-    NodeReady,
-    AllReady,
-    NodeExited,
-    NodeCascaded,
-    NodeHung,
-    StartTimedOut,
-    RunFinished,
-    ResultKnown,
-    ChildExited,
-    ConnectionLost,
-    StopAsked,
-    StopAnswered,
-    NodeReloading,
-    NodeAdded,
-    NodeRemoved,
-    ReloadNoted,
-    ReloadAsked,
-    DeadlinePassed,
-)
+EVENTS = tuple(Event.__subclasses__())
+"""All of them, in this order."""

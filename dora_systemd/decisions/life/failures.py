@@ -2,28 +2,31 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from typing import Any
 
+from dora_systemd.decisions.cell.exits import Exit
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.life.states import Action, Cell, Deadline, Do, Record, RunnerExit, State
 from dora_systemd.decisions.resources.oom import Owner
 from dora_systemd.values import SECOND
 
-Step = tuple[Cell, tuple[Action, ...]]
-Handler = Callable[[Cell, life.Event], Step]
+Next = tuple[Cell, tuple[Action, ...]]
+"""The cell after an event, and the actions of the runner."""
+Handler = Callable[[Cell, Any], Next]
+"""Any: each takes the events that TABLE lists it for."""
 
 ENGINE_TIMEOUT = 30 * SECOND
 """µs; dora's own timeout for answers between its parts."""
 
 
-def to(cell: Cell, state: State, *actions: Action, after: int | None = None) -> Step:
+def to(cell: Cell, state: State, *actions: Action, after: int | None = None) -> Next:
     """Change the state. after: µs until DeadlinePassed, or None."""
     return replace(cell, state=state), (*actions, Deadline(after))
 
 
-def refused(cell: Cell, event: life.Event) -> Step:
+def refused(cell: Cell, event: life.Refused) -> Next:
     """dora refuses the dataflow, or a request of the runner."""
-    assert isinstance(event, life.Refused)
     return fail(because(cell, event.cause), event.reason, RunnerExit.FAILED)
 
 
@@ -32,9 +35,8 @@ def because(cell: Cell, cause: Cause, nodes: Iterable[str] = ()) -> Cell:
     return replace(cell, cause=cause, culprits=tuple(nodes))
 
 
-def broken(cell: Cell, event: life.Event) -> Step:
+def broken(cell: Cell, event: life.Failed) -> Next:
     """An exception in the runner: end the cell now, whatever is left to do."""
-    assert isinstance(event, life.Failed)
     cell = replace(cell, reload=False)
     if cell.failure:
         return fail(cell, cell.failure, cell.exit)  # the first failure counts
@@ -42,7 +44,7 @@ def broken(cell: Cell, event: life.Event) -> Step:
     return fail(because(cell, Cause.RUNNER_BROKEN), reason, RunnerExit.FAILED)
 
 
-def fail(cell: Cell, reason: str, code: RunnerExit) -> Step:
+def fail(cell: Cell, reason: str, code: RunnerExit) -> Next:
     """End at once, and record the reason."""
     cell = replace(cell, failure=reason, exit=code)
     is_trial = cell.is_trial and not cell.ready_us and not cell.stop_by
@@ -52,27 +54,25 @@ def fail(cell: Cell, reason: str, code: RunnerExit) -> Step:
     return to(cell, State.ENDED, Record(name, "", known), Do.EXIT)
 
 
-def child_exited(cell: Cell, event: life.Event) -> Step:
+def child_exited(cell: Cell, event: life.ChildExited) -> Next:
     """A dataflow cannot run without coordinator or daemon."""
-    assert isinstance(event, life.ChildExited)
     reason = f"the dora {event.child} is gone ({event.exit})"
     cell, actions = _lose(cell, event.child, reason, event.exit)
     return cell, (*oom_of_all(event), *actions)
 
 
-def connection_lost(cell: Cell, event: life.Event) -> Step:
+def connection_lost(cell: Cell, event: life.ConnectionLost) -> Next:
     """A lost connection means the same as an exited child."""
-    assert isinstance(event, life.ConnectionLost)
-    return _lose(cell, event.child, event.reason, "")
+    return _lose(cell, event.child, event.reason, Exit())
 
 
-def _lose(cell: Cell, child: str, reason: str, how: str) -> Step:
+def _lose(cell: Cell, child: str, reason: str, exit: Exit) -> Next:
     cell = because(cell, Cause(f"{child}-lost"))
     cell, actions = fail(cell, reason, RunnerExit.ENGINE_LOST)
-    return cell, (Record(f"{child}-lost", "", {"exit": how} if how else {}), *actions)
+    return cell, (Record(f"{child}-lost", "", exit.details()), *actions)
 
 
-def engine_deadline(cell: Cell, event: life.Event) -> Step:  # noqa: ARG001 - as all handlers
+def engine_deadline(cell: Cell, event: life.Event) -> Next:  # noqa: ARG001 - as all handlers
     """dora does not answer in time."""
     reason = f"dora did not answer within {ENGINE_TIMEOUT // SECOND} s while {cell.state.value}"
     return fail(because(cell, Cause.NO_ANSWER), reason, RunnerExit.ENGINE_LOST)

@@ -14,11 +14,10 @@ events came before: dora's events and the ends of its processes arrive in any or
 from dataclasses import replace
 
 from dora_systemd.decisions.cell.status import HELD
-from dora_systemd.decisions.descriptor.wiring import with_downstream
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life import nodes as table
 from dora_systemd.decisions.life.causes import Cause
-from dora_systemd.decisions.life.failures import ENGINE_TIMEOUT, Step, because, fail, oom_of_all, to
+from dora_systemd.decisions.life.failures import ENGINE_TIMEOUT, Next, because, fail, oom_of_all, to
 from dora_systemd.decisions.life.states import Action, Cell, Deadline, Do, Record, RunnerExit, State
 from dora_systemd.decisions.life.stop_budget import LEAVE_TIMEOUT, stop_timeout
 from dora_systemd.values import SECOND, format_duration
@@ -28,35 +27,34 @@ CASCADE_TIMEOUT = 5 * SECOND
 """µs; dora ends a dataflow within milliseconds after a node failed before it was ready."""
 
 
-def ignore(cell: Cell, event: life.Event) -> Step:
+def ignore(cell: Cell, event: life.Event) -> Next:
     """The event has no effect in this state."""
     return cell, ()
 
 
-def listening(cell: Cell, event: life.Event) -> Step:
+def listening(cell: Cell, event: life.Event) -> Next:
     """The coordinator listens: start the daemon."""
     return to(cell, State.JOINING, Do.START_DAEMON, after=ENGINE_TIMEOUT)
 
 
-def joined(cell: Cell, event: life.Event) -> Step:
+def joined(cell: Cell, event: life.Event) -> Next:
     """The daemon has registered: send the descriptor."""
     return to(cell, State.STARTING, Do.SEND_START, after=ENGINE_TIMEOUT)
 
 
-def started(cell: Cell, event: life.Event) -> Step:
+def started(cell: Cell, event: life.RunStarted) -> Next:
     """Dora has accepted the descriptor: subscribe to the events of the run."""
-    assert isinstance(event, life.RunStarted)
     return replace(cell, run=event.run), (Do.SUBSCRIBE,)
 
 
-def subscribed(cell: Cell, event: life.Event) -> Step:
+def subscribed(cell: Cell, event: life.Event) -> Next:
     """The subscription is active: no event of a node gets lost from here on."""
     # Launchers wait for OPEN_PIPES, so their nodes cannot end before this. Nodes that dora starts
     # without a launcher can, and no event would say so: ASK_RESULT asks whether the run has ended.
     return to(cell, State.WAITING, Do.OPEN_PIPES, Do.ASK_SPAWN, Do.ASK_RESULT)
 
 
-def barrier_opened(cell: Cell, event: life.Event) -> Step:
+def barrier_opened(cell: Cell, event: life.Event) -> Next:
     """Dora opened its start barrier: the dataflow runs, unless a node failed before."""
     # Dora also opens the barrier after a node failed before it was ready, and then ends the other
     # nodes: RunFinished follows. If it does not follow within CASCADE_TIMEOUT, the dataflow runs.
@@ -65,21 +63,20 @@ def barrier_opened(cell: Cell, event: life.Event) -> Step:
     return run(cell, event)
 
 
-def run(cell: Cell, event: life.Event) -> Step:
+def run(cell: Cell, event: life.Event) -> Next:
     """Mark all nodes as ready and the dataflow as running."""
     cell = replace(cell, nodes=table.all_ready(cell.nodes, event.at_us), ready_us=event.at_us)
     return to(cell, State.RUNNING, Record("dataflow-started"))
 
 
-def start_timed_out(cell: Cell, event: life.Event) -> Step:
+def start_timed_out(cell: Cell, event: life.StartTimedOut) -> Next:
     """The start fails and names the nodes that are not ready."""
-    assert isinstance(event, life.StartTimedOut)
     late = [ident for ident, node in cell.nodes.items() if node.state in _NOT_READY]
     reason = f"{_nodes(late)} not ready within {format_duration(event.after)}"
     return _fail_start(because(cell, Cause.START_TIMEOUT, late), reason)
 
 
-def _fail_start(cell: Cell, reason: str) -> Step:
+def _fail_start(cell: Cell, reason: str) -> Next:
     if not cell.is_trial:
         return fail(cell, reason, RunnerExit.FAILED)
     # A reload started this run, and the version before it follows: stop the nodes properly.
@@ -91,12 +88,12 @@ def _nodes(idents: list[str]) -> str:
     return f"node {idents[0]} was" if len(idents) == 1 else f"nodes {', '.join(idents)} were"
 
 
-def node_event(cell: Cell, event: life.Event) -> Step:
+def node_event(cell: Cell, event: life.Event) -> Next:
     """Update the live table for an event of a node, and record what it means."""
     is_open = cell.ready_us > 0
     stops = _is_stopping(cell)
     nodes, record = table.update(cell.nodes, event, is_stopping=stops, is_open=is_open)
-    actions = () if record is None else (Record(*with_downstream(record, cell.downstream)),)
+    actions = () if record is None else (table.with_downstream(record, cell.downstream),)
     return replace(cell, nodes=nodes), (*oom_of_all(event), *actions)
 
 
@@ -104,16 +101,14 @@ def _is_stopping(cell: Cell) -> bool:
     return bool(cell.stop_by) or cell.reload or (cell.is_trial and bool(cell.failure))
 
 
-def stop_early(cell: Cell, event: life.Event) -> Step:
+def stop_early(cell: Cell, event: life.StopAsked) -> Next:
     """Stop before the launchers go on: end at once, and EXIT kills what there is."""
-    assert isinstance(event, life.StopAsked)
     cell = replace(cell, stop_by=event.by)
     return to(cell, State.ENDED, _stopping(event), Record("dataflow-stopped"), Do.EXIT)
 
 
-def stop(cell: Cell, event: life.Event) -> Step:
+def stop(cell: Cell, event: life.StopAsked) -> Next:
     """Have dora stop the nodes, if any of them runs."""
-    assert isinstance(event, life.StopAsked)
     return _wind_down(replace(cell, stop_by=event.by), _stopping(event))
 
 
@@ -121,7 +116,7 @@ def _stopping(event: life.StopAsked) -> Record:
     return Record("dataflow-stopping", "", {"by": event.by})
 
 
-def node_event_stopping(cell: Cell, event: life.Event) -> Step:
+def node_event_stopping(cell: Cell, event: life.Event) -> Next:
     """A node event while stopping: dismiss the daemon after the last node has exited."""
     cell, actions = node_event(cell, event)
     if table.has_process(cell.nodes):
@@ -130,63 +125,55 @@ def node_event_stopping(cell: Cell, event: life.Event) -> Step:
     return _leave(cell, *actions)
 
 
-def _leave(cell: Cell, *actions: Action) -> Step:
+def _leave(cell: Cell, *actions: Action) -> Next:
     return to(cell, State.LEAVING, *actions, Do.DISMISS_DAEMON, after=LEAVE_TIMEOUT)
 
 
-def leave_now(cell: Cell, event: life.Event) -> Step:
+def leave_now(cell: Cell, event: life.Event) -> Next:
     """Dismiss the daemon: there is nothing else to wait for."""
     return _leave(cell)
 
 
-def reload(cell: Cell, event: life.Event) -> Step:
+def reload(cell: Cell, event: life.Event) -> Next:
     """Wind down as for a stop, but record no event: the reloader starts the next run."""
     return _wind_down(replace(cell, reload=True))
 
 
-def _wind_down(cell: Cell, *actions: Action) -> Step:
+def _wind_down(cell: Cell, *actions: Action) -> Next:
     if not table.has_process(cell.nodes):
         return _leave(cell, *actions)
     return to(cell, State.STOPPING, *actions, Do.ASK_STOP, after=stop_timeout(cell.grace))
 
 
-def stop_again(cell: Cell, event: life.Event) -> Step:
+def stop_again(cell: Cell, event: life.StopAsked) -> Next:
     """A stop while stopping: a second request skips the grace period, any other replaces a reload.
 
     stop_by is empty while a reload or a failed trial stops the nodes; then a stop takes over.
     """
-    assert isinstance(event, life.StopAsked)
     if cell.stop_by:
         return _leave(cell)
     return replace(cell, stop_by=event.by, reload=False), (_stopping(event),)
 
 
-def stop_leaving(cell: Cell, event: life.Event) -> Step:
+def stop_leaving(cell: Cell, event: life.StopAsked) -> Next:
     """Stop while the daemon leaves: end at once, and record the end as a stop."""
-    assert isinstance(event, life.StopAsked)
     return end(replace(cell, stop_by=event.by, reload=False), event)
 
 
-def reshape(cell: Cell, event: life.Event) -> Step:
-    """A reload adds, replaces or removes a node."""
-    return replace(cell, nodes=table.reshape(cell.nodes, event)), ()
-
-
-def note_reload(cell: Cell, event: life.Event) -> Step:
+def note_reload(cell: Cell, event: life.ReloadNoted) -> Next:
     """Set the notice of the last reload, which the status line shows."""
-    assert isinstance(event, life.ReloadNoted)
     cell = replace(cell, notice=event.notice)
     return cell if event.downstream is None else replace(cell, downstream=event.downstream), ()
 
 
-def node_event_waiting(cell: Cell, event: life.Event) -> Step:
+def node_event_waiting(cell: Cell, event: life.NodeExited) -> Next:
     """A node exited before the start barrier: fail the start, or keep a held node waiting.
 
     A node with the policy HELD waits for a reload after it failed. That is no help while the start
     can still fail: on the first run, and in a trial, where the version before can come back.
     """
     after, actions = node_event(cell, event)
-    if isinstance(event, life.NodeExited) and (cell.is_trial or not cell.is_again):
+    if cell.is_trial or not cell.is_again:
         node = after.nodes[event.node]
         if node.state == "failed" and node.policy == HELD:
             reason = f"node {event.node}: {node.exit} before it was ready"
@@ -196,19 +183,22 @@ def node_event_waiting(cell: Cell, event: life.Event) -> Step:
     return after, actions
 
 
-def run_finished(cell: Cell, event: life.Event) -> Step:
+def run_finished(cell: Cell, event: life.Event) -> Next:
     """All nodes have exited: ask dora for the result."""
     return to(cell, State.CLOSING, Do.ASK_RESULT, after=ENGINE_TIMEOUT)
 
 
-def result(cell: Cell, event: life.Event) -> Step:
+def result(cell: Cell, event: life.ResultKnown) -> Next:
     """The results of the nodes decide between a finished and a failed dataflow."""
-    assert isinstance(event, life.ResultKnown)
     cell = replace(cell, nodes=table.apply_results(cell.nodes, event.results, event.at_us))
     if not event.results:
         lost = because(cell, Cause.NO_ANSWER)
         return fail(lost, "dora lost the dataflow", RunnerExit.ENGINE_LOST)
-    failed = {node: _known_exit(cell, node, how) for node, how in event.results.items() if how}
+    failed = {
+        node: str(cell.nodes[node].exit if node in cell.nodes else how)
+        for node, how in event.results.items()
+        if how.is_failure
+    }
     spent = table.spent(cell.nodes)
     if failed or spent:
         reason = ", ".join(f"node {node}: {how}" for node, how in {**failed, **spent}.items())
@@ -218,17 +208,12 @@ def result(cell: Cell, event: life.Event) -> Step:
     return _leave(cell)
 
 
-def _known_exit(cell: Cell, node: str, how: str) -> str:
-    return cell.nodes[node].exit if node in cell.nodes else how
-
-
-def stop_while_closing(cell: Cell, event: life.Event) -> Step:
+def stop_while_closing(cell: Cell, event: life.StopAsked) -> Next:
     """Stop while the result is pending: the run has ended, so only note the request."""
-    assert isinstance(event, life.StopAsked)
     return replace(cell, stop_by=event.by), ()
 
 
-def end(cell: Cell, event: life.Event) -> Step:
+def end(cell: Cell, event: life.Event) -> Next:
     """Nothing runs any more: record the end and exit."""
     if cell.stop_by:
         # A requested stop always counts as clean, whatever exit status the nodes had.
@@ -241,7 +226,6 @@ def end(cell: Cell, event: life.Event) -> Step:
     return to(cell, State.ENDED, Record("dataflow-finished"), Do.EXIT)
 
 
-def daemon_left(cell: Cell, event: life.Event) -> Step:
+def daemon_left(cell: Cell, event: life.ChildExited) -> Next:
     """The daemon has exited, which is the last thing to wait for."""
-    assert isinstance(event, life.ChildExited)
     return end(cell, event) if event.child == "daemon" else (cell, ())

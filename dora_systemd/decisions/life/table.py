@@ -11,11 +11,11 @@ from collections.abc import Mapping
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life import failures
 from dora_systemd.decisions.life import handlers as handle
-from dora_systemd.decisions.life.failures import Handler, Step
+from dora_systemd.decisions.life.failures import Handler, Next
 from dora_systemd.decisions.life.states import Cell, State
 
 
-def step(cell: Cell, event: life.Event) -> Step:
+def step(cell: Cell, event: life.Event) -> Next:
     """The cell after `event`, and the actions of the runner, in this order."""
     return TABLE[cell.state][type(event)](cell, event)
 
@@ -30,11 +30,10 @@ _NODES: dict[str, Handler] = dict.fromkeys(
     ("NodeSpawned", "NodeReady", "NodeExited", "NodeCascaded", "NodeHung"), handle.node_event
 )
 _RELOADS: dict[str, Handler] = {
-    **dict.fromkeys(("NodeReloading", "NodeAdded", "NodeRemoved"), handle.reshape),
+    **dict.fromkeys(("NodeReloading", "NodeAdded", "NodeRemoved"), handle.node_event),
     "ReloadNoted": handle.note_reload,
     "ReloadAsked": handle.reload,
 }
-_NODES_STOPPING: dict[str, Handler] = dict.fromkeys(_NODES, handle.node_event_stopping)
 _LOST: dict[str, Handler] = {
     "ChildExited": failures.child_exited,
     "ConnectionLost": failures.connection_lost,
@@ -56,17 +55,9 @@ _ALIVE: dict[str, Handler] = {
     "StopAsked": handle.stop,
 }
 _STOPPING: dict[str, Handler] = {
-    **_NODES_STOPPING,
-    **dict.fromkeys(
-        (
-            "StopAnswered",
-            "RunFinished",
-            "DeadlinePassed",
-            "ChildExited",
-            "ConnectionLost",
-        ),
-        handle.leave_now,
-    ),
+    **dict.fromkeys(_NODES, handle.node_event_stopping),
+    **dict.fromkeys(("StopAnswered", "RunFinished", "DeadlinePassed"), handle.leave_now),
+    **dict.fromkeys(("ChildExited", "ConnectionLost"), handle.leave_now),
     "Failed": failures.broken,
     "StopAsked": handle.stop_again,
 }

@@ -5,25 +5,22 @@ from typing import Any
 
 from dora_systemd.decisions.cell.restarts import HELD_SECONDS
 from dora_systemd.decisions.cell.status import HELD, CellStatus, CpuSample, LineCount, NodeStatus
+from dora_systemd.decisions.life.nodes import WITH_PROCESS
+from dora_systemd.decisions.life.refusal import FAILED
 from dora_systemd.decisions.life.states import Cell, State
 
-_STAGES = {
-    State.BOOTING: "starting",
-    State.JOINING: "starting",
-    State.STARTING: "starting",
-    State.WAITING: "waiting",
-    State.STOPPING: "stopping",
-    State.CLOSING: "stopping",
-    State.LEAVING: "stopping",
-    State.ENDED: "ended",
+_SHOWN = {
+    State.BOOTING: ("starting", "starting the dora coordinator"),
+    State.JOINING: ("starting", "starting the dora daemon"),
+    State.STARTING: ("starting", "starting the nodes"),
+    State.WAITING: ("waiting", ""),
+    State.RUNNING: ("running", ""),
+    State.STOPPING: ("stopping", ""),
+    State.CLOSING: ("stopping", "asking dora how the dataflow ended"),
+    State.LEAVING: ("stopping", "stopping the dora daemon"),
+    State.ENDED: ("ended", ""),
 }
-_FIXED = {
-    State.BOOTING: "starting the dora coordinator",
-    State.JOINING: "starting the dora daemon",
-    State.STARTING: "starting the nodes",
-    State.CLOSING: "asking dora how the dataflow ended",
-    State.LEAVING: "stopping the dora daemon",
-}
+"""Stage and STATUS= of each state; "" if the text depends on more."""
 _NAMED = 5
 """Maximum nodes that a status line names."""
 
@@ -31,13 +28,13 @@ _NAMED = 5
 def format_status(cell: Cell) -> str:
     """One line for STATUS=, see sd_notify(3)."""
     if cell.failure:
-        return f"failed: {cell.failure}"
-    if cell.state in _FIXED:
-        return _FIXED[cell.state]
+        return f"{FAILED}{cell.failure}"
+    if text := _SHOWN[cell.state][1]:
+        return text
     if cell.state is State.ENDED:
         return "stopped" if cell.stop_by else "finished"
     if cell.state is State.STOPPING:
-        return f"stopping, {_plural(_count(cell, 'starting', 'ready', 'running'))} left"
+        return f"stopping, {_plural(_count(cell, *WITH_PROCESS))} left"
     return _format_waiting(cell) if cell.state is State.WAITING else _format_running(cell)
 
 
@@ -50,7 +47,8 @@ def _format_waiting(cell: Cell) -> str:
 
 
 def _format_running(cell: Cell) -> str:
-    parts = [f"{_count(cell, 'running', 'ready', 'dynamic')}/{len(cell.nodes)} nodes running"]
+    alive = sum(node.is_alive for node in cell.nodes.values())
+    parts = [f"{alive}/{len(cell.nodes)} nodes running"]
     for state in ("starting", "restarting", "reloading", "finished", "failed"):
         nodes = {ident: node for ident, node in cell.nodes.items() if node.state == state}
         if nodes:
@@ -61,7 +59,7 @@ def _format_running(cell: Cell) -> str:
 
 
 def _with_exit(ident: str, node: NodeStatus) -> str:
-    return f"{ident} ({node.exit})" if node.exit else ident
+    return f"{ident} ({node.exit})" if node.exit.is_failure else ident
 
 
 def _names(texts: list[str]) -> str:
@@ -79,9 +77,9 @@ def _count(cell: Cell, *states: str) -> int:
 
 def stage(cell: Cell) -> str:
     """One of dora_systemd.decisions.cell.status.STAGES."""
-    if cell.state is State.RUNNING:
-        return "degraded" if _count(cell, "failed") else "running"
-    return _STAGES[cell.state]
+    if cell.state is State.RUNNING and _count(cell, "failed"):
+        return "degraded"
+    return _SHOWN[cell.state][0]
 
 
 def cell_status(

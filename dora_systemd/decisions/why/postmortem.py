@@ -5,21 +5,17 @@ If the cause is not recorded, the verdict says so; it never guesses.
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
+from dora_systemd.decisions.cell.exits import ExitKind, parse_exit
 from dora_systemd.decisions.life.causes import Cause
-from dora_systemd.decisions.views.dataflows import (
-    FAILED,
-    FINISHED,
-    RESTARTING,
-    STOPPED,
-    UP_WORDS,
-)
+from dora_systemd.decisions.views.dataflows import FAILED, FINISHED, RESTARTING, STOPPED, UP_WORDS
 from dora_systemd.decisions.why.lives import Happening, Life, with_restarts
 from dora_systemd.decisions.why.verdict import Facts, Restart, Verdict
 
 _CRASHES = ("node-crashed", "node-oom")
-_LOSSES = {"daemon-lost": Cause.DAEMON_LOST, "coordinator-lost": Cause.COORDINATOR_LOST}
+_LOSSES = (Cause.DAEMON_LOST, Cause.COORDINATOR_LOST)
+"""Their events have the same names."""
 _END_WORDS = {"dataflow-finished": FINISHED, "dataflow-stopped": STOPPED, "dataflow-failed": FAILED}
 _ENDS = (*_END_WORDS, "unit-succeeded", "unit-failed")
 _RESULTS = {
@@ -32,16 +28,12 @@ NO_END = "its end is not recorded: it was killed, or the machine went down"
 UNKNOWN_PERSON = "a request to systemd (by whom is not recorded)"
 
 
-@dataclass(frozen=True)
-class _Finding:
+def _found(
+    cause: Cause, summary: str, at: Happening | None = None, node: str = "", by: str = ""
+) -> Verdict:
     """The part of a verdict that explains an end."""
-
-    cause: Cause
-    summary: str
-    at: Happening | None = None
-    node: str = ""
-    by: str = ""
-    is_passing: bool = False
+    at_us, details = (at.at_us, at.details) if at else (0, {})
+    return Verdict("", cause, summary, node=node, at_us=at_us, stopped_by=by, details=details)
 
 
 def examine(lives: Sequence[Life], facts: Facts, shutdowns: Sequence[int] = ()) -> Verdict:
@@ -51,7 +43,8 @@ def examine(lives: Sequence[Life], facts: Facts, shutdowns: Sequence[int] = ()) 
     """
     chain = with_restarts(lives)
     life = chain[-1] if chain else Life()
-    if facts.status == RESTARTING and len(chain) > 1 and _only_begins(life):
+    only_begins = all(one.name == "unit-starting" for one in life.happenings)
+    if facts.status == RESTARTING and len(chain) > 1 and only_begins:
         life = chain[-2]  # the runner of the last life still waits for its restart delay
     status = facts.status if facts.status in UP_WORDS else ended_word(life, facts.status)
     if status in UP_WORDS and status != RESTARTING:
@@ -60,36 +53,22 @@ def examine(lives: Sequence[Life], facts: Facts, shutdowns: Sequence[int] = ()) 
         found = _end(life, facts, shutdowns)
     if found.cause in (Cause.STOPPED, Cause.FINISHED):
         status = STOPPED if found.cause is Cause.STOPPED else FINISHED
-    return Verdict(
-        status,
-        found.cause,
-        found.summary,
-        facts.text if status in UP_WORDS else "",
-        found.node,
-        found.at.at_us if found.at else 0,
-        life.began_us,
-        life.invocation,
-        found.by,
-        life.last("start-limit") is not None,
-        found.is_passing,
-        found.at.details if found.at else {},
-        _starved(found, life),
-        tuple(restarts_of(chain)),
-        tuple(one for each in chain for one in each.happenings if _is_news(one)),
-        *_before(lives[: -len(chain)] if chain else (), facts, shutdowns),
+    earlier = lives[: len(lives) - len(chain)]
+    before = _end(earlier[-1], facts, shutdowns) if earlier else _found(Cause.NONE, "")
+    happenings = (one for each in chain for one in each.happenings)
+    return replace(
+        found,
+        status=status,
+        now=facts.text if status in UP_WORDS else "",
+        began_us=life.began_us,
+        invocation=life.invocation,
+        is_given_up=life.last("start-limit") is not None,
+        starved=_starved(found, life),
+        restarts=tuple(restarts_of(chain)),
+        timeline=tuple(one for one in happenings if one.name not in _NO_NEWS),
+        before=before.summary,
+        before_us=before.at_us,
     )
-
-
-def _only_begins(life: Life) -> bool:
-    return all(one.name == "unit-starting" for one in life.happenings)
-
-
-def _before(lives: Sequence[Life], facts: Facts, shutdowns: Sequence[int]) -> tuple[str, int]:
-    """How the life before a start or boot ended."""
-    if not lives:
-        return "", 0
-    end = _end(lives[-1], facts, shutdowns)
-    return end.summary, end.at.at_us if end.at else 0
 
 
 def ended_word(life: Life, known: str = "") -> str:
@@ -103,7 +82,7 @@ def ended_word(life: Life, known: str = "") -> str:
     return _END_WORDS.get(end.name, FAILED)
 
 
-def _present(life: Life, facts: Facts) -> _Finding:
+def _present(life: Life, facts: Facts) -> Verdict:
     """The state of a running dataflow: the node that failed for good, else the last restart."""
     gone = [one for one in final_crashes(life) if one.node in facts.failed]
     if gone:
@@ -113,7 +92,7 @@ def _present(life: Life, facts: Facts) -> _Finding:
     waiting = [one for one in final_crashes(life) if one.node in facts.restarting]
     if waiting:
         return replace(_crash(waiting[-1]), is_passing=True)
-    return _Finding(Cause.NONE, "")
+    return _found(Cause.NONE, "")
 
 
 def final_crashes(life: Life) -> list[Happening]:
@@ -122,43 +101,44 @@ def final_crashes(life: Life) -> list[Happening]:
     return sorted(last.values(), key=lambda one: one.at_us)
 
 
-def _crash(crash: Happening) -> _Finding:
-    how = crash.detail("exit") or "ended, how is not recorded"
+def _crash(crash: Happening) -> Verdict:
+    exit = parse_exit(crash.detail("exit"))
     cause = Cause.NODE_FAILED
     if crash.name == "node-oom":
         cause = Cause.NODE_OUT_OF_MEMORY
-    elif how.startswith("hung"):
+    elif exit.kind is ExitKind.HUNG:
         cause = Cause.NODE_HUNG
-    return _Finding(cause, f"node {crash.node}: {how}", crash, crash.node)
+    how = str(exit) or "ended, how is not recorded"
+    return _found(cause, f"node {crash.node}: {how}", crash, crash.node)
 
 
-def _end(life: Life, facts: Facts, shutdowns: Sequence[int]) -> _Finding:
+def _end(life: Life, facts: Facts, shutdowns: Sequence[int]) -> Verdict:
     if (failure := life.last("dataflow-failed")) is not None:
         return _failure(life, failure)
     if (end := life.last("unit-failed")) is not None:
         return _unit_failure(life, end)
     if (end := life.last("dataflow-finished")) is not None:
-        return _Finding(Cause.FINISHED, "all nodes ended by themselves", end)
+        return _found(Cause.FINISHED, "all nodes ended by themselves", end)
     if (end := life.last("dataflow-stopped", "unit-succeeded")) is not None:
         by = stopped_by(life, shutdowns)
-        return _Finding(Cause.STOPPED, f"stopped by {by}", end, by=by)
+        return _found(Cause.STOPPED, f"stopped by {by}", end, by=by)
     return _without_end(life, facts)
 
 
-def _failure(life: Life, end: Happening) -> _Finding:
+def _failure(life: Life, end: Happening) -> Verdict:
     reason = end.detail("reason") or "for a reason that is not recorded"
     named = end.detail("nodes").split()
     crashes = [one for one in final_crashes(life) if not named or one.node in named]
     cause = _cause_of(life, end)
     if cause is Cause.NODE_FAILED and crashes:
         found = _crash(crashes[0])
-        return _Finding(found.cause, _with_tail(found, reason), found.at, found.node)
+        return replace(found, summary=_with_tail(found, reason))
     node = named[0] if named else ""
     lost = life.last(*_LOSSES)
-    return _Finding(cause, reason, lost if cause in _LOSSES.values() and lost else end, node)
+    return _found(cause, reason, lost if cause in _LOSSES and lost else end, node)
 
 
-def _with_tail(found: _Finding, reason: str) -> str:
+def _with_tail(found: Verdict, reason: str) -> str:
     """The runner's own text for that node, which has the number of restarts."""
     parts = [one for one in reason.split(", node ") if one.removeprefix("node ")]
     own = [one for one in parts if one.removeprefix("node ").startswith(f"{found.node}: ")]
@@ -172,19 +152,19 @@ def _cause_of(life: Life, end: Happening) -> Cause:
         return Cause(word)
     lost = life.last(*_LOSSES)  # records of older versions do not have the cause
     if lost is not None:
-        return _LOSSES[lost.name]
+        return Cause(lost.name)
     return Cause.NODE_FAILED if final_crashes(life) else Cause.UNIT_FAILED
 
 
-def _unit_failure(life: Life, end: Happening) -> _Finding:
+def _unit_failure(life: Life, end: Happening) -> Verdict:
     """Without an event of the runner, systemd's result is all that is known."""
     result = end.detail("unit_result")
     if result in _RESULTS:
         cause, words = _RESULTS[result]
-        return _Finding(cause, words, end)
+        return _found(cause, words, end)
     exit = life.last("process-exited")
     how = _exit_words(exit) if exit else f"the unit failed: {result or 'systemd does not say how'}"
-    return _Finding(Cause.UNIT_FAILED, how, end)
+    return _found(Cause.UNIT_FAILED, how, end)
 
 
 def _exit_words(exit: Happening) -> str:
@@ -197,14 +177,14 @@ def _exit_words(exit: Happening) -> str:
     )
 
 
-def _without_end(life: Life, facts: Facts) -> _Finding:
+def _without_end(life: Life, facts: Facts) -> Verdict:
     if not life.happenings:
-        return _Finding(Cause.NONE, "nothing is recorded about it")
+        return _found(Cause.NONE, "nothing is recorded about it")
     last = life.happenings[-1]
     if life.boot and facts.now_boot and life.boot != facts.now_boot:
         words = "the machine went down while it ran, without a shutdown"
-        return _Finding(Cause.NO_END, words, last)
-    return _Finding(Cause.NO_END, NO_END, last)
+        return _found(Cause.NO_END, words, last)
+    return _found(Cause.NO_END, NO_END, last)
 
 
 def stopped_by(life: Life, shutdowns: Sequence[int]) -> str:
@@ -224,7 +204,7 @@ def stopped_by(life: Life, shutdowns: Sequence[int]) -> str:
     return f"the signal {by}" if by else "an unknown caller"
 
 
-def _starved(found: _Finding, life: Life) -> tuple[str, ...]:
+def _starved(found: Verdict, life: Life) -> tuple[str, ...]:
     crash = next((one for one in reversed(life.all(*_CRASHES)) if one.node == found.node), None)
     return tuple(crash.detail("downstream").split()) if crash and found.node else ()
 
@@ -250,7 +230,3 @@ _NO_NEWS = (
     *("unit-stopped", "unit-succeeded", "unit-failed", "process-exited", "dataflow-stopping"),
     *("cpu-throttled", "lines-suppressed"),
 )
-
-
-def _is_news(one: Happening) -> bool:
-    return one.name not in _NO_NEWS

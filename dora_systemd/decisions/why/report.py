@@ -1,14 +1,15 @@
 """Formats the verdict of `doractl why`: as one screen of text, or as values for JSON."""
 
 import re
+import signal
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from dora_systemd.decisions.cell.exits import ExitKind, parse_exit
 from dora_systemd.decisions.cell.restarts import budget_words
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.views.dataflows import RESTARTING, UNKNOWN, local_time
-from dora_systemd.decisions.why.lives import Happening
 from dora_systemd.decisions.why.sandbox_signs import sandbox_remedy
 from dora_systemd.decisions.why.verdict import Restart, Verdict
 from dora_systemd.terminal_text import one_line
@@ -52,10 +53,10 @@ _MEMORY_REMEDIES = {
     "machine": "the machine is short of memory: limit single nodes (--node-limit NODE:memory=SIZE)",
 }
 """By the owner of the exceeded memory limit, unless it is the node."""
-_SIGNAL_REMEDIES = {
-    "SIGKILL": "find out who killed {node}: journalctl -k, or somebody's kill -9",
+_SIGNAL_REMEDIES: Mapping[int, str] = {
+    signal.SIGKILL: "find out who killed {node}: journalctl -k, or somebody's kill -9",
     **dict.fromkeys(
-        ("SIGSEGV", "SIGABRT", "SIGBUS", "SIGILL", "SIGFPE"),
+        (signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS, signal.SIGILL, signal.SIGFPE),
         "fix {node}; coredumpctl info {pid} shows where it crashed",
     ),
 }
@@ -99,12 +100,10 @@ class Report:
 def remedies(report: Report) -> list[str]:
     """What to do, one line each."""
     verdict, subject = report.verdict, report.subject
-    texts = [_remedy(verdict)]
-    if verdict.is_passing:
-        texts = [_AGAIN]
-    elif verdict.node and verdict.is_up and verdict.status != RESTARTING:
-        texts.append(_AWAY)
     hint = sandbox_remedy(one.text for one in report.words) if verdict.node else ""
+    texts = [hint, _AGAIN if verdict.is_passing else _remedy(verdict)]
+    if verdict.node and verdict.is_up and verdict.status != RESTARTING and not verdict.is_passing:
+        texts.append(_AWAY)
     if verdict.is_given_up:
         texts.append(_GIVEN_UP)
     elif verdict.status == RESTARTING:
@@ -117,7 +116,7 @@ def remedies(report: Report) -> list[str]:
         "flag": subject.flag,
         "pid": verdict.details.get("node_pid", "PID"),
     }
-    filled = [*([hint] if hint else []), *(text.format(**values) for text in texts if text)]
+    filled = [text.format(**values) for text in texts if text]
     if subject.is_loaded:
         return filled
     again = f"doractl start {values['file']} --name {subject.name}"
@@ -128,9 +127,9 @@ def _remedy(verdict: Verdict) -> str:
     if verdict.cause is Cause.NODE_OUT_OF_MEMORY:
         owner = verdict.details.get("owner", "")
         return _MEMORY_REMEDIES.get(owner, _REMEDIES[verdict.cause])
-    signal = verdict.details.get("exit", "").removeprefix("signal ")
-    if verdict.cause is Cause.NODE_FAILED and signal in _SIGNAL_REMEDIES:
-        return _SIGNAL_REMEDIES[signal]
+    exit = parse_exit(verdict.details.get("exit", ""))
+    if verdict.cause is Cause.NODE_FAILED and exit.kind is ExitKind.SIGNAL:
+        return _SIGNAL_REMEDIES.get(exit.number, _REMEDIES[verdict.cause])
     return _REMEDIES.get(verdict.cause, "")
 
 
@@ -149,12 +148,11 @@ def _cut(line: str, width: int) -> str:
 
 def _colored(lines: list[str], verdict: Verdict) -> list[str]:
     color = _RED if verdict.is_failure else _GREEN
-    titles = [f"{_BOLD}{one}{_PLAIN}" if _is_title(one) else one for one in lines[1:]]
+    titles = [
+        f"{_BOLD}{line}{_PLAIN}" if line.endswith(":") and not line.startswith(" ") else line
+        for line in lines[1:]
+    ]
     return [f"{color}{_BOLD}{lines[0]}{_PLAIN}", *titles]
-
-
-def _is_title(line: str) -> bool:
-    return line.endswith(":") and not line.startswith(" ")
 
 
 def _head(report: Report) -> list[str]:
@@ -200,8 +198,8 @@ def _span(duration: int) -> str:
 
 def _memory_words(details: Mapping[str, str]) -> str:
     sizes = [
-        f"{words} {format_rounded_size(int(details[key]))}"
-        for key, words in (("peak", "peak"), ("limit", "limit"), ("held", "held"))
+        f"{key} {format_rounded_size(int(details[key]))}"
+        for key in ("peak", "limit", "held")
         if _SIZE.fullmatch(details.get(key, ""))
     ]
     owner = {"dataflow": " of the dataflow", "machine": "; the machine had no memory left"}
@@ -219,18 +217,11 @@ def _restart_words(restarts: Sequence[Restart]) -> str:
 
 def _timeline(report: Report) -> list[str]:
     news = report.verdict.timeline
-    if not news:
-        return []
-    shown = list(news)
-    if len(news) > _TIMELINE:
-        shown = [*news[:2], None, *news[2 - _TIMELINE :]]  # type: ignore[list-item]
-    left = len(news) - _TIMELINE
-    lines = [f"  ... {left} more ..." if one is None else _news(one) for one in shown]
-    return ["What happened:", *lines]
-
-
-def _news(one: Happening) -> str:
-    return f"  {_clock(one.at_us)}  {one.text or one.name}"
+    lines = [f"  {_clock(one.at_us)}  {one.text or one.name}" for one in news]
+    left = len(lines) - _TIMELINE
+    if left > 0:
+        lines[2 : 2 - _TIMELINE] = [f"  ... {left} more ..."]
+    return ["What happened:", *lines] if lines else []
 
 
 def _clock(moment: int) -> str:

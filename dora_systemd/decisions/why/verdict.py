@@ -13,8 +13,7 @@ class Facts:
     """The current state from systemd and the runner, in addition to the journal.
 
     status: a word of `list`. text: STATUS=. failed: nodes that have failed for good. restarting:
-    nodes that wait for a restart. result, exit_words: of the unit, in words. now_boot: id of this
-    boot.
+    nodes that wait for a restart. now_boot: id of this boot.
     """
 
     status: str = ""

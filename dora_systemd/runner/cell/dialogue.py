@@ -10,15 +10,18 @@ from typing import Any
 
 from dora_systemd.adapters.dora import engine
 from dora_systemd.adapters.host import notify
+from dora_systemd.adapters.logs.pipes import LogPipes
+from dora_systemd.decisions.cell.exits import Exit
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.dora import protocol
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Do, State
 from dora_systemd.decisions.life.stop_budget import stop_timeout
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.runner.cell.failure import failed
-from dora_systemd.runner.cell.parts import CellDora, CellNodes, CellPipes
+from dora_systemd.runner.cell.engine import Engine
+from dora_systemd.runner.cell.failure import Tasks, failed
 from dora_systemd.runner.cell.pump import Pump, now_us
+from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.values import SECOND
 
 _LISTENING = "Listening on port "
@@ -30,24 +33,19 @@ _QUIET_SECONDS = 0.1
 _LONG_SECONDS = 3600.0 * 24 * 365
 
 
-class Dialogue:
+class Dialogue(Tasks):
     """Carries out each Do; every answer becomes an event of the pump."""
 
     def __init__(
-        self,
-        options: RunnerOptions,
-        pump: Pump,
-        dora: CellDora,
-        nodes: CellNodes,
-        pipes: CellPipes,
+        self, options: RunnerOptions, pump: Pump, dora: Engine, nodes: Nodes, pipes: LogPipes
     ) -> None:
+        super().__init__()
         self._options = options
         self._pump = pump
         self._engine = dora
         self._nodes = nodes
         self._pipes = pipes
         self._loop = asyncio.get_running_loop()
-        self._tasks: set[asyncio.Task[None]] = set()
 
     def actions(
         self, descriptor: Mapping[str, Any], variables: Mapping[str, str]
@@ -71,41 +69,27 @@ class Dialogue:
     def _ask(self, what: Do, work: Coroutine[Any, Any, None]) -> None:
         self.spawn(what.value, work)
 
-    def spawn(self, what: str, work: Coroutine[Any, Any, None]) -> None:
-        """Run `work` as a task; an exception in it ends the cell.
-
-        what: what it does, as in "could not ...".
-        """
-        task = self._loop.create_task(self._guard(what, work))
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
-
-    async def _guard(self, what: str, work: Coroutine[Any, Any, None]) -> None:
-        event: life.Event | None = None
-        try:
-            await work
-        except DoraSystemdError as error:
+    async def raised(self, what: str, error: Exception) -> None:
+        """Have the exception of a task end the cell."""
+        event: life.Event
+        if isinstance(error, DoraSystemdError):
             event = life.Refused(now_us(), error.message)
-        except Exception as error:
+        else:
             event = failed(what, error)
-        if event is not None:
-            # If a child is exiting, let ChildExited come first: it explains a lost connection.
-            await asyncio.sleep(_SETTLE_SECONDS)
-            self._pump.push(event)
-
-    def cancel(self) -> None:
-        """Cancel all pending requests."""
-        for task in self._tasks:
-            task.cancel()
+        # If a child is exiting, let ChildExited come first: it explains a lost connection.
+        await asyncio.sleep(_SETTLE_SECONDS)
+        self._pump.push(event)
 
     def watch(self, child: engine.Child, on_line: Callable[[str], None] | None = None) -> None:
         """Read the output of a child process, and report its exit."""
         self._pipes.add_output(child.label, child.output, on_line)
         engine.watch(self._loop, child, self._child_exited)
 
-    def _child_exited(self, label: str, how: str) -> None:
+    def _child_exited(self, label: str, exit: Exit) -> None:
         oom = self._nodes.find_oom_of_dora()
-        event = life.ChildExited(now_us(), label, how if oom is None else oom.text, oom)
+        event = life.ChildExited(
+            now_us(), label, exit if oom is None else Exit(words=oom.text), oom
+        )
         self._loop.call_later(_SETTLE_SECONDS, self._pump.push, event)
 
     def read_coordinator(self, line: str) -> None:
@@ -148,7 +132,7 @@ class Dialogue:
             node = self._pump.cell.nodes.get(event.node)
             is_stale = node is not None and self._nodes.has_process(event.node, node.pid)
             event = protocol.with_facts(event, is_stale, self._nodes.find_oom(event.node))
-            if node is not None and event.exit and event.will_restart and not is_stale:
+            if node is not None and event.exit.is_failure and event.will_restart and not is_stale:
                 self._nodes.clear(event.node, node.pid)
         if event is not None:
             self._pump.push(event)
@@ -191,7 +175,7 @@ class Dialogue:
         # The daemon writes the last output of its nodes after it has reported their exit.
         await self._nodes.wait_quiet(_QUIET_SECONDS)
         if not self._engine.dismiss_daemon():
-            self._pump.push(life.ChildExited(now_us(), "daemon", "earlier"))
+            self._pump.push(life.ChildExited(now_us(), "daemon", Exit(words="earlier")))
 
     async def feed_watchdog(self, seconds: float) -> None:
         """Send WATCHDOG=1 every `seconds`, and wait for nothing in between.

@@ -31,15 +31,42 @@ def words(error: Exception) -> str:
     return " ".join(f"{type(error).__name__}: {error}".removesuffix(": ").split())
 
 
-class Beside:
+class Tasks:
+    """Tasks of the runner. An exception in one is given to raised(), so it does not get lost."""
+
+    def __init__(self) -> None:
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    def spawn(self, what: str, work: Coroutine[Any, Any, None]) -> None:
+        """Run `work` until it ends or cancel(). what: what it does, as in "could not ..."."""
+        task = asyncio.create_task(self._guard(what, work))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _guard(self, what: str, work: Coroutine[Any, Any, None]) -> None:
+        try:
+            await work
+        except Exception as error:
+            await self.raised(what, error)
+
+    async def raised(self, what: str, error: Exception) -> None:
+        """Handle the exception of a task."""
+        raise NotImplementedError
+
+    def cancel(self) -> None:
+        """Cancel all tasks."""
+        for task in self._tasks:
+            task.cancel()
+
+
+class Beside(Tasks):
     """Tasks that outlast the runs of the dataflow. An exception in one ends the current run.
 
     push: takes the events of that run; between two runs the next run gets the event.
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
-        self._loop = loop
-        self._tasks: list[asyncio.Task[None]] = []
+        super().__init__()
         self._push: Push | None = None
         self._failure: life.Failed | None = None
         loop.set_exception_handler(self._callback_raised)
@@ -50,17 +77,10 @@ class Beside:
         if self._failure is not None:
             push(self._failure)
 
-    def spawn(self, what: str, work: Coroutine[Any, Any, None]) -> None:
-        """Run `work` until cancel(). what: what it does, as in "could not ..."."""
-        self._tasks.append(self._loop.create_task(self._guard(what, work)))
-
-    async def _guard(self, what: str, work: Coroutine[Any, Any, None]) -> None:
-        try:
-            await work
-        except Exception as error:
-            # The later runs would lack this task too.
-            self._failure = failed(what, error)
-            self._tell(self._failure)
+    async def raised(self, what: str, error: Exception) -> None:
+        """End the current run, and the later ones: they would lack this task too."""
+        self._failure = failed(what, error)
+        self._tell(self._failure)
 
     def _tell(self, failure: life.Failed) -> None:
         if self._push is not None:
@@ -75,8 +95,3 @@ class Beside:
             return
         name = getattr(getattr(callback, "func", callback), "__qualname__", "a callback")
         self._tell(failed(f"finish {name}", error))
-
-    def cancel(self) -> None:
-        """Cancel all tasks."""
-        for task in self._tasks:
-            task.cancel()

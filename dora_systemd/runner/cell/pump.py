@@ -21,6 +21,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from dora_systemd.adapters.host import files, notify
+from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.decisions.cell.status import CpuSample, add_sample
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
@@ -32,7 +33,7 @@ from dora_systemd.decisions.logs.events import END_EVENTS
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.failure import failed
-from dora_systemd.runner.cell.parts import CellNodes, CellPipes
+from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.values import SECOND
 
 
@@ -57,7 +58,7 @@ class Pump:
     """
 
     def __init__(
-        self, cell: Cell, uuid: str, paths: CellPaths, nodes: CellNodes, pipes: CellPipes
+        self, cell: Cell, uuid: str, paths: CellPaths, nodes: Nodes, pipes: LogPipes
     ) -> None:
         self.cell = cell
         self._uuid = uuid

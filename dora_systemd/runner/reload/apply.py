@@ -6,13 +6,14 @@ from pathlib import PurePath
 from typing import Any
 
 from dora_systemd.adapters.dora.preparation import Prepared
+from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.decisions.cell.launch import has_pipes, kinds
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import HELD
 from dora_systemd.decisions.life.states import State
 from dora_systemd.decisions.reload.steps import How, Step
-from dora_systemd.runner.cell.parts import CellNodes, CellPipes
 from dora_systemd.runner.cell.pump import Pump
+from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.runner.reload.sources import Change
 from dora_systemd.runner.reload.swap import NotReady, Swapper
 
@@ -25,8 +26,8 @@ class Run:
     """The parts of one run of the dataflow that reloads use."""
 
     pump: Pump
-    nodes: CellNodes
-    pipes: CellPipes
+    nodes: Nodes
+    pipes: LogPipes
     swapper: Swapper
 
 

@@ -5,8 +5,9 @@ run ends and the next one begins, in the same unit and the same process.
 """
 
 import asyncio
+import contextlib
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from pathlib import PurePath
 from typing import Any
@@ -20,6 +21,7 @@ from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.reload.steps import How, Step
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.runner.cell.begin import let_openssl_in
+from dora_systemd.runner.cell.failure import words
 from dora_systemd.runner.cell.pump import now_us
 from dora_systemd.runner.reload.apply import Applier, Run
 from dora_systemd.runner.reload.settings_file import SettingsFile
@@ -106,15 +108,19 @@ class Reloader:
             self._wake.clear()
             changed, self._changed = self._changed, set()
             pause = asyncio.create_task(asyncio.sleep(PAUSE_SECONDS))
-            try:
+            with self._refusing("cannot reload"):
                 await self._reload(changed)
-            except DoraSystemdError as error:
-                self._refuse(error)
-            except Exception as error:
-                # Whatever it is, the dataflow keeps running, and the next change can succeed.
-                what = f"cannot reload: {type(error).__name__}: {error}"
-                self._refuse(DoraSystemdError(what, "please report it"))
             await pause
+
+    @contextlib.contextmanager
+    def _refusing(self, what: str) -> Iterator[None]:
+        """Report any exception: the dataflow keeps running, and the next change can succeed."""
+        try:
+            yield
+        except DoraSystemdError as error:
+            self._refuse(error)
+        except Exception as error:
+            self._refuse(DoraSystemdError(f"{what}: {words(error)}", "please report it"))
 
     def _watch(self, is_on: bool) -> None:
         if self._watcher is not None:
@@ -122,17 +128,12 @@ class Reloader:
         self._watcher = asyncio.create_task(self._collect()) if is_on else None
 
     async def _collect(self) -> None:
-        try:
+        with self._refusing("cannot watch files any more"):
             rules = await asyncio.to_thread(watch_rules, self.options)
             let_openssl_in()  # watchfiles imports anyio, which imports ssl
             async for files in changed_files(rules):
                 self._changed |= files
                 self._wake.set()
-        except DoraSystemdError as error:
-            self._refuse(error)
-        except Exception as error:
-            what = f"cannot watch files any more: {type(error).__name__}: {error}"
-            self._refuse(DoraSystemdError(what, "please report it"))
 
     def _refuse(self, error: DoraSystemdError) -> None:
         """Report that the old version keeps running, in the notice as soon as there is a run."""
@@ -155,7 +156,7 @@ class Reloader:
             changed = [path for path in changed if path != self._settings.path]
             change = await asyncio.to_thread(self._sources.look, current, changed)
             change = _with_node(change, node, self.options.dataflow)
-            if not change.is_empty:
+            if change.steps or change.whole:
                 run.pipes.write_event("files-changed", files=", ".join(_names(change, changed)))
                 done += await self._apply(run, change)
             self._taken |= taken
@@ -202,10 +203,8 @@ class Reloader:
             return DoraSystemdError(f"cannot use what was saved: {error}")
         assert self.current is not None
         await applier.undo(self.current)
-        message = (
-            f"cannot use {self.options.dataflow}: {error}; the previous version is running again"
-        )
-        return DoraSystemdError(message)
+        again = "the previous version is running again"
+        return DoraSystemdError(f"cannot use {self.options.dataflow}: {error}; {again}")
 
     async def _restart(self, run: Run, change: Change, reason: str) -> list[str]:
         """End this run, and let the next one begin with the new version."""
@@ -217,9 +216,9 @@ class Reloader:
         if failure := await self._outcome:
             raise DoraSystemdError(f"cannot use {self.options.dataflow}: {failure}")
         took = f"{time.monotonic() - begun:.2f}s"
-        words = f"{reason}; ready after {took}"
-        run.pipes.write_event("reloaded", reason=words, file=", ".join(_files(change)))
-        return [f"the dataflow was reloaded: {words}"]
+        text = f"{reason}; ready after {took}"
+        run.pipes.write_event("reloaded", reason=text, file=", ".join(_files(change)))
+        return [f"the dataflow was reloaded: {text}"]
 
     async def answer(self, request: Mapping[str, Any]) -> Answer:
         """Answer a request of doractl: {"verb": "reload"} or {"verb": "hot-reload", "on": true}.
@@ -259,8 +258,7 @@ class Reloader:
 
     def close(self) -> None:
         """Stop watching."""
-        if self._watcher is not None:
-            self._watcher.cancel()
+        self._watch(False)
 
 
 def _with_node(change: Change, node: str, dataflow: str) -> Change:

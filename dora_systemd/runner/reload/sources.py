@@ -28,11 +28,6 @@ class Change:
     whole: str = ""
     operators: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
 
-    @property
-    def is_empty(self) -> bool:
-        """Whether there is nothing to do."""
-        return not self.steps and not self.whole
-
 
 class Sources:
     """Reads files for a runner with these options. environment: that of the nodes."""

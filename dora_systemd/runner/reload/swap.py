@@ -22,15 +22,12 @@ from dora_systemd.decisions.life.states import Cell
 from dora_systemd.decisions.life.stop_budget import stop_timeout
 from dora_systemd.decisions.life.view import initial_nodes
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.runner.cell.parts import CellDora
+from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.cell.pump import Pump, now_us
 from dora_systemd.values import SECOND, format_duration
 
 READY_SECONDS = 30.0
 """How long dora may take to answer, and then a reloaded node to be ready, before it fails."""
-
-_READY = ("ready", "running", "dynamic")
-_SETTLED = (*_READY, "failed", "finished")
 
 
 class NotReady(Exception):
@@ -40,7 +37,7 @@ class NotReady(Exception):
 class Swapper:
     """Has dora change nodes of the run of `pump`, and waits for the effect."""
 
-    def __init__(self, pump: Pump, dora: CellDora) -> None:
+    def __init__(self, pump: Pump, dora: Engine) -> None:
         self._pump = pump
         self._engine = dora
 
@@ -52,7 +49,7 @@ class Swapper:
         """
         node = str(definition["id"])
         old = self._pump.cell.nodes[node]
-        self._push(life.NodeReloading(now_us(), node, _status(definition, kind)))
+        self._pump.push(life.NodeReloading(now_us(), node, _status(definition, kind)))
         if old.pid and not starts_first and _is_restartable(old):
             await self._end(node, "RestartNode")
         await self._ask(protocol.replace_params(self._run, definition))
@@ -61,7 +58,7 @@ class Swapper:
     async def rewire(self, definition: Mapping[str, Any], kind: str) -> None:
         """Replace a node whose inputs or outputs change. Raises DoraSystemdError and NotReady."""
         node = str(definition["id"])
-        self._push(life.NodeReloading(now_us(), node, _status(definition, kind)))
+        self._pump.push(life.NodeReloading(now_us(), node, _status(definition, kind)))
         await self._end(node, "RemoveNode")
         await self._ask(protocol.add_params(self._run, definition))
         await self._wait_ready(node)
@@ -69,16 +66,16 @@ class Swapper:
     async def add(self, definition: Mapping[str, Any], kind: str) -> None:
         """Add a node, whose pipes must be open. Raises DoraSystemdError and NotReady."""
         node = str(definition["id"])
-        self._push(life.NodeAdded(now_us(), node, _status(definition, kind)))
+        self._pump.push(life.NodeAdded(now_us(), node, _status(definition, kind)))
         await self._ask(protocol.add_params(self._run, definition))
         if kind != "dynamic":
             await self._wait_ready(node)
 
     async def remove(self, node: str) -> None:
         """Remove a node from the run. Raises DoraSystemdError."""
-        self._push(life.NodeReloading(now_us(), node))
+        self._pump.push(life.NodeReloading(now_us(), node))
         await self._end(node, "RemoveNode")
-        self._push(life.NodeRemoved(now_us(), node))
+        self._pump.push(life.NodeRemoved(now_us(), node))
 
     async def reload_operator(self, node: str, operator: str) -> None:
         """Have a Python operator load its file again. Raises DoraSystemdError."""
@@ -87,9 +84,6 @@ class Swapper:
     @property
     def _run(self) -> str:
         return self._pump.cell.run
-
-    def _push(self, event: life.Event) -> None:
-        self._pump.push(event)
 
     async def _ask(self, params: protocol.Params) -> None:
         reply = await self._engine.ask_apart(params, READY_SECONDS)
@@ -102,11 +96,15 @@ class Swapper:
         await self._pump.wait(_of(node, lambda one: not one.pid), stop_timeout(grace) / SECOND)
 
     async def _wait_ready(self, node: str) -> None:
-        await self._pump.wait(_of(node, lambda one: one.state in _SETTLED), READY_SECONDS)
+        await self._pump.wait(_of(node, _is_settled), READY_SECONDS)
         state = self._pump.cell.nodes[node]
-        if state.state not in _READY:
+        if not state.is_alive:
             late = f"not ready within {format_duration(int(READY_SECONDS * SECOND))}"
-            raise NotReady(f"node {node}: {state.exit or late}")
+            raise NotReady(f"node {node}: {str(state.exit) or late}")
+
+
+def _is_settled(node: NodeStatus) -> bool:
+    return node.is_alive or node.state in ("failed", "finished")
 
 
 def _is_restartable(node: NodeStatus) -> bool:

@@ -235,7 +235,7 @@ def _node_row(node: str, status: NodeStatus | None, numbers: dict[str, Any]) -> 
         "pid": status.pid,
         "restarts": status.restarts,
         "max_restarts": status.max_restarts or None,
-        "exit": status.exit,
+        "exit": str(status.exit),
         "since": status.since_us,
     }
     return NodeRow(node, status.state, **facts, **numbers)  # type: ignore[arg-type]

@@ -3,7 +3,7 @@
 from typing import Any
 
 from dora_systemd.adapters.bus.manager import Manager
-from dora_systemd.decisions.life.causes import signal_name
+from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.life.refusal import FAILED, parse_refusal
 from dora_systemd.errors import DoraSystemdError
 
@@ -68,8 +68,8 @@ def failure_reason(manager: Manager, unit: str) -> str:
 def _exit_words(unit: dict[str, Any]) -> str:
     status = unit["ExecMainStatus"]
     if unit["ExecMainCode"] == _CLD_EXITED:
-        refused = _REFUSED.get(status)
-        return f"{refused} (exit code {status})" if refused else f"exit code {status}"
+        refused, how = _REFUSED.get(status), exit_of(status)
+        return f"{refused} ({how})" if refused else str(how)
     if status:
-        return f"signal {signal_name(status)}"
+        return str(exit_of(-status))
     return "ended" if unit["Result"] == "success" else str(unit["Result"])

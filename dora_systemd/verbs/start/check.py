@@ -14,6 +14,7 @@ from pathlib import Path
 from dora_systemd.adapters.bus.manager import Manager, Property
 from dora_systemd.adapters.dora.command import DORA_SECONDS
 from dora_systemd.adapters.host.process import Beside, Completed, read_streams, run_command
+from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.cell.options import check_command
 from dora_systemd.decisions.life.refusal import parse_refusal
 from dora_systemd.decisions.properties.assignments import typed
@@ -40,7 +41,7 @@ def check_plan(connect: Callable[[], Manager], plan: Plan) -> None:
     if refusal := parse_refusal(done.stdout, done.status):
         raise refusal
     if done.status:
-        raise _no_check(plan, done.stderr.strip() or f"exit code {done.status}")
+        raise _no_check(plan, done.stderr.strip() or str(exit_of(done.status)))
 
 
 def run_beside(connect: Callable[[], Manager], plan: Plan, command: Sequence[str]) -> Completed:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from dora_systemd.adapters.dora.preparation import Prepared, prepare
+from dora_systemd.decisions.cell.exits import Exit, exit_of
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.life import events as life
@@ -58,7 +59,7 @@ class ReloadBench:
         return str([call for call in self.calls if call[0] == "ask"][-1][2])
 
     def end(self) -> None:
-        self.pump.push(life.NodeExited(1, self.node, "", False))
+        self.pump.push(life.NodeExited(1, self.node, Exit(), False))
 
     def spawn(self) -> None:
         self.pump.push(life.NodeSpawned(2, self.node, 8))
@@ -66,7 +67,7 @@ class ReloadBench:
 
     def crash(self) -> None:
         self.pump.push(life.NodeSpawned(2, self.node, 8))
-        self.pump.push(life.NodeExited(3, self.node, "exit code 1", False))
+        self.pump.push(life.NodeExited(3, self.node, exit_of(1), False))
 
     def applier(self, *steps: tuple[How, str], **more: Any) -> Applier:
         found = tuple(Step(how, node, f"{self.root}/{node}.py") for how, node in steps)

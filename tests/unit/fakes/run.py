@@ -2,11 +2,12 @@
 
 import asyncio
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
 from dora_systemd.adapters.dora.engine import Child
+from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.decisions.cell.limits import NodeLimits
 from dora_systemd.decisions.cell.line_rates import RateLimits
 from dora_systemd.decisions.cell.status import CpuSample, LineCount
@@ -16,28 +17,31 @@ from dora_systemd.decisions.life.states import Record
 from dora_systemd.decisions.logs.fields import Value
 from dora_systemd.decisions.resources.oom import Oom
 from dora_systemd.errors import DoraSystemdError
+from dora_systemd.runner.cell.engine import Engine
+from dora_systemd.runner.nodes.nodes import Nodes
+from dora_systemd.runner.nodes.resources import Resources
 
 Calls = list[tuple[Any, ...]]
 """What the fakes of one run were asked to do, in its order."""
 
 
-class FakeResources:
+class FakeResources(Resources):
     """Limits that come close when `records` says so."""
 
     def __init__(self) -> None:
         self.records: list[Record] = []
 
-    def look(self, samples: tuple[CpuSample, ...], now: CpuSample) -> Sequence[Record]:
+    def look(self, samples: tuple[CpuSample, ...], now: CpuSample) -> list[Record]:
         del samples, now
         return self.records
 
 
-class FakeNodes:
+class FakeNodes(Nodes):
     """living: nodes and processes that are there. ooms: by node, and by "" for dora."""
 
     def __init__(self, calls: Calls | None = None) -> None:
         self.calls: Calls = [] if calls is None else calls
-        self.resources = FakeResources()
+        self.resources: FakeResources = FakeResources()
         self.living: set[tuple[str, int]] = set()
         self.ooms: dict[str, Oom] = {}
 
@@ -97,7 +101,7 @@ class FakeNodes:
             self.calls.append(("end", node))
 
 
-class FakePipes:
+class FakePipes(LogPipes):
     """events: what was written. broken: life events that cannot be."""
 
     def __init__(self, calls: Calls | None = None) -> None:
@@ -112,7 +116,7 @@ class FakePipes:
         self.calls.append(("event", name))
         self.events.append((name, node, details))
 
-    def line_counts(self) -> Mapping[str, LineCount]:
+    def line_counts(self) -> dict[str, LineCount]:
         return {}
 
     def add_output(self, label: str, fd: int, on_line: Callable[[str], None] | None = None) -> None:
@@ -130,7 +134,7 @@ class FakePipes:
         return [details["reason"] for event, _, details in self.events if event == name]
 
 
-class FakeDora:
+class FakeDora(Engine):
     """A coordinator that gives each request the next of its `answers`, and is silent without one.
 
     An answer is a result, or an error to raise; then: what happens meanwhile. silent: who hangs.

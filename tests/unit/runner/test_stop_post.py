@@ -15,7 +15,6 @@ from dora_systemd.runner.stop_post import (
     READ_SECONDS,
     kill_nodes,
     killed_by,
-    killed_cause,
     main,
     out_of_memory,
     write_last_words,
@@ -53,8 +52,7 @@ def test_only_a_killed_runner_has_last_words(
     code: str, status: str, result: str, reason: str, cause: str
 ) -> None:
     environ = {"EXIT_CODE": code, "EXIT_STATUS": status, "SERVICE_RESULT": result}
-    assert killed_by(environ) == reason
-    assert killed_cause(environ) == cause
+    assert killed_by(environ) == (cause, reason)
 
 
 def test_a_runner_that_was_killed_for_want_of_memory(tmp_path: Path) -> None:

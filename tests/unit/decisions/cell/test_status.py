@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dora_systemd.decisions.cell.exits import parse_exit
 from dora_systemd.decisions.cell.status import (
     NODE_STATES,
     STAGES,
@@ -23,9 +24,10 @@ from dora_systemd.errors import DoraSystemdError
 counts = st.integers(0, 2**63 - 1)
 times = st.integers(0, 2**56)
 ids = st.from_regex(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,20}", fullmatch=True)
+exits = st.builds(parse_exit, st.text() | st.sampled_from(["exit code 3", "signal SIGKILL"]))
 nodes = st.builds(
     NodeStatus,
-    *(st.sampled_from(NODE_STATES), counts, counts, times, st.text(), st.text()),
+    *(st.sampled_from(NODE_STATES), counts, counts, times, exits, st.text()),
     max_restarts=counts,
 )
 samples = st.builds(
@@ -124,7 +126,7 @@ def test_what_no_runner_writes_is_refused_in_one_line(text: str) -> None:
 
 def test_a_long_text_is_cut() -> None:
     node = CellStatus.from_json(json.dumps({"nodes": {"a": {"exit": "x" * 10**6}}})).nodes["a"]
-    assert len(node.exit) == 1000
+    assert len(str(node.exit)) == 1000
 
 
 def test_counts() -> None:

@@ -1,7 +1,7 @@
 """Who gets nothing any more when a node is gone."""
 
 from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
-from dora_systemd.decisions.descriptor.wiring import downstream_of, with_downstream
+from dora_systemd.decisions.descriptor.wiring import downstream_of
 
 NODES = [
     {"id": "a", "path": "a", "outputs": ["x"], "inputs": {"t": "dora/timer/millis/1"}},
@@ -16,11 +16,3 @@ def test_chain_and_circle() -> None:
     assert found == {"a": ("b", "c", "d"), "b": ("c", "d"), "c": ("d",), "d": ()}
     circle = [{**NODES[0], "inputs": {"z": "c/z"}}, *NODES[1:3]]
     assert downstream_of(parse_dataflow({"nodes": circle}, "f"))["b"] == ("c", "a")
-
-
-def test_only_failures_name_whom_they_starve() -> None:
-    fed = {"a": ("b", "c"), "c": ()}
-    crash = ("node-crashed", "a", {"exit": "exit code 1"})
-    assert with_downstream(crash, fed)[2] == {"exit": "exit code 1", "downstream": "b c"}
-    for event, node in (("node-exited", "a"), ("node-crashed", "c"), ("node-oom", "x")):
-        assert with_downstream((event, node, {}), fed) == (event, node, {})

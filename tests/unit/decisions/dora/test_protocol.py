@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dora_systemd.decisions.cell.exits import Exit, exit_of, parse_exit
 from dora_systemd.decisions.dora import protocol
 from dora_systemd.decisions.dora.protocol import LogRecord, Reply
 from dora_systemd.decisions.life import events as life
@@ -33,19 +34,19 @@ def event(message: str, target: str = "daemon", node: str | None = "a") -> life.
         (event("node is ready"), life.NodeReady(5, "a")),
         (
             event("handling node stop with exit status Success (restart: false, restart_count: 0)"),
-            life.NodeExited(5, "a", "", False),
+            life.NodeExited(5, "a", Exit(), False),
         ),
         (
             event(
                 "handling node stop with exit status ExitCode(3) (restart: true, restart_count: 1)"
             ),
-            life.NodeExited(5, "a", "exit code 3", True),
+            life.NodeExited(5, "a", exit_of(3), True),
         ),
         (
             event(
                 "handling node stop with exit status Signal(9) (restart: false, restart_count: 0)"
             ),
-            life.NodeExited(5, "a", "signal SIGKILL", False),
+            life.NodeExited(5, "a", exit_of(-9), False),
         ),
         (
             event("marking `camera` as cascading error caused by `opnode`"),
@@ -81,11 +82,11 @@ def test_results() -> None:
     }
     reply = Reply("1", {"DataflowStopped": {"uuid": RUN, "result": {"node_results": nodes}}}, "")
     assert protocol.parse_results(reply) == {
-        "a": "exit code 1",
-        "b": "signal SIGTERM because node a failed",
-        "c": "signal SIGKILL after the grace duration",
-        "d": "failed to spawn: no",
-        "ok": "",
+        "a": exit_of(1),
+        "b": parse_exit("signal SIGTERM because node a failed"),
+        "c": parse_exit("signal SIGKILL after the grace duration"),
+        "d": parse_exit("failed to spawn: no"),
+        "ok": Exit(),
     }
     assert protocol.parse_results(Reply("1", {"DataflowSpawned": {"uuid": RUN}}, "")) is None
     assert protocol.parse_results(Reply("1", None, "no such dataflow")) == {}

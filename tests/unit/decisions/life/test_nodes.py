@@ -1,20 +1,27 @@
 """The live table while reloads change which nodes there are."""
 
+from dora_systemd.decisions.cell.exits import Exit, exit_of
 from dora_systemd.decisions.cell.status import HELD, NodeStatus
 from dora_systemd.decisions.life import events as life
-from dora_systemd.decisions.life.nodes import has_process, reshape, update
+from dora_systemd.decisions.life.nodes import NodeTable, has_process, update, with_downstream
+from dora_systemd.decisions.life.states import Record
 
 RUNNING = {"a": NodeStatus("running", 7, restarts=2, policy=HELD)}
+
+
+def reshape(nodes: NodeTable, event: life.Event) -> NodeTable:
+    after, record = update(nodes, event, is_stopping=False, is_open=True)
+    assert record is None
+    return after
 
 
 def updated(nodes: dict[str, NodeStatus], *events: life.Event) -> list[str]:
     """States of `a` after each event, and what the journal was told."""
     found = []
-    table = dict(nodes)
+    table: NodeTable = nodes
     for event in events:
-        after, record = update(table, event, is_stopping=False, is_open=True)
-        table = dict(reshape(after, event))
-        found.append(f"{table['a'].state} {record[0] if record else ''}".strip())
+        table, record = update(table, event, is_stopping=False, is_open=True)
+        found.append(f"{table['a'].state} {record.event if record else ''}".strip())
     return found
 
 
@@ -23,7 +30,7 @@ def test_a_swap_is_no_crash_and_no_restart() -> None:
     assert updated(
         RUNNING,
         life.NodeReloading(1, "a", fresh),
-        life.NodeExited(2, "a", "", True),
+        life.NodeExited(2, "a", Exit(), True),
         life.NodeSpawned(3, "a", 8),
         life.NodeReady(4, "a"),
     ) == ["reloading", "reloading node-exited", "starting", "running node-ready"]
@@ -34,17 +41,17 @@ def test_the_old_one_may_end_after_its_successor_has_begun() -> None:
         RUNNING,
         life.NodeReloading(1, "a"),
         life.NodeSpawned(2, "a", 8),
-        life.NodeExited(3, "a", "signal SIGTERM", False, is_stale=True),
+        life.NodeExited(3, "a", exit_of(-15), False, is_stale=True),
         life.NodeReady(4, "a"),
     ) == ["reloading", "starting", "starting", "running node-ready"]
 
 
 def test_a_node_that_is_held_fails_and_is_not_restarted() -> None:
     nodes, record = update(
-        RUNNING, life.NodeExited(1, "a", "exit code 1", True), is_stopping=False, is_open=True
+        RUNNING, life.NodeExited(1, "a", exit_of(1), True), is_stopping=False, is_open=True
     )
     assert record is not None
-    assert (nodes["a"].state, nodes["a"].restarts, record[0]) == ("failed", 2, "node-crashed")
+    assert (nodes["a"].state, nodes["a"].restarts, record.event) == ("failed", 2, "node-crashed")
 
 
 def test_processes_of_a_node_that_reloads() -> None:
@@ -57,3 +64,11 @@ def test_nodes_come_and_go() -> None:
     more = reshape(RUNNING, life.NodeAdded(1, "b", NodeStatus()))
     assert set(more) == {"a", "b"}
     assert set(reshape(more, life.NodeRemoved(1, "a"))) == {"b"}
+
+
+def test_only_failures_name_whom_they_starve() -> None:
+    fed = {"a": ("b", "c"), "c": ()}
+    crash = Record("node-crashed", "a", {"exit": "exit code 1"})
+    assert with_downstream(crash, fed).details == {"exit": "exit code 1", "downstream": "b c"}
+    for event, node in (("node-exited", "a"), ("node-crashed", "c"), ("node-oom", "x")):
+        assert with_downstream(Record(event, node), fed) == Record(event, node)

@@ -1,9 +1,11 @@
 """The runner's state machine: every pair of state and event, and whole lives as tables."""
 
 from dataclasses import replace
+from typing import get_type_hints
 
 import pytest
 
+from dora_systemd.decisions.cell.exits import Exit, exit_of
 from dora_systemd.decisions.cell.status import HELD, NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.failures import ENGINE_TIMEOUT
@@ -24,20 +26,20 @@ SAMPLES: dict[type[life.Event], tuple[life.Event, ...]] = {
     life.NodeReady: (life.NodeReady(1, "a"), life.NodeReady(1, "unknown")),
     life.AllReady: (life.AllReady(1),),
     life.NodeExited: (
-        life.NodeExited(1, "a", "", False),
-        life.NodeExited(1, "a", "exit code 1", False),
-        life.NodeExited(1, "a", "signal SIGKILL", True),
-        life.NodeExited(1, "a", "", False, is_stale=True),
-        life.NodeExited(1, "unknown", "", True, is_stale=True),
+        life.NodeExited(1, "a", Exit(), False),
+        life.NodeExited(1, "a", exit_of(1), False),
+        life.NodeExited(1, "a", exit_of(-9), True),
+        life.NodeExited(1, "a", Exit(), False, is_stale=True),
+        life.NodeExited(1, "unknown", Exit(), True, is_stale=True),
     ),
     life.NodeCascaded: (life.NodeCascaded(1, "a", "b"),),
     life.NodeHung: (life.NodeHung(1, "a", "unresponsive"), life.NodeHung(1, "unknown", "")),
     life.StartTimedOut: (life.StartTimedOut(1, 1_000_000),),
     life.RunFinished: (life.RunFinished(1),),
-    life.ResultKnown: (life.ResultKnown(1), life.ResultKnown(1, {"a": "", "b": "exit code 1"})),
+    life.ResultKnown: (life.ResultKnown(1), life.ResultKnown(1, {"a": Exit(), "b": exit_of(1)})),
     life.ChildExited: (
-        life.ChildExited(1, "daemon", "signal SIGKILL"),
-        life.ChildExited(1, "coordinator", "exit code 1"),
+        life.ChildExited(1, "daemon", exit_of(-9)),
+        life.ChildExited(1, "coordinator", exit_of(1)),
     ),
     life.ConnectionLost: (life.ConnectionLost(1),),
     life.StopAsked: (life.StopAsked(1, "SIGTERM"),),
@@ -182,9 +184,9 @@ def test_history_stop() -> None:
     now, done = live(
         *READY,
         life.StopAsked(9, "SIGTERM"),
-        life.NodeExited(10, "a", "", False),
-        life.NodeExited(10, "b", "signal SIGTERM", False),
-        life.ChildExited(11, "daemon", "exit code 0"),
+        life.NodeExited(10, "a", Exit(), False),
+        life.NodeExited(10, "b", exit_of(-15), False),
+        life.ChildExited(11, "daemon", exit_of(0)),
     )
     assert now.exit is RunnerExit.OK
     ends = done[done.index(Record("dataflow-stopping", "", {"by": "SIGTERM"})) :]
@@ -200,11 +202,11 @@ def test_history_stop() -> None:
 def test_history_finish() -> None:
     now, done = live(
         *READY,
-        life.NodeExited(9, "a", "", False),
-        life.NodeExited(9, "b", "", False),
+        life.NodeExited(9, "a", Exit(), False),
+        life.NodeExited(9, "b", Exit(), False),
         life.RunFinished(10),
-        life.ResultKnown(11, {"a": "", "b": ""}),
-        life.ChildExited(12, "daemon", "exit code 0"),
+        life.ResultKnown(11, {"a": Exit(), "b": Exit()}),
+        life.ChildExited(12, "daemon", exit_of(0)),
     )
     assert now.exit is RunnerExit.OK
     assert done[-2:] == [Record("dataflow-finished"), Do.EXIT]
@@ -213,11 +215,11 @@ def test_history_finish() -> None:
 def test_history_failed_before_ready() -> None:
     now, done = live(
         *START,
-        life.NodeExited(9, "a", "exit code 1", False),
+        life.NodeExited(9, "a", exit_of(1), False),
         life.NodeCascaded(9, "b", "a"),
         life.RunFinished(10),
-        life.ResultKnown(11, {"a": "exit code 1", "b": "exit code 1 because node a failed"}),
-        life.ChildExited(12, "daemon", "exit code 0"),
+        life.ResultKnown(11, {"a": exit_of(1), "b": exit_of(1)._replace(by="a")}),
+        life.ChildExited(12, "daemon", exit_of(0)),
     )
     assert now.exit is RunnerExit.FAILED
     assert Record("node-crashed", "a", {"exit": "exit code 1"}) in done
@@ -225,7 +227,7 @@ def test_history_failed_before_ready() -> None:
 
 
 def test_the_barrier_opens_although_a_node_has_failed() -> None:
-    failed = (*START, life.NodeExited(5, "a", "exit code 1", False), life.NodeReady(6, "b"))
+    failed = (*START, life.NodeExited(5, "a", exit_of(1), False), life.NodeReady(6, "b"))
     now, done = live(*failed, life.AllReady(7))
     assert now.state is State.WAITING
     assert Record("dataflow-started") not in done
@@ -242,8 +244,8 @@ def test_an_empty_result_is_unknown_and_not_success() -> None:
 def test_stop_does_not_wait_for_a_node_in_its_restart_delay() -> None:
     now, done = live(
         *READY,
-        life.NodeExited(9, "a", "", False),
-        life.NodeExited(9, "b", "exit code 1", True),
+        life.NodeExited(9, "a", Exit(), False),
+        life.NodeExited(9, "b", exit_of(1), True),
         life.StopAsked(10, "SIGTERM"),
     )
     assert now.state is State.LEAVING
@@ -258,15 +260,15 @@ def test_stop_timeout_covers_what_dora_takes_to_kill() -> None:
 
 
 def test_crash_restart_and_stale_exits() -> None:
-    now, done = live(*READY, life.NodeExited(9, "a", "exit code 3", True))
+    now, done = live(*READY, life.NodeExited(9, "a", exit_of(3), True))
     assert now.nodes["a"].state == "restarting"
     now, actions = step(now, life.NodeSpawned(10, "a", 70))
     assert actions == (Record("node-restarted", "a", {"restarts": "1"}),)
-    now, _ = step(now, life.NodeExited(11, "a", "signal SIGKILL", False, is_stale=True))
+    now, _ = step(now, life.NodeExited(11, "a", exit_of(-9), False, is_stale=True))
     assert (now.nodes["a"].pid, now.nodes["a"].state) == (70, "starting")
     now, _ = step(now, life.NodeReady(12, "a"))
     assert (now.nodes["a"].state, now.nodes["a"].restarts) == ("running", 1)
-    now, _ = step(now, life.NodeExited(13, "a", "signal SIGKILL", True, is_stale=True))
+    now, _ = step(now, life.NodeExited(13, "a", exit_of(-9), True, is_stale=True))
     assert (now.nodes["a"].pid, now.nodes["a"].restarts) == (70, 2)
     assert Record("node-crashed", "a", {"exit": "exit code 3"}) in done
 
@@ -283,9 +285,9 @@ def test_a_reload_of_the_whole_ends_without_a_word() -> None:
     after, done = lives(
         cell(State.RUNNING),
         life.ReloadAsked(1),
-        life.NodeExited(2, "a", "", False),
-        life.NodeExited(3, "b", "", False),
-        life.ChildExited(4, "daemon", "exit code 0"),
+        life.NodeExited(2, "a", Exit(), False),
+        life.NodeExited(3, "b", Exit(), False),
+        life.ChildExited(4, "daemon", exit_of(0)),
     )
     assert after.state is State.ENDED
     assert (after.reload, after.exit, after.failure) == (True, RunnerExit.OK, "")
@@ -299,7 +301,7 @@ def test_a_stop_is_stronger_than_a_reload() -> None:
         life.ReloadAsked(1),
         life.StopAsked(2, "SIGTERM"),
         life.StopAnswered(3),
-        life.ChildExited(4, "daemon", "exit code 0"),
+        life.ChildExited(4, "daemon", exit_of(0)),
     )
     assert (after.state, after.reload, after.stop_by) == (State.ENDED, False, "SIGTERM")
     assert [one.event for one in done if isinstance(one, Record)] == [
@@ -320,7 +322,7 @@ def test_a_held_node_that_fails_before_the_start(
 ) -> None:
     nodes = {"a": NodeStatus("starting", 7, policy=HELD), "b": NodeStatus("ready", 8)}
     now = cell(State.WAITING, nodes=nodes, **changes)
-    after, done = lives(now, life.NodeExited(1, "a", "exit code 1", True))
+    after, done = lives(now, life.NodeExited(1, "a", exit_of(1), True))
     assert (after.state is State.ENDED) == ends
     names = [one.event for one in done if isinstance(one, Record)]
     assert names == ["node-crashed", *([word] if word else [])]
@@ -331,9 +333,9 @@ def test_a_trial_that_fails_ends_in_good_order() -> None:
     now = cell(State.WAITING, nodes=nodes, is_again=True, is_trial=True)
     after, done = lives(
         now,
-        life.NodeExited(1, "a", "exit code 1", True),
-        life.NodeExited(2, "b", "", False),
-        life.ChildExited(3, "daemon", "exit code 0"),
+        life.NodeExited(1, "a", exit_of(1), True),
+        life.NodeExited(2, "b", Exit(), False),
+        life.ChildExited(3, "daemon", exit_of(0)),
     )
     assert Do.ASK_STOP in done
     assert after.state is State.ENDED
@@ -343,7 +345,7 @@ def test_a_trial_that_fails_ends_in_good_order() -> None:
 
 
 def test_nodes_that_all_crashed_at_once_run_again() -> None:
-    crashes = [life.NodeExited(9, node, "signal SIGKILL", True) for node in ("a", "b")]
+    crashes = [life.NodeExited(9, node, exit_of(-9), True) for node in ("a", "b")]
     again = [life.NodeSpawned(10, "a", 70), life.NodeSpawned(10, "b", 80)]
     now, _ = live(*READY, *crashes, *again, life.NodeReady(11, "a"), life.NodeReady(12, "b"))
     assert [node.state for node in now.nodes.values()] == ["running", "running"]
@@ -354,7 +356,7 @@ def test_nodes_that_all_crashed_at_once_run_again() -> None:
     [
         ((life.Refused(9, "no"),), "refused", ""),
         ((life.StartTimedOut(9, SECOND),), "start-timeout", "a b"),
-        ((life.ChildExited(9, "daemon", "signal SIGKILL"),), "daemon-lost", ""),
+        ((life.ChildExited(9, "daemon", exit_of(-9)),), "daemon-lost", ""),
         ((life.ConnectionLost(9),), "coordinator-lost", ""),
     ],
 )
@@ -369,14 +371,21 @@ def test_a_failed_node_names_itself_and_whom_it_starves() -> None:
     now = replace(now, downstream={"a": ("b",)})
     said: list[Record] = []
     for event in (
-        life.NodeExited(9, "a", "exit code 1", False),
-        life.NodeExited(9, "b", "", False),
+        life.NodeExited(9, "a", exit_of(1), False),
+        life.NodeExited(9, "b", Exit(), False),
         life.RunFinished(10),
-        life.ResultKnown(11, {"a": "exit code 1", "b": ""}),
-        life.ChildExited(12, "daemon", "exit code 0"),
+        life.ResultKnown(11, {"a": exit_of(1), "b": Exit()}),
+        life.ChildExited(12, "daemon", exit_of(0)),
     ):
         now, actions = step(now, event)
         said += [one for one in actions if isinstance(one, Record)]
     crash, _, failure = said
     assert crash.details == {"exit": "exit code 1", "downstream": "b"}
     assert (failure.details["cause"], failure.details["nodes"]) == ("node-failed", "a")
+
+
+def test_each_handler_takes_the_events_of_its_entries() -> None:
+    for state, row in TABLE.items():
+        for event, handler in row.items():
+            taken = get_type_hints(handler)["event"]
+            assert issubclass(event, taken), f"{handler.__name__} for {event} in {state}"

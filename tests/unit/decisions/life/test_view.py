@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.cell.status import CellStatus, LineCount, NodeStatus
 from dora_systemd.decisions.life.states import Cell, State
 from dora_systemd.decisions.life.view import cell_status, format_status, initial_nodes, stage
@@ -35,7 +36,7 @@ def test_status_lines() -> None:
 
 
 def test_failures_are_named_and_many_are_counted() -> None:
-    nodes = {f"n{i}": NodeStatus("failed", exit="exit code 1") for i in range(7)}
+    nodes = {f"n{i}": NodeStatus("failed", exit=exit_of(1)) for i in range(7)}
     text = format_status(Cell(0, 0, nodes, State.RUNNING))
     assert text.startswith("0/7 nodes running; failed: n0 (exit code 1), ")
     assert text.endswith("n4 (exit code 1) and 2 more")

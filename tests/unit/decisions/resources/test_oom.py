@@ -2,6 +2,7 @@
 
 import pytest
 
+from dora_systemd.decisions.cell.exits import Exit, exit_of
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.dora.protocol import with_facts
 from dora_systemd.decisions.life import events as life
@@ -49,7 +50,7 @@ def test_largest() -> None:
 
 def records(oom: Oom, will_restart: bool = False) -> tuple[Cell, list[Record]]:
     """What the death of node "a" makes of a cell that runs."""
-    event = life.NodeExited(5, "a", "signal SIGKILL", will_restart)
+    event = life.NodeExited(5, "a", exit_of(-9), will_restart)
     cell = Cell(0, 0, {"a": NodeStatus("running", 7), "b": NodeStatus("running", 8)}, State.RUNNING)
     after, actions = step(cell, with_facts(event, False, oom))
     return after, [one for one in actions if isinstance(one, Record)]
@@ -59,10 +60,10 @@ def test_a_node_at_its_own_limit() -> None:
     oom = Oom(Owner.NODE, 64 * MIB, 64 * MIB)
     after, said = records(oom, will_restart=True)
     assert after.nodes["a"].state == "restarting"
-    assert after.nodes["a"].exit == oom.text
+    assert after.nodes["a"].exit == Exit(words=oom.text)
     assert said == [Record("node-oom", "a", oom.node_details())]
     again = step(after, life.NodeSpawned(6, "a", 9))[0]
-    assert again.nodes["a"].exit == oom.text, "it stays to be seen"
+    assert again.nodes["a"].exit == Exit(words=oom.text), "it stays to be seen"
 
 
 def test_the_dataflow_at_its_limit() -> None:
@@ -78,7 +79,7 @@ def test_the_dataflow_at_its_limit() -> None:
 def test_the_dataflow_without_its_daemon() -> None:
     oom = Oom(Owner.DATAFLOW, 19 * MIB, 700 * MIB, "b", 500 * MIB)
     cell = Cell(0, 0, {"b": NodeStatus("running", 8)}, State.RUNNING)
-    after, actions = step(cell, life.ChildExited(5, "daemon", oom.text, oom))
+    after, actions = step(cell, life.ChildExited(5, "daemon", Exit(words=oom.text), oom))
     said = [one for one in actions if isinstance(one, Record)]
     assert [one.event for one in said] == ["dataflow-oom", "daemon-lost", "dataflow-failed"]
     assert after.failure == (
@@ -90,11 +91,11 @@ def test_doras_verdict_does_not_hide_it() -> None:
     oom = Oom(Owner.NODE, 64 * MIB, 64 * MIB)
     after = records(oom)[0]
     after = step(after, life.RunFinished(6))[0]
-    after = step(after, life.ResultKnown(7, {"a": "signal SIGKILL", "b": "exit code 1"}))[0]
+    after = step(after, life.ResultKnown(7, {"a": exit_of(-9), "b": exit_of(1)}))[0]
     assert after.failure == f"node a: {oom.text}, node b: exit code 1"
-    assert after.nodes["a"].exit == oom.text
+    assert after.nodes["a"].exit == Exit(words=oom.text)
 
 
 def test_a_node_that_ended_well_did_not_want_memory() -> None:
-    event = with_facts(life.NodeExited(5, "a", "", False), False, Oom(Owner.NODE, 1, 1))
-    assert (event.exit, event.oom) == ("", None)
+    event = with_facts(life.NodeExited(5, "a", Exit(), False), False, Oom(Owner.NODE, 1, 1))
+    assert (event.exit, event.oom) == (Exit(), None)

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from dora_systemd.adapters.dora import engine
+from dora_systemd.decisions.cell.exits import Exit, exit_of
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Do, RunnerExit, State
 from dora_systemd.decisions.resources.oom import Oom, Owner
@@ -101,7 +102,7 @@ def test_the_result_is_asked_for_until_it_is_there(tmp_path: Path) -> None:
         bench.dora.answers["Check"].extend(
             [{"DataflowSpawned": {}}, {"DataflowSpawned": {}}, ENDED]
         )
-        assert await bench.do(Do.ASK_RESULT) == [life.ResultKnown(0, {"a": ""})]
+        assert await bench.do(Do.ASK_RESULT) == [life.ResultKnown(0, {"a": Exit()})]
 
     live(work)
 
@@ -158,7 +159,9 @@ def test_the_daemon_is_dismissed_when_its_nodes_have_said_all(
             ("wait quiet",),
             ("dismiss",),
         ]
-        assert heard == ([] if has_daemon else [life.ChildExited(0, "daemon", "earlier")])
+        assert heard == (
+            [] if has_daemon else [life.ChildExited(0, "daemon", Exit(words="earlier"))]
+        )
 
     live(work)
 
@@ -213,7 +216,7 @@ def test_the_daemon_from_its_start_to_its_end(tmp_path: Path, oom: Oom | None) -
         async with asyncio.timeout(20):
             while len(bench.heard) < 3:
                 await asyncio.sleep(0.005)
-        how = "exit code 3" if oom is None else oom.text
+        how = exit_of(3) if oom is None else Exit(words=oom.text)
         hung = life.NodeHung(0, "a", "unresponsive for 5322ms (timeout: 5s)")
         assert bench.heard[0] == hung
         assert life.DaemonConnected(0) in bench.heard

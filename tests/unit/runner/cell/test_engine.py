@@ -13,6 +13,7 @@ import pytest
 from websockets.asyncio.server import ServerConnection, serve
 
 from dora_systemd.adapters.dora import engine
+from dora_systemd.decisions.cell.exits import Exit, exit_of
 from dora_systemd.decisions.dora.protocol import LogRecord
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
@@ -133,8 +134,8 @@ def test_a_coordinator_without_a_token_is_an_error(tmp_path: Path) -> None:
     live(tmp_path, work)
 
 
-async def exits(child: engine.Child) -> tuple[str, str]:
-    ended: asyncio.Future[tuple[str, str]] = asyncio.get_running_loop().create_future()
+async def exits(child: engine.Child) -> tuple[str, Exit]:
+    ended: asyncio.Future[tuple[str, Exit]] = asyncio.get_running_loop().create_future()
     engine.watch(asyncio.get_running_loop(), child, lambda *how: ended.set_result(how))
     return await ended
 
@@ -144,7 +145,7 @@ def test_the_daemon_is_asked_to_end_in_good_order(tmp_path: Path) -> None:
         assert not bench.engine.dismiss_daemon(), "there is none"
         daemon = bench.daemon()
         assert bench.engine.dismiss_daemon()
-        assert await exits(daemon) == ("daemon", "signal SIGINT")
+        assert await exits(daemon) == ("daemon", exit_of(-2))
         assert not bench.engine.dismiss_daemon(), "it has left"
 
     live(tmp_path, work)

@@ -3,6 +3,7 @@
 import asyncio
 from pathlib import Path
 
+from dora_systemd.decisions.cell.exits import Exit, exit_of
 from dora_systemd.decisions.dora.protocol import LogRecord
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Do
@@ -51,7 +52,7 @@ def test_what_a_crashed_node_has_left_goes_before_the_next_one(tmp_path: Path) -
         bench = Bench(tmp_path)
         done = await hear(bench, EXITED.format("true"))
         assert done == [("clear", "a", 7), ("push", "NodeExited"), ("forget", "a")]
-        assert bench.heard == [life.NodeExited(0, "a", "exit code 1", True)]
+        assert bench.heard == [life.NodeExited(0, "a", exit_of(1), True)]
 
     live(work)
 
@@ -69,7 +70,7 @@ def test_the_end_of_a_node_that_has_been_replaced(tmp_path: Path) -> None:
         bench = Bench(tmp_path)
         bench.nodes.living = {("a", 7)}
         assert await hear(bench, EXITED.format("true")) == [("push", "NodeExited")]
-        assert bench.heard == [life.NodeExited(0, "a", "exit code 1", True, is_stale=True)]
+        assert bench.heard == [life.NodeExited(0, "a", exit_of(1), True, is_stale=True)]
 
     live(work)
 
@@ -79,7 +80,7 @@ def test_a_node_that_used_up_its_memory(tmp_path: Path) -> None:
         bench, oom = Bench(tmp_path), Oom(Owner.NODE, 1 << 30, 1 << 30)
         bench.nodes.ooms = {"a": oom}
         await hear(bench, EXITED.format("false"))
-        assert bench.heard == [life.NodeExited(0, "a", oom.text, False, oom=oom)]
+        assert bench.heard == [life.NodeExited(0, "a", Exit(words=oom.text), False, oom=oom)]
 
     live(work)
 

@@ -9,6 +9,7 @@ from typing import Any, cast
 
 import pytest
 
+from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.dora.protocol import Reply
@@ -140,7 +141,7 @@ def test_the_pump_hears_after_something_has_raised(tmp_path: Path) -> None:
     async def work() -> None:
         bench = Bench(tmp_path, Side("drain"), State.LEAVING)
         bench.connect()
-        bench.pump.push(life.NodeExited(1, "a", "exit code 1", False))
+        bench.pump.push(life.NodeExited(1, "a", exit_of(1), False))
         assert bench.pump.cell.state is State.ENDED
         assert bench.pump.end.done()
 

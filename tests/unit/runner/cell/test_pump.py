@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
@@ -54,7 +55,7 @@ EVENTS: list[tuple[State, life.Event, list[Do]]] = [
     (State.STARTING, life.Subscribed(1), [Do.OPEN_PIPES, Do.ASK_SPAWN, Do.ASK_RESULT]),
     (State.RUNNING, life.StopAsked(1, "SIGTERM"), [Do.ASK_STOP]),
     (State.STOPPING, life.StopAnswered(1), [Do.DISMISS_DAEMON]),
-    (State.LEAVING, life.ChildExited(1, "daemon", "exit code 0"), [Do.EXIT]),
+    (State.LEAVING, life.ChildExited(1, "daemon", exit_of(0)), [Do.EXIT]),
 ]
 
 
@@ -79,7 +80,7 @@ def test_these_are_all_actions() -> None:
         (State.LEAVING, life.DeadlinePassed(1), [("kill",), ("event", "dataflow-finished")]),
         (
             State.RUNNING,
-            life.NodeExited(1, "a", "exit code 1", False),
+            life.NodeExited(1, "a", exit_of(1), False),
             [("drain", "a"), ("event", "node-crashed")],
         ),
     ],

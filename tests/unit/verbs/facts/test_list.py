@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from dora_systemd.adapters.cgroup import groups as cgroup
+from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.cell.status import CellStatus, CpuSample, NodeStatus
 from dora_systemd.decisions.views.dataflows import DataflowRow, format_dataflow, format_dataflows
 from dora_systemd.decisions.views.prometheus import format_metrics
@@ -73,7 +74,7 @@ def test_running_dataflow(scope: Scope) -> None:
     sample = CpuSample(now_us() - 4 * SECOND, {"": 2 * SECOND, "camera": SECOND})
     nodes = {
         "camera": NodeStatus("running", 42, restarts=2),
-        "plot": NodeStatus("failed", exit="exit code 1"),
+        "plot": NodeStatus("failed", exit=exit_of(1)),
     }
     write_status(scope, CellStatus(stage="degraded", nodes=nodes, samples=(sample,)))
     row = row_of(manager, scope)
