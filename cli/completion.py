@@ -19,6 +19,9 @@ from dora_systemd.cli.parameters import current_scope
 from dora_systemd.decisions.properties.sandbox import LEVELS, NETWORKS
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import is_uuid_prefix
+from dora_systemd.verbs.facts.cells import read_cells
+from dora_systemd.verbs.facts.list import dataflow_row
+from dora_systemd.verbs.facts.selector import Selector
 
 VARIABLE = "_DORACTL_COMPLETE"
 
@@ -49,8 +52,6 @@ class Live(click.types.StringParamType):
 
 def dataflow_names(ctx: click.Context, incomplete: str) -> list[str]:
     """The dataflows of systemd and, for logs, of the journal; UUIDs if the word looks like one."""
-    from dora_systemd.verbs.facts.cells import read_cells
-
     verb = ctx.command.name or ""
     cells = [cell for cell in read_cells(_bus()) if cell.is_up or verb not in _RUNNING_ONLY]
     names = [cell.name for cell in cells] + (
@@ -64,16 +65,13 @@ def dataflow_names(ctx: click.Context, incomplete: str) -> list[str]:
 
 def node_names(ctx: click.Context, incomplete: str) -> list[str]:
     """The nodes of the dataflow that is on the command line."""
-    from dora_systemd.verbs.facts.cells import read_cells, select_cell
-    from dora_systemd.verbs.facts.list import dataflow_row
-
     del incomplete
     # After an option without its value, click leaves the arguments in ctx.args.
     selector = ctx.params.get("selector") or next(iter(ctx.args), "")
     if ctx.command.name == "logs":
         return JournalReader().known_nodes(selector)
     bus = _bus()
-    row = dataflow_row(bus, current_scope(), select_cell(read_cells(bus), selector))
+    row = dataflow_row(bus, current_scope(), Selector(selector).find(bus))
     return [one.node for one in row.nodes]
 
 

@@ -9,9 +9,9 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from itertools import islice
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
-from dora_systemd.adapters.journal.reader import end_journalctl, is_volatile, open_journalctl
+from dora_systemd.adapters.journal.reader import end_journalctl, open_journalctl
 from dora_systemd.decisions.logs.fields import ExportReader
 from dora_systemd.decisions.logs.query import (
     UNIT_ENDS,
@@ -23,10 +23,10 @@ from dora_systemd.decisions.logs.query import (
 )
 from dora_systemd.decisions.logs.terminal import ShownLines, TerminalLines
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.names import is_uuid_prefix, name_from_unit
 from dora_systemd.scope import Scope
-from dora_systemd.suggestions import did_you_mean
 from dora_systemd.values import quoted
+from dora_systemd.verbs.facts.ended import volatile_note
+from dora_systemd.verbs.facts.selector import Selector
 
 _CHUNK = 1 << 18
 _TURN = 1 << 14
@@ -54,6 +54,13 @@ class Journal(Protocol):
 
     def invocations(self, scope: Scope, name: str, uuid: str) -> Iterator[str]:
         """Invocations of its unit, newest first."""
+
+
+class _Recorded(NamedTuple):
+    """A dataflow in the journal."""
+
+    name: str
+    uuid: str
 
 
 @dataclass(frozen=True)
@@ -85,27 +92,16 @@ def find_query(journal: Journal, request: LogRequest) -> LogQuery:
 
 def _select_dataflow(journal: Journal, query: LogQuery, selector: str) -> LogQuery:
     names = journal.known_names()
-    name = name_from_unit(selector) or selector
-    if name in names:
-        return replace(query, name=name)
-    uuids = journal.known_uuids() if is_uuid_prefix(selector) else []
-    found = [uuid for uuid in uuids if uuid.startswith(selector.lower())]
-    if len(found) > 1:
-        message = f"cannot tell which dataflow {quoted(selector)} is"
-        raise DoraSystemdError(message, f"one of {', '.join(found[:10])}", ExitCode.USAGE)
-    if not found:
-        raise _unknown_dataflow(selector, names)
-    return replace(query, uuid=found[0], name=journal.name_of(found[0]))
-
-
-def _unknown_dataflow(selector: str, names: list[str]) -> DoraSystemdError:
-    hint = did_you_mean(selector, names)
-    if not hint and names:
-        hint = f"in the journal: {', '.join(names[:10])}"
-    if is_volatile():
-        hint = f"{hint + '; ' if hint else ''}the journal is volatile: a reboot empties it"
-    message = f"no dataflow named {quoted(selector)} in the journal"
-    return DoraSystemdError(message, hint, ExitCode.NOT_FOUND)
+    wanted = Selector(selector)
+    if wanted.name in names:
+        return replace(query, name=wanted.name)
+    fitting = wanted.meant(_Recorded("", uuid) for uuid in journal.known_uuids())
+    found = wanted.only(_Recorded(journal.name_of(one.uuid), one.uuid) for one in fitting)
+    if found is None:
+        error = wanted.missing(names)
+        error.hint += volatile_note()
+        raise error
+    return replace(query, uuid=found.uuid, name=found.name)
 
 
 def _select_nodes(journal: Journal, query: LogQuery, patterns: tuple[str, ...]) -> tuple[str, ...]:

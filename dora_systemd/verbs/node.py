@@ -16,11 +16,12 @@ from dora_systemd.decisions.reload.changes import has_readers
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.paths import CellPaths
 from dora_systemd.scope import Scope
+from dora_systemd.suggestions import did_you_mean
 from dora_systemd.trust.programs import Account, account_of_uid, become, fresh_environment
 from dora_systemd.trust.sockets import plain, require_listener
 from dora_systemd.trust.terminals import run_apart
 from dora_systemd.values import quoted
-from dora_systemd.verbs.facts.cells import Cell, not_found
+from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.list import read_status
 
 _NO_USER = 2**32 - 1
@@ -169,7 +170,7 @@ def require_node(scope: Scope, cell: Cell, node: str) -> CellStatus:
     if node not in status.nodes:
         raise DoraSystemdError(
             f"cannot find a node {quoted(node)} in the dataflow {cell.name}",
-            not_found(node, list(status.nodes)).hint,
+            did_you_mean(node, status.nodes) or f"nodes: {', '.join(status.nodes) or 'none'}",
             ExitCode.NOT_FOUND,
         )
     return status

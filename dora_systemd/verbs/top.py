@@ -7,8 +7,9 @@ from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.decisions.resources.usage import Strain, waits
 from dora_systemd.decisions.views.top import Look, TopEntry
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.facts.cells import Cell, read_cells, select_cell
+from dora_systemd.verbs.facts.cells import Cell, read_cells
 from dora_systemd.verbs.facts.list import Reading, read_dataflow, row_of
+from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.facts.snapshot import read_strains
 from dora_systemd.verbs.node import require_running
 
@@ -27,7 +28,7 @@ class Top:
         self._scope = scope
         self._before: dict[str, _Seen] = {}
         cells = read_cells(manager) if selectors else []
-        chosen = [select_cell(cells, selector) for selector in selectors]
+        chosen = [Selector(selector).loaded(cells) for selector in selectors]
         for cell in chosen:
             require_running(cell)
         self._units = frozenset(cell.unit for cell in chosen)

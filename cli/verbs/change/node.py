@@ -4,7 +4,8 @@ import click
 
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import current_scope, scope_options
-from dora_systemd.verbs.facts.cells import Cell, read_cells, select_cell
+from dora_systemd.verbs.facts.cells import Cell
+from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.node import restart_node, stop_node
 
 _EPILOG = """\b
@@ -41,4 +42,4 @@ def stop(selector: str, node: str) -> None:
 
 
 def _cell(selector: str) -> Cell:
-    return select_cell(read_cells(Bus(current_scope())), selector)
+    return Selector(selector).find(Bus(current_scope()))

@@ -4,7 +4,7 @@ import click
 
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import current_scope, scope_options
-from dora_systemd.verbs.facts.cells import read_cells, select_cell
+from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.reload import reload_cell
 
 _EPILOG = """\b
@@ -25,6 +25,5 @@ def command(selector: str, node: str | None) -> None:
     be used has no effect. See HOT RELOAD in dora-systemd(7).
     """
     scope = current_scope()
-    cell = select_cell(read_cells(Bus(scope)), selector)
-    done = reload_cell(scope, cell, node)
+    done = reload_cell(scope, Selector(selector).find(Bus(scope)), node)
     click.echo("\n".join(f"{line[:1].upper()}{line[1:]}" for line in done) or "Nothing has changed")

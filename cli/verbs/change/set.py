@@ -7,7 +7,7 @@ import click
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import current_scope, print_warnings, scope_options
 from dora_systemd.cli.settingoptions import live_options
-from dora_systemd.verbs.facts.cells import read_cells, select_cell
+from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.reload import switch_hot_reload
 from dora_systemd.verbs.set import set_limits
 
@@ -34,7 +34,7 @@ def command(selector: str, hot_reload: str | None, **flags: Any) -> None:
     """
     scope = current_scope()
     bus = Bus(scope)
-    cell = select_cell(read_cells(bus), selector)
+    cell = Selector(selector).find(bus)
     if hot_reload is None or any(value not in (None, ()) for value in flags.values()):
         print_warnings(set_limits(bus, scope, cell, flags))
         click.echo(f"Limits changed: {cell.uuid} ({cell.name})")

@@ -4,7 +4,7 @@ import click
 
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import current_scope, scope_options
-from dora_systemd.verbs.facts.cells import read_cells, select_cell
+from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.node import exec_dora
 
 _EPILOG = """\b
@@ -26,4 +26,4 @@ def command(selector: str, arguments: tuple[str, ...]) -> int:
     """
     scope = current_scope()
     bus = Bus(scope)
-    return exec_dora(scope, bus, select_cell(read_cells(bus), selector), arguments)
+    return exec_dora(scope, bus, Selector(selector).find(bus), arguments)

@@ -5,7 +5,7 @@ import click
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.edge import write_exactly
 from dora_systemd.cli.parameters import current_scope, scope_options
-from dora_systemd.verbs.facts.cells import find_cell
+from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.show import export_cell
 
 _EPILOG = """\b
@@ -26,4 +26,4 @@ def command(selector: str) -> None:
     """
     scope = current_scope()
     bus = Bus(scope, for_reading=True)
-    write_exactly(export_cell(bus, scope, find_cell(bus, selector)))
+    write_exactly(export_cell(bus, scope, Selector(selector).find(bus)))

@@ -2,9 +2,8 @@
 
 import click
 
-from dora_systemd.cli.listing import print_dataflows
+from dora_systemd.cli.listing import ListRequest, print_dataflows
 from dora_systemd.cli.parameters import current_scope, output_option, scope_options
-from dora_systemd.cli.quick import ListRequest
 
 _EPILOG = """\b
 Examples:

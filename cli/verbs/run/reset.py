@@ -5,7 +5,8 @@ import click
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import current_scope, print_outcomes, scope_options
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.verbs.facts.cells import read_cells, select_cell
+from dora_systemd.verbs.facts.cells import read_cells
+from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.stop import reset_cells
 
 _EPILOG = """\b
@@ -33,7 +34,7 @@ def command(selectors: tuple[str, ...], want_all: bool) -> int:
         )
     bus = Bus(current_scope())
     cells = read_cells(bus)
-    chosen = cells if want_all else [select_cell(cells, one) for one in selectors]
+    chosen = cells if want_all else [Selector(one).loaded(cells) for one in selectors]
     if want_all and not chosen:
         click.echo("No dataflow.")
     return print_outcomes(reset_cells(bus, list(dict.fromkeys(chosen))))

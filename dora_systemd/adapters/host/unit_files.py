@@ -108,11 +108,6 @@ def remove_changes(fragment: Path) -> None:
         drop_in_directory(fragment, is_transient=False).rmdir()
 
 
-def wanted_units(directory: Path) -> frozenset[str]:
-    """The units that targets in `directory` start: the links in its .wants directories."""
-    return frozenset(path.name for path in directory.glob("*.wants/dora-*.service"))
-
-
 def foreign_file(path: Path) -> DoraSystemdError:
     """The error for a foreign file at one of our paths."""
     return DoraSystemdError(

@@ -13,7 +13,8 @@ from dora_systemd.gateway.control.state import ended_result
 from dora_systemd.gateway.control.talk import Talk, find_by_uuid
 from dora_systemd.scope import Scope
 from dora_systemd.values import SECOND
-from dora_systemd.verbs.facts.cells import Cell, find_cell
+from dora_systemd.verbs.facts.cells import Cell
+from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.stop import Outcome, note_stop, restart_cells, stop_cells
 
 _KILL_FACTOR = 1.5
@@ -45,7 +46,7 @@ async def restart_name(talk: Talk, request: Request) -> dict[str, Any]:
 
 
 async def _named(scope: Scope, request: Request) -> Cell:
-    return await asyncio.to_thread(lambda: find_cell(Bus(scope), request.text("name")))
+    return await asyncio.to_thread(lambda: Selector(request.text("name")).find(Bus(scope)))
 
 
 async def _stop(scope: Scope, cell: Cell, request: Request) -> dict[str, Any]:

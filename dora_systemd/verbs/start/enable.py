@@ -16,7 +16,6 @@ from dora_systemd.adapters.host.unit_files import (
     read_unit_file,
     remove_changes,
     remove_unit_file,
-    wanted_units,
     write_unit_file,
 )
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -31,7 +30,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
-from dora_systemd.verbs.facts.enabled import own_directories
+from dora_systemd.verbs.facts.enabled import own_directories, wanted_units
 
 _FORGET_SECONDS = 2.0
 _RETRY_SECONDS = 0.02

@@ -57,7 +57,7 @@ def test_selector(selector: str, name: str, uuid: str) -> None:
     ("selector", "hint"),
     [
         ("robto", "did you mean robot?"),
-        ("zzz", "in the journal: arm, robot"),
+        ("zzz", "known dataflows: 550e, arm, robot"),
         *(("550e-", ""), ("5", ""), ("\n", ""), ("../x", ""), ("é", "")),
     ],
 )
@@ -76,7 +76,7 @@ def test_ambiguous_uuid() -> None:
     with pytest.raises(DoraSystemdError) as caught:
         find_query(WithoutThatName(), LogRequest("550e", (), "ALL", QUERY))
     assert caught.value.code is ExitCode.USAGE
-    assert caught.value.hint == f"one of {ROBOT}, {ARM}"
+    assert caught.value.hint == f"one of {ROBOT} (robot), {ARM} (arm)"
 
 
 @pytest.mark.parametrize(
