@@ -1,5 +1,6 @@
 """The verbs of doractl as a click group that imports only the verb that runs."""
 
+from difflib import get_close_matches
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -82,8 +83,6 @@ class VerbGroup(click.Group):
         name = args[0]
         if name.startswith("-") or self.get_command(ctx, name):
             return super().resolve_command(ctx, args)
-        from difflib import get_close_matches
-
         near = get_close_matches(name, [*VERBS, *ALIASES], n=1)
         hint = f"did you mean doractl {near[0]}?" if near else "doractl --help lists all commands"
         raise DoraSystemdError(f"unknown command {name!r}", hint, ExitCode.USAGE)

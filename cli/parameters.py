@@ -1,5 +1,6 @@
 """Options and arguments that several verbs share."""
 
+import json
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -50,8 +51,6 @@ def output_option(function: F) -> F:
 
 def print_json(value: Any) -> None:
     """`value` as JSON, indented."""
-    import json
-
     click.echo(json.dumps(value, indent=2))
 
 

@@ -22,6 +22,7 @@ from tempfile import TemporaryDirectory
 from typing import Protocol
 
 from dora_systemd.adapters.bus.manager import DOWN, Manager
+from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.adapters.journal.reader import open_journalctl
 from dora_systemd.decisions.logs.query import (
     UNIT_ENDS,
@@ -118,9 +119,6 @@ def follow_to_end(query: LogQuery, print_query: Callable[[LogQuery], object]) ->
 
     Raises DoraSystemdError.
     """
-    # Imported here: other uses of `doractl logs` do not talk to systemd.
-    from dora_systemd.adapters.bus.systemd import Bus
-
     start_us = time.time_ns() // 1000
     bus = Bus(query.scope, for_reading=True)
     with (

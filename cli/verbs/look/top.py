@@ -8,6 +8,7 @@ import click
 
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import current_scope, output_option, scope_options
+from dora_systemd.cli.screen import Screen
 from dora_systemd.decisions.views.top import SORTS, Look, format_summary, format_top, look_values
 from dora_systemd.errors import ExitCode
 from dora_systemd.verbs.top import Top
@@ -82,8 +83,6 @@ def _print_objects(top: Top, interval: float, sort: str, is_once: bool) -> None:
 
 
 def _show(top: Top, interval: float, sort: str) -> None:
-    from dora_systemd.cli.screen import Screen
-
     with Screen() as screen:
         look, due = top.look(), time.monotonic() + _FIRST_SECONDS
         while True:

@@ -19,6 +19,7 @@ from dora_systemd.cli.parameters import (
 from dora_systemd.cli.settingoptions import setting_options
 from dora_systemd.cli.stageline import StageLine
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.verbs.facts.last_words import last_words
 from dora_systemd.verbs.start.check import check_plan
 from dora_systemd.verbs.start.enable import boot_target
 from dora_systemd.verbs.start.job import Started, format_started
@@ -100,8 +101,5 @@ def _start(bus: Bus, claimed: Claim, wait: bool) -> Started:
 
 
 def _print_last_words(plan: Plan) -> None:
-    # Imported late: only needed after a failure.
-    from dora_systemd.verbs.facts.last_words import last_words
-
     for line in last_words(plan.scope, plan.options.uuid):
         click.echo(f"  {line}", err=True)

@@ -9,11 +9,11 @@ from dora_systemd.decisions.settings.resolve import resolve_settings
 from dora_systemd.decisions.unit.properties import UnitContext, format_unit, unit_properties
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
+from dora_systemd.verbs.export import export_cell
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.enabled import enabled_units
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.list import find_row
-from dora_systemd.verbs.show import export_cell
 from dora_systemd.verbs.start import linger
 from dora_systemd.verbs.start.enable import boot_target, disable_cell, enable_cell
 from dora_systemd.verbs.start.linger import ensure_linger
