@@ -1,34 +1,53 @@
 """Options and arguments that several verbs share."""
 
 import json
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, TypeVar
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from dora_systemd.errors import ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope, scope_of
 
 if TYPE_CHECKING:
     # Imported late: only some verbs print outcomes.
     from dora_systemd.verbs.stop import Outcome
 
-F = TypeVar("F", bound=Callable[..., Any])
-
 _SCOPE_KEY = "dora_systemd.is_user"
 
 
-def scope_options(function: F) -> F:
-    """`--system` and `--user`, before or after the verb; the last one counts."""
-    return click.option(
-        # Its own name, because one of the settings is called "user".
-        "--user/--system",
-        "wants_user",
-        default=None,
-        expose_value=False,
-        callback=_remember,
-        help="Dataflows of the calling user (default unless root), or of the system.",
-    )(function)
+def _remember(ctx: click.Context, param: click.Parameter, value: bool | None) -> None:
+    del param
+    if value is not None:
+        ctx.meta[_SCOPE_KEY] = value
+
+
+scope_options = click.option(
+    # Its own name, because one of the settings is called "user".
+    "--user/--system",
+    "wants_user",
+    default=None,
+    expose_value=False,
+    callback=_remember,
+    help="Dataflows of the calling user (default unless root), or of the system.",
+)
+"""`--system` and `--user`, before or after the verb; the last one counts."""
+
+output_option = click.option(
+    "-o",
+    "--output",
+    type=click.Choice(["table", "json"]),
+    default="table",
+    show_default=True,
+    help="Table or JSON.",
+)
+
+name_option = click.option(
+    "--name",
+    metavar="NAME",
+    help="Name of the dataflow; default: that of its file, or of the directory of a dataflow.yml.",
+)
+"""For what starts a dataflow."""
 
 
 def current_scope() -> Scope:
@@ -36,28 +55,16 @@ def current_scope() -> Scope:
     return scope_of(click.get_current_context().meta.get(_SCOPE_KEY))
 
 
-def output_option(function: F) -> F:
-    """`-o table|json`."""
-    option = click.option(
-        "-o",
-        "--output",
-        type=click.Choice(["table", "json"]),
-        default="table",
-        show_default=True,
-        help="Table or JSON.",
-    )
-    return option(function)
-
-
 def print_json(value: Any) -> None:
     """`value` as JSON, indented."""
     click.echo(json.dumps(value, indent=2))
 
 
-def _remember(ctx: click.Context, param: click.Parameter, value: bool | None) -> None:
-    del param
-    if value is not None:
-        ctx.meta[_SCOPE_KEY] = value
+def require_names_or_all(verb: str, selectors: Sequence[str], want_all: bool) -> None:
+    """Raise DoraSystemdError (USAGE) unless a command line has either names or --all."""
+    if bool(selectors) == want_all:
+        hint = f"doractl {verb} NAME, or doractl {verb} --all"
+        raise DoraSystemdError(f"cannot {verb}: give names or --all", hint, ExitCode.USAGE)
 
 
 def print_outcomes(outcomes: "Sequence[Outcome]") -> int:
@@ -74,9 +81,3 @@ def print_warnings(warnings: Sequence[str]) -> None:
     """One line each, on standard error."""
     for warning in warnings:
         click.echo(f"doractl: {warning}", err=True)
-
-
-def name_option(function: F) -> F:
-    """`--name NAME`, for what starts a dataflow."""
-    text = "Name of the dataflow; default: that of its file, or of the directory of a dataflow.yml."
-    return click.option("--name", metavar="NAME", help=text)(function)

@@ -9,9 +9,9 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from itertools import islice
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
-from dora_systemd.adapters.journal.reader import end_journalctl, open_journalctl
+from dora_systemd.adapters.journal.reader import JournalReader, end_journalctl, open_journalctl
 from dora_systemd.decisions.logs.fields import ExportReader
 from dora_systemd.decisions.logs.query import (
     UNIT_ENDS,
@@ -37,25 +37,6 @@ _FIELDS = "MESSAGE,PRIORITY,SYSLOG_IDENTIFIER,MESSAGE_ID,UNIT,USER_UNIT"
 Write = Callable[[bytes], object]
 
 
-class Journal(Protocol):
-    """The part of dora_systemd.adapters.journal.reader.JournalReader that this module uses."""
-
-    def known_names(self) -> list[str]:
-        """Names of dataflows."""
-
-    def known_uuids(self) -> list[str]:
-        """UUIDs of dataflows."""
-
-    def known_nodes(self, name: str) -> list[str]:
-        """Nodes of a dataflow."""
-
-    def name_of(self, uuid: str) -> str:
-        """The name of a dataflow."""
-
-    def invocations(self, scope: Scope, name: str, uuid: str) -> Iterator[str]:
-        """Invocations of its unit, newest first."""
-
-
 class _Recorded(NamedTuple):
     """A dataflow in the journal."""
 
@@ -77,7 +58,7 @@ class LogRequest:
     query: LogQuery
 
 
-def find_query(journal: Journal, request: LogRequest) -> LogQuery:
+def find_query(journal: JournalReader, request: LogRequest) -> LogQuery:
     """The query, with name, nodes and run resolved by the journal.
 
     Raises DoraSystemdError: NOT_FOUND for a dataflow, node or run without any record.
@@ -90,7 +71,7 @@ def find_query(journal: Journal, request: LogRequest) -> LogQuery:
     return _select_run(journal, query, request.run)
 
 
-def _select_dataflow(journal: Journal, query: LogQuery, selector: str) -> LogQuery:
+def _select_dataflow(journal: JournalReader, query: LogQuery, selector: str) -> LogQuery:
     names = journal.known_names()
     wanted = Selector(selector)
     if wanted.name in names:
@@ -104,7 +85,9 @@ def _select_dataflow(journal: Journal, query: LogQuery, selector: str) -> LogQue
     return replace(query, uuid=found.uuid, name=found.name)
 
 
-def _select_nodes(journal: Journal, query: LogQuery, patterns: tuple[str, ...]) -> tuple[str, ...]:
+def _select_nodes(
+    journal: JournalReader, query: LogQuery, patterns: tuple[str, ...]
+) -> tuple[str, ...]:
     if not query.name:
         hint = "say which dataflow: doractl logs NAME --node NODE"
         raise DoraSystemdError("cannot select nodes of all dataflows", hint, ExitCode.USAGE)
@@ -124,7 +107,7 @@ def _fits(node: str, pattern: str) -> bool:
     return node == pattern or (bool(_GLOB.search(pattern)) and fnmatchcase(node, pattern))
 
 
-def _select_run(journal: Journal, query: LogQuery, run: str) -> LogQuery:
+def _select_run(journal: JournalReader, query: LogQuery, run: str) -> LogQuery:
     if run == "ALL":
         return query
     if run not in ("CURRENT", "PREVIOUS"):

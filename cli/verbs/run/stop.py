@@ -3,8 +3,12 @@
 import click
 
 from dora_systemd.adapters.bus.systemd import Bus
-from dora_systemd.cli.parameters import current_scope, print_outcomes, scope_options
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.cli.parameters import (
+    current_scope,
+    print_outcomes,
+    require_names_or_all,
+    scope_options,
+)
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell, read_cells
 from dora_systemd.verbs.facts.selector import Selector
@@ -28,12 +32,7 @@ def command(selectors: tuple[str, ...], want_all: bool) -> int:
     Nodes are told to stop; those still running after the grace duration of the dataflow are
     killed. Several dataflows stop at the same time.
     """
-    if bool(selectors) == want_all:
-        raise DoraSystemdError(
-            "cannot stop: give names or --all",
-            "doractl stop NAME, or doractl stop --all",
-            ExitCode.USAGE,
-        )
+    require_names_or_all("stop", selectors, want_all)
     scope = current_scope()
     bus = Bus(scope)
     cells = read_cells(bus)

@@ -8,7 +8,7 @@ from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.start.check import check_plan
 from dora_systemd.verbs.start.claim import place_unit_file, require_free_name, with_known_uuid
-from dora_systemd.verbs.start.job import StageObserver, Started, start_plan, start_unit_file
+from dora_systemd.verbs.start.job import StageObserver, Started, start_plan
 from dora_systemd.verbs.start.plan import Plan, StartRequest, make_plan, request_name
 from dora_systemd.verbs.start.unit import plan_properties
 
@@ -41,6 +41,5 @@ def start_claim(
     manager: Manager, claim: Claim, on_stage: StageObserver | None, wait: bool
 ) -> Started:
     """Start the unit. Raises DoraSystemdError as start_plan does."""
-    if claim.properties is None:
-        return start_unit_file(manager, claim.plan, on_stage, wait)
-    return start_plan(manager, claim.plan, list(claim.properties.values()), on_stage, wait)
+    properties = None if claim.properties is None else list(claim.properties.values())
+    return start_plan(manager, claim.plan, properties, on_stage, wait)

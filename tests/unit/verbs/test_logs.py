@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 
+from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.decisions.logs.query import LogQuery
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
@@ -14,7 +15,7 @@ ARM = "550e9999-e29b-41d4-a716-446655440000"
 QUERY = LogQuery(Scope(is_user=False, uid=0))
 
 
-class FakeJournal:
+class FakeJournal(JournalReader):
     def known_names(self) -> list[str]:
         return ["arm", "robot", "550e"]
 
