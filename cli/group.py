@@ -2,6 +2,7 @@
 
 from difflib import get_close_matches
 from importlib import import_module
+from inspect import cleandoc
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,6 +34,9 @@ class Verb(NamedTuple):
         """The click command."""
         name = f"dora_systemd.cli.verbs.{self.section}.{self.name}"
         found: click.Command = import_module(name).command
+        _put_examples_last(found)
+        for member in getattr(found, "commands", {}).values():
+            member.epilog = found.epilog
         return found
 
     @property
@@ -40,6 +44,13 @@ class Verb(NamedTuple):
         """The first line of the docstring, read from the file: imports would slow down --help."""
         with self.path.open(encoding="utf-8") as lines:
             return lines.readline().strip().strip('"')
+
+
+def _put_examples_last(command: click.Command) -> None:
+    """Let --help print the examples, with which the docstring ends, below the options."""
+    text, mark, examples = cleandoc(command.help or "").partition("\n\nExamples:")
+    if mark:
+        command.help, command.epilog = text, f"\b\nExamples:{examples}"
 
 
 def find_verbs() -> dict[str, Verb]:

@@ -7,19 +7,17 @@ from dora_systemd.cli.parameters import current_scope, scope_options
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.start.enable import disable_cell
 
-_EPILOG = """\b
-Examples:
-  doractl disable robot
-"""
 
-
-@click.command("disable", epilog=_EPILOG)
+@click.command("disable")
 @click.argument("selectors", nargs=-1, required=True, metavar="SELECTOR...")
 @scope_options
 def command(selectors: tuple[str, ...]) -> None:
     """No longer start dataflows at boot. Running dataflows keep running.
 
     Removes what enable has created. A dataflow that is not enabled is not an error.
+
+    Examples:
+      doractl disable robot
     """
     scope = current_scope()
     bus = Bus(scope)

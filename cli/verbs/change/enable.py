@@ -8,14 +8,8 @@ from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.start.enable import enable_cell
 from dora_systemd.verbs.start.linger import ensure_linger
 
-_EPILOG = """\b
-Examples:
-  doractl enable robot
-  doractl enable robot vision
-"""
 
-
-@click.command("enable", epilog=_EPILOG)
+@click.command("enable")
 @click.argument("selectors", nargs=-1, required=True, metavar="SELECTOR...")
 @scope_options
 def command(selectors: tuple[str, ...]) -> None:
@@ -23,6 +17,10 @@ def command(selectors: tuple[str, ...]) -> None:
 
     UUID and settings stay, and running dataflows keep running. The unit becomes a file that
     systemctl edits, shows and disables like any other.
+
+    Examples:
+      doractl enable robot
+      doractl enable robot vision
     """
     scope = current_scope()
     bus = Bus(scope)

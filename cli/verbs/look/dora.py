@@ -7,14 +7,8 @@ from dora_systemd.cli.parameters import current_scope, scope_options
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.node import exec_dora
 
-_EPILOG = """\b
-Examples:
-  doractl dora robot -- topic echo camera/image
-  doractl dora robot -- node list
-"""
 
-
-@click.command("dora", epilog=_EPILOG, context_settings={"ignore_unknown_options": True})
+@click.command("dora", context_settings={"ignore_unknown_options": True})
 @click.argument("selector")
 @click.argument("arguments", nargs=-1, type=click.UNPROCESSED, metavar="-- ARGUMENT...")
 @scope_options
@@ -23,6 +17,10 @@ def command(selector: str, arguments: tuple[str, ...]) -> int:
 
     Only root and the user that the dataflow runs as may do this. Use doractl logs to read logs:
     dora logs cannot show them.
+
+    Examples:
+      doractl dora robot -- topic echo camera/image
+      doractl dora robot -- node list
     """
     scope = current_scope()
     bus = Bus(scope)

@@ -8,14 +8,8 @@ from dora_systemd.cli.parameters import current_scope, scope_options
 from dora_systemd.verbs.export import export_cell
 from dora_systemd.verbs.facts.selector import Selector
 
-_EPILOG = """\b
-Examples:
-  doractl export robot
-  doractl export robot > /etc/systemd/system/dora-robot.service
-"""
 
-
-@click.command("export", epilog=_EPILOG)
+@click.command("export")
 @click.argument("selector")
 @scope_options
 def command(selector: str) -> None:
@@ -23,6 +17,10 @@ def command(selector: str) -> None:
 
     Copy it to a unit directory and run systemctl enable. Of dora-systemd it needs only the runner.
     Environment variables are printed with their values.
+
+    Examples:
+      doractl export robot
+      doractl export robot > /etc/systemd/system/dora-robot.service
     """
     scope = current_scope()
     bus = Bus(scope, for_reading=True)

@@ -8,14 +8,8 @@ from dora_systemd.cli.parameters import current_scope, output_option, print_json
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.show import format_unit_files, unit_files
 
-_EPILOG = """\b
-Examples:
-  doractl show robot
-  doractl show robot -o json
-"""
 
-
-@click.command("show", epilog=_EPILOG)
+@click.command("show")
 @click.argument("selector")
 @output_option
 @scope_options
@@ -23,6 +17,10 @@ def command(selector: str, output: str) -> None:
     """Print the unit of a dataflow, each file below a comment with its path.
 
     Environment variables are printed with their values.
+
+    Examples:
+      doractl show robot
+      doractl show robot -o json
     """
     bus = Bus(current_scope(), for_reading=True)
     cell = Selector(selector).find(bus)

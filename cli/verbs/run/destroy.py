@@ -18,14 +18,8 @@ from dora_systemd.verbs.facts.enabled import enabled_units
 from dora_systemd.verbs.gateway import read_gateway
 from dora_systemd.verbs.stop import note_stop
 
-_EPILOG = """\b
-Examples:
-  doractl destroy
-  doractl --user destroy --force
-"""
 
-
-@click.command("destroy", epilog=_EPILOG)
+@click.command("destroy")
 @click.option("--force", is_flag=True, help="Kill the nodes, instead of telling them to stop.")
 @scope_options
 def command(force: bool) -> int:
@@ -33,6 +27,10 @@ def command(force: bool) -> int:
 
     Only this scope is affected: the system's, or the calling user's. Enabled dataflows
     stay enabled.
+
+    Examples:
+      doractl destroy
+      doractl --user destroy --force
     """
     scope = current_scope()
     bus = Bus(scope)

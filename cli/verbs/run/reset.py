@@ -13,14 +13,8 @@ from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.stop import reset_cells
 
-_EPILOG = """\b
-Examples:
-  doractl reset robot
-  doractl reset --all
-"""
 
-
-@click.command("reset", epilog=_EPILOG)
+@click.command("reset")
 @click.argument("selectors", nargs=-1, metavar="SELECTOR...")
 @click.option("-a", "--all", "want_all", is_flag=True, help="All dataflows that systemd knows.")
 @scope_options
@@ -29,6 +23,10 @@ def command(selectors: tuple[str, ...], want_all: bool) -> int:
 
     Like systemctl reset-failed: running dataflows keep running, and systemd may restart them as
     often as at the beginning. dora counts restarts of single nodes; doractl restart resets those.
+
+    Examples:
+      doractl reset robot
+      doractl reset --all
     """
     require_names_or_all("reset", selectors, want_all)
     bus = Bus(current_scope())

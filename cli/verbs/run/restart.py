@@ -12,14 +12,8 @@ from dora_systemd.cli.stageline import StageLine
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.stop import restart_cells
 
-_EPILOG = """\b
-Examples:
-  doractl restart robot
-  doractl restart robot vision
-"""
 
-
-@click.command("restart", epilog=_EPILOG)
+@click.command("restart")
 @click.argument("selectors", nargs=-1, required=True, metavar="SELECTOR...")
 @scope_options
 def command(selectors: tuple[str, ...]) -> int:
@@ -27,6 +21,10 @@ def command(selectors: tuple[str, ...]) -> int:
 
     Name, UUID and settings stay; the dataflow file is read again. A failed dataflow is started
     again.
+
+    Examples:
+      doractl restart robot
+      doractl restart robot vision
     """
     scope = current_scope()
     bus = Bus(scope)

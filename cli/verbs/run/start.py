@@ -30,22 +30,8 @@ from dora_systemd.verbs.start.plan import DEFAULT_FILE, Plan, StartRequest, make
 from dora_systemd.verbs.start.unit import format_plan
 from dora_systemd.verbs.start.watch import watched_patterns
 
-_EPILOG = """\b
-Examples:
-  doractl start                                    ./dataflow.yml
-  doractl start dataflow.yml --name robot
-  doractl start dataflow.yml --env MODEL=yolov8n.pt --venv .venv
-  doractl start dataflow.yml --memory-limit 4G --node-limit detector:memory=1G,cpu=1.5
-  doractl start dataflow.yml --restart-policy on-failure --max-restarts 3
-  doractl start dataflow.yml --credential token=/etc/robot/token
-  doractl start dataflow.yml --hot-reload --watch "*.py,config/*"
-  doractl start dataflow.yml --device /dev/video0 --writable /srv/recordings
-  doractl start dataflow.yml --enable              now and at every boot
-  doractl start dataflow.yml --dry-run
-"""
 
-
-@click.command("start", epilog=_EPILOG)
+@click.command("start")
 @click.argument("dataflow", default=DEFAULT_FILE, metavar="[FILE]")
 @name_option
 @setting_options
@@ -68,6 +54,18 @@ def command(
     Returns when all nodes are ready, or fails with the reason. The name must be free; a failed
     dataflow of that name is replaced, its logs stay. An enabled dataflow is started from its unit
     file if its settings are the same; --enable replaces that file.
+
+    Examples:
+      doractl start                                    ./dataflow.yml
+      doractl start dataflow.yml --name robot
+      doractl start dataflow.yml --env MODEL=yolov8n.pt --venv .venv
+      doractl start dataflow.yml --memory-limit 4G --node-limit detector:memory=1G,cpu=1.5
+      doractl start dataflow.yml --restart-policy on-failure --max-restarts 3
+      doractl start dataflow.yml --credential token=/etc/robot/token
+      doractl start dataflow.yml --hot-reload --watch "*.py,config/*"
+      doractl start dataflow.yml --device /dev/video0 --writable /srv/recordings
+      doractl start dataflow.yml --enable              now and at every boot
+      doractl start dataflow.yml --dry-run
     """
     scope = current_scope()
     request = StartRequest(dataflow, name, flags, os.environ)

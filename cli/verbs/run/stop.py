@@ -14,15 +14,8 @@ from dora_systemd.verbs.facts.cells import Cell, read_cells
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.stop import note_stop, stop_cells
 
-_EPILOG = """\b
-Examples:
-  doractl stop robot
-  doractl stop 550e8400 vision
-  doractl stop --all
-"""
 
-
-@click.command("stop", epilog=_EPILOG)
+@click.command("stop")
 @click.argument("selectors", nargs=-1, metavar="SELECTOR...")
 @click.option("-a", "--all", "want_all", is_flag=True, help="All dataflows that run.")
 @scope_options
@@ -31,6 +24,11 @@ def command(selectors: tuple[str, ...], want_all: bool) -> int:
 
     Nodes are told to stop; those still running after the grace duration of the dataflow are
     killed. Several dataflows stop at the same time.
+
+    Examples:
+      doractl stop robot
+      doractl stop 550e8400 vision
+      doractl stop --all
     """
     require_names_or_all("stop", selectors, want_all)
     scope = current_scope()
