@@ -7,10 +7,7 @@ from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import JOB_DONE, Manager
 from dora_systemd.adapters.host.loopback import port_error
-from dora_systemd.adapters.host.process_table import (
-    read_processes,
-    socket_owners,
-)
+from dora_systemd.adapters.host.process_table import read_processes, socket_owners
 from dora_systemd.adapters.host.unit_files import read_unit_file, remove_unit_file, write_unit_file
 from dora_systemd.decisions.gateway.place import ADDRESS, DEFAULT_PORT, SERVICE_UNIT, SOCKET_UNIT
 from dora_systemd.decisions.gateway.port import port_drop_in

@@ -14,7 +14,7 @@ from dora_systemd.cli.parameters import current_scope, scope_options
 from dora_systemd.decisions.logs.query import OUTPUTS, LogQuery, parse_level
 from dora_systemd.decisions.logs.terminal import ShownLines, TerminalLines
 from dora_systemd.errors import ExitCode
-from dora_systemd.verbs.logs import LogRequest, find_query, pass_logs, read_logs
+from dora_systemd.verbs.logs import find_query, pass_logs, read_logs
 
 Lines = TerminalLines | ShownLines | None
 """Formats lines for a terminal; None for a pipe."""
@@ -124,7 +124,7 @@ def command(
 
         check_until_end(selector, options["is_reverse"])
     journal = JournalReader()
-    query = find_query(journal, LogRequest(selector, nodes, run, LogQuery(scope, **options)))
+    query = find_query(journal, LogQuery(scope, **options), selector, nodes, run)
     lines: Lines = ShownLines() if sys.stdout.isatty() else None
     if sys.stdout.isatty() and query.output.startswith("short"):
         known = query.nodes or (journal.known_nodes(query.name) if query.name else ())

@@ -22,8 +22,8 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.verbs.facts.last_words import last_words
 from dora_systemd.verbs.start.check import check_plan
 from dora_systemd.verbs.start.enable import boot_target
-from dora_systemd.verbs.start.job import Started, format_started
-from dora_systemd.verbs.start.launch import Claim, claim, start_claim
+from dora_systemd.verbs.start.job import Started, format_started, start_plan
+from dora_systemd.verbs.start.launch import Claim, claim
 from dora_systemd.verbs.start.linger import ensure_linger
 from dora_systemd.verbs.start.logins import start_notes
 from dora_systemd.verbs.start.plan import DEFAULT_FILE, Plan, StartRequest, make_plan
@@ -91,7 +91,7 @@ def command(
 def _start(bus: Bus, claimed: Claim, wait: bool) -> Started:
     try:
         with StageLine(sys.stderr) as stage:
-            return start_claim(bus, claimed, stage, wait)
+            return start_plan(bus, claimed.plan, claimed.properties, stage, wait)
     except DoraSystemdError as error:
         if error.code is ExitCode.FAILURE:
             _print_last_words(claimed.plan)

@@ -23,7 +23,8 @@ from dora_systemd.trust.files import read_file
 from dora_systemd.trust.paths import list_directory
 from dora_systemd.values import shown
 from dora_systemd.verbs.start.check import run_beside
-from dora_systemd.verbs.start.launch import claim, start_claim
+from dora_systemd.verbs.start.job import start_plan
+from dora_systemd.verbs.start.launch import claim
 from dora_systemd.verbs.start.plan import StartRequest, make_plan
 
 _SUFFIXES = (".yml", ".yaml")
@@ -67,7 +68,8 @@ def _start(scope: Scope, request: Request) -> str:
         str(found.path), name if isinstance(name, str) else None, found.flags, os.environ
     )
     bus = Bus(scope)
-    return start_claim(bus, claim(bus, scope, wanted), None, wait=False).uuid
+    claimed = claim(bus, scope, wanted)
+    return start_plan(bus, claimed.plan, claimed.properties, None, wait=False).uuid
 
 
 def find_file(scope: Scope, request: Request) -> Match:

@@ -51,7 +51,9 @@ def start_plan(
             _wait_until_checked(manager, plan.unit)
     except KeyboardInterrupt as error:
         raise _interruption(plan.options.name) from error
-    has_failed = result != JOB_DONE or _has_failed(manager, plan.unit)
+    # A dataflow that finishes right after its start has not failed.
+    state = manager.read(plan.unit, ["ActiveState"])["ActiveState"]
+    has_failed = result != JOB_DONE or state == "failed"
     if has_failed and (refusal := runners_refusal(manager, plan.unit)):
         # It never ran, so do not keep its name in use.
         with suppress(DoraSystemdError):
@@ -124,11 +126,6 @@ def _wait_until_checked(manager: Manager, unit: str) -> None:
             return
         select.select([manager.fileno()], [], [], _POLL_SECONDS)
         manager.changes(unit)
-
-
-def _has_failed(manager: Manager, unit: str) -> bool:
-    """Whether the start failed; a dataflow that finishes right after its start has not failed."""
-    return bool(manager.read(unit, ["ActiveState"])["ActiveState"] == "failed")
 
 
 def _start_failure(

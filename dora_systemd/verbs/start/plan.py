@@ -104,22 +104,13 @@ def make_plan(scope: Scope, request: StartRequest) -> Plan:
     user = choose_user(scope, settings[USER], written.place, str(directory))
     with sight_of(account_of(user)) as sight:
         look = Look(sight, settings, user)
-        return _make_plan(_Found(scope, request, dataflow, settings, user), str(directory), look)
+        return _make_plan(scope, request, dataflow, str(directory), look)
 
 
-@dataclass(frozen=True)
-class _Found:
-    """What was read, and for which user."""
-
-    scope: Scope
-    request: StartRequest
-    dataflow: Dataflow
-    settings: Settings
-    user: pwd.struct_passwd | None
-
-
-def _make_plan(found: _Found, directory: str, look: Look) -> Plan:
-    request, settings, path = found.request, found.settings, found.dataflow.source
+def _make_plan(
+    scope: Scope, request: StartRequest, dataflow: Dataflow, directory: str, look: Look
+) -> Plan:
+    settings, path = look.settings, dataflow.source
     venv = look.find_venv(path, request.environment)
     search_path = request.environment.get("PATH") or os.defpath
     variables = _variables(settings, look)
@@ -146,17 +137,17 @@ def _make_plan(found: _Found, directory: str, look: Look) -> Plan:
         reload=hot_reload(settings, directory),
     )
     environment = unit_environment(search_path, venv, variables)
-    check_credentials(found.scope, credential_files(settings))
+    check_credentials(scope, credential_files(settings))
     launch = LaunchPlan(
         options, "", environment["PATH"], look.sight.exists, look.read_session(path)
     )
-    if not any(node.kind in UNEXPANDED for node in found.dataflow.nodes):
+    if not any(node.kind in UNEXPANDED for node in dataflow.nodes):
         # The runner repeats this, but an error here needs no unit.
-        check_named_nodes(options, found.dataflow)
-        launch_descriptor(found.dataflow, launch)
-    prepared = Prepared(found.dataflow, launch, {})
-    sandbox = make_sandbox(found.scope, settings, found.user, prepared, look.sight)
-    return Plan(found.scope, options, settings, found.user, environment, sandbox)
+        check_named_nodes(options, dataflow)
+        launch_descriptor(dataflow, launch)
+    prepared = Prepared(dataflow, launch, {})
+    sandbox = make_sandbox(scope, settings, look.user, prepared, look.sight)
+    return Plan(scope, options, settings, look.user, environment, sandbox)
 
 
 def _variables(settings: Settings, look: Look) -> dict[str, str]:
