@@ -1,7 +1,7 @@
 """Options and arguments that several verbs share."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -77,7 +77,7 @@ def print_outcomes(outcomes: "Sequence[Outcome]") -> int:
     return ExitCode.FAILURE if any(one.problem for one in outcomes) else ExitCode.OK
 
 
-def print_warnings(warnings: Sequence[str]) -> None:
-    """One line each, on standard error."""
-    for warning in warnings:
+def print_warnings(warnings: Iterable[str]) -> None:
+    """One line each, on standard error, without empty ones."""
+    for warning in filter(None, warnings):
         click.echo(f"doractl: {warning}", err=True)

@@ -17,9 +17,9 @@ from dora_systemd.adapters.host.machine import read_machine
 from dora_systemd.adapters.host.unit_files import (
     NODE_LIMITS_FILE,
     drop_in_directory,
+    put_unit_file,
     read_unit_file,
     remove_empty,
-    remove_unit_file,
     write_unit_file,
 )
 from dora_systemd.decisions.cell.limits import (
@@ -128,11 +128,8 @@ def _remember(unit: Mapping[str, Any], nodes: tuple[NodeLimits, ...], undo: Exit
 
 
 def _put_back(path: Path, text: str | None) -> None:
-    if text is not None:
-        write_unit_file(path, text)
-    else:
-        remove_unit_file(path)
-        remove_empty(path.parent)
+    put_unit_file(path, text)
+    remove_empty(path.parent)
 
 
 def _limit_groups(unit: Mapping[str, Any], nodes: tuple[NodeLimits, ...], undo: ExitStack) -> None:

@@ -30,4 +30,4 @@ def command(selectors: tuple[str, ...]) -> None:
         already = "" if is_news else " already"
         click.echo(f"Dataflow{already} enabled: {cell.uuid} ({cell.name})")
         click.echo(f"Unit file: {boot.path}")
-    print_warnings([note for note in [ensure_linger(scope)] if note])
+    print_warnings([ensure_linger(scope)])

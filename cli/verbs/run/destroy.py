@@ -5,7 +5,6 @@ import click
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import current_scope, scope_options
 from dora_systemd.errors import ExitCode
-from dora_systemd.names import name_from_unit
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.destroy import (
     processes_left,
@@ -14,7 +13,7 @@ from dora_systemd.verbs.destroy import (
     stop_gateway,
     stop_slice,
 )
-from dora_systemd.verbs.facts.enabled import enabled_units
+from dora_systemd.verbs.facts.enabled import enabled_names
 from dora_systemd.verbs.gateway import read_gateway
 from dora_systemd.verbs.stop import note_stop
 
@@ -72,7 +71,6 @@ def _print_left(bus: Bus, scope: Scope, others: list[str]) -> bool:
         click.echo(f"doractl: cannot end {one}", err=True)
     if not left:
         click.echo("Nothing is left: no process in dora.slice.")
-    names = sorted(filter(None, map(name_from_unit, enabled_units(bus, scope))))
-    if names:
+    if names := enabled_names(bus, scope):
         click.echo(f"Still enabled: {', '.join(names)}; they start at the next boot.")
     return not left

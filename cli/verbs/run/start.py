@@ -78,10 +78,10 @@ def command(
     bus = Bus(scope)
     claimed = claim(bus, scope, request, want_boot)
     print_warnings(claimed.warnings)
-    print_warnings([note for note in [ensure_linger(scope) if want_boot else ""] if note])
+    print_warnings([ensure_linger(scope) if want_boot else ""])
     started = _start(bus, claimed, not no_wait)
     # Only after the start: a refusal must be one line and a hint.
-    print_warnings([*start_notes(claimed.plan)])
+    print_warnings(start_notes(claimed.plan))
     if output == "json":
         print_json({**vars(started), "dataflow": claimed.plan.options.dataflow})
     else:

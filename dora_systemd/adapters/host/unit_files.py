@@ -80,6 +80,14 @@ def remove_unit_file(path: Path) -> None:
         raise _failure("remove", path, error) from error
 
 
+def put_unit_file(path: Path, text: str | None) -> None:
+    """Write `text` to `path`, or remove it for None. Raises DoraSystemdError."""
+    if text is None:
+        remove_unit_file(path)
+    else:
+        write_unit_file(path, text)
+
+
 NODE_LIMITS_FILE = "60-node-limits.conf"
 HOT_RELOAD_FILE = "60-hot-reload.conf"
 _CHANGES = ("50-*.conf", NODE_LIMITS_FILE, HOT_RELOAD_FILE)

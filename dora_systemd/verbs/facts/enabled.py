@@ -4,6 +4,7 @@ from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.decisions.unit.directories import unit_directories
+from dora_systemd.names import name_from_unit
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import exists
 
@@ -11,6 +12,11 @@ from dora_systemd.trust.paths import exists
 def enabled_units(manager: Manager, scope: Scope) -> frozenset[str]:
     """The names of the units that are started at boot."""
     return wanted_units(own_directories(manager, scope)[0])
+
+
+def enabled_names(manager: Manager, scope: Scope) -> list[str]:
+    """The names of the dataflows that are started at boot, sorted."""
+    return sorted(filter(None, map(name_from_unit, enabled_units(manager, scope))))
 
 
 def wanted_units(directory: Path) -> frozenset[str]:
