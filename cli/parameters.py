@@ -67,14 +67,16 @@ def require_names_or_all(verb: str, selectors: Sequence[str], want_all: bool) ->
         raise DoraSystemdError(f"cannot {verb}: give names or --all", hint, ExitCode.USAGE)
 
 
-def print_outcomes(outcomes: "Sequence[Outcome]") -> int:
-    """One line for each dataflow; the exit status is FAILURE if any has a problem."""
+def print_outcomes(outcomes: "Iterable[Outcome]") -> ExitCode:
+    """One line for each dataflow, at once; FAILURE if any has a problem."""
+    status = ExitCode.OK
     for one in outcomes:
         if one.problem:
             click.echo(f"doractl: {one.problem}", err=True)
+            status = ExitCode.FAILURE
         else:
             click.echo(one.text)
-    return ExitCode.FAILURE if any(one.problem for one in outcomes) else ExitCode.OK
+    return status
 
 
 def print_warnings(warnings: Iterable[str]) -> None:

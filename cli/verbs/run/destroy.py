@@ -3,7 +3,7 @@
 import click
 
 from dora_systemd.adapters.bus.systemd import Bus
-from dora_systemd.cli.parameters import current_scope, scope_options
+from dora_systemd.cli.parameters import current_scope, print_outcomes, scope_options
 from dora_systemd.errors import ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.destroy import (
@@ -52,14 +52,7 @@ def _stop_dataflows(bus: Bus, scope: Scope, force: bool) -> bool:
         return True
     note_stop(cells, "doractl destroy")
     click.echo("Stopping all dataflows...")
-    is_good = True
-    for ended in stop_all(bus, scope, force):
-        if ended.problem:
-            click.echo(f"doractl: {ended.problem}", err=True)
-        else:
-            click.echo(f"  ✓ {ended.name} stopped{f' ({ended.note})' if ended.note else ''}")
-        is_good = is_good and not ended.problem
-    return is_good
+    return print_outcomes(stop_all(bus, scope, force)) is ExitCode.OK
 
 
 def _print_left(bus: Bus, scope: Scope, others: list[str]) -> bool:
