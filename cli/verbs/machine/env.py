@@ -42,6 +42,5 @@ def command(selector: str | None, shell: str, want_unset: bool) -> None:
         click.echo(format_unsets(shell))
         return
     scope = current_scope()
-    write_exactly(
-        f"{format_exports(shell, read_variables(Bus(scope, for_reading=True), scope, selector))}\n"
-    )
+    variables = read_variables(Bus(scope, for_reading=True), scope, selector)
+    write_exactly(f"{format_exports(shell, variables)}\n")
