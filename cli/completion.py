@@ -19,9 +19,6 @@ from dora_systemd.cli.parameters import current_scope
 from dora_systemd.decisions.properties.sandbox import LEVELS, NETWORKS
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import is_uuid_prefix
-from dora_systemd.verbs.facts.cells import read_cells
-from dora_systemd.verbs.facts.list import dataflow_row
-from dora_systemd.verbs.facts.selector import Selector
 
 VARIABLE = "_DORACTL_COMPLETE"
 
@@ -52,6 +49,8 @@ class Live(click.types.StringParamType):
 
 def dataflow_names(ctx: click.Context, incomplete: str) -> list[str]:
     """The dataflows of systemd and, for logs, of the journal; UUIDs if the word looks like one."""
+    from dora_systemd.verbs.facts.cells import read_cells
+
     verb = ctx.command.name or ""
     cells = [cell for cell in read_cells(_bus()) if cell.is_up or verb not in _RUNNING_ONLY]
     names = [cell.name for cell in cells] + (
@@ -65,6 +64,9 @@ def dataflow_names(ctx: click.Context, incomplete: str) -> list[str]:
 
 def node_names(ctx: click.Context, incomplete: str) -> list[str]:
     """The nodes of the dataflow that is on the command line."""
+    from dora_systemd.verbs.facts.list import dataflow_row
+    from dora_systemd.verbs.facts.selector import Selector
+
     del incomplete
     # After an option without its value, click leaves the arguments in ctx.args.
     selector = ctx.params.get("selector") or next(iter(ctx.args), "")

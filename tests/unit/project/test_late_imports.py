@@ -12,6 +12,9 @@ LATE = {
         "cli.listing": {"verbs.list", "verbs.facts.ended"},
         "suggestions": {"difflib"},
     },
+    "a Tab after a verb or an option does not ask for a dataflow": {
+        "cli.completion": {"verbs.facts.cells", "verbs.facts.list", "verbs.facts.selector"},
+    },
     "the journal reader: only what is not in systemd, or has restarted, needs it": {
         "verbs.facts.budget": {"adapters.journal.reader"},
         "verbs.facts.selector": {"verbs.facts.ended"},
