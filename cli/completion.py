@@ -64,8 +64,8 @@ def dataflow_names(ctx: click.Context, incomplete: str) -> list[str]:
 
 def node_names(ctx: click.Context, incomplete: str) -> list[str]:
     """The nodes of the dataflow that is on the command line."""
-    from dora_systemd.verbs.facts.cells import read_cells, select_cell
     from dora_systemd.verbs.facts.list import dataflow_row
+    from dora_systemd.verbs.facts.selector import Selector
 
     del incomplete
     # After an option without its value, click leaves the arguments in ctx.args.
@@ -73,7 +73,7 @@ def node_names(ctx: click.Context, incomplete: str) -> list[str]:
     if ctx.command.name == "logs":
         return JournalReader().known_nodes(selector)
     bus = _bus()
-    row = dataflow_row(bus, current_scope(), select_cell(read_cells(bus), selector))
+    row = dataflow_row(bus, current_scope(), Selector(selector).find(bus))
     return [one.node for one in row.nodes]
 
 

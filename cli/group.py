@@ -1,6 +1,8 @@
 """The verbs of doractl as a click group that imports only the verb that runs."""
 
+from difflib import get_close_matches
 from importlib import import_module
+from inspect import cleandoc
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,6 +34,9 @@ class Verb(NamedTuple):
         """The click command."""
         name = f"dora_systemd.cli.verbs.{self.section}.{self.name}"
         found: click.Command = import_module(name).command
+        _put_examples_last(found)
+        for member in getattr(found, "commands", {}).values():
+            member.epilog = found.epilog
         return found
 
     @property
@@ -39,6 +44,13 @@ class Verb(NamedTuple):
         """The first line of the docstring, read from the file: imports would slow down --help."""
         with self.path.open(encoding="utf-8") as lines:
             return lines.readline().strip().strip('"')
+
+
+def _put_examples_last(command: click.Command) -> None:
+    """Let --help print the examples, with which the docstring ends, below the options."""
+    text, mark, examples = cleandoc(command.help or "").partition("\n\nExamples:")
+    if mark:
+        command.help, command.epilog = text, f"\b\nExamples:{examples}"
 
 
 def find_verbs() -> dict[str, Verb]:
@@ -82,8 +94,6 @@ class VerbGroup(click.Group):
         name = args[0]
         if name.startswith("-") or self.get_command(ctx, name):
             return super().resolve_command(ctx, args)
-        from difflib import get_close_matches
-
         near = get_close_matches(name, [*VERBS, *ALIASES], n=1)
         hint = f"did you mean doractl {near[0]}?" if near else "doractl --help lists all commands"
         raise DoraSystemdError(f"unknown command {name!r}", hint, ExitCode.USAGE)

@@ -1,9 +1,9 @@
-"""The output of `doractl list`; works without click, see main."""
+"""`doractl list` without click, which takes longer to import than the list takes."""
 
 import json
+from typing import Any, NamedTuple
 
 from dora_systemd.adapters.bus.systemd import Bus
-from dora_systemd.cli.quick import ListRequest
 from dora_systemd.decisions.views.dataflows import (
     DataflowRow,
     format_dataflow,
@@ -13,7 +13,44 @@ from dora_systemd.decisions.views.dataflows import (
 )
 from dora_systemd.errors import ExitCode
 from dora_systemd.scope import Scope, scope_of
-from dora_systemd.verbs.facts.list import find_row, read_rows
+from dora_systemd.verbs.facts.list import read_rows
+
+_FLAGS: dict[str, dict[str, Any]] = {
+    "-a": {"want_all": True},
+    "--all": {"want_all": True},
+    "--user": {"is_user": True},
+    "--system": {"is_user": False},
+    "--output=json": {"output": "json"},
+    "--output=table": {"output": "table"},
+}
+"""What click makes of the options of `list`; test_command.py compares the two."""
+
+
+class ListRequest(NamedTuple):
+    """A `doractl list` command. is_user: None without --user and --system."""
+
+    selector: str | None = None
+    want_all: bool = False
+    output: str = "table"
+    is_user: bool | None = None
+
+
+def parse_list(arguments: list[str]) -> ListRequest | None:
+    """The request in `[--all] [--user|--system] [-o json|table] [SELECTOR]`, else None.
+
+    None also for every wrong command line: click reports the error.
+    """
+    request = ListRequest()
+    rest = iter(arguments)
+    for word in rest:
+        flag = f"--output={next(rest, '')}" if word in ("-o", "--output") else word
+        if flag in _FLAGS:
+            request = request._replace(**_FLAGS[flag])
+        elif flag and not flag.startswith("-") and request.selector is None:
+            request = request._replace(selector=flag)
+        else:
+            return None
+    return request
 
 
 def print_dataflows(request: ListRequest) -> int:
@@ -23,18 +60,17 @@ def print_dataflows(request: ListRequest) -> int:
     if request.selector is None:
         _print_all(_rows(bus, scope, request), request)
         return ExitCode.OK
+    # Imported late: the table of all dataflows does without it, and is asked for most often.
+    from dora_systemd.verbs.list import find_row
+
     row = find_row(bus, scope, request.selector)
-    print(json.dumps(row_values(row), indent=2) if is_json(request) else format_dataflow(row))
+    is_json = request.output == "json"
+    print(json.dumps(row_values(row), indent=2) if is_json else format_dataflow(row))
     return ExitCode.OK if is_up_word(row) else ExitCode.NOT_RUNNING
 
 
-def is_json(request: ListRequest) -> bool:
-    """Whether the output is JSON."""
-    return request.output == "json"
-
-
 def _rows(bus: Bus, scope: Scope, request: ListRequest) -> list[DataflowRow]:
-    rows = read_rows(bus, scope, with_details=is_json(request))
+    rows = read_rows(bus, scope, with_details=request.output == "json")
     if not request.want_all:
         return [row for row in rows if is_up_word(row)]
     # Only dataflows that systemd has unloaded need the journal.
@@ -44,7 +80,7 @@ def _rows(bus: Bus, scope: Scope, request: ListRequest) -> list[DataflowRow]:
 
 
 def _print_all(rows: list[DataflowRow], request: ListRequest) -> None:
-    if is_json(request):
+    if request.output == "json":
         print(json.dumps([row_values(row) for row in rows], indent=2))
     elif rows:
         print(format_dataflows(rows))

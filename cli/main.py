@@ -8,8 +8,9 @@ from typing import NoReturn
 
 from dora_systemd import __version__
 from dora_systemd.cli.edge import put_in_place
-from dora_systemd.cli.quick import parse_quick_list
 from dora_systemd.errors import DoraSystemdError, ExitCode
+
+LIST_VERBS = ("list", "ps", "status")
 
 
 def main() -> None:
@@ -80,11 +81,11 @@ def _dispatch(arguments: list[str]) -> int:
     if arguments == ["--version"]:
         print(f"doractl {__version__}")
         return ExitCode.OK
-    request = parse_quick_list(arguments)
-    if request is not None:
-        from dora_systemd.cli.listing import print_dataflows
+    if arguments and arguments[0] in LIST_VERBS:
+        from dora_systemd.cli.listing import parse_list, print_dataflows
 
-        return print_dataflows(request)
+        if (request := parse_list(arguments[1:])) is not None:
+            return print_dataflows(request)
     from dora_systemd.cli.group import run_verb
 
     return run_verb(arguments)

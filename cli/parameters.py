@@ -1,58 +1,19 @@
 """Options and arguments that several verbs share."""
 
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, TypeVar
+import json
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from dora_systemd.errors import ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope, scope_of
 
 if TYPE_CHECKING:
     # Imported late: only some verbs print outcomes.
     from dora_systemd.verbs.stop import Outcome
 
-F = TypeVar("F", bound=Callable[..., Any])
-
 _SCOPE_KEY = "dora_systemd.is_user"
-
-
-def scope_options(function: F) -> F:
-    """`--system` and `--user`, before or after the verb; the last one counts."""
-    return click.option(
-        # Its own name, because one of the settings is called "user".
-        "--user/--system",
-        "wants_user",
-        default=None,
-        expose_value=False,
-        callback=_remember,
-        help="Dataflows of the calling user (default unless root), or of the system.",
-    )(function)
-
-
-def current_scope() -> Scope:
-    """The scope of the command line."""
-    return scope_of(click.get_current_context().meta.get(_SCOPE_KEY))
-
-
-def output_option(function: F) -> F:
-    """`-o table|json`."""
-    option = click.option(
-        "-o",
-        "--output",
-        type=click.Choice(["table", "json"]),
-        default="table",
-        show_default=True,
-        help="Table or JSON.",
-    )
-    return option(function)
-
-
-def print_json(value: Any) -> None:
-    """`value` as JSON, indented."""
-    import json
-
-    click.echo(json.dumps(value, indent=2))
 
 
 def _remember(ctx: click.Context, param: click.Parameter, value: bool | None) -> None:
@@ -61,23 +22,64 @@ def _remember(ctx: click.Context, param: click.Parameter, value: bool | None) ->
         ctx.meta[_SCOPE_KEY] = value
 
 
-def print_outcomes(outcomes: "Sequence[Outcome]") -> int:
-    """One line for each dataflow; the exit status is FAILURE if any has a problem."""
+scope_options = click.option(
+    # Its own name, because one of the settings is called "user".
+    "--user/--system",
+    "wants_user",
+    default=None,
+    expose_value=False,
+    callback=_remember,
+    help="Dataflows of the calling user (default unless root), or of the system.",
+)
+"""`--system` and `--user`, before or after the verb; the last one counts."""
+
+output_option = click.option(
+    "-o",
+    "--output",
+    type=click.Choice(["table", "json"]),
+    default="table",
+    show_default=True,
+    help="Table or JSON.",
+)
+
+name_option = click.option(
+    "--name",
+    metavar="NAME",
+    help="Name of the dataflow; default: that of its file, or of the directory of a dataflow.yml.",
+)
+"""For what starts a dataflow."""
+
+
+def current_scope() -> Scope:
+    """The scope of the command line."""
+    return scope_of(click.get_current_context().meta.get(_SCOPE_KEY))
+
+
+def print_json(value: Any) -> None:
+    """`value` as JSON, indented."""
+    click.echo(json.dumps(value, indent=2))
+
+
+def require_names_or_all(verb: str, selectors: Sequence[str], want_all: bool) -> None:
+    """Raise DoraSystemdError (USAGE) unless a command line has either names or --all."""
+    if bool(selectors) == want_all:
+        hint = f"doractl {verb} NAME, or doractl {verb} --all"
+        raise DoraSystemdError(f"cannot {verb}: give names or --all", hint, ExitCode.USAGE)
+
+
+def print_outcomes(outcomes: "Iterable[Outcome]") -> ExitCode:
+    """One line for each dataflow, at once; FAILURE if any has a problem."""
+    status = ExitCode.OK
     for one in outcomes:
         if one.problem:
             click.echo(f"doractl: {one.problem}", err=True)
+            status = ExitCode.FAILURE
         else:
             click.echo(one.text)
-    return ExitCode.FAILURE if any(one.problem for one in outcomes) else ExitCode.OK
+    return status
 
 
-def print_warnings(warnings: Sequence[str]) -> None:
-    """One line each, on standard error."""
-    for warning in warnings:
+def print_warnings(warnings: Iterable[str]) -> None:
+    """One line each, on standard error, without empty ones."""
+    for warning in filter(None, warnings):
         click.echo(f"doractl: {warning}", err=True)
-
-
-def name_option(function: F) -> F:
-    """`--name NAME`, for what starts a dataflow."""
-    text = "Name of the dataflow; default: that of its file, or of the directory of a dataflow.yml."
-    return click.option("--name", metavar="NAME", help=text)(function)

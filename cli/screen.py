@@ -11,7 +11,7 @@ import sys
 import termios
 import tty
 from collections.abc import Iterable
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import TextIO
 
 from dora_systemd.terminal_text import one_line
@@ -50,12 +50,7 @@ class Screen:
         self._take()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_exception: object) -> None:
         self._give_back()
         signal.set_wakeup_fd(-1)
         for number in (*_ENDINGS, signal.SIGTSTP, signal.SIGWINCH):

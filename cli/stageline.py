@@ -1,7 +1,7 @@
 """One status line on a terminal that is rewritten during a wait; no output to a pipe."""
 
 import shutil
-from types import TracebackType
+from contextlib import AbstractContextManager
 from typing import TextIO
 
 from dora_systemd.cli.edge import write_own
@@ -10,7 +10,7 @@ from dora_systemd.terminal_text import one_line
 _BACK_AND_CLEAR = "\r\x1b[K"
 
 
-class StageLine:
+class StageLine(AbstractContextManager["StageLine"]):
     """Shows the text of the last call, until the `with` block ends and erases it."""
 
     def __init__(self, stream: TextIO) -> None:
@@ -31,15 +31,7 @@ class StageLine:
             self._write(_BACK_AND_CLEAR)
             self._is_shown = False
 
-    def __enter__(self) -> "StageLine":
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_exception: object) -> None:
         self.wipe()
 
     def _write(self, text: str) -> None:

@@ -23,7 +23,7 @@ from dora_systemd.values import INFINITY, SECOND
 from dora_systemd.verbs.facts.cells import Cell, read_cell, read_cells
 from dora_systemd.verbs.facts.reason import failure_reason
 from dora_systemd.verbs.facts.slice import slice_group
-from dora_systemd.verbs.stop import release_enabled
+from dora_systemd.verbs.stop import Outcome, release_enabled
 from dora_systemd.verbs.up import written_files
 
 UNBOUNDED_SECONDS = 90.0
@@ -36,15 +36,6 @@ _ROUNDS = 5
 """Maximum searches for dataflows that were started meanwhile."""
 
 _GATEWAY = (SOCKET_UNIT, SERVICE_UNIT)
-
-
-@dataclass(frozen=True)
-class Ended:
-    """One dataflow that was stopped. note: what else to report; problem: why it did not stop."""
-
-    name: str
-    note: str = ""
-    problem: str = ""
 
 
 @dataclass(frozen=True)
@@ -63,7 +54,7 @@ def running_cells(manager: Manager) -> list[Cell]:
 
 def stop_all(
     manager: Manager, scope: Scope, want_kill: bool, now: Callable[[], float] = time.monotonic
-) -> Iterator[Ended]:
+) -> Iterator[Outcome]:
     """Stop all dataflows in parallel; yields each as soon as it has ended.
 
     want_kill: kill the nodes at once. Otherwise each dataflow has the TimeoutStopSec= of its unit,
@@ -74,9 +65,9 @@ def stop_all(
         cells = [cell for cell in running_cells(manager) if cell.unit not in given_up]
         if not cells:
             return
-        for cell, ended in _stop(manager, cells, want_kill, now):
-            given_up |= {cell.unit} if ended.problem else set()
-            yield ended
+        for outcome in _stop(manager, cells, want_kill, now):
+            given_up |= {outcome.cell.unit} if outcome.problem else set()
+            yield outcome
         release_enabled(manager, scope, [cell.unit for cell in cells])
 
 
@@ -143,20 +134,20 @@ def _state(manager: Manager, unit: str) -> str:
 
 def _stop(
     manager: Manager, cells: Sequence[Cell], want_kill: bool, now: Callable[[], float]
-) -> Iterator[tuple[Cell, Ended]]:
+) -> Iterator[Outcome]:
     pending = [_begin(manager, cell, want_kill, now()) for cell in cells]
     while pending:
         left = []
         for one in pending:
             if (state := _state(manager, one.cell.unit)) in DOWN:
-                yield one.cell, _ended(manager, one, state)
+                yield _ended(manager, one, state)
             elif now() < one.deadline:
                 left.append(one)
             elif not one.is_killed:
                 left.append(_begin(manager, one.cell, True, now()))
             else:
                 text = f"cannot stop {one.cell.unit}: it is {state} although it was killed"
-                yield one.cell, Ended(one.cell.name, problem=text)
+                yield Outcome(one.cell, "", text)
         pending = left
         if pending:
             time.sleep(_POLL_SECONDS)
@@ -175,10 +166,12 @@ def _begin(manager: Manager, cell: Cell, want_kill: bool, now: float) -> _Stop:
     return _Stop(cell, now + seconds + _MARGIN_SECONDS, False)
 
 
-def _ended(manager: Manager, one: _Stop, state: str) -> Ended:
+def _ended(manager: Manager, one: _Stop, state: str) -> Outcome:
+    note = ""
     if one.is_killed:
         with suppress(DoraSystemdError):
             manager.reset_failed(one.cell.unit)
-        return Ended(one.cell.name, "killed")
-    note = failure_reason(manager, one.cell.unit) if state == "failed" else ""
-    return Ended(one.cell.name, note)
+        note = " (killed)"
+    elif state == "failed":
+        note = f" ({failure_reason(manager, one.cell.unit)})"
+    return Outcome(one.cell, f"  ✓ {one.cell.name} stopped{note}")

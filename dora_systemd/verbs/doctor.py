@@ -18,10 +18,7 @@ from dora_systemd.adapters.dora.command import (
 )
 from dora_systemd.adapters.host.files import read_yaml
 from dora_systemd.adapters.host.process import run_command
-from dora_systemd.adapters.host.process_table import (
-    read_processes,
-    socket_owners,
-)
+from dora_systemd.adapters.host.process_table import read_processes, socket_owners
 from dora_systemd.adapters.host.unit_files import read_unit_file
 from dora_systemd.adapters.journal import reader as journal_reader
 from dora_systemd.decisions.unit.file import BOOT_TARGET, runner_of
@@ -82,8 +79,7 @@ def _controllers(manager: Manager, scope: Scope) -> Iterator[Finding]:
     yield judge_controllers(cgroup.read_controllers(group), scope.is_user)
 
 
-def _linger(manager: Manager, scope: Scope) -> Iterator[Finding]:
-    del manager
+def _linger(_manager: Manager, scope: Scope) -> Iterator[Finding]:
     if not scope.is_user:
         return
     if is_lingering(scope):
@@ -109,8 +105,7 @@ def _boot(manager: Manager, scope: Scope) -> Iterator[Finding]:
             yield Finding("boot", State.WARNING, text, f"systemctl {scope.flag} daemon-reload")
 
 
-def _ports(manager: Manager, scope: Scope) -> Iterator[Finding]:
-    del scope
+def _ports(manager: Manager, _scope: Scope) -> Iterator[Finding]:
     gateway = read_gateway(manager)
     processes: list[Process] = []
     for port in DORA_PORTS:
@@ -183,11 +178,8 @@ def _journal(scope: Scope) -> Iterator[Finding]:
     except DoraSystemdError as error:
         yield Finding("journal", State.WARNING, error.message, error.hint)
     if journal_reader.is_volatile():
-        text, remedy = (
-            "it is kept in memory and lost at a reboot",
-            "as root: mkdir /var/log/journal",
-        )
-        remedy += " and systemctl restart systemd-journald"
+        text = "it is kept in memory and lost at a reboot"
+        remedy = "as root: mkdir /var/log/journal and systemctl restart systemd-journald"
         yield Finding("journal", State.WARNING, text, remedy)
     else:
         yield Finding("journal", State.OK, "it survives a reboot")
@@ -200,8 +192,7 @@ def _journal(scope: Scope) -> Iterator[Finding]:
         yield judge_rate(config, scope.is_user)
 
 
-def _dora(scope: Scope) -> Iterator[Finding]:
-    del scope
+def _dora(_scope: Scope) -> Iterator[Finding]:
     path = os.environ.get("PATH", os.defpath)
     try:
         dora = find_dora(None, os.environ.get("VIRTUAL_ENV"), path)
@@ -228,9 +219,8 @@ def _user(scope: Scope) -> Iterator[Finding]:
         yield Finding("user", State.OK, f"{DEFAULT_USER} runs the dataflows of root's files")
 
 
-def _settings(scope: Scope) -> Iterator[Finding]:
+def _settings(_scope: Scope) -> Iterator[Finding]:
     """Check the settings files for all dataflows; `start` checks the one beside a dataflow."""
-    del scope
     for path in settings_files(Path("/dataflow.yml"), os.environ)[1:]:
         if path.exists():
             try:
@@ -241,8 +231,7 @@ def _settings(scope: Scope) -> Iterator[Finding]:
                 yield Finding("settings", State.OK, f"{path} can be read")
 
 
-def _processes(scope: Scope) -> Iterator[Finding]:
-    del scope
+def _processes(_scope: Scope) -> Iterator[Finding]:
     yield from judge_processes(read_processes())
 
 

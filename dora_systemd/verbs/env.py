@@ -3,7 +3,7 @@
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.decisions.dora.variables import coordinator_variables
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.facts.cells import read_cells, select_cell
+from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.gateway import read_token, require_gateway
 from dora_systemd.verbs.node import dora_environment, reached_coordinator
 
@@ -17,5 +17,5 @@ def read_variables(manager: Manager, scope: Scope, selector: str | None) -> dict
     if selector is None:
         port = require_gateway(manager, scope)
         return coordinator_variables(port, read_token(scope, port))
-    cell = select_cell(read_cells(manager), selector)
+    cell = Selector(selector).find(manager)
     return dora_environment(reached_coordinator(scope, manager, cell))

@@ -11,18 +11,16 @@ unit on restarts too; so the ActiveState and the job of the unit decide whether 
 order matters: is_up() comes before the last step, or records written in between would be missing.
 """
 
-import os
-import select
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Protocol
 
 from dora_systemd.adapters.bus.manager import DOWN, Manager
-from dora_systemd.adapters.journal.reader import open_journalctl
+from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.decisions.logs.query import (
     UNIT_ENDS,
     LogQuery,
@@ -33,6 +31,7 @@ from dora_systemd.decisions.logs.query import (
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
+from dora_systemd.verbs.logs import Follower
 
 STEP_SECONDS = 0.2
 """At least this long between two steps: journalctl needs tens of ms to open all journal files."""
@@ -55,41 +54,27 @@ class Watch(Protocol):
         """Whether systemd has logged an end of the unit since the last call."""
 
 
-class UnitWatch:
+class UnitWatch(Follower):
     """Watches the journal for new records of a unit and of its end.
 
     since_us: CLOCK_REALTIME in µs; earlier records do not count.
     """
 
     def __init__(self, scope: Scope, name: str, since_us: int) -> None:
-        self._stack = ExitStack()
+        matches = [*scope_matches(scope, name), "+", *end_matches(scope, name)]
+        super().__init__(since_us, "MESSAGE_ID", matches)
         self._rest = b""
         self._has_ended = False
-        options = ["--follow", "--quiet", "--output=export", "--output-fields=MESSAGE_ID"]
-        matches = [*scope_matches(scope, name), "+", *end_matches(scope, name)]
-        arguments = [*options, f"--since={journal_timestamp(since_us)}", "--", *matches]
-        child = self._stack.enter_context(open_journalctl(arguments))
-        assert child.stdout
-        self._fd = child.stdout.fileno()
-        os.set_blocking(self._fd, False)
 
     def wait(self, seconds: float) -> bool:
         """See Watch."""
-        poll = select.poll()
-        poll.register(self._fd, select.POLLIN)
-        if not poll.poll(seconds * 1000):
+        if not self.is_readable(seconds):
             return False
-        while data := self._read():
+        while data := self.read(_CHUNK):
             seen = self._rest + data
             self._has_ended |= any(one.encode() in seen for one in UNIT_ENDS)
             self._rest = seen[-len(UNIT_ENDS[0]) :]
         return True
-
-    def _read(self) -> bytes:
-        try:
-            return os.read(self._fd, _CHUNK)
-        except BlockingIOError:
-            return b""
 
     def take_end(self) -> bool:
         """See Watch."""
@@ -97,10 +82,6 @@ class UnitWatch:
         if ended:
             self._rest = b""
         return ended
-
-    def close(self) -> None:
-        """Terminate the journalctl process."""
-        self._stack.close()
 
 
 def check_until_end(selector: str, is_reverse: bool) -> None:
@@ -118,9 +99,6 @@ def follow_to_end(query: LogQuery, print_query: Callable[[LogQuery], object]) ->
 
     Raises DoraSystemdError.
     """
-    # Imported here: other uses of `doractl logs` do not talk to systemd.
-    from dora_systemd.adapters.bus.systemd import Bus
-
     start_us = time.time_ns() // 1000
     bus = Bus(query.scope, for_reading=True)
     with (

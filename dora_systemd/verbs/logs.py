@@ -4,14 +4,14 @@ import os
 import re
 import select
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from fnmatch import fnmatchcase
 from itertools import islice
-from typing import Protocol
+from typing import NamedTuple
 
-from dora_systemd.adapters.journal.reader import end_journalctl, is_volatile, open_journalctl
+from dora_systemd.adapters.journal.reader import JournalReader, end_journalctl, open_journalctl
 from dora_systemd.decisions.logs.fields import ExportReader
 from dora_systemd.decisions.logs.query import (
     UNIT_ENDS,
@@ -23,10 +23,10 @@ from dora_systemd.decisions.logs.query import (
 )
 from dora_systemd.decisions.logs.terminal import ShownLines, TerminalLines
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.names import is_uuid_prefix, name_from_unit
 from dora_systemd.scope import Scope
-from dora_systemd.suggestions import did_you_mean
 from dora_systemd.values import quoted
+from dora_systemd.verbs.facts.ended import volatile_note
+from dora_systemd.verbs.facts.selector import Selector
 
 _CHUNK = 1 << 18
 _TURN = 1 << 14
@@ -37,78 +37,50 @@ _FIELDS = "MESSAGE,PRIORITY,SYSLOG_IDENTIFIER,MESSAGE_ID,UNIT,USER_UNIT"
 Write = Callable[[bytes], object]
 
 
-class Journal(Protocol):
-    """The part of dora_systemd.adapters.journal.reader.JournalReader that this module uses."""
+class _Recorded(NamedTuple):
+    """A dataflow in the journal."""
 
-    def known_names(self) -> list[str]:
-        """Names of dataflows."""
-
-    def known_uuids(self) -> list[str]:
-        """UUIDs of dataflows."""
-
-    def known_nodes(self, name: str) -> list[str]:
-        """Nodes of a dataflow."""
-
-    def name_of(self, uuid: str) -> str:
-        """The name of a dataflow."""
-
-    def invocations(self, scope: Scope, name: str, uuid: str) -> Iterator[str]:
-        """Invocations of its unit, newest first."""
+    name: str
+    uuid: str
 
 
-@dataclass(frozen=True)
-class LogRequest:
-    """A request for logs: a query whose names and patterns are not resolved yet.
+def find_query(
+    journal: JournalReader,
+    query: LogQuery,
+    selector: str,
+    nodes: tuple[str, ...] = (),
+    run: str = "ALL",
+) -> LogQuery:
+    """The query, with the name, nodes and run that the journal has for it.
 
     selector: "" for all dataflows of the scope. nodes: names or patterns as in glob(7). run:
-    CURRENT, PREVIOUS, ALL, or dora's id of a run.
+    CURRENT, PREVIOUS, ALL, or dora's id of a run. Raises DoraSystemdError: NOT_FOUND for a
+    dataflow, node or run without any record.
     """
-
-    selector: str
-    nodes: tuple[str, ...]
-    run: str
-    query: LogQuery
-
-
-def find_query(journal: Journal, request: LogRequest) -> LogQuery:
-    """The query, with name, nodes and run resolved by the journal.
-
-    Raises DoraSystemdError: NOT_FOUND for a dataflow, node or run without any record.
-    """
-    query = request.query
-    if request.selector:
-        query = _select_dataflow(journal, query, request.selector)
-    if request.nodes:
-        query = replace(query, nodes=_select_nodes(journal, query, request.nodes))
-    return _select_run(journal, query, request.run)
+    if selector:
+        query = _select_dataflow(journal, query, selector)
+    if nodes:
+        query = replace(query, nodes=_select_nodes(journal, query, nodes))
+    return _select_run(journal, query, run)
 
 
-def _select_dataflow(journal: Journal, query: LogQuery, selector: str) -> LogQuery:
+def _select_dataflow(journal: JournalReader, query: LogQuery, selector: str) -> LogQuery:
     names = journal.known_names()
-    name = name_from_unit(selector) or selector
-    if name in names:
-        return replace(query, name=name)
-    uuids = journal.known_uuids() if is_uuid_prefix(selector) else []
-    found = [uuid for uuid in uuids if uuid.startswith(selector.lower())]
-    if len(found) > 1:
-        message = f"cannot tell which dataflow {quoted(selector)} is"
-        raise DoraSystemdError(message, f"one of {', '.join(found[:10])}", ExitCode.USAGE)
-    if not found:
-        raise _unknown_dataflow(selector, names)
-    return replace(query, uuid=found[0], name=journal.name_of(found[0]))
+    wanted = Selector(selector)
+    if wanted.name in names:
+        return replace(query, name=wanted.name)
+    fitting = wanted.meant(_Recorded("", uuid) for uuid in journal.known_uuids())
+    found = wanted.only(_Recorded(journal.name_of(one.uuid), one.uuid) for one in fitting)
+    if found is None:
+        error = wanted.missing(names)
+        error.hint += volatile_note()
+        raise error
+    return replace(query, uuid=found.uuid, name=found.name)
 
 
-def _unknown_dataflow(selector: str, names: list[str]) -> DoraSystemdError:
-    hint = did_you_mean(selector, names)
-    if not hint and names:
-        hint = f"in the journal: {', '.join(names[:10])}"
-    if is_volatile():
-        hint = f"{hint + '; ' if hint else ''}the journal is volatile: a reboot empties it"
-    message = f"no dataflow named {quoted(selector)} in the journal"
-    return DoraSystemdError(message, hint, ExitCode.NOT_FOUND)
-
-
-def _select_nodes(journal: Journal, query: LogQuery, patterns: tuple[str, ...]) -> tuple[str, ...]:
+def _select_nodes(
+    journal: JournalReader, query: LogQuery, patterns: tuple[str, ...]
+) -> tuple[str, ...]:
     if not query.name:
         hint = "say which dataflow: doractl logs NAME --node NODE"
         raise DoraSystemdError("cannot select nodes of all dataflows", hint, ExitCode.USAGE)
@@ -128,7 +100,7 @@ def _fits(node: str, pattern: str) -> bool:
     return node == pattern or (bool(_GLOB.search(pattern)) and fnmatchcase(node, pattern))
 
 
-def _select_run(journal: Journal, query: LogQuery, run: str) -> LogQuery:
+def _select_run(journal: JournalReader, query: LogQuery, run: str) -> LogQuery:
     if run == "ALL":
         return query
     if run not in ("CURRENT", "PREVIOUS"):
@@ -168,7 +140,47 @@ def pass_logs(query: LogQuery, fd: int) -> int:
         return end_journalctl(child)
 
 
-class FollowedLog:
+class Follower:
+    """A `journalctl --follow`, for poll(2). Use it with contextlib.closing().
+
+    since_us: CLOCK_REALTIME µs of the first records. outlives_interrupt: see open_journalctl().
+    """
+
+    def __init__(
+        self, since_us: int, fields: str, matches: Sequence[str], outlives_interrupt: bool = False
+    ) -> None:
+        options = ["--follow", "--quiet", "--output=export", f"--output-fields={fields}"]
+        arguments = [*options, f"--since={journal_timestamp(since_us)}", "--", *matches]
+        self._stack = ExitStack()
+        journalctl = open_journalctl(arguments, outlives_interrupt=outlives_interrupt)
+        child = self._stack.enter_context(journalctl)
+        assert child.stdout
+        self._fd = child.stdout.fileno()
+        os.set_blocking(self._fd, False)
+        self._poll = select.poll()
+        self._poll.register(self._fd, select.POLLIN)
+
+    def fileno(self) -> int:
+        """For poll(2): readable when there may be records."""
+        return self._fd
+
+    def is_readable(self, seconds: float) -> bool:
+        """Wait at most `seconds`; whether there may be records."""
+        return bool(self._poll.poll(seconds * 1000))
+
+    def read(self, size: int) -> bytes | None:
+        """At most `size` bytes, b"" at the end, None if there is nothing to read now."""
+        try:
+            return os.read(self._fd, size)
+        except BlockingIOError:
+            return None
+
+    def close(self) -> None:
+        """Terminate the journalctl process."""
+        self._stack.close()
+
+
+class FollowedLog(Follower):
     """The records of one invocation of a dataflow's unit, while it runs and up to its end.
 
     since_us: CLOCK_REALTIME µs of the start of the unit. write: called with the lines.
@@ -183,37 +195,21 @@ class FollowedLog:
         write: Write,
         terminal: TerminalLines,
     ) -> None:
-        query = LogQuery(scope, name=name, uuid=uuid)
-        since = f"--since={journal_timestamp(since_us)}"
-        options = ["--follow", "--quiet", "--output=export", f"--output-fields={_FIELDS}", since]
-        matches = [*query_matches(query), "+", *end_matches(scope, name)]
+        matches = [*query_matches(LogQuery(scope, name=name, uuid=uuid)), "+"]
+        matches += end_matches(scope, name)
+        # After the first Ctrl+C the nodes still have to say something.
+        super().__init__(since_us, _FIELDS, matches, outlives_interrupt=True)
         self.has_ended = False
         self._write = write
         self._terminal = terminal
         self._records = ExportReader()
-        self._stack = ExitStack()
-        # After the first Ctrl+C the nodes still have to say something.
-        journalctl = open_journalctl([*options, "--", *matches], outlives_interrupt=True)
-        child = self._stack.enter_context(journalctl)
-        assert child.stdout
-        self._fd = child.stdout.fileno()
-        os.set_blocking(self._fd, False)
-
-    def fileno(self) -> int:
-        """For poll(2): readable when there may be lines."""
-        return self._fd
 
     def print_new(self) -> None:
         """Write some of the lines that have come: a flood of them must not keep the caller here."""
-        if self.has_ended:
-            return
-        try:
-            data = os.read(self._fd, _TURN)
-        except BlockingIOError:
-            return
-        if not data:
-            self.has_ended = True
-        self._print(data)
+        data = None if self.has_ended else self.read(_TURN)
+        if data is not None:
+            self.has_ended = not data
+            self._print(data)
 
     def _print(self, data: bytes) -> None:
         lines: list[bytes] = []
@@ -228,12 +224,6 @@ class FollowedLog:
     def finish(self, seconds: float = 3.0) -> None:
         """Write the remaining lines of a unit that has ended; wait at most `seconds`."""
         deadline = time.monotonic() + seconds
-        poll = select.poll()
-        poll.register(self._fd, select.POLLIN)
         while not self.has_ended and (left := deadline - time.monotonic()) > 0:
-            poll.poll(left * 1000)
+            self.is_readable(left)
             self.print_new()
-
-    def close(self) -> None:
-        """Terminate the journalctl process."""
-        self._stack.close()

@@ -16,11 +16,12 @@ from dora_systemd.decisions.reload.changes import has_readers
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.paths import CellPaths
 from dora_systemd.scope import Scope
+from dora_systemd.suggestions import did_you_mean
 from dora_systemd.trust.programs import Account, account_of_uid, become, fresh_environment
 from dora_systemd.trust.sockets import plain, require_listener
 from dora_systemd.trust.terminals import run_apart
 from dora_systemd.values import quoted
-from dora_systemd.verbs.facts.cells import Cell, not_found
+from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.list import read_status
 
 _NO_USER = 2**32 - 1
@@ -35,7 +36,7 @@ def read_coordinator(scope: Scope, cell: Cell) -> Coordinator:
     Raises DoraSystemdError: NOT_RUNNING, or NO_PERMISSION for another user's dataflow.
     """
     require_running(cell)
-    return runner_socket.ask_coordinator(_socket(scope, cell))
+    return runner_socket.ask_coordinator(socket_of(scope, cell))
 
 
 def reached_coordinator(scope: Scope, manager: Manager, cell: Cell) -> Coordinator:
@@ -70,7 +71,7 @@ def ask_coordinator(scope: Scope, cell: Cell, params: Params) -> Reply:
     # Imported late: WebSockets are slow to import, and no other verb needs them.
     from dora_systemd.adapters.dora import control
 
-    return control.request(*runner_socket.relay(_socket(scope, cell)), params)
+    return control.request(*runner_socket.relay(socket_of(scope, cell)), params)
 
 
 def restart_node(scope: Scope, cell: Cell, node: str, ask: Ask = ask_coordinator) -> None:
@@ -133,7 +134,7 @@ def _relayed(scope: Scope, cell: Cell, uid: int, account: Account | None) -> Coo
     from dora_systemd.adapters.runner_socket.relay import open_port
 
     coordinator = read_coordinator(scope, cell)
-    port = open_port(_socket(scope, cell), {uid, os.getuid()}, lambda: _settle(account))
+    port = open_port(socket_of(scope, cell), {uid, os.getuid()}, lambda: _settle(account))
     return replace(coordinator, port=port, local_listen_port=None)
 
 
@@ -143,7 +144,8 @@ def _unit_facts(manager: Manager, cell: Cell) -> tuple[int, bool]:
     return os.getuid() if facts["UID"] == _NO_USER else facts["UID"], facts["PrivateNetwork"]
 
 
-def _socket(scope: Scope, cell: Cell) -> Path:
+def socket_of(scope: Scope, cell: Cell) -> Path:
+    """The socket of the runner of a dataflow."""
     return CellPaths(scope.cell_directory(cell.name)).socket
 
 
@@ -159,7 +161,7 @@ def dora_environment(coordinator: Coordinator) -> dict[str, str]:
 
 def _checked_status(scope: Scope, cell: Cell, node: str) -> CellStatus:
     require_running(cell)
-    runner_socket.require_access(_socket(scope, cell))
+    runner_socket.require_access(socket_of(scope, cell))
     return require_node(scope, cell, node)
 
 
@@ -169,7 +171,7 @@ def require_node(scope: Scope, cell: Cell, node: str) -> CellStatus:
     if node not in status.nodes:
         raise DoraSystemdError(
             f"cannot find a node {quoted(node)} in the dataflow {cell.name}",
-            not_found(node, list(status.nodes)).hint,
+            did_you_mean(node, status.nodes) or f"nodes: {', '.join(status.nodes) or 'none'}",
             ExitCode.NOT_FOUND,
         )
     return status

@@ -14,11 +14,10 @@ from dora_systemd.adapters.runner_socket.client import done_of, order
 from dora_systemd.decisions.cell.hot_reload import CHANGE_VARIABLE
 from dora_systemd.decisions.properties.assignments import typed
 from dora_systemd.decisions.unit.properties import format_unit
-from dora_systemd.paths import CellPaths
 from dora_systemd.scope import Scope
 from dora_systemd.values import format_bool
 from dora_systemd.verbs.facts.cells import Cell
-from dora_systemd.verbs.node import require_node, require_running
+from dora_systemd.verbs.node import require_node, require_running, socket_of
 
 Ask = Callable[[Path, Mapping[str, Any]], dict[str, Any]]
 
@@ -31,7 +30,7 @@ def reload_cell(scope: Scope, cell: Cell, node: str | None, ask: Ask = order) ->
     require_running(cell)
     if node is not None:
         require_node(scope, cell, node)
-    path = _socket(scope, cell)
+    path = socket_of(scope, cell)
     return done_of(path, ask(path, {"verb": "reload", "node": node}))
 
 
@@ -44,12 +43,8 @@ def switch_hot_reload(
     """
     require_running(cell)
     unit = manager.read(cell.unit, ("FragmentPath", "Transient"))
-    ask(_socket(scope, cell), {"verb": "hot-reload", "on": is_on})
+    ask(socket_of(scope, cell), {"verb": "hot-reload", "on": is_on})
     text = format_unit(typed(Environment=(f"{CHANGE_VARIABLE}={format_bool(is_on)}",)))
     directory = drop_in_directory(Path(unit["FragmentPath"]), bool(unit["Transient"]))
     write_unit_file(directory / HOT_RELOAD_FILE, f"# Written by doractl set.\n{text}")
     manager.reload()
-
-
-def _socket(scope: Scope, cell: Cell) -> Path:
-    return CellPaths(scope.cell_directory(cell.name)).socket

@@ -17,9 +17,9 @@ from dora_systemd.adapters.host.machine import read_machine
 from dora_systemd.adapters.host.unit_files import (
     NODE_LIMITS_FILE,
     drop_in_directory,
+    put_unit_file,
     read_unit_file,
     remove_empty,
-    remove_unit_file,
     write_unit_file,
 )
 from dora_systemd.decisions.cell.limits import (
@@ -33,12 +33,7 @@ from dora_systemd.decisions.cell.limits import (
 )
 from dora_systemd.decisions.descriptor.nodes import UNEXPANDED
 from dora_systemd.decisions.properties.assignments import typed
-from dora_systemd.decisions.settings.limit_checks import (
-    check_controllers,
-    needed_controllers,
-    size_warnings,
-    use_warnings,
-)
+from dora_systemd.decisions.settings.limit_checks import size_warnings, use_warnings
 from dora_systemd.decisions.settings.limits import LIVE_SETTINGS, NODE_LIMIT
 from dora_systemd.decisions.settings.resolve import Settings, resolve_settings
 from dora_systemd.decisions.unit.properties import format_unit, settings_properties
@@ -48,6 +43,7 @@ from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.enabled import enabled_units
 from dora_systemd.verbs.facts.list import read_status
 from dora_systemd.verbs.facts.nodes import written_dataflow
+from dora_systemd.verbs.start.limits import require_controllers
 
 _PROPERTIES = ("ControlGroup", "Environment", "FragmentPath", "Transient")
 
@@ -69,9 +65,7 @@ def set_limits(
         message = f"cannot change the limits of {cell.name}: permission denied"
         raise DoraSystemdError(message, "use sudo", ExitCode.NO_PERMISSION)
     _check_nodes(scope, cell, nodes)
-    if needed := needed_controllers(properties, nodes):
-        available = cgroup.read_controllers(cgroup.group_path(manager.control_group()))
-        check_controllers(needed, available, scope.is_user)
+    require_controllers(manager, scope, properties, nodes)
     unit = manager.read(cell.unit, _PROPERTIES)
     warnings = _warnings(settings, nodes, unit)
     # systemd stores drop-ins of a transient unit in /run in any case.
@@ -135,11 +129,8 @@ def _remember(unit: Mapping[str, Any], nodes: tuple[NodeLimits, ...], undo: Exit
 
 
 def _put_back(path: Path, text: str | None) -> None:
-    if text is not None:
-        write_unit_file(path, text)
-    else:
-        remove_unit_file(path)
-        remove_empty(path.parent)
+    put_unit_file(path, text)
+    remove_empty(path.parent)
 
 
 def _limit_groups(unit: Mapping[str, Any], nodes: tuple[NodeLimits, ...], undo: ExitStack) -> None:

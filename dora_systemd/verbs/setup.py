@@ -158,9 +158,5 @@ def text_of(file: SetupFile) -> str:
 
 def _directory(kind: str) -> Path:
     """The directory of the files of one kind, in the installed package or in a checkout."""
-    installed = _PACKAGE / kind
-    return (
-        installed
-        if installed.is_dir()
-        else _PACKAGE.parent / _CHECKOUT.get(kind, f"packaging/{kind}")
-    )
+    in_checkout = _PACKAGE.parent / _CHECKOUT.get(kind, f"packaging/{kind}")
+    return _PACKAGE / kind if (_PACKAGE / kind).is_dir() else in_checkout

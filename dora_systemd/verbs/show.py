@@ -1,10 +1,9 @@
-"""`doractl show` and `doractl export`: the unit of a dataflow, from the files that systemd has."""
+"""`doractl show`: the unit of a dataflow, from the files that systemd has."""
 
 from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
 
 _PROPERTIES = ("FragmentPath", "DropInPaths")
@@ -23,20 +22,6 @@ def unit_files(manager: Manager, cell: Cell) -> dict[str, str]:
 def format_unit_files(files: dict[str, str]) -> str:
     """The files in sequence, each after a comment with its path."""
     return "\n".join(f"# {path}\n{text.rstrip()}\n" for path, text in files.items())
-
-
-def export_cell(manager: Manager, scope: Scope, cell: Cell) -> str:
-    """The unit as one file that needs nothing of doractl, with its drop-ins in it.
-
-    Raises DoraSystemdError.
-    """
-    # What starting and enabling need is nothing to wait for in `show`.
-    from dora_systemd.decisions.unit.file import persistent_unit, plain_target
-    from dora_systemd.verbs.start.enable import refuse_attached
-
-    refuse_attached(cell)
-    texts = list(unit_files(manager, cell).values())
-    return persistent_unit(texts, cell.options, scope.is_user, plain_target(scope.is_user))
 
 
 def _read(path: str) -> str:

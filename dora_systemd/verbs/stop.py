@@ -15,6 +15,7 @@ from dora_systemd.trust.paths import user_name
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.enabled import enabled_units
 from dora_systemd.verbs.facts.reason import failure_reason, job_reason
+from dora_systemd.verbs.start.enable import read_boot_unit, release_transient
 
 
 @dataclass(frozen=True)
@@ -45,8 +46,6 @@ def release_enabled(manager: Manager, scope: Scope, units: Sequence[str]) -> Non
         state = manager.read(unit, ["LoadState", "Transient", "ActiveState"])
         is_one_lost |= state["LoadState"] == "not-found"
         if state["Transient"] and state["ActiveState"] == "inactive":
-            from dora_systemd.verbs.start.enable import read_boot_unit, release_transient
-
             # If something references the transient unit, it stays: its text equals the file's.
             with suppress(DoraSystemdError):
                 boot = read_boot_unit(manager, scope, unit)

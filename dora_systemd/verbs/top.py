@@ -7,8 +7,9 @@ from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.decisions.resources.usage import Strain, waits
 from dora_systemd.decisions.views.top import Look, TopEntry
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.facts.cells import Cell, read_cells, select_cell
+from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.facts.list import Reading, read_dataflow, row_of
+from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.facts.snapshot import read_strains
 from dora_systemd.verbs.node import require_running
 
@@ -27,25 +28,20 @@ class Top:
         self._scope = scope
         self._before: dict[str, _Seen] = {}
         cells = read_cells(manager) if selectors else []
-        chosen = [select_cell(cells, selector) for selector in selectors]
+        chosen = [Selector(selector).loaded(cells) for selector in selectors]
         for cell in chosen:
             require_running(cell)
         self._units = frozenset(cell.unit for cell in chosen)
 
     def look(self) -> Look:
         """A snapshot of what is running; rates are since the last snapshot."""
-        wanted = filter(self._want, read_cells(self._manager))
-        seen = {cell.unit: self._see(cell) for cell in wanted}
+        cells = [cell for cell in read_cells(self._manager) if cell.is_up]
+        wanted = [cell for cell in cells if not self._units or cell.unit in self._units]
+        readings = (read_dataflow(self._manager, self._scope, cell) for cell in wanted)
+        seen = {one.cell.unit: (one, read_strains(one)) for one in readings}
         entries = [_entry(now, self._before.get(unit)) for unit, now in seen.items()]
         self._before = seen
         return Look(time.time_ns() // 1000, entries)
-
-    def _want(self, cell: Cell) -> bool:
-        return cell.is_up and (not self._units or cell.unit in self._units)
-
-    def _see(self, cell: Cell) -> _Seen:
-        reading = read_dataflow(self._manager, self._scope, cell)
-        return reading, read_strains(reading)
 
 
 def _entry(now: _Seen, before: _Seen | None) -> TopEntry:

@@ -7,11 +7,8 @@ from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import JOB_DONE, Manager
 from dora_systemd.adapters.host.loopback import port_error
-from dora_systemd.adapters.host.process_table import (
-    read_processes,
-    socket_owners,
-)
-from dora_systemd.adapters.host.unit_files import read_unit_file, remove_unit_file, write_unit_file
+from dora_systemd.adapters.host.process_table import read_processes, socket_owners
+from dora_systemd.adapters.host.unit_files import put_unit_file, read_unit_file
 from dora_systemd.decisions.gateway.place import ADDRESS, DEFAULT_PORT, SERVICE_UNIT, SOCKET_UNIT
 from dora_systemd.decisions.gateway.port import port_drop_in
 from dora_systemd.decisions.unit.file import BOOT_TARGET
@@ -19,12 +16,11 @@ from dora_systemd.decisions.unit.setup_files import gateway_files
 from dora_systemd.decisions.views.diagnosis import Process
 from dora_systemd.decisions.views.findings import State
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.names import name_from_unit
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import user_name
 from dora_systemd.trust.socket_table import listener_uids, listening_sockets
 from dora_systemd.verbs.doctor import examine
-from dora_systemd.verbs.facts.enabled import enabled_units, own_directories
+from dora_systemd.verbs.facts.enabled import enabled_names, own_directories
 from dora_systemd.verbs.gateway import read_gateway
 from dora_systemd.verbs.setup import text_of
 
@@ -74,7 +70,7 @@ def start_boot_target(manager: Manager, scope: Scope) -> list[str]:
     if state["LoadState"] != "loaded" or state["ActiveState"] == "active":
         return []
     manager.run_jobs("StartUnit", [BOOT_TARGET])
-    return sorted(filter(None, map(name_from_unit, enabled_units(manager, scope))))
+    return enabled_names(manager, scope)
 
 
 def written_files(manager: Manager, scope: Scope) -> list[Path]:
@@ -94,11 +90,7 @@ def _write_units(manager: Manager, scope: Scope, port: int | None) -> bool:
     texts[port_file] = None if port is None else port_drop_in(ADDRESS, port)
     changed = [path for path, text in texts.items() if read_unit_file(path) != text]
     for path in changed:
-        text = texts[path]
-        if text is None:
-            remove_unit_file(path)
-        else:
-            write_unit_file(path, text)
+        put_unit_file(path, texts[path])
     return bool(changed)
 
 

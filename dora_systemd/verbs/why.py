@@ -5,7 +5,7 @@ from itertools import islice
 from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import Manager
-from dora_systemd.adapters.journal.reader import JournalReader, is_volatile
+from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.decisions.life import nodes as node_table
 from dora_systemd.decisions.logs.query import scope_matches, story_matches
@@ -24,9 +24,10 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.budget import restart_budget
-from dora_systemd.verbs.facts.cells import Cell, find_cell, matching_cells, read_cells
-from dora_systemd.verbs.facts.ended import select_ended
+from dora_systemd.verbs.facts.cells import Cell, read_cell, read_cells
+from dora_systemd.verbs.facts.ended import volatile_note
 from dora_systemd.verbs.facts.list import look_at_table, read_status
+from dora_systemd.verbs.facts.selector import Selector
 
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 _MOST_RECORDS = 1000
@@ -51,26 +52,20 @@ def explain(manager: Manager, scope: Scope, selector: str, journal: JournalReade
 
 
 def _select(manager: Manager, scope: Scope, selector: str) -> tuple[Cell | None, Subject]:
-    cells = read_cells(manager)
-    if not matching_cells(cells, selector):
-        ended = select_ended(scope, selector)
-        if ended is not None:
-            return _with_file(manager, scope, ended.uuid, ended.name)
+    wanted = Selector(selector)
+    if not wanted.meant(read_cells(manager)) and (ended := wanted.ended(scope)):
+        return _with_file(manager, scope, ended.uuid, ended.name)
     try:
-        cell = find_cell(manager, selector)
+        cell = wanted.find(manager)
     except DoraSystemdError as error:
-        if is_volatile():
-            error.hint += "; the journal is volatile: a reboot empties it"
+        error.hint += volatile_note()
         raise
     return cell, _subject(scope, cell)
 
 
 def _with_file(manager: Manager, scope: Scope, uuid: str, name: str) -> tuple[Cell | None, Subject]:
     """An ended dataflow; an enabled one has a unit file even if systemd has not loaded it."""
-    try:
-        cell = find_cell(manager, name)
-    except DoraSystemdError:
-        cell = None
+    cell = read_cell(manager, unit_name(name))
     if cell is not None and cell.uuid == uuid:
         return cell, _subject(scope, cell)
     return None, Subject(uuid, name, unit_name(name), scope.flag)

@@ -4,25 +4,23 @@ import click
 
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import current_scope, scope_options
-from dora_systemd.verbs.facts.enabled import find_enabled_cell
+from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.start.enable import disable_cell
 
-_EPILOG = """\b
-Examples:
-  doractl disable robot
-"""
 
-
-@click.command("disable", epilog=_EPILOG)
+@click.command("disable")
 @click.argument("selectors", nargs=-1, required=True, metavar="SELECTOR...")
 @scope_options
 def command(selectors: tuple[str, ...]) -> None:
     """No longer start dataflows at boot. Running dataflows keep running.
 
     Removes what enable has created. A dataflow that is not enabled is not an error.
+
+    Examples:
+      doractl disable robot
     """
     scope = current_scope()
     bus = Bus(scope)
-    for cell in dict.fromkeys(find_enabled_cell(bus, scope, one) for one in selectors):
+    for cell in dict.fromkeys(Selector(one).find_enabled(bus, scope) for one in selectors):
         done = disable_cell(bus, scope, cell)
         click.echo(f"Dataflow {'disabled' if done else 'not enabled'}: {cell.uuid} ({cell.name})")

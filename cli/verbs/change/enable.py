@@ -4,18 +4,12 @@ import click
 
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import current_scope, print_warnings, scope_options
-from dora_systemd.verbs.facts.enabled import find_enabled_cell
+from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.start.enable import enable_cell
 from dora_systemd.verbs.start.linger import ensure_linger
 
-_EPILOG = """\b
-Examples:
-  doractl enable robot
-  doractl enable robot vision
-"""
 
-
-@click.command("enable", epilog=_EPILOG)
+@click.command("enable")
 @click.argument("selectors", nargs=-1, required=True, metavar="SELECTOR...")
 @scope_options
 def command(selectors: tuple[str, ...]) -> None:
@@ -23,13 +17,17 @@ def command(selectors: tuple[str, ...]) -> None:
 
     UUID and settings stay, and running dataflows keep running. The unit becomes a file that
     systemctl edits, shows and disables like any other.
+
+    Examples:
+      doractl enable robot
+      doractl enable robot vision
     """
     scope = current_scope()
     bus = Bus(scope)
-    cells = dict.fromkeys(find_enabled_cell(bus, scope, one) for one in selectors)
+    cells = dict.fromkeys(Selector(one).find_enabled(bus, scope) for one in selectors)
     for cell in cells:
         boot, is_news = enable_cell(bus, scope, cell)
         already = "" if is_news else " already"
         click.echo(f"Dataflow{already} enabled: {cell.uuid} ({cell.name})")
         click.echo(f"Unit file: {boot.path}")
-    print_warnings([note for note in [ensure_linger(scope)] if note])
+    print_warnings([ensure_linger(scope)])

@@ -4,23 +4,23 @@ import click
 
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import current_scope, scope_options
-from dora_systemd.verbs.facts.cells import Cell, read_cells, select_cell
+from dora_systemd.verbs.facts.cells import Cell
+from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.node import restart_node, stop_node
 
-_EPILOG = """\b
-Examples:
-  doractl node restart robot camera
-  doractl node stop robot plot
-"""
 
-
-@click.group("node", epilog=_EPILOG)
+@click.group("node")
 @scope_options
 def command() -> None:
-    """Restart or stop a single node of a running dataflow."""
+    """Restart or stop a single node of a running dataflow.
+
+    Examples:
+      doractl node restart robot camera
+      doractl node stop robot plot
+    """
 
 
-@command.command("restart", epilog=_EPILOG)
+@command.command("restart")
 @click.argument("selector")
 @click.argument("node")
 @scope_options
@@ -30,7 +30,7 @@ def restart(selector: str, node: str) -> None:
     click.echo(f"Node restarting: {node}")
 
 
-@command.command("stop", epilog=_EPILOG)
+@command.command("stop")
 @click.argument("selector")
 @click.argument("node")
 @scope_options
@@ -41,4 +41,4 @@ def stop(selector: str, node: str) -> None:
 
 
 def _cell(selector: str) -> Cell:
-    return select_cell(read_cells(Bus(current_scope())), selector)
+    return Selector(selector).find(Bus(current_scope()))

@@ -4,17 +4,11 @@ import click
 
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import current_scope, scope_options
-from dora_systemd.verbs.facts.cells import read_cells, select_cell
+from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.reload import reload_cell
 
-_EPILOG = """\b
-Examples:
-  doractl reload robot
-  doractl reload robot --node detector
-"""
 
-
-@click.command("reload", epilog=_EPILOG)
+@click.command("reload")
 @click.argument("selector")
 @click.option("--node", metavar="NODE", help="Reload this node, whether it has changed or not.")
 @scope_options
@@ -23,8 +17,11 @@ def command(selector: str, node: str | None) -> None:
 
     Like hot reload when a file is saved: only the affected nodes restart, and a change that cannot
     be used has no effect. See HOT RELOAD in dora-systemd(7).
+
+    Examples:
+      doractl reload robot
+      doractl reload robot --node detector
     """
     scope = current_scope()
-    cell = select_cell(read_cells(Bus(scope)), selector)
-    done = reload_cell(scope, cell, node)
+    done = reload_cell(scope, Selector(selector).find(Bus(scope)), node)
     click.echo("\n".join(f"{line[:1].upper()}{line[1:]}" for line in done) or "Nothing has changed")

@@ -7,20 +7,12 @@ import click
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import current_scope, print_warnings, scope_options
 from dora_systemd.cli.settingoptions import live_options
-from dora_systemd.verbs.facts.cells import read_cells, select_cell
+from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.reload import switch_hot_reload
 from dora_systemd.verbs.set import set_limits
 
-_EPILOG = """\b
-Examples:
-  doractl set robot --memory-limit 6G
-  doractl set robot --node-limit detector:memory=2G,cpu=1.5
-  doractl set robot --cpu-limit infinity
-  doractl set robot --hot-reload on
-"""
 
-
-@click.command("set", epilog=_EPILOG)
+@click.command("set")
 @click.argument("selector")
 @live_options
 @click.option("--hot-reload", type=click.Choice(["on", "off"]), help="Turn hot reload on or off.")
@@ -31,10 +23,16 @@ def command(selector: str, hot_reload: str | None, **flags: Any) -> None:
     Changes take effect at once and survive restarts, until the dataflow is stopped; those of an
     enabled dataflow, until it is disabled. infinity removes a limit. If one change is invalid,
     nothing is changed.
+
+    Examples:
+      doractl set robot --memory-limit 6G
+      doractl set robot --node-limit detector:memory=2G,cpu=1.5
+      doractl set robot --cpu-limit infinity
+      doractl set robot --hot-reload on
     """
     scope = current_scope()
     bus = Bus(scope)
-    cell = select_cell(read_cells(bus), selector)
+    cell = Selector(selector).find(bus)
     if hot_reload is None or any(value not in (None, ()) for value in flags.values()):
         print_warnings(set_limits(bus, scope, cell, flags))
         click.echo(f"Limits changed: {cell.uuid} ({cell.name})")

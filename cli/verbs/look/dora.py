@@ -4,17 +4,11 @@ import click
 
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import current_scope, scope_options
-from dora_systemd.verbs.facts.cells import read_cells, select_cell
+from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.node import exec_dora
 
-_EPILOG = """\b
-Examples:
-  doractl dora robot -- topic echo camera/image
-  doractl dora robot -- node list
-"""
 
-
-@click.command("dora", epilog=_EPILOG, context_settings={"ignore_unknown_options": True})
+@click.command("dora", context_settings={"ignore_unknown_options": True})
 @click.argument("selector")
 @click.argument("arguments", nargs=-1, type=click.UNPROCESSED, metavar="-- ARGUMENT...")
 @scope_options
@@ -23,7 +17,11 @@ def command(selector: str, arguments: tuple[str, ...]) -> int:
 
     Only root and the user that the dataflow runs as may do this. Use doractl logs to read logs:
     dora logs cannot show them.
+
+    Examples:
+      doractl dora robot -- topic echo camera/image
+      doractl dora robot -- node list
     """
     scope = current_scope()
     bus = Bus(scope)
-    return exec_dora(scope, bus, select_cell(read_cells(bus), selector), arguments)
+    return exec_dora(scope, bus, Selector(selector).find(bus), arguments)

@@ -5,17 +5,11 @@ import click
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.edge import write_exactly
 from dora_systemd.cli.parameters import current_scope, scope_options
-from dora_systemd.verbs.facts.cells import find_cell
-from dora_systemd.verbs.show import export_cell
-
-_EPILOG = """\b
-Examples:
-  doractl export robot
-  doractl export robot > /etc/systemd/system/dora-robot.service
-"""
+from dora_systemd.verbs.export import export_cell
+from dora_systemd.verbs.facts.selector import Selector
 
 
-@click.command("export", epilog=_EPILOG)
+@click.command("export")
 @click.argument("selector")
 @scope_options
 def command(selector: str) -> None:
@@ -23,7 +17,11 @@ def command(selector: str) -> None:
 
     Copy it to a unit directory and run systemctl enable. Of dora-systemd it needs only the runner.
     Environment variables are printed with their values.
+
+    Examples:
+      doractl export robot
+      doractl export robot > /etc/systemd/system/dora-robot.service
     """
     scope = current_scope()
     bus = Bus(scope, for_reading=True)
-    write_exactly(export_cell(bus, scope, find_cell(bus, selector)))
+    write_exactly(export_cell(bus, scope, Selector(selector).find(bus)))

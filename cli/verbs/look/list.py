@@ -2,20 +2,11 @@
 
 import click
 
-from dora_systemd.cli.listing import print_dataflows
+from dora_systemd.cli.listing import ListRequest, print_dataflows
 from dora_systemd.cli.parameters import current_scope, output_option, scope_options
-from dora_systemd.cli.quick import ListRequest
-
-_EPILOG = """\b
-Examples:
-  doractl list                all that run
-  doractl list --all          also those that failed or ended
-  doractl list robot          the nodes of one
-  doractl list -o json
-"""
 
 
-@click.command("list", epilog=_EPILOG)
+@click.command("list")
 @click.argument("selector", required=False)
 @click.option("-a", "--all", "want_all", is_flag=True, help="Include failed and ended dataflows.")
 @output_option
@@ -25,5 +16,11 @@ def command(selector: str | None, want_all: bool, output: str) -> int:
 
     CPU% is the percentage of one processor. With a SELECTOR the exit status is 3 unless that
     dataflow is running, as with systemctl status.
+
+    Examples:
+      doractl list                all that run
+      doractl list --all          also those that failed or ended
+      doractl list robot          the nodes of one
+      doractl list -o json
     """
     return print_dataflows(ListRequest(selector, want_all, output, current_scope().is_user))

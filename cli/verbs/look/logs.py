@@ -14,23 +14,13 @@ from dora_systemd.cli.parameters import current_scope, scope_options
 from dora_systemd.decisions.logs.query import OUTPUTS, LogQuery, parse_level
 from dora_systemd.decisions.logs.terminal import ShownLines, TerminalLines
 from dora_systemd.errors import ExitCode
-from dora_systemd.verbs.logs import LogRequest, find_query, pass_logs, read_logs
+from dora_systemd.verbs.logs import find_query, pass_logs, read_logs
 
 Lines = TerminalLines | ShownLines | None
 """Formats lines for a terminal; None for a pipe."""
 
-_EPILOG = """\b
-Examples:
-  doractl logs robot                          all there is, in a pager
-  doractl logs robot --node camera --follow   what one node writes, from now on
-  doractl logs robot --until-end -o json      all until it ends, for a program
-  doractl logs robot --tail 100 --level warn  the last 100 warnings and errors
-  doractl logs robot --run PREVIOUS --events  what happened to the run before this one
-  journalctl -t robot/camera                  the same records, with systemd's own tool
-"""
 
-
-@click.command("logs", epilog=_EPILOG)
+@click.command("logs")
 @click.argument("selector", default="")
 @click.option(
     "-n",
@@ -115,6 +105,14 @@ def command(
     """Print what the nodes of a dataflow wrote, and what happened to them.
 
     Without SELECTOR: the logs of all dataflows. The dataflow may have ended long ago.
+
+    Examples:
+      doractl logs robot                          all there is, in a pager
+      doractl logs robot --node camera --follow   what one node writes, from now on
+      doractl logs robot --until-end -o json      all until it ends, for a program
+      doractl logs robot --tail 100 --level warn  the last 100 warnings and errors
+      doractl logs robot --run PREVIOUS --events  what happened to the run before this one
+      journalctl -t robot/camera                  the same records, with systemd's own tool
     """
     options.pop("all_nodes")
     options["level"] = parse_level(options["level"]) if options["level"] else ""
@@ -126,7 +124,7 @@ def command(
 
         check_until_end(selector, options["is_reverse"])
     journal = JournalReader()
-    query = find_query(journal, LogRequest(selector, nodes, run, LogQuery(scope, **options)))
+    query = find_query(journal, LogQuery(scope, **options), selector, nodes, run)
     lines: Lines = ShownLines() if sys.stdout.isatty() else None
     if sys.stdout.isatty() and query.output.startswith("short"):
         known = query.nodes or (journal.known_nodes(query.name) if query.name else ())

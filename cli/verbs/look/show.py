@@ -5,17 +5,11 @@ import click
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.edge import write_exactly
 from dora_systemd.cli.parameters import current_scope, output_option, print_json, scope_options
-from dora_systemd.verbs.facts.cells import find_cell
+from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.show import format_unit_files, unit_files
 
-_EPILOG = """\b
-Examples:
-  doractl show robot
-  doractl show robot -o json
-"""
 
-
-@click.command("show", epilog=_EPILOG)
+@click.command("show")
 @click.argument("selector")
 @output_option
 @scope_options
@@ -23,9 +17,13 @@ def command(selector: str, output: str) -> None:
     """Print the unit of a dataflow, each file below a comment with its path.
 
     Environment variables are printed with their values.
+
+    Examples:
+      doractl show robot
+      doractl show robot -o json
     """
     bus = Bus(current_scope(), for_reading=True)
-    cell = find_cell(bus, selector)
+    cell = Selector(selector).find(bus)
     files = unit_files(bus, cell)
     if output == "json":
         print_json({"unit": cell.unit, "name": cell.name, "uuid": cell.uuid, "files": files})

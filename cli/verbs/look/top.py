@@ -8,17 +8,10 @@ import click
 
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import current_scope, output_option, scope_options
+from dora_systemd.cli.screen import Screen
 from dora_systemd.decisions.views.top import SORTS, Look, format_summary, format_top, look_values
 from dora_systemd.errors import ExitCode
 from dora_systemd.verbs.top import Top
-
-_EPILOG = """\b
-Examples:
-  doractl top                          all that run, until q
-  doractl top robot --sort memory      one dataflow, the largest nodes first
-  doractl top --once                   one reading, for a script or a report
-  doractl top -o json --interval 10    a JSON object every ten seconds
-"""
 
 _FIRST_SECONDS = 0.5
 """Time between the two samples of one reading."""
@@ -26,7 +19,7 @@ _FIRST_SECONDS = 0.5
 _KEYS = {sort[0]: sort for sort in SORTS}
 
 
-@click.command("top", epilog=_EPILOG)
+@click.command("top")
 @click.argument("selectors", nargs=-1, metavar="[SELECTOR]...")
 @click.option(
     "--interval",
@@ -53,6 +46,12 @@ def command(
 
     On a terminal: q quits, and c, m and n sort by CPU, memory and name. In a pipe one reading is
     printed; with JSON, one object per line until it is interrupted.
+
+    Examples:
+      doractl top                          all that run, until q
+      doractl top robot --sort memory      one dataflow, the largest nodes first
+      doractl top --once                   one reading, for a script or a report
+      doractl top -o json --interval 10    a JSON object every ten seconds
     """
     scope = current_scope()
     top = Top(Bus(scope, for_reading=True), scope, selectors)
@@ -82,8 +81,6 @@ def _print_objects(top: Top, interval: float, sort: str, is_once: bool) -> None:
 
 
 def _show(top: Top, interval: float, sort: str) -> None:
-    from dora_systemd.cli.screen import Screen
-
     with Screen() as screen:
         look, due = top.look(), time.monotonic() + _FIRST_SECONDS
         while True:

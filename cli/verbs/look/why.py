@@ -13,15 +13,8 @@ from dora_systemd.decisions.why.report import format_report, report_values
 from dora_systemd.errors import ExitCode
 from dora_systemd.verbs.why import explain
 
-_EPILOG = """\b
-Examples:
-  doractl why robot             what ended it, which node, when, what to do
-  doractl why robot -o json     the same for a program
-  doractl why 44f30e60          one that ended long ago, by its UUID
-"""
 
-
-@click.command("why", epilog=_EPILOG)
+@click.command("why")
 @click.argument("selector")
 @output_option
 @scope_options
@@ -29,6 +22,11 @@ def command(selector: str, output: str) -> int:
     """Explain what happened to a dataflow and why: what ended, when, which node, what to do.
 
     The dataflow may be running, failed, stopped, or known only to the journal. Nothing is changed.
+
+    Examples:
+      doractl why robot             what ended it, which node, when, what to do
+      doractl why robot -o json     the same for a program
+      doractl why 44f30e60          one that ended long ago, by its UUID
     """
     scope = current_scope()
     check_readable(scope)

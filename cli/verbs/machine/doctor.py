@@ -10,14 +10,8 @@ from dora_systemd.decisions.views.findings import finding_values, format_finding
 from dora_systemd.errors import ExitCode
 from dora_systemd.verbs.doctor import examine
 
-_EPILOG = """\b
-Examples:
-  doractl doctor
-  doractl --user doctor -o json
-"""
 
-
-@click.command("doctor", epilog=_EPILOG)
+@click.command("doctor")
 @output_option
 @scope_options
 def command(output: str) -> int:
@@ -25,6 +19,10 @@ def command(output: str) -> int:
 
     Changes nothing. The exit status is 1 if a problem keeps dataflows from working; notes and
     warnings do not count.
+
+    Examples:
+      doractl doctor
+      doractl --user doctor -o json
     """
     findings = examine(partial(Bus, for_reading=True), current_scope())
     if output == "json":

@@ -9,16 +9,8 @@ from dora_systemd.decisions.dora.variables import SHELLS, format_exports, format
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.verbs.env import read_variables
 
-_EPILOG = """\b
-Examples:
-  eval "$(doractl env)"; dora list
-  eval "$(doractl env robot)"; dora node list
-  doractl env --shell fish | source
-  eval "$(doractl env --unset)"
-"""
 
-
-@click.command("env", epilog=_EPILOG)
+@click.command("env")
 @click.argument("selector", required=False)
 @click.option(
     "--shell",
@@ -36,6 +28,12 @@ def command(selector: str | None, shell: str, want_unset: bool) -> None:
 
     With SELECTOR: the coordinator of that dataflow only, unless its network is private. The output
     contains a token that is as good as a password; it is meant for eval.
+
+    Examples:
+      eval "$(doractl env)"; dora list
+      eval "$(doractl env robot)"; dora node list
+      doractl env --shell fish | source
+      eval "$(doractl env --unset)"
     """
     if want_unset and selector is not None:
         hint = "leave SELECTOR out: --unset is for all variables"
@@ -44,6 +42,5 @@ def command(selector: str | None, shell: str, want_unset: bool) -> None:
         click.echo(format_unsets(shell))
         return
     scope = current_scope()
-    write_exactly(
-        f"{format_exports(shell, read_variables(Bus(scope, for_reading=True), scope, selector))}\n"
-    )
+    variables = read_variables(Bus(scope, for_reading=True), scope, selector)
+    write_exactly(f"{format_exports(shell, variables)}\n")

@@ -15,15 +15,8 @@ from dora_systemd.verbs.setup import (
     tell_systemd,
 )
 
-_EPILOG = """\b
-Examples:
-  doractl setup
-  doractl setup --user
-  doractl setup --remove
-"""
 
-
-@click.command("setup", epilog=_EPILOG)
+@click.command("setup")
 @click.option(
     "--remove", "want_removal", is_flag=True, help="Remove everything that setup has installed."
 )
@@ -33,6 +26,11 @@ def command(want_removal: bool) -> None:
 
     Below /usr/local for the system, below ~/.local/share for a user; the Debian package contains
     all of it. A file of the same name that is not from dora-systemd is refused and not touched.
+
+    Examples:
+      doractl setup
+      doractl setup --user
+      doractl setup --remove
     """
     scope = current_scope()
     if not want_removal and (packaged := packaged_unit(scope)):

@@ -10,14 +10,8 @@ from dora_systemd.decisions.gateway.port import wanted_port
 from dora_systemd.verbs.gateway import check_answer, read_gateway
 from dora_systemd.verbs.up import check_machine, open_port, start_boot_target
 
-_EPILOG = """\b
-Examples:
-  doractl up
-  doractl up --port 53291
-"""
 
-
-@click.command("up", epilog=_EPILOG)
+@click.command("up")
 @click.option(
     "--port",
     type=click.IntRange(1, 65535),
@@ -30,6 +24,10 @@ def command(port: int | None) -> None:
 
     systemd holds the port and starts the gateway on the first connection. Dataflows, doractl start
     and all other verbs work without it.
+
+    Examples:
+      doractl up
+      doractl up --port 53291
     """
     scope = current_scope()
     bus = Bus(scope)

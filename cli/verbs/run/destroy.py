@@ -3,9 +3,8 @@
 import click
 
 from dora_systemd.adapters.bus.systemd import Bus
-from dora_systemd.cli.parameters import current_scope, scope_options
+from dora_systemd.cli.parameters import current_scope, print_outcomes, scope_options
 from dora_systemd.errors import ExitCode
-from dora_systemd.names import name_from_unit
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.destroy import (
     processes_left,
@@ -14,18 +13,12 @@ from dora_systemd.verbs.destroy import (
     stop_gateway,
     stop_slice,
 )
-from dora_systemd.verbs.facts.enabled import enabled_units
+from dora_systemd.verbs.facts.enabled import enabled_names
 from dora_systemd.verbs.gateway import read_gateway
 from dora_systemd.verbs.stop import note_stop
 
-_EPILOG = """\b
-Examples:
-  doractl destroy
-  doractl --user destroy --force
-"""
 
-
-@click.command("destroy", epilog=_EPILOG)
+@click.command("destroy")
 @click.option("--force", is_flag=True, help="Kill the nodes, instead of telling them to stop.")
 @scope_options
 def command(force: bool) -> int:
@@ -33,6 +26,10 @@ def command(force: bool) -> int:
 
     Only this scope is affected: the system's, or the calling user's. Enabled dataflows
     stay enabled.
+
+    Examples:
+      doractl destroy
+      doractl --user destroy --force
     """
     scope = current_scope()
     bus = Bus(scope)
@@ -55,14 +52,7 @@ def _stop_dataflows(bus: Bus, scope: Scope, force: bool) -> bool:
         return True
     note_stop(cells, "doractl destroy")
     click.echo("Stopping all dataflows...")
-    is_good = True
-    for ended in stop_all(bus, scope, force):
-        if ended.problem:
-            click.echo(f"doractl: {ended.problem}", err=True)
-        else:
-            click.echo(f"  ✓ {ended.name} stopped{f' ({ended.note})' if ended.note else ''}")
-        is_good = is_good and not ended.problem
-    return is_good
+    return print_outcomes(stop_all(bus, scope, force)) is ExitCode.OK
 
 
 def _print_left(bus: Bus, scope: Scope, others: list[str]) -> bool:
@@ -74,7 +64,6 @@ def _print_left(bus: Bus, scope: Scope, others: list[str]) -> bool:
         click.echo(f"doractl: cannot end {one}", err=True)
     if not left:
         click.echo("Nothing is left: no process in dora.slice.")
-    names = sorted(filter(None, map(name_from_unit, enabled_units(bus, scope))))
-    if names:
+    if names := enabled_names(bus, scope):
         click.echo(f"Still enabled: {', '.join(names)}; they start at the next boot.")
     return not left

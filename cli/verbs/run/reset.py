@@ -3,19 +3,18 @@
 import click
 
 from dora_systemd.adapters.bus.systemd import Bus
-from dora_systemd.cli.parameters import current_scope, print_outcomes, scope_options
-from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.verbs.facts.cells import read_cells, select_cell
+from dora_systemd.cli.parameters import (
+    current_scope,
+    print_outcomes,
+    require_names_or_all,
+    scope_options,
+)
+from dora_systemd.verbs.facts.cells import read_cells
+from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.stop import reset_cells
 
-_EPILOG = """\b
-Examples:
-  doractl reset robot
-  doractl reset --all
-"""
 
-
-@click.command("reset", epilog=_EPILOG)
+@click.command("reset")
 @click.argument("selectors", nargs=-1, metavar="SELECTOR...")
 @click.option("-a", "--all", "want_all", is_flag=True, help="All dataflows that systemd knows.")
 @scope_options
@@ -24,16 +23,15 @@ def command(selectors: tuple[str, ...], want_all: bool) -> int:
 
     Like systemctl reset-failed: running dataflows keep running, and systemd may restart them as
     often as at the beginning. dora counts restarts of single nodes; doractl restart resets those.
+
+    Examples:
+      doractl reset robot
+      doractl reset --all
     """
-    if bool(selectors) == want_all:
-        raise DoraSystemdError(
-            "cannot reset: give names or --all",
-            "doractl reset NAME, or doractl reset --all",
-            ExitCode.USAGE,
-        )
+    require_names_or_all("reset", selectors, want_all)
     bus = Bus(current_scope())
     cells = read_cells(bus)
-    chosen = cells if want_all else [select_cell(cells, one) for one in selectors]
+    chosen = cells if want_all else [Selector(one).loaded(cells) for one in selectors]
     if want_all and not chosen:
         click.echo("No dataflow.")
     return print_outcomes(reset_cells(bus, list(dict.fromkeys(chosen))))

@@ -21,16 +21,10 @@ from dora_systemd.verbs.start.plan import DEFAULT_FILE, StartRequest, make_plan,
 from dora_systemd.verbs.start.run import attached_properties, follow_unit, life_line
 from dora_systemd.verbs.start.unit import plan_properties
 
-_EPILOG = """\b
-Examples:
-  doractl run                          ./dataflow.yml
-  doractl run dataflow.yml --name robot --env MODEL=yolov8n.pt
-  doractl run dataflow.yml --hot-reload
-"""
 _MICROSECOND_NS = 1000
 
 
-@click.command("run", epilog=_EPILOG)
+@click.command("run")
 @click.argument("dataflow", default=DEFAULT_FILE, metavar="[FILE]")
 @name_option
 @setting_options
@@ -40,6 +34,11 @@ def command(dataflow: str, name: str | None, **flags: Any) -> int:
 
     Ctrl+C stops it gracefully, a second Ctrl+C kills it. The dataflow ends with this command,
     however that ends. The exit status is that of the dataflow: 0 when all nodes ended well.
+
+    Examples:
+      doractl run                          ./dataflow.yml
+      doractl run dataflow.yml --name robot --env MODEL=yolov8n.pt
+      doractl run dataflow.yml --hot-reload
     """
     scope = current_scope()
     request = StartRequest(dataflow, name, flags, os.environ, attached=True)

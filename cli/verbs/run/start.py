@@ -19,32 +19,19 @@ from dora_systemd.cli.parameters import (
 from dora_systemd.cli.settingoptions import setting_options
 from dora_systemd.cli.stageline import StageLine
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.verbs.facts.last_words import last_words
 from dora_systemd.verbs.start.check import check_plan
 from dora_systemd.verbs.start.enable import boot_target
-from dora_systemd.verbs.start.job import Started, format_started
-from dora_systemd.verbs.start.launch import Claim, claim, start_claim
+from dora_systemd.verbs.start.job import Started, format_started, start_plan
+from dora_systemd.verbs.start.launch import Claim, claim
 from dora_systemd.verbs.start.linger import ensure_linger
 from dora_systemd.verbs.start.logins import start_notes
 from dora_systemd.verbs.start.plan import DEFAULT_FILE, Plan, StartRequest, make_plan
 from dora_systemd.verbs.start.unit import format_plan
 from dora_systemd.verbs.start.watch import watched_patterns
 
-_EPILOG = """\b
-Examples:
-  doractl start                                    ./dataflow.yml
-  doractl start dataflow.yml --name robot
-  doractl start dataflow.yml --env MODEL=yolov8n.pt --venv .venv
-  doractl start dataflow.yml --memory-limit 4G --node-limit detector:memory=1G,cpu=1.5
-  doractl start dataflow.yml --restart-policy on-failure --max-restarts 3
-  doractl start dataflow.yml --credential token=/etc/robot/token
-  doractl start dataflow.yml --hot-reload --watch "*.py,config/*"
-  doractl start dataflow.yml --device /dev/video0 --writable /srv/recordings
-  doractl start dataflow.yml --enable              now and at every boot
-  doractl start dataflow.yml --dry-run
-"""
 
-
-@click.command("start", epilog=_EPILOG)
+@click.command("start")
 @click.argument("dataflow", default=DEFAULT_FILE, metavar="[FILE]")
 @name_option
 @setting_options
@@ -67,6 +54,18 @@ def command(
     Returns when all nodes are ready, or fails with the reason. The name must be free; a failed
     dataflow of that name is replaced, its logs stay. An enabled dataflow is started from its unit
     file if its settings are the same; --enable replaces that file.
+
+    Examples:
+      doractl start                                    ./dataflow.yml
+      doractl start dataflow.yml --name robot
+      doractl start dataflow.yml --env MODEL=yolov8n.pt --venv .venv
+      doractl start dataflow.yml --memory-limit 4G --node-limit detector:memory=1G,cpu=1.5
+      doractl start dataflow.yml --restart-policy on-failure --max-restarts 3
+      doractl start dataflow.yml --credential token=/etc/robot/token
+      doractl start dataflow.yml --hot-reload --watch "*.py,config/*"
+      doractl start dataflow.yml --device /dev/video0 --writable /srv/recordings
+      doractl start dataflow.yml --enable              now and at every boot
+      doractl start dataflow.yml --dry-run
     """
     scope = current_scope()
     request = StartRequest(dataflow, name, flags, os.environ)
@@ -79,10 +78,10 @@ def command(
     bus = Bus(scope)
     claimed = claim(bus, scope, request, want_boot)
     print_warnings(claimed.warnings)
-    print_warnings([note for note in [ensure_linger(scope) if want_boot else ""] if note])
+    print_warnings([ensure_linger(scope) if want_boot else ""])
     started = _start(bus, claimed, not no_wait)
     # Only after the start: a refusal must be one line and a hint.
-    print_warnings([*start_notes(claimed.plan)])
+    print_warnings(start_notes(claimed.plan))
     if output == "json":
         print_json({**vars(started), "dataflow": claimed.plan.options.dataflow})
     else:
@@ -92,7 +91,7 @@ def command(
 def _start(bus: Bus, claimed: Claim, wait: bool) -> Started:
     try:
         with StageLine(sys.stderr) as stage:
-            return start_claim(bus, claimed, stage, wait)
+            return start_plan(bus, claimed.plan, claimed.properties, stage, wait)
     except DoraSystemdError as error:
         if error.code is ExitCode.FAILURE:
             _print_last_words(claimed.plan)
@@ -100,8 +99,5 @@ def _start(bus: Bus, claimed: Claim, wait: bool) -> Started:
 
 
 def _print_last_words(plan: Plan) -> None:
-    # Imported late: only needed after a failure.
-    from dora_systemd.verbs.facts.last_words import last_words
-
     for line in last_words(plan.scope, plan.options.uuid):
         click.echo(f"  {line}", err=True)

@@ -3,21 +3,19 @@
 import click
 
 from dora_systemd.adapters.bus.systemd import Bus
-from dora_systemd.cli.parameters import current_scope, print_outcomes, scope_options
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.cli.parameters import (
+    current_scope,
+    print_outcomes,
+    require_names_or_all,
+    scope_options,
+)
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.facts.cells import Cell, matching_cells, not_found, read_cells, select_cell
+from dora_systemd.verbs.facts.cells import Cell, read_cells
+from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.stop import note_stop, stop_cells
 
-_EPILOG = """\b
-Examples:
-  doractl stop robot
-  doractl stop 550e8400 vision
-  doractl stop --all
-"""
 
-
-@click.command("stop", epilog=_EPILOG)
+@click.command("stop")
 @click.argument("selectors", nargs=-1, metavar="SELECTOR...")
 @click.option("-a", "--all", "want_all", is_flag=True, help="All dataflows that run.")
 @scope_options
@@ -26,13 +24,13 @@ def command(selectors: tuple[str, ...], want_all: bool) -> int:
 
     Nodes are told to stop; those still running after the grace duration of the dataflow are
     killed. Several dataflows stop at the same time.
+
+    Examples:
+      doractl stop robot
+      doractl stop 550e8400 vision
+      doractl stop --all
     """
-    if bool(selectors) == want_all:
-        raise DoraSystemdError(
-            "cannot stop: give names or --all",
-            "doractl stop NAME, or doractl stop --all",
-            ExitCode.USAGE,
-        )
+    require_names_or_all("stop", selectors, want_all)
     scope = current_scope()
     bus = Bus(scope)
     cells = read_cells(bus)
@@ -41,27 +39,15 @@ def command(selectors: tuple[str, ...], want_all: bool) -> int:
         if not chosen:
             click.echo("No dataflow is running.")
         return _stop(bus, scope, chosen)
-    _print_ended(scope, [one for one in selectors if not matching_cells(cells, one)], cells)
-    chosen = [cell for one in selectors for cell in _cells(cells, one)]
-    return _stop(bus, scope, list(dict.fromkeys(chosen)))
+    found = {one: one.only(cells) for one in map(Selector, selectors)}
+    for one in [one for one, cell in found.items() if cell is None]:
+        row = one.ended(scope)
+        if row is None:
+            raise one.missing(cell.name for cell in cells)
+        click.echo(f"Dataflow not running: {row.uuid} ({row.name} {row.status.lower()})")
+    return _stop(bus, scope, list(dict.fromkeys(cell for cell in found.values() if cell)))
 
 
 def _stop(bus: Bus, scope: Scope, cells: list[Cell]) -> int:
     note_stop(cells)
     return print_outcomes(stop_cells(bus, scope, cells))
-
-
-def _print_ended(scope: Scope, selectors: list[str], cells: list[Cell]) -> None:
-    """Report dataflows that ended earlier. Raises DoraSystemdError for the others."""
-    for selector in selectors:
-        # Only the journal knows these, and it is slow: dataflows that systemd knows do not need it.
-        from dora_systemd.verbs.facts.ended import select_ended
-
-        row = select_ended(scope, selector)
-        if row is None:
-            raise not_found(selector, [cell.name for cell in cells])
-        click.echo(f"Dataflow not running: {row.uuid} ({row.name} {row.status.lower()})")
-
-
-def _cells(cells: list[Cell], selector: str) -> list[Cell]:
-    return [select_cell(cells, selector)] if matching_cells(cells, selector) else []

@@ -68,6 +68,14 @@ def remove_unit_file(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
+def put_unit_file(path: Path, text: str | None) -> None:
+    """Write `text` to `path`, or remove it for None. Raises DoraSystemdError."""
+    if text is None:
+        remove_unit_file(path)
+    else:
+        write_unit_file(path, text)
+
+
 NODE_LIMITS_FILE = "60-node-limits.conf"
 HOT_RELOAD_FILE = "60-hot-reload.conf"
 _CHANGES = ("50-*.conf", NODE_LIMITS_FILE, HOT_RELOAD_FILE)
@@ -93,11 +101,6 @@ def remove_changes(fragment: Path) -> None:
     for path in changed_files(fragment):
         remove_unit_file(path)
     remove_empty(drop_in_directory(fragment, is_transient=False))  # may have other drop-ins
-
-
-def wanted_units(directory: Path) -> frozenset[str]:
-    """The units that targets in `directory` start: the links in its .wants directories."""
-    return frozenset(path.name for path in directory.glob("*.wants/dora-*.service"))
 
 
 def foreign_file(path: Path) -> DoraSystemdError:

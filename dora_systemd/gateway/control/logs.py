@@ -31,8 +31,8 @@ from dora_systemd.gateway.control.talk import Place, Result, Talk, find_if_loade
 from dora_systemd.scope import Scope
 from dora_systemd.suggestions import did_you_mean
 from dora_systemd.values import quoted
-from dora_systemd.verbs.facts.cells import find_cell
 from dora_systemd.verbs.facts.list import read_status
+from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.follow import is_unit_up
 
 _CHUNK = 1 << 18
@@ -82,7 +82,7 @@ def _read_logs(scope: Scope, request: Request, node: str) -> tuple[str, list[byt
 
 def _uuid_of(scope: Scope, request: Request) -> str:
     if request.body.get("uuid") is None:
-        return find_cell(Bus(scope, for_reading=True), request.text("name")).uuid
+        return Selector(request.text("name")).find(Bus(scope, for_reading=True)).uuid
     return request.text("uuid").lower()
 
 

@@ -13,7 +13,8 @@ from dora_systemd.gateway.control.state import ended_result
 from dora_systemd.gateway.control.talk import Talk, find_by_uuid
 from dora_systemd.scope import Scope
 from dora_systemd.values import SECOND
-from dora_systemd.verbs.facts.cells import Cell, find_cell
+from dora_systemd.verbs.facts.cells import Cell
+from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.stop import Outcome, note_stop, restart_cells, stop_cells
 
 _KILL_FACTOR = 1.5
@@ -51,7 +52,7 @@ async def restart(talk: Talk, request: Request) -> dict[str, Any]:
 
 async def _find(talk: Talk, request: Request) -> Cell:
     if request.name.endswith("ByName"):
-        return await asyncio.to_thread(lambda: find_cell(Bus(talk.scope), request.text("name")))
+        return await asyncio.to_thread(lambda: Selector(request.text("name")).find(Bus(talk.scope)))
     return await asyncio.to_thread(find_by_uuid, talk.scope, request.dataflow)
 
 

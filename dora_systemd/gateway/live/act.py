@@ -8,9 +8,10 @@ from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
 from dora_systemd.decisions.gateway.page_messages import PageMessage, graph_values
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.facts.cells import Cell, find_cell
+from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.list import read_status
 from dora_systemd.verbs.facts.nodes import written_dataflow
+from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.node import ask_coordinator, restart_node, stop_node
 from dora_systemd.verbs.stop import note_stop, restart_cells, stop_cells
 
@@ -23,7 +24,7 @@ def act(scope: Scope, message: PageMessage) -> str:
     Raises DoraSystemdError as the verbs of doractl do.
     """
     bus = Bus(scope)
-    cell = find_cell(bus, message.dataflow)
+    cell = Selector(message.dataflow).find(bus)
     if message.node:
         do = stop_node if message.action == "stop" else restart_node
         do(scope, cell, message.node)
@@ -43,7 +44,7 @@ def read_graph(scope: Scope, uuid: str) -> dict[str, Any]:
 
     dora's own copy is what runs, with modules expanded; the file may have changed since the start.
     """
-    cell = find_cell(Bus(scope), uuid)
+    cell = Selector(uuid).find(Bus(scope))
     path = cell.options.dataflow
     running = _running_descriptor(scope, cell)
     return graph_values(parse_dataflow(running, path) if running else written_dataflow(path))

@@ -12,7 +12,7 @@ from dora_systemd.decisions.gateway.page_messages import LOG_FIELDS, PageMessage
 from dora_systemd.decisions.logs.fields import ExportReader
 from dora_systemd.decisions.logs.query import LogQuery, query_arguments
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.facts.cells import find_cell
+from dora_systemd.verbs.facts.selector import Selector
 
 FIRST_LINES = 200
 """Number of older lines that a page gets first."""
@@ -59,7 +59,7 @@ async def _batches(stream: asyncio.StreamReader) -> AsyncIterator[tuple[Lines, i
 
 def _query(scope: Scope, message: PageMessage) -> LogQuery:
     check_readable(scope)
-    cell = find_cell(Bus(scope, for_reading=True), message.dataflow)
+    cell = Selector(message.dataflow).find(Bus(scope, for_reading=True))
     return LogQuery(
         scope,
         name=cell.name,

@@ -11,6 +11,7 @@ import time
 
 from dora_systemd.adapters.host import fd_store
 from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import unit_name
 from dora_systemd.paths import CellPaths
 from dora_systemd.values import INFINITY, SECOND, format_duration
@@ -35,7 +36,6 @@ def pause(options: RunnerOptions, paths: CellPaths) -> None:
 def counted_restarts(name: str, is_user: bool, otherwise: int) -> int:
     """NRestarts= of the unit, which a reset or a restart of the unit sets to 0."""
     from dora_systemd.adapters.host import process
-    from dora_systemd.errors import DoraSystemdError
 
     scope = ["--user"] if is_user else []
     command = ["systemctl", *scope, "show", "--value", "--property=NRestarts", unit_name(name)]

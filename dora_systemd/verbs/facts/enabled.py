@@ -3,17 +3,25 @@
 from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import Manager
-from dora_systemd.adapters.host.unit_files import wanted_units
 from dora_systemd.decisions.unit.directories import unit_directories
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import name_from_unit
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import exists
-from dora_systemd.verbs.facts.cells import Cell, find_cell
 
 
 def enabled_units(manager: Manager, scope: Scope) -> frozenset[str]:
     """The names of the units that are started at boot."""
     return wanted_units(own_directories(manager, scope)[0])
+
+
+def enabled_names(manager: Manager, scope: Scope) -> list[str]:
+    """The names of the dataflows that are started at boot, sorted."""
+    return sorted(filter(None, map(name_from_unit, enabled_units(manager, scope))))
+
+
+def wanted_units(directory: Path) -> frozenset[str]:
+    """The units that targets in `directory` start: the links in its .wants directories."""
+    return frozenset(path.name for path in directory.glob("*.wants/dora-*.service"))
 
 
 def lost_units(manager: Manager, scope: Scope) -> frozenset[str]:
@@ -30,17 +38,6 @@ def lost_units(manager: Manager, scope: Scope) -> frozenset[str]:
         if manager.read(unit, ["LoadState"])["LoadState"] == "not-found"
     )
     return frozenset(unit for unit in unknown if exists(directory / unit))
-
-
-def find_enabled_cell(manager: Manager, scope: Scope, selector: str) -> Cell:
-    """As find_cell, also for an enabled dataflow that systemd has lost. Raises DoraSystemdError."""
-    try:
-        return find_cell(manager, selector)
-    except DoraSystemdError as error:
-        if error.code is not ExitCode.NOT_FOUND or not lost_units(manager, scope):
-            raise
-    manager.reload()
-    return find_cell(manager, selector)
 
 
 def own_directories(manager: Manager, scope: Scope) -> tuple[Path, Path]:

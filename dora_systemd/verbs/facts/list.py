@@ -24,13 +24,7 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
 from dora_systemd.trust.cells import read_table
 from dora_systemd.values import INFINITY, SECOND
-from dora_systemd.verbs.facts.budget import restart_budget
-from dora_systemd.verbs.facts.cells import (
-    Cell,
-    matching_cells,
-    read_cells,
-    select_cell,
-)
+from dora_systemd.verbs.facts.cells import Cell, read_cells
 from dora_systemd.verbs.facts.enabled import enabled_units
 from dora_systemd.verbs.facts.slice import slice_group
 
@@ -139,25 +133,6 @@ def mark_enabled(manager: Manager, scope: Scope, rows: Sequence[DataflowRow]) ->
     """The rows, with a mark on those that are started at boot."""
     enabled = enabled_units(manager, scope)
     return [row._replace(enabled=row.unit in enabled) for row in rows]
-
-
-def find_row(manager: Manager, scope: Scope, selector: str) -> DataflowRow:
-    """All that is known of the dataflow that `selector` means, including ended ones.
-
-    Raises DoraSystemdError as select_cell does.
-    """
-    cells = read_cells(manager)
-    if not matching_cells(cells, selector):
-        from dora_systemd.verbs.facts.ended import select_ended
-
-        row = select_ended(scope, selector)
-        if row is not None:
-            return row
-    cell = select_cell(cells, selector)
-    row = dataflow_row(manager, scope, cell)
-    budget = restart_budget(manager, scope, cell, read_status(scope, cell))
-    row = row._replace(restart_budget=budget)
-    return mark_enabled(manager, scope, [row])[0]
 
 
 def read_status(scope: Scope, cell: Cell) -> CellStatus:

@@ -65,31 +65,27 @@ def check_identity(dataflow: Place, directory: Place) -> None:
 
 
 def _entry(wanted: str) -> pwd.struct_passwd:
-    try:
-        return pwd.getpwuid(int(wanted)) if wanted.isdecimal() else pwd.getpwnam(wanted)
-    except (KeyError, OverflowError) as error:
-        raise DoraSystemdError(
-            f"cannot find a user {quoted(wanted)}", "see getent passwd", ExitCode.USAGE
-        ) from error
+    refusal = DoraSystemdError(
+        f"cannot find a user {quoted(wanted)}", "see getent passwd", ExitCode.USAGE
+    )
+    return _known(int(wanted) if wanted.isdecimal() else wanted, refusal)
 
 
 def _owner_entry(owner: int, dataflow: str) -> pwd.struct_passwd:
-    try:
-        return pwd.getpwuid(owner)
-    except KeyError as error:
-        raise DoraSystemdError(
-            f"cannot choose a user: the owner of {dataflow} is {owner}, which has no name",
-            "choose one with --uid USER",
-            ExitCode.BAD_INPUT,
-        ) from error
+    message = f"cannot choose a user: the owner of {dataflow} is {owner}, which has no name"
+    hint = "choose one with --uid USER"
+    return _known(owner, DoraSystemdError(message, hint, ExitCode.BAD_INPUT))
 
 
 def _default_entry() -> pwd.struct_passwd:
+    message = f"cannot choose a user: the dataflow is root's and there is no user {DEFAULT_USER}"
+    hint = f"choose one with --uid USER, or make it: useradd --system {DEFAULT_USER}"
+    return _known(DEFAULT_USER, DoraSystemdError(message, hint, ExitCode.BAD_INPUT))
+
+
+def _known(user: int | str, refusal: DoraSystemdError) -> pwd.struct_passwd:
+    """The entry of a uid or a name. Raises `refusal` if there is none."""
     try:
-        return pwd.getpwnam(DEFAULT_USER)
-    except KeyError as error:
-        raise DoraSystemdError(
-            f"cannot choose a user: the dataflow is root's and there is no user {DEFAULT_USER}",
-            f"choose one with --uid USER, or make it: useradd --system {DEFAULT_USER}",
-            ExitCode.BAD_INPUT,
-        ) from error
+        return pwd.getpwuid(user) if isinstance(user, int) else pwd.getpwnam(user)
+    except (KeyError, OverflowError) as error:
+        raise refusal from error

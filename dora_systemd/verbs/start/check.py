@@ -75,10 +75,7 @@ def _properties(
     """The dataflow's unit properties, for a command; the unit disappears with this client."""
     properties, _ = plan_properties(plan, manager)
     kept = {key: one for key, one in properties.items() if not key.startswith(_OF_RUNNERS)}
-    kept |= typed(
-        Type="oneshot",
-        TimeoutStartSec=int(DORA_SECONDS) * SECOND,
-    )
+    kept |= typed(Type="oneshot", TimeoutStartSec=int(DORA_SECONDS) * SECOND)
     for key in ("StandardOutput", "StandardError"):
         del kept[key]
     if binds := kept.pop("BindPaths", None):

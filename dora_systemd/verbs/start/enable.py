@@ -13,10 +13,10 @@ from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.host.unit_files import (
     changed_files,
     foreign_file,
+    put_unit_file,
     read_unit_file,
     remove_changes,
     remove_unit_file,
-    wanted_units,
     write_unit_file,
 )
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -31,7 +31,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
-from dora_systemd.verbs.facts.enabled import own_directories
+from dora_systemd.verbs.facts.enabled import own_directories, wanted_units
 
 _FORGET_SECONDS = 2.0
 _RETRY_SECONDS = 0.02
@@ -119,10 +119,7 @@ def install_unit_file(manager: Manager, boot: BootUnit, text: str) -> None:
     try:
         _link(manager, str(boot.path), boot.unit)
     except DoraSystemdError as error:
-        if boot.text is None:
-            remove_unit_file(boot.path)
-        else:
-            write_unit_file(boot.path, boot.text)
+        put_unit_file(boot.path, boot.text)
         raise _no_link(boot.unit) if error.code is ExitCode.NOT_FOUND else error from error
 
 

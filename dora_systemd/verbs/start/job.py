@@ -4,16 +4,17 @@ import select
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from dora_systemd.adapters.bus.manager import JOB_DONE, ON_THE_WAY, Manager, Observer, Property
-from dora_systemd.adapters.dora.command import version_numbers
 from dora_systemd.decisions.life.refusal import FAILED
-from dora_systemd.decisions.unit.versions import MIN_VERSION, transient_commands
+from dora_systemd.decisions.unit.versions import transient_commands
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.reason import job_reason, runners_refusal
 from dora_systemd.verbs.start.plan import Plan
+from dora_systemd.verbs.start.unit import systemd_number
 
 _POLL_SECONDS = 0.2
 
@@ -34,58 +35,25 @@ class Started:
 def start_plan(
     manager: Manager,
     plan: Plan,
-    properties: Sequence[Property],
+    properties: Sequence[Property] | None,
     on_stage: StageObserver | None,
     wait: bool,
 ) -> Started:
-    """Start the transient unit of a plan; if `wait`, wait until its nodes are ready.
+    """Start a plan; if `wait`, wait until its nodes are ready.
 
-    Raises DoraSystemdError with the reason when the start fails; the unit stays as failed. If the
-    runner refuses the dataflow, no unit is left.
+    properties: of a transient unit; None for a plan whose unit file systemd has loaded. Raises
+    DoraSystemdError with the reason when the start fails; the unit stays as failed. If the runner
+    refuses the dataflow, no unit is left.
     """
-    number = next(iter(version_numbers(manager.version())), MIN_VERSION)
-    told = transient_commands(properties, number)
-    return _started(
-        manager,
-        plan,
-        lambda observe: manager.start_transient(plan.unit, told, observe, wait),
-        on_stage,
-        wait,
-    )
-
-
-def start_unit_file(
-    manager: Manager, plan: Plan, on_stage: StageObserver | None, wait: bool
-) -> Started:
-    """Start the unit file of a plan, which systemd has loaded; as start_plan()."""
-
-    def start(observe: Observer) -> str:
-        if wait:
-            return manager.run_jobs("StartUnit", [plan.unit], observe)[plan.unit]
-        manager.queue_job("StartUnit", plan.unit)
-        return JOB_DONE
-
-    return _started(manager, plan, start, on_stage, wait)
-
-
-def _started(
-    manager: Manager,
-    plan: Plan,
-    start: Callable[[Observer], str],
-    on_stage: StageObserver | None,
-    wait: bool,
-) -> Started:
-    def observe(changes: Mapping[str, Any]) -> None:
-        if on_stage and changes.get("StatusText"):
-            on_stage(changes["StatusText"])
-
     try:
-        result = start(observe)
+        result = _begin(manager, plan.unit, properties, partial(tell_stage, on_stage), wait)
         if not wait:
             _wait_until_checked(manager, plan.unit)
     except KeyboardInterrupt as error:
         raise _interruption(plan.options.name) from error
-    has_failed = result != JOB_DONE or _has_failed(manager, plan.unit)
+    # A dataflow that finishes right after its start has not failed.
+    state = manager.read(plan.unit, ["ActiveState"])["ActiveState"]
+    has_failed = result != JOB_DONE or state == "failed"
     if has_failed and (refusal := runners_refusal(manager, plan.unit)):
         # It never ran, so do not keep its name in use.
         with suppress(DoraSystemdError):
@@ -95,6 +63,29 @@ def _started(
         result = "failed" if result == JOB_DONE else result
         raise _start_failure(manager, plan.scope, plan.unit, plan.options.name, result)
     return Started(plan.options.uuid, plan.options.name, plan.unit, is_ready=wait)
+
+
+def _begin(
+    manager: Manager,
+    unit: str,
+    properties: Sequence[Property] | None,
+    observe: Observer,
+    wait: bool,
+) -> str:
+    """Begin the start; the result of the job, which is that of a whole start only if `wait`."""
+    if properties is not None:
+        told = transient_commands(properties, systemd_number(manager))
+        return manager.start_transient(unit, told, observe, wait)
+    if wait:
+        return manager.run_jobs("StartUnit", [unit], observe)[unit]
+    manager.queue_job("StartUnit", unit)
+    return JOB_DONE
+
+
+def tell_stage(on_stage: StageObserver | None, changes: Mapping[str, Any]) -> None:
+    """Call `on_stage` if a unit has changed its STATUS=."""
+    if on_stage and changes.get("StatusText"):
+        on_stage(changes["StatusText"])
 
 
 def format_started(started: Started, watched: Sequence[str] = ()) -> str:
@@ -135,11 +126,6 @@ def _wait_until_checked(manager: Manager, unit: str) -> None:
             return
         select.select([manager.fileno()], [], [], _POLL_SECONDS)
         manager.changes(unit)
-
-
-def _has_failed(manager: Manager, unit: str) -> bool:
-    """Whether the start failed; a dataflow that finishes right after its start has not failed."""
-    return bool(manager.read(unit, ["ActiveState"])["ActiveState"] == "failed")
 
 
 def _start_failure(

@@ -1,24 +1,23 @@
 """The steps from a request to a started unit that all ways of starting share."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-from dora_systemd.adapters.bus.manager import Manager
-from dora_systemd.decisions.properties.assignments import Properties
+from dora_systemd.adapters.bus.manager import Manager, Property
 from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.start.check import check_plan
 from dora_systemd.verbs.start.claim import place_unit_file, require_free_name, with_known_uuid
-from dora_systemd.verbs.start.job import StageObserver, Started, start_plan, start_unit_file
 from dora_systemd.verbs.start.plan import Plan, StartRequest, make_plan, request_name
 from dora_systemd.verbs.start.unit import plan_properties
 
 
 @dataclass(frozen=True)
 class Claim:
-    """A dataflow whose name is free. properties: of a transient unit; None: it has a unit file."""
+    """A dataflow whose name is free. properties: for start_plan()."""
 
     plan: Plan
-    properties: Properties | None
+    properties: Sequence[Property] | None
     warnings: tuple[str, ...]
 
 
@@ -34,13 +33,4 @@ def claim(manager: Manager, scope: Scope, request: StartRequest, want_boot: bool
         # Check first: the unit file is written before a runner could refuse the dataflow.
         check_plan(lambda: manager, plan)
     has_file = place_unit_file(manager, plan, properties, boot, want_boot)
-    return Claim(plan, None if has_file else properties, tuple(warnings))
-
-
-def start_claim(
-    manager: Manager, claim: Claim, on_stage: StageObserver | None, wait: bool
-) -> Started:
-    """Start the unit. Raises DoraSystemdError as start_plan does."""
-    if claim.properties is None:
-        return start_unit_file(manager, claim.plan, on_stage, wait)
-    return start_plan(manager, claim.plan, list(claim.properties.values()), on_stage, wait)
+    return Claim(plan, None if has_file else list(properties.values()), tuple(warnings))

@@ -5,7 +5,7 @@ from pathlib import Path
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.host.machine import read_machine
-from dora_systemd.decisions.cell.limits import BY_KEY
+from dora_systemd.decisions.cell.limits import BY_KEY, NodeLimits
 from dora_systemd.decisions.properties.assignments import Properties
 from dora_systemd.decisions.settings.limit_checks import (
     check_controllers,
@@ -13,6 +13,7 @@ from dora_systemd.decisions.settings.limit_checks import (
     size_warnings,
 )
 from dora_systemd.decisions.settings.limits import DEVICE, NICE
+from dora_systemd.scope import Scope
 from dora_systemd.verbs.start.plan import Plan
 
 
@@ -22,13 +23,19 @@ def check_limits(manager: Manager, plan: Plan, properties: Properties) -> tuple[
     Raises DoraSystemdError (NO_SYSTEMD) for a limit that nothing would enforce.
     """
     nodes = plan.options.node_limits
-    needed = needed_controllers(properties, nodes)
-    if needed:
-        available = cgroup.read_controllers(cgroup.group_path(manager.control_group()))
-        check_controllers(needed, available, plan.scope.is_user)
+    require_controllers(manager, plan.scope, properties, nodes)
     values = {limit.word: plan.settings.values[key] for key, limit in BY_KEY.items()}
     sizes = size_warnings(values, nodes, read_machine())
     return (*sizes, *_missing_devices(plan), *_powerless(plan))
+
+
+def require_controllers(
+    manager: Manager, scope: Scope, properties: Properties, nodes: tuple[NodeLimits, ...]
+) -> None:
+    """Raise DoraSystemdError (NO_SYSTEMD) for a limit whose controller this manager lacks."""
+    if needed := needed_controllers(properties, nodes):
+        available = cgroup.read_controllers(cgroup.group_path(manager.control_group()))
+        check_controllers(needed, available, scope.is_user)
 
 
 def _powerless(plan: Plan) -> list[str]:

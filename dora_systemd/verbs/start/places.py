@@ -7,6 +7,7 @@ clearer errors.
 
 import pwd
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,17 +28,17 @@ from dora_systemd.trust.sight import Sight, cannot_reach
 _OWN = Sight()
 
 
+@dataclass(frozen=True)
 class Look:
     """sight: that of `user`, which is None if the caller runs the dataflow as itself."""
 
-    def __init__(self, sight: Sight, settings: Settings, user: pwd.struct_passwd | None) -> None:
-        self.sight = sight
-        self._settings = settings
-        self._user = user
+    sight: Sight
+    settings: Settings
+    user: pwd.struct_passwd | None
 
     def find_venv(self, dataflow: str, environment: Mapping[str, str]) -> str | None:
         """--venv, else the caller's VIRTUAL_ENV, else .venv beside the dataflow, else None."""
-        given = self._settings[VENV]
+        given = self.settings[VENV]
         if given is not None:
             return self._checked_venv(str(Path(given).absolute()))
         places = [environment.get("VIRTUAL_ENV", ""), str(Path(dataflow).parent / ".venv")]
@@ -66,13 +67,13 @@ class Look:
                 ExitCode.BAD_INPUT,
             )
         for path in (dataflow, __file__):
-            if self._user is not None and not self.sight.exists(path):
-                raise cannot_reach(self._user.pw_name, path)
+            if self.user is not None and not self.sight.exists(path):
+                raise cannot_reach(self.user.pw_name, path)
 
     def find_dora(self, venv: str | None, search_path: str) -> str:
         """Absolute path of the dora command. Raises DoraSystemdError."""
-        is_given = self._settings.source(DORA) != "default"
-        given = self._settings[DORA] if is_given else None
+        is_given = self.settings.source(DORA) != "default"
+        given = self.settings[DORA] if is_given else None
         try:
             return find_dora(given, venv, search_path, self.sight)
         except DoraSystemdError:
@@ -82,11 +83,11 @@ class Look:
 
     def _blame(self, setting: Setting[Any], path: str, is_there: bool) -> None:
         """Raise DoraSystemdError for a path that root can see and the user cannot."""
-        if self._user is not None and is_there and not self._is_named_in_file(setting):
-            raise cannot_reach(self._user.pw_name, path)
+        if self.user is not None and is_there and not self._is_named_in_file(setting):
+            raise cannot_reach(self.user.pw_name, path)
 
     def _is_named_in_file(self, setting: Setting[Any]) -> bool:
-        return self._settings.source(setting).startswith("/")
+        return self.settings.source(setting).startswith("/")
 
     def read_lent(self, file: str) -> str:
         """Read an environment file of the user's own settings, with that user's permissions."""

@@ -7,7 +7,7 @@ import os
 import pwd
 import uuid
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from dora_systemd.adapters.dora.preparation import Prepared, check_named_nodes
@@ -53,7 +53,8 @@ DEFAULT_FILE = "dataflow.yml"
 class StartRequest:
     """A request to start a dataflow. flags: raw values by setting name, see resolve_settings.
 
-    environment: the caller's variables. attached: the dataflow ends with the caller.
+    environment: the caller's variables. attached: the dataflow ends with the caller. caller: the
+    variables that the dataflow may read.
     """
 
     dataflow: str
@@ -61,6 +62,7 @@ class StartRequest:
     flags: Mapping[str, object] = field(default_factory=dict)
     environment: Mapping[str, str] = field(default_factory=dict)
     attached: bool = False
+    caller: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -108,24 +110,13 @@ def make_plan(scope: Scope, request: StartRequest) -> Plan:
         # Root's variables are not for the file of another user, which could read them out.
         is_own = scope.is_user or written.place.uid == os.geteuid()
         caller = request.environment if is_own else {}
-        found = _Found(scope, request, dataflow, settings, user, caller)
-        return _make_plan(found, str(directory), look)
+        return _make_plan(scope, replace(request, caller=caller), dataflow, str(directory), look)
 
 
-@dataclass(frozen=True)
-class _Found:
-    """What was read, and for which user. caller: variables of the caller that the file may use."""
-
-    scope: Scope
-    request: StartRequest
-    dataflow: Dataflow
-    settings: Settings
-    user: pwd.struct_passwd | None
-    caller: Mapping[str, str]
-
-
-def _make_plan(found: _Found, directory: str, look: Look) -> Plan:
-    request, settings, path = found.request, found.settings, found.dataflow.source
+def _make_plan(
+    scope: Scope, request: StartRequest, dataflow: Dataflow, directory: str, look: Look
+) -> Plan:
+    settings, path = look.settings, dataflow.source
     venv = look.find_venv(path, request.environment)
     search_path = request.environment.get("PATH") or os.defpath
     variables = _variables(settings, look)
@@ -151,19 +142,19 @@ def _make_plan(found: _Found, directory: str, look: Look) -> Plan:
         start_timeout=settings[START_TIMEOUT],
         reload=hot_reload(settings, directory),
     )
-    called = called_variables(found.dataflow, found.caller)
+    called = called_variables(dataflow, request.caller)
     environment = unit_environment(search_path, venv, {**called, **variables})
-    check_credentials(found.scope, credential_files(settings))
+    check_credentials(scope, credential_files(settings))
     launch = LaunchPlan(
         options, "", environment["PATH"], look.sight.exists, look.read_session(path)
     )
-    if not any(node.kind in UNEXPANDED for node in found.dataflow.nodes):
+    if not any(node.kind in UNEXPANDED for node in dataflow.nodes):
         # The runner repeats this, but an error here needs no unit.
-        check_named_nodes(options, found.dataflow)
-        launch_descriptor(found.dataflow, launch)
-    prepared = Prepared(found.dataflow, launch, {})
-    sandbox = make_sandbox(found.scope, settings, found.user, prepared, look.sight)
-    return Plan(found.scope, options, settings, found.user, environment, sandbox)
+        check_named_nodes(options, dataflow)
+        launch_descriptor(dataflow, launch)
+    prepared = Prepared(dataflow, launch, {})
+    sandbox = make_sandbox(scope, settings, look.user, prepared, look.sight)
+    return Plan(scope, options, settings, look.user, environment, sandbox)
 
 
 def _variables(settings: Settings, look: Look) -> dict[str, str]:

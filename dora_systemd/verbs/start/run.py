@@ -3,13 +3,12 @@
 import os
 import select
 import signal
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 from dora_systemd.adapters.bus.manager import DOWN, Manager, Property
-from dora_systemd.verbs.start.job import StageObserver
+from dora_systemd.verbs.start.job import StageObserver, tell_stage
 
 _POLL_SECONDS = 0.5
 _CLD_EXITED = 1
@@ -29,33 +28,28 @@ class LogSource(Protocol):
         """Print the remaining lines of a unit that has ended."""
 
 
-@dataclass(frozen=True)
-class Pipe:
-    """A pipe whose read end is the runner's standard input; its end of file requests a stop."""
-
-    read: int
-    write: int
-
-
 @contextmanager
-def life_line() -> Iterator[Pipe]:
-    """A pipe whose write end only this process has: however it dies, the dataflow stops."""
+def life_line() -> Iterator[int]:
+    """The read end of a pipe, the runner's standard input: its end of file requests a stop.
+
+    Only this process has the write end: however it dies, the dataflow stops.
+    """
     read, write = os.pipe2(os.O_CLOEXEC)
     try:
-        yield Pipe(read, write)
+        yield read
     finally:
         os.close(read)
         os.close(write)
 
 
-def attached_properties(pipe: Pipe) -> list[Property]:
+def attached_properties(pipe: int) -> list[Property]:
     """The additional properties of an attached unit.
 
     See systemd.service(5) and org.freedesktop.systemd1(5). systemd unloads the unit even if it
     failed, but not before this client has read the result.
     """
     return [
-        ("StandardInputFileDescriptor", "h", pipe.read),
+        ("StandardInputFileDescriptor", "h", pipe),
         ("CollectMode", "s", "inactive-or-failed"),
         ("AddRef", "b", True),
     ]
@@ -80,18 +74,13 @@ def follow_unit(
                 _interrupt(manager, unit, interrupts)
             logs.print_new()
             changed = manager.changes(unit)
-            _tell(changed, on_stage)
+            for changes in changed:
+                tell_stage(on_stage, changes)
             # Many lines must not cause as many requests to systemd.
             status = None if ready and not changed else _exit_status(manager, unit)
             if status is not None:
                 logs.finish()
                 return status
-
-
-def _tell(changed: Sequence[Mapping[str, Any]], on_stage: StageObserver | None) -> None:
-    for changes in changed:
-        if on_stage and changes.get("StatusText"):
-            on_stage(changes["StatusText"])
 
 
 def _interrupt(manager: Manager, unit: str, count: int) -> None:

@@ -23,11 +23,15 @@ def plan_properties(plan: Plan, manager: Manager) -> tuple[dict[str, Property], 
     The warnings are about unsupported properties, and limits above the machine's size. Raises
     DoraSystemdError.
     """
-    number = next(iter(version_numbers(manager.version())), MIN_VERSION)
-    properties, warnings = drop_unsupported(_properties(plan), number)
+    properties, warnings = drop_unsupported(_properties(plan), systemd_number(manager))
     warnings = (*warnings, *restart_warnings(plan.settings), *reload_warnings(plan.settings))
     warnings = (*warnings, *watch_warnings(plan), *sandbox_warnings(plan.sandbox))
     return properties, (*warnings, *check_limits(manager, plan, properties))
+
+
+def systemd_number(manager: Manager) -> int:
+    """The version of systemd as a number; the oldest supported one if it has none."""
+    return next(iter(version_numbers(manager.version())), MIN_VERSION)
 
 
 def format_plan(plan: Plan, target: str | None = None) -> str:

@@ -3,14 +3,13 @@
 import os
 from collections.abc import Iterator
 
+from dora_systemd.decisions.reload.watch_rules import DEFAULT_WATCH, unmatched_patterns
 from dora_systemd.values import quoted
 from dora_systemd.verbs.start.plan import Plan
 
 
 def watched_patterns(plan: Plan) -> tuple[str, ...]:
     """The patterns of the files that cause a reload, empty without hot reload."""
-    from dora_systemd.decisions.reload.watch_rules import DEFAULT_WATCH
-
     if not plan.options.hot_reload:
         return ()
     return plan.options.reload.watch or DEFAULT_WATCH
@@ -24,9 +23,8 @@ def watch_warnings(plan: Plan) -> Iterator[str]:
     """
     if not plan.options.hot_reload or not plan.options.reload.watch or _is_anothers(plan):
         return
-    # Imported late: only given patterns need a search.
+    # Imported late: asyncio is slow to import, and only given patterns need a search.
     from dora_systemd.adapters.host.watch import watch_rules, watched_files
-    from dora_systemd.decisions.reload.watch_rules import unmatched_patterns
 
     rules = watch_rules(plan.options)
     for pattern in unmatched_patterns(rules, watched_files(rules)):

@@ -12,7 +12,8 @@ from dora_systemd.decisions.gateway.place import SERVICE_UNIT, SOCKET_UNIT
 from dora_systemd.decisions.unit.file import BOOT_TARGET
 from dora_systemd.names import SLICE
 from dora_systemd.verbs import destroy as destroy_module
-from dora_systemd.verbs.destroy import Ended, processes_left, stop_all, stop_gateway, stop_slice
+from dora_systemd.verbs.destroy import processes_left, stop_all, stop_gateway, stop_slice
+from dora_systemd.verbs.stop import Outcome
 from dora_systemd.verbs.up import PORT_FILE
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options
 
@@ -67,7 +68,7 @@ def systemd(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Systemd:
     return Systemd(tmp_path / "etc")
 
 
-def destroy(systemd: Systemd, scope: ScopeIn, want_kill: bool = False) -> list[Ended]:
+def destroy(systemd: Systemd, scope: ScopeIn, want_kill: bool = False) -> list[Outcome]:
     return list(stop_all(systemd, scope, want_kill, Clock()))
 
 
@@ -76,7 +77,7 @@ def test_everything_that_is_up_is_stopped(active: str, systemd: Systemd, scope: 
     systemd.add(options("a"), active=active, TimeoutStopUSec=17_000_000)
     systemd.add(options("b"), active="failed")
     systemd.add(options("robot"), TimeoutStopUSec=17_000_000)
-    assert {one.name for one in destroy(systemd, scope)} == {"a", "robot"}
+    assert {one.cell.name for one in destroy(systemd, scope)} == {"a", "robot"}
     assert systemd.calls == [("StopUnit", "dora-a.service"), ("StopUnit", ROBOT)]
 
 
@@ -84,14 +85,14 @@ def test_one_that_ends_by_itself_meanwhile(systemd: Systemd, scope: ScopeIn) -> 
     systemd.add(options("a"), TimeoutStopUSec=17_000_000)
     systemd.add(options("robot"), TimeoutStopUSec=17_000_000)
     systemd.gone = {"dora-a.service"}
-    assert {one.name for one in destroy(systemd, scope)} == {"a", "robot"}
+    assert {one.cell.name for one in destroy(systemd, scope)} == {"a", "robot"}
     assert systemd.calls == [("StopUnit", ROBOT)]
 
 
 def test_what_does_not_end_is_killed(systemd: Systemd, scope: ScopeIn) -> None:
     systemd.add(options(), TimeoutStopUSec=3_000_000)
     systemd.looks[ROBOT] = 1000
-    assert destroy(systemd, scope) == [Ended("robot", "killed")]
+    assert [one.text for one in destroy(systemd, scope)] == ["  ✓ robot stopped (killed)"]
     stop = ("StopUnit", ROBOT)
     assert systemd.calls == [stop, stop, ("kill", ROBOT, 9, "all"), ("reset", ROBOT)]
 
@@ -107,7 +108,8 @@ def test_there_is_an_end_to_it(timeout: int, systemd: Systemd, scope: ScopeIn) -
 
 def test_by_force(systemd: Systemd, scope: ScopeIn) -> None:
     systemd.add(options(), TimeoutStopUSec=3_000_000)
-    assert destroy(systemd, scope, want_kill=True) == [Ended("robot", "killed")]
+    (killed,) = destroy(systemd, scope, want_kill=True)
+    assert (killed.text, killed.problem) == ("  ✓ robot stopped (killed)", "")
     assert systemd.calls[:2] == [("StopUnit", ROBOT), ("kill", ROBOT, 9, "all")]
 
 
@@ -115,7 +117,7 @@ def test_what_somebody_starts_meanwhile_is_stopped(systemd: Systemd, scope: Scop
     systemd.add(options("a"), TimeoutStopUSec=3_000_000)
     names = []
     for ended in stop_all(systemd, scope, False, Clock()):
-        names.append(ended.name)
+        names.append(ended.cell.name)
         if len(names) == 1:
             systemd.add(options("late"), TimeoutStopUSec=3_000_000)
     assert names == ["a", "late"]

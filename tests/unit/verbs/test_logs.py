@@ -4,17 +4,18 @@ from collections.abc import Iterator
 
 import pytest
 
+from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.decisions.logs.query import LogQuery
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.logs import LogRequest, find_query
+from dora_systemd.verbs.logs import find_query
 
 ROBOT = "550e8400-e29b-41d4-a716-446655440000"
 ARM = "550e9999-e29b-41d4-a716-446655440000"
 QUERY = LogQuery(Scope(is_user=False, uid=0))
 
 
-class FakeJournal:
+class FakeJournal(JournalReader):
     def known_names(self) -> list[str]:
         return ["arm", "robot", "550e"]
 
@@ -33,7 +34,7 @@ class FakeJournal:
 
 
 def find(selector: str = "robot", nodes: tuple[str, ...] = (), run: str = "ALL") -> LogQuery:
-    return find_query(FakeJournal(), LogRequest(selector, nodes, run, QUERY))
+    return find_query(FakeJournal(), QUERY, selector, nodes, run)
 
 
 @pytest.mark.parametrize(
@@ -57,7 +58,7 @@ def test_selector(selector: str, name: str, uuid: str) -> None:
     ("selector", "hint"),
     [
         ("robto", "did you mean robot?"),
-        ("zzz", "in the journal: arm, robot"),
+        ("zzz", "known dataflows: 550e, arm, robot"),
         *(("550e-", ""), ("5", ""), ("\n", ""), ("../x", ""), ("é", "")),
     ],
 )
@@ -74,9 +75,9 @@ def test_ambiguous_uuid() -> None:
             return ["arm", "robot"]
 
     with pytest.raises(DoraSystemdError) as caught:
-        find_query(WithoutThatName(), LogRequest("550e", (), "ALL", QUERY))
+        find_query(WithoutThatName(), QUERY, "550e")
     assert caught.value.code is ExitCode.USAGE
-    assert caught.value.hint == f"one of {ROBOT}, {ARM}"
+    assert caught.value.hint == f"one of {ROBOT} (robot), {ARM} (arm)"
 
 
 @pytest.mark.parametrize(

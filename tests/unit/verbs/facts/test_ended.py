@@ -3,7 +3,7 @@
 import pytest
 
 from dora_systemd.adapters.journal.reader import LastEvent
-from dora_systemd.verbs.facts.ended import ended_row, is_meant
+from dora_systemd.verbs.facts.ended import ended_row
 from dora_systemd.verbs.facts.last_words import _line
 
 UUID = "550e8400-e29b-41d4-a716-446655440000"
@@ -23,22 +23,6 @@ def test_rows(event: str, word: str, text: str) -> None:
     assert (row.name, row.unit, row.uuid) == ("robot", "dora-robot.service", UUID)
     assert (row.status, row.ended) == (word, 17)
     assert row.text.startswith(text)
-
-
-@pytest.mark.parametrize(
-    ("selector", "fits"),
-    [
-        ("robot", True),
-        ("dora-robot.service", True),
-        (UUID, True),
-        ("550E8400", True),
-        ("550", False),
-        ("robo", False),
-        ("", False),
-    ],
-)
-def test_selectors(selector: str, fits: bool) -> None:
-    assert is_meant(LastEvent("robot", UUID, "dataflow-stopped", 1, ""), selector) is fits
 
 
 def test_lines_of_nodes() -> None:

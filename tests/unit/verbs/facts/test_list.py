@@ -20,8 +20,9 @@ from dora_systemd.trust.cells import MAX_TABLE, read_table
 from dora_systemd.verbs import why
 from dora_systemd.verbs.facts import list as dataflow_list
 from dora_systemd.verbs.facts.cells import read_cells
-from dora_systemd.verbs.facts.list import dataflow_row, find_row, read_rows
+from dora_systemd.verbs.facts.list import dataflow_row, read_rows
 from dora_systemd.verbs.facts.snapshot import read_snapshot
+from dora_systemd.verbs.list import find_row
 from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
 
 GROUP = "/dora.slice/dora-robot.service"

@@ -9,10 +9,11 @@ from dora_systemd.decisions.settings.resolve import resolve_settings
 from dora_systemd.decisions.unit.properties import UnitContext, format_unit, unit_properties
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.facts.cells import Cell, find_cell
-from dora_systemd.verbs.facts.enabled import enabled_units, find_enabled_cell
-from dora_systemd.verbs.facts.list import find_row
-from dora_systemd.verbs.show import export_cell
+from dora_systemd.verbs.export import export_cell
+from dora_systemd.verbs.facts.cells import Cell
+from dora_systemd.verbs.facts.enabled import enabled_units
+from dora_systemd.verbs.facts.selector import Selector
+from dora_systemd.verbs.list import find_row
 from dora_systemd.verbs.start import linger
 from dora_systemd.verbs.start.enable import boot_target, disable_cell, enable_cell
 from dora_systemd.verbs.start.linger import ensure_linger
@@ -30,7 +31,7 @@ def started(manager: FakeManager) -> Cell:
     fragment.parent.mkdir(parents=True)
     fragment.write_text(f"# This is a transient unit file\n{text}")
     manager.add(options(), FragmentPath=str(fragment), DropInPaths=[])
-    return find_cell(manager, "robot")
+    return Selector("robot").find(manager)
 
 
 def path_of(manager: FakeManager) -> Path:
@@ -48,11 +49,11 @@ def test_a_lost_unit_is_looked_for_when_it_has_stopped(manager: FakeManager, sco
 def test_only_a_lost_unit_is_looked_for_in_the_files(manager: FakeManager, scope: Scope) -> None:
     enable_cell(manager, scope, started(manager))
     manager.calls.clear()
-    assert find_enabled_cell(manager, scope, "robot").unit == UNIT
+    assert Selector("robot").find_enabled(manager, scope).unit == UNIT
     del manager.units[UNIT]
     assert manager.calls == []
     with pytest.raises(DoraSystemdError, match="no dataflow named"):
-        find_enabled_cell(manager, scope, "robot")  # this systemd does not read files
+        Selector("robot").find_enabled(manager, scope)  # this systemd does not read files
     assert manager.calls == [("reload",)]
 
 
@@ -117,9 +118,9 @@ def test_attached_dataflows_cannot_outlive_their_terminal(
 ) -> None:
     manager.add(options(attached=True))
     with pytest.raises(DoraSystemdError, match="doractl run"):
-        enable_cell(manager, scope, find_cell(manager, "robot"))
+        enable_cell(manager, scope, Selector("robot").find(manager))
     with pytest.raises(DoraSystemdError, match="doractl run"):
-        export_cell(manager, scope, find_cell(manager, "robot"))
+        export_cell(manager, scope, Selector("robot").find(manager))
 
 
 def test_disabled_while_the_transient_unit_runs(manager: FakeManager, scope: Scope) -> None:

@@ -96,9 +96,9 @@ def test_first_ctrl_c_stops_and_second_kills(logs: Lines) -> None:
 
 def test_the_life_line_is_closed_with_the_block() -> None:
     with life_line() as pipe:
-        kept = os.dup(pipe.read)
+        kept = os.dup(pipe)
         names = {name: value for name, _, value in attached_properties(pipe)}
-        assert names["StandardInputFileDescriptor"] == pipe.read
+        assert names["StandardInputFileDescriptor"] == pipe
         assert names["AddRef"] is True
     assert os.read(kept, 1) == b""
     os.close(kept)

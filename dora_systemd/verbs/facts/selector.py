@@ -1,0 +1,112 @@
+"""What a user types to mean a dataflow, and which one it means.
+
+Every search for a dataflow that a user or a client names begins here, so that all of them accept
+the same words and give the same errors. `list` without a name does not load this module.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.decisions.views.dataflows import DataflowRow
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import is_name, is_uuid_prefix, name_from_unit, unit_name
+from dora_systemd.scope import Scope
+from dora_systemd.suggestions import did_you_mean
+from dora_systemd.values import quoted
+from dora_systemd.verbs.facts.cells import Cell, read_cell, read_cells
+from dora_systemd.verbs.facts.enabled import lost_units
+
+_SHOWN = 10
+
+
+class Named(Protocol):
+    """A dataflow, from wherever it is known."""
+
+    @property
+    def name(self) -> str:
+        """The name of the dataflow."""
+
+    @property
+    def uuid(self) -> str:
+        """The UUID of the dataflow."""
+
+
+N = TypeVar("N", bound=Named)
+
+
+@dataclass(frozen=True)
+class Selector:
+    """The text that a user has typed: a name, a unit, a UUID, or the beginning of a UUID.
+
+    Only meant() decides what a text means. only(), loaded(), find(), find_enabled() and ended()
+    differ in where they look. They raise DoraSystemdError: USAGE if several dataflows match, and
+    those that return no None, NOT_FOUND if none does.
+    """
+
+    text: str
+
+    @property
+    def name(self) -> str:
+        """The text, or the name in it if it is a unit of ours; nobody has checked the name."""
+        return name_from_unit(self.text) or self.text
+
+    def meant(self, known: Iterable[N]) -> list[N]:
+        """Those of `known` that match, in their order; a name takes precedence over UUIDs."""
+        candidates = list(known)
+        named = [one for one in candidates if one.name == self.name]
+        if named or not is_uuid_prefix(self.text):
+            return named
+        return [one for one in candidates if one.uuid.startswith(self.text.lower())]
+
+    def only(self, known: Iterable[N]) -> N | None:
+        """The only one of `known` that matches, None if none does."""
+        found = self.meant(known)
+        if len(found) > 1:
+            candidates = ", ".join(f"{one.uuid} ({one.name})" for one in found[:_SHOWN])
+            message = f"cannot tell which dataflow {quoted(self.text)} is"
+            raise DoraSystemdError(message, f"one of {candidates}", ExitCode.USAGE)
+        return found[0] if found else None
+
+    def missing(self, names: Iterable[str]) -> DoraSystemdError:
+        """The error (NOT_FOUND) if nothing matches. names: of the dataflows that are known."""
+        known = sorted(names)
+        hint = did_you_mean(self.text, known)
+        if not hint and known:
+            hint = f"known dataflows: {', '.join(known[:_SHOWN])}"
+        hint = hint or "nothing is running; ended ones: doractl list --all"
+        return DoraSystemdError(f"no dataflow named {quoted(self.text)}", hint, ExitCode.NOT_FOUND)
+
+    def loaded(self, cells: Iterable[Cell]) -> Cell:
+        """The one of `cells`, from read_cells()."""
+        known = list(cells)
+        cell = self.only(known)
+        if cell is None:
+            raise self.missing(one.name for one in known)
+        return cell
+
+    def find(self, manager: Manager) -> Cell:
+        """One that systemd has loaded, or can load from a unit file."""
+        cells = read_cells(manager)
+        cell = self.only(cells)
+        if cell is None and is_name(self.name):
+            cell = read_cell(manager, unit_name(self.name))
+        return self.loaded(cells) if cell is None else cell
+
+    def find_enabled(self, manager: Manager, scope: Scope) -> Cell:
+        """As find(), also an enabled one that systemd has lost, see lost_units()."""
+        try:
+            return self.find(manager)
+        except DoraSystemdError as error:
+            if error.code is not ExitCode.NOT_FOUND or not lost_units(manager, scope):
+                raise
+        manager.reload()
+        return self.find(manager)
+
+    def ended(self, scope: Scope) -> DataflowRow | None:
+        """The newest one of which the journal has an end; None if there is none."""
+        # Imported late: the journal is slow, and dataflows that systemd knows do not need it.
+        from dora_systemd.verbs.facts.ended import ended_rows
+
+        return next(iter(self.meant(ended_rows(scope))), None)

@@ -1,0 +1,91 @@
+"""Imports stand at the top of a module. The ones inside functions pay, and each says why."""
+
+import ast
+
+from tests.unit.checkout import module_paths
+
+LATE = {
+    "click takes 35 ms: no --version, and no usual list, waits for it": {
+        "cli.main": {"cli.group", "cli.completion", "cli.listing"},
+    },
+    "the table of list does without it": {
+        "cli.listing": {"verbs.list", "verbs.facts.ended"},
+        "suggestions": {"difflib"},
+    },
+    "a Tab after a verb or an option does not ask for a dataflow": {
+        "cli.completion": {"verbs.facts.cells", "verbs.facts.list", "verbs.facts.selector"},
+    },
+    "the journal reader: only what is not in systemd, or has restarted, needs it": {
+        "verbs.facts.budget": {"adapters.journal.reader"},
+        "verbs.facts.selector": {"verbs.facts.ended"},
+        "runner.nodes.losses": {"adapters.journal.reader"},
+    },
+    "pydantic: only a settings file needs it": {
+        "decisions.settings.resolve": {"decisions.settings.schema"},
+    },
+    "the runner knows the class, and the settings are read by a child": {
+        "runner.reload.settings_file": {
+            *("decisions.settings.changes", "decisions.settings.resolve"),
+        },
+    },
+    "YAML, and every compressor: most who read a file need neither": {
+        "adapters.host.files": {"yaml", "adapters.host.yaml_loader", "tempfile"},
+        "cli.verbs.look.logs": {"verbs.follow"},
+    },
+    "hot reload only": {
+        "adapters.host.watch": {"watchfiles"},
+        "decisions.reload.watch_rules": {"pathspec"},
+        "verbs.start.watch": {"adapters.host.watch"},
+    },
+    "asyncio and WebSockets: of all verbs, a few need one of them": {
+        "verbs.node": {"adapters.dora.control", "adapters.runner_socket.relay"},
+        "adapters.dora.control": {
+            *("adapters.dora.websocket", "websockets.exceptions", "websockets.sync.client"),
+        },
+    },
+    "a library of systemd that may be missing: its error comes when it is used": {
+        "adapters.bus.connection": {"adapters.bus.library"},
+        "adapters.host.notify": {"systemd.daemon"},
+    },
+    "the coordinator boots while the rest of the runner is imported": {
+        "runner.__main__": {"adapters.dora.check", "runner.main"},
+        "runner.cell.pause": {
+            *("adapters.host.process", "adapters.host.files", "adapters.host.notify"),
+            *("decisions.cell.status", "asyncio"),
+        },
+    },
+    "systemd runs it after every life, and it has nothing to do unless the runner was killed": {
+        "runner.stop_post": {
+            *("asyncio", "adapters.journal.socket", "adapters.logs.pipes", "adapters.logs.jsonl"),
+            *("adapters.cgroup.groups", "adapters.cgroup.strain", "decisions.resources.oom"),
+            *("decisions.cell.status", "decisions.logs.lines", "errors", "paths", "values"),
+        },
+    },
+}
+"""By reason and module: what it imports inside functions. Without dora_systemd. for our own."""
+
+
+def imported(node: ast.AST) -> set[str]:
+    """The modules that a statement imports."""
+    if isinstance(node, ast.Import):
+        return {alias.name for alias in node.names}
+    if not isinstance(node, ast.ImportFrom):
+        return set()
+    module = f"{node.module}".removeprefix("dora_systemd.")
+    below = {f"{module}.{alias.name}" for alias in node.names} & module_paths().keys()
+    return below or {module}
+
+
+def late_imports(name: str) -> set[str]:
+    """What the functions of a module import."""
+    tree = ast.parse(module_paths()[name].read_text())
+    kinds = (ast.FunctionDef, ast.AsyncFunctionDef)
+    functions = [node for node in ast.walk(tree) if isinstance(node, kinds)]
+    return {one for function in functions for node in ast.walk(function) for one in imported(node)}
+
+
+def test_imports_inside_functions_have_a_reason() -> None:
+    found = {name: late for name in module_paths() if (late := late_imports(name))}
+    allowed = {name: late for group in LATE.values() for name, late in group.items()}
+    assert sum(map(len, LATE.values())) == len(allowed), "a module has one reason"
+    assert found == allowed

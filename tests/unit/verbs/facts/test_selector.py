@@ -1,0 +1,114 @@
+"""Which dataflow a text means, wherever it is looked for."""
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dora_systemd.adapters.bus.manager import UnitState
+from dora_systemd.adapters.journal.reader import JournalReader, LastEvent
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.verbs.facts.cells import Cell, read_cells
+from dora_systemd.verbs.facts.ended import ended_row
+from dora_systemd.verbs.facts.selector import Selector
+from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
+
+OTHER = "550e8400-0000-41d4-a716-446655440000"
+THIRD = "abcdef00-0000-41d4-a716-446655440000"
+
+
+@pytest.fixture
+def cells() -> list[Cell]:
+    manager = FakeManager()
+    for name, uuid in (("robot", UUID), ("vision", OTHER), ("abcdef00", THIRD)):
+        manager.add(options(name, uuid))
+    return read_cells(manager)
+
+
+@pytest.mark.parametrize(
+    "selector", ["robot", "dora-robot.service", UUID, UUID.upper(), UUID[:12], "550E8400-E"]
+)
+def test_selectors(cells: list[Cell], selector: str) -> None:
+    assert Selector(selector).loaded(cells).name == "robot"
+
+
+def test_a_name_wins_over_a_prefix(cells: list[Cell]) -> None:
+    assert Selector("abcdef00").loaded(cells).uuid == THIRD
+
+
+def test_an_ambiguous_prefix_lists_what_it_fits(cells: list[Cell]) -> None:
+    with pytest.raises(DoraSystemdError) as caught:
+        Selector("550e8400").loaded(cells)
+    assert caught.value.code is ExitCode.USAGE
+    assert f"{UUID} (robot)" in caught.value.hint
+    assert f"{OTHER} (vision)" in caught.value.hint
+
+
+@pytest.mark.parametrize(
+    ("selector", "hint"),
+    [
+        ("robto", "did you mean robot?"),
+        ("zzzz", "known dataflows: abcdef00, robot, vision"),
+        ("550", "known dataflows: abcdef00, robot, vision"),
+    ],
+)
+def test_nothing_fits(cells: list[Cell], selector: str, hint: str) -> None:
+    with pytest.raises(DoraSystemdError) as caught:
+        Selector(selector).loaded(cells)
+    assert caught.value.code is ExitCode.NOT_FOUND
+    assert caught.value.hint == hint
+
+
+@given(st.text())
+def test_any_selector_is_answered(selector: str) -> None:
+    manager = FakeManager()
+    manager.add(options())
+    try:
+        assert Selector(selector).find(manager).name == "robot"
+    except DoraSystemdError as error:
+        assert error.message.startswith(("cannot", "no dataflow named"))
+
+
+@pytest.mark.parametrize(
+    ("selector", "fits"),
+    [
+        ("robot", True),
+        ("dora-robot.service", True),
+        (UUID, True),
+        ("550E8400", True),
+        ("550", False),
+        ("robo", False),
+        ("", False),
+    ],
+)
+def test_selectors_of_ended_ones(selector: str, fits: bool) -> None:
+    row = ended_row(LastEvent("robot", UUID, "dataflow-stopped", 1, ""))
+    assert Selector(selector).meant([row]) == [row] * fits
+
+
+def test_the_newest_one_that_has_ended(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    names = (("other", OTHER), ("robot", UUID), ("robot", OTHER))
+    events = [LastEvent(name, uuid, "dataflow-stopped", 1, "") for name, uuid in names]
+    monkeypatch.setattr(JournalReader, "last_events", lambda _self, _scope: events)
+    scope = ScopeIn(is_user=True, uid=1000, root=tmp_path)
+    assert Selector("robot").ended(scope) == ended_row(events[1])
+    assert Selector("dora-other.service").ended(scope) == ended_row(events[0])
+    assert Selector("nobody").ended(scope) is None
+
+
+class Unloaded(FakeManager):
+    """Units that are found by name only."""
+
+    def list_units(self, pattern: str) -> list[UnitState]:
+        del pattern
+        return []
+
+
+def test_a_unit_file_that_systemd_has_not_loaded() -> None:
+    manager = Unloaded()
+    unit = manager.add(options())
+    for text in ("robot", "dora-robot.service"):
+        assert Selector(text).find(manager).unit == unit
+    with pytest.raises(DoraSystemdError, match="no dataflow named"):
+        Selector(UUID[:8]).find(manager)
