@@ -25,6 +25,7 @@ from dora_systemd.decisions.cell.line_rates import RateLimit, format_rate
 from dora_systemd.decisions.cell.status import WHOLE_CELL, LineCount
 from dora_systemd.decisions.logs.events import event_fields
 from dora_systemd.decisions.logs.fields import Value, encode_entry
+from dora_systemd.decisions.logs.limiter import LineLimiter
 from dora_systemd.decisions.logs.lines import LineEncoder, LineSplitter, Origin, dora_log_fields
 from dora_systemd.paths import CellPaths
 
@@ -70,7 +71,7 @@ class LogPipes:
 
     def limit(self, node_id: str, limit: RateLimit) -> None:
         """Limit the rate of a node's lines from now on; an event counts the suppressed ones."""
-        self._source(node_id).limit(limit)
+        self._source(node_id).limiter = LineLimiter(limit)
 
     def open(self, node_id: str) -> None:
         """Start reading a node's FIFOs, which unblocks its launcher's open(2). Raises OSError."""
