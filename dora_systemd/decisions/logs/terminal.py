@@ -45,15 +45,12 @@ class TerminalLines:
         self._want_dataflow = want_dataflow
         self._want_colors = want_colors
         self._labels: dict[bytes, bytes] = {}
-        self._rest = b""
+        self._whole = ShownLines()
         self._old_indent = self._new_indent = 0
 
     def feed(self, data: bytes) -> bytes:
         """The lines that `data` completes, rewritten."""
-        data = self._rest + data
-        end = data.rfind(b"\n") + 1
-        self._rest = data[end:]
-        return _PREFIX.sub(self._rewrite, shown_log(data[:end]))
+        return _PREFIX.sub(self._rewrite, self._whole.feed(data))
 
     def record(self, record: Mapping[str, bytes]) -> bytes:
         """The lines of one record of the Journal Export Format."""
