@@ -121,7 +121,6 @@ class JournalReader:
     def unique(self, field: str) -> list[str]:
         """All values of `field` in the journal, sorted."""
         with open_journalctl([f"--field={field}", "--quiet"]) as child:
-            assert child.stdout
             lines = list(_lines(child))
             end_journalctl(child)
         return sorted(line.decode("utf-8", "replace").rstrip("\n") for line in lines)
@@ -211,15 +210,17 @@ def _lines(child: "subprocess.Popen[bytes]") -> Iterator[bytes]:
     lines that are too long, and ends after MAX_BYTES or the timeout.
     """
     assert child.stdout
-    fd, rest, left, deadline = child.stdout.fileno(), b"", MAX_BYTES, None
+    fd, rest, left = child.stdout.fileno(), b"", MAX_BYTES
+    deadline = time.monotonic() + FIRST_SECONDS
     poll = select.poll()
     poll.register(fd, select.POLLIN)
-    while left > 0 and poll.poll(_seconds_until(deadline) * 1000):
+    while left > 0 and poll.poll(max(deadline - time.monotonic(), 0.0) * 1000):
         if not (data := os.read(fd, _CHUNK)):
             if rest and len(rest) <= MAX_LINE:
                 yield rest
             return
-        deadline = deadline or time.monotonic() + READ_SECONDS
+        if left == MAX_BYTES:
+            deadline = time.monotonic() + READ_SECONDS
         left -= len(data)
         *lines, last = data.split(b"\n")
         for line in lines:
@@ -229,10 +230,6 @@ def _lines(child: "subprocess.Popen[bytes]") -> Iterator[bytes]:
         # Keep just enough of a long line to see that it is too long.
         rest = (rest + last)[: MAX_LINE + 1]
     child.kill()
-
-
-def _seconds_until(deadline: float | None) -> float:
-    return FIRST_SECONDS if deadline is None else max(deadline - time.monotonic(), 0.0)
 
 
 def _trusted_name(record: dict[str, Any]) -> str:

@@ -97,18 +97,16 @@ class JsonlTail:
         if self._fd >= 0:
             own, place = os.fstat(self._fd), os.lseek(self._fd, 0, os.SEEK_CUR)
             total = own.st_size - (place if place <= own.st_size else 0)
-        for path in self._chain():
-            with contextlib.suppress(OSError):
-                status = path.stat()
-                if own and status.st_ino == own.st_ino:
-                    break
-                total += status.st_size
+        for _, status in self._chain():
+            if own and status.st_ino == own.st_ino:
+                break
+            total += status.st_size
         return total
 
     def resume(self, inode: int, offset: int) -> None:
         """Begin with byte `offset` of the file `inode`, if that still exists."""
-        for path in self._chain():
-            if _inode(path) == inode and self._open(path):
+        for path, status in self._chain():
+            if status.st_ino == inode and self._open(path):
                 os.lseek(self._fd, offset, os.SEEK_SET)
 
     def _note_place(self) -> None:
@@ -134,14 +132,14 @@ class JsonlTail:
         """Open the file after the one that has been read; whether there is one."""
         chain = self._chain()
         if self._fd < 0:
-            return bool(chain) and self._open(chain[-1])
+            return bool(chain) and self._open(chain[-1][0])
         own = os.fstat(self._fd).st_ino
-        inodes = [_inode(path) for path in chain]
+        inodes = [status.st_ino for _, status in chain]
         if own not in inodes:
             if not chain:
                 return False
             self.lost_files += 1
-            return self._open(chain[-1])
+            return self._open(chain[-1][0])
         place = inodes.index(own)
         if place == 0:
             return False
@@ -149,17 +147,18 @@ class JsonlTail:
         if rest := self._read():
             os.lseek(self._fd, -len(rest), os.SEEK_CUR)
             return True
-        return self._open(chain[place - 1])
+        return self._open(chain[place - 1][0])
 
-    def _chain(self) -> list[Path]:
+    def _chain(self) -> list[tuple[Path, os.stat_result]]:
         """The file and its rotated ones, newest first."""
-        chain = [self.path]
-        for number in range(1, MAX_ROTATED):
-            path = self.path.with_name(f"{self.path.stem}.{number}{self.path.suffix}")
-            if not path.exists():
-                break
-            chain.append(path)
-        return [path for path in chain if path.exists()]
+        chain = []
+        with contextlib.suppress(OSError):
+            chain.append((self.path, self.path.stat()))
+        with contextlib.suppress(OSError):
+            for number in range(1, MAX_ROTATED):
+                path = self.path.with_name(f"{self.path.stem}.{number}{self.path.suffix}")
+                chain.append((path, path.stat()))
+        return chain
 
     def _open(self, path: Path) -> bool:
         try:
@@ -206,10 +205,3 @@ def resume_tail(loop: asyncio.AbstractEventLoop, place: Path, put: Put) -> Jsonl
     tail = JsonlTail(loop, Path(os.fsdecode(words[2])), put)
     tail.resume(int(words[0]), int(words[1]))
     return tail
-
-
-def _inode(path: Path) -> int:
-    try:
-        return path.stat().st_ino
-    except OSError:
-        return -1

@@ -77,9 +77,7 @@ class TerminalLines:
         name = node
         if self._want_dataflow or not node:
             name = dataflow + (b"/" + node if node else b"")
-        label = self._labels.get(name)
-        if label is None:
-            label = self._label(name)
+        label = self._labels.get(name) or self._label(name)
         self._new_indent = len(when) + self._width + 2
         return b"%s %s " % (when, label)
 
