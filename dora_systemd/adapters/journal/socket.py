@@ -166,11 +166,11 @@ class _Channel:
         self._arm()
 
     def wait_ready(self, seconds: float) -> None:
-        if self._socket is None:
-            time.sleep(min(seconds, RETRY_SECONDS))
-            return
         poll = select.poll()
-        poll.register(self._socket, select.POLLOUT)
+        if self._socket is None:
+            seconds = min(seconds, RETRY_SECONDS)
+        else:
+            poll.register(self._socket, select.POLLOUT)
         poll.poll(seconds * 1000)
 
     def _refuse(self) -> None:

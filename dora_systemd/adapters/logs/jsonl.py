@@ -22,6 +22,7 @@ MAX_ROTATED = 1000
 LINE_LIMIT = 8 << 20
 
 PLACE_SUFFIX = ".place"
+_PLACE_FLAGS = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC
 
 Put = Callable[[dict[str, Value]], None]
 
@@ -54,7 +55,8 @@ class JsonlTail:
         self._lines = LineSplitter(LINE_LIMIT)
         self._fd = -1
         self._timer: asyncio.TimerHandle | None = None
-        self._place = _Place(place, path) if place is not None else None
+        self._place = -1 if place is None else os.open(place, _PLACE_FLAGS, 0o600)
+        self._noted = b""
 
     def start(self) -> None:
         """Start reading every POLL_SECONDS."""
@@ -81,8 +83,9 @@ class JsonlTail:
         for line in self._lines.flush():
             self._put(jsonl_fields(line))
         self._shut()
-        if self._place is not None:
-            self._place.close()
+        if self._place >= 0:
+            os.close(self._place)
+            self._place = -1
 
     @property
     def loss(self) -> str:
@@ -110,9 +113,17 @@ class JsonlTail:
                 os.lseek(self._fd, offset, os.SEEK_SET)
 
     def _note_place(self) -> None:
-        if self._place is not None and self._fd >= 0 and not self._is_busy():
-            offset = os.lseek(self._fd, 0, os.SEEK_CUR) - len(self._lines.rest)
-            self._place.note(os.fstat(self._fd).st_ino, offset)
+        """Note inode and offset of what the journal has, and the path of the log file."""
+        if self._place < 0 or self._fd < 0 or self._is_busy():
+            return
+        inode = os.fstat(self._fd).st_ino
+        offset = os.lseek(self._fd, 0, os.SEEK_CUR) - len(self._lines.rest)
+        place = b"%020d %020d %s" % (inode, offset, bytes(self.path))
+        if place != self._noted:
+            self._noted = place
+            with contextlib.suppress(OSError):
+                # One write of constant length, so it is never half done.
+                os.pwrite(self._place, place, 0)
 
     def _read_chunk(self) -> int:
         """Read on, in the next file at the end of this one; number of bytes read."""
@@ -173,25 +184,6 @@ class JsonlTail:
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
-
-
-class _Place:
-    """Inode and offset in a file that outlives this process, with the path of the log file."""
-
-    def __init__(self, path: Path, log: Path) -> None:
-        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
-        self._log = log
-        self._noted = (0, -1)
-
-    def note(self, inode: int, offset: int) -> None:
-        if self._noted != (inode, offset):
-            self._noted = (inode, offset)
-            with contextlib.suppress(OSError):
-                # One write of constant length, so it is never half done.
-                os.pwrite(self._fd, b"%020d %020d %s" % (inode, offset, bytes(self._log)), 0)
-
-    def close(self) -> None:
-        os.close(self._fd)
 
 
 def resume_tail(loop: asyncio.AbstractEventLoop, place: Path, put: Put) -> JsonlTail | None:

@@ -64,8 +64,7 @@ class LogPipes:
         if node_id in self._paths:
             return
         for path in fifos(node_id, paths).values():
-            with contextlib.suppress(FileNotFoundError):
-                path.unlink()
+            path.unlink(missing_ok=True)
             os.mkfifo(path, 0o600)
         self._paths[node_id] = paths
 

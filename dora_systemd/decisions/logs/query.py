@@ -4,6 +4,7 @@ journalctl finds, filters and formats records quickly. This module selects exact
 dataflow.
 """
 
+import re
 from dataclasses import dataclass
 
 from dora_systemd.decisions.logs.events import EVENTS
@@ -21,7 +22,7 @@ LEVELS = {
 
 UNIT_ENDS = ("7ad2d189f7e94e70a38c781354912448", "d9b373ed55a64feb8242e02dbe79a49c")
 
-_UNITS = ("ms", "s", "min", "m", "h", "d", "w")
+_DURATION = re.compile(r"(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:ms|s|min|m|h|d|w)")
 
 
 @dataclass(frozen=True)
@@ -63,9 +64,7 @@ def parse_level(text: str) -> str:
 
 def journal_time(text: str) -> str:
     """A point in time for journalctl; dora's `5m` becomes `-5m`."""
-    number = text.rstrip("abcdefghijklmnopqrstuvwxyz")
-    is_duration = number.replace(".", "", 1).isdigit() and text[len(number) :] in _UNITS
-    return f"-{text}" if is_duration else text
+    return f"-{text}" if _DURATION.fullmatch(text) else text
 
 
 def journal_timestamp(us: int) -> str:
