@@ -13,18 +13,13 @@ _ILLEGAL = re.compile(r"[^A-Z0-9_]+")
 Value = str | bytes | int
 
 
-def legal_name(name: str, prefix: str = "") -> str:
+def legal_name(name: str, prefix: str) -> str:
     """The journal field name for `name`: upper case, [A-Z0-9_], at most 64 characters.
 
-    journald drops fields whose name begins with an underscore, which are its own, or with a digit.
+    prefix: such as DORA_. journald drops fields whose name begins with an underscore, which are its
+    own, or with a digit.
     """
-    legal = _ILLEGAL.sub("_", name.upper())
-    if prefix:
-        return (prefix + legal)[:MAX_NAME]
-    legal = legal.lstrip("_")
-    if not legal or legal[0].isdigit():
-        legal = "X_" + legal
-    return legal[:MAX_NAME]
+    return (prefix + _ILLEGAL.sub("_", name.upper()))[:MAX_NAME]
 
 
 def encode_entry(fields: Mapping[str, Value]) -> bytes:
