@@ -86,7 +86,8 @@ def write_last_words(
     # Imported late: they take long, and in most cases there is nothing to do.
     import asyncio
 
-    from dora_systemd.adapters.journal.socket import JOURNAL_SOCKET, JournalSocket
+    from dora_systemd.adapters.journal.note import JOURNAL_SOCKET
+    from dora_systemd.adapters.journal.socket import JournalSocket
     from dora_systemd.adapters.logs.pipes import LogPipes
     from dora_systemd.decisions.cell.status import CellStatus
     from dora_systemd.decisions.logs.lines import Origin

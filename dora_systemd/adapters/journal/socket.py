@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 
-JOURNAL_SOCKET = "/run/systemd/journal/socket"
+from dora_systemd.adapters.journal.note import JOURNAL_SOCKET
 
 # journald takes the entries of all senders from one queue, in order. So a line of a quiet node
 # waits for what one flood has in that queue: some 50 entries (about 1.3 kB each in the kernel) or

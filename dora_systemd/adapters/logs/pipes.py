@@ -113,7 +113,7 @@ class LogPipes:
         """
         pipe = self._source(node_id).pipes[-1]
         data, done = read_held(path)
-        lines = pipe.lines(data)[done:] if data else []
+        lines = pipe.splitter.feed(data)[done:]
         self._queue.put(node_id, lambda: list(map(pipe.encoder.entry, lines)))
 
     def set_pid(self, node_id: str, pid: int) -> None:
