@@ -103,6 +103,15 @@ def end_journalctl(child: "subprocess.Popen[bytes]") -> int:
     return status
 
 
+def journal_output(arguments: Sequence[str], want_colors: bool = False) -> Iterator[bytes]:
+    """What journalctl prints, in chunks. Raises DoraSystemdError for its error message."""
+    with open_journalctl(arguments, want_colors) as child:
+        assert child.stdout
+        while data := os.read(child.stdout.fileno(), _CHUNK):
+            yield data
+        end_journalctl(child)
+
+
 def _complaint_error(complaint: str) -> DoraSystemdError:
     if complaint.startswith("Failed to parse timestamp"):
         hint = 'such as "2026-11-20 18:00", "10 min ago", "today" or "5m", see systemd.time(7)'
@@ -142,11 +151,8 @@ class JournalReader:
         times = (("since", since_us), ("until", until_us))
         options = [f"--{name}={journal_timestamp(us)}" for name, us in times]
         options += ["--quiet", "--boot", "--output=cat", "--output-fields=_PID"]
-        with open_journalctl([*options, "--", f"_PID={os.getpid()}"]) as child:
-            assert child.stdout
-            count = sum(1 for _ in child.stdout)
-            end_journalctl(child)
-        return count
+        output = journal_output([*options, "--", f"_PID={os.getpid()}"])
+        return sum(data.count(b"\n") for data in output)
 
     def name_of(self, uuid: str) -> str:
         """The name of the dataflow `uuid`, "" if it has no record."""
