@@ -178,7 +178,8 @@ class LogPipes:
     def line_counts(self) -> dict[str, LineCount]:
         """Lines written, suppressed and lost, by node; lost ones have no node: WHOLE_CELL."""
         whole = {WHOLE_CELL: LineCount(lost=self._lost)}
-        return whole | {node: source.line_count for node, source in self._sources.items()}
+        each = self._sources.items()
+        return whole | {node: LineCount(one.written, one.suppressed) for node, one in each}
 
     def is_busy(self, node: str) -> bool:
         """Whether entries of the node still wait for journald."""

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from dora_systemd.adapters.logs.held import HeldLines
-from dora_systemd.decisions.cell.status import LineCount
 from dora_systemd.decisions.logs.limiter import LineLimiter
 from dora_systemd.decisions.logs.lines import LineEncoder, LineSplitter, Origin
 from dora_systemd.paths import CellPaths
@@ -37,8 +36,6 @@ class Pipe:
     batches: int = 0
     # Whether the last line is unterminated.
     is_open: bool = False
-    # Number of lines that journald has taken.
-    written: int = 0
 
     def read(self) -> bytes:
         """Read at most CHUNK bytes; b"" if the pipe is empty."""
@@ -86,15 +83,9 @@ class Source:
     limiter: LineLimiter | None = None
     # The timer of the event about suppressed lines.
     report: asyncio.TimerHandle | None = None
-    # Lines that did not come from a pipe, and suppressed lines that were reported.
+    # Number of lines written, and of suppressed lines that were reported.
     written: int = 0
     suppressed: int = 0
-
-    @property
-    def line_count(self) -> LineCount:
-        """Lines written and suppressed so far."""
-        piped = sum(pipe.written for pipe in self.pipes)
-        return LineCount(self.written + piped, self.suppressed)
 
     def renew(self, **changes: Any) -> None:
         """Change the origin of the node's later lines."""
@@ -105,10 +96,11 @@ class Source:
     def batch(self, pipe: Pipe, data: bytes, now: float) -> "LineBatch":
         """The entries of the lines that `data` of `pipe` completes; `now` in seconds."""
         pipe.take(data)
-        batch = LineBatch(pipe, pipe.encoder, data)
+        batch = LineBatch(self, pipe, pipe.encoder, data)
         if self.limiter is not None:
-            batch.lines = pipe.lines(data)
-            batch.passed = self.admit(pipe.stream, len(batch.lines), now)
+            lines = pipe.lines(data)
+            batch.lines = lines[: self.admit(pipe.stream, len(lines), now)]
+            batch.suppressed = len(lines) - len(batch.lines)
         return batch
 
     def admit(self, stream: str, count: int, now: float) -> int:
@@ -120,33 +112,33 @@ class Source:
 class LineBatch:
     """The entries of one read. They are made late, because raw bytes take less memory.
 
-    data: what was read from `pipe`. lines, passed: for a node with a rate limit, which had to count
-    the lines at once: the lines of `data`, and how many of them may pass.
+    data: what was read from `pipe`. lines, suppressed: for a node with a rate limit, which had to
+    count the lines at once: the lines of `data` that may pass, and the number of the others.
     """
 
+    source: Source
     pipe: Pipe
     encoder: LineEncoder
     data: bytes
     lines: list[bytes] | None = None
+    suppressed: int = 0
     passed: int = 0
-    count: int = 0
 
     def entries(self) -> list[bytes]:
         """Make the entries."""
         lines = self.pipe.lines(self.data) if self.lines is None else self.lines
-        self.count = len(lines)
-        if self.lines is None:
-            self.passed = self.count
-        return list(map(self.encoder.entry, lines[: self.passed]))
+        self.passed = len(lines)
+        return list(map(self.encoder.entry, lines))
 
     def note(self, left: int) -> None:
         """Note that journald has taken all but the last `left` entries."""
         held = self.pipe.held
         if not left:
-            self.pipe.written += self.passed
+            self.source.written += self.passed
             self.pipe.batches -= 1
             if held is not None:
-                held.sent_all(self.count, None if self.pipe.batches else self.pipe.splitter.rest)
+                rest = None if self.pipe.batches else self.pipe.splitter.rest
+                held.sent_all(self.passed + self.suppressed, rest)
         elif held is not None:
             held.sent(self.passed - left)
 
