@@ -91,7 +91,8 @@ def write_last_words(
     # Imported late: they take long, and the nodes are killed before that.
     import asyncio
 
-    from dora_systemd.adapters.journal.socket import JOURNAL_SOCKET, JournalSocket
+    from dora_systemd.adapters.journal.note import JOURNAL_SOCKET
+    from dora_systemd.adapters.journal.socket import JournalSocket
     from dora_systemd.adapters.logs.pipes import LogPipes
 
     paths = CellPaths(directory)

@@ -11,7 +11,12 @@ from fnmatch import fnmatchcase
 from itertools import islice
 from typing import NamedTuple
 
-from dora_systemd.adapters.journal.reader import JournalReader, end_journalctl, open_journalctl
+from dora_systemd.adapters.journal.reader import (
+    JournalReader,
+    end_journalctl,
+    journal_output,
+    open_journalctl,
+)
 from dora_systemd.decisions.logs.fields import ExportReader
 from dora_systemd.decisions.logs.query import (
     UNIT_ENDS,
@@ -28,7 +33,6 @@ from dora_systemd.values import quoted
 from dora_systemd.verbs.facts.ended import volatile_note
 from dora_systemd.verbs.facts.selector import Selector
 
-_CHUNK = 1 << 18
 _TURN = 1 << 14
 """Bytes of records between two looks at what else has happened: a terminal may be slow."""
 _GLOB = re.compile(r"[*?\[]")
@@ -124,11 +128,8 @@ def read_logs(
 
     Raises DoraSystemdError: USAGE for a time or pattern that journalctl does not accept.
     """
-    with open_journalctl(query_arguments(query), want_colors=terminal is not None) as child:
-        assert child.stdout
-        while data := os.read(child.stdout.fileno(), _CHUNK):
-            yield terminal.feed(data) if terminal else data
-        end_journalctl(child)
+    for data in journal_output(query_arguments(query), want_colors=terminal is not None):
+        yield terminal.feed(data) if terminal else data
 
 
 def pass_logs(query: LogQuery, fd: int) -> int:

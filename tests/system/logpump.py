@@ -17,8 +17,9 @@ import time
 import uuid
 from pathlib import Path
 
+from dora_systemd.adapters.journal.note import JOURNAL_SOCKET
 from dora_systemd.adapters.journal.reader import JournalReader
-from dora_systemd.adapters.journal.socket import JOURNAL_SOCKET, JournalSocket
+from dora_systemd.adapters.journal.socket import JournalSocket
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.decisions.logs.lines import Origin
 from dora_systemd.paths import CellPaths

@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -102,6 +103,15 @@ def end_journalctl(child: "subprocess.Popen[bytes]") -> int:
     return status
 
 
+def journal_output(arguments: Sequence[str], want_colors: bool = False) -> Iterator[bytes]:
+    """What journalctl prints, in chunks. Raises DoraSystemdError for its error message."""
+    with open_journalctl(arguments, want_colors) as child:
+        assert child.stdout
+        while data := os.read(child.stdout.fileno(), _CHUNK):
+            yield data
+        end_journalctl(child)
+
+
 def _complaint_error(complaint: str) -> DoraSystemdError:
     if complaint.startswith("Failed to parse timestamp"):
         hint = 'such as "2026-11-20 18:00", "10 min ago", "today" or "5m", see systemd.time(7)'
@@ -120,10 +130,7 @@ class JournalReader:
 
     def unique(self, field: str) -> list[str]:
         """All values of `field` in the journal, sorted."""
-        with open_journalctl([f"--field={field}", "--quiet"]) as child:
-            assert child.stdout
-            lines = list(_lines(child))
-            end_journalctl(child)
+        lines = _lines([f"--field={field}", "--quiet"])
         return sorted(line.decode("utf-8", "replace").rstrip("\n") for line in lines)
 
     def known_names(self) -> list[str]:
@@ -144,11 +151,8 @@ class JournalReader:
         times = (("since", since_us), ("until", until_us))
         options = [f"--{name}={journal_timestamp(us)}" for name, us in times]
         options += ["--quiet", "--boot", "--output=cat", "--output-fields=_PID"]
-        with open_journalctl([*options, "--", f"_PID={os.getpid()}"]) as child:
-            assert child.stdout
-            count = sum(1 for _ in child.stdout)
-            end_journalctl(child)
-        return count
+        output = journal_output([*options, "--", f"_PID={os.getpid()}"])
+        return sum(data.count(b"\n") for data in output)
 
     def name_of(self, uuid: str) -> str:
         """The name of the dataflow `uuid`, "" if it has no record."""
@@ -169,11 +173,8 @@ class JournalReader:
         options = [] if limit is None else [f"--lines={limit}"]
         options += [f"--until={journal_timestamp(until_us)}"] if until_us else []
         options += ["--all"] if is_whole else []
-        arguments = ["--output=json", "--reverse", "--quiet", *options, "--", *matches]
-        with open_journalctl(arguments) as child:
-            for line in _lines(child):
-                yield json.loads(line)
-            end_journalctl(child)
+        for line in _lines(["--output=json", "--reverse", "--quiet", *options, "--", *matches]):
+            yield json.loads(line)
 
     def last_events(self, scope: Scope, limit: int = 100) -> list[LastEvent]:
         """The last life event of each of the `limit` newest dataflows, newest first."""
@@ -196,43 +197,41 @@ class JournalReader:
         matches = [*scope_matches(scope, name), "DORA_EVENT=dataflow-starting"]
         if uuid:
             matches.append(f"DORA_DATAFLOW={uuid}")
-        previous = ""
-        for record in self.newest(matches, None):
-            invocation = str(record.get("_SYSTEMD_INVOCATION_ID", ""))
-            if invocation != previous:
-                yield invocation
-            previous = invocation
+        records = self.newest(matches, None)
+        ids = (str(record.get("_SYSTEMD_INVOCATION_ID", "")) for record in records)
+        yield from (invocation for invocation, _ in groupby(ids) if invocation)
 
 
-def _lines(child: "subprocess.Popen[bytes]") -> Iterator[bytes]:
-    """The lines that a journalctl prints, within limits.
+def _lines(arguments: Sequence[str]) -> Iterator[bytes]:
+    """The lines that journalctl prints, within limits. Raises DoraSystemdError for its error.
 
     Every node can write to the journal, and fill it with records of 32 MiB each. So this leaves out
     lines that are too long, and ends after MAX_BYTES or the timeout.
     """
-    assert child.stdout
-    fd, rest, left, deadline = child.stdout.fileno(), b"", MAX_BYTES, None
-    poll = select.poll()
-    poll.register(fd, select.POLLIN)
-    while left > 0 and poll.poll(_seconds_until(deadline) * 1000):
-        if not (data := os.read(fd, _CHUNK)):
-            if rest and len(rest) <= MAX_LINE:
-                yield rest
-            return
-        deadline = deadline or time.monotonic() + READ_SECONDS
-        left -= len(data)
-        *lines, last = data.split(b"\n")
-        for line in lines:
-            if len(rest) + len(line) <= MAX_LINE:
-                yield rest + line + b"\n"
-            rest = b""
-        # Keep just enough of a long line to see that it is too long.
-        rest = (rest + last)[: MAX_LINE + 1]
-    child.kill()
-
-
-def _seconds_until(deadline: float | None) -> float:
-    return FIRST_SECONDS if deadline is None else max(deadline - time.monotonic(), 0.0)
+    with open_journalctl(arguments) as child:
+        assert child.stdout
+        fd, rest, left = child.stdout.fileno(), b"", MAX_BYTES
+        deadline = time.monotonic() + FIRST_SECONDS
+        poll = select.poll()
+        poll.register(fd, select.POLLIN)
+        while left > 0 and poll.poll(max(deadline - time.monotonic(), 0.0) * 1000):
+            if not (data := os.read(fd, _CHUNK)):
+                if rest and len(rest) <= MAX_LINE:
+                    yield rest
+                break
+            if left == MAX_BYTES:
+                deadline = time.monotonic() + READ_SECONDS
+            left -= len(data)
+            *lines, last = data.split(b"\n")
+            for line in lines:
+                if len(rest) + len(line) <= MAX_LINE:
+                    yield rest + line + b"\n"
+                rest = b""
+            # Keep just enough of a long line to see that it is too long.
+            rest = (rest + last)[: MAX_LINE + 1]
+        else:
+            child.kill()
+        end_journalctl(child)
 
 
 def _trusted_name(record: dict[str, Any]) -> str:

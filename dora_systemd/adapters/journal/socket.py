@@ -4,6 +4,7 @@ https://systemd.io/JOURNAL_NATIVE_PROTOCOL/
 """
 
 import asyncio
+import contextlib
 import errno
 import fcntl
 import os
@@ -13,8 +14,9 @@ import sys
 import termios
 import time
 from collections.abc import Callable
+from functools import partial
 
-JOURNAL_SOCKET = "/run/systemd/journal/socket"
+from dora_systemd.adapters.journal.note import JOURNAL_SOCKET
 
 # journald takes the entries of all senders from one queue, in order. So a line of a quiet node
 # waits for what one flood has in that queue: some 50 entries (about 1.3 kB each in the kernel) or
@@ -25,7 +27,6 @@ EXPRESS_BUFFER = 1 << 20
 RETRY_SECONDS = 0.05
 UNREAD_SECONDS = 0.002
 
-_FULL = {errno.EAGAIN}
 _TOO_BIG = {errno.EMSGSIZE, errno.ENOBUFS}
 _SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_WRITE | fcntl.F_SEAL_SEAL
 
@@ -33,14 +34,12 @@ _SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_WRITE | fcntl.F_
 class JournalSocket:
     """Sends entries to journald without blocking; the caller keeps those that are refused.
 
-    path: the socket; tests use another one. bulk: maximum bytes in the kernel of entries sent by
-    send_bulk().
+    path: the socket; tests use another one.
     """
 
-    def __init__(self, path: str = JOURNAL_SOCKET, bulk: int = BULK_BUFFER) -> None:
-        self.path = path
+    def __init__(self, path: str = JOURNAL_SOCKET) -> None:
         self._express = _Channel(path, EXPRESS_BUFFER)
-        self._bulk = _Channel(path, bulk)
+        self._bulk = _Channel(path, BULK_BUFFER)
 
     def send(self, entry: bytes) -> bool:
         """Send one entry; False: refused, journald is busy or restarting, see call_when_ready()."""
@@ -58,14 +57,12 @@ class JournalSocket:
     def call_when_ready(
         self, loop: asyncio.AbstractEventLoop, callback: Callable[[], None]
     ) -> None:
-        """Call `callback` once a refused entry may be sent again.
+        """From now on call `callback` each time a refused entry may be sent again.
 
-        It is called once for each of the two channels that refused. A new callback replaces the
-        last one.
+        A new callback replaces the last one.
         """
         for channel in (self._express, self._bulk):
-            if channel.refused:
-                channel.call_when_ready(loop, callback)
+            channel.call_when_ready(loop, callback)
 
     def wait_ready(self, seconds: float) -> None:
         """Block until a refused entry may be sent again, at most `seconds`. Only for the end."""
@@ -85,7 +82,7 @@ class JournalSocket:
         time.sleep(UNREAD_SECONDS)  # for the entry that journald has just read
 
     def close(self) -> None:
-        """Close the sockets, and drop the callbacks."""
+        """Close the sockets, and drop the callback."""
         self._express.close()
         self._bulk.close()
 
@@ -97,8 +94,9 @@ class _Channel:
         self._path = path
         self._buffer = buffer
         self._socket: socket.socket | None = None
-        self._waiter: tuple[asyncio.AbstractEventLoop, Callable[[], None]] | None = None
-        self._cancel: Callable[[], object] | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._callback: Callable[[], None] = _ignore
+        self._cancel: Callable[[], object] = _ignore
         self.sent = 0
         # Set until the callback: other entries may get through before that.
         self.refused = False
@@ -108,7 +106,7 @@ class _Channel:
             (self._socket or self._connect()).send(entry)
         except OSError as error:
             if not self._send_otherwise(error, entry):
-                self.refused = True
+                self._refuse()
                 return False
         self.sent += 1
         return True
@@ -125,36 +123,33 @@ class _Channel:
         return sock
 
     def _send_otherwise(self, error: OSError, entry: bytes) -> bool:
-        if error.errno in _FULL:
+        if isinstance(error, BlockingIOError):
             return False
         if error.errno in _TOO_BIG and self._socket is not None:
             return self._send_memfd(self._socket, entry)
         was_connected = self._socket is not None
         self._disconnect()
-        # journald has restarted, and may have its new socket already.
-        return was_connected and self._send_again(entry)
-
-    def _send_again(self, entry: bytes) -> bool:
-        try:
-            self._connect().send(entry)
-        except OSError:
-            return False
-        return True
+        if was_connected:
+            # journald has restarted, and may have its new socket already.
+            with contextlib.suppress(OSError):
+                self._connect().send(entry)
+                return True
+        return False
 
     def _send_memfd(self, sock: socket.socket, entry: bytes) -> bool:
         """Send a large entry as a sealed file, as sd_journal_send(3) does."""
         fd = os.memfd_create("dora-journal-entry", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         try:
-            with os.fdopen(os.dup(fd), "wb") as file:
+            with os.fdopen(fd, "wb") as file:
                 file.write(entry)
-            fcntl.fcntl(fd, fcntl.F_ADD_SEALS, _SEALS)
-            socket.send_fds(sock, [b""], [fd])
-        except OSError as error:
-            if error.errno not in _FULL:
-                self._disconnect()
+                file.flush()
+                fcntl.fcntl(fd, fcntl.F_ADD_SEALS, _SEALS)
+                socket.send_fds(sock, [b""], [fd])
+        except BlockingIOError:
             return False
-        finally:
-            os.close(fd)
+        except OSError:
+            self._disconnect()
+            return False
         return True
 
     @property
@@ -167,40 +162,42 @@ class _Channel:
     def call_when_ready(
         self, loop: asyncio.AbstractEventLoop, callback: Callable[[], None]
     ) -> None:
-        self._waiter = (loop, callback)
+        self._loop, self._callback = loop, callback
         self._arm()
 
     def wait_ready(self, seconds: float) -> None:
-        if self._socket is None:
-            time.sleep(min(seconds, RETRY_SECONDS))
-            return
         poll = select.poll()
-        poll.register(self._socket, select.POLLOUT)
+        if self._socket is None:
+            seconds = min(seconds, RETRY_SECONDS)
+        else:
+            poll.register(self._socket, select.POLLOUT)
         poll.poll(seconds * 1000)
 
+    def _refuse(self) -> None:
+        if not self.refused:
+            self.refused = True
+            self._arm()
+
     def _arm(self) -> None:
+        """Have the loop call _ready() when a refused entry may be sent again."""
         self._disarm()
-        if self._waiter is None:
+        if not self.refused or self._loop is None:
             return
-        loop = self._waiter[0]
         if self._socket is None:
-            self._cancel = loop.call_later(RETRY_SECONDS, self._ready).cancel
+            self._cancel = self._loop.call_later(RETRY_SECONDS, self._ready).cancel
             return
         fd = self._socket.fileno()
-        loop.add_writer(fd, self._ready)
-        self._cancel = lambda: loop.remove_writer(fd)
+        self._loop.add_writer(fd, self._ready)
+        self._cancel = partial(self._loop.remove_writer, fd)
+
+    def _disarm(self) -> None:
+        self._cancel()
+        self._cancel = _ignore
 
     def _ready(self) -> None:
         self._disarm()
         self.refused = False
-        waiter, self._waiter = self._waiter, None
-        if waiter is not None:
-            waiter[1]()
-
-    def _disarm(self) -> None:
-        cancel, self._cancel = self._cancel, None
-        if cancel is not None:
-            cancel()
+        self._callback()
 
     def _disconnect(self) -> None:
         self._disarm()
@@ -210,5 +207,9 @@ class _Channel:
         self._arm()
 
     def close(self) -> None:
-        self._waiter = None
+        self.refused = False
         self._disconnect()
+
+
+def _ignore() -> None:
+    """The callback before there is one."""

@@ -1,5 +1,10 @@
 """Keeps the bytes that the runner has read from a pipe and journald does not have, in a file.
 
+systemd's file descriptor store keeps what is still in the pipe, and that is not enough: a flood, a
+prompt without a newline and a line longer than the pipe all lost lines when the runner was killed.
+To copy with tee(2), and read once journald has the line, saves only the flood: a prompt keeps the
+pipe readable, so the runner would spin, and a line longer than the pipe would never be complete.
+
 The file is in the RuntimeDirectory, which is in memory, and outlives a runner that is killed: the
 process of ExecStopPost= sends its content to journald. splice(2) moves the bytes from the pipe to
 the file in one system call, so they are always in one of the two. A kill after an entry was sent,
@@ -27,11 +32,11 @@ class HeldLines:
 
     def __init__(self, pipe: Path) -> None:
         self._path = held_path(pipe)
-        self._size = 0
-        self._lines = 0
-        # The file would lack some of these bytes, so it stays empty.
+        self._fd = -1
+        self._size = self._done = self._noted = 0
+        # The file would lack some bytes, so it stays empty.
         self._is_broken = False
-        self._fd = self._make(self._path, b"")
+        self._begin(b"")
 
     def take(self, fd: int, size: int) -> bytes:
         """Read up to `size` bytes from the pipe `fd` and keep them; b"" at the end of the file.
@@ -39,19 +44,16 @@ class HeldLines:
         Raises BlockingIOError if the pipe is empty.
         """
         if not self._is_broken:
+            place = _HEAD.size + self._size
             try:
-                return self._splice(fd, size)
+                count = os.splice(fd, self._fd, size, offset_dst=place)
+                self._size += count
+                return os.pread(self._fd, count, place)
             except BlockingIOError:
                 raise
             except OSError:
                 self._give_up()
         return os.read(fd, size)
-
-    def _splice(self, fd: int, size: int) -> bytes:
-        place = _HEAD.size + self._size
-        count = os.splice(fd, self._fd, size, offset_dst=place)
-        self._size += count
-        return os.pread(self._fd, count, place)
 
     def add(self, data: bytes) -> None:
         """Keep `data`, which did not come from the pipe, after the other bytes."""
@@ -62,24 +64,27 @@ class HeldLines:
                 self._give_up()
 
     def sent(self, lines: int) -> None:
-        """Note that journald has the first `lines` lines."""
-        if lines != self._lines and not self._is_broken:
-            self._lines = lines
+        """Note that journald has the first `lines` lines of the oldest batch."""
+        if self._done + lines != self._noted and not self._is_broken:
+            self._noted = self._done + lines
             with contextlib.suppress(OSError):
-                os.pwrite(self._fd, _HEAD.pack(_TO_THE_END, lines), 0)
+                os.pwrite(self._fd, _HEAD.pack(_TO_THE_END, self._noted), 0)
 
-    def restart(self, rest: bytes) -> bool:
-        """journald has all but the unterminated line `rest`; whether lines count from 0 again."""
-        if not rest:
+    def sent_all(self, lines: int, rest: bytes | None) -> None:
+        """Note that journald has the oldest batch, which has `lines` lines.
+
+        rest: the unterminated line at the end of this batch; None if other batches wait.
+        """
+        self._done += lines
+        if rest == b"":
             self._empty()
-            return True
-        if not self._is_broken and self._size - len(rest) < _MOST_DONE:
-            return False
-        try:
-            self._replace(rest)
-        except OSError:
-            self._give_up()
-        return True
+        elif rest and (self._is_broken or self._size - len(rest) >= _MOST_DONE):
+            try:
+                self._begin(rest)
+            except OSError:
+                self._give_up()
+        else:
+            self.sent(0)
 
     def close(self) -> None:
         """Close the file, and leave it in place."""
@@ -89,23 +94,20 @@ class HeldLines:
     def _empty(self) -> None:
         with contextlib.suppress(OSError):
             os.ftruncate(self._fd, _HEAD.size)
-        self._size, self._is_broken = 0, False
+        self._size, self._done, self._is_broken = 0, 0, False
         self.sent(0)
 
-    def _replace(self, rest: bytes) -> None:
+    def _begin(self, rest: bytes) -> None:
         """Replace the file atomically: after a kill there is the old or the new one."""
         path = self._path.with_suffix(f"{SUFFIX}-new")
-        fd = self._make(path, rest)
-        path.replace(self._path)
-        os.close(self._fd)
-        self._fd = fd
-        self._size, self._lines, self._is_broken = len(rest), 0, False
-
-    def _make(self, path: Path, data: bytes) -> int:
         fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
         with contextlib.suppress(OSError):
-            os.pwritev(fd, [_HEAD.pack(_TO_THE_END, 0), data], 0)
-        return fd
+            os.pwritev(fd, [_HEAD.pack(_TO_THE_END, 0), rest], 0)
+        path.replace(self._path)
+        if self._fd >= 0:
+            os.close(self._fd)
+        self._fd, self._size, self._is_broken = fd, len(rest), False
+        self._done = self._noted = 0
 
     def _give_up(self) -> None:
         self._empty()

@@ -22,6 +22,7 @@ MAX_ROTATED = 1000
 LINE_LIMIT = 8 << 20
 
 PLACE_SUFFIX = ".place"
+_PLACE_FLAGS = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC
 
 Put = Callable[[dict[str, Value]], None]
 
@@ -54,7 +55,8 @@ class JsonlTail:
         self._lines = LineSplitter(LINE_LIMIT)
         self._fd = -1
         self._timer: asyncio.TimerHandle | None = None
-        self._place = _Place(place, path) if place is not None else None
+        self._place = -1 if place is None else os.open(place, _PLACE_FLAGS, 0o600)
+        self._noted = b""
 
     def start(self) -> None:
         """Start reading every POLL_SECONDS."""
@@ -81,8 +83,9 @@ class JsonlTail:
         for line in self._lines.flush():
             self._put(jsonl_fields(line))
         self._shut()
-        if self._place is not None:
-            self._place.close()
+        if self._place >= 0:
+            os.close(self._place)
+            self._place = -1
 
     @property
     def loss(self) -> str:
@@ -97,24 +100,30 @@ class JsonlTail:
         if self._fd >= 0:
             own, place = os.fstat(self._fd), os.lseek(self._fd, 0, os.SEEK_CUR)
             total = own.st_size - (place if place <= own.st_size else 0)
-        for path in self._chain():
-            with contextlib.suppress(OSError):
-                status = path.stat()
-                if own and status.st_ino == own.st_ino:
-                    break
-                total += status.st_size
+        for _, status in self._chain():
+            if own and status.st_ino == own.st_ino:
+                break
+            total += status.st_size
         return total
 
     def resume(self, inode: int, offset: int) -> None:
         """Begin with byte `offset` of the file `inode`, if that still exists."""
-        for path in self._chain():
-            if _inode(path) == inode and self._open(path):
+        for path, status in self._chain():
+            if status.st_ino == inode and self._open(path):
                 os.lseek(self._fd, offset, os.SEEK_SET)
 
     def _note_place(self) -> None:
-        if self._place is not None and self._fd >= 0 and not self._is_busy():
-            offset = os.lseek(self._fd, 0, os.SEEK_CUR) - len(self._lines.rest)
-            self._place.note(os.fstat(self._fd).st_ino, offset)
+        """Note inode and offset of what the journal has, and the path of the log file."""
+        if self._place < 0 or self._fd < 0 or self._is_busy():
+            return
+        inode = os.fstat(self._fd).st_ino
+        offset = os.lseek(self._fd, 0, os.SEEK_CUR) - len(self._lines.rest)
+        place = b"%020d %020d %s" % (inode, offset, bytes(self.path))
+        if place != self._noted:
+            self._noted = place
+            with contextlib.suppress(OSError):
+                # One write of constant length, so it is never half done.
+                os.pwrite(self._place, place, 0)
 
     def _read_chunk(self) -> int:
         """Read on, in the next file at the end of this one; number of bytes read."""
@@ -134,14 +143,14 @@ class JsonlTail:
         """Open the file after the one that has been read; whether there is one."""
         chain = self._chain()
         if self._fd < 0:
-            return bool(chain) and self._open(chain[-1])
+            return bool(chain) and self._open(chain[-1][0])
         own = os.fstat(self._fd).st_ino
-        inodes = [_inode(path) for path in chain]
+        inodes = [status.st_ino for _, status in chain]
         if own not in inodes:
             if not chain:
                 return False
             self.lost_files += 1
-            return self._open(chain[-1])
+            return self._open(chain[-1][0])
         place = inodes.index(own)
         if place == 0:
             return False
@@ -149,17 +158,18 @@ class JsonlTail:
         if rest := self._read():
             os.lseek(self._fd, -len(rest), os.SEEK_CUR)
             return True
-        return self._open(chain[place - 1])
+        return self._open(chain[place - 1][0])
 
-    def _chain(self) -> list[Path]:
+    def _chain(self) -> list[tuple[Path, os.stat_result]]:
         """The file and its rotated ones, newest first."""
-        chain = [self.path]
-        for number in range(1, MAX_ROTATED):
-            path = self.path.with_name(f"{self.path.stem}.{number}{self.path.suffix}")
-            if not path.exists():
-                break
-            chain.append(path)
-        return [path for path in chain if path.exists()]
+        chain = []
+        with contextlib.suppress(OSError):
+            chain.append((self.path, self.path.stat()))
+        with contextlib.suppress(OSError):
+            for number in range(1, MAX_ROTATED):
+                path = self.path.with_name(f"{self.path.stem}.{number}{self.path.suffix}")
+                chain.append((path, path.stat()))
+        return chain
 
     def _open(self, path: Path) -> bool:
         try:
@@ -176,25 +186,6 @@ class JsonlTail:
             self._fd = -1
 
 
-class _Place:
-    """Inode and offset in a file that outlives this process, with the path of the log file."""
-
-    def __init__(self, path: Path, log: Path) -> None:
-        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
-        self._log = log
-        self._noted = (0, -1)
-
-    def note(self, inode: int, offset: int) -> None:
-        if self._noted != (inode, offset):
-            self._noted = (inode, offset)
-            with contextlib.suppress(OSError):
-                # One write of constant length, so it is never half done.
-                os.pwrite(self._fd, b"%020d %020d %s" % (inode, offset, bytes(self._log)), 0)
-
-    def close(self) -> None:
-        os.close(self._fd)
-
-
 def resume_tail(loop: asyncio.AbstractEventLoop, place: Path, put: Put) -> JsonlTail | None:
     """Follow the file of a process that was killed, from the position that it noted.
 
@@ -206,10 +197,3 @@ def resume_tail(loop: asyncio.AbstractEventLoop, place: Path, put: Put) -> Jsonl
     tail = JsonlTail(loop, Path(os.fsdecode(words[2])), put)
     tail.resume(int(words[0]), int(words[1]))
     return tail
-
-
-def _inode(path: Path) -> int:
-    try:
-        return path.stat().st_ino
-    except OSError:
-        return -1

@@ -25,6 +25,7 @@ from dora_systemd.decisions.cell.line_rates import RateLimit, format_rate
 from dora_systemd.decisions.cell.status import WHOLE_CELL, LineCount
 from dora_systemd.decisions.logs.events import event_fields
 from dora_systemd.decisions.logs.fields import Value, encode_entry
+from dora_systemd.decisions.logs.limiter import LineLimiter
 from dora_systemd.decisions.logs.lines import LineEncoder, LineSplitter, Origin, dora_log_fields
 from dora_systemd.paths import CellPaths
 
@@ -63,14 +64,13 @@ class LogPipes:
         if node_id in self._paths:
             return
         for path in fifos(node_id, paths).values():
-            with contextlib.suppress(FileNotFoundError):
-                path.unlink()
+            path.unlink(missing_ok=True)
             os.mkfifo(path, 0o600)
         self._paths[node_id] = paths
 
     def limit(self, node_id: str, limit: RateLimit) -> None:
         """Limit the rate of a node's lines from now on; an event counts the suppressed ones."""
-        self._source(node_id).limit(limit)
+        self._source(node_id).limiter = LineLimiter(limit)
 
     def open(self, node_id: str) -> None:
         """Start reading a node's FIFOs, which unblocks its launcher's open(2). Raises OSError."""
@@ -113,7 +113,7 @@ class LogPipes:
         """
         pipe = self._source(node_id).pipes[-1]
         data, done = read_held(path)
-        lines = pipe.lines(data)[done:] if data else []
+        lines = pipe.splitter.feed(data)[done:]
         self._queue.put(node_id, lambda: list(map(pipe.encoder.entry, lines)))
 
     def set_pid(self, node_id: str, pid: int) -> None:
@@ -178,7 +178,8 @@ class LogPipes:
     def line_counts(self) -> dict[str, LineCount]:
         """Lines written, suppressed and lost, by node; lost ones have no node: WHOLE_CELL."""
         whole = {WHOLE_CELL: LineCount(lost=self._lost)}
-        return whole | {node: source.line_count for node, source in self._sources.items()}
+        each = self._sources.items()
+        return whole | {node: LineCount(one.written, one.suppressed) for node, one in each}
 
     def is_busy(self, node: str) -> bool:
         """Whether entries of the node still wait for journald."""

@@ -13,7 +13,7 @@ The queue has no I/O of its own except through the given Journal, and belongs to
 """
 
 import asyncio
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -38,7 +38,7 @@ class Journal(Protocol):
     def call_when_ready(
         self, loop: asyncio.AbstractEventLoop, callback: Callable[[], None]
     ) -> None:
-        """Call `callback` once a refused entry may be sent again."""
+        """From now on call `callback` each time a refused entry may be sent again."""
 
     def wait_ready(self, seconds: float) -> None:
         """Block until a refused entry may be sent again, at most `seconds`."""
@@ -87,20 +87,20 @@ class LogQueue:
         pause: Callable[[str], None],
         resume: Callable[[str], None],
     ) -> None:
-        self._loop = loop
         self._journal = journal
         self._pause = pause
         self._resume = resume
-        self._lanes: dict[str, _Lane] = {}
+        self._lanes: defaultdict[str, _Lane] = defaultdict(_Lane)
         self._events: deque[_Event] = deque()
         self._turn = 0
         self._lost = 0
+        journal.call_when_ready(loop, self.flush)
 
     def put(
         self, node: str, make_entries: MakeEntries, is_flood: bool = False, note: Note = _ignore
     ) -> None:
         """Send the entries of a node after its earlier ones, now or as soon as journald can."""
-        lane = self._lanes.setdefault(node, _Lane())
+        lane = self._lanes[node]
         was_waiting = lane.waiting
         lane.items.append((make_entries, note))
         if was_waiting:
@@ -108,11 +108,10 @@ class LogQueue:
         lane.is_flood = is_flood
         if not self._send(lane):
             self._pause(node)
-            self._journal.call_when_ready(self._loop, self.flush)
 
     def put_record(self, node: str, entry: bytes) -> None:
         """Send one entry that no paused pipe holds back; above MAX_RECORDS count it as lost."""
-        lane = self._lanes.setdefault(node, _Lane())
+        lane = self._lanes[node]
         if lane.records >= MAX_RECORDS:
             self._lost += 1
             return
@@ -126,13 +125,11 @@ class LogQueue:
             return
         behind = {node for node, lane in self._lanes.items() if lane.waiting}
         self._events.append(_Event(entry, behind))
-        if not self._send_events():
-            self._journal.call_when_ready(self._loop, self.flush)
+        self._send_events()
 
     def waiting(self, node: str) -> int:
         """Number of waiting items of a node."""
-        lane = self._lanes.get(node)
-        return lane.waiting if lane else 0
+        return self._lanes[node].waiting
 
     @property
     def is_empty(self) -> bool:
@@ -148,8 +145,6 @@ class LogQueue:
             if self._send(self._lanes[node]):
                 self._emptied(node)
         self._send_events()
-        if not self.is_empty:
-            self._journal.call_when_ready(self._loop, self.flush)
 
     def give_up(self) -> int:
         """Discard what waits; returns the number of these entries plus take_lost()."""
@@ -188,9 +183,8 @@ class LogQueue:
             event.behind.discard(node)
         self._resume(node)
 
-    def _send_events(self) -> bool:
+    def _send_events(self) -> None:
         while self._events and not self._events[0].behind:
             if not self._journal.send(self._events[0].entry):
-                return False
+                return
             self._events.popleft()
-        return True

@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from dora_systemd.adapters.logs.held import HeldLines
-from dora_systemd.decisions.cell.line_rates import RateLimit
-from dora_systemd.decisions.cell.status import LineCount
 from dora_systemd.decisions.logs.limiter import LineLimiter
 from dora_systemd.decisions.logs.lines import LineEncoder, LineSplitter, Origin
 from dora_systemd.paths import CellPaths
@@ -33,14 +31,11 @@ class Pipe:
     splitter: LineSplitter = field(default_factory=LineSplitter)
     since: float = 0.0
     taken: int = 0
-    # Keeps the bytes that journald does not have; number of such batches; lines of earlier ones.
+    # Keeps the bytes that journald does not have; number of such batches.
     held: HeldLines | None = None
     batches: int = 0
-    noted: int = 0
     # Whether the last line is unterminated.
     is_open: bool = False
-    # Number of lines that journald has taken.
-    written: int = 0
 
     def read(self) -> bytes:
         """Read at most CHUNK bytes; b"" if the pipe is empty."""
@@ -76,22 +71,6 @@ class Pipe:
             if self.held is not None:
                 self.held.add(b"\n")
 
-    def note_part(self, lines: int) -> None:
-        """Note that journald has the first `lines` lines of the current batch."""
-        if self.held is not None:
-            self.held.sent(self.noted + lines)
-
-    def note_all(self, lines: int) -> None:
-        """Note that journald has the whole current batch of `lines` lines."""
-        self.batches -= 1
-        self.noted += lines
-        if self.held is None:
-            return
-        if self.batches or not self.held.restart(self.splitter.rest):
-            self.note_part(0)
-        else:
-            self.noted = 0
-
 
 @dataclass
 class Source:
@@ -104,19 +83,9 @@ class Source:
     limiter: LineLimiter | None = None
     # The timer of the event about suppressed lines.
     report: asyncio.TimerHandle | None = None
-    # Lines that did not come from a pipe, and suppressed lines that were reported.
+    # Number of lines written, and of suppressed lines that were reported.
     written: int = 0
     suppressed: int = 0
-
-    def limit(self, limit: RateLimit) -> None:
-        """Limit the rate of its lines from now on."""
-        self.limiter = LineLimiter(limit)
-
-    @property
-    def line_count(self) -> LineCount:
-        """Lines written and suppressed so far."""
-        piped = sum(pipe.written for pipe in self.pipes)
-        return LineCount(self.written + piped, self.suppressed)
 
     def renew(self, **changes: Any) -> None:
         """Change the origin of the node's later lines."""
@@ -127,48 +96,51 @@ class Source:
     def batch(self, pipe: Pipe, data: bytes, now: float) -> "LineBatch":
         """The entries of the lines that `data` of `pipe` completes; `now` in seconds."""
         pipe.take(data)
-        if self.limiter is None:
-            return LineBatch(pipe, data)
-        lines = pipe.lines(data)
-        return LineBatch(pipe, data, lines, self.admit(pipe.stream, len(lines), now))
+        batch = LineBatch(self, pipe, pipe.encoder, data)
+        if self.limiter is not None:
+            lines = pipe.lines(data)
+            batch.lines = lines[: self.admit(pipe.stream, len(lines), now)]
+            batch.suppressed = len(lines) - len(batch.lines)
+        return batch
 
     def admit(self, stream: str, count: int, now: float) -> int:
         """How many of `count` lines that have arrived at `now` (seconds) may pass."""
         return count if self.limiter is None else self.limiter.admit(stream, count, now)
 
 
+@dataclass
 class LineBatch:
     """The entries of one read. They are made late, because raw bytes take less memory.
 
-    data: what was read from `pipe`. lines, passed: for a node with a rate limit, which had to count
-    the lines at once: the lines of `data`, and how many of them may pass.
+    data: what was read from `pipe`. lines, suppressed: for a node with a rate limit, which had to
+    count the lines at once: the lines of `data` that may pass, and the number of the others.
     """
 
-    def __init__(
-        self, pipe: Pipe, data: bytes, lines: list[bytes] | None = None, passed: int = 0
-    ) -> None:
-        self._pipe = pipe
-        self._encoder = pipe.encoder
-        self._data = data
-        self._lines = lines
-        self._passed = passed
-        self._count = 0
+    source: Source
+    pipe: Pipe
+    encoder: LineEncoder
+    data: bytes
+    lines: list[bytes] | None = None
+    suppressed: int = 0
+    passed: int = 0
 
     def entries(self) -> list[bytes]:
         """Make the entries."""
-        lines = self._pipe.lines(self._data) if self._lines is None else self._lines
-        self._count = len(lines)
-        if self._lines is None:
-            self._passed = self._count
-        return list(map(self._encoder.entry, lines[: self._passed]))
+        lines = self.pipe.lines(self.data) if self.lines is None else self.lines
+        self.passed = len(lines)
+        return list(map(self.encoder.entry, lines))
 
     def note(self, left: int) -> None:
         """Note that journald has taken all but the last `left` entries."""
-        if left:
-            self._pipe.note_part(self._passed - left)
-        else:
-            self._pipe.written += self._passed
-            self._pipe.note_all(self._count)
+        held = self.pipe.held
+        if not left:
+            self.source.written += self.passed
+            self.pipe.batches -= 1
+            if held is not None:
+                rest = None if self.pipe.batches else self.pipe.splitter.rest
+                held.sent_all(self.passed + self.suppressed, rest)
+        elif held is not None:
+            held.sent(self.passed - left)
 
 
 def fifos(node_id: str, paths: CellPaths) -> dict[str, Path]:

@@ -19,30 +19,22 @@ class EventKind:
     text: str
 
 
+def _dataflow(message_id: str, priority: int, text: str) -> EventKind:
+    return EventKind(message_id, priority, f"Dataflow {{dataflow}} {text}")
+
+
 EVENTS = {
-    "dataflow-starting": EventKind(
-        "0486727a2190411eb78f66e816da2520", INFO, "Dataflow {dataflow} is starting"
+    "dataflow-starting": _dataflow("0486727a2190411eb78f66e816da2520", INFO, "is starting"),
+    "dataflow-started": _dataflow(
+        "c8e3833d172d44c5a32de08c980c4d67", NOTICE, "is running, all nodes are ready"
     ),
-    "dataflow-started": EventKind(
-        "c8e3833d172d44c5a32de08c980c4d67",
-        NOTICE,
-        "Dataflow {dataflow} is running, all nodes are ready",
-    ),
-    "dataflow-stopping": EventKind(
-        "822b051bbbe24788bf93c0952aafa491", INFO, "Dataflow {dataflow} is stopping"
-    ),
+    "dataflow-stopping": _dataflow("822b051bbbe24788bf93c0952aafa491", INFO, "is stopping"),
     "stop-asked": EventKind(
         "958c39b63a3d47cd9dd585937d57d927", INFO, "Stop of dataflow {dataflow} requested by {by}"
     ),
-    "dataflow-finished": EventKind(
-        "61a9895e49214871ae2381a42f2a1968", NOTICE, "Dataflow {dataflow} finished"
-    ),
-    "dataflow-stopped": EventKind(
-        "5e9f54e3c8fa448fab7d9114ae8f8e87", NOTICE, "Dataflow {dataflow} was stopped"
-    ),
-    "dataflow-failed": EventKind(
-        "99f4f6038d0146de8190e12fc9726881", ERR, "Dataflow {dataflow} failed"
-    ),
+    "dataflow-finished": _dataflow("61a9895e49214871ae2381a42f2a1968", NOTICE, "finished"),
+    "dataflow-stopped": _dataflow("5e9f54e3c8fa448fab7d9114ae8f8e87", NOTICE, "was stopped"),
+    "dataflow-failed": _dataflow("99f4f6038d0146de8190e12fc9726881", ERR, "failed"),
     "node-ready": EventKind("b365b9011367406fafffd2bbd63d5693", INFO, "Node {node} is ready"),
     "node-exited": EventKind("617721968a69470486dcfe591e37fd3c", INFO, "Node {node} exited"),
     "node-crashed": EventKind("c2afc7aa5aac4b8882b951d397ce9297", ERR, "Node {node} crashed"),
@@ -50,18 +42,14 @@ EVENTS = {
         "436622a1703a4db68ed8a1aac4ddc336", WARNING, "Node {node} is being restarted by dora"
     ),
     "node-oom": EventKind("1e5f89981faf4b0ba7cd69e0b844f9a3", ERR, "Node {node} was killed"),
-    "dataflow-oom": EventKind(
-        "074b91207b234b46973343bb14a637a9", ERR, "Dataflow {dataflow} has used up its memory limit"
+    "dataflow-oom": _dataflow(
+        "074b91207b234b46973343bb14a637a9", ERR, "has used up its memory limit"
     ),
-    "memory-pressure": EventKind(
-        "df01123a855d446d8a751cc3e2f99656",
-        WARNING,
-        "Dataflow {dataflow} is close to a memory limit",
+    "memory-pressure": _dataflow(
+        "df01123a855d446d8a751cc3e2f99656", WARNING, "is close to a memory limit"
     ),
-    "cpu-throttled": EventKind(
-        "1c40798a51c14a89a416ed625e0afc1a",
-        NOTICE,
-        "Dataflow {dataflow} is throttled by a CPU limit",
+    "cpu-throttled": _dataflow(
+        "1c40798a51c14a89a416ed625e0afc1a", NOTICE, "is throttled by a CPU limit"
     ),
     "node-hung": EventKind("6bb24464fee34a848c077fc1b20c1802", ERR, "Node {node} hangs"),
     "coordinator-lost": EventKind(
@@ -70,14 +58,10 @@ EVENTS = {
     "daemon-lost": EventKind(
         "4252b5e8e29d4cc4be2e3acdae5f3da4", ERR, "The daemon of dataflow {dataflow} is lost"
     ),
-    "reloaded": EventKind(
-        "6ddc74129bfd4d61bd13747edb506634", NOTICE, "Dataflow {dataflow} was reloaded"
-    ),
+    "reloaded": _dataflow("6ddc74129bfd4d61bd13747edb506634", NOTICE, "was reloaded"),
     "files-changed": EventKind("902dc080ec514a37b5dfa7ecceb95347", INFO, "File changed: {files}"),
     "node-reloaded": EventKind("4c9f8decbcc94dfbb46948d6c865191d", NOTICE, "Node {node} was {how}"),
-    "reload-failed": EventKind(
-        "47ac7b36b7204f468199e716c9176175", WARNING, "Dataflow {dataflow} was not reloaded"
-    ),
+    "reload-failed": _dataflow("47ac7b36b7204f468199e716c9176175", WARNING, "was not reloaded"),
     "lines-lost": EventKind(
         "d880d0e56bbe4318ac5ac2afbb8cb42f",
         WARNING,

@@ -5,7 +5,7 @@ systemd.journal-fields(7)
 """
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 
 MAX_NAME = 64
 _ILLEGAL = re.compile(r"[^A-Z0-9_]+")
@@ -13,33 +13,27 @@ _ILLEGAL = re.compile(r"[^A-Z0-9_]+")
 Value = str | bytes | int
 
 
-def legal_name(name: str, prefix: str = "") -> str:
+def legal_name(name: str, prefix: str) -> str:
     """The journal field name for `name`: upper case, [A-Z0-9_], at most 64 characters.
 
-    journald drops fields whose name begins with an underscore, which are its own, or with a digit.
+    prefix: such as DORA_. journald drops fields whose name begins with an underscore, which are its
+    own, or with a digit.
     """
-    legal = _ILLEGAL.sub("_", name.upper())
-    if prefix:
-        return (prefix + legal)[:MAX_NAME]
-    legal = legal.lstrip("_")
-    if not legal or legal[0].isdigit():
-        legal = "X_" + legal
-    return legal[:MAX_NAME]
+    return (prefix + _ILLEGAL.sub("_", name.upper()))[:MAX_NAME]
 
 
-def encode_field(name: str, value: Value) -> bytes:
+def encode_entry(fields: Mapping[str, Value]) -> bytes:
+    """A complete entry, for one datagram to /run/systemd/journal/socket."""
+    return b"".join(_encode_field(name, value) for name, value in fields.items())
+
+
+def _encode_field(name: str, value: Value) -> bytes:
     """One field; a value with a newline needs the form with a 64-bit little-endian length."""
     data = value if isinstance(value, bytes) else str(value).encode("utf-8", "surrogateescape")
     key = name.encode("ascii")
     if b"\n" in data:
         return key + b"\n" + len(data).to_bytes(8, "little") + data + b"\n"
     return key + b"=" + data + b"\n"
-
-
-def encode_entry(fields: Mapping[str, Value] | Iterable[tuple[str, Value]]) -> bytes:
-    """A complete entry, for one datagram to /run/systemd/journal/socket."""
-    pairs = fields.items() if isinstance(fields, Mapping) else fields
-    return b"".join(encode_field(name, value) for name, value in pairs)
 
 
 class ExportReader:

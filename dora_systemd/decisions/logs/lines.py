@@ -21,7 +21,7 @@ PLAIN_PRIORITY = {"stdout": INFO, "stderr": NOTICE}
 
 _ANSI = re.compile(r"\x1b\[[0-9;]*m")
 _TRACING = re.compile(
-    r"^(?P<time>\d{4}-\d\d-\d\dT\S+Z)\s+(?P<level>ERROR|WARN|INFO|DEBUG|TRACE)\s+(?P<rest>.*)$"
+    r"^(?P<timestamp>\d{4}-\d\d-\d\dT\S+Z)\s+(?P<level>ERROR|WARN)\s+(?P<message>.*)$"
 )
 _TARGET = re.compile(r"(?:^|: )(?P<target>dora_[a-z0-9_]+(?:::[a-z0-9_]+)*): ")
 
@@ -34,30 +34,25 @@ class LineSplitter:
     """Splits bytes into lines. A line above `limit` bytes yields several `Piece`s and the rest.
 
     Removes the newline, and one carriage return before it, as dora does. All other bytes pass
-    unchanged, even NUL.
+    unchanged, even NUL. rest: the bytes after the last newline.
     """
 
     def __init__(self, limit: int = LINE_LIMIT) -> None:
         self.limit = limit
-        self._rest = b""
+        self.rest = b""
 
     def feed(self, data: bytes) -> list[bytes]:
         """The lines that `data` completes."""
-        data = self._rest + data
+        data = self.rest + data
         lines = data.split(b"\n")
-        self._rest = lines.pop()
+        self.rest = lines.pop()
         if len(data) > self.limit:
             lines = [piece for line in lines for piece in self._cut(line)]
-            *pieces, self._rest = self._cut(self._rest)
+            *pieces, self.rest = self._cut(self.rest)
             lines += pieces
         if b"\r\n" in data:
             lines = [line if type(line) is Piece else line.removesuffix(b"\r") for line in lines]
         return lines
-
-    @property
-    def rest(self) -> bytes:
-        """The bytes after the last newline."""
-        return self._rest
 
     def _cut(self, line: bytes) -> list[bytes]:
         cuts = range(0, max(len(line), 1), self.limit)
@@ -67,7 +62,7 @@ class LineSplitter:
 
     def flush(self) -> list[bytes]:
         """The bytes after the last newline, as a `Piece`: call this after the writer has ended."""
-        rest, self._rest = self._rest, b""
+        rest, self.rest = self.rest, b""
         return [Piece(rest)] if rest else []
 
 
@@ -81,15 +76,11 @@ class Origin:
     run: str = ""
     pid: int = 0
 
-    @property
-    def identifier(self) -> str:
-        """SYSLOG_IDENTIFIER, for `journalctl -t`: <name>/<node>, or <name> of the dataflow."""
-        return f"{self.name}/{self.node}" if self.node else self.name
-
     def fields(self) -> dict[str, Value]:
         """The fields that every record of this origin has."""
         fields: dict[str, Value] = {
-            "SYSLOG_IDENTIFIER": self.identifier,
+            # For `journalctl -t`.
+            "SYSLOG_IDENTIFIER": f"{self.name}/{self.node}" if self.node else self.name,
             "DORA_DATAFLOW": self.uuid,
             "DORA_DATAFLOW_NAME": self.name,
             "DORA_NODE": self.node,
@@ -114,12 +105,6 @@ class LineEncoder:
             cut = b"DORA_CUT=1\n" if type(line) is Piece else b""
             return self._constant + cut + encode_entry(fields)
         return (self._piece if type(line) is Piece else self._plain) + line + b"\n"
-
-
-def line_fields(line: bytes, stream: str) -> dict[str, Value]:
-    """The fields from the line itself: level and message, and more for dora's JSON form."""
-    fields = json_fields(line) if line[:1] == b"{" else None
-    return fields or {"PRIORITY": PLAIN_PRIORITY.get(stream, INFO), "MESSAGE": line}
 
 
 def json_fields(line: bytes) -> dict[str, Value] | None:
@@ -197,15 +182,7 @@ def dora_log_fields(line: bytes) -> dict[str, Value] | None:
     Their INFO lines contain the descriptor with its `env:` values, which must not be stored.
     """
     match = _TRACING.match(_ANSI.sub("", line.decode("utf-8", "replace")))
-    if match is None or match["level"] not in ("WARN", "ERROR"):
+    if match is None:
         return None
-    level = match["level"].lower()
-    fields: dict[str, Value] = {
-        "PRIORITY": PRIORITIES[level],
-        "DORA_LEVEL": level,
-        "DORA_TIMESTAMP": match["time"],
-        "MESSAGE": match["rest"],
-    }
-    if target := _TARGET.search(match["rest"]):
-        fields["DORA_TARGET"] = target["target"]
-    return fields
+    target = _TARGET.search(match["message"])
+    return _record_fields({**match.groupdict(), **(target.groupdict() if target else {})})

@@ -4,6 +4,7 @@ journalctl finds, filters and formats records quickly. This module selects exact
 dataflow.
 """
 
+import re
 from dataclasses import dataclass
 
 from dora_systemd.decisions.logs.events import EVENTS
@@ -12,7 +13,6 @@ from dora_systemd.names import SLICE, unit_name
 from dora_systemd.scope import Scope
 
 OUTPUTS = ("short", "short-precise", "json", "cat", "export")
-RUNS = ("CURRENT", "PREVIOUS", "ALL")
 
 # Levels of dora and of syslog(3), with the highest PRIORITY to show.
 LEVELS = {
@@ -22,7 +22,7 @@ LEVELS = {
 
 UNIT_ENDS = ("7ad2d189f7e94e70a38c781354912448", "d9b373ed55a64feb8242e02dbe79a49c")
 
-_UNITS = ("ms", "s", "min", "m", "h", "d", "w")
+_DURATION = re.compile(r"(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:ms|s|min|m|h|d|w)")
 
 
 @dataclass(frozen=True)
@@ -64,9 +64,7 @@ def parse_level(text: str) -> str:
 
 def journal_time(text: str) -> str:
     """A point in time for journalctl; dora's `5m` becomes `-5m`."""
-    number = text.rstrip("abcdefghijklmnopqrstuvwxyz")
-    is_duration = number.replace(".", "", 1).isdigit() and text[len(number) :] in _UNITS
-    return f"-{text}" if is_duration else text
+    return f"-{text}" if _DURATION.fullmatch(text) else text
 
 
 def journal_timestamp(us: int) -> str:
@@ -87,16 +85,15 @@ def query_matches(query: LogQuery) -> list[str]:
     """The matches of a query, see "Matches" in journalctl(1)."""
     # Each match costs journalctl time, and the unit implies the dataflow's name.
     base = scope_matches(query.scope, query.name)
-    for field, value in (
-        ("DORA_DATAFLOW", query.uuid),
-        ("_SYSTEMD_INVOCATION_ID", query.invocation),
-        ("DORA_RUN", query.run),
-    ):
-        if value:
-            base.append(f"{field}={value}")
+    fields = {
+        "DORA_DATAFLOW": query.uuid,
+        "_SYSTEMD_INVOCATION_ID": query.invocation,
+        "DORA_RUN": query.run,
+    }
+    base += [f"{field}={value}" for field, value in fields.items() if value]
     base += [f"DORA_NODE={node}" for node in query.nodes]
     if query.is_events:
-        base += [f"MESSAGE_ID={kind.message_id}" for kind in EVENTS.values()]
+        base += _event_matches()
     return _with_level(base, query.level)
 
 
@@ -105,22 +102,27 @@ def end_matches(scope: Scope, name: str) -> list[str]:
 
     7ad2... SD_MESSAGE_UNIT_SUCCESS and d9b3... SD_MESSAGE_UNIT_FAILURE_RESULT, see sd-messages.h.
     """
+    return [*_systemd_matches(scope, name), *(f"MESSAGE_ID={one}" for one in UNIT_ENDS)]
+
+
+def _systemd_matches(scope: Scope, name: str) -> list[str]:
     unit = unit_name(name)
-    who = (
-        [f"USER_UNIT={unit}", f"_UID={scope.uid}"] if scope.is_user else [f"UNIT={unit}", "_PID=1"]
-    )
-    return [*who, *(f"MESSAGE_ID={message_id}" for message_id in UNIT_ENDS)]
+    if scope.is_user:
+        return [f"USER_UNIT={unit}", f"_UID={scope.uid}"]
+    return [f"UNIT={unit}", "_PID=1"]
 
 
 def story_matches(scope: Scope, name: str, uuid: str) -> list[str]:
     """Matches for life events, systemd's records of the unit, and stop requests."""
-    own = [*scope_matches(scope, name), f"DORA_DATAFLOW={uuid}"]
-    events = [f"MESSAGE_ID={kind.message_id}" for kind in EVENTS.values()]
-    unit = unit_name(name)
-    who = f"_UID={scope.uid}" if scope.is_user else "_UID=0"
-    systemd = [f"USER_UNIT={unit}", who] if scope.is_user else [f"UNIT={unit}", "_PID=1"]
-    asked = [f"DORA_DATAFLOW={uuid}", "DORA_EVENT=stop-asked", who]
-    return [*own, *events, "+", *systemd, "+", *asked]
+    dataflow = f"DORA_DATAFLOW={uuid}"
+    own = [*scope_matches(scope, name), dataflow, *_event_matches()]
+    who = f"_UID={scope.uid if scope.is_user else 0}"
+    asked = [dataflow, "DORA_EVENT=stop-asked", who]
+    return [*own, "+", *_systemd_matches(scope, name), "+", *asked]
+
+
+def _event_matches() -> list[str]:
+    return [f"MESSAGE_ID={kind.message_id}" for kind in EVENTS.values()]
 
 
 def _with_level(base: list[str], level: str) -> list[str]:
@@ -137,20 +139,18 @@ def query_arguments(query: LogQuery) -> list[str]:
     options = [f"--output={query.output}"]
     if query.output not in ("short", "short-precise") or query.cursor_file:
         options.append("--quiet")  # no line between two boots
-    for option, value in (
-        ("--since", journal_time(query.since)),
-        ("--until", journal_time(query.until)),
-        ("--grep", query.grep),
-        ("--lines", "" if query.tail is None else str(query.tail)),
-        ("--cursor-file", query.cursor_file),
-    ):
-        if value:
-            options.append(f"{option}={value}")
-    for flag, is_set in (
-        ("--follow", query.is_follow),
-        ("--reverse", query.is_reverse),
-        ("--all", query.want_unprintable),
-    ):
-        if is_set:
-            options.append(flag)
+    values = {
+        "--since": journal_time(query.since),
+        "--until": journal_time(query.until),
+        "--grep": query.grep,
+        "--lines": "" if query.tail is None else str(query.tail),
+        "--cursor-file": query.cursor_file,
+    }
+    flags = {
+        "--follow": query.is_follow,
+        "--reverse": query.is_reverse,
+        "--all": query.want_unprintable,
+    }
+    options += [f"{option}={value}" for option, value in values.items() if value]
+    options += [flag for flag, is_set in flags.items() if is_set]
     return [*options, "--", *query_matches(query)]

@@ -45,15 +45,12 @@ class TerminalLines:
         self._want_dataflow = want_dataflow
         self._want_colors = want_colors
         self._labels: dict[bytes, bytes] = {}
-        self._rest = b""
+        self._whole = ShownLines()
         self._old_indent = self._new_indent = 0
 
     def feed(self, data: bytes) -> bytes:
         """The lines that `data` completes, rewritten."""
-        data = self._rest + data
-        end = data.rfind(b"\n") + 1
-        self._rest = data[end:]
-        return _PREFIX.sub(self._rewrite, shown_log(data[:end]))
+        return _PREFIX.sub(self._rewrite, self._whole.feed(data))
 
     def record(self, record: Mapping[str, bytes]) -> bytes:
         """The lines of one record of the Journal Export Format."""
@@ -80,9 +77,7 @@ class TerminalLines:
         name = node
         if self._want_dataflow or not node:
             name = dataflow + (b"/" + node if node else b"")
-        label = self._labels.get(name)
-        if label is None:
-            label = self._label(name)
+        label = self._labels.get(name) or self._label(name)
         self._new_indent = len(when) + self._width + 2
         return b"%s %s " % (when, label)
 

@@ -6,12 +6,11 @@ the two requests.
 """
 
 import asyncio
-import os
 import time
 from collections.abc import AsyncIterator, Iterator, Sequence
 
 from dora_systemd.adapters.bus.systemd import Bus
-from dora_systemd.adapters.journal.reader import JournalReader, end_journalctl, open_journalctl
+from dora_systemd.adapters.journal.reader import JournalReader, journal_output, open_journalctl
 from dora_systemd.adapters.journal.stream import open_stream
 from dora_systemd.decisions.gateway.answers import (
     LOG_FIELDS,
@@ -101,11 +100,8 @@ def _check_node(scope: Scope, uuid: str, name: str, node: str) -> None:
 
 def _records(arguments: Sequence[str]) -> Iterator[Record]:
     reader = ExportReader()
-    with open_journalctl(arguments) as child:
-        assert child.stdout
-        while data := os.read(child.stdout.fileno(), _CHUNK):
-            yield from reader.feed(data)
-        end_journalctl(child)
+    for data in journal_output(arguments):
+        yield from reader.feed(data)
 
 
 async def subscribe_logs(talk: Talk, request: Request) -> Result:

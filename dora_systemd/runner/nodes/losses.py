@@ -66,7 +66,11 @@ class LossWatch:
         until = self._now_us()
         self._stored += await asyncio.to_thread(self._count, self._since, until - 1)
         self._since, self._seen = until, sent
-        self._tell(sent - self._base - self._stored, tolerance)
+        lost = sent - self._base - self._stored
+        if lost - self._lost > tolerance:
+            self._report(lost - self._lost)
+            self._lost = lost
+        self._is_open = lost > self._lost
 
     async def finish(self) -> None:
         """The last check, after everything has been sent: without a tolerance."""
@@ -75,12 +79,6 @@ class LossWatch:
         await asyncio.sleep(_SETTLE_SECONDS)
         self._is_open = True
         await self.check(tolerance=0)
-
-    def _tell(self, lost: int, tolerance: int) -> None:
-        if lost - self._lost > tolerance:
-            self._report(lost - self._lost)
-            self._lost = lost
-        self._is_open = lost > self._lost
 
 
 def losses_of_user(journal: JournalSocket, pipes: LogPipes) -> LossWatch | None:

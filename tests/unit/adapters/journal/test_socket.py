@@ -183,3 +183,27 @@ def test_waits_until_what_was_sent_is_read(journal: JournalSocket, journald: Jou
     journal.wait_read(10)
     assert time.monotonic() - begun < 9
     reader.join()
+
+
+def test_the_callback_comes_each_time(journal: JournalSocket, journald: Journald) -> None:
+    """Until nothing is refused any more: it is given once."""
+
+    async def scenario() -> None:
+        calls: list[int] = []
+
+        def again() -> None:
+            calls.append(len(fill(journal)) if len(calls) < 3 else 0)
+
+        journal.call_when_ready(asyncio.get_running_loop(), again)
+        await asyncio.sleep(0.01)
+        assert not calls, "nothing is refused yet"
+        fill(journal)
+        async with asyncio.timeout(60):
+            while len(calls) < 4:
+                journald.all()
+                await asyncio.sleep(0)
+        journald.all()
+        await asyncio.sleep(0.01)
+        assert len(calls) == 4
+
+    asyncio.run(scenario())

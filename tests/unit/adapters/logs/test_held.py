@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import select
 import tempfile
 from pathlib import Path
 
@@ -103,6 +104,23 @@ def test_parts_of_a_huge_line(fifo: Path) -> None:
     assert [len(piece) for piece in found] == [LINE_LIMIT, LINE_LIMIT, 40963]
 
 
+def test_a_prompt_that_has_no_newline(tmp_path: Path) -> None:
+    """It has left the pipe, where it would keep the runner busy, and journald does not have it."""
+    fifo = tmp_path / "a.out"
+    os.mkfifo(fifo)
+    journal = SlowJournal()
+    journal.room = 1 << 30
+    runner = Runner(fifo, journal)
+    runner.pipes.adopt("a", "stdout", runner.fd, HeldLines(fifo))
+    os.write(runner.fd, b"ready\nEnter a number: ")
+    runner.turn()
+    readable, _, _ = select.select([runner.fd], [], [], 0)
+    assert not readable
+    runner.kill()
+    assert messages(journal) == [b"ready"]
+    assert replayed(fifo) == [b"Enter a number: "]
+
+
 def test_no_file_and_a_torn_one(tmp_path: Path) -> None:
     fifo = tmp_path / "a.out"
     assert read_held(fifo) == (b"", 0)
@@ -142,6 +160,6 @@ def test_a_full_disk_is_no_reason_to_stop(fifo: Path) -> None:
     assert held.take(fd, 100) == b"line\n"
     held.add(b"\n")
     held.sent(1)
-    assert held.restart(b"rest")
+    held.sent_all(1, b"rest")
     assert read_held(fifo) == (b"rest", 0)
     held.close()

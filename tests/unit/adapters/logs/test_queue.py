@@ -17,10 +17,12 @@ class SlowJournal:
     def __init__(self) -> None:
         self.room = 0
         self.taken: list[bytes] = []
+        self.refused = False
         self.callback: Callable[[], None] | None = None
 
     def send(self, entry: bytes) -> bool:
         if not self.room:
+            self.refused = True
             return False
         self.room -= 1
         self.taken.append(entry)
@@ -36,9 +38,9 @@ class SlowJournal:
 
     def make_room(self, room: int) -> None:
         self.room = room
-        if (callback := self.callback) is not None:
-            self.callback = None
-            callback()
+        if self.refused and self.callback:
+            self.refused = False
+            self.callback()
 
 
 class Case:

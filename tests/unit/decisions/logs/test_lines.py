@@ -6,7 +6,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dora_systemd.decisions.logs.fields import encode_entry
 from dora_systemd.decisions.logs.lines import (
     LineEncoder,
     LineSplitter,
@@ -14,7 +13,6 @@ from dora_systemd.decisions.logs.lines import (
     Piece,
     dora_log_fields,
     json_fields,
-    line_fields,
 )
 
 ORIGIN = Origin("robot", "550e8400-e29b-41d4-a716-446655440000", "camera", "run1", 42)
@@ -104,7 +102,7 @@ def test_line_of_node_log() -> None:
         rb'"message":"hello \u00e4\nsecond","target":"my.t","file":"a.py","line":7,'
         rb'"fields":{"a":"1","b c":{"x":[2]}}}'
     )
-    assert line_fields(line, "stdout") == {
+    assert json_fields(line) == {
         "PRIORITY": 4,
         "DORA_LEVEL": "warn",
         "DORA_TIMESTAMP": "2026-11-21T00:43:18.648985609+00:00",
@@ -148,7 +146,9 @@ def test_line_of_rust_tracing() -> None:
     ],
 )
 def test_not_in_dora_form_is_plain(line: bytes) -> None:
-    assert line_fields(line, "stderr") == {"PRIORITY": 5, "MESSAGE": line}
+    assert json_fields(line) is None
+    entry = LineEncoder(ORIGIN, "stderr").entry(line)
+    assert entry.endswith(b"\nDORA_STREAM=stderr\nPRIORITY=5\nMESSAGE=" + line + b"\n")
 
 
 def test_half_a_surrogate_pair_is_no_error() -> None:
@@ -172,7 +172,7 @@ def test_many_fields_stay_below_the_limit_of_journald() -> None:
 @given(st.binary(max_size=200))
 def test_no_line_is_an_error(line: bytes) -> None:
     for data in (line, b'{"level":"info","timestamp":"t",' + line):
-        assert encode_entry(line_fields(data, "stdout")).endswith(b"\n")
+        assert LineEncoder(ORIGIN, "stdout").entry(data).endswith(b"\n")
 
 
 @pytest.mark.parametrize(
