@@ -94,6 +94,19 @@ def parse_policy(text: str) -> RestartPolicy:
     )
 
 
+def format_node_policy(of_node: tuple[str, RestartPolicy]) -> str:
+    """The policy of one node in the runner's command line, NODE:POLICY."""
+    node, policy = of_node
+    return f"{node}:{format_policy(policy)}"
+
+
+def parse_node_policy(text: str) -> tuple[str, RestartPolicy]:
+    """The exact inverse of format_node_policy. Raises DoraSystemdError (USAGE)."""
+    # Policies contain no colon, but node ids may contain one.
+    node, _, policy = text.rpartition(":")
+    return node, parse_policy(policy)
+
+
 def parse_count(text: str) -> int:
     """A number of restarts, or INFINITY. Raises DoraSystemdError (USAGE)."""
     if text.strip() == "infinity":
