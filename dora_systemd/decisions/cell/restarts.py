@@ -7,6 +7,7 @@ systemd.service(5), systemd.unit(5) and dora's descriptor.
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+from dora_systemd.decisions.cell.limits import format_number
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.suggestions import missing_node
 from dora_systemd.values import (
@@ -74,7 +75,7 @@ _KEYS = ("policy", "max", "window", "delay", "max-delay")
 
 def format_policy(policy: RestartPolicy) -> str:
     """The policy in the runner's command line, such as `on-failure,max=5,window=10min,...`."""
-    maximum = "infinity" if policy.max_restarts == INFINITY else str(policy.max_restarts)
+    maximum = format_number(policy.max_restarts)
     times = (format_duration(one) for one in (policy.window, policy.delay, policy.max_delay))
     pairs = zip(_KEYS[1:], (maximum, *times), strict=True)
     return ",".join([policy.policy, *(f"{key}={text}" for key, text in pairs)])
