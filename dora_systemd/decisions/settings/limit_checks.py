@@ -3,17 +3,8 @@
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
-from dora_systemd.decisions.cell.limits import (
-    BY_KEY,
-    BY_WORD,
-    LIMITS,
-    NodeLimits,
-    merge_node_limits,
-    node_limits,
-)
+from dora_systemd.decisions.cell.limits import BY_WORD, LIMITS, NodeLimits
 from dora_systemd.decisions.properties.assignments import Properties
-from dora_systemd.decisions.settings.limits import NODE_LIMIT
-from dora_systemd.decisions.settings.resolve import Settings
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import INFINITY, SECOND, format_rounded_size
 
@@ -35,18 +26,6 @@ class Machine:
     memory: int
     cores: int
     tasks: int
-
-
-def settings_node_limits(settings: Settings) -> tuple[NodeLimits, ...]:
-    """The limits of all nodes: those of settings files, overridden by `node_limit`."""
-    given = settings[NODE_LIMIT]
-    return merge_node_limits(_of_files(settings), given)
-
-
-def _of_files(settings: Settings) -> Iterator[NodeLimits]:
-    for node, values in settings.nodes.items():
-        limits = {BY_KEY[key].word: value for key, value in values.items() if key in BY_KEY}
-        yield node_limits(node, limits)
 
 
 def needed_controllers(properties: Properties, nodes: Iterable[NodeLimits]) -> dict[str, str]:

@@ -44,6 +44,15 @@ class Settings:
         """The source of the value of `setting`, for messages and `show`."""
         return self.sources[setting.name]
 
+    def is_given(self, setting: Setting[Any]) -> bool:
+        """Whether anything but the default gives a value for `setting`."""
+        return self.sources[setting.name] != DEFAULT_SOURCE
+
+    def by_node(self, setting: Setting[T]) -> dict[str, T]:
+        """The values of `setting` for single nodes, by node id."""
+        name = setting.name
+        return {node: values[name] for node, values in self.nodes.items() if name in values}
+
 
 def resolve_settings(
     flags: Mapping[str, object],
