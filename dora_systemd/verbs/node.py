@@ -21,7 +21,7 @@ from dora_systemd.trust.sockets import plain, require_listener
 from dora_systemd.trust.terminals import run_apart
 from dora_systemd.values import quoted
 from dora_systemd.verbs.facts.cells import Cell, not_found
-from dora_systemd.verbs.facts.list import read_status
+from dora_systemd.verbs.facts.reading import read_status
 
 _NO_USER = 2**32 - 1
 """UID of a unit without User=: it runs as the manager's own user."""

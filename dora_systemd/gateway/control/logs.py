@@ -31,7 +31,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.suggestions import did_you_mean
 from dora_systemd.values import quoted
 from dora_systemd.verbs.facts.cells import find_cell
-from dora_systemd.verbs.facts.list import read_status
+from dora_systemd.verbs.facts.reading import read_status
 from dora_systemd.verbs.follow import is_unit_up
 
 _CHUNK = 1 << 18

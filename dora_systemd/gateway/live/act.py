@@ -11,7 +11,7 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
 from dora_systemd.trust.files import read_file
 from dora_systemd.verbs.facts.cells import Cell, find_cell
-from dora_systemd.verbs.facts.list import read_status
+from dora_systemd.verbs.facts.reading import read_status
 from dora_systemd.verbs.node import ask_coordinator, restart_node, stop_node
 from dora_systemd.verbs.stop import note_stop, restart_cells, stop_cells
 
