@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dora_systemd.decisions.life.causes import signal_name
+
 if TYPE_CHECKING:
     import asyncio
 
@@ -104,9 +106,4 @@ def watch(
 
 def format_exit(status: int) -> str:
     """An exit status of subprocess in systemd's terms: "exit code 1", "signal SIGKILL"."""
-    if status >= 0:
-        return f"exit code {status}"
-    try:
-        return f"signal {signal.Signals(-status).name}"
-    except ValueError:
-        return f"signal {-status}"
+    return f"exit code {status}" if status >= 0 else f"signal {signal_name(-status)}"

@@ -7,17 +7,17 @@ documents some of them.
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 from uuid import uuid4
 
-from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import signal_name
-from dora_systemd.decisions.resources.oom import Oom
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.values import INFINITY, SECOND
 
 Params = str | Mapping[str, Any]
+
+_ENDED_ALREADY = re.compile(r"unknown dataflow\b")
 
 
 @dataclass(frozen=True)
@@ -160,7 +160,6 @@ def reload_params(run: str, node: str, operator: str) -> Params:
 
 DAEMON_CONNECTED: Params = "DaemonConnected"
 CONNECTED_DAEMONS: Params = "ConnectedMachines"
-HELLO: Params = {"Hello": {"dora_version": "1.0.0"}}
 
 
 def parse_heartbeat(reply: Reply) -> int:
@@ -209,82 +208,24 @@ def _failure(verdict: Any) -> str:
     cause = _mapping(error.get("cause"))
     if "FailedToSpawn" in cause:
         return f"failed to spawn: {first_line(str(cause['FailedToSpawn']))}"
-    ended = _exit_status(_mapping(error.get("exit_status")))
+    status = _mapping(error.get("exit_status"))
+    ended = exit_text(*next(iter(status.items()), ("", None)))
     if "Cascading" in cause:
         by = _mapping(cause["Cascading"]).get("caused_by_node")
         return f"{ended} because node {by} failed"
     return f"{ended} after the grace duration" if error.get("cause") == "GraceDuration" else ended
 
 
-def _exit_status(status: dict[str, Any]) -> str:
-    if "ExitCode" in status:
-        return f"exit code {status['ExitCode']}"
-    number = status.get("Signal")
-    return f"signal {signal_name(number)}" if isinstance(number, int) else "unknown exit status"
+def exit_text(kind: str, number: object) -> str:
+    """How a process ended, from the name of dora's exit status and its number; "" for success."""
+    if kind == "ExitCode" and isinstance(number, int):
+        return f"exit code {number}"
+    if kind == "Signal" and isinstance(number, int):
+        return f"signal {signal_name(number)}"
+    return "" if kind == "Success" else "unknown exit status"
 
 
 def first_line(text: str) -> str:
     """An error of dora without the location and backtrace after it."""
     head = re.split(r"\n\s*\n?(?:Location|Stack backtrace|Suggestion)\b", text, maxsplit=1)[0]
     return " ".join(head.split())
-
-
-_ENDED_ALREADY = re.compile(r"unknown dataflow\b")
-_SPAWNED = re.compile(r"spawned node with pid (\d+)")
-_EXITED = re.compile(
-    r"handling node stop with exit status (\w+)(?:\((-?\d+)\))? \(restart: (true|false)"
-)
-_CASCADED = re.compile(r"marking `(.+)` as cascading error caused by `(.+)`")
-
-
-def parse_life_event(record: LogRecord, at_us: int) -> life.Event | None:
-    """The life event that a line of dora's own means; None for other lines.
-
-    Nodes cannot forge one: lines that they print have the level "stdout" or another target.
-    """
-    if record.target == "coordinator":
-        return life.RunFinished(at_us) if record.message == "dataflow finished" else None
-    if record.node:
-        return _node_event(record, at_us) if record.target in ("daemon", "spawner") else None
-    if record.target == "daemon" and record.message.endswith("starting dataflow"):
-        return life.AllReady(at_us)
-    return None
-
-
-def _node_event(record: LogRecord, at_us: int) -> life.Event | None:
-    if record.message == "node is ready":
-        return life.NodeReady(at_us, record.node)
-    if spawned := _SPAWNED.fullmatch(record.message):
-        return life.NodeSpawned(at_us, record.node, int(spawned[1]))
-    if exited := _EXITED.match(record.message):
-        how = _exit_text(exited[1], exited[2])
-        return life.NodeExited(at_us, record.node, how, exited[3] == "true")
-    if cascaded := _CASCADED.match(record.message):
-        return life.NodeCascaded(at_us, cascaded[1], cascaded[2])
-    return None
-
-
-def _exit_text(kind: str, number: str | None) -> str:
-    if kind == "Success":
-        return ""
-    if kind == "Signal" and number:
-        return f"signal {signal_name(int(number))}"
-    return f"exit code {number}" if kind == "ExitCode" and number else "unknown exit status"
-
-
-_UNRESPONSIVE = re.compile(r"node `([^`]+)` (unresponsive for \d+ms \(timeout: [^)]*\)), killing")
-
-
-def parse_daemon_line(line: str, at_us: int) -> life.Event | None:
-    """The event of a line printed by the daemon: dora reports hung nodes only there."""
-    match = _UNRESPONSIVE.search(line)
-    return life.NodeHung(at_us, match[1], match[2]) if match else None
-
-
-def with_facts(event: life.NodeExited, is_stale: bool, oom: Oom | None) -> life.NodeExited:
-    """The event with facts that only the runner knows.
-
-    is_stale: whether the node's current process is alive. oom: the OOM kill that ended it.
-    """
-    how = event.exit if oom is None or not event.exit else oom.text
-    return replace(event, exit=how, is_stale=is_stale, oom=oom if event.exit else None)
