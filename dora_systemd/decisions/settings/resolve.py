@@ -6,7 +6,7 @@ from functools import reduce
 from pathlib import PurePath
 from typing import Any, TypeVar, cast
 
-from dora_systemd.decisions.descriptor.json_size import check_json
+from dora_systemd.decisions.descriptor.json_size import check_json, refusal
 from dora_systemd.decisions.settings.kinds import Base, Setting
 from dora_systemd.decisions.settings.table import SETTINGS
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -96,8 +96,7 @@ def check_document(
         return {}
     if not isinstance(document, dict):
         hint = "a settings file is a mapping, KEY: VALUE"
-        message = f"cannot use {shown(source)}: it is not a mapping"
-        raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+        raise refusal(source, "it is not a mapping", hint)
     check_json(document, source, MAX_JSON)
     try:
         settings_model(table).model_validate(document)
