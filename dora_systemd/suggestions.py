@@ -6,15 +6,17 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import quoted
 
 
-def missing_node(problem: str, node: str, nodes: Iterable[str]) -> DoraSystemdError:
-    """The error (BAD_INPUT) for a setting of a node that is not in `nodes`.
+def check_known(problem: str, named: Iterable[str], nodes: Iterable[str]) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) for the first of `named` that is not in `nodes`.
 
     problem: the text before "the node", such as "cannot limit".
     """
     known = list(nodes)
-    message = f"{problem} the node {quoted(node)}: no such node"
-    hint = did_you_mean(node, known) or f"nodes: {', '.join(known)}"
-    return DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+    for node in named:
+        if node not in known:
+            message = f"{problem} the node {quoted(node)}: no such node"
+            hint = did_you_mean(node, known) or f"nodes: {', '.join(known)}"
+            raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

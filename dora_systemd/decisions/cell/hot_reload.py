@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from dora_systemd.decisions.cell.limits import NodeLimits
-from dora_systemd.suggestions import missing_node
+from dora_systemd.suggestions import check_known
 
 START_FIRST = "start-first"
 REPLACE_WORDS = ("stop-first", START_FIRST)
@@ -61,6 +61,5 @@ def parse_of_node(text: str) -> tuple[str, str]:
 
 def check_reload_nodes(reload: HotReload, nodes: Sequence[str]) -> None:
     """Raise DoraSystemdError (BAD_INPUT) for a node that is not in `nodes`."""
-    for node in (*dict(reload.node_watch), *filter(None, dict(reload.replace))):
-        if node not in nodes:
-            raise missing_node("cannot watch files of", node, nodes)
+    named = (*dict(reload.node_watch), *filter(None, dict(reload.replace)))
+    check_known("cannot watch files of", named, nodes)

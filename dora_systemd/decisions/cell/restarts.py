@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from dora_systemd.decisions.cell.limits import format_number
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.suggestions import missing_node
+from dora_systemd.suggestions import check_known
 from dora_systemd.values import (
     INFINITY,
     SECOND,
@@ -19,7 +19,6 @@ from dora_systemd.values import (
 )
 
 POLICIES = ("no", "on-failure", "always")
-_DORA_POLICIES = {"no": "never", "on-failure": "on-failure", "always": "always"}
 
 MIN_DELAY = SECOND // 2
 """µs. dora's default is 0, and restarted a node that cannot start 37 times a second."""
@@ -47,7 +46,7 @@ class RestartPolicy(NamedTuple):
         is_endless = self.max_restarts == INFINITY
         window = {} if self.window == INFINITY else {"restart_window": self.window / SECOND}
         return {
-            "restart_policy": _DORA_POLICIES[self.policy],
+            "restart_policy": self.policy,
             "max_restarts": 0 if is_endless else self.max_restarts,
             "restart_delay": self.delay / SECOND,
             "max_restart_delay": self.max_delay / SECOND,
@@ -85,7 +84,7 @@ def parse_policy(text: str) -> RestartPolicy:
     """The exact inverse of format_policy. Raises DoraSystemdError (USAGE)."""
     word, *pairs = text.split(",")
     given = dict(pair.split("=", 1) for pair in pairs if "=" in pair)
-    if word not in POLICIES or set(given) != set(_KEYS[1:]):
+    if word not in POLICIES or given.keys() != set(_KEYS[1:]):
         message = f"cannot use {quoted(text)} as restart policy"
         raise DoraSystemdError(message, f"valid values: {', '.join(POLICIES)}", ExitCode.USAGE)
     return RestartPolicy(
@@ -141,9 +140,7 @@ def check_restart_nodes(
     policies: Iterable[tuple[str, RestartPolicy]], nodes: Sequence[str]
 ) -> None:
     """Raise DoraSystemdError (BAD_INPUT) for the policy of a node that is not in `nodes`."""
-    for node, _ in policies:
-        if node not in nodes:
-            raise missing_node("cannot set the restart policy of", node, nodes)
+    check_known("cannot set the restart policy of", dict(policies), nodes)
 
 
 def budget_words(budget: Mapping[str, int | None]) -> str:

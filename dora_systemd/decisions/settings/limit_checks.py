@@ -9,7 +9,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import INFINITY, SECOND, format_rounded_size
 
 _CONTROLLERS = {
-    **{limit.property: limit.controller for limit in LIMITS},
+    **{limit.property: limit.controller() for limit in LIMITS},
     **dict.fromkeys(("StartupCPUWeight",), "cpu"),
     **dict.fromkeys(("MemoryMin", "MemoryLow", "MemoryZSwapMax"), "memory"),
     **dict.fromkeys(("StartupIOWeight", "IODeviceWeight", "IODeviceLatencyTargetSec"), "io"),
@@ -38,7 +38,7 @@ def needed_controllers(properties: Properties, nodes: Iterable[NodeLimits]) -> d
     for one in nodes:
         for word, value in one.limits:
             if value != INFINITY:
-                needed.setdefault(BY_WORD[word].controller, f"{word} of the node {one.node}")
+                needed.setdefault(BY_WORD[word].controller(), f"{word} of the node {one.node}")
     return needed
 
 

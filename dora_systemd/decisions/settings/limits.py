@@ -41,13 +41,13 @@ _HELPS = {
 def _limit_setting(key: str, help_text: str) -> Setting[int | None]:
     limit = BY_KEY[key]
     is_weight = key.endswith("weight")
-    expected = "a weight from 1 to 10000" if is_weight else _EXPECTED[limit.controller]
+    expected = "a weight from 1 to 10000" if is_weight else _EXPECTED[limit.controller()]
     return Setting(
         key,
         one_text(str | int | float, expected, limit.parse, limit.format),
         None,
         help_text,
-        metavar="WEIGHT" if is_weight else _METAVARS[limit.controller],
+        metavar="WEIGHT" if is_weight else _METAVARS[limit.controller()],
         per_node=True,
         property=limit.property,
         # A higher weight takes resources from all others on the machine.
