@@ -38,6 +38,7 @@ class Kind(Generic[T]):
     is_flag: `--x` and `--no-x` without a value.
     is_repeatable: the flag may be given more than once.
     merge: joins the values of two sources, higher precedence last; None: only the latter counts.
+    metavar: the value in --help, such as TIME; a setting may have a better one.
     """
 
     schema: Any
@@ -47,6 +48,7 @@ class Kind(Generic[T]):
     is_flag: bool = False
     is_repeatable: bool = False
     merge: Callable[[T, T], T] | None = None
+    metavar: str = ""
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,7 @@ class Setting(Generic[T]):
         variable = "" if self.kind.is_repeatable else f"DORA_{self.name.upper()}"
         object.__setattr__(self, "flags", self.flags or (f"--{word}",))
         object.__setattr__(self, "variable", self.variable or variable)
+        object.__setattr__(self, "metavar", self.metavar or self.kind.metavar)
 
 
 def scalar_text(value: Scalar) -> str:
@@ -99,16 +102,25 @@ def texts_of(value: Any) -> list[str]:
 
 
 def one_text(
-    schema: Any, expected: str, parse: Callable[[str], T], to_text: Callable[[T], str] = str
+    schema: Any,
+    expected: str,
+    metavar: str,
+    parse: Callable[[str], T],
+    to_text: Callable[[T], str] = str,
 ) -> Kind[T]:
     """A kind with one text for each value, which means the same in every directory."""
     return Kind(
-        schema, expected, lambda value, _: parse(scalar_text(value)), lambda value: [to_text(value)]
+        schema,
+        expected,
+        lambda value, _: parse(scalar_text(value)),
+        lambda value: [to_text(value)],
+        metavar=metavar,
     )
 
 
 def many_texts(
     expected: str,
+    metavar: str,
     parse: Callable[[list[str]], T],
     to_texts: Callable[[T], Sequence[str]],
     merge: Callable[[T, T], T] | None = None,
@@ -121,6 +133,7 @@ def many_texts(
         to_texts,
         is_repeatable=True,
         merge=merge,
+        metavar=metavar,
     )
 
 
@@ -164,11 +177,13 @@ def _property_text(value: Scalar) -> str:
     return format_bool(value) if isinstance(value, bool) else str(value)
 
 
-TEXT = one_text(Scalar, "a text", _checked_text)
+TEXT = one_text(Scalar, "a text", "TEXT", _checked_text)
 PATH = Kind[str](str, "a path", _parse_path, lambda value: [value])
-PROGRAM = Kind[str](str, "a program", _parse_program, lambda value: [value])
-BOOL = replace(one_text(bool | str, "yes or no", parse_bool, format_bool), is_flag=True)
-DURATION = one_text(str | int | float, "a time span such as 10s", parse_duration, format_duration)
+PROGRAM = Kind[str](str, "a program", _parse_program, lambda value: [value], metavar="FILE")
+BOOL = replace(one_text(bool | str, "yes or no", "", parse_bool, format_bool), is_flag=True)
+DURATION = one_text(
+    str | int | float, "a time span such as 10s", "TIME", parse_duration, format_duration
+)
 PATHS = Kind[tuple[str, ...]](
     str | list[str], "a path or a list of paths", _parse_paths, list, is_repeatable=True, merge=add
 )
@@ -179,6 +194,7 @@ ENVIRONMENT = Kind[Mapping[str, str]](
     environment_entries,
     is_repeatable=True,
     merge=or_,
+    metavar="KEY=VALUE",
 )
 PROPERTIES = Kind[tuple[str, ...]](
     dict[str, Scalar | list[Scalar]] | list[str],
@@ -187,5 +203,8 @@ PROPERTIES = Kind[tuple[str, ...]](
     list,
     is_repeatable=True,
     merge=add,
+    metavar="KEY=VALUE",
 )
-LINE_RATES = many_texts("LINES/TIME such as 1000/1s", parse_rates, format_rates, or_)
+LINE_RATES = many_texts(
+    "LINES/TIME such as 1000/1s", "[NODE=]LINES/TIME", parse_rates, format_rates, or_
+)

@@ -22,11 +22,11 @@ _LOWEST_NICE, _HIGHEST_NICE = -20, 19
 _DEFAULT_ACCESS = "rw"
 
 _EXPECTED = {
-    "memory": "a size such as 512M or 4G",
-    "cpu": "cores such as 1.5, or a share of one such as 150%",
-    "pids": "a number of tasks",
+    "memory": ("a size such as 512M or 4G", "SIZE"),
+    "cpu": ("cores such as 1.5, or a share of one such as 150%", "CORES"),
+    "pids": ("a number of tasks", "N"),
+    "weight": ("a weight from 1 to 10000", "WEIGHT"),
 }
-_METAVARS = {"memory": "SIZE", "cpu": "CORES", "pids": "N"}
 _HELPS = {
     "cpu_limit": "CPU time that all nodes together may use, in cores.",
     "memory_limit": "Memory that all nodes together may use; beyond it a node is killed.",
@@ -41,13 +41,12 @@ _HELPS = {
 def _limit_setting(key: str, help_text: str) -> Setting[int | None]:
     limit = BY_KEY[key]
     is_weight = key.endswith("weight")
-    expected = "a weight from 1 to 10000" if is_weight else _EXPECTED[limit.controller()]
+    words = _EXPECTED["weight" if is_weight else limit.controller()]
     return Setting(
         key,
-        one_text(str | int | float, expected, limit.parse, limit.format),
+        one_text(str | int | float, *words, limit.parse, limit.format),
         None,
         help_text,
-        metavar="WEIGHT" if is_weight else _METAVARS[limit.controller()],
         per_node=True,
         property=limit.property,
         # A higher weight takes resources from all others on the machine.
@@ -87,42 +86,40 @@ NODE_LIMIT = Setting[tuple[NodeLimits, ...]](
     "node_limit",
     many_texts(
         "NODE:memory=1G,cpu=1.5 or a list of such texts",
+        "NODE:LIMIT=VALUE,...",
         lambda texts: merge_node_limits(map(parse_node_limits, texts)),
         lambda limits: list(map(format_node_limits, limits)),
         merge_node_limits,
     ),
     (),
     f"Limits of one node: {', '.join(limit.word for limit in LIMITS)}.",
-    metavar="NODE:LIMIT=VALUE,...",
 )
 NICE = Setting[int | None](
     "nice",
-    one_text(int | str, "a number from -20 to 19", _parse_nice),
+    one_text(int | str, "a number from -20 to 19", "N", _parse_nice),
     None,
     "Nice value of all processes, see nice(1).",
-    metavar="N",
     property="Nice",
     root_only=True,
 )
 REALTIME = Setting[str | None](
     "realtime",
-    one_text(int | str, "a priority such as 20 or fifo:20", _parse_realtime),
+    one_text(int | str, "a priority such as 20 or fifo:20", "[rr:|fifo:]PRIORITY", _parse_realtime),
     None,
     "Realtime scheduling of all processes with this priority, 1 to 99; see sched(7).",
-    metavar="[rr:|fifo:]PRIORITY",
     root_only=True,
 )
 DEVICE = Setting[tuple[str, ...]](
     "device",
     many_texts(
         "a path below /dev or a list of them",
+        "PATH[:r|w|rw]",
         lambda texts: tuple(map(_parse_device, texts)),
         list,
         add,
     ),
     (),
     "Device that the nodes may use; all other devices are then blocked.",
-    metavar="PATH[:r|w|rw]",
     property="DeviceAllow",
 )
 LIVE_SETTINGS: tuple[Setting[Any], ...] = (

@@ -16,7 +16,9 @@ def _parse_replace(text: str) -> str:
     return text
 
 
-PATTERNS = many_texts("a pattern such as *.py or a list of them", parse_patterns, list)
+PATTERNS = many_texts(
+    "a pattern such as *.py or a list of them", "PATTERN,...", parse_patterns, list
+)
 
 HOT_RELOAD = Setting[bool]("hot_reload", BOOL, False, "Restart nodes when their files change.")
 WATCH = Setting[tuple[str, ...]](
@@ -25,7 +27,6 @@ WATCH = Setting[tuple[str, ...]](
     (),
     f"Files that trigger a reload, as in gitignore(5); default: {', '.join(DEFAULT_WATCH)}.",
     variable="DORA_WATCH",
-    metavar="PATTERN,...",
     per_node=True,
 )
 IGNORE = Setting[tuple[str, ...]](
@@ -34,14 +35,12 @@ IGNORE = Setting[tuple[str, ...]](
     (),
     "Files that never trigger a reload, besides those that git ignores.",
     variable="DORA_IGNORE",
-    metavar="PATTERN,...",
 )
 REPLACE = Setting[str](
     "replace",
-    one_text(str, "stop-first or start-first", _parse_replace),
+    one_text(str, "stop-first or start-first", "HOW", _parse_replace),
     "stop-first",
     "Whether a reloaded node stops before its replacement starts, or after.",
-    metavar="HOW",
     per_node=True,
 )
 

@@ -33,32 +33,28 @@ def _parse_window(text: str) -> int:
     return window
 
 
-_COUNT = one_text(int | str, "a number of restarts", parse_count, format_number)
-_WINDOW = one_text(DURATION.schema, DURATION.expected, _parse_window, format_duration)
-_DELAY = one_text(DURATION.schema, DURATION.expected, parse_delay, format_duration)
+_COUNT = one_text(int | str, "a number of restarts", "N", parse_count, format_number)
+_WINDOW = one_text(DURATION.schema, DURATION.expected, "TIME", _parse_window, format_duration)
+_DELAY = one_text(DURATION.schema, DURATION.expected, "TIME", parse_delay, format_duration)
 
+_CHOICE = Kind[str](
+    bool | str, "no, on-failure or always", _parse_choice, lambda value: [value], metavar="POLICY"
+)
 RESTART_POLICY = Setting[str](
     "restart_policy",
-    Kind[str](bool | str, "no, on-failure or always", _parse_choice, lambda value: [value]),
+    _CHOICE,
     DEFAULT.policy,
     "When to restart automatically: no, on-failure or always.",
-    metavar="POLICY",
     per_node=True,
 )
 MAX_RESTARTS = Setting[int](
-    "max_restarts",
-    _COUNT,
-    DEFAULT.max_restarts,
-    "Maximum restarts per window.",
-    metavar="N",
-    per_node=True,
+    "max_restarts", _COUNT, DEFAULT.max_restarts, "Maximum restarts per window.", per_node=True
 )
 RESTART_WINDOW = Setting[int](
     "restart_window",
     _WINDOW,
     DEFAULT.window,
     "Time after which the restart counter is reset.",
-    metavar="TIME",
     per_node=True,
 )
 RESTART_DELAY = Setting[int](
@@ -66,23 +62,13 @@ RESTART_DELAY = Setting[int](
     _DELAY,
     DEFAULT.delay,
     "Delay before a restart; doubles with each restart.",
-    metavar="TIME",
     per_node=True,
 )
 MAX_RESTART_DELAY = Setting[int](
-    "max_restart_delay",
-    _DELAY,
-    DEFAULT.max_delay,
-    "Longest delay before a restart.",
-    metavar="TIME",
-    per_node=True,
+    "max_restart_delay", _DELAY, DEFAULT.max_delay, "Longest delay before a restart.", per_node=True
 )
 START_TIMEOUT = Setting[int](
-    "start_timeout",
-    _WINDOW,
-    INFINITY,
-    "Time for all nodes to become ready; infinity for no limit.",
-    metavar="TIME",
+    "start_timeout", _WINDOW, INFINITY, "Time for all nodes to become ready; infinity for no limit."
 )
 
 POLICY_SETTINGS: tuple[Setting[Any], ...] = (

@@ -15,7 +15,7 @@ from dora_systemd.suggestions import did_you_mean
 from dora_systemd.values import quoted
 
 
-def _choice(what: str, choices: Sequence[str]) -> Kind[str]:
+def _choice(what: str, metavar: str, choices: Sequence[str]) -> Kind[str]:
     expected = f"{', '.join(choices[:-1])} or {choices[-1]}"
 
     def parse(given: str) -> str:
@@ -25,15 +25,14 @@ def _choice(what: str, choices: Sequence[str]) -> Kind[str]:
             raise DoraSystemdError(f"cannot use {quoted(text)} as {what}", hint, ExitCode.USAGE)
         return text
 
-    return one_text(str, expected, parse)
+    return one_text(str, expected, metavar, parse)
 
 
 SANDBOX = Setting[str](
     "sandbox",
-    _choice("sandbox", LEVELS),
+    _choice("sandbox", "LEVEL", LEVELS),
     DEFAULT_LEVEL,
     "Sandbox level: none, default or strict.",
-    metavar="LEVEL",
 )
 WRITABLE = Setting[tuple[str, ...]](
     "writable",
@@ -44,9 +43,8 @@ WRITABLE = Setting[tuple[str, ...]](
 )
 NETWORK = Setting[str](
     "network",
-    _choice("network", NETWORKS),
+    _choice("network", "REACH", NETWORKS),
     DEFAULT_NETWORK,
     "Network of the nodes: host, loopback (the host's loopback only) or private (one of its own).",
-    metavar="REACH",
 )
 SANDBOX_SETTINGS: tuple[Setting[Any], ...] = (SANDBOX, WRITABLE, NETWORK)

@@ -27,9 +27,7 @@ from dora_systemd.decisions.settings.restarts import RESTART_SETTINGS
 from dora_systemd.decisions.settings.sandbox import SANDBOX_SETTINGS
 from dora_systemd.values import SECOND
 
-ENV = Setting[Mapping[str, str]](
-    "env", ENVIRONMENT, {}, "Environment variable of all nodes.", metavar="KEY=VALUE"
-)
+ENV = Setting[Mapping[str, str]]("env", ENVIRONMENT, {}, "Environment variable of all nodes.")
 ENV_FILE = Setting[tuple[str, ...]](
     "env_file",
     PATHS,
@@ -54,7 +52,6 @@ GRACE_DURATION = Setting[int](
     DURATION,
     10 * SECOND,
     "Time for a node to exit after it is told to stop; then it is killed.",
-    metavar="TIME",
 )
 PROPERTY = Setting[tuple[str, ...]](
     "property",
@@ -62,7 +59,6 @@ PROPERTY = Setting[tuple[str, ...]](
     (),
     "Property of the unit, as systemd-run(1) takes it.",
     flags=("--property", "-p"),
-    metavar="KEY=VALUE",
     root_only=True,
 )
 USER = Setting[str | None](
@@ -84,16 +80,13 @@ EXIT_WHEN_NODES_FINISH = Setting[bool | None](
     None,
     "End the dataflow when its nodes have finished; default: as in the dataflow file.",
 )
-DORA = Setting[str](
-    "dora", PROGRAM, "dora", "The dora program to run.", variable="DORA_PROGRAM", metavar="FILE"
-)
+DORA = Setting[str]("dora", PROGRAM, "dora", "The dora program to run.", variable="DORA_PROGRAM")
 LOG_RATE_LIMIT = Setting[RateLimits](
     "log_rate_limit",
     LINE_RATES,
     {},
     "Log lines per time to keep of each node, or of NODE; the rest is dropped and counted.",
     variable="DORA_LOG_RATE_LIMIT",
-    metavar="[NODE=]LINES/TIME",
     per_node=True,
 )
 
