@@ -9,11 +9,7 @@ from operator import attrgetter
 from pathlib import PurePath
 from typing import Any, NamedTuple
 
-from dora_systemd.decisions.cell.hot_reload import (
-    DEFAULT_RELOAD,
-    HotReload,
-    parse_of_node,
-)
+from dora_systemd.decisions.cell.hot_reload import DEFAULT_RELOAD, HotReload, parse_of_node
 from dora_systemd.decisions.cell.limits import NodeLimits, format_node_limits, parse_node_limits
 from dora_systemd.decisions.cell.line_rates import UNLIMITED, RateLimits, format_rates, parse_rates
 from dora_systemd.decisions.cell.restarts import (
@@ -37,9 +33,6 @@ from dora_systemd.values import (
 )
 
 RUNNER_MODULE = "dora_systemd.runner"
-POST_MODULE = "dora_systemd.runner.stop_post"
-RELOAD_MODULE = "dora_systemd.runner.reload.request"
-CHECK_MODULE = "dora_systemd.runner.check"
 _STOP_POST = str(PurePath(__file__).parents[2] / "stoppost.sh")
 
 
@@ -210,7 +203,7 @@ def _options(dataflow: str, given: dict[str, list[str]]) -> RunnerOptions:
 
 def runner_command(python: str, options: RunnerOptions) -> list[str]:
     """ExecStart= of the unit. python: absolute path of the interpreter of dora-systemd."""
-    return [*_python(python, RUNNER_MODULE), *format_runner_argv(options)]
+    return [*_python(python), *format_runner_argv(options)]
 
 
 def post_command(python: str, options: RunnerOptions) -> list[str]:
@@ -218,17 +211,17 @@ def post_command(python: str, options: RunnerOptions) -> list[str]:
 
     It starts no Python if the runner exited by itself, because a restart would wait for that.
     """
-    return ["/bin/sh", _STOP_POST, *_python(python, POST_MODULE), options.name, options.uuid]
+    return ["/bin/sh", _STOP_POST, *_python(python, ".stop_post"), options.name, options.uuid]
 
 
 def reload_command(python: str) -> list[str]:
     """ExecReload= of the unit, for `systemctl reload`."""
-    return _python(python, RELOAD_MODULE)
+    return _python(python, ".reload.request")
 
 
 def check_command(python: str, options: RunnerOptions) -> list[str]:
     """The command that checks whether a runner with these options would refuse to start."""
-    return [*_python(python, CHECK_MODULE), *format_runner_argv(options)]
+    return [*_python(python, ".check"), *format_runner_argv(options)]
 
 
 def options_from_command(command: Sequence[str]) -> RunnerOptions:
@@ -238,10 +231,10 @@ def options_from_command(command: Sequence[str]) -> RunnerOptions:
     return parse_runner_argv(command[list(command).index(RUNNER_MODULE) + 1 :])
 
 
-def _python(python: str, module: str) -> list[str]:
+def _python(python: str, module: str = "") -> list[str]:
     # Ignore PYTHON* variables, and keep the working directory out of sys.path: a module of the
     # project must never replace one of the runner's.
-    return [python, "-E", "-P", "-m", module]
+    return [python, "-E", "-P", "-m", RUNNER_MODULE + module]
 
 
 def _refusal(reason: str) -> DoraSystemdError:

@@ -10,13 +10,7 @@ from typing import Any, NamedTuple
 from dora_systemd.decisions.cell.limits import format_number
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.suggestions import check_known
-from dora_systemd.values import (
-    INFINITY,
-    SECOND,
-    format_duration,
-    parse_duration,
-    quoted,
-)
+from dora_systemd.values import INFINITY, SECOND, format_duration, parse_duration, quoted
 
 POLICIES = ("no", "on-failure", "always")
 
@@ -69,14 +63,14 @@ HELD_KEYS: Mapping[str, Any] = {
 """The keys of a node that waits after a failure. dora can replace such a node at any time, but
 never one that it has given up."""
 
-_KEYS = ("policy", "max", "window", "delay", "max-delay")
+_KEYS = ("max", "window", "delay", "max-delay")
 
 
 def format_policy(policy: RestartPolicy) -> str:
     """The policy in the runner's command line, such as `on-failure,max=5,window=10min,...`."""
     maximum = format_number(policy.max_restarts)
     times = (format_duration(one) for one in (policy.window, policy.delay, policy.max_delay))
-    pairs = zip(_KEYS[1:], (maximum, *times), strict=True)
+    pairs = zip(_KEYS, (maximum, *times), strict=True)
     return ",".join([policy.policy, *(f"{key}={text}" for key, text in pairs)])
 
 
@@ -84,14 +78,11 @@ def parse_policy(text: str) -> RestartPolicy:
     """The exact inverse of format_policy. Raises DoraSystemdError (USAGE)."""
     word, *pairs = text.split(",")
     given = dict(pair.split("=", 1) for pair in pairs if "=" in pair)
-    if word not in POLICIES or given.keys() != set(_KEYS[1:]):
+    if word not in POLICIES or given.keys() != set(_KEYS):
         message = f"cannot use {quoted(text)} as restart policy"
         raise DoraSystemdError(message, f"valid values: {', '.join(POLICIES)}", ExitCode.USAGE)
-    return RestartPolicy(
-        word,
-        parse_count(given["max"]),
-        *(parse_duration(given[key]) for key in ("window", "delay", "max-delay")),
-    )
+    times = (parse_duration(given[key]) for key in _KEYS[1:])
+    return RestartPolicy(word, parse_count(given["max"]), *times)
 
 
 def format_node_policy(of_node: tuple[str, RestartPolicy]) -> str:

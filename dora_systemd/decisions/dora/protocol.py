@@ -106,9 +106,7 @@ def start_params(descriptor: Mapping[str, Any], name: str, work: str) -> Params:
 
 def stop_params(run: str, grace: int) -> Params:
     """Stop a run. grace: µs until dora sends SIGTERM; SIGKILL follows after 1.5 times that."""
-    return {
-        "Stop": {"dataflow_uuid": run, "grace_duration": duration(grace), "force": False},
-    }
+    return {"Stop": {"dataflow_uuid": run, "grace_duration": duration(grace), "force": False}}
 
 
 def duration(microseconds: int) -> Mapping[str, int]:

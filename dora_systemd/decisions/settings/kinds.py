@@ -13,13 +13,7 @@ from dora_systemd.decisions.cell.environment import (
 )
 from dora_systemd.decisions.cell.line_rates import format_rates, parse_rates
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.values import (
-    format_bool,
-    format_duration,
-    parse_bool,
-    parse_duration,
-    quoted,
-)
+from dora_systemd.values import format_bool, format_duration, parse_bool, parse_duration, quoted
 
 T = TypeVar("T")
 Scalar = str | int | float | bool

@@ -4,12 +4,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from dora_systemd.decisions.cell.hot_reload import HotReload
-from dora_systemd.decisions.cell.limits import (
-    BY_KEY,
-    NodeLimits,
-    merge_node_limits,
-    node_limits,
-)
+from dora_systemd.decisions.cell.limits import BY_KEY, NodeLimits, merge_node_limits, node_limits
 from dora_systemd.decisions.cell.line_rates import RateLimits, merge_rates
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.restarts import DEFAULT, RestartPolicy, with_values
@@ -18,11 +13,7 @@ from dora_systemd.decisions.settings.kinds import Setting
 from dora_systemd.decisions.settings.limits import NODE_LIMIT
 from dora_systemd.decisions.settings.reload import HOT_RELOAD, IGNORE, REPLACE, WATCH
 from dora_systemd.decisions.settings.resolve import Settings
-from dora_systemd.decisions.settings.restarts import (
-    POLICY_SETTINGS,
-    RESTART_POLICY,
-    START_TIMEOUT,
-)
+from dora_systemd.decisions.settings.restarts import POLICY_SETTINGS, RESTART_POLICY, START_TIMEOUT
 from dora_systemd.decisions.settings.table import (
     ALLOW_SHELL_NODES,
     DEBUG,

@@ -19,13 +19,7 @@ from dora_systemd.values import INFINITY, SECOND
 from dora_systemd.verbs.facts.budget import restart_budget
 from dora_systemd.verbs.facts.cells import Cell, matching_cells, read_cells, select_cell
 from dora_systemd.verbs.facts.enabled import enabled_units
-from dora_systemd.verbs.facts.reading import (
-    STARTED,
-    UP_SINCE,
-    Reading,
-    read_dataflow,
-    read_status,
-)
+from dora_systemd.verbs.facts.reading import STARTED, UP_SINCE, Reading, read_dataflow, read_status
 from dora_systemd.verbs.facts.slice import slice_group
 
 
