@@ -33,6 +33,8 @@ from dora_systemd.values import (
 )
 
 RUNNER_MODULE = "dora_systemd.runner"
+DEFAULT_GRACE = 10 * SECOND
+"""µs."""
 _STOP_POST = str(PurePath(__file__).parents[2] / "stoppost.sh")
 
 
@@ -68,7 +70,7 @@ class RunnerOptions(NamedTuple):
     uv: bool = False
     debug: bool = False
     allow_shell_nodes: bool = False
-    grace: int = 10 * SECOND
+    grace: int = DEFAULT_GRACE
     attached: bool = False
     exit_when_nodes_finish: bool | None = None
     env_keys: tuple[str, ...] = ()

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from dora_systemd.decisions.cell.line_rates import RateLimits
+from dora_systemd.decisions.cell.options import DEFAULT_GRACE
 from dora_systemd.decisions.settings.credentials import CREDENTIAL_SETTINGS
 from dora_systemd.decisions.settings.kinds import (
     BOOL,
@@ -25,7 +26,6 @@ from dora_systemd.decisions.settings.limits import LIMIT_SETTINGS
 from dora_systemd.decisions.settings.reload import RELOAD_SETTINGS
 from dora_systemd.decisions.settings.restarts import RESTART_SETTINGS
 from dora_systemd.decisions.settings.sandbox import SANDBOX_SETTINGS
-from dora_systemd.values import SECOND
 
 ENV = Setting[Mapping[str, str]]("env", ENVIRONMENT, {}, "Environment variable of all nodes.")
 ENV_FILE = Setting[tuple[str, ...]](
@@ -50,7 +50,7 @@ WORKING_DIRECTORY = Setting[str | None](
 GRACE_DURATION = Setting[int](
     "grace_duration",
     DURATION,
-    10 * SECOND,
+    DEFAULT_GRACE,
     "Time for a node to exit after it is told to stop; then it is killed.",
 )
 PROPERTY = Setting[tuple[str, ...]](
