@@ -1,6 +1,10 @@
-"""Names of dataflows, their units and UUIDs; checked so that no name can mean another unit."""
+"""Names of dataflows, their units, UUIDs and nodes; no name can mean another unit.
+
+For a name that is not known there is a hint with similar ones.
+"""
 
 import re
+from collections.abc import Iterable
 from pathlib import PurePath
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -118,3 +122,29 @@ def is_uuid_prefix(text: str) -> bool:
     With fewer than 4 characters, a typing error could stop the wrong dataflow.
     """
     return len(text) >= _MIN_PREFIX and is_uuid(text.lower() + _ZERO_UUID[len(text) :])
+
+
+def check_known(problem: str, named: Iterable[str], nodes: Iterable[str]) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) for the first of `named` that is not in `nodes`.
+
+    problem: the text before "the node", such as "cannot limit".
+    """
+    known = list(nodes)
+    for node in named:
+        if node not in known:
+            message = f"{problem} the node {quoted(node)}: no such node"
+            hint = did_you_mean(node, known) or f"nodes: {', '.join(known)}"
+            raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """A hint with up to three of the `known` words that are similar to `word`, or ""."""
+    # Imported late: only needed after an error.
+    import difflib
+
+    by_lower = {one.lower().replace("-", "_"): one for one in known}
+    wanted = word[:100].lower().replace("-", "_")
+    if wanted in by_lower:
+        return f"did you mean {by_lower[wanted]}?"
+    near = [by_lower[one] for one in difflib.get_close_matches(wanted, by_lower, n=3)]
+    return f"did you mean {' or '.join(near)}?" if near else ""

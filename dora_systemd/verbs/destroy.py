@@ -21,8 +21,8 @@ from dora_systemd.names import SLICE, name_from_unit
 from dora_systemd.scope import Scope
 from dora_systemd.values import INFINITY, SECOND
 from dora_systemd.verbs.facts.cells import Cell, read_cell, read_cells
+from dora_systemd.verbs.facts.reading import slice_group
 from dora_systemd.verbs.facts.reason import failure_reason
-from dora_systemd.verbs.facts.slice import slice_group
 from dora_systemd.verbs.stop import Outcome, release_enabled
 from dora_systemd.verbs.up import written_files
 

@@ -38,7 +38,7 @@ from dora_systemd.scope import RUNTIME_NAME, Scope
 from dora_systemd.trust.paths import exists
 from dora_systemd.trust.socket_table import listening_sockets
 from dora_systemd.verbs.facts.enabled import enabled_units, lost_units, own_directories
-from dora_systemd.verbs.facts.slice import slice_group
+from dora_systemd.verbs.facts.reading import slice_group
 from dora_systemd.verbs.gateway import read_gateway
 from dora_systemd.verbs.start.account import DEFAULT_USER
 from dora_systemd.verbs.start.enable import boot_target

@@ -5,7 +5,8 @@ from dora_systemd.decisions.views.dataflows import DataflowRow
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.budget import restart_budget
 from dora_systemd.verbs.facts.cells import read_cells
-from dora_systemd.verbs.facts.list import dataflow_row, mark_enabled, read_status
+from dora_systemd.verbs.facts.list import dataflow_row, mark_enabled
+from dora_systemd.verbs.facts.reading import read_status
 from dora_systemd.verbs.facts.selector import Selector
 
 

@@ -14,15 +14,15 @@ from dora_systemd.decisions.dora.protocol import Params, Reply, node_params, rep
 from dora_systemd.decisions.dora.variables import coordinator_variables
 from dora_systemd.decisions.reload.changes import has_readers
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import did_you_mean
 from dora_systemd.paths import CellPaths
 from dora_systemd.scope import Scope
-from dora_systemd.suggestions import did_you_mean
 from dora_systemd.trust.programs import Account, account_of_uid, become, fresh_environment
 from dora_systemd.trust.sockets import plain, require_listener
 from dora_systemd.trust.terminals import run_apart
 from dora_systemd.values import quoted
 from dora_systemd.verbs.facts.cells import Cell
-from dora_systemd.verbs.facts.list import read_status
+from dora_systemd.verbs.facts.reading import read_status
 
 _NO_USER = 2**32 - 1
 """UID of a unit without User=: it runs as the manager's own user."""

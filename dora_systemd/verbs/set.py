@@ -41,8 +41,8 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.enabled import enabled_units
-from dora_systemd.verbs.facts.list import read_status
 from dora_systemd.verbs.facts.nodes import written_dataflow
+from dora_systemd.verbs.facts.reading import read_status
 from dora_systemd.verbs.start.limits import require_controllers
 
 _PROPERTIES = ("ControlGroup", "Environment", "FragmentPath", "Transient")

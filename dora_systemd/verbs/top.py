@@ -8,7 +8,8 @@ from dora_systemd.decisions.resources.usage import Strain, waits
 from dora_systemd.decisions.views.top import Look, TopEntry
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import read_cells
-from dora_systemd.verbs.facts.list import Reading, read_dataflow, row_of
+from dora_systemd.verbs.facts.list import row_of
+from dora_systemd.verbs.facts.reading import Reading, read_dataflow
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.facts.snapshot import read_strains
 from dora_systemd.verbs.node import require_running

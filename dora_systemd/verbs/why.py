@@ -26,7 +26,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.budget import restart_budget
 from dora_systemd.verbs.facts.cells import Cell, read_cell, read_cells
 from dora_systemd.verbs.facts.ended import volatile_note
-from dora_systemd.verbs.facts.list import look_at_table, read_status
+from dora_systemd.verbs.facts.reading import look_at_table, read_status
 from dora_systemd.verbs.facts.selector import Selector
 
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")

@@ -45,19 +45,13 @@ def find_dora(
     Last comes that beside our own Python: pip has put both into one virtual environment, and what
     is linked onto PATH is only doractl. sight: whose eyes look. Raises DoraSystemdError (NO_DORA).
     """
-    sight = sight or Sight()
-    if given is not None:
-        found = _which(given, search_path.split(os.pathsep), sight)
-        if found is None:
-            raise DoraSystemdError(
-                f"cannot run the dora command {given}", _INSTALL_HINT, ExitCode.NO_DORA
-            )
-        return found
-    last = str(Path(sys.executable).parent)
-    places = [*([f"{venv}/bin"] if venv else []), *search_path.split(os.pathsep), last]
-    found = _which("dora", places, sight)
+    places = search_path.split(os.pathsep)
+    if given is None:
+        places = [*([f"{venv}/bin"] if venv else []), *places, str(Path(sys.executable).parent)]
+    found = _which("dora" if given is None else given, places, sight or Sight())
     if found is None:
-        raise DoraSystemdError("cannot find the dora command", _INSTALL_HINT, ExitCode.NO_DORA)
+        what = "find the dora command" if given is None else f"run the dora command {given}"
+        raise DoraSystemdError(f"cannot {what}", _INSTALL_HINT, ExitCode.NO_DORA)
     return found
 
 

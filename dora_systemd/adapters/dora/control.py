@@ -2,11 +2,10 @@
 
 import asyncio
 import json
-import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from dora_systemd.decisions.dora.coordinator import Coordinator, parse_coordinator
 from dora_systemd.decisions.dora.protocol import (
@@ -27,24 +26,12 @@ if TYPE_CHECKING:
 MAX_BYTES = 64 * 1024 * 1024
 """Maximum bytes of a message over a relay, where the peer may be hostile."""
 
-_OPTIONS: dict[str, Any] = {
-    # A coordinator answers no ping while a request is pending. No proxy may come between two
-    # processes of one machine.
-    "ping_interval": None,
-    "compression": None,
-    "max_size": MAX_BYTES,
-    "proxy": None,
-}
 OPEN_SECONDS = 4.0
+"""Timeout of the handshake over a relay."""
 REQUEST_SECONDS = 35.0
 """Just above the 30 s after which the coordinator gives up on its daemon."""
 
-
-_RELAY = "ws://127.0.0.1/api/control"
-
-
-def _url(port: int) -> str:
-    return f"ws://127.0.0.1:{port}/api/control"
+_URL = "ws://127.0.0.1:{}/api/control"
 
 
 def _headers(token: str) -> dict[str, str]:
@@ -63,7 +50,7 @@ class Connection:
         from dora_systemd.adapters.dora.websocket import WebSocket, WebSocketException
 
         try:
-            return cls(await WebSocket.connect(_url(port), _headers(token)))
+            return cls(await WebSocket.connect(_URL.format(port), _headers(token)))
         except (OSError, WebSocketException) as error:
             raise _unreachable(f" on port {port}", error) from error
 
@@ -73,7 +60,7 @@ class Connection:
         from dora_systemd.adapters.dora.websocket import WebSocket, WebSocketException
 
         try:
-            return cls(await WebSocket.connect(_RELAY, _headers(token), stream, MAX_BYTES))
+            return cls(await WebSocket.connect(_URL.format(80), _headers(token), stream, MAX_BYTES))
         except (OSError, WebSocketException) as error:
             stream.close()
             raise _unreachable("", error) from error
@@ -117,35 +104,25 @@ class Connection:
 def request(
     stream: "sockets.socket", token: str, params: Params, seconds: float = REQUEST_SECONDS
 ) -> Reply:
-    """Send one request through a relay of a cell's runner, without asyncio, and close.
+    """Send one request through a relay of a cell's runner, and close.
 
-    The reply may take `seconds`, including other messages before it. Raises DoraSystemdError.
+    Not for a thread with a running loop. The reply may take `seconds`, including other messages
+    before it. Raises DoraSystemdError.
     """
-    from websockets.exceptions import WebSocketException
-    from websockets.sync.client import unix_connect
 
-    ident, text = encode_request(params)
-    deadline = time.monotonic() + seconds
-    headers = _headers(token)
-    try:
-        with unix_connect(
-            None,
-            _RELAY,
-            sock=stream,
-            additional_headers=headers,
-            open_timeout=OPEN_SECONDS,
-            **_OPTIONS,
-        ) as socket:
-            socket.send(text)
-            while True:
-                left = max(deadline - time.monotonic(), 0)
-                frame = parse_frame(socket.recv(timeout=left))
-                if isinstance(frame, Reply) and frame.id == ident:
-                    return frame
-    except TimeoutError as error:
-        raise _silent(params, error) from error
-    except (OSError, WebSocketException) as error:
-        raise _unreachable("", error) from error
+    async def ask() -> Reply:
+        try:
+            async with asyncio.timeout(OPEN_SECONDS):
+                connection = await Connection.over(stream, token)
+        except TimeoutError as error:
+            raise _silent(params, error) from error
+        try:
+            return await connection.request(params, seconds)
+        finally:
+            connection.abort()
+
+    with stream:
+        return asyncio.run(ask())
 
 
 def read_coordinator(path: Path) -> Coordinator:

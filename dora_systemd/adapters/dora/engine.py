@@ -30,15 +30,9 @@ def coordinator_environment(environment: Mapping[str, str], directory: Path) -> 
 
 def daemon_command(dora: str, port: int, local_listen_port: int) -> list[str]:
     """A daemon that only connects to its coordinator: cells must not discover each other."""
-    ports = ("--coordinator-addr", "127.0.0.1", "--coordinator-port", str(port))
-    return [
-        dora,
-        "daemon",
-        *ports,
-        "--local-listen-port",
-        str(local_listen_port),
-        "--zenoh-no-multicast",
-    ]
+    coordinator = ("--coordinator-addr", "127.0.0.1", "--coordinator-port", str(port))
+    own = ("--local-listen-port", str(local_listen_port), "--zenoh-no-multicast")
+    return [dora, "daemon", *coordinator, *own]
 
 
 def free_port() -> int:

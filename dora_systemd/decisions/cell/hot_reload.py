@@ -3,20 +3,17 @@
 They are part of the runner's command line, which `list` parses: imports only what loads quickly.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from dora_systemd.decisions.cell.limits import NodeLimits
-from dora_systemd.suggestions import missing_node
+from dora_systemd.names import check_known
 
 START_FIRST = "start-first"
 REPLACE_WORDS = ("stop-first", START_FIRST)
 
 CHANGE_VARIABLE = "DORA_SYSTEMD_HOT_RELOAD"
 """Passes changes by `doractl set --hot-reload` since the unit was created to the runner."""
-
-ARGUMENTS = ("watch", "ignore", "node-watch", "replace")
-"""Repeatable options of the runner."""
 
 
 class HotReload(NamedTuple):
@@ -56,33 +53,13 @@ class SettingsChange(NamedTuple):
     others: tuple[str, ...]
 
 
-def format_reload(reload: HotReload) -> list[tuple[str, str]]:
-    """The options of the runner and their values; is_on is a separate flag."""
-    nodes = [("node-watch", f"{node}={pattern}") for node, pattern in reload.node_watch]
-    words = [("replace", f"{node}={word}") for node, word in reload.replace]
-    watch = [("watch", one) for one in reload.watch]
-    return [*watch, *(("ignore", one) for one in reload.ignore), *nodes, *words]
-
-
-def parse_reload(is_on: bool, given: Mapping[str, Sequence[str]]) -> HotReload:
-    """The exact inverse of format_reload. given: the values of ARGUMENTS."""
-    return HotReload(
-        is_on,
-        tuple(given["watch"]),
-        tuple(given["ignore"]),
-        tuple(map(_pair, given["node-watch"])),
-        tuple(map(_pair, given["replace"])),
-    )
-
-
-def _pair(text: str) -> tuple[str, str]:
-    # Node ids contain no "=".
+def parse_of_node(text: str) -> tuple[str, str]:
+    """Node and value of NODE=VALUE, as the runner's command line has them. Ids contain no "="."""
     node, _, value = text.partition("=")
     return node, value
 
 
 def check_reload_nodes(reload: HotReload, nodes: Sequence[str]) -> None:
     """Raise DoraSystemdError (BAD_INPUT) for a node that is not in `nodes`."""
-    for node in (*dict(reload.node_watch), *filter(None, dict(reload.replace))):
-        if node not in nodes:
-            raise missing_node("cannot watch files of", node, nodes)
+    named = (*dict(reload.node_watch), *filter(None, dict(reload.replace)))
+    check_known("cannot watch files of", named, nodes)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import NamedTuple
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.suggestions import did_you_mean, missing_node
+from dora_systemd.names import check_known, did_you_mean
 from dora_systemd.values import (
     INFINITY,
     SECOND,
@@ -36,20 +36,21 @@ _NUMBER = re.compile(r"[0-9]{1,18}")
 
 def parse_memory(text: str) -> int:
     """Bytes of memory, at least 1M; INFINITY for no limit. Raises DoraSystemdError (USAGE)."""
-    size = parse_size(text)
-    if size < SMALLEST_MEMORY:
-        hint = "write at least 1M, such as 512M or 4G; or infinity for no limit"
-        raise _refusal(f"{quoted(text)} as a limit of memory", hint)
+    if (size := parse_size(text)) < SMALLEST_MEMORY:
+        raise _too_small(text, "memory", "1M, such as 512M or 4G")
     return size
 
 
 def parse_share(text: str) -> int:
     """µs of CPU per second, at least a hundredth of a core. Raises DoraSystemdError (USAGE)."""
-    share = parse_cpu(text)
-    if share < SMALLEST_CPU:
-        hint = "write at least 0.01 cores, such as 1.5; or infinity for no limit"
-        raise _refusal(f"{quoted(text)} as a limit of CPU time", hint)
+    if (share := parse_cpu(text)) < SMALLEST_CPU:
+        raise _too_small(text, "CPU time", "0.01 cores, such as 1.5")
     return share
+
+
+def _too_small(text: str, what: str, smallest: str) -> DoraSystemdError:
+    hint = f"write at least {smallest}; or infinity for no limit"
+    return _refusal(f"{quoted(text)} as a limit of {what}", hint)
 
 
 def parse_tasks(text: str) -> int:
@@ -93,46 +94,32 @@ class Limit(NamedTuple):
     """A resource that can be limited, for a dataflow and for a node.
 
     word: its name in `--node-limit NODE:WORD=VALUE`. key: the setting, in settings files. property:
-    of the unit, see systemd.resource-control(5). controller, file: of cgroup v2. parse, format:
-    text to value and back. file_text: the text for the control file.
+    of the unit, see systemd.resource-control(5). file: the control file of cgroup v2. parse,
+    format: text to value and back. file_text: the text for the control file.
     """
 
     word: str
     key: str
     property: str
-    controller: str
     file: str
     parse: Callable[[str], int]
-    format: Callable[[int], str]
-    file_text: Callable[[int], str]
+    format: Callable[[int], str] = format_number
+    file_text: Callable[[int], str] = _plain_file
+
+    def controller(self) -> str:
+        """The controller of cgroup v2 that enforces it."""
+        return self.file.partition(".")[0]
 
 
-def _memory(word: str, key: str, unit_property: str, file: str) -> Limit:
+LIMITS = (
+    Limit("cpu", "cpu_limit", "CPUQuota", "cpu.max", parse_share, format_cpu, _quota_file),
+    Limit("memory", "memory_limit", "MemoryMax", "memory.max", parse_memory, format_size),
+    Limit("memory-high", "memory_high", "MemoryHigh", "memory.high", parse_memory, format_size),
     # A limit of 0 is useful for swap, unlike for memory.
-    parse = parse_size if word == "swap" else parse_memory
-    return Limit(word, key, unit_property, "memory", file, parse, format_size, _plain_file)
-
-
-LIMITS: tuple[Limit, ...] = (
-    Limit(
-        *("cpu", "cpu_limit", "CPUQuota", "cpu", "cpu.max"),
-        *(parse_share, format_cpu, _quota_file),
-    ),
-    _memory("memory", "memory_limit", "MemoryMax", "memory.max"),
-    _memory("memory-high", "memory_high", "MemoryHigh", "memory.high"),
-    _memory("swap", "swap_limit", "MemorySwapMax", "memory.swap.max"),
-    Limit(
-        *("tasks", "tasks_limit", "TasksMax", "pids", "pids.max"),
-        *(parse_tasks, format_number, _plain_file),
-    ),
-    Limit(
-        *("cpu-weight", "cpu_weight", "CPUWeight", "cpu", "cpu.weight"),
-        *(parse_weight, format_number, _plain_file),
-    ),
-    Limit(
-        *("io-weight", "io_weight", "IOWeight", "io", "io.weight"),
-        *(parse_weight, format_number, _weight_file),
-    ),
+    Limit("swap", "swap_limit", "MemorySwapMax", "memory.swap.max", parse_size, format_size),
+    Limit("tasks", "tasks_limit", "TasksMax", "pids.max", parse_tasks),
+    Limit("cpu-weight", "cpu_weight", "CPUWeight", "cpu.weight", parse_weight),
+    Limit("io-weight", "io_weight", "IOWeight", "io.weight", parse_weight, file_text=_weight_file),
 )
 BY_WORD: Mapping[str, Limit] = {limit.word: limit for limit in LIMITS}
 BY_KEY: Mapping[str, Limit] = {limit.key: limit for limit in LIMITS}
@@ -150,7 +137,7 @@ class NodeLimits(NamedTuple):
 
     def controllers(self) -> dict[str, str]:
         """The required controllers, each with the control file of one of the limits."""
-        return {BY_WORD[word].controller: BY_WORD[word].file for word, _ in self.limits}
+        return {BY_WORD[word].controller(): BY_WORD[word].file for word, _ in self.limits}
 
 
 def node_limits(node: str, limits: Mapping[str, int]) -> NodeLimits:
@@ -211,8 +198,7 @@ def check_nodes(limits: Iterable[NodeLimits], nodes: Iterable[str], dynamic: Ite
     """
     known, free = list(nodes), frozenset(dynamic)
     for one in limits:
-        if one.node not in known:
-            raise missing_node("cannot limit", one.node, known)
+        check_known("cannot limit", [one.node], known)
         if one.node in free:
             hint = "limit what it is started with"
             reason = "it is dynamic, so it does not run inside the dataflow's unit"

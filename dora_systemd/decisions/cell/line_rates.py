@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.suggestions import missing_node
+from dora_systemd.names import check_known
 from dora_systemd.values import INFINITY, SECOND, format_duration, parse_duration, quoted
 
 SHORTEST = SECOND // 10
@@ -96,6 +96,4 @@ def _refusal(text: str) -> DoraSystemdError:
 
 def check_rates(limits: RateLimits, nodes: Sequence[str]) -> None:
     """Raise DoraSystemdError (BAD_INPUT) for a limit of a node that is not in `nodes`."""
-    for node in limits:
-        if node != ALL_NODES and node not in nodes:
-            raise missing_node("cannot limit the lines of", node, nodes)
+    check_known("cannot limit the lines of", filter(None, limits), nodes)

@@ -4,20 +4,22 @@ There is no registry: `list` reads UUID and path of a dataflow from this command
 module imports only what loads quickly.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from operator import attrgetter
 from pathlib import PurePath
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from dora_systemd.decisions.cell.hot_reload import (
-    ARGUMENTS,
-    DEFAULT_RELOAD,
-    HotReload,
-    format_reload,
-    parse_reload,
-)
+from dora_systemd.decisions.cell.hot_reload import DEFAULT_RELOAD, HotReload, parse_of_node
 from dora_systemd.decisions.cell.limits import NodeLimits, format_node_limits, parse_node_limits
 from dora_systemd.decisions.cell.line_rates import UNLIMITED, RateLimits, format_rates, parse_rates
-from dora_systemd.decisions.cell.restarts import DEFAULT, RestartPolicy, format_policy, parse_policy
+from dora_systemd.decisions.cell.restarts import (
+    DEFAULT,
+    RestartPolicy,
+    format_node_policy,
+    format_policy,
+    parse_node_policy,
+    parse_policy,
+)
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import parse_name, parse_uuid
 from dora_systemd.values import (
@@ -31,19 +33,9 @@ from dora_systemd.values import (
 )
 
 RUNNER_MODULE = "dora_systemd.runner"
-POST_MODULE = "dora_systemd.runner.stop_post"
-RELOAD_MODULE = "dora_systemd.runner.reload.request"
-CHECK_MODULE = "dora_systemd.runner.check"
+DEFAULT_GRACE = 10 * SECOND
+"""µs."""
 _STOP_POST = str(PurePath(__file__).parents[2] / "stoppost.sh")
-
-_PYTHON_FLAGS = ("-E", "-P", "-m", RUNNER_MODULE)
-"""Ignore PYTHON* variables, and keep the working directory out of sys.path: a module of the project
-must never replace one of the runner's."""
-
-_TEXTS = ("working-directory", "dora", "venv", "restart", "start-timeout")
-_FLAGS = ("uv", "debug", "allow-shell-nodes", "attached", "hot-reload")
-_REPEATED = ("env-key", "log-rate-limit", "node-limit", "node-restart", *ARGUMENTS)
-_REQUIRED = ("name", "uuid", "working-directory", "dora")
 
 
 class RunnerOptions(NamedTuple):
@@ -78,7 +70,7 @@ class RunnerOptions(NamedTuple):
     uv: bool = False
     debug: bool = False
     allow_shell_nodes: bool = False
-    grace: int = 10 * SECOND
+    grace: int = DEFAULT_GRACE
     attached: bool = False
     exit_when_nodes_finish: bool | None = None
     env_keys: tuple[str, ...] = ()
@@ -98,32 +90,82 @@ class RunnerOptions(NamedTuple):
         return self.reload.is_on
 
 
+Parse = Callable[[str], Any]
+Format = Callable[[Any], str]
+
+
+class Option(NamedTuple):
+    """One option of the command line, `--key=value`, or `--key` if it is a flag.
+
+    field: of RunnerOptions. parse: the value of the field from the texts of all arguments with this
+    key. format: the inverse, a text for each argument.
+    """
+
+    key: str
+    field: str
+    parse: Callable[[list[str]], Any]
+    format: Callable[[Any], list[str]]
+    is_repeated: bool = False
+    is_flag: bool = False
+
+
+def _always(key: str, field: str, parse: Parse = str, to_text: Format = str) -> Option:
+    return Option(key, field, lambda texts: parse(texts[0]), lambda value: [to_text(value)])
+
+
+def _unless_default(key: str, field: str, parse: Parse = str, to_text: Format = str) -> Option:
+    option, default = _always(key, field, parse, to_text), RunnerOptions._field_defaults[field]
+    return option._replace(format=lambda value: [] if value == default else [to_text(value)])
+
+
+def _each(key: str, field: str, parse: Parse = str, to_text: Format = str) -> Option:
+    def parse_all(texts: list[str]) -> tuple[Any, ...]:
+        return tuple(map(parse, texts))
+
+    return Option(key, field, parse_all, lambda values: list(map(to_text, values)), True)
+
+
+def _flag(key: str, field: str) -> Option:
+    return Option(key, field, lambda _: True, lambda value: [""] * value, is_flag=True)
+
+
+_REQUIRED = ("name", "uuid", "working-directory", "dora")
+_OPTIONS = (
+    _always("name", "name", parse_name),
+    _always("uuid", "uuid", parse_uuid),
+    _always("working-directory", "working_directory"),
+    _always("dora", "dora"),
+    _always("grace-duration", "grace", parse_duration, format_duration),
+    _unless_default("venv", "venv"),
+    _unless_default("exit-when-nodes-finish", "exit_when_nodes_finish", parse_bool, format_bool),
+    _unless_default("restart", "restart", parse_policy, format_policy),
+    _unless_default("start-timeout", "start_timeout", parse_duration, format_duration),
+    _each("env-key", "env_keys"),
+    Option("log-rate-limit", "log_rates", parse_rates, format_rates, is_repeated=True),
+    _each("node-limit", "node_limits", parse_node_limits, format_node_limits),
+    _each("node-restart", "node_restarts", parse_node_policy, format_node_policy),
+    _each("watch", "reload.watch"),
+    _each("ignore", "reload.ignore"),
+    _each("node-watch", "reload.node_watch", parse_of_node, "=".join),
+    _each("replace", "reload.replace", parse_of_node, "=".join),
+    _flag("uv", "uv"),
+    _flag("debug", "debug"),
+    _flag("allow-shell-nodes", "allow_shell_nodes"),
+    _flag("attached", "attached"),
+    _flag("hot-reload", "reload.is_on"),
+)
+"""All options in the order of the command line, which ends with the path of the dataflow."""
+
+_BY_KEY = {option.key: option for option in _OPTIONS}
+
+
 def format_runner_argv(options: RunnerOptions) -> list[str]:
     """The arguments of `python3 -m dora_systemd.runner`, with readable long options."""
-    pairs = [
-        ("name", options.name),
-        ("uuid", options.uuid),
-        ("working-directory", options.working_directory),
-        ("dora", options.dora),
-        ("grace-duration", format_duration(options.grace)),
-    ]
-    if options.venv is not None:
-        pairs.append(("venv", options.venv))
-    if options.exit_when_nodes_finish is not None:
-        pairs.append(("exit-when-nodes-finish", format_bool(options.exit_when_nodes_finish)))
-    if options.restart != DEFAULT:
-        pairs.append(("restart", format_policy(options.restart)))
-    if options.start_timeout != INFINITY:
-        pairs.append(("start-timeout", format_duration(options.start_timeout)))
-    pairs += [("env-key", key) for key in options.env_keys]
-    pairs += [("log-rate-limit", text) for text in format_rates(options.log_rates)]
-    pairs += [("node-limit", format_node_limits(one)) for one in options.node_limits]
-    pairs += [
-        ("node-restart", f"{node}:{format_policy(one)}") for node, one in options.node_restarts
-    ]
-    pairs += format_reload(options.reload)
-    flags = [f"--{flag}" for flag in _FLAGS if getattr(options, flag.replace("-", "_"))]
-    return [f"--{key}={value}" for key, value in pairs] + flags + [options.dataflow]
+    arguments = []
+    for one in _OPTIONS:
+        texts = one.format(attrgetter(one.field)(options))
+        arguments += [f"--{one.key}" if one.is_flag else f"--{one.key}={text}" for text in texts]
+    return [*arguments, options.dataflow]
 
 
 def parse_runner_argv(argv: Sequence[str]) -> RunnerOptions:
@@ -131,25 +173,39 @@ def parse_runner_argv(argv: Sequence[str]) -> RunnerOptions:
 
     Raises DoraSystemdError (USAGE) for an unknown, repeated or missing option, and for a bad value.
     """
-    dataflow, given = argv[-1] if argv else "", argv[:-1]
+    dataflow = argv[-1] if argv else ""
     if not dataflow.startswith("/"):
         raise _refusal(f"no absolute path of a dataflow in {quoted(' '.join(argv))}")
-    values: dict[str, str] = {}
-    lists: dict[str, list[str]] = {key: [] for key in _REPEATED}
-    for argument in given:
-        key, value = _split(argument)
-        if key in lists:
-            lists[key].append(value)
-        elif key in values:
-            raise _refusal(f"--{key} is given twice")
-        else:
-            values[key] = value
-    return _options(dataflow, values, lists)
+    given: dict[str, list[str]] = {}
+    for argument in argv[:-1]:
+        option, text = _split(argument)
+        if option.key in given and not option.is_repeated:
+            raise _refusal(f"--{option.key} is given twice")
+        given.setdefault(option.key, []).append(text)
+    missing = [f"--{key}" for key in _REQUIRED if key not in given]
+    if missing:
+        raise _refusal(f"{' and '.join(missing)} missing")
+    return _options(dataflow, given)
+
+
+def _split(argument: str) -> tuple[Option, str]:
+    key, equals, text = argument.removeprefix("--").partition("=")
+    option = _BY_KEY.get(key)
+    if not argument.startswith("--") or option is None or option.is_flag == bool(equals):
+        raise _refusal(f"unknown argument {quoted(argument)}")
+    return option, text
+
+
+def _options(dataflow: str, given: dict[str, list[str]]) -> RunnerOptions:
+    parsed = {one.field: one.parse(given[one.key]) for one in _OPTIONS if one.key in given}
+    own = {field: value for field, value in parsed.items() if "." not in field}
+    of_reload = {field.removeprefix("reload."): parsed[field] for field in parsed.keys() - own}
+    return RunnerOptions(dataflow=dataflow, **own, reload=HotReload(**of_reload))
 
 
 def runner_command(python: str, options: RunnerOptions) -> list[str]:
     """ExecStart= of the unit. python: absolute path of the interpreter of dora-systemd."""
-    return [python, *_PYTHON_FLAGS, *format_runner_argv(options)]
+    return [*_python(python), *format_runner_argv(options)]
 
 
 def post_command(python: str, options: RunnerOptions) -> list[str]:
@@ -157,18 +213,17 @@ def post_command(python: str, options: RunnerOptions) -> list[str]:
 
     It starts no Python if the runner exited by itself, because a restart would wait for that.
     """
-    command = [python, *_PYTHON_FLAGS[:-1], POST_MODULE, options.name, options.uuid]
-    return ["/bin/sh", _STOP_POST, *command]
+    return ["/bin/sh", _STOP_POST, *_python(python, ".stop_post"), options.name, options.uuid]
 
 
 def reload_command(python: str) -> list[str]:
     """ExecReload= of the unit, for `systemctl reload`."""
-    return [python, *_PYTHON_FLAGS[:-1], RELOAD_MODULE]
+    return _python(python, ".reload.request")
 
 
 def check_command(python: str, options: RunnerOptions) -> list[str]:
     """The command that checks whether a runner with these options would refuse to start."""
-    return [python, *_PYTHON_FLAGS[:-1], CHECK_MODULE, *format_runner_argv(options)]
+    return [*_python(python, ".check"), *format_runner_argv(options)]
 
 
 def options_from_command(command: Sequence[str]) -> RunnerOptions:
@@ -178,47 +233,10 @@ def options_from_command(command: Sequence[str]) -> RunnerOptions:
     return parse_runner_argv(command[list(command).index(RUNNER_MODULE) + 1 :])
 
 
-def _split(argument: str) -> tuple[str, str]:
-    key, equals, value = argument.removeprefix("--").partition("=")
-    known = (*_REQUIRED, *_TEXTS, "grace-duration", "exit-when-nodes-finish", *_REPEATED)
-    expected = known if equals else _FLAGS
-    if not argument.startswith("--") or key not in expected:
-        raise _refusal(f"unknown argument {quoted(argument)}")
-    return key, value
-
-
-def _options(dataflow: str, values: dict[str, str], lists: dict[str, list[str]]) -> RunnerOptions:
-    missing = [f"--{key}" for key in _REQUIRED if key not in values]
-    if missing:
-        raise _refusal(f"{' and '.join(missing)} missing")
-    exits = values.get("exit-when-nodes-finish")
-    return RunnerOptions(
-        name=parse_name(values["name"]),
-        uuid=parse_uuid(values["uuid"]),
-        dataflow=dataflow,
-        env_keys=tuple(lists["env-key"]),
-        log_rates=parse_rates(lists["log-rate-limit"]),
-        node_limits=tuple(map(parse_node_limits, lists["node-limit"])),
-        restart=parse_policy(values["restart"]) if "restart" in values else DEFAULT,
-        node_restarts=tuple(map(_node_restart, lists["node-restart"])),
-        start_timeout=parse_duration(values.get("start-timeout", "infinity")),
-        grace=parse_duration(values.get("grace-duration", "10s")),
-        exit_when_nodes_finish=None if exits is None else parse_bool(exits),
-        working_directory=values["working-directory"],
-        dora=values["dora"],
-        venv=values.get("venv"),
-        uv="uv" in values,
-        debug="debug" in values,
-        allow_shell_nodes="allow-shell-nodes" in values,
-        attached="attached" in values,
-        reload=parse_reload("hot-reload" in values, lists),
-    )
-
-
-def _node_restart(text: str) -> tuple[str, RestartPolicy]:
-    # Times contain no colon, but node ids may contain one.
-    node, _, policy = text.rpartition(":")
-    return node, parse_policy(policy)
+def _python(python: str, module: str = "") -> list[str]:
+    # Ignore PYTHON* variables, and keep the working directory out of sys.path: a module of the
+    # project must never replace one of the runner's.
+    return [python, "-E", "-P", "-m", RUNNER_MODULE + module]
 
 
 def _refusal(reason: str) -> DoraSystemdError:

@@ -7,18 +7,12 @@ systemd.service(5), systemd.unit(5) and dora's descriptor.
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+from dora_systemd.decisions.cell.limits import format_number
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.suggestions import missing_node
-from dora_systemd.values import (
-    INFINITY,
-    SECOND,
-    format_duration,
-    parse_duration,
-    quoted,
-)
+from dora_systemd.names import check_known
+from dora_systemd.values import INFINITY, SECOND, format_duration, parse_duration, quoted
 
 POLICIES = ("no", "on-failure", "always")
-_DORA_POLICIES = {"no": "never", "on-failure": "on-failure", "always": "always"}
 
 MIN_DELAY = SECOND // 2
 """µs. dora's default is 0, and restarted a node that cannot start 37 times a second."""
@@ -46,7 +40,7 @@ class RestartPolicy(NamedTuple):
         is_endless = self.max_restarts == INFINITY
         window = {} if self.window == INFINITY else {"restart_window": self.window / SECOND}
         return {
-            "restart_policy": _DORA_POLICIES[self.policy],
+            "restart_policy": self.policy,
             "max_restarts": 0 if is_endless else self.max_restarts,
             "restart_delay": self.delay / SECOND,
             "max_restart_delay": self.max_delay / SECOND,
@@ -69,14 +63,14 @@ HELD_KEYS: Mapping[str, Any] = {
 """The keys of a node that waits after a failure. dora can replace such a node at any time, but
 never one that it has given up."""
 
-_KEYS = ("policy", "max", "window", "delay", "max-delay")
+_KEYS = ("max", "window", "delay", "max-delay")
 
 
 def format_policy(policy: RestartPolicy) -> str:
     """The policy in the runner's command line, such as `on-failure,max=5,window=10min,...`."""
-    maximum = "infinity" if policy.max_restarts == INFINITY else str(policy.max_restarts)
+    maximum = format_number(policy.max_restarts)
     times = (format_duration(one) for one in (policy.window, policy.delay, policy.max_delay))
-    pairs = zip(_KEYS[1:], (maximum, *times), strict=True)
+    pairs = zip(_KEYS, (maximum, *times), strict=True)
     return ",".join([policy.policy, *(f"{key}={text}" for key, text in pairs)])
 
 
@@ -84,14 +78,24 @@ def parse_policy(text: str) -> RestartPolicy:
     """The exact inverse of format_policy. Raises DoraSystemdError (USAGE)."""
     word, *pairs = text.split(",")
     given = dict(pair.split("=", 1) for pair in pairs if "=" in pair)
-    if word not in POLICIES or set(given) != set(_KEYS[1:]):
+    if word not in POLICIES or given.keys() != set(_KEYS):
         message = f"cannot use {quoted(text)} as restart policy"
         raise DoraSystemdError(message, f"valid values: {', '.join(POLICIES)}", ExitCode.USAGE)
-    return RestartPolicy(
-        word,
-        parse_count(given["max"]),
-        *(parse_duration(given[key]) for key in ("window", "delay", "max-delay")),
-    )
+    times = (parse_duration(given[key]) for key in _KEYS[1:])
+    return RestartPolicy(word, parse_count(given["max"]), *times)
+
+
+def format_node_policy(of_node: tuple[str, RestartPolicy]) -> str:
+    """The policy of one node in the runner's command line, NODE:POLICY."""
+    node, policy = of_node
+    return f"{node}:{format_policy(policy)}"
+
+
+def parse_node_policy(text: str) -> tuple[str, RestartPolicy]:
+    """The exact inverse of format_node_policy. Raises DoraSystemdError (USAGE)."""
+    # Policies contain no colon, but node ids may contain one.
+    node, _, policy = text.rpartition(":")
+    return node, parse_policy(policy)
 
 
 def parse_count(text: str) -> int:
@@ -127,9 +131,7 @@ def check_restart_nodes(
     policies: Iterable[tuple[str, RestartPolicy]], nodes: Sequence[str]
 ) -> None:
     """Raise DoraSystemdError (BAD_INPUT) for the policy of a node that is not in `nodes`."""
-    for node, _ in policies:
-        if node not in nodes:
-            raise missing_node("cannot set the restart policy of", node, nodes)
+    check_known("cannot set the restart policy of", dict(policies), nodes)
 
 
 def budget_words(budget: Mapping[str, int | None]) -> str:

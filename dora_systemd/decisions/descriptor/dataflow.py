@@ -7,12 +7,11 @@ run forever, and only `dora validate` finds an input without a source. dora chec
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
-from dora_systemd.decisions.descriptor.json_size import check_json
+from dora_systemd.decisions.descriptor.json_size import check_json, refusal
 from dora_systemd.decisions.descriptor.nodes import (
     UNEXPANDED,
     Node,
     NodeKind,
-    dataflow_refusal,
     described,
     mapping_of,
     parse_node,
@@ -49,12 +48,12 @@ def parse_dataflow(document: object, source: str) -> Dataflow:
     """
     if not isinstance(document, dict):
         hint = "a dataflow is a mapping with the key 'nodes'"
-        raise dataflow_refusal(source, f"it holds {described(document)}", hint)
+        raise refusal(source, f"it holds {described(document)}", hint)
     check_json(document, source, MAX_JSON)
     nodes = document.get("nodes")
     if not nodes or not isinstance(nodes, list):
         reason = "it has no nodes" if not nodes else f"'nodes' is {described(nodes)}"
-        raise dataflow_refusal(source, reason, "list at least one node below 'nodes:'")
+        raise refusal(source, reason, "list at least one node below 'nodes:'")
     parsed = [parse_node(node, place, source) for place, node in enumerate(nodes)]
     exits = document.get("exit_when_nodes_finish")
     dataflow = Dataflow(
@@ -81,7 +80,7 @@ def _check_ids(dataflow: Dataflow) -> None:
     for node in dataflow.nodes:
         if node.id in seen:
             hint = "every node needs an id of its own"
-            raise dataflow_refusal(dataflow.source, f"two nodes have the id {node.id}", hint)
+            raise refusal(dataflow.source, f"two nodes have the id {node.id}", hint)
         seen.add(node.id)
 
 
@@ -93,9 +92,7 @@ def _check_wiring(dataflow: Dataflow) -> None:
             if reason:
                 hint = "an input comes from NODE/OUTPUT, where NODE lists OUTPUT in its outputs"
                 where = f"node {node.id}: input {quoted(given.name)} comes from"
-                raise dataflow_refusal(
-                    dataflow.source, f"{where} {quoted(given.source)}, {reason}", hint
-                )
+                raise refusal(dataflow.source, f"{where} {quoted(given.source)}, {reason}", hint)
 
 
 def _missing(source: str, nodes: Mapping[str, Node]) -> str:

@@ -25,9 +25,9 @@ def check_json(document: object, source: str, max_bytes: int) -> None:
         size += _size(value, source)
         if size > max_bytes:
             hint = f"{max_bytes // 1024} KiB is the most; look for anchors that repeat much"
-            raise _refusal(source, "it is too large once its anchors are written out", hint)
+            raise refusal(source, "it is too large once its anchors are written out", hint)
         if depth > MAX_DEPTH:
-            raise _refusal(source, f"it is nested more than {MAX_DEPTH} levels deep", "flatten it")
+            raise refusal(source, f"it is nested more than {MAX_DEPTH} levels deep", "flatten it")
         waiting += [(child, depth + 1) for child in _children(value, source)]
 
 
@@ -42,9 +42,9 @@ def _size(value: object, source: str) -> int:
     if isinstance(value, float) and math.isfinite(value):
         return 20
     if isinstance(value, int | float):
-        raise _refusal(source, "a number in it is too large for JSON", "write it as text")
+        raise refusal(source, "a number in it is too large for JSON", "write it as text")
     kind = type(value).__name__
-    raise _refusal(source, f"a value in it is of type {kind}", "write plain text or a number")
+    raise refusal(source, f"a value in it is of type {kind}", "write plain text or a number")
 
 
 def _text_size(value: str, source: str) -> int:
@@ -52,7 +52,7 @@ def _text_size(value: str, source: str) -> int:
         return len(value.encode()) + 4
     except UnicodeEncodeError as error:
         hint = "save the file as UTF-8"
-        raise _refusal(source, "a text in it is not Unicode", hint) from error
+        raise refusal(source, "a text in it is not Unicode", hint) from error
 
 
 def _children(value: object, source: str) -> Iterator[object]:
@@ -60,12 +60,13 @@ def _children(value: object, source: str) -> Iterator[object]:
         for key, child in value.items():
             if not isinstance(key, str):
                 kind = f"a key in it is {type(key).__name__}, not text"
-                raise _refusal(source, kind, "put the key in quotes")
+                raise refusal(source, kind, "put the key in quotes")
             yield key
             yield child
     elif isinstance(value, list):
         yield from value
 
 
-def _refusal(source: str, reason: str, hint: str) -> DoraSystemdError:
+def refusal(source: str, reason: str, hint: str) -> DoraSystemdError:
+    """The error (BAD_INPUT) for a descriptor or settings file `source` that cannot be used."""
     return DoraSystemdError(f"cannot use {shown(source)}: {reason}", hint, ExitCode.BAD_INPUT)

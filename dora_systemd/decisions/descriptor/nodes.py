@@ -4,9 +4,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.decisions.descriptor.json_size import refusal
 from dora_systemd.names import MAX_NODE_ID, NODE_ID
-from dora_systemd.values import quoted, shown
+from dora_systemd.values import quoted
 
 _RESERVED_IDS = frozenset({"dora"})
 _OUTPUT_KEYS = ("send_stdout_as", "send_logs_as", "min_log_level")
@@ -84,7 +84,7 @@ def parse_node(node: object, place: int, source: str) -> Node:
     """The node at index `place` of the list; raises as parse_dataflow does."""
     if not isinstance(node, dict):
         hint = "a node is a mapping with at least 'id' and 'path'"
-        raise dataflow_refusal(source, f"node {place + 1} is {described(node)}", hint)
+        raise refusal(source, f"node {place + 1} is {described(node)}", hint)
     node_id = _parse_id(node.get("id"), place, source)
     what = f"node {node_id}"
     return Node(
@@ -112,19 +112,19 @@ def parse_node(node: object, place: int, source: str) -> Node:
 def _parse_id(node_id: object, place: int, source: str) -> str:
     what = f"node {place + 1}"
     if node_id is None:
-        raise dataflow_refusal(source, f"{what} has no id", "give every node an 'id'")
+        raise refusal(source, f"{what} has no id", "give every node an 'id'")
     if not isinstance(node_id, str):
         hint = f'in quotes it is text: id: "{node_id}"'
-        raise dataflow_refusal(source, f"the id of {what} is {described(node_id)}", hint)
+        raise refusal(source, f"the id of {what} is {described(node_id)}", hint)
     hint = "an id is letters, digits, '_', '-' and '.', and begins with no '.'"
     if not NODE_ID.fullmatch(node_id):
-        raise dataflow_refusal(source, f"{what} has the id {quoted(node_id)}", hint)
+        raise refusal(source, f"{what} has the id {quoted(node_id)}", hint)
     if node_id in _RESERVED_IDS:
         hint = "'dora' stands for dora's own sources, such as dora/timer"
-        raise dataflow_refusal(source, f"{what} has the id {quoted(node_id)}", hint)
+        raise refusal(source, f"{what} has the id {quoted(node_id)}", hint)
     if len(node_id) > MAX_NODE_ID:
         hint = f"an id has at most {MAX_NODE_ID} characters: it names a cgroup"
-        raise dataflow_refusal(source, f"{what} has the id {quoted(node_id)}", hint)
+        raise refusal(source, f"{what} has the id {quoted(node_id)}", hint)
     return node_id
 
 
@@ -135,7 +135,7 @@ def _kind_of(node: Mapping[str, object], source: str, what: str) -> NodeKind:
     path = text_of(node.get("path"))
     if not path:
         hint = "a node needs one of path, operator, operators, ros2, module and hub"
-        raise dataflow_refusal(source, f"{what} has no path", hint)
+        raise refusal(source, f"{what} has no path", hint)
     if path in _PATH_KINDS:
         return _PATH_KINDS[path]
     if path.startswith(("http://", "https://")):
@@ -182,13 +182,13 @@ def mapping_of(value: object, source: str, what: str) -> Mapping[str, object]:
     """
     if value is not None and not isinstance(value, dict):
         hint = "write a mapping, KEY: VALUE"
-        raise dataflow_refusal(source, f"{what} is {described(value)}", hint)
+        raise refusal(source, f"{what} is {described(value)}", hint)
     return value or {}
 
 
 def _sequence(value: object, source: str, what: str) -> Sequence[object]:
     if value is not None and not isinstance(value, list):
-        raise dataflow_refusal(source, f"{what} is {described(value)}", "write a list")
+        raise refusal(source, f"{what} is {described(value)}", "write a list")
     return value or ()
 
 
@@ -198,8 +198,3 @@ def described(value: object) -> str:
         return f"the text {quoted(value)}"
     words = {dict: "a mapping", list: "a list", bool: "true or false", type(None): "nothing"}
     return words.get(type(value), "a number")
-
-
-def dataflow_refusal(source: str, reason: str, hint: str) -> DoraSystemdError:
-    """The error (BAD_INPUT) for a descriptor `source` that cannot be used."""
-    return DoraSystemdError(f"cannot use {shown(source)}: {reason}", hint, ExitCode.BAD_INPUT)

@@ -7,17 +7,17 @@ documents some of them.
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 from uuid import uuid4
 
 from dora_systemd.decisions.cell.exits import Exit, ExitKind
-from dora_systemd.decisions.life import events as life
-from dora_systemd.decisions.resources.oom import Oom
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.values import INFINITY, SECOND
 
 Params = str | Mapping[str, Any]
+
+_ENDED_ALREADY = re.compile(r"unknown dataflow\b")
 
 
 @dataclass(frozen=True)
@@ -106,9 +106,7 @@ def start_params(descriptor: Mapping[str, Any], name: str, work: str) -> Params:
 
 def stop_params(run: str, grace: int) -> Params:
     """Stop a run. grace: µs until dora sends SIGTERM; SIGKILL follows after 1.5 times that."""
-    return {
-        "Stop": {"dataflow_uuid": run, "grace_duration": duration(grace), "force": False},
-    }
+    return {"Stop": {"dataflow_uuid": run, "grace_duration": duration(grace), "force": False}}
 
 
 def duration(microseconds: int) -> Mapping[str, int]:
@@ -160,7 +158,6 @@ def reload_params(run: str, node: str, operator: str) -> Params:
 
 DAEMON_CONNECTED: Params = "DaemonConnected"
 CONNECTED_DAEMONS: Params = "ConnectedMachines"
-HELLO: Params = {"Hello": {"dora_version": "1.0.0"}}
 
 
 def parse_heartbeat(reply: Reply) -> int:
@@ -209,7 +206,7 @@ def _failure(verdict: Any) -> Exit:
     cause = _mapping(error.get("cause"))
     if "FailedToSpawn" in cause:
         return Exit(words=f"failed to spawn: {first_line(str(cause['FailedToSpawn']))}")
-    ended = _exit(*next(iter(_mapping(error.get("exit_status")).items()), ("", None)))
+    ended = exit_value(*next(iter(_mapping(error.get("exit_status")).items()), ("", None)))
     if "Cascading" in cause:
         return ended._replace(by=str(_mapping(cause["Cascading"]).get("caused_by_node")))
     if error.get("cause") == "GraceDuration":
@@ -217,7 +214,7 @@ def _failure(verdict: Any) -> Exit:
     return ended
 
 
-def _exit(kind: str, number: Any) -> Exit:
+def exit_value(kind: str, number: Any) -> Exit:
     """An exit status as dora writes it; kind: ExitCode, Signal or a word without a number."""
     kinds = {"ExitCode": ExitKind.CODE, "Signal": ExitKind.SIGNAL}
     if kind in kinds and isinstance(number, int):
@@ -229,57 +226,3 @@ def first_line(text: str) -> str:
     """An error of dora without the location and backtrace after it."""
     head = re.split(r"\n\s*\n?(?:Location|Stack backtrace|Suggestion)\b", text, maxsplit=1)[0]
     return " ".join(head.split())
-
-
-_ENDED_ALREADY = re.compile(r"unknown dataflow\b")
-_SPAWNED = re.compile(r"spawned node with pid (\d+)")
-_EXITED = re.compile(
-    r"handling node stop with exit status (\w+)(?:\((-?\d+)\))? \(restart: (true|false)"
-)
-_CASCADED = re.compile(r"marking `(.+)` as cascading error caused by `(.+)`")
-
-
-def parse_life_event(record: LogRecord, at_us: int) -> life.Event | None:
-    """The life event that a line of dora's own means; None for other lines.
-
-    Nodes cannot forge one: lines that they print have the level "stdout" or another target.
-    """
-    if record.target == "coordinator":
-        return life.RunFinished(at_us) if record.message == "dataflow finished" else None
-    if record.node:
-        return _node_event(record, at_us) if record.target in ("daemon", "spawner") else None
-    if record.target == "daemon" and record.message.endswith("starting dataflow"):
-        return life.AllReady(at_us)
-    return None
-
-
-def _node_event(record: LogRecord, at_us: int) -> life.Event | None:
-    if record.message == "node is ready":
-        return life.NodeReady(at_us, record.node)
-    if spawned := _SPAWNED.fullmatch(record.message):
-        return life.NodeSpawned(at_us, record.node, int(spawned[1]))
-    if exited := _EXITED.match(record.message):
-        how = _exit(exited[1], int(exited[2]) if exited[2] else None)
-        return life.NodeExited(at_us, record.node, how, exited[3] == "true")
-    if cascaded := _CASCADED.match(record.message):
-        return life.NodeCascaded(at_us, cascaded[1], cascaded[2])
-    return None
-
-
-_UNRESPONSIVE = re.compile(r"node `([^`]+)` (unresponsive for \d+ms \(timeout: [^)]*\)), killing")
-
-
-def parse_daemon_line(line: str, at_us: int) -> life.Event | None:
-    """The event of a line printed by the daemon: dora reports hung nodes only there."""
-    match = _UNRESPONSIVE.search(line)
-    return life.NodeHung(at_us, match[1], match[2]) if match else None
-
-
-def with_facts(event: life.NodeExited, is_stale: bool, oom: Oom | None) -> life.NodeExited:
-    """The event with facts that only the runner knows.
-
-    is_stale: whether the node's current process is alive. oom: the OOM kill that ended it.
-    """
-    oom = oom if event.exit.is_failure else None
-    how = event.exit if oom is None else Exit(words=oom.text)
-    return replace(event, exit=how, is_stale=is_stale, oom=oom)

@@ -6,7 +6,7 @@ from typing import Any
 from dora_systemd.decisions.properties.kinds import Property
 from dora_systemd.decisions.properties.table import RLIMITS, TABLE, Row
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.suggestions import did_you_mean
+from dora_systemd.names import did_you_mean
 from dora_systemd.values import quoted, shown
 
 Properties = Mapping[str, Property]

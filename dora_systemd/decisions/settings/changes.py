@@ -5,9 +5,9 @@ from typing import Any
 
 from dora_systemd.decisions.cell.hot_reload import SettingsChange
 from dora_systemd.decisions.cell.limits import BY_KEY, NodeLimits, node_limits
-from dora_systemd.decisions.settings.limit_checks import settings_node_limits
 from dora_systemd.decisions.settings.limits import NODE_LIMIT
 from dora_systemd.decisions.settings.resolve import Settings
+from dora_systemd.decisions.settings.runner_options import settings_node_limits
 from dora_systemd.values import INFINITY
 
 _USUAL_WEIGHT = 100

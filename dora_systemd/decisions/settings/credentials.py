@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Mapping
+from operator import or_
 from typing import Any
 
 from dora_systemd.decisions.properties.assignments import typed
@@ -20,7 +21,7 @@ def parse_credentials(value: Any, base: Base) -> Mapping[str, str]:
     """Files by name, from a mapping or from texts NAME=FILE. Raises DoraSystemdError (USAGE)."""
     if isinstance(value, Mapping):
         return dict(_pair(scalar_text(name), file, base) for name, file in value.items())
-    return dict(_parse_one(scalar_text(one), base) for one in texts_of(value))
+    return dict(_parse_one(one, base) for one in texts_of(value))
 
 
 def credential_properties(files: Mapping[str, str]) -> dict[str, Property]:
@@ -56,7 +57,7 @@ CREDENTIALS = Setting[Mapping[str, str]](
         parse_credentials,
         lambda value: [f"{name}={file}" for name, file in value.items()],
         is_repeatable=True,
-        merge=lambda lower, higher: {**lower, **higher},
+        merge=or_,
     ),
     {},
     "Secret that the nodes read as the file NAME in $CREDENTIALS_DIRECTORY.",

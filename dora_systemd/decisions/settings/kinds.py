@@ -1,7 +1,8 @@
 """Defines settings, and the kinds of their values."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from operator import add, or_
 from pathlib import PurePath
 from typing import Any, Generic, TypeVar
 
@@ -10,15 +11,9 @@ from dora_systemd.decisions.cell.environment import (
     environment_entries,
     parse_assignment,
 )
-from dora_systemd.decisions.cell.line_rates import RateLimits, format_rates, parse_rates
+from dora_systemd.decisions.cell.line_rates import format_rates, parse_rates
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.values import (
-    format_bool,
-    format_duration,
-    parse_bool,
-    parse_duration,
-    quoted,
-)
+from dora_systemd.values import format_bool, format_duration, parse_bool, parse_duration, quoted
 
 T = TypeVar("T")
 Scalar = str | int | float | bool
@@ -37,6 +32,7 @@ class Kind(Generic[T]):
     is_flag: `--x` and `--no-x` without a value.
     is_repeatable: the flag may be given more than once.
     merge: joins the values of two sources, higher precedence last; None: only the latter counts.
+    metavar: the value in --help, such as TIME; a setting may have a better one.
     """
 
     schema: Any
@@ -46,6 +42,7 @@ class Kind(Generic[T]):
     is_flag: bool = False
     is_repeatable: bool = False
     merge: Callable[[T, T], T] | None = None
+    metavar: str = ""
 
 
 @dataclass(frozen=True)
@@ -54,8 +51,10 @@ class Setting(Generic[T]):
 
     name: its key in settings files.
     help: one sentence, for --help and the manual.
-    flags: its options, the long one first; a kind with is_flag has `--no-...` as well.
-    variable: the environment variable, or "".
+    flags: its options, the long one first; a kind with is_flag has `--no-...` as well. Without any
+    it is the name with "-" for "_".
+    variable: the environment variable. Without one it is DORA_ and the name, or for a repeatable
+    kind there is none.
     per_node: also valid below `nodes: NODE:` in a settings file.
     property: the systemd property with the same value, as in a unit file, or "".
     root_only: the setting makes root read, run or grant something. In system scope it is only valid
@@ -73,15 +72,66 @@ class Setting(Generic[T]):
     property: str = ""
     root_only: bool = False
 
+    def __post_init__(self) -> None:
+        word = self.name.replace("_", "-")
+        variable = "" if self.kind.is_repeatable else f"DORA_{self.name.upper()}"
+        object.__setattr__(self, "flags", self.flags or (f"--{word}",))
+        object.__setattr__(self, "variable", self.variable or variable)
+        object.__setattr__(self, "metavar", self.metavar or self.kind.metavar)
+
 
 def scalar_text(value: Scalar) -> str:
     """A YAML scalar as the author sees it: true, 1, 0.5, text."""
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
-def _parse_text(value: Scalar, base: Base) -> str:
-    del base
-    text = scalar_text(value)
+def listed(value: Any) -> Sequence[Any]:
+    """The values of a repeatable flag or a settings file: a list, or a single value."""
+    return value if isinstance(value, list | tuple) else [value]
+
+
+def texts_of(value: Any) -> list[str]:
+    """The same as texts."""
+    return list(map(scalar_text, listed(value)))
+
+
+def one_text(
+    schema: Any,
+    expected: str,
+    metavar: str,
+    parse: Callable[[str], T],
+    to_text: Callable[[T], str] = str,
+) -> Kind[T]:
+    """A kind with one text for each value, which means the same in every directory."""
+    return Kind(
+        schema,
+        expected,
+        lambda value, _: parse(scalar_text(value)),
+        lambda value: [to_text(value)],
+        metavar=metavar,
+    )
+
+
+def many_texts(
+    expected: str,
+    metavar: str,
+    parse: Callable[[list[str]], T],
+    to_texts: Callable[[T], Sequence[str]],
+    merge: Callable[[T, T], T] | None = None,
+) -> Kind[T]:
+    """A repeatable kind of texts, which mean the same in every directory."""
+    return Kind(
+        str | list[str],
+        expected,
+        lambda value, _: parse(texts_of(value)),
+        to_texts,
+        is_repeatable=True,
+        merge=merge,
+        metavar=metavar,
+    )
+
+
+def _checked_text(text: str) -> str:
     if not text.strip() or not text.isprintable():
         hint = "write one line of plain text"
         raise DoraSystemdError(f"cannot read {quoted(text)} as a text", hint, ExitCode.USAGE)
@@ -89,69 +139,47 @@ def _parse_text(value: Scalar, base: Base) -> str:
 
 
 def _parse_path(value: Scalar, base: Base) -> str:
-    text = _parse_text(value, None)
+    text = _checked_text(scalar_text(value))
     return str(base / text) if base else text
 
 
 def _parse_program(value: Scalar, base: Base) -> str:
     """A path, or a program name to look up in PATH."""
-    text = _parse_text(value, None)
-    return _parse_path(text, base) if "/" in text else text
-
-
-def texts_of(value: Any) -> Sequence[Any]:
-    """The values of a repeatable flag or a settings file: a list, or a single value."""
-    return value if isinstance(value, list | tuple) else [value]
+    return _parse_path(value, base if "/" in scalar_text(value) else None)
 
 
 def _parse_paths(value: Any, base: Base) -> tuple[str, ...]:
     return tuple(_parse_path(one, base) for one in texts_of(value))
 
 
-def _parse_environment(value: Any, base: Base) -> Mapping[str, str]:
-    del base
+def _parse_environment(value: Any, _: Base) -> Mapping[str, str]:
     if isinstance(value, Mapping):
         return dict(checked_variable(key, scalar_text(one)) for key, one in value.items())
-    return dict(parse_assignment(scalar_text(one)) for one in texts_of(value))
+    return dict(map(parse_assignment, texts_of(value)))
 
 
-def _parse_properties(value: Any, base: Base) -> tuple[str, ...]:
+def _parse_properties(value: Any, _: Base) -> tuple[str, ...]:
     """Assignments KEY=VALUE; the table of properties parses the values."""
-    del base
     if isinstance(value, Mapping):
         return tuple(
-            f"{key}={_property_text(one)}" for key, many in value.items() for one in texts_of(many)
+            f"{key}={_property_text(one)}" for key, many in value.items() for one in listed(many)
         )
-    return tuple(scalar_text(one) for one in texts_of(value))
+    return tuple(texts_of(value))
 
 
 def _property_text(value: Scalar) -> str:
     return format_bool(value) if isinstance(value, bool) else str(value)
 
 
-TEXT = Kind[str](Scalar, "a text", _parse_text, lambda value: [value])
+TEXT = one_text(Scalar, "a text", "TEXT", _checked_text)
 PATH = Kind[str](str, "a path", _parse_path, lambda value: [value])
-PROGRAM = Kind[str](str, "a program", _parse_program, lambda value: [value])
-BOOL = Kind[bool](
-    bool | str,
-    "yes or no",
-    lambda value, _: parse_bool(scalar_text(value)),
-    lambda value: [format_bool(value)],
-    is_flag=True,
-)
-DURATION = Kind[int](
-    str | int | float,
-    "a time span such as 10s",
-    lambda value, _: parse_duration(scalar_text(value)),
-    lambda value: [format_duration(value)],
+PROGRAM = Kind[str](str, "a program", _parse_program, lambda value: [value], metavar="FILE")
+BOOL = replace(one_text(bool | str, "yes or no", "", parse_bool, format_bool), is_flag=True)
+DURATION = one_text(
+    str | int | float, "a time span such as 10s", "TIME", parse_duration, format_duration
 )
 PATHS = Kind[tuple[str, ...]](
-    str | list[str],
-    "a path or a list of paths",
-    _parse_paths,
-    list,
-    is_repeatable=True,
-    merge=lambda lower, higher: lower + higher,
+    str | list[str], "a path or a list of paths", _parse_paths, list, is_repeatable=True, merge=add
 )
 ENVIRONMENT = Kind[Mapping[str, str]](
     dict[str, Scalar] | list[str],
@@ -159,7 +187,8 @@ ENVIRONMENT = Kind[Mapping[str, str]](
     _parse_environment,
     environment_entries,
     is_repeatable=True,
-    merge=lambda lower, higher: {**lower, **higher},
+    merge=or_,
+    metavar="KEY=VALUE",
 )
 PROPERTIES = Kind[tuple[str, ...]](
     dict[str, Scalar | list[Scalar]] | list[str],
@@ -167,13 +196,9 @@ PROPERTIES = Kind[tuple[str, ...]](
     _parse_properties,
     list,
     is_repeatable=True,
-    merge=lambda lower, higher: lower + higher,
+    merge=add,
+    metavar="KEY=VALUE",
 )
-LINE_RATES = Kind[RateLimits](
-    str | list[str],
-    "LINES/TIME such as 1000/1s",
-    lambda value, _: parse_rates(map(scalar_text, texts_of(value))),
-    format_rates,
-    is_repeatable=True,
-    merge=lambda lower, higher: {**lower, **higher},
+LINE_RATES = many_texts(
+    "LINES/TIME such as 1000/1s", "[NODE=]LINES/TIME", parse_rates, format_rates, or_
 )

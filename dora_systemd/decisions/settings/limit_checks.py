@@ -3,22 +3,13 @@
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
-from dora_systemd.decisions.cell.limits import (
-    BY_KEY,
-    BY_WORD,
-    LIMITS,
-    NodeLimits,
-    merge_node_limits,
-    node_limits,
-)
+from dora_systemd.decisions.cell.limits import BY_WORD, LIMITS, NodeLimits
 from dora_systemd.decisions.properties.assignments import Properties
-from dora_systemd.decisions.settings.limits import NODE_LIMIT
-from dora_systemd.decisions.settings.resolve import Settings
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import INFINITY, SECOND, format_rounded_size
 
 _CONTROLLERS = {
-    **{limit.property: limit.controller for limit in LIMITS},
+    **{limit.property: limit.controller() for limit in LIMITS},
     **dict.fromkeys(("StartupCPUWeight",), "cpu"),
     **dict.fromkeys(("MemoryMin", "MemoryLow", "MemoryZSwapMax"), "memory"),
     **dict.fromkeys(("StartupIOWeight", "IODeviceWeight", "IODeviceLatencyTargetSec"), "io"),
@@ -37,18 +28,6 @@ class Machine:
     tasks: int
 
 
-def settings_node_limits(settings: Settings) -> tuple[NodeLimits, ...]:
-    """The limits of all nodes: those of settings files, overridden by `node_limit`."""
-    given = settings[NODE_LIMIT]
-    return merge_node_limits(_of_files(settings), given)
-
-
-def _of_files(settings: Settings) -> Iterator[NodeLimits]:
-    for node, values in settings.nodes.items():
-        limits = {BY_KEY[key].word: value for key, value in values.items() if key in BY_KEY}
-        yield node_limits(node, limits)
-
-
 def needed_controllers(properties: Properties, nodes: Iterable[NodeLimits]) -> dict[str, str]:
     """The controllers that limits need, each with one of these limits in words."""
     needed = {
@@ -59,7 +38,7 @@ def needed_controllers(properties: Properties, nodes: Iterable[NodeLimits]) -> d
     for one in nodes:
         for word, value in one.limits:
             if value != INFINITY:
-                needed.setdefault(BY_WORD[word].controller, f"{word} of the node {one.node}")
+                needed.setdefault(BY_WORD[word].controller(), f"{word} of the node {one.node}")
     return needed
 
 

@@ -6,7 +6,7 @@ from functools import reduce
 from pathlib import PurePath
 from typing import Any, TypeVar, cast
 
-from dora_systemd.decisions.descriptor.json_size import check_json
+from dora_systemd.decisions.descriptor.json_size import check_json, refusal
 from dora_systemd.decisions.settings.kinds import Base, Setting
 from dora_systemd.decisions.settings.table import SETTINGS
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -43,6 +43,15 @@ class Settings:
     def source(self, setting: Setting[Any]) -> str:
         """The source of the value of `setting`, for messages and `show`."""
         return self.sources[setting.name]
+
+    def is_given(self, setting: Setting[Any]) -> bool:
+        """Whether anything but the default gives a value for `setting`."""
+        return self.sources[setting.name] != DEFAULT_SOURCE
+
+    def by_node(self, setting: Setting[T]) -> dict[str, T]:
+        """The values of `setting` for single nodes, by node id."""
+        name = setting.name
+        return {node: values[name] for node, values in self.nodes.items() if name in values}
 
 
 def resolve_settings(
@@ -87,8 +96,7 @@ def check_document(
         return {}
     if not isinstance(document, dict):
         hint = "a settings file is a mapping, KEY: VALUE"
-        message = f"cannot use {shown(source)}: it is not a mapping"
-        raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+        raise refusal(source, "it is not a mapping", hint)
     check_json(document, source, MAX_JSON)
     try:
         settings_model(table).model_validate(document)

@@ -5,10 +5,11 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 
+from dora_systemd.decisions.descriptor.json_size import refusal
 from dora_systemd.decisions.settings.kinds import Setting
-from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.suggestions import did_you_mean
-from dora_systemd.values import quoted, shown
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.names import did_you_mean
+from dora_systemd.values import quoted
 
 NODES = "nodes"
 """The key of per-node settings in a settings file: `nodes: NODE: KEY: VALUE`."""
@@ -33,23 +34,19 @@ def validation_error(
 ) -> DoraSystemdError:
     """The first error that pydantic found in the file `source`, in one line."""
     if not isinstance(error, ValidationError):
-        message = f"cannot use {shown(source)}: it is not a settings file"
-        return DoraSystemdError(message, str(error), ExitCode.BAD_INPUT)
+        return refusal(source, "it is not a settings file", str(error))
     first = error.errors(include_url=False, include_input=False)[0]
     place = [str(part) for part in first["loc"]]
     settings = {setting.name: setting for setting in table}
     if first["type"] == "extra_forbidden":
-        hint = (
-            did_you_mean(place[-1], _known(place, table))
-            or "doractl start --help lists the settings"
-        )
+        near = did_you_mean(place[-1], _known(place, table))
+        hint = near or "doractl start --help lists the settings"
         reason = f"unknown key {quoted(place[-1])}"
     else:
         key = next((part for part in reversed(place) if part in settings), place[0])
         expected = settings[key].kind.expected if key in settings else "a mapping"
         reason, hint = f"the value of {key} is of another type", f"write {expected}"
-    message = f"cannot use {shown(source)}: {reason}"
-    return DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+    return refusal(source, reason, hint)
 
 
 def _fields(table: Sequence[Setting[Any]]) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from dora_systemd.decisions.cell.line_rates import RateLimits
+from dora_systemd.decisions.cell.options import DEFAULT_GRACE
 from dora_systemd.decisions.settings.credentials import CREDENTIAL_SETTINGS
 from dora_systemd.decisions.settings.kinds import (
     BOOL,
@@ -25,66 +26,32 @@ from dora_systemd.decisions.settings.limits import LIMIT_SETTINGS
 from dora_systemd.decisions.settings.reload import RELOAD_SETTINGS
 from dora_systemd.decisions.settings.restarts import RESTART_SETTINGS
 from dora_systemd.decisions.settings.sandbox import SANDBOX_SETTINGS
-from dora_systemd.values import SECOND
 
-ENV = Setting[Mapping[str, str]](
-    "env",
-    ENVIRONMENT,
-    {},
-    "Environment variable of all nodes.",
-    flags=("--env",),
-    metavar="KEY=VALUE",
-)
+ENV = Setting[Mapping[str, str]]("env", ENVIRONMENT, {}, "Environment variable of all nodes.")
 ENV_FILE = Setting[tuple[str, ...]](
     "env_file",
     PATHS,
     (),
     "File with environment variables, as EnvironmentFile= in systemd.exec(5).",
-    flags=("--env-file",),
     metavar="FILE",
 )
 VENV = Setting[str | None](
-    "venv",
-    PATH,
-    None,
-    "Virtual environment whose Python runs the nodes.",
-    flags=("--venv",),
-    variable="DORA_VENV",
-    metavar="DIR",
+    "venv", PATH, None, "Virtual environment whose Python runs the nodes.", metavar="DIR"
 )
-UV = Setting[bool](
-    "uv",
-    BOOL,
-    False,
-    "Run Python nodes with uv, like dora start --uv.",
-    flags=("--uv",),
-    variable="DORA_UV",
-)
-DEBUG = Setting[bool](
-    "debug",
-    BOOL,
-    False,
-    "Allow inspection of topics, like dora start --debug.",
-    flags=("--debug",),
-    variable="DORA_DEBUG",
-)
+UV = Setting[bool]("uv", BOOL, False, "Run Python nodes with uv, like dora start --uv.")
+DEBUG = Setting[bool]("debug", BOOL, False, "Allow inspection of topics, like dora start --debug.")
 WORKING_DIRECTORY = Setting[str | None](
     "working_directory",
     PATH,
     None,
     "Working directory of the nodes and of relative paths; default: that of the dataflow file.",
-    flags=("--working-directory",),
-    variable="DORA_WORKING_DIRECTORY",
     metavar="DIR",
 )
 GRACE_DURATION = Setting[int](
     "grace_duration",
     DURATION,
-    10 * SECOND,
+    DEFAULT_GRACE,
     "Time for a node to exit after it is told to stop; then it is killed.",
-    flags=("--grace-duration",),
-    variable="DORA_GRACE_DURATION",
-    metavar="TIME",
 )
 PROPERTY = Setting[tuple[str, ...]](
     "property",
@@ -92,7 +59,6 @@ PROPERTY = Setting[tuple[str, ...]](
     (),
     "Property of the unit, as systemd-run(1) takes it.",
     flags=("--property", "-p"),
-    metavar="KEY=VALUE",
     root_only=True,
 )
 USER = Setting[str | None](
@@ -106,38 +72,21 @@ USER = Setting[str | None](
     root_only=True,
 )
 ALLOW_SHELL_NODES = Setting[bool](
-    "allow_shell_nodes",
-    BOOL,
-    False,
-    "Allow nodes with the path 'shell'.",
-    flags=("--allow-shell-nodes",),
-    variable="DORA_ALLOW_SHELL_NODES",
+    "allow_shell_nodes", BOOL, False, "Allow nodes with the path 'shell'."
 )
 EXIT_WHEN_NODES_FINISH = Setting[bool | None](
     "exit_when_nodes_finish",
     BOOL,
     None,
     "End the dataflow when its nodes have finished; default: as in the dataflow file.",
-    flags=("--exit-when-nodes-finish",),
-    variable="DORA_EXIT_WHEN_NODES_FINISH",
 )
-DORA = Setting[str](
-    "dora",
-    PROGRAM,
-    "dora",
-    "The dora program to run.",
-    flags=("--dora",),
-    variable="DORA_PROGRAM",
-    metavar="FILE",
-)
+DORA = Setting[str]("dora", PROGRAM, "dora", "The dora program to run.", variable="DORA_PROGRAM")
 LOG_RATE_LIMIT = Setting[RateLimits](
     "log_rate_limit",
     LINE_RATES,
     {},
     "Log lines per time to keep of each node, or of NODE; the rest is dropped and counted.",
-    flags=("--log-rate-limit",),
     variable="DORA_LOG_RATE_LIMIT",
-    metavar="[NODE=]LINES/TIME",
     per_node=True,
 )
 

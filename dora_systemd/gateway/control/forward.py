@@ -21,8 +21,8 @@ from dora_systemd.gateway.control.talk import Result, Talk, find_by_uuid
 from dora_systemd.paths import CellPaths
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
-from dora_systemd.verbs.facts.list import read_status
 from dora_systemd.verbs.facts.nodes import written_dataflow
+from dora_systemd.verbs.facts.reading import read_status
 from dora_systemd.verbs.node import require_running, restart_node
 
 _GOING_AWAY = 1001

@@ -27,10 +27,10 @@ from dora_systemd.decisions.logs.query import end_matches, journal_timestamp, sc
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.gateway.control.state import find_name
 from dora_systemd.gateway.control.talk import Place, Result, Talk, find_if_loaded
+from dora_systemd.names import did_you_mean
 from dora_systemd.scope import Scope
-from dora_systemd.suggestions import did_you_mean
 from dora_systemd.values import quoted
-from dora_systemd.verbs.facts.list import read_status
+from dora_systemd.verbs.facts.reading import read_status
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.follow import is_unit_up
 

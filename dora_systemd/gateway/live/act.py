@@ -9,8 +9,8 @@ from dora_systemd.decisions.gateway.page_messages import PageMessage, graph_valu
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
-from dora_systemd.verbs.facts.list import read_status
 from dora_systemd.verbs.facts.nodes import written_dataflow
+from dora_systemd.verbs.facts.reading import read_status
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.node import ask_coordinator, restart_node, stop_node
 from dora_systemd.verbs.stop import note_stop, restart_cells, stop_cells

@@ -13,7 +13,7 @@ from dora_systemd.adapters.host import notify
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.decisions.cell.exits import Exit
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.dora import protocol
+from dora_systemd.decisions.dora import life_events, protocol
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Do, State
 from dora_systemd.decisions.life.stop_budget import stop_timeout
@@ -103,7 +103,7 @@ class Dialogue(Tasks):
         self.spawn("wait until the daemon has joined", self._wait_joined())
 
     def _read_daemon(self, line: str) -> None:
-        event = protocol.parse_daemon_line(line, now_us())
+        event = life_events.parse_daemon_line(line, now_us())
         if event is not None:
             self._pump.push(event)
 
@@ -125,13 +125,13 @@ class Dialogue(Tasks):
         self._pump.push(life.ConnectionLost(now_us()))
 
     def _hear(self, record: protocol.LogRecord) -> None:
-        event = protocol.parse_life_event(record, now_us())
+        event = life_events.parse_life_event(record, now_us())
         if isinstance(event, life.NodeSpawned):
             self._nodes.adopt(event.node, event.pid)
         if isinstance(event, life.NodeExited):
             node = self._pump.cell.nodes.get(event.node)
             is_stale = node is not None and self._nodes.has_process(event.node, node.pid)
-            event = protocol.with_facts(event, is_stale, self._nodes.find_oom(event.node))
+            event = life_events.with_facts(event, is_stale, self._nodes.find_oom(event.node))
             if node is not None and event.exit.is_failure and event.will_restart and not is_stale:
                 self._nodes.clear(event.node, node.pid)
         if event is not None:

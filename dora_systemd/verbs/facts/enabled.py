@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import Manager
-from dora_systemd.decisions.unit.directories import unit_directories
 from dora_systemd.names import name_from_unit
+from dora_systemd.paths import unit_directories
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import exists
 

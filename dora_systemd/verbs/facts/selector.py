@@ -11,9 +11,8 @@ from typing import Protocol, TypeVar
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.decisions.views.dataflows import DataflowRow
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.names import is_name, is_uuid_prefix, name_from_unit, unit_name
+from dora_systemd.names import did_you_mean, is_name, is_uuid_prefix, name_from_unit, unit_name
 from dora_systemd.scope import Scope
-from dora_systemd.suggestions import did_you_mean
 from dora_systemd.values import quoted
 from dora_systemd.verbs.facts.cells import Cell, read_cell, read_cells
 from dora_systemd.verbs.facts.enabled import lost_units

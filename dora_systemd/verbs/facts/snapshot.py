@@ -8,7 +8,8 @@ from dora_systemd.decisions.resources.usage import Strain
 from dora_systemd.decisions.views.snapshot import Observed
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import read_cells
-from dora_systemd.verbs.facts.list import Reading, read_dataflow, row_of
+from dora_systemd.verbs.facts.list import row_of
+from dora_systemd.verbs.facts.reading import Reading, read_dataflow
 
 
 def read_snapshot(manager: Manager, scope: Scope) -> list[Observed]:

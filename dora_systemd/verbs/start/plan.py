@@ -19,23 +19,9 @@ from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
 from dora_systemd.decisions.descriptor.expansion import called_variables
 from dora_systemd.decisions.descriptor.nodes import UNEXPANDED
 from dora_systemd.decisions.properties.sandbox import Sandbox
-from dora_systemd.decisions.settings.limit_checks import settings_node_limits
-from dora_systemd.decisions.settings.line_rates import log_rates
-from dora_systemd.decisions.settings.reload_rules import hot_reload
 from dora_systemd.decisions.settings.resolve import Settings
-from dora_systemd.decisions.settings.restart_policies import node_policies, restart_policy
-from dora_systemd.decisions.settings.restarts import START_TIMEOUT
-from dora_systemd.decisions.settings.table import (
-    ALLOW_SHELL_NODES,
-    DEBUG,
-    ENV,
-    ENV_FILE,
-    EXIT_WHEN_NODES_FINISH,
-    GRACE_DURATION,
-    USER,
-    UV,
-    WORKING_DIRECTORY,
-)
+from dora_systemd.decisions.settings.runner_options import with_settings
+from dora_systemd.decisions.settings.table import ENV, ENV_FILE, USER, WORKING_DIRECTORY
 from dora_systemd.names import name_from_path, parse_name, unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.trust.files import read_file
@@ -128,20 +114,10 @@ def _make_plan(
         working_directory=directory,
         dora=look.find_dora(venv, search_path),
         venv=venv,
-        uv=settings[UV],
-        debug=settings[DEBUG],
-        allow_shell_nodes=settings[ALLOW_SHELL_NODES],
-        grace=settings[GRACE_DURATION],
         attached=request.attached,
-        exit_when_nodes_finish=settings[EXIT_WHEN_NODES_FINISH],
         env_keys=tuple(variables),
-        log_rates=log_rates(settings),
-        node_limits=settings_node_limits(settings),
-        restart=restart_policy(settings),
-        node_restarts=node_policies(settings),
-        start_timeout=settings[START_TIMEOUT],
-        reload=hot_reload(settings, directory),
     )
+    options = with_settings(options, settings)
     called = called_variables(dataflow, request.caller)
     environment = unit_environment(search_path, venv, {**called, **variables})
     check_credentials(scope, credential_files(settings))

@@ -5,8 +5,7 @@ import sys
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.dora.command import version_numbers
 from dora_systemd.decisions.properties.kinds import Property
-from dora_systemd.decisions.settings.reload_rules import reload_warnings
-from dora_systemd.decisions.settings.restart_policies import restart_warnings
+from dora_systemd.decisions.settings.runner_options import idle_warnings
 from dora_systemd.decisions.unit.file import persistent_unit
 from dora_systemd.decisions.unit.properties import UnitContext, format_unit, unit_properties
 from dora_systemd.decisions.unit.versions import MIN_VERSION, drop_unsupported
@@ -24,8 +23,8 @@ def plan_properties(plan: Plan, manager: Manager) -> tuple[dict[str, Property], 
     DoraSystemdError.
     """
     properties, warnings = drop_unsupported(_properties(plan), systemd_number(manager))
-    warnings = (*warnings, *restart_warnings(plan.settings), *reload_warnings(plan.settings))
-    warnings = (*warnings, *watch_warnings(plan), *sandbox_warnings(plan.sandbox))
+    warnings = (*warnings, *idle_warnings(plan.settings), *watch_warnings(plan))
+    warnings = (*warnings, *sandbox_warnings(plan.sandbox))
     return properties, (*warnings, *check_limits(manager, plan, properties))
 
 

@@ -112,8 +112,13 @@ def test_dora_starts_the_file_of_its_session(
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "flow.dora-session.yaml").write_text("session_id: one\n")
     asked: list[StartRequest] = []
-    monkeypatch.setattr(starting, "claim", lambda _bus, _scope, wanted: asked.append(wanted))
-    monkeypatch.setattr(starting, "start_claim", lambda *_, **__: SimpleNamespace(uuid=UUID))
+
+    def claimed(_bus: object, _scope: object, wanted: StartRequest) -> SimpleNamespace:
+        asked.append(wanted)
+        return SimpleNamespace(plan=None, properties={})
+
+    monkeypatch.setattr(starting, "claim", claimed)
+    monkeypatch.setattr(starting, "start_plan", lambda *_, **__: SimpleNamespace(uuid=UUID))
     sent = {"nodes": [{"id": "a"}], "env": {"A": "b"}}
     body = {"dataflow": sent, "local_working_dir": str(tmp_path), "session_id": "one"}
     answer = bench.ask("Start", **body, name="robot", uv=True)

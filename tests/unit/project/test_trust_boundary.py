@@ -51,7 +51,7 @@ _TABLE = {
     """,
     KERNEL: """
         adapters.cgroup.groups adapters.host.machine adapters.host.process_table
-        trust.socket_table verbs.destroy verbs.facts.list verbs.start.sandbox verbs.why
+        trust.socket_table verbs.destroy verbs.facts.reading verbs.start.sandbox verbs.why
     """,
     ROOTS: """
         adapters.bus.connection adapters.bus.errors adapters.host.unit_files

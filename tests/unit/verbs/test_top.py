@@ -51,7 +51,7 @@ def manager_of(*states: str) -> FakeManager:
 def clock(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """The monotonic clock in µs, which stands still."""
     now = [SECOND]
-    monkeypatch.setattr("dora_systemd.verbs.facts.list._monotonic_us", lambda: now[0])
+    monkeypatch.setattr("dora_systemd.verbs.facts.reading._monotonic_us", lambda: now[0])
     return now
 
 

@@ -19,8 +19,8 @@ from dora_systemd.decisions.cell.line_rates import (
     rate_of,
 )
 from dora_systemd.decisions.logs.limiter import LineLimiter
-from dora_systemd.decisions.settings.line_rates import log_rates
 from dora_systemd.decisions.settings.resolve import Settings, resolve_settings
+from dora_systemd.decisions.settings.runner_options import log_rates
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import INFINITY, SECOND
 

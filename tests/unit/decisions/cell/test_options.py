@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dora_systemd.decisions.cell.hot_reload import REPLACE_WORDS, HotReload
+from dora_systemd.decisions.cell.limits import parse_node_limits
 from dora_systemd.decisions.cell.line_rates import ALL_NODES, SHORTEST, RateLimit
 from dora_systemd.decisions.cell.options import (
     RunnerOptions,
@@ -19,7 +20,7 @@ from dora_systemd.decisions.cell.options import (
 )
 from dora_systemd.decisions.cell.restarts import POLICIES, RestartPolicy
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.values import INFINITY
+from dora_systemd.values import INFINITY, SECOND
 from tests.unit.fakes.limit_values import limits_of_a_node
 
 UUID = "550e8400-e29b-41d4-a716-446655440000"
@@ -77,6 +78,44 @@ def test_arguments_are_readable() -> None:
     )
 
 
+ALL = RunnerOptions(
+    *("robot", UUID, "/srv/robot.yml", "/srv", "/usr/bin/dora", "/srv/venv"),
+    uv=True,
+    debug=True,
+    allow_shell_nodes=True,
+    grace=5 * SECOND,
+    attached=True,
+    exit_when_nodes_finish=False,
+    env_keys=("MODEL", "RATE"),
+    log_rates={ALL_NODES: RateLimit(1000, SECOND), "camera": None},
+    node_limits=(parse_node_limits("camera:cpu=1.5,memory=1G"),),
+    restart=RestartPolicy("on-failure"),
+    node_restarts=(("a:b", RestartPolicy("always", INFINITY, INFINITY, SECOND, SECOND)),),
+    start_timeout=90 * SECOND,
+    reload=HotReload(
+        True, ("*.py", "a=b"), ("tmp_*",), (("camera", "x=y"),), (("", "start-first"), ("a", "b"))
+    ),
+)
+ARGUMENTS = f"""\
+--name=robot --uuid={UUID} --working-directory=/srv --dora=/usr/bin/dora --grace-duration=5s
+--venv=/srv/venv --exit-when-nodes-finish=no
+--restart=on-failure,max=5,window=10min,delay=500ms,max-delay=30s '--start-timeout=1min 30s'
+--env-key=MODEL --env-key=RATE --log-rate-limit=1000/1s --log-rate-limit=camera=infinity
+--node-limit=camera:cpu=150%,memory=1G
+--node-restart=a:b:always,max=infinity,window=infinity,delay=1s,max-delay=1s
+--watch=*.py --watch=a=b --ignore=tmp_* --node-watch=camera=x=y --replace==start-first --replace=a=b
+--uv --debug --allow-shell-nodes --attached --hot-reload /srv/robot.yml
+"""
+
+
+def test_unit_files_on_machines_have_these_arguments() -> None:
+    """Whatever is changed here, units of older versions must go on working."""
+    assert format_runner_argv(ALL) == shlex.split(ARGUMENTS)
+    assert parse_runner_argv(shlex.split(ARGUMENTS)) == ALL
+    short = ["--dora=/usr/bin/dora", f"--uuid={UUID}", "--name=robot", "--working-directory=/srv"]
+    assert parse_runner_argv([*short, "/srv/robot.yml"]) == OPTIONS
+
+
 @given(options)
 def test_arguments_and_back(given_options: RunnerOptions) -> None:
     assert parse_runner_argv(format_runner_argv(given_options)) == given_options
@@ -104,6 +143,8 @@ def test_garbage_is_refused_by_our_error(argv: list[str]) -> None:
         ["--colour=red", *format_runner_argv(OPTIONS)],
         ["--uv=yes", *format_runner_argv(OPTIONS)],
         ["--venv", *format_runner_argv(OPTIONS)],
+        ["--uv", "--uv", *format_runner_argv(OPTIONS)],
+        ["watch=*.py", *format_runner_argv(OPTIONS)],
     ],
 )
 def test_bad_command_lines(argv: list[str]) -> None:

@@ -16,10 +16,10 @@ from dora_systemd.decisions.cell.restarts import (
 )
 from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
 from dora_systemd.decisions.settings.resolve import Settings, resolve_settings
-from dora_systemd.decisions.settings.restart_policies import (
+from dora_systemd.decisions.settings.runner_options import (
+    idle_warnings,
     node_policies,
     restart_policy,
-    restart_warnings,
 )
 from dora_systemd.decisions.unit.properties import restart_properties
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -51,9 +51,17 @@ def test_default_restarts_nothing() -> None:
 
 
 def test_warnings() -> None:
-    warnings = list(restart_warnings(settings({"max_restarts": "3"})))
+    warnings = list(idle_warnings(settings({"max_restarts": "3"})))
     assert warnings == ["--max-restarts has no effect without --restart-policy"]
-    assert not list(restart_warnings(settings({"max_restarts": "3", "restart_policy": "always"})))
+    assert not list(idle_warnings(settings({"max_restarts": "3", "restart_policy": "always"})))
+    nodes = {"nodes": {"camera": {"restart_policy": "always"}}}
+    assert not list(idle_warnings(settings({"max_restarts": "3"}, nodes)))
+    given: dict[str, object] = {"watch": ("*.py",), "ignore": ("a",), "replace": "start-first"}
+    assert list(idle_warnings(settings(given))) == [
+        "--watch has no effect without --hot-reload",
+        "--ignore has no effect without --hot-reload",
+    ]
+    assert not list(idle_warnings(settings({**given, "hot_reload": True})))
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dora_systemd.decisions.cell.exits import Exit, exit_of, parse_exit
-from dora_systemd.decisions.dora import protocol
+from dora_systemd.decisions.dora import life_events, protocol
 from dora_systemd.decisions.dora.protocol import LogRecord, Reply
 from dora_systemd.decisions.life import events as life
 from dora_systemd.errors import DoraSystemdError
@@ -24,7 +24,7 @@ def log_frame(message: str, target: str = "daemon", node: str | None = "a") -> s
 def event(message: str, target: str = "daemon", node: str | None = "a") -> life.Event | None:
     record = protocol.parse_frame(log_frame(message, target, node))
     assert isinstance(record, LogRecord)
-    return protocol.parse_life_event(record, 5)
+    return life_events.parse_life_event(record, 5)
 
 
 @pytest.mark.parametrize(
@@ -119,7 +119,7 @@ json_values = st.recursive(
 def test_no_frame_breaks_the_parser(text: str) -> None:
     frame = protocol.parse_frame(text)
     if isinstance(frame, LogRecord):
-        protocol.parse_life_event(frame, 1)
+        life_events.parse_life_event(frame, 1)
     if isinstance(frame, Reply):
         protocol.parse_results(frame)
 
@@ -177,3 +177,19 @@ def test_what_nobody_who_is_dora_would_send() -> None:
             reply = protocol.parse_frame(json.dumps(frame))
             assert isinstance(reply, protocol.Reply)
             assert reply.error == "an error without words"
+
+
+@pytest.mark.parametrize(
+    ("kind", "number", "text"),
+    [
+        ("Success", None, ""),
+        ("ExitCode", 3, "exit code 3"),
+        ("Signal", 9, "signal SIGKILL"),
+        ("Signal", 200, "signal 200"),
+        ("Signal", None, "unknown exit status"),
+        ("ExitCode", None, "unknown exit status"),
+        ("", None, "unknown exit status"),
+    ],
+)
+def test_exit_value(kind: str, number: object, text: str) -> None:
+    assert str(protocol.exit_value(kind, number)) == text

@@ -4,7 +4,7 @@ import pytest
 
 from dora_systemd.decisions.cell.exits import Exit, exit_of
 from dora_systemd.decisions.cell.status import NodeStatus
-from dora_systemd.decisions.dora.protocol import with_facts
+from dora_systemd.decisions.dora.life_events import with_facts
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Cell, Record, State
 from dora_systemd.decisions.life.table import step

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from dora_systemd.decisions.cell.hot_reload import REPLACE_WORDS
 from dora_systemd.decisions.cell.line_rates import RateLimit
 from dora_systemd.decisions.properties.sandbox import LEVELS, NETWORKS
-from dora_systemd.decisions.settings.kinds import DURATION, TEXT, Setting
+from dora_systemd.decisions.settings.kinds import DURATION, PATHS, TEXT, Setting
 from dora_systemd.decisions.settings.resolve import (
     DEFAULT_SOURCE,
     Settings,
@@ -243,6 +243,13 @@ def test_every_setting_can_be_set_everywhere() -> None:
         assert setting.metavar or setting.kind.is_flag
     names = [setting.name for setting in SETTINGS]
     assert len(set(names)) == len(names)
+
+
+def test_flag_and_variable_follow_from_the_name() -> None:
+    one = Setting[int]("pace_limit", DURATION, 5, "A pace.")
+    assert (one.flags, one.variable) == (("--pace-limit",), "DORA_PACE_LIMIT")
+    many = Setting[tuple[str, ...]]("pace", PATHS, (), "Paces.")
+    assert (many.flags, many.variable) == (("--pace",), ""), "a variable has one value"
 
 
 MODE = Setting[str](

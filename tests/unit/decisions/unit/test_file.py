@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.settings.resolve import resolve_settings
-from dora_systemd.decisions.unit.directories import UnitDirectories, unit_directories
 from dora_systemd.decisions.unit.file import (
     persistent_unit,
     runner_of,
@@ -17,6 +16,7 @@ from dora_systemd.decisions.unit.file import (
 )
 from dora_systemd.decisions.unit.properties import UnitContext, format_unit, unit_properties
 from dora_systemd.errors import DoraSystemdError
+from dora_systemd.paths import UnitDirectories, unit_directories
 from tests.unit.fakes.manager import UUID, options
 
 texts = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]), max_size=30)

@@ -18,9 +18,9 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
 from dora_systemd.trust.cells import MAX_TABLE, read_table
 from dora_systemd.verbs import why
-from dora_systemd.verbs.facts import list as dataflow_list
 from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.facts.list import dataflow_row, read_rows
+from dora_systemd.verbs.facts.reading import read_dataflow, read_status
 from dora_systemd.verbs.facts.snapshot import read_snapshot
 from dora_systemd.verbs.list import find_row
 from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
@@ -229,7 +229,7 @@ def test_groups_that_the_nodes_user_has_made(scope: Scope, unit_group: Path) -> 
     manager = FakeManager()
     manager.add(options(), ControlGroup=GROUP)
     write_status(scope, CellStatus(nodes={"camera": NodeStatus("running")}))
-    reading = dataflow_list.read_dataflow(manager, scope, read_cells(manager)[0])
+    reading = read_dataflow(manager, scope, read_cells(manager)[0])
     assert list(reading.usage) == ["", "camera"]
 
 
@@ -274,4 +274,4 @@ def test_a_row_is_found_by_selector(scope: Scope) -> None:
     manager = FakeManager()
     manager.add(options(), active="failed")
     assert find_row(manager, scope, "robot").name == "robot"
-    assert dataflow_list.read_status(scope, read_cells(manager)[0]) == CellStatus()
+    assert read_status(scope, read_cells(manager)[0]) == CellStatus()

@@ -1,0 +1,59 @@
+"""Lines that dora's coordinator and daemon print become life events. Pure."""
+
+import re
+from dataclasses import replace
+
+from dora_systemd.decisions.cell.exits import Exit
+from dora_systemd.decisions.dora.protocol import LogRecord, exit_value
+from dora_systemd.decisions.life import events as life
+from dora_systemd.decisions.resources.oom import Oom
+
+_SPAWNED = re.compile(r"spawned node with pid (\d+)")
+_EXITED = re.compile(
+    r"handling node stop with exit status (\w+)(?:\((-?\d+)\))? \(restart: (true|false)"
+)
+_UNRESPONSIVE = re.compile(r"node `([^`]+)` (unresponsive for \d+ms \(timeout: [^)]*\)), killing")
+_CASCADED = re.compile(r"marking `(.+)` as cascading error caused by `(.+)`")
+
+
+def parse_life_event(record: LogRecord, at_us: int) -> life.Event | None:
+    """The life event that a line of dora's own means; None for other lines.
+
+    Nodes cannot forge one: lines that they print have the level "stdout" or another target.
+    """
+    if record.target == "coordinator":
+        return life.RunFinished(at_us) if record.message == "dataflow finished" else None
+    if record.node:
+        return _node_event(record, at_us) if record.target in ("daemon", "spawner") else None
+    if record.target == "daemon" and record.message.endswith("starting dataflow"):
+        return life.AllReady(at_us)
+    return None
+
+
+def _node_event(record: LogRecord, at_us: int) -> life.Event | None:
+    if record.message == "node is ready":
+        return life.NodeReady(at_us, record.node)
+    if spawned := _SPAWNED.fullmatch(record.message):
+        return life.NodeSpawned(at_us, record.node, int(spawned[1]))
+    if exited := _EXITED.match(record.message):
+        how = exit_value(exited[1], int(exited[2]) if exited[2] else None)
+        return life.NodeExited(at_us, record.node, how, exited[3] == "true")
+    if cascaded := _CASCADED.match(record.message):
+        return life.NodeCascaded(at_us, cascaded[1], cascaded[2])
+    return None
+
+
+def parse_daemon_line(line: str, at_us: int) -> life.Event | None:
+    """The event of a line printed by the daemon: dora reports hung nodes only there."""
+    match = _UNRESPONSIVE.search(line)
+    return life.NodeHung(at_us, match[1], match[2]) if match else None
+
+
+def with_facts(event: life.NodeExited, is_stale: bool, oom: Oom | None) -> life.NodeExited:
+    """The event with facts that only the runner knows.
+
+    is_stale: whether the node's current process is alive. oom: the OOM kill that ended it.
+    """
+    oom = oom if event.exit.is_failure else None
+    how = event.exit if oom is None else Exit(words=oom.text)
+    return replace(event, exit=how, is_stale=is_stale, oom=oom)

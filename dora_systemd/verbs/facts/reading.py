@@ -1,0 +1,108 @@
+"""Reads one dataflow: systemd, its cgroups and the runner's node table.
+
+It needs no running process of ours.
+"""
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.cgroup import groups as cgroup
+from dora_systemd.decisions.cell.status import WHOLE_CELL, CellStatus, CpuSample
+from dora_systemd.decisions.resources.usage import Usage
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.names import SLICE
+from dora_systemd.scope import Scope
+from dora_systemd.trust.cells import read_table
+from dora_systemd.verbs.facts.cells import Cell
+
+UP_SINCE = "ActiveEnterTimestampMonotonic"
+STARTED = "InactiveExitTimestampMonotonic"
+_ALL = ("ControlGroup", "NRestarts", UP_SINCE, STARTED, "StatusText", "ActiveEnterTimestamp")
+
+
+class Reading(NamedTuple):
+    """One reading of a dataflow: its state from systemd and its runner, and usage of its groups.
+
+    unit: properties of its unit. problem: why its node table is not usable, or "". groups, usage:
+    by node, with the unit's own as WHOLE_CELL; empty for a dataflow that is not running. at_us:
+    time of the reading, CLOCK_MONOTONIC.
+    """
+
+    cell: Cell
+    unit: Mapping[str, Any]
+    status: CellStatus = CellStatus()
+    problem: str = ""
+    groups: Mapping[str, Path] = {}
+    usage: Mapping[str, Usage] = {}
+    at_us: int = 0
+
+    @property
+    def sample(self) -> CpuSample:
+        """The CPU time and throttling of this reading."""
+        return CpuSample(
+            self.at_us,
+            {key: one.cpu_us for key, one in self.usage.items()},
+            {key: one.throttling for key, one in self.usage.items()},
+        )
+
+
+def read_dataflow(
+    manager: Manager, scope: Scope, cell: Cell, slice_path: Path | None = None
+) -> Reading:
+    """Read one dataflow.
+
+    slice_path: where the groups of dataflows usually are; given if only the table of `list` is
+    wanted.
+    """
+    status, problem = look_at_table(scope, cell) if cell.is_up else (CellStatus(), "")
+    path = slice_path / cell.unit if slice_path else None
+    path = path if path and path.is_dir() else None
+    unit = manager.read(cell.unit, _few(cell, status, path) if slice_path else _ALL)
+    if not cell.is_up or not (path or unit["ControlGroup"]):
+        return Reading(cell, unit, status, problem)
+    path = path or cgroup.group_path(unit["ControlGroup"])
+    # Without a node table the groups are all that is known of the nodes, and the dataflow's user
+    # can create groups too. With a table, the groups of its nodes are enough.
+    nodes = cgroup.shown_groups(path, status.nodes) if not slice_path or not status.nodes else {}
+    groups = {WHOLE_CELL: path, **nodes}
+    usage = {key: cgroup.read_usage(group) for key, group in groups.items()}
+    return Reading(cell, unit, status, problem, groups, usage, _monotonic_us())
+
+
+def _few(cell: Cell, status: CellStatus, path: Path | None) -> list[str]:
+    """The properties that a row of the table needs: reading each one costs as much as a file."""
+    names = ["NRestarts"]
+    if cell.is_up:
+        names += [UP_SINCE] if path else [UP_SINCE, "ControlGroup"]
+        # Not needed for a running unit whose runner has samples, which are younger.
+        names += [] if cell.state.active == "active" and status.samples else [STARTED]
+    return names
+
+
+def read_status(scope: Scope, cell: Cell) -> CellStatus:
+    """The runner's node table; an empty one if it is missing or not usable."""
+    return look_at_table(scope, cell)[0]
+
+
+def look_at_table(scope: Scope, cell: Cell) -> tuple[CellStatus, str]:
+    """The runner's node table, and what is wrong with it, or "".
+
+    A table that is invalid, missing or another user's counts as empty: the nodes' user can break
+    only the own row, not the list.
+    """
+    try:
+        return read_table(scope.cell_directory(cell.name)) or CellStatus(), ""
+    except DoraSystemdError as error:
+        return CellStatus(), error.message
+
+
+def _monotonic_us() -> int:
+    return time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000
+
+
+def slice_group(manager: Manager) -> Path:
+    """The directory of dora.slice, which has the units unless a property puts them elsewhere."""
+    return cgroup.group_path(manager.control_group()) / SLICE
