@@ -182,6 +182,7 @@ async def run_once(runs: Runs, is_again: bool) -> Cell:
             is_again=is_again,
             is_trial=reloader.before is not None,
             notice=reloader.notice,
+            is_attached=options.attached,
         )
         pump = Pump(cell, options.uuid, runs.paths, runs.nodes, runs.pipes)
         dialogue = Dialogue(options, pump, dora, runs.nodes, runs.pipes)

@@ -304,6 +304,19 @@ def test_disabled_while_it_runs(boots: Cell, project: Project) -> None:
     assert boots.show("Transient") == "yes"
 
 
+def test_run_after_it_was_disabled_and_stopped(boots: Cell, project: Project) -> None:
+    """The unit file moves to /run while it runs, and stays there."""
+    project.write("node.py", "from dora import Node\nNode()\n")
+    flow = project.three_nodes()
+    boots.start(flow)
+    for verb in ("enable", "stop", "restart", "disable", "stop"):
+        boots.doractl(verb, boots.name)
+    short = project.write("short.yml", "nodes: [{id: one, path: node.py}]\n")
+    boots.doractl("run", str(short), "--name", boots.name)
+    assert boots.is_gone
+    assert not (Path("/run/systemd/system") / boots.unit).exists()
+
+
 def test_enabled_and_disabled_again_while_it_runs(boots: Cell, project: Project) -> None:
     boots.start(project.three_nodes())
     boots.doractl("enable", boots.name)

@@ -16,6 +16,7 @@ from dora_systemd.decisions.logs.terminal import TerminalLines
 from dora_systemd.names import unit_name
 from dora_systemd.verbs.logs import FollowedLog
 from dora_systemd.verbs.start.claim import refuse_unit_file, require_free_name
+from dora_systemd.verbs.start.enable import drop_unit_files
 from dora_systemd.verbs.start.job import start_plan
 from dora_systemd.verbs.start.plan import DEFAULT_FILE, StartRequest, make_plan, request_name
 from dora_systemd.verbs.start.run import attached_properties, follow_unit, life_line
@@ -33,7 +34,7 @@ def command(dataflow: str, name: str | None, **flags: Any) -> int:
     """Run the dataflow in FILE and print its logs until it ends.
 
     Ctrl+C stops it gracefully, a second Ctrl+C kills it. The dataflow ends with this command,
-    however that ends. The exit status is that of the dataflow: 0 when all nodes ended well.
+    however that ends. The exit status is 0 when all nodes ended well, and 1 when one failed.
 
     Examples:
       doractl run                          ./dataflow.yml
@@ -43,9 +44,11 @@ def command(dataflow: str, name: str | None, **flags: Any) -> int:
     scope = current_scope()
     request = StartRequest(dataflow, name, flags, os.environ, attached=True)
     bus = Bus(scope)
-    refuse_unit_file(require_free_name(bus, scope, unit_name(request_name(request))))
+    boot = require_free_name(bus, scope, unit_name(request_name(request)))
+    refuse_unit_file(boot)
     plan = make_plan(scope, request)
     properties, warnings = plan_properties(plan, bus)
+    drop_unit_files(bus, boot)
     print_warnings(warnings)
     options = plan.options
     terminal = TerminalLines((), want_colors=sys.stdout.isatty())

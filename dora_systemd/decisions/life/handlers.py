@@ -216,14 +216,22 @@ def stop_while_closing(cell: Cell, event: life.StopAsked) -> Next:
 def end(cell: Cell, event: life.Event) -> Next:
     """Nothing runs any more: record the end and exit."""
     if cell.stop_by:
-        # A requested stop always counts as clean, whatever exit status the nodes had.
-        cell = replace(cell, failure="", exit=RunnerExit.OK)
+        cell = replace(cell, failure="", exit=_exit_of_stop(cell))
         return to(cell, State.ENDED, Record("dataflow-stopped"), Do.EXIT)
     if cell.reload:
         return to(replace(cell, failure="", exit=RunnerExit.OK), State.ENDED, Do.EXIT)
     if cell.failure:
         return fail(cell, cell.failure, cell.exit)
     return to(cell, State.ENDED, Record("dataflow-finished"), Do.EXIT)
+
+
+def _exit_of_stop(cell: Cell) -> RunnerExit:
+    """A requested stop of a service counts as clean, whatever exit status the nodes had.
+
+    `doractl run` ends as `dora run` does, which fails if a node failed on the way out.
+    """
+    is_failed = cell.is_attached and any(node.exit.is_failure for node in cell.nodes.values())
+    return RunnerExit.NODES_FAILED if is_failed else RunnerExit.OK
 
 
 def daemon_left(cell: Cell, event: life.ChildExited) -> Next:

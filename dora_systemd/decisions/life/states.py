@@ -77,7 +77,8 @@ class Cell:
     exit: the future exit status of the runner. cause, culprits: of the failure, and the nodes that
     caused it. downstream: the nodes that depend on each node. is_again: whether a reload has
     started this run. is_trial: whether the version before can come back. reload: whether the run
-    ends for the next one. notice: the result of the last reload.
+    ends for the next one. notice: the result of the last reload. is_attached: whether it belongs to
+    `doractl run`, which tells how the nodes ended after a stop, too.
     """
 
     grace: int
@@ -96,3 +97,4 @@ class Cell:
     is_trial: bool = False
     reload: bool = False
     notice: str = ""
+    is_attached: bool = False

@@ -3,14 +3,18 @@
 import os
 import select
 import signal
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
 from dora_systemd.adapters.bus.manager import DOWN, Manager, Property
+from dora_systemd.decisions.life.states import RunnerExit
 from dora_systemd.verbs.start.job import StageObserver, tell_stage
 
 _POLL_SECONDS = 0.5
+_ONE_REQUEST_SECONDS = 0.3
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _CLD_EXITED = 1
 _STATE = ("ActiveState", "Job", "ExecMainCode", "ExecMainStatus", "Result")
 
@@ -60,9 +64,9 @@ def follow_unit(
 ) -> int:
     """Print the logs of a started unit until it has ended; its exit status.
 
-    The first Ctrl+C stops the dataflow gracefully, the second kills it.
+    The first SIGINT (Ctrl+C) or SIGTERM stops the dataflow gracefully, a later one kills it.
     """
-    interrupts = 0
+    stop = _Stop(manager, unit)
     with _interrupts() as wakeup:
         poll = select.poll()
         for source in (manager.fileno(), logs.fileno(), wakeup):
@@ -70,8 +74,8 @@ def follow_unit(
         while True:
             ready = {fd for fd, _ in poll.poll(_POLL_SECONDS * 1000)}
             if wakeup in ready:
-                interrupts += len(os.read(wakeup, 16))
-                _interrupt(manager, unit, interrupts)
+                os.read(wakeup, 64)
+                stop.ask(time.monotonic())
             logs.print_new()
             changed = manager.changes(unit)
             for changes in changed:
@@ -83,11 +87,22 @@ def follow_unit(
                 return status
 
 
-def _interrupt(manager: Manager, unit: str, count: int) -> None:
-    if count == 1:
-        manager.queue_job("StopUnit", unit)
-    else:
-        manager.kill(unit, signal.SIGKILL)
+class _Stop:
+    """What signals ask for: to stop the unit, then to kill it."""
+
+    def __init__(self, manager: Manager, unit: str) -> None:
+        self._manager = manager
+        self._unit = unit
+        self._asked = float("inf")
+
+    def ask(self, now: float) -> None:
+        """A signal has come. now: CLOCK_MONOTONIC in seconds."""
+        if self._asked > now:
+            self._asked = now
+            self._manager.queue_job("StopUnit", self._unit)
+        # timeout(1) sends its signal to us and to our process group: that is one request.
+        elif now - self._asked > _ONE_REQUEST_SECONDS:
+            self._manager.kill(self._unit, signal.SIGKILL)
 
 
 def _exit_status(manager: Manager, unit: str) -> int | None:
@@ -96,6 +111,9 @@ def _exit_status(manager: Manager, unit: str) -> int | None:
     if state["ActiveState"] not in DOWN or state["Job"][0]:
         return None
     status: int = state["ExecMainStatus"]
+    if status == RunnerExit.NODES_FAILED:
+        # Its own status only tells systemd not to start the dataflow again.
+        return RunnerExit.FAILED
     if state["ExecMainCode"] != _CLD_EXITED and status:
         return 128 + status
     # A timeout, or a failure before the runner was executed: there is no exit status.
@@ -104,14 +122,15 @@ def _exit_status(manager: Manager, unit: str) -> int | None:
 
 @contextmanager
 def _interrupts() -> Iterator[int]:
-    """A file descriptor that receives a byte for each SIGINT; nothing else is interrupted."""
+    """A file descriptor that receives a byte for each signal; nothing else is interrupted."""
     read, write = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
-    before = signal.signal(signal.SIGINT, lambda *_: None)
+    before = {number: signal.signal(number, lambda *_: None) for number in _SIGNALS}
     wakeup = signal.set_wakeup_fd(write)
     try:
         yield read
     finally:
         signal.set_wakeup_fd(wakeup)
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
         os.close(read)
         os.close(write)

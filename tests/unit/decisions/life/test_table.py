@@ -389,3 +389,21 @@ def test_each_handler_takes_the_events_of_its_entries() -> None:
         for event, handler in row.items():
             taken = get_type_hints(handler)["event"]
             assert issubclass(event, taken), f"{handler.__name__} for {event} in {state}"
+
+
+@pytest.mark.parametrize(
+    ("is_attached", "exit", "status"),
+    [
+        (False, exit_of(5), RunnerExit.OK),
+        (True, exit_of(5), RunnerExit.NODES_FAILED),
+        (True, Exit(), RunnerExit.OK),
+    ],
+)
+def test_a_node_that_fails_on_the_way_out(
+    is_attached: bool, exit: Exit, status: RunnerExit
+) -> None:
+    """Only `doractl run` fails then; systemd must not call a stop of a service a failure."""
+    before = cell(State.LEAVING, stop_by="SIGTERM", is_attached=is_attached)
+    nodes = {"a": NodeStatus("stopped", exit=exit), "b": NodeStatus("stopped")}
+    after, actions = step(replace(before, nodes=nodes), life.ChildExited(1, "daemon", exit_of(-2)))
+    assert (after.exit, Record("dataflow-stopped") in actions) == (status, True)

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from dora_systemd.verbs.start import run
 from dora_systemd.verbs.start.run import attached_properties, follow_unit, life_line
 from tests.unit.fakes.manager import FakeManager, options
 
@@ -20,8 +21,14 @@ class Life(FakeManager):
     Its file descriptor is a pipe, as poll(2) wants one.
     """
 
-    def __init__(self, states: list[dict[str, Any]], interrupts: int = 0) -> None:
+    def __init__(
+        self,
+        states: list[dict[str, Any]],
+        interrupts: int = 0,
+        number: signal.Signals = signal.SIGINT,
+    ) -> None:
         super().__init__()
+        self.number = number
         self.add(options())
         self.states = states
         self.interrupts = interrupts
@@ -32,7 +39,7 @@ class Life(FakeManager):
 
     def changes(self, unit: str) -> list[Mapping[str, Any]]:
         if len(self.calls) < self.interrupts:
-            threading.Timer(0.01, os.kill, (os.getpid(), signal.SIGINT)).start()
+            threading.Timer(0.01, os.kill, (os.getpid(), self.number)).start()
         elif self.states:
             self.units[unit] |= self.states.pop(0)
         return [{"StatusText": "1/1 nodes running"}, {"NRestarts": 0}]
@@ -75,6 +82,8 @@ RESTARTING = {"ActiveState": "inactive", "Job": [7, "/job/7"]}
         ([ENDED], 0),
         ([FAILED], 1),
         ([KILLED], 137),
+        ([{**FAILED, "ExecMainStatus": 70}], 1),
+        ([{**FAILED, "ExecMainStatus": 69}], 69),
         ([RESTARTING, {"Job": [0, "/"], "ActiveState": "active"}, ENDED], 0),
         ([{"ActiveState": "failed", "Result": "timeout"}], 1),
     ],
@@ -86,12 +95,31 @@ def test_exit_status(logs: Lines, states: list[dict[str, Any]], status: int) -> 
     assert set(stages) == {"1/1 nodes running"}
 
 
-def test_first_ctrl_c_stops_and_second_kills(logs: Lines) -> None:
+def test_first_ctrl_c_stops_and_second_kills(logs: Lines, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run, "_ONE_REQUEST_SECONDS", 0.0)
     before = signal.getsignal(signal.SIGINT)
     manager = Life([ENDED], interrupts=2)
     follow_unit(manager, UNIT, logs, None)
     assert manager.calls == [("StopUnit", UNIT), ("kill", UNIT, signal.SIGKILL, "all")]
     assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_timeout_signals_twice_and_means_one_stop() -> None:
+    manager = FakeManager()
+    manager.add(options())
+    stop = run._Stop(manager, UNIT)
+    for now in (10.0, 10.001, 10.2):
+        stop.ask(now)
+    assert manager.calls == [("StopUnit", UNIT)]
+    stop.ask(10.5)
+    assert manager.calls[1:] == [("kill", UNIT, signal.SIGKILL, "all")]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_stops_gracefully(logs: Lines, number: signal.Signals) -> None:
+    manager = Life([ENDED], interrupts=1, number=number)
+    assert follow_unit(manager, UNIT, logs, None) == 0
+    assert manager.calls == [("StopUnit", UNIT)]
 
 
 def test_the_life_line_is_closed_with_the_block() -> None:

@@ -1,0 +1,48 @@
+"""`doractl run` ends as `dora run` does, however the nodes and the command end."""
+
+import pytest
+
+from tests.system.cells import Cell, Project, run
+
+LISTENS = """
+import sys, time
+from dora import Node
+node = Node()
+print("up", flush=True)
+for event in node:
+    if event["type"] == "STOP":
+        break
+"""
+NODES = {
+    "well": LISTENS,
+    "five-at-stop": LISTENS + "sys.exit(5)\n",
+    "crashes": "from dora import Node\nNode()\nraise SystemExit(3)\n",
+    "ends": "from dora import Node\nNode()\n",
+    "deaf": LISTENS.split("for event")[0]
+    + "import signal\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\ntime.sleep(300)\n",
+}
+CASES = {
+    "well": ("INT", "", 0),
+    "five-at-stop": ("INT", "", 1),
+    "deaf": ("TERM", "", 1),
+    "crashes": ("INT", "restart_policy: on-failure, restart_delay: 1, max_restarts: 100", 1),
+    "ends": ("INT", "", 0),
+}
+"""The node: the signal that ends the command after some seconds, more keys, and the status."""
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.warns("'exit-code'", "crashed", "node_failure", "failed: node one", "was killed")
+def test_exit_status(cell: Cell, project: Project, case: str) -> None:
+    number, keys, status = CASES[case]
+    project.write("node.py", NODES[case])
+    flow = project.write("dataflow.yml", f"nodes: [{{id: one, path: node.py, {keys}}}]\n")
+    wait = ("timeout", "--preserve-status", f"--signal={number}", "8")
+    bare = run(*wait, "dora", "run", str(flow), cwd=project.root, check=False)
+    ours = run(
+        *(*wait, "doractl", "run", str(flow), "--name", cell.name, "--grace-duration", "1s"),
+        check=False,
+    )
+    words = f"{bare.stdout}{bare.stderr}\n{ours.stdout}{ours.stderr}"
+    assert (min(bare.returncode, 1), ours.returncode) == (status, status), words
+    assert cell.is_gone
