@@ -20,6 +20,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import user_name
 from dora_systemd.trust.socket_table import listener_uids, listening_sockets
 from dora_systemd.verbs.doctor import examine
+from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.facts.enabled import enabled_names, own_directories
 from dora_systemd.verbs.gateway import read_gateway
 from dora_systemd.verbs.setup import text_of
@@ -65,12 +66,13 @@ def open_port(manager: Manager, scope: Scope, port: int | None) -> int:
 
 
 def start_boot_target(manager: Manager, scope: Scope) -> list[str]:
-    """Start the dataflows of a boot if the boot has not done so; their names."""
+    """Start the dataflows of a boot if the boot has not done so; the names of those it started."""
     state = manager.read(BOOT_TARGET, ["LoadState", "ActiveState"])
     if state["LoadState"] != "loaded" or state["ActiveState"] == "active":
         return []
+    running = {cell.name for cell in read_cells(manager) if cell.is_up}
     manager.run_jobs("StartUnit", [BOOT_TARGET])
-    return enabled_names(manager, scope)
+    return [name for name in enabled_names(manager, scope) if name not in running]
 
 
 def written_files(manager: Manager, scope: Scope) -> list[Path]:

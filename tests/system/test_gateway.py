@@ -27,20 +27,25 @@ Starting dora daemon...
 
 Daemon running at: http://localhost:{port}
 """
+USE = """
+Use 'eval "$(doractl env)"' to connect the dora command to it
+"""
+UP += USE
+AGAIN = "Daemon already running at: http://localhost:{port}\n" + USE
 
 
 def test_up(front: Front) -> None:
     assert front.doractl("up").stdout == UP.format(port=53290)
     pid, token = front.pid, front.token
     again = front.doractl("up")
-    assert again.stdout == "Daemon already running at: http://localhost:53290\n"
+    assert again.stdout == AGAIN.format(port=53290)
     assert (front.pid, front.token) == (pid, token)
     # To another port, and back.
     front.port = 53292
     assert front.up() == UP.format(port=53292)
     assert front.get("/health") == (200, "ok")
     assert front.token != token
-    assert front.doractl("up").stdout == "Daemon already running at: http://localhost:53292\n"
+    assert front.doractl("up").stdout == AGAIN.format(port=53292)
     environment = {**os.environ, "DORA_COORDINATOR_ADDR": "localhost:53290"}
     assert run("doractl", "up", env=environment).stdout == UP.format(port=53290)
     assert "process" not in front.journal()

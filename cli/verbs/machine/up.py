@@ -10,6 +10,10 @@ from dora_systemd.decisions.gateway.port import wanted_port
 from dora_systemd.verbs.gateway import check_answer, read_gateway
 from dora_systemd.verbs.up import check_machine, open_port, start_boot_target
 
+_USE = """
+
+Use 'eval "$(doractl env)"' to connect the dora command to it"""
+
 
 @click.command("up")
 @click.option(
@@ -36,7 +40,7 @@ def command(port: int | None) -> None:
     if now.is_up and wanted in (None, now.port):
         assert now.port is not None
         check_answer(scope, now.port)
-        click.echo(f"Daemon already running at: http://localhost:{now.port}")
+        click.echo(f"Daemon already running at: http://localhost:{now.port}{_USE}")
         return
     click.echo("Starting dora daemon...")
     check_machine(Bus, scope)
@@ -47,4 +51,4 @@ def command(port: int | None) -> None:
     click.echo("  ✓ Daemon ready")
     if names:
         click.echo(f"  ✓ Enabled dataflows started: {', '.join(names)}")
-    click.echo(f"\nDaemon running at: http://localhost:{opened}")
+    click.echo(f"\nDaemon running at: http://localhost:{opened}{_USE}")

@@ -19,7 +19,7 @@ from dora_systemd.verbs.up import (
     open_port,
     start_boot_target,
 )
-from tests.unit.fakes.manager import FakeManager, ScopeIn
+from tests.unit.fakes.manager import FakeManager, ScopeIn, options
 
 
 class Systemd(FakeManager):
@@ -140,5 +140,6 @@ def test_what_a_boot_starts(
 ) -> None:
     assert start_boot_target(systemd, scope) == []
     systemd.units[BOOT_TARGET] = {"LoadState": "loaded", "ActiveState": active}
-    systemd.enable_unit_files(["dora-robot.service"])
+    systemd.enable_unit_files(["dora-robot.service", "dora-runs.service"])
+    systemd.add(options("runs"))
     assert start_boot_target(systemd, scope) == started
