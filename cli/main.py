@@ -15,8 +15,11 @@ LIST_VERBS = ("list", "ps", "status")
 
 def main() -> None:
     """Run doractl, and exit with its status, see ExitCode."""
-    put_in_place()
-    _leave(run(sys.argv[1:]))
+    status: int = ExitCode.INTERRUPTED
+    with suppress(KeyboardInterrupt):  # one that comes while an error is printed
+        put_in_place()
+        status = run(sys.argv[1:])
+    _leave(status)
 
 
 def _leave(status: int) -> NoReturn:
