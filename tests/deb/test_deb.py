@@ -194,6 +194,7 @@ def test_an_enabled_unit_of_before_the_packages_goes_on() -> None:
     assert "Nothing has changed" in reload_words()
     sh("systemctl kill --kill-whom=main --signal=KILL dora-robot")
     wait_for("its end is told", lambda: ends_told("runner-killed") == 1, 60)
+    sh("systemctl start dora-robot")
     wait_for_plot("root", len(lines("root", "plot")))
     sh("doractl disable robot")
 
