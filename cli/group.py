@@ -114,7 +114,9 @@ class VerbGroup(click.Group):
     invoke_without_command=True,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
-@click.version_option(__version__, prog_name="doractl", message="%(prog)s %(version)s")
+@click.version_option(
+    __version__, "-V", "--version", prog_name="doractl", message="%(prog)s %(version)s"
+)
 @scope_options
 @click.pass_context
 def doractl(ctx: click.Context) -> None:
@@ -128,6 +130,8 @@ def doractl(ctx: click.Context) -> None:
 
 def run_verb(arguments: list[str]) -> int:
     """Run a command line; its exit status. Raises DoraSystemdError for a wrong one, too."""
+    if arguments[:1] == ["help"]:
+        arguments = [*arguments[1:2], "--help"]
     try:
         result = doractl.main(arguments, prog_name="doractl", standalone_mode=False)
     except click.ClickException as error:

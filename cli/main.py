@@ -81,7 +81,7 @@ def _dispatch(arguments: list[str]) -> int:
         from dora_systemd.cli.completion import complete
 
         return complete(instruction)
-    if arguments == ["--version"]:
+    if arguments in (["--version"], ["-V"]):
         print(f"doractl {__version__}")
         return ExitCode.OK
     if arguments and arguments[0] in LIST_VERBS:

@@ -108,6 +108,10 @@ def _select_run(journal: JournalReader, query: LogQuery, run: str) -> LogQuery:
     if run == "ALL":
         return query
     if run not in ("CURRENT", "PREVIOUS"):
+        if run and not journal.has_run(query.name, run):
+            message = f"cannot find the run {quoted(run)}"
+            hint = "doractl list --all, or journalctl --field=DORA_RUN"
+            raise DoraSystemdError(message, hint, ExitCode.NOT_FOUND)
         return replace(query, run=run)
     if not query.name:
         hint = "say which dataflow: doractl logs NAME --run CURRENT"
@@ -122,13 +126,13 @@ def _select_run(journal: JournalReader, query: LogQuery, run: str) -> LogQuery:
 
 
 def read_logs(
-    query: LogQuery, terminal: TerminalLines | ShownLines | None = None
+    query: LogQuery, terminal: TerminalLines | ShownLines | None = None, want_colors: bool = False
 ) -> Iterator[bytes]:
     """The output of journalctl for a query, in chunks; formatted by `terminal` if given.
 
     Raises DoraSystemdError: USAGE for a time or pattern that journalctl does not accept.
     """
-    for data in journal_output(query_arguments(query), want_colors=terminal is not None):
+    for data in journal_output(query_arguments(query), want_colors=want_colors):
         yield terminal.feed(data) if terminal else data
 
 

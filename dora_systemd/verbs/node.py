@@ -10,7 +10,13 @@ from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.runner_socket import client as runner_socket
 from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.decisions.dora.coordinator import Coordinator
-from dora_systemd.decisions.dora.protocol import Params, Reply, node_params, replace_params
+from dora_systemd.decisions.dora.protocol import (
+    Params,
+    Reply,
+    first_line,
+    node_params,
+    replace_params,
+)
 from dora_systemd.decisions.dora.variables import coordinator_variables
 from dora_systemd.decisions.reload.changes import has_readers
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -180,7 +186,7 @@ def require_node(scope: Scope, cell: Cell, node: str) -> CellStatus:
 def _answer(cell: Cell, reply: Reply) -> dict[str, Any]:
     if reply.error:
         raise DoraSystemdError(
-            f"cannot do that in the dataflow {cell.name}: {plain(reply.error)}",
+            f"cannot do that in the dataflow {cell.name}: {plain(first_line(reply.error))}",
             f"doractl restart {cell.name} starts all of it again",
         )
     return reply.result if isinstance(reply.result, dict) else {}

@@ -121,7 +121,7 @@ def test_a_port_in_use(front: Front, alice: Front) -> None:
 )
 def test_wrong_variables(variable: str, front: Front) -> None:
     done = run("env", variable, "doractl", "up", check=False)
-    assert (done.returncode, done.stdout) == (ExitCode.BAD_INPUT, "")
+    assert (done.returncode, done.stdout) == (ExitCode.USAGE, "")
     assert variable.partition("=")[0] in done.stderr
     assert not front.pid
 

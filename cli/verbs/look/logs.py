@@ -10,6 +10,7 @@ from typing import Any
 import click
 
 from dora_systemd.adapters.journal.reader import JournalReader, check_readable
+from dora_systemd.cli.colors import is_dumb, wants_colors
 from dora_systemd.cli.parameters import current_scope, scope_options
 from dora_systemd.decisions.logs.query import OUTPUTS, LogQuery, parse_level
 from dora_systemd.decisions.logs.terminal import ShownLines, TerminalLines
@@ -128,21 +129,29 @@ def command(
     lines: Lines = ShownLines() if sys.stdout.isatty() else None
     if sys.stdout.isatty() and query.output.startswith("short"):
         known = query.nodes or (journal.known_nodes(query.name) if query.name else ())
-        lines = TerminalLines([*known, query.name], want_dataflow=not query.name)
+        lines = TerminalLines(
+            [*known, query.name],
+            want_dataflow=not query.name,
+            want_colors=wants_colors(sys.stdout),
+        )
     if until_end:
         follow_to_end(query, lambda step: _print(step, lines))
         return ExitCode.OK
     if no_pager or query.is_follow or not sys.stdout.isatty():
         return _exit_status(_print(query, lines))
-    _page(read_logs(query, lines))
+    _page(_read(query, lines))
     return ExitCode.OK
+
+
+def _read(query: LogQuery, lines: Lines) -> Iterator[bytes]:
+    return read_logs(query, lines, wants_colors(sys.stdout))
 
 
 def _print(query: LogQuery, lines: Lines) -> int:
     """Print the records of a query, formatted for a terminal, or by journalctl itself."""
     if not sys.stdout.isatty():
         return pass_logs(query, sys.stdout.fileno())
-    _write(read_logs(query, lines), sys.stdout.fileno())
+    _write(_read(query, lines), sys.stdout.fileno())
     return ExitCode.OK
 
 
@@ -178,7 +187,7 @@ def pager_of(environ: Mapping[str, str]) -> tuple[str, dict[str, str]]:
 def _page(chunks: Iterator[bytes]) -> None:
     """Print to the pager that journalctl(1) would use, with the same options."""
     pager, environment = pager_of(os.environ)
-    if not shutil.which(pager.split()[0]) or pager == "cat":
+    if not shutil.which(pager.split()[0]) or pager == "cat" or is_dumb():
         _write(chunks, sys.stdout.fileno())
         return
     with subprocess.Popen(pager, shell=True, stdin=subprocess.PIPE, env=environment) as child:

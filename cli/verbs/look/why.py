@@ -7,6 +7,7 @@ import click
 
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.adapters.journal.reader import JournalReader, check_readable
+from dora_systemd.cli.colors import wants_colors
 from dora_systemd.cli.edge import write_own
 from dora_systemd.cli.parameters import current_scope, output_option, print_json, scope_options
 from dora_systemd.decisions.why.report import format_report, report_values
@@ -36,5 +37,5 @@ def command(selector: str, output: str) -> int:
         return ExitCode.OK
     is_terminal = sys.stdout.isatty()
     width = shutil.get_terminal_size().columns if is_terminal else None
-    write_own(sys.stdout, f"{format_report(report, width, want_colors=is_terminal)}\n")
+    write_own(sys.stdout, f"{format_report(report, width, want_colors=wants_colors(sys.stdout))}\n")
     return ExitCode.OK

@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from dora_systemd.adapters.bus.systemd import Bus
+from dora_systemd.cli.colors import wants_colors
 from dora_systemd.cli.parameters import current_scope, name_option, print_warnings, scope_options
 from dora_systemd.cli.settingoptions import setting_options
 from dora_systemd.cli.stageline import StageLine
@@ -51,7 +52,7 @@ def command(dataflow: str, name: str | None, **flags: Any) -> int:
     drop_unit_files(bus, boot)
     print_warnings(warnings)
     options = plan.options
-    terminal = TerminalLines((), want_colors=sys.stdout.isatty())
+    terminal = TerminalLines(want_colors=wants_colors(sys.stdout), is_terminal=sys.stdout.isatty())
     since = time.time_ns() // _MICROSECOND_NS
     with life_line() as pipe, StageLine(sys.stderr) as stage:
 

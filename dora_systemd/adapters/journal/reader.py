@@ -187,6 +187,11 @@ class JournalReader:
                 break
         return list(found.values())
 
+    def has_run(self, name: str, run: str) -> bool:
+        """Whether there is a record of the run with that id. name: of its dataflow, "" for any."""
+        matches = [f"DORA_RUN={run}", *([f"DORA_DATAFLOW_NAME={name}"] if name else [])]
+        return any(self.newest(matches, 1))
+
     def starts(self, scope: Scope, uuid: str, limit: int) -> list[int]:
         """Start times of the newest runs of a dataflow's unit, CLOCK_REALTIME µs, newest first."""
         matches = [*scope_matches(scope), f"DORA_DATAFLOW={uuid}", "DORA_EVENT=dataflow-starting"]

@@ -15,13 +15,13 @@ _REMOTE_HINT = "the gateway is for this machine; from another one: ssh -L PORT:1
 def wanted_port(option: int | None, environ: Mapping[str, str]) -> int | None:
     """The requested port, or None.
 
-    Raises DoraSystemdError (BAD_INPUT) for variables that do not mean a port of 127.0.0.1.
+    Raises DoraSystemdError (USAGE) for variables that do not mean a port of 127.0.0.1.
     """
     address = environ.get(ADDRESS_VARIABLE, "")
     host, _, port = address.partition(":") if address.count(":") < 2 else (address, "", "")
     if address and host not in _LOOPBACK:
         message = f"cannot listen where {ADDRESS_VARIABLE} says: {quoted(address)} is not 127.0.0.1"
-        raise DoraSystemdError(message, _REMOTE_HINT, ExitCode.BAD_INPUT)
+        raise DoraSystemdError(message, _REMOTE_HINT, ExitCode.USAGE)
     from_port = _parse(PORT_VARIABLE, environ.get(PORT_VARIABLE, ""))
     from_address = _parse(ADDRESS_VARIABLE, port)
     return next((one for one in (option, from_port, from_address) if one is not None), None)
@@ -46,5 +46,5 @@ def _parse(variable: str, text: str) -> int | None:
         return None
     if not (text.isascii() and text.isdecimal() and 0 < int(text[:6]) < 65536):
         message = f"cannot read {variable}: {quoted(text)} is not a port"
-        raise DoraSystemdError(message, "a port is 1 to 65535", ExitCode.BAD_INPUT)
+        raise DoraSystemdError(message, "a port is 1 to 65535", ExitCode.USAGE)
     return int(text)

@@ -35,15 +35,20 @@ class TerminalLines:
     """Rewrites journalctl's short lines; formats records as such lines.
 
     nodes: known names, for the width of their column. want_dataflow: show the name of the dataflow.
-    want_colors: whether the output is a terminal.
+    want_colors: for nodes and priorities. is_terminal: escape control characters.
     """
 
     def __init__(
-        self, nodes: Iterable[str] = (), want_dataflow: bool = False, want_colors: bool = True
+        self,
+        nodes: Iterable[str] = (),
+        want_dataflow: bool = False,
+        want_colors: bool = True,
+        is_terminal: bool = True,
     ) -> None:
         self._width = min(max(map(len, nodes), default=0), MAX_WIDTH)
         self._want_dataflow = want_dataflow
         self._want_colors = want_colors
+        self._is_terminal = is_terminal
         self._labels: dict[bytes, bytes] = {}
         self._whole = ShownLines()
         self._old_indent = self._new_indent = 0
@@ -58,7 +63,7 @@ class TerminalLines:
         when = time.strftime("%b %d %H:%M:%S", time.localtime(seconds)).encode()
         start = self._start(when, *record.get("SYSLOG_IDENTIFIER", b"").partition(b"/")[::2])
         text = record.get("MESSAGE", b"")
-        text = shown_log(text) if self._want_colors else text
+        text = shown_log(text) if self._is_terminal else text
         text = text.replace(b"\n", b"\n" + b" " * self._new_indent)
         color = _MESSAGE_COLORS.get(record.get("PRIORITY", b""))
         if color and self._want_colors:

@@ -47,6 +47,8 @@ def requests(monkeypatch: pytest.MonkeyPatch) -> list[ListRequest]:
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert main.run(["--version"]) == 0
     assert capsys.readouterr().out == f"doractl {__version__}\n"
+    assert main.run(["-V"]) == 0
+    assert capsys.readouterr().out == f"doractl {__version__}\n"
     assert main.run(["--user", "--version"]) == 0
     assert capsys.readouterr().out == f"doractl {__version__}\n"
 
@@ -260,6 +262,16 @@ def test_list_loads_little() -> None:
     assert not loaded & {"click", "asyncio", "subprocess"}
     ours = {name.removeprefix("dora_systemd.") for name in loaded} & module_paths().keys()
     assert len(ours) <= MOST_MODULES_OF_LIST, sorted(ours)
+
+
+def test_help_is_a_word_too(capsys: pytest.CaptureFixture[str]) -> None:
+    for verb in ([], ["stop"], ["node"]):
+        assert main.run([*verb, "--help"]) == 0
+        shown = capsys.readouterr().out
+        assert main.run(["help", *verb]) == 0
+        assert capsys.readouterr().out == shown
+    assert main.run(["help", "stpo"]) == ExitCode.USAGE
+    assert "did you mean doractl stop?" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -28,6 +28,9 @@ class FakeJournal(JournalReader):
     def name_of(self, uuid: str) -> str:
         return {ROBOT: "robot", ARM: "arm"}[uuid]
 
+    def has_run(self, name: str, run: str) -> bool:
+        return (name, run) == ("robot", "0190-run")
+
     def invocations(self, scope: Scope, name: str, uuid: str) -> Iterator[str]:
         del scope, uuid
         return iter(["i2", "i1"] if name == "robot" else [])
@@ -107,9 +110,10 @@ def test_run() -> None:
     assert find(run="CURRENT").invocation == "i2"
     assert find(run="PREVIOUS").invocation == "i1"
     assert find(run="0190-run").run == "0190-run"
-    with pytest.raises(DoraSystemdError) as caught:
-        find("arm", run="CURRENT")
-    assert caught.value.code is ExitCode.NOT_FOUND
+    for selector, run in (("arm", "CURRENT"), ("arm", "0190-run"), ("robot", "nosuch")):
+        with pytest.raises(DoraSystemdError, match="cannot find the") as caught:
+            find(selector, run=run)
+        assert caught.value.code is ExitCode.NOT_FOUND
 
 
 @pytest.mark.parametrize(("nodes", "run"), [(("a",), "ALL"), ((), "CURRENT")])

@@ -137,10 +137,11 @@ def test_an_odd_answer(scope: Scope, cell: Cell, info: dict[str, Any]) -> None:
 
 def test_words_of_dora_are_no_orders_for_a_terminal(scope: Scope, cell: Cell) -> None:
     fake = FakeCoordinator(None)
-    fake.error = "no\x1b]0;title\x07"
+    fake.error = "no\x1b]0;title\x07\n\nLocation:\n    binaries/daemon/src/lib.rs:3:5"
     with pytest.raises(DoraSystemdError) as caught:
         node.stop_node(scope, cell, "camera", fake)
     assert caught.value.message.isprintable()
+    assert "Location" not in caught.value.message
 
 
 def test_a_port_of_somebody_else(scope: Scope, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -84,7 +84,7 @@ def test_a_record_on_a_terminal_and_in_a_pipe() -> None:
     assert rb"\x1b]52;c;eA==\x07" in shown
     assert rb"cam\x1b]0;x" in shown
     assert rb"\x9b2J" in shown
-    assert b"\x1b]52;c;eA==\x07\n" in TerminalLines(want_colors=False).record(record)
+    assert b"\x1b]52;c;eA==\x07\n" in TerminalLines(is_terminal=False).record(record)
 
 
 def test_lines_of_other_forms() -> None:

@@ -42,7 +42,7 @@ def test_precedence(option: int | None, environ: Mapping[str, str], port: int | 
 def test_refusals(environ: Mapping[str, str]) -> None:
     with pytest.raises(DoraSystemdError, match="cannot ") as caught:
         wanted_port(None, environ)
-    assert caught.value.code is ExitCode.BAD_INPUT
+    assert caught.value.code is ExitCode.USAGE
     assert next(iter(environ)) in caught.value.message
     assert caught.value.hint
 
