@@ -1,8 +1,9 @@
 """One status line on a terminal that is rewritten during a wait; no output to a pipe."""
 
 import shutil
+from collections.abc import Mapping
 from contextlib import AbstractContextManager
-from typing import TextIO
+from typing import Any, TextIO
 
 from dora_systemd.cli.edge import write_own
 from dora_systemd.terminal_text import one_line
@@ -24,6 +25,11 @@ class StageLine(AbstractContextManager["StageLine"]):
             shown = one_line(text)[: columns - 1]
             self._write(f"{_BACK_AND_CLEAR}{shown}")
             self._is_shown = True
+
+    def show(self, changes: Mapping[str, Any]) -> None:
+        """Show STATUS= of a unit, if it is among these changes of its properties."""
+        if changes.get("StatusText"):
+            self(changes["StatusText"])
 
     def wipe(self) -> None:
         """Make room for other output; the next stage is shown below it."""

@@ -27,13 +27,15 @@ class Outcome:
     problem: str = ""
 
 
-def stop_cells(manager: Manager, scope: Scope, cells: Sequence[Cell]) -> list[Outcome]:
+def stop_cells(
+    manager: Manager, scope: Scope, cells: Sequence[Cell], observer: Observer | None = None
+) -> list[Outcome]:
     """Stop dataflows in parallel, and wait until the last one has ended.
 
     Each has its own grace duration; after that systemd kills what is left.
     """
     up = [cell.unit for cell in cells if cell.is_up]
-    results = manager.run_jobs("StopUnit", up) if up else {}
+    results = manager.run_jobs("StopUnit", up, observer) if up else {}
     outcomes = [_stop_outcome(manager, cell, results.get(cell.unit)) for cell in cells]
     release_enabled(manager, scope, up)
     return outcomes

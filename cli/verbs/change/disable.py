@@ -4,7 +4,7 @@ import click
 
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import current_scope, scope_options
-from dora_systemd.verbs.facts.selector import Selector
+from dora_systemd.verbs.facts.selector import find_all
 from dora_systemd.verbs.start.enable import disable_cell
 
 
@@ -21,6 +21,6 @@ def command(selectors: tuple[str, ...]) -> None:
     """
     scope = current_scope()
     bus = Bus(scope)
-    for cell in dict.fromkeys(Selector(one).find_enabled(bus, scope) for one in selectors):
+    for cell in find_all(bus, scope, selectors):
         done = disable_cell(bus, scope, cell)
         click.echo(f"Dataflow {'disabled' if done else 'not enabled'}: {cell.uuid} ({cell.name})")

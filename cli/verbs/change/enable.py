@@ -4,7 +4,7 @@ import click
 
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import current_scope, print_warnings, scope_options
-from dora_systemd.verbs.facts.selector import Selector
+from dora_systemd.verbs.facts.selector import find_all
 from dora_systemd.verbs.start.enable import enable_cell
 from dora_systemd.verbs.start.linger import ensure_linger
 
@@ -24,8 +24,7 @@ def command(selectors: tuple[str, ...]) -> None:
     """
     scope = current_scope()
     bus = Bus(scope)
-    cells = dict.fromkeys(Selector(one).find_enabled(bus, scope) for one in selectors)
-    for cell in cells:
+    for cell in find_all(bus, scope, selectors):
         boot, is_news = enable_cell(bus, scope, cell)
         already = "" if is_news else " already"
         click.echo(f"Dataflow{already} enabled: {cell.uuid} ({cell.name})")

@@ -10,7 +10,7 @@ from dora_systemd.cli.parameters import (
     scope_options,
 )
 from dora_systemd.verbs.facts.cells import read_cells
-from dora_systemd.verbs.facts.selector import Selector
+from dora_systemd.verbs.facts.selector import selectors_of
 from dora_systemd.verbs.stop import reset_cells
 
 
@@ -31,7 +31,7 @@ def command(selectors: tuple[str, ...], want_all: bool) -> int:
     require_names_or_all("reset", selectors, want_all)
     bus = Bus(current_scope())
     cells = read_cells(bus)
-    chosen = cells if want_all else [Selector(one).loaded(cells) for one in selectors]
+    chosen = cells if want_all else [one.loaded(cells) for one in selectors_of(selectors, cells)]
     if want_all and not chosen:
         click.echo("No dataflow.")
     return print_outcomes(reset_cells(bus, list(dict.fromkeys(chosen))))

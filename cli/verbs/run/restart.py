@@ -1,15 +1,13 @@
 """Restart dataflows."""
 
 import sys
-from collections.abc import Mapping
-from typing import Any
 
 import click
 
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import current_scope, print_outcomes, scope_options
 from dora_systemd.cli.stageline import StageLine
-from dora_systemd.verbs.facts.selector import Selector
+from dora_systemd.verbs.facts.selector import find_all
 from dora_systemd.verbs.stop import restart_cells
 
 
@@ -28,12 +26,7 @@ def command(selectors: tuple[str, ...]) -> int:
     """
     scope = current_scope()
     bus = Bus(scope)
-    chosen = dict.fromkeys(Selector(one).find_enabled(bus, scope) for one in selectors)
+    chosen = find_all(bus, scope, selectors)
     with StageLine(sys.stderr) as stage:
-        outcomes = restart_cells(bus, list(chosen), lambda changes: _show(stage, changes))
+        outcomes = restart_cells(bus, chosen, stage.show)
     return print_outcomes(outcomes)
-
-
-def _show(stage: StageLine, changes: Mapping[str, Any]) -> None:
-    if changes.get("StatusText"):
-        stage(changes["StatusText"])

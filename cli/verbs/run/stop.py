@@ -1,5 +1,7 @@
 """Stop dataflows."""
 
+import sys
+
 import click
 
 from dora_systemd.adapters.bus.systemd import Bus
@@ -9,9 +11,10 @@ from dora_systemd.cli.parameters import (
     require_names_or_all,
     scope_options,
 )
+from dora_systemd.cli.stageline import StageLine
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell, read_cells
-from dora_systemd.verbs.facts.selector import Selector
+from dora_systemd.verbs.facts.selector import selectors_of
 from dora_systemd.verbs.stop import note_stop, stop_cells
 
 
@@ -28,6 +31,7 @@ def command(selectors: tuple[str, ...], want_all: bool) -> int:
     Examples:
       doractl stop robot
       doractl stop 550e8400 vision
+      doractl stop 'cam*'
       doractl stop --all
     """
     require_names_or_all("stop", selectors, want_all)
@@ -39,7 +43,7 @@ def command(selectors: tuple[str, ...], want_all: bool) -> int:
         if not chosen:
             click.echo("No dataflow is running.")
         return _stop(bus, scope, chosen)
-    found = {one: one.only(cells) for one in map(Selector, selectors)}
+    found = {one: one.only(cells) for one in selectors_of(selectors, cells)}
     for one in [one for one, cell in found.items() if cell is None]:
         row = one.ended(scope)
         if row is None:
@@ -50,4 +54,6 @@ def command(selectors: tuple[str, ...], want_all: bool) -> int:
 
 def _stop(bus: Bus, scope: Scope, cells: list[Cell]) -> int:
     note_stop(cells)
-    return print_outcomes(stop_cells(bus, scope, cells))
+    with StageLine(sys.stderr) as stage:
+        outcomes = stop_cells(bus, scope, cells, stage.show)
+    return print_outcomes(outcomes)

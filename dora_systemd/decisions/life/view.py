@@ -8,6 +8,7 @@ from dora_systemd.decisions.cell.status import HELD, CellStatus, CpuSample, Line
 from dora_systemd.decisions.life.nodes import WITH_PROCESS
 from dora_systemd.decisions.life.refusal import FAILED
 from dora_systemd.decisions.life.states import Cell, State
+from dora_systemd.values import format_duration
 
 _SHOWN = {
     State.BOOTING: ("starting", "starting the dora coordinator"),
@@ -34,8 +35,16 @@ def format_status(cell: Cell) -> str:
     if cell.state is State.ENDED:
         return "stopped" if cell.stop_by else "finished"
     if cell.state is State.STOPPING:
-        return f"stopping, {_plural(_count(cell, *WITH_PROCESS))} left"
+        return _format_stopping(cell)
     return _format_waiting(cell) if cell.state is State.WAITING else _format_running(cell)
+
+
+def _format_stopping(cell: Cell) -> str:
+    left = [ident for ident, node in cell.nodes.items() if node.state in WITH_PROCESS]
+    if not left:
+        return "stopping"
+    # dora sends SIGTERM after the grace duration, and SIGKILL after half of it more.
+    return f"stopping, {_names(left)} left, killed after {format_duration(cell.grace * 3 // 2)}"
 
 
 def _format_waiting(cell: Cell) -> str:
@@ -65,10 +74,6 @@ def _with_exit(ident: str, node: NodeStatus) -> str:
 def _names(texts: list[str]) -> str:
     more = len(texts) - _NAMED
     return ", ".join(texts[:_NAMED]) + (f" and {more} more" if more > 0 else "")
-
-
-def _plural(count: int) -> str:
-    return f"{count} node" if count == 1 else f"{count} nodes"
 
 
 def _count(cell: Cell, *states: str) -> int:

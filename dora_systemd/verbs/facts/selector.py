@@ -4,20 +4,31 @@ Every search for a dataflow that a user or a client names begins here, so that a
 the same words and give the same errors. `list` without a name does not load this module.
 """
 
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from typing import Protocol, TypeVar
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.decisions.views.dataflows import DataflowRow
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.names import did_you_mean, is_name, is_uuid_prefix, name_from_unit, unit_name
+from dora_systemd.names import (
+    UNIT_PREFIX,
+    UNIT_SUFFIX,
+    did_you_mean,
+    is_name,
+    is_uuid_prefix,
+    name_from_unit,
+    unit_name,
+)
 from dora_systemd.scope import Scope
 from dora_systemd.values import quoted
 from dora_systemd.verbs.facts.cells import Cell, read_cell, read_cells
 from dora_systemd.verbs.facts.enabled import lost_units
 
 _SHOWN = 10
+_PATTERN = re.compile(r"[*?\[]")
 
 
 class Named(Protocol):
@@ -54,10 +65,18 @@ class Selector:
     def meant(self, known: Iterable[N]) -> list[N]:
         """Those of `known` that match, in their order; a name takes precedence over UUIDs."""
         candidates = list(known)
-        named = [one for one in candidates if one.name == self.name]
-        if named or not is_uuid_prefix(self.text):
-            return named
+        for name in self._names:
+            if named := [one for one in candidates if one.name == name]:
+                return named
+        if not is_uuid_prefix(self.text):
+            return []
         return [one for one in candidates if one.uuid.startswith(self.text.lower())]
+
+    @property
+    def _names(self) -> list[str]:
+        """As in systemctl, ".service" may be left out; a dataflow can be called dora-x, too."""
+        short = name_from_unit(f"{self.text}{UNIT_SUFFIX}")
+        return [self.name, *([short] if short else [])]
 
     def only(self, known: Iterable[N]) -> N | None:
         """The only one of `known` that matches, None if none does."""
@@ -89,8 +108,10 @@ class Selector:
         """One that systemd has loaded, or can load from a unit file."""
         cells = read_cells(manager)
         cell = self.only(cells)
-        if cell is None and is_name(self.name):
-            cell = read_cell(manager, unit_name(self.name))
+        names = filter(is_name, self._names if cell is None else ())
+        cell = cell or next(
+            filter(None, (read_cell(manager, unit_name(one)) for one in names)), None
+        )
         return self.loaded(cells) if cell is None else cell
 
     def find_enabled(self, manager: Manager, scope: Scope) -> Cell:
@@ -109,3 +130,33 @@ class Selector:
         from dora_systemd.verbs.facts.ended import ended_rows
 
         return next(iter(self.meant(ended_rows(scope))), None)
+
+
+def selectors_of(texts: Sequence[str], cells: Iterable[Cell]) -> list[Selector]:
+    """A selector for each text; a pattern as in glob(7) gives one for each match.
+
+    cells: from read_cells(). Raises DoraSystemdError (NOT_FOUND) for a pattern that matches none.
+    """
+    known = list(cells)
+    return [one for text in texts for one in _expanded(text, known)]
+
+
+def find_all(manager: Manager, scope: Scope, texts: Sequence[str]) -> list[Cell]:
+    """The dataflows that `texts` mean, each once; as selectors_of() and find_enabled()."""
+    given = selectors_of(texts, read_cells(manager))
+    return list(dict.fromkeys(one.find_enabled(manager, scope) for one in given))
+
+
+def _expanded(text: str, cells: Sequence[Cell]) -> list[Selector]:
+    if not _PATTERN.search(text):
+        return [Selector(text)]
+    # "*o*" must not match every dataflow because of the "dora-" of its unit.
+    units = text.startswith(UNIT_PREFIX)
+    fitting = [
+        cell.name
+        for cell in cells
+        if fnmatchcase(cell.name, text) or (units and fnmatchcase(cell.unit, text))
+    ]
+    if not fitting:
+        raise Selector(text).missing(cell.name for cell in cells)
+    return [Selector(name) for name in fitting]

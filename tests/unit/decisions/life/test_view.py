@@ -24,7 +24,11 @@ def test_status_lines() -> None:
         ),
         (cell(State.RUNNING, a="running", b="dynamic"), "2/2 nodes running"),
         (cell(State.RUNNING, a="running", b="finished"), "1/2 nodes running; finished: b"),
-        (cell(State.STOPPING, a="running", b="stopped"), "stopping, 1 node left"),
+        (
+            replace(cell(State.STOPPING, a="running", b="stopped"), grace=10_000_000),
+            "stopping, a left, killed after 15s",
+        ),
+        (cell(State.STOPPING, a="stopped"), "stopping"),
         (cell(State.CLOSING), "asking dora how the dataflow ended"),
         (cell(State.LEAVING), "stopping the dora daemon"),
         (cell(State.ENDED), "finished"),

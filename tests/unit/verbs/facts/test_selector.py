@@ -11,7 +11,7 @@ from dora_systemd.adapters.journal.reader import JournalReader, LastEvent
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.verbs.facts.cells import Cell, read_cells
 from dora_systemd.verbs.facts.ended import ended_row
-from dora_systemd.verbs.facts.selector import Selector
+from dora_systemd.verbs.facts.selector import Selector, find_all
 from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
 
 OTHER = "550e8400-0000-41d4-a716-446655440000"
@@ -27,7 +27,8 @@ def cells() -> list[Cell]:
 
 
 @pytest.mark.parametrize(
-    "selector", ["robot", "dora-robot.service", UUID, UUID.upper(), UUID[:12], "550E8400-E"]
+    "selector",
+    ["robot", "dora-robot.service", "dora-robot", UUID, UUID.upper(), UUID[:12], "550E8400-E"],
 )
 def test_selectors(cells: list[Cell], selector: str) -> None:
     assert Selector(selector).loaded(cells).name == "robot"
@@ -35,6 +36,34 @@ def test_selectors(cells: list[Cell], selector: str) -> None:
 
 def test_a_name_wins_over_a_prefix(cells: list[Cell]) -> None:
     assert Selector("abcdef00").loaded(cells).uuid == THIRD
+
+
+def test_a_name_wins_over_a_unit() -> None:
+    manager = FakeManager()
+    for name, uuid in (("robot", UUID), ("dora-robot", OTHER)):
+        manager.add(options(name, uuid))
+    assert Selector("dora-robot").find(manager).uuid == OTHER
+    assert Selector("dora-dora-robot").find(manager).uuid == OTHER
+
+
+@pytest.mark.parametrize(
+    ("texts", "names"),
+    [
+        (["r*"], ["robot"]),
+        (["*o*"], ["robot", "vision"]),
+        (["dora-*.service"], ["robot", "vision", "abcdef00"]),
+        (["[rv]*", "robot"], ["robot", "vision"]),
+        (["robot"], ["robot"]),
+    ],
+)
+def test_patterns(texts: list[str], names: list[str], tmp_path: Path) -> None:
+    manager = FakeManager()
+    for name, uuid in (("robot", UUID), ("vision", OTHER), ("abcdef00", THIRD)):
+        manager.add(options(name, uuid))
+    found = find_all(manager, ScopeIn(is_user=False, uid=0, root=tmp_path), texts)
+    assert sorted(one.name for one in found) == sorted(names)
+    with pytest.raises(DoraSystemdError, match="no dataflow named 'x"):
+        find_all(manager, ScopeIn(is_user=False, uid=0, root=tmp_path), ["robot", "x*"])
 
 
 def test_an_ambiguous_prefix_lists_what_it_fits(cells: list[Cell]) -> None:
