@@ -1,12 +1,14 @@
 """`doractl list` without click, which takes longer to import than the list takes."""
 
 import json
+import os
+import sys
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.decisions.views.dataflows import (
     DataflowRow,
-    format_dataflow,
     format_dataflows,
     is_up_word,
     row_values,
@@ -61,6 +63,7 @@ def print_dataflows(request: ListRequest) -> int:
         _print_all(_rows(bus, scope, request), request)
         return ExitCode.OK
     # Imported late: the table of all dataflows does without it, and is asked for most often.
+    from dora_systemd.decisions.views.details import format_dataflow
     from dora_systemd.verbs.list import find_row
 
     row = find_row(bus, scope, request.selector)
@@ -83,6 +86,15 @@ def _print_all(rows: list[DataflowRow], request: ListRequest) -> None:
     if request.output == "json":
         print(json.dumps([row_values(row) for row in rows], indent=2))
     elif rows:
-        print(format_dataflows(rows))
+        print(format_dataflows(rows, _width()))
     else:
         print("No dataflow." if request.want_all else "No dataflow is running.")
+
+
+def _width() -> int | None:
+    """Columns of the terminal, None for a pipe; $COLUMNS has precedence, as in systemctl."""
+    if not sys.stdout.isatty():
+        return None
+    with suppress(OSError, ValueError):
+        return int(os.environ.get("COLUMNS", "0")) or os.get_terminal_size().columns
+    return None

@@ -1,10 +1,9 @@
-"""Formats dataflows for `doractl list`, from facts of systemd and the runner."""
+"""The table of `doractl list` and its JSON, from facts of systemd and the runner."""
 
 import time
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from dora_systemd.decisions.cell.restarts import budget_words
 from dora_systemd.values import SECOND, format_rounded_size
 
 STARTING, RUNNING, DEGRADED = "Starting", "Running", "Degraded"
@@ -140,14 +139,50 @@ def _prefix(uuid: str, others: Sequence[str]) -> str:
     return uuid[: next(free, len(uuid))]
 
 
+_OPTIONAL = ("BOOT", "RESTARTS", "UPTIME", "MEM", "CPU%")
+"""Columns that a narrow terminal does without, in this order."""
+_SHORTEST_NAME = 12
 _RIGHT_ALIGNED = frozenset({"CPU%", "THROTTLED%", "MEM", "PEAK", "RESTARTS", "PID", "UPTIME"})
 
 
-def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Columns with two blanks between them, numbers right-aligned, without trailing blanks."""
-    lines = [header, *rows]
-    widths = [max(len(line[column]) for line in lines) for column in range(len(header))]
-    return "\n".join(_line(header, line, widths) for line in lines)
+def format_table(
+    header: Sequence[str], rows: Sequence[Sequence[str]], width: int | None = None
+) -> str:
+    """Columns with two blanks between them, numbers right-aligned, without trailing blanks.
+
+    width: of the terminal. Then long names are cut, and the least important columns left out, until
+    the table fits.
+    """
+    lines = [list(header), *map(list, rows)]
+    if width is not None:
+        _fit(lines, width)
+    widths = _widths(lines)
+    return "\n".join(_line(lines[0], line, widths) for line in lines)
+
+
+def _widths(lines: Sequence[Sequence[str]]) -> list[int]:
+    return [max(map(len, column)) for column in zip(*lines, strict=True)]
+
+
+def _excess(lines: Sequence[Sequence[str]], width: int) -> int:
+    """By how much the table is wider than that."""
+    return sum(_widths(lines)) + 2 * (len(lines[0]) - 1) - width
+
+
+def _fit(lines: list[list[str]], width: int) -> None:
+    """Cut names, and if that is not enough, leave out columns."""
+    names = lines[0].index("NAME")
+    longest = max(len(line[names]) for line in lines)
+    for title in _OPTIONAL:
+        if _excess(lines, width) <= max(longest - _SHORTEST_NAME, 0):
+            break
+        place = lines[0].index(title)
+        for line in lines:
+            del line[place]
+    room = longest - max(_excess(lines, width), 0)
+    for line in lines:
+        if len(line[names]) > room:
+            line[names] = f"{line[names][: max(room, 2) - 1]}…"
 
 
 def _line(header: Sequence[str], cells: Sequence[str], widths: Sequence[int]) -> str:
@@ -161,10 +196,11 @@ def _line(header: Sequence[str], cells: Sequence[str], widths: Sequence[int]) ->
 _HEADER = ("UUID", "NAME", "STATUS", "UPTIME", "NODES", "CPU%", "MEM", "RESTARTS", "BOOT")
 
 
-def format_dataflows(rows: Sequence[DataflowRow]) -> str:
-    """The table of `doractl list`."""
+def format_dataflows(rows: Sequence[DataflowRow], width: int | None = None) -> str:
+    """The table of `doractl list`; for a terminal of that width."""
     prefixes = shortest_prefixes([row.uuid for row in rows])
-    return format_table(_HEADER, [_dataflow_cells(row, prefixes[row.uuid]) for row in rows])
+    cells = [_dataflow_cells(row, prefixes[row.uuid]) for row in rows]
+    return format_table(_HEADER, cells, width)
 
 
 def _dataflow_cells(row: DataflowRow, prefix: str) -> tuple[str, ...]:
@@ -188,76 +224,6 @@ def node_count(row: DataflowRow) -> str:
     return f"{row.nodes_alive}/{row.nodes_total}" if row.nodes_total else ""
 
 
-def format_nodes(rows: Sequence[NodeRow]) -> str:
-    """The node table of `doractl list SELECTOR`; with THROTTLED% if any node has a CPU limit."""
-    cells = [_node_cells(row) for row in rows]
-    is_limited = any(row.cpu_limit is not None for row in rows)
-    header = [title for title in cells[0] if is_limited or title != _THROTTLED]
-    return format_table(header, [[row[title] for title in header] for row in cells])
-
-
-_THROTTLED = "THROTTLED%"
-
-
-def _node_cells(row: NodeRow) -> dict[str, str]:
-    return {
-        "NODE": row.node,
-        "STATE": row.state.capitalize(),
-        "PID": str(row.pid) if row.pid else UNKNOWN,
-        "CPU%": format_cpu(row),
-        _THROTTLED: format_percent(row.throttled),
-        "MEM": format_memory(row.memory, row.memory_limit),
-        "PEAK": format_memory(row.memory_peak),
-        "RESTARTS": _restarts_of(row),
-        "EXIT": row.exit or UNKNOWN,
-    }
-
-
-def _restarts_of(row: NodeRow) -> str:
-    used = format_count(row.restarts)
-    return f"{used}/{row.max_restarts}" if row.max_restarts else used
-
-
-_WITH_REASON = (FAILED, DEGRADED, RESTARTING)
-
-
-def format_dataflow(row: DataflowRow) -> str:
-    """The output of `doractl list SELECTOR`: the dataflow's values, then the table of its nodes."""
-    facts = (
-        ("Dataflow", row.uuid),
-        ("Name", row.name),
-        ("Unit", row.unit),
-        ("File", row.dataflow or UNKNOWN),
-        ("Status", f"{row.status} ({row.text})" if row.text else row.status),
-        ("Uptime", format_uptime(row.uptime)),
-        ("Started", local_time(row.started)),
-        ("Ended", local_time(row.ended) if row.ended else ""),
-        ("Nodes", row.problem),
-        ("CPU", _cpu_words(row)),
-        ("Memory", _memory_words(row)),
-        ("Restarts", format_count(row.restarts)),
-        ("Budget", budget_words(row.restart_budget) if row.restart_budget else ""),
-        ("At boot", "started" if row.enabled else ""),
-        ("Reason", f"doractl why {row.name}" if row.status in _WITH_REASON else ""),
-    )
-    lines = [f"{title + ':':<10}{text}" for title, text in facts if text]
-    return "\n".join([*lines, "", format_nodes(row.nodes)] if row.nodes else lines)
-
-
-def _cpu_words(row: DataflowRow) -> str:
-    now = UNKNOWN if row.cpu_percent is None else f"{row.cpu_percent:.1f}%"
-    if row.cpu_limit is None:
-        return now
-    return f"{now} of {row.cpu_limit:g}%, throttled {format_percent(row.throttled)}% of the time"
-
-
-def _memory_words(row: DataflowRow) -> str:
-    now = format_memory(row.memory)
-    if row.memory_limit is not None:
-        now = f"{now} of {format_memory(row.memory_limit)}"
-    return now if row.memory_peak is None else f"{now} (peak {format_memory(row.memory_peak)})"
-
-
 def local_time(moment: int) -> str:
     """CLOCK_REALTIME µs as "2026-01-15 13:00:00" in the local time zone; 0 is unknown."""
     if not moment:
@@ -276,9 +242,13 @@ def row_values(row: DataflowRow) -> dict[str, Any]:
 
 
 def _json_values(row: DataflowRow | NodeRow) -> dict[str, Any]:
-    return {_JSON_KEYS.get(key, key): value for key, value in row._asdict().items()}
+    return {
+        _JSON_KEYS.get(key, key): value or None if key in _TIMES else value
+        for key, value in row._asdict().items()
+    }
 
 
+_TIMES = ("started", "since", "ended")
 _JSON_KEYS = {
     "uptime": "uptime_us",
     "started": "started_us",

@@ -9,7 +9,7 @@ LATE = {
         "cli.main": {"cli.group", "cli.completion", "cli.listing"},
     },
     "the table of list does without it": {
-        "cli.listing": {"verbs.list", "verbs.facts.ended"},
+        "cli.listing": {"verbs.list", "verbs.facts.ended", "decisions.views.details"},
         "names": {"difflib"},
     },
     "a Tab after a verb or an option does not ask for a dataflow": {

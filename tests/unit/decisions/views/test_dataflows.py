@@ -5,13 +5,13 @@ import pytest
 from dora_systemd.decisions.views.dataflows import (
     DataflowRow,
     NodeRow,
-    format_dataflow,
     format_dataflows,
     format_uptime,
     row_values,
     shortest_prefixes,
     status_word,
 )
+from dora_systemd.decisions.views.details import format_dataflow
 from dora_systemd.values import SECOND
 
 A = "550e8400-e29b-41d4-a716-446655440000"
@@ -96,6 +96,30 @@ def test_table_of_dataflows() -> None:
         "550e8400  robot          Running  00:05:32  2/2    12.5  256M         0  yes\n"
         "550e8401  a-longer-name  Failed          -  -         -     -        12  -"
     )
+
+
+def test_a_narrow_terminal() -> None:
+    long = ROWS[0]._replace(uuid=C, name="a-very-long-name-of-a-dataflow-that-fits-nowhere")
+    rows = [*ROWS, long]
+    whole = format_dataflows(rows)
+    assert format_dataflows(rows, 200) == whole
+    for width in (60, 70, 80, 100):
+        lines = format_dataflows(rows, width).splitlines()
+        assert max(map(len, lines)) <= width
+        assert lines[1].split()[1:3] == ["robot", "Running"]
+        assert lines[3].split()[1].startswith("a-very-long")
+        assert lines[3].split()[1].endswith("…")
+    assert format_dataflows(rows, 80).splitlines()[0].split()[-1] == "RESTARTS"
+    assert format_dataflows(rows, 60).splitlines()[0].split() == (
+        ["UUID", "NAME", "STATUS", "NODES", "CPU%", "MEM"]
+    )
+    assert max(map(len, format_dataflows(rows, 10).splitlines())) < 40
+
+
+def test_json_has_null_for_unknown_times() -> None:
+    values = row_values(ROWS[1])
+    assert (values["started_us"], values["ended_us"]) == (None, None)
+    assert row_values(ROWS[0]._replace(started=5))["started_us"] == 5
 
 
 def test_one_dataflow() -> None:

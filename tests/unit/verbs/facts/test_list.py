@@ -11,7 +11,8 @@ import pytest
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.cell.status import CellStatus, CpuSample, NodeStatus
-from dora_systemd.decisions.views.dataflows import DataflowRow, format_dataflow, format_dataflows
+from dora_systemd.decisions.views.dataflows import DataflowRow, format_dataflows
+from dora_systemd.decisions.views.details import format_dataflow
 from dora_systemd.decisions.views.prometheus import format_metrics
 from dora_systemd.decisions.views.top import Look, TopEntry, format_top
 from dora_systemd.errors import DoraSystemdError

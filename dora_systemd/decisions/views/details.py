@@ -1,0 +1,90 @@
+"""Formats one dataflow and its nodes for `doractl list SELECTOR`."""
+
+from collections.abc import Sequence
+
+from dora_systemd.decisions.cell.restarts import budget_words
+from dora_systemd.decisions.views.dataflows import (
+    DEGRADED,
+    FAILED,
+    RESTARTING,
+    UNKNOWN,
+    DataflowRow,
+    NodeRow,
+    format_count,
+    format_cpu,
+    format_memory,
+    format_percent,
+    format_table,
+    format_uptime,
+    local_time,
+)
+
+
+def format_nodes(rows: Sequence[NodeRow]) -> str:
+    """The node table of `doractl list SELECTOR`; with THROTTLED% if any node has a CPU limit."""
+    cells = [_node_cells(row) for row in rows]
+    is_limited = any(row.cpu_limit is not None for row in rows)
+    header = [title for title in cells[0] if is_limited or title != _THROTTLED]
+    return format_table(header, [[row[title] for title in header] for row in cells])
+
+
+_THROTTLED = "THROTTLED%"
+
+
+def _node_cells(row: NodeRow) -> dict[str, str]:
+    return {
+        "NODE": row.node,
+        "STATE": row.state.capitalize(),
+        "PID": str(row.pid) if row.pid else UNKNOWN,
+        "CPU%": format_cpu(row),
+        _THROTTLED: format_percent(row.throttled),
+        "MEM": format_memory(row.memory, row.memory_limit),
+        "PEAK": format_memory(row.memory_peak),
+        "RESTARTS": _restarts_of(row),
+        "EXIT": row.exit or UNKNOWN,
+    }
+
+
+def _restarts_of(row: NodeRow) -> str:
+    used = format_count(row.restarts)
+    return f"{used}/{row.max_restarts}" if row.max_restarts else used
+
+
+_WITH_REASON = (FAILED, DEGRADED, RESTARTING)
+
+
+def format_dataflow(row: DataflowRow) -> str:
+    """The output of `doractl list SELECTOR`: the dataflow's values, then the table of its nodes."""
+    facts = (
+        ("Dataflow", row.uuid),
+        ("Name", row.name),
+        ("Unit", row.unit),
+        ("File", row.dataflow or UNKNOWN),
+        ("Status", f"{row.status} ({row.text})" if row.text else row.status),
+        ("Uptime", format_uptime(row.uptime)),
+        ("Started", local_time(row.started)),
+        ("Ended", local_time(row.ended) if row.ended else ""),
+        ("Nodes", row.problem),
+        ("CPU", _cpu_words(row)),
+        ("Memory", _memory_words(row)),
+        ("Restarts", format_count(row.restarts)),
+        ("Budget", budget_words(row.restart_budget) if row.restart_budget else ""),
+        ("At boot", "started" if row.enabled else ""),
+        ("Reason", f"doractl why {row.name}" if row.status in _WITH_REASON else ""),
+    )
+    lines = [f"{title + ':':<10}{text}" for title, text in facts if text]
+    return "\n".join([*lines, "", format_nodes(row.nodes)] if row.nodes else lines)
+
+
+def _cpu_words(row: DataflowRow) -> str:
+    now = UNKNOWN if row.cpu_percent is None else f"{row.cpu_percent:.1f}%"
+    if row.cpu_limit is None:
+        return now
+    return f"{now} of {row.cpu_limit:g}%, throttled {format_percent(row.throttled)}% of the time"
+
+
+def _memory_words(row: DataflowRow) -> str:
+    now = format_memory(row.memory)
+    if row.memory_limit is not None:
+        now = f"{now} of {format_memory(row.memory_limit)}"
+    return now if row.memory_peak is None else f"{now} (peak {format_memory(row.memory_peak)})"
