@@ -7,9 +7,27 @@ import click
 
 from dora_systemd.decisions.settings.kinds import Setting
 from dora_systemd.decisions.settings.limits import LIVE_SETTINGS
-from dora_systemd.decisions.settings.table import SETTINGS
+from dora_systemd.decisions.settings.table import SECTIONS, SETTINGS
 
 F = TypeVar("F", bound=Callable[..., Any])
+
+_SECTION_OF = {setting.name: title for title, table in SECTIONS.items() for setting in table}
+
+
+class SettingsCommand(click.Command):
+    """A verb whose --help shows its own options first, then those of settings by concern."""
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the sections of options."""
+        sections: dict[str, list[tuple[str, str]]] = {title: [] for title in ("Options", *SECTIONS)}
+        for parameter in self.get_params(ctx):
+            if isinstance(parameter, click.Option) and (record := parameter.get_help_record(ctx)):
+                title = _SECTION_OF.get(parameter.name or "", "Options")
+                sections[title].append(record)
+        for title, records in sections.items():
+            if records:
+                with formatter.section(title):
+                    formatter.write_dl(records)
 
 
 def setting_options(function: F) -> F:
@@ -41,5 +59,13 @@ def _option(setting: Setting[Any]) -> Callable[[F], F]:
         metavar=setting.metavar or "TEXT",
         multiple=setting.kind.is_repeatable,
         default=None,
-        help=setting.help,
+        help=_help(setting),
     )
+
+
+def _help(setting: Setting[Any]) -> str:
+    """The help text with the default, if there is one."""
+    if setting.default is None or "default" in setting.help:
+        return setting.help
+    default = " ".join(setting.kind.format(setting.default))
+    return f"{setting.help.removesuffix('.')}; default: {default}." if default else setting.help

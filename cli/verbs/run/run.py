@@ -11,7 +11,7 @@ import click
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.colors import wants_colors
 from dora_systemd.cli.parameters import current_scope, name_option, print_warnings, scope_options
-from dora_systemd.cli.settingoptions import setting_options
+from dora_systemd.cli.settingoptions import SettingsCommand, setting_options
 from dora_systemd.cli.stageline import StageLine
 from dora_systemd.decisions.logs.terminal import TerminalLines
 from dora_systemd.names import unit_name
@@ -26,7 +26,7 @@ from dora_systemd.verbs.start.unit import plan_properties
 _MICROSECOND_NS = 1000
 
 
-@click.command("run")
+@click.command("run", cls=SettingsCommand)
 @click.argument("dataflow", default=DEFAULT_FILE, metavar="[FILE]")
 @name_option
 @setting_options

@@ -16,7 +16,7 @@ from dora_systemd.cli.parameters import (
     print_warnings,
     scope_options,
 )
-from dora_systemd.cli.settingoptions import setting_options
+from dora_systemd.cli.settingoptions import SettingsCommand, setting_options
 from dora_systemd.cli.stageline import StageLine
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.verbs.facts.last_words import last_words
@@ -31,7 +31,7 @@ from dora_systemd.verbs.start.unit import format_plan
 from dora_systemd.verbs.start.watch import watched_patterns
 
 
-@click.command("start")
+@click.command("start", cls=SettingsCommand)
 @click.argument("dataflow", default=DEFAULT_FILE, metavar="[FILE]")
 @name_option
 @setting_options

@@ -40,7 +40,7 @@ REPLACE = Setting[str](
     "replace",
     one_text(str, "stop-first or start-first", "HOW", _parse_replace),
     "stop-first",
-    "Whether a reloaded node stops before its replacement starts, or after.",
+    "A reloaded node stops before its replacement starts (stop-first) or after (start-first).",
     per_node=True,
 )
 

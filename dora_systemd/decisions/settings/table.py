@@ -90,13 +90,14 @@ LOG_RATE_LIMIT = Setting[RateLimits](
     per_node=True,
 )
 
-# All settings above, in this order, so that a setting is declared in one place only; then those of
-# other modules.
-SETTINGS: tuple[Setting[Any], ...] = (
-    *(value for value in list(globals().values()) if isinstance(value, Setting)),
-    *LIMIT_SETTINGS,
-    *RESTART_SETTINGS,
-    *CREDENTIAL_SETTINGS,
-    *SANDBOX_SETTINGS,
-    *RELOAD_SETTINGS,
-)
+SECTIONS: dict[str, tuple[Setting[Any], ...]] = {
+    # All settings above, in this order, so that a setting is declared in one place only.
+    "Nodes": tuple(value for value in list(globals().values()) if isinstance(value, Setting)),
+    "Limits": LIMIT_SETTINGS,
+    "Restarts": RESTART_SETTINGS,
+    "Sandbox and secrets": (*CREDENTIAL_SETTINGS, *SANDBOX_SETTINGS),
+    "Hot reload": RELOAD_SETTINGS,
+}
+"""All settings by concern, as --help shows them."""
+
+SETTINGS = tuple(setting for section in SECTIONS.values() for setting in section)

@@ -19,6 +19,7 @@ from dora_systemd.cli import listing, main
 from dora_systemd.cli.group import ALIASES, VERBS, doractl
 from dora_systemd.cli.listing import ListRequest
 from dora_systemd.cli.parameters import current_scope
+from dora_systemd.decisions.settings.table import SETTINGS
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import scope_of
 from tests.unit.checkout import module_paths
@@ -262,6 +263,20 @@ def test_list_loads_little() -> None:
     assert not loaded & {"click", "asyncio", "subprocess"}
     ours = {name.removeprefix("dora_systemd.") for name in loaded} & module_paths().keys()
     assert len(ours) <= MOST_MODULES_OF_LIST, sorted(ours)
+
+
+@pytest.mark.parametrize("verb", ["start", "run"])
+def test_settings_stand_by_concern_with_their_defaults(
+    capsys: pytest.CaptureFixture[str], verb: str
+) -> None:
+    assert main.run([verb, "--help"]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    titles = ["Options:", "Nodes:", "Limits:", "Restarts:", "Sandbox and secrets:", "Hot reload:"]
+    places = [shown.index(f" {title} -") for title in titles]
+    assert places == sorted(places)
+    for setting in SETTINGS:
+        assert shown.count(f" {setting.flags[0]}") >= 1
+    assert "Maximum restarts per window; default: 5." in shown
 
 
 def test_help_is_a_word_too(capsys: pytest.CaptureFixture[str]) -> None:
