@@ -58,6 +58,8 @@ def shell() -> Iterator["Shell"]:
     if not EXAMPLE.exists():
         # The image leaves out /usr/share/doc, as images of containers do.
         shutil.copytree(packages.ROBOT, EXAMPLE)
+    # A new machine has no dataflows that have ended.
+    sh("journalctl --quiet --rotate && journalctl --quiet --vacuum-time=1us")
     shell = Shell()
     yield shell
     shell.end()

@@ -37,10 +37,13 @@ def test_exit_status(cell: Cell, project: Project, case: str) -> None:
     number, keys, status = CASES[case]
     project.write("node.py", NODES[case])
     flow = project.write("dataflow.yml", f"nodes: [{{id: one, path: node.py, {keys}}}]\n")
-    wait = ("timeout", "--preserve-status", f"--signal={number}", "8")
-    bare = run(*wait, "dora", "run", str(flow), cwd=project.root, check=False)
+    wait = ("timeout", "--preserve-status", f"--signal={number}")
+    # Two signals at once, as timeout sends them without --foreground, make dora itself fail.
+    bare = run(
+        *(*wait, "--foreground", "8", "dora", "run", str(flow)), cwd=project.root, check=False
+    )
     ours = run(
-        *(*wait, "doractl", "run", str(flow), "--name", cell.name, "--grace-duration", "1s"),
+        *(*wait, "8", "doractl", "run", str(flow), "--name", cell.name, "--grace-duration", "1s"),
         check=False,
     )
     words = f"{bare.stdout}{bare.stderr}\n{ours.stdout}{ours.stderr}"

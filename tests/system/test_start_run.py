@@ -106,6 +106,13 @@ def test_run_takes_the_dataflow_with_it(cell: Cell, project: Project, how: signa
     assert ("dataflow-stopped", "") in cell.events()
 
 
+def press_again(cell: Cell, child: "subprocess.Popen[str]") -> bool:
+    """Ctrl+C as a person presses it: again, while nothing happens. Whether it has ended."""
+    if cell.show("ActiveState") == "deactivating":
+        child.send_signal(signal.SIGINT)
+    return child.poll() is not None
+
+
 @pytest.mark.warns("code=killed", "Failed with result 'signal'", "Killing process", "was killed (")
 def test_second_ctrl_c_kills(cell: Cell, project: Project) -> None:
     project.write("stubborn.py", STUBBORN)
@@ -113,8 +120,8 @@ def test_second_ctrl_c_kills(cell: Cell, project: Project) -> None:
     child = run_attached(cell, flow)
     child.send_signal(signal.SIGINT)
     wait_for("it stops", lambda: cell.show("ActiveState") == "deactivating")
-    child.send_signal(signal.SIGINT)
-    child.communicate(timeout=bound(5))
+    wait_for("it ends", lambda: press_again(cell, child), 5)
+    child.communicate()
     assert child.returncode == 128 + signal.SIGKILL
     assert cell.is_gone
 

@@ -228,10 +228,11 @@ def end(cell: Cell, event: life.Event) -> Next:
 def _exit_of_stop(cell: Cell) -> RunnerExit:
     """A requested stop of a service counts as clean, whatever exit status the nodes had.
 
-    `doractl run` ends as `dora run` does, which fails if a node failed on the way out.
+    `doractl run` ends as `dora run` does, which fails if a node failed on the way out. For its unit
+    that status is a success: the stop itself has worked.
     """
     is_failed = cell.is_attached and any(node.exit.is_failure for node in cell.nodes.values())
-    return RunnerExit.NODES_FAILED if is_failed else RunnerExit.OK
+    return RunnerExit.FAILED_AT_STOP if is_failed else RunnerExit.OK
 
 
 def daemon_left(cell: Cell, event: life.ChildExited) -> Next:

@@ -16,6 +16,7 @@ class RunnerExit(IntEnum):
     FAILED = 1
     ENGINE_LOST = 69
     NODES_FAILED = 70
+    FAILED_AT_STOP = 71
     NO_DORA = 72
     NO_ACCESS = 77
     BAD_DATAFLOW = 78

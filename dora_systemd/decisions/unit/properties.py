@@ -43,6 +43,8 @@ START_MARGIN = 10 * SECOND
 """What TimeoutStartSec= allows in addition to the delay before a restart and --start-timeout, which
 the runner measures itself."""
 
+_ENDS_OF_ATTACHED = (RunnerExit.OK, RunnerExit.FAILED_AT_STOP)
+
 
 @dataclass(frozen=True)
 class UnitContext:
@@ -148,7 +150,7 @@ def restart_properties(options: RunnerOptions) -> dict[str, Property]:
     # A restart does not help nodes that dora gave up, or a dataflow that is refused. An attached
     # dataflow that has finished stays finished.
     refused = (RunnerExit.BAD_DATAFLOW, RunnerExit.NO_ACCESS, RunnerExit.NO_DORA)
-    final = (RunnerExit.NODES_FAILED, *refused, *([0] if options.attached else []))
+    final = (RunnerExit.NODES_FAILED, *refused, *(_ENDS_OF_ATTACHED if options.attached else ()))
     common = typed(RestartPreventExitStatus=(tuple(sorted(map(int, final))), ()))
     if policy.policy == "no":
         return common | typed(Restart="no")

@@ -13,7 +13,7 @@ from dora_systemd.decisions.life.states import RunnerExit
 from dora_systemd.verbs.start.job import StageObserver, tell_stage
 
 _POLL_SECONDS = 0.5
-_ONE_REQUEST_SECONDS = 0.3
+_ONE_REQUEST_SECONDS = 0.1
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _CLD_EXITED = 1
 _STATE = ("ActiveState", "Job", "ExecMainCode", "ExecMainStatus", "Result")
@@ -56,6 +56,7 @@ def attached_properties(pipe: int) -> list[Property]:
         ("StandardInputFileDescriptor", "h", pipe),
         ("CollectMode", "s", "inactive-or-failed"),
         ("AddRef", "b", True),
+        ("SuccessExitStatus", "(aiai)", ((RunnerExit.FAILED_AT_STOP,), ())),
     ]
 
 
@@ -75,7 +76,7 @@ def follow_unit(
             ready = {fd for fd, _ in poll.poll(_POLL_SECONDS * 1000)}
             if wakeup in ready:
                 os.read(wakeup, 64)
-                stop.ask(time.monotonic())
+                stop.ask()
             logs.print_new()
             changed = manager.changes(unit)
             for changes in changed:
@@ -93,15 +94,15 @@ class _Stop:
     def __init__(self, manager: Manager, unit: str) -> None:
         self._manager = manager
         self._unit = unit
-        self._asked = float("inf")
+        self._asked: float | None = None
 
-    def ask(self, now: float) -> None:
-        """A signal has come. now: CLOCK_MONOTONIC in seconds."""
-        if self._asked > now:
-            self._asked = now
+    def ask(self) -> None:
+        """A signal has come."""
+        if self._asked is None:
             self._manager.queue_job("StopUnit", self._unit)
+            self._asked = time.monotonic()
         # timeout(1) sends its signal to us and to our process group: that is one request.
-        elif now - self._asked > _ONE_REQUEST_SECONDS:
+        elif time.monotonic() - self._asked > _ONE_REQUEST_SECONDS:
             self._manager.kill(self._unit, signal.SIGKILL)
 
 
@@ -111,8 +112,8 @@ def _exit_status(manager: Manager, unit: str) -> int | None:
     if state["ActiveState"] not in DOWN or state["Job"][0]:
         return None
     status: int = state["ExecMainStatus"]
-    if status == RunnerExit.NODES_FAILED:
-        # Its own status only tells systemd not to start the dataflow again.
+    if status in (RunnerExit.NODES_FAILED, RunnerExit.FAILED_AT_STOP):
+        # Statuses of their own only tell systemd what to do then.
         return RunnerExit.FAILED
     if state["ExecMainCode"] != _CLD_EXITED and status:
         return 128 + status

@@ -395,7 +395,7 @@ def test_each_handler_takes_the_events_of_its_entries() -> None:
     ("is_attached", "exit", "status"),
     [
         (False, exit_of(5), RunnerExit.OK),
-        (True, exit_of(5), RunnerExit.NODES_FAILED),
+        (True, exit_of(5), RunnerExit.FAILED_AT_STOP),
         (True, Exit(), RunnerExit.OK),
     ],
 )

@@ -3,6 +3,7 @@
 import os
 import signal
 import threading
+import time
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -84,6 +85,7 @@ RESTARTING = {"ActiveState": "inactive", "Job": [7, "/job/7"]}
         ([KILLED], 137),
         ([{**FAILED, "ExecMainStatus": 70}], 1),
         ([{**FAILED, "ExecMainStatus": 69}], 69),
+        ([{**ENDED, "ExecMainCode": 1, "ExecMainStatus": 71}], 1),
         ([RESTARTING, {"Job": [0, "/"], "ActiveState": "active"}, ENDED], 0),
         ([{"ActiveState": "failed", "Result": "timeout"}], 1),
     ],
@@ -104,14 +106,16 @@ def test_first_ctrl_c_stops_and_second_kills(logs: Lines, monkeypatch: pytest.Mo
     assert signal.getsignal(signal.SIGINT) is before
 
 
-def test_timeout_signals_twice_and_means_one_stop() -> None:
+def test_timeout_signals_twice_and_means_one_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     manager = FakeManager()
     manager.add(options())
+    clock = iter([10.0, 10.001, 10.09, 10.5])
+    monkeypatch.setattr(time, "monotonic", lambda: next(clock))
     stop = run._Stop(manager, UNIT)
-    for now in (10.0, 10.001, 10.2):
-        stop.ask(now)
+    for _ in range(3):
+        stop.ask()
     assert manager.calls == [("StopUnit", UNIT)]
-    stop.ask(10.5)
+    stop.ask()
     assert manager.calls[1:] == [("kill", UNIT, signal.SIGKILL, "all")]
 
 
