@@ -92,9 +92,12 @@ def _print_all(rows: list[DataflowRow], request: ListRequest) -> None:
 
 
 def _width() -> int | None:
-    """Columns of the terminal, None for a pipe; $COLUMNS has precedence, as in systemctl."""
+    """Columns of the terminal, None for a pipe; $COLUMNS has precedence, as in systemctl.
+
+    Not by shutil, which imports every compressor. A pseudoterminal may have no size.
+    """
     if not sys.stdout.isatty():
         return None
     with suppress(OSError, ValueError):
-        return int(os.environ.get("COLUMNS", "0")) or os.get_terminal_size().columns
+        return int(os.environ.get("COLUMNS", "0")) or os.get_terminal_size().columns or None
     return None

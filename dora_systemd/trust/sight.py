@@ -1,8 +1,7 @@
 """Checks paths that another user names with that user's permissions: root could see too much.
 
 A child process takes on the account and answers; it runs only the few lines of eyes.py. The account
-can
-trace the child and make it lie, so callers trust an answer no more than the account itself.
+can trace the child and make it lie, so callers trust an answer no more than the account itself.
 """
 
 import contextlib

@@ -31,6 +31,8 @@ VARIES = re.compile(
     r"|(?P<number>\b\d+(?:\.\d+)?(?:%|M| MB)?(?=\s|$))|\x1b[\[(][0-9;?]*[a-zA-Z]|#+\.+"
 )
 """What differs each time: it is compared by its kind."""
+ERASED = re.compile(r"[^\n]*\r\x1b\[K")
+"""A line that a command has written anew, which nobody sees any more."""
 KEYS = {"doractl top": ("plot", b"q"), "doractl run": ("frame ", b"\x03")}
 """Commands that wait for a key: when to press it, and which."""
 DONE = "typed and ended with status"
@@ -39,8 +41,9 @@ EXAMPLE = Path("/usr/share/doc/dora-systemd/examples/robot")
 
 
 def by_kind(text: str) -> str:
-    """The text with what varies replaced by the name of its kind."""
-    return VARIES.sub(lambda match: f" <{match.lastgroup}> " if match.lastgroup else "", text)
+    """The text as it stays on a terminal, with what varies replaced by the name of its kind."""
+    seen = ERASED.sub("", text)
+    return VARIES.sub(lambda match: f" <{match.lastgroup}> " if match.lastgroup else "", seen)
 
 
 def typed_lines() -> Iterator[tuple[str, str]]:

@@ -5,6 +5,7 @@ import os
 import pty
 import re
 import select
+import shlex
 import struct
 import subprocess
 import termios
@@ -14,6 +15,7 @@ from collections.abc import Callable
 from contextlib import suppress
 
 from tests.lab.pace import bound
+from tests.system.cells import run
 
 
 def on_terminal(command: list[str], **environment: str) -> tuple[int, int]:
@@ -34,13 +36,10 @@ def read_until(fd: int, is_done: Callable[[str], bool]) -> str:
     return seen.decode()
 
 
-def read_to_end(fd: int) -> bytes:
-    """All output of a terminal."""
-    data = b""
-    with suppress(OSError):  # the last end of the other side is closed
-        while chunk := os.read(fd, 65536):
-            data += chunk
-    return data
+def shown(*command: str, **environment: str) -> str:
+    """What a command that succeeds shows on a terminal, whatever this process runs on."""
+    env = {**os.environ, "TERM": "xterm", **environment}
+    return run("script", "-qec", shlex.join(command), "/dev/null", env=env).stdout
 
 
 class Screen:

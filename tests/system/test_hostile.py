@@ -12,6 +12,7 @@ from dora_systemd.decisions.logs.events import EVENTS
 from dora_systemd.errors import ExitCode
 from tests.system.cells import Cell, Project, run, wait_for
 from tests.system.gateways import Front
+from tests.system.terminal import shown
 
 # As root, whose verbs read what other users' nodes have written.
 pytestmark = pytest.mark.lab
@@ -184,6 +185,6 @@ def test_lines_on_a_terminal(cell: Cell, project: Project) -> None:
     project.write("a.py", f'print("{line}", flush=True)\nfrom dora import Node\nNode()\n')
     flow = project.write("dataflow.yml", "nodes: [{id: a, path: a.py}]\n")
     command = ["doractl", "run", str(flow), "--name", cell.name]
-    shown = run("script", "-qec", " ".join(command), "/dev/null").stdout
-    assert "\x1b[32mgreen\x1b[0m \\x1b]52;c;eA==\\x07 \\u009b2J" in shown
+    text = shown(*command)
+    assert "\x1b[32mgreen\x1b[0m \\x1b]52;c;eA==\\x07 \\u009b2J" in text
     assert "\x1b[32mgreen\x1b[0m \x1b]52;c;eA==\x07 \x9b2J" in run(*command).stdout

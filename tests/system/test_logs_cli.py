@@ -1,8 +1,6 @@
 """doractl logs with a real journal."""
 
 import json
-import os
-import pty
 import re
 import subprocess
 from collections.abc import Iterator
@@ -12,9 +10,8 @@ import pytest
 
 from dora_systemd.decisions.logs.events import EVENTS
 from dora_systemd.errors import ExitCode
-from tests.lab.pace import bound
 from tests.system.cells import Cell, Project, run, sync_journal, wait_for
-from tests.system.terminal import read_to_end
+from tests.system.terminal import shown
 
 TALK = """
 import sys
@@ -149,15 +146,9 @@ def test_until_the_end_of_what_does_not_run(talking: Cell) -> None:
 
 def test_terminal(talking: Cell) -> None:
     """Aligned and coloured; the pager is not asked for."""
-    master, slave = pty.openpty()
     command = ["doractl", talking.scope.flag, "logs", talking.name, "--no-pager", "--tail", "40"]
-    child = subprocess.Popen(command, stdout=slave)
-    os.close(slave)
-    data = read_to_end(master)
-    assert child.wait() == 0
-    os.close(master)
-    lines = data.decode().splitlines()
-    assert len({re.sub(r"^.*(\x1b\[\d+m)cam.*$", r"\1", line) for line in lines if "cam-" in line})
+    lines = shown(*command).splitlines()
+    assert len(set(re.findall(r"(\x1b\[\d+m)cam", "\n".join(lines)))) == 2
     plain = [re.sub(r"\x1b\[[0-9;:]*m", "", line) for line in lines]
     places = {line.index("tick") for line in plain if line.endswith(" tick")}
     assert len(places) == 1
@@ -165,16 +156,8 @@ def test_terminal(talking: Cell) -> None:
 
 def test_pager(talking: Cell, tmp_path: Path) -> None:
     seen = tmp_path / "seen"
-    environment = {**os.environ, "PAGER": f"tee {seen}", "TERM": "xterm"}
-    done = subprocess.run(
-        ["script", "-qec", f"doractl logs {talking.name} --tail 5", "/dev/null"],
-        env=environment,
-        capture_output=True,
-        timeout=bound(30),
-        check=True,
-    )
+    assert shown("doractl", "logs", talking.name, "--tail", "5", PAGER=f"tee {seen}")
     assert len(seen.read_text().splitlines()) == 5
-    assert done.stdout
 
 
 BAD_INPUT = [

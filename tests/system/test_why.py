@@ -12,6 +12,7 @@ import pytest
 
 from dora_systemd.errors import ExitCode
 from tests.system.cells import Cell, Project, is_alive, run, sync_journal, wait_for
+from tests.system.terminal import shown
 
 TRACEBACK = """
 from dora import Node
@@ -198,9 +199,9 @@ def test_unknown_and_in_a_pipe(cell: Cell, project: Project) -> None:
     command = f"doractl why {cell.name} | head -1"
     assert run("sh", "-c", command).stdout == f"{cell.name}: Running\n"
     # On a terminal, in colours, and no line longer than that.
-    script = run("script", "-qec", f"COLUMNS=60 doractl why {cell.name}", "/dev/null").stdout
-    assert script.startswith("\x1b[32m")
-    assert max(len(line) for line in script.splitlines()[1:]) <= 60 + len("\x1b[1m\x1b[0m")
+    text = shown("doractl", "why", cell.name, COLUMNS="60")
+    assert text.startswith("\x1b[32m")
+    assert max(len(line) for line in text.splitlines()[1:]) <= 60 + len("\x1b[1m\x1b[0m")
 
 
 @pytest.mark.lab

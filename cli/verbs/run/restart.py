@@ -1,9 +1,11 @@
 """Restart dataflows."""
 
 import sys
+from functools import partial
 
 import click
 
+from dora_systemd.adapters.bus.manager import tell_stage
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import current_scope, print_outcomes, scope_options
 from dora_systemd.cli.stageline import StageLine
@@ -28,5 +30,5 @@ def command(selectors: tuple[str, ...]) -> int:
     bus = Bus(scope)
     chosen = find_all(bus, scope, selectors)
     with StageLine(sys.stderr) as stage:
-        outcomes = restart_cells(bus, chosen, stage.show)
+        outcomes = restart_cells(bus, chosen, partial(tell_stage, stage))
     return print_outcomes(outcomes)

@@ -1,9 +1,11 @@
 """Stop dataflows."""
 
 import sys
+from functools import partial
 
 import click
 
+from dora_systemd.adapters.bus.manager import tell_stage
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import (
     current_scope,
@@ -55,5 +57,5 @@ def command(selectors: tuple[str, ...], want_all: bool) -> int:
 def _stop(bus: Bus, scope: Scope, cells: list[Cell]) -> int:
     note_stop(cells)
     with StageLine(sys.stderr) as stage:
-        outcomes = stop_cells(bus, scope, cells, stage.show)
+        outcomes = stop_cells(bus, scope, cells, partial(tell_stage, stage))
     return print_outcomes(outcomes)

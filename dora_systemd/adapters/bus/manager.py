@@ -16,6 +16,9 @@ Property = tuple[str, str, Any]
 Observer = Callable[[Mapping[str, Any]], None]
 """Called with the changed properties of a unit during a wait."""
 
+StageObserver = Callable[[str], None]
+"""Called with a new STATUS= of a unit."""
+
 
 class UnitState(NamedTuple):
     """One unit as ListUnits reports it, in the terms of `systemctl list-units`."""
@@ -90,3 +93,9 @@ class Manager(Protocol):
 
     def version(self) -> str:
         """The systemd version, as in "257.13-1"."""
+
+
+def tell_stage(on_stage: StageObserver | None, changes: Mapping[str, Any]) -> None:
+    """Call `on_stage` if a unit has changed its STATUS=; with partial() an Observer."""
+    if on_stage and changes.get("StatusText"):
+        on_stage(changes["StatusText"])

@@ -14,14 +14,19 @@ RESERVE = SECOND
 LEAVE_TIMEOUT = 2 * SECOND
 
 
+def kill_delay(grace: int) -> int:
+    """The time after which dora kills a node that it has told to stop."""
+    return grace + grace // 2
+
+
 def stop_timeout(grace: int) -> int:
-    """Timeout of dora's Stop: dora kills after 1.5 times the grace duration."""
-    return grace + grace // 2 + 2 * SECOND
+    """Timeout of dora's Stop."""
+    return kill_delay(grace) + 2 * SECOND
 
 
 def unit_timeout(grace: int) -> int:
     """TimeoutStopSec= of the unit."""
-    return INFINITY if grace == INFINITY else grace + grace // 2 + STOP_MARGIN
+    return INFINITY if grace == INFINITY else kill_delay(grace) + STOP_MARGIN
 
 
 def runner_timeout(grace: int) -> int:

@@ -8,7 +8,8 @@ from dora_systemd.decisions.cell.status import HELD, CellStatus, CpuSample, Line
 from dora_systemd.decisions.life.nodes import WITH_PROCESS
 from dora_systemd.decisions.life.refusal import FAILED
 from dora_systemd.decisions.life.states import Cell, State
-from dora_systemd.values import format_duration
+from dora_systemd.decisions.life.stop_budget import kill_delay
+from dora_systemd.values import INFINITY, format_duration
 
 _SHOWN = {
     State.BOOTING: ("starting", "starting the dora coordinator"),
@@ -43,8 +44,10 @@ def _format_stopping(cell: Cell) -> str:
     left = [ident for ident, node in cell.nodes.items() if node.state in WITH_PROCESS]
     if not left:
         return "stopping"
-    # dora sends SIGTERM after the grace duration, and SIGKILL after half of it more.
-    return f"stopping, {_names(left)} left, killed after {format_duration(cell.grace * 3 // 2)}"
+    text = f"stopping, {_names(left)} left"
+    if cell.grace == INFINITY:
+        return text
+    return f"{text}, killed after {format_duration(kill_delay(cell.grace))}"
 
 
 def _format_waiting(cell: Cell) -> str:

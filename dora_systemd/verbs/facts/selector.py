@@ -143,8 +143,11 @@ def selectors_of(texts: Sequence[str], cells: Iterable[Cell]) -> list[Selector]:
 
 def find_all(manager: Manager, scope: Scope, texts: Sequence[str]) -> list[Cell]:
     """The dataflows that `texts` mean, each once; as selectors_of() and find_enabled()."""
-    given = selectors_of(texts, read_cells(manager))
-    return list(dict.fromkeys(one.find_enabled(manager, scope) for one in given))
+    cells = read_cells(manager)
+    found = (
+        one.only(cells) or one.find_enabled(manager, scope) for one in selectors_of(texts, cells)
+    )
+    return list(dict.fromkeys(found))
 
 
 def _expanded(text: str, cells: Sequence[Cell]) -> list[Selector]:

@@ -1,13 +1,20 @@
 """`doractl start`: starts the transient unit of a checked plan, and waits for it."""
 
 import select
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
-from dora_systemd.adapters.bus.manager import JOB_DONE, ON_THE_WAY, Manager, Observer, Property
+from dora_systemd.adapters.bus.manager import (
+    JOB_DONE,
+    ON_THE_WAY,
+    Manager,
+    Observer,
+    Property,
+    StageObserver,
+    tell_stage,
+)
 from dora_systemd.decisions.life.refusal import FAILED
 from dora_systemd.decisions.unit.versions import transient_commands
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -17,9 +24,6 @@ from dora_systemd.verbs.start.plan import Plan
 from dora_systemd.verbs.start.unit import systemd_number
 
 _POLL_SECONDS = 0.2
-
-StageObserver = Callable[[str], None]
-"""Called with the unit's STATUS= during the start."""
 
 
 @dataclass(frozen=True)
@@ -80,12 +84,6 @@ def _begin(
         return manager.run_jobs("StartUnit", [unit], observe)[unit]
     manager.queue_job("StartUnit", unit)
     return JOB_DONE
-
-
-def tell_stage(on_stage: StageObserver | None, changes: Mapping[str, Any]) -> None:
-    """Call `on_stage` if a unit has changed its STATUS=."""
-    if on_stage and changes.get("StatusText"):
-        on_stage(changes["StatusText"])
 
 
 def format_started(started: Started, watched: Sequence[str] = ()) -> str:

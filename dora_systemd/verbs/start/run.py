@@ -8,9 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
-from dora_systemd.adapters.bus.manager import DOWN, Manager, Property
+from dora_systemd.adapters.bus.manager import DOWN, Manager, Property, StageObserver, tell_stage
 from dora_systemd.decisions.life.states import RunnerExit
-from dora_systemd.verbs.start.job import StageObserver, tell_stage
 
 _POLL_SECONDS = 0.5
 _ONE_REQUEST_SECONDS = 0.1
