@@ -16,7 +16,8 @@ from websockets.frames import Frame, Opcode
 from websockets.protocol import State
 from websockets.uri import parse_uri
 
-OPEN_SECONDS = 10.0
+OPEN_SECONDS = 35.0
+"""As long as for a request: a coordinator that waits for its daemon accepts nothing for 30 s."""
 CHUNK = 1 << 16
 
 
