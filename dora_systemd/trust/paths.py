@@ -125,6 +125,15 @@ def exists(path: str | Path) -> bool:
         return False
 
 
+def is_directory(path: str | Path) -> bool:
+    """Whether a directory exists at `path`; not for a link that must not be followed."""
+    try:
+        with reached(path) as (_, place):
+            return stat.S_ISDIR(place.mode)
+    except (DoraSystemdError, OSError, ValueError):
+        return False
+
+
 def user_name(uid: int, nameless: str = "uid ") -> str:
     """The name of a uid; where it has none its number, behind `nameless`."""
     try:

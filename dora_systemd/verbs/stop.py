@@ -1,28 +1,41 @@
 """`doractl stop`, `restart` and `reset`: what systemd does for several dataflows at once."""
 
-import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import Protocol
 
 from dora_systemd.adapters.bus.manager import JOB_DONE, Manager, Observer
-from dora_systemd.adapters.journal.note import send_note
-from dora_systemd.decisions.logs.events import event_fields
-from dora_systemd.decisions.logs.fields import encode_entry
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
-from dora_systemd.trust.paths import user_name
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.enabled import enabled_units
 from dora_systemd.verbs.facts.reason import failure_reason, job_reason
+from dora_systemd.verbs.start.asked import note_request
 from dora_systemd.verbs.start.enable import read_boot_unit, release_transient
+
+
+class Dataflow(Protocol):
+    """A dataflow that systemd or only the journal knows."""
+
+    @property
+    def name(self) -> str:
+        """The name of the dataflow."""
+
+    @property
+    def uuid(self) -> str:
+        """The UUID of the dataflow."""
+
+    @property
+    def unit(self) -> str:
+        """The name of the unit."""
 
 
 @dataclass(frozen=True)
 class Outcome:
     """The result for one dataflow: `problem` is "" for success."""
 
-    cell: Cell
+    cell: Dataflow
     text: str
     problem: str = ""
 
@@ -80,23 +93,10 @@ def reset_cells(manager: Manager, cells: Sequence[Cell]) -> list[Outcome]:
 
 
 def note_stop(cells: Iterable[Cell], command: str = "doractl stop") -> None:
-    """Write the event stop-asked for those dataflows that run: systemd notes no caller.
-
-    command: by which it is asked.
-    """
-    by = f"{caller(os.getuid(), os.environ)} ({command})"
+    """Write the event stop-asked for those dataflows that run. command: by which it is asked."""
     for cell in cells:
         if cell.is_up:
-            fields = event_fields("stop-asked", dataflow=cell.name, by=by)
-            own = {"DORA_DATAFLOW": cell.uuid, "DORA_DATAFLOW_NAME": cell.name}
-            send_note(encode_entry({**fields, **own, "SYSLOG_IDENTIFIER": "doractl"}))
-
-
-def caller(uid: int, environ: Mapping[str, str]) -> str:
-    """A user's name; root by sudo(8) is told with the one who called it."""
-    name = user_name(uid, nameless="the user ")
-    behind = environ.get("SUDO_USER", "")
-    return f"{name}, by sudo of {behind}" if uid == 0 and behind not in ("", "root") else name
+            note_request("stop-asked", cell.name, cell.uuid, command)
 
 
 def _stop_outcome(manager: Manager, cell: Cell, result: str | None) -> Outcome:

@@ -1,5 +1,6 @@
 """Restart dataflows."""
 
+import os
 import sys
 from functools import partial
 
@@ -9,7 +10,8 @@ from dora_systemd.adapters.bus.manager import tell_stage
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import current_scope, print_outcomes, scope_options
 from dora_systemd.cli.stageline import StageLine
-from dora_systemd.verbs.facts.selector import find_all
+from dora_systemd.verbs.restart import restart_asked
+from dora_systemd.verbs.start.again import find_known
 from dora_systemd.verbs.stop import restart_cells
 
 
@@ -19,8 +21,8 @@ from dora_systemd.verbs.stop import restart_cells
 def command(selectors: tuple[str, ...]) -> int:
     """Restart dataflows and wait until all their nodes are ready again.
 
-    Name, UUID and settings stay; the dataflow file is read again. A failed dataflow is started
-    again.
+    Name, UUID and settings stay; the dataflow file is read again. A dataflow that has failed or
+    ended is started again.
 
     Examples:
       doractl restart robot
@@ -28,7 +30,8 @@ def command(selectors: tuple[str, ...]) -> int:
     """
     scope = current_scope()
     bus = Bus(scope)
-    chosen = find_all(bus, scope, selectors)
+    cells, ended = find_known(bus, scope, selectors)
     with StageLine(sys.stderr) as stage:
-        outcomes = restart_cells(bus, chosen, partial(tell_stage, stage))
+        outcomes = restart_cells(bus, cells, partial(tell_stage, stage)) if cells else []
+        outcomes += [restart_asked(bus, scope, one, os.environ, stage) for one in ended]
     return print_outcomes(outcomes)

@@ -16,9 +16,10 @@ from dora_systemd.cli.stageline import StageLine
 from dora_systemd.decisions.logs.terminal import TerminalLines
 from dora_systemd.names import unit_name
 from dora_systemd.verbs.logs import FollowedLog
+from dora_systemd.verbs.start.again import note_start
 from dora_systemd.verbs.start.claim import refuse_unit_file, require_free_name
 from dora_systemd.verbs.start.enable import drop_unit_files
-from dora_systemd.verbs.start.job import start_plan
+from dora_systemd.verbs.start.job import start_unit
 from dora_systemd.verbs.start.plan import DEFAULT_FILE, StartRequest, make_plan, request_name
 from dora_systemd.verbs.start.run import attached_properties, follow_unit, life_line
 from dora_systemd.verbs.start.unit import plan_properties
@@ -50,6 +51,7 @@ def command(dataflow: str, name: str | None, **flags: Any) -> int:
     plan = make_plan(scope, request)
     properties, warnings = plan_properties(plan, bus)
     drop_unit_files(bus, boot)
+    note_start(plan, request, "doractl run")
     print_warnings(warnings)
     options = plan.options
     terminal = TerminalLines(want_colors=wants_colors(sys.stdout), is_terminal=sys.stdout.isatty())
@@ -64,5 +66,5 @@ def command(dataflow: str, name: str | None, **flags: Any) -> int:
         followed = FollowedLog(scope, options.name, options.uuid, since, write, terminal)
         with closing(followed) as logs:
             given = [*properties.values(), *attached_properties(pipe)]
-            start_plan(bus, plan, given, stage, wait=False)
+            start_unit(bus, scope, options, given, stage, wait=False)
             return follow_unit(bus, plan.unit, logs, stage)

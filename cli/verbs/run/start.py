@@ -2,6 +2,8 @@
 
 import os
 import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import click
@@ -18,21 +20,26 @@ from dora_systemd.cli.parameters import (
 )
 from dora_systemd.cli.settingoptions import SettingsCommand, setting_options
 from dora_systemd.cli.stageline import StageLine
+from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.scope import Scope
+from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.last_words import last_words
+from dora_systemd.verbs.facts.selector import Selector
+from dora_systemd.verbs.start.again import find_start, is_given, means_name
 from dora_systemd.verbs.start.check import check_plan
 from dora_systemd.verbs.start.enable import boot_target
-from dora_systemd.verbs.start.job import Started, format_started, start_plan
-from dora_systemd.verbs.start.launch import Claim, claim
+from dora_systemd.verbs.start.job import Started, format_started, start_unit
+from dora_systemd.verbs.start.launch import claim
 from dora_systemd.verbs.start.linger import ensure_linger
 from dora_systemd.verbs.start.logins import start_notes
-from dora_systemd.verbs.start.plan import DEFAULT_FILE, Plan, StartRequest, make_plan
+from dora_systemd.verbs.start.plan import DEFAULT_FILE, StartRequest, make_plan
 from dora_systemd.verbs.start.unit import format_plan
 from dora_systemd.verbs.start.watch import watched_patterns
 
 
 @click.command("start", cls=SettingsCommand)
-@click.argument("dataflow", default=DEFAULT_FILE, metavar="[FILE]")
+@click.argument("dataflow", default=DEFAULT_FILE, metavar="[FILE|NAME]")
 @name_option
 @setting_options
 @click.option("--no-wait", is_flag=True, help="Do not wait until all nodes are ready.")
@@ -48,12 +55,15 @@ def command(
     dry_run: bool,
     output: str,
     **flags: Any,
-) -> None:
+) -> ExitCode:
     """Start the dataflow in FILE as the service dora-NAME.service.
 
-    Returns when all nodes are ready, or fails with the reason. The name must be free; a failed
-    dataflow of that name is replaced, its logs stay. An enabled dataflow is started from its unit
-    file if its settings are the same; --enable replaces that file.
+    NAME instead of FILE starts a dataflow that has ended, with the UUID and the settings it had;
+    options change these. Returns when all nodes are ready, or fails with the reason.
+
+    The name of a FILE must be free; a failed dataflow of that name is replaced, its logs stay. An
+    enabled dataflow is started from its unit file if its settings are the same; --enable replaces
+    that file.
 
     Examples:
       doractl start                                    ./dataflow.yml
@@ -66,38 +76,67 @@ def command(
       doractl start dataflow.yml --device /dev/video0 --writable /srv/recordings
       doractl start dataflow.yml --enable              now and at every boot
       doractl start dataflow.yml --dry-run
+      doractl start robot                              what list --all shows, once more
     """
     scope = current_scope()
     request = StartRequest(dataflow, name, flags, os.environ)
+    if means_name(dataflow):
+        bus = Bus(scope)
+        is_changed = bool(name or want_boot or dry_run or any(map(is_given, flags.values())))
+        known = find_start(bus, scope, Selector(dataflow), is_changed)
+        if isinstance(known, Cell):
+            return _start_known(bus, scope, known, not no_wait, output)
+        request = known.request(request)
     if dry_run:
         target = boot_target(Bus(scope), scope) if want_boot else None
         plan = make_plan(scope, request)
         check_plan(lambda: Bus(scope), plan)
         write_exactly(format_plan(plan, target))
-        return
+        return ExitCode.OK
     bus = Bus(scope)
-    claimed = claim(bus, scope, request, want_boot)
+    claimed = claim(bus, scope, request, "doractl start", want_boot)
     print_warnings(claimed.warnings)
     print_warnings([ensure_linger(scope) if want_boot else ""])
-    started = _start(bus, claimed, not no_wait)
+    options = claimed.plan.options
+    with _last_words(scope, options.uuid), StageLine(sys.stderr) as stage:
+        started = start_unit(bus, scope, options, claimed.properties, stage, not no_wait)
     # Only after the start: a refusal must be one line and a hint.
     print_warnings(start_notes(claimed.plan))
+    _print_started(started, options, watched_patterns(claimed.plan), output)
+    return ExitCode.OK
+
+
+def _start_known(bus: Bus, scope: Scope, cell: Cell, wait: bool, output: str) -> ExitCode:
+    """As systemctl start: what runs goes on running."""
+    started = Started(cell.uuid, cell.name, cell.unit, is_ready=cell.state.active == "active")
+    if cell.is_up and output != "json":
+        click.echo(f"Dataflow already running: {cell.uuid} ({cell.name})")
+        return ExitCode.OK
+    if not cell.is_up:
+        bus.hold(cell.unit)  # keep a failed transient unit
+        bus.reset_failed(cell.unit)
+        with _last_words(scope, cell.uuid), StageLine(sys.stderr) as stage:
+            started = start_unit(bus, scope, cell.options, None, stage, wait)
+    _print_started(started, cell.options, (), output)
+    return ExitCode.OK
+
+
+def _print_started(
+    started: Started, options: RunnerOptions, watched: Sequence[str], output: str
+) -> None:
     if output == "json":
-        print_json({**vars(started), "dataflow": claimed.plan.options.dataflow})
+        print_json({**vars(started), "dataflow": options.dataflow})
     else:
-        click.echo(format_started(started, watched_patterns(claimed.plan)))
+        click.echo(format_started(started, watched))
 
 
-def _start(bus: Bus, claimed: Claim, wait: bool) -> Started:
+@contextmanager
+def _last_words(scope: Scope, uuid: str) -> Iterator[None]:
+    """Print what the nodes of a dataflow said last if the block fails to start it."""
     try:
-        with StageLine(sys.stderr) as stage:
-            return start_plan(bus, claimed.plan, claimed.properties, stage, wait)
+        yield
     except DoraSystemdError as error:
         if error.code is ExitCode.FAILURE:
-            _print_last_words(claimed.plan)
+            for line in last_words(scope, uuid):
+                click.echo(f"  {line}", err=True)
         raise
-
-
-def _print_last_words(plan: Plan) -> None:
-    for line in last_words(plan.scope, plan.options.uuid):
-        click.echo(f"  {line}", err=True)

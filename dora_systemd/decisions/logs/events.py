@@ -29,6 +29,9 @@ EVENTS = {
         "c8e3833d172d44c5a32de08c980c4d67", NOTICE, "is running, all nodes are ready"
     ),
     "dataflow-stopping": _dataflow("822b051bbbe24788bf93c0952aafa491", INFO, "is stopping"),
+    "start-asked": EventKind(
+        "1a28e80e37394313a9ddb940986531e3", INFO, "Start of dataflow {dataflow} requested by {by}"
+    ),
     "stop-asked": EventKind(
         "958c39b63a3d47cd9dd585937d57d927", INFO, "Stop of dataflow {dataflow} requested by {by}"
     ),

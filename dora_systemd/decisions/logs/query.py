@@ -121,6 +121,12 @@ def story_matches(scope: Scope, name: str, uuid: str) -> list[str]:
     return [*own, "+", *_systemd_matches(scope, name), "+", *asked]
 
 
+def request_matches(scope: Scope, event: str) -> list[str]:
+    """Matches for requests of root, or of the user: journald itself sets _UID."""
+    who = f"_UID={scope.uid if scope.is_user else 0}"
+    return [f"DORA_EVENT={event}", who, f"DORA_SCOPE={scope.flag.lstrip('-')}"]
+
+
 def _event_matches() -> list[str]:
     return [f"MESSAGE_ID={kind.message_id}" for kind in EVENTS.values()]
 

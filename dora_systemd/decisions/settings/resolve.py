@@ -81,6 +81,23 @@ def resolve_settings(
     return Settings(values, sources, _resolve_nodes(documents, table), table)
 
 
+def given_texts(
+    flags: Mapping[str, object], environment: Mapping[str, str], directory: PurePath
+) -> dict[str, str | list[str]]:
+    """What flags and variables give, as flags that mean the same in every directory.
+
+    directory: where relative paths start. Raises DoraSystemdError (USAGE) as resolve_settings().
+    """
+    found: dict[str, str | list[str]] = {}
+    for setting in SETTINGS:
+        given = [*_from_variable(setting, environment, directory)]
+        given += _from_flag(setting, flags, directory)
+        if given:
+            texts = list(setting.kind.format(given[-1][1]))
+            found[setting.name] = texts if setting.kind.is_repeatable else " ".join(texts)
+    return found
+
+
 def check_document(
     source: str, document: object, table: Sequence[Setting[Any]] = SETTINGS
 ) -> Mapping[str, Any]:
@@ -105,17 +122,21 @@ def check_document(
     return {key: value for key, value in document.items() if value is not None}
 
 
-def _from_flag(setting: Setting[Any], flags: Mapping[str, object]) -> Iterator[Given]:
+def _from_flag(
+    setting: Setting[Any], flags: Mapping[str, object], base: Base = None
+) -> Iterator[Given]:
     value = flags.get(setting.name)
     if value is not None and value != ():
-        yield setting.flags[0], _parsed(setting, value, setting.flags[0], ExitCode.USAGE)
+        yield setting.flags[0], _parsed(setting, value, setting.flags[0], ExitCode.USAGE, base)
 
 
-def _from_variable(setting: Setting[Any], environment: Mapping[str, str]) -> Iterator[Given]:
+def _from_variable(
+    setting: Setting[Any], environment: Mapping[str, str], base: Base = None
+) -> Iterator[Given]:
     # For shells, an empty variable usually means unset.
     value = environment.get(setting.variable, "") if setting.variable else ""
     if value:
-        yield setting.variable, _parsed(setting, value, setting.variable, ExitCode.USAGE)
+        yield setting.variable, _parsed(setting, value, setting.variable, ExitCode.USAGE, base)
 
 
 def _from_files(

@@ -29,7 +29,7 @@ from dora_systemd.trust.files import read_file
 from dora_systemd.trust.paths import list_directory
 from dora_systemd.values import shown
 from dora_systemd.verbs.facts.nodes import written_dataflow
-from dora_systemd.verbs.start.job import start_plan
+from dora_systemd.verbs.start.job import start_unit
 from dora_systemd.verbs.start.launch import claim
 from dora_systemd.verbs.start.plan import StartRequest
 
@@ -67,8 +67,8 @@ def _start(scope: Scope, request: Request) -> str:
     flags = sent_flags(request, written_dataflow(str(path)).raw)
     wanted = StartRequest(str(path), name if isinstance(name, str) else None, flags, os.environ)
     bus = Bus(scope)
-    claimed = claim(bus, scope, wanted)
-    return start_plan(bus, claimed.plan, claimed.properties, None, wait=False).uuid
+    claimed = claim(bus, scope, wanted, "dora start")
+    return start_unit(bus, scope, claimed.plan.options, claimed.properties, None, wait=False).uuid
 
 
 def find_file(directory: Path, session: str) -> Path:

@@ -65,7 +65,7 @@ class Selector:
     def meant(self, known: Iterable[N]) -> list[N]:
         """Those of `known` that match, in their order; a name takes precedence over UUIDs."""
         candidates = list(known)
-        for name in self._names:
+        for name in self.names:
             if named := [one for one in candidates if one.name == name]:
                 return named
         if not is_uuid_prefix(self.text):
@@ -73,8 +73,11 @@ class Selector:
         return [one for one in candidates if one.uuid.startswith(self.text.lower())]
 
     @property
-    def _names(self) -> list[str]:
-        """As in systemctl, ".service" may be left out; a dataflow can be called dora-x, too."""
+    def names(self) -> list[str]:
+        """The names that the text can mean.
+
+        As in systemctl, ".service" may be left out; a dataflow can be called dora-x, too.
+        """
         short = name_from_unit(f"{self.text}{UNIT_SUFFIX}")
         return [self.name, *([short] if short else [])]
 
@@ -108,7 +111,7 @@ class Selector:
         """One that systemd has loaded, or can load from a unit file."""
         cells = read_cells(manager)
         cell = self.only(cells)
-        names = filter(is_name, self._names if cell is None else ())
+        names = filter(is_name, self.names if cell is None else ())
         cell = cell or next(
             filter(None, (read_cell(manager, unit_name(one)) for one in names)), None
         )

@@ -1,4 +1,4 @@
-"""`doractl start`: starts the transient unit of a checked plan, and waits for it."""
+"""`doractl start`: starts the unit of a dataflow, and waits for it."""
 
 import select
 from collections.abc import Sequence
@@ -15,12 +15,13 @@ from dora_systemd.adapters.bus.manager import (
     StageObserver,
     tell_stage,
 )
+from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.life.refusal import FAILED
 from dora_systemd.decisions.unit.versions import transient_commands
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.reason import job_reason, runners_refusal
-from dora_systemd.verbs.start.plan import Plan
 from dora_systemd.verbs.start.unit import systemd_number
 
 _POLL_SECONDS = 0.2
@@ -36,37 +37,39 @@ class Started:
     is_ready: bool
 
 
-def start_plan(
+def start_unit(
     manager: Manager,
-    plan: Plan,
+    scope: Scope,
+    options: RunnerOptions,
     properties: Sequence[Property] | None,
     on_stage: StageObserver | None,
     wait: bool,
 ) -> Started:
-    """Start a plan; if `wait`, wait until its nodes are ready.
+    """Start the unit of a dataflow; if `wait`, wait until its nodes are ready.
 
-    properties: of a transient unit; None for a plan whose unit file systemd has loaded. Raises
+    properties: of a transient unit; None for a unit that systemd has loaded. Raises
     DoraSystemdError with the reason when the start fails; the unit stays as failed. If the runner
     refuses the dataflow, no unit is left.
     """
+    unit = unit_name(options.name)
     try:
-        result = _begin(manager, plan.unit, properties, partial(tell_stage, on_stage), wait)
+        result = _begin(manager, unit, properties, partial(tell_stage, on_stage), wait)
         if not wait:
-            _wait_until_checked(manager, plan.unit)
+            _wait_until_checked(manager, unit)
     except KeyboardInterrupt as error:
-        raise _interruption(plan.options.name) from error
+        raise _interruption(options.name) from error
     # A dataflow that finishes right after its start has not failed.
-    state = manager.read(plan.unit, ["ActiveState"])["ActiveState"]
+    state = manager.read(unit, ["ActiveState"])["ActiveState"]
     has_failed = result != JOB_DONE or state == "failed"
-    if has_failed and (refusal := runners_refusal(manager, plan.unit)):
+    if has_failed and (refusal := runners_refusal(manager, unit)):
         # It never ran, so do not keep its name in use.
         with suppress(DoraSystemdError):
-            manager.reset_failed(plan.unit)
+            manager.reset_failed(unit)
         raise refusal
     if has_failed and wait:
         result = "failed" if result == JOB_DONE else result
-        raise _start_failure(manager, plan.scope, plan.unit, plan.options.name, result)
-    return Started(plan.options.uuid, plan.options.name, plan.unit, is_ready=wait)
+        raise _start_failure(manager, scope, unit, options.name, result)
+    return Started(options.uuid, options.name, unit, is_ready=wait)
 
 
 def _begin(

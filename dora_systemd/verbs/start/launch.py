@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from dora_systemd.adapters.bus.manager import Manager, Property
 from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
+from dora_systemd.verbs.start.again import note_start
 from dora_systemd.verbs.start.check import check_plan
 from dora_systemd.verbs.start.claim import place_unit_file, require_free_name, with_known_uuid
 from dora_systemd.verbs.start.plan import Plan, StartRequest, make_plan, request_name
@@ -21,8 +22,16 @@ class Claim:
     warnings: tuple[str, ...]
 
 
-def claim(manager: Manager, scope: Scope, request: StartRequest, want_boot: bool = False) -> Claim:
-    """Check the request and prepare its unit. want_boot: as a unit file that is started at boot.
+def claim(
+    manager: Manager,
+    scope: Scope,
+    request: StartRequest,
+    command: str,
+    want_boot: bool = False,
+) -> Claim:
+    """Check the request, prepare its unit and note the request, see again.py.
+
+    command: by which it is asked. want_boot: as a unit file that is started at boot.
 
     Raises DoraSystemdError; then nothing has changed.
     """
@@ -33,4 +42,5 @@ def claim(manager: Manager, scope: Scope, request: StartRequest, want_boot: bool
         # Check first: the unit file is written before a runner could refuse the dataflow.
         check_plan(lambda: manager, plan)
     has_file = place_unit_file(manager, plan, properties, boot, want_boot)
+    note_start(plan, request, command)
     return Claim(plan, None if has_file else list(properties.values()), tuple(warnings))

@@ -40,7 +40,7 @@ class StartRequest:
     """A request to start a dataflow. flags: raw values by setting name, see resolve_settings.
 
     environment: the caller's variables. attached: the dataflow ends with the caller. caller: the
-    variables that the dataflow may read.
+    variables that the dataflow may read. uuid: of a dataflow that is started again.
     """
 
     dataflow: str
@@ -49,6 +49,7 @@ class StartRequest:
     environment: Mapping[str, str] = field(default_factory=dict)
     attached: bool = False
     caller: Mapping[str, str] = field(default_factory=dict)
+    uuid: str = ""
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,7 @@ def _make_plan(
     look.check_reach(path, directory)
     options = RunnerOptions(
         name=request_name(request),
-        uuid=str(uuid.uuid4()),
+        uuid=request.uuid or str(uuid.uuid4()),
         dataflow=path,
         working_directory=directory,
         dora=look.find_dora(venv, search_path),

@@ -113,12 +113,13 @@ def test_dora_starts_the_file_of_its_session(
     (tmp_path / "out" / "flow.dora-session.yaml").write_text("session_id: one\n")
     asked: list[StartRequest] = []
 
-    def claimed(_bus: object, _scope: object, wanted: StartRequest) -> SimpleNamespace:
+    def claimed(_bus: object, _scope: object, wanted: StartRequest, by: str) -> SimpleNamespace:
+        assert by == "dora start"
         asked.append(wanted)
-        return SimpleNamespace(plan=None, properties={})
+        return SimpleNamespace(plan=SimpleNamespace(options=None), properties={})
 
     monkeypatch.setattr(starting, "claim", claimed)
-    monkeypatch.setattr(starting, "start_plan", lambda *_, **__: SimpleNamespace(uuid=UUID))
+    monkeypatch.setattr(starting, "start_unit", lambda *_, **__: SimpleNamespace(uuid=UUID))
     sent = {"nodes": [{"id": "a"}], "env": {"A": "b"}}
     body = {"dataflow": sent, "local_working_dir": str(tmp_path), "session_id": "one"}
     answer = bench.ask("Start", **body, name="robot", uv=True)

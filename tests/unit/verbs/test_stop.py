@@ -17,7 +17,8 @@ from dora_systemd.verbs.facts import budget as budget_module
 from dora_systemd.verbs.facts.budget import restart_budget
 from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.facts.reason import failure_reason
-from dora_systemd.verbs.stop import caller, reset_cells, restart_cells, stop_cells
+from dora_systemd.verbs.start.asked import caller
+from dora_systemd.verbs.stop import reset_cells, restart_cells, stop_cells
 from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
 
 UNIT = "dora-robot.service"

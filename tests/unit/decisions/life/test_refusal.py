@@ -7,9 +7,9 @@ import pytest
 from dora_systemd.decisions.life.refusal import format_refusal, parse_refusal, refusal_exit
 from dora_systemd.decisions.life.states import RunnerExit
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.verbs.start.job import start_plan
+from dora_systemd.verbs.start.job import start_unit
 from tests.unit.fakes.manager import FakeManager, options
-from tests.unit.verbs.start.test_job import UNIT, make_plan
+from tests.unit.verbs.start.test_job import SCOPE, UNIT
 
 
 @pytest.mark.parametrize("code", [ExitCode.BAD_INPUT, ExitCode.NO_DORA, ExitCode.NO_PERMISSION])
@@ -50,7 +50,7 @@ def test_a_refused_start_leaves_no_unit(wait: bool) -> None:
     facts = {"ActiveState": "failed", "StatusText": status, "ExecMainStatus": 78}
     manager.after_job[UNIT] = facts
     with pytest.raises(DoraSystemdError) as caught:
-        start_plan(manager, make_plan(), [], None, wait)
+        start_unit(manager, SCOPE, options(), [], None, wait)
     assert caught.value.message == "cannot use /srv/robot.yml: why\\x1b[2J"
     assert (caught.value.hint, caught.value.code) == ("do this", ExitCode.BAD_INPUT)
     assert UNIT not in manager.units
@@ -74,5 +74,5 @@ def test_a_start_that_is_not_waited_for_waits_for_the_first_word() -> None:
     manager.add(options(), **states.pop(0))
     manager.after_job[UNIT] = {"ActiveState": "inactive", "Job": [7, "/job"]}
     with pytest.raises(DoraSystemdError, match="cannot use x"):
-        start_plan(manager, make_plan(), [], None, wait=False)
+        start_unit(manager, SCOPE, options(), [], None, wait=False)
     assert not states

@@ -32,6 +32,7 @@ def test_catalog_entry_says_what_and_what_to_do(name: str) -> None:
             "DORA_NODE",
             "DORA_BY",
             "DORA_EXIT",
+            "DORA_FILE",
             "DORA_COUNT",
             "DORA_LIMIT",
             "DORA_MOST",

@@ -7,25 +7,25 @@ import pytest
 from dora_systemd.decisions.settings.resolve import resolve_settings
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.start.job import Started, format_started, start_plan
+from dora_systemd.verbs.start.job import Started, format_started, start_unit
 from dora_systemd.verbs.start.plan import Plan
 from dora_systemd.verbs.start.unit import format_plan, plan_properties
 from tests.unit.fakes.manager import UUID, FakeManager, options
 
 UNIT = "dora-robot.service"
+SCOPE = Scope(is_user=True, uid=1000)
 
 
 def make_plan(**flags: object) -> Plan:
-    scope = Scope(is_user=True, uid=1000)
     settings = resolve_settings(flags, {}, [])
-    return Plan(scope, options(), settings, None, {"PATH": "/bin"})
+    return Plan(SCOPE, options(), settings, None, {"PATH": "/bin"})
 
 
 def test_stages_are_told_while_it_starts() -> None:
     manager = FakeManager()
     manager.stages = ["0/3 nodes ready", "", "3/3 nodes ready"]
     told: list[str] = []
-    started = start_plan(manager, make_plan(), [], told.append, wait=True)
+    started = start_unit(manager, SCOPE, options(), [], told.append, wait=True)
     assert told == ["0/3 nodes ready", "3/3 nodes ready"]
     assert started == Started(UUID, "robot", UNIT, is_ready=True)
 
@@ -45,7 +45,7 @@ def test_a_start_that_fails(result: str, facts: dict[str, Any], reason: str) -> 
     manager.job_results[UNIT] = result
     manager.after_job[UNIT] = facts
     with pytest.raises(DoraSystemdError) as caught:
-        start_plan(manager, make_plan(), [], None, wait=True)
+        start_unit(manager, SCOPE, options(), [], None, wait=True)
     assert caught.value.message == f"cannot start robot: {reason}"
     assert caught.value.code is ExitCode.FAILURE
 

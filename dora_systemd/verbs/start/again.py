@@ -1,0 +1,160 @@
+"""Starts again what has ended, with the settings it had.
+
+systemd unloads a transient unit at its end. So each start writes what was asked for to the journal,
+in the name of the process that starts; a later start by name makes its plan from that.
+"""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.journal.reader import JournalReader
+from dora_systemd.decisions.logs.query import request_matches
+from dora_systemd.decisions.settings.resolve import given_texts
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import is_name, is_uuid, is_uuid_prefix, unit_name
+from dora_systemd.scope import Scope
+from dora_systemd.trust.paths import exists, is_directory
+from dora_systemd.values import quoted
+from dora_systemd.verbs.facts.cells import Cell, read_cells
+from dora_systemd.verbs.facts.selector import Selector, selectors_of
+from dora_systemd.verbs.start.asked import note_request
+from dora_systemd.verbs.start.plan import Plan, StartRequest
+
+EVENT = "start-asked"
+_INIT = "1"
+"""PID 1 adds LogExtraFields= of a unit to its own records, so the unit's owner writes in them."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A start that was asked for. flags: as in StartRequest, the same in every directory."""
+
+    name: str
+    uuid: str
+    dataflow: str
+    flags: Mapping[str, object]
+
+    @property
+    def unit(self) -> str:
+        """The name of the unit."""
+        return unit_name(self.name)
+
+    def request(self, wanted: StartRequest) -> StartRequest:
+        """The same start once more; what `wanted` gives has precedence over the flags it had.
+
+        Raises DoraSystemdError (USAGE) for another name.
+        """
+        if wanted.name not in (None, self.name):
+            message = f"cannot start {self.name} as {quoted(wanted.name)}"
+            hint = f"doractl start {self.dataflow} --name NAME starts one more"
+            raise DoraSystemdError(message, hint, ExitCode.USAGE)
+        given = {key: value for key, value in wanted.flags.items() if is_given(value)}
+        flags = {**self.flags, **given}
+        return replace(wanted, dataflow=self.dataflow, name=self.name, flags=flags, uuid=self.uuid)
+
+
+def means_name(text: str) -> bool:
+    """Whether the text is not that of a file: it can be a name, a unit or a UUID."""
+    if "/" in text or text.endswith((".yml", ".yaml", ".json")):
+        return False
+    path = Path(text).absolute()
+    return is_directory(path) or not exists(path)
+
+
+def is_given(flag: object) -> bool:
+    """Whether a raw value of a flag is one, see StartRequest."""
+    return flag not in (None, ())
+
+
+def note_start(plan: Plan, request: StartRequest, command: str) -> None:
+    """Write what was asked for to the journal. command: by which, such as "doractl start"."""
+    options = plan.options
+    note_request(
+        EVENT,
+        options.name,
+        options.uuid,
+        command,
+        scope=plan.scope.flag.lstrip("-"),
+        file=options.dataflow,
+        settings=json.dumps(given_texts(request.flags, request.environment, Path.cwd())),
+    )
+
+
+def find_asked(scope: Scope, selector: Selector) -> Asked | None:
+    """The newest start of the dataflow that is meant; None if the journal has none.
+
+    Raises DoraSystemdError if the journal cannot be read.
+    """
+    names = [f"DORA_DATAFLOW_NAME={name}" for name in filter(is_name, selector.names)]
+    if names and (found := next(_asked(scope, names), None)):
+        return found
+    uuids = _asked(scope, []) if is_uuid_prefix(selector.text) else iter(())
+    return next((one for one in uuids if selector.meant([one])), None)
+
+
+def find_known(
+    manager: Manager, scope: Scope, texts: Sequence[str]
+) -> tuple[list[Cell], list[Asked]]:
+    """The dataflows that `texts` mean, each once: those systemd knows, and those that have ended.
+
+    Raises DoraSystemdError as Selector.find_enabled().
+    """
+    given = selectors_of(texts, read_cells(manager))
+    found = {one.uuid: one for one in (find_start(manager, scope, text) for text in given)}
+    cells = [one for one in found.values() if isinstance(one, Cell)]
+    return cells, [one for one in found.values() if isinstance(one, Asked)]
+
+
+def find_start(
+    manager: Manager, scope: Scope, selector: Selector, is_changed: bool = False
+) -> Cell | Asked:
+    """The dataflow that is meant: what systemd knows, else the last start in the journal.
+
+    is_changed: the last start in any case, for other settings. Raises DoraSystemdError as
+    Selector.find_enabled() if there is neither, or this user may not read the journal.
+    """
+    try:
+        cell = selector.find_enabled(manager, scope)
+    except DoraSystemdError as error:
+        if error.code is ExitCode.NOT_FOUND and (found := _readable(scope, selector)):
+            return found
+        raise
+    if not is_changed:
+        return cell
+    if found := find_asked(scope, Selector(cell.name)):
+        return found
+    message = f"cannot change settings of {cell.name}: the journal does not have its start"
+    raise DoraSystemdError(message, f"doractl start {cell.options.dataflow} takes the file itself")
+
+
+def _readable(scope: Scope, selector: Selector) -> Asked | None:
+    """As find_asked(), also None for a user who may not read the journal."""
+    with suppress(DoraSystemdError):
+        return find_asked(scope, selector)
+    return None
+
+
+def _asked(scope: Scope, matches: list[str]) -> Iterator[Asked]:
+    every = [*request_matches(scope, EVENT), *matches]
+    for record in JournalReader().newest(every, None, is_whole=True):
+        with suppress(ValueError, TypeError, AttributeError, RecursionError):
+            if record.get("_PID") != _INIT and (found := _parse(record)):
+                yield found
+
+
+def _parse(record: Mapping[str, Any]) -> Asked | None:
+    keys = ("DORA_DATAFLOW_NAME", "DORA_DATAFLOW", "DORA_FILE", "DORA_SETTINGS")
+    name, uuid, path, settings = (str(record.get(key, "")) for key in keys)
+    flags = json.loads(settings)
+    if not (is_name(name) and is_uuid(uuid) and Path(path).is_absolute()):
+        return None
+    return Asked(name, uuid, path, {key: _flag(value) for key, value in flags.items()})
+
+
+def _flag(value: object) -> object:
+    return tuple(map(str, value)) if isinstance(value, list) else str(value)

@@ -1,0 +1,27 @@
+"""Writes the events of requests: systemd notes no caller, and forgets what it has unloaded."""
+
+import os
+from collections.abc import Mapping
+
+from dora_systemd.adapters.journal.note import send_note
+from dora_systemd.decisions.logs.events import event_fields
+from dora_systemd.decisions.logs.fields import encode_entry
+from dora_systemd.trust.paths import user_name
+
+
+def note_request(event: str, name: str, uuid: str, command: str, **details: str) -> None:
+    """Write an event about a dataflow in the name of this process.
+
+    command: by which it is asked, such as "doractl stop". details: as in event_fields().
+    """
+    by = f"{caller(os.getuid(), os.environ)} ({command})"
+    fields = event_fields(event, dataflow=name, by=by, **details)
+    own = {"DORA_DATAFLOW": uuid, "DORA_DATAFLOW_NAME": name, "SYSLOG_IDENTIFIER": "doractl"}
+    send_note(encode_entry({**fields, **own}))
+
+
+def caller(uid: int, environ: Mapping[str, str]) -> str:
+    """A user's name; root by sudo(8) is told with the one who called it."""
+    name = user_name(uid, nameless="the user ")
+    behind = environ.get("SUDO_USER", "")
+    return f"{name}, by sudo of {behind}" if uid == 0 and behind not in ("", "root") else name

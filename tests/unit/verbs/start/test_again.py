@@ -1,0 +1,142 @@
+"""What a start leaves in the journal, and a start by name."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dora_systemd.adapters.journal.reader import JournalReader
+from dora_systemd.decisions.settings.resolve import resolve_settings
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.scope import Scope
+from dora_systemd.verbs.facts.cells import Cell
+from dora_systemd.verbs.facts.selector import Selector
+from dora_systemd.verbs.start import asked as asked_module
+from dora_systemd.verbs.start.again import (
+    Asked,
+    find_known,
+    find_start,
+    means_name,
+    note_start,
+)
+from dora_systemd.verbs.start.plan import Plan, StartRequest
+from tests.unit.fakes.manager import UUID, FakeManager, options
+
+SCOPE = Scope(is_user=False, uid=0)
+FLAGS = {"memory_limit": "1G", "env": ("A=1", "B=2"), "venv": ".venv", "debug": True, "uv": None}
+KEPT = {
+    "memory_limit": "1G",
+    "env": ("A=1", "B=2"),
+    "venv": "/home/robot/.venv",
+    "debug": "yes",
+    "grace_duration": "3s",
+}
+
+
+def record(name: str = "robot", uuid: str = UUID, **fields: Any) -> dict[str, Any]:
+    settings = json.dumps(KEPT)
+    own = {"DORA_DATAFLOW_NAME": name, "DORA_DATAFLOW": uuid, "DORA_FILE": f"/srv/{name}.yml"}
+    return {"_PID": "77", "DORA_SETTINGS": settings, **own, **fields}
+
+
+@pytest.fixture
+def journal(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+    """The records of starts, newest first; journalctl's own matches are left out."""
+    records: list[dict[str, Any]] = []
+
+    def newest(_: object, matches: list[str], *__: object, **___: object) -> Iterator[Any]:
+        names = [one.partition("=")[2] for one in matches if one.startswith("DORA_DATAFLOW_NAME=")]
+        for one in records:
+            if not names or one["DORA_DATAFLOW_NAME"] in names:
+                yield one
+
+    monkeypatch.setattr(JournalReader, "newest", newest)
+    return records
+
+
+def test_a_start_is_noted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    sent: list[bytes] = []
+    monkeypatch.setattr(asked_module, "send_note", sent.append)
+    monkeypatch.chdir(tmp_path)
+    plan = Plan(SCOPE, options(), resolve_settings({}, {}, []), None, {})
+    request = StartRequest("robot.yml", flags=FLAGS, environment={"DORA_GRACE_DURATION": "3s"})
+    note_start(plan, request, "doractl start")
+    (entry,) = sent
+    lines = dict(line.split(b"=", 1) for line in entry.splitlines())
+    kept = {**KEPT, "venv": str(tmp_path / ".venv"), "env": ["A=1", "B=2"]}
+    assert json.loads(lines[b"DORA_SETTINGS"]) == kept
+    assert lines[b"DORA_FILE"] == b"/srv/robot.yml"
+    assert lines[b"DORA_SCOPE"] == b"system"
+    assert lines[b"MESSAGE"].startswith(b"Start of dataflow robot requested by ")
+
+
+@pytest.mark.parametrize(
+    "text", ["robot", "dora-robot", "dora-robot.service", UUID, UUID[:8], UUID[:8].upper()]
+)
+def test_the_last_start(text: str, journal: list[dict[str, Any]]) -> None:
+    journal += [record("other", UUID.replace("5", "6")), record(), record(DORA_FILE="/srv/old.yml")]
+    found = find_start(FakeManager(), SCOPE, Selector(text))
+    assert found == Asked("robot", UUID, "/srv/robot.yml", KEPT)
+    wanted = StartRequest(text, flags={"env": ("C=3",), "debug": None, "writable": ()})
+    again = found.request(wanted)
+    assert (again.dataflow, again.name, again.uuid) == ("/srv/robot.yml", "robot", UUID)
+    assert again.flags == {**KEPT, "env": ("C=3",)}
+    with pytest.raises(DoraSystemdError, match="cannot start robot as 'x'"):
+        found.request(StartRequest(text, "x"))
+
+
+FORGED: list[dict[str, Any]] = [
+    {"_PID": "1"},
+    {"DORA_FILE": "robot.yml"},
+    {"DORA_FILE": None},
+    {"DORA_DATAFLOW": "x"},
+    {"DORA_DATAFLOW": ["a", "b"]},
+    {"DORA_SETTINGS": "[1]"},
+    {"DORA_SETTINGS": "{"},
+    {"DORA_SETTINGS": [1, 2]},
+    {"DORA_SETTINGS": "[" * 100_000},
+]
+
+
+@pytest.mark.parametrize("fields", FORGED)
+def test_records_that_are_none(fields: dict[str, Any], journal: list[dict[str, Any]]) -> None:
+    journal.append(record(**fields))
+    with pytest.raises(DoraSystemdError) as caught:
+        find_start(FakeManager(), SCOPE, Selector("robot"))
+    assert caught.value.code is ExitCode.NOT_FOUND
+
+
+def test_what_systemd_knows_comes_first(journal: list[dict[str, Any]]) -> None:
+    manager = FakeManager()
+    manager.add(options(), active="failed")
+    journal += [record(), record("gone", UUID.replace("5", "6"))]
+    found = find_start(manager, SCOPE, Selector("robot"))
+    assert isinstance(found, Cell)
+    cells, ended = find_known(manager, SCOPE, ["robot", "gone", "dora-gone", "rob*"])
+    assert ([one.name for one in cells], [one.name for one in ended]) == (["robot"], ["gone"])
+    # Other settings are for the plan of the last start.
+    assert isinstance(find_start(manager, SCOPE, Selector("robot"), is_changed=True), Asked)
+    journal.clear()
+    with pytest.raises(DoraSystemdError, match="the journal does not have its start"):
+        find_start(manager, SCOPE, Selector("robot"), is_changed=True)
+
+
+def test_a_journal_that_cannot_be_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(*_: object, **__: object) -> Iterator[Any]:
+        raise DoraSystemdError("cannot read the journal", "", ExitCode.NO_PERMISSION)
+
+    monkeypatch.setattr(JournalReader, "newest", refused)
+    with pytest.raises(DoraSystemdError, match="no dataflow named 'robot'"):
+        find_start(FakeManager(), SCOPE, Selector("robot"))
+
+
+def test_names_and_files(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    (tmp_path / "directory").mkdir()
+
+    assert means_name("robot")
+    assert means_name("directory")
+    assert not any(map(means_name, ("file", "a.yml", "./robot", "b/robot")))
