@@ -3,12 +3,12 @@
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 
 from dora_systemd.adapters.bus.manager import JOB_DONE, Manager, Observer
 from dora_systemd.adapters.journal.note import send_note
 from dora_systemd.decisions.logs.events import event_fields
 from dora_systemd.decisions.logs.fields import encode_entry
+from dora_systemd.decisions.views.outcome import Outcome, Subject
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import user_name
@@ -16,15 +16,6 @@ from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.enabled import enabled_units
 from dora_systemd.verbs.facts.reason import failure_reason, job_reason
 from dora_systemd.verbs.start.enable import read_boot_unit, release_transient
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """The result for one dataflow: `problem` is "" for success."""
-
-    cell: Cell
-    text: str
-    problem: str = ""
 
 
 def stop_cells(
@@ -99,10 +90,16 @@ def caller(uid: int, environ: Mapping[str, str]) -> str:
     return f"{name}, by sudo of {behind}" if uid == 0 and behind not in ("", "root") else name
 
 
+def not_running(subject: Subject, state: str) -> Outcome:
+    """The outcome for a dataflow that need not be stopped. state: as in "has failed"."""
+    text = f"Dataflow not running: {subject.uuid} ({subject.name} {state})"
+    return Outcome(subject, text, is_news=False)
+
+
 def _stop_outcome(manager: Manager, cell: Cell, result: str | None) -> Outcome:
     if result is None:
         ended = "has failed" if cell.state.active == "failed" else "does not run"
-        return Outcome(cell, f"Dataflow not running: {cell.uuid} ({cell.name} {ended})")
+        return not_running(cell, ended)
     if result != JOB_DONE:
         return Outcome(cell, "", f"cannot stop {cell.unit}: the job was {result}")
     state = manager.read(cell.unit, ["ActiveState", "Result"])

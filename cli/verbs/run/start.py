@@ -9,15 +9,16 @@ import click
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.edge import write_exactly
 from dora_systemd.cli.parameters import (
+    acting_options,
     current_scope,
     name_option,
-    output_option,
-    print_json,
+    print_outcomes,
     print_warnings,
-    scope_options,
+    tell,
 )
 from dora_systemd.cli.settingoptions import SettingsCommand, setting_options
 from dora_systemd.cli.stageline import StageLine
+from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.verbs.facts.last_words import last_words
 from dora_systemd.verbs.start.check import check_plan
@@ -38,17 +39,15 @@ from dora_systemd.verbs.start.watch import watched_patterns
 @click.option("--no-wait", is_flag=True, help="Do not wait until all nodes are ready.")
 @click.option("--enable", "want_boot", is_flag=True, help="Also start it at every boot.")
 @click.option("--dry-run", is_flag=True, help="Print the unit and start nothing.")
-@output_option
-@scope_options
+@acting_options
 def command(
     dataflow: str,
     name: str | None,
     no_wait: bool,
     want_boot: bool,
     dry_run: bool,
-    output: str,
     **flags: Any,
-) -> None:
+) -> int:
     """Start the dataflow in FILE as the service dora-NAME.service.
 
     Returns when all nodes are ready, or fails with the reason. The name must be free; a failed
@@ -74,7 +73,7 @@ def command(
         plan = make_plan(scope, request)
         check_plan(lambda: Bus(scope), plan)
         write_exactly(format_plan(plan, target))
-        return
+        return ExitCode.OK
     bus = Bus(scope)
     claimed = claim(bus, scope, request, want_boot)
     print_warnings(claimed.warnings)
@@ -82,10 +81,9 @@ def command(
     started = _start(bus, claimed, not no_wait)
     # Only after the start: a refusal must be one line and a hint.
     print_warnings(start_notes(claimed.plan))
-    if output == "json":
-        print_json({**vars(started), "dataflow": claimed.plan.options.dataflow})
-    else:
-        click.echo(format_started(started, watched_patterns(claimed.plan)))
+    text = format_started(started, watched_patterns(claimed.plan))
+    details = {"file": claimed.plan.options.dataflow, "is_ready": started.is_ready}
+    return print_outcomes([Outcome(started, text, details=details)])
 
 
 def _start(bus: Bus, claimed: Claim, wait: bool) -> Started:
@@ -100,4 +98,4 @@ def _start(bus: Bus, claimed: Claim, wait: bool) -> Started:
 
 def _print_last_words(plan: Plan) -> None:
     for line in last_words(plan.scope, plan.options.uuid):
-        click.echo(f"  {line}", err=True)
+        tell(f"  {line}", err=True)

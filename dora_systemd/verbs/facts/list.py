@@ -58,9 +58,16 @@ def read_rows(manager: Manager, scope: Scope, with_details: bool = True) -> list
 
 
 def mark_enabled(manager: Manager, scope: Scope, rows: Sequence[DataflowRow]) -> list[DataflowRow]:
-    """The rows, with a mark on those that are started at boot."""
-    enabled = enabled_units(manager, scope)
-    return [row._replace(enabled=row.unit in enabled) for row in rows]
+    """The rows, with a mark on those that are started at boot.
+
+    Of several with the same unit it is the first one; the others are gone.
+    """
+    units = set(enabled_units(manager, scope))
+    marked = []
+    for row in rows:
+        marked.append(row._replace(enabled=row.unit in units))
+        units.discard(row.unit)
+    return marked
 
 
 def _life(reading: Reading) -> dict[str, Any]:
