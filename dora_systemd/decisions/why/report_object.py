@@ -6,7 +6,6 @@ from typing import Any
 from dora_systemd.decisions.views.dataflows import DataflowRow
 from dora_systemd.decisions.views.objects import dataflow_object, moment
 from dora_systemd.decisions.why.report import Report, remedies
-from dora_systemd.decisions.why.verdict import Verdict
 
 _TOLD = ("event", "node", "nodes", "dataflow", "dataflow_name", "downstream", "cause", "reason")
 """Details of an event that have their own keys."""
@@ -41,7 +40,6 @@ def report_object(report: Report, row: DataflowRow) -> dict[str, Any]:
         "given_up": verdict.is_given_up,
         "details": _details(verdict.details),
         "starved": list(verdict.starved),
-        "before": _before(verdict),
         **_history(report),
         "remedies": remedies(report),
     }
@@ -57,34 +55,20 @@ def _number(text: str) -> int | None:
     return int(text) if text.isascii() and text.isdigit() else None
 
 
-def _before(verdict: Verdict) -> dict[str, Any] | None:
-    if not verdict.before:
-        return None
-    return {"summary": verdict.before, **moment("at", verdict.before_us)}
-
-
 def _history(report: Report) -> dict[str, Any]:
     verdict = report.verdict
     return {
+        "before": _at(verdict.before_us, summary=verdict.before) if verdict.before else None,
         "restart_history": [
-            {
-                **moment("at", one.at_us),
-                "owner": one.owner,
-                "node": one.node or None,
-                "reason": one.reason,
-            }
+            _at(one.at_us, owner=one.owner, node=one.node, reason=one.reason)
             for one in verdict.restarts
         ],
         "timeline": [
-            {
-                **moment("at", one.at_us),
-                "event": one.name,
-                "node": one.node or None,
-                "text": one.text or None,
-            }
-            for one in verdict.timeline
+            _at(one.at_us, event=one.name, node=one.node, text=one.text) for one in verdict.timeline
         ],
-        "last_lines": [
-            {**moment("at", one.at_us), "node": one.node, "text": one.text} for one in report.words
-        ],
+        "last_lines": [_at(one.at_us, node=one.node, text=one.text) for one in report.words],
     }
+
+
+def _at(at_us: int, **texts: str) -> dict[str, Any]:
+    return {**moment("at", at_us), **{key: text or None for key, text in texts.items()}}

@@ -15,7 +15,7 @@ from dora_systemd.values import INFINITY
 from dora_systemd.verbs.facts.cells import Cell
 
 _READY_SINCE = "ActiveEnterTimestampMonotonic"
-_PROPERTIES = ("Restart", "NRestarts", "StartLimitBurst", "StartLimitIntervalUSec", _READY_SINCE)
+_PROPERTIES = ("NRestarts", "StartLimitBurst", "StartLimitIntervalUSec", _READY_SINCE)
 _WAITING = ("RestartUSec", "StateChangeTimestampMonotonic")
 _MOST_STARTS = 1000
 
@@ -28,9 +28,11 @@ def restart_budget(
     status: from its runner. used, max: numbers of restarts. next_us, resets_us: µs until the next
     restart, and until the counter is reset; None: neither will happen.
     """
+    if manager.read(cell.unit, ["Restart"])["Restart"] == "no":
+        return None
     facts = manager.read(cell.unit, _PROPERTIES)
     window = facts["StartLimitIntervalUSec"]
-    if facts["Restart"] == "no" or window in (0, INFINITY):
+    if window in (0, INFINITY):
         return None
     most = max(facts["StartLimitBurst"] - 1, 0)
     budget = unit_budget(
