@@ -1,6 +1,7 @@
 """What is known of a dataflow beside its table: the boot, and the restarts left."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -20,7 +21,11 @@ from dora_systemd.verbs.why import subject_row
 from tests.unit.fakes.manager import UUID, FakeManager, options
 
 UNIT = "dora-robot.service"
-POLICY = {"Restart": "on-failure", "StartLimitBurst": 6, "StartLimitIntervalUSec": 600 * SECOND}
+POLICY: dict[str, Any] = {
+    "Restart": "on-failure",
+    "StartLimitBurst": 6,
+    "StartLimitIntervalUSec": 600 * SECOND,
+}
 NEVER_YET = {"used": 0, "max": 5, "next_us": None, "resets_us": None}
 
 
