@@ -18,7 +18,14 @@ from dora_systemd.scope import Scope
 from dora_systemd.values import INFINITY, SECOND
 from dora_systemd.verbs.facts.cells import Cell, read_cells
 from dora_systemd.verbs.facts.enabled import enabled_units
-from dora_systemd.verbs.facts.reading import STARTED, UP_SINCE, Reading, read_dataflow, slice_group
+from dora_systemd.verbs.facts.reading import (
+    ENDED,
+    STARTED,
+    UP_SINCE,
+    Reading,
+    read_dataflow,
+    slice_group,
+)
 
 
 def row_of(reading: Reading, before: Reading | None = None) -> DataflowRow:
@@ -38,6 +45,8 @@ def row_of(reading: Reading, before: Reading | None = None) -> DataflowRow:
         "restarts": unit["NRestarts"] + status.node_restarts,
         "problem": reading.problem,
     }
+    if not cell.is_up:
+        return DataflowRow(**facts, ended=unit.get(ENDED) or 0)
     if not reading.usage:
         return DataflowRow(**facts)
     samples = (before.sample,) if before else status.samples
