@@ -6,8 +6,10 @@ stream for all output cannot be forgotten in any of them.
 
 import io
 import sys
-from typing import TextIO
+from collections.abc import Sequence
+from typing import Any, TextIO
 
+from dora_systemd.errors import DoraSystemdError
 from dora_systemd.terminal_text import escaped
 
 
@@ -54,3 +56,37 @@ def write_exactly(text: str) -> None:
         sys.stdout.write(text)
     else:
         write_own(sys.stdout, text)
+
+
+def asks_for_json(arguments: Sequence[str]) -> bool:
+    """Whether a command line, which may be wrong, has `-o json`."""
+    own = arguments[: arguments.index("--")] if "--" in arguments else arguments
+    words = f" {' '.join(own)} "
+    return any(f" {one}json " in words for one in ("-o ", "-o", "--output ", "--output="))
+
+
+def print_error(error: DoraSystemdError, is_json: bool) -> None:
+    """An error on standard error: a line and a hint for people, or an object for programs."""
+    if is_json:
+        # Imported late: a command that works does without it.
+        from dora_systemd.decisions.views.objects import error_object
+
+        _print_object("error", error_object(error))
+        return
+    print(f"doractl: {error.message}", file=sys.stderr)
+    if error.hint:
+        print(f"hint: {error.hint}", file=sys.stderr)
+
+
+def print_warning(text: str, is_json: bool) -> None:
+    """The same for a warning."""
+    if is_json:
+        _print_object("warning", {"message": text})
+    else:
+        print(f"doractl: {text}", file=sys.stderr)
+
+
+def _print_object(key: str, value: dict[str, Any]) -> None:
+    from dora_systemd.decisions.views.objects import format_json
+
+    print(format_json({key: value}), file=sys.stderr)

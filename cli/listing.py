@@ -1,6 +1,5 @@
 """`doractl list` without click, which takes longer to import than the list takes."""
 
-import json
 import os
 import sys
 from contextlib import suppress
@@ -11,11 +10,10 @@ from dora_systemd.decisions.views.dataflows import (
     DataflowRow,
     format_dataflows,
     is_up_word,
-    row_values,
 )
 from dora_systemd.errors import ExitCode
 from dora_systemd.scope import Scope, scope_of
-from dora_systemd.verbs.facts.list import read_rows
+from dora_systemd.verbs.facts.list import mark_enabled, read_rows
 
 _FLAGS: dict[str, dict[str, Any]] = {
     "-a": {"want_all": True},
@@ -64,27 +62,35 @@ def print_dataflows(request: ListRequest) -> int:
         return ExitCode.OK
     # Imported late: the table of all dataflows does without it, and is asked for most often.
     from dora_systemd.decisions.views.details import format_dataflow
+    from dora_systemd.decisions.views.objects import dataflow_object, format_json
     from dora_systemd.verbs.list import find_row
 
     row = find_row(bus, scope, request.selector)
     is_json = request.output == "json"
-    print(json.dumps(row_values(row), indent=2) if is_json else format_dataflow(row))
+    print(format_json(dataflow_object(row), indent=2) if is_json else format_dataflow(row))
     return ExitCode.OK if is_up_word(row) else ExitCode.NOT_RUNNING
 
 
 def _rows(bus: Bus, scope: Scope, request: ListRequest) -> list[DataflowRow]:
-    rows = read_rows(bus, scope, with_details=request.output == "json")
+    if request.output == "json":
+        from dora_systemd.verbs.list import all_rows
+
+        rows = all_rows(bus, scope)
+    else:
+        rows = read_rows(bus, scope, with_details=False)
     if not request.want_all:
         return [row for row in rows if is_up_word(row)]
     # Only dataflows that systemd has unloaded need the journal.
     from dora_systemd.verbs.facts.ended import ended_rows
 
-    return [*rows, *ended_rows(scope, rows)]
+    return mark_enabled(bus, scope, [*rows, *ended_rows(scope, rows)])
 
 
 def _print_all(rows: list[DataflowRow], request: ListRequest) -> None:
     if request.output == "json":
-        print(json.dumps([row_values(row) for row in rows], indent=2))
+        from dora_systemd.decisions.views.objects import dataflow_object, format_json
+
+        print(format_json(list(map(dataflow_object, rows)), indent=2))
     elif rows:
         print(format_dataflows(rows, _width()))
     else:

@@ -1,4 +1,4 @@
-"""The entry point of doractl, and the only place that prints its errors."""
+"""The entry point of doractl, and the only place that reports its errors."""
 
 import errno
 import os
@@ -7,7 +7,7 @@ from contextlib import suppress
 from typing import NoReturn
 
 from dora_systemd import __version__
-from dora_systemd.cli.edge import put_in_place
+from dora_systemd.cli.edge import asks_for_json, print_error, put_in_place
 from dora_systemd.errors import DoraSystemdError, ExitCode
 
 LIST_VERBS = ("list", "ps", "status")
@@ -35,13 +35,14 @@ def _leave(status: int) -> NoReturn:
 
 
 def run(arguments: list[str]) -> int:
-    """Run doractl; the exit status. Errors have been printed, in two lines."""
+    """Run doractl; the exit status. Errors have been printed, in two lines or as JSON."""
     try:
         status = _dispatch(arguments)
         if sys.stdout:
             sys.stdout.flush()
+        return status
     except DoraSystemdError as error:
-        return _report(error)
+        problem = error
     except BrokenPipeError:
         # The reader of our output is gone.
         _give_up_output()
@@ -49,14 +50,15 @@ def run(arguments: list[str]) -> int:
     except OSError as error:
         _give_up_output()
         what = "write output" if error.errno in _OUTPUT_ERRORS else "continue"
-        return _report(DoraSystemdError(f"cannot {what}: {error.strerror}", error.filename or ""))
+        problem = DoraSystemdError(f"cannot {what}: {error.strerror}", error.filename or "")
     except KeyboardInterrupt:
         return ExitCode.INTERRUPTED
     except Exception as error:
         if "DORACTL_DEBUG" in os.environ:
             raise
-        return _report(_mistake_of_ours(error))
-    return status
+        problem = _mistake_of_ours(error)
+    print_error(problem, asks_for_json(arguments))
+    return problem.code
 
 
 def _mistake_of_ours(error: Exception) -> DoraSystemdError:
@@ -92,13 +94,6 @@ def _dispatch(arguments: list[str]) -> int:
     from dora_systemd.cli.group import run_verb
 
     return run_verb(arguments)
-
-
-def _report(error: DoraSystemdError) -> int:
-    print(f"doractl: {error.message}", file=sys.stderr)
-    if error.hint:
-        print(f"hint: {error.hint}", file=sys.stderr)
-    return error.code
 
 
 if __name__ == "__main__":

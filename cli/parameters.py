@@ -1,19 +1,20 @@
 """Options and arguments that several verbs share."""
 
-import json
-from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, TypeVar
 
 import click
 
+from dora_systemd.cli.edge import print_warning
+from dora_systemd.decisions.views.objects import format_json
+from dora_systemd.decisions.views.outcome import Outcome, outcome_object
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope, scope_of
 
-if TYPE_CHECKING:
-    # Imported late: only some verbs print outcomes.
-    from dora_systemd.verbs.stop import Outcome
+C = TypeVar("C", bound=Callable[..., Any] | click.Command)
 
 _SCOPE_KEY = "dora_systemd.is_user"
+_OUTPUT_KEY = "dora_systemd.output"
 
 
 def _remember(ctx: click.Context, param: click.Parameter, value: bool | None) -> None:
@@ -33,14 +34,34 @@ scope_options = click.option(
 )
 """`--system` and `--user`, before or after the verb; the last one counts."""
 
-output_option = click.option(
-    "-o",
-    "--output",
-    type=click.Choice(["table", "json"]),
-    default="table",
-    show_default=True,
-    help="Table or JSON.",
-)
+
+def _output_option(is_exposed: bool) -> Callable[[C], C]:
+    return click.option(
+        "-o",
+        "--output",
+        type=click.Choice(["table", "json"]),
+        default="table",
+        show_default=True,
+        expose_value=is_exposed,
+        callback=_remember_output,
+        help="Table or JSON.",
+    )
+
+
+def _remember_output(ctx: click.Context, param: click.Parameter, value: str) -> str:
+    del param
+    ctx.meta[_OUTPUT_KEY] = value
+    return value
+
+
+output_option = _output_option(is_exposed=True)
+"""For a verb that has something to show."""
+
+
+def acting_options(command: C) -> C:
+    """For a verb that does something: scope_options, and `-o` for print_outcomes() and tell()."""
+    return _output_option(is_exposed=False)(scope_options(command))
+
 
 name_option = click.option(
     "--name",
@@ -55,9 +76,21 @@ def current_scope() -> Scope:
     return scope_of(click.get_current_context().meta.get(_SCOPE_KEY))
 
 
+def wants_json() -> bool:
+    """Whether the command line has `-o json`."""
+    context = click.get_current_context(silent=True)
+    return context is not None and context.meta.get(_OUTPUT_KEY) == "json"
+
+
 def print_json(value: Any) -> None:
-    """`value` as JSON, indented."""
-    click.echo(json.dumps(value, indent=2))
+    """An object or a list of objects as JSON, indented."""
+    click.echo(format_json(value, indent=2))
+
+
+def tell(text: str, err: bool = False) -> None:
+    """A line for people only."""
+    if not wants_json():
+        click.echo(text, err=err)
 
 
 def require_names_or_all(verb: str, selectors: Sequence[str], want_all: bool) -> None:
@@ -67,19 +100,26 @@ def require_names_or_all(verb: str, selectors: Sequence[str], want_all: bool) ->
         raise DoraSystemdError(f"cannot {verb}: give names or --all", hint, ExitCode.USAGE)
 
 
-def print_outcomes(outcomes: "Iterable[Outcome]") -> ExitCode:
-    """One line for each dataflow, at once; FAILURE if any has a problem."""
+def print_outcomes(outcomes: Iterable[Outcome]) -> ExitCode:
+    """One line or one JSON object for each outcome, at once; FAILURE if any has a problem."""
     status = ExitCode.OK
     for one in outcomes:
-        if one.problem:
-            click.echo(f"doractl: {one.problem}", err=True)
-            status = ExitCode.FAILURE
-        else:
-            click.echo(one.text)
+        _print_outcome(one)
+        status = ExitCode.FAILURE if one.problem else status
     return status
 
 
+def _print_outcome(one: Outcome) -> None:
+    if wants_json():
+        _, _, action = click.get_current_context().command_path.partition(" ")
+        click.echo(format_json(outcome_object(one, action)))
+    elif one.problem:
+        print_warning(one.problem, is_json=False)
+    else:
+        click.echo(one.text)
+
+
 def print_warnings(warnings: Iterable[str]) -> None:
-    """One line each, on standard error, without empty ones."""
+    """One line or one JSON object each, on standard error, without empty ones."""
     for warning in filter(None, warnings):
-        click.echo(f"doractl: {warning}", err=True)
+        print_warning(warning, wants_json())

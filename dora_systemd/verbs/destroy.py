@@ -16,6 +16,7 @@ from dora_systemd.adapters.host.process_table import read_processes
 from dora_systemd.adapters.host.unit_files import read_unit_file, remove_empty, remove_unit_file
 from dora_systemd.decisions.gateway.place import SERVICE_UNIT, SOCKET_UNIT
 from dora_systemd.decisions.unit.file import BOOT_TARGET
+from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import SLICE, name_from_unit
 from dora_systemd.scope import Scope
@@ -23,7 +24,7 @@ from dora_systemd.values import INFINITY, SECOND
 from dora_systemd.verbs.facts.cells import Cell, read_cell, read_cells
 from dora_systemd.verbs.facts.reading import slice_group
 from dora_systemd.verbs.facts.reason import failure_reason
-from dora_systemd.verbs.stop import Outcome, release_enabled
+from dora_systemd.verbs.stop import release_enabled
 from dora_systemd.verbs.up import written_files
 
 UNBOUNDED_SECONDS = 90.0
@@ -66,7 +67,7 @@ def stop_all(
         if not cells:
             return
         for outcome in _stop(manager, cells, want_kill, now):
-            given_up |= {outcome.cell.unit} if outcome.problem else set()
+            given_up |= {outcome.subject.unit} if outcome.problem else set()
             yield outcome
         release_enabled(manager, scope, [cell.unit for cell in cells])
 

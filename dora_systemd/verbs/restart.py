@@ -3,13 +3,13 @@
 from collections.abc import Mapping
 
 from dora_systemd.adapters.bus.manager import Manager, StageObserver
+from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.start.again import Asked
 from dora_systemd.verbs.start.job import start_unit
 from dora_systemd.verbs.start.launch import claim
 from dora_systemd.verbs.start.plan import StartRequest
-from dora_systemd.verbs.stop import Outcome
 
 
 def restart_asked(

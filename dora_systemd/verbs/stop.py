@@ -2,10 +2,9 @@
 
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import Protocol
 
 from dora_systemd.adapters.bus.manager import JOB_DONE, Manager, Observer
+from dora_systemd.decisions.views.outcome import Outcome, Subject
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
@@ -13,31 +12,6 @@ from dora_systemd.verbs.facts.enabled import enabled_units
 from dora_systemd.verbs.facts.reason import failure_reason, job_reason
 from dora_systemd.verbs.start.asked import note_request
 from dora_systemd.verbs.start.enable import read_boot_unit, release_transient
-
-
-class Dataflow(Protocol):
-    """A dataflow that systemd or only the journal knows."""
-
-    @property
-    def name(self) -> str:
-        """The name of the dataflow."""
-
-    @property
-    def uuid(self) -> str:
-        """The UUID of the dataflow."""
-
-    @property
-    def unit(self) -> str:
-        """The name of the unit."""
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """The result for one dataflow: `problem` is "" for success."""
-
-    cell: Dataflow
-    text: str
-    problem: str = ""
 
 
 def stop_cells(
@@ -99,10 +73,16 @@ def note_stop(cells: Iterable[Cell], command: str = "doractl stop") -> None:
             note_request("stop-asked", cell.name, cell.uuid, command)
 
 
+def not_running(subject: Subject, state: str) -> Outcome:
+    """The outcome for a dataflow that need not be stopped. state: as in "has failed"."""
+    text = f"Dataflow not running: {subject.uuid} ({subject.name} {state})"
+    return Outcome(subject, text, is_news=False)
+
+
 def _stop_outcome(manager: Manager, cell: Cell, result: str | None) -> Outcome:
     if result is None:
         ended = "has failed" if cell.state.active == "failed" else "does not run"
-        return Outcome(cell, f"Dataflow not running: {cell.uuid} ({cell.name} {ended})")
+        return not_running(cell, ended)
     if result != JOB_DONE:
         return Outcome(cell, "", f"cannot stop {cell.unit}: the job was {result}")
     state = manager.read(cell.unit, ["ActiveState", "Result"])

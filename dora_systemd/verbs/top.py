@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.decisions.resources.usage import Strain, waits
@@ -12,6 +13,7 @@ from dora_systemd.verbs.facts.list import row_of
 from dora_systemd.verbs.facts.reading import Reading, read_dataflow
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.facts.snapshot import read_strains
+from dora_systemd.verbs.facts.whole import whole_rows
 from dora_systemd.verbs.node import require_running
 
 _Seen = tuple[Reading, Mapping[str, Strain]]
@@ -38,11 +40,15 @@ class Top:
         """A snapshot of what is running; rates are since the last snapshot."""
         cells = [cell for cell in read_cells(self._manager) if cell.is_up]
         wanted = [cell for cell in cells if not self._units or cell.unit in self._units]
-        readings = (read_dataflow(self._manager, self._scope, cell) for cell in wanted)
+        readings = [read_dataflow(self._manager, self._scope, cell) for cell in wanted]
         seen = {one.cell.unit: (one, read_strains(one)) for one in readings}
         entries = [_entry(now, self._before.get(unit)) for unit, now in seen.items()]
         self._before = seen
-        return Look(time.time_ns() // 1000, entries)
+        rows = whole_rows(self._manager, self._scope, readings, [one.row for one in entries])
+        return Look(
+            time.time_ns() // 1000,
+            [replace(one, row=row) for one, row in zip(entries, rows, strict=True)],
+        )
 
 
 def _entry(now: _Seen, before: _Seen | None) -> TopEntry:

@@ -9,7 +9,7 @@ from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.decisions.life import nodes as node_table
 from dora_systemd.decisions.logs.query import scope_matches, story_matches
-from dora_systemd.decisions.views.dataflows import status_word
+from dora_systemd.decisions.views.dataflows import DataflowRow, status_word
 from dora_systemd.decisions.why.lives import (
     SHUTDOWN_MESSAGE,
     Life,
@@ -26,8 +26,10 @@ from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.budget import restart_budget
 from dora_systemd.verbs.facts.cells import Cell, read_cell, read_cells
 from dora_systemd.verbs.facts.ended import volatile_note
+from dora_systemd.verbs.facts.list import mark_enabled
 from dora_systemd.verbs.facts.reading import look_at_table, read_status
 from dora_systemd.verbs.facts.selector import Selector
+from dora_systemd.verbs.facts.whole import read_whole_rows
 
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 _MOST_RECORDS = 1000
@@ -143,3 +145,13 @@ def _words(records: Iterable[dict[str, object]]) -> list[Word]:
         if "DORA_EVENT" not in one and "DORA_NODE" in one
     ]
     return found[::-1]
+
+
+def subject_row(manager: Manager, scope: Scope, subject: Subject) -> DataflowRow:
+    """The dataflow of a report, as `list` knows it."""
+    cell = read_cell(manager, subject.unit) if subject.is_loaded else None
+    if cell is not None:
+        return read_whole_rows(manager, scope, [cell])[0]
+    known = DataflowRow(subject.uuid, subject.name, subject.unit, "", subject.file)
+    ended = Selector(subject.uuid).ended(scope) or known
+    return mark_enabled(manager, scope, [ended])[0]

@@ -176,7 +176,7 @@ def test_a_directory_whose_name_is_an_order(cell: Cell, project: Project) -> Non
     cell.start(project.write(f"{place}/dataflow.yml", SLEEPER))
     for words in (["list", cell.name], ["status", cell.name], ["why", cell.name]):
         assert r"evil\x1b]0;x\x07\u202e" in looked_at(cell, *words)
-    assert place in json.loads(looked_at(cell, "list", cell.name, "-o", "json"))["dataflow"]
+    assert place in json.loads(looked_at(cell, "list", cell.name, "-o", "json"))["file"]
 
 
 def test_lines_on_a_terminal(cell: Cell, project: Project) -> None:

@@ -76,7 +76,10 @@ def test_a_limit_of_the_unit_kills_the_leaking_node_alone(cell: Cell, project: P
         *("Degraded", "node-out-of-memory"),
         "sink",
     )
-    assert (found["details"]["owner"], found["details"]["limit"]) == ("dataflow", str(700 << 20))
+    assert (found["details"]["owner"], found["details"]["memory_limit_bytes"]) == (
+        "dataflow",
+        700 << 20,
+    )
     text = cell.doractl("why", cell.name).stdout
     assert re.search(r"\n  Memory: +peak \S+M, limit 700M of the dataflow\n", text), text
     assert f"doractl set {cell.name} --memory-limit" in text
@@ -101,7 +104,7 @@ def test_a_node_over_its_limit_is_killed_alone(cell: Cell, project: Project) -> 
     assert cell.pids("node-source") + cell.pids("node-doubler") == before
     cell.wait_exchanging("source")
     assert "out of memory, peak 300M, limit 300M" in cell.doractl("list", cell.name).stdout
-    (restart,) = why(cell)["restarts"][:1]
+    (restart,) = why(cell)["restart_history"][:1]
     assert (restart["node"], restart["reason"]) == ("sink", "out of memory, peak 300M, limit 300M")
     assert not [one for one in cell.events() if one[0] == "dataflow-oom"]
 

@@ -71,7 +71,7 @@ def test_start_as_json(cell: Cell, project: Project) -> None:
     started = json.loads(cell.start(flow, "-o", "json").stdout)
     assert started["name"] == cell.name
     assert started["unit"] == cell.unit
-    assert started["dataflow"] == str(flow)
+    assert started["details"]["file"] == str(flow)
     assert started["uuid"] in cell.show("ExecStart")
 
 

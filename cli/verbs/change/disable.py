@@ -3,15 +3,17 @@
 import click
 
 from dora_systemd.adapters.bus.systemd import Bus
-from dora_systemd.cli.parameters import current_scope, scope_options
+from dora_systemd.cli.parameters import acting_options, current_scope, print_outcomes
+from dora_systemd.decisions.views.outcome import Outcome
+from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.selector import find_all
 from dora_systemd.verbs.start.enable import disable_cell
 
 
 @click.command("disable")
 @click.argument("selectors", nargs=-1, required=True, metavar="SELECTOR...")
-@scope_options
-def command(selectors: tuple[str, ...]) -> None:
+@acting_options
+def command(selectors: tuple[str, ...]) -> int:
     """No longer start dataflows at boot. Running dataflows keep running.
 
     Removes what enable has created. A dataflow that is not enabled is not an error.
@@ -21,6 +23,10 @@ def command(selectors: tuple[str, ...]) -> None:
     """
     scope = current_scope()
     bus = Bus(scope)
-    for cell in find_all(bus, scope, selectors):
-        done = disable_cell(bus, scope, cell)
-        click.echo(f"Dataflow {'disabled' if done else 'not enabled'}: {cell.uuid} ({cell.name})")
+    chosen = find_all(bus, scope, selectors)
+    return print_outcomes(_disabled(cell, disable_cell(bus, scope, cell)) for cell in chosen)
+
+
+def _disabled(cell: Cell, is_news: bool) -> Outcome:
+    done = "disabled" if is_news else "not enabled"
+    return Outcome(cell, f"Dataflow {done}: {cell.uuid} ({cell.name})", is_news=is_news)

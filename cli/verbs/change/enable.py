@@ -3,16 +3,23 @@
 import click
 
 from dora_systemd.adapters.bus.systemd import Bus
-from dora_systemd.cli.parameters import current_scope, print_warnings, scope_options
+from dora_systemd.cli.parameters import (
+    acting_options,
+    current_scope,
+    print_outcomes,
+    print_warnings,
+)
+from dora_systemd.decisions.views.outcome import Outcome
+from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.selector import find_all
-from dora_systemd.verbs.start.enable import enable_cell
+from dora_systemd.verbs.start.enable import BootUnit, enable_cell
 from dora_systemd.verbs.start.linger import ensure_linger
 
 
 @click.command("enable")
 @click.argument("selectors", nargs=-1, required=True, metavar="SELECTOR...")
-@scope_options
-def command(selectors: tuple[str, ...]) -> None:
+@acting_options
+def command(selectors: tuple[str, ...]) -> int:
     """Start dataflows at every boot, as they run now.
 
     UUID and settings stay, and running dataflows keep running. The unit becomes a file that
@@ -24,9 +31,13 @@ def command(selectors: tuple[str, ...]) -> None:
     """
     scope = current_scope()
     bus = Bus(scope)
-    for cell in find_all(bus, scope, selectors):
-        boot, is_news = enable_cell(bus, scope, cell)
-        already = "" if is_news else " already"
-        click.echo(f"Dataflow{already} enabled: {cell.uuid} ({cell.name})")
-        click.echo(f"Unit file: {boot.path}")
+    chosen = find_all(bus, scope, selectors)
+    status = print_outcomes(_enabled(cell, *enable_cell(bus, scope, cell)) for cell in chosen)
     print_warnings([ensure_linger(scope)])
+    return status
+
+
+def _enabled(cell: Cell, boot: BootUnit, is_news: bool) -> Outcome:
+    already = "" if is_news else " already"
+    text = f"Dataflow{already} enabled: {cell.uuid} ({cell.name})\nUnit file: {boot.path}"
+    return Outcome(cell, text, is_news=is_news, details={"unit_file": str(boot.path)})

@@ -1,12 +1,21 @@
 """Change limits or hot reload of a running dataflow."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import click
 
 from dora_systemd.adapters.bus.systemd import Bus
-from dora_systemd.cli.parameters import current_scope, print_warnings, scope_options
+from dora_systemd.cli.parameters import (
+    acting_options,
+    current_scope,
+    print_outcomes,
+    print_warnings,
+)
 from dora_systemd.cli.settingoptions import live_options
+from dora_systemd.decisions.views.outcome import Outcome
+from dora_systemd.scope import Scope
+from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.reload import switch_hot_reload
 from dora_systemd.verbs.set import set_limits
@@ -16,8 +25,8 @@ from dora_systemd.verbs.set import set_limits
 @click.argument("selector")
 @live_options
 @click.option("--hot-reload", type=click.Choice(["on", "off"]), help="Turn hot reload on or off.")
-@scope_options
-def command(selector: str, hot_reload: str | None, **flags: Any) -> None:
+@acting_options
+def command(selector: str, hot_reload: str | None, **flags: Any) -> int:
     """Change limits or hot reload of a running dataflow.
 
     Changes take effect at once and survive restarts, until the dataflow is stopped; those of an
@@ -33,9 +42,17 @@ def command(selector: str, hot_reload: str | None, **flags: Any) -> None:
     scope = current_scope()
     bus = Bus(scope)
     cell = Selector(selector).find(bus)
+    done = _changes(bus, scope, cell, hot_reload, flags)
+    return print_outcomes(Outcome(cell, f"{one}: {cell.uuid} ({cell.name})") for one in done)
+
+
+def _changes(
+    bus: Bus, scope: Scope, cell: Cell, hot_reload: str | None, flags: dict[str, Any]
+) -> Iterator[str]:
+    """Make each change, then yield it."""
     if hot_reload is None or any(value not in (None, ()) for value in flags.values()):
         print_warnings(set_limits(bus, scope, cell, flags))
-        click.echo(f"Limits changed: {cell.uuid} ({cell.name})")
+        yield "Limits changed"
     if hot_reload is not None:
         switch_hot_reload(bus, scope, cell, hot_reload == "on")
-        click.echo(f"Hot reload {hot_reload}: {cell.uuid} ({cell.name})")
+        yield f"Hot reload {hot_reload}"

@@ -26,6 +26,6 @@ def command(selector: str, output: str) -> None:
     cell = Selector(selector).find(bus)
     files = unit_files(bus, cell)
     if output == "json":
-        print_json({"unit": cell.unit, "name": cell.name, "uuid": cell.uuid, "files": files})
+        print_json({"name": cell.name, "uuid": cell.uuid, "unit": cell.unit, "files": files})
     else:
         write_exactly(format_unit_files(files))

@@ -1,6 +1,5 @@
 """Show live resource usage of dataflows and nodes."""
 
-import json
 import sys
 import time
 
@@ -9,6 +8,7 @@ import click
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import current_scope, output_option, scope_options
 from dora_systemd.cli.screen import Screen
+from dora_systemd.decisions.views.objects import format_json
 from dora_systemd.decisions.views.top import SORTS, Look, format_summary, format_top, look_values
 from dora_systemd.errors import ExitCode
 from dora_systemd.verbs.top import Top
@@ -74,7 +74,7 @@ def command(
 def _print_objects(top: Top, interval: float, sort: str, is_once: bool) -> None:
     time.sleep(_FIRST_SECONDS)
     while True:
-        print(json.dumps(look_values(top.look(), sort)), flush=True)
+        print(format_json(look_values(top.look(), sort)), flush=True)
         if is_once:
             return
         time.sleep(interval)

@@ -10,9 +10,10 @@ from dora_systemd.adapters.journal.reader import JournalReader, check_readable
 from dora_systemd.cli.colors import wants_colors
 from dora_systemd.cli.edge import write_own
 from dora_systemd.cli.parameters import current_scope, output_option, print_json, scope_options
-from dora_systemd.decisions.why.report import format_report, report_values
+from dora_systemd.decisions.why.report import format_report
+from dora_systemd.decisions.why.report_object import report_object
 from dora_systemd.errors import ExitCode
-from dora_systemd.verbs.why import explain
+from dora_systemd.verbs.why import explain, subject_row
 
 
 @click.command("why")
@@ -31,9 +32,10 @@ def command(selector: str, output: str) -> int:
     """
     scope = current_scope()
     check_readable(scope)
-    report = explain(Bus(scope, for_reading=True), scope, selector, JournalReader())
+    bus = Bus(scope, for_reading=True)
+    report = explain(bus, scope, selector, JournalReader())
     if output == "json":
-        print_json(report_values(report))
+        print_json(report_object(report, subject_row(bus, scope, report.subject)))
         return ExitCode.OK
     is_terminal = sys.stdout.isatty()
     width = shutil.get_terminal_size().columns if is_terminal else None

@@ -3,7 +3,13 @@
 import click
 
 from dora_systemd.adapters.bus.systemd import Bus
-from dora_systemd.cli.parameters import current_scope, print_warnings, scope_options
+from dora_systemd.cli.parameters import (
+    acting_options,
+    current_scope,
+    print_outcomes,
+    print_warnings,
+)
+from dora_systemd.decisions.views.outcome import Outcome, Thing
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.setup import (
@@ -20,8 +26,8 @@ from dora_systemd.verbs.setup import (
 @click.option(
     "--remove", "want_removal", is_flag=True, help="Remove everything that setup has installed."
 )
-@scope_options
-def command(want_removal: bool) -> None:
+@acting_options
+def command(want_removal: bool) -> int:
     """Install dora.slice, dora.target, catalog, completions and manuals after pip install.
 
     Below /usr/local for the system, below ~/.local/share for a user; the Debian package contains
@@ -34,19 +40,23 @@ def command(want_removal: bool) -> None:
     """
     scope = current_scope()
     if not want_removal and (packaged := packaged_unit(scope)):
-        click.echo(f"Everything is installed by a package: {packaged}")
-        return
+        return _nothing(f"Everything is installed by a package: {packaged}")
     steps = plan_setup(scope)
     if want_removal:
         _check_use(scope)
     changed = take_away(steps) if want_removal else put_in_place(steps)
+    if not changed:
+        return _nothing("Nothing to remove." if want_removal else "Everything is installed.")
     word = "Removed" if want_removal else "Installed"
-    for path in changed:
-        click.echo(f"{word}: {path}")
-    if changed:
-        print_warnings(tell_systemd(Bus, scope))
-    else:
-        click.echo("Nothing to remove." if want_removal else "Everything is installed.")
+    status = print_outcomes(
+        Outcome(Thing(), f"{word}: {path}", details={"path": str(path)}) for path in changed
+    )
+    print_warnings(tell_systemd(Bus, scope))
+    return status
+
+
+def _nothing(text: str) -> int:
+    return print_outcomes([Outcome(Thing(), text, is_news=False)])
 
 
 def _check_use(scope: Scope) -> None:

@@ -5,8 +5,10 @@ import os
 import click
 
 from dora_systemd.adapters.bus.systemd import Bus
-from dora_systemd.cli.parameters import current_scope, scope_options
+from dora_systemd.cli.parameters import acting_options, current_scope, print_outcomes, tell
+from dora_systemd.decisions.gateway.place import SOCKET_UNIT
 from dora_systemd.decisions.gateway.port import wanted_port
+from dora_systemd.decisions.views.outcome import Outcome, Thing
 from dora_systemd.verbs.gateway import check_answer, read_gateway
 from dora_systemd.verbs.up import check_machine, open_port, start_boot_target
 
@@ -22,8 +24,8 @@ Use 'eval "$(doractl env)"' to connect the dora command to it"""
     metavar="PORT",
     help="Port of 127.0.0.1 to listen on; default: DORA_DAEMON_PORT, or 53290.",
 )
-@scope_options
-def command(port: int | None) -> None:
+@acting_options
+def command(port: int | None) -> int:
     """Open the port of the gateway, which acts as one coordinator for all dataflows.
 
     systemd holds the port and starts the gateway on the first connection. Dataflows, doractl start
@@ -40,15 +42,23 @@ def command(port: int | None) -> None:
     if now.is_up and wanted in (None, now.port):
         assert now.port is not None
         check_answer(scope, now.port)
-        click.echo(f"Daemon already running at: http://localhost:{now.port}{_USE}")
-        return
-    click.echo("Starting dora daemon...")
+        return _print_port("Daemon already running", now.port)
+    tell("Starting dora daemon...")
     check_machine(Bus, scope)
     opened = open_port(bus, scope, wanted)
-    click.echo(f"  ✓ Coordinator started on port {opened}")
+    tell(f"  ✓ Coordinator started on port {opened}")
     names = start_boot_target(bus, scope)
     check_answer(scope, opened)
-    click.echo("  ✓ Daemon ready")
+    tell("  ✓ Daemon ready")
     if names:
-        click.echo(f"  ✓ Enabled dataflows started: {', '.join(names)}")
-    click.echo(f"\nDaemon running at: http://localhost:{opened}{_USE}")
+        tell(f"  ✓ Enabled dataflows started: {', '.join(names)}")
+    return _print_port("\nDaemon running", opened, names)
+
+
+def _print_port(text: str, port: int, started: list[str] | None = None) -> int:
+    """started: the enabled dataflows that were started, None if the port was open before."""
+    url = f"http://localhost:{port}"
+    details = {"port": port, "url": url, "started": started or []}
+    is_news = started is not None
+    outcome = Outcome(Thing(SOCKET_UNIT), f"{text} at: {url}{_USE}", "", is_news, "", details)
+    return print_outcomes([outcome])

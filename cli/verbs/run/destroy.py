@@ -3,8 +3,10 @@
 import click
 
 from dora_systemd.adapters.bus.systemd import Bus
-from dora_systemd.cli.parameters import current_scope, print_outcomes, scope_options
+from dora_systemd.cli.parameters import acting_options, current_scope, print_outcomes, tell
+from dora_systemd.decisions.views.outcome import Outcome, Thing
 from dora_systemd.errors import ExitCode
+from dora_systemd.names import SLICE
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.destroy import (
     processes_left,
@@ -20,7 +22,7 @@ from dora_systemd.verbs.stop import note_stop
 
 @click.command("destroy")
 @click.option("--force", is_flag=True, help="Kill the nodes, instead of telling them to stop.")
-@scope_options
+@acting_options
 def command(force: bool) -> int:
     """Stop all dataflows, the gateway and dora.slice, and check that no process is left.
 
@@ -36,11 +38,11 @@ def command(force: bool) -> int:
     is_good = _stop_dataflows(bus, scope, force)
     was_up = read_gateway(bus).is_up
     if was_up:
-        click.echo("Shutting down daemon...")
+        tell("Shutting down daemon...")
     stop_gateway(bus, scope)
     others = stop_slice(bus)
     if was_up:
-        click.echo("  ✓ Daemon stopped")
+        tell("  ✓ Daemon stopped")
     return ExitCode.OK if _print_left(bus, scope, others) and is_good else ExitCode.FAILURE
 
 
@@ -48,22 +50,22 @@ def _stop_dataflows(bus: Bus, scope: Scope, force: bool) -> bool:
     """Print the results; whether all dataflows have stopped."""
     cells = running_cells(bus)
     if not cells:
-        click.echo("No dataflow is running.")
+        tell("No dataflow is running.")
         return True
     note_stop(cells, "doractl destroy")
-    click.echo("Stopping all dataflows...")
+    tell("Stopping all dataflows...")
     return print_outcomes(stop_all(bus, scope, force)) is ExitCode.OK
 
 
 def _print_left(bus: Bus, scope: Scope, others: list[str]) -> bool:
     """Print what is left; whether nothing of ours is."""
     if others:
-        click.echo(f"Not touched in dora.slice, not managed by doractl: {', '.join(others)}")
-    left = processes_left(bus, others)
-    for one in left:
-        click.echo(f"doractl: cannot end {one}", err=True)
-    if not left:
-        click.echo("Nothing is left: no process in dora.slice.")
-    if names := enabled_names(bus, scope):
-        click.echo(f"Still enabled: {', '.join(names)}; they start at the next boot.")
-    return not left
+        tell(f"Not touched in dora.slice, not managed by doractl: {', '.join(others)}")
+    names = enabled_names(bus, scope)
+    details = {"other_units": others, "enabled": names}
+    left = [("", f"cannot end {one}") for one in processes_left(bus, others)]
+    texts = left or [("Nothing is left: no process in dora.slice.", "")]
+    status = print_outcomes(Outcome(Thing(SLICE), *one, details=details) for one in texts)
+    if names:
+        tell(f"Still enabled: {', '.join(names)}; they start at the next boot.")
+    return status is ExitCode.OK

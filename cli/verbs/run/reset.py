@@ -4,10 +4,11 @@ import click
 
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import (
+    acting_options,
     current_scope,
     print_outcomes,
     require_names_or_all,
-    scope_options,
+    tell,
 )
 from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.facts.selector import selectors_of
@@ -17,7 +18,7 @@ from dora_systemd.verbs.stop import reset_cells
 @click.command("reset")
 @click.argument("selectors", nargs=-1, metavar="SELECTOR...")
 @click.option("-a", "--all", "want_all", is_flag=True, help="All dataflows that systemd knows.")
-@scope_options
+@acting_options
 def command(selectors: tuple[str, ...], want_all: bool) -> int:
     """Clear the failure of dataflows and reset their restart counters.
 
@@ -33,5 +34,5 @@ def command(selectors: tuple[str, ...], want_all: bool) -> int:
     cells = read_cells(bus)
     chosen = cells if want_all else [one.loaded(cells) for one in selectors_of(selectors, cells)]
     if want_all and not chosen:
-        click.echo("No dataflow.")
+        tell("No dataflow.")
     return print_outcomes(reset_cells(bus, list(dict.fromkeys(chosen))))

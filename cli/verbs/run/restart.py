@@ -8,7 +8,7 @@ import click
 
 from dora_systemd.adapters.bus.manager import tell_stage
 from dora_systemd.adapters.bus.systemd import Bus
-from dora_systemd.cli.parameters import current_scope, print_outcomes, scope_options
+from dora_systemd.cli.parameters import acting_options, current_scope, print_outcomes
 from dora_systemd.cli.stageline import StageLine
 from dora_systemd.verbs.restart import restart_asked
 from dora_systemd.verbs.start.again import find_known
@@ -17,7 +17,7 @@ from dora_systemd.verbs.stop import restart_cells
 
 @click.command("restart")
 @click.argument("selectors", nargs=-1, required=True, metavar="SELECTOR...")
-@scope_options
+@acting_options
 def command(selectors: tuple[str, ...]) -> int:
     """Restart dataflows and wait until all their nodes are ready again.
 

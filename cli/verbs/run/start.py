@@ -11,16 +11,16 @@ import click
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.edge import write_exactly
 from dora_systemd.cli.parameters import (
+    acting_options,
     current_scope,
     name_option,
-    output_option,
-    print_json,
+    print_outcomes,
     print_warnings,
-    scope_options,
+    tell,
 )
 from dora_systemd.cli.settingoptions import SettingsCommand, setting_options
 from dora_systemd.cli.stageline import StageLine
-from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
@@ -45,15 +45,13 @@ from dora_systemd.verbs.start.watch import watched_patterns
 @click.option("--no-wait", is_flag=True, help="Do not wait until all nodes are ready.")
 @click.option("--enable", "want_boot", is_flag=True, help="Also start it at every boot.")
 @click.option("--dry-run", is_flag=True, help="Print the unit and start nothing.")
-@output_option
-@scope_options
+@acting_options
 def command(
     dataflow: str,
     name: str | None,
     no_wait: bool,
     want_boot: bool,
     dry_run: bool,
-    output: str,
     **flags: Any,
 ) -> ExitCode:
     """Start the dataflow in FILE as the service dora-NAME.service.
@@ -85,7 +83,7 @@ def command(
         is_changed = bool(name or want_boot or dry_run or any(map(is_given, flags.values())))
         known = find_start(bus, scope, Selector(dataflow), is_changed)
         if isinstance(known, Cell):
-            return _start_known(bus, scope, known, not no_wait, output)
+            return _start_known(bus, scope, known, not no_wait)
         request = known.request(request)
     if dry_run:
         target = boot_target(Bus(scope), scope) if want_boot else None
@@ -102,32 +100,26 @@ def command(
         started = start_unit(bus, scope, options, claimed.properties, stage, not no_wait)
     # Only after the start: a refusal must be one line and a hint.
     print_warnings(start_notes(claimed.plan))
-    _print_started(started, options, watched_patterns(claimed.plan), output)
-    return ExitCode.OK
+    return _print_started(started, options.dataflow, watched_patterns(claimed.plan))
 
 
-def _start_known(bus: Bus, scope: Scope, cell: Cell, wait: bool, output: str) -> ExitCode:
+def _start_known(bus: Bus, scope: Scope, cell: Cell, wait: bool) -> ExitCode:
     """As systemctl start: what runs goes on running."""
-    started = Started(cell.uuid, cell.name, cell.unit, is_ready=cell.state.active == "active")
-    if cell.is_up and output != "json":
-        click.echo(f"Dataflow already running: {cell.uuid} ({cell.name})")
-        return ExitCode.OK
-    if not cell.is_up:
-        bus.hold(cell.unit)  # keep a failed transient unit
-        bus.reset_failed(cell.unit)
-        with _last_words(scope, cell.uuid), StageLine(sys.stderr) as stage:
-            started = start_unit(bus, scope, cell.options, None, stage, wait)
-    _print_started(started, cell.options, (), output)
-    return ExitCode.OK
+    file = cell.options.dataflow
+    if cell.is_up:
+        text = f"Dataflow already running: {cell.uuid} ({cell.name})"
+        details = {"file": file, "is_ready": cell.state.active == "active"}
+        return print_outcomes([Outcome(cell, text, is_news=False, details=details)])
+    bus.hold(cell.unit)  # keep a failed transient unit
+    bus.reset_failed(cell.unit)
+    with _last_words(scope, cell.uuid), StageLine(sys.stderr) as stage:
+        started = start_unit(bus, scope, cell.options, None, stage, wait)
+    return _print_started(started, file, ())
 
 
-def _print_started(
-    started: Started, options: RunnerOptions, watched: Sequence[str], output: str
-) -> None:
-    if output == "json":
-        print_json({**vars(started), "dataflow": options.dataflow})
-    else:
-        click.echo(format_started(started, watched))
+def _print_started(started: Started, file: str, watched: Sequence[str]) -> ExitCode:
+    details = {"file": file, "is_ready": started.is_ready}
+    return print_outcomes([Outcome(started, format_started(started, watched), details=details)])
 
 
 @contextmanager
@@ -138,5 +130,5 @@ def _last_words(scope: Scope, uuid: str) -> Iterator[None]:
     except DoraSystemdError as error:
         if error.code is ExitCode.FAILURE:
             for line in last_words(scope, uuid):
-                click.echo(f"  {line}", err=True)
+                tell(f"  {line}", err=True)
         raise

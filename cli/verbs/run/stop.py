@@ -8,22 +8,23 @@ import click
 from dora_systemd.adapters.bus.manager import tell_stage
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import (
+    acting_options,
     current_scope,
     print_outcomes,
     require_names_or_all,
-    scope_options,
+    tell,
 )
 from dora_systemd.cli.stageline import StageLine
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell, read_cells
 from dora_systemd.verbs.facts.selector import selectors_of
-from dora_systemd.verbs.stop import note_stop, stop_cells
+from dora_systemd.verbs.stop import not_running, note_stop, stop_cells
 
 
 @click.command("stop")
 @click.argument("selectors", nargs=-1, metavar="SELECTOR...")
 @click.option("-a", "--all", "want_all", is_flag=True, help="All dataflows that run.")
-@scope_options
+@acting_options
 def command(selectors: tuple[str, ...], want_all: bool) -> int:
     """Stop dataflows and wait until they have ended.
 
@@ -43,14 +44,14 @@ def command(selectors: tuple[str, ...], want_all: bool) -> int:
     if want_all:
         chosen = [cell for cell in cells if cell.is_up]
         if not chosen:
-            click.echo("No dataflow is running.")
+            tell("No dataflow is running.")
         return _stop(bus, scope, chosen)
     found = {one: one.only(cells) for one in selectors_of(selectors, cells)}
     for one in [one for one, cell in found.items() if cell is None]:
         row = one.ended(scope)
         if row is None:
             raise one.missing(cell.name for cell in cells)
-        click.echo(f"Dataflow not running: {row.uuid} ({row.name} {row.status.lower()})")
+        print_outcomes([not_running(row, row.status.lower())])
     return _stop(bus, scope, list(dict.fromkeys(cell for cell in found.values() if cell)))
 
 

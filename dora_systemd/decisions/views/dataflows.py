@@ -1,8 +1,8 @@
-"""The table of `doractl list` and its JSON, from facts of systemd and the runner."""
+"""The table of `doractl list`, from facts of systemd and the runner."""
 
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from dora_systemd.values import SECOND, format_rounded_size
 
@@ -234,29 +234,3 @@ def local_time(moment: int) -> str:
 def is_up_word(row: DataflowRow) -> bool:
     """Whether the dataflow is running, starting or stopping."""
     return row.status in UP_WORDS
-
-
-def row_values(row: DataflowRow) -> dict[str, Any]:
-    """The row for JSON: exact numbers with units in the keys, null for unknown."""
-    return {**_json_values(row), "nodes": [_json_values(node) for node in row.nodes]}
-
-
-def _json_values(row: DataflowRow | NodeRow) -> dict[str, Any]:
-    return {
-        _JSON_KEYS.get(key, key): value or None if key in _TIMES else value
-        for key, value in row._asdict().items()
-    }
-
-
-_TIMES = ("started", "since", "ended")
-_JSON_KEYS = {
-    "uptime": "uptime_us",
-    "started": "started_us",
-    "since": "since_us",
-    "ended": "ended_us",
-    "memory": "memory_bytes",
-    "memory_peak": "memory_peak_bytes",
-    "memory_limit": "memory_limit_bytes",
-    "cpu_limit": "cpu_limit_percent",
-    "throttled": "throttled_percent",
-}

@@ -40,6 +40,11 @@ def format_findings(findings: Sequence[Finding]) -> str:
     return "\n".join(lines)
 
 
-def finding_values(one: Finding) -> dict[str, str]:
+def finding_values(one: Finding) -> dict[str, str | None]:
     """The finding for JSON."""
-    return {"topic": one.topic, "state": one.state, "text": one.text, "remedy": one.remedy}
+    return {
+        "topic": one.topic,
+        "state": one.state,
+        "text": one.text,
+        "remedy": one.remedy or None,
+    }

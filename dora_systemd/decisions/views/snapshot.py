@@ -9,7 +9,8 @@ from typing import Any
 
 from dora_systemd.decisions.cell.status import LineCount
 from dora_systemd.decisions.resources.usage import Strain, Usage
-from dora_systemd.decisions.views.dataflows import DataflowRow, row_values
+from dora_systemd.decisions.views.dataflows import DataflowRow
+from dora_systemd.decisions.views.objects import dataflow_object
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class Observed:
 def observed_values(one: Observed) -> dict[str, Any]:
     """The snapshot for JSON; time counters in µs."""
     groups = {key: _counters(use, one.strains.get(key, Strain())) for key, use in one.usage.items()}
-    return {**row_values(one.row), "at_us": one.at_us, "groups": groups}
+    return {**dataflow_object(one.row), "monotonic_us": one.at_us, "groups": groups}
 
 
 def _counters(use: Usage, strain: Strain) -> dict[str, Any]:

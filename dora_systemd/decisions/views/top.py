@@ -16,15 +16,12 @@ from dora_systemd.decisions.views.dataflows import (
     format_table,
     format_uptime,
     node_count,
-    row_values,
 )
+from dora_systemd.decisions.views.objects import Shares, dataflow_object, moment
 
 SORTS = ("cpu", "memory", "name")
 HEADER = ("NAME", "STATE", "UPTIME", "CPU%", "MEM", "PEAK", "RESTARTS", "WAITS FOR")
 NOTHING = "No dataflow is running."
-
-Waits = Mapping[str, float]
-"""By resource, the percentage of the time in which some process waited for it."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +29,7 @@ class TopEntry:
     """A dataflow with its nodes. waits: by node, WHOLE_CELL is the whole dataflow."""
 
     row: DataflowRow
-    waits: Mapping[str, Waits] = field(default_factory=dict)
+    waits: Mapping[str, Shares] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -79,7 +76,7 @@ def _node_line(node: NodeRow, entry: TopEntry, look: Look) -> tuple[str, ...]:
 
 
 def _numbers(
-    row: DataflowRow | NodeRow, waits: Mapping[str, Waits], key: str
+    row: DataflowRow | NodeRow, waits: Mapping[str, Shares], key: str
 ) -> tuple[str, str, str, str, str]:
     shares = dict(waits.get(key, {}))
     if row.throttled:
@@ -110,15 +107,9 @@ def _counted(count: int, what: str) -> str:
 
 
 def look_values(look: Look, by: str) -> dict[str, Any]:
-    """The values for JSON: rows as in `doractl list`, and the waits in percent of the time."""
+    """The values for JSON: dataflows as in `doractl list`, with their waits."""
+    entries = sort_entries(look.entries, by)
     return {
-        "at_us": look.at_us,
-        "dataflows": [_entry_values(one) for one in sort_entries(look.entries, by)],
+        **moment("at", look.at_us),
+        "dataflows": [dataflow_object(one.row, one.waits) for one in entries],
     }
-
-
-def _entry_values(entry: TopEntry) -> dict[str, Any]:
-    values = row_values(entry.row)
-    for one in values["nodes"]:
-        one["waits_percent"] = dict(entry.waits.get(one["node"], {}))
-    return {**values, "waits_percent": dict(entry.waits.get(WHOLE_CELL, {}))}

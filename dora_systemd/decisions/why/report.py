@@ -1,10 +1,9 @@
-"""Formats the verdict of `doractl why`: as one screen of text, or as values for JSON."""
+"""Formats the verdict of `doractl why` as one screen of text."""
 
 import re
 import signal
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from dora_systemd.decisions.cell.exits import ExitKind, parse_exit
 from dora_systemd.decisions.cell.restarts import budget_words
@@ -14,9 +13,6 @@ from dora_systemd.decisions.why.sandbox_signs import sandbox_remedy
 from dora_systemd.decisions.why.verdict import Restart, Verdict
 from dora_systemd.terminal_text import one_line
 from dora_systemd.values import SECOND, format_duration, format_rounded_size
-
-_TOLD = ("event", "node", "nodes", "dataflow", "dataflow_name", "downstream", "cause", "reason")
-"""Details of an event that have their own keys in JSON."""
 
 LINES = 20
 """Maximum number of last lines to show."""
@@ -245,37 +241,3 @@ def _line(word: Word, node: str) -> str:
 def _todo(report: Report) -> list[str]:
     found = remedies(report)
     return ["What to do:", *(f"  {one}" for one in found)] if found else []
-
-
-def report_values(report: Report) -> dict[str, Any]:
-    """The report for JSON: exact numbers, with units in the keys."""
-    verdict, subject = report.verdict, report.subject
-    return {
-        "uuid": subject.uuid,
-        "name": subject.name,
-        "unit": subject.unit,
-        "dataflow": subject.file or None,
-        "status": verdict.status,
-        "is_failure": verdict.is_failure,
-        "cause": str(verdict.cause) or None,
-        "summary": verdict.summary or None,
-        "now": verdict.now or None,
-        "node": verdict.node or None,
-        "at_us": verdict.at_us or None,
-        "began_us": verdict.began_us or None,
-        "stopped_by": verdict.stopped_by or None,
-        "given_up": verdict.is_given_up,
-        "details": {k: text for k, text in verdict.details.items() if k not in _TOLD},
-        "starved": list(verdict.starved),
-        "restarts": [vars(one) for one in verdict.restarts],
-        "restart_budget": report.budget,
-        "before": {"summary": verdict.before, "at_us": verdict.before_us or None}
-        if verdict.before
-        else None,
-        "timeline": [
-            {"at_us": one.at_us, "event": one.name, "node": one.node or None, "text": one.text}
-            for one in verdict.timeline
-        ],
-        "last_lines": [vars(one) for one in report.words],
-        "remedies": remedies(report),
-    }

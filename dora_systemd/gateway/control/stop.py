@@ -8,6 +8,7 @@ from typing import Any
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.decisions.gateway.answers import stopped
 from dora_systemd.decisions.gateway.frames import Request
+from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.gateway.control.state import ended_result
 from dora_systemd.gateway.control.talk import Talk, find_by_uuid
@@ -15,7 +16,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.values import SECOND
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.selector import Selector
-from dora_systemd.verbs.stop import Outcome, note_stop, restart_cells, stop_cells
+from dora_systemd.verbs.stop import note_stop, restart_cells, stop_cells
 
 _KILL_FACTOR = 1.5
 """dora sends SIGTERM after the grace duration, and SIGKILL after 1.5 times that."""

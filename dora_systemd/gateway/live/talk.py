@@ -145,4 +145,5 @@ def _greeting(scope: Scope) -> dict[str, str]:
 
 
 def _snapshot(scope: Scope) -> list[dict[str, Any]]:
-    return [observed_values(one) for one in read_snapshot(Bus(scope, for_reading=True), scope)]
+    found = read_snapshot(Bus(scope, for_reading=True), scope, is_whole=True)
+    return [observed_values(one) for one in found]

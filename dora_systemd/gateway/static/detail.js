@@ -152,7 +152,7 @@ export class Detail {
     say(this.facts["Peak memory"].value, bytes(flow.memory_peak_bytes));
     this.facts["Peak memory"].node.hidden = flow.memory_peak_bytes == null;
     say(this.facts.UUID.value, flow.uuid);
-    say(this.facts.File.value, flow.dataflow);
+    say(this.facts.File.value, flow.file);
   }
 }
 

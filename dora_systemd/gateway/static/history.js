@@ -26,7 +26,7 @@ export class History {
         const key = `${flow.uuid} ${node}`;
         const facts = node ? flow.nodes.find((one) => one.node === node) : flow;
         seen.add(key);
-        this.#note(key, facts, counters, before?.groups[node], flow.at_us - (before?.at_us ?? 0));
+        this.#note(key, facts, counters, before?.groups[node], flow.monotonic_us - (before?.monotonic_us ?? 0));
       }
       this.last.set(flow.uuid, flow);
     }

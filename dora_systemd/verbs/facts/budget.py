@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any
 
 from dora_systemd.adapters.bus.manager import Manager
@@ -13,7 +14,8 @@ from dora_systemd.scope import Scope
 from dora_systemd.values import INFINITY
 from dora_systemd.verbs.facts.cells import Cell
 
-_PROPERTIES = ("Restart", "NRestarts", "StartLimitBurst", "StartLimitIntervalUSec")
+_READY_SINCE = "ActiveEnterTimestampMonotonic"
+_PROPERTIES = ("NRestarts", "StartLimitBurst", "StartLimitIntervalUSec", _READY_SINCE)
 _WAITING = ("RestartUSec", "StateChangeTimestampMonotonic")
 _MOST_STARTS = 1000
 
@@ -26,13 +28,15 @@ def restart_budget(
     status: from its runner. used, max: numbers of restarts. next_us, resets_us: µs until the next
     restart, and until the counter is reset; None: neither will happen.
     """
+    if manager.read(cell.unit, ["Restart"])["Restart"] == "no":
+        return None
     facts = manager.read(cell.unit, _PROPERTIES)
     window = facts["StartLimitIntervalUSec"]
-    if facts["Restart"] == "no" or window in (0, INFINITY):
+    if window in (0, INFINITY):
         return None
     most = max(facts["StartLimitBurst"] - 1, 0)
     budget = unit_budget(
-        _starts(scope, cell, facts["NRestarts"]),
+        _starts(scope, cell.uuid, facts["NRestarts"], (cell.state, facts[_READY_SINCE])),
         most,
         window,
         time.time_ns() // 1000,
@@ -46,15 +50,19 @@ def restart_budget(
     }
 
 
-def _starts(scope: Scope, cell: Cell, restarts: int) -> list[int]:
-    """The starts that NRestarts= counts, and the one before them; CLOCK_REALTIME µs."""
+@lru_cache
+def _starts(scope: Scope, uuid: str, restarts: int, _life: object) -> list[int]:
+    """The starts that NRestarts= counts, and the one before them; CLOCK_REALTIME µs.
+
+    _life: another one, or another state, asks the journal again; `top` and the page ask often.
+    """
     if not restarts:
         return []
     # Imported only after a restart, because the journal is slow.
     from dora_systemd.adapters.journal.reader import JournalReader
 
     try:
-        found = JournalReader().starts(scope, cell.uuid, min(restarts + 1, _MOST_STARTS))
+        found = JournalReader().starts(scope, uuid, min(restarts + 1, _MOST_STARTS))
     except DoraSystemdError:
         return []
     return sorted(found)

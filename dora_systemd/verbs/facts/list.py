@@ -18,7 +18,14 @@ from dora_systemd.scope import Scope
 from dora_systemd.values import INFINITY, SECOND
 from dora_systemd.verbs.facts.cells import Cell, read_cells
 from dora_systemd.verbs.facts.enabled import enabled_units
-from dora_systemd.verbs.facts.reading import STARTED, UP_SINCE, Reading, read_dataflow, slice_group
+from dora_systemd.verbs.facts.reading import (
+    ENDED,
+    STARTED,
+    UP_SINCE,
+    Reading,
+    read_dataflow,
+    slice_group,
+)
 
 
 def row_of(reading: Reading, before: Reading | None = None) -> DataflowRow:
@@ -38,6 +45,8 @@ def row_of(reading: Reading, before: Reading | None = None) -> DataflowRow:
         "restarts": unit["NRestarts"] + status.node_restarts,
         "problem": reading.problem,
     }
+    if not cell.is_up:
+        return DataflowRow(**facts, ended=unit.get(ENDED) or 0)
     if not reading.usage:
         return DataflowRow(**facts)
     samples = (before.sample,) if before else status.samples
@@ -58,9 +67,16 @@ def read_rows(manager: Manager, scope: Scope, with_details: bool = True) -> list
 
 
 def mark_enabled(manager: Manager, scope: Scope, rows: Sequence[DataflowRow]) -> list[DataflowRow]:
-    """The rows, with a mark on those that are started at boot."""
-    enabled = enabled_units(manager, scope)
-    return [row._replace(enabled=row.unit in enabled) for row in rows]
+    """The rows, with a mark on those that are started at boot.
+
+    Of several with the same unit it is the first one; the others are gone.
+    """
+    units = set(enabled_units(manager, scope))
+    marked = []
+    for row in rows:
+        marked.append(row._replace(enabled=row.unit in units))
+        units.discard(row.unit)
+    return marked
 
 
 def _life(reading: Reading) -> dict[str, Any]:

@@ -20,7 +20,8 @@ from dora_systemd.verbs.facts.cells import Cell
 
 UP_SINCE = "ActiveEnterTimestampMonotonic"
 STARTED = "InactiveExitTimestampMonotonic"
-_ALL = ("ControlGroup", "NRestarts", UP_SINCE, STARTED, "StatusText", "ActiveEnterTimestamp")
+ENDED = "InactiveEnterTimestamp"
+_ALL = ("ControlGroup", "NRestarts", UP_SINCE, STARTED, "StatusText", "ActiveEnterTimestamp", ENDED)
 
 
 class Reading(NamedTuple):

@@ -5,23 +5,32 @@ from collections.abc import Mapping
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.cgroup.strain import read_strain
 from dora_systemd.decisions.resources.usage import Strain
+from dora_systemd.decisions.views.dataflows import DataflowRow
 from dora_systemd.decisions.views.snapshot import Observed
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.facts.list import row_of
 from dora_systemd.verbs.facts.reading import Reading, read_dataflow
+from dora_systemd.verbs.facts.whole import whole_rows
 
 
-def read_snapshot(manager: Manager, scope: Scope) -> list[Observed]:
-    """All dataflows that systemd has loaded, including failed ones."""
-    return [observe(read_dataflow(manager, scope, cell)) for cell in read_cells(manager)]
+def read_snapshot(manager: Manager, scope: Scope, is_whole: bool = False) -> list[Observed]:
+    """All dataflows that systemd has loaded, including failed ones.
+
+    is_whole: with all that `list` knows of them, and not only what a reading shows.
+    """
+    readings = [read_dataflow(manager, scope, cell) for cell in read_cells(manager)]
+    rows = list(map(row_of, readings))
+    if is_whole:
+        rows = whole_rows(manager, scope, readings, rows)
+    return list(map(_observe, readings, rows))
 
 
-def observe(reading: Reading) -> Observed:
+def _observe(reading: Reading, row: DataflowRow) -> Observed:
     """What a reading shows of a dataflow, with its pressure stall information."""
     restarts = reading.unit["NRestarts"]
     return Observed(
-        row_of(reading),
+        row,
         reading.at_us,
         restarts,
         reading.usage,

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dora_systemd.decisions.life.causes import Cause
+from dora_systemd.decisions.views.dataflows import DataflowRow
 from dora_systemd.decisions.why.lives import (
     SHUTDOWN_MESSAGE,
     START_LIMIT_FUNCTION,
@@ -18,7 +19,8 @@ from dora_systemd.decisions.why.lives import (
     plain_text,
 )
 from dora_systemd.decisions.why.postmortem import UNKNOWN_PERSON, examine
-from dora_systemd.decisions.why.report import Report, Subject, Word, format_report, report_values
+from dora_systemd.decisions.why.report import Report, Subject, Word, format_report
+from dora_systemd.decisions.why.report_object import report_object
 from dora_systemd.decisions.why.verdict import Facts, Verdict
 
 Record = Mapping[str, Any]
@@ -320,4 +322,5 @@ def test_whatever_is_missing_there_is_a_verdict(
     verdict = examine(find_lives(found), facts, shutdowns)
     report = Report(SUBJECT, verdict)
     assert format_report(report, 80, want_colors=True)
-    assert report_values(report)["status"] == verdict.status
+    row = DataflowRow(SUBJECT.uuid, SUBJECT.name, SUBJECT.unit, "Stopped")
+    assert report_object(report, row)["status"] == verdict.status

@@ -9,8 +9,12 @@ LATE = {
         "cli.main": {"cli.group", "cli.completion", "cli.listing"},
     },
     "the table of list does without it": {
-        "cli.listing": {"verbs.list", "verbs.facts.ended", "decisions.views.details"},
+        "cli.listing": {
+            *("verbs.list", "verbs.facts.ended"),
+            *("decisions.views.details", "decisions.views.objects"),
+        },
         "names": {"difflib"},
+        "cli.edge": {"decisions.views.objects"},
     },
     "a Tab after a verb or an option does not ask for a dataflow": {
         "cli.completion": {"verbs.facts.cells", "verbs.facts.list", "verbs.facts.selector"},

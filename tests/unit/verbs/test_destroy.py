@@ -10,10 +10,10 @@ import pytest
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.decisions.gateway.place import SERVICE_UNIT, SOCKET_UNIT
 from dora_systemd.decisions.unit.file import BOOT_TARGET
+from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.names import SLICE
 from dora_systemd.verbs import destroy as destroy_module
 from dora_systemd.verbs.destroy import processes_left, stop_all, stop_gateway, stop_slice
-from dora_systemd.verbs.stop import Outcome
 from dora_systemd.verbs.up import PORT_FILE
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options
 
@@ -77,7 +77,7 @@ def test_everything_that_is_up_is_stopped(active: str, systemd: Systemd, scope: 
     systemd.add(options("a"), active=active, TimeoutStopUSec=17_000_000)
     systemd.add(options("b"), active="failed")
     systemd.add(options("robot"), TimeoutStopUSec=17_000_000)
-    assert {one.cell.name for one in destroy(systemd, scope)} == {"a", "robot"}
+    assert {one.subject.name for one in destroy(systemd, scope)} == {"a", "robot"}
     assert systemd.calls == [("StopUnit", "dora-a.service"), ("StopUnit", ROBOT)]
 
 
@@ -85,7 +85,7 @@ def test_one_that_ends_by_itself_meanwhile(systemd: Systemd, scope: ScopeIn) -> 
     systemd.add(options("a"), TimeoutStopUSec=17_000_000)
     systemd.add(options("robot"), TimeoutStopUSec=17_000_000)
     systemd.gone = {"dora-a.service"}
-    assert {one.cell.name for one in destroy(systemd, scope)} == {"a", "robot"}
+    assert {one.subject.name for one in destroy(systemd, scope)} == {"a", "robot"}
     assert systemd.calls == [("StopUnit", ROBOT)]
 
 
@@ -117,7 +117,7 @@ def test_what_somebody_starts_meanwhile_is_stopped(systemd: Systemd, scope: Scop
     systemd.add(options("a"), TimeoutStopUSec=3_000_000)
     names = []
     for ended in stop_all(systemd, scope, False, Clock()):
-        names.append(ended.cell.name)
+        names.append(ended.subject.name)
         if len(names) == 1:
             systemd.add(options("late"), TimeoutStopUSec=3_000_000)
     assert names == ["a", "late"]

@@ -7,11 +7,11 @@ from dora_systemd.decisions.views.dataflows import (
     NodeRow,
     format_dataflows,
     format_uptime,
-    row_values,
     shortest_prefixes,
     status_word,
 )
 from dora_systemd.decisions.views.details import format_dataflow
+from dora_systemd.decisions.views.objects import dataflow_object
 from dora_systemd.values import SECOND
 
 A = "550e8400-e29b-41d4-a716-446655440000"
@@ -117,9 +117,9 @@ def test_a_narrow_terminal() -> None:
 
 
 def test_json_has_null_for_unknown_times() -> None:
-    values = row_values(ROWS[1])
+    values = dataflow_object(ROWS[1])
     assert (values["started_us"], values["ended_us"]) == (None, None)
-    assert row_values(ROWS[0]._replace(started=5))["started_us"] == 5
+    assert dataflow_object(ROWS[0]._replace(started=5))["started_us"] == 5
 
 
 def test_one_dataflow() -> None:
@@ -164,7 +164,7 @@ def test_limits_stand_beside_what_is_used() -> None:
         "camera    Running   42  5.0/150        31.2  128M/1G  200M         0  -",
         "detector  Failed     -        -           -        -     -         3  exit code 1",
     ]
-    values = row_values(LIMITED)
+    values = dataflow_object(LIMITED)
     assert (values["memory_limit_bytes"], values["cpu_limit_percent"]) == (4 << 30, 200.0)
     assert values["nodes"][0]["throttled_percent"] == 31.25
     assert values["nodes"][1]["memory_limit_bytes"] is None
@@ -175,7 +175,7 @@ def test_one_dataflow_without_nodes() -> None:
 
 
 def test_json_has_units_in_its_keys() -> None:
-    values = row_values(ROWS[0])
+    values = dataflow_object(ROWS[0])
     assert values["uuid"] == A
     assert values["uptime_us"] == 332 * SECOND
     assert values["memory_bytes"] == 256 * 1024**2

@@ -87,5 +87,5 @@ def test_values_are_json() -> None:
     assert values["at_us"] == NOW
     assert robot["waits_percent"] == {"memory": 12.3, "io": 0.2}
     waits = {one["node"]: one["waits_percent"] for one in robot["nodes"]}
-    assert waits == {"camera": {}, "detector": {"cpu": 30.0}, "plot": {}}
+    assert waits == {"camera": None, "detector": {"cpu": 30.0}, "plot": None}
     assert robot["memory_bytes"] == 300 << 20

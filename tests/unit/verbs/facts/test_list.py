@@ -266,9 +266,13 @@ def test_starting_dataflow(scope: Scope) -> None:
 
 def test_failed_dataflow(scope: Scope) -> None:
     manager = FakeManager()
-    manager.add(options(), active="failed", StatusText="node camera failed")
+    facts = {"StatusText": "node camera failed", "InactiveEnterTimestamp": SECOND}
+    manager.add(options(), active="failed", **facts)
     row = row_of(manager, scope)
     assert (row.status, row.text, row.uptime) == ("Failed", "node camera failed", None)
+    assert row.ended == SECOND
+    manager.units["dora-robot.service"] |= {"ActiveState": "activating", "SubState": "auto-restart"}
+    assert row_of(manager, scope).ended == 0
 
 
 def test_a_row_is_found_by_selector(scope: Scope) -> None:

@@ -1,0 +1,102 @@
+"""The objects of `-o json`, described in dora-systemd-json(7). Pure.
+
+What is unknown is None, and becomes null. Units are in the keys. A point in time has two keys:
+`ended` is text in ISO 8601, `ended_us` is CLOCK_REALTIME µs. Other keys in `_us` are durations.
+"""
+
+import json
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from dora_systemd.decisions.cell.status import WHOLE_CELL
+from dora_systemd.decisions.views.dataflows import DataflowRow, NodeRow
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.values import SECOND
+
+SCHEMA = 1
+"""The version of all objects. New keys leave it; anything else makes it one more."""
+
+Shares = Mapping[str, float]
+"""By resource, the percentage of the time in which some process waited for it."""
+
+
+def format_json(value: Any, indent: int | None = None) -> str:
+    """`value` as text, in one line without `indent`; outermost objects begin with SCHEMA."""
+    stamped = list(map(_stamped, value)) if isinstance(value, list) else _stamped(value)
+    return json.dumps(stamped, indent=indent)
+
+
+def _stamped(value: Mapping[str, Any]) -> dict[str, Any]:
+    return {"schema": SCHEMA, **value}
+
+
+def moment(key: str, at_us: int) -> dict[str, Any]:
+    """A point in time in both forms; at_us: CLOCK_REALTIME µs, 0 is unknown."""
+    if not at_us:
+        return {key: None, f"{key}_us": None}
+    seconds, rest = divmod(at_us, SECOND)
+    text = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(seconds))
+    return {key: f"{text}.{rest:06}Z", f"{key}_us": at_us}
+
+
+def dataflow_object(row: DataflowRow, waits: Mapping[str, Shares] | None = None) -> dict[str, Any]:
+    """A dataflow with its nodes, the same wherever one is printed.
+
+    waits: by node, WHOLE_CELL is the whole dataflow; only `top` knows them.
+    """
+    shares = waits or {}
+    is_counted = row.nodes_total and not row.problem
+    return {
+        "name": row.name,
+        "uuid": row.uuid,
+        "unit": row.unit,
+        "file": row.dataflow or None,
+        "status": row.status,
+        "text": row.text or None,
+        "problem": row.problem or None,
+        "enabled": row.enabled,
+        "uptime_us": row.uptime,
+        **moment("started", row.started),
+        **moment("ended", row.ended),
+        "nodes_alive": row.nodes_alive if is_counted else None,
+        "nodes_total": row.nodes_total if is_counted else None,
+        **_usage(row, shares.get(WHOLE_CELL)),
+        "restarts": row.restarts,
+        "restart_budget": row.restart_budget,
+        "nodes": [_node_object(one, shares.get(one.node)) for one in row.nodes],
+    }
+
+
+def _node_object(row: NodeRow, shares: Shares | None) -> dict[str, Any]:
+    return {
+        "node": row.node,
+        "state": row.state,
+        "pid": row.pid or None,
+        "exit": row.exit or None,
+        **moment("since", row.since),
+        **_usage(row, shares),
+        "restarts": row.restarts,
+        "max_restarts": row.max_restarts,
+    }
+
+
+def _usage(row: DataflowRow | NodeRow, shares: Shares | None) -> dict[str, Any]:
+    return {
+        "cpu_percent": row.cpu_percent,
+        "cpu_limit_percent": row.cpu_limit,
+        "throttled_percent": row.throttled,
+        "memory_bytes": row.memory,
+        "memory_peak_bytes": row.memory_peak,
+        "memory_limit_bytes": row.memory_limit,
+        "waits_percent": shares or None,
+    }
+
+
+def error_object(error: DoraSystemdError) -> dict[str, Any]:
+    """What a command that fails prints, and the `error` of an outcome."""
+    return {
+        "message": error.message,
+        "hint": error.hint or None,
+        "exit_status": int(error.code),
+    }

@@ -1,0 +1,66 @@
+"""What a verb has done with one thing: a line for people, an object for programs."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Protocol
+
+from dora_systemd.decisions.views.objects import error_object
+from dora_systemd.errors import DoraSystemdError
+
+DONE, UNCHANGED, FAILED = "done", "unchanged", "failed"
+
+
+class Subject(Protocol):
+    """A dataflow, from wherever it is known."""
+
+    @property
+    def name(self) -> str:
+        """The name of the dataflow."""
+
+    @property
+    def uuid(self) -> str:
+        """The UUID of the dataflow."""
+
+    @property
+    def unit(self) -> str:
+        """The name of its unit."""
+
+
+class Thing(NamedTuple):
+    """What is no dataflow: another unit, or "" for a file."""
+
+    unit: str = ""
+    name: str = ""
+    uuid: str = ""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The result for one dataflow or Thing.
+
+    problem: "" for success. is_news: whether anything had to be done. details: what else a program
+    may need, by key.
+    """
+
+    subject: Subject
+    text: str
+    problem: str = ""
+    is_news: bool = True
+    node: str = ""
+    details: Mapping[str, Any] = field(default_factory=dict)
+
+
+def outcome_object(one: Outcome, action: str) -> dict[str, Any]:
+    """The outcome for JSON. action: the verb, such as "stop" or "node restart"."""
+    result = FAILED if one.problem else DONE if one.is_news else UNCHANGED
+    return {
+        "action": action,
+        "name": one.subject.name or None,
+        "uuid": one.subject.uuid or None,
+        "unit": one.subject.unit or None,
+        "node": one.node or None,
+        "result": result,
+        "text": one.text.strip().partition("\n")[0] or None,
+        "details": dict(one.details),
+        "error": error_object(DoraSystemdError(one.problem)) if one.problem else None,
+    }
