@@ -35,8 +35,6 @@ _KEY_KINDS = {
     "module": NodeKind.MODULE,
     "hub": NodeKind.HUB,
 }
-_KEYS = ("id", "inputs", "outputs", "env", "args", "name", "description", "build", "git")
-"""Keys of a node that are no misspelled kind of it."""
 _PATH_KINDS = {"dynamic": NodeKind.DYNAMIC, "shell": NodeKind.SHELL}
 UNEXPANDED = frozenset({NodeKind.MODULE, NodeKind.HUB})
 """Kinds that `dora expand` replaces: their outputs are declared elsewhere."""
@@ -136,7 +134,8 @@ def _kind_of(node: Mapping[str, object], source: str, what: str) -> NodeKind:
             return kind
     path = text_of(node.get("path"))
     if not path:
-        near = [did_you_mean(key, ("path", *_KEY_KINDS)) for key in node if key not in _KEYS]
+        kinds = ("path", *_KEY_KINDS)
+        near = (did_you_mean(key, kinds) for key in node if key not in kinds)
         hint = "a node needs one of path, operator, operators, ros2, module and hub"
         hint = next(filter(None, near), hint)
         raise refusal(source, f"{what} has no path", hint)
