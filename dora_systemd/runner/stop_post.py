@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.cgroup.strain import read_oom
 from dora_systemd.decisions.cell.status import CellStatus
-from dora_systemd.decisions.life.causes import Cause
+from dora_systemd.decisions.life.causes import UNIT_RESULTS, Cause
 from dora_systemd.decisions.logs.lines import Origin
 from dora_systemd.decisions.resources.oom import Owner, largest
 from dora_systemd.errors import DoraSystemdError
@@ -39,13 +39,6 @@ ALL_SECONDS = 8.0
 """For all steps together. systemd allows as much as for a stop, at least STOP_MARGIN in
 dora_systemd.decisions.life.stop_budget; the start of Python is part of that."""
 STREAMS = {".out": "stdout", ".err": "stderr"}
-
-
-_RESULTS = {
-    "watchdog": (Cause.WATCHDOG, "the supervisor process hung and was killed by the watchdog"),
-    "timeout": (Cause.TIMEOUT, "it did not start or stop in time and was killed"),
-}
-"""By SERVICE_RESULT of systemd."""
 
 
 def main(argv: list[str]) -> int:
@@ -70,7 +63,7 @@ def killed_by(environ: Mapping[str, str]) -> tuple[Cause, str]:
     if environ.get("EXIT_CODE", "") not in ("killed", "dumped") or result == "success":
         return Cause.RUNNER_KILLED, ""
     killed = f"the supervisor process was killed (SIG{environ.get('EXIT_STATUS', '')})"
-    return _RESULTS.get(result, (Cause.RUNNER_KILLED, killed))
+    return UNIT_RESULTS.get(result, (Cause.RUNNER_KILLED, killed))
 
 
 def write_last_words(

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from dora_systemd.decisions.cell.exits import ExitKind, exit_of, parse_exit
-from dora_systemd.decisions.life.causes import Cause
+from dora_systemd.decisions.life.causes import UNIT_RESULTS, Cause
 from dora_systemd.decisions.views.dataflows import FAILED, FINISHED, RESTARTING, STOPPED, UP_WORDS
 from dora_systemd.decisions.why.lives import Happening, Life, with_restarts
 from dora_systemd.decisions.why.verdict import Facts, Restart, Verdict
@@ -19,11 +19,6 @@ _LOSSES = (Cause.DAEMON_LOST, Cause.COORDINATOR_LOST)
 """Their events have the same names."""
 _END_WORDS = {"dataflow-finished": FINISHED, "dataflow-stopped": STOPPED, "dataflow-failed": FAILED}
 _ENDS = (*_END_WORDS, "unit-succeeded", "unit-failed")
-_RESULTS = {
-    "timeout": (Cause.TIMEOUT, "systemd ended it: it did not start or stop in time"),
-    "watchdog": (Cause.WATCHDOG, "the supervisor process hung and was killed by the watchdog"),
-    "oom-kill": (Cause.OUT_OF_MEMORY, "it ran out of memory"),
-}
 _KILLED = "the supervisor process was killed"
 _STATUS = re.compile(r"status=(\S+)")
 _OOM_SPAN = 10 * SECOND
@@ -163,8 +158,8 @@ def _cause_of(life: Life, end: Happening) -> Cause:
 def _unit_failure(life: Life, end: Happening) -> Verdict:
     """Without an event of the runner, systemd's result is all that is known."""
     result = end.detail("unit_result")
-    if result in _RESULTS:
-        cause, words = _RESULTS[result]
+    if result in UNIT_RESULTS:
+        cause, words = UNIT_RESULTS[result]
         return _found(cause, words, end)
     exit = life.last("process-exited")
     if exit is not None and _is_oom(exit, life):

@@ -135,7 +135,7 @@ CASES: dict[str, tuple[tuple[Record, ...], str, Cause, str, str]] = {
     ),
     "systemd lost patience": (
         (*RUNS, unit("unit-failed", UNIT_RESULT="timeout")),
-        *("Failed", Cause.TIMEOUT, "", "systemd ended it: it did not start or stop in time"),
+        *("Failed", Cause.TIMEOUT, "", "it did not start or stop in time and was killed"),
     ),
     "finished": (
         (*RUNS, event("dataflow-finished"), unit("unit-succeeded")),
