@@ -33,7 +33,8 @@ _UNIT_SUFFIXES = (
 )
 _UUID = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}")
 _ZERO_UUID = "00000000-0000-0000-0000-000000000000"
-_MIN_PREFIX = 4
+MIN_PREFIX = 4
+"""Minimum characters of the beginning of a UUID."""
 _HINT = (
     f"a name is 1 to {MAX_NAME} letters, digits, '.', '_' or '-', and begins with a letter or digit"
 )
@@ -116,12 +117,12 @@ def parse_uuid(text: str) -> str:
     raise DoraSystemdError(f"cannot read {quoted(text)} as a UUID", hint, ExitCode.USAGE)
 
 
-def is_uuid_prefix(text: str) -> bool:
+def is_uuid_prefix(text: str, at_least: int = MIN_PREFIX) -> bool:
     """Whether `text` can be the beginning of a UUID: 4 to 36 hexadecimal digits and dashes.
 
     With fewer than 4 characters, a typing error could stop the wrong dataflow.
     """
-    return len(text) >= _MIN_PREFIX and is_uuid(text.lower() + _ZERO_UUID[len(text) :])
+    return len(text) >= at_least and is_uuid(text.lower() + _ZERO_UUID[len(text) :])
 
 
 def check_known(problem: str, named: Iterable[str], nodes: Iterable[str]) -> None:

@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.cgroup.strain import read_oom
 from dora_systemd.decisions.cell.status import CellStatus
-from dora_systemd.decisions.life.causes import Cause
+from dora_systemd.decisions.life.causes import UNIT_RESULTS, Cause
 from dora_systemd.decisions.logs.lines import Origin
-from dora_systemd.decisions.resources.oom import largest
+from dora_systemd.decisions.resources.oom import Owner, largest
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.values import format_rounded_size
@@ -41,13 +41,6 @@ dora_systemd.decisions.life.stop_budget; the start of Python is part of that."""
 STREAMS = {".out": "stdout", ".err": "stderr"}
 
 
-_RESULTS = {
-    "watchdog": (Cause.WATCHDOG, "the supervisor process hung and was killed by the watchdog"),
-    "timeout": (Cause.TIMEOUT, "it did not start or stop in time and was killed"),
-}
-"""By SERVICE_RESULT of systemd."""
-
-
 def main(argv: list[str]) -> int:
     """Kill the nodes, and write their last lines and the event dataflow-failed."""
     deadline = time.monotonic() + ALL_SECONDS
@@ -55,12 +48,11 @@ def main(argv: list[str]) -> int:
     if not reason or len(argv) != 2 or not directory:
         return 0
     unit = unit_group()
-    if memory := out_of_memory(unit):
-        cause, reason = Cause.OUT_OF_MEMORY, memory
+    details = {"reason": reason, "cause": cause, **out_of_memory(unit)}
     with contextlib.suppress(OSError):
         kill_nodes(unit, KILL_SECONDS)
     left = deadline - time.monotonic()
-    write_last_words(argv[0], argv[1], Path(directory), reason, cause=cause, seconds=left)
+    write_last_words(argv[0], argv[1], Path(directory), details, seconds=left)
     return 0
 
 
@@ -71,21 +63,21 @@ def killed_by(environ: Mapping[str, str]) -> tuple[Cause, str]:
     if environ.get("EXIT_CODE", "") not in ("killed", "dumped") or result == "success":
         return Cause.RUNNER_KILLED, ""
     killed = f"the supervisor process was killed (SIG{environ.get('EXIT_STATUS', '')})"
-    return _RESULTS.get(result, (Cause.RUNNER_KILLED, killed))
+    return UNIT_RESULTS.get(result, (Cause.RUNNER_KILLED, killed))
 
 
 def write_last_words(
     name: str,
     uuid: str,
     directory: Path,
-    reason: str,
+    details: Mapping[str, str],
     journal_socket: str = "",
-    cause: str = "",
     seconds: float = ALL_SECONDS,
 ) -> None:
     """Write the content of the pipes below `directory`, and that the dataflow failed.
 
-    journal_socket: another socket than journald's, for tests. seconds: timeout for everything.
+    details: of that event. journal_socket: another socket than journald's, for tests. seconds:
+    timeout for everything.
     """
     deadline = time.monotonic() + seconds
     # Imported late: they take long, and the nodes are killed before that.
@@ -112,7 +104,7 @@ def write_last_words(
                 pipes.replay(path.stem, path)
                 pipes.drain(path.stem)
         read_logs_of_dora(loop, pipes, paths.io, min(DAEMON_SECONDS, seconds / 2))
-    pipes.write_event("dataflow-failed", reason=reason, cause=cause)
+    pipes.write_event("dataflow-failed", **details)
     pipes.close(max(deadline - time.monotonic() - READ_SECONDS, 0.0))
     journal.wait_read(READ_SECONDS)
     journal.close()
@@ -151,14 +143,21 @@ def unit_group() -> Path:
     return unit
 
 
-def out_of_memory(unit: Path) -> str:
-    """The reason if the kernel has killed the runner because of memory, else ""."""
+def out_of_memory(unit: Path) -> dict[str, str]:
+    """Details of dataflow-failed if the kernel has killed the runner because of memory, else {}."""
     if not read_oom(unit / cgroup.SUPERVISOR).kills:
-        return ""
+        return {}
     groups = cgroup.node_groups(unit)
     node, held = largest({key: cgroup.read_usage(one).memory or 0 for key, one in groups.items()})
     most = f"; the node {node} held most, {format_rounded_size(held)}" if node else ""
-    return f"the supervisor process was killed, out of memory{most}"
+    details = {
+        "reason": f"the supervisor process was killed, out of memory{most}",
+        "cause": str(Cause.OUT_OF_MEMORY),
+    }
+    if not read_oom(unit).refusals:
+        return {**details, "owner": Owner.MACHINE.value}
+    limit = cgroup.read_usage(unit).memory_max or 0
+    return {**details, "owner": Owner.DATAFLOW.value, "limit": str(limit)}
 
 
 def kill_nodes(unit: Path, seconds: float) -> None:

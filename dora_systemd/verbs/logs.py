@@ -30,7 +30,7 @@ from dora_systemd.decisions.logs.terminal import ShownLines, TerminalLines
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.values import quoted
-from dora_systemd.verbs.facts.ended import volatile_note
+from dora_systemd.verbs.facts.ended import not_recorded
 from dora_systemd.verbs.facts.selector import Selector
 
 _TURN = 1 << 14
@@ -76,9 +76,7 @@ def _select_dataflow(journal: JournalReader, query: LogQuery, selector: str) -> 
     fitting = wanted.meant(_Recorded("", uuid) for uuid in journal.known_uuids())
     found = wanted.only(_Recorded(journal.name_of(one.uuid), one.uuid) for one in fitting)
     if found is None:
-        error = wanted.missing(names)
-        error.hint += volatile_note()
-        raise error
+        raise not_recorded(wanted.missing(names))
     return replace(query, uuid=found.uuid, name=found.name)
 
 

@@ -1,4 +1,4 @@
-"""`doractl set`: changes limits of a running dataflow and its nodes, and makes them persistent.
+"""`doractl set`: changes limits of a dataflow and its nodes, and makes them persistent.
 
 systemd stores the limits of the dataflow, as for `systemctl set-property`. The limits of nodes are
 in a drop-in of ours beside systemd's. Drop-ins of a transient unit disappear with it, those of a
@@ -33,9 +33,9 @@ from dora_systemd.decisions.cell.limits import (
 )
 from dora_systemd.decisions.descriptor.nodes import UNEXPANDED
 from dora_systemd.decisions.properties.assignments import typed
-from dora_systemd.decisions.settings.limit_checks import size_warnings, use_warnings
+from dora_systemd.decisions.settings.limit_checks import check_use, size_warnings
 from dora_systemd.decisions.settings.limits import LIVE_SETTINGS, NODE_LIMIT
-from dora_systemd.decisions.settings.resolve import Settings, resolve_settings
+from dora_systemd.decisions.settings.resolve import resolve_settings
 from dora_systemd.decisions.unit.properties import format_unit, settings_properties
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
@@ -49,11 +49,16 @@ _PROPERTIES = ("ControlGroup", "Environment", "FragmentPath", "Transient")
 
 
 def set_limits(
-    manager: Manager, scope: Scope, cell: Cell, flags: Mapping[str, object]
+    manager: Manager,
+    scope: Scope,
+    cell: Cell,
+    flags: Mapping[str, object],
+    is_forced: bool = False,
 ) -> tuple[str, ...]:
-    """Change limits of a dataflow; warnings. flags: raw values by name of LIVE_SETTINGS.
+    """Change limits of a dataflow; warnings. If it does not run, they are those of its next start.
 
-    Raises DoraSystemdError; then nothing is changed.
+    flags: raw values by name of LIVE_SETTINGS. is_forced: also memory limits below the current
+    usage. Raises DoraSystemdError; then nothing is changed.
     """
     settings = resolve_settings(flags, {}, (), LIVE_SETTINGS)
     properties, nodes = settings_properties(settings), settings[NODE_LIMIT]
@@ -67,7 +72,11 @@ def set_limits(
     _check_nodes(scope, cell, nodes)
     require_controllers(manager, scope, properties, nodes)
     unit = manager.read(cell.unit, _PROPERTIES)
-    warnings = _warnings(settings, nodes, unit)
+    values = {limit.word: settings.values[key] for key, limit in BY_KEY.items()}
+    warnings = size_warnings(values, nodes, read_machine())
+    if unit["ControlGroup"] and not is_forced:
+        group = cgroup.group_path(unit["ControlGroup"])
+        check_use(values, nodes, cgroup.read_usage(group).memory, _held(group))
     # systemd stores drop-ins of a transient unit in /run in any case.
     is_fleeting = Path(unit["FragmentPath"]).is_relative_to("/run")
     # The kernel is the most likely to refuse, then systemd. `undo` reverts the steps before that.
@@ -105,16 +114,9 @@ def _check_nodes(scope: Scope, cell: Cell, limits: tuple[NodeLimits, ...]) -> No
     check_nodes(limits, kinds, [node for node, kind in kinds.items() if kind == "dynamic"])
 
 
-def _warnings(
-    settings: Settings, nodes: tuple[NodeLimits, ...], unit: Mapping[str, Any]
-) -> tuple[str, ...]:
-    values = {limit.word: settings.values[key] for key, limit in BY_KEY.items()}
-    warnings = size_warnings(values, nodes, read_machine())
-    if not unit["ControlGroup"]:
-        return warnings
-    path = cgroup.group_path(unit["ControlGroup"])
-    held = {node: cgroup.read_usage(one).memory for node, one in cgroup.node_groups(path).items()}
-    return (*warnings, *use_warnings(values, nodes, cgroup.read_usage(path).memory, held))
+def _held(group: Path) -> dict[str, int | None]:
+    """The memory of each node in bytes."""
+    return {node: cgroup.read_usage(one).memory for node, one in cgroup.node_groups(group).items()}
 
 
 def _remember(unit: Mapping[str, Any], nodes: tuple[NodeLimits, ...], undo: ExitStack) -> None:

@@ -25,7 +25,7 @@ from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.budget import restart_budget
 from dora_systemd.verbs.facts.cells import Cell, read_cell, read_cells
-from dora_systemd.verbs.facts.ended import volatile_note
+from dora_systemd.verbs.facts.ended import not_recorded
 from dora_systemd.verbs.facts.list import mark_enabled
 from dora_systemd.verbs.facts.reading import look_at_table, read_status
 from dora_systemd.verbs.facts.selector import Selector
@@ -60,8 +60,7 @@ def _select(manager: Manager, scope: Scope, selector: str) -> tuple[Cell | None,
     try:
         cell = wanted.find(manager)
     except DoraSystemdError as error:
-        error.hint += volatile_note()
-        raise
+        raise not_recorded(error) from error
     return cell, _subject(scope, cell)
 
 

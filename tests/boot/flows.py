@@ -6,11 +6,26 @@ from typing import Any
 
 from tests.deb import packages
 from tests.system.cells import run
+from tests.system.typed import Shell, replay
 
 NOTES = Path("/var/lib/dora-systemd-boot.json")
 ALICE, ROOT = packages.caller("alice"), packages.caller("root")
 VENV = Path("/opt/boot")
 """Of the nodes: it has their modules, but no dora command."""
+
+ROBOT = Path("/srv/robot")
+BEFORE, AFTER = (
+    (packages.CHECKOUT / "tests/system/transcripts/reboot.txt").read_text().split("$ reboot\n")
+)
+"""What a person types before and after the reboot."""
+
+
+def check_typed(text: str) -> None:
+    """The lines of that, as root types them beside the robot, show what they should."""
+    shell = Shell(ROOT, ROBOT)
+    wrong = replay(shell, text)
+    shell.end()
+    assert not wrong, "reboot.txt differs:\n" + "".join(wrong)
 
 
 def doractl(*words: str) -> str:

@@ -6,7 +6,7 @@ from typing import Any
 
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.scope import scope_of
-from tests.boot.flows import ALICE, NOTES, ROOT, doractl, listed
+from tests.boot.flows import AFTER, ALICE, NOTES, ROOT, check_typed, doractl, listed
 from tests.system.cells import run, wait_for
 
 # Asked often, and much faster than doractl in an emulated machine.
@@ -72,3 +72,7 @@ def test_what_was_before_the_reboot_is_explained() -> None:
     passing = why("passing")
     assert (passing["status"], passing["is_failure"]) == ("Stopped", False), passing
     assert passing["stopped_by"] == "the shutdown of the machine"
+
+
+def test_what_a_person_types_after_it() -> None:
+    check_typed(AFTER)

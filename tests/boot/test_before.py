@@ -5,7 +5,7 @@ import shutil
 from functools import partial
 from pathlib import Path
 
-from tests.boot.flows import ALICE, NOTES, ROOT, VENV, doractl, listed
+from tests.boot.flows import ALICE, BEFORE, NOTES, ROBOT, ROOT, VENV, check_typed, doractl, listed
 from tests.deb import packages
 from tests.system.cells import run, wait_for
 
@@ -56,3 +56,8 @@ def test_enable() -> None:
     assert notes.keys() == {"begun", "running", "gone", "never", "mine"}
     Path(gone).unlink()
     NOTES.write_text(json.dumps({**notes, "files": before}))
+
+
+def test_what_a_person_types_before_it() -> None:
+    flow(ROBOT)
+    check_typed(BEFORE)

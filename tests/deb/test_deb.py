@@ -221,9 +221,10 @@ def test_stop_and_start_after_that(flows: dict[str, Path]) -> None:
 def test_remove_stops_dataflows_and_leaves_configuration(before: set[str]) -> None:
     config = Path("/etc/dora-systemd/config.yml")
     config.write_text("grace_duration: 5s\n")
+    sh("systemctl start dora.target")  # as after a boot
     packages.apt("remove", "--yes", *packages.PACKAGES)
     assert not dora_processes()
-    assert "dora-" not in sh("systemctl list-units --all --plain --no-legend 'dora-*'").stdout
+    assert sh("systemctl list-units --all --plain --no-legend 'dora[-.]*'").stdout == ""
     assert left(before) == {str(config.parent), str(config)}
 
 

@@ -190,6 +190,27 @@ def test_limits_change_live_and_are_remembered(cell: Cell, project: Project) -> 
     assert not list(Path("/run/systemd").glob(f"*/{cell.unit}*")), "nothing is left of it"
 
 
+@pytest.mark.warns("oom", "OOM", "killed", "failed", "Failed", "Memory", "memory", "exited")
+def test_a_limit_that_kills_the_supervisor_process_is_named(cell: Cell, project: Project) -> None:
+    flow = project.write("dataflow.yml", ALONE)
+    project.write("sink.py", "from dora import Node\nfor event in Node():\n    pass\n")
+    cell.start(flow, "--memory-limit=300M")
+    done = cell.doractl("set", cell.name, "--memory-limit=5M", check=False)
+    words = r"cannot limit the memory of the dataflow to 5M: it uses \S+ now"
+    assert re.search(words, done.stderr), done.stderr
+    assert (done.returncode, control(cell, ".", "memory.max")) == (1, str(300 << 20))
+    cell.doractl("set", cell.name, "--memory-limit=5M", "--force", check=False)
+    wait_for("it has failed", lambda: cell.show("ActiveState") == "failed", 120)
+    found = why(cell)
+    assert (found["status"], found["cause"]) == ("Failed", "out-of-memory")
+    assert found["summary"].startswith("the supervisor process was killed, out of memory")
+    assert f"doractl set {cell.name} --memory-limit SIZE" in found["remedies"][0]
+    done = cell.doractl("set", cell.name, "--memory-limit=300M")
+    assert done.stdout.startswith("Limits changed for the next start: ")
+    cell.doractl("restart", cell.name)
+    assert control(cell, ".", "memory.max") == str(300 << 20)
+
+
 def test_changes_of_an_enabled_dataflow_stay_until_it_is_disabled(
     cell: Cell, project: Project
 ) -> None:

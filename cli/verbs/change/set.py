@@ -17,6 +17,7 @@ from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.selector import Selector
+from dora_systemd.verbs.node import require_running
 from dora_systemd.verbs.reload import switch_hot_reload
 from dora_systemd.verbs.set import set_limits
 
@@ -25,13 +26,14 @@ from dora_systemd.verbs.set import set_limits
 @click.argument("selector")
 @live_options
 @click.option("--hot-reload", type=click.Choice(["on", "off"]), help="Turn hot reload on or off.")
+@click.option("--force", is_flag=True, help="Set a memory limit below the current usage, too.")
 @acting_options
-def command(selector: str, hot_reload: str | None, **flags: Any) -> int:
+def command(selector: str, hot_reload: str | None, force: bool, **flags: Any) -> int:
     """Change limits or hot reload of a running dataflow.
 
     Changes take effect at once and survive restarts, until the dataflow is stopped; those of an
-    enabled dataflow, until it is disabled. infinity removes a limit. If one change is invalid,
-    nothing is changed.
+    enabled dataflow, until it is disabled. If it does not run, its next start has them. infinity
+    removes a limit. If one change is invalid, nothing is changed.
 
     Examples:
       doractl set robot --memory-limit 6G
@@ -42,17 +44,19 @@ def command(selector: str, hot_reload: str | None, **flags: Any) -> int:
     scope = current_scope()
     bus = Bus(scope)
     cell = Selector(selector).find(bus)
-    done = _changes(bus, scope, cell, hot_reload, flags)
+    if hot_reload is not None:
+        require_running(cell)
+    done = _changes(bus, scope, cell, hot_reload, flags, force)
     return print_outcomes(Outcome(cell, f"{one}: {cell.uuid} ({cell.name})") for one in done)
 
 
 def _changes(
-    bus: Bus, scope: Scope, cell: Cell, hot_reload: str | None, flags: dict[str, Any]
+    bus: Bus, scope: Scope, cell: Cell, hot_reload: str | None, flags: dict[str, Any], force: bool
 ) -> Iterator[str]:
     """Make each change, then yield it."""
     if hot_reload is None or any(value not in (None, ()) for value in flags.values()):
-        print_warnings(set_limits(bus, scope, cell, flags))
-        yield "Limits changed"
+        print_warnings(set_limits(bus, scope, cell, flags, force))
+        yield "Limits changed" if cell.is_up else "Limits changed for the next start"
     if hot_reload is not None:
         switch_hot_reload(bus, scope, cell, hot_reload == "on")
         yield f"Hot reload {hot_reload}"

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 from dora_systemd.decisions.descriptor.json_size import refusal
-from dora_systemd.names import MAX_NODE_ID, NODE_ID
+from dora_systemd.names import MAX_NODE_ID, NODE_ID, did_you_mean
 from dora_systemd.values import quoted
 
 _RESERVED_IDS = frozenset({"dora"})
@@ -134,7 +134,10 @@ def _kind_of(node: Mapping[str, object], source: str, what: str) -> NodeKind:
             return kind
     path = text_of(node.get("path"))
     if not path:
+        kinds = ("path", *_KEY_KINDS)
+        near = (did_you_mean(key, kinds) for key in node if key not in kinds)
         hint = "a node needs one of path, operator, operators, ros2, module and hub"
+        hint = next(filter(None, near), hint)
         raise refusal(source, f"{what} has no path", hint)
     if path in _PATH_KINDS:
         return _PATH_KINDS[path]

@@ -3,12 +3,13 @@
 import re
 from itertools import pairwise
 
+from dora_systemd.names import did_you_mean
 from dora_systemd.terminal_text import short_line, without_sequences
 
 _NUMBERED = re.compile(r"\d+: +")
 _OS_ERROR = re.compile(r"\(os error \d+\)$")
 _END = ("Location:", "Stack backtrace:", "Backtrace omitted", "Run with ")
-_CHOICES = re.compile(r", expected one of (?:`[^`]*`(?:, )?){6,}")
+_CHOICES = re.compile(r"`([^`]*)`, expected one of ((?:`[^`]*`(?:, )?){6,})")
 _BAD_VALUE = re.compile(r"data did not match any variant of untagged enum EnvValue")
 _VALUE_REASON = "a value names a variable that is not set (see --env), or is a list or mapping"
 _MAX_LENGTH = 300
@@ -26,7 +27,13 @@ def parse_dora_error(stderr: str) -> str:
     usage = [line for line in lines if line.startswith("error: ")][:1]
     last = [line for line in lines if line][-1:]
     reason = _innermost(_after(lines, "Caused by:")) or " ".join(headline or usage or last)
-    return short_line(_BAD_VALUE.sub(_VALUE_REASON, _CHOICES.sub("", reason)), _MAX_LENGTH)
+    return short_line(_BAD_VALUE.sub(_VALUE_REASON, _CHOICES.sub(_nearest, reason)), _MAX_LENGTH)
+
+
+def _nearest(choices: re.Match[str]) -> str:
+    """What was written, with the one of many choices that it was meant to be."""
+    near = did_you_mean(choices[1], re.findall("`([^`]*)`", choices[2]))
+    return f"`{choices[1]}`" + (f" ({near})" if near else "")
 
 
 def _after(lines: list[str], mark: str) -> list[str]:

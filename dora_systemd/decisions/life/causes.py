@@ -27,3 +27,11 @@ class Cause(StrEnum):
     STOPPED = "stopped"
     FINISHED = "finished"
     NONE = ""
+
+
+UNIT_RESULTS = {
+    "timeout": (Cause.TIMEOUT, "it did not start or stop in time and was killed"),
+    "watchdog": (Cause.WATCHDOG, "the supervisor process hung and was killed by the watchdog"),
+    "oom-kill": (Cause.OUT_OF_MEMORY, "it ran out of memory"),
+}
+"""What a Result= of systemd means, see SERVICE_RESULT in systemd.exec(5)."""

@@ -70,24 +70,25 @@ def size_warnings(
     return tuple(found)
 
 
-def use_warnings(
+def check_use(
     limits: Mapping[str, int | None],
     nodes: Iterable[NodeLimits],
     whole: int | None,
     held: Mapping[str, int | None],
-) -> tuple[str, ...]:
-    """A warning for each memory limit below the current usage.
+) -> None:
+    """Raise DoraSystemdError for the first memory limit below the current usage.
 
     limits: of the dataflow, by word. whole, held: bytes in use by it and by each node.
     """
     pairs = [("the dataflow", limits.get("memory"), whole)]
     pairs += [(f"the node {n.node}", dict(n.limits).get("memory"), held.get(n.node)) for n in nodes]
-    return tuple(
-        f"the limit memory={_shown('memory', limit)} of {whose} is less than it uses now: "
-        f"{_shown('memory', used)}; something may be killed"
-        for whose, limit, used in pairs
-        if limit is not None and used is not None and limit < used
-    )
+    for whose, limit, used in pairs:
+        if limit is not None and used is not None and limit < used:
+            raise DoraSystemdError(
+                f"cannot limit the memory of {whose} to {_shown('memory', limit)}: "
+                f"it uses {_shown('memory', used)} now",
+                "--force does it; the kernel may kill processes then",
+            )
 
 
 def _too_large(whose: str, limits: Mapping[str, int], machine: Machine) -> Iterator[str]:

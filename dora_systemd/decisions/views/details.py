@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 from dora_systemd.decisions.cell.restarts import budget_words
+from dora_systemd.decisions.life.refusal import FAILED as FAILED_BECAUSE
 from dora_systemd.decisions.views.dataflows import (
     DEGRADED,
     FAILED,
@@ -60,7 +61,7 @@ def format_dataflow(row: DataflowRow) -> str:
         ("Name", row.name),
         ("Unit", row.unit),
         ("File", row.dataflow or UNKNOWN),
-        ("Status", f"{row.status} ({row.text})" if row.text else row.status),
+        ("Status", _status_words(row)),
         ("Uptime", format_uptime(row.uptime)),
         ("Started", local_time(row.started)),
         ("Ended", local_time(row.ended) if row.ended else ""),
@@ -74,6 +75,12 @@ def format_dataflow(row: DataflowRow) -> str:
     )
     lines = [f"{title + ':':<10}{text}" for title, text in facts if text]
     return "\n".join([*lines, "", format_nodes(row.nodes)] if row.nodes else lines)
+
+
+def _status_words(row: DataflowRow) -> str:
+    """The status and STATUS= of the runner, which begins with the same word after a failure."""
+    text = row.text.removeprefix(FAILED_BECAUSE)
+    return f"{row.status} ({text})" if text else row.status
 
 
 def _cpu_words(row: DataflowRow) -> str:

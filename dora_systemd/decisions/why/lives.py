@@ -18,6 +18,7 @@ UNIT_MESSAGES = {
     "d9b373ed55a64feb8242e02dbe79a49c": "unit-failed",
     "98e322203f7a4ed290d09fe03c09fe15": "process-exited",
     "5eb03494b6584870a536b337290809b3": "unit-restart",
+    "fe6faa94e7774663a0da52717891d8ef": "unit-oom",
 }
 """systemd's own records about a unit: SD_MESSAGE_UNIT_* by MESSAGE_ID."""
 

@@ -7,23 +7,22 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 
-from dora_systemd.decisions.cell.exits import ExitKind, parse_exit
-from dora_systemd.decisions.life.causes import Cause
+from dora_systemd.decisions.cell.exits import ExitKind, exit_of, parse_exit
+from dora_systemd.decisions.life.causes import UNIT_RESULTS, Cause
 from dora_systemd.decisions.views.dataflows import FAILED, FINISHED, RESTARTING, STOPPED, UP_WORDS
 from dora_systemd.decisions.why.lives import Happening, Life, with_restarts
 from dora_systemd.decisions.why.verdict import Facts, Restart, Verdict
+from dora_systemd.values import SECOND
 
 _CRASHES = ("node-crashed", "node-oom")
 _LOSSES = (Cause.DAEMON_LOST, Cause.COORDINATOR_LOST)
 """Their events have the same names."""
 _END_WORDS = {"dataflow-finished": FINISHED, "dataflow-stopped": STOPPED, "dataflow-failed": FAILED}
 _ENDS = (*_END_WORDS, "unit-succeeded", "unit-failed")
-_RESULTS = {
-    "timeout": (Cause.TIMEOUT, "systemd ended it: it did not start or stop in time"),
-    "watchdog": (Cause.WATCHDOG, "the supervisor process hung and was killed by the watchdog"),
-    "oom-kill": (Cause.OUT_OF_MEMORY, "it ran out of memory"),
-}
+_KILLED = "the supervisor process was killed"
 _STATUS = re.compile(r"status=(\S+)")
+_OOM_SPAN = 10 * SECOND
+"""Maximum µs between systemd's records of an OOM kill and of the end of the killed process."""
 NO_END = "its end is not recorded: it was killed, or the machine went down"
 UNKNOWN_PERSON = "a request to systemd (by whom is not recorded)"
 
@@ -159,18 +158,26 @@ def _cause_of(life: Life, end: Happening) -> Cause:
 def _unit_failure(life: Life, end: Happening) -> Verdict:
     """Without an event of the runner, systemd's result is all that is known."""
     result = end.detail("unit_result")
-    if result in _RESULTS:
-        cause, words = _RESULTS[result]
+    if result in UNIT_RESULTS:
+        cause, words = UNIT_RESULTS[result]
         return _found(cause, words, end)
     exit = life.last("process-exited")
+    if exit is not None and _is_oom(exit, life):
+        return _found(Cause.OUT_OF_MEMORY, f"{_KILLED}, out of memory", end)
     how = _exit_words(exit) if exit else f"the unit failed: {result or 'systemd does not say how'}"
     return _found(Cause.UNIT_FAILED, how, end)
+
+
+def _is_oom(exit: Happening, life: Life) -> bool:
+    """Whether the kernel killed that process because of memory: systemd has noticed it then."""
+    is_kill = exit.detail("exit_status") in ("9", "KILL") and exit.detail("exit_code") == "killed"
+    return is_kill and any(abs(exit.at_us - oom.at_us) <= _OOM_SPAN for oom in life.all("unit-oom"))
 
 
 def _exit_words(exit: Happening) -> str:
     status = exit.detail("exit_status") or "unknown"
     if exit.detail("exit_code") != "exited":
-        return f"the supervisor process was killed (signal {status})"
+        return f"{_KILLED} ({exit_of(-int(status)) if status.isdecimal() else f'signal {status}'})"
     named = _STATUS.search(exit.text)  # such as "217/USER"
     return (
         f"systemd could not start the supervisor process: exit code {named[1] if named else status}"
@@ -228,5 +235,5 @@ def restarts_of(chain: Sequence[Life]) -> list[Restart]:
 _NO_NEWS = (
     *("node-ready", "node-exited", "unit-starting", "unit-started", "unit-stopping"),
     *("unit-stopped", "unit-succeeded", "unit-failed", "process-exited", "dataflow-stopping"),
-    *("cpu-throttled", "lines-suppressed"),
+    *("unit-oom", "cpu-throttled", "lines-suppressed"),
 )

@@ -23,6 +23,7 @@ _RED, _GREEN, _BOLD, _PLAIN = "\x1b[31m", "\x1b[32m", "\x1b[1m", "\x1b[0m"
 
 _AUTOMATIC = "run: doractl restart {name}; --restart-policy on-failure does this automatically"
 _OVERLOADED = "run: doractl restart {name}; check whether the machine was overloaded"
+_MORE_MEMORY = "doractl set {name} --memory-limit SIZE, or limit single nodes (--node-limit)"
 _REMEDIES = {
     Cause.NODE_FAILED: "fix {node}, then run: doractl restart {name}",
     Cause.NODE_HUNG: "find out what {node} waited for, or raise health_check_timeout: in its YAML",
@@ -39,13 +40,13 @@ _REMEDIES = {
     "ran out of processes, files or disk space",
     Cause.RUNNER_KILLED: _AUTOMATIC,
     Cause.WATCHDOG: _OVERLOADED,
-    Cause.OUT_OF_MEMORY: "limit single nodes (--node-limit NODE:memory=SIZE) to find which one",
+    Cause.OUT_OF_MEMORY: _MORE_MEMORY,
     Cause.UNIT_FAILED: "systemctl {flag} status {unit} shows what systemd did",
     Cause.TIMEOUT: "raise --start-timeout or --grace-duration",
     Cause.NO_END: "run: doractl start {file}; to start it at every boot, doractl enable {name}",
 }
 _MEMORY_REMEDIES = {
-    "dataflow": "doractl set {name} --memory-limit SIZE, or limit single nodes (--node-limit)",
+    "dataflow": _MORE_MEMORY,
     "machine": "the machine is short of memory: limit single nodes (--node-limit NODE:memory=SIZE)",
 }
 """By the owner of the exceeded memory limit, unless it is the node."""
@@ -120,7 +121,7 @@ def remedies(report: Report) -> list[str]:
 
 
 def _remedy(verdict: Verdict) -> str:
-    if verdict.cause is Cause.NODE_OUT_OF_MEMORY:
+    if verdict.cause in (Cause.NODE_OUT_OF_MEMORY, Cause.OUT_OF_MEMORY):
         owner = verdict.details.get("owner", "")
         return _MEMORY_REMEDIES.get(owner, _REMEDIES[verdict.cause])
     exit = parse_exit(verdict.details.get("exit", ""))

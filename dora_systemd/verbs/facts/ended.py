@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from dora_systemd.adapters.journal.reader import JournalReader, LastEvent, is_volatile
 from dora_systemd.decisions.views.dataflows import FAILED, FINISHED, STOPPED, DataflowRow
-from dora_systemd.errors import DoraSystemdError
+from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
 
@@ -19,9 +19,12 @@ def ended_rows(scope: Scope, rows: Sequence[DataflowRow] = ()) -> list[DataflowR
     return [ended_row(event) for event in _last_events(scope) if event.uuid not in known]
 
 
-def volatile_note() -> str:
-    """What the hint adds if a dataflow is not in the journal either."""
-    return "; the journal is volatile: a reboot empties it" if is_volatile() else ""
+def not_recorded(error: DoraSystemdError) -> DoraSystemdError:
+    """The error for a dataflow that is not in the journal either."""
+    if not is_volatile() or error.code is not ExitCode.NOT_FOUND:
+        return error
+    told = f"{error.message}, and the journal is volatile: a reboot empties it"
+    return DoraSystemdError(told, error.hint, error.code)
 
 
 def ended_row(event: LastEvent) -> DataflowRow:

@@ -4,6 +4,7 @@ from typing import Any
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.decisions.cell.exits import exit_of
+from dora_systemd.decisions.life.causes import UNIT_RESULTS
 from dora_systemd.decisions.life.refusal import FAILED, parse_refusal
 from dora_systemd.errors import DoraSystemdError
 
@@ -21,10 +22,9 @@ _REFUSED = {
 """Failures of systemd before it executed the runner: exit statuses of systemd.exec(5)."""
 
 _WORDS = {
+    **{result: words for result, (_, words) in UNIT_RESULTS.items()},
     "protocol": "its supervisor process ended without a message",
     "timeout": "it did not end in time and was killed",
-    "watchdog": "the supervisor process hung and was killed by the watchdog",
-    "oom-kill": "it ran out of memory",
     "start-limit-hit": "it was started too often",
     "resources": "systemd could not set it up",
     "exec-condition": "a condition was not met",

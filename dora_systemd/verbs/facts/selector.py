@@ -14,6 +14,7 @@ from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.decisions.views.dataflows import DataflowRow
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import (
+    MIN_PREFIX,
     UNIT_PREFIX,
     UNIT_SUFFIX,
     did_you_mean,
@@ -94,6 +95,8 @@ class Selector:
         """The error (NOT_FOUND) if nothing matches. names: of the dataflows that are known."""
         known = sorted(names)
         hint = did_you_mean(self.text, known)
+        if not hint and len(self.text) < MIN_PREFIX and is_uuid_prefix(self.text, 1):
+            hint = f"the beginning of a UUID must have at least {MIN_PREFIX} characters"
         if not hint and known:
             hint = f"known dataflows: {', '.join(known[:_SHOWN])}"
         hint = hint or "nothing is running; ended ones: doractl list --all"

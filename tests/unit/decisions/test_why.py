@@ -120,9 +120,24 @@ CASES: dict[str, tuple[tuple[Record, ...], str, Cause, str, str]] = {
         *("Failed", Cause.UNIT_FAILED, ""),
         "systemd could not start the supervisor process: exit code 217/USER",
     ),
+    "the kernel and its limit, and nothing of ours survived": (
+        (*RUNS, unit("unit-oom"),
+         unit("process-exited", EXIT_CODE="killed", EXIT_STATUS="9"),
+         unit("unit-failed", UNIT_RESULT="signal")),
+        *("Failed", Cause.OUT_OF_MEMORY, ""),
+        "the supervisor process was killed, out of memory",
+    ),
+    "killed long after the kernel killed a process of it": (
+        (*RUNS, unit("unit-oom"),
+         unit("process-exited", EXIT_CODE="killed", EXIT_STATUS="9",
+              __REALTIME_TIMESTAMP="20000000"),
+         unit("unit-failed", UNIT_RESULT="signal", __REALTIME_TIMESTAMP="20000001")),
+        *("Failed", Cause.UNIT_FAILED, ""),
+        "the supervisor process was killed (signal SIGKILL)",
+    ),
     "systemd lost patience": (
         (*RUNS, unit("unit-failed", UNIT_RESULT="timeout")),
-        *("Failed", Cause.TIMEOUT, "", "systemd ended it: it did not start or stop in time"),
+        *("Failed", Cause.TIMEOUT, "", "it did not start or stop in time and was killed"),
     ),
     "finished": (
         (*RUNS, event("dataflow-finished"), unit("unit-succeeded")),
@@ -183,6 +198,13 @@ def test_memory() -> None:
     text = format_report(Report(SUBJECT, judge(*RUNS, OOM, NODE_FAILED)))
     assert "Memory:   peak 300M, limit 300M\n" in text
     assert "doractl set robot --node-limit camera:memory=SIZE" in text
+
+
+def test_memory_of_the_dataflow() -> None:
+    end = {**failed("out-of-memory"), "DORA_OWNER": "dataflow", "DORA_LIMIT": "5242880"}
+    text = format_report(Report(SUBJECT, judge(*RUNS, end)))
+    assert "Memory:   limit 5M of the dataflow\n" in text
+    assert "doractl set robot --memory-limit SIZE" in text
 
 
 def test_memory_that_is_no_number() -> None:

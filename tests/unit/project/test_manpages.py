@@ -8,10 +8,13 @@ from typing import Any
 import click
 import pytest
 
+from dora_systemd.adapters.host import files
 from dora_systemd.cli.group import VERBS, doractl
 from dora_systemd.decisions.gateway.port import ADDRESS_VARIABLE, PORT_VARIABLE
+from dora_systemd.decisions.life.states import RunnerExit
 from dora_systemd.decisions.logs.events import EVENTS
 from dora_systemd.decisions.settings.kinds import Setting
+from dora_systemd.decisions.settings.schema import settings_model
 from dora_systemd.decisions.settings.table import SETTINGS
 from dora_systemd.errors import ExitCode
 from dora_systemd.verbs.start.settings import SYSTEM_FILE
@@ -68,6 +71,37 @@ def test_options_of_the_page_are_those_of_help(verb: str) -> None:
     assert documented == declared_options(all_verbs()[verb]) - COMMON
 
 
+@pytest.mark.parametrize("verb", sorted(all_verbs()))
+def test_values_and_defaults_are_those_of_help(verb: str) -> None:
+    """The default stands in the entry of an option; of several values it is the first."""
+    items = re.split(r"^\.It ", sections("doractl.1")[verb], flags=re.M)[1:]
+    for param in all_verbs()[verb].params:
+        if not isinstance(param, click.Option) or not (default := param.to_info_dict()["default"]):
+            continue
+        flag = param.opts[-1][1:]
+        (entry,) = (one for one in items if re.search(rf"Fl {flag}(?: |$)", one, flags=re.M))
+        assert re.search(
+            rf"\b{re.escape(f'{default:g}' if isinstance(default, float) else default)}\b", entry
+        )
+        if isinstance(param.type, click.Choice):
+            listed = entry.partition("\n")[0].partition("Cm ")[2].split(" | ")
+            assert listed == list(param.type.choices)
+            assert listed[0] == default
+
+
+@pytest.mark.parametrize("verb", sorted(all_verbs()))
+def test_synopses_are_those_of_help(verb: str) -> None:
+    (macros,) = re.findall(r"^\.D1 Nm Cm (.*)$", sections("doractl.1")[verb], flags=re.M)
+    text = re.sub(r"\b(?:Ar|No) ", "", macros).replace(r"\-", "-")
+    text = re.sub(r"Oo (.*?) Oc", r"[\1]", text)
+    shown = re.sub(r"\bOp (.*)", r"[\1]", text)
+    command = all_verbs()[verb]
+    context = click.Context(command, **doractl.context_settings)
+    usage = " ".join([verb, *command.collect_usage_pieces(context)])
+    usage = usage.replace("[OPTIONS]", "[OPTION...]").replace("]...", "...]")
+    assert shown.replace(" ...", "...") == usage
+
+
 def test_common_options() -> None:
     assert documented_options(sections("doractl.1")["Common options"]) == COMMON
 
@@ -75,6 +109,25 @@ def test_common_options() -> None:
 def test_exit_statuses() -> None:
     listed = re.findall(r"^\.It (\d+)$", sections("doractl.1")["EXIT STATUS"], flags=re.M)
     assert [int(number) for number in listed] == [int(code) for code in ExitCode]
+
+
+def test_exit_statuses_of_the_unit() -> None:
+    """All are in one paragraph, which says what each means."""
+    text = (MAN / "dora-systemd.7").read_text().partition("The exit status of the runner, ")[2]
+    listed = re.findall(r"\b(\d+)\b", text.partition(".Pp")[0])
+    assert [int(number) for number in listed] == [int(code) for code in RunnerExit]
+    run = sections("doractl.1")["EXIT STATUS"].partition("ends with the exit status of the")[2]
+    assert str(int(RunnerExit.ENGINE_LOST)) in run
+
+
+def test_settings_files_of_the_examples(tmp_path: Path) -> None:
+    text = sections("dora-systemd.yml.5")["EXAMPLES"]
+    blocks = re.findall(r"^\.Bd -literal.*\n((?:.*\n)*?)^\.Ed", text, flags=re.M)
+    assert len(blocks) == 2
+    for block in blocks:
+        path = tmp_path / "config.yml"
+        path.write_text(block)
+        settings_model(SETTINGS).model_validate(files.read_yaml(path))
 
 
 def entries() -> dict[str, str]:

@@ -59,11 +59,17 @@ def test_a_runner_that_was_killed_for_want_of_memory(tmp_path: Path) -> None:
     for name, held in (("supervisor", 1), ("node-a", 300), ("node-b", 500)):
         (tmp_path / name).mkdir()
         (tmp_path / name / "memory.current").write_text(str(held << 20))
-    assert out_of_memory(tmp_path) == ""
+    assert out_of_memory(tmp_path) == {}
     (tmp_path / "supervisor/memory.events").write_text("oom_kill 1\n")
-    assert out_of_memory(tmp_path) == (
-        "the supervisor process was killed, out of memory; the node b held most, 500M"
-    )
+    details = {
+        "reason": "the supervisor process was killed, out of memory; the node b held most, 500M",
+        "cause": "out-of-memory",
+    }
+    assert out_of_memory(tmp_path) == {**details, "owner": "machine"}
+    (tmp_path / "memory.events.local").write_text("oom 1\n")
+    (tmp_path / "memory.max").write_text(str(600 << 20))
+    limit = {"owner": "dataflow", "limit": str(600 << 20)}
+    assert out_of_memory(tmp_path) == {**details, **limit}
 
 
 def test_a_node_that_cannot_be_killed_is_left_to_systemd(tmp_path: Path) -> None:
@@ -92,7 +98,7 @@ def last_words(directory: Path) -> list[bytes]:
     path = directory / "socket"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as server:
         server.bind(str(path))
-        write_last_words("robot", UUID, directory, "killed", str(path))
+        write_last_words("robot", UUID, directory, {"reason": "killed"}, str(path))
         entries = []
         while True:
             try:

@@ -108,9 +108,23 @@ def test_changes_add_up(place: Place) -> None:
 
 def test_what_is_too_small_or_too_large_is_said(place: Place) -> None:
     (place.group / "memory.current").write_text(str(5 << 20))
-    warnings = place.set(node_limit=("camera:memory=2M",), cpu_limit="99999")
-    assert "than this machine has" in warnings[0]
-    assert warnings[1].startswith("the limit memory=2M of the node camera is less than it uses")
+    with pytest.raises(DoraSystemdError) as caught:
+        place.set(node_limit=("camera:memory=2M",))
+    told = "cannot limit the memory of the node camera to 2M: it uses 5M now"
+    assert (caught.value.message, "--force" in caught.value.hint) == (told, True)
+    assert (place.manager.calls, place.drop_in.exists()) == ([], False)
+    flags = {"node_limit": ("camera:memory=2M",), "cpu_limit": "99999"}
+    (warning,) = set_limits(place.manager, place.scope, place.cell, flags, is_forced=True)
+    assert "than this machine has" in warning
+    assert "camera:memory=2M" in place.drop_in.read_text()
+
+
+def test_a_limit_below_what_the_dataflow_uses(place: Place) -> None:
+    (place.root / "cgroup/unit/memory.current").write_text(str(300 << 20))
+    with pytest.raises(DoraSystemdError) as caught:
+        place.set(memory_limit="5M")
+    told = "cannot limit the memory of the dataflow to 5M: it uses 300M now"
+    assert (caught.value.message, place.manager.calls) == (told, [])
 
 
 @pytest.mark.parametrize(

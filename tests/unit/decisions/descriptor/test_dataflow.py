@@ -154,6 +154,18 @@ def test_bad_nodes(nodes: list[object], reason: str) -> None:
 
 
 @pytest.mark.parametrize(
+    ("key", "hint"),
+    [("paht", "did you mean path?"), ("oprator", "did you mean operator or operators?"),
+     ("outputs", "a node needs one of path, "), (7, "put the key in quotes")],
+)  # fmt: skip
+def test_a_misspelled_key(key: object, hint: str) -> None:
+    node = {"id": "a", key: "x", "inputs": {}, "git": "x", "description": "x"}
+    with pytest.raises(DoraSystemdError) as caught:
+        parse_dataflow({"nodes": [node]}, "robot.yml")
+    assert caught.value.hint.startswith(hint)
+
+
+@pytest.mark.parametrize(
     ("source", "reason"),
     [
         ("nobody/image", "a node that does not exist"),
@@ -251,6 +263,10 @@ Caused by:
     [
         (WIRING, "source node `b` mapped to input `a/a` does not exist"),
         (PARSING, "nodes[0]: unknown field `foo` at line 1"),
+        (
+            PARSING.replace("`foo`", "`paht`").replace("`g`", "`path`"),
+            "nodes[0]: unknown field `paht` (did you mean path?) at line 1",
+        ),
         (MISSING, "module file not found: m.yml: No such file or directory (os error 2)"),
         ("[ERROR]\ncannot connect\n\n  hint: x\n", "cannot connect"),
         ("error: unexpected argument '-x'\n\nUsage: dora\n", "error: unexpected argument '-x'"),

@@ -142,6 +142,11 @@ def test_one_dataflow() -> None:
     )
 
 
+def test_failed_is_said_once() -> None:
+    row = ROWS[0]._replace(status="Failed", text="failed: node a: exit code 1", nodes=())
+    assert "Status:   Failed (node a: exit code 1)\n" in format_dataflow(row)
+
+
 LIMITED = ROWS[0]._replace(
     memory_limit=4 << 30,
     memory_peak=300 << 20,

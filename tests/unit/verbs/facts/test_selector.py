@@ -79,7 +79,9 @@ def test_an_ambiguous_prefix_lists_what_it_fits(cells: list[Cell]) -> None:
     [
         ("robto", "did you mean robot?"),
         ("zzzz", "known dataflows: abcdef00, robot, vision"),
-        ("550", "known dataflows: abcdef00, robot, vision"),
+        ("550", "the beginning of a UUID must have at least 4 characters"),
+        ("55", "the beginning of a UUID must have at least 4 characters"),
+        ("5x", "known dataflows: abcdef00, robot, vision"),
     ],
 )
 def test_nothing_fits(cells: list[Cell], selector: str, hint: str) -> None:

@@ -1,0 +1,54 @@
+"""Twelve tasks as a person types them, from the first start to the end.
+
+Each is a text: tests/system/typed.py says how it is read. Where one differs, the whole of it is
+printed as it was really shown. Two of them need another lab: reboot.txt is replayed by tests/boot,
+uninstall.txt by tests/deb.
+"""
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.deb.packages import ROBOT
+from tests.system.cells import dora_processes, run, wait_for
+from tests.system.typed import Shell, replay
+
+# They have the name of the README's robot, and a journal that knows of no other.
+pytestmark = pytest.mark.lab
+
+HERE = Path(__file__).parent
+PLACE = Path("/srv/robot")
+ELSEWHERE = ("reboot", "uninstall")
+TASKS = [path for path in sorted(HERE.glob("*.txt")) if path.stem not in ELSEWHERE]
+
+
+@pytest.fixture
+def shell() -> Iterator[Shell]:
+    shutil.copytree(ROBOT, PLACE)
+    run("chmod", "--recursive", "a+rX", str(PLACE))
+    run("journalctl", "--quiet", "--rotate")
+    run("journalctl", "--quiet", "--vacuum-time=1us")
+    shell = Shell(("env",), PLACE)
+    yield shell
+    shell.end()
+    run("doractl", "disable", "robot", check=False)
+    run("doractl", "destroy", "--force")
+    run("systemctl", "reset-failed", "dora-robot", check=False)
+    run("umount", f"{PLACE}/records", check=False)
+    shutil.rmtree(PLACE)
+    wait_for("no process is left", lambda: not dora_processes())
+
+
+def needs(path: Path) -> list[pytest.MarkDecorator]:
+    """The lab that a task needs."""
+    return [pytest.mark.vm] if "Needs memory limits." in path.read_text() else []
+
+
+@pytest.mark.parametrize(
+    "path", [pytest.param(one, marks=needs(one), id=one.stem) for one in TASKS]
+)
+def test_task(path: Path, shell: Shell) -> None:
+    wrong = replay(shell, path.read_text())
+    assert not wrong, f"{path.name} differs:\n" + "".join(wrong)
