@@ -80,7 +80,7 @@ def test_running_dataflow(scope: Scope) -> None:
     }
     write_status(scope, CellStatus(stage="degraded", nodes=nodes, samples=(sample,)))
     row = row_of(manager, scope)
-    assert (row.status, row.restarts, row.nodes_alive, row.nodes_total) == ("Degraded", 3, 1, 2)
+    assert (row.status, row.restarts, row.nodes_alive, row.nodes_total) == ("Degraded", 1, 1, 2)
     assert row.uptime is not None
     assert 90 * SECOND <= row.uptime < 95 * SECOND
     assert row.cpu_percent == pytest.approx(50, rel=0.2)
@@ -266,9 +266,10 @@ def test_starting_dataflow(scope: Scope) -> None:
 
 def test_failed_dataflow(scope: Scope) -> None:
     manager = FakeManager()
-    manager.add(options(), active="failed", StatusText="node camera failed")
+    manager.add(options(), active="failed", StatusText="node camera failed", NRestarts=2)
     row = row_of(manager, scope)
     assert (row.status, row.text, row.uptime) == ("Failed", "node camera failed", None)
+    assert row.restarts == 2
 
 
 def test_a_row_is_found_by_selector(scope: Scope) -> None:
