@@ -9,7 +9,10 @@ LATE = {
         "cli.main": {"cli.group", "cli.completion", "cli.listing"},
     },
     "the table of list does without it": {
-        "cli.listing": {"verbs.list", "verbs.facts.ended", "decisions.views.details"},
+        "cli.listing": {
+            *("verbs.list", "verbs.facts.ended", "decisions.views.details"),
+            *("decisions.views.selection", "cli.colors"),
+        },
         "names": {"difflib"},
     },
     "a Tab after a verb or an option does not ask for a dataflow": {
@@ -18,6 +21,7 @@ LATE = {
     "the journal reader: only what is not in systemd, or has restarted, needs it": {
         "verbs.facts.budget": {"adapters.journal.reader"},
         "verbs.facts.selector": {"verbs.facts.ended"},
+        "verbs.list": {"verbs.facts.ended"},
         "runner.nodes.losses": {"adapters.journal.reader"},
     },
     "pydantic: only a settings file needs it": {

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from dora_systemd.adapters.cgroup import groups as cgroup
+from dora_systemd.adapters.journal.reader import JournalReader, LastEvent
 from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.cell.status import CellStatus, CpuSample, NodeStatus
 from dora_systemd.decisions.views.dataflows import DataflowRow, format_dataflows
@@ -272,8 +273,22 @@ def test_failed_dataflow(scope: Scope) -> None:
     assert row.restarts == 2
 
 
-def test_a_row_is_found_by_selector(scope: Scope) -> None:
+def test_a_row_is_found_by_selector(scope: Scope, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[dict[str, Any]] = []
+
+    def last_events(*_: object, **what: Any) -> list[LastEvent]:
+        asked.append(what)
+        return []
+
+    monkeypatch.setattr(JournalReader, "last_events", last_events)
     manager = FakeManager()
-    manager.add(options(), active="failed")
-    assert find_row(manager, scope, "robot").name == "robot"
+    manager.add(
+        options(),
+        active="failed",
+        StatusText="failed: node a: exit code 1",
+        InactiveEnterTimestamp=7,
+    )
+    row = find_row(manager, scope, "robot")
+    assert (row.name, row.text, row.ended) == ("robot", "node a: exit code 1", 7)
+    assert asked == [{"limit": 1, "name": "robot"}]
     assert read_status(scope, read_cells(manager)[0]) == CellStatus()
