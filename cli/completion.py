@@ -83,6 +83,7 @@ TYPES: dict[str, Any] = {
     "selectors": Live(dataflow_names),
     "node": Live(node_names),
     "nodes": Live(node_names),
+    "pattern": Live(dataflow_names),
     "level": click.Choice(["error", "warn", "info", "debug", "trace"]),
     "run": click.Choice(["CURRENT", "PREVIOUS", "ALL"]),
     "dataflow": click.File(),

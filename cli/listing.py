@@ -6,12 +6,13 @@ from contextlib import suppress
 from typing import Any, NamedTuple
 
 from dora_systemd.adapters.bus.systemd import Bus
+from dora_systemd.cli.edge import write_own
 from dora_systemd.decisions.views.dataflows import (
     DataflowRow,
     format_dataflows,
     is_up_word,
 )
-from dora_systemd.errors import ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope, scope_of
 from dora_systemd.verbs.facts.list import mark_enabled, read_rows
 
@@ -22,23 +23,42 @@ _FLAGS: dict[str, dict[str, Any]] = {
     "--system": {"is_user": False},
     "--output=json": {"output": "json"},
     "--output=table": {"output": "table"},
+    "-q": {"is_quiet": True},
+    "--quiet": {"is_quiet": True},
 }
 """What click makes of the options of `list`; test_command.py compares the two."""
 
+_MORE = "Why: doractl why NAME; all runs: doractl logs NAME --run ALL"
+"""Below a table with ended dataflows, for a person."""
+
 
 class ListRequest(NamedTuple):
-    """A `doractl list` command. is_user: None without --user and --system."""
+    """A `doractl list` command. is_user: None without --user and --system.
+
+    last: the maximum number of ended dataflows. status, pattern, sort_by: see matching_rows() and
+    sorted_rows().
+    """
 
     selector: str | None = None
     want_all: bool = False
     output: str = "table"
     is_user: bool | None = None
+    is_quiet: bool = False
+    last: int | None = None
+    status: str | None = None
+    pattern: str | None = None
+    sort_by: str | None = None
+
+    @property
+    def is_filtered(self) -> bool:
+        """Whether it has options that only the list of all dataflows has, and that are rare."""
+        return any(one is not None for one in (self.last, self.status, self.pattern, self.sort_by))
 
 
 def parse_list(arguments: list[str]) -> ListRequest | None:
-    """The request in `[--all] [--user|--system] [-o json|table] [SELECTOR]`, else None.
+    """The request in `[--all] [-q] [--user|--system] [-o json|table] [SELECTOR]`, else None.
 
-    None also for every wrong command line: click reports the error.
+    None also for other options, and for every wrong command line: click reports the error.
     """
     request = ListRequest()
     rest = iter(arguments)
@@ -54,7 +74,11 @@ def parse_list(arguments: list[str]) -> ListRequest | None:
 
 
 def print_dataflows(request: ListRequest) -> int:
-    """Print the list; NOT_RUNNING if a single dataflow was requested and is not up."""
+    """Print the list; NOT_RUNNING if a single dataflow was requested and is not up.
+
+    Raises DoraSystemdError: USAGE for options that exclude each other.
+    """
+    _check(request)
     scope = scope_of(request.is_user)
     bus = Bus(scope, for_reading=True)
     if request.selector is None:
@@ -66,9 +90,23 @@ def print_dataflows(request: ListRequest) -> int:
     from dora_systemd.verbs.list import find_row
 
     row = find_row(bus, scope, request.selector)
-    is_json = request.output == "json"
-    print(format_json(dataflow_object(row), indent=2) if is_json else format_dataflow(row))
+    if request.is_quiet:
+        print(row.uuid)
+    elif request.output == "json":
+        from dora_systemd.decisions.views.objects import dataflow_object, format_json
+
+        print(format_json(dataflow_object(row), indent=2))
+    else:
+        _print_view(format_dataflow(row, _width(), want_colors=_wants_colors()))
     return ExitCode.OK if is_up_word(row) else ExitCode.NOT_RUNNING
+
+
+def _check(request: ListRequest) -> None:
+    if request.is_quiet and request.output == "json":
+        raise DoraSystemdError("cannot use --quiet with JSON", "omit one of them", ExitCode.USAGE)
+    if request.selector is not None and request.is_filtered:
+        hint = "--last, --status, --name and --sort-by are for the list of all dataflows"
+        raise DoraSystemdError("cannot filter a single dataflow", hint, ExitCode.USAGE)
 
 
 def _rows(bus: Bus, scope: Scope, request: ListRequest) -> list[DataflowRow]:
@@ -78,23 +116,51 @@ def _rows(bus: Bus, scope: Scope, request: ListRequest) -> list[DataflowRow]:
         rows = all_rows(bus, scope)
     else:
         rows = read_rows(bus, scope, with_details=False)
-    if not request.want_all:
-        return [row for row in rows if is_up_word(row)]
-    # Only dataflows that systemd has unloaded need the journal.
-    from dora_systemd.verbs.facts.ended import ended_rows
+    found = [row for row in rows if is_up_word(row)]
+    if not request.want_all and not request.is_filtered:
+        return found
+    # Only dataflows that have ended need the journal, and few commands select some rows.
+    from dora_systemd.decisions.views.selection import is_of_the_past, matching_rows, sorted_rows
+    from dora_systemd.verbs.facts.ended import newest_ended
 
-    return mark_enabled(bus, scope, [*rows, *ended_rows(scope, rows)])
+    found = matching_rows(found, request.status, request.pattern)
+    if request.want_all or request.last or is_of_the_past(request.status):
+        is_every = request.status is None and request.pattern is None
+        past = newest_ended(bus, scope, rows, request.last if is_every else None)
+        past = mark_enabled(bus, scope, past)
+        found += matching_rows(past, request.status, request.pattern)[: request.last]
+    return sorted_rows(found, request.sort_by)
 
 
 def _print_all(rows: list[DataflowRow], request: ListRequest) -> None:
-    if request.output == "json":
+    if request.is_quiet:
+        print(*(row.uuid for row in rows), sep="\n", end="\n" if rows else "")
+    elif request.output == "json":
         from dora_systemd.decisions.views.objects import dataflow_object, format_json
 
         print(format_json(list(map(dataflow_object, rows)), indent=2))
     elif rows:
-        print(format_dataflows(rows, _width()))
+        width = _width()
+        _print_view(format_dataflows(rows, width, want_colors=_wants_colors()))
+        if width is not None and not all(map(is_up_word, rows)):
+            print(f"\n{_MORE}")
     else:
-        print("No dataflow." if request.want_all else "No dataflow is running.")
+        is_all = request.want_all or request.is_filtered
+        print("No dataflow." if is_all else "No dataflow is running.")
+
+
+def _print_view(text: str) -> None:
+    """Print a text in which nothing but our own colours can control the terminal."""
+    write_own(sys.stdout, f"{text}\n")
+
+
+def _wants_colors() -> bool:
+    # Imported late: most lists that are not for a terminal do without it.
+    if not sys.stdout.isatty() and "SYSTEMD_COLORS" not in os.environ:
+        return False
+    from dora_systemd.cli.colors import wants_colors
+
+    return wants_colors(sys.stdout)
 
 
 def _width() -> int | None:

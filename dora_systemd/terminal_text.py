@@ -30,6 +30,8 @@ def escaped(text: str) -> str:
 
 def one_line(text: str) -> str:
     """`text` escaped in one line: tabs and newlines become blanks."""
+    if text.isprintable():  # as nearly all are, and tables have many cells
+        return text
     return escaped(text.replace("\n", " ").replace("\t", " "))
 
 
@@ -39,6 +41,11 @@ def short_line(text: str, most: int) -> str:
     if len(line.encode()) <= most:
         return line
     return f"{line.encode()[: most - 3].decode(errors='ignore')}..."
+
+
+def cut(text: str, width: int | None) -> str:
+    """`text` with at most `width` characters, None for any number; an ellipsis is the last one."""
+    return text if width is None or len(text) <= width else f"{text[: max(width - 1, 0)]}…"
 
 
 def without_sequences(text: str) -> str:

@@ -1,7 +1,7 @@
 """`doractl list NAME` and JSON: all that is known of dataflows. The table does not load this."""
 
 from dora_systemd.adapters.bus.manager import Manager
-from dora_systemd.decisions.views.dataflows import DataflowRow
+from dora_systemd.decisions.views.dataflows import DataflowRow, is_up_word
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.facts.list import mark_enabled
@@ -19,4 +19,10 @@ def find_row(manager: Manager, scope: Scope, selector: str) -> DataflowRow:
     wanted, cells = Selector(selector), read_cells(manager)
     if not wanted.meant(cells) and (row := wanted.ended(scope)):
         return mark_enabled(manager, scope, [row])[0]
-    return read_whole_rows(manager, scope, [wanted.loaded(cells)])[0]
+    row = read_whole_rows(manager, scope, [wanted.loaded(cells)])[0]
+    if is_up_word(row):
+        return row
+    # Imported late: the journal is slow, and what runs does not need it.
+    from dora_systemd.verbs.facts.ended import read_end
+
+    return read_end(manager, scope, row)

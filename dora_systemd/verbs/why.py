@@ -79,12 +79,14 @@ def _subject(scope: Scope, cell: Cell) -> Subject:
 def _facts(manager: Manager, scope: Scope, cell: Cell) -> Facts:
     status, problem = look_at_table(scope, cell) if cell.is_up else (CellStatus(), "")
     nodes, spent = status.nodes.items(), node_table.spent(status.nodes)
+    unit = manager.read(cell.unit, ["StatusText", "NRestarts"])
     return Facts(
         status_word(cell.state.active, cell.state.sub, status.stage),
-        problem or str(manager.read(cell.unit, ["StatusText"])["StatusText"]),
+        problem or str(unit["StatusText"]),
         {key: spent.get(key, str(node.exit)) for key, node in nodes if node.state == "failed"},
         tuple(key for key, node in nodes if node.state == "restarting"),
         _now_boot(),
+        unit["NRestarts"],
     )
 
 

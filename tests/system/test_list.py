@@ -11,6 +11,7 @@ import pytest
 
 from dora_systemd.errors import ExitCode
 from tests.system.cells import Cell, Project, is_alive, run, wait_for
+from tests.system.terminal import shown
 
 
 def listed(cell: Cell, *words: str) -> dict[str, dict[str, Any]]:
@@ -119,6 +120,98 @@ def test_ended_dataflows(cell: Cell, project: Project) -> None:
         done = cell.doractl("list", selector, check=False)
         assert done.returncode == ExitCode.NOT_RUNNING
         assert "Status:   Stopped" in done.stdout
+
+
+CRASH = "from dora import Node\nNode()\nraise SystemExit(3)\n"
+CRASHING = "nodes: [{id: bad, path: bad.py, inputs: {t: dora/timer/millis/20}}]"
+CRASHES = ("crashed", "exit code 3", "ExitCode(3)", "Failed with", "failed: ", "restarted", "after")
+
+
+def crash(cell: Cell, project: Project, *words: str) -> None:
+    """Start a dataflow whose node fails, and wait for its end in the journal."""
+    project.write("bad.py", CRASH)
+    cell.start(project.write("bad.yml", CRASHING), *words, check=False)
+    wait_for("it has failed", lambda: cell.show("ActiveState") == "failed")
+    wait_for("it is recorded", lambda: ("dataflow-failed", "") in cell.events())
+
+
+@pytest.mark.warns(*CRASHES)
+def test_what_has_ended_and_why(cell: Cell, project: Project) -> None:
+    """One row for a name, whatever ran before under it."""
+    other = Cell(f"{cell.name}-two")
+    flow = project.three_nodes()
+    for _ in range(2):
+        other.start(flow)
+        other.doractl("stop", other.name)
+    crash(cell, project)
+    rows = cell.doractl("list", "--all").stdout.splitlines()
+    assert rows[0].split()[-3:] == ["BOOT", "ENDED", "WHY"]
+    assert len([row for row in rows if row.split()[1] == other.name]) == 1
+    newest, *older = rows[1:]
+    assert newest.split()[1:3] == [cell.name, "Failed"]
+    assert re.search(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d  node bad: exit code 3$", newest)
+    assert older[0].split()[1:3] == [other.name, "Stopped"]
+    last = cell.doractl("list", "--last", "1").stdout.splitlines()
+    assert last[1:] == [line for line in last if cell.name in line.split()]
+    screen = shown(
+        "doractl", cell.scope.flag, "list", "-a", COLUMNS="60", NO_COLOR="1"
+    ).splitlines()
+    assert max(map(len, screen)) <= 60
+    assert screen[-1] == "Why: doractl why NAME; all runs: doractl logs NAME --run ALL"
+    one = cell.doractl("list", cell.name, check=False).stdout
+    assert "Status:   Failed (node bad: exit code 3)\n" in one
+    assert "\nEnded:    2" in one
+
+
+@pytest.mark.warns(*CRASHES)
+def test_options_of_doras_own_list(cell: Cell, project: Project) -> None:
+    def uuids(*words: str) -> list[str]:
+        return cell.doractl("list", "-q", *words).stdout.splitlines()
+
+    uuid = json.loads(cell.start(project.three_nodes(), "-o", "json").stdout)["uuid"]
+    other = Cell(f"{cell.name}-two")
+    crash(other, project)
+    try:
+        assert uuids() == uuids("--status", "running") == uuids(cell.name) == [uuid]
+        failed = listed(cell, "--status", "failed")
+        assert failed[other.name]["status"] == "Failed"
+        assert cell.name not in failed
+        assert uuids("--status", "failed", "--last", "1") == [failed[other.name]["uuid"]]
+        assert uuids("--name", f"{cell.name[1:-1].upper()}*TWO", "-a")[0] != uuid
+        for column in ("cpu", "memory", "uptime", "name"):
+            assert uuids("--all", "--name", cell.name, "--sort-by", column)[0] == uuid
+        assert uuids("--name", "no-such-name") == []
+    finally:
+        other.end()
+
+
+@pytest.mark.warns(*CRASHES)
+def test_colors_by_state(cell: Cell, project: Project) -> None:
+    crash(cell, project)
+    command = ("doractl", cell.scope.flag, "list", "-a")
+    screen = shown(*command, COLUMNS="300")
+    assert screen.startswith("\x1b[4mUUID ")
+    assert re.search(rf"{cell.name} +\x1b\[31mFailed\x1b\[0m ", screen)
+    assert "\x1b" not in shown(*command, NO_COLOR="1")
+    assert "\x1b" not in run(*command).stdout
+    assert "\x1b[31mFailed" in run(*command, env={**os.environ, "SYSTEMD_COLORS": "1"}).stdout
+
+
+@pytest.mark.warns(*CRASHES)
+def test_restarts_have_one_meaning(cell: Cell, project: Project) -> None:
+    """Those of a node are dora's, and not among those of the dataflow."""
+    words = (
+        "--restart-policy",
+        "on-failure",
+        "--max-restarts",
+        "1",
+        "--max-restart-delay",
+        "500ms",
+    )
+    crash(cell, project, *words)
+    assert listed(cell, "--all")[cell.name]["restarts"] == int(cell.show("NRestarts")) == 0
+    assert "\nRestarts: 0\n" in cell.doractl("list", cell.name, check=False).stdout
+    assert "Restarts: bad 1 (exit code 3)\n" in cell.doractl("why", cell.name).stdout
 
 
 def test_unknown_selector(cell: Cell, project: Project) -> None:

@@ -176,13 +176,18 @@ class JournalReader:
         for line in _lines(["--output=json", "--reverse", "--quiet", *options, "--", *matches]):
             yield json.loads(line)
 
-    def last_events(self, scope: Scope, limit: int = 100) -> list[LastEvent]:
-        """The last life event of each of the `limit` newest dataflows, newest first."""
+    def last_events(
+        self, scope: Scope, limit: int = 100, name: str = "", is_by_name: bool = False
+    ) -> list[LastEvent]:
+        """The last life event of each of the `limit` newest dataflows, newest first.
+
+        name: only of those with that name. is_by_name: of each name instead of each UUID.
+        """
         matches = [f"DORA_EVENT=dataflow-{event}" for event in _LIFE_EVENTS]
         found: dict[tuple[str, str], LastEvent] = {}
-        for record in self.newest([*scope_matches(scope), *matches], None):
+        for record in self.newest([*scope_matches(scope, name), *matches], None):
             if event := _last_event(record):
-                found.setdefault((event.name, event.uuid), event)
+                found.setdefault((event.name, "" if is_by_name else event.uuid), event)
             if len(found) >= limit:
                 break
         return list(found.values())

@@ -110,11 +110,6 @@ class CellStatus(NamedTuple):
         """Number of nodes that are alive, including dynamic ones."""
         return sum(node.is_alive for node in self.nodes.values())
 
-    @property
-    def node_restarts(self) -> int:
-        """Restarts of all nodes in this run, by dora."""
-        return sum(node.restarts for node in self.nodes.values())
-
     def to_json(self) -> str:
         """The text of status.json."""
         values = self._asdict()

@@ -4,6 +4,7 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+from dora_systemd.terminal_text import cut, one_line
 from dora_systemd.values import SECOND, format_rounded_size
 
 STARTING, RUNNING, DEGRADED = "Starting", "Running", "Degraded"
@@ -139,68 +140,90 @@ def _prefix(uuid: str, others: Sequence[str]) -> str:
     return uuid[: next(free, len(uuid))]
 
 
-_OPTIONAL = ("BOOT", "RESTARTS", "UPTIME", "MEM", "CPU%")
+_OPTIONAL = (
+    *("BOOT", "PEAK", "PID", "THROTTLED%", "RESTARTS", "UPTIME", "MEM", "CPU%", "NODES", "UUID"),
+)
 """Columns that a narrow terminal does without, in this order."""
-_SHORTEST_NAME = 12
+_LEAST = 12
+_ROOM = {"NAME": _LEAST, "NODE": _LEAST, "WHY": 24, "EXIT": _LEAST}
+"""Columns whose cells may be cut to _LEAST, and the width for which other columns are left out."""
 _RIGHT_ALIGNED = frozenset({"CPU%", "THROTTLED%", "MEM", "PEAK", "RESTARTS", "PID", "UPTIME"})
+_RED, _YELLOW, _UNDERLINED, _PLAIN = "\x1b[31m", "\x1b[33m", "\x1b[4m", "\x1b[0m"
+_COLORS = {
+    FAILED: _RED,
+    **dict.fromkeys((STARTING, DEGRADED, STOPPING, RESTARTING, "Reloading"), _YELLOW),
+}
+"""By the word for a state, as in systemctl(1); others have none."""
+
+
+def colored_state(text: str, word: str) -> str:
+    """`text` with the first `word` in it in the colour of that state."""
+    color = _COLORS.get(word)
+    return text.replace(word, f"{color}{word}{_PLAIN}", 1) if color else text
 
 
 def format_table(
-    header: Sequence[str], rows: Sequence[Sequence[str]], width: int | None = None
+    header: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    width: int | None = None,
+    want_colors: bool = False,
 ) -> str:
     """Columns with two blanks between them, numbers right-aligned, without trailing blanks.
 
-    width: of the terminal. Then long names are cut, and the least important columns left out, until
-    the table fits.
+    width: of the terminal. Then the least important columns are left out, and long texts cut, until
+    the table fits. Nothing in a cell can control the terminal.
     """
-    lines = [list(header), *map(list, rows)]
+    columns = [[one_line(cell) for cell in column] for column in zip(header, *rows, strict=True)]
     if width is not None:
-        _fit(lines, width)
-    widths = _widths(lines)
-    return "\n".join(_line(lines[0], line, widths) for line in lines)
+        _fit(columns, width)
+    aligned = zip(*(_aligned(column, want_colors) for column in columns), strict=True)
+    titles, *lines = ("  ".join(cells).rstrip() for cells in aligned)
+    return "\n".join([f"{_UNDERLINED}{titles}{_PLAIN}" if want_colors else titles, *lines])
 
 
-def _widths(lines: Sequence[Sequence[str]]) -> list[int]:
-    return [max(map(len, column)) for column in zip(*lines, strict=True)]
-
-
-def _excess(lines: Sequence[Sequence[str]], width: int) -> int:
-    """By how much the table is wider than that."""
-    return sum(_widths(lines)) + 2 * (len(lines[0]) - 1) - width
-
-
-def _fit(lines: list[list[str]], width: int) -> None:
-    """Cut names, and if that is not enough, leave out columns."""
-    names = lines[0].index("NAME")
-    longest = max(len(line[names]) for line in lines)
+def _fit(columns: list[list[str]], width: int) -> None:
+    """Leave out columns, and cut texts, the last column first."""
     for title in _OPTIONAL:
-        if _excess(lines, width) <= max(longest - _SHORTEST_NAME, 0):
+        slack = sum(max(_width(one) - _ROOM.get(one[0], _width(one)), 0) for one in columns)
+        if _excess(columns, width) <= slack:
             break
-        place = lines[0].index(title)
-        for line in lines:
-            del line[place]
-    room = longest - max(_excess(lines, width), 0)
-    for line in lines:
-        if len(line[names]) > room:
-            line[names] = f"{line[names][: max(room, 2) - 1]}…"
+        columns[:] = [one for one in columns if one[0] != title]
+    for column in reversed(columns):
+        if column[0] in _ROOM and (excess := _excess(columns, width)) > 0:
+            column[:] = [cut(cell, max(_width(column) - excess, _LEAST)) for cell in column]
 
 
-def _line(header: Sequence[str], cells: Sequence[str], widths: Sequence[int]) -> str:
-    aligned = (
-        cell.rjust(width) if title in _RIGHT_ALIGNED else cell.ljust(width)
-        for title, cell, width in zip(header, cells, widths, strict=True)
-    )
-    return "  ".join(aligned).rstrip()
+def _width(column: Sequence[str]) -> int:
+    return max(map(len, column))
+
+
+def _excess(columns: Sequence[Sequence[str]], width: int) -> int:
+    """By how much the table is wider than that."""
+    return sum(map(_width, columns)) + 2 * (len(columns) - 1) - width
+
+
+def _aligned(column: Sequence[str], want_colors: bool) -> list[str]:
+    adjust = str.rjust if column[0] in _RIGHT_ALIGNED else str.ljust
+    cells = [adjust(cell, _width(column)) for cell in column]
+    if want_colors and column[0] in ("STATUS", "STATE"):
+        return [colored_state(cell, cell.split()[0]) for cell in cells]
+    return cells
 
 
 _HEADER = ("UUID", "NAME", "STATUS", "UPTIME", "NODES", "CPU%", "MEM", "RESTARTS", "BOOT")
 
 
-def format_dataflows(rows: Sequence[DataflowRow], width: int | None = None) -> str:
-    """The table of `doractl list`; for a terminal of that width."""
+def format_dataflows(
+    rows: Sequence[DataflowRow], width: int | None = None, want_colors: bool = False
+) -> str:
+    """The table of `doractl list`, for a terminal of that width.
+
+    With ENDED and WHY if any of them has ended.
+    """
     prefixes = shortest_prefixes([row.uuid for row in rows])
-    cells = [_dataflow_cells(row, prefixes[row.uuid]) for row in rows]
-    return format_table(_HEADER, cells, width)
+    header = _HEADER if all(map(is_up_word, rows)) else (*_HEADER, "ENDED", "WHY")
+    cells = [_dataflow_cells(row, prefixes[row.uuid])[: len(header)] for row in rows]
+    return format_table(header, cells, width, want_colors)
 
 
 def _dataflow_cells(row: DataflowRow, prefix: str) -> tuple[str, ...]:
@@ -210,10 +233,12 @@ def _dataflow_cells(row: DataflowRow, prefix: str) -> tuple[str, ...]:
         row.status,
         format_uptime(row.uptime),
         node_count(row) or UNKNOWN,
-        format_percent(row.cpu_percent),
+        format_cpu(row),
         format_memory(row.memory, row.memory_limit),
         format_count(row.restarts),
         "yes" if row.enabled else UNKNOWN,
+        local_time(row.ended),
+        UNKNOWN if is_up_word(row) else row.text or UNKNOWN,
     )
 
 

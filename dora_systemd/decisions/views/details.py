@@ -11,6 +11,7 @@ from dora_systemd.decisions.views.dataflows import (
     UNKNOWN,
     DataflowRow,
     NodeRow,
+    colored_state,
     format_count,
     format_cpu,
     format_memory,
@@ -19,14 +20,16 @@ from dora_systemd.decisions.views.dataflows import (
     format_uptime,
     local_time,
 )
+from dora_systemd.terminal_text import cut, one_line
 
 
-def format_nodes(rows: Sequence[NodeRow]) -> str:
-    """The node table of `doractl list SELECTOR`; with THROTTLED% if any node has a CPU limit."""
+def _format_nodes(rows: Sequence[NodeRow], width: int | None, want_colors: bool) -> str:
+    """The node table; with THROTTLED% if any node has a CPU limit."""
     cells = [_node_cells(row) for row in rows]
     is_limited = any(row.cpu_limit is not None for row in rows)
     header = [title for title in cells[0] if is_limited or title != _THROTTLED]
-    return format_table(header, [[row[title] for title in header] for row in cells])
+    lines = [[row[title] for title in header] for row in cells]
+    return format_table(header, lines, width, want_colors)
 
 
 _THROTTLED = "THROTTLED%"
@@ -54,8 +57,11 @@ def _restarts_of(row: NodeRow) -> str:
 _WITH_REASON = (FAILED, DEGRADED, RESTARTING)
 
 
-def format_dataflow(row: DataflowRow) -> str:
-    """The output of `doractl list SELECTOR`: the dataflow's values, then the table of its nodes."""
+def format_dataflow(row: DataflowRow, width: int | None = None, want_colors: bool = False) -> str:
+    """The output of `doractl list SELECTOR`: the dataflow's values, then the table of its nodes.
+
+    width: of the terminal. Nothing in the values can control it.
+    """
     facts = (
         ("Dataflow", row.uuid),
         ("Name", row.name),
@@ -73,8 +79,12 @@ def format_dataflow(row: DataflowRow) -> str:
         ("At boot", "started" if row.enabled else ""),
         ("Reason", f"doractl why {row.name}" if row.status in _WITH_REASON else ""),
     )
-    lines = [f"{title + ':':<10}{text}" for title, text in facts if text]
-    return "\n".join([*lines, "", format_nodes(row.nodes)] if row.nodes else lines)
+    lines = [cut(one_line(f"{title + ':':<10}{text}"), width) for title, text in facts if text]
+    if want_colors:
+        lines = [colored_state(one, row.status) if one[:7] == "Status:" else one for one in lines]
+    if not row.nodes:
+        return "\n".join(lines)
+    return "\n".join([*lines, "", _format_nodes(row.nodes, width, want_colors)])
 
 
 def _status_words(row: DataflowRow) -> str:

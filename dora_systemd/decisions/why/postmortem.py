@@ -9,6 +9,7 @@ from dataclasses import replace
 
 from dora_systemd.decisions.cell.exits import ExitKind, exit_of, parse_exit
 from dora_systemd.decisions.life.causes import UNIT_RESULTS, Cause
+from dora_systemd.decisions.reload.steps import How
 from dora_systemd.decisions.views.dataflows import FAILED, FINISHED, RESTARTING, STOPPED, UP_WORDS
 from dora_systemd.decisions.why.lives import Happening, Life, with_restarts
 from dora_systemd.decisions.why.verdict import Facts, Restart, Verdict
@@ -63,7 +64,7 @@ def examine(lives: Sequence[Life], facts: Facts, shutdowns: Sequence[int] = ()) 
         invocation=life.invocation,
         is_given_up=life.last("start-limit") is not None,
         starved=_starved(found, life),
-        restarts=tuple(restarts_of(chain)),
+        restarts=tuple(_counted(restarts_of(chain), life, facts)),
         timeline=tuple(one for one in happenings if one.name not in _NO_NEWS),
         before=before.summary,
         before_us=before.at_us,
@@ -230,6 +231,21 @@ def restarts_of(chain: Sequence[Life]) -> list[Restart]:
                 reason = _end(life, Facts(), ()).summary
                 found.append(Restart(one.at_us, "systemd", "", reason))
     return found
+
+
+_FRESH = {"node-reloaded": (How.SWAP.value, How.REWIRE.value), "reloaded": ("",)}
+"""Events after which dora counts from zero, by what was done."""
+
+
+def _counted(restarts: Sequence[Restart], life: Life, facts: Facts) -> list[Restart]:
+    """Those that `list` counts: by systemd since the last reset, and by dora in this run."""
+    fresh = [one for one in life.all(*_FRESH) if one.detail("how") in _FRESH[one.name]]
+    since = {one.node: one.at_us for one in fresh}
+    begin = max(life.began_us, since.get("", 0))
+    whole = [one for one in restarts if one.owner == "systemd"]
+    left = len(whole) if facts.restarts is None else facts.restarts
+    own = [one for one in restarts if one.node and one.at_us >= max(begin, since.get(one.node, 0))]
+    return sorted([*whole[max(len(whole) - left, 0) :], *own], key=lambda one: one.at_us)
 
 
 _NO_NEWS = (

@@ -11,7 +11,7 @@ from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.views.dataflows import RESTARTING, UNKNOWN, local_time
 from dora_systemd.decisions.why.sandbox_signs import sandbox_remedy
 from dora_systemd.decisions.why.verdict import Restart, Verdict
-from dora_systemd.terminal_text import one_line
+from dora_systemd.terminal_text import cut, one_line
 from dora_systemd.values import SECOND, format_duration, format_rounded_size
 
 LINES = 20
@@ -135,12 +135,8 @@ def format_report(report: Report, width: int | None = None, want_colors: bool = 
     blocks = [_head(report), _timeline(report), _words(report), _todo(report)]
     # Texts of nodes must not control the terminal, or add lines to the report.
     lines = [one_line(line) for block in blocks if block for line in (*block, "")][:-1]
-    cut = [line if width is None else _cut(line, width) for line in lines]
-    return "\n".join(_colored(cut, report.verdict)) if want_colors else "\n".join(cut)
-
-
-def _cut(line: str, width: int) -> str:
-    return line if len(line) <= width else line[: max(width - 1, 0)] + "…"
+    shown = [cut(line, width) for line in lines]
+    return "\n".join(_colored(shown, report.verdict) if want_colors else shown)
 
 
 def _colored(lines: list[str], verdict: Verdict) -> list[str]:

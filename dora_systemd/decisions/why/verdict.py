@@ -13,7 +13,8 @@ class Facts:
     """The current state from systemd and the runner, in addition to the journal.
 
     status: a word of `list`. text: STATUS=. failed: nodes that have failed for good. restarting:
-    nodes that wait for a restart. now_boot: id of this boot.
+    nodes that wait for a restart. now_boot: id of this boot. restarts: NRestarts= of the unit, None
+    if systemd has unloaded it.
     """
 
     status: str = ""
@@ -21,6 +22,7 @@ class Facts:
     failed: Mapping[str, str] = field(default_factory=dict)
     restarting: tuple[str, ...] = ()
     now_boot: str = ""
+    restarts: int | None = None
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,8 @@ class Verdict:
     node that failed first, or "". at_us: time of that; began_us: beginning of that life;
     CLOCK_REALTIME µs, 0: unknown. invocation: systemd's id of that life. details: other facts about
     the end. is_given_up: systemd's start limit is reached. is_passing: dora restarts the node.
-    starved: nodes downstream. before: how the life before these ended, and when.
+    starved: nodes downstream. restarts: those that `list` counts, oldest first. before: how the
+    life before these ended, and when.
     """
 
     status: str

@@ -1,16 +1,27 @@
-"""Finds dataflows that have ended and that systemd has unloaded, in the journal."""
+"""Finds dataflows that have ended: what systemd still knows of them, and the journal."""
 
 import contextlib
 from collections.abc import Sequence
+from typing import Any
 
+from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.journal.reader import JournalReader, LastEvent, is_volatile
-from dora_systemd.decisions.views.dataflows import FAILED, FINISHED, STOPPED, DataflowRow
+from dora_systemd.decisions.views.dataflows import (
+    FAILED,
+    FINISHED,
+    STOPPED,
+    DataflowRow,
+    is_up_word,
+)
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
+from dora_systemd.verbs.facts.reason import failure_reason
 
 _WORDS = {"dataflow-finished": FINISHED, "dataflow-stopped": STOPPED, "dataflow-failed": FAILED}
 _NO_END = "its end is not recorded: it was killed, or the machine went down"
+_MOST_NAMES = 100
+_TIMES = ("InactiveEnterTimestamp", "InactiveExitTimestamp")
 
 
 def ended_rows(scope: Scope, rows: Sequence[DataflowRow] = ()) -> list[DataflowRow]:
@@ -27,6 +38,41 @@ def not_recorded(error: DoraSystemdError) -> DoraSystemdError:
     return DoraSystemdError(told, error.hint, error.code)
 
 
+def newest_ended(
+    manager: Manager, scope: Scope, rows: Sequence[DataflowRow], limit: int | None
+) -> list[DataflowRow]:
+    """What has ended: for each name without a running dataflow the newest one, newest first.
+
+    rows: all that systemd has loaded. limit: the maximum number of them, None: _MOST_NAMES.
+    """
+    limit = limit or _MOST_NAMES
+    # A name that runs has its own row, but also an event.
+    events = _last_events(scope, limit=limit + len(rows), is_by_name=True)
+    known = {event.name: event for event in events}
+    loaded = [_with_end(manager, row, known.get(row.name)) for row in rows if not is_up_word(row)]
+    unloaded = [ended_row(known[name]) for name in known.keys() - {row.name for row in rows}]
+    return sorted([*loaded, *unloaded], key=lambda row: (-row.ended, row.name))[:limit]
+
+
+def read_end(manager: Manager, scope: Scope, row: DataflowRow) -> DataflowRow:
+    """The row of a loaded unit that is not up, with the time of its end, and why it failed."""
+    return _with_end(manager, row, next(iter(_last_events(scope, limit=1, name=row.name)), None))
+
+
+def _with_end(manager: Manager, row: DataflowRow, event: LastEvent | None) -> DataflowRow:
+    # The event says more than systemd, which forgets an enabled unit, too. But a failure before the
+    # runner has begun has no event.
+    times = manager.read(row.unit, _TIMES)
+    is_own = event and event.uuid == row.uuid and event.at_us >= times["InactiveExitTimestamp"]
+    own = event if is_own else None
+    row = row._replace(ended=times["InactiveEnterTimestamp"] or (own.at_us if own else 0))
+    if row.status != FAILED:
+        return row
+    if own and own.event == "dataflow-failed":
+        return row._replace(text=own.detail)
+    return row._replace(text=failure_reason(manager, row.unit))
+
+
 def ended_row(event: LastEvent) -> DataflowRow:
     """The row of `list --all` for a dataflow of which only the last life event is known."""
     word = _WORDS.get(event.event)
@@ -40,8 +86,8 @@ def ended_row(event: LastEvent) -> DataflowRow:
     )
 
 
-def _last_events(scope: Scope) -> list[LastEvent]:
+def _last_events(scope: Scope, **what: Any) -> list[LastEvent]:
     # Without access to the journal, the rows from systemd are still shown.
     with contextlib.suppress(DoraSystemdError):
-        return JournalReader().last_events(scope)
+        return JournalReader().last_events(scope, **what)
     return []

@@ -42,7 +42,7 @@ def row_of(reading: Reading, before: Reading | None = None) -> DataflowRow:
         "status": status_word(cell.state.active, cell.state.sub, status.stage),
         "dataflow": cell.options.dataflow,
         "text": unit.get("StatusText", ""),
-        "restarts": unit["NRestarts"] + status.node_restarts,
+        "restarts": unit["NRestarts"],
         "problem": reading.problem,
     }
     if not cell.is_up:

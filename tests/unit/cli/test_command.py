@@ -101,6 +101,9 @@ def test_every_option_says_what_it_does(name: str) -> None:
         (["show"], "missing argument", "see doractl show --help"),
         (["list", "a", "b"], "got unexpected extra", ""),
         (["list", "-o", "xml"], "invalid value", ""),
+        (["list", "--last", "0"], "invalid value", ""),
+        (["list", "x", "--status", "failed"], "cannot filter a single dataflow", "--last, "),
+        (["list", "--sort-by", "uuid"], "invalid value for '--sort-by'", ""),
     ],
 )
 def test_wrong_command_lines(
@@ -198,6 +201,15 @@ def test_list_by_all_its_names(verb: str, requests: list[ListRequest]) -> None:
     assert main.run([verb, "robot", "-o", "json"]) == 0
     assert main.run(["--user", verb]) == 0
     assert requests == [ListRequest("robot", output="json"), ListRequest(is_user=True)]
+
+
+def test_what_list_selects(requests: list[ListRequest]) -> None:
+    words = ["--status", "Failed", "--name", "rob", "--sort-by", "cpu", "--last", "3", "--quiet"]
+    assert main.run(["--user", "list", *words]) == 0
+    (request,) = requests
+    assert (request.status, request.pattern, request.sort_by) == ("failed", "rob", "cpu")
+    assert (request.last, request.is_quiet, request.is_filtered) == (3, True, True)
+    assert not ListRequest().is_filtered
 
 
 @pytest.mark.parametrize(

@@ -146,6 +146,8 @@ def test_errors(capsys: Printed) -> None:
     assert (wrong["message"], wrong["exit_status"]) == ("cannot stop: give names or --all", 2)
     assert error(capsys, "list", "--oll", "-ojson")["message"] == "unknown option --oll"
     assert error(capsys, "strat", "-o", "json")["hint"] == "did you mean doractl start?"
+    wrong = error(capsys, "list", "-q", "-o", "json")
+    assert (wrong["message"], wrong["hint"]) == ("cannot use --quiet with JSON", "omit one of them")
 
 
 def test_who_asks_for_json() -> None:

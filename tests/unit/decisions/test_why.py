@@ -246,6 +246,32 @@ def test_restarts_of_the_whole_and_the_limit_of_them() -> None:
     assert "systemd has stopped restarting it" in text
 
 
+def test_restarts_are_those_that_list_counts() -> None:
+    def restarted(node: str, life: str) -> Record:
+        return event("node-restarted", node, life)
+
+    first = (event("dataflow-starting"), restarted("camera", "1"), unit("unit-restart"))
+    second = (event("dataflow-starting", life="2"), unit("unit-restart", "2"))
+    third = (event("dataflow-starting", life="3"), restarted("camera", "3"), restarted("plot", "3"))
+    chain = (*first, *second, *third)
+
+    def counted(*more: Record, restarts: int | None = None) -> str:
+        facts = Facts("Running", restarts=restarts)
+        verdict = judge(*chain, *more, facts=facts)
+        return " ".join(one.node or one.owner for one in verdict.restarts)
+
+    assert counted() == "systemd systemd camera plot"
+    assert counted(restarts=2) == counted(restarts=9) == counted()
+    assert counted(restarts=1) == "systemd camera plot"
+    assert counted(restarts=0) == "camera plot"
+    fresh = event("node-reloaded", "plot", "3", how="reloaded")
+    assert counted(fresh, restarts=0) == "camera"
+    limits = event("node-reloaded", "plot", "3", how="given new limits")
+    assert counted(limits, restarts=0) == "camera plot"
+    again = (event("reloaded", life="3"), restarted("plot", "3"))
+    assert counted(*again, restarts=0) == "plot"
+
+
 def test_running_degraded_and_restarting() -> None:
     again = (CRASH, event("node-restarted", "camera"))
     verdict = judge(*RUNS, *again, facts=Facts("Running", "2/2 nodes running"))

@@ -12,6 +12,7 @@ LATE = {
         "cli.listing": {
             *("verbs.list", "verbs.facts.ended"),
             *("decisions.views.details", "decisions.views.objects"),
+            *("decisions.views.selection", "cli.colors"),
         },
         "names": {"difflib"},
         "cli.edge": {"decisions.views.objects"},
@@ -22,6 +23,7 @@ LATE = {
     "the journal reader: only what is not in systemd, or has restarted, needs it": {
         "verbs.facts.budget": {"adapters.journal.reader"},
         "verbs.facts.selector": {"verbs.facts.ended"},
+        "verbs.list": {"verbs.facts.ended"},
         "runner.nodes.losses": {"adapters.journal.reader"},
     },
     "pydantic: only a settings file needs it": {

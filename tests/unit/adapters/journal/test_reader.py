@@ -83,6 +83,25 @@ def test_last_event_of_each_dataflow(journalctl: Path) -> None:
     assert len(JournalReader().last_events(SYSTEM, limit=1)) == 1
 
 
+def test_last_event_of_each_name(journalctl: Path) -> None:
+    """Of all its runs; and journald says which name a record has."""
+    runs = [("a", UUID, 30), ("a", UUID[:-1] + "1", 20), ("b", UUID, 10)]
+    records = [
+        {
+            **{"DORA_DATAFLOW": uuid, "DORA_DATAFLOW_NAME": name, "DORA_EVENT": "dataflow-stopped"},
+            **{"_SYSTEMD_UNIT": f"dora-{name}.service", "__REALTIME_TIMESTAMP": f"{at}"},
+        }
+        for name, uuid, at in runs
+    ]
+    lines = "\n".join(map(json.dumps, records))
+    play(journalctl, f"""echo "$@" >'{journalctl}.asked'; cat <<'E'\n{lines}\nE""")
+    found = JournalReader().last_events(SYSTEM, is_by_name=True)
+    assert [(one.name, one.at_us) for one in found] == [("a", 30), ("b", 10)]
+    assert len(JournalReader().last_events(SYSTEM)) == 3
+    JournalReader().last_events(SYSTEM, limit=1, name="a")
+    assert " _SYSTEMD_UNIT=dora-a.service " in Path(f"{journalctl}.asked").read_text()
+
+
 def test_lives_of_a_unit(journalctl: Path) -> None:
     lines = [f'{{"_SYSTEMD_INVOCATION_ID":"{one}"}}' for one in ("i2", "i2", "i1")]
     play(journalctl, "cat <<'E'\n" + "\n".join(lines) + "\nE")

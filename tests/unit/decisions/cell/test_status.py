@@ -137,7 +137,6 @@ def test_counts() -> None:
     }
     cell = CellStatus(nodes=table)
     assert cell.alive_count == 2
-    assert cell.node_restarts == 3
 
 
 def test_throttled_percent() -> None:

@@ -7,6 +7,7 @@ from dora_systemd.decisions.views.dataflows import (
     NodeRow,
     format_dataflows,
     format_uptime,
+    local_time,
     shortest_prefixes,
     status_word,
 )
@@ -91,16 +92,78 @@ ROWS = (
 
 
 def test_table_of_dataflows() -> None:
-    assert format_dataflows(ROWS) == (
-        "UUID      NAME           STATUS     UPTIME  NODES  CPU%   MEM  RESTARTS  BOOT\n"
-        "550e8400  robot          Running  00:05:32  2/2    12.5  256M         0  yes\n"
-        "550e8401  a-longer-name  Failed          -  -         -     -        12  -"
+    rows = [ROWS[0], ROWS[1]._replace(status="Restarting")]
+    assert format_dataflows(rows) == (
+        "UUID      NAME           STATUS        UPTIME  NODES  CPU%   MEM  RESTARTS  BOOT\n"
+        "550e8400  robot          Running     00:05:32  2/2    12.5  256M         0  yes\n"
+        "550e8401  a-longer-name  Restarting         -  -         -     -        12  -"
     )
+
+
+ENDED = ROWS[1]._replace(
+    ended=1_790_000_000_000_000, text="node detector: exit code 1, node plot: x"
+)
+
+
+def test_table_with_what_has_ended() -> None:
+    rows = [ROWS[0], ENDED, ROWS[1]._replace(uuid=C, status="Stopped")]
+    header, up, failed, stopped = format_dataflows(rows).splitlines()
+    assert header.split()[-3:] == ["BOOT", "ENDED", "WHY"]
+    assert up.split()[-3:] == ["yes", "-", "-"]
+    moment = local_time(ENDED.ended)
+    assert failed.endswith(f"        12  -     {moment}  node detector: exit code 1, node plot: x")
+    assert stopped.split()[-2:] == ["-", "-"]
+    for width in (60, 80, 100, 120):
+        lines = format_dataflows(rows, width).splitlines()
+        assert max(map(len, lines)) <= width
+        assert moment in lines[2]
+        assert lines[2].endswith("…")
+    assert format_dataflows(rows, 60).split()[:4] == ["NAME", "STATUS", "ENDED", "WHY"]
+
+
+@pytest.mark.parametrize(
+    ("status", "color"),
+    [
+        *(("Failed", 31), ("Degraded", 33), ("Starting", 33), ("Restarting", 33)),
+        *(("Running", 0), ("Stopped", 0), ("Finished", 0)),
+    ],
+)
+def test_colors_of_the_table(status: str, color: int) -> None:
+    row = ROWS[0]._replace(name=status, status=status)
+    plain = format_dataflows([row], 100).splitlines()
+    header, line = format_dataflows([row], 100, want_colors=True).splitlines()
+    assert header == f"\x1b[4m{plain[0]}\x1b[0m"
+    painted = f"\x1b[{color}m{status}\x1b[0m" if color else status
+    assert line.split()[1:3] == [status, painted]
+    assert line.replace(painted, status) == plain[1]
+    shown = format_dataflow(row, 100, want_colors=True)
+    assert f"Name:     {status}\n" in shown
+    assert f"Status:   {painted} (2/2 nodes" in shown
+    assert "\x1b[31mFailed\x1b[0m     -" in shown  # the state of a node
+
+
+def test_no_text_controls_the_terminal() -> None:
+    row = ENDED._replace(text="\x1b]0;x\a\nnode", dataflow="/srv/\x1b[2J.yml")
+    for shown in (format_dataflows([row]), format_dataflow(row), format_dataflow(row, 60)):
+        assert "\x1b" not in shown
+        assert "\\x1b" in shown
+    assert len(format_dataflows([row]).splitlines()) == 2
+
+
+@pytest.mark.parametrize("width", [60, 80])
+def test_one_dataflow_on_a_narrow_terminal(width: int) -> None:
+    node = LIMITED.nodes[1]._replace(node="n" * 30, exit="out of memory, peak 300M, limit 300M")
+    row = LIMITED._replace(dataflow=f"/{'d' * 90}/flow.yml", nodes=(LIMITED.nodes[0], node))
+    shown = format_dataflow(row, width).splitlines()
+    assert max(map(len, shown)) <= width
+    assert shown[3].endswith("…")
+    assert shown[-3].split()[:2] == ["NODE", "STATE"]
+    assert shown[-3].split()[-1] == "EXIT"
 
 
 def test_a_narrow_terminal() -> None:
     long = ROWS[0]._replace(uuid=C, name="a-very-long-name-of-a-dataflow-that-fits-nowhere")
-    rows = [*ROWS, long]
+    rows = [ROWS[0], ROWS[1]._replace(status="Degraded"), long]
     whole = format_dataflows(rows)
     assert format_dataflows(rows, 200) == whole
     for width in (60, 70, 80, 100):
@@ -161,6 +224,7 @@ LIMITED = ROWS[0]._replace(
 
 def test_limits_stand_beside_what_is_used() -> None:
     assert format_dataflows([LIMITED]).splitlines()[1].split()[6:] == ["256M/4G", "0", "yes"]
+    assert format_dataflows([LIMITED]).splitlines()[1].split()[5] == "12.5/200"
     lines = format_dataflow(LIMITED).splitlines()
     assert "CPU:      12.5% of 200%, throttled 12.0% of the time" in lines
     assert "Memory:   256M of 4G (peak 300M)" in lines

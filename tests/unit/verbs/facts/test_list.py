@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from dora_systemd.adapters.cgroup import groups as cgroup
+from dora_systemd.adapters.journal.reader import JournalReader, LastEvent
 from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.cell.status import CellStatus, CpuSample, NodeStatus
 from dora_systemd.decisions.views.dataflows import DataflowRow, format_dataflows
@@ -80,7 +81,7 @@ def test_running_dataflow(scope: Scope) -> None:
     }
     write_status(scope, CellStatus(stage="degraded", nodes=nodes, samples=(sample,)))
     row = row_of(manager, scope)
-    assert (row.status, row.restarts, row.nodes_alive, row.nodes_total) == ("Degraded", 3, 1, 2)
+    assert (row.status, row.restarts, row.nodes_alive, row.nodes_total) == ("Degraded", 1, 1, 2)
     assert row.uptime is not None
     assert 90 * SECOND <= row.uptime < 95 * SECOND
     assert row.cpu_percent == pytest.approx(50, rel=0.2)
@@ -267,16 +268,30 @@ def test_starting_dataflow(scope: Scope) -> None:
 def test_failed_dataflow(scope: Scope) -> None:
     manager = FakeManager()
     facts = {"StatusText": "node camera failed", "InactiveEnterTimestamp": SECOND}
-    manager.add(options(), active="failed", **facts)
+    manager.add(options(), active="failed", NRestarts=2, **facts)
     row = row_of(manager, scope)
     assert (row.status, row.text, row.uptime) == ("Failed", "node camera failed", None)
-    assert row.ended == SECOND
+    assert (row.ended, row.restarts) == (SECOND, 2)
     manager.units["dora-robot.service"] |= {"ActiveState": "activating", "SubState": "auto-restart"}
     assert row_of(manager, scope).ended == 0
 
 
-def test_a_row_is_found_by_selector(scope: Scope) -> None:
+def test_a_row_is_found_by_selector(scope: Scope, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[dict[str, Any]] = []
+
+    def last_events(*_: object, **what: Any) -> list[LastEvent]:
+        asked.append(what)
+        return []
+
+    monkeypatch.setattr(JournalReader, "last_events", last_events)
     manager = FakeManager()
-    manager.add(options(), active="failed")
-    assert find_row(manager, scope, "robot").name == "robot"
+    manager.add(
+        options(),
+        active="failed",
+        StatusText="failed: node a: exit code 1",
+        InactiveEnterTimestamp=7,
+    )
+    row = find_row(manager, scope, "robot")
+    assert (row.name, row.text, row.ended) == ("robot", "node a: exit code 1", 7)
+    assert asked == [{"limit": 1, "name": "robot"}]
     assert read_status(scope, read_cells(manager)[0]) == CellStatus()

@@ -1,0 +1,98 @@
+"""Which dataflows `doractl list` shows, and how it prints them."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dora_systemd.adapters.journal.reader import JournalReader, LastEvent
+from dora_systemd.cli import listing
+from dora_systemd.cli.listing import ListRequest
+from dora_systemd.decisions.views.dataflows import DataflowRow
+from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
+
+OTHER = UUID[:-1] + "1"
+
+
+class Journal:
+    """Two dataflows that systemd does not know; counts how often it is asked."""
+
+    def __init__(self) -> None:
+        self.limits: list[int] = []
+
+    def __call__(self, _scope: object, limit: int, **_what: Any) -> list[LastEvent]:
+        self.limits.append(limit)
+        names = (("old", "dataflow-failed"), ("older", "dataflow-stopped"))
+        return [LastEvent(name, OTHER, event, 9, "it broke") for name, event in names][:limit]
+
+
+@pytest.fixture
+def journal(monkeypatch: pytest.MonkeyPatch) -> Journal:
+    found = Journal()
+    monkeypatch.setattr(JournalReader, "last_events", lambda _, *one, **two: found(*one, **two))
+    return found
+
+
+def names(place: Path, **request: Any) -> str:
+    """The names that a request shows, of two that run and one that has failed."""
+    manager = FakeManager()
+    manager.add(options("b-arm"))
+    manager.add(options("a"))
+    manager.add(options("bad"), "failed", InactiveEnterTimestamp=5, ExecMainStatus=1)
+    scope = ScopeIn(is_user=True, uid=1000, root=place)
+    rows = listing._rows(manager, scope, ListRequest(**request))  # type: ignore[arg-type]
+    return " ".join(row.name for row in rows)
+
+
+def test_what_runs_needs_no_journal(tmp_path: Path, journal: Journal) -> None:
+    assert names(tmp_path) == "a b-arm"
+    assert names(tmp_path, pattern="ARM") == "b-arm"
+    assert names(tmp_path, status="running", sort_by="name") == "a b-arm"
+    assert journal.limits == []
+
+
+def test_what_ended_is_below_it(tmp_path: Path, journal: Journal) -> None:
+    assert names(tmp_path, want_all=True) == "a b-arm old older bad"
+    assert names(tmp_path, want_all=True, sort_by="name") == "a b-arm bad old older"
+    assert names(tmp_path, last=1) == "a b-arm old"
+    assert names(tmp_path, status="failed") == "old bad"
+    # The newest of those that match, not those that match of the newest.
+    assert names(tmp_path, status="failed", pattern="bad", last=1) == "bad"
+    assert names(tmp_path, status="stopped", last=5) == "older"
+    assert journal.limits == [103, 103, 4, 103, 103, 103]
+
+
+ROWS = [
+    DataflowRow(UUID, "robot", "dora-robot.service", "Running"),
+    DataflowRow(OTHER, "old", "dora-old.service", "Failed", text="it broke"),
+]
+
+
+def test_uuids_alone(capsys: pytest.CaptureFixture[str]) -> None:
+    request = ListRequest(is_quiet=True)
+    listing._print_all(ROWS, request)
+    listing._print_all([], request)
+    assert capsys.readouterr().out == f"{UUID}\n{OTHER}\n"
+
+
+@pytest.mark.parametrize("rows", [ROWS, ROWS[:1]])
+def test_a_terminal_says_where_more_is(
+    rows: list[DataflowRow], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("SYSTEMD_COLORS", raising=False)
+    listing._print_all(rows, ListRequest())
+    assert capsys.readouterr().out.count("\n") == 1 + len(rows)
+    monkeypatch.setenv("COLUMNS", "60")
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    listing._print_all(rows, ListRequest())
+    shown = capsys.readouterr().out.splitlines()
+    assert shown[0].startswith("\x1b[4m")
+    assert (shown[-1] == listing._MORE) == (rows is ROWS)
+    assert len(listing._MORE) <= 60
+
+
+def test_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    for request in (ListRequest(), ListRequest(want_all=True), ListRequest(pattern="x")):
+        listing._print_all([], request)
+    assert capsys.readouterr().out == "No dataflow is running.\nNo dataflow.\nNo dataflow.\n"
