@@ -19,16 +19,16 @@ from dora_systemd.cli.parameters import (
 from dora_systemd.cli.settingoptions import SettingsCommand, setting_options
 from dora_systemd.cli.stageline import StageLine
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.verbs.facts.last_words import last_words
 from dora_systemd.verbs.start.check import check_plan
 from dora_systemd.verbs.start.enable import boot_target
 from dora_systemd.verbs.start.job import Started, format_started, start_plan
 from dora_systemd.verbs.start.launch import Claim, claim
 from dora_systemd.verbs.start.linger import ensure_linger
 from dora_systemd.verbs.start.logins import start_notes
-from dora_systemd.verbs.start.plan import DEFAULT_FILE, Plan, StartRequest, make_plan
+from dora_systemd.verbs.start.plan import DEFAULT_FILE, StartRequest, make_plan
 from dora_systemd.verbs.start.unit import format_plan
 from dora_systemd.verbs.start.watch import watched_patterns
+from dora_systemd.verbs.why import words_of_start
 
 
 @click.command("start", cls=SettingsCommand)
@@ -94,10 +94,6 @@ def _start(bus: Bus, claimed: Claim, wait: bool) -> Started:
             return start_plan(bus, claimed.plan, claimed.properties, stage, wait)
     except DoraSystemdError as error:
         if error.code is ExitCode.FAILURE:
-            _print_last_words(claimed.plan)
+            for line in words_of_start(bus, claimed.plan.scope, claimed.plan.options.uuid):
+                click.echo(f"  {line}", err=True)
         raise
-
-
-def _print_last_words(plan: Plan) -> None:
-    for line in last_words(plan.scope, plan.options.uuid):
-        click.echo(f"  {line}", err=True)

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dora_systemd.decisions.life.causes import Cause
+from dora_systemd.decisions.why.last_lines import Word
 from dora_systemd.decisions.why.lives import (
     SHUTDOWN_MESSAGE,
     START_LIMIT_FUNCTION,
@@ -18,7 +19,7 @@ from dora_systemd.decisions.why.lives import (
     plain_text,
 )
 from dora_systemd.decisions.why.postmortem import UNKNOWN_PERSON, examine
-from dora_systemd.decisions.why.report import Report, Subject, Word, format_report, report_values
+from dora_systemd.decisions.why.report import Report, Subject, format_report, report_values
 from dora_systemd.decisions.why.verdict import Facts, Verdict
 
 Record = Mapping[str, Any]

@@ -4,7 +4,6 @@ import pytest
 
 from dora_systemd.adapters.journal.reader import LastEvent
 from dora_systemd.verbs.facts.ended import ended_row
-from dora_systemd.verbs.facts.last_words import _line
 
 UUID = "550e8400-e29b-41d4-a716-446655440000"
 
@@ -23,8 +22,3 @@ def test_rows(event: str, word: str, text: str) -> None:
     assert (row.name, row.unit, row.uuid) == ("robot", "dora-robot.service", UUID)
     assert (row.status, row.ended) == (word, 17)
     assert row.text.startswith(text)
-
-
-def test_lines_of_nodes() -> None:
-    assert _line({"DORA_NODE": "camera", "MESSAGE": "hello"}) == "camera: hello"
-    assert _line({"DORA_NODE": "camera", "MESSAGE": [1, 2]}) == "camera: (binary)"
