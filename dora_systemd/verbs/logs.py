@@ -126,14 +126,17 @@ def _select_run(journal: JournalReader, query: LogQuery, run: str) -> LogQuery:
 
 
 def read_logs(
-    query: LogQuery, terminal: TerminalLines | ShownLines | None = None, want_colors: bool = False
+    query: LogQuery, terminal: TerminalLines | ShownLines, want_colors: bool = False
 ) -> Iterator[bytes]:
-    """The output of journalctl for a query, in chunks; formatted by `terminal` if given.
+    """The output of journalctl for a query, in chunks, formatted by `terminal`.
 
     Raises DoraSystemdError: USAGE for a time or pattern that journalctl does not accept.
     """
     for data in journal_output(query_arguments(query), want_colors=want_colors):
-        yield terminal.feed(data) if terminal else data
+        yield terminal.feed(data)
+        if query.is_follow:
+            yield terminal.flush()  # what has come is shown at once
+    yield terminal.flush()
 
 
 def pass_logs(query: LogQuery, fd: int) -> int:

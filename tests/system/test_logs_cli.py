@@ -73,6 +73,19 @@ def test_what_is_shown(talking: Cell) -> None:
     assert messages(talking, "--events", "--reverse")[-1] == first
 
 
+def test_repetitions_on_a_terminal(talking: Cell) -> None:
+    """A pipe gets every line, and people how often it came."""
+    wait_for("ticks", lambda: talking.messages("cam-left").count("tick") > 5)
+    talking.systemctl("stop")
+    sync_journal()
+    words = ("logs", talking.name, "--node", "cam-left", "--grep", "^tick$", "--no-pager")
+    ticks = messages(talking, "--node", "cam-left").count("tick")
+    text = re.sub(r"\x1b\[[0-9;:]*m", "", shown("doractl", talking.scope.flag, *words))
+    said = [line.partition(" cam-left ")[2].strip() for line in text.splitlines()]
+    assert said.count("tick") == 1
+    assert f"... {ticks} times" in said
+
+
 def test_journalctl_shows_the_same(talking: Cell) -> None:
     talking.systemctl("stop")
     sync_journal()
@@ -156,7 +169,8 @@ def test_terminal(talking: Cell) -> None:
 
 def test_pager(talking: Cell, tmp_path: Path) -> None:
     seen = tmp_path / "seen"
-    assert shown("doractl", "logs", talking.name, "--tail", "5", PAGER=f"tee {seen}")
+    words = ("--tail", "5", "--grep", "^line")
+    assert shown("doractl", "logs", talking.name, *words, PAGER=f"tee {seen}")
     assert len(seen.read_text().splitlines()) == 5
 
 

@@ -133,25 +133,22 @@ def command(
             [*known, query.name],
             want_dataflow=not query.name,
             want_colors=wants_colors(sys.stdout),
+            has_events=not (query.nodes or query.grep or query.level),
         )
     if until_end:
         follow_to_end(query, lambda step: _print(step, lines))
         return ExitCode.OK
-    if no_pager or query.is_follow or not sys.stdout.isatty():
+    if no_pager or query.is_follow or lines is None:
         return _exit_status(_print(query, lines))
-    _page(_read(query, lines))
+    _page(read_logs(query, lines, wants_colors(sys.stdout)))
     return ExitCode.OK
-
-
-def _read(query: LogQuery, lines: Lines) -> Iterator[bytes]:
-    return read_logs(query, lines, wants_colors(sys.stdout))
 
 
 def _print(query: LogQuery, lines: Lines) -> int:
     """Print the records of a query, formatted for a terminal, or by journalctl itself."""
-    if not sys.stdout.isatty():
+    if lines is None:
         return pass_logs(query, sys.stdout.fileno())
-    _write(_read(query, lines), sys.stdout.fileno())
+    _write(read_logs(query, lines, wants_colors(sys.stdout)), sys.stdout.fileno())
     return ExitCode.OK
 
 
