@@ -69,9 +69,10 @@ def node_names(ctx: click.Context, incomplete: str) -> list[str]:
 
     del incomplete
     # After an option without its value, click leaves the arguments in ctx.args.
-    selector = ctx.params.get("selector") or next(iter(ctx.args), "")
     if ctx.command.name == "logs":
-        return JournalReader().known_nodes(selector)
+        given = ctx.params.get("selectors") or ctx.args
+        return [node for one in given for node in JournalReader().known_nodes(one)]
+    selector = ctx.params.get("selector") or next(iter(ctx.args), "")
     bus = _bus()
     row = dataflow_row(bus, current_scope(), Selector(selector).find(bus))
     return [one.node for one in row.nodes]
@@ -84,7 +85,7 @@ TYPES: dict[str, Any] = {
     "node": Live(node_names),
     "nodes": Live(node_names),
     "pattern": Live(dataflow_names),
-    "level": click.Choice(["error", "warn", "info", "debug", "trace"]),
+    "level": Live(lambda *_: ["error", "warn", "info", "debug", "trace", "stdout"]),
     "run": click.Choice(["CURRENT", "PREVIOUS", "ALL"]),
     "dataflow": click.File(),
     "dora": click.File(),

@@ -84,12 +84,14 @@ class UnitWatch(Follower):
         return ended
 
 
-def check_until_end(selector: str, is_reverse: bool) -> None:
-    """Raise DoraSystemdError (USAGE) for options that --until-end cannot have."""
-    if not selector:
+def check_until_end(query: LogQuery) -> None:
+    """Raise DoraSystemdError (USAGE) for a query that --until-end cannot have."""
+    if not query.name or query.others:
+        which = "several" if query.others else "all"
         hint = "say which dataflow: doractl logs NAME --until-end"
-        raise DoraSystemdError("cannot wait for the end of all dataflows", hint, ExitCode.USAGE)
-    if is_reverse:
+        message = f"cannot wait for the end of {which} dataflows"
+        raise DoraSystemdError(message, hint, ExitCode.USAGE)
+    if query.is_reverse:
         hint = "leave --reverse or --until-end out"
         raise DoraSystemdError("cannot follow with the newest lines first", hint, ExitCode.USAGE)
 
@@ -152,8 +154,8 @@ def is_unit_up(manager: Manager, name: str) -> bool:
 
 def first_step(query: LogQuery, cursor: Path) -> LogQuery:
     """The query for the existing records. cursor: a file that does not exist yet."""
-    is_bare = query.tail is None and not query.since
-    tail = FIRST_LINES if is_bare else query.tail
+    is_bare = not query.tail and not query.since
+    tail = str(FIRST_LINES) if is_bare else query.tail
     return replace(query, is_follow=False, tail=tail, cursor_file=str(cursor))
 
 
@@ -161,4 +163,4 @@ def next_step(query: LogQuery, cursor: Path, start_us: int) -> LogQuery:
     """The query for the records after the cursor, or since `start_us` (µs) without a cursor."""
     has_cursor = cursor.exists() and cursor.stat().st_size
     since = "" if has_cursor else journal_timestamp(start_us)
-    return replace(query, is_follow=False, tail=None, since=since, cursor_file=str(cursor))
+    return replace(query, is_follow=False, tail="", since=since, cursor_file=str(cursor))

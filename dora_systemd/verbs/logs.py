@@ -1,24 +1,20 @@
 """`doractl logs` and `doractl run`: read the records of a dataflow from the journal."""
 
 import os
-import re
 import select
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
-from fnmatch import fnmatchcase
-from itertools import islice
-from typing import NamedTuple
 
 from dora_systemd.adapters.journal.reader import (
-    JournalReader,
     end_journalctl,
     journal_output,
     open_journalctl,
 )
 from dora_systemd.decisions.logs.fields import ExportReader
 from dora_systemd.decisions.logs.query import (
+    ALL_LINES,
     UNIT_ENDS,
     LogQuery,
     end_matches,
@@ -27,111 +23,28 @@ from dora_systemd.decisions.logs.query import (
     query_matches,
 )
 from dora_systemd.decisions.logs.terminal import ShownLines, TerminalLines
-from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
-from dora_systemd.values import quoted
-from dora_systemd.verbs.facts.ended import not_recorded
-from dora_systemd.verbs.facts.selector import Selector
 
 _TURN = 1 << 14
 """Bytes of records between two looks at what else has happened: a terminal may be slow."""
-_GLOB = re.compile(r"[*?\[]")
 _FIELDS = "MESSAGE,PRIORITY,SYSLOG_IDENTIFIER,MESSAGE_ID,UNIT,USER_UNIT"
 
 Write = Callable[[bytes], object]
 
 
-class _Recorded(NamedTuple):
-    """A dataflow in the journal."""
-
-    name: str
-    uuid: str
-
-
-def find_query(
-    journal: JournalReader,
-    query: LogQuery,
-    selector: str,
-    nodes: tuple[str, ...] = (),
-    run: str = "ALL",
-) -> LogQuery:
-    """The query, with the name, nodes and run that the journal has for it.
-
-    selector: "" for all dataflows of the scope. nodes: names or patterns as in glob(7). run:
-    CURRENT, PREVIOUS, ALL, or dora's id of a run. Raises DoraSystemdError: NOT_FOUND for a
-    dataflow, node or run without any record.
-    """
-    if selector:
-        query = _select_dataflow(journal, query, selector)
-    if nodes:
-        query = replace(query, nodes=_select_nodes(journal, query, nodes))
-    return _select_run(journal, query, run)
-
-
-def _select_dataflow(journal: JournalReader, query: LogQuery, selector: str) -> LogQuery:
-    names = journal.known_names()
-    wanted = Selector(selector)
-    if wanted.name in names:
-        return replace(query, name=wanted.name)
-    fitting = wanted.meant(_Recorded("", uuid) for uuid in journal.known_uuids())
-    found = wanted.only(_Recorded(journal.name_of(one.uuid), one.uuid) for one in fitting)
-    if found is None:
-        raise not_recorded(wanted.missing(names))
-    return replace(query, uuid=found.uuid, name=found.name)
-
-
-def _select_nodes(
-    journal: JournalReader, query: LogQuery, patterns: tuple[str, ...]
-) -> tuple[str, ...]:
-    if not query.name:
-        hint = "say which dataflow: doractl logs NAME --node NODE"
-        raise DoraSystemdError("cannot select nodes of all dataflows", hint, ExitCode.USAGE)
-    known = journal.known_nodes(query.name)
-    found: dict[str, None] = {}
-    for pattern in patterns:
-        fitting = [node for node in known if _fits(node, pattern)]
-        if not fitting:
-            there = f"nodes: {', '.join(known)}" if known else "no node has written anything yet"
-            message = f"cannot find a node {quoted(pattern)} of dataflow {query.name}"
-            raise DoraSystemdError(message, there, ExitCode.NOT_FOUND)
-        found.update(dict.fromkeys(fitting))
-    return tuple(found)
-
-
-def _fits(node: str, pattern: str) -> bool:
-    return node == pattern or (bool(_GLOB.search(pattern)) and fnmatchcase(node, pattern))
-
-
-def _select_run(journal: JournalReader, query: LogQuery, run: str) -> LogQuery:
-    if run == "ALL":
-        return query
-    if run not in ("CURRENT", "PREVIOUS"):
-        if run and not journal.has_run(query.name, run):
-            message = f"cannot find the run {quoted(run)}"
-            hint = "doractl list --all, or journalctl --field=DORA_RUN"
-            raise DoraSystemdError(message, hint, ExitCode.NOT_FOUND)
-        return replace(query, run=run)
-    if not query.name:
-        hint = "say which dataflow: doractl logs NAME --run CURRENT"
-        raise DoraSystemdError("cannot select a run of all dataflows", hint, ExitCode.USAGE)
-    index = 0 if run == "CURRENT" else 1
-    lives = journal.invocations(query.scope, query.name, query.uuid)
-    invocation = next(islice(lives, index, None), None)
-    if invocation is None:
-        message = f"cannot find the {run.lower()} run of dataflow {query.name}"
-        raise DoraSystemdError(message, "--run ALL shows all there is", ExitCode.NOT_FOUND)
-    return replace(query, invocation=invocation)
-
-
 def read_logs(
-    query: LogQuery, terminal: TerminalLines | ShownLines | None = None, want_colors: bool = False
+    query: LogQuery, terminal: TerminalLines | ShownLines, want_colors: bool = False
 ) -> Iterator[bytes]:
-    """The output of journalctl for a query, in chunks; formatted by `terminal` if given.
+    """The output of journalctl for a query, in chunks, formatted by `terminal`.
 
     Raises DoraSystemdError: USAGE for a time or pattern that journalctl does not accept.
     """
-    for data in journal_output(query_arguments(query), want_colors=want_colors):
-        yield terminal.feed(data) if terminal else data
+    arguments = query_arguments(_oldest_first(query))
+    for data in journal_output(arguments, want_colors=want_colors):
+        yield terminal.feed(data)
+        if query.is_follow:
+            yield terminal.flush()  # what has come is shown at once
+    yield terminal.flush()
 
 
 def pass_logs(query: LogQuery, fd: int) -> int:
@@ -139,8 +52,24 @@ def pass_logs(query: LogQuery, fd: int) -> int:
 
     Raises DoraSystemdError as read_logs does.
     """
-    with open_journalctl(query_arguments(query), stdout=fd) as child:
+    with open_journalctl(query_arguments(_oldest_first(query)), stdout=fd) as child:
         return end_journalctl(child)
+
+
+def _oldest_first(query: LogQuery) -> LogQuery:
+    """The query for the same records in the order of time: --grep with --lines reverses it."""
+    is_counted = query.tail not in ("", ALL_LINES)
+    if not (query.grep and is_counted) or query.is_follow or query.is_reverse:
+        return query
+    wanted = replace(query, output="export", cursor_file="")
+    arguments = ["--output-fields=MESSAGE_ID", *query_arguments(wanted)]
+    records, times = ExportReader(), []
+    for data in journal_output(arguments):
+        times += [int(one["__REALTIME_TIMESTAMP"]) for one in records.feed(data)]
+    if not times:
+        return query
+    first, last = journal_timestamp(min(times)), journal_timestamp(max(times))
+    return replace(query, tail="", since=first, until=last)
 
 
 class Follower:

@@ -1,6 +1,6 @@
 """`doractl why`: collects what systemd, the journal and the runner know about a dataflow."""
 
-from collections.abc import Iterable
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 
@@ -10,15 +10,10 @@ from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.decisions.life import nodes as node_table
 from dora_systemd.decisions.logs.query import scope_matches, story_matches
 from dora_systemd.decisions.views.dataflows import DataflowRow, status_word
-from dora_systemd.decisions.why.lives import (
-    SHUTDOWN_MESSAGE,
-    Life,
-    find_lives,
-    parse_happening,
-    plain_text,
-)
+from dora_systemd.decisions.why.last_lines import Word, choose_last, shown_last
+from dora_systemd.decisions.why.lives import SHUTDOWN_MESSAGE, Life, find_lives, parse_happening
 from dora_systemd.decisions.why.postmortem import examine
-from dora_systemd.decisions.why.report import LINES, Report, Subject, Word
+from dora_systemd.decisions.why.report import LINES, Report, Subject
 from dora_systemd.decisions.why.verdict import Facts, Verdict
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import unit_name
@@ -34,7 +29,8 @@ from dora_systemd.verbs.facts.whole import read_whole_rows
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 _MOST_RECORDS = 1000
 _MOST_SHUTDOWNS = 20
-_LINES_READ = 4 * LINES
+WORDS_OF_START = 10
+"""Maximum number of lines that a failed start prints."""
 
 
 def explain(manager: Manager, scope: Scope, selector: str, journal: JournalReader) -> Report:
@@ -124,28 +120,12 @@ def _last_words(
     """The last lines of the node that failed first, up to its end; else those of all nodes."""
     if not (verdict.is_failure or verdict.node) or not verdict.invocation:
         return ()
-    matches = [
-        *scope_matches(scope, subject.name),
-        f"DORA_DATAFLOW={subject.uuid}",
-        f"_SYSTEMD_INVOCATION_ID={verdict.invocation}",
-    ]
+    invocation = f"_SYSTEMD_INVOCATION_ID={verdict.invocation}"
+    matches = [*_own_matches(scope, subject), invocation]
     if verdict.node:
         matches.append(f"DORA_NODE={verdict.node}")
     records = journal.newest(matches, None, until_us=verdict.at_us, is_whole=True)
-    return tuple(_words(islice(records, _LINES_READ)))[-LINES:]
-
-
-def _words(records: Iterable[dict[str, object]]) -> list[Word]:
-    found = [
-        Word(
-            int(plain_text(one.get("__REALTIME_TIMESTAMP")) or 0),
-            plain_text(one.get("DORA_NODE")),
-            plain_text(one.get("MESSAGE")),
-        )
-        for one in records
-        if "DORA_EVENT" not in one and "DORA_NODE" in one
-    ]
-    return found[::-1]
+    return choose_last(records, LINES)
 
 
 def subject_row(manager: Manager, scope: Scope, subject: Subject) -> DataflowRow:
@@ -156,3 +136,24 @@ def subject_row(manager: Manager, scope: Scope, subject: Subject) -> DataflowRow
     known = DataflowRow(subject.uuid, subject.name, subject.unit, "", subject.file)
     ended = Selector(subject.uuid).ended(scope) or known
     return mark_enabled(manager, scope, [ended])[0]
+
+
+def _own_matches(scope: Scope, subject: Subject) -> list[str]:
+    return [*scope_matches(scope, subject.name), f"DORA_DATAFLOW={subject.uuid}"]
+
+
+def words_of_start(manager: Manager, scope: Scope, uuid: str) -> list[str]:
+    """The last lines of a dataflow whose start failed, with their node, oldest first.
+
+    They are those of the node that failed first; of all nodes, if it has written nothing or is not
+    known. [] if they are not readable.
+    """
+    journal = JournalReader()
+    with suppress(DoraSystemdError):
+        report = explain(manager, scope, uuid, journal)
+        words = report.words
+        if not words:
+            records = journal.newest(_own_matches(scope, report.subject), None)
+            words = choose_last(records, WORDS_OF_START)
+        return [f"{one.node}: {one.text}" for one in shown_last(words, WORDS_OF_START)]
+    return []

@@ -73,6 +73,68 @@ def test_what_is_shown(talking: Cell) -> None:
     assert messages(talking, "--events", "--reverse")[-1] == first
 
 
+def test_letters_mean_what_they_mean_in_journalctl(talking: Cell) -> None:
+    assert len(messages(talking, "-n", "3")) == len(messages(talking, "--lines=3")) == 3
+    assert len(messages(talking, "-n", "all")) > 10
+    everything = messages(talking, "--events")
+    assert messages(talking, "--events", "-b") == messages(talking, "-b0", "--events") == everything
+    assert "No entries" in "".join(logs(talking, talking.name, "--until", "1h", check=False))
+    assert logs(talking, talking.name, "--until", "1h", "-q", check=False) == []
+    done = talking.doractl("logs", talking.name, "-o", "cat", "-n", "cam-left", "-g", "^line 3$")
+    assert done.stdout == "line 3\n"
+    assert done.stderr.startswith("doractl: -n is the number of lines now")
+    assert done.stderr.count("\n") == 1
+
+
+def test_found_lines_come_oldest_first(talking: Cell) -> None:
+    lines = [f"line {i}" for i in range(5)]
+    words = ("--node", "cam-left", "--grep", "^line")
+    assert messages(talking, *words, "--tail", "3") == lines[-3:]
+    assert messages(talking, *words, "--tail", "3", "--reverse") == lines[:1:-1]
+    assert len(messages(talking, "--grep", "tick", "--tail", "2")) == 2
+
+
+def test_levels_of_single_nodes(talking: Cell) -> None:
+    words = ("--log-filter", "cam-left=debug, cam-right=error", "--grep", "detail|bad|stderr")
+    records = [json.loads(line) for line in logs(talking, talking.name, "-o", "json", *words)]
+    told = {(one["DORA_NODE"], one["MESSAGE"]) for one in records}
+    left = ("on stderr", "a bad thing", "a detail")
+    assert told == {*(("cam-left", text) for text in left), ("cam-right", "a bad thing")}
+    started = ("--log-filter", "cam-left=error", "--grep", "all nodes are ready")
+    assert len(messages(talking, *started)) == 1
+    assert set(messages(talking, "--level", "stdout")) >= {"a tiny detail", "line 0", "on stderr"}
+
+
+def test_several_dataflows(talking: Cell, project: Project) -> None:
+    other = Cell(f"{talking.name}-b", talking.scope)
+    try:
+        other.start(Project(project.root / "other").three_nodes())
+        sync_journal()
+        starting = [f"Dataflow {cell.name} is starting" for cell in (talking, other)]
+        for selectors in ((talking.name, other.name), (f"{talking.name}*",)):
+            found = logs(talking, *selectors, "-o", "cat", "--events", "--grep", "is starting")
+            assert found == starting
+        text = shown("doractl", talking.scope.flag, "logs", f"{talking.name}*", "--no-pager")
+        assert f"{talking.name}/cam-left" in text
+        done = talking.doractl("logs", talking.name, other.name, "--until-end", check=False)
+        assert done.stderr.startswith("doractl: cannot wait for the end of several dataflows")
+    finally:
+        other.end()
+
+
+def test_repetitions_on_a_terminal(talking: Cell) -> None:
+    """A pipe gets every line, and people how often it came."""
+    wait_for("ticks", lambda: talking.messages("cam-left").count("tick") > 5)
+    talking.systemctl("stop")
+    sync_journal()
+    words = ("logs", talking.name, "--node", "cam-left", "--grep", "^tick$", "--no-pager")
+    ticks = messages(talking, "--node", "cam-left").count("tick")
+    text = re.sub(r"\x1b\[[0-9;:]*m", "", shown("doractl", talking.scope.flag, *words))
+    said = [line.partition(" cam-left ")[2].strip() for line in text.splitlines()]
+    assert said.count("tick") == 1
+    assert f"... {ticks} times" in said
+
+
 def test_journalctl_shows_the_same(talking: Cell) -> None:
     talking.systemctl("stop")
     sync_journal()
@@ -156,7 +218,8 @@ def test_terminal(talking: Cell) -> None:
 
 def test_pager(talking: Cell, tmp_path: Path) -> None:
     seen = tmp_path / "seen"
-    assert shown("doractl", "logs", talking.name, "--tail", "5", PAGER=f"tee {seen}")
+    words = ("--tail", "5", "--grep", "^line")
+    assert shown("doractl", "logs", talking.name, *words, PAGER=f"tee {seen}")
     assert len(seen.read_text().splitlines()) == 5
 
 
@@ -171,7 +234,13 @@ BAD_INPUT = [
     (["{name}", "-r", "--until-end"], 2, "cannot follow with the newest", "--reverse"),
     (["--node", "cam-left"], 2, "cannot select nodes of all dataflows", ""),
     (["{name}", "-o", "yaml"], 2, "invalid value for '-o'", ""),
-    (["{name}", "--tail", "-1"], 2, "invalid value for '--tail'", ""),
+    (["{name}", "--tail", "-1"], 2, "cannot use '-1' as a number of lines", "such as 100"),
+    (["{name}", "-n", "1 2"], 2, "cannot use '1 2' as a number of lines", "such as 100"),
+    (["{name}", "--log-filter", "cam"], 2, "cannot use 'cam' as a filter", "NODE=LEVEL"),
+    (["{name}", "--log-filter", "a=loud"], 2, "cannot use 'loud' as a level", "error, warn"),
+    (["--log-filter", "a=info"], 2, "cannot select nodes of all dataflows", ""),
+    (["{name}", "-b", "-5000"], 4, "cannot find the boot", "--list-boots"),
+    (["{name}", "nosuch*"], 4, "no dataflow named 'nosuch*'", ""),
 ]
 
 

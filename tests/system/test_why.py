@@ -81,6 +81,19 @@ def test_a_node_that_crashed_for_good(cell: Cell, project: Project) -> None:
     assert again["before"] == {key: found[key] for key in ("summary", "at", "at_us")}
 
 
+@pytest.mark.warns(*CRASHES, "exit code 3", "ExitCode(3)", "Failed to start", "initializ")
+def test_a_failed_start_shows_the_words_of_the_guilty_node(cell: Cell, project: Project) -> None:
+    """The others fail because of it, with many more lines; and dora says it again."""
+    camera = 'import sys\nprint("no camera there", file=sys.stderr, flush=True)\nsys.exit(3)\n'
+    project.write("bad.py", camera)
+    project.write("taker.py", TAKER)
+    done = cell.start(project.write("flow.yml", BAD), check=False)
+    assert done.returncode == ExitCode.FAILURE
+    *words, message, _ = done.stderr.splitlines()
+    assert words == ["  bad: no camera there"]
+    assert message.startswith(f"doractl: cannot start {cell.name}: node bad: exit code 3")
+
+
 @pytest.mark.warns(*CRASHES)
 def test_restarts_come_with_their_causes(cell: Cell, project: Project) -> None:
     words = ("--restart-policy=on-failure", "--max-restarts=2", "--max-restart-delay=500ms")

@@ -1,30 +1,59 @@
 """Print what the nodes of a dataflow wrote."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import click
 
 from dora_systemd.adapters.journal.reader import JournalReader, check_readable
 from dora_systemd.cli.colors import is_dumb, wants_colors
-from dora_systemd.cli.parameters import current_scope, scope_options
-from dora_systemd.decisions.logs.query import OUTPUTS, LogQuery, parse_level
+from dora_systemd.cli.parameters import current_scope, print_warnings, scope_options
+from dora_systemd.decisions.logs.query import (
+    ALL_LINES,
+    OUTPUTS,
+    LogQuery,
+    is_boot,
+    parse_filter,
+    parse_level,
+)
 from dora_systemd.decisions.logs.terminal import ShownLines, TerminalLines
-from dora_systemd.errors import ExitCode
-from dora_systemd.verbs.logs import find_query, pass_logs, read_logs
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.values import quoted
+from dora_systemd.verbs.facts.recorded import find_query
+from dora_systemd.verbs.logs import pass_logs, read_logs
 
 Lines = TerminalLines | ShownLines | None
 """Formats lines for a terminal; None for a pipe."""
 
+_BOOT_OPTION = re.compile("-[afqr]*b|--boot")
+_COUNT = re.compile("[0-9]+")
+_OLD_NODE = re.compile(r"[A-Za-z0-9_.*?\[][A-Za-z0-9_.*?\[\]!-]*")
+_OLD_N = "-n is the number of lines now, as in journalctl; for a node use --node {}"
 
-@click.command("logs")
-@click.argument("selector", default="")
+
+class LogsCommand(click.Command):
+    """Takes `-b` without a value, as journalctl does: only a boot can be its value."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        words: list[str] = []
+        for word in [*args, ""]:
+            if words and _BOOT_OPTION.fullmatch(words[-1]):
+                words[-1] += "=" if words[-1] == "--boot" else ""
+                words[-1] += word if is_boot(word) else "0"
+                if is_boot(word):
+                    continue
+            words.append(word)
+        return super().parse_args(ctx, words[:-1])
+
+
+@click.command("logs", cls=LogsCommand)
+@click.argument("selectors", nargs=-1, metavar="[SELECTOR]...")
 @click.option(
-    "-n",
     "--node",
     "nodes",
     multiple=True,
@@ -39,14 +68,29 @@ Lines = TerminalLines | ShownLines | None
     "--follow",
     "is_follow",
     is_flag=True,
-    help="Wait for new lines; starts with the last 10 unless --tail or --since is given.",
+    help="Wait for new lines; starts with the last 10 unless --lines or --since is given.",
 )
 @click.option(
     "--until-end",
     is_flag=True,
     help="Follow until the dataflow has ended; keeps following across restarts.",
 )
-@click.option("--tail", type=click.IntRange(min=0), metavar="N", help="Only the last N lines.")
+@click.option(
+    "-n",
+    "--lines",
+    "--tail",
+    "counts",
+    multiple=True,
+    metavar="N",
+    help="Only the last N lines, or all.",
+)
+@click.option(
+    "-b",
+    "--boot",
+    default="",
+    metavar="[ID]",
+    help="Only this boot, or the boot ID: -1 is the one before, see journalctl.",
+)
 @click.option(
     "--since",
     default="",
@@ -58,7 +102,13 @@ Lines = TerminalLines | ShownLines | None
     "--level",
     default="",
     metavar="LEVEL",
-    help="This level and above: error, warn, info, debug, trace.",
+    help="This level and above: error, warn, info, debug, trace, stdout (all).",
+)
+@click.option(
+    "--log-filter",
+    default="",
+    metavar="FILTER",
+    help='Another --level for some nodes, as in dora: "camera=debug,detector=warn".',
 )
 @click.option(
     "-g",
@@ -78,6 +128,7 @@ Lines = TerminalLines | ShownLines | None
     "--events", "is_events", is_flag=True, help="Only what happened to the dataflow and its nodes."
 )
 @click.option("-r", "--reverse", "is_reverse", is_flag=True, help="Newest lines first.")
+@click.option("-q", "--quiet", "is_quiet", is_flag=True, help="Print lines only, no notes.")
 @click.option(
     "-a",
     "--all",
@@ -96,62 +147,91 @@ Lines = TerminalLines | ShownLines | None
 @click.option("--no-pager", is_flag=True, help="Do not use a pager.")
 @scope_options
 def command(
-    selector: str,
+    selectors: tuple[str, ...],
     nodes: tuple[str, ...],
     run: str,
     no_pager: bool,
     until_end: bool,
+    counts: tuple[str, ...],
+    log_filter: str,
     **options: Any,
 ) -> int:
-    """Print what the nodes of a dataflow wrote, and what happened to them.
+    """Print what the nodes of dataflows wrote, and what happened to them.
 
-    Without SELECTOR: the logs of all dataflows. The dataflow may have ended long ago.
+    Without SELECTOR: the logs of all dataflows. SELECTOR may be a shell pattern. A dataflow may
+    have ended long ago. On a terminal, a line that repeats is shown once.
 
     Examples:
       doractl logs robot                          all there is, in a pager
       doractl logs robot --node camera --follow   what one node writes, from now on
       doractl logs robot --until-end -o json      all until it ends, for a program
-      doractl logs robot --tail 100 --level warn  the last 100 warnings and errors
+      doractl logs robot -n 100 --level warn      the last 100 warnings and errors
+      doractl logs 'cam*' robot -b                several dataflows, since the machine booted
       doractl logs robot --run PREVIOUS --events  what happened to the run before this one
       journalctl -t robot/camera                  the same records, with systemd's own tool
     """
     options.pop("all_nodes")
     options["level"] = parse_level(options["level"]) if options["level"] else ""
+    tail, old_nodes = split_counts(counts)
+    if old_nodes and not options["is_quiet"]:
+        print_warnings([_OLD_N.format(old_nodes[0])])
     scope = current_scope()
     check_readable(scope)
+    journal = JournalReader()
+    wanted = LogQuery(scope, tail=tail, levels=parse_filter(log_filter), **options)
+    query = find_query(journal, wanted, selectors, (*nodes, *old_nodes), run)
+    lines = _lines(journal, query)
     if until_end:
         # Imported late: only --until-end needs it.
         from dora_systemd.verbs.follow import check_until_end, follow_to_end
 
-        check_until_end(selector, options["is_reverse"])
-    journal = JournalReader()
-    query = find_query(journal, LogQuery(scope, **options), selector, nodes, run)
-    lines: Lines = ShownLines() if sys.stdout.isatty() else None
-    if sys.stdout.isatty() and query.output.startswith("short"):
-        known = query.nodes or (journal.known_nodes(query.name) if query.name else ())
-        lines = TerminalLines(
-            [*known, query.name],
-            want_dataflow=not query.name,
-            want_colors=wants_colors(sys.stdout),
-        )
-    if until_end:
+        check_until_end(query)
         follow_to_end(query, lambda step: _print(step, lines))
         return ExitCode.OK
-    if no_pager or query.is_follow or not sys.stdout.isatty():
+    if no_pager or query.is_follow or lines is None:
         return _exit_status(_print(query, lines))
-    _page(_read(query, lines))
+    _page(read_logs(query, lines, wants_colors(sys.stdout)))
     return ExitCode.OK
 
 
-def _read(query: LogQuery, lines: Lines) -> Iterator[bytes]:
-    return read_logs(query, lines, wants_colors(sys.stdout))
+def split_counts(values: Sequence[str]) -> tuple[str, list[str]]:
+    """The number of lines, "" for none, and the nodes: -n was --node, and 0.1 still takes both.
+
+    Raises DoraSystemdError (USAGE).
+    """
+    tail, nodes = "", []
+    for value in values:
+        if value == ALL_LINES or _COUNT.fullmatch(value):
+            tail = value
+        elif _OLD_NODE.fullmatch(value):
+            nodes.append(value)
+        else:
+            hint = "a number such as 100, or all"
+            message = f"cannot use {quoted(value)} as a number of lines"
+            raise DoraSystemdError(message, hint, ExitCode.USAGE)
+    return tail, nodes
+
+
+def _lines(journal: JournalReader, query: LogQuery) -> Lines:
+    if not sys.stdout.isatty():
+        return None
+    if not query.output.startswith("short"):
+        return ShownLines()
+    is_one = bool(query.name) and not query.others
+    known = query.nodes or journal.known_nodes(query.name) if is_one else ()
+    return TerminalLines(
+        [*known, query.name],
+        want_dataflow=not is_one,
+        want_colors=wants_colors(sys.stdout),
+        has_events=not (query.nodes or query.grep or query.level),
+    )
 
 
 def _print(query: LogQuery, lines: Lines) -> int:
     """Print the records of a query, formatted for a terminal, or by journalctl itself."""
-    if not sys.stdout.isatty():
+    if lines is None:
         return pass_logs(query, sys.stdout.fileno())
-    _write(_read(query, lines), sys.stdout.fileno())
+    _write(read_logs(query, lines, wants_colors(sys.stdout)), sys.stdout.fileno())
     return ExitCode.OK
 
 

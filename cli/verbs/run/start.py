@@ -24,7 +24,6 @@ from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
-from dora_systemd.verbs.facts.last_words import last_words
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.start.again import find_start, is_given, means_name
 from dora_systemd.verbs.start.check import check_plan
@@ -36,6 +35,7 @@ from dora_systemd.verbs.start.logins import start_notes
 from dora_systemd.verbs.start.plan import DEFAULT_FILE, StartRequest, make_plan
 from dora_systemd.verbs.start.unit import format_plan
 from dora_systemd.verbs.start.watch import watched_patterns
+from dora_systemd.verbs.why import words_of_start
 
 
 @click.command("start", cls=SettingsCommand)
@@ -96,7 +96,7 @@ def command(
     print_warnings(claimed.warnings)
     print_warnings([ensure_linger(scope) if want_boot else ""])
     options = claimed.plan.options
-    with _last_words(scope, options.uuid), StageLine(sys.stderr) as stage:
+    with _last_words(bus, scope, options.uuid), StageLine(sys.stderr) as stage:
         started = start_unit(bus, scope, options, claimed.properties, stage, not no_wait)
     # Only after the start: a refusal must be one line and a hint.
     print_warnings(start_notes(claimed.plan))
@@ -112,7 +112,7 @@ def _start_known(bus: Bus, scope: Scope, cell: Cell, wait: bool) -> ExitCode:
         return print_outcomes([Outcome(cell, text, is_news=False, details=details)])
     bus.hold(cell.unit)  # keep a failed transient unit
     bus.reset_failed(cell.unit)
-    with _last_words(scope, cell.uuid), StageLine(sys.stderr) as stage:
+    with _last_words(bus, scope, cell.uuid), StageLine(sys.stderr) as stage:
         started = start_unit(bus, scope, cell.options, None, stage, wait)
     return _print_started(started, file, ())
 
@@ -123,12 +123,12 @@ def _print_started(started: Started, file: str, watched: Sequence[str]) -> ExitC
 
 
 @contextmanager
-def _last_words(scope: Scope, uuid: str) -> Iterator[None]:
+def _last_words(bus: Bus, scope: Scope, uuid: str) -> Iterator[None]:
     """Print what the nodes of a dataflow said last if the block fails to start it."""
     try:
         yield
     except DoraSystemdError as error:
         if error.code is ExitCode.FAILURE:
-            for line in last_words(scope, uuid):
+            for line in words_of_start(bus, scope, uuid):
                 tell(f"  {line}", err=True)
         raise

@@ -120,6 +120,9 @@ def _complaint_error(complaint: str) -> DoraSystemdError:
         return DoraSystemdError(
             f"cannot use the {complaint[4:]}", "see pcre2pattern(3)", ExitCode.USAGE
         )
+    if " boot " in complaint:
+        hint = "journalctl --list-boots shows them"
+        return DoraSystemdError(f"cannot find the boot: {complaint}", hint, ExitCode.NOT_FOUND)
     if "insufficient permissions" in complaint:
         return DoraSystemdError("cannot read the journal", _JOIN, ExitCode.NO_PERMISSION)
     return DoraSystemdError(f"cannot read the journal: {complaint}", "see journalctl(1)")

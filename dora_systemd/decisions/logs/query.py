@@ -5,12 +5,14 @@ dataflow.
 """
 
 import re
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 from dora_systemd.decisions.logs.events import EVENTS
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import SLICE, unit_name
 from dora_systemd.scope import Scope
+from dora_systemd.values import quoted
 
 OUTPUTS = ("short", "short-precise", "json", "cat", "export")
 
@@ -22,16 +24,22 @@ LEVELS = {
 
 UNIT_ENDS = ("7ad2d189f7e94e70a38c781354912448", "d9b373ed55a64feb8242e02dbe79a49c")
 
+ALL_LINES = "all"
+"""As a number of lines: no restriction, and no default of --follow."""
+_BOOT = re.compile(r"all|(?:[0-9a-f]{32})?(?:[+-]?[0-9]+)?")
 _DURATION = re.compile(r"(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:ms|s|min|m|h|d|w)")
 
 
 @dataclass(frozen=True)
 class LogQuery:
-    """The records to show, their order and form. "" and None: no restriction.
+    """The records to show, their order and form. "" and (): no restriction.
 
-    invocation: of systemd, one life of the unit. run: dora's id of one run. since, until: as in
-    systemd.time(7), or a duration, which means that long ago. tail: number of last records.
-    cursor_file: begin after the record in this file, and write the last one to it.
+    nodes: "" stands for the records of the dataflow itself. levels: by node, instead of `level`;
+    they need `nodes`. invocation: of systemd, one life of the unit. run: dora's id of one run.
+    boot: as in journalctl(1). since, until: as in systemd.time(7), or a duration, which means that
+    long ago. tail: number of last records, or ALL_LINES. cursor_file: begin after the record in
+    this file, and write the last one to it. others: more dataflows, of which only the matches
+    count.
     """
 
     scope: Scope
@@ -42,24 +50,48 @@ class LogQuery:
     run: str = ""
     is_events: bool = False
     level: str = ""
+    levels: Mapping[str, str] = field(default_factory=dict)
+    boot: str = ""
     since: str = ""
     until: str = ""
     grep: str = ""
-    tail: int | None = None
+    tail: str = ""
     is_follow: bool = False
     is_reverse: bool = False
+    is_quiet: bool = False
     want_unprintable: bool = False
     output: str = "short"
     cursor_file: str = ""
+    others: tuple["LogQuery", ...] = ()
 
 
 def parse_level(text: str) -> str:
     """A level, in lower case; raises DoraSystemdError (USAGE) for an unknown one."""
     level = text.lower()
     if level not in LEVELS:
-        known = "error, warn, info, debug, trace; those of syslog are understood too"
+        known = "error, warn, info, debug, trace, stdout; those of syslog are understood too"
         raise DoraSystemdError(f"cannot use {text!r} as a level", f"one of {known}", ExitCode.USAGE)
     return level
+
+
+def parse_filter(text: str) -> dict[str, str]:
+    """Levels by node, from "camera=debug,detector=warn" as in `dora logs --log-filter`.
+
+    Raises DoraSystemdError (USAGE).
+    """
+    levels = {}
+    for pair in filter(None, map(str.strip, text.split(","))):
+        node, equals, level = pair.partition("=")
+        if not equals:
+            hint = "NODE=LEVEL, such as camera=debug,detector=warn"
+            raise DoraSystemdError(f"cannot use {quoted(pair)} as a filter", hint, ExitCode.USAGE)
+        levels[node.strip()] = parse_level(level.strip())
+    return levels
+
+
+def is_boot(text: str) -> bool:
+    """Whether it can follow `journalctl --boot`: an id, an offset or both, or "all"."""
+    return bool(text) and _BOOT.fullmatch(text) is not None
 
 
 def journal_time(text: str) -> str:
@@ -91,10 +123,26 @@ def query_matches(query: LogQuery) -> list[str]:
         "DORA_RUN": query.run,
     }
     base += [f"{field}={value}" for field, value in fields.items() if value]
-    base += [f"DORA_NODE={node}" for node in query.nodes]
     if query.is_events:
         base += _event_matches()
-    return _with_level(base, query.level)
+    terms = [_with_level([*base, *nodes], level) for level, nodes in _node_terms(query)]
+    return _either([*terms, *map(query_matches, query.others)])
+
+
+def _node_terms(query: LogQuery) -> list[tuple[str, list[str]]]:
+    """Levels, with the matches of the nodes whose records are shown from that level on."""
+    found: dict[tuple[str, bool], list[str]] = {}
+    for node in query.nodes:
+        match = f"DORA_NODE={node}" if node else f"SYSLOG_IDENTIFIER={query.name}"
+        # Matches of different fields exclude each other within a term.
+        key = (query.levels.get(node, query.level), bool(node))
+        found.setdefault(key, []).append(match)
+    return [(level, nodes) for (level, _), nodes in found.items()] or [(query.level, [])]
+
+
+def _either(terms: Sequence[list[str]]) -> list[str]:
+    first, *others = terms
+    return [*first, *(match for term in others for match in ("+", *term))]
 
 
 def end_matches(scope: Scope, name: str) -> list[str]:
@@ -143,13 +191,14 @@ def _with_level(base: list[str], level: str) -> list[str]:
 def query_arguments(query: LogQuery) -> list[str]:
     """The arguments of journalctl for a query."""
     options = [f"--output={query.output}"]
-    if query.output not in ("short", "short-precise") or query.cursor_file:
+    if query.is_quiet or query.cursor_file or query.output not in ("short", "short-precise"):
         options.append("--quiet")  # no line between two boots
     values = {
+        "--boot": query.boot,
         "--since": journal_time(query.since),
         "--until": journal_time(query.until),
         "--grep": query.grep,
-        "--lines": "" if query.tail is None else str(query.tail),
+        "--lines": query.tail,
         "--cursor-file": query.cursor_file,
     }
     flags = {

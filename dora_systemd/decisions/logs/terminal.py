@@ -1,4 +1,4 @@
-"""Formats lines of the journal for a terminal: aligned, with a colour for each node.
+"""Formats lines of the journal for a terminal: aligned, with a colour for each node, without noise.
 
 It rewrites journalctl's `short` output in chunks, because there can be hundreds of thousands of
 lines.
@@ -7,8 +7,10 @@ lines.
 import re
 import time
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
+from dora_systemd.decisions.logs.noise import is_same, is_told_by_event, repeated
 from dora_systemd.terminal_text import one_line, shown_log
 
 # The beginning of a line of `journalctl -o short`, with or without journalctl's own colours, or
@@ -24,6 +26,22 @@ _COLORS = (32, 34, 35, 36, 92, 94, 95, 96)
 # Colours of messages by PRIORITY, as in journalctl.
 _MESSAGE_COLORS = {b"3": b"\x1b[0;1;31m", b"4": b"\x1b[0;1;38:5:185m", b"7": b"\x1b[0;38:5:245m"}
 MAX_WIDTH = 24
+_MARK = b"\0"
+"""Before each record while it is rewritten: ShownLines leaves none in a text."""
+
+
+@dataclass
+class _Said:
+    """What a node has said last: how its line begins, the rest, and how often it came."""
+
+    start: bytes = b""
+    text: bytes = b""
+    times: int = 1
+
+    def ending(self) -> bytes:
+        """What is still to be shown of the repetitions."""
+        again = repeated(self.text.decode("utf-8", "replace").rstrip("\n"), self.times)
+        return self.start + again.encode() + b"\n" if again else b""
 
 
 def color_of(node: str) -> int:
@@ -35,7 +53,8 @@ class TerminalLines:
     """Rewrites journalctl's short lines; formats records as such lines.
 
     nodes: known names, for the width of their column. want_dataflow: show the name of the dataflow.
-    want_colors: for nodes and priorities. is_terminal: escape control characters.
+    want_colors: for nodes and priorities. is_terminal: escape control characters. has_events: the
+    life events are among the lines, so what dora's daemon says of them is left out.
     """
 
     def __init__(
@@ -44,18 +63,52 @@ class TerminalLines:
         want_dataflow: bool = False,
         want_colors: bool = True,
         is_terminal: bool = True,
+        has_events: bool = False,
     ) -> None:
         self._width = min(max(map(len, nodes), default=0), MAX_WIDTH)
         self._want_dataflow = want_dataflow
         self._want_colors = want_colors
         self._is_terminal = is_terminal
+        self._has_events = has_events
         self._labels: dict[bytes, bytes] = {}
+        self._said: dict[bytes, _Said] = {}
+        self._last: list[bytes] = []
         self._whole = ShownLines()
         self._old_indent = self._new_indent = 0
 
     def feed(self, data: bytes) -> bytes:
-        """The lines that `data` completes, rewritten."""
-        return _PREFIX.sub(self._rewrite, self._whole.feed(data))
+        """The lines that `data` completes, rewritten, but for the last record, which may go on."""
+        before, *parts = _PREFIX.sub(self._rewrite, self._whole.feed(data)).split(_MARK)
+        if self._last:
+            self._last[-1] += before
+            before = b""
+        parts = [*self._last, *parts]
+        self._last = parts[-3:]
+        return before + self._without_repeats(parts[:-3])
+
+    def flush(self) -> bytes:
+        """The rest: the last record, and how often the last line of each node came."""
+        last, self._last = self._without_repeats(self._last), []
+        said, self._said = self._said, {}
+        return last + b"".join(one.ending() for one in said.values())
+
+    def _without_repeats(self, parts: Sequence[bytes]) -> bytes:
+        """The lines of records, of which each has three parts: origin, begin of the line, rest."""
+        shown: list[bytes] = []
+        for name, start, text in zip(parts[::3], parts[1::3], parts[2::3], strict=True):
+            if self._has_events and is_told_by_event(name, text):
+                continue
+            said = self._said.get(name)
+            if said is None:
+                said = self._said[name] = _Said()
+            elif is_same(said.text, text):
+                said.start, said.text, said.times = start, text, said.times + 1
+                continue
+            elif said.times > 1:
+                shown.append(said.ending())
+            said.text, said.times = text, 1
+            shown += (start, text)
+        return b"".join(shown)
 
     def record(self, record: Mapping[str, bytes]) -> bytes:
         """The lines of one record of the Journal Export Format."""
@@ -76,7 +129,9 @@ class TerminalLines:
                 return indent
             return b" " * (len(indent) - self._old_indent + self._new_indent)
         self._old_indent = len(match[0]) - _escapes(match[0])
-        return self._start(match["time"], match["dataflow"], match["node"] or b"")
+        dataflow, node = match["dataflow"], match["node"] or b""
+        start = self._start(match["time"], dataflow, node)
+        return _MARK.join((b"", dataflow + b"/" + node, start, b""))
 
     def _start(self, when: bytes, dataflow: bytes, node: bytes) -> bytes:
         name = node
@@ -111,6 +166,10 @@ class ShownLines:
             return b""
         done, self._rest = self._rest + whole + end, rest
         return shown_log(done)
+
+    def flush(self) -> bytes:
+        """Nothing: it holds no line back."""
+        return b""
 
 
 def _escapes(text: bytes) -> int:

@@ -9,6 +9,7 @@ from dora_systemd.decisions.cell.exits import ExitKind, parse_exit
 from dora_systemd.decisions.cell.restarts import budget_words
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.views.dataflows import RESTARTING, UNKNOWN, local_time
+from dora_systemd.decisions.why.last_lines import Word, shown_last
 from dora_systemd.decisions.why.sandbox_signs import sandbox_remedy
 from dora_systemd.decisions.why.verdict import Restart, Verdict
 from dora_systemd.terminal_text import cut, one_line
@@ -73,15 +74,6 @@ class Subject:
     flag: str
     file: str = ""
     is_loaded: bool = False
-
-
-@dataclass(frozen=True)
-class Word:
-    """One line of a node. at_us: CLOCK_REALTIME µs."""
-
-    at_us: int
-    node: str
-    text: str
 
 
 @dataclass(frozen=True)
@@ -228,7 +220,8 @@ def _words(report: Report) -> list[str]:
     count = "line" if len(report.words) == 1 else f"{len(report.words)} lines"
     every = f"doractl logs {report.subject.name}" + (f" --node {node}" if node else "")
     title = f"The last {count} of {node or 'its nodes'} (all: {every}):"
-    return [title, *(f"  {_clock(one.at_us)[6:]}  {_line(one, node)}" for one in report.words)]
+    shown = shown_last(report.words, LINES)
+    return [title, *(f"  {_clock(one.at_us)[6:]}  {_line(one, node)}" for one in shown)]
 
 
 def _line(word: Word, node: str) -> str:

@@ -66,7 +66,9 @@ def _history(report: Report) -> dict[str, Any]:
         "timeline": [
             _at(one.at_us, event=one.name, node=one.node, text=one.text) for one in verdict.timeline
         ],
-        "last_lines": [_at(one.at_us, node=one.node, text=one.text) for one in report.words],
+        "last_lines": [
+            _at(one.at_us, node=one.node, text=one.text, times=one.times) for one in report.words
+        ],
     }
 
 

@@ -22,12 +22,11 @@ from dora_systemd.gateway.control.talk import find_by_uuid, find_if_loaded
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell, read_cells
 from dora_systemd.verbs.facts.ended import ended_rows
-from dora_systemd.verbs.facts.last_words import last_words
 from dora_systemd.verbs.facts.list import read_rows
 from dora_systemd.verbs.facts.nodes import written_dataflow
 from dora_systemd.verbs.facts.reason import failure_reason
 from dora_systemd.verbs.follow import is_unit_up
-from dora_systemd.verbs.why import explain
+from dora_systemd.verbs.why import explain, words_of_start
 
 _MOST_ENDED = 20
 """Maximum number of dataflows that ended earlier in `dora list`."""
@@ -122,7 +121,7 @@ def spawned(scope: Scope, uuid: str) -> dict[str, Any] | None:
         return None
     if state["ActiveState"] != "failed":
         return _over(scope, uuid)
-    lines = "".join(f"\n  {line}" for line in last_words(scope, uuid))
+    lines = "".join(f"\n  {line}" for line in words_of_start(bus, scope, uuid))
     hint = f"doractl {scope.flag} why {cell.name} tells more"
     error = f"cannot start {cell.name}: {failure_reason(bus, cell.unit)}\n\n  hint: {hint}"
     return {"Error": error + (f"\n{lines}" if lines else "")}

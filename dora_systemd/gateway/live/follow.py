@@ -64,7 +64,7 @@ def _query(scope: Scope, message: PageMessage) -> LogQuery:
         scope,
         name=cell.name,
         nodes=(message.node,) if message.node else (),
-        tail=FIRST_LINES,
+        tail=str(FIRST_LINES),
         is_follow=True,
         want_unprintable=True,
         output="export",

@@ -138,13 +138,18 @@ class Selector:
         return next(iter(self.meant(ended_rows(scope))), None)
 
 
-def selectors_of(texts: Sequence[str], cells: Iterable[Cell]) -> list[Selector]:
-    """A selector for each text; a pattern as in glob(7) gives one for each match.
+def selectors_of(texts: Sequence[str], known: Iterable[Named]) -> list[Selector]:
+    """A selector for each text; a pattern as in glob(7) gives one for each match in `known`.
 
-    cells: from read_cells(). Raises DoraSystemdError (NOT_FOUND) for a pattern that matches none.
+    Raises DoraSystemdError (NOT_FOUND) for a pattern that matches none.
     """
-    known = list(cells)
-    return [one for text in texts for one in _expanded(text, known)]
+    candidates = list(known)
+    return [one for text in texts for one in _expanded(text, candidates)]
+
+
+def is_pattern(text: str) -> bool:
+    """Whether it is a pattern as in glob(7)."""
+    return _PATTERN.search(text) is not None
 
 
 def find_all(manager: Manager, scope: Scope, texts: Sequence[str]) -> list[Cell]:
@@ -156,16 +161,16 @@ def find_all(manager: Manager, scope: Scope, texts: Sequence[str]) -> list[Cell]
     return list(dict.fromkeys(found))
 
 
-def _expanded(text: str, cells: Sequence[Cell]) -> list[Selector]:
-    if not _PATTERN.search(text):
+def _expanded(text: str, known: Sequence[Named]) -> list[Selector]:
+    if not is_pattern(text):
         return [Selector(text)]
     # "*o*" must not match every dataflow because of the "dora-" of its unit.
     units = text.startswith(UNIT_PREFIX)
     fitting = [
-        cell.name
-        for cell in cells
-        if fnmatchcase(cell.name, text) or (units and fnmatchcase(cell.unit, text))
+        one.name
+        for one in known
+        if fnmatchcase(one.name, text) or (units and fnmatchcase(unit_name(one.name), text))
     ]
     if not fitting:
-        raise Selector(text).missing(cell.name for cell in cells)
+        raise Selector(text).missing(one.name for one in known)
     return [Selector(name) for name in fitting]

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.views.dataflows import DataflowRow
+from dora_systemd.decisions.why.last_lines import Word
 from dora_systemd.decisions.why.lives import (
     SHUTDOWN_MESSAGE,
     START_LIMIT_FUNCTION,
@@ -19,7 +20,7 @@ from dora_systemd.decisions.why.lives import (
     plain_text,
 )
 from dora_systemd.decisions.why.postmortem import UNKNOWN_PERSON, examine
-from dora_systemd.decisions.why.report import Report, Subject, Word, format_report
+from dora_systemd.decisions.why.report import Report, Subject, format_report
 from dora_systemd.decisions.why.report_object import report_object
 from dora_systemd.decisions.why.verdict import Facts, Verdict
 

@@ -1,6 +1,7 @@
 """Following a dataflow to its end: which steps, when the last one, and what cannot be."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -97,22 +98,23 @@ def test_steps(tmp_path: Path) -> None:
     assert arguments(later)[1:] == ["--quiet", "--since=@1.500000", option]
     cursor.write_text("s=1")
     assert arguments(next_step(QUERY, cursor, 1_500_000))[1:] == ["--quiet", option]
-    given = LogQuery(QUERY.scope, since="5m", tail=3, grep="x", is_follow=True)
-    assert first_step(given, cursor).tail == 3
+    given = LogQuery(QUERY.scope, since="5m", tail="3", grep="x", is_follow=True)
+    assert first_step(given, cursor).tail == "3"
     assert first_step(given, cursor).since == "5m"
     assert next_step(given, cursor, 0).grep == "x"
 
 
 @pytest.mark.parametrize(
-    ("selector", "is_reverse", "message"),
+    ("query", "message"),
     [
-        ("", False, "cannot wait for the end of all dataflows"),
-        ("robot", True, "cannot follow with the newest lines first"),
+        (replace(QUERY, name=""), "cannot wait for the end of all dataflows"),
+        (replace(QUERY, others=(QUERY,)), "cannot wait for the end of several dataflows"),
+        (replace(QUERY, is_reverse=True), "cannot follow with the newest lines first"),
     ],
 )
-def test_what_has_no_end(selector: str, is_reverse: bool, message: str) -> None:
+def test_what_has_no_end(query: LogQuery, message: str) -> None:
     with pytest.raises(DoraSystemdError) as caught:
-        check_until_end(selector, is_reverse)
+        check_until_end(query)
     assert (caught.value.message, caught.value.code) == (message, ExitCode.USAGE)
 
 

@@ -1,14 +1,19 @@
 """Selectors, nodes and runs, looked up in a journal of our own."""
 
 from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import pytest
 
 from dora_systemd.adapters.journal.reader import JournalReader
-from dora_systemd.decisions.logs.query import LogQuery
+from dora_systemd.decisions.logs.query import LogQuery, query_matches
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.logs import find_query
+from dora_systemd.verbs.facts.recorded import find_query
+from dora_systemd.verbs.logs import pass_logs
+from tests.unit.fakes.library import fake_journalctl
 
 ROBOT = "550e8400-e29b-41d4-a716-446655440000"
 ARM = "550e9999-e29b-41d4-a716-446655440000"
@@ -37,7 +42,7 @@ class FakeJournal(JournalReader):
 
 
 def find(selector: str = "robot", nodes: tuple[str, ...] = (), run: str = "ALL") -> LogQuery:
-    return find_query(FakeJournal(), QUERY, selector, nodes, run)
+    return find_query(FakeJournal(), QUERY, [selector], nodes, run)
 
 
 @pytest.mark.parametrize(
@@ -45,6 +50,7 @@ def find(selector: str = "robot", nodes: tuple[str, ...] = (), run: str = "ALL")
     [
         ("robot", "robot", ""),
         ("dora-robot.service", "robot", ""),
+        ("dora-robot", "robot", ""),
         (ROBOT, "robot", ROBOT),
         ("550e84", "robot", ROBOT),
         ("550E99", "arm", ARM),
@@ -78,9 +84,50 @@ def test_ambiguous_uuid() -> None:
             return ["arm", "robot"]
 
     with pytest.raises(DoraSystemdError) as caught:
-        find_query(WithoutThatName(), QUERY, "550e")
+        find_query(WithoutThatName(), QUERY, ["550e"])
     assert caught.value.code is ExitCode.USAGE
     assert caught.value.hint == f"one of {ROBOT} (robot), {ARM} (arm)"
+
+
+@pytest.mark.parametrize(
+    ("selectors", "names"),
+    [
+        (("robot", "arm"), ["robot", "arm"]),
+        (("*r*", "arm"), ["arm", "robot"]),
+        (("robot", "dora-robot", "rob*"), ["robot"]),
+        (("550E99", "robot"), ["arm", "robot"]),
+    ],
+)
+def test_several_dataflows(selectors: tuple[str, ...], names: list[str]) -> None:
+    query = find_query(FakeJournal(), QUERY, selectors)
+    assert [query.name, *(one.name for one in query.others)] == names
+    assert query_matches(query).count("+") == len(names) - 1
+
+
+def test_a_pattern_without_a_match() -> None:
+    with pytest.raises(DoraSystemdError) as caught:
+        find_query(FakeJournal(), QUERY, ["robot", "cam*"])
+    assert caught.value.code is ExitCode.NOT_FOUND
+
+
+def test_nodes_of_several_dataflows() -> None:
+    """A node needs to be in one of them."""
+    query = find_query(FakeJournal(), QUERY, ["arm", "robot"], ["sink"])
+    assert (query.name, query.nodes, query.others) == ("robot", ("sink",), ())
+    with pytest.raises(DoraSystemdError) as caught:
+        find_query(FakeJournal(), QUERY, ["arm", "robot"], ["nope"])
+    assert caught.value.hint == "nodes: cam-left, cam-right, sink"
+
+
+def test_levels_of_nodes() -> None:
+    """Without --node, all nodes and the dataflow itself are shown, each from its level on."""
+    query = replace(QUERY, levels={"sink": "err", "elsewhere": "debug"})
+    found = find_query(FakeJournal(), query, ["robot"])
+    assert found.nodes == ("", "cam-left", "cam-right", "sink")
+    assert find_query(FakeJournal(), query, ["robot"], ["sink"]).nodes == ("sink",)
+    with pytest.raises(DoraSystemdError) as caught:
+        find_query(FakeJournal(), query, [])
+    assert caught.value.code is ExitCode.USAGE
 
 
 @pytest.mark.parametrize(
@@ -121,3 +168,39 @@ def test_nodes_and_runs_are_those_of_one_dataflow(nodes: tuple[str, ...], run: s
     with pytest.raises(DoraSystemdError) as caught:
         find("", nodes=nodes, run=run)
     assert caught.value.code is ExitCode.USAGE
+
+
+def entry(us: int) -> bytes:
+    return f"__REALTIME_TIMESTAMP={us}\nMESSAGE=x\n\n".encode()
+
+
+@pytest.mark.parametrize(
+    ("given", "is_asked"),
+    [
+        ({"grep": "x", "tail": "2"}, True),
+        ({"grep": "x", "tail": "2", "is_follow": True}, False),
+        ({"grep": "x", "tail": "2", "is_reverse": True}, False),
+        ({"grep": "x", "tail": "all"}, False),
+        ({"grep": "x"}, False),
+        ({"tail": "2"}, False),
+    ],
+)
+def test_found_lines_come_in_the_order_of_time(
+    given: dict[str, Any], is_asked: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """journalctl reverses --grep with --lines: ask it when these lines were, then for that time."""
+    calls = fake_journalctl(monkeypatch, tmp_path, entry(5_000_000) + entry(3_000_000))
+    with (tmp_path / "out").open("wb") as out:
+        assert pass_logs(replace(QUERY, name="robot", **given), out.fileno()) == 0
+    *first, last = calls.read_text().splitlines()
+    assert len(first) == is_asked
+    if is_asked:
+        assert "--lines=2" in first[0]
+        assert "--since=@3.000000 --until=@5.000000 --grep=x --" in last
+
+
+def test_nothing_is_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    calls = fake_journalctl(monkeypatch, tmp_path, b"")
+    with (tmp_path / "out").open("wb") as out:
+        pass_logs(replace(QUERY, grep="x", tail="2"), out.fileno())
+    assert "--grep=x --lines=2 --" in calls.read_text().splitlines()[-1]

@@ -39,6 +39,12 @@ def play(script: Path, text: str) -> None:
             "cannot read the journal",
             ExitCode.NO_PERMISSION,
         ),
+        (
+            "Data from the specified boot (-5) is not available: No such boot ID in journal",
+            "cannot find the boot: Data from the specified boot (-5) is not available: "
+            "No such boot ID in journal",
+            ExitCode.NOT_FOUND,
+        ),
         ("Something else", "cannot read the journal: Something else", ExitCode.FAILURE),
     ],
 )

@@ -8,7 +8,9 @@ from dora_systemd.decisions.logs.events import EVENTS
 from dora_systemd.decisions.logs.query import (
     LogQuery,
     end_matches,
+    is_boot,
     journal_time,
+    parse_filter,
     parse_level,
     query_arguments,
     query_matches,
@@ -63,9 +65,12 @@ def test_debug_leaves_out_trace() -> None:
 
 
 def test_arguments() -> None:
-    query = LogQuery(SYSTEM, since="5m", until="now", grep="-x", tail=0, is_follow=True)
+    query = LogQuery(
+        SYSTEM, since="5m", until="now", grep="-x", tail="0", boot="-1", is_follow=True
+    )
     assert query_arguments(query) == [
         "--output=short",
+        "--boot=-1",
         "--since=-5m",
         "--until=now",
         "--grep=-x",
@@ -79,6 +84,61 @@ def test_arguments() -> None:
 @pytest.mark.parametrize("output", ["json", "cat", "export"])
 def test_programs_get_records_only(output: str) -> None:
     assert "--quiet" in query_arguments(LogQuery(SYSTEM, output=output))
+    assert "--quiet" in query_arguments(LogQuery(SYSTEM, is_quiet=True))
+
+
+ROBOT = "_SYSTEMD_UNIT=dora-robot.service"
+
+
+def test_several_dataflows() -> None:
+    arm = LogQuery(SYSTEM, name="arm", nodes=("hand",))
+    matches = query_matches(LogQuery(SYSTEM, name="robot", others=(arm, arm)))
+    other = ["_SYSTEMD_UNIT=dora-arm.service", "DORA_NODE=hand"]
+    assert matches == [ROBOT, "+", *other, "+", *other]
+
+
+def test_levels_by_node() -> None:
+    """Each node from its level on; the others, and the dataflow itself, from that for all."""
+    levels = {"camera": "emerg", "plot": "emerg", "detector": "stdout"}
+    nodes = ("", "camera", "detector", "plot", "sink")
+    query = LogQuery(SYSTEM, name="robot", nodes=nodes, level="alert", levels=levels)
+    alert = ["PRIORITY=0", "PRIORITY=1"]
+    assert query_matches(query) == [
+        *(ROBOT, "SYSLOG_IDENTIFIER=robot", *alert, "+"),
+        *(ROBOT, "DORA_NODE=camera", "DORA_NODE=plot", "PRIORITY=0", "+"),
+        *(ROBOT, "DORA_NODE=detector", "+"),
+        *(ROBOT, "DORA_NODE=sink", *alert),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "levels"),
+    [
+        ("camera=debug", {"camera": "debug"}),
+        (" camera = DEBUG , plot=stdout,", {"camera": "debug", "plot": "stdout"}),
+        ("", {}),
+    ],
+)
+def test_filter(text: str, levels: dict[str, str]) -> None:
+    assert parse_filter(text) == levels
+
+
+@pytest.mark.parametrize("text", ["camera", "camera=loud", "camera=", "a=debug,b"])
+def test_wrong_filter(text: str) -> None:
+    with pytest.raises(DoraSystemdError) as caught:
+        parse_filter(text)
+    assert caught.value.code is ExitCode.USAGE
+
+
+@pytest.mark.parametrize(
+    ("text", "is_one"),
+    [
+        *((word, True) for word in ("0", "-1", "+2", "12", "all", "a" * 32, "a" * 32 + "-1")),
+        *((word, False) for word in ("", "robot", "-f", "--follow", "a" * 31, "1x", "-")),
+    ],
+)
+def test_boot(text: str, is_one: bool) -> None:
+    assert is_boot(text) is is_one
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,11 @@ from dora_systemd.decisions.logs.terminal import TerminalLines, color_of
 SHORT = b"Nov 21 01:02:59 lab robot/camera[95]: "
 
 
+def fed(lines: TerminalLines, data: bytes) -> bytes:
+    """All that becomes of `data`."""
+    return lines.feed(data) + lines.flush()
+
+
 def plain(data: bytes) -> bytes:
     return re.sub(rb"\x1b\[[0-9;:]*m", b"", data)
 
@@ -25,25 +30,27 @@ def plain(data: bytes) -> bytes:
     ],
 )
 def test_line(line: bytes, expected: bytes) -> None:
-    assert plain(TerminalLines(["camera", "detector"]).feed(line)) == expected
+    assert plain(fed(TerminalLines(["camera", "detector"]), line)) == expected
 
 
 def test_several_dataflows() -> None:
     lines = TerminalLines(want_dataflow=True)
-    assert plain(lines.feed(SHORT + b"hi\n")) == b"Nov 21 01:02:59 robot/camera hi\n"
+    assert plain(fed(lines, SHORT + b"hi\n")) == b"Nov 21 01:02:59 robot/camera hi\n"
 
 
 def test_second_line_of_a_message_stays_below_the_first() -> None:
     data = SHORT + b"one\n" + b" " * len(SHORT) + b"  two\n"
-    found = plain(TerminalLines(["detector"]).feed(data)).splitlines()
+    found = plain(fed(TerminalLines(["detector"]), data)).splitlines()
     assert found[1].index(b"two") == found[0].index(b"one") + 2
 
 
 def test_chunks_make_no_difference() -> None:
-    data = (SHORT + b"one\n" + SHORT + b"two\n") * 3
-    whole = TerminalLines().feed(data)
+    data = (SHORT + b"one\n" + SHORT + b"two\n") * 3 + (SHORT + b"one\n") * 5
+    data += SHORT + b"one\n" + b" " * len(SHORT) + b"more\n"
+    whole = fed(TerminalLines(), data)
     lines = TerminalLines()
-    assert b"".join(lines.feed(data[i : i + 1]) for i in range(len(data))) == whole
+    pieces = b"".join(lines.feed(data[i : i + 1]) for i in range(len(data)))
+    assert pieces + lines.flush() == whole
 
 
 def test_color_of_a_node_is_always_the_same() -> None:
@@ -52,7 +59,7 @@ def test_color_of_a_node_is_always_the_same() -> None:
 
 
 def test_no_colors() -> None:
-    assert b"\x1b" not in TerminalLines(want_colors=False).feed(SHORT + b"x\n")
+    assert b"\x1b" not in fed(TerminalLines(want_colors=False), SHORT + b"x\n")
 
 
 def test_record() -> None:
@@ -69,3 +76,46 @@ def test_record() -> None:
     assert b"\x1b[0;1;31mone" in lines.record(record)
     assert b"\x1b" not in TerminalLines(want_colors=False).record(record)
     assert TerminalLines().record({}).endswith(b"\n")
+
+
+def line(node: str, text: str, second: int = 0) -> bytes:
+    return f"Nov 21 01:02:{second:02} lab robot/{node}[95]: {text}\n".encode()
+
+
+def texts(data: bytes, has_events: bool = False) -> list[str]:
+    """What is shown: seconds, node and text."""
+    lines = TerminalLines(["camera"], want_colors=False, has_events=has_events)
+    return [one[13:] for one in fed(lines, data).decode().splitlines()]
+
+
+def test_repetitions_are_counted_by_node() -> None:
+    """Other nodes may say something meanwhile. The count stands where the last one stood."""
+    data = b"".join(line("camera", "slow", i) + line("sink", "idle", i) for i in range(5))
+    assert texts(data + line("camera", "fast", 7)) == [
+        *("00 camera slow", "00 sink   idle"),
+        *("04 camera ... 5 times", "07 camera fast", "04 sink   ... 5 times"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("said", "shown"),
+    [
+        (["a", "a"], ["a", "a"]),
+        (["a", "b", "a"], ["a", "b", "a"]),
+        (["line 1", "line 2", "line 3"], ["line 1", "line 2", "line 3"]),
+        (["07:50:52,123 x", "07:50:53,004 x", "07:51:00,999 x"], ["07:50:52,123 x", "... 3 times"]),
+        (["2026-11-21T07:50:52.1Z x"] * 3, ["2026-11-21T07:50:52.1Z x", "... 3 times"]),
+        (["at 07:50:52 1", "at 07:50:53 2"], ["at 07:50:52 1", "at 07:50:53 2"]),
+    ],
+)
+def test_what_is_the_same_line(said: list[str], shown: list[str]) -> None:
+    found = texts(b"".join(line("camera", text) for text in said))
+    assert found == [f"00 camera {text}" for text in shown]
+
+
+def test_what_an_event_says_is_said_once() -> None:
+    crash = "node_failure: dora_daemon::spawn::prepared: node exited with error: ExitCode(1)"
+    data = line("daemon", crash) + line("camera", "Node camera crashed: exit code 1")
+    assert texts(data, has_events=True) == ["00 camera Node camera crashed: exit code 1"]
+    assert len(texts(data)) == 2
+    assert len(texts(line("camera", crash) + line("daemon", "other"), has_events=True)) == 2

@@ -9,7 +9,6 @@ from dora_systemd.decisions.views.dataflows import DataflowRow
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.ended import ended_row, newest_ended, not_recorded
-from dora_systemd.verbs.facts.last_words import _line
 from dora_systemd.verbs.facts.list import read_rows
 from tests.unit.fakes.manager import UUID, FakeManager, options
 
@@ -114,8 +113,3 @@ def test_an_enabled_one_that_systemd_has_loaded_again(manager: FakeManager) -> N
     manager.add(options("still"), "inactive", InactiveEnterTimestamp=0)
     event = LastEvent("still", UUID, "dataflow-stopped", 60, "")
     assert [row.ended for row in ended(manager, Events(event))] == [60, 20]
-
-
-def test_lines_of_nodes() -> None:
-    assert _line({"DORA_NODE": "camera", "MESSAGE": "hello"}) == "camera: hello"
-    assert _line({"DORA_NODE": "camera", "MESSAGE": [1, 2]}) == "camera: (binary)"

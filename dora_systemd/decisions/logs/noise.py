@@ -1,0 +1,31 @@
+"""What people need not read twice: lines that repeat, and what an event says already. Pure."""
+
+import re
+
+_TIME = re.compile(rb"(?:\d{4}-\d\d-\d\d[T ])?\d\d:\d\d:\d\d(?:[.,]\d+)?")
+_EXIT_OF_A_NODE = b"node_failure: dora_daemon::"
+"""In a line of dora's daemon about an end, of which node-crashed or node-exited tells too."""
+
+
+def is_same(one: bytes, other: bytes) -> bool:
+    """Whether two lines differ at most in the digits of times."""
+    if one == other:
+        return True
+    if len(one) != len(other) or b":" not in one:
+        return False
+    return _TIME.sub(b"", one) == _TIME.sub(b"", other)
+
+
+def repeated(text: str, times: int) -> str:
+    """What stands below a line that came so often in all: "" for a single one."""
+    if times < 3:
+        return text * (times - 1)
+    return f"... {times} times"
+
+
+def is_told_by_event(origin: bytes, text: bytes) -> bool:
+    """Whether a line tells of the end of a node, which a life event does too.
+
+    origin: "daemon", or with the name of the dataflow before a slash.
+    """
+    return _EXIT_OF_A_NODE in text and origin.rpartition(b"/")[2] == b"daemon"

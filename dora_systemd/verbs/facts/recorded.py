@@ -1,0 +1,118 @@
+"""Which records of the journal a user means: of which dataflows, nodes and runs."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from fnmatch import fnmatchcase
+from itertools import islice
+from typing import NamedTuple
+
+from dora_systemd.adapters.journal.reader import JournalReader
+from dora_systemd.decisions.logs.query import LogQuery
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.values import quoted
+from dora_systemd.verbs.facts.ended import not_recorded
+from dora_systemd.verbs.facts.selector import Selector, is_pattern, selectors_of
+
+
+class _Recorded(NamedTuple):
+    """A dataflow in the journal."""
+
+    name: str
+    uuid: str = ""
+
+
+def find_query(
+    journal: JournalReader,
+    query: LogQuery,
+    selectors: Sequence[str],
+    nodes: Sequence[str] = (),
+    run: str = "ALL",
+) -> LogQuery:
+    """The query, with the names, nodes and runs that the journal has for it.
+
+    selectors: names, units, UUIDs or patterns; none for all dataflows of the scope. nodes: names or
+    patterns as in glob(7). run: CURRENT, PREVIOUS, ALL, or dora's id of a run. Raises
+    DoraSystemdError: NOT_FOUND for a dataflow, node or run without any record.
+    """
+    named = list(filter(None, selectors))
+    found = [query]
+    if named:
+        found = [replace(query, **one._asdict()) for one in _dataflows(journal, named)]
+    if nodes or query.levels:
+        found = _with_nodes(journal, found, nodes)
+    first, *others = (_select_run(journal, one, run) for one in found)
+    return replace(first, others=tuple(others))
+
+
+def _dataflows(journal: JournalReader, texts: Sequence[str]) -> list[_Recorded]:
+    names = [_Recorded(name) for name in journal.known_names()]
+    try:
+        found = [_dataflow(journal, one, names) for one in selectors_of(texts, names)]
+    except DoraSystemdError as error:
+        raise not_recorded(error) from error
+    return list(dict.fromkeys(found))
+
+
+def _dataflow(journal: JournalReader, wanted: Selector, names: list[_Recorded]) -> _Recorded:
+    if named := wanted.only(names):
+        return named
+    fitting = wanted.meant(_Recorded("", uuid) for uuid in journal.known_uuids())
+    found = wanted.only(_Recorded(journal.name_of(one.uuid), one.uuid) for one in fitting)
+    if found is None:
+        raise wanted.missing(one.name for one in names)
+    return found
+
+
+def _with_nodes(
+    journal: JournalReader, queries: list[LogQuery], patterns: Sequence[str]
+) -> list[LogQuery]:
+    """The queries with their nodes, without those of dataflows that have none of them."""
+    if not queries[0].name:
+        hint = "say which dataflow: doractl logs NAME --node NODE"
+        raise DoraSystemdError("cannot select nodes of all dataflows", hint, ExitCode.USAGE)
+    known = [journal.known_nodes(one.name) for one in queries]
+    if not patterns:
+        every = zip(queries, known, strict=True)
+        return [replace(one, nodes=("", *nodes)) for one, nodes in every]
+    for pattern in patterns:
+        if not any(_fitting(nodes, pattern) for nodes in known):
+            nodes = dict.fromkeys(node for each in known for node in each)
+            raise _no_node(pattern, [one.name for one in queries], list(nodes))
+    found = []
+    for one, there in zip(queries, known, strict=True):
+        nodes = dict.fromkeys(node for pattern in patterns for node in _fitting(there, pattern))
+        found += [replace(one, nodes=tuple(nodes))] if nodes else []
+    return found
+
+
+def _fitting(nodes: Sequence[str], pattern: str) -> list[str]:
+    if not is_pattern(pattern):
+        return [pattern] if pattern in nodes else []
+    return [node for node in nodes if node == pattern or fnmatchcase(node, pattern)]
+
+
+def _no_node(pattern: str, names: Sequence[str], known: Sequence[str]) -> DoraSystemdError:
+    message = f"cannot find a node {quoted(pattern)} of dataflow {', '.join(names)}"
+    hint = f"nodes: {', '.join(known)}" if known else "no node has written anything yet"
+    return DoraSystemdError(message, hint, ExitCode.NOT_FOUND)
+
+
+def _select_run(journal: JournalReader, query: LogQuery, run: str) -> LogQuery:
+    if run == "ALL":
+        return query
+    if run not in ("CURRENT", "PREVIOUS"):
+        if run and not journal.has_run(query.name, run):
+            message = f"cannot find the run {quoted(run)}"
+            hint = "doractl list --all, or journalctl --field=DORA_RUN"
+            raise DoraSystemdError(message, hint, ExitCode.NOT_FOUND)
+        return replace(query, run=run)
+    if not query.name:
+        hint = "say which dataflow: doractl logs NAME --run CURRENT"
+        raise DoraSystemdError("cannot select a run of all dataflows", hint, ExitCode.USAGE)
+    index = 0 if run == "CURRENT" else 1
+    lives = journal.invocations(query.scope, query.name, query.uuid)
+    invocation = next(islice(lives, index, None), None)
+    if invocation is None:
+        message = f"cannot find the {run.lower()} run of dataflow {query.name}"
+        raise DoraSystemdError(message, "--run ALL shows all there is", ExitCode.NOT_FOUND)
+    return replace(query, invocation=invocation)

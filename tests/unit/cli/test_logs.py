@@ -1,0 +1,61 @@
+"""The command line of `doractl logs`: letters mean what they mean in journalctl."""
+
+import pytest
+
+from dora_systemd.cli.verbs.look.logs import command, split_counts
+from dora_systemd.errors import DoraSystemdError, ExitCode
+
+
+@pytest.mark.parametrize(
+    ("words", "boot", "selectors"),
+    [
+        ("", "", ()),
+        ("robot", "", ("robot",)),
+        ("-b", "0", ()),
+        ("-b robot", "0", ("robot",)),
+        ("robot -b", "0", ("robot",)),
+        ("-b -1 robot", "-1", ("robot",)),
+        ("-b-1 robot arm", "-1", ("robot", "arm")),
+        ("--boot robot", "0", ("robot",)),
+        ("--boot=-2 robot", "-2", ("robot",)),
+        ("--boot all robot", "all", ("robot",)),
+        ("-qb robot", "0", ("robot",)),
+        (f"-b {'a' * 32} robot", "a" * 32, ("robot",)),
+        ("-b -f robot", "0", ("robot",)),
+        ("-b --node camera robot", "0", ("robot",)),
+    ],
+)
+def test_boot(words: str, boot: str, selectors: tuple[str, ...]) -> None:
+    params = command.make_context("logs", words.split()).params
+    assert (params["boot"], params["selectors"]) == (boot, selectors)
+
+
+@pytest.mark.parametrize("option", ["-n 5", "-n5", "--lines 5", "--lines=5", "--tail=5", "-qn 5"])
+def test_lines(option: str) -> None:
+    params = command.make_context("logs", [*option.split(), "robot"]).params
+    assert (params["counts"], params["selectors"]) == (("5",), ("robot",))
+
+
+@pytest.mark.parametrize(
+    ("values", "tail", "nodes"),
+    [
+        ((), "", []),
+        (("5",), "5", []),
+        (("0",), "0", []),
+        (("5", "7"), "7", []),
+        (("all",), "all", []),
+        (("camera",), "", ["camera"]),
+        (("cam-*", "5", "sink[12]"), "5", ["cam-*", "sink[12]"]),
+        (("*",), "", ["*"]),
+    ],
+)
+def test_numbers_and_nodes(values: tuple[str, ...], tail: str, nodes: list[str]) -> None:
+    """In 0.1 -n still takes nodes, too."""
+    assert split_counts(values) == (tail, nodes)
+
+
+@pytest.mark.parametrize("value", ["-1", "+5", "", "a b", "é", "--node"])
+def test_neither_number_nor_node(value: str) -> None:
+    with pytest.raises(DoraSystemdError) as caught:
+        split_counts((value,))
+    assert caught.value.code is ExitCode.USAGE

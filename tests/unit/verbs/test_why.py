@@ -1,0 +1,76 @@
+"""The words with which a failed start ends, from a journal of our own."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dora_systemd.verbs.why import words_of_start
+from tests.unit.fakes.manager import FakeManager, ScopeIn, options
+
+UUID = options().uuid
+ORIGIN = {"DORA_DATAFLOW": UUID, "_SYSTEMD_INVOCATION_ID": "1", "_BOOT_ID": "b"}
+
+
+def record(us: int, node: str, text: str, **fields: str) -> dict[str, Any]:
+    named = {"DORA_NODE": node} if node else {}
+    return {**ORIGIN, "__REALTIME_TIMESTAMP": str(us), "MESSAGE": text, **named, **fields}
+
+
+def crash(us: int, node: str, code: int) -> dict[str, Any]:
+    exit = f"exit code {code}"
+    return record(us, node, "crashed", DORA_EVENT="node-crashed", DORA_EXIT=exit)
+
+
+EVENTS = [
+    record(1, "", "is starting", DORA_EVENT="dataflow-starting"),
+    crash(3, "camera", 3),
+    crash(9, "detector", 101),
+    record(
+        9, "", "failed", DORA_EVENT="dataflow-failed", DORA_CAUSE="node-failed",
+        DORA_NODES="camera detector", DORA_REASON="node camera: exit code 3",
+    ),
+]  # fmt: skip
+CAMERA = [record(2, "camera", "no camera there", DORA_STREAM="stderr")]
+DETECTOR = [record(n, "detector", f"frame {n}", DORA_STREAM="stderr") for n in range(4, 8)]
+
+
+def play(patch: pytest.MonkeyPatch, place: Path, camera: list[dict[str, Any]]) -> None:
+    """A journalctl that answers with events, the camera's lines, or those of all nodes."""
+    answers = {"events": EVENTS, "camera": camera, "all": [*camera, *DETECTOR]}
+    for name, records in answers.items():
+        lines = [f"{json.dumps(one)}\n" for one in reversed(records)]
+        (place / name).write_text("".join(lines))
+    script = place / "journalctl"
+    script.write_text(
+        f'#!/bin/sh\ncd {place}\ncase "$*" in\n*DORA_EVENT=stop-asked*) cat events;;\n'
+        "*DORA_NODE=camera*) cat camera;;\n*_UID=0*) ;;\n*) cat all;;\nesac\n"
+    )
+    script.chmod(0o755)
+    patch.setenv("PATH", f"{place}:/usr/bin:/bin")
+
+
+@pytest.mark.parametrize(
+    ("camera", "words"),
+    [
+        (CAMERA, ["camera: no camera there"]),
+        ([], [f"detector: frame {n}" for n in range(4, 8)]),
+    ],
+)
+def test_a_failed_start_ends_with_the_words_of_the_guilty_node(
+    camera: list[dict[str, Any]],
+    words: list[str],
+    scope: ScopeIn,
+    manager: FakeManager,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    """Those of the others only if it has written nothing."""
+    manager.add(options(), ActiveState="failed", SubState="failed")
+    play(monkeypatch, tmp_path, camera)
+    assert words_of_start(manager, scope, UUID) == words
+
+
+def test_nothing_is_known(scope: ScopeIn, manager: FakeManager) -> None:
+    assert words_of_start(manager, scope, UUID) == []
