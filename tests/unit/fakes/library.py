@@ -95,10 +95,11 @@ class FakeSystemd:
         self._end_jobs()
 
     def _end_jobs(self) -> None:
-        for job, result in self._waiting:
-            for one in self.connections:
-                one.tell(Message("JobRemoved", [0, job, "", result]))
-        self._waiting.clear()
+        with self._lock:  # a connection that is closed meanwhile must not hide the next one
+            for job, result in self._waiting:
+                for one in tuple(self.connections):
+                    one.tell(Message("JobRemoved", [0, job, "", result]))
+            self._waiting.clear()
 
 
 class Connection:
@@ -116,9 +117,10 @@ class Connection:
         return self._fd
 
     def close(self) -> None:
-        if self in self._systemd.connections:
-            self._systemd.connections.remove(self)
-            os.close(self._fd)
+        with self._systemd._lock:
+            if self in self._systemd.connections:
+                self._systemd.connections.remove(self)
+                os.close(self._fd)
 
     def call_method(
         self, _service: bytes, path: bytes, _interface: bytes, method: bytes, words: list[Any]
@@ -131,8 +133,9 @@ class Connection:
         """All signals come anyway."""
 
     def tell(self, message: Message) -> None:
-        self._messages.append(message)
-        os.eventfd_write(self._fd, 1)
+        if self in self._systemd.connections:
+            self._messages.append(message)
+            os.eventfd_write(self._fd, 1)
 
     def process(self) -> Message:
         if self._messages:
