@@ -11,6 +11,7 @@ from dora_systemd.decisions.cell.exits import ExitKind, parse_exit
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.views.dataflows import FAILED, FINISHED, RESTARTING, STOPPED, UP_WORDS
 from dora_systemd.decisions.why.lives import Happening, Life, with_restarts
+from dora_systemd.decisions.why.nodes import ended_nodes
 from dora_systemd.decisions.why.verdict import Facts, Restart, Verdict
 
 _CRASHES = ("node-crashed", "node-oom")
@@ -68,6 +69,7 @@ def examine(lives: Sequence[Life], facts: Facts, shutdowns: Sequence[int] = ()) 
         timeline=tuple(one for one in happenings if one.name not in _NO_NEWS),
         before=before.summary,
         before_us=before.at_us,
+        nodes=() if status in UP_WORDS else ended_nodes(life),
     )
 
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from dora_systemd.decisions.life.causes import Cause
-from dora_systemd.decisions.views.dataflows import FAILED, RESTARTING, UP_WORDS
+from dora_systemd.decisions.views.dataflows import FAILED, RESTARTING, UP_WORDS, NodeRow
 from dora_systemd.decisions.why.lives import Happening
 
 
@@ -41,7 +41,8 @@ class Verdict:
     node that failed first, or "". at_us: time of that; began_us: beginning of that life;
     CLOCK_REALTIME µs, 0: unknown. invocation: systemd's id of that life. details: other facts about
     the end. is_given_up: systemd's start limit is reached. is_passing: dora restarts the node.
-    starved: nodes downstream. before: how the life before these ended, and when.
+    starved: nodes downstream. before: how the life before these ended, and when. nodes: of a
+    dataflow that has ended, as its events name them.
     """
 
     status: str
@@ -61,6 +62,7 @@ class Verdict:
     timeline: tuple[Happening, ...] = ()
     before: str = ""
     before_us: int = 0
+    nodes: tuple[NodeRow, ...] = ()
 
     @property
     def is_up(self) -> bool:
