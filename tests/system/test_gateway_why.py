@@ -229,6 +229,9 @@ def test_what_can_be_changed(browser: Browser, cell: Cell, project: Project) -> 
 def test_limits_are_changed(browser: Browser, cell: Cell, project: Project) -> None:
     cell.start(project.three_nodes())
     browser.wait_text("#detail dl", "Sandbox")
+    browser.click("#detail .menu summary")
+    browser.press("Escape")
+    assert not browser.js("document.querySelector('#detail .menu').open")
     choose(browser, "set")
     browser.wait_text("#question", f"Limits of {cell.name}")
     assert browser.js("document.activeElement.id") == "memory_limit"

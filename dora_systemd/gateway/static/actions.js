@@ -41,7 +41,12 @@ export class Buttons {
     this.all = Object.fromEntries(Object.keys(ACTIONS).filter((one) => !one.endsWith(" node"))
       .map((action) => [action, button(action)]));
     const { start, stop, restart, ...rest } = this.all;
-    this.menu = el("details", { class: "menu" }, el("summary", {}, "More"),
+    const leave = (event) => {
+      if (event.key !== "Escape" || !this.menu.open) return;
+      this.menu.open = false;
+      this.menu.firstElementChild.focus();
+    };
+    this.menu = el("details", { class: "menu", onkeydown: leave }, el("summary", {}, "More"),
       el("div", { class: "items" }, ...Object.values(rest)));
     this.pending = el("span", { class: "pending muted", role: "status" });
     this.node = el("div", { class: "buttons" }, this.pending, start, restart, stop, this.menu);
