@@ -103,6 +103,20 @@ class Browser:
         for kind in ("mousePressed", "mouseReleased"):
             self.call("Input.dispatchMouseEvent", type=kind, **at)
 
+    def point(self, selector: str, share: float) -> None:
+        """The pointer over an element, at a share of its width."""
+        place = f"document.querySelector({json.dumps(selector)})"
+        self.js(f"{place}.scrollIntoView({{block: 'center'}})")
+        box = self.js(f"{place}.getBoundingClientRect().toJSON()")
+        at = {"x": box["x"] + share * box["width"], "y": box["y"] + box["height"] / 2}
+        self.call("Input.dispatchMouseEvent", type="mouseMoved", **at)
+
+    def fill(self, selector: str, value: str) -> None:
+        """Type a value into a field, or choose it, and go on."""
+        place = f"document.querySelector({json.dumps(selector)})"
+        self.js(f"{place}.value = {json.dumps(value)}")
+        self.js(f"{place}.dispatchEvent(new Event('change')), 0")
+
     def press(self, key: str, text: str = "") -> None:
         """A key, as KeyboardEvent.key names it."""
         codes = {"Enter": 13, "Tab": 9, "Escape": 27, " ": 32}

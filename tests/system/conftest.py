@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.system.cells import Cell, Project, dora_processes, run, wait_for
+from tests.system.chromium import Browser
 from tests.system.gateways import Front
 from tests.system.tolerated import is_tolerated
 
@@ -83,6 +84,18 @@ def alice(reserved_ports: None) -> Iterator[Front]:
 def gateway_up(front: Front) -> None:
     """For modules whose tests all ask the system's gateway."""
     front.up()
+
+
+@pytest.fixture
+def browser(front: Front, gateway_up: None, cell: Cell) -> Iterator[Browser]:
+    """At the page of the system's gateway, in which nothing comes from elsewhere by the end."""
+    del gateway_up, cell  # the dataflow ends after the browser has looked at it
+    place = f"127.0.0.1:{front.port}/"
+    with Browser() as browser:
+        browser.open(f"http://{place}")
+        yield browser
+        own = (f"http://{place}", f"ws://{place}", "blob:")
+        assert [url for url in browser.requests() if not url.startswith(own)] == []
 
 
 def _cursor() -> str:

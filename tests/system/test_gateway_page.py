@@ -1,7 +1,6 @@
 """The status page of a real gateway, with real dataflows, in a real browser."""
 
 import json
-from collections.abc import Iterator
 
 import pytest
 
@@ -9,6 +8,7 @@ from dora_systemd.decisions.gateway.place import SERVICE_UNIT, SOCKET_UNIT
 from tests.system.cells import Cell, Project, run, wait_for
 from tests.system.chromium import Browser
 from tests.system.gateways import Front
+from tests.system.pages import CONTRAST, node
 
 pytestmark = [pytest.mark.lab, pytest.mark.browser, pytest.mark.usefixtures("gateway_up")]
 
@@ -30,23 +30,6 @@ for event in Node():
 """
 
 
-@pytest.fixture
-def browser(front: Front, cell: Cell) -> Iterator[Browser]:
-    """At the page, in which nothing has gone wrong by the end."""
-    del cell  # it ends after the browser has looked at it
-    place = f"127.0.0.1:{front.port}/"
-    with Browser() as browser:
-        browser.open(f"http://{place}")
-        yield browser
-        own = (f"http://{place}", f"ws://{place}")
-        assert [url for url in browser.requests() if not url.startswith(own)] == []
-
-
-def node(name: str) -> str:
-    """The line of a node."""
-    return f"#detail .nodes li[data-node={name}]"
-
-
 def test_what_runs(browser: Browser, cell: Cell, project: Project) -> None:
     browser.wait_text("#none", "doractl start")
     cell.start(project.three_nodes())
@@ -59,6 +42,9 @@ def test_what_runs(browser: Browser, cell: Cell, project: Project) -> None:
     # From the second snapshot on there is a line to draw.
     browser.wait_js("document.querySelector('#detail .charts .line').getAttribute('d') !== ''")
     assert "MiB" in browser.text("#detail .charts .memory .value")
+    assert "now" in browser.text("#detail .charts .axis")
+    browser.point("#detail .charts svg", 0.98)
+    browser.wait_text("#detail .charts .of", "at ")
     drawn = "[...document.querySelectorAll('.graph {}')].map((e) => e.textContent)"
     assert len(browser.wait_js(drawn.format(".box"))) == 3
     assert set(browser.js(drawn.format(".edge title"))) == {
@@ -121,7 +107,10 @@ def test_buttons(browser: Browser, cell: Cell, project: Project) -> None:
     assert cell.is_gone
     asked = [one["MESSAGE"] for one in cell_notes(cell)]
     assert any("status page" in text for text in asked), asked
-    browser.wait_text("#none", "No dataflow is running")
+    # It stays, with how it ended, and is among the ended ones.
+    browser.wait_text("#detail .badge", "Stopped")
+    browser.wait_text("#detail .why .summary", "(status page)")
+    assert not browser.js("document.querySelector('#ended').hidden")
     assert browser.failures() == []
 
 
@@ -194,35 +183,10 @@ def test_disconnected_and_back(
     front.systemctl("stop", SOCKET_UNIT)
     browser.wait_text("#link", "disconnected")
     assert browser.js("document.querySelector('#detail [data-action=stop]').disabled")
+    assert "doractl up" in browser.text("#problem")
     front.systemctl("start", SOCKET_UNIT)
     browser.click("#again")
     browser.wait_text("#link", "live")
-
-
-CONTRAST = """
-(() => {
-  const parse = (text) => text.match(/[\\d.]+/g).map(Number);
-  const light = ([r, g, b]) => [r, g, b]
-    .map((c) => c / 255).map((c) => c <= .03928 ? c / 12.92 : ((c + .055) / 1.055) ** 2.4)
-    .reduce((sum, c, at) => sum + c * [.2126, .7152, .0722][at], 0);
-  const ground = (e) => {
-    for (; e; e = e.parentElement) {
-      const color = parse(getComputedStyle(e).backgroundColor);
-      if (color.length === 3 || color[3] > 0) return color;
-    }
-    return [255, 255, 255];
-  };
-  const bad = [];
-  for (const e of document.querySelectorAll('body *')) {
-    const own = [...e.childNodes].some((n) => n.nodeType === 3 && n.data.trim());
-    if (!own || !e.checkVisibility() || e.closest('svg, :disabled, option')) continue;
-    const [a, b] = [light(parse(getComputedStyle(e).color)), light(ground(e))];
-    const ratio = (Math.max(a, b) + .05) / (Math.min(a, b) + .05);
-    if (ratio < 4.5) bad.push([e.className, e.textContent.slice(0, 30), ratio.toFixed(2)]);
-  }
-  return bad;
-})()
-"""
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

@@ -2,38 +2,66 @@
 
 The page sends, each with its `type`:
   follow    {dataflow, node, number}          stream the lines of a node, "" for all nodes; ends
-                                              the stream before it
+                                              the stream or the search before it
+  find      {dataflow, node, number, search, since, until, run}
+                                              the newest lines that match, in place of a stream
+  save      as find                           many more of them, as the text of a file
   unfollow  {}
   graph     {dataflow}
-  act       {action, dataflow, node, number}  action: "stop" or "restart"; node "": the dataflow
+  about     {dataflow}
+  ended     {}
+  act       {action, dataflow, node, number, values}
+                                              action: one of ACTIONS; node "": the dataflow;
+                                              values: texts by the settings of "set"
 
 It receives:
   hello     {version, host, scope}            first
   snapshot  {dataflows}                       repeatedly; each as in snapshot.observed_values
   graph     {dataflow, nodes, edges, problem}
+  about     {dataflow, row, why, facts, problem}
+                                              row: as `list` has it, with the nodes of an ended one;
+                                              why: as in report_object; facts: see page_facts
+  ended     {dataflows, problem}              those that systemd has unloaded, newest first
   lines     {number, lines, skipped}          lines: {at_us, node, text, priority, event};
                                               skipped: number of lines left out before these
+  file      {number, text}                    a part of the file, in order
+  found     {number, count, is_whole, problem, hint}
+                                              after the last line or part; is_whole: all that match;
+                                              problem: why there is no stream, or ""
   acted     {number, text, problem, hint}     the result of an action
   problem   {text, hint}                      why nothing works at the moment
 
-`dataflow` is a UUID. The page chooses `number`, and answers to its message repeat it.
+`dataflow` is a UUID. The page chooses `number`, and answers to its message repeat it. `since` and
+`until` are as in systemd.time(7) or a duration, `run` is CURRENT, PREVIOUS or "".
 """
 
 import json
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from typing import Any
 
+from dora_systemd.decisions.cell.limits import BY_KEY
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.gateway.answers import Record, record_text
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.terminal_text import escaped, without_sequences
+from dora_systemd.terminal_text import escaped, one_line, without_sequences
+from dora_systemd.values import SECOND
 
-TYPES = ("follow", "unfollow", "graph", "act")
-ACTIONS = ("stop", "restart")
+TYPES = ("follow", "find", "save", "unfollow", "graph", "about", "ended", "act")
+ACTIONS = ("stop", "start", "restart", "enable", "disable", "reload", "set")
+RUNS = ("", "CURRENT", "PREVIOUS")
+HOT_RELOAD = "hot_reload"
 LOG_FIELDS = "MESSAGE,PRIORITY,DORA_NODE,DORA_EVENT,SYSLOG_IDENTIFIER"
 MAX_TEXT = 4000
 """Maximum characters of one line for a page."""
+MAX_ITEMS = 100
+"""Maximum entries of a list in the answer to `about`; the newest ones are kept."""
 
+_MAX_ASKED = 1000
+"""Maximum characters of a text in a request."""
+_TEXTS = ("type", "dataflow", "node", "action", "search", "since", "until", "run")
+_SETTINGS = frozenset({*BY_KEY, HOT_RELOAD})
 _DEFAULT_PRIORITY = 6
 _PRIORITIES = frozenset(b"%d" % number for number in range(8))
 
@@ -47,21 +75,35 @@ class PageMessage:
     node: str = ""
     action: str = ""
     number: int = 0
+    search: str = ""
+    since: str = ""
+    until: str = ""
+    run: str = ""
+    values: Mapping[str, str] = field(default_factory=dict)
 
 
 def parse_message(text: str | bytes) -> PageMessage:
     """Parse a request of a page. Raises DoraSystemdError (USAGE) if it is not valid."""
     try:
         raw = json.loads(text)
-        texts = {key: raw.get(key, "") for key in ("type", "dataflow", "node", "action")}
-        message = PageMessage(**texts, number=int(raw.get("number", 0)))
+        texts = {key: raw.get(key, "") for key in _TEXTS}
+        values = dict(raw.get("values", {}))
+        message = PageMessage(**texts, number=int(raw.get("number", 0)), values=values)
     except (ValueError, TypeError, AttributeError, RecursionError, OverflowError) as error:
         raise _refusal() from error
-    is_text = all(isinstance(one, str) for one in texts.values())
     is_known = message.type != "act" or message.action in ACTIONS
-    if not is_text or message.type not in TYPES or not is_known:
+    is_known = is_known and message.run in RUNS and values.keys() <= _SETTINGS
+    is_known = is_known and values.get(HOT_RELOAD, "on") in ("on", "off")
+    if not all(map(_is_text, (*texts.values(), *values.values()))):
+        raise _refusal()
+    if message.type not in TYPES or not is_known:
         raise _refusal()
     return message
+
+
+def _is_text(value: object) -> bool:
+    """Whether it can be an argument of journalctl: no program takes a NUL in one."""
+    return isinstance(value, str) and len(value) <= _MAX_ASKED and value.isprintable()
 
 
 def _refusal() -> DoraSystemdError:
@@ -86,6 +128,23 @@ def _printable(text: str) -> str:
     """Remove colours and other terminal sequences; show remaining control characters escaped."""
     text = without_sequences(text)
     return escaped(text if len(text) <= MAX_TEXT else f"{text[:MAX_TEXT]}…")
+
+
+def saved_line(line: Mapping[str, Any]) -> str:
+    """A line of line_values() in a file, with the time in UTC."""
+    seconds, rest = divmod(line["at_us"], SECOND)
+    at = datetime.fromtimestamp(seconds, UTC).replace(microsecond=rest, tzinfo=None)
+    stamp = at.isoformat(timespec="microseconds")
+    return f"{stamp}Z {line['node'] or 'dataflow'}: {one_line(line['text'])}\n"
+
+
+def shown_values(value: Any) -> Any:
+    """A JSON value with printable texts of MAX_TEXT and lists of MAX_ITEMS: nodes write them."""
+    if isinstance(value, Mapping):
+        return {key: shown_values(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [shown_values(one) for one in value[-MAX_ITEMS:]]
+    return _printable(value) if isinstance(value, str) else value
 
 
 def graph_values(dataflow: Dataflow) -> dict[str, Any]:

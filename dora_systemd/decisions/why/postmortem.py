@@ -12,6 +12,7 @@ from dora_systemd.decisions.life.causes import UNIT_RESULTS, Cause
 from dora_systemd.decisions.reload.steps import How
 from dora_systemd.decisions.views.dataflows import FAILED, FINISHED, RESTARTING, STOPPED, UP_WORDS
 from dora_systemd.decisions.why.lives import Happening, Life, with_restarts
+from dora_systemd.decisions.why.nodes import ended_nodes
 from dora_systemd.decisions.why.verdict import Facts, Restart, Verdict
 from dora_systemd.values import SECOND
 
@@ -68,6 +69,7 @@ def examine(lives: Sequence[Life], facts: Facts, shutdowns: Sequence[int] = ()) 
         timeline=tuple(one for one in happenings if one.name not in _NO_NEWS),
         before=before.summary,
         before_us=before.at_us,
+        nodes=() if status in UP_WORDS else ended_nodes(life),
     )
 
 

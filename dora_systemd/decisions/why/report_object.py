@@ -72,5 +72,5 @@ def _history(report: Report) -> dict[str, Any]:
     }
 
 
-def _at(at_us: int, **texts: str) -> dict[str, Any]:
-    return {**moment("at", at_us), **{key: text or None for key, text in texts.items()}}
+def _at(at_us: int, **more: str | int) -> dict[str, Any]:
+    return {**moment("at", at_us), **{key: one or None for key, one in more.items()}}

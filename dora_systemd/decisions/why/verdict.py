@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from dora_systemd.decisions.life.causes import Cause
-from dora_systemd.decisions.views.dataflows import FAILED, RESTARTING, UP_WORDS
+from dora_systemd.decisions.views.dataflows import FAILED, RESTARTING, UP_WORDS, NodeRow
 from dora_systemd.decisions.why.lives import Happening
 
 
@@ -44,7 +44,8 @@ class Verdict:
     CLOCK_REALTIME µs, 0: unknown. invocation: systemd's id of that life. details: other facts about
     the end. is_given_up: systemd's start limit is reached. is_passing: dora restarts the node.
     starved: nodes downstream. restarts: those that `list` counts, oldest first. before: how the
-    life before these ended, and when.
+    life before these ended, and when. nodes: of a dataflow that has ended, as its events name
+    them.
     """
 
     status: str
@@ -64,6 +65,7 @@ class Verdict:
     timeline: tuple[Happening, ...] = ()
     before: str = ""
     before_us: int = 0
+    nodes: tuple[NodeRow, ...] = ()
 
     @property
     def is_up(self) -> bool:

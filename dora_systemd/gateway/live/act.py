@@ -1,42 +1,118 @@
 """The actions of the status page's buttons, and the data of its graph of a dataflow."""
 
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
+from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
-from dora_systemd.decisions.gateway.page_messages import PageMessage, graph_values
-from dora_systemd.errors import DoraSystemdError
+from dora_systemd.decisions.gateway.page_messages import HOT_RELOAD, PageMessage, graph_values
+from dora_systemd.decisions.views.outcome import Outcome
+from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.nodes import written_dataflow
 from dora_systemd.verbs.facts.reading import read_status
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.node import ask_coordinator, restart_node, stop_node
+from dora_systemd.verbs.reload import reload_cell, switch_hot_reload
+from dora_systemd.verbs.set import set_limits
+from dora_systemd.verbs.start.enable import disable_cell, enable_cell
+from dora_systemd.verbs.start.linger import ensure_linger
 from dora_systemd.verbs.stop import note_stop, restart_cells, stop_cells
 
 _BY = "status page"
 
+Action = Callable[[Manager, Scope, Cell, PageMessage], str]
+
 
 def act(scope: Scope, message: PageMessage) -> str:
-    """Stop or restart a dataflow, or one of its nodes; what was done, for the page.
+    """Carry out an action on a dataflow or one of its nodes; what was done, for the page.
 
     Raises DoraSystemdError as the verbs of doractl do.
     """
-    bus = Bus(scope)
-    cell = Selector(message.dataflow).find(bus)
+    bus, wanted = Bus(scope), Selector(message.dataflow)
+    try:
+        cell = wanted.find_enabled(bus, scope)
+    except DoraSystemdError as error:
+        if (row := wanted.ended(scope)) is None:
+            raise
+        problem = f"cannot {message.action} {row.name}: systemd has unloaded it"
+        hint = f"doractl start FILE --name {row.name}"
+        raise DoraSystemdError(problem, hint, ExitCode.NOT_FOUND) from error
+    return _ACTIONS[message.action](bus, scope, cell, message)
+
+
+def _stop(manager: Manager, scope: Scope, cell: Cell, message: PageMessage) -> str:
     if message.node:
-        do = stop_node if message.action == "stop" else restart_node
-        do(scope, cell, message.node)
-        return f"Node {message.node} of {cell.name}: {message.action} begun"
-    if message.action == "stop":
-        note_stop([cell], _BY)
-        (outcome,) = stop_cells(bus, scope, [cell])
-    else:
-        (outcome,) = restart_cells(bus, [cell])
+        stop_node(scope, cell, message.node)
+        return _begun(cell, message)
+    note_stop([cell], _BY)
+    (outcome,) = stop_cells(manager, scope, [cell])
+    return _told(outcome)
+
+
+def _restart(manager: Manager, scope: Scope, cell: Cell, message: PageMessage) -> str:
+    if message.node:
+        restart_node(scope, cell, message.node)
+        return _begun(cell, message)
+    (outcome,) = restart_cells(manager, [cell])
+    return _told(outcome)
+
+
+def _begun(cell: Cell, message: PageMessage) -> str:
+    return f"Node {message.node} of {cell.name}: {message.action} begun"
+
+
+def _told(outcome: Outcome) -> str:
     if outcome.problem:
-        raise DoraSystemdError(outcome.problem, f"doractl why {cell.name}")
+        raise DoraSystemdError(outcome.problem, f"doractl why {outcome.subject.name}")
     return outcome.text
+
+
+def _enable(manager: Manager, scope: Scope, cell: Cell, _message: PageMessage) -> str:
+    boot, is_news = enable_cell(manager, scope, cell)
+    done = f"Dataflow{'' if is_news else ' already'} enabled: {cell.uuid} ({cell.name})"
+    return _joined(done, str(boot.path), ensure_linger(scope))
+
+
+def _disable(manager: Manager, scope: Scope, cell: Cell, _message: PageMessage) -> str:
+    done = disable_cell(manager, scope, cell)
+    return f"Dataflow {'disabled' if done else 'not enabled'}: {cell.uuid} ({cell.name})"
+
+
+def _reload(_manager: Manager, scope: Scope, cell: Cell, message: PageMessage) -> str:
+    return _joined(*reload_cell(scope, cell, message.node or None)) or "Nothing has changed"
+
+
+def _set(manager: Manager, scope: Scope, cell: Cell, message: PageMessage) -> str:
+    limits, switch = dict(message.values), message.values.get(HOT_RELOAD)
+    limits.pop(HOT_RELOAD, None)
+    done: list[str] = []
+    if limits or switch is None:
+        warnings = set_limits(manager, scope, cell, limits)
+        done += [f"Limits changed: {cell.uuid} ({cell.name})", *warnings]
+    if switch is not None:
+        switch_hot_reload(manager, scope, cell, switch == "on")
+        done.append(f"Hot reload {switch}: {cell.uuid} ({cell.name})")
+    return _joined(*done)
+
+
+def _joined(*texts: str) -> str:
+    return "; ".join(filter(None, texts))
+
+
+_ACTIONS: dict[str, Action] = {
+    "stop": _stop,
+    # Only what has ended can be started, and a restart does that.
+    "start": _restart,
+    "restart": _restart,
+    "enable": _enable,
+    "disable": _disable,
+    "reload": _reload,
+    "set": _set,
+}
 
 
 def read_graph(scope: Scope, uuid: str) -> dict[str, Any]:

@@ -3,16 +3,15 @@
 import asyncio
 from collections import deque
 from collections.abc import AsyncGenerator, AsyncIterator
-from typing import Any
+from dataclasses import replace
 
-from dora_systemd.adapters.bus.systemd import Bus
-from dora_systemd.adapters.journal.reader import check_readable, end_journalctl, open_journalctl
+from dora_systemd.adapters.journal.reader import end_journalctl, open_journalctl
 from dora_systemd.adapters.journal.stream import open_stream
 from dora_systemd.decisions.gateway.page_messages import LOG_FIELDS, PageMessage, line_values
 from dora_systemd.decisions.logs.fields import ExportReader
 from dora_systemd.decisions.logs.query import LogQuery, query_arguments
+from dora_systemd.gateway.live.find import Lines, log_query
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.facts.selector import Selector
 
 FIRST_LINES = 200
 """Number of older lines that a page gets first."""
@@ -20,8 +19,6 @@ MAX_LINES = 400
 """Maximum lines in one message: a node can write more than anyone can read."""
 PAUSE_SECONDS = 0.2
 _CHUNK = 1 << 17
-
-Lines = list[dict[str, Any]]
 
 
 async def follow_lines(
@@ -58,17 +55,9 @@ async def _batches(stream: asyncio.StreamReader) -> AsyncIterator[tuple[Lines, i
 
 
 def _query(scope: Scope, message: PageMessage) -> LogQuery:
-    check_readable(scope)
-    cell = Selector(message.dataflow).find(Bus(scope, for_reading=True))
-    return LogQuery(
-        scope,
-        name=cell.name,
-        nodes=(message.node,) if message.node else (),
-        tail=str(FIRST_LINES),
-        is_follow=True,
-        want_unprintable=True,
-        output="export",
-    )
+    nodes = (message.node,) if message.node else ()
+    query = log_query(scope, message.dataflow)
+    return replace(query, nodes=nodes, tail=str(FIRST_LINES), is_follow=True)
 
 
 async def _read_until(stream: asyncio.StreamReader, until: float) -> bytes:

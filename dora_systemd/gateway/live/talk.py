@@ -3,18 +3,20 @@
 import asyncio
 import json
 import socket as sockets
-from collections.abc import Coroutine
+from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import aclosing, suppress
 from typing import Any
 
 from dora_systemd import __version__
 from dora_systemd.adapters.bus.systemd import Bus
-from dora_systemd.decisions.gateway.page_messages import PageMessage, parse_message
+from dora_systemd.decisions.gateway.page_messages import PageMessage, parse_message, saved_line
 from dora_systemd.decisions.gateway.request import Request, Socket
 from dora_systemd.decisions.views.snapshot import observed_values
 from dora_systemd.errors import DoraSystemdError
+from dora_systemd.gateway.live.about import read_about, read_ended
 from dora_systemd.gateway.live.act import act, read_graph
-from dora_systemd.gateway.live.follow import follow_lines
+from dora_systemd.gateway.live.find import MAX_FOUND, MAX_SAVED, Lines, find_lines
+from dora_systemd.gateway.live.follow import MAX_LINES, follow_lines
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import user_name
 from dora_systemd.verbs.facts.snapshot import read_snapshot
@@ -24,6 +26,14 @@ SEND_SECONDS = 10.0
 """Close the connection of a page that accepts no data for this long; others would queue forever."""
 MAX_TASKS = 8
 """Maximum parallel questions and actions of one page."""
+
+_QUESTIONS: dict[str, Callable[[Scope, str], dict[str, Any]]] = {
+    "graph": read_graph,
+    "about": read_about,
+    "ended": read_ended,
+}
+_STREAMS = ("follow", "find", "unfollow")
+"""Each ends the one before it."""
 
 
 async def talk(socket: Socket, request: Request) -> None:
@@ -52,7 +62,7 @@ class _Page:
         self._socket = socket
         self._scope = scope
         self._is_due = asyncio.Event()
-        self._follower: asyncio.Task[None] | None = None
+        self._stream: asyncio.Task[None] | None = None
         self.tasks: set[asyncio.Task[None]] = set()
 
     async def show(self) -> None:
@@ -73,16 +83,13 @@ class _Page:
                 await self._send(type="problem", text=error.message, hint=error.hint)
 
     def _take(self, message: PageMessage) -> None:
-        if message.type in ("follow", "unfollow"):
-            if self._follower:
-                self._follower.cancel()
-            self._follower = None
-        if message.type == "follow":
-            self._follower = self._spawn(self._follow(message))
-        elif message.type == "graph":
-            self._spawn(self._send_graph(message))
-        elif message.type == "act":
-            self._spawn(self._act(message))
+        if message.type in _STREAMS and self._stream:
+            self._stream.cancel()
+            self._stream = None
+        works = {"follow": self._follow, "find": self._find, "save": self._save, "act": self._act}
+        if message.type != "unfollow":
+            task = self._spawn(works.get(message.type, self._answer)(message))
+            self._stream = task if message.type in _STREAMS else self._stream
 
     def _spawn(self, work: Coroutine[Any, Any, None]) -> "asyncio.Task[None]":
         if len(self.tasks) >= MAX_TASKS:
@@ -115,15 +122,47 @@ class _Page:
                     values = {"number": message.number, "lines": lines, "skipped": skipped}
                     await self._send(type="lines", **values)
         except DoraSystemdError as error:
-            await self._send(type="problem", text=error.message, hint=error.hint)
+            await self._send_found(message, error=error)
 
-    async def _send_graph(self, message: PageMessage) -> None:
-        values: dict[str, Any] = {"nodes": [], "edges": [], "problem": ""}
+    async def _find(self, message: PageMessage) -> None:
+        async for part in self._parts(message, MAX_FOUND):
+            await self._send(type="lines", number=message.number, lines=part, skipped=0)
+
+    async def _save(self, message: PageMessage) -> None:
+        async for part in self._parts(message, MAX_SAVED):
+            text = "".join(map(saved_line, part))
+            await self._send(type="file", number=message.number, text=text)
+
+    async def _parts(self, message: PageMessage, most: int) -> AsyncIterator[Lines]:
+        """What a search has found, in parts; then tells the page how it ended."""
         try:
-            values |= await asyncio.to_thread(read_graph, self._scope, message.dataflow)
+            found, is_whole = await find_lines(self._scope, message, most)
+        except DoraSystemdError as error:
+            await self._send_found(message, error=error)
+            return
+        for start in range(0, len(found), MAX_LINES):
+            yield found[start : start + MAX_LINES]
+        await self._send_found(message, len(found), is_whole)
+
+    async def _send_found(
+        self,
+        message: PageMessage,
+        count: int = 0,
+        is_whole: bool = False,
+        error: DoraSystemdError | None = None,
+    ) -> None:
+        problem, hint = (error.message, error.hint) if error else ("", "")
+        values = {"count": count, "is_whole": is_whole, "problem": problem, "hint": hint}
+        await self._send(type="found", number=message.number, **values)
+
+    async def _answer(self, message: PageMessage) -> None:
+        values: dict[str, Any] = {"problem": ""}
+        try:
+            read = _QUESTIONS[message.type]
+            values |= await asyncio.to_thread(read, self._scope, message.dataflow)
         except DoraSystemdError as error:
             values["problem"] = error.message
-        await self._send(type="graph", dataflow=message.dataflow, **values)
+        await self._send(type=message.type, dataflow=message.dataflow, **values)
 
     async def _act(self, message: PageMessage) -> None:
         answer = {"text": "", "problem": "", "hint": ""}

@@ -18,9 +18,9 @@ export const el = (tag, attributes = {}, ...children) =>
 export const svg = (tag, attributes = {}, ...children) =>
   fill(document.createElementNS(SVG, tag), attributes, children);
 
-/** Sets the text only where it is another one: a selection by hand stays. */
+/** Sets the text only where it is another one: a selection by hand stays. null is no text. */
 export function say(node, text) {
-  if (node.textContent !== text) node.textContent = text;
+  if (node.textContent !== (text ?? "")) node.textContent = text;
 }
 
 /** The children of `parent` in the order of `keys`; each is made once, and kept. */

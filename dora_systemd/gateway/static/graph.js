@@ -6,12 +6,25 @@ import { plural, sourceName, tone } from "./words.js";
 
 const HEIGHT = 46;
 const SOURCE_HEIGHT = 28;
+const LINE = 16;
 const LETTER = 7.6;
 const SMALL_LETTER = 6.2;
 const LONGEST = 22;
 const MARGIN = 12;
 
 const cut = (text, most) => (text.length > most ? `${text.slice(0, most - 1)}…` : text);
+
+/** A name in lines that fit into a box, broken where its words end. */
+function folded(text) {
+  const lines = [];
+  let rest = text;
+  while (rest.length > LONGEST) {
+    const [head] = rest.match(/^.{1,21}[-_./]|^.{1,22}/u);
+    lines.push(head);
+    rest = rest.slice(head.length);
+  }
+  return [...lines, rest];
+}
 
 export class Graph {
   /** choose: is called with the id of a node that was chosen. */
@@ -30,12 +43,17 @@ export class Graph {
     this.#draw();
   }
 
-  /** nodes: those of a snapshot; chosen: an id, or "". */
-  mark(nodes, chosen) {
-    this.marks = { nodes, chosen };
+  /** Whether there is nothing to draw. */
+  get isEmpty() {
+    return !this.data?.nodes?.length;
+  }
+
+  /** nodes: those of a row; chosen: an id, or "". rest: the state of all others. */
+  mark(nodes, chosen, rest = "unknown") {
+    this.marks = { nodes, chosen, rest };
     const states = new Map(nodes.map((node) => [node.node, node.state]));
     for (const [id, box] of this.boxes) {
-      const state = states.get(id) ?? "unknown";
+      const state = states.get(id) ?? rest;
       box.group.setAttribute("data-tone", tone(state));
       box.group.setAttribute("aria-pressed", String(id === chosen));
       box.group.setAttribute("aria-label", `${id}, ${state}: show its logs`);
@@ -46,7 +64,7 @@ export class Graph {
   #draw() {
     const wide = this.node.clientWidth;
     if (!this.data || !wide) return void (this.data ?? this.node.replaceChildren());
-    const { nodes, edges, problem } = this.data;
+    const { nodes = [], edges = [], problem } = this.data;
     if (!nodes.length) {
       this.node.replaceChildren(el("p", { class: "muted" }, problem || "No nodes."));
       return;
@@ -64,16 +82,17 @@ export class Graph {
     this.shape = shape;
     this.boxes.clear();
     this.node.replaceChildren(this.#picture(nodes, bundles, plan, isDown));
-    if (this.marks) this.mark(this.marks.nodes, this.marks.chosen);
+    if (this.marks) this.mark(this.marks.nodes, this.marks.chosen, this.marks.rest);
   }
 
   #plan(nodes, bundles, isDown) {
     const sized = nodes.map((node) => {
       const isSource = node.kind === "dora";
-      const text = cut(isSource ? sourceName(node.id) : node.id, LONGEST);
-      const width = Math.max(text.length * LETTER + (isSource ? 24 : 40), isSource ? 60 : 112);
-      const height = isSource ? SOURCE_HEIGHT : HEIGHT;
-      return { id: node.id, text, width, height,
+      const texts = isSource ? [cut(sourceName(node.id), LONGEST)] : folded(node.id);
+      const widest = Math.max(...texts.map((one) => one.length));
+      const width = Math.max(widest * LETTER + (isSource ? 24 : 40), isSource ? 60 : 112);
+      const height = isSource ? SOURCE_HEIGHT : HEIGHT + (texts.length - 1) * LINE;
+      return { id: node.id, texts, width, height,
         length: isDown ? height : width, breadth: (isDown ? width : height) + 20 };
     });
     const longest = Math.max(0, ...bundles.map((one) => label(one).length));
@@ -119,15 +138,17 @@ export class Graph {
   }
 
   #box(node, place, at) {
-    const { width, height, text } = place;
+    const { width, height, texts } = place;
     const [x, y] = at(place);
     const shape = { x: x - width / 2, y: y - height / 2, width, height };
     if (node.kind === "dora") {
       return svg("g", { class: "source" }, svg("title", {}, node.id),
         svg("rect", { ...shape, rx: height / 2 }),
-        svg("text", { x, y: y + 4, "text-anchor": "middle" }, text));
+        svg("text", { x, y: y + 4, "text-anchor": "middle" }, texts[0]));
     }
-    const state = svg("text", { x: x - width / 2 + 26, y: y + 14, class: "state" });
+    const left = x - width / 2;
+    const first = y - ((texts.length - 1) * LINE) / 2;
+    const state = svg("text", { x: left + 26, y: y + height / 2 - 9, class: "state" });
     const group = svg("g", { class: "box", role: "button", tabindex: 0, "data-node": node.id,
       onclick: () => this.choose(node.id),
       onkeydown: (event) => {
@@ -137,8 +158,8 @@ export class Graph {
       } },
     svg("title", {}, `${node.id} (${node.kind})`),
     svg("rect", { ...shape, rx: 9 }),
-    svg("circle", { cx: x - width / 2 + 14, cy: y - 4, r: 4.5 }),
-    svg("text", { x: x - width / 2 + 26, y, class: "name" }, text),
+    svg("circle", { cx: left + 14, cy: first - 4, r: 4.5 }),
+    ...texts.map((text, at) => svg("text", { x: left + 26, y: first + at * LINE, class: "name" }, text)),
     state);
     this.boxes.set(node.id, { group, state });
     return group;

@@ -4,7 +4,7 @@
 export const KEPT = 150;
 const WORTH = 5;
 
-const series = () => ({ cpu: [], memory: [], waits: {} });
+const series = () => ({ cpu: [], memory: [], times: [], waits: {} });
 
 export class History {
   constructor() {
@@ -41,8 +41,9 @@ export class History {
     const share = (from, to) => (100 * Math.max(to - from, 0)) / window;
     kept.cpu.push(isSame ? share(before.cpu_us, now.cpu_us) : facts.cpu_percent ?? 0);
     kept.memory.push(facts.memory_bytes ?? 0);
+    kept.times.push(Date.now() * 1000);
     kept.waits = isSame ? this.#waits(now, before, share) : {};
-    for (const list of [kept.cpu, kept.memory]) if (list.length > KEPT) list.shift();
+    for (const list of [kept.cpu, kept.memory, kept.times]) if (list.length > KEPT) list.shift();
     this.groups.set(key, kept);
   }
 

@@ -1,41 +1,58 @@
 // The status page: what comes from the gateway goes to the list and to the dataflow that is chosen.
 
-import { Card, Detail, totals } from "./detail.js";
+import { askFirst, doing, tell } from "./actions.js";
+import { Card, totals } from "./cards.js";
+import { Detail } from "./detail.js";
 import { arrange, el, say } from "./dom.js";
 import { History } from "./history.js";
 import { Link } from "./link.js";
-
-const SAID_MS = 8000;
+import { byNeed } from "./words.js";
 
 const by = (id) => document.getElementById(id);
 const history = new History();
 const cards = new Map();
+const endedCards = new Map();
 const actions = new Map();
 let flows = [];
+let ended = null;
 let isKnown = false;
 let detail = null;
+let kept = "";
 let number = 0;
 
 const link = new Link(take, showLink);
 
+const TAKERS = {
+  hello: begin,
+  snapshot: ({ dataflows }) => update(dataflows),
+  ended: showEnded,
+  graph: (message) => detail?.graph.show(message),
+  about: (message) => detail?.learn(message),
+  lines: (message) => detail?.logs.take(message),
+  found: (message) => detail?.logs.take(message),
+  file: (message) => detail?.logs.take(message),
+  acted,
+  problem: showProblem,
+};
+
 function take(message) {
-  if (message.type === "hello") begin(message);
-  else if (message.type === "snapshot") update(message.dataflows);
-  else if (message.type === "graph" && message.dataflow === detail?.uuid) detail.graph.show(message);
-  else if (message.type === "lines") detail?.logs.add(message);
-  else if (message.type === "acted") acted(message);
-  else if (message.type === "problem") showProblem(message);
+  const isForeign = ["graph", "about"].includes(message.type) && message.dataflow !== detail?.uuid;
+  if (!isForeign) TAKERS[message.type]?.(message);
 }
 
 function begin({ host, scope }) {
   say(by("place"), `${host} · ${scope === "system" ? "system" : `of ${scope}`}`);
   document.title = `dora on ${host}`;
   actions.clear();
+  link.send({ type: "ended" });
   detail?.begin();
 }
 
 function update(dataflows) {
-  flows = dataflows;
+  const isOneLost = flows.some(({ uuid }) => !dataflows.some((one) => one.uuid === uuid));
+  const isOneNew = dataflows.some(({ name }) => ended?.some((one) => one.name === name));
+  if (isOneLost || isOneNew) link.send({ type: "ended" });
+  flows = dataflows.sort(byNeed);
   isKnown = true;
   by("problem").hidden = true;
   history.add(flows);
@@ -43,15 +60,22 @@ function update(dataflows) {
   show();
 }
 
+function showEnded({ dataflows = [] }) {
+  ended = dataflows.map((flow) => ({ ...flow, isEnded: true }));
+  show();
+}
+
+const flowOf = (uuid) => [...flows, ...ended ?? []].find((one) => one.uuid === uuid);
+
+/** The address has it; without one, what was chosen before, or on a wide screen the first. */
 function chosenUuid() {
-  const wanted = location.hash.slice(1);
-  if (flows.some((flow) => flow.uuid === wanted)) return wanted;
   const isWide = matchMedia("(min-width: 960px)").matches;
-  return isWide && flows.length ? flows[0].uuid : "";
+  return location.hash.slice(1) || kept || (isWide && flows.length ? flows[0].uuid : "");
 }
 
 function choose() {
   const uuid = chosenUuid();
+  kept = uuid;
   if (uuid === (detail?.uuid ?? "")) return;
   detail = uuid ? new Detail(uuid, ask, (message) => link.send(message)) : null;
   by("detail").replaceChildren(...(detail ? [detail.node] : []));
@@ -61,21 +85,40 @@ function choose() {
 }
 
 function show() {
-  arrange(by("list"), cards, flows.map((flow) => flow.uuid), (uuid) => new Card(uuid));
-  for (const flow of flows) cards.get(flow.uuid).show(flow, history, flow.uuid === detail?.uuid);
-  const flow = flows.find((one) => one.uuid === detail?.uuid);
-  if (flow) {
-    detail.show(flow, history, link.isLive && ![...actions.values()].includes(flow.uuid));
-  }
+  showCards(by("list"), cards, flows);
+  showCards(by("ended-list"), endedCards, ended ?? []);
+  by("ended").hidden = !ended?.length;
+  say(by("ended-title"), `Ended (${ended?.length ?? 0})`);
+  if (detail) showDetail(flowOf(detail.uuid));
   const words = totals(flows, history).map((word) => el("span", {}, word));
   by("totals").replaceChildren(...words);
   showNothing();
 }
 
+function showCards(parent, known, shown) {
+  arrange(parent, known, shown.map((flow) => flow.uuid), (uuid) => new Card(uuid));
+  for (const flow of shown) known.get(flow.uuid).show(flow, history, flow.uuid === detail?.uuid);
+}
+
+function showDetail(flow) {
+  by("gone")?.remove();
+  detail.node.hidden = !flow && !detail.flow;
+  if (flow) {
+    detail.show(flow, history, link.isLive && ![...actions.values()].includes(flow.uuid));
+  } else if (isKnown && ended) {
+    detail.node.hidden = true;
+    by("detail").prepend(el("div", { id: "gone", class: "none" },
+      el("h1", {}, `${detail.flow?.name ?? "This dataflow"} is no longer there`),
+      el("p", {}, "It has ended, and systemd has unloaded it. The journal may still have its logs:"),
+      el("pre", {}, `doractl logs ${detail.flow?.name ?? detail.uuid}`),
+      el("p", {}, el("a", { href: "#", class: "back" }, "All dataflows"))));
+  }
+}
+
 function showNothing() {
   by("none")?.remove();
-  if (flows.length || !isKnown) return;
-  by("list").before(el("div", { id: "none", class: "none" },
+  if (flows.length || !isKnown || detail) return;
+  document.querySelector("main").prepend(el("div", { id: "none", class: "none" },
     el("h1", {}, "No dataflow is running"),
     el("p", {}, "Start one on this machine, and it appears here:"),
     el("pre", {}, "doractl start dataflow.yml")));
@@ -88,6 +131,10 @@ function showLink(state, wait = 0) {
   say(pill, state === "disconnected" ? `disconnected, next try in ${seconds} s` : state);
   by("again").hidden = state !== "disconnected";
   document.body.classList.toggle("stale", state !== "live");
+  if (state === "disconnected") {
+    showProblem({ text: "No connection to the gateway: this is what was known last.",
+      hint: "if somebody has stopped it, run: doractl up" });
+  }
   if (state !== "live") show();
 }
 
@@ -97,52 +144,46 @@ function showProblem({ text, hint }) {
   node.hidden = false;
 }
 
-const CONSEQUENCES = {
-  stop: ["Stop", "Its nodes are told to stop; those still running after the grace duration are killed."],
-  restart: ["Restart", "All nodes stop and start again; name, UUID and settings stay."],
-  "stop node": ["Stop", "It stays down until the dataflow is restarted; the other nodes keep running."],
-  "restart node": ["Restart", "The other nodes keep running."],
-};
-
 function ask(action, node) {
-  const flow = flows.find((one) => one.uuid === detail.uuid);
-  const [word, consequence] = CONSEQUENCES[node ? `${action} node` : action];
-  say(by("question"), `${word} ${node ? `node ${node} of ${flow.name}` : flow.name}?`);
-  say(by("consequence"), consequence);
-  say(by("confirmed"), word);
-  by("confirmed").dataset.action = action;
-  const dialog = by("confirm");
-  dialog.returnValue = "";
-  dialog.onclose = () => {
-    if (dialog.returnValue === "yes") act(action, flow, node);
-  };
-  dialog.showModal();
+  const flow = flowOf(detail.uuid);
+  const facts = detail.about?.facts ?? {};
+  askFirst(action, node, flow, facts, (...done) => act(flow, ...done));
 }
 
-function act(action, flow, node) {
+function act(flow, action, node, values) {
   number += 1;
   actions.set(number, flow.uuid);
-  link.send({ type: "act", action, dataflow: flow.uuid, node, number });
-  const doing = action === "stop" ? "stopping" : "restarting";
-  if (detail?.uuid === flow.uuid) say(detail.pending, `${doing} ${node || flow.name} …`);
+  link.send({ type: "act", action, dataflow: flow.uuid, node, number, values });
+  if (detail?.uuid === flow.uuid) say(detail.buttons.pending, doing(action, node || flow.name));
   show();
 }
 
-function acted({ number: done, text, problem, hint }) {
-  actions.delete(done);
-  if (detail) say(detail.pending, "");
-  const note = el("p", { class: problem ? "toast bad" : "toast" },
-    problem ? [problem, hint].filter(Boolean).join(" – ") : text);
-  by("said").append(note);
-  setTimeout(() => note.remove(), SAID_MS);
+function acted(message) {
+  actions.delete(message.number);
+  if (detail) {
+    say(detail.buttons.pending, "");
+    link.send({ type: "about", dataflow: detail.uuid });
+  }
+  tell(message);
+  show();
+}
+
+function leave() {
+  kept = "";
+  // The address may be without a dataflow already.
+  choose();
   show();
 }
 
 addEventListener("hashchange", () => {
+  kept = "";
   choose();
   show();
   if (detail) by("detail").focus({ preventScroll: true });
   scrollTo(0, 0);
+});
+by("detail").addEventListener("click", ({ target }) => {
+  if (target.closest(".return, .back") && !location.hash.slice(1)) leave();
 });
 by("again").addEventListener("click", () => link.connect());
 link.connect();

@@ -30,6 +30,24 @@ export function clock(us) {
   return [date.getHours(), date.getMinutes(), date.getSeconds()].map(two).join(":");
 }
 
+const SPANS = [[86400, "d"], [3600, "h"], [60, "min"], [1, "s"]];
+
+/** A duration in µs by its largest unit, such as "5 min". */
+export function span(us) {
+  const seconds = Math.max(us / 1e6, 0);
+  const [size, unit] = SPANS.find(([one]) => seconds >= one) ?? SPANS.at(-1);
+  return `${Math.floor(seconds / size)} ${unit}`;
+}
+
+/** A time in the zone of the reader, and how long ago that is. */
+export function since(us) {
+  const at = new Date(us / 1000).toLocaleString([], {
+    day: "numeric", month: "short", year: "numeric", hour: "2-digit", minute: "2-digit",
+    second: "2-digit", hourCycle: "h23", timeZoneName: "short",
+  });
+  return `${at}, ${span(Date.now() * 1000 - us)} ago`;
+}
+
 export const plural = (count, what) => `${count} ${what}${count === 1 ? "" : "s"}`;
 
 const TONES = {
@@ -42,6 +60,14 @@ const TONES = {
 export const tone = (state) => TONES[state.toLowerCase()] ?? "calm";
 
 export const titled = (state) => state.charAt(0).toUpperCase() + state.slice(1);
+
+const FIRST = ["Failed", "Degraded", "Restarting"];
+
+/** For sort(): what needs a hand comes first, the rest by name. */
+export function byNeed(a, b) {
+  const rank = ({ status }) => (FIRST.includes(status) ? FIRST.indexOf(status) : FIRST.length);
+  return rank(a) - rank(b) || (a.name < b.name ? -1 : 1);
+}
 
 const UP = ["Starting", "Running", "Degraded", "Stopping", "Restarting"];
 export const isUp = (dataflow) => UP.includes(dataflow.status);

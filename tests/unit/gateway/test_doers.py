@@ -14,13 +14,16 @@ import pytest
 from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
 from dora_systemd.decisions.gateway.frames import Request
 from dora_systemd.decisions.gateway.page_messages import PageMessage
+from dora_systemd.decisions.views.dataflows import DataflowRow
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.gateway.control import start as starting
 from dora_systemd.gateway.control.forward import forward
 from dora_systemd.gateway.control.serve import HANDLERS
 from dora_systemd.gateway.control.talk import Talk
+from dora_systemd.gateway.live import act as acting
 from dora_systemd.gateway.live.act import act, read_graph
 from dora_systemd.scope import Scope
+from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.start.plan import StartRequest
 from tests.unit.fakes.library import FakeSystemd, fake_journalctl, fake_systemd
 from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
@@ -42,8 +45,8 @@ class Bench:
         patch.setattr(socket.socket, "sendto", lambda _, data, *__: self.notes.append(data))
         (root / "flow.yml").write_text("nodes: [{id: a, path: a.py}]\n")
 
-    def act(self, action: str, dataflow: str = UUID, node: str = "") -> str:
-        return act(self.scope, PageMessage("act", dataflow, node, action))
+    def act(self, action: str, dataflow: str = UUID, node: str = "", **values: str) -> str:
+        return act(self.scope, PageMessage("act", dataflow, node, action, values=values))
 
     def ask(self, variant: str, **body: Any) -> Any:
         talk = Talk(FakeSocket([]), self.scope)
@@ -100,6 +103,70 @@ def test_a_node_of_a_dataflow_that_does_not_run(
     with pytest.raises(DoraSystemdError, match="cannot use the dataflow robot: it is not running"):
         bench.act(action, node="a")
     assert not bench.manager.calls, "the dataflow is not stopped in place of its node"
+
+
+def test_the_page_starts_what_has_failed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Bench(tmp_path, monkeypatch, active="failed")
+    assert bench.act("start") == f"Dataflow restarted: {UUID} (robot)"
+    assert bench.jobs == ["RestartUnit"]
+
+
+def test_the_page_cannot_start_what_systemd_has_unloaded(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row = DataflowRow(NOBODY, "arm", "dora-arm.service", "Stopped")
+    monkeypatch.setattr(Selector, "ended", lambda *_: row)
+    with pytest.raises(DoraSystemdError, match="cannot start arm: systemd has unloaded") as caught:
+        bench.act("start", NOBODY)
+    assert caught.value.hint == "doractl start FILE --name arm"
+
+
+@pytest.mark.parametrize(
+    ("action", "values", "problem"),
+    [
+        ("set", {}, "cannot change the limits of robot: none is given"),
+        ("set", {"memory_limit": "much"}, "cannot read 'much' as a size"),
+        ("set", {"hot_reload": "on"}, "robot"),
+        ("reload", {}, "robot"),
+    ],
+)
+def test_what_the_verbs_refuse_the_page_refuses(
+    bench: Bench, action: str, values: dict[str, str], problem: str
+) -> None:
+    with pytest.raises(DoraSystemdError, match=problem):
+        bench.act(action, **values)
+    assert not bench.manager.calls
+
+
+def test_the_page_sets_limits(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[object] = []
+
+    def note(*given: object) -> tuple[str, ...]:
+        asked.append(given[-1])
+        return ()
+
+    monkeypatch.setattr(acting, "set_limits", note)
+    monkeypatch.setattr(acting, "switch_hot_reload", note)
+    done = bench.act("set", memory_limit="6G", hot_reload="off")
+    assert done == f"Limits changed: {UUID} (robot); Hot reload off: {UUID} (robot)"
+    assert asked == [{"memory_limit": "6G"}, False]
+
+
+def test_the_page_reloads(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    done = {None: [], "a": ["a was restarted", "b was restarted"]}
+    monkeypatch.setattr(acting, "reload_cell", lambda _scope, _cell, node: done[node])
+    assert bench.act("reload") == "Nothing has changed"
+    assert bench.act("reload", node="a") == "a was restarted; b was restarted"
+
+
+def test_the_page_enables_and_disables(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    boot = SimpleNamespace(path=Path("/etc/robot"))
+    monkeypatch.setattr(acting, "enable_cell", lambda *_: (boot, True))
+    monkeypatch.setattr(acting, "disable_cell", lambda *_: False)
+    monkeypatch.setattr(acting, "ensure_linger", lambda _scope: "lingering is now on")
+    done = bench.act("enable")
+    assert done == f"Dataflow enabled: {UUID} (robot); /etc/robot; lingering is now on"
+    assert bench.act("disable") == f"Dataflow not enabled: {UUID} (robot)"
 
 
 def test_the_drawing_of_a_dataflow_that_has_no_coordinator(bench: Bench) -> None:

@@ -12,6 +12,7 @@ from dora_systemd.decisions.gateway.page_messages import PageMessage
 from dora_systemd.decisions.gateway.request import Request
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.gateway.live import talk as live_talk
+from dora_systemd.gateway.live.follow import MAX_LINES
 from dora_systemd.gateway.live.talk import MAX_TASKS, talk
 from dora_systemd.scope import Scope
 from tests.unit.fakes.library import FakeSystemd, fake_systemd
@@ -155,6 +156,53 @@ def test_what_is_followed_takes_the_place_of_the_last(monkeypatch: pytest.Monkey
         browser.say(type="unfollow")
         await browser.wait_for("snapshot", len(browser.got) + 2)
         assert followed == ["+a", "-a", "+b", "-b"]
+
+    play(story)
+
+
+def test_questions(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(_scope: Scope, uuid: str) -> dict[str, Any]:
+        raise DoraSystemdError(f"no dataflow named {uuid!r}")
+
+    answers = {"about": lambda *_: {"row": {}, "problem": "x"}, "graph": refuse}
+    monkeypatch.setattr(live_talk, "_QUESTIONS", answers)
+
+    async def story(browser: Browser) -> None:
+        browser.say(type="about", dataflow=UUID)
+        browser.say(type="graph", dataflow="y")
+        assert await browser.wait_for("about") == [
+            {"type": "about", "dataflow": UUID, "row": {}, "problem": "x"}
+        ]
+        (graph,) = await browser.wait_for("graph")
+        assert (graph["dataflow"], graph["problem"]) == ("y", "no dataflow named 'y'")
+
+    play(story)
+
+
+def test_a_search_comes_in_parts_and_ends_the_stream(monkeypatch: pytest.MonkeyPatch) -> None:
+    lines = [{"at_us": at, "node": "a", "text": str(at)} for at in range(MAX_LINES + 1)]
+
+    async def find(_scope: Scope, message: PageMessage, most: int) -> tuple[list[Any], bool]:
+        if message.since == "x":
+            raise DoraSystemdError("cannot read the time", "see systemd.time(7)")
+        return lines[:most], False
+
+    monkeypatch.setattr(live_talk, "find_lines", find)
+
+    async def story(browser: Browser) -> None:
+        browser.say(type="find", number=1)
+        (found,) = await browser.wait_for("found")
+        assert (found["count"], found["is_whole"], found["problem"]) == (len(lines), False, "")
+        parts = [one["lines"] for one in browser.got if one["type"] == "lines"]
+        assert [len(part) for part in parts] == [MAX_LINES, 1]
+        browser.say(type="save", number=2)
+        await browser.wait_for("found", 2)
+        text = "".join(one["text"] for one in browser.got if one["type"] == "file")
+        assert text.count("\n") == len(lines)
+        browser.say(type="find", number=3, since="x")
+        *_, problem = await browser.wait_for("found", 3)
+        assert (problem["number"], problem["problem"]) == (3, "cannot read the time")
+        assert problem["hint"] == "see systemd.time(7)"
 
     play(story)
 

@@ -27,8 +27,9 @@ from dora_systemd.decisions.views.objects import (
 from dora_systemd.decisions.views.outcome import Outcome, outcome_object
 from dora_systemd.decisions.views.prometheus import UNKNOWN_STATE
 from dora_systemd.decisions.views.top import Look, TopEntry, look_values
+from dora_systemd.decisions.why.last_lines import Word
 from dora_systemd.decisions.why.lives import Happening
-from dora_systemd.decisions.why.report import Report, Subject, Word
+from dora_systemd.decisions.why.report import Report, Subject
 from dora_systemd.decisions.why.report_object import report_object
 from dora_systemd.decisions.why.verdict import Restart, Verdict
 from dora_systemd.errors import DoraSystemdError, ExitCode

@@ -9,11 +9,14 @@ from hypothesis import strategies as st
 
 from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
 from dora_systemd.decisions.gateway.page_messages import (
+    MAX_ITEMS,
     MAX_TEXT,
     PageMessage,
     graph_values,
     line_values,
     parse_message,
+    saved_line,
+    shown_values,
 )
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.terminal_text import escaped
@@ -23,6 +26,11 @@ def test_messages() -> None:
     text = '{"type": "act", "action": "stop", "dataflow": "u", "node": "camera", "number": 7}'
     assert parse_message(text) == PageMessage("act", "u", "camera", "stop", 7)
     assert parse_message(b'{"type": "unfollow"}') == PageMessage("unfollow")
+    text = '{"type": "act", "action": "set", "values": {"memory_limit": "6G", "hot_reload": "on"}}'
+    values = {"memory_limit": "6G", "hot_reload": "on"}
+    assert parse_message(text) == PageMessage("act", action="set", values=values)
+    text = '{"type": "find", "search": "b\u00f6se", "run": "PREVIOUS", "since": "@7"}'
+    assert parse_message(text) == PageMessage("find", search="böse", run="PREVIOUS", since="@7")
 
 
 @pytest.mark.parametrize(
@@ -32,6 +40,13 @@ def test_messages() -> None:
         *('{"type": "act", "action": "kill"}', '{"type": "follow", "node": 3}'),
         *('{"type": "follow", "number": "x"}', '{"type": ["follow"]}', "[" * 100_000),
         *('{"type": "follow", "number": 1e999}', '{"type": "follow", "number": null}'),
+        *('{"type": "find", "run": "0190"}', '{"type": "find", "search": null}'),
+        # No argument of a program can have these.
+        *(r'{"type": "find", "search": "a\u0000b"}', r'{"type": "find", "since": "\ud800"}'),
+        json.dumps({"type": "find", "search": "x" * 2000}),
+        *('{"type": "act", "action": "set", "values": {"nice": "-20"}}', '{"values": 3}'),
+        *('{"type": "act", "action": "set", "values": {"memory_limit": 3}}', '{"values": "x"}'),
+        '{"type": "act", "action": "set", "values": {"hot_reload": "perhaps"}}',
     ],
 )
 def test_what_is_no_message(text: str | bytes) -> None:
@@ -81,6 +96,19 @@ def test_no_line_commands_a_terminal(message: bytes) -> None:
     text = line_values(record(message))["text"]
     json.dumps(text).encode()
     assert escaped(text) == text
+
+
+def test_lines_of_a_file() -> None:
+    line = {"at_us": 1_700_000_000_000_017, "node": "camera", "text": "two\nlines", "priority": 3}
+    assert saved_line(line) == "2023-11-14T22:13:20.000017Z camera: two lines\n"
+    assert saved_line({**line, "node": ""}).endswith("Z dataflow: two lines\n")
+
+
+def test_values_for_the_page() -> None:
+    raw = {"a": ["\x1b[31mred\x1b[0m\x07", 3, None, True], "b": {"c": "x" * (MAX_TEXT + 1)}}
+    assert shown_values(raw) == {"a": [r"red\x07", 3, None, True], "b": {"c": "x" * MAX_TEXT + "…"}}
+    newest = shown_values(list(range(MAX_ITEMS + 5)))
+    assert (len(newest), newest[-1]) == (MAX_ITEMS, MAX_ITEMS + 4)
 
 
 def test_graph() -> None:

@@ -1,0 +1,62 @@
+"""What the status page shows of the settings of a dataflow, from its unit. Pure."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from dora_systemd.decisions.cell.hot_reload import CHANGE_VARIABLE
+from dora_systemd.decisions.cell.limits import (
+    CHANGES_VARIABLE,
+    LIMITS,
+    Limit,
+    format_node_limits,
+    merge_node_limits,
+    parse_changes,
+)
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.values import INFINITY, format_bool, parse_bool
+
+_LEVEL = ("NoNewPrivileges", "MemoryDenyWriteExecute")
+_NETWORK = ("PrivateNetwork", "IPAddressDeny")
+
+
+def _read_as(limit: Limit) -> str:
+    """The property of the limit on D-Bus, see org.freedesktop.systemd1(5)."""
+    return "CPUQuotaPerSecUSec" if limit.property == "CPUQuota" else limit.property
+
+
+PROPERTIES = (*map(_read_as, LIMITS), *_LEVEL, *_NETWORK, "Environment")
+"""What fact_values() needs of the unit."""
+
+
+def fact_values(options: RunnerOptions, unit: Mapping[str, Any]) -> dict[str, Any]:
+    """Limits and switches, with the keys of the settings; texts as `doractl set` takes them.
+
+    unit: its PROPERTIES. Raises DoraSystemdError for an Environment= that is not ours.
+    """
+    environment = dict(one.partition("=")[::2] for one in unit["Environment"] or ())
+    changes = parse_changes(environment.get(CHANGES_VARIABLE, ""))
+    switch = environment.get(CHANGE_VARIABLE) or format_bool(options.hot_reload)
+    limits = {one: unit[_read_as(one)] for one in LIMITS}
+    nodes = merge_node_limits(options.node_limits, changes)
+    return {
+        **{one.key: one.format(value) for one, value in limits.items() if _is_set(value)},
+        "node_limit": list(map(format_node_limits, nodes)),
+        "hot_reload": parse_bool(switch),
+        "sandbox": _level(unit),
+        "network": _network(unit),
+    }
+
+
+def _is_set(value: object) -> bool:
+    return isinstance(value, int) and value != INFINITY
+
+
+def _level(unit: Mapping[str, Any]) -> str:
+    """The level of the sandbox, by a property that only it and those above it have."""
+    is_on, is_strict = (unit[one] for one in _LEVEL)
+    return "strict" if is_on and is_strict else "default" if is_on else "none"
+
+
+def _network(unit: Mapping[str, Any]) -> str:
+    is_private, denied = (unit[one] for one in _NETWORK)
+    return "private" if is_private else "loopback" if denied else "host"

@@ -1,0 +1,119 @@
+// What can be done with a dataflow or a node: buttons, the question before it, and how it went.
+
+import { el, say } from "./dom.js";
+import { isUp } from "./words.js";
+
+const SAID_MS = 8000;
+
+const by = (id) => document.getElementById(id);
+
+// Word on the button, what it does, and the word while it is done.
+const ACTIONS = {
+  start: ["Start", "All nodes start, with the settings that it had.", "starting"],
+  stop: ["Stop", "Its nodes are told to stop; those still running after the grace duration are killed.",
+    "stopping"],
+  restart: ["Restart", "All nodes stop and start again; name, UUID and settings stay.", "restarting"],
+  reload: ["Reload", "Files that have changed take effect; only the affected nodes restart.",
+    "reloading"],
+  enable: ["Start at boot", "It starts at every boot, as it runs now.", "enabling"],
+  disable: ["Not at boot", "It no longer starts at boot; if it runs, it keeps running.", "disabling"],
+  set: ["Limits", "They take effect at once, and last until the dataflow is stopped or disabled. "
+    + "An empty field means no limit.", "changing"],
+  "hot-reload": ["Hot reload", "While it is on, nodes restart when their files change.", "changing"],
+  "stop node": ["Stop", "It stays down until the dataflow is restarted; the other nodes keep running.",
+    "stopping"],
+  "restart node": ["Restart", "The other nodes keep running.", "restarting"],
+};
+
+const LIMITS = {
+  memory_limit: ["Memory", "4G"], memory_high: ["Memory, slowed down beyond", "3G"],
+  cpu_limit: ["CPU, in cores or percent of one", "1.5"], tasks_limit: ["Processes and threads", "500"],
+};
+
+/** The buttons of a dataflow. ask: is called with an action. */
+export class Buttons {
+  constructor(ask) {
+    const button = (action) => el("button", { type: "button", "data-action": action,
+      onclick: () => {
+        this.menu.open = false;
+        ask(action, "");
+      } }, ACTIONS[action][0]);
+    this.all = Object.fromEntries(Object.keys(ACTIONS).filter((one) => !one.endsWith(" node"))
+      .map((action) => [action, button(action)]));
+    const { start, stop, restart, ...rest } = this.all;
+    const leave = (event) => {
+      if (event.key !== "Escape" || !this.menu.open) return;
+      this.menu.open = false;
+      this.menu.firstElementChild.focus();
+    };
+    this.menu = el("details", { class: "menu", onkeydown: leave }, el("summary", {}, "More"),
+      el("div", { class: "items" }, ...Object.values(rest)));
+    this.pending = el("span", { class: "pending muted", role: "status" });
+    this.node = el("div", { class: "buttons" }, this.pending, start, restart, stop, this.menu);
+  }
+
+  /** flow: a row, with isEnded if systemd has unloaded it. about: the message of that type. */
+  show(flow, about, isFree) {
+    const { start, stop, restart, reload, enable, disable, set } = this.all;
+    const up = isUp(flow);
+    start.hidden = up;
+    restart.hidden = stop.hidden = !up;
+    disable.hidden = !about?.row?.enabled;
+    enable.hidden = !disable.hidden;
+    this.menu.hidden = Boolean(flow.isEnded);
+    for (const button of Object.values(this.all)) button.disabled = !isFree;
+    for (const button of [reload, set, this.all["hot-reload"]]) button.disabled = !isFree || !up;
+    say(this.all["hot-reload"], `Hot reload ${about?.facts?.hot_reload ? "off" : "on"}`);
+  }
+}
+
+const limitField = (key, facts) => el("label", { for: key }, LIMITS[key][0],
+  el("input", { id: key, value: facts[key] ?? "", placeholder: LIMITS[key][1], maxlength: 40,
+    autocomplete: "off", onkeydown: (event) => {
+      if (event.key !== "Enter") return;
+      // The first button of the form is the one that Enter would press.
+      event.preventDefault();
+      by("confirmed").click();
+    } }));
+
+/** What has been typed into the fields of limits, as far as it is new. */
+function limitsGiven(facts) {
+  const pairs = Object.keys(LIMITS).map((key) => [key, by(key).value.trim()]);
+  return Object.fromEntries(pairs.filter(([key, text]) => text !== (facts[key] ?? ""))
+    .map(([key, text]) => [key, text || "infinity"]));
+}
+
+/** Asks in a dialog; then calls `act` with the action, the node and the values of "set". */
+export function askFirst(action, node, flow, facts, act) {
+  const [word, consequence] = ACTIONS[node ? `${action} node` : action];
+  const isSet = action === "set";
+  const hotReload = { hot_reload: facts.hot_reload ? "off" : "on" };
+  const title = action === "hot-reload" ? `${word} ${hotReload.hot_reload}` : word;
+  say(by("question"), isSet ? `Limits of ${flow.name}`
+    : `${title} ${node ? `node ${node} of ${flow.name}` : flow.name}?`);
+  say(by("consequence"), consequence);
+  say(by("confirmed"), isSet ? "Set" : title);
+  by("confirmed").dataset.action = action;
+  by("limits").replaceChildren(...(isSet ? Object.keys(LIMITS).map((k) => limitField(k, facts)) : []));
+  const dialog = by("confirm");
+  dialog.returnValue = "";
+  dialog.onclose = () => {
+    if (dialog.returnValue !== "yes") return;
+    const values = isSet ? limitsGiven(facts) : hotReload;
+    if (action === "hot-reload") act("set", "", values);
+    else if (!isSet || Object.keys(values).length) act(action, node, isSet ? values : {});
+  };
+  dialog.showModal();
+  by("limits").querySelector("input")?.focus();
+}
+
+/** What is being done, for beside the buttons. */
+export const doing = (action, what) => `${ACTIONS[action][2]} ${what} …`;
+
+/** How an action went. */
+export function tell({ text, problem, hint }) {
+  const note = el("p", { class: problem ? "toast bad" : "toast" },
+    problem ? [problem, hint].filter(Boolean).join(" – ") : text);
+  by("said").append(note);
+  setTimeout(() => note.remove(), SAID_MS);
+}

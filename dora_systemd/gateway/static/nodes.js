@@ -1,0 +1,45 @@
+// The nodes of a dataflow, one line each.
+
+import { el, say } from "./dom.js";
+import { waitWords } from "./history.js";
+import { cpuChart, memoryChart, showState, showUse } from "./parts.js";
+import { plural, since, uptime } from "./words.js";
+
+const ALIVE = ["ready", "running", "dynamic"];
+
+export class NodeRow {
+  /** ask: is called with an action and the node. choose: with the node whose logs are wanted. */
+  constructor(name, ask, choose) {
+    this.badge = el("span", { class: "badge" });
+    this.exit = el("span", { class: "exit" });
+    this.up = el("span", { class: "up" });
+    this.restarts = el("span", { class: "restarts" });
+    this.charts = { cpu: cpuChart("small"), memory: memoryChart("small") };
+    this.waits = el("span", { class: "waits" });
+    const act = (action, text) => el("button", { type: "button", class: "small",
+      "aria-label": `${text} ${name}`, onclick: () => ask(action, name) }, text);
+    this.buttons = { restart: act("restart", "Restart"), stop: act("stop", "Stop") };
+    this.choose = el("button", { type: "button", class: "plain name", "aria-pressed": "false",
+      title: `Show the logs of ${name}`, onclick: () => choose(name) }, name);
+    this.node = el("li", { "data-node": name },
+      el("div", { class: "what" }, this.choose, this.badge, this.exit),
+      el("div", { class: "facts muted" }, this.up, this.restarts, this.waits),
+      this.charts.cpu.node, this.charts.memory.node,
+      el("div", { class: "buttons" }, this.buttons.restart, this.buttons.stop));
+  }
+
+  /** isFree: whether its dataflow is up and nobody acts on it. */
+  show(facts, history, isChosen, isFree) {
+    const { state, exit, restarts, since_us: at } = facts;
+    const isAlive = ALIVE.includes(state);
+    showState(this.badge, state);
+    say(this.exit, isAlive ? "" : exit);
+    const ended = at ? since(at) : "";
+    say(this.up, isAlive ? `up ${uptime(at ? Date.now() * 1000 - at : null)}` : ended);
+    say(this.restarts, restarts ? plural(restarts, "restart") : "");
+    say(this.waits, waitWords(history.waits));
+    showUse(this.charts, history, facts);
+    this.choose.setAttribute("aria-pressed", String(isChosen));
+    for (const button of Object.values(this.buttons)) button.disabled = !isFree || !isAlive;
+  }
+}

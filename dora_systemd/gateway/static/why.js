@@ -1,0 +1,106 @@
+// Why a dataflow failed, since when, and what to do: what `doractl why` says.
+
+import { el } from "./dom.js";
+import { Facts, showState } from "./parts.js";
+import { bytes, clock, plural, since, span, tone } from "./words.js";
+
+const TITLES = {
+  Failed: "Why it failed", Degraded: "Why it is degraded", Restarting: "Why it restarts",
+  Stopped: "How it ended", Finished: "How it ended",
+};
+const COMMAND = /((?:doractl|systemctl|journalctl|coredumpctl) [^;,]+)/;
+const SIZES = { peak: "memory_peak_bytes", limit: "memory_limit_bytes", held: "memory_bytes" };
+
+/** "detector 3 (exit code 1), dataflow 1 (the dora daemon is gone)". */
+function restartWords(restarts) {
+  const groups = new Map();
+  for (const { node, reason } of restarts) {
+    const key = JSON.stringify([node || "dataflow", reason]);
+    groups.set(key, (groups.get(key) ?? 0) + 1);
+  }
+  return [...groups].map(([key, count]) => {
+    const [who, reason] = JSON.parse(key);
+    return `${who} ${count} (${reason})`;
+  }).join(", ");
+}
+
+function memoryWords(details) {
+  const known = Object.entries(SIZES).filter(([, key]) => details[key]);
+  return known.map(([name, key]) => `${name} ${bytes(details[key])}`).join(", ");
+}
+
+function budgetWords(budget) {
+  if (!budget?.used) return "";
+  const next = budget.next_us == null ? "" : `, the next one in ${span(budget.next_us)}`;
+  return `${budget.used} of ${budget.max} restarts used${next}`;
+}
+
+const list = (title, className, items) => (items.length
+  ? el("section", { class: className }, el("h3", {}, title),
+    el("ul", { tabindex: className === "remedies" ? null : 0, "aria-label": title }, ...items)) : null);
+
+const remedy = (text) => el("li", {}, ...text.split(COMMAND).map((part, at) =>
+  (at % 2 ? el("code", {}, part) : part)));
+
+const line = (at, ...parts) => el("li", {}, el("time", {}, clock(at)), " ", ...parts);
+
+export class Why {
+  /** choose: is called with the node whose logs are wanted. */
+  constructor(choose) {
+    this.choose = choose;
+    this.node = el("section", { class: "panel why", "aria-label": "Why", hidden: true });
+  }
+
+  /** about: the message of that type. */
+  show({ why, row, problem }) {
+    const status = why?.status ?? row?.status;
+    const key = JSON.stringify([why, problem, status]);
+    if (key === this.key) return;
+    Object.assign(this, { key, at: null });
+    const told = why?.summary && TITLES[status] ? this.#told(why, status) : [];
+    if (problem && TITLES[status]) told.push(el("p", { class: "muted" }, problem));
+    this.node.hidden = !told.length;
+    this.node.className = `panel why ${tone(status ?? "")}`;
+    const head = el("div", { class: "head" }, el("h2", {}, TITLES[status] ?? ""));
+    this.node.replaceChildren(head, ...told);
+    // The end of a backtrace says most.
+    for (const one of this.node.querySelectorAll("ul")) one.scrollTop = one.scrollHeight;
+  }
+
+  /** The time goes on, the text stays: somebody may be selecting it. */
+  tick() {
+    if (this.at) this.facts.show("Since", since(this.at));
+  }
+
+  #told(why, status) {
+    const badge = el("span", { class: "badge" });
+    showState(badge, status);
+    const last = why.last_lines.map((one) =>
+      line(one.at_us, why.node ? "" : el("b", {}, `${one.node}: `), el("span", {}, one.text)));
+    const news = why.timeline.map((one) => line(one.at_us, el("span", {}, one.text || one.event)));
+    return [
+      el("p", { class: "summary" }, badge, " ", el("strong", {}, why.summary)),
+      this.#facts(why),
+      list("What to do", "remedies", why.remedies.map(remedy)),
+      list(`The last ${plural(last.length, "line")} of ${why.node || "its nodes"}`, "words", last),
+      why.node ? el("p", {}, el("button", { type: "button", class: "small",
+        onclick: () => this.choose(why.node) }, `All logs of ${why.node}`)) : null,
+      list("What happened", "timeline", news),
+    ].filter(Boolean);
+  }
+
+  #facts(why) {
+    const facts = new Facts();
+    Object.assign(this, { facts, at: why.at_us });
+    const lasted = why.began_us && why.at_us ? why.at_us - why.began_us : -1;
+    facts.show("Since", why.at_us ? since(why.at_us) : "");
+    facts.show("After its start", lasted >= 0 ? span(lasted) : "");
+    facts.show("Node", why.node ?? "");
+    facts.show("Memory", memoryWords(why.details));
+    facts.show("Without input", why.starved.join(", "));
+    facts.show("Restarts before", restartWords(why.restart_history));
+    facts.show("Budget", budgetWords(why.restart_budget));
+    facts.show("Before that", why.before ? why.before.summary : "");
+    return facts.node;
+  }
+}
