@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
-from dora_systemd.decisions.gateway.answers import Record, record_text
+from dora_systemd.decisions.logs.records import Record, record_text
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.terminal_text import escaped, without_sequences
 
