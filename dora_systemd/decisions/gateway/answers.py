@@ -141,7 +141,7 @@ def _program(node: Mapping[str, Any]) -> dict[str, str]:
         launcher, *words = shlex.split(str(node.get("args")))
     except ValueError:
         return {}
-    command = words[3:]
+    command = words[5:] if words[3:5] == ["uv", "run"] else words[3:]
     if not launcher.endswith(("/launcher.pl", "/launcher.sh")) or not command:
         return {}
     if command[:2] == ["/bin/sh", "-c"]:

@@ -259,6 +259,7 @@ def test_descriptors() -> None:
     [
         ("/venv/bin/python -u /x/a.py 'b c'", "/x/a.py", "'b c'"),
         ("uv run python -u /x/a.py", "/x/a.py", ""),
+        ("uv run /x/tool -n", "/x/tool", "-n"),
         ("/x/tool -u 5", "/x/tool", "-u 5"),
         ("/bin/sh -c 'echo $X | cat'", "shell", "echo $X | cat"),
     ],
