@@ -1,8 +1,8 @@
 """Options and arguments that several verbs share."""
 
 import json
-from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
@@ -12,6 +12,8 @@ from dora_systemd.scope import Scope, scope_of
 if TYPE_CHECKING:
     # Imported late: only some verbs print outcomes.
     from dora_systemd.verbs.stop import Outcome
+
+T = TypeVar("T")
 
 _SCOPE_KEY = "dora_systemd.is_user"
 
@@ -48,6 +50,20 @@ name_option = click.option(
     help="Name of the dataflow; default: that of its file, or of the directory of a dataflow.yml.",
 )
 """For what starts a dataflow."""
+
+
+def parsed_by(parse: Callable[[str], T]) -> Callable[[click.Context, click.Parameter, str], T]:
+    """The callback of an option whose text `parse` reads; its errors (USAGE) name the option."""
+
+    def parsed(ctx: click.Context, param: click.Parameter, text: str) -> T:
+        del ctx
+        try:
+            return parse(text)
+        except DoraSystemdError as error:
+            message = f"{error.message} ({param.opts[-1]})"
+            raise DoraSystemdError(message, error.hint, error.code) from error
+
+    return parsed
 
 
 def current_scope() -> Scope:
