@@ -70,6 +70,19 @@ def test_levels(
     assert {one["dataflow_id"] for one in lines} <= {lines[0]["dataflow_id"] if lines else ""}
 
 
+@pytest.mark.warns("Failed with result 'signal'", "code=killed", "was killed", "Killing process")
+def test_logs_go_on_after_a_restart(cell: Cell, speaker: Path) -> None:
+    words = ("--restart-policy", "on-failure", "--restart-delay", "100ms")
+    command = ["doractl", "--system", "run", str(speaker), "--name", cell.name, *words]
+    child = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)
+    wait_for("it speaks", lambda: "raw" in cell.messages("speaker"))
+    os.kill(cell.supervisor_pid("runner"), signal.SIGKILL)
+    wait_for("it speaks again", lambda: cell.messages("speaker").count("raw") == 2)
+    child.send_signal(signal.SIGINT)
+    out, _ = child.communicate(timeout=bound(30))
+    assert out.count("raw") == 2
+
+
 def attach(cell: Cell, flow: Path) -> "subprocess.Popen[str]":
     command = ("doractl", "--system", "start", str(flow), "--name", cell.name, "--attach")
     child = subprocess.Popen(

@@ -1,14 +1,18 @@
 """Selectors, nodes and runs, looked up in a journal of our own."""
 
+import os
 from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from types import SimpleNamespace
 
 import pytest
 
 from dora_systemd.adapters.journal.reader import JournalReader
-from dora_systemd.decisions.logs.query import LogQuery
+from dora_systemd.decisions.logs.query import UNIT_ENDS, LogQuery
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.logs import find_query
+from dora_systemd.verbs import logs
+from dora_systemd.verbs.logs import FollowedLog, find_query
 
 ROBOT = "550e8400-e29b-41d4-a716-446655440000"
 ARM = "550e9999-e29b-41d4-a716-446655440000"
@@ -121,3 +125,26 @@ def test_nodes_and_runs_are_those_of_one_dataflow(nodes: tuple[str, ...], run: s
     with pytest.raises(DoraSystemdError) as caught:
         find("", nodes=nodes, run=run)
     assert caught.value.code is ExitCode.USAGE
+
+
+def test_lines_go_on_after_an_automatic_restart(monkeypatch: pytest.MonkeyPatch) -> None:
+    reading, writing = os.pipe()
+
+    @contextmanager
+    def journalctl(*_: object, **__: object) -> Iterator[SimpleNamespace]:
+        with os.fdopen(reading, "rb") as stdout:
+            yield SimpleNamespace(stdout=stdout)
+
+    monkeypatch.setattr(logs, "open_journalctl", journalctl)
+    printed: list[bytes] = []
+    log = FollowedLog(QUERY.scope, "robot", ROBOT, 0, printed.append, lambda one: one["MESSAGE"])
+    end = b"MESSAGE_ID=%s\nMESSAGE=end\n\n" % UNIT_ENDS[1].encode()
+    with closing(log):
+        os.write(writing, b"MESSAGE=one\n\n" + end)
+        log.print_new()
+        assert log.has_ended
+        os.write(writing, b"MESSAGE=two\n\n" + end)
+        log.finish()
+        log.print_new()
+    assert (printed, log.has_ended) == ([b"one", b"two"], True)
+    os.close(writing)
