@@ -7,6 +7,7 @@ user is in the middle of a command line.
 
 from collections.abc import Callable, Iterable
 from contextlib import suppress
+from copy import copy
 from typing import Any
 
 import click
@@ -103,9 +104,7 @@ class CompletingGroup(VerbGroup):
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         command = super().get_command(ctx, cmd_name)
-        for one in getattr(command, "commands", {}).values():
-            _set_types(one)
-        return command and _set_types(command)
+        return command and _completing(command)
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
         """Complete verbs from the table, without importing them, and options."""
@@ -125,9 +124,14 @@ def complete(instruction: str) -> int:
     return ExitCode.USAGE
 
 
-def _set_types(command: click.Command) -> click.Command:
+def _completing(command: click.Command) -> click.Command:
+    """A copy with the types above, which would refuse values that the verb takes."""
+    command = copy(command)
+    command.params = list(map(copy, command.params))
     for param in command.params:
         param.type = TYPES.get(param.name or "", param.type)
+    if isinstance(command, click.Group):
+        command.commands = {name: _completing(one) for name, one in command.commands.items()}
     return command
 
 

@@ -13,6 +13,8 @@ from dora_systemd.scope import Scope, scope_of
 
 C = TypeVar("C", bound=Callable[..., Any] | click.Command)
 
+T = TypeVar("T")
+
 _SCOPE_KEY = "dora_systemd.is_user"
 _OUTPUT_KEY = "dora_systemd.output"
 
@@ -69,6 +71,20 @@ name_option = click.option(
     help="Name of the dataflow; default: that of its file, or of the directory of a dataflow.yml.",
 )
 """For what starts a dataflow."""
+
+
+def parsed_by(parse: Callable[[str], T]) -> Callable[[click.Context, click.Parameter, str], T]:
+    """The callback of an option whose text `parse` reads; its errors (USAGE) name the option."""
+
+    def parsed(ctx: click.Context, param: click.Parameter, text: str) -> T:
+        del ctx
+        try:
+            return parse(text)
+        except DoraSystemdError as error:
+            message = f"{error.message} ({param.opts[-1]})"
+            raise DoraSystemdError(message, error.hint, error.code) from error
+
+    return parsed
 
 
 def current_scope() -> Scope:

@@ -35,7 +35,10 @@ def answer(letter: bytes, path: bytes, most: int) -> bytes:
         return os.path.realpath(path)
     if letter == b"r":
         return read_regular(path, most)
-    mode = os.stat(path).st_mode  # noqa: PTH116 - a Path has no bytes
+    found = os.stat(path)  # noqa: PTH116 - a Path has no bytes
+    if letter == b"m":
+        return b"%d" % found.st_mtime_ns
+    mode = found.st_mode
     is_so = {
         b"e": True,
         b"d": stat.S_ISDIR(mode),

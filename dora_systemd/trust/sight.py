@@ -26,6 +26,7 @@ stop the child."""
 _LONGEST = 4096
 """Maximum bytes of a path, see PATH_MAX in limits.h(0p); a longer one may not fit into the pipe."""
 _MOST_DIGITS = 4
+_MOST_TIME_DIGITS = 20
 _HEAD = 8
 _CHUNK = 65536
 
@@ -55,6 +56,13 @@ class Sight:
     def read(self, path: str) -> bytes:
         """The content of a regular file, at most MAX_BYTES + 1 bytes. Raises OSError."""
         return self._ask(b"r", path)
+
+    def modified_ns(self, path: str) -> int:
+        """When the file was last written, ns since 1970; 0 if there is none."""
+        with contextlib.suppress(OSError, ValueError):
+            found = self._ask(b"m", path)
+            return int(found) if len(found) <= _MOST_TIME_DIGITS else 0
+        return 0
 
     def _is(self, letter: bytes, path: str) -> bool:
         with contextlib.suppress(OSError, ValueError):

@@ -7,7 +7,6 @@ import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import DOWN, Manager
@@ -20,32 +19,20 @@ from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import SLICE, name_from_unit
 from dora_systemd.scope import Scope
-from dora_systemd.values import INFINITY, SECOND
 from dora_systemd.verbs.facts.cells import Cell, read_cell, read_cells
 from dora_systemd.verbs.facts.reading import slice_group
-from dora_systemd.verbs.facts.reason import failure_reason
-from dora_systemd.verbs.stop import release_enabled
+from dora_systemd.verbs.stop import (
+    KILLED_SECONDS,
+    POLL_SECONDS,
+    release_enabled,
+    stop_within,
+)
 from dora_systemd.verbs.up import written_files
 
-UNBOUNDED_SECONDS = 90.0
-"""Timeout for a dataflow with TimeoutStopSec=infinity: systemd's own default."""
-
-_MARGIN_SECONDS = 5.0
-_KILLED_SECONDS = 10.0
-_POLL_SECONDS = 0.05
 _ROUNDS = 5
 """Maximum searches for dataflows that were started meanwhile."""
 
 _GATEWAY = (SOCKET_UNIT, SERVICE_UNIT)
-
-
-@dataclass(frozen=True)
-class _Stop:
-    """A stop in progress. deadline: seconds of the monotonic clock."""
-
-    cell: Cell
-    deadline: float
-    is_killed: bool
 
 
 def running_cells(manager: Manager) -> list[Cell]:
@@ -66,9 +53,10 @@ def stop_all(
         cells = [cell for cell in running_cells(manager) if cell.unit not in given_up]
         if not cells:
             return
-        for outcome in _stop(manager, cells, want_kill, now):
-            given_up |= {outcome.subject.unit} if outcome.problem else set()
-            yield outcome
+        for one in stop_within(manager, cells, 0 if want_kill else None, now):
+            given_up |= {one.cell.unit} if one.problem else set()
+            note = f" ({one.note})" if one.note else ""
+            yield Outcome(one.cell, f"  ✓ {one.cell.name} stopped{note}", one.problem)
         release_enabled(manager, scope, [cell.unit for cell in cells])
 
 
@@ -104,12 +92,12 @@ def processes_left(
 
     Kills these processes once more: with SendSIGKILL=no systemd leaves some behind.
     """
-    deadline = now() + _KILLED_SECONDS
+    deadline = now() + KILLED_SECONDS
     while (groups := _populated(manager, others)) and now() < deadline:
         for group in groups:
             with suppress(DoraSystemdError):
                 manager.kill(group.name, signal.SIGKILL)
-        time.sleep(_POLL_SECONDS)
+        time.sleep(POLL_SECONDS)
     pids = {pid for group in groups for pid in cgroup.pids(group)}
     return [str(one) for one in read_processes() if one.pid in pids]
 
@@ -131,48 +119,3 @@ def _is_ours(manager: Manager, unit: str) -> bool:
 def _state(manager: Manager, unit: str) -> str:
     active: str = manager.read(unit, ["ActiveState"])["ActiveState"]
     return active
-
-
-def _stop(
-    manager: Manager, cells: Sequence[Cell], want_kill: bool, now: Callable[[], float]
-) -> Iterator[Outcome]:
-    pending = [_begin(manager, cell, want_kill, now()) for cell in cells]
-    while pending:
-        left = []
-        for one in pending:
-            if (state := _state(manager, one.cell.unit)) in DOWN:
-                yield _ended(manager, one, state)
-            elif now() < one.deadline:
-                left.append(one)
-            elif not one.is_killed:
-                left.append(_begin(manager, one.cell, True, now()))
-            else:
-                text = f"cannot stop {one.cell.unit}: it is {state} although it was killed"
-                yield Outcome(one.cell, "", text)
-        pending = left
-        if pending:
-            time.sleep(_POLL_SECONDS)
-
-
-def _begin(manager: Manager, cell: Cell, want_kill: bool, now: float) -> _Stop:
-    """Stop a dataflow in any state: the job replaces a start or restart that is queued."""
-    given = manager.read(cell.unit, ["TimeoutStopUSec"])["TimeoutStopUSec"]
-    manager.queue_job("StopUnit", cell.unit)
-    if want_kill:
-        # There may be no process, as between two restarts.
-        with suppress(DoraSystemdError):
-            manager.kill(cell.unit, signal.SIGKILL)
-        return _Stop(cell, now + _KILLED_SECONDS, True)
-    seconds = given / SECOND if given and given != INFINITY else UNBOUNDED_SECONDS
-    return _Stop(cell, now + seconds + _MARGIN_SECONDS, False)
-
-
-def _ended(manager: Manager, one: _Stop, state: str) -> Outcome:
-    note = ""
-    if one.is_killed:
-        with suppress(DoraSystemdError):
-            manager.reset_failed(one.cell.unit)
-        note = " (killed)"
-    elif state == "failed":
-        note = f" ({failure_reason(manager, one.cell.unit)})"
-    return Outcome(one.cell, f"  ✓ {one.cell.name} stopped{note}")

@@ -22,12 +22,13 @@ from dora_systemd.decisions.logs.query import (
     query_arguments,
     query_matches,
 )
+from dora_systemd.decisions.logs.records import LOG_FIELDS, Record
 from dora_systemd.decisions.logs.terminal import ShownLines, TerminalLines
 from dora_systemd.scope import Scope
 
 _TURN = 1 << 14
 """Bytes of records between two looks at what else has happened: a terminal may be slow."""
-_FIELDS = "MESSAGE,PRIORITY,SYSLOG_IDENTIFIER,MESSAGE_ID,UNIT,USER_UNIT"
+_FIELDS = ",".join((*LOG_FIELDS, "SYSLOG_IDENTIFIER"))
 
 Write = Callable[[bytes], object]
 
@@ -113,9 +114,10 @@ class Follower:
 
 
 class FollowedLog(Follower):
-    """The records of one invocation of a dataflow's unit, while it runs and up to its end.
+    """The records of a dataflow's unit, while it runs and up to its end.
 
-    since_us: CLOCK_REALTIME µs of the start of the unit. write: called with the lines.
+    since_us: CLOCK_REALTIME µs of the start of the unit. write: called with the lines. form: the
+    lines of a record, b"" to leave it out.
     """
 
     def __init__(
@@ -125,7 +127,7 @@ class FollowedLog(Follower):
         uuid: str,
         since_us: int,
         write: Write,
-        terminal: TerminalLines,
+        form: Callable[[Record], bytes],
     ) -> None:
         matches = [*query_matches(LogQuery(scope, name=name, uuid=uuid)), "+"]
         matches += end_matches(scope, name)
@@ -133,29 +135,31 @@ class FollowedLog(Follower):
         super().__init__(since_us, _FIELDS, matches, outlives_interrupt=True)
         self.has_ended = False
         self._write = write
-        self._terminal = terminal
+        self._form = form
         self._records = ExportReader()
+        self._is_closed = False
 
     def print_new(self) -> None:
         """Write some of the lines that have come: a flood of them must not keep the caller here."""
-        data = None if self.has_ended else self.read(_TURN)
+        data = None if self._is_closed else self.read(_TURN)
         if data is not None:
-            self.has_ended = not data
+            self.has_ended = self._is_closed = not data
             self._print(data)
 
     def _print(self, data: bytes) -> None:
         lines: list[bytes] = []
         for record in self._records.feed(data):
-            if record.get("MESSAGE_ID", b"").decode() in UNIT_ENDS:
-                self.has_ended = True
-                break
-            lines.append(self._terminal.record(record))
-        if lines:
-            self._write(b"".join(lines))
+            # After an automatic restart more records follow.
+            self.has_ended = record.get("MESSAGE_ID", b"").decode() in UNIT_ENDS
+            if not self.has_ended:
+                lines.append(self._form(record))
+        if text := b"".join(lines):
+            self._write(text)
 
     def finish(self, seconds: float = 3.0) -> None:
         """Write the remaining lines of a unit that has ended; wait at most `seconds`."""
         deadline = time.monotonic() + seconds
-        while not self.has_ended and (left := deadline - time.monotonic()) > 0:
-            self.is_readable(left)
+        while (left := deadline - time.monotonic()) > 0 and not self._is_closed:
+            if not self.is_readable(0 if self.has_ended else left):
+                return
             self.print_new()

@@ -9,6 +9,7 @@ from typing import Any
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.runner_socket import client as runner_socket
 from dora_systemd.decisions.cell.status import CellStatus
+from dora_systemd.decisions.descriptor.expansion import sent_again
 from dora_systemd.decisions.dora.coordinator import Coordinator
 from dora_systemd.decisions.dora.protocol import (
     Params,
@@ -94,7 +95,7 @@ def restart_node(scope: Scope, cell: Cell, node: str, ask: Ask = ask_coordinator
     definition = next((one for one in nodes if one.get("id") == node), {})
     is_replaceable = definition.get("restart_policy", "never") == "never"
     if is_replaceable and has_readers(node, nodes):
-        params = replace_params(status.run, definition)
+        params = replace_params(status.run, sent_again(definition))
     else:
         params = node_params("RestartNode", status.run, node)
     _answer(cell, ask(scope, cell, params))

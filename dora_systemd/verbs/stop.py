@@ -1,17 +1,49 @@
 """`doractl stop`, `restart` and `reset`: what systemd does for several dataflows at once."""
 
-from collections.abc import Iterable, Sequence
+import signal
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 
-from dora_systemd.adapters.bus.manager import JOB_DONE, Manager, Observer
+from dora_systemd.adapters.bus.manager import DOWN, JOB_DONE, Manager, Observer
 from dora_systemd.decisions.views.outcome import Outcome, Subject
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
+from dora_systemd.values import INFINITY, SECOND
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.enabled import enabled_units
 from dora_systemd.verbs.facts.reason import failure_reason, job_reason
 from dora_systemd.verbs.start.asked import note_request
 from dora_systemd.verbs.start.enable import read_boot_unit, release_transient
+
+UNBOUNDED_SECONDS = 90.0
+"""Timeout for a dataflow with TimeoutStopSec=infinity: systemd's own default."""
+
+_MARGIN_SECONDS = 5.0
+KILLED_SECONDS = 10.0
+"""Timeout for the end of processes that were killed."""
+POLL_SECONDS = 0.05
+
+Clock = Callable[[], float]
+
+
+@dataclass(frozen=True)
+class Ended:
+    """A dataflow that was told to stop. note: how it ended, or "". problem: why it has not."""
+
+    cell: Cell
+    note: str = ""
+    problem: str = ""
+
+
+@dataclass(frozen=True)
+class _Stop:
+    """A stop in progress. deadline: seconds of the monotonic clock."""
+
+    cell: Cell
+    deadline: float
+    is_killed: bool
 
 
 def stop_cells(
@@ -26,6 +58,47 @@ def stop_cells(
     outcomes = [_stop_outcome(manager, cell, results.get(cell.unit)) for cell in cells]
     release_enabled(manager, scope, up)
     return outcomes
+
+
+def stop_cells_within(
+    manager: Manager, scope: Scope, cells: Sequence[Cell], most: int
+) -> list[Outcome]:
+    """Stop dataflows as stop_cells() does, and kill those that still run after `most` µs."""
+    up = [cell for cell in cells if cell.is_up]
+    ended = {one.cell: one for one in stop_within(manager, up, most)}
+    release_enabled(manager, scope, [cell.unit for cell in up])
+    return [
+        Outcome(cell, _stopped(cell, ended[cell].note), ended[cell].problem)
+        if cell in ended
+        else _not_running(cell)
+        for cell in cells
+    ]
+
+
+def stop_within(
+    manager: Manager, cells: Sequence[Cell], most: int | None, now: Clock = time.monotonic
+) -> Iterator[Ended]:
+    """Stop dataflows in parallel; yields each as soon as it has ended.
+
+    most: µs until it is killed, at once for 0; None: the TimeoutStopSec= of the unit.
+    """
+    pending = [_begin(manager, cell, most, now()) for cell in cells]
+    while pending:
+        left = []
+        for one in pending:
+            state = manager.read(one.cell.unit, ["ActiveState"])["ActiveState"]
+            if state in DOWN:
+                yield _ended(manager, one, state)
+            elif now() < one.deadline:
+                left.append(one)
+            elif not one.is_killed:
+                left.append(_begin(manager, one.cell, 0, now()))
+            else:
+                text = f"cannot stop {one.cell.unit}: it is {state} although it was killed"
+                yield Ended(one.cell, problem=text)
+        pending = left
+        if pending:
+            time.sleep(POLL_SECONDS)
 
 
 def release_enabled(manager: Manager, scope: Scope, units: Sequence[str]) -> None:
@@ -81,15 +154,20 @@ def not_running(subject: Subject, state: str) -> Outcome:
 
 def _stop_outcome(manager: Manager, cell: Cell, result: str | None) -> Outcome:
     if result is None:
-        ended = "has failed" if cell.state.active == "failed" else "does not run"
-        return not_running(cell, ended)
+        return _not_running(cell)
     if result != JOB_DONE:
         return Outcome(cell, "", f"cannot stop {cell.unit}: the job was {result}")
     state = manager.read(cell.unit, ["ActiveState", "Result"])
-    note = ""
-    if state["ActiveState"] == "failed":
-        note = f": {failure_reason(manager, cell.unit)}"
-    return Outcome(cell, f"Dataflow stopped: {cell.uuid} ({cell.name}){note}")
+    is_failed = state["ActiveState"] == "failed"
+    return Outcome(cell, _stopped(cell, failure_reason(manager, cell.unit) if is_failed else ""))
+
+
+def _stopped(cell: Cell, note: str) -> str:
+    return f"Dataflow stopped: {cell.uuid} ({cell.name}){note and f': {note}'}"
+
+
+def _not_running(cell: Cell) -> Outcome:
+    return not_running(cell, "has failed" if cell.state.active == "failed" else "does not run")
 
 
 def _restart_outcome(manager: Manager, cell: Cell, result: str) -> Outcome:
@@ -105,3 +183,28 @@ def _reset(manager: Manager, cell: Cell) -> Outcome:
     return Outcome(
         cell, f"Dataflow reset: {cell.uuid} ({cell.name}, restart counter reset, was {used})"
     )
+
+
+def _begin(manager: Manager, cell: Cell, most: int | None, now: float) -> _Stop:
+    """Stop a dataflow in any state: the job replaces a start or restart that is queued."""
+    given = manager.read(cell.unit, ["TimeoutStopUSec"])["TimeoutStopUSec"]
+    manager.queue_job("StopUnit", cell.unit)
+    if most is not None and most <= 0:
+        # There may be no process, as between two restarts.
+        with suppress(DoraSystemdError):
+            manager.kill(cell.unit, signal.SIGKILL)
+        return _Stop(cell, now + KILLED_SECONDS, True)
+    seconds = given / SECOND if given and given != INFINITY else UNBOUNDED_SECONDS
+    seconds += _MARGIN_SECONDS
+    return _Stop(cell, now + (seconds if most is None else min(seconds, most / SECOND)), False)
+
+
+def _ended(manager: Manager, one: _Stop, state: str) -> Ended:
+    note = ""
+    if one.is_killed:
+        with suppress(DoraSystemdError):
+            manager.reset_failed(one.cell.unit)
+        note = "killed"
+    elif state == "failed":
+        note = failure_reason(manager, one.cell.unit)
+    return Ended(one.cell, note)

@@ -39,6 +39,7 @@ VARIABLES: dict[str, dict[str, object]] = {
     "odd": {"my.var": "1", "MY-VAR": "2", "a b": "3", "OPTIND": "7", "OLDPWD": "/old"},
     "numbers": {"A": 1.50, "B": 16, "C": 1000.0, "D": "1.10", "E": "007", "F": True, "G": "1e3"},
     "texts": {"A": "a b", "B": "ü", "C": "x\ny", "D": "", "E": "#x", "F": "~", "G": "no"},
+    "infinite": {"A": "inf", "B": "-Infinity", "C": "NaN", "D": "1e999", "E": "infinite"},
     "price": {"A": "$$", "B": "a$$b", "C": "$$HOME", "D": "$$$$"},
     "caller": {"A": "${FROM_CALLER}", "B": "x$FROM_CALLER.y"},
 }
@@ -74,7 +75,7 @@ def seen_with(flow: Path, *command: str) -> dict[str, Any]:
     """What the nodes wrote down, by case, when alice runs the dataflow."""
     out = flow.parent / "seen"
     words = " ".join(command)
-    script = f"cd {flow.parent} && FROM_CALLER=yolo exec {words} {flow}"
+    script = f"cd {flow.parent} && FROM_CALLER=yolo RUST_LOG=warn exec {words} {flow}"
     run("su", "alice", "-s", "/bin/sh", "-c", script)
     found = {path.name: json.loads(path.read_text()) for path in sorted(out.iterdir())}
     for path in out.iterdir():
@@ -90,10 +91,20 @@ def test_arguments_directory_and_environment(flow: Path) -> None:
     for case in cases:
         assert ours[case]["argv"] == bare[case]["argv"], case
         assert ours[case]["cwd"] == bare[case]["cwd"], case
+    assert ours["path-here"]["env"]["RUST_LOG"] == bare["path-here"]["env"]["RUST_LOG"] == "warn"
     for name, variables in VARIABLES.items():
         case = f"env-{name}"
         keys = variables.keys() - OWN
         assert chosen(ours[case], keys) == chosen(bare[case], keys), case
+
+
+def test_infinite_numbers_of_yaml(flow: Path) -> None:
+    flow.write_text(
+        "nodes: [{id: one, path: probe.py, env: {PROBE: one, A: .inf, B: -.inf, C: .nan}}]\n"
+    )
+    bare = seen_with(flow, "dora", "run")["one"]
+    ours = seen_with(flow, "doractl", "run", "--name", "fidelity")["one"]
+    assert chosen(ours, {"A", "B", "C"}) == chosen(bare, {"A", "B", "C"})
 
 
 def chosen(seen: dict[str, Any], keys: set[str]) -> dict[str, str | None]:

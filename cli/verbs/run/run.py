@@ -1,38 +1,77 @@
 """Run a dataflow in the foreground."""
 
 import os
-import sys
-import time
-from contextlib import closing
 from typing import Any
 
 import click
 
 from dora_systemd.adapters.bus.systemd import Bus
-from dora_systemd.cli.colors import wants_colors
-from dora_systemd.cli.parameters import current_scope, name_option, print_warnings, scope_options
+from dora_systemd.cli.foreground import FORMATS, Foreground, print_until_end
+from dora_systemd.cli.parameters import (
+    current_scope,
+    name_option,
+    parsed_by,
+    print_warnings,
+    scope_options,
+)
 from dora_systemd.cli.settingoptions import SettingsCommand, setting_options
-from dora_systemd.cli.stageline import StageLine
-from dora_systemd.decisions.logs.terminal import TerminalLines
+from dora_systemd.decisions.logs.filter import RAW, LogFilter, parse_filter
+from dora_systemd.decisions.logs.records import DORA_LEVELS
 from dora_systemd.names import unit_name
-from dora_systemd.verbs.logs import FollowedLog
+from dora_systemd.values import parse_duration
 from dora_systemd.verbs.start.again import note_start
 from dora_systemd.verbs.start.claim import refuse_unit_file, require_free_name
 from dora_systemd.verbs.start.enable import drop_unit_files
-from dora_systemd.verbs.start.job import start_unit
 from dora_systemd.verbs.start.plan import DEFAULT_FILE, StartRequest, make_plan, request_name
-from dora_systemd.verbs.start.run import attached_properties, follow_unit, life_line
+from dora_systemd.verbs.start.run import attached_properties, life_line
 from dora_systemd.verbs.start.unit import plan_properties
-
-_MICROSECOND_NS = 1000
 
 
 @click.command("run", cls=SettingsCommand)
 @click.argument("dataflow", default=DEFAULT_FILE, metavar="[FILE]")
 @name_option
+@click.option(
+    "--stop-after",
+    metavar="TIME",
+    default="infinity",
+    callback=parsed_by(parse_duration),
+    help="Stop it gracefully when it has run so long, such as 30s or 5min.",
+)
+@click.option(
+    "--log-level",
+    type=click.Choice((RAW, *DORA_LEVELS[1:]), case_sensitive=False),
+    default=RAW,
+    envvar="DORA_LOG_LEVEL",
+    show_default=True,
+    help="Print this level and above; stdout: everything, also what has no level.",
+)
+@click.option(
+    "--log-filter",
+    metavar="NODE=LEVEL,...",
+    default="",
+    envvar="DORA_LOG_FILTER",
+    callback=parsed_by(parse_filter),
+    help="Other levels for single nodes.",
+)
+@click.option(
+    "--log-format",
+    type=click.Choice(FORMATS),
+    default=FORMATS[0],
+    envvar="DORA_LOG_FORMAT",
+    show_default=True,
+    help="Form of the lines; json: one object for each, as dora writes them.",
+)
 @setting_options
 @scope_options
-def command(dataflow: str, name: str | None, **flags: Any) -> int:
+def command(
+    dataflow: str,
+    name: str | None,
+    stop_after: int,
+    log_level: str,
+    log_filter: dict[str, str],
+    log_format: str,
+    **flags: Any,
+) -> int:
     """Run the dataflow in FILE and print its logs until it ends.
 
     Ctrl+C stops it gracefully, a second Ctrl+C kills it. The dataflow ends with this command,
@@ -42,6 +81,7 @@ def command(dataflow: str, name: str | None, **flags: Any) -> int:
       doractl run                          ./dataflow.yml
       doractl run dataflow.yml --name robot --env MODEL=yolov8n.pt
       doractl run dataflow.yml --hot-reload
+      doractl run dataflow.yml --stop-after 30s --log-level warn --log-filter camera=debug
     """
     scope = current_scope()
     request = StartRequest(dataflow, name, flags, os.environ, attached=True)
@@ -53,18 +93,8 @@ def command(dataflow: str, name: str | None, **flags: Any) -> int:
     drop_unit_files(bus, boot)
     note_start(plan, request, "doractl run")
     print_warnings(warnings)
-    options = plan.options
-    terminal = TerminalLines(want_colors=wants_colors(sys.stdout), is_terminal=sys.stdout.isatty())
-    since = time.time_ns() // _MICROSECOND_NS
-    with life_line() as pipe, StageLine(sys.stderr) as stage:
-
-        def write(data: bytes) -> None:
-            stage.wipe()
-            sys.stdout.buffer.write(data)
-            sys.stdout.buffer.flush()
-
-        followed = FollowedLog(scope, options.name, options.uuid, since, write, terminal)
-        with closing(followed) as logs:
-            given = [*properties.values(), *attached_properties(pipe)]
-            start_unit(bus, scope, options, given, stage, wait=False)
-            return follow_unit(bus, plan.unit, logs, stage)
+    shown = LogFilter(log_level, log_filter)
+    how = Foreground(shown, log_format, stop_after=stop_after, notes=plan.notes)
+    with life_line() as pipe:
+        given = [*properties.values(), *attached_properties(pipe)]
+        return print_until_end(bus, plan, given, how)

@@ -1,6 +1,7 @@
 """Start a dataflow as a systemd service."""
 
 import os
+import signal
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -10,6 +11,7 @@ import click
 
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.edge import write_exactly
+from dora_systemd.cli.foreground import Foreground, print_until_end
 from dora_systemd.cli.parameters import (
     acting_options,
     current_scope,
@@ -17,6 +19,7 @@ from dora_systemd.cli.parameters import (
     print_outcomes,
     print_warnings,
     tell,
+    wants_json,
 )
 from dora_systemd.cli.settingoptions import SettingsCommand, setting_options
 from dora_systemd.cli.stageline import StageLine
@@ -29,10 +32,11 @@ from dora_systemd.verbs.start.again import find_start, is_given, means_name
 from dora_systemd.verbs.start.check import check_plan
 from dora_systemd.verbs.start.enable import boot_target
 from dora_systemd.verbs.start.job import Started, format_started, start_unit
-from dora_systemd.verbs.start.launch import claim
+from dora_systemd.verbs.start.launch import Claim, claim
 from dora_systemd.verbs.start.linger import ensure_linger
 from dora_systemd.verbs.start.logins import start_notes
 from dora_systemd.verbs.start.plan import DEFAULT_FILE, StartRequest, make_plan
+from dora_systemd.verbs.start.run import HELD
 from dora_systemd.verbs.start.unit import format_plan
 from dora_systemd.verbs.start.watch import watched_patterns
 from dora_systemd.verbs.why import words_of_start
@@ -42,6 +46,12 @@ from dora_systemd.verbs.why import words_of_start
 @click.argument("dataflow", default=DEFAULT_FILE, metavar="[FILE|NAME]")
 @name_option
 @setting_options
+@click.option(
+    "--attach/--detach",
+    "want_logs",
+    default=False,
+    help="Print its logs until it ends; Ctrl+C stops it then, closing the terminal does not.",
+)
 @click.option("--no-wait", is_flag=True, help="Do not wait until all nodes are ready.")
 @click.option("--enable", "want_boot", is_flag=True, help="Also start it at every boot.")
 @click.option("--dry-run", is_flag=True, help="Print the unit and start nothing.")
@@ -49,11 +59,12 @@ from dora_systemd.verbs.why import words_of_start
 def command(
     dataflow: str,
     name: str | None,
+    want_logs: bool,
     no_wait: bool,
     want_boot: bool,
     dry_run: bool,
     **flags: Any,
-) -> ExitCode:
+) -> int:
     """Start the dataflow in FILE as the service dora-NAME.service.
 
     NAME instead of FILE starts a dataflow that has ended, with the UUID and the settings it had;
@@ -73,14 +84,19 @@ def command(
       doractl start dataflow.yml --hot-reload --watch "*.py,config/*"
       doractl start dataflow.yml --device /dev/video0 --writable /srv/recordings
       doractl start dataflow.yml --enable              now and at every boot
+      doractl start dataflow.yml --attach              with its logs, as doractl run
       doractl start dataflow.yml --dry-run
       doractl start robot                              what list --all shows, once more
     """
+    if want_logs and (no_wait or wants_json()):
+        hint = "leave out --no-wait and --output"
+        raise DoraSystemdError("cannot print logs with --no-wait or json", hint, ExitCode.USAGE)
     scope = current_scope()
     request = StartRequest(dataflow, name, flags, os.environ)
     if means_name(dataflow):
         bus = Bus(scope)
-        is_changed = bool(name or want_boot or dry_run or any(map(is_given, flags.values())))
+        is_changed = bool(name or want_boot or dry_run or want_logs)
+        is_changed |= any(map(is_given, flags.values()))
         known = find_start(bus, scope, Selector(dataflow), is_changed)
         if isinstance(known, Cell):
             return _start_known(bus, scope, known, not no_wait)
@@ -95,12 +111,23 @@ def command(
     claimed = claim(bus, scope, request, "doractl start", want_boot)
     print_warnings(claimed.warnings)
     print_warnings([ensure_linger(scope) if want_boot else ""])
+    notes = [*start_notes(claimed.plan), *claimed.plan.notes]
+    if want_logs:
+        return _attach(bus, claimed, notes)
     options = claimed.plan.options
     with _last_words(bus, scope, options.uuid), StageLine(sys.stderr) as stage:
         started = start_unit(bus, scope, options, claimed.properties, stage, not no_wait)
     # Only after the start: a refusal must be one line and a hint.
-    print_warnings(start_notes(claimed.plan))
+    print_warnings(notes)
     return _print_started(started, options.dataflow, watched_patterns(claimed.plan))
+
+
+def _attach(bus: Bus, claimed: Claim, notes: Sequence[str]) -> int:
+    """Print the logs of the dataflow, which goes on if this process ends."""
+    how = Foreground(signals=(signal.SIGINT,), notes=notes)
+    # What is started from a unit file stays loaded if it has failed.
+    properties = None if claimed.properties is None else [*claimed.properties, HELD]
+    return print_until_end(bus, claimed.plan, properties, how)
 
 
 def _start_known(bus: Bus, scope: Scope, cell: Cell, wait: bool) -> ExitCode:

@@ -1,6 +1,7 @@
 """Stop dataflows."""
 
 import sys
+from collections.abc import Sequence
 from functools import partial
 
 import click
@@ -10,53 +11,99 @@ from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import (
     acting_options,
     current_scope,
+    parsed_by,
     print_outcomes,
     require_names_or_all,
     tell,
 )
 from dora_systemd.cli.stageline import StageLine
+from dora_systemd.decisions.life.stop_budget import kill_delay
+from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
+from dora_systemd.values import INFINITY, parse_duration
 from dora_systemd.verbs.facts.cells import Cell, read_cells
-from dora_systemd.verbs.facts.selector import selectors_of
-from dora_systemd.verbs.stop import not_running, note_stop, stop_cells
+from dora_systemd.verbs.facts.selector import Selector, selectors_of
+from dora_systemd.verbs.stop import not_running, note_stop, stop_cells, stop_cells_within
 
 
 @click.command("stop")
-@click.argument("selectors", nargs=-1, metavar="SELECTOR...")
+@click.argument("selectors", nargs=-1, metavar="[SELECTOR...]")
+@click.option("-n", "--name", metavar="NAME", help="The same as SELECTOR, as in dora stop.")
 @click.option("-a", "--all", "want_all", is_flag=True, help="All dataflows that run.")
+@click.option(
+    "--grace-duration",
+    metavar="TIME",
+    default="infinity",
+    callback=parsed_by(parse_duration),
+    help="Kill what still runs after 1.5 times this, if that is sooner than the dataflow's own.",
+)
+@click.option("-f", "--force", is_flag=True, help="Kill the nodes at once.")
 @acting_options
-def command(selectors: tuple[str, ...], want_all: bool) -> int:
+def command(
+    selectors: tuple[str, ...], name: str | None, want_all: bool, grace_duration: int, force: bool
+) -> int:
     """Stop dataflows and wait until they have ended.
 
     Nodes are told to stop; those still running after the grace duration of the dataflow are
-    killed. Several dataflows stop at the same time.
+    killed. Several dataflows stop at the same time. Without SELECTOR, a terminal is asked which
+    one; the only one that runs is stopped.
 
     Examples:
+      doractl stop                                the one that runs, or asks
       doractl stop robot
       doractl stop 550e8400 vision
-      doractl stop 'cam*'
+      doractl stop 'cam*' --grace-duration 2s
+      doractl stop robot --force
       doractl stop --all
     """
-    require_names_or_all("stop", selectors, want_all)
+    if force and grace_duration != INFINITY:
+        hint = "give one of them"
+        raise DoraSystemdError("cannot use --force with --grace-duration", hint, ExitCode.USAGE)
+    most = 0 if force else min(kill_delay(grace_duration), INFINITY)
+    texts = (*selectors, *([name] if name else []))
+    if texts or want_all or not sys.stdin.isatty():
+        require_names_or_all("stop", texts, want_all)
     scope = current_scope()
     bus = Bus(scope)
     cells = read_cells(bus)
-    if want_all:
-        chosen = [cell for cell in cells if cell.is_up]
-        if not chosen:
-            tell("No dataflow is running.")
-        return _stop(bus, scope, chosen)
-    found = {one: one.only(cells) for one in selectors_of(selectors, cells)}
+    chosen = _named(scope, cells, texts) if texts else _running(cells, want_all)
+    return _stop(bus, scope, chosen, most)
+
+
+def _running(cells: Sequence[Cell], want_all: bool) -> list[Cell]:
+    """All dataflows that run, or the one that the user chooses."""
+    up = [cell for cell in cells if cell.is_up]
+    if not up:
+        tell("No dataflow is running.")
+    return up if want_all or len(up) <= 1 else [_asked(up)]
+
+
+def _named(scope: Scope, cells: Sequence[Cell], texts: Sequence[str]) -> list[Cell]:
+    """The dataflows to stop; prints those that have ended."""
+    found = {one: one.only(cells) for one in selectors_of(texts, cells)}
     for one in [one for one, cell in found.items() if cell is None]:
         row = one.ended(scope)
         if row is None:
             raise one.missing(cell.name for cell in cells)
         print_outcomes([not_running(row, row.status.lower())])
-    return _stop(bus, scope, list(dict.fromkeys(cell for cell in found.values() if cell)))
+    return list(dict.fromkeys(cell for cell in found.values() if cell))
 
 
-def _stop(bus: Bus, scope: Scope, cells: list[Cell]) -> int:
+def _asked(cells: Sequence[Cell]) -> Cell:
+    """The dataflow that the user chooses on the terminal."""
+    click.echo("Which dataflow is to be stopped?", err=True)
+    for number, cell in enumerate(cells, 1):
+        click.echo(f"{number:3}  {cell.name}  {cell.uuid}", err=True)
+    text = str(click.prompt("Number or name", err=True)).strip()
+    numbers = {str(number): cell for number, cell in enumerate(cells, 1)}
+    by_text = {**numbers, **{cell.name: cell for cell in cells}}
+    return by_text.get(text) or Selector(text).loaded(cells)
+
+
+def _stop(bus: Bus, scope: Scope, cells: list[Cell], most: int) -> int:
     note_stop(cells)
+    if most != INFINITY:
+        return print_outcomes(stop_cells_within(bus, scope, cells, most))
     with StageLine(sys.stderr) as stage:
         outcomes = stop_cells(bus, scope, cells, partial(tell_stage, stage))
     return print_outcomes(outcomes)

@@ -26,6 +26,7 @@ PROGRAM_KEYS = ("path", "args", "build", "git", "branch", "tag", "rev")
 """Keys of a node that define its program; dora gets other values."""
 PERL = "/usr/bin/perl"
 """The interpreter of launcher.pl."""
+_UV_RUN = ("uv", "run")
 DEFAULT_OPERATOR = "op"
 """dora's id of the operator in a node with a single operator."""
 
@@ -148,7 +149,7 @@ def _command(node: Node, directory: str, source: str, plan: LaunchPlan) -> list[
     program = _find(node, directory, source, plan)
     arguments = _split(node, source)
     if node.kind is NodeKind.EXECUTABLE:
-        return [program, *arguments]
+        return [*(_UV_RUN if plan.options.uv else ()), program, *arguments]
     return [*_interpreter(node, plan), "-u", program, *arguments]
 
 
@@ -177,7 +178,7 @@ def _node_sources(node: Node, source: str, plan: LaunchPlan) -> Iterator[tuple[s
 
 
 def _find(node: Node, directory: str, source: str, plan: LaunchPlan) -> str:
-    places = [directory, *filter(None, plan.search_path.split(":"))]
+    places = [directory, *_uv_places(directory, plan), *filter(None, plan.search_path.split(":"))]
     for place in places:
         path = str(PurePath(place, node.path))
         if plan.exists(path):
@@ -187,11 +188,23 @@ def _find(node: Node, directory: str, source: str, plan: LaunchPlan) -> str:
     raise _refusal(source, node, reason, hint)
 
 
+def uv_project(directory: str, exists: Callable[[str], bool]) -> str | None:
+    """The project that `uv run` uses in `directory`: the nearest one with a pyproject.toml."""
+    places = map(str, (PurePath(directory), *PurePath(directory).parents))
+    return next((one for one in places if exists(str(PurePath(one, "pyproject.toml")))), None)
+
+
+def _uv_places(directory: str, plan: LaunchPlan) -> list[str]:
+    """Where `uv run which` looks first, by which dora finds programs."""
+    project = uv_project(directory, plan.exists) if plan.options.uv else None
+    return [str(PurePath(project, ".venv", "bin"))] if project else []
+
+
 def _interpreter(node: Node, plan: LaunchPlan) -> list[str]:
     if not plan.options.uv:
         return [python_of(plan)]
     own = _env_python(node, plan)
-    return [own] if own else ["uv", "run", "python"]
+    return [own] if own else [*_UV_RUN, "python"]
 
 
 def _env_python(node: Node, plan: LaunchPlan) -> str | None:

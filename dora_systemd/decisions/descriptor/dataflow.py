@@ -6,8 +6,9 @@ run forever, and only `dora validate` finds an input without a source. dora chec
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
-from dora_systemd.decisions.descriptor.json_size import check_json, refusal
+from dora_systemd.decisions.descriptor.json_size import check_json, is_infinite, refusal
 from dora_systemd.decisions.descriptor.nodes import (
     UNEXPANDED,
     Node,
@@ -49,8 +50,11 @@ def parse_dataflow(document: object, source: str) -> Dataflow:
     if not isinstance(document, dict):
         hint = "a dataflow is a mapping with the key 'nodes'"
         raise refusal(source, f"it holds {described(document)}", hint)
-    check_json(document, source, MAX_JSON)
+    document = {**_with_finite_env(document)}
     nodes = document.get("nodes")
+    if isinstance(nodes, list):
+        document["nodes"] = nodes = [_with_finite_env(node) for node in nodes]
+    check_json(document, source, MAX_JSON)
     if not nodes or not isinstance(nodes, list):
         reason = "it has no nodes" if not nodes else f"'nodes' is {described(nodes)}"
         raise refusal(source, reason, "list at least one node below 'nodes:'")
@@ -66,6 +70,15 @@ def parse_dataflow(document: object, source: str) -> Dataflow:
     _check_ids(dataflow)
     _check_wiring(dataflow)
     return dataflow
+
+
+def _with_finite_env(part: Any) -> Any:
+    """A dataflow or node, with `.inf` and `.nan` in `env:` as texts, as dora has them."""
+    env = part.get("env") if isinstance(part, dict) else None
+    if not isinstance(env, dict):
+        return part
+    odd = {key: str(one) for key, one in env.items() if isinstance(one, float) and is_infinite(one)}
+    return {**part, "env": {**env, **odd}} if odd else part
 
 
 def _with_kept_output(node: Node, nodes: Iterable[Node]) -> Node:

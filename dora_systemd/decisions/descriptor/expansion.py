@@ -7,14 +7,20 @@ replaces them: dora's coordinator and its daemon would each do it once more (see
 
 import re
 from collections.abc import Iterator, Mapping
+from typing import Any
 
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
+from dora_systemd.decisions.descriptor.json_size import is_infinite
 
 _NAME = "[A-Za-z_][A-Za-z0-9_]*"
 _REFERENCE = re.compile(rf"\$\$|\$\{{({_NAME})(?::-([^}}]*))?\}}|\$({_NAME})")
 
 _DOLLAR = "$$$$"
 """A "$" that coordinator and daemon have both halved."""
+
+_UNTIL_DAEMON = "$${DORA_SYSTEMD_UNSET:-%s}"
+"""A text that only the daemon reads as a number. dora makes a float of "inf" and "nan". If the
+coordinator did, its JSON could not hold it, and the daemon would never answer."""
 
 _OF_THE_UNIT = {
     *("HOME", "USER", "LOGNAME", "SHELL", "PATH", "PWD", "VIRTUAL_ENV", "TMPDIR"),
@@ -23,9 +29,14 @@ _OF_THE_UNIT = {
 """Variables that systemd sets or that describe the nodes' user, see systemd.exec(5)."""
 
 
+_ALWAYS = "RUST_LOG"
+"""The level of dora's own log, and of nodes in Rust: dora passes it on from the caller as well."""
+
+
 def called_variables(dataflow: Dataflow, caller: Mapping[str, str]) -> dict[str, str]:
-    """The variables of the caller that values of `env:` name, except those of the unit itself."""
+    """RUST_LOG and the variables of the caller that values of `env:` name, except the unit's."""
     named = dict.fromkeys(name for text in _texts(dataflow) for name in _names(text))
+    named |= {_ALWAYS: None}
     return {name: caller[name] for name in named if name in caller and name not in _OF_THE_UNIT}
 
 
@@ -41,9 +52,22 @@ def expanded(env: Mapping[str, object], environment: Mapping[str, str]) -> dict[
         return match[0] if value is None else value.replace("$", _DOLLAR)
 
     return {
-        key: _REFERENCE.sub(replaced, value) if isinstance(value, str) else value
+        key: _until_daemon(_REFERENCE.sub(replaced, value)) if isinstance(value, str) else value
         for key, value in env.items()
     }
+
+
+def sent_again(node: Mapping[str, Any]) -> dict[str, Any]:
+    """A node as the coordinator has it, for a request: it replaces variables in it once more."""
+    env = node.get("env")
+    if not isinstance(env, Mapping):
+        return dict(node)
+    texts = {key: one.replace("$", "$$") for key, one in env.items() if isinstance(one, str)}
+    return {**node, "env": {**env, **texts}}
+
+
+def _until_daemon(text: str) -> str:
+    return _UNTIL_DAEMON % text if is_infinite(text) else text
 
 
 def _texts(dataflow: Dataflow) -> Iterator[str]:

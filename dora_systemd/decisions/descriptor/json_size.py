@@ -1,6 +1,7 @@
 """Checks that a loaded document is JSON of a limited size, without walking all of a huge one."""
 
 import math
+import re
 from collections.abc import Iterator
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -45,6 +46,16 @@ def _size(value: object, source: str) -> int:
         raise refusal(source, "a number in it is too large for JSON", "write it as text")
     kind = type(value).__name__
     raise refusal(source, f"a value in it is of type {kind}", "write plain text or a number")
+
+
+def is_infinite(value: str | float) -> bool:
+    """Whether dora makes of it a number that JSON cannot hold: infinite, or not a number."""
+    if isinstance(value, str) and (not value.isascii() or re.search(r"[_\s]", value)):
+        return False  # only Python reads these as numbers
+    try:
+        return not math.isfinite(float(value))
+    except ValueError:
+        return False
 
 
 def _text_size(value: str, source: str) -> int:

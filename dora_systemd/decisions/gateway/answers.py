@@ -7,33 +7,24 @@ nodes, times of results as 64-bit NTP timestamps.
 import json
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
-from datetime import UTC, datetime
 from typing import Any
 
 from dora_systemd.decisions.cell.exits import ExitKind, find_exit
+from dora_systemd.decisions.logs.records import (
+    DORA_LEVELS,
+    Record,
+    level_of,
+    record_text,
+    timestamp,
+)
 from dora_systemd.decisions.views.dataflows import FAILED, UP_WORDS, DataflowRow, NodeRow
 from dora_systemd.values import SECOND
 
-Record = Mapping[str, bytes]
-"""An entry of the journal in the export format."""
-
-LOG_FIELDS = (
-    *("MESSAGE", "PRIORITY", "MESSAGE_ID", "UNIT", "USER_UNIT"),
-    *("DORA_NODE", "DORA_LEVEL", "DORA_TARGET", "DORA_STREAM"),
-)
-"""The fields of a record that this module uses."""
-
-_OWN_TARGET = "dora-systemd"
 _MEGABYTE = 1_000_000
 _NTP_BITS = 32
 _NODE_STATES = {
     **{"failed": "failed", "finished": "stopped", "stopped": "stopped"},
     **{"restarting": "restarting", "reloading": "restarting"},
-}
-_LEVELS = ("off", "error", "warn", "info", "debug", "trace")
-_BY_PRIORITY = {
-    **dict.fromkeys((b"0", b"1", b"2", b"3"), "error"),
-    **{b"4": "warn", b"7": "debug"},
 }
 _EXITS = {ExitKind.CODE: "ExitCode", ExitKind.SIGNAL: "Signal"}
 _SYSTEMD_FIELDS = ("UNIT", "USER_UNIT")
@@ -150,7 +141,7 @@ def _program(node: Mapping[str, Any]) -> dict[str, str]:
         launcher, *words = shlex.split(str(node.get("args")))
     except ValueError:
         return {}
-    command = words[3:]
+    command = words[5:] if words[3:5] == ["uv", "run"] else words[3:]
     if not launcher.endswith(("/launcher.pl", "/launcher.sh")) or not command:
         return {}
     if command[:2] == ["/bin/sh", "-c"]:
@@ -164,8 +155,8 @@ def _program(node: Mapping[str, Any]) -> dict[str, str]:
 def log_line(record: Record) -> bytes:
     """A line of a node as in dora's log file log_<node>.jsonl, except for empty keys."""
     line = {
-        "ts": _timestamp(record),
-        "level": _level(record),
+        "ts": timestamp(record),
+        "level": level_of(record),
         "node": record_text(record, "DORA_NODE"),
         "msg": record_text(record, "MESSAGE"),
     }
@@ -174,54 +165,14 @@ def log_line(record: Record) -> bytes:
     return json.dumps(line, separators=(",", ":")).encode() + b"\n"
 
 
-def log_payload(record: Record, uuid: str) -> dict[str, Any]:
-    """A record of the journal as an event of dora's log stream. uuid: of the dataflow."""
-    level = _level(record)
-    target = record_text(record, "DORA_TARGET") or ("" if "DORA_STREAM" in record else _OWN_TARGET)
-    return {
-        "build_id": None,
-        "dataflow_id": uuid,
-        "node_id": record_text(record, "DORA_NODE") or None,
-        "daemon_id": None,
-        "level": level if level == "stdout" else level.upper(),
-        "target": target or None,
-        "module_path": None,
-        "file": None,
-        "line": None,
-        "message": record_text(record, "MESSAGE"),
-        "timestamp": _timestamp(record),
-        "fields": None,
-    }
-
-
 def is_wanted(record: Record, level: object) -> bool:
     """Whether a subscriber at `level`, a name of dora's, gets the record; plain lines always."""
-    own, asked = _level(record), str(level).lower()
-    if own == "stdout" or asked not in _LEVELS:
+    own, asked = level_of(record), str(level).lower()
+    if own == "stdout" or asked not in DORA_LEVELS:
         return True
-    return _LEVELS.index(own) <= _LEVELS.index(asked)
+    return DORA_LEVELS.index(own) <= DORA_LEVELS.index(asked)
 
 
 def is_from_systemd(record: Record) -> bool:
     """Whether the record is systemd's, about the end of the unit."""
     return any(name in record for name in _SYSTEMD_FIELDS)
-
-
-def _level(record: Record) -> str:
-    level = record_text(record, "DORA_LEVEL")
-    if level in _LEVELS:
-        return level
-    if "DORA_STREAM" in record:
-        return "stdout"
-    return _BY_PRIORITY.get(record.get("PRIORITY", b""), "info")
-
-
-def record_text(record: Record, name: str) -> str:
-    """The field `name` of the record as text, "" without it."""
-    return record.get(name, b"").decode("utf-8", "replace")
-
-
-def _timestamp(record: Record) -> str:
-    at_us = int(record.get("__REALTIME_TIMESTAMP", b"0"))
-    moment = datetime.fromtimestamp(at_us // SECOND, UTC).replace(microsecond=at_us % SECOND)
-    return moment.isoformat(timespec="microseconds").replace("+00:00", "Z")

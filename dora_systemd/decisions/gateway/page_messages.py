@@ -43,7 +43,7 @@ from typing import Any
 
 from dora_systemd.decisions.cell.limits import BY_KEY
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
-from dora_systemd.decisions.gateway.answers import Record, record_text
+from dora_systemd.decisions.logs.records import Record, record_text
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.terminal_text import escaped, one_line, without_sequences
 from dora_systemd.values import SECOND

@@ -12,7 +12,6 @@ from dora_systemd.decisions.logs.events import EVENTS
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import SLICE, unit_name
 from dora_systemd.scope import Scope
-from dora_systemd.values import quoted
 
 OUTPUTS = ("short", "short-precise", "json", "cat", "export")
 
@@ -72,21 +71,6 @@ def parse_level(text: str) -> str:
         known = "error, warn, info, debug, trace, stdout; those of syslog are understood too"
         raise DoraSystemdError(f"cannot use {text!r} as a level", f"one of {known}", ExitCode.USAGE)
     return level
-
-
-def parse_filter(text: str) -> dict[str, str]:
-    """Levels by node, from "camera=debug,detector=warn" as in `dora logs --log-filter`.
-
-    Raises DoraSystemdError (USAGE).
-    """
-    levels = {}
-    for pair in filter(None, map(str.strip, text.split(","))):
-        node, equals, level = pair.partition("=")
-        if not equals:
-            hint = "NODE=LEVEL, such as camera=debug,detector=warn"
-            raise DoraSystemdError(f"cannot use {quoted(pair)} as a filter", hint, ExitCode.USAGE)
-        levels[node.strip()] = parse_level(level.strip())
-    return levels
 
 
 def is_boot(text: str) -> bool:

@@ -38,7 +38,7 @@ ENV_FILE = Setting[tuple[str, ...]](
 VENV = Setting[str | None](
     "venv", PATH, None, "Virtual environment whose Python runs the nodes.", metavar="DIR"
 )
-UV = Setting[bool]("uv", BOOL, False, "Run Python nodes with uv, like dora start --uv.")
+UV = Setting[bool]("uv", BOOL, False, "Run the programs of nodes with uv, like dora start --uv.")
 DEBUG = Setting[bool]("debug", BOOL, False, "Allow inspection of topics, like dora start --debug.")
 WORKING_DIRECTORY = Setting[str | None](
     "working_directory",

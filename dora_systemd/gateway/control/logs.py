@@ -12,18 +12,11 @@ from collections.abc import AsyncIterator, Iterator, Sequence
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.adapters.journal.reader import JournalReader, journal_output, open_journalctl
 from dora_systemd.adapters.journal.stream import open_stream
-from dora_systemd.decisions.gateway.answers import (
-    LOG_FIELDS,
-    Record,
-    is_from_systemd,
-    is_wanted,
-    log_line,
-    log_payload,
-    record_text,
-)
+from dora_systemd.decisions.gateway.answers import is_from_systemd, is_wanted, log_line
 from dora_systemd.decisions.gateway.frames import LOGS_LIMIT, Request, format_event, logs_parts
 from dora_systemd.decisions.logs.fields import ExportReader
 from dora_systemd.decisions.logs.query import end_matches, journal_timestamp, scope_matches
+from dora_systemd.decisions.logs.records import LOG_FIELDS, Record, log_payload, record_text
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.gateway.control.state import find_name
 from dora_systemd.gateway.control.talk import Place, Result, Talk, find_if_loaded

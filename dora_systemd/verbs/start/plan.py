@@ -28,6 +28,7 @@ from dora_systemd.trust.files import read_file
 from dora_systemd.trust.sight import sight_of
 from dora_systemd.verbs.start.account import account_of, choose_user
 from dora_systemd.verbs.start.credentials import check_credentials, credential_files
+from dora_systemd.verbs.start.notes import plan_notes
 from dora_systemd.verbs.start.places import Look
 from dora_systemd.verbs.start.sandbox import make_sandbox
 from dora_systemd.verbs.start.settings import read_settings
@@ -56,7 +57,8 @@ class StartRequest:
 class Plan:
     """A checked request.
 
-    user: for User=, None in user scope. environment: all of Environment=.
+    user: for User=, None in user scope. environment: all of Environment=. notes: for people, once
+    it has started.
     """
 
     scope: Scope
@@ -65,6 +67,7 @@ class Plan:
     user: pwd.struct_passwd | None
     environment: Mapping[str, str]
     sandbox: Sandbox = field(default_factory=Sandbox)
+    notes: tuple[str, ...] = ()
 
     @property
     def unit(self) -> str:
@@ -131,7 +134,8 @@ def _make_plan(
         launch_descriptor(dataflow, launch)
     prepared = Prepared(dataflow, launch, {})
     sandbox = make_sandbox(scope, settings, look.user, prepared, look.sight)
-    return Plan(scope, options, settings, look.user, environment, sandbox)
+    notes = tuple(plan_notes(scope, dataflow, launch, look))
+    return Plan(scope, options, settings, look.user, environment, sandbox, notes)
 
 
 def _variables(settings: Settings, look: Look) -> dict[str, str]:

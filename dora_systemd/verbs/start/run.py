@@ -1,19 +1,26 @@
-"""`doractl run`: a dataflow that ends with the terminal it was started in."""
+"""`doractl run` and `start --attach`: a dataflow in the terminal that it was started in."""
 
+import math
 import os
 import select
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Protocol
 
 from dora_systemd.adapters.bus.manager import DOWN, Manager, Property, StageObserver, tell_stage
 from dora_systemd.decisions.life.states import RunnerExit
+from dora_systemd.values import INFINITY, SECOND
+
+HELD: Property = ("AddRef", "b", True)
+"""Keeps an ended unit, and its result, for this client; for a new unit what hold() is for others.
+"""
 
 _POLL_SECONDS = 0.5
 _ONE_REQUEST_SECONDS = 0.1
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+"""What stops a dataflow that ends with this process."""
 _CLD_EXITED = 1
 _STATE = ("ActiveState", "Job", "ExecMainCode", "ExecMainStatus", "Result")
 
@@ -54,27 +61,35 @@ def attached_properties(pipe: int) -> list[Property]:
     return [
         ("StandardInputFileDescriptor", "h", pipe),
         ("CollectMode", "s", "inactive-or-failed"),
-        ("AddRef", "b", True),
+        HELD,
         ("SuccessExitStatus", "(aiai)", ((RunnerExit.FAILED_AT_STOP,), ())),
     ]
 
 
 def follow_unit(
-    manager: Manager, unit: str, logs: LogSource, on_stage: StageObserver | None
+    manager: Manager,
+    unit: str,
+    logs: LogSource,
+    on_stage: StageObserver | None,
+    signals: Sequence[signal.Signals] = SIGNALS,
+    stop_after: int = INFINITY,
 ) -> int:
     """Print the logs of a started unit until it has ended; its exit status.
 
-    The first SIGINT (Ctrl+C) or SIGTERM stops the dataflow gracefully, a later one kills it.
+    The first of `signals` stops the dataflow gracefully, a later one kills it. stop_after: µs from
+    now; then it is stopped gracefully as well.
     """
-    stop = _Stop(manager, unit)
-    with _interrupts() as wakeup:
+    stop = _Stop(manager, unit, time.monotonic() + stop_after / SECOND)
+    with _interrupts(signals) as wakeup:
         poll = select.poll()
         for source in (manager.fileno(), logs.fileno(), wakeup):
             poll.register(source, select.POLLIN)
         while True:
-            ready = {fd for fd, _ in poll.poll(_POLL_SECONDS * 1000)}
+            ready = {fd for fd, _ in poll.poll(min(_POLL_SECONDS, stop.seconds_left) * 1000)}
             if wakeup in ready:
                 os.read(wakeup, 64)
+                stop.ask()
+            elif not stop.seconds_left:
                 stop.ask()
             logs.print_new()
             changed = manager.changes(unit)
@@ -88,15 +103,24 @@ def follow_unit(
 
 
 class _Stop:
-    """What signals ask for: to stop the unit, then to kill it."""
+    """What signals ask for: to stop the unit, then to kill it.
 
-    def __init__(self, manager: Manager, unit: str) -> None:
+    due: seconds of the monotonic clock, when it is stopped without a signal.
+    """
+
+    def __init__(self, manager: Manager, unit: str, due: float = math.inf) -> None:
         self._manager = manager
         self._unit = unit
         self._asked: float | None = None
+        self._due = due
+
+    @property
+    def seconds_left(self) -> float:
+        """Seconds until it is due; infinite once it has been told to stop."""
+        return math.inf if self._asked is not None else max(self._due - time.monotonic(), 0)
 
     def ask(self) -> None:
-        """A signal has come."""
+        """A signal has come, or the time is up."""
         if self._asked is None:
             self._manager.queue_job("StopUnit", self._unit)
             self._asked = time.monotonic()
@@ -121,10 +145,10 @@ def _exit_status(manager: Manager, unit: str) -> int | None:
 
 
 @contextmanager
-def _interrupts() -> Iterator[int]:
+def _interrupts(signals: Sequence[signal.Signals]) -> Iterator[int]:
     """A file descriptor that receives a byte for each signal; nothing else is interrupted."""
     read, write = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
-    before = {number: signal.signal(number, lambda *_: None) for number in _SIGNALS}
+    before = {number: signal.signal(number, lambda *_: None) for number in signals}
     wakeup = signal.set_wakeup_fd(write)
     try:
         yield read

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from dora_systemd.adapters.dora.preparation import PACKAGE, Prepared
 from dora_systemd.adapters.host.files import absolute_path
-from dora_systemd.decisions.cell.launch import python_of
+from dora_systemd.decisions.cell.launch import python_of, uv_project
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.properties.sandbox import Sandbox, loose_paths, odd_paths, widened_paths
 from dora_systemd.decisions.settings.limits import DEVICE, REALTIME
@@ -44,7 +44,7 @@ def make_sandbox(
     options = prepared.plan.options
     given = [_checked(path, sight) for path in settings[WRITABLE]]
     needed = tuple(dict.fromkeys(_existing(_needed(prepared, sight), sight)))
-    writable = (*given, *_existing(_written_by_uv(options, user), sight))
+    writable = (*given, *_existing(_written_by_uv(options, user, sight), sight))
     return Sandbox(
         level=settings[SANDBOX],
         network=settings[NETWORK],
@@ -154,7 +154,11 @@ def _prefix(program: Path) -> Path:
     return program.parent.parent if program.parent.name == "bin" else program.parent
 
 
-def _written_by_uv(options: RunnerOptions, user: pwd.struct_passwd | None) -> Iterator[Path]:
+def _written_by_uv(
+    options: RunnerOptions, user: pwd.struct_passwd | None, sight: Sight
+) -> Iterator[Path]:
     if options.uv and user is not None:
-        yield Path(options.working_directory)
+        directory = options.working_directory
+        # `uv run` brings .venv and uv.lock up to date, beside the pyproject.toml.
+        yield from (Path(one) for one in (directory, uv_project(directory, sight.exists)) if one)
         yield from (Path(user.pw_dir, place) for place in _UV_PLACES)

@@ -15,7 +15,6 @@ from dora_systemd.decisions.gateway.answers import (
     dataflow_list,
     is_wanted,
     log_line,
-    log_payload,
     node_list,
     restored_descriptor,
     stopped,
@@ -31,6 +30,7 @@ from dora_systemd.decisions.gateway.frames import (
     renamed,
 )
 from dora_systemd.decisions.gateway.request import Request as HttpRequest
+from dora_systemd.decisions.logs.records import log_payload
 from dora_systemd.decisions.views.dataflows import DataflowRow, NodeRow
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.gateway.control.serve import HANDLERS, REFUSED, serve_control
@@ -259,6 +259,7 @@ def test_descriptors() -> None:
     [
         ("/venv/bin/python -u /x/a.py 'b c'", "/x/a.py", "'b c'"),
         ("uv run python -u /x/a.py", "/x/a.py", ""),
+        ("uv run /x/tool -n", "/x/tool", "-n"),
         ("/x/tool -u 5", "/x/tool", "-u 5"),
         ("/bin/sh -c 'echo $X | cat'", "shell", "echo $X | cat"),
     ],

@@ -166,7 +166,14 @@ def test_variables_of_the_command() -> None:
     text = sections("doractl.1")["ENVIRONMENT"]
     listed = re.findall(r"\b(DORA_[A-Z_]+)", text)
     settings = filter(None, (setting.variable for setting in SETTINGS))
-    assert sorted(set(listed)) == sorted([*settings, PORT_VARIABLE, ADDRESS_VARIABLE])
+    options = [
+        param.envvar
+        for command in all_verbs().values()
+        for param in command.params
+        if isinstance(param.envvar, str)
+    ]
+    known = {*settings, *options, PORT_VARIABLE, ADDRESS_VARIABLE}
+    assert sorted(set(listed)) == sorted(known)
 
 
 def test_events() -> None:

@@ -13,6 +13,7 @@ from dora_systemd.decisions.unit.file import BOOT_TARGET
 from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.names import SLICE
 from dora_systemd.verbs import destroy as destroy_module
+from dora_systemd.verbs import stop as stop_module
 from dora_systemd.verbs.destroy import processes_left, stop_all, stop_gateway, stop_slice
 from dora_systemd.verbs.up import PORT_FILE
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options
@@ -64,7 +65,8 @@ class Clock:
 
 @pytest.fixture
 def systemd(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Systemd:
-    monkeypatch.setattr(destroy_module, "_POLL_SECONDS", 0)
+    for module in (destroy_module, stop_module):
+        monkeypatch.setattr(module, "POLL_SECONDS", 0)
     return Systemd(tmp_path / "etc")
 
 

@@ -1,18 +1,22 @@
 """Selectors, nodes and runs, looked up in a journal of our own."""
 
+import os
 from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from dora_systemd.adapters.journal.reader import JournalReader
-from dora_systemd.decisions.logs.query import LogQuery, query_matches
+from dora_systemd.decisions.logs.query import UNIT_ENDS, LogQuery, query_matches
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
+from dora_systemd.verbs import logs
 from dora_systemd.verbs.facts.recorded import find_query
-from dora_systemd.verbs.logs import pass_logs
+from dora_systemd.verbs.logs import FollowedLog, pass_logs
 from tests.unit.fakes.library import fake_journalctl
 
 ROBOT = "550e8400-e29b-41d4-a716-446655440000"
@@ -204,3 +208,26 @@ def test_nothing_is_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> No
     with (tmp_path / "out").open("wb") as out:
         pass_logs(replace(QUERY, grep="x", tail="2"), out.fileno())
     assert "--grep=x --lines=2 --" in calls.read_text().splitlines()[-1]
+
+
+def test_lines_go_on_after_an_automatic_restart(monkeypatch: pytest.MonkeyPatch) -> None:
+    reading, writing = os.pipe()
+
+    @contextmanager
+    def journalctl(*_: object, **__: object) -> Iterator[SimpleNamespace]:
+        with os.fdopen(reading, "rb") as stdout:
+            yield SimpleNamespace(stdout=stdout)
+
+    monkeypatch.setattr(logs, "open_journalctl", journalctl)
+    printed: list[bytes] = []
+    log = FollowedLog(QUERY.scope, "robot", ROBOT, 0, printed.append, lambda one: one["MESSAGE"])
+    end = b"MESSAGE_ID=%s\nMESSAGE=end\n\n" % UNIT_ENDS[1].encode()
+    with closing(log):
+        os.write(writing, b"MESSAGE=one\n\n" + end)
+        log.print_new()
+        assert log.has_ended
+        os.write(writing, b"MESSAGE=two\n\n" + end)
+        log.finish()
+        log.print_new()
+    assert (printed, log.has_ended) == ([b"one", b"two"], True)
+    os.close(writing)

@@ -2,6 +2,7 @@
 
 import os
 import pwd
+import signal
 import socket
 import time
 from pathlib import Path
@@ -18,7 +19,12 @@ from dora_systemd.verbs.facts.budget import restart_budget
 from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.facts.reason import failure_reason
 from dora_systemd.verbs.start.asked import caller
-from dora_systemd.verbs.stop import reset_cells, restart_cells, stop_cells
+from dora_systemd.verbs.stop import (
+    reset_cells,
+    restart_cells,
+    stop_cells,
+    stop_cells_within,
+)
 from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
 
 UNIT = "dora-robot.service"
@@ -52,6 +58,21 @@ def test_stop_that_had_to_kill_says_so() -> None:
     (outcome,) = stop_cells(manager, SCOPE, read_cells(manager))
     assert outcome.text.endswith("(robot): it did not end in time and was killed")
     assert outcome.problem == ""
+
+
+def test_stop_by_force() -> None:
+    manager = FakeManager()
+    manager.add(options(), active="failed")
+    assert stop_cells_within(manager, SCOPE, read_cells(manager), 0)[0].text.endswith("has failed)")
+    manager.units[UNIT]["ActiveState"] = "active"
+    cells = read_cells(manager)
+    manager.units[UNIT]["ActiveState"] = "inactive"  # as soon as it is told to stop
+    (outcome,) = stop_cells_within(manager, SCOPE, cells, 0)
+    assert outcome.text == f"Dataflow stopped: {UUID} (robot): killed"
+    assert manager.calls[:2] == [("StopUnit", UNIT), ("kill", UNIT, signal.SIGKILL, "all")]
+    manager.add(options())
+    manager.units[UNIT]["ActiveState"] = "inactive"
+    assert stop_cells_within(manager, SCOPE, cells, SECOND)[0].text.endswith("(robot)")
 
 
 def test_stop_that_was_cancelled() -> None:

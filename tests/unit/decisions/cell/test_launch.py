@@ -32,6 +32,8 @@ FILES = {
     "/usr/bin/cat",
     "/usr/bin/python3",
     "/env/bin/python",
+    "/repo/pyproject.toml",
+    "/repo/.venv/bin/tool",
 }
 
 
@@ -64,6 +66,10 @@ def words(node: dict[str, Any], given: LaunchPlan | None = None) -> list[str]:
         ({"path": "bin/detector", "args": "-x 'a b' $HOME"}, {},
          ["/p", "pipe", "/p/bin/detector", "-x", "a b", "$HOME"]),
         ({"path": "cat"}, {}, ["/p", "pipe", "/usr/bin/cat"]),
+        ({"path": "cat", "args": "-n"}, {"uv": True},
+         ["/p", "pipe", "uv", "run", "/usr/bin/cat", "-n"]),
+        ({"path": "tool", "deploy": {"working_dir": "/repo/flows"}}, {"uv": True},
+         ["/repo/flows", "pipe", "uv", "run", "/repo/.venv/bin/tool"]),
         ({"path": "shell", "args": "echo $X | cat"}, {"allow_shell_nodes": True},
          ["/p", "pipe", "/bin/sh", "-c", "echo $X | cat"]),
         ({"path": "a.py", "send_stdout_as": "log", "outputs": ["log"]}, {},

@@ -300,3 +300,11 @@ def test_whose_output_dora_must_read() -> None:
     for node in ({"operator": operator}, {"operators": [{"id": "a", **operator}]}):
         assert flow({"id": "one", **node}).nodes[0].keeps_output
     assert flow({"id": "one", "path": "o.py", "min_log_level": "info"}).nodes[0].keeps_output
+
+
+def test_infinite_numbers_in_env_are_texts() -> None:
+    env = {"A": float("inf"), "B": float("nan"), "C": 0.5}
+    node = {"id": "one", "path": "o.py", "env": {"A": float("-inf")}}
+    read = parse_dataflow({"nodes": [node], "env": env}, "f.yml")
+    assert read.env == {"A": "inf", "B": "nan", "C": 0.5}
+    assert read.nodes[0].env == read.nodes[0].raw["env"] == {"A": "-inf"}

@@ -3,7 +3,7 @@
 import pytest
 
 from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
-from dora_systemd.decisions.descriptor.expansion import called_variables, expanded
+from dora_systemd.decisions.descriptor.expansion import called_variables, expanded, sent_again
 
 
 def test_what_is_named_and_set() -> None:
@@ -18,6 +18,7 @@ def test_what_is_named_and_set() -> None:
     dataflow = parse_dataflow({"nodes": [node], "env": env}, "f")
     caller = dict.fromkeys(("MODEL", "KEY", "_k", "HOME", "PRICE", "WITH", "ARGS", "OTHER"), "v")
     assert called_variables(dataflow, caller) == dict.fromkeys(("KEY", "_k", "WITH", "MODEL"), "v")
+    assert called_variables(dataflow, {"RUST_LOG": "debug"}) == {"RUST_LOG": "debug"}
 
 
 @pytest.mark.parametrize(
@@ -30,7 +31,21 @@ def test_what_is_named_and_set() -> None:
         ("$$ a$$b $$A", "$$$$ a$$$$b $$$$A"),
         ("$P", "$$$$x"),
         ("5$ $5 ${", "5$ $5 ${"),
+        ("inf", "$${DORA_SYSTEMD_UNSET:-inf}"),
+        ("-Infinity", "$${DORA_SYSTEMD_UNSET:--Infinity}"),
+        ("${F}", "$${DORA_SYSTEMD_UNSET:-NaN}"),
+        ("1e999", "$${DORA_SYSTEMD_UNSET:-1e999}"),
+        ("infinite", "infinite"),
+        (" inf", " inf"),
+        ("1_0", "1_0"),
     ],
 )
 def test_what_is_sent(text: str, sent: str) -> None:
-    assert expanded({"K": text, "N": 5}, {"A": "a", "P": "$x"}) == {"K": sent, "N": 5}
+    assert expanded({"K": text, "N": 5}, {"A": "a", "P": "$x", "F": "NaN"}) == {"K": sent, "N": 5}
+
+
+def test_what_the_coordinator_gets_again() -> None:
+    env = {"A": "$$", "B": "${DORA_SYSTEMD_UNSET:-inf}", "N": 5}
+    again = sent_again({"id": "one", "env": env})
+    assert again["env"] == {"A": "$$$$", "B": "$${DORA_SYSTEMD_UNSET:-inf}", "N": 5}
+    assert sent_again({"id": "one", "env": None}) == {"id": "one", "env": None}

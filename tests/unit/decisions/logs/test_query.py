@@ -10,7 +10,6 @@ from dora_systemd.decisions.logs.query import (
     end_matches,
     is_boot,
     journal_time,
-    parse_filter,
     parse_level,
     query_arguments,
     query_matches,
@@ -109,25 +108,6 @@ def test_levels_by_node() -> None:
         *(ROBOT, "DORA_NODE=detector", "+"),
         *(ROBOT, "DORA_NODE=sink", *alert),
     ]
-
-
-@pytest.mark.parametrize(
-    ("text", "levels"),
-    [
-        ("camera=debug", {"camera": "debug"}),
-        (" camera = DEBUG , plot=stdout,", {"camera": "debug", "plot": "stdout"}),
-        ("", {}),
-    ],
-)
-def test_filter(text: str, levels: dict[str, str]) -> None:
-    assert parse_filter(text) == levels
-
-
-@pytest.mark.parametrize("text", ["camera", "camera=loud", "camera=", "a=debug,b"])
-def test_wrong_filter(text: str) -> None:
-    with pytest.raises(DoraSystemdError) as caught:
-        parse_filter(text)
-    assert caught.value.code is ExitCode.USAGE
 
 
 @pytest.mark.parametrize(

@@ -313,3 +313,28 @@ def test_a_module_that_is_no_file_is_refused(tmp_path: Path) -> None:
     flow = parse_dataflow({"nodes": [{"id": "a", "module": "module.yml"}]}, str(tmp_path / "f.yml"))
     with pytest.raises(DoraSystemdError, match="it is not a regular file"):
         list(named_places(flow, Sight()))
+
+
+def test_a_dynamic_node_is_started_by_hand(project: Path) -> None:
+    (project / "robot.yml").write_text("nodes: [{id: cam, path: dynamic}, {id: a, path: a.py}]\n")
+    (note,) = plan_of(project).notes
+    assert note.startswith("start the dynamic node cam in another terminal")
+    assert note.endswith('eval "$(doractl --user env robot)"')
+    assert plan_of(project, network="private").notes == ()
+
+
+def test_a_build_that_is_older_than_the_dataflow(project: Path) -> None:
+    flow, session = project / "robot.yml", project / "out/robot.dora-session.yaml"
+    flow.write_text("nodes: [{id: a, path: a.py, build: make}]\n")
+    assert plan_of(project).notes == ()
+    session.parent.mkdir()
+    session.write_text("local_build: {node_working_dirs: {a: /x}}\n")
+    os.utime(flow, (1000, 1000))
+    assert plan_of(project).notes == ()
+    os.utime(session, (500, 500))
+    (note,) = plan_of(project, uv=True).notes
+    assert note.endswith(f"newer than its last build; to build again: dora build --uv {flow}")
+
+
+def test_rust_log_of_the_owner(project: Path) -> None:
+    assert plan_of(project, {"RUST_LOG": "debug"}).environment["RUST_LOG"] == "debug"

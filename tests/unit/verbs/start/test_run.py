@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from dora_systemd.values import SECOND
 from dora_systemd.verbs.start import run
 from dora_systemd.verbs.start.run import attached_properties, follow_unit, life_line
 from tests.unit.fakes.manager import FakeManager, options
@@ -124,6 +125,24 @@ def test_a_signal_stops_gracefully(logs: Lines, number: signal.Signals) -> None:
     manager = Life([ENDED], interrupts=1, number=number)
     assert follow_unit(manager, UNIT, logs, None) == 0
     assert manager.calls == [("StopUnit", UNIT)]
+
+
+def test_another_signal_is_left_alone(logs: Lines) -> None:
+    before = [signal.getsignal(one) for one in run.SIGNALS]
+    during: list[Any] = []
+
+    def look(_: str) -> None:
+        during.extend(signal.getsignal(one) for one in run.SIGNALS)
+
+    follow_unit(Life([ENDED]), UNIT, logs, look, (signal.SIGINT,))
+    assert [now == then for now, then in zip(during, before, strict=False)] == [False, True]
+
+
+@pytest.mark.parametrize(("after", "calls"), [(0, [("StopUnit", UNIT)]), (3600 * SECOND, [])])
+def test_it_stops_after_a_time(logs: Lines, after: int, calls: list[Any]) -> None:
+    manager = Life([ENDED])
+    assert follow_unit(manager, UNIT, logs, None, stop_after=after) == 0
+    assert manager.calls == calls
 
 
 def test_the_life_line_is_closed_with_the_block() -> None:

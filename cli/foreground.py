@@ -1,0 +1,76 @@
+"""Prints the logs of a dataflow until it ends: `doractl run` and `doractl start --attach`."""
+
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+
+from dora_systemd.adapters.bus.manager import Property
+from dora_systemd.adapters.bus.systemd import Bus
+from dora_systemd.cli.colors import wants_colors
+from dora_systemd.cli.parameters import print_warnings
+from dora_systemd.cli.stageline import StageLine
+from dora_systemd.decisions.logs.filter import LogFilter
+from dora_systemd.decisions.logs.records import DoraLines, Record
+from dora_systemd.decisions.logs.terminal import TerminalLines
+from dora_systemd.values import INFINITY
+from dora_systemd.verbs.logs import FollowedLog
+from dora_systemd.verbs.start.job import start_unit
+from dora_systemd.verbs.start.plan import Plan
+from dora_systemd.verbs.start.run import SIGNALS, follow_unit
+
+FORMATS = ("pretty", "json", "compact")
+"""Those of `dora run --log-format`."""
+
+_MICROSECOND_NS = 1000
+
+
+@dataclass(frozen=True)
+class Foreground:
+    """What to print of a dataflow, and what stops it.
+
+    form: one of FORMATS. signals, stop_after: as for follow_unit(). notes: for people, printed once
+    the dataflow has been accepted.
+    """
+
+    shown: LogFilter = field(default_factory=LogFilter)
+    form: str = FORMATS[0]
+    signals: Sequence[signal.Signals] = SIGNALS
+    stop_after: int = INFINITY
+    notes: Sequence[str] = ()
+
+
+def print_until_end(
+    bus: Bus, plan: Plan, properties: Sequence[Property] | None, how: Foreground
+) -> int:
+    """Start a plan, and print its logs until it has ended; its exit status.
+
+    properties: as for start_unit(). Raises DoraSystemdError if the dataflow is refused.
+    """
+    lines, options = _lines(how.form, plan), plan.options
+    since = time.time_ns() // _MICROSECOND_NS
+    with StageLine(sys.stderr) as stage:
+
+        def write(data: bytes) -> None:
+            stage.wipe()
+            sys.stdout.buffer.write(data)
+            sys.stdout.buffer.flush()
+
+        def form(record: Record) -> bytes:
+            return lines.record(record) if how.shown.shows(record) else b""
+
+        followed = FollowedLog(plan.scope, options.name, options.uuid, since, write, form)
+        with closing(followed) as logs:
+            start_unit(bus, plan.scope, options, properties, stage, wait=False)
+            stage.wipe()
+            print_warnings(how.notes)
+            return follow_unit(bus, plan.unit, logs, stage, how.signals, how.stop_after)
+
+
+def _lines(form: str, plan: Plan) -> TerminalLines | DoraLines:
+    is_terminal = sys.stdout.isatty()
+    if form == FORMATS[0]:
+        return TerminalLines(want_colors=wants_colors(sys.stdout), is_terminal=is_terminal)
+    return DoraLines(form, plan.options.uuid, is_terminal)

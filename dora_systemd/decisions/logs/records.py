@@ -1,0 +1,95 @@
+"""Records of the journal as messages of dora's log stream, in dora's form and words."""
+
+import json
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from typing import Any
+
+from dora_systemd.terminal_text import shown_log
+from dora_systemd.values import SECOND
+
+Record = Mapping[str, bytes]
+"""An entry of the journal in the export format."""
+
+LOG_FIELDS = (
+    *("MESSAGE", "PRIORITY", "MESSAGE_ID", "UNIT", "USER_UNIT"),
+    *("DORA_NODE", "DORA_LEVEL", "DORA_TARGET", "DORA_STREAM"),
+)
+"""The fields that these functions, and is_from_systemd() of the gateway, use."""
+
+_OWN_TARGET = "dora-systemd"
+DORA_LEVELS = ("off", "error", "warn", "info", "debug", "trace")
+"""The levels of dora; raw lines of nodes are `stdout`."""
+_BY_PRIORITY = {
+    **dict.fromkeys((b"0", b"1", b"2", b"3"), "error"),
+    **{b"4": "warn", b"7": "debug"},
+}
+
+
+class DoraLines:
+    """Formats records as `dora run` does with --log-format json or compact.
+
+    uuid: of the dataflow. is_terminal: escape control characters.
+    """
+
+    def __init__(self, form: str, uuid: str, is_terminal: bool) -> None:
+        self._form = _compact if form == "compact" else _json
+        self._uuid = uuid
+        self._is_terminal = is_terminal
+
+    def record(self, record: Record) -> bytes:
+        """The line of one record."""
+        line = self._form(log_payload(record, self._uuid)).encode()
+        return (shown_log(line) if self._is_terminal else line) + b"\n"
+
+
+def _json(payload: Mapping[str, Any]) -> str:
+    return json.dumps(payload, separators=(",", ":"))
+
+
+def _compact(payload: Mapping[str, Any]) -> str:
+    when = datetime.fromisoformat(payload["timestamp"]).astimezone()
+    node = payload["node_id"] or "dora"
+    return f"{when:%H:%M:%S} {payload['level'].upper()} {node}: {payload['message']}"
+
+
+def log_payload(record: Record, uuid: str) -> dict[str, Any]:
+    """A record of the journal as an event of dora's log stream. uuid: of the dataflow."""
+    level = level_of(record)
+    target = record_text(record, "DORA_TARGET") or ("" if "DORA_STREAM" in record else _OWN_TARGET)
+    return {
+        "build_id": None,
+        "dataflow_id": uuid,
+        "node_id": record_text(record, "DORA_NODE") or None,
+        "daemon_id": None,
+        "level": level if level == "stdout" else level.upper(),
+        "target": target or None,
+        "module_path": None,
+        "file": None,
+        "line": None,
+        "message": record_text(record, "MESSAGE"),
+        "timestamp": timestamp(record),
+        "fields": None,
+    }
+
+
+def level_of(record: Record) -> str:
+    """Its level: one of DORA_LEVELS, or "stdout" for a raw line of a node."""
+    level = record_text(record, "DORA_LEVEL")
+    if level in DORA_LEVELS:
+        return level
+    if "DORA_STREAM" in record:
+        return "stdout"
+    return _BY_PRIORITY.get(record.get("PRIORITY", b""), "info")
+
+
+def record_text(record: Record, name: str) -> str:
+    """The field `name` of the record as text, "" without it."""
+    return record.get(name, b"").decode("utf-8", "replace")
+
+
+def timestamp(record: Record) -> str:
+    """When journald got it, as in RFC 3339, in UTC."""
+    at_us = int(record.get("__REALTIME_TIMESTAMP", b"0"))
+    moment = datetime.fromtimestamp(at_us // SECOND, UTC).replace(microsecond=at_us % SECOND)
+    return moment.isoformat(timespec="microseconds").replace("+00:00", "Z")
