@@ -139,7 +139,7 @@ def _prefix(uuid: str, others: Sequence[str]) -> str:
     return uuid[: next(free, len(uuid))]
 
 
-_OPTIONAL = ("BOOT", "RESTARTS", "UPTIME", "MEM", "CPU%")
+_OPTIONAL = ("BOOT", "PEAK", "RESTARTS", "UPTIME", "WAITS FOR", "MEM", "CPU%")
 """Columns that a narrow terminal does without, in this order."""
 _SHORTEST_NAME = 12
 _RIGHT_ALIGNED = frozenset({"CPU%", "THROTTLED%", "MEM", "PEAK", "RESTARTS", "PID", "UPTIME"})
@@ -173,7 +173,7 @@ def _fit(lines: list[list[str]], width: int) -> None:
     """Cut names, and if that is not enough, leave out columns."""
     names = lines[0].index("NAME")
     longest = max(len(line[names]) for line in lines)
-    for title in _OPTIONAL:
+    for title in (one for one in _OPTIONAL if one in lines[0]):
         if _excess(lines, width) <= max(longest - _SHORTEST_NAME, 0):
             break
         place = lines[0].index(title)

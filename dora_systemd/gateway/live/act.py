@@ -8,12 +8,12 @@ from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
 from dora_systemd.decisions.gateway.page_messages import PageMessage, graph_values
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
+from dora_systemd.verbs.act import act_on
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.nodes import written_dataflow
 from dora_systemd.verbs.facts.reading import read_status
 from dora_systemd.verbs.facts.selector import Selector
-from dora_systemd.verbs.node import ask_coordinator, restart_node, stop_node
-from dora_systemd.verbs.stop import note_stop, restart_cells, stop_cells
+from dora_systemd.verbs.node import ask_coordinator
 
 _BY = "status page"
 
@@ -23,20 +23,7 @@ def act(scope: Scope, message: PageMessage) -> str:
 
     Raises DoraSystemdError as the verbs of doractl do.
     """
-    bus = Bus(scope)
-    cell = Selector(message.dataflow).find(bus)
-    if message.node:
-        do = stop_node if message.action == "stop" else restart_node
-        do(scope, cell, message.node)
-        return f"Node {message.node} of {cell.name}: {message.action} begun"
-    if message.action == "stop":
-        note_stop([cell], _BY)
-        (outcome,) = stop_cells(bus, scope, [cell])
-    else:
-        (outcome,) = restart_cells(bus, [cell])
-    if outcome.problem:
-        raise DoraSystemdError(outcome.problem, f"doractl why {cell.name}")
-    return outcome.text
+    return act_on(scope, message.dataflow, message.node, message.action, by=_BY)
 
 
 def read_graph(scope: Scope, uuid: str) -> dict[str, Any]:
