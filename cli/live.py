@@ -18,7 +18,7 @@ FIRST_SECONDS = 0.5
 """Time between the two samples of one reading."""
 
 
-class _Work(Thread):
+class Work(Thread):
     """One change that is being made; a dataflow takes its grace duration to stop.
 
     A daemon, so that Ctrl+C ends doractl; systemd goes on, as after Ctrl+C in `doractl stop`.
@@ -57,14 +57,14 @@ def show_live(scope: Scope, top: Top, interval: float, sort: str) -> None:
     interval: seconds between two. Changes that are not finished then are waited for. Raises
     DoraSystemdError.
     """
-    view, works = TopScreen(sort), list[_Work]()
+    view, works = TopScreen(sort), list[Work]()
     with open_screen(wants_colors(sys.stdout)) as screen:
         view.see(top.look())
         due = time.monotonic() + FIRST_SECONDS
         while not view.is_over:
             screen.show(view.lines(*screen.size()))
             if change := view.press(screen.wait_key(due - time.monotonic())):
-                works.append(_Work(scope, change, view, screen))
+                works.append(Work(scope, change, view, screen))
                 works[-1].start()
             if time.monotonic() >= due:
                 view.see(top.look())
