@@ -1,112 +1,152 @@
-"""Redraws the whole terminal, and restores it at the end.
+"""Redraws the whole terminal, reads its keys, and restores it at the end.
 
-The sequences are those of xterm, see console_codes(4); the settings those of termios(3).
+By curses of the standard library: it knows the sequences of each terminal, decodes its keys, and
+writes only what has changed. Its import takes 2 ms and half a megabyte, which only `doractl top`
+pays, and it saves the tables of keys and sequences that a screen of our own needs. In return, a
+terminal must be one that terminfo(5) knows. Signals are handled here: curses loses a SIGTSTP in the
+middle of a drawing, and makes an exit status 1 of SIGTERM.
 """
 
+import curses
 import os
 import select
 import shutil
 import signal
 import sys
-import termios
-import tty
-from collections.abc import Iterable
-from types import FrameType
-from typing import TextIO
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 
+from dora_systemd.decisions.views.top_screen import Line
+from dora_systemd.errors import DoraSystemdError
 from dora_systemd.terminal_text import one_line
 
-_ENTER = "\x1b[?1049h\x1b[?25l"
-_LEAVE = "\x1b[?25h\x1b[?1049l"
-_HOME = "\x1b[H"
-_CLEAR_LINE, _CLEAR_BELOW = "\x1b[K", "\x1b[J"
-_BOLD, _PLAIN = "\x1b[1m", "\x1b[0m"
+_ENDINGS = (signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+_SIGNALS = (*_ENDINGS, signal.SIGTSTP, signal.SIGCONT, signal.SIGWINCH)
+_COLORS = {"red": curses.COLOR_RED, "yellow": curses.COLOR_YELLOW}
 
-_ENDINGS = (signal.SIGTERM, signal.SIGHUP)
+
+class _Ended(Exception):
+    """A signal that terminates the process has arrived."""
 
 
 class Screen:
-    """The terminal of this process, during the `with` block.
+    """The terminal of this process, during the block of open_screen()."""
 
-    It is also restored when a signal terminates or stops the process.
-    """
-
-    def __init__(self, stream: TextIO = sys.stdout) -> None:
-        stream.flush()
-        # Not the stream: a signal handler must not write to it during another write.
-        self._terminal = stream.fileno()
-        self._keys = sys.stdin.fileno()
-        self._is_entered = False
-        # A signal, for example for a new window size, interrupts wait_key().
+    def __init__(self, want_colors: bool) -> None:
+        # Python's own signal handler writes the number of each signal to the pipe, and does nothing
+        # else; wait_key() reads it. The pipe stays open: threads may still call wake().
         self._woken, self._wake = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
-
-    def __enter__(self) -> "Screen":
-        self._settings = termios.tcgetattr(self._keys)
-        for number in _ENDINGS:
-            signal.signal(number, self._end)
-        signal.signal(signal.SIGTSTP, self._suspend)
-        signal.signal(signal.SIGWINCH, lambda _number, _frame: None)
+        self._keys = sys.stdin.fileno()
+        for number in _SIGNALS:
+            signal.signal(number, _ignored)
         signal.set_wakeup_fd(self._wake, warn_on_full_buffer=False)
-        self._take()
-        return self
+        # curses sees handlers that are in place before it, and then has none of its own.
+        self._window = curses.initscr()
+        self._set_modes()
+        self._attributes = _attributes(want_colors)
 
-    def __exit__(self, *_exception: object) -> None:
-        self._give_back()
-        signal.set_wakeup_fd(-1)
-        for number in (*_ENDINGS, signal.SIGTSTP, signal.SIGWINCH):
-            signal.signal(number, signal.SIG_DFL)
-        os.close(self._woken)
-        os.close(self._wake)
+    def _set_modes(self) -> None:
+        curses.noecho()
+        curses.cbreak()
+        self._window.keypad(True)
+        self._window.nodelay(True)
+        curses.set_escdelay(25)
+        with suppress(curses.error):  # a terminal that cannot hide its cursor
+            curses.curs_set(0)
 
-    def show(self, lines: Iterable[str], bold: Iterable[int] = ()) -> None:
-        """Draw as many and as much of `lines` as there is room for. bold: indices of bold lines."""
+    def size(self) -> tuple[int, int]:
+        """Columns and rows of the terminal."""
         columns, rows = shutil.get_terminal_size()
-        shown = list(lines)
-        if len(shown) > rows:
-            shown = [*shown[: rows - 1], f"... {len(shown) - rows + 1} more lines"]
-        emphasized = frozenset(bold)
-        drawn = (_drawn(line, columns, at in emphasized) for at, line in enumerate(shown))
-        self._write(f"{_HOME}{(_CLEAR_LINE + chr(13) + chr(10)).join(drawn)}{_CLEAR_BELOW}")
+        if curses.is_term_resized(rows, columns):
+            curses.resize_term(rows, columns)
+        return columns, rows
+
+    def show(self, lines: Sequence[Line]) -> None:
+        """Draw these lines and nothing else. They are not longer than size() says."""
+        self._window.erase()
+        for row, line in enumerate(lines):
+            attributes = sum(self._attributes[word] for word in line.style.split())
+            with suppress(curses.error):  # the terminal has become smaller
+                # Not addstr(), which would go on in the next row.
+                self._window.insstr(row, 0, one_line(line.text), attributes)
+        self._window.refresh()
 
     def wait_key(self, seconds: float) -> str:
-        """The key pressed within `seconds`; "" without a key or after a signal."""
+        """The key pressed within `seconds`, with its name as in curses(3), "a" or "KEY_UP".
+
+        "" without a key, after a signal and after wake().
+        """
+        if key := self._read_key():
+            return key
         ready, _, _ = select.select([self._keys, self._woken], [], [], max(seconds, 0.0))
         if self._woken in ready:
-            os.read(self._woken, 512)
-        if self._keys not in ready:
-            return ""
+            self._take_signals(os.read(self._woken, 512))
         # No data means that the terminal is gone.
-        return os.read(self._keys, 32).decode("ascii", "replace")[:1] or "q"
+        return self._read_key() or "q" if self._keys in ready else ""
 
-    def _take(self) -> None:
-        tty.setcbreak(self._keys)
-        self._is_entered = True
-        self._write(_ENTER)
+    def wake(self) -> None:
+        """Let wait_key() return; from any thread."""
+        with suppress(BlockingIOError):  # it is about to return
+            os.write(self._wake, b"\0")
 
-    def _give_back(self) -> None:
-        if self._is_entered:
-            self._is_entered = False
-            self._write(_LEAVE)
-            termios.tcsetattr(self._keys, termios.TCSADRAIN, self._settings)
-
-    def _end(self, number: int, _frame: FrameType | None) -> None:
+    def _read_key(self) -> str:
         try:
-            self._give_back()
-        finally:
-            signal.signal(number, signal.SIG_DFL)
-            os.kill(os.getpid(), number)
+            return self._window.getkey()
+        except curses.error:
+            return ""
 
-    def _suspend(self, _number: int, _frame: FrameType | None) -> None:
-        self._give_back()
-        os.kill(os.getpid(), signal.SIGSTOP)
-        self._take()
+    def _take_signals(self, numbers: bytes) -> None:
+        for number in numbers:
+            if number in _ENDINGS:
+                raise _Ended(number)
+        if signal.SIGTSTP in numbers:
+            curses.endwin()
+            os.kill(os.getpid(), signal.SIGSTOP)
+        # After SIGWINCH and SIGCONT, the terminal may show anything.
+        self._window.clearok(any(numbers))
 
-    def _write(self, text: str) -> None:
-        data = text.encode()
-        while data:
-            data = data[os.write(self._terminal, data) :]
+
+@contextmanager
+def open_screen(want_colors: bool) -> Iterator[Screen]:
+    """The whole terminal, until the end of the block, also by an exception or a signal.
+
+    Raises DoraSystemdError for a terminal without an entry in terminfo.
+    """
+    try:
+        curses.setupterm()
+    except curses.error as error:
+        name = os.environ.get("TERM", "")
+        hint = "run TERM=xterm doractl top, or doractl top --once"
+        raise DoraSystemdError(f"cannot use the terminal {name}: {error}", hint) from error
+    try:
+        yield Screen(want_colors)
+    except _Ended as ended:
+        _give_back()
+        os.kill(os.getpid(), ended.args[0])
+    finally:
+        _give_back()
 
 
-def _drawn(line: str, columns: int, is_bold: bool) -> str:
-    text = one_line(line)[:columns]
-    return f"{_BOLD}{text}{_PLAIN}" if is_bold else text
+def _give_back() -> None:
+    with suppress(curses.error):  # it has not been taken
+        curses.endwin()
+    signal.set_wakeup_fd(-1)
+    for number in _SIGNALS:
+        signal.signal(number, signal.SIG_DFL)
+
+
+def _ignored(_number: int, _frame: object) -> None:
+    """Without a handler, Python would not write to the pipe."""
+
+
+def _attributes(want_colors: bool) -> dict[str, int]:
+    """By word of a style, the attribute."""
+    attributes = {"bold": curses.A_BOLD, "reverse": curses.A_REVERSE, **dict.fromkeys(_COLORS, 0)}
+    with suppress(curses.error):  # a terminal without colours
+        if want_colors:
+            curses.start_color()
+            curses.use_default_colors()
+            for pair, (word, color) in enumerate(_COLORS.items(), 1):
+                curses.init_pair(pair, color, -1)
+                attributes[word] = curses.color_pair(pair)
+    return attributes

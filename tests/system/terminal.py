@@ -2,38 +2,17 @@
 
 import fcntl
 import os
-import pty
 import re
-import select
 import shlex
 import struct
 import subprocess
 import termios
 import threading
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 
 from tests.lab.pace import bound
-from tests.system.cells import run
-
-
-def on_terminal(command: list[str], **environment: str) -> tuple[int, int]:
-    """Start a program on a terminal of its own; its pid, and our end of the terminal."""
-    pid, fd = pty.fork()
-    if not pid:
-        os.environ |= environment
-        os.execvp(command[0], command)
-    return pid, fd
-
-
-def read_until(fd: int, is_done: Callable[[str], bool]) -> str:
-    """The output of a terminal up to where `is_done` says of all of it that it is enough."""
-    deadline, seen = time.monotonic() + bound(30), b""
-    while not is_done(seen.decode()):
-        assert select.select([fd], [], [], deadline - time.monotonic())[0], seen
-        seen += os.read(fd, 65536)
-    return seen.decode()
+from tests.system.cells import run, wait_for
 
 
 def shown(*command: str, **environment: str) -> str:
@@ -78,3 +57,41 @@ class Screen:
         text = b"".join(self._pieces).decode().replace("\r\n", "\n")
         lines = (line.rpartition("\r\x1b[K")[2] for line in text.split("\n"))
         return [re.sub(r"\x1b\[[0-9;]*m", "", line) for line in lines if line]
+
+
+class Tmux(AbstractContextManager["Tmux"]):
+    """A shell in tmux(1), which knows what stays on the screen, as a person sees it."""
+
+    def __init__(self, columns: int, rows: int) -> None:
+        self._server = ["tmux", "-L", f"test-{os.getpid()}", "-f", "/dev/null"]
+        size = ("-x", str(columns), "-y", str(rows))
+        shell = "env PS1='% ' HISTFILE= bash --norc --noprofile -i"
+        self._tmux("new-session", "-d", *size, shell)
+        self.wait_prompt()
+
+    def __exit__(self, *_exception: object) -> None:
+        self._tmux("kill-server")
+
+    def _tmux(self, *arguments: str) -> str:
+        return run(*self._server, *arguments).stdout
+
+    def press(self, *keys: str) -> None:
+        """Keys by their names in tmux, such as Down, PPage, C-z, or a text."""
+        self._tmux("send-keys", *keys)
+
+    def resize(self, columns: int, rows: int) -> None:
+        self._tmux("resize-window", "-x", str(columns), "-y", str(rows))
+
+    def lines(self) -> list[str]:
+        """The lines of the screen, without blanks at their ends."""
+        return [line.rstrip() for line in self._tmux("capture-pane", "-p").split("\n")][:-1]
+
+    def wait(self, text: str, *, seconds: float = 30) -> list[str]:
+        """The lines, once `text` is somewhere in them."""
+        wait_for(text, lambda: text in "\n".join(self.lines()), seconds)
+        return self.lines()
+
+    def wait_prompt(self) -> list[str]:
+        """The lines that are not empty, once the shell is ready for a command."""
+        wait_for("a prompt", lambda: [*filter(None, self.lines())][-1:] == ["%"])
+        return [*filter(None, self.lines())]

@@ -1,15 +1,16 @@
 """doractl top: what runs uses, once, as JSON, and live on a terminal."""
 
 import json
-import os
 import re
+import shlex
 import subprocess
+from collections.abc import Iterator
 
 import pytest
 
 from dora_systemd.errors import ExitCode
-from tests.system.cells import Cell, Project, run
-from tests.system.terminal import on_terminal, read_until
+from tests.system.cells import Cell, Project, run, wait_for
+from tests.system.terminal import Screen, Tmux
 
 BUSY = """
 import threading
@@ -61,18 +62,104 @@ def test_objects_go_on(cell: Cell, project: Project) -> None:
     assert set(row["waits_percent"] or ()) in ({"cpu", "memory", "io"}, set())
 
 
-@pytest.mark.parametrize("key", [b"q", b"\x03"])
-def test_live(key: bytes, cell: Cell, project: Project) -> None:
+@pytest.fixture
+def tmux() -> Iterator[Tmux]:
+    with Tmux(80, 12) as terminal:
+        yield terminal
+
+
+def start_top(tmux: Tmux, cell: Cell, *options: str) -> None:
+    tmux.press(shlex.join(["doractl", cell.scope.flag, "top", cell.name, *options]), "Enter")
+    tmux.wait("  sink")
+
+
+@pytest.mark.parametrize("key", ["q", "C-c"])
+def test_live(key: str, cell: Cell, project: Project, tmux: Tmux) -> None:
     cell.start(project.three_nodes())
-    command = ["doractl", cell.scope.flag, "top", "--interval", "0.2"]
-    pid, fd = on_terminal(command, LINES="20", COLUMNS="120")
-    seen = read_until(fd, lambda text: text.count("doractl top") > 3 and "  sink" in text)
-    assert seen.startswith("\x1b[?1049h")
-    assert re.search(rf"{cell.name} +Running 3/3", seen)
-    os.write(fd, key)
-    end = read_until(fd, lambda text: "\x1b[?1049l" in text)
-    assert end.endswith("\x1b[?25h\x1b[?1049l")
-    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
+    tmux.press("before=$(stty -a); echo ready", "Enter")
+    tmux.wait("\nready")
+    start_top(tmux, cell, "--interval", "0.2", "--sort", "name")
+    title, header, *rows = tmux.lines()
+    assert re.match(r"\d\d:\d\d:\d\d  1 dataflow, 3 nodes, CPU [\d.]+%, memory ", title)
+    assert header.split()[:4] == ["NAME", "STATE", "UPTIME", "CPU%"]
+    assert re.match(rf"{cell.name[:6]}.* +Running 3/3", rows[0])
+    assert [row.split()[0] for row in rows[1:4]] == ["source", "doubler", "sink"]
+    assert rows[-1].startswith("q quit")
+    wait_for("the next second", lambda: tmux.lines()[0] > title)
+    tmux.press(key)
+    assert "ready" in tmux.wait_prompt(), "the screen before it is back"
+    assert not any("doubler" in line for line in tmux.lines())
+    tmux.press('test "$(stty -a)" = "$before" && echo as before', "Enter")
+    tmux.wait("\nas before")
+
+
+def test_any_size(cell: Cell, project: Project, tmux: Tmux) -> None:
+    cell.start(project.three_nodes())
+    start_top(tmux, cell, "--sort", "name")
+    for columns, rows in ((60, 12), (200, 5), (60, 3), (30, 2), (100, 30)):
+        tmux.resize(columns, rows)
+        wait_for("a row and the last line", lambda: "q quit" in tmux.lines()[-1])
+        wide = [line for line in tmux.lines() if cell.name[:6] in line]
+        assert len(wide) == 1, "one line for one row"
+    tmux.resize(60, 4)
+    tmux.press("End")
+    assert "sink" in "".join(tmux.wait("4-4/4"))
+    tmux.press("PPage")
+    assert "doubler" in "".join(tmux.wait("3-3/4"))
+    tmux.press("Home")
+    assert cell.name[:6] in "".join(tmux.wait("1-1/4"))
+    tmux.press("q")
+
+
+@pytest.mark.warns("failed to receive reply from daemon", "Signal(15)")
+def test_keys_restart_and_stop(cell: Cell, project: Project, tmux: Tmux) -> None:
+    def pid() -> int:
+        return cell.status.nodes["doubler"].pid
+
+    cell.start(project.three_nodes())
+    start_top(tmux, cell, "--interval", "0.2", "--sort", "name")
+    tmux.press("?")
+    tmux.wait("select a row")
+    tmux.press("x", "Down", "Down", "R")
+    tmux.wait(f"Restart node doubler of {cell.name}? y/n")
+    before = pid()
+    tmux.press("n")
+    tmux.wait("q quit")
+    tmux.press("R", "y")
+    tmux.wait(f"Node doubler of {cell.name}: restart begun")
+    wait_for("another process", lambda: pid() not in (0, before))
+    tmux.press("Home", "R", "y")
+    tmux.wait("Dataflow restarted: ", seconds=60)
+    tmux.press("S")
+    tmux.wait(f"Stop {cell.name}? y/n")
+    tmux.press("y", "q")
+    tmux.wait("Dataflow stopped: ", seconds=60)
+    assert cell.is_gone
+
+
+def test_suspended(cell: Cell, project: Project, tmux: Tmux) -> None:
+    cell.start(project.three_nodes())
+    start_top(tmux, cell)
+    tmux.press("C-z")
+    assert not any("doubler" in line for line in tmux.wait("Stopped"))
+    tmux.press("fg", "Enter")
+    tmux.wait("q quit")
+    tmux.press("q")
+    tmux.wait_prompt()
+
+
+@pytest.mark.parametrize("term", ["dumb", "nosuch"])
+def test_other_terminals(term: str, cell: Cell, project: Project) -> None:
+    cell.start(project.three_nodes())
+    command = ["env", f"TERM={term}", "doractl", cell.scope.flag, "top", cell.name]
+    seen = Screen(command)
+    status = seen.end()
+    if term == "dumb":
+        assert (status, seen.lines()[0].split()[0]) == (0, "NAME")
+    else:
+        assert status == ExitCode.FAILURE
+        assert seen.lines()[0].startswith("doractl: cannot use the terminal nosuch: ")
+        assert seen.lines()[1].startswith("hint: ")
 
 
 def test_what_is_not_there(cell: Cell, project: Project) -> None:

@@ -6,17 +6,13 @@ import time
 import click
 
 from dora_systemd.adapters.bus.systemd import Bus
+from dora_systemd.cli.colors import is_dumb
+from dora_systemd.cli.live import FIRST_SECONDS, show_live
 from dora_systemd.cli.parameters import current_scope, output_option, scope_options
-from dora_systemd.cli.screen import Screen
 from dora_systemd.decisions.views.objects import format_json
-from dora_systemd.decisions.views.top import SORTS, Look, format_summary, format_top, look_values
+from dora_systemd.decisions.views.top import SORTS, format_top, look_values
 from dora_systemd.errors import ExitCode
 from dora_systemd.verbs.top import Top
-
-_FIRST_SECONDS = 0.5
-"""Time between the two samples of one reading."""
-
-_KEYS = {sort[0]: sort for sort in SORTS}
 
 
 @click.command("top")
@@ -44,8 +40,9 @@ def command(
 ) -> int:
     """Show live resource usage of dataflows and their nodes; without SELECTOR, of all that run.
 
-    On a terminal: q quits, and c, m and n sort by CPU, memory and name. In a pipe one reading is
-    printed; with JSON, one object per line until it is interrupted.
+    On a terminal: the arrow keys select a row, R restarts it and S stops it, ? shows all keys, and
+    q quits. In a pipe one reading is printed; with JSON, one object per line until it is
+    interrupted.
 
     Examples:
       doractl top                          all that run, until q
@@ -56,15 +53,15 @@ def command(
     scope = current_scope()
     top = Top(Bus(scope, for_reading=True), scope, selectors)
     top.look()
-    is_terminal = sys.stdin.isatty() and sys.stdout.isatty()
+    is_terminal = sys.stdin.isatty() and sys.stdout.isatty() and not is_dumb()
     try:
         if output == "json":
             _print_objects(top, interval, sort, is_once)
         elif is_once or not is_terminal:
-            time.sleep(_FIRST_SECONDS)
+            time.sleep(FIRST_SECONDS)
             print(format_top(top.look(), sort))
         else:
-            _show(top, interval, sort)
+            show_live(scope, top, interval, sort)
     except KeyboardInterrupt:
         # Ctrl+C quits, as in top(1).
         pass
@@ -72,30 +69,9 @@ def command(
 
 
 def _print_objects(top: Top, interval: float, sort: str, is_once: bool) -> None:
-    time.sleep(_FIRST_SECONDS)
+    time.sleep(FIRST_SECONDS)
     while True:
         print(format_json(look_values(top.look(), sort)), flush=True)
         if is_once:
             return
         time.sleep(interval)
-
-
-def _show(top: Top, interval: float, sort: str) -> None:
-    with Screen() as screen:
-        look, due = top.look(), time.monotonic() + _FIRST_SECONDS
-        while True:
-            table = format_top(look, sort).splitlines()
-            screen.show([_title(look, interval), "", *table], bold=[0, 2])
-            key = screen.wait_key(due - time.monotonic())
-            if key in ("q", "Q"):
-                return
-            sort = _KEYS.get(key, sort)
-            if time.monotonic() >= due:
-                look, due = top.look(), time.monotonic() + interval
-
-
-def _title(look: Look, interval: float) -> str:
-    return (
-        f"doractl top {time.strftime('%H:%M:%S')}, every {interval:g}s: {format_summary(look)}"
-        " (q ends, c m n sort)"
-    )

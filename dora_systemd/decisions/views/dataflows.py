@@ -141,25 +141,27 @@ def _prefix(uuid: str, others: Sequence[str]) -> str:
 
 
 _OPTIONAL = (
-    *("BOOT", "PEAK", "PID", "THROTTLED%", "RESTARTS", "UPTIME", "MEM", "CPU%", "NODES", "UUID"),
+    *("BOOT", "PEAK", "PID", "THROTTLED%", "RESTARTS", "UPTIME", "WAITS FOR", "MEM", "CPU%"),
+    *("NODES", "UUID"),
 )
 """Columns that a narrow terminal does without, in this order."""
 _LEAST = 12
 _ROOM = {"NAME": _LEAST, "NODE": _LEAST, "WHY": 24, "EXIT": _LEAST}
 """Columns whose cells may be cut to _LEAST, and the width for which other columns are left out."""
 _RIGHT_ALIGNED = frozenset({"CPU%", "THROTTLED%", "MEM", "PEAK", "RESTARTS", "PID", "UPTIME"})
-_RED, _YELLOW, _UNDERLINED, _PLAIN = "\x1b[31m", "\x1b[33m", "\x1b[4m", "\x1b[0m"
-_COLORS = {
-    FAILED: _RED,
-    **dict.fromkeys((STARTING, DEGRADED, STOPPING, RESTARTING, "Reloading"), _YELLOW),
+_ANSI = {"red": "\x1b[31m", "yellow": "\x1b[33m"}
+_UNDERLINED, _PLAIN = "\x1b[4m", "\x1b[0m"
+STATE_COLORS = {
+    FAILED: "red",
+    **dict.fromkeys((STARTING, DEGRADED, STOPPING, RESTARTING, "Reloading"), "yellow"),
 }
 """By the word for a state, as in systemctl(1); others have none."""
 
 
 def colored_state(text: str, word: str) -> str:
     """`text` with the first `word` in it in the colour of that state."""
-    color = _COLORS.get(word)
-    return text.replace(word, f"{color}{word}{_PLAIN}", 1) if color else text
+    color = STATE_COLORS.get(word)
+    return text.replace(word, f"{_ANSI[color]}{word}{_PLAIN}", 1) if color else text
 
 
 def format_table(

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 from dora_systemd.decisions.cell.status import ALIVE_NODE_STATES, WHOLE_CELL
 from dora_systemd.decisions.resources.usage import format_waits
@@ -40,39 +40,69 @@ class Look:
     entries: Sequence[TopEntry] = ()
 
 
-def sort_entries(entries: Sequence[TopEntry], by: str) -> list[TopEntry]:
+class TopRow(NamedTuple):
+    """One line of the table: a dataflow, or one of its nodes. node: "" is the whole dataflow.
+
+    cells: texts in the order of HEADER. state: the word that a colour stands for.
+    """
+
+    uuid: str
+    name: str
+    node: str
+    state: str
+    cells: Sequence[str]
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """What stays the same from one reading to the next."""
+        return self.uuid, self.node
+
+
+def sort_entries(entries: Sequence[TopEntry], by: str, is_reversed: bool = False) -> list[TopEntry]:
     """Entries by one of SORTS: highest usage first, or by name."""
-    if by == "name":
-        return sorted(entries, key=lambda entry: entry.row.name)
-    return sorted(entries, key=lambda entry: (-_amount(entry.row, by), entry.row.name))
+    named = sorted(entries, key=lambda entry: entry.row.name)
+    if by != "name":
+        named.sort(key=lambda entry: -_amount(entry.row, by))
+    return named[::-1] if is_reversed else named
 
 
 def _amount(row: DataflowRow | NodeRow, by: str) -> float:
     return (row.cpu_percent if by == "cpu" else row.memory) or 0.0
 
 
+def top_rows(look: Look, by: str, is_reversed: bool = False) -> list[TopRow]:
+    """A row for each dataflow, followed by a row for each of its nodes."""
+    entries = sort_entries(look.entries, by, is_reversed)
+    return [row for one in entries for row in _rows(one, look, by, is_reversed)]
+
+
 def format_top(look: Look, by: str) -> str:
-    """The table: a row for each dataflow, followed by a row for each of its nodes."""
-    if not look.entries:
-        return NOTHING
-    lines = [line for one in sort_entries(look.entries, by) for line in _lines(one, look, by)]
-    return format_table(HEADER, lines)
+    """The whole table, for a pipe."""
+    rows = top_rows(look, by)
+    return format_table(HEADER, [row.cells for row in rows]) if rows else NOTHING
 
 
-def _lines(entry: TopEntry, look: Look, by: str) -> list[tuple[str, ...]]:
+def _rows(entry: TopEntry, look: Look, by: str, is_reversed: bool) -> list[TopRow]:
     row = entry.row
-    nodes = row.nodes if by == "name" else sorted(row.nodes, key=lambda one: -_amount(one, by))
+    nodes = (
+        list(row.nodes) if by == "name" else sorted(row.nodes, key=lambda one: -_amount(one, by))
+    )
     state = f"{row.status} {node_count(row)}".rstrip()
     first = (row.name, state, format_uptime(row.uptime), *_numbers(row, entry.waits, WHOLE_CELL))
-    return [first, *(_node_line(node, entry, look) for node in nodes)]
+    return [
+        TopRow(row.uuid, row.name, "", row.status, first),
+        *(_node_row(node, entry, look) for node in (nodes[::-1] if is_reversed else nodes)),
+    ]
 
 
-def _node_line(node: NodeRow, entry: TopEntry, look: Look) -> tuple[str, ...]:
+def _node_row(node: NodeRow, entry: TopEntry, look: Look) -> TopRow:
     is_alive = node.state in ALIVE_NODE_STATES and node.since
     uptime = format_uptime(max(look.at_us - node.since, 0)) if is_alive else UNKNOWN
-    state = node.state.capitalize()
-    state = f"{state} ({node.exit})" if node.exit and not is_alive else state
-    return (f"  {node.node}", state, uptime, *_numbers(node, entry.waits, node.node))
+    word = node.state.capitalize()
+    state = f"{word} ({node.exit})" if node.exit and not is_alive else word
+    cells = (f"  {node.node}", state, uptime, *_numbers(node, entry.waits, node.node))
+    whole = entry.row
+    return TopRow(whole.uuid, whole.name, node.node, word, cells)
 
 
 def _numbers(

@@ -1,5 +1,6 @@
 """The actions of the status page's buttons, and the data of its graph of a dataflow."""
 
+import os
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
@@ -8,19 +9,20 @@ from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
 from dora_systemd.decisions.gateway.page_messages import HOT_RELOAD, PageMessage, graph_values
-from dora_systemd.decisions.views.outcome import Outcome
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
+from dora_systemd.verbs.act import act_on, told
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.nodes import written_dataflow
 from dora_systemd.verbs.facts.reading import read_status
 from dora_systemd.verbs.facts.selector import Selector
-from dora_systemd.verbs.node import ask_coordinator, restart_node, stop_node
+from dora_systemd.verbs.node import ask_coordinator
 from dora_systemd.verbs.reload import reload_cell, switch_hot_reload
+from dora_systemd.verbs.restart import restart_asked
 from dora_systemd.verbs.set import set_limits
+from dora_systemd.verbs.start.again import find_start
 from dora_systemd.verbs.start.enable import disable_cell, enable_cell
 from dora_systemd.verbs.start.linger import ensure_linger
-from dora_systemd.verbs.stop import note_stop, restart_cells, stop_cells
 
 _BY = "status page"
 
@@ -32,43 +34,22 @@ def act(scope: Scope, message: PageMessage) -> str:
 
     Raises DoraSystemdError as the verbs of doractl do.
     """
-    bus, wanted = Bus(scope), Selector(message.dataflow)
-    try:
-        cell = wanted.find_enabled(bus, scope)
-    except DoraSystemdError as error:
-        if (row := wanted.ended(scope)) is None:
-            raise
-        problem = f"cannot {message.action} {row.name}: systemd has unloaded it"
-        hint = f"doractl start FILE --name {row.name}"
-        raise DoraSystemdError(problem, hint, ExitCode.NOT_FOUND) from error
-    return _ACTIONS[message.action](bus, scope, cell, message)
+    bus = Bus(scope)
+    known = find_start(bus, scope, Selector(message.dataflow))
+    if isinstance(known, Cell):
+        return _ACTIONS[message.action](bus, scope, known, message)
+    if message.action in ("start", "restart"):
+        return told(restart_asked(bus, scope, known, os.environ, None))
+    hint = f"doractl start {known.name}"
+    raise DoraSystemdError(f"cannot {message.action} {known.name}: it has ended", hint)
 
 
 def _stop(manager: Manager, scope: Scope, cell: Cell, message: PageMessage) -> str:
-    if message.node:
-        stop_node(scope, cell, message.node)
-        return _begun(cell, message)
-    note_stop([cell], _BY)
-    (outcome,) = stop_cells(manager, scope, [cell])
-    return _told(outcome)
+    return act_on(manager, scope, cell, message.node, "stop", by=_BY)
 
 
 def _restart(manager: Manager, scope: Scope, cell: Cell, message: PageMessage) -> str:
-    if message.node:
-        restart_node(scope, cell, message.node)
-        return _begun(cell, message)
-    (outcome,) = restart_cells(manager, [cell])
-    return _told(outcome)
-
-
-def _begun(cell: Cell, message: PageMessage) -> str:
-    return f"Node {message.node} of {cell.name}: {message.action} begun"
-
-
-def _told(outcome: Outcome) -> str:
-    if outcome.problem:
-        raise DoraSystemdError(outcome.problem, f"doractl why {outcome.subject.name}")
-    return outcome.text
+    return act_on(manager, scope, cell, message.node, "restart", by=_BY)
 
 
 def _enable(manager: Manager, scope: Scope, cell: Cell, _message: PageMessage) -> str:

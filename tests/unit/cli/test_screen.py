@@ -1,101 +1,119 @@
 """The terminal of `doractl top` on a real pseudo terminal: drawn, and left as it was."""
 
+import fcntl
 import os
-import pty
+import re
 import select
 import signal
+import struct
 import sys
 import termios
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
 SCRIPT = """
-import sys
-from dora_systemd.cli.screen import Screen
-with Screen() as screen:
-    while True:
-        screen.show(["first", "second\\x1b[31m", *["more"] * 99], bold=[0])
+from dora_systemd.cli.screen import open_screen
+from dora_systemd.decisions.views.top_screen import Line
+with open_screen(want_colors=True) as screen:
+    key = ""
+    while key != "q":
+        columns, rows = screen.size()
+        size = Line(f"{columns}x{rows} {key}")
+        screen.show([Line("first", "bold"), Line("second\\x1b[31m", "red reverse"), size])
         key = screen.wait_key(30)
-        if key == "q":
-            break
 """
 WIDE = """
-from dora_systemd.cli.screen import Screen
-with Screen() as screen:
-    screen.show(["x" * 100000] * 4)
-    screen.wait_key(30)
+from dora_systemd.cli.screen import open_screen
+from dora_systemd.decisions.views.top_screen import Line
+with open_screen(want_colors=False) as screen:
+    while True:
+        columns, rows = screen.size()
+        screen.show([Line("x" * columns)] * rows)
+        if screen.wait_key(30) == "q":
+            break
 """
 ENTER, LEAVE = b"\x1b[?1049h", b"\x1b[?1049l"
+SIZE = b"60x8"
 
 
 class Terminal:
-    """A program on a terminal of its own."""
+    """A program on a terminal of its own.
 
-    def __init__(self, script: str, **environment: str) -> None:
-        self.pid, self.fd = pty.fork()
+    Not as the leader of its session: when that one ends, the kernel discards what it has just
+    written.
+    """
+
+    def __init__(self, script: str, rows: int = 8, columns: int = 60, **environment: str) -> None:
+        self.fd, theirs = os.openpty()
+        fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("4H", rows, columns, 0, 0))
+        self.pid = os.fork()
         if not self.pid:
+            for stream in range(3):
+                os.dup2(theirs, stream)
             for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTSTP):
                 signal.signal(number, signal.SIG_DFL)  # a shell's background job ignores some
-            environment = {**os.environ, "LINES": "8", **environment}
+            environment = {**os.environ, "TERM": "xterm", **environment}
+            for name in ("LINES", "COLUMNS"):
+                environment.pop(name, None)
             os.execve(sys.executable, [sys.executable, "-c", script], environment)
+        os.close(theirs)
         self.before = termios.tcgetattr(self.fd)
         self.seen = b""
 
     def wait_for(self, text: bytes) -> None:
-        deadline = time.monotonic() + 120
+        deadline = time.monotonic() + 60
         while text not in self.seen:
             assert select.select([self.fd], [], [], deadline - time.monotonic())[0], self.seen
             self.seen += os.read(self.fd, 65536)
 
     def wait_asleep(self) -> None:
-        deadline = time.monotonic() + 120
+        deadline = time.monotonic() + 60
         while Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()[0] != "S":
             assert time.monotonic() < deadline
 
     def end(self) -> int:
         """The exit status as waitpid has it, after all output was read."""
-        _, status = os.waitpid(self.pid, 0)
-        while select.select([self.fd], [], [], 0)[0]:
-            try:
-                data = os.read(self.fd, 65536)
-            except OSError:
-                break
-            if not data:
-                break
-            self.seen += data
-        return status
+        with suppress(OSError):  # the other side is closed
+            while data := os.read(self.fd, 65536):
+                self.seen += data
+        return os.waitpid(self.pid, 0)[1]
 
 
 @pytest.fixture
 def terminal() -> Terminal:
     terminal = Terminal(SCRIPT)
-    terminal.wait_for(b"more lines")
+    terminal.wait_for(SIZE)
     return terminal
 
 
 def test_it_is_drawn_and_left(terminal: Terminal) -> None:
     assert terminal.seen.startswith(ENTER)
-    assert b"\x1b[1mfirst\x1b[0m" in terminal.seen
-    assert rb"second\x1b[31m" in terminal.seen
-    assert b"... 94 more lines" in terminal.seen
+    assert b";1mfirst" in terminal.seen
+    assert rb"second\x1b[31m" in terminal.seen, "escaped"
+    assert re.search(rb"7m(\x1b\[31m)?second", terminal.seen)
+    assert b"\x1b[31m" in terminal.seen
     os.write(terminal.fd, b"q")
     assert terminal.end() == 0
-    assert terminal.seen.endswith(LEAVE)
+    assert LEAVE in terminal.seen
+    assert b"\x1b[?25h" in terminal.seen
+    assert termios.tcgetattr(terminal.fd)[3] == terminal.before[3]
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT])
 def test_a_signal_leaves_it_clean(terminal: Terminal, number: int) -> None:
     os.kill(terminal.pid, number)
     status = terminal.end()
     assert os.WTERMSIG(status) == number
-    assert terminal.seen.endswith(LEAVE)
+    assert LEAVE in terminal.seen
+    assert termios.tcgetattr(terminal.fd)[3] == terminal.before[3]
 
 
 def test_a_signal_in_the_middle_of_a_drawing() -> None:
     """Nobody reads, so it is still drawing when the signal comes."""
-    terminal = Terminal(WIDE, COLUMNS="100000")
+    terminal = Terminal(WIDE, 200, 500)
     terminal.wait_for(ENTER)
     terminal.wait_asleep()
     os.kill(terminal.pid, signal.SIGTSTP)
@@ -103,13 +121,14 @@ def test_a_signal_in_the_middle_of_a_drawing() -> None:
     _, status = os.waitpid(terminal.pid, os.WUNTRACED)
     assert os.WIFSTOPPED(status)
     os.kill(terminal.pid, signal.SIGCONT)
-    terminal.wait_for(b"x\x1b[J")
+    terminal.seen = b""
+    terminal.wait_for(b"x\x1b[?7h")  # the last column of the last row
     os.write(terminal.fd, b"q")
     assert terminal.end() == 0
 
 
 def test_interrupt(terminal: Terminal) -> None:
-    os.write(terminal.fd, b"\x03")
+    os.kill(terminal.pid, signal.SIGINT)
     terminal.end()
     assert LEAVE in terminal.seen
 
@@ -124,14 +143,46 @@ def test_suspended_and_back(terminal: Terminal) -> None:
     terminal.seen = b""
     os.kill(terminal.pid, signal.SIGCONT)
     terminal.wait_for(ENTER)
-    terminal.wait_for(b"more lines")
+    terminal.wait_for(SIZE)
     os.write(terminal.fd, b"q")
     assert terminal.end() == 0
 
 
 def test_another_size_is_drawn_at_once(terminal: Terminal) -> None:
     terminal.seen = b""
+    fcntl.ioctl(terminal.fd, termios.TIOCSWINSZ, struct.pack("4H", 5, 70, 0, 0))
     os.kill(terminal.pid, signal.SIGWINCH)
-    terminal.wait_for(b"more lines")
+    terminal.wait_for(b"70x5")
+    assert b"first" in terminal.seen, "the terminal may have moved its lines"
     os.write(terminal.fd, b"q")
     assert terminal.end() == 0
+
+
+@pytest.mark.parametrize(
+    ("sent", "name"),
+    [
+        (b"\x1bOA", b"KEY_UP"),
+        (b"\x1b[6~", b"KEY_NPAGE"),
+        (b"\x1bOF", b"KEY_END"),
+        (b"c", b"c\r"),
+        (b"\x1bOB" * 3, b"KEY_DOWN"),
+    ],
+)
+def test_keys_have_names(terminal: Terminal, sent: bytes, name: bytes) -> None:
+    os.write(terminal.fd, sent)
+    terminal.wait_for(name)
+    os.write(terminal.fd, b"q")
+    assert terminal.end() == 0
+
+
+def test_a_terminal_that_goes_away_ends_it(terminal: Terminal) -> None:
+    os.close(terminal.fd)
+    _, status = os.waitpid(terminal.pid, 0)
+    assert status == 0
+
+
+def test_a_terminal_that_terminfo_does_not_know() -> None:
+    terminal = Terminal(SCRIPT, TERM="nosuch")
+    assert terminal.end() != 0
+    assert b"DoraSystemdError: cannot use the terminal nosuch" in terminal.seen
+    assert ENTER not in terminal.seen

@@ -14,7 +14,7 @@ import pytest
 from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
 from dora_systemd.decisions.gateway.frames import Request
 from dora_systemd.decisions.gateway.page_messages import PageMessage
-from dora_systemd.decisions.views.dataflows import DataflowRow
+from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.gateway.control import start as starting
 from dora_systemd.gateway.control.forward import forward
@@ -23,7 +23,7 @@ from dora_systemd.gateway.control.talk import Talk
 from dora_systemd.gateway.live import act as acting
 from dora_systemd.gateway.live.act import act, read_graph
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.facts.selector import Selector
+from dora_systemd.verbs.start.again import Asked
 from dora_systemd.verbs.start.plan import StartRequest
 from tests.unit.fakes.library import FakeSystemd, fake_journalctl, fake_systemd
 from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
@@ -111,14 +111,20 @@ def test_the_page_starts_what_has_failed(tmp_path: Path, monkeypatch: pytest.Mon
     assert bench.jobs == ["RestartUnit"]
 
 
-def test_the_page_cannot_start_what_systemd_has_unloaded(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("action", ["start", "enable"])
+def test_the_page_starts_what_has_ended(
+    action: str, bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    row = DataflowRow(NOBODY, "arm", "dora-arm.service", "Stopped")
-    monkeypatch.setattr(Selector, "ended", lambda *_: row)
-    with pytest.raises(DoraSystemdError, match="cannot start arm: systemd has unloaded") as caught:
-        bench.act("start", NOBODY)
-    assert caught.value.hint == "doractl start FILE --name arm"
+    asked = Asked("arm", NOBODY, "/srv/arm.yml", {})
+    done = Outcome(asked, "Dataflow restarted")
+    monkeypatch.setattr(acting, "find_start", lambda *_: asked)
+    monkeypatch.setattr(acting, "restart_asked", lambda *_: done)
+    if action == "start":
+        assert bench.act(action, NOBODY) == "Dataflow restarted"
+        return
+    with pytest.raises(DoraSystemdError, match="cannot enable arm: it has ended") as caught:
+        bench.act(action, NOBODY)
+    assert caught.value.hint == "doractl start arm"
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,47 @@
+"""Stops or restarts one dataflow or one node, for the views in which a person chooses it."""
+
+from functools import partial
+
+from dora_systemd.adapters.bus.manager import Manager, StageObserver, tell_stage
+from dora_systemd.decisions.views.outcome import Outcome
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.scope import Scope
+from dora_systemd.verbs.facts.cells import Cell
+from dora_systemd.verbs.node import restart_node, stop_node
+from dora_systemd.verbs.stop import note_stop, restart_cells, stop_cells
+
+
+def act_on(
+    manager: Manager,
+    scope: Scope,
+    cell: Cell,
+    node: str,
+    action: str,
+    *,
+    by: str,
+    on_stage: StageObserver | None = None,
+) -> str:
+    """Stop or restart a dataflow, or one of its nodes; what was done, in one line.
+
+    node: "" is the whole dataflow. action: "stop" or "restart". by: the view,
+    for the journal. on_stage: called with each stage of a dataflow. Raises DoraSystemdError as the
+    verbs of doractl do.
+    """
+    if node:
+        do = stop_node if action == "stop" else restart_node
+        do(scope, cell, node)
+        return f"Node {node} of {cell.name}: {action} begun"
+    observer = partial(tell_stage, on_stage)
+    if action == "stop":
+        note_stop([cell], by)
+        (outcome,) = stop_cells(manager, scope, [cell], observer)
+    else:
+        (outcome,) = restart_cells(manager, [cell], observer)
+    return told(outcome)
+
+
+def told(outcome: Outcome) -> str:
+    """What was done. Raises DoraSystemdError for a problem."""
+    if outcome.problem:
+        raise DoraSystemdError(outcome.problem, f"doractl why {outcome.subject.name}")
+    return outcome.text

@@ -1,0 +1,41 @@
+"""What a view does with the dataflow or node that a person has chosen, and what it hears of it."""
+
+import os
+import socket
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.verbs.act import act_on
+from dora_systemd.verbs.facts.cells import read_cells
+from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
+
+
+@pytest.fixture
+def manager() -> FakeManager:
+    manager = FakeManager()
+    manager.add(options())
+    return manager
+
+
+@pytest.mark.parametrize("action", ["stop", "restart"])
+def test_a_dataflow(
+    action: str, manager: FakeManager, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    notes: list[bytes] = []
+    monkeypatch.setattr(socket.socket, "sendto", lambda _, data, *__: notes.append(data))
+    scope = ScopeIn(is_user=True, uid=os.getuid(), root=tmp_path)
+    (cell,) = read_cells(manager)
+    done = act_on(manager, scope, cell, "", action, by="doractl top", on_stage=print)
+    assert done.endswith(f"{UUID} (robot)")
+    assert [call[0] for call in manager.calls if "Unit" in call[0]] == [f"{action.title()}Unit"]
+    assert [b"(doractl top)" in note for note in notes] == [True] * (action == "stop")
+
+
+def test_a_node_of_a_dataflow_whose_runner_is_gone(manager: FakeManager, tmp_path: Path) -> None:
+    scope = ScopeIn(is_user=True, uid=os.getuid(), root=tmp_path)
+    (cell,) = read_cells(manager)
+    with pytest.raises(DoraSystemdError):
+        act_on(manager, scope, cell, "camera", "restart", by="doractl top")
+    assert not manager.calls
