@@ -10,7 +10,6 @@ middle of a drawing, and makes an exit status 1 of SIGTERM.
 import curses
 import os
 import select
-import shutil
 import signal
 import sys
 from collections.abc import Iterator, Sequence
@@ -55,8 +54,10 @@ class Screen:
             curses.curs_set(0)
 
     def size(self) -> tuple[int, int]:
-        """Columns and rows of the terminal."""
-        columns, rows = shutil.get_terminal_size()
+        """Columns and rows of the terminal; 80 and 24 if it does not know."""
+        # Not $COLUMNS and $LINES, which stay as they are when the terminal is resized.
+        known = os.get_terminal_size(sys.stdout.fileno())
+        columns, rows = known.columns or 80, known.lines or 24
         if curses.is_term_resized(rows, columns):
             curses.resize_term(rows, columns)
         return columns, rows

@@ -31,7 +31,7 @@ from dora_systemd.decisions.logs.query import (
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.logs import Follower
+from dora_systemd.verbs.logs import Follower, find_span
 
 STEP_SECONDS = 0.2
 """At least this long between two steps: journalctl needs tens of ms to open all journal files."""
@@ -112,9 +112,24 @@ def follow_to_end(query: LogQuery, print_query: Callable[[LogQuery], object]) ->
 
 
 def _steps(query: LogQuery, cursor: Path, start_us: int) -> Iterator[LogQuery]:
-    yield first_step(query, cursor)
+    yield _with_cursor(first_step(query, cursor), cursor)
     while True:
-        yield next_step(query, cursor, start_us)
+        yield _with_cursor(next_step(query, cursor, start_us), cursor)
+
+
+def _with_cursor(query: LogQuery, cursor: Path) -> LogQuery:
+    """The step as journalctl takes it, which leaves the cursor of its last record.
+
+    journalctl refuses --cursor-file with --since, and would leave that of the oldest record for
+    --grep with --lines. For these this asks first where the records are.
+    """
+    if not query.since and not (query.grep and query.is_counted):
+        return query
+    span = find_span(query)
+    if span is None:
+        return replace(query, tail="0", grep="", cursor_file="")
+    cursor.write_text(f"{span.cursor}\n")
+    return replace(query, tail="", since=span.first, until=span.last, cursor_file="")
 
 
 def follow_steps(print_step: Callable[[], object], watch: Watch, is_up: Callable[[], bool]) -> None:

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from typing import NamedTuple
 
 from dora_systemd.adapters.journal.reader import (
     end_journalctl,
@@ -14,7 +15,6 @@ from dora_systemd.adapters.journal.reader import (
 )
 from dora_systemd.decisions.logs.fields import ExportReader
 from dora_systemd.decisions.logs.query import (
-    ALL_LINES,
     UNIT_ENDS,
     LogQuery,
     end_matches,
@@ -59,18 +59,37 @@ def pass_logs(query: LogQuery, fd: int) -> int:
 
 def _oldest_first(query: LogQuery) -> LogQuery:
     """The query for the same records in the order of time: --grep with --lines reverses it."""
-    is_counted = query.tail not in ("", ALL_LINES)
-    if not (query.grep and is_counted) or query.is_follow or query.is_reverse:
+    if not (query.grep and query.is_counted) or query.is_follow or query.is_reverse:
         return query
-    wanted = replace(query, output="export", cursor_file="")
+    span = find_span(query)
+    return query if span is None else replace(query, tail="", since=span.first, until=span.last)
+
+
+class Span(NamedTuple):
+    """Where records are in the journal. first, last: times for journalctl. cursor: of the last."""
+
+    first: str
+    last: str
+    cursor: str
+
+
+def find_span(query: LogQuery) -> Span | None:
+    """Where the records of a query are, None if there are none. Raises DoraSystemdError."""
+    wanted = replace(query, output="export", cursor_file="", is_follow=False)
+    if not query.is_counted:
+        wanted = replace(wanted, tail="1")  # the last one, and --since is known
     arguments = ["--output-fields=MESSAGE_ID", *query_arguments(wanted)]
-    records, times = ExportReader(), []
+    reader, found = ExportReader(), list[tuple[int, str]]()
     for data in journal_output(arguments):
-        times += [int(one["__REALTIME_TIMESTAMP"]) for one in records.feed(data)]
-    if not times:
-        return query
-    first, last = journal_timestamp(min(times)), journal_timestamp(max(times))
-    return replace(query, tail="", since=first, until=last)
+        found += [
+            (int(one["__REALTIME_TIMESTAMP"]), one.get("__CURSOR", b"").decode())
+            for one in reader.feed(data)
+        ]
+    if not found:
+        return None
+    (first, _), (last, cursor) = min(found), max(found, key=lambda one: one[0])
+    begin = journal_timestamp(first) if query.is_counted else query.since
+    return Span(begin, journal_timestamp(last), cursor)
 
 
 class Follower:

@@ -10,6 +10,7 @@ import termios
 import threading
 import time
 from contextlib import AbstractContextManager, suppress
+from pathlib import Path
 
 from tests.lab.pace import bound
 from tests.system.cells import run, wait_for
@@ -80,7 +81,10 @@ class Tmux(AbstractContextManager["Tmux"]):
         self._tmux("send-keys", *keys)
 
     def resize(self, columns: int, rows: int) -> None:
+        """Return once the program can see the new size: tmux may drop the first of two at once."""
         self._tmux("resize-window", "-x", str(columns), "-y", str(rows))
+        with Path(self._tmux("display-message", "-p", "#{pane_tty}").strip()).open() as tty:
+            wait_for("the size", lambda: os.get_terminal_size(tty.fileno()) == (columns, rows))
 
     def lines(self) -> list[str]:
         """The lines of the screen, without blanks at their ends."""

@@ -142,7 +142,7 @@ def test_mended_and_started_again(browser: Browser, cell: Cell, project: Project
     cell.start(bad(project), check=False)
     failed(cell)
     browser.wait_text("#detail .why h2", "Why it failed")
-    assert not browser.js("document.querySelector('#detail [data-action=stop]').checkVisibility()")
+    browser.wait_js("!document.querySelector('#detail [data-action=stop]').checkVisibility()")
     project.write("bad.py", TAKER)
     browser.click("#detail [data-action=start]")
     browser.wait_text("#question", f"Start {cell.name}?")

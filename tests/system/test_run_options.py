@@ -31,6 +31,8 @@ signal.signal(signal.SIGTERM, signal.SIG_IGN)
 while True:
     time.sleep(1)
 """
+pytestmark = pytest.mark.warns("careful")
+
 TICK = "inputs: {tick: dora/timer/millis/50}"
 
 
@@ -72,7 +74,7 @@ def test_levels(
 
 @pytest.mark.warns("Failed with result 'signal'", "code=killed", "was killed", "Killing process")
 def test_logs_go_on_after_a_restart(cell: Cell, speaker: Path) -> None:
-    words = ("--restart-policy", "on-failure", "--restart-delay", "100ms")
+    words = ("--restart-policy", "on-failure", "--restart-delay", "500ms")
     command = ["doractl", "--system", "run", str(speaker), "--name", cell.name, *words]
     child = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)
     wait_for("it speaks", lambda: "raw" in cell.messages("speaker"))

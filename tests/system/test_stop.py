@@ -147,5 +147,5 @@ def test_verbs_that_need_a_running_dataflow(cell: Cell, project: Project) -> Non
     flow = project.write("dataflow.yml", "nodes: [{id: never, path: sleep, args: '100'}]")
     cell.start(flow, "--no-wait")
     cell.doractl("stop", cell.name)
-    for words in (["show", cell.name], ["restart", cell.name], ["dora", cell.name, "--", "list"]):
+    for words in (["show", cell.name], ["dora", cell.name, "--", "list"]):
         assert cell.doractl(*words, check=False).returncode == ExitCode.NOT_FOUND

@@ -98,9 +98,12 @@ def test_any_size(cell: Cell, project: Project, tmux: Tmux) -> None:
     start_top(tmux, cell, "--sort", "name")
     for columns, rows in ((60, 12), (200, 5), (60, 3), (30, 2), (100, 30)):
         tmux.resize(columns, rows)
-        wait_for("a row and the last line", lambda: "q quit" in tmux.lines()[-1])
-        wide = [line for line in tmux.lines() if cell.name[:6] in line]
-        assert len(wide) == 1, "one line for one row"
+
+        def is_whole() -> bool:
+            lines = tmux.lines()
+            return "q quit" in lines[-1] and sum(cell.name[:6] in line for line in lines) == 1
+
+        wait_for(f"one line for one row, and the last line at {columns}x{rows}", is_whole)
     tmux.resize(60, 4)
     tmux.press("End")
     assert "sink" in "".join(tmux.wait("4-4/4"))

@@ -25,14 +25,14 @@ VARIES = re.compile(
     r"|(?P<date>\b\d{4}-\d\d-\d\d\b)"
     r"|(?P<time>[A-Z][a-z]{2} \d\d \d\d:\d\d:\d\d|\d\d:\d\d:\d\d)"
     r"|(?P<span>\b\d+(?:\.\d+)?(?:ms|s|min)\b)"
-    r"|(?P<number>\b\d+(?:\.\d+)?(?:%|M| MB)?(?=\s|$))|\x1b[\[(][0-9;?]*[a-zA-Z]|#+\.+"
+    r"|(?P<number>\b\d+(?:\.\d+)?(?:%|M| MB)?(?=\s|$))|#+\.+"
 )
 """What differs each time: it is compared by its kind."""
 LOOKS = re.compile(r"doractl (list|why|logs)\b|systemctl (is-|list-|status)|journalctl\b")
 """Commands that change nothing. They are typed again until they show what is expected."""
 LOOK_SECONDS = 20.0
-ERASED = re.compile(r"[^\n]*\r\x1b\[K")
-"""A line that a command has written anew, which nobody sees any more."""
+UNSEEN = re.compile(r"[^\n]*\r\x1b\[K|\x1b[\[(][0-9;:?]*[a-zA-Z]")
+"""A line that a command has written anew, and colours."""
 
 
 class Typed(NamedTuple):
@@ -53,8 +53,9 @@ class Typed(NamedTuple):
 
 def by_kind(text: str) -> str:
     """The text as it stays on a terminal, with what varies replaced by the name of its kind."""
-    seen = ERASED.sub("", text)
-    return VARIES.sub(lambda match: f" <{match.lastgroup}> " if match.lastgroup else "", seen)
+    return VARIES.sub(
+        lambda match: f" <{match.lastgroup}> " if match.lastgroup else "", UNSEEN.sub("", text)
+    )
 
 
 def typed_lines(text: str) -> Iterator[Typed]:
@@ -70,8 +71,7 @@ def typed_lines(text: str) -> Iterator[Typed]:
 
 def as_text(line: str, shown: str, status: int) -> str:
     """One line and what it has shown, as such a text has them."""
-    seen = re.sub(r"\x1b[\[(][0-9;?]*[a-zA-Z]", "", ERASED.sub("", shown))
-    return f"$ {line}\n{seen}" + (f"(exit status {status})\n" if status else "")
+    return f"$ {line}\n{UNSEEN.sub('', shown)}" + (f"(exit status {status})\n" if status else "")
 
 
 class Shell:

@@ -18,7 +18,7 @@ _REFERENCE = re.compile(rf"\$\$|\$\{{({_NAME})(?::-([^}}]*))?\}}|\$({_NAME})")
 _DOLLAR = "$$$$"
 """A "$" that coordinator and daemon have both halved."""
 
-_UNTIL_DAEMON = "$${DORA_SYSTEMD_UNSET:-%s}"
+_UNTIL_DAEMON = "$${DORA_SYSTEMD_NUMBER:-%s}"
 """A text that only the daemon reads as a number. dora makes a float of "inf" and "nan". If the
 coordinator did, its JSON could not hold it, and the daemon would never answer."""
 

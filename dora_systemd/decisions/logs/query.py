@@ -61,6 +61,12 @@ class LogQuery:
     want_unprintable: bool = False
     output: str = "short"
     cursor_file: str = ""
+
+    @property
+    def is_counted(self) -> bool:
+        """Whether only some of the last records are wanted."""
+        return self.tail not in ("", ALL_LINES)
+
     others: tuple["LogQuery", ...] = ()
 
 

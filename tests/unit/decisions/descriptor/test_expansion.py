@@ -31,10 +31,10 @@ def test_what_is_named_and_set() -> None:
         ("$$ a$$b $$A", "$$$$ a$$$$b $$$$A"),
         ("$P", "$$$$x"),
         ("5$ $5 ${", "5$ $5 ${"),
-        ("inf", "$${DORA_SYSTEMD_UNSET:-inf}"),
-        ("-Infinity", "$${DORA_SYSTEMD_UNSET:--Infinity}"),
-        ("${F}", "$${DORA_SYSTEMD_UNSET:-NaN}"),
-        ("1e999", "$${DORA_SYSTEMD_UNSET:-1e999}"),
+        ("inf", "$${DORA_SYSTEMD_NUMBER:-inf}"),
+        ("-Infinity", "$${DORA_SYSTEMD_NUMBER:--Infinity}"),
+        ("${F}", "$${DORA_SYSTEMD_NUMBER:-NaN}"),
+        ("1e999", "$${DORA_SYSTEMD_NUMBER:-1e999}"),
         ("infinite", "infinite"),
         (" inf", " inf"),
         ("1_0", "1_0"),
@@ -45,7 +45,7 @@ def test_what_is_sent(text: str, sent: str) -> None:
 
 
 def test_what_the_coordinator_gets_again() -> None:
-    env = {"A": "$$", "B": "${DORA_SYSTEMD_UNSET:-inf}", "N": 5}
+    env = {"A": "$$", "B": "${DORA_SYSTEMD_NUMBER:-inf}", "N": 5}
     again = sent_again({"id": "one", "env": env})
-    assert again["env"] == {"A": "$$$$", "B": "$${DORA_SYSTEMD_UNSET:-inf}", "N": 5}
+    assert again["env"] == {"A": "$$$$", "B": "$${DORA_SYSTEMD_NUMBER:-inf}", "N": 5}
     assert sent_again({"id": "one", "env": None}) == {"id": "one", "env": None}
