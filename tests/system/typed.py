@@ -31,8 +31,8 @@ VARIES = re.compile(
 LOOKS = re.compile(r"doractl (list|why|logs)\b|systemctl (is-|list-|status)|journalctl\b")
 """Commands that change nothing. They are typed again until they show what is expected."""
 LOOK_SECONDS = 20.0
-UNSEEN = re.compile(r"[^\n]*\r\x1b\[K|\x1b[\[(][0-9;:?]*[a-zA-Z]")
-"""A line that a command has written anew, and colours."""
+UNSEEN = re.compile(r"[^\n]*\r\x1b\[K|\x1b[\[(][0-9;:?]*[a-zA-Z]|\x1b[=>]")
+"""A line that a command has written anew, colours, and modes of the terminal."""
 
 
 class Typed(NamedTuple):
