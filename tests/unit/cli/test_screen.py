@@ -182,7 +182,7 @@ def test_a_terminal_that_goes_away_ends_it(terminal: Terminal) -> None:
 
 
 def test_a_terminal_that_terminfo_does_not_know() -> None:
-    terminal = Terminal(SCRIPT, TERM="nosuch")
+    terminal = Terminal(SCRIPT, TERM="nosuch", PYTHON_COLORS="0")
     assert terminal.end() != 0
     assert b"DoraSystemdError: cannot use the terminal nosuch" in terminal.seen
     assert ENTER not in terminal.seen

@@ -54,12 +54,13 @@ def problem(arguments: Sequence[str], is_part: bool = False) -> str:
             parse(doractl, "doractl", list(arguments), None)
     except DoraSystemdError as error:
         return error.message
-    except (click.MissingParameter, click.exceptions.NoArgsIsHelpError) as error:
+    except click.MissingParameter as error:
         return "" if is_part else error.format_message()
     except click.BadOptionUsage as error:
         return "" if is_part and "requires an argument" in error.message else error.message
     except click.UsageError as error:
-        return error.format_message()
+        is_help = type(error).__name__ == "NoArgsIsHelpError"  # not in click 8.1, which exits
+        return "" if is_part and is_help else error.format_message()
     except click.exceptions.Exit:
         pass  # --help and --version
     return ""
@@ -68,7 +69,9 @@ def problem(arguments: Sequence[str], is_part: bool = False) -> str:
 def parse(command: click.Command, name: str, words: list[str], above: click.Context | None) -> None:
     """Parse a command line without running it."""
     context = command.make_context(name, words, parent=above)
-    if isinstance(command, click.Group) and (left := [*context._protected_args, *context.args]):
+    held = getattr(context, "_protected_args", None)  # click 8.1 has no underscore there
+    held = context.protected_args if held is None else held
+    if isinstance(command, click.Group) and (left := [*held, *context.args]):
         verb, inner, rest = command.resolve_command(context, left)
         assert verb is not None and inner is not None
         parse(inner, verb, rest, context)
