@@ -25,7 +25,7 @@ VARIES = re.compile(
     r"|(?P<date>\b\d{4}-\d\d-\d\d\b)"
     r"|(?P<time>[A-Z][a-z]{2} \d\d \d\d:\d\d:\d\d|\d\d:\d\d:\d\d)"
     r"|(?P<span>\b\d+(?:\.\d+)?(?:ms|s|min)\b)"
-    r"|(?P<number>\b\d+(?:\.\d+)?(?:%|M| MB)?(?=\s|$))|#+\.+"
+    r"|(?P<number>\b\d+(?:\.\d+)?(?:%|M| MB)?(?=\s|$))|\.*##+\.*"
 )
 """What differs each time: it is compared by its kind."""
 LOOKS = re.compile(r"doractl (list|why|logs)\b|systemctl (is-|list-|status)|journalctl\b")
