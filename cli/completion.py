@@ -71,8 +71,8 @@ def node_names(ctx: click.Context, incomplete: str) -> list[str]:
     del incomplete
     # After an option without its value, click leaves the arguments in ctx.args.
     if ctx.command.name == "logs":
-        given = ctx.params.get("selectors") or ctx.args
-        return [node for one in given for node in JournalReader().known_nodes(one)]
+        journal, given = JournalReader(), ctx.params.get("selectors") or ctx.args
+        return [node for one in given for node in journal.known_nodes(one)]
     selector = ctx.params.get("selector") or next(iter(ctx.args), "")
     bus = _bus()
     row = dataflow_row(bus, current_scope(), Selector(selector).find(bus))

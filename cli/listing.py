@@ -86,16 +86,13 @@ def print_dataflows(request: ListRequest) -> int:
         return ExitCode.OK
     # Imported late: the table of all dataflows does without it, and is asked for most often.
     from dora_systemd.decisions.views.details import format_dataflow
-    from dora_systemd.decisions.views.objects import dataflow_object, format_json
     from dora_systemd.verbs.list import find_row
 
     row = find_row(bus, scope, request.selector)
     if request.is_quiet:
         print(row.uuid)
     elif request.output == "json":
-        from dora_systemd.decisions.views.objects import dataflow_object, format_json
-
-        print(format_json(dataflow_object(row), indent=2))
+        _print_json(row)
     else:
         _print_view(format_dataflow(row, _width(), want_colors=_wants_colors()))
     return ExitCode.OK if is_up_word(row) else ExitCode.NOT_RUNNING
@@ -136,9 +133,7 @@ def _print_all(rows: list[DataflowRow], request: ListRequest) -> None:
     if request.is_quiet:
         print(*(row.uuid for row in rows), sep="\n", end="\n" if rows else "")
     elif request.output == "json":
-        from dora_systemd.decisions.views.objects import dataflow_object, format_json
-
-        print(format_json(list(map(dataflow_object, rows)), indent=2))
+        _print_json(rows)
     elif rows:
         width = _width()
         _print_view(format_dataflows(rows, width, want_colors=_wants_colors()))
@@ -147,6 +142,16 @@ def _print_all(rows: list[DataflowRow], request: ListRequest) -> None:
     else:
         is_all = request.want_all or request.is_filtered
         print("No dataflow." if is_all else "No dataflow is running.")
+
+
+def _print_json(found: DataflowRow | list[DataflowRow]) -> None:
+    """One object, or a list of them."""
+    from dora_systemd.decisions.views.objects import dataflow_object, format_json
+
+    if isinstance(found, DataflowRow):
+        print(format_json(dataflow_object(found), indent=2))
+    else:
+        print(format_json([dataflow_object(row) for row in found], indent=2))
 
 
 def _print_view(text: str) -> None:

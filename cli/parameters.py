@@ -10,6 +10,7 @@ from dora_systemd.decisions.views.objects import format_json
 from dora_systemd.decisions.views.outcome import Outcome, outcome_object
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope, scope_of
+from dora_systemd.values import parse_duration
 
 C = TypeVar("C", bound=Callable[..., Any] | click.Command)
 
@@ -85,6 +86,12 @@ def parsed_by(parse: Callable[[str], T]) -> Callable[[click.Context, click.Param
             raise DoraSystemdError(message, error.hint, error.code) from error
 
     return parsed
+
+
+def duration_option(flag: str, text: str) -> Callable[[C], C]:
+    """An option with a time span in µs, INFINITY without it. text: for --help."""
+    callback = parsed_by(parse_duration)
+    return click.option(flag, metavar="TIME", default="infinity", callback=callback, help=text)
 
 
 def current_scope() -> Scope:

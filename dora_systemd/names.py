@@ -6,6 +6,7 @@ For a name that is not known there is a hint with similar ones.
 import re
 from collections.abc import Iterable
 from pathlib import PurePath
+from typing import Protocol
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import quoted
@@ -38,6 +39,18 @@ MIN_PREFIX = 4
 _HINT = (
     f"a name is 1 to {MAX_NAME} letters, digits, '.', '_' or '-', and begins with a letter or digit"
 )
+
+
+class Named(Protocol):
+    """A dataflow, from wherever it is known."""
+
+    @property
+    def name(self) -> str:
+        """The name of the dataflow."""
+
+    @property
+    def uuid(self) -> str:
+        """The UUID of the dataflow."""
 
 
 def is_name(text: str) -> bool:

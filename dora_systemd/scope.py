@@ -23,9 +23,14 @@ class Scope(NamedTuple):
         return self.runtime_root / RUNTIME_NAME / name
 
     @property
+    def word(self) -> str:
+        """The name of this scope."""
+        return "user" if self.is_user else "system"
+
+    @property
     def flag(self) -> str:
         """The option that selects this scope in systemctl, journalctl and doractl."""
-        return "--user" if self.is_user else "--system"
+        return f"--{self.word}"
 
 
 def scope_of(is_user: bool | None) -> Scope:

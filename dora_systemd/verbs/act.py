@@ -23,9 +23,9 @@ def act_on(
 ) -> str:
     """Stop or restart a dataflow, or one of its nodes; what was done, in one line.
 
-    node: "" is the whole dataflow. action: "stop" or "restart". by: the view,
-    for the journal. on_stage: called with each stage of a dataflow. Raises DoraSystemdError as the
-    verbs of doractl do.
+    node: "" is the whole dataflow. action: "stop" or "restart". by: the view, for the journal.
+    on_stage: called with each stage of a dataflow. Raises DoraSystemdError as the verbs of doractl
+    do.
     """
     if node:
         do = stop_node if action == "stop" else restart_node

@@ -13,6 +13,7 @@ from dora_systemd.cli.parameters import (
     print_warnings,
 )
 from dora_systemd.cli.settingoptions import live_options
+from dora_systemd.decisions.settings.resolve import is_given
 from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
@@ -54,7 +55,7 @@ def _changes(
     bus: Bus, scope: Scope, cell: Cell, hot_reload: str | None, flags: dict[str, Any], force: bool
 ) -> Iterator[str]:
     """Make each change, then yield it."""
-    if hot_reload is None or any(value not in (None, ()) for value in flags.values()):
+    if hot_reload is None or any(map(is_given, flags.values())):
         print_warnings(set_limits(bus, scope, cell, flags, force))
         yield "Limits changed" if cell.is_up else "Limits changed for the next start"
     if hot_reload is not None:

@@ -9,6 +9,7 @@ from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.foreground import FORMATS, Foreground, print_until_end
 from dora_systemd.cli.parameters import (
     current_scope,
+    duration_option,
     name_option,
     parsed_by,
     print_warnings,
@@ -18,7 +19,6 @@ from dora_systemd.cli.settingoptions import SettingsCommand, setting_options
 from dora_systemd.decisions.logs.filter import RAW, LogFilter, parse_filter
 from dora_systemd.decisions.logs.records import DORA_LEVELS
 from dora_systemd.names import unit_name
-from dora_systemd.values import parse_duration
 from dora_systemd.verbs.start.again import note_start
 from dora_systemd.verbs.start.claim import refuse_unit_file, require_free_name
 from dora_systemd.verbs.start.enable import drop_unit_files
@@ -30,13 +30,7 @@ from dora_systemd.verbs.start.unit import plan_properties
 @click.command("run", cls=SettingsCommand)
 @click.argument("dataflow", default=DEFAULT_FILE, metavar="[FILE]")
 @name_option
-@click.option(
-    "--stop-after",
-    metavar="TIME",
-    default="infinity",
-    callback=parsed_by(parse_duration),
-    help="Stop it gracefully when it has run so long, such as 30s or 5min.",
-)
+@duration_option("--stop-after", "Stop it gracefully when it has run so long, such as 30s or 5min.")
 @click.option(
     "--log-level",
     type=click.Choice((RAW, *DORA_LEVELS[1:]), case_sensitive=False),

@@ -11,7 +11,7 @@ from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import (
     acting_options,
     current_scope,
-    parsed_by,
+    duration_option,
     print_outcomes,
     require_names_or_all,
     tell,
@@ -20,7 +20,7 @@ from dora_systemd.cli.stageline import StageLine
 from dora_systemd.decisions.life.stop_budget import kill_delay
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
-from dora_systemd.values import INFINITY, parse_duration
+from dora_systemd.values import INFINITY
 from dora_systemd.verbs.facts.cells import Cell, read_cells
 from dora_systemd.verbs.facts.selector import Selector, selectors_of
 from dora_systemd.verbs.stop import not_running, note_stop, stop_cells, stop_cells_within
@@ -30,12 +30,9 @@ from dora_systemd.verbs.stop import not_running, note_stop, stop_cells, stop_cel
 @click.argument("selectors", nargs=-1, metavar="[SELECTOR...]")
 @click.option("-n", "--name", metavar="NAME", help="The same as SELECTOR, as in dora stop.")
 @click.option("-a", "--all", "want_all", is_flag=True, help="All dataflows that run.")
-@click.option(
+@duration_option(
     "--grace-duration",
-    metavar="TIME",
-    default="infinity",
-    callback=parsed_by(parse_duration),
-    help="Kill what still runs after 1.5 times this, if that is sooner than the dataflow's own.",
+    "Kill what still runs after 1.5 times this, if that is sooner than the dataflow's own.",
 )
 @click.option("-f", "--force", is_flag=True, help="Kill the nodes at once.")
 @acting_options

@@ -154,15 +154,18 @@ def story_matches(scope: Scope, name: str, uuid: str) -> list[str]:
     """Matches for life events, systemd's records of the unit, and stop requests."""
     dataflow = f"DORA_DATAFLOW={uuid}"
     own = [*scope_matches(scope, name), dataflow, *_event_matches()]
-    who = f"_UID={scope.uid if scope.is_user else 0}"
-    asked = [dataflow, "DORA_EVENT=stop-asked", who]
+    asked = [dataflow, *_asked_matches(scope, "stop-asked")]
     return [*own, "+", *_systemd_matches(scope, name), "+", *asked]
 
 
 def request_matches(scope: Scope, event: str) -> list[str]:
-    """Matches for requests of root, or of the user: journald itself sets _UID."""
-    who = f"_UID={scope.uid if scope.is_user else 0}"
-    return [f"DORA_EVENT={event}", who, f"DORA_SCOPE={scope.flag.lstrip('-')}"]
+    """Matches for requests of root, or of the user, in that scope."""
+    return [*_asked_matches(scope, event), f"DORA_SCOPE={scope.word}"]
+
+
+def _asked_matches(scope: Scope, event: str) -> list[str]:
+    # journald itself sets _UID.
+    return [f"DORA_EVENT={event}", f"_UID={scope.uid if scope.is_user else 0}"]
 
 
 def _event_matches() -> list[str]:

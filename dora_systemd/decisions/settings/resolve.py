@@ -98,6 +98,11 @@ def given_texts(
     return found
 
 
+def is_given(value: object) -> bool:
+    """Whether a raw value of a flag is one, see resolve_settings()."""
+    return value not in (None, ())
+
+
 def check_document(
     source: str, document: object, table: Sequence[Setting[Any]] = SETTINGS
 ) -> Mapping[str, Any]:
@@ -126,7 +131,7 @@ def _from_flag(
     setting: Setting[Any], flags: Mapping[str, object], base: Base = None
 ) -> Iterator[Given]:
     value = flags.get(setting.name)
-    if value is not None and value != ():
+    if is_given(value):
         yield setting.flags[0], _parsed(setting, value, setting.flags[0], ExitCode.USAGE, base)
 
 

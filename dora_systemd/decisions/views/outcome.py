@@ -6,20 +6,13 @@ from typing import Any, NamedTuple, Protocol
 
 from dora_systemd.decisions.views.objects import error_object
 from dora_systemd.errors import DoraSystemdError
+from dora_systemd.names import Named
 
 DONE, UNCHANGED, FAILED = "done", "unchanged", "failed"
 
 
-class Subject(Protocol):
-    """A dataflow, from wherever it is known."""
-
-    @property
-    def name(self) -> str:
-        """The name of the dataflow."""
-
-    @property
-    def uuid(self) -> str:
-        """The UUID of the dataflow."""
+class Subject(Named, Protocol):
+    """A dataflow with its unit."""
 
     @property
     def unit(self) -> str:

@@ -8,6 +8,7 @@ from typing import Any
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.decisions.gateway.answers import stopped
 from dora_systemd.decisions.gateway.frames import Request
+from dora_systemd.decisions.life.stop_budget import kill_delay
 from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.gateway.control.state import ended_result
@@ -18,8 +19,6 @@ from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.stop import note_stop, restart_cells, stop_cells
 
-_KILL_FACTOR = 1.5
-"""dora sends SIGTERM after the grace duration, and SIGKILL after 1.5 times that."""
 _FORCE_SECONDS = 0.2
 """Time for systemd to begin the stop: a kill before that would count as a failure."""
 
@@ -75,7 +74,7 @@ def _patience(request: Request) -> float | None:
     if request.body.get("force"):
         return _FORCE_SECONDS
     grace = request.grace
-    return None if grace is None else max(_KILL_FACTOR * grace / SECOND, _FORCE_SECONDS)
+    return None if grace is None else max(kill_delay(grace) / SECOND, _FORCE_SECONDS)
 
 
 def _life(scope: Scope, cell: Cell) -> object:

@@ -21,7 +21,7 @@ from dora_systemd.verbs.facts.cells import Cell
 UP_SINCE = "ActiveEnterTimestampMonotonic"
 STARTED = "InactiveExitTimestampMonotonic"
 ENDED = "InactiveEnterTimestamp"
-_ALL = ("ControlGroup", "NRestarts", UP_SINCE, STARTED, "StatusText", "ActiveEnterTimestamp", ENDED)
+_ALL = ("ControlGroup", "NRestarts", UP_SINCE, STARTED, "StatusText", "ActiveEnterTimestamp")
 
 
 class Reading(NamedTuple):
@@ -61,7 +61,8 @@ def read_dataflow(
     status, problem = look_at_table(scope, cell) if cell.is_up else (CellStatus(), "")
     path = slice_path / cell.unit if slice_path else None
     path = path if path and path.is_dir() else None
-    unit = manager.read(cell.unit, _few(cell, status, path) if slice_path else _ALL)
+    every = _ALL if cell.is_up else (*_ALL, ENDED)
+    unit = manager.read(cell.unit, _few(cell, status, path) if slice_path else every)
     if not cell.is_up or not (path or unit["ControlGroup"]):
         return Reading(cell, unit, status, problem)
     path = path or cgroup.group_path(unit["ControlGroup"])

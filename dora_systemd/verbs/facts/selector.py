@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.decisions.views.dataflows import DataflowRow
@@ -17,6 +17,7 @@ from dora_systemd.names import (
     MIN_PREFIX,
     UNIT_PREFIX,
     UNIT_SUFFIX,
+    Named,
     did_you_mean,
     is_name,
     is_uuid_prefix,
@@ -30,18 +31,6 @@ from dora_systemd.verbs.facts.enabled import lost_units
 
 _SHOWN = 10
 _PATTERN = re.compile(r"[*?\[]")
-
-
-class Named(Protocol):
-    """A dataflow, from wherever it is known."""
-
-    @property
-    def name(self) -> str:
-        """The name of the dataflow."""
-
-    @property
-    def uuid(self) -> str:
-        """The UUID of the dataflow."""
 
 
 N = TypeVar("N", bound=Named)

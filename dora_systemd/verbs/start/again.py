@@ -14,7 +14,7 @@ from typing import Any
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.decisions.logs.query import request_matches
-from dora_systemd.decisions.settings.resolve import given_texts
+from dora_systemd.decisions.settings.resolve import given_texts, is_given
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import is_name, is_uuid, is_uuid_prefix, unit_name
 from dora_systemd.scope import Scope
@@ -66,11 +66,6 @@ def means_name(text: str) -> bool:
     return is_directory(path) or not exists(path)
 
 
-def is_given(flag: object) -> bool:
-    """Whether a raw value of a flag is one, see StartRequest."""
-    return flag not in (None, ())
-
-
 def note_start(plan: Plan, request: StartRequest, command: str) -> None:
     """Write what was asked for to the journal. command: by which, such as "doractl start"."""
     options = plan.options
@@ -79,7 +74,7 @@ def note_start(plan: Plan, request: StartRequest, command: str) -> None:
         options.name,
         options.uuid,
         command,
-        scope=plan.scope.flag.lstrip("-"),
+        scope=plan.scope.word,
         file=options.dataflow,
         settings=json.dumps(given_texts(request.flags, request.environment, Path.cwd())),
     )
