@@ -18,12 +18,11 @@ from dora_systemd.decisions.gateway.frames import Request, renamed
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.gateway.control.state import ended_descriptor
 from dora_systemd.gateway.control.talk import Result, Talk, find_by_uuid
-from dora_systemd.paths import CellPaths
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.nodes import written_dataflow
 from dora_systemd.verbs.facts.reading import read_status
-from dora_systemd.verbs.node import require_running, restart_node
+from dora_systemd.verbs.node import require_running, restart_node, socket_of
 
 _GOING_AWAY = 1001
 
@@ -123,8 +122,7 @@ def _running(scope: Scope, uuid: str) -> tuple[Cell, str]:
 
 
 async def _open(scope: Scope, cell: Cell) -> Connection:
-    path = CellPaths(scope.cell_directory(cell.name)).socket
-    return await Connection.over(*await asyncio.to_thread(relay, path))
+    return await Connection.over(*await asyncio.to_thread(relay, socket_of(scope, cell)))
 
 
 async def _ask(scope: Scope, cell: Cell, params: Params) -> Reply:

@@ -10,7 +10,7 @@ import time
 from collections.abc import AsyncIterator, Iterator, Sequence
 
 from dora_systemd.adapters.bus.systemd import Bus
-from dora_systemd.adapters.journal.reader import JournalReader, journal_output, open_journalctl
+from dora_systemd.adapters.journal.reader import JournalReader, journal_output
 from dora_systemd.adapters.journal.stream import open_stream
 from dora_systemd.decisions.gateway.answers import is_from_systemd, is_wanted, log_line
 from dora_systemd.decisions.gateway.frames import LOGS_LIMIT, Request, format_event, logs_parts
@@ -128,11 +128,9 @@ class Follower:
         matches = [*scope_matches(scope, self._name), f"DORA_DATAFLOW={self._uuid}"]
         matches += ["+", *end_matches(scope, self._name)]
         since = f"--since={journal_timestamp(first)}"
-        with open_journalctl([*_EXPORT, "--follow", since, "--", *matches]) as child:
-            assert child.stdout
-            async with open_stream(child.stdout) as stream:
-                if self._uuid in self._talk.started or await self._is_up():
-                    await self._send_all(stream)
+        async with open_stream([*_EXPORT, "--follow", since, "--", *matches]) as (_, stream):
+            if self._uuid in self._talk.started or await self._is_up():
+                await self._send_all(stream)
         if self._uuid not in self._talk.started:
             await self._talk.socket.close()
 

@@ -24,8 +24,6 @@ from dora_systemd.verbs.start.again import find_start
 from dora_systemd.verbs.start.enable import disable_cell, enable_cell
 from dora_systemd.verbs.start.linger import ensure_linger
 
-_BY = "status page"
-
 Action = Callable[[Manager, Scope, Cell, PageMessage], str]
 
 
@@ -44,12 +42,10 @@ def act(scope: Scope, message: PageMessage) -> str:
     raise DoraSystemdError(f"cannot {message.action} {known.name}: it has ended", hint)
 
 
-def _stop(manager: Manager, scope: Scope, cell: Cell, message: PageMessage) -> str:
-    return act_on(manager, scope, cell, message.node, "stop", by=_BY)
-
-
-def _restart(manager: Manager, scope: Scope, cell: Cell, message: PageMessage) -> str:
-    return act_on(manager, scope, cell, message.node, "restart", by=_BY)
+def _act(manager: Manager, scope: Scope, cell: Cell, message: PageMessage) -> str:
+    # Only what has ended can be started, and a restart does that.
+    action = "stop" if message.action == "stop" else "restart"
+    return act_on(manager, scope, cell, message.node, action, by="status page")
 
 
 def _enable(manager: Manager, scope: Scope, cell: Cell, _message: PageMessage) -> str:
@@ -85,10 +81,7 @@ def _joined(*texts: str) -> str:
 
 
 _ACTIONS: dict[str, Action] = {
-    "stop": _stop,
-    # Only what has ended can be started, and a restart does that.
-    "start": _restart,
-    "restart": _restart,
+    **dict.fromkeys(("stop", "start", "restart"), _act),
     "enable": _enable,
     "disable": _disable,
     "reload": _reload,

@@ -5,11 +5,11 @@ from collections import deque
 from collections.abc import AsyncGenerator, AsyncIterator
 from dataclasses import replace
 
-from dora_systemd.adapters.journal.reader import end_journalctl, open_journalctl
+from dora_systemd.adapters.journal.reader import end_journalctl
 from dora_systemd.adapters.journal.stream import open_stream
 from dora_systemd.decisions.gateway.page_messages import LOG_FIELDS, PageMessage, line_values
 from dora_systemd.decisions.logs.fields import ExportReader
-from dora_systemd.decisions.logs.query import LogQuery, query_arguments
+from dora_systemd.decisions.logs.query import query_arguments
 from dora_systemd.gateway.live.find import Lines, log_query
 from dora_systemd.scope import Scope
 
@@ -28,13 +28,12 @@ async def follow_lines(
 
     Raises DoraSystemdError if the dataflow does not exist or the journal is not readable.
     """
-    query = await asyncio.to_thread(_query, scope, message)
+    query = await asyncio.to_thread(log_query, scope, message)
+    query = replace(query, tail=str(FIRST_LINES), is_follow=True)
     arguments = [f"--output-fields={LOG_FIELDS}", *query_arguments(query)]
-    with open_journalctl(arguments) as child:
-        assert child.stdout
-        async with open_stream(child.stdout) as stream:
-            async for lines in _batches(stream):
-                yield lines
+    async with open_stream(arguments) as (child, stream):
+        async for lines in _batches(stream):
+            yield lines
         end_journalctl(child)
 
 
@@ -52,12 +51,6 @@ async def _batches(stream: asyncio.StreamReader) -> AsyncIterator[tuple[Lines, i
         if newest:
             yield list(map(line_values, newest)), count - len(newest)
         newest.clear()
-
-
-def _query(scope: Scope, message: PageMessage) -> LogQuery:
-    nodes = (message.node,) if message.node else ()
-    query = log_query(scope, message.dataflow)
-    return replace(query, nodes=nodes, tail=str(FIRST_LINES), is_follow=True)
 
 
 async def _read_until(stream: asyncio.StreamReader, until: float) -> bytes:
