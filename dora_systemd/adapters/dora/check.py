@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from typing import TypeVar
 
 from dora_systemd.adapters.dora.command import dora_version, find_dora, run_dora
-from dora_systemd.adapters.host.process import Beside
+from dora_systemd.adapters.host.process import beside
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.dora.errors import parse_dora_error
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -27,18 +27,15 @@ class DoraCheck:
 
     def __init__(self, options: RunnerOptions, environment: Mapping[str, str]) -> None:
         self._options = options
-        self._version = Beside(lambda: dora_version(options.dora, own_account(), environment))
-        self._refusal = Beside(lambda: refusal_of_dora(options, environment))
+        self._version = beside(lambda: dora_version(options.dora, own_account(), environment))
+        self._refusal = beside(lambda: refusal_of_dora(options, environment))
 
     def beside(self, call: Callable[[], T]) -> T:
         """Call `call` while the checks run; its result. Errors of the checks take precedence."""
         try:
-            done = call()
-        except DoraSystemdError:
+            return call()
+        finally:
             self.result()
-            raise
-        self.result()
-        return done
 
     def result(self) -> None:
         """Wait for all checks. Raises DoraSystemdError for what is refused.

@@ -4,11 +4,12 @@ import contextlib
 import os
 import selectors
 import signal
-import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass
-from typing import Generic, TypeVar, cast
+from threading import Thread
+from typing import TypeVar
 
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.trust.programs import Account, spawn
@@ -57,31 +58,21 @@ def run_command(
         return Completed(child.wait(), *(one.decode(errors="replace") for one in streams))
 
 
-class Beside(Generic[T]):
-    """Runs a function in a thread, for calls that wait for child processes.
+def beside(call: Callable[[], T]) -> "Future[T]":
+    """Run a function in a thread, for calls that wait for child processes.
 
     Not a daemon thread, so that a child is reaped even if nothing uses the result.
     """
+    future: Future[T] = Future()
 
-    def __init__(self, call: Callable[[], T]) -> None:
-        self._call = call
-        self._result: T | None = None
-        self._error: Exception | None = None
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
-
-    def _run(self) -> None:
+    def run() -> None:
         try:
-            self._result = self._call()
+            future.set_result(call())
         except Exception as error:
-            self._error = error
+            future.set_exception(error)
 
-    def result(self) -> T:
-        """Wait for the function; its result. Raises what it raised."""
-        self._thread.join()
-        if self._error is not None:
-            raise self._error
-        return cast(T, self._result)
+    Thread(target=run).start()
+    return future
 
 
 def read_streams(streams: Sequence[int], seconds: float) -> list[bytes]:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import Manager, Property
 from dora_systemd.adapters.dora.command import DORA_SECONDS
-from dora_systemd.adapters.host.process import Beside, Completed, read_streams, run_command
+from dora_systemd.adapters.host.process import Completed, beside, read_streams, run_command
 from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.cell.options import check_command
 from dora_systemd.decisions.life.refusal import parse_refusal
@@ -56,7 +56,7 @@ def run_beside(connect: Callable[[], Manager], plan: Plan, command: Sequence[str
 def _run_unit(manager: Manager, plan: Plan, command: Sequence[str]) -> Completed:
     unit = f"doractl-check-{secrets.token_hex(8)}.service"
     reading, writing = zip(*(os.pipe2(os.O_CLOEXEC) for _ in range(2)), strict=True)
-    streams = Beside(lambda: read_streams(reading, DORA_SECONDS + 5))
+    streams = beside(lambda: read_streams(reading, DORA_SECONDS + 5))
     try:
         manager.start_transient(unit, _properties(manager, plan, command, writing), None, True)
     finally:

@@ -40,11 +40,11 @@ def test_what_cannot_be_run() -> None:
 
 def test_calls_beside_each_other_take_the_time_of_one() -> None:
     meeting = threading.Barrier(2, timeout=30)
-    calls = [process.Beside(meeting.wait) for _ in range(2)]
+    calls = [process.beside(meeting.wait) for _ in range(2)]
     assert {call.result() for call in calls} == {0, 1}
 
 
 def test_call_beside_raises_where_its_result_is_wanted() -> None:
-    call = process.Beside(lambda: process.run_command(["/nowhere/x"], 1))
+    call = process.beside(lambda: process.run_command(["/nowhere/x"], 1))
     with pytest.raises(DoraSystemdError, match="cannot run /nowhere/x"):
         call.result()
