@@ -15,8 +15,14 @@ from dora_systemd.decisions.views.snapshot import observed_values
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.gateway.live.about import read_about, read_ended
 from dora_systemd.gateway.live.act import act, read_graph
-from dora_systemd.gateway.live.find import MAX_FOUND, MAX_SAVED, Lines, find_lines
-from dora_systemd.gateway.live.follow import MAX_LINES, follow_lines
+from dora_systemd.gateway.live.lines import (
+    MAX_FOUND,
+    MAX_LINES,
+    MAX_SAVED,
+    Lines,
+    find_lines,
+    follow_lines,
+)
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import user_name
 from dora_systemd.verbs.facts.snapshot import read_snapshot

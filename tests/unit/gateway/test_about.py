@@ -10,9 +10,10 @@ import pytest
 
 from dora_systemd.decisions.gateway.page_messages import MAX_TEXT, PageMessage
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.gateway.live import about, find
+from dora_systemd.gateway.live import about
+from dora_systemd.gateway.live import lines as lines_module
 from dora_systemd.gateway.live.about import read_about, read_ended
-from dora_systemd.gateway.live.find import find_lines
+from dora_systemd.gateway.live.lines import find_lines
 from dora_systemd.scope import Scope
 from tests.unit.fakes.library import fake_journalctl, fake_systemd
 from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
@@ -51,7 +52,7 @@ class Bench:
         self.manager.add(options(), active="failed", StatusText="failed: node a: exit code 3")
         self.scope: Scope = ScopeIn(is_user=False, uid=os.getuid(), root=root)
         fake_systemd(patch, self.manager)
-        for module in (about, find):
+        for module in (about, lines_module):
             patch.setattr(module, "check_readable", lambda _scope: None)
 
     def journal(self, *records: bytes) -> Path:

@@ -12,7 +12,7 @@ from dora_systemd.decisions.gateway.page_messages import PageMessage
 from dora_systemd.decisions.gateway.request import Request
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.gateway.live import talk as live_talk
-from dora_systemd.gateway.live.follow import MAX_LINES
+from dora_systemd.gateway.live.lines import MAX_LINES
 from dora_systemd.gateway.live.talk import MAX_TASKS, talk
 from dora_systemd.scope import Scope
 from tests.unit.fakes.library import FakeSystemd, fake_systemd

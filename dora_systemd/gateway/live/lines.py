@@ -1,7 +1,9 @@
-"""Searches the logs of a dataflow for a page: the newest lines that match, within limits."""
+"""The lines of a dataflow for a page, within limits: a stream, or the newest that match."""
 
 import asyncio
 import re
+from collections import deque
+from collections.abc import AsyncGenerator, AsyncIterator
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any
@@ -17,6 +19,11 @@ from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.facts.recorded import find_query
 from dora_systemd.verbs.facts.selector import Selector
 
+FIRST_LINES = 200
+"""Number of older lines that a page gets first."""
+MAX_LINES = 400
+"""Maximum lines in one message: a node can write more than anyone can read."""
+PAUSE_SECONDS = 0.2
 MAX_FOUND = 1000
 """Maximum lines of a search: as many as a page keeps."""
 MAX_SAVED = 50_000
@@ -42,6 +49,47 @@ def log_query(scope: Scope, message: PageMessage) -> LogQuery:
         query = LogQuery(scope, name=wanted.loaded(cells).name)
     nodes = (message.node,) if message.node else ()
     return replace(query, nodes=nodes, want_unprintable=True, output="export")
+
+
+async def follow_lines(
+    scope: Scope, message: PageMessage
+) -> AsyncGenerator[tuple[Lines, int], None]:
+    """New lines in batches, and how many lines before each batch were left out.
+
+    Raises DoraSystemdError if the dataflow does not exist or the journal is not readable.
+    """
+    query = await asyncio.to_thread(log_query, scope, message)
+    query = replace(query, tail=str(FIRST_LINES), is_follow=True)
+    arguments = [f"--output-fields={LOG_FIELDS}", *query_arguments(query)]
+    async with open_stream(arguments) as (child, stream):
+        async for lines in _batches(stream):
+            yield lines
+        end_journalctl(child)
+
+
+async def _batches(stream: asyncio.StreamReader) -> AsyncIterator[tuple[Lines, int]]:
+    """Batches of the lines of PAUSE_SECONDS each, until the stream ends."""
+    newest: deque[dict[str, bytes]] = deque(maxlen=MAX_LINES)
+    reader = ExportReader()
+    while data := await stream.read(_CHUNK):
+        count, until = 0, asyncio.get_running_loop().time() + PAUSE_SECONDS
+        while data:
+            records = reader.feed(data)
+            newest.extend(records)
+            count += len(records)
+            data = await _read_until(stream, until)
+        if newest:
+            yield list(map(line_values, newest)), count - len(newest)
+        newest.clear()
+
+
+async def _read_until(stream: asyncio.StreamReader, until: float) -> bytes:
+    """The bytes that arrive up to that time of the loop, or b""."""
+    try:
+        async with asyncio.timeout_at(until):
+            return await stream.read(_CHUNK)
+    except TimeoutError:
+        return b""
 
 
 async def find_lines(scope: Scope, message: PageMessage, most: int) -> tuple[Lines, bool]:
