@@ -19,17 +19,12 @@ from typing import Any
 from dora_systemd.adapters.dora.check import DoraCheck
 from dora_systemd.adapters.dora.control import read_coordinator
 from dora_systemd.adapters.dora.engine import Child
-from dora_systemd.adapters.dora.preparation import (
-    Prepared,
-    check_named_nodes,
-    prepare,
-    with_changes,
-)
+from dora_systemd.adapters.dora.preparation import Prepared, check_named_nodes, prepare
 from dora_systemd.adapters.host import fd_store, notify
 from dora_systemd.adapters.journal.socket import JournalSocket
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.adapters.runner_socket.listener import serve
-from dora_systemd.decisions.cell.environment import node_environment
+from dora_systemd.decisions.cell.environment import node_environment, with_changes
 from dora_systemd.decisions.cell.launch import kinds
 from dora_systemd.decisions.cell.options import RunnerOptions, parse_runner_argv
 from dora_systemd.decisions.descriptor.wiring import downstream_of

@@ -8,14 +8,9 @@ from typing import Any
 
 from dora_systemd.adapters.dora.command import run_dora
 from dora_systemd.adapters.host import files
-from dora_systemd.decisions.cell.hot_reload import CHANGE_VARIABLE, check_reload_nodes
+from dora_systemd.decisions.cell.hot_reload import check_reload_nodes
 from dora_systemd.decisions.cell.launch import LaunchPlan, launch_descriptor
-from dora_systemd.decisions.cell.limits import (
-    CHANGES_VARIABLE,
-    check_nodes,
-    merge_node_limits,
-    parse_changes,
-)
+from dora_systemd.decisions.cell.limits import check_nodes
 from dora_systemd.decisions.cell.line_rates import check_rates
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.restarts import check_restart_nodes
@@ -29,7 +24,6 @@ from dora_systemd.decisions.descriptor.nodes import UNEXPANDED, NodeKind
 from dora_systemd.decisions.dora.errors import parse_dora_error
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.programs import own_account
-from dora_systemd.values import format_bool, parse_bool
 
 PACKAGE = Path(__file__).parents[2]
 
@@ -80,14 +74,6 @@ def _check_limited(options: RunnerOptions, dataflow: Dataflow) -> None:
     dynamic = [node.id for node in dataflow.nodes if node.kind is NodeKind.DYNAMIC]
     check_nodes(options.node_limits, ids, dynamic)
     check_restart_nodes(options.node_restarts, ids)
-
-
-def with_changes(options: RunnerOptions, environment: Mapping[str, str]) -> RunnerOptions:
-    """The options, with the changes that `doractl set` has made since the unit was created."""
-    changes = parse_changes(environment.get(CHANGES_VARIABLE, ""))
-    limits = merge_node_limits(options.node_limits, changes)
-    is_on = parse_bool(environment.get(CHANGE_VARIABLE) or format_bool(options.hot_reload))
-    return options._replace(node_limits=limits, reload=options.reload._replace(is_on=is_on))
 
 
 def load_dataflow(options: RunnerOptions) -> Dataflow:

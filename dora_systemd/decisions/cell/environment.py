@@ -4,9 +4,10 @@ import re
 from collections.abc import Mapping
 
 from dora_systemd.decisions.cell.hot_reload import CHANGE_VARIABLE
-from dora_systemd.decisions.cell.limits import CHANGES_VARIABLE
+from dora_systemd.decisions.cell.limits import CHANGES_VARIABLE, merge_node_limits, parse_changes
+from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.values import quoted, shown
+from dora_systemd.values import format_bool, parse_bool, quoted, shown
 
 MAX_ENTRY = 128 * 1024 - 1
 """Maximum bytes of one `KEY=VALUE`: execve(2) refuses a longer one (MAX_ARG_STRLEN) with its NUL.
@@ -36,6 +37,17 @@ _QUOTED = re.compile(r"""'(?P<single>[^']*)'|"(?P<double>(?:[^"\\]|\\.)*)"|\\(?P
 def node_environment(environment: Mapping[str, str]) -> dict[str, str]:
     """The runner's environment without the variables that systemd sets."""
     return {key: text for key, text in environment.items() if key not in MANAGER_VARIABLES}
+
+
+def with_changes(options: RunnerOptions, environment: Mapping[str, str]) -> RunnerOptions:
+    """The options, with the changes that `doractl set` has made since the unit was created.
+
+    Raises DoraSystemdError for variables that `doractl set` cannot have written.
+    """
+    changes = parse_changes(environment.get(CHANGES_VARIABLE, ""))
+    limits = merge_node_limits(options.node_limits, changes)
+    is_on = parse_bool(environment.get(CHANGE_VARIABLE) or format_bool(options.hot_reload))
+    return options._replace(node_limits=limits, reload=options.reload._replace(is_on=is_on))
 
 
 def parse_assignment(text: str) -> tuple[str, str]:

@@ -3,17 +3,10 @@
 from collections.abc import Mapping
 from typing import Any
 
-from dora_systemd.decisions.cell.hot_reload import CHANGE_VARIABLE
-from dora_systemd.decisions.cell.limits import (
-    CHANGES_VARIABLE,
-    LIMITS,
-    Limit,
-    format_node_limits,
-    merge_node_limits,
-    parse_changes,
-)
+from dora_systemd.decisions.cell.environment import with_changes
+from dora_systemd.decisions.cell.limits import LIMITS, Limit, format_node_limits
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.values import INFINITY, format_bool, parse_bool
+from dora_systemd.values import INFINITY
 
 _LEVEL = ("NoNewPrivileges", "MemoryDenyWriteExecute")
 _NETWORK = ("PrivateNetwork", "IPAddressDeny")
@@ -34,14 +27,12 @@ def fact_values(options: RunnerOptions, unit: Mapping[str, Any]) -> dict[str, An
     unit: its PROPERTIES. Raises DoraSystemdError for an Environment= that is not ours.
     """
     environment = dict(one.partition("=")[::2] for one in unit["Environment"] or ())
-    changes = parse_changes(environment.get(CHANGES_VARIABLE, ""))
-    switch = environment.get(CHANGE_VARIABLE) or format_bool(options.hot_reload)
+    now = with_changes(options, environment)
     limits = {one: unit[_read_as(one)] for one in LIMITS}
-    nodes = merge_node_limits(options.node_limits, changes)
     return {
         **{one.key: one.format(value) for one, value in limits.items() if _is_set(value)},
-        "node_limit": list(map(format_node_limits, nodes)),
-        "hot_reload": parse_bool(switch),
+        "node_limit": list(map(format_node_limits, now.node_limits)),
+        "hot_reload": now.hot_reload,
         "sandbox": _level(unit),
         "network": _network(unit),
     }

@@ -207,8 +207,7 @@ def test_root_is_needed_for_others(place: Place, monkeypatch: pytest.MonkeyPatch
 
 
 def test_the_runner_is_told() -> None:
-    from dora_systemd.adapters.dora.preparation import with_changes
-    from dora_systemd.decisions.cell.environment import node_environment
+    from dora_systemd.decisions.cell.environment import node_environment, with_changes
 
     before = options(node_limits=(parse_node_limits("camera:cpu=1,memory=1G"),))
     variables = {"DORA_SYSTEMD_NODE_LIMITS": "camera:memory=2G ui:tasks=9"}
