@@ -92,12 +92,8 @@ class Connection:
             while True:
                 yield await self._socket.recv()
 
-    async def close(self) -> None:
-        """Close at once, because the peer may be dead or hang."""
-        self.abort()
-
     def abort(self) -> None:
-        """Close at once, without waiting."""
+        """Close at once, because the peer may be dead or hang."""
         self._socket.abort()
 
 

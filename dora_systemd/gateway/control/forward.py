@@ -73,7 +73,7 @@ async def subscribe_topics(talk: Talk, request: Request) -> Result:
         ident = _subscription(reply)
         talk.after_reply(_pass_frames(talk, ident, connection))
     except BaseException:
-        await connection.close()
+        connection.abort()
         raise
     talk.topics[ident] = connection
     return _answer(reply, run, cell.uuid)
@@ -93,7 +93,7 @@ async def unsubscribe_topics(talk: Talk, request: Request) -> Result:
     connection = talk.topics.pop(ident, None)
     if connection is None:
         raise DoraSystemdError("cannot unsubscribe: no such subscription", "", ExitCode.NOT_FOUND)
-    await connection.close()
+    connection.abort()
     return {"unsubscribed": True, "subscription_id": ident}
 
 
@@ -102,7 +102,7 @@ async def _pass_frames(talk: Talk, ident: str, connection: Connection) -> None:
         async for frame in connection.frames():
             await talk.socket.send(frame)
     finally:
-        await connection.close()
+        connection.abort()
     if talk.topics.pop(ident, None) is not None:  # the dataflow has ended
         await talk.socket.close(_GOING_AWAY, "the dataflow has ended")
 
@@ -130,7 +130,7 @@ async def _ask(scope: Scope, cell: Cell, params: Params) -> Reply:
     try:
         return await connection.request(params)
     finally:
-        await connection.close()
+        connection.abort()
 
 
 def _answer(reply: Reply, run: str, uuid: str) -> Result:

@@ -106,7 +106,7 @@ class Engine:
         try:
             return await connection.request(params, seconds)
         finally:
-            await connection.close()
+            connection.abort()
 
     async def connect(self) -> control.Connection:
         """Open a new connection to the coordinator."""
