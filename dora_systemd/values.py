@@ -60,6 +60,11 @@ def shown(text: str) -> str:
     return text if text.isprintable() and text.strip() == text and text else quoted(text)
 
 
+def scalar_text(value: object) -> str:
+    """A YAML scalar as the author and dora see it: true, 1, 0.5, text."""
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
 def parse_size(text: str) -> int:
     """Bytes; K, M, G, T, P and E are powers of 1024 as in systemd.resource-control(5)."""
     if text.strip() == "infinity":

@@ -6,7 +6,7 @@ from enum import StrEnum
 
 from dora_systemd.decisions.descriptor.json_size import refusal
 from dora_systemd.names import MAX_NODE_ID, NODE_ID, did_you_mean
-from dora_systemd.values import quoted
+from dora_systemd.values import quoted, scalar_text
 
 _RESERVED_IDS = frozenset({"dora"})
 _OUTPUT_KEYS = ("send_stdout_as", "send_logs_as", "min_log_level")
@@ -116,14 +116,14 @@ def _parse_id(node_id: object, place: int, source: str) -> str:
     if not isinstance(node_id, str):
         hint = f'in quotes it is text: id: "{node_id}"'
         raise refusal(source, f"the id of {what} is {described(node_id)}", hint)
-    hint = "an id is letters, digits, '_', '-' and '.', and begins with no '.'"
+    hint = ""
     if not NODE_ID.fullmatch(node_id):
-        raise refusal(source, f"{what} has the id {quoted(node_id)}", hint)
-    if node_id in _RESERVED_IDS:
+        hint = "an id is letters, digits, '_', '-' and '.', and begins with no '.'"
+    elif node_id in _RESERVED_IDS:
         hint = "'dora' stands for dora's own sources, such as dora/timer"
-        raise refusal(source, f"{what} has the id {quoted(node_id)}", hint)
-    if len(node_id) > MAX_NODE_ID:
+    elif len(node_id) > MAX_NODE_ID:
         hint = f"an id has at most {MAX_NODE_ID} characters: it names a cgroup"
+    if hint:
         raise refusal(source, f"{what} has the id {quoted(node_id)}", hint)
     return node_id
 
@@ -173,9 +173,7 @@ def _outputs(node: Mapping[str, object], source: str, what: str) -> Iterator[str
 
 def text_of(value: object) -> str:
     """Text as dora reads it: dora accepts numbers and booleans as text."""
-    if value is None or isinstance(value, dict | list):
-        return ""
-    return str(value).lower() if isinstance(value, bool) else str(value)
+    return "" if value is None or isinstance(value, dict | list) else scalar_text(value)
 
 
 def mapping_of(value: object, source: str, what: str) -> Mapping[str, object]:

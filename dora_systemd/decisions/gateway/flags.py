@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from dora_systemd.decisions.gateway.frames import Request
+from dora_systemd.values import scalar_text
 
 
 def sent_flags(request: Request, written: Mapping[str, Any]) -> dict[str, object]:
@@ -30,14 +31,10 @@ def sent_flags(request: Request, written: Mapping[str, Any]) -> dict[str, object
 
 def _changed_env(sent: Mapping[str, Any], written: Mapping[str, Any]) -> tuple[str, ...]:
     # As text: dora sends the number 5 for "5".
-    old = {key: _env_text(value) for key, value in written.items()}
-    new = {key: _env_text(value) for key, value in sent.items()}
+    old = {key: scalar_text(value) for key, value in written.items()}
+    new = {key: scalar_text(value) for key, value in sent.items()}
     return tuple(f"{key}={value}" for key, value in new.items() if old.get(key) != value)
 
 
 def _mapping(value: object) -> Mapping[str, Any]:
     return value if isinstance(value, Mapping) else {}
-
-
-def _env_text(value: object) -> str:
-    return str(value).lower() if isinstance(value, bool) else str(value)

@@ -7,9 +7,9 @@ from typing import Any
 
 from dora_systemd.decisions.properties.assignments import typed
 from dora_systemd.decisions.properties.kinds import Property
-from dora_systemd.decisions.settings.kinds import PATH, Base, Kind, Setting, scalar_text, texts_of
+from dora_systemd.decisions.settings.kinds import PATH, Base, Kind, Setting, texts_of
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.values import quoted
+from dora_systemd.values import quoted, scalar_text
 
 MAX_SIZE = 1024 * 1024
 """Maximum bytes of all credentials of a unit together; the limit of systemd."""

@@ -13,7 +13,14 @@ from dora_systemd.decisions.cell.environment import (
 )
 from dora_systemd.decisions.cell.line_rates import format_rates, parse_rates
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.values import format_bool, format_duration, parse_bool, parse_duration, quoted
+from dora_systemd.values import (
+    format_bool,
+    format_duration,
+    parse_bool,
+    parse_duration,
+    quoted,
+    scalar_text,
+)
 
 T = TypeVar("T")
 Scalar = str | int | float | bool
@@ -78,11 +85,6 @@ class Setting(Generic[T]):
         object.__setattr__(self, "flags", self.flags or (f"--{word}",))
         object.__setattr__(self, "variable", self.variable or variable)
         object.__setattr__(self, "metavar", self.metavar or self.kind.metavar)
-
-
-def scalar_text(value: Scalar) -> str:
-    """A YAML scalar as the author sees it: true, 1, 0.5, text."""
-    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def listed(value: Any) -> Sequence[Any]:

@@ -62,11 +62,18 @@ def size_warnings(
 ) -> tuple[str, ...]:
     """A warning for each limit above the machine's size. limits: of the dataflow, by word."""
     own = {word: value for word, value in limits.items() if value is not None}
-    found = list(_too_large("the dataflow", own, machine))
+    whole = {word: own[word] for word in ("memory", "cpu", "tasks") if word in own}
+    there = {
+        "memory": machine.memory,
+        "memory-high": machine.memory,
+        "cpu": machine.cores * SECOND,
+        "tasks": machine.tasks,
+    }
+    found = [*_above("the dataflow", own, there, "this machine has")]
     for one in nodes:
-        of_node = dict(one.limits)
-        found += _too_large(f"the node {one.node}", of_node, machine)
-        found += _above_whole(one.node, of_node, own)
+        whose, of_node = f"the node {one.node}", dict(one.limits)
+        found += _above(whose, of_node, there, "this machine has")
+        found += _above(whose, of_node, whole, "the dataflow may use")
     return tuple(found)
 
 
@@ -91,30 +98,14 @@ def check_use(
             )
 
 
-def _too_large(whose: str, limits: Mapping[str, int], machine: Machine) -> Iterator[str]:
-    there = {
-        "memory": machine.memory,
-        "memory-high": machine.memory,
-        "cpu": machine.cores * SECOND,
-        "tasks": machine.tasks,
-    }
-    for word, most in there.items():
+def _above(
+    whose: str, limits: Mapping[str, int], bounds: Mapping[str, int], there: str
+) -> Iterator[str]:
+    for word, most in bounds.items():
         value = limits.get(word, 0)
         if most < value < INFINITY:
-            yield (
-                f"the limit {word}={_shown(word, value)} of {whose} is more than this machine "
-                f"has: {_shown(word, most)}"
-            )
-
-
-def _above_whole(node: str, limits: Mapping[str, int], whole: Mapping[str, int]) -> Iterator[str]:
-    for word in ("memory", "cpu", "tasks"):
-        most = whole.get(word, INFINITY)
-        if most < limits.get(word, 0) < INFINITY:
-            yield (
-                f"the limit {word}={_shown(word, limits[word])} of the node {node} is more than "
-                f"the dataflow may use: {_shown(word, most)}"
-            )
+            limit = f"the limit {word}={_shown(word, value)} of {whose}"
+            yield f"{limit} is more than {there}: {_shown(word, most)}"
 
 
 def _shown(word: str, value: int) -> str:
