@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 from dora_systemd.errors import DoraSystemdError
 
@@ -53,19 +52,13 @@ class CellPaths:
         return self.io / f"{node}.pid"
 
 
-class UnitDirectories(NamedTuple):
-    """The directory of the admin's (or user's) unit files, and the one that a reboot empties."""
-
-    persistent: str
-    runtime: str
-
-
 def unit_directories(
     search_path: Sequence[str], is_user: bool, runtime_root: str
-) -> UnitDirectories:
-    """The two directories of a manager, from its property UnitPath.
+) -> tuple[str, str]:
+    """The directory of the admin's (or user's) unit files, and the one that a reboot empties.
 
-    runtime_root: a reboot empties everything below it. Raises DoraSystemdError.
+    search_path: the manager's property UnitPath. runtime_root: a reboot empties everything below
+    it. Raises DoraSystemdError.
     """
     ending = "/systemd/user" if is_user else "/systemd/system"
     fleeting = ("/run/", f"{runtime_root}/")
@@ -73,4 +66,4 @@ def unit_directories(
     lasting = next((one for one in places if not one.startswith(fleeting)), None)
     if lasting is None:
         raise DoraSystemdError(f"cannot find a directory {ending} for unit files", _UNIT_PATH_HINT)
-    return UnitDirectories(lasting, runtime_root + ending)
+    return lasting, runtime_root + ending

@@ -9,8 +9,12 @@ from dora_systemd.adapters.bus.manager import JOB_DONE, Manager
 from dora_systemd.adapters.host.loopback import port_error
 from dora_systemd.adapters.host.process_table import read_processes, socket_owners
 from dora_systemd.adapters.host.unit_files import put_unit_file, read_unit_file
-from dora_systemd.decisions.gateway.place import ADDRESS, DEFAULT_PORT, SERVICE_UNIT, SOCKET_UNIT
-from dora_systemd.decisions.gateway.port import port_drop_in
+from dora_systemd.decisions.gateway.place import (
+    DEFAULT_PORT,
+    SERVICE_UNIT,
+    SOCKET_UNIT,
+    port_drop_in,
+)
 from dora_systemd.decisions.unit.file import BOOT_TARGET
 from dora_systemd.decisions.unit.setup_files import gateway_files
 from dora_systemd.decisions.views.diagnosis import Process
@@ -89,7 +93,7 @@ def _write_units(manager: Manager, scope: Scope, port: int | None) -> bool:
     if facts["LoadState"] != "loaded" or Path(facts["FragmentPath"]) in units:
         files = gateway_files(scope.is_user)
         texts |= {path: text_of(file) for path, file in zip(units, files, strict=True)}
-    texts[port_file] = None if port is None else port_drop_in(ADDRESS, port)
+    texts[port_file] = None if port is None else port_drop_in(port)
     changed = [path for path, text in texts.items() if read_unit_file(path) != text]
     for path in changed:
         put_unit_file(path, texts[path])

@@ -6,8 +6,7 @@ import click
 
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import acting_options, current_scope, print_outcomes, tell
-from dora_systemd.decisions.gateway.place import SOCKET_UNIT
-from dora_systemd.decisions.gateway.port import wanted_port
+from dora_systemd.decisions.gateway.place import SOCKET_UNIT, wanted_port
 from dora_systemd.decisions.views.outcome import Outcome, Thing
 from dora_systemd.verbs.gateway import check_answer, read_gateway
 from dora_systemd.verbs.up import check_machine, open_port, start_boot_target

@@ -135,10 +135,6 @@ class NodeLimits(NamedTuple):
         """The text for each control file of the node's group."""
         return {BY_WORD[word].file: BY_WORD[word].file_text(value) for word, value in self.limits}
 
-    def controllers(self) -> dict[str, str]:
-        """The required controllers, each with the control file of one of the limits."""
-        return {BY_WORD[word].controller(): BY_WORD[word].file for word, _ in self.limits}
-
 
 def node_limits(node: str, limits: Mapping[str, int]) -> NodeLimits:
     """The limits of `node`, by word."""

@@ -1,9 +1,12 @@
 """The units of the gateway, its port, and the file of its token."""
 
 import posixpath
+from collections.abc import Mapping
 from pathlib import Path
 
+from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
+from dora_systemd.values import quoted
 
 SOCKET_UNIT = "dora-gateway.socket"
 SERVICE_UNIT = "dora-gateway.service"
@@ -15,6 +18,12 @@ DEFAULT_PORT = 53290
 DIRECTORY_NAME = "dora-systemd-gateway"
 """RuntimeDirectory= of both units."""
 
+PORT_VARIABLE = "DORA_DAEMON_PORT"
+ADDRESS_VARIABLE = "DORA_COORDINATOR_ADDR"
+
+_LOOPBACK = ("localhost", ADDRESS)
+_REMOTE_HINT = "the gateway is for this machine; from another one: ssh -L PORT:127.0.0.1:PORT HOST"
+
 
 def token_path(scope: Scope) -> Path:
     """The file (mode 0600) of the token that callers of other users need."""
@@ -24,3 +33,41 @@ def token_path(scope: Scope) -> Path:
 def is_directory_of_user(directory: str) -> bool:
     """Whether the RuntimeDirectory of a unit belongs to a user's manager."""
     return posixpath.normpath(directory).startswith("/run/user/")
+
+
+def wanted_port(option: int | None, environ: Mapping[str, str]) -> int | None:
+    """The requested port, or None.
+
+    Raises DoraSystemdError (USAGE) for variables that do not mean a port of 127.0.0.1.
+    """
+    address = environ.get(ADDRESS_VARIABLE, "")
+    host, _, port = address.partition(":") if address.count(":") < 2 else (address, "", "")
+    if address and host not in _LOOPBACK:
+        message = f"cannot listen where {ADDRESS_VARIABLE} says: {quoted(address)} is not 127.0.0.1"
+        raise DoraSystemdError(message, _REMOTE_HINT, ExitCode.USAGE)
+    from_port = _parse(PORT_VARIABLE, environ.get(PORT_VARIABLE, ""))
+    from_address = _parse(ADDRESS_VARIABLE, port)
+    return next((one for one in (option, from_port, from_address) if one is not None), None)
+
+
+def port_of(listen: object) -> int | None:
+    """The first TCP port in Listen of a socket unit, see org.freedesktop.systemd1(5)."""
+    if not isinstance(listen, list | tuple):
+        return None
+    ports = (str(one[1]).rpartition(":")[2] for one in listen if one[0] == "Stream")
+    return next((int(port) for port in ports if port.isdecimal()), None)
+
+
+def port_drop_in(port: int) -> str:
+    """A drop-in for the gateway's socket."""
+    listen = f"ListenStream=\nListenStream={ADDRESS}:{port}\n"
+    return f"# Written by doractl(1) for up --port.\n[Socket]\n{listen}"
+
+
+def _parse(variable: str, text: str) -> int | None:
+    if not text:
+        return None
+    if not (text.isascii() and text.isdecimal() and 0 < int(text[:6]) < 65536):
+        message = f"cannot read {variable}: {quoted(text)} is not a port"
+        raise DoraSystemdError(message, "a port is 1 to 65535", ExitCode.USAGE)
+    return int(text)

@@ -10,7 +10,7 @@ import pytest
 
 from dora_systemd.adapters.host import files
 from dora_systemd.cli.group import VERBS, doractl
-from dora_systemd.decisions.gateway.port import ADDRESS_VARIABLE, PORT_VARIABLE
+from dora_systemd.decisions.gateway.place import ADDRESS_VARIABLE, PORT_VARIABLE
 from dora_systemd.decisions.life.states import RunnerExit
 from dora_systemd.decisions.logs.events import EVENTS
 from dora_systemd.decisions.settings.kinds import Setting

@@ -16,7 +16,7 @@ from dora_systemd.decisions.unit.file import (
 )
 from dora_systemd.decisions.unit.properties import UnitContext, format_unit, unit_properties
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.paths import UnitDirectories, unit_directories
+from dora_systemd.paths import unit_directories
 from tests.unit.fakes.manager import UUID, options
 
 texts = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]), max_size=30)
@@ -170,10 +170,11 @@ USER: Any = ["/home/a/.config/systemd/user", "/etc/systemd/user", "/run/user/100
 
 def test_directories() -> None:
     more = ["/run/systemd/system", "/usr/lib/systemd/system"]
-    assert unit_directories([*SYSTEM, *more], False, "/run") == UnitDirectories(
-        "/etc/systemd/system", "/run/systemd/system"
+    assert unit_directories([*SYSTEM, *more], False, "/run") == (
+        "/etc/systemd/system",
+        "/run/systemd/system",
     )
-    assert unit_directories(USER, True, "/run/user/1000") == UnitDirectories(USER[0], USER[2])
+    assert unit_directories(USER, True, "/run/user/1000") == (USER[0], USER[2])
     with pytest.raises(DoraSystemdError, match="systemd/user"):
         unit_directories(SYSTEM, True, "/run/user/1000")
 

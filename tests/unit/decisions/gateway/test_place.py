@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import pytest
 
-from dora_systemd.decisions.gateway.port import port_drop_in, port_of, wanted_port
+from dora_systemd.decisions.gateway.place import port_drop_in, port_of, wanted_port
 from dora_systemd.errors import DoraSystemdError, ExitCode
 
 
@@ -55,5 +55,5 @@ def test_listen_property() -> None:
 
 
 def test_drop_in_replaces_the_address() -> None:
-    lines = port_drop_in("127.0.0.1", 53291).splitlines()
+    lines = port_drop_in(53291).splitlines()
     assert lines[1:] == ["[Socket]", "ListenStream=", "ListenStream=127.0.0.1:53291"]
