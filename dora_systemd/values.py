@@ -6,6 +6,7 @@ message, and keep the hint.
 """
 
 import re
+import time
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
 
@@ -146,6 +147,12 @@ def format_cpu(share: int) -> str:
         return "infinity"
     whole, hundredths = divmod(share // _CPU_STEP, 100)
     return f"{whole}.{hundredths:02}".rstrip("0").rstrip(".") + "%"
+
+
+def format_moment(at_us: int) -> str:
+    """`at_us` (CLOCK_REALTIME µs) in ISO 8601 and UTC, such as "2026-11-20T18:00:00.000017Z"."""
+    seconds, rest = divmod(at_us, SECOND)
+    return f"{time.strftime('%Y-%m-%dT%H:%M:%S', time.gmtime(seconds))}.{rest:06}Z"
 
 
 def parse_bool(text: str) -> bool:

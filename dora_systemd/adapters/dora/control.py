@@ -3,7 +3,7 @@
 import asyncio
 import json
 from collections.abc import AsyncIterator, Callable
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -92,7 +92,7 @@ class Connection:
             while True:
                 yield await self._socket.recv()
 
-    def abort(self) -> None:
+    def close(self) -> None:
         """Close at once, because the peer may be dead or hang."""
         self._socket.abort()
 
@@ -112,10 +112,8 @@ def request(
                 connection = await Connection.over(stream, token)
         except TimeoutError as error:
             raise _silent(params, error) from error
-        try:
+        with closing(connection):
             return await connection.request(params, seconds)
-        finally:
-            connection.abort()
 
     with stream:
         return asyncio.run(ask())

@@ -38,7 +38,6 @@ It receives:
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from typing import Any
 
 from dora_systemd.decisions.cell.limits import BY_KEY
@@ -46,7 +45,7 @@ from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.logs.records import Record, record_text
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.terminal_text import escaped, one_line, without_sequences
-from dora_systemd.values import SECOND
+from dora_systemd.values import format_moment
 
 TYPES = ("follow", "find", "save", "unfollow", "graph", "about", "ended", "act")
 ACTIONS = ("stop", "start", "restart", "enable", "disable", "reload", "set")
@@ -132,10 +131,8 @@ def _printable(text: str) -> str:
 
 def saved_line(line: Mapping[str, Any]) -> str:
     """A line of line_values() in a file, with the time in UTC."""
-    seconds, rest = divmod(line["at_us"], SECOND)
-    at = datetime.fromtimestamp(seconds, UTC).replace(microsecond=rest, tzinfo=None)
-    stamp = at.isoformat(timespec="microseconds")
-    return f"{stamp}Z {line['node'] or 'dataflow'}: {one_line(line['text'])}\n"
+    origin = line["node"] or "dataflow"
+    return f"{format_moment(line['at_us'])} {origin}: {one_line(line['text'])}\n"
 
 
 def shown_values(value: Any) -> Any:

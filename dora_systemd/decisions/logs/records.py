@@ -2,11 +2,11 @@
 
 import json
 from collections.abc import Mapping
-from datetime import UTC, datetime
+from datetime import datetime
 from typing import Any
 
 from dora_systemd.terminal_text import shown_log
-from dora_systemd.values import SECOND
+from dora_systemd.values import format_moment
 
 Record = Mapping[str, bytes]
 """An entry of the journal in the export format."""
@@ -90,6 +90,4 @@ def record_text(record: Record, name: str) -> str:
 
 def timestamp(record: Record) -> str:
     """When journald got it, as in RFC 3339, in UTC."""
-    at_us = int(record.get("__REALTIME_TIMESTAMP", b"0"))
-    moment = datetime.fromtimestamp(at_us // SECOND, UTC).replace(microsecond=at_us % SECOND)
-    return moment.isoformat(timespec="microseconds").replace("+00:00", "Z")
+    return format_moment(int(record.get("__REALTIME_TIMESTAMP", b"0")))

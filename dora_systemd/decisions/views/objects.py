@@ -5,14 +5,13 @@ What is unknown is None, and becomes null. Units are in the keys. A point in tim
 """
 
 import json
-import time
 from collections.abc import Mapping
 from typing import Any
 
 from dora_systemd.decisions.cell.status import WHOLE_CELL
 from dora_systemd.decisions.views.dataflows import DataflowRow, NodeRow
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.values import SECOND
+from dora_systemd.values import format_moment
 
 SCHEMA = 1
 """The version of all objects. New keys leave it; anything else makes it one more."""
@@ -35,9 +34,7 @@ def moment(key: str, at_us: int) -> dict[str, Any]:
     """A point in time in both forms; at_us: CLOCK_REALTIME µs, 0 is unknown."""
     if not at_us:
         return {key: None, f"{key}_us": None}
-    seconds, rest = divmod(at_us, SECOND)
-    text = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(seconds))
-    return {key: f"{text}.{rest:06}Z", f"{key}_us": at_us}
+    return {key: format_moment(at_us), f"{key}_us": at_us}
 
 
 def dataflow_object(row: DataflowRow, waits: Mapping[str, Shares] | None = None) -> dict[str, Any]:

@@ -6,7 +6,7 @@ with the id of a subscription, which each coordinator chooses itself.
 """
 
 import asyncio
-from contextlib import suppress
+from contextlib import closing, suppress
 from typing import Any
 
 from dora_systemd.adapters.dora.control import Connection
@@ -73,7 +73,7 @@ async def subscribe_topics(talk: Talk, request: Request) -> Result:
         ident = _subscription(reply)
         talk.after_reply(_pass_frames(talk, ident, connection))
     except BaseException:
-        connection.abort()
+        connection.close()
         raise
     talk.topics[ident] = connection
     return _answer(reply, run, cell.uuid)
@@ -93,16 +93,14 @@ async def unsubscribe_topics(talk: Talk, request: Request) -> Result:
     connection = talk.topics.pop(ident, None)
     if connection is None:
         raise DoraSystemdError("cannot unsubscribe: no such subscription", "", ExitCode.NOT_FOUND)
-    connection.abort()
+    connection.close()
     return {"unsubscribed": True, "subscription_id": ident}
 
 
 async def _pass_frames(talk: Talk, ident: str, connection: Connection) -> None:
-    try:
+    with closing(connection):
         async for frame in connection.frames():
             await talk.socket.send(frame)
-    finally:
-        connection.abort()
     if talk.topics.pop(ident, None) is not None:  # the dataflow has ended
         await talk.socket.close(_GOING_AWAY, "the dataflow has ended")
 
@@ -126,11 +124,8 @@ async def _open(scope: Scope, cell: Cell) -> Connection:
 
 
 async def _ask(scope: Scope, cell: Cell, params: Params) -> Reply:
-    connection = await _open(scope, cell)
-    try:
+    with closing(await _open(scope, cell)) as connection:
         return await connection.request(params)
-    finally:
-        connection.abort()
 
 
 def _answer(reply: Reply, run: str, uuid: str) -> Result:

@@ -5,6 +5,7 @@ import json
 import os
 import signal
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -102,11 +103,8 @@ class Engine:
 
     async def ask_apart(self, params: protocol.Params, seconds: float) -> protocol.Reply:
         """Send a request that may take long, on its own connection, because each is serial."""
-        connection = await self.connect()
-        try:
+        with closing(await self.connect()) as connection:
             return await connection.request(params, seconds)
-        finally:
-            connection.abort()
 
     async def connect(self) -> control.Connection:
         """Open a new connection to the coordinator."""
@@ -125,15 +123,12 @@ class Engine:
         on_record: OnRecord,
     ) -> None:
         """Subscribe to a run, call on_start, and pass its events to on_record until the end."""
-        connection = await self.connect()
-        try:
+        with closing(await self.connect()) as connection:
             reply = await connection.request(protocol.subscribe_params(run))
             if reply.error:
                 raise DoraSystemdError(f"cannot read events of dora: {reply.error}")
             on_start()
             await connection.read_events(on_record)
-        finally:
-            connection.abort()
 
     def dismiss_daemon(self) -> bool:
         """Have the daemon exit properly; False if it has exited already."""
@@ -148,7 +143,7 @@ class Engine:
     def kill(self) -> None:
         """Kill and reap coordinator and daemon, and close the connection."""
         if self._requests is not None:
-            self._requests.abort()
+            self._requests.close()
         for child in self._children.values():
             child.send_signal(signal.SIGKILL)
         for child in self._children.values():
