@@ -17,7 +17,6 @@ from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Protocol
 
 from dora_systemd.adapters.bus.manager import DOWN, Manager
 from dora_systemd.adapters.bus.systemd import Bus
@@ -44,16 +43,6 @@ FIRST_LINES = 10
 _CHUNK = 1 << 18
 
 
-class Watch(Protocol):
-    """The part of UnitWatch that follow_steps uses."""
-
-    def wait(self, seconds: float) -> bool:
-        """Wait for a new record, at most `seconds`; whether there is one."""
-
-    def take_end(self) -> bool:
-        """Whether systemd has logged an end of the unit since the last call."""
-
-
 class UnitWatch(Follower):
     """Watches the journal for new records of a unit and of its end.
 
@@ -67,7 +56,7 @@ class UnitWatch(Follower):
         self._has_ended = False
 
     def wait(self, seconds: float) -> bool:
-        """See Watch."""
+        """Wait for a new record, at most `seconds`; whether there is one."""
         if not self.is_readable(seconds):
             return False
         while data := self.read(_CHUNK):
@@ -77,7 +66,7 @@ class UnitWatch(Follower):
         return True
 
     def take_end(self) -> bool:
-        """See Watch."""
+        """Whether systemd has logged an end of the unit since the last call."""
         ended, self._has_ended = self._has_ended, False
         if ended:
             self._rest = b""
@@ -132,7 +121,9 @@ def _with_cursor(query: LogQuery, cursor: Path) -> LogQuery:
     return replace(query, tail="", since=span.first, until=span.last, cursor_file="")
 
 
-def follow_steps(print_step: Callable[[], object], watch: Watch, is_up: Callable[[], bool]) -> None:
+def follow_steps(
+    print_step: Callable[[], object], watch: UnitWatch, is_up: Callable[[], bool]
+) -> None:
     """Call `print_step` whenever there are new records, and once after the end.
 
     is_up: whether the unit runs or is about to. A record of its end alone does not count, because
@@ -154,7 +145,7 @@ def follow_steps(print_step: Callable[[], object], watch: Watch, is_up: Callable
             time.sleep(max(printed + STEP_SECONDS - time.monotonic(), 0))
 
 
-def _wait_end(watch: Watch) -> None:
+def _wait_end(watch: UnitWatch) -> None:
     """Wait for systemd's record of the unit's end, at most END_SECONDS."""
     deadline = time.monotonic() + END_SECONDS
     while not watch.take_end() and time.monotonic() < deadline:

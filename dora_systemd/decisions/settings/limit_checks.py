@@ -62,7 +62,7 @@ def size_warnings(
 ) -> tuple[str, ...]:
     """A warning for each limit above the machine's size. limits: of the dataflow, by word."""
     own = {word: value for word, value in limits.items() if value is not None}
-    whole = {word: own[word] for word in ("memory", "cpu", "tasks") if word in own}
+    whole: dict[str, int] = {word: own[word] for word in ("memory", "cpu", "tasks") if word in own}
     there = {
         "memory": machine.memory,
         "memory-high": machine.memory,

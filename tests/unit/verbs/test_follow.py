@@ -11,6 +11,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs import follow as follow_module
 from dora_systemd.verbs.follow import (
+    UnitWatch,
     check_until_end,
     first_step,
     follow_steps,
@@ -22,7 +23,7 @@ from tests.unit.fakes.manager import FakeManager, options
 QUERY = LogQuery(Scope(is_user=False, uid=0), name="robot", is_follow=True)
 
 
-class History:
+class History(UnitWatch):
     """What happens, one item for each wait: "line", "end", "" (silence), "up" or "down"."""
 
     def __init__(self, *happens: str) -> None:
