@@ -2,6 +2,7 @@
 
 import os
 import platform
+from collections.abc import Callable
 
 from dora_systemd import __version__
 from dora_systemd.adapters.bus.systemd import Bus
@@ -12,25 +13,17 @@ from dora_systemd.scope import Scope
 
 def read_versions(scope: Scope) -> dict[str, str | None]:
     """Versions by name; None for a program that is missing or unreachable."""
+    path = os.environ.get("PATH", os.defpath)
     return {
         "doractl": __version__,
         "python": platform.python_version(),
-        "systemd": _systemd(scope),
-        "dora": _dora(),
+        "systemd": _found(lambda: Bus(scope, for_reading=True).version()),
+        "dora": _found(lambda: dora_version(find_dora(None, os.environ.get("VIRTUAL_ENV"), path))),
     }
 
 
-def _systemd(scope: Scope) -> str | None:
+def _found(read: Callable[[], str]) -> str | None:
     try:
-        return Bus(scope, for_reading=True).version()
-    except DoraSystemdError:
-        return None
-
-
-def _dora() -> str | None:
-    try:
-        return dora_version(
-            find_dora(None, os.environ.get("VIRTUAL_ENV"), os.environ.get("PATH", os.defpath))
-        )
+        return read()
     except DoraSystemdError:
         return None

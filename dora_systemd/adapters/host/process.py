@@ -68,7 +68,7 @@ def beside(call: Callable[[], T]) -> "Future[T]":
     def run() -> None:
         try:
             future.set_result(call())
-        except Exception as error:
+        except BaseException as error:  # whatever it is, result() must not wait forever
             future.set_exception(error)
 
     Thread(target=run).start()
