@@ -48,3 +48,9 @@ def test_call_beside_raises_where_its_result_is_wanted() -> None:
     call = process.beside(lambda: process.run_command(["/nowhere/x"], 1))
     with pytest.raises(DoraSystemdError, match="cannot run /nowhere/x"):
         call.result()
+
+
+def test_nothing_that_ends_a_call_beside_makes_its_result_wait_forever() -> None:
+    call = process.beside(lambda: sys.exit(3))
+    with pytest.raises(SystemExit):
+        call.result(timeout=30)
