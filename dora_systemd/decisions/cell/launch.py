@@ -145,7 +145,7 @@ def _command(node: Node, directory: str, source: str, plan: LaunchPlan) -> list[
         if not plan.options.allow_shell_nodes:
             hint = "start with --allow-shell-nodes if you trust the dataflow"
             raise _refusal(source, node, "shell nodes are not allowed by default", hint)
-        return ["/bin/sh", "-c", node.args]
+        return ["sh", "-c", node.args]
     program = _find(node, directory, source, plan)
     arguments = _split(node, source)
     if node.kind is NodeKind.EXECUTABLE:

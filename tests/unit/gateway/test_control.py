@@ -262,6 +262,7 @@ def test_descriptors() -> None:
         ("uv run /x/tool -n", "/x/tool", "-n"),
         ("/x/tool -u 5", "/x/tool", "-u 5"),
         ("/bin/sh -c 'echo $X | cat'", "shell", "echo $X | cat"),
+        ("sh -c 'exit 3'", "shell", "exit 3"),
     ],
 )
 def test_a_program_that_is_in_no_file(command: str, path: str, args: str) -> None:
