@@ -368,6 +368,16 @@ def test_what_the_file_says_is_no_flag() -> None:
     assert sent_flags(Request("x", "Start", body), written) == {"env": ("A=b",)}
 
 
+def test_numbers_that_json_cannot_hold() -> None:
+    """The dora command sends null for them, whoever named them."""
+    written = {"env": {"A": "inf", "B": "-NaN", "C": "${X}"}}
+    body = {"dataflow": {"env": {"A": None, "B": None, "C": 1}}}
+    assert sent_flags(Request("x", "Start", body), written) == {"env": ("C=1",)}
+    for env in ({"C": None}, {"D": None}):
+        with pytest.raises(DoraSystemdError, match=f"env '{next(iter(env))}' is infinite"):
+            sent_flags(Request("x", "Start", {"dataflow": {"env": env}}), written)
+
+
 def talk(*frames: str | bytes) -> list[Any]:
     socket = FakeSocket(frames)
     asyncio.run(serve_control(socket, HttpRequest("/api/control", Scope(True, 1000))))
