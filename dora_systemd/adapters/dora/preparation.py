@@ -29,6 +29,7 @@ from dora_systemd.decisions.descriptor.nodes import UNEXPANDED, NodeKind
 from dora_systemd.decisions.dora.errors import parse_dora_error
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.programs import own_account
+from dora_systemd.trust.sight import Sight
 from dora_systemd.values import format_bool, parse_bool
 
 PACKAGE = Path(__file__).parents[2]
@@ -53,11 +54,13 @@ def prepare(options: RunnerOptions, environment: Mapping[str, str]) -> Prepared:
     """
     dataflow = load_dataflow(options)
     _check_limited(options, dataflow)
+    sight = Sight()
     plan = LaunchPlan(
         options,
         str(PACKAGE / "launcher.pl"),
         environment.get("PATH") or os.defpath,
-        os.path.exists,
+        sight.exists,
+        sight.read,
         _load_session(options),
         environment,
     )

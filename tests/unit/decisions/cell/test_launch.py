@@ -40,8 +40,14 @@ FILES = {
 def plan(session: BuildSession | None = None, **changes: Any) -> LaunchPlan:
     options = RunnerOptions("robot", UUID, "/p/flow.yml", "/p", "/usr/bin/dora", **changes)
     return LaunchPlan(
-        options, "/l.sh", "/usr/bin:/bin", FILES.__contains__, session or BuildSession()
+        options, "/l.sh", "/usr/bin:/bin", FILES.__contains__, read, session or BuildSession()
     )
+
+
+def read(path: str) -> bytes:
+    if path not in FILES:
+        raise FileNotFoundError(path)
+    return b""
 
 
 def launch(node: dict[str, Any], given: LaunchPlan | None = None) -> dict[str, Any]:
