@@ -23,6 +23,7 @@ from dora_systemd.adapters.dora.preparation import (
     Prepared,
     check_named_nodes,
     prepare,
+    resolved,
     with_changes,
 )
 from dora_systemd.adapters.host import fd_store, notify
@@ -271,7 +272,7 @@ def run_loop(cell: Coroutine[Any, Any, RunnerExit]) -> RunnerExit:
 def run(argv: list[str], begun: Begun | None) -> int:
     """Run the cell that `argv` describes; the exit status. begun: see run_cell."""
     try:
-        options = with_changes(parse_runner_argv(argv), os.environ)
+        options = resolved(with_changes(parse_runner_argv(argv), os.environ))
         directory = os.environ.get("RUNTIME_DIRECTORY")
         if not directory:
             hint = "it is started by systemd: use `doractl start`"

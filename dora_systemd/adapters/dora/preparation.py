@@ -93,6 +93,16 @@ def with_changes(options: RunnerOptions, environment: Mapping[str, str]) -> Runn
     return options._replace(node_limits=limits, reload=options.reload._replace(is_on=is_on))
 
 
+def resolved(options: RunnerOptions) -> RunnerOptions:
+    """The options with the links and ".." in directories resolved, as dora does: nodes see them.
+
+    The runner does this, because its user may own the links.
+    """
+    dataflow, directory = Path(options.dataflow), os.path.realpath(options.working_directory)
+    file = str(Path(os.path.realpath(dataflow.parent), dataflow.name))
+    return options._replace(dataflow=file, working_directory=directory)
+
+
 def load_dataflow(options: RunnerOptions) -> Dataflow:
     """The dataflow of `options` with modules expanded. Raises DoraSystemdError."""
     path = Path(options.dataflow)

@@ -52,11 +52,11 @@ _SHELL = (
 
 _IDENTS = ("5", "1.10", "true", "null.x", "node", "a-b", "A_b", "x.y.z", "0x10", "output", "-a")
 _NAMES = ("A", "B", "my.var", "MY-VAR", "node", "directory", "output", "last", "IFS")
-_PLAIN = (
+_PLAIN: tuple[str, ...] = (
     *("1", "007", "1.50", "1e3", "0x1F", ".5", "-0.0", "true", "no", "~x", "'~'", "''", "a  b"),
     *("'${CALLER}'", "x$CALLER.y", "'${NONE:-d e}'"),
 )
-_VALUES = (*_PLAIN, "inf", "'-inf'", "NaN", "$$", "a$$b")
+_VALUES: tuple[str, ...] = (*_PLAIN, "inf", "'-inf'", "NaN", "$$", "a$$b")
 """Of `env:`, as in YAML. The caller has CALLER, and no NONE."""
 _ODD = "ab0 \t\n'\"\\$`#*=-;|&ü☕{}[]~%!:,<>?^"
 _PLAIN_ARGS = ("1.50", "007", "0x10", "true", "~", "--a b", "a#b")
@@ -106,7 +106,8 @@ class _Maker:
 
     def value(self) -> str:
         """A variable's, as in YAML."""
-        return self.dice.choice((*(_PLAIN if self.is_plain else _VALUES), _quoted(self.text())))
+        known = _PLAIN if self.is_plain else _VALUES
+        return self.dice.choice([*known, _quoted(self.text())])
 
     def text(self) -> str:
         """Any text. A variable that is not set would be refused."""
@@ -114,7 +115,7 @@ class _Maker:
         return text.replace("$", "" if self.is_plain else "$$")
 
     def args(self) -> str:
-        """A value of `args:`: one of the scalars, or quoted words, in double quotes or a block."""
+        """A value of `args:`: a plain scalar, or words with quotes of the shell."""
         if self.dice.random() < 0.25:
             return self.dice.choice(_PLAIN_ARGS)
         quotes: tuple[Callable[[str], str], ...] = (_single, _double, _escaped, _bare)
