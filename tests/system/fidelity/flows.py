@@ -66,7 +66,8 @@ _LINES = (
 )
 _EXITS = (1, 3, 42, 255, -9, -15)
 """Statuses; below 0, signals."""
-_DIRECTORIES = ("", "./", "sub/", "../project/")
+_DIRECTORIES = {"": "", "./": "", "../project/": "", "sub/": "sub/", "ö d'#/": "ö d'#/"}
+"""As a path begins, and where the file is."""
 
 
 @dataclass(frozen=True)
@@ -171,9 +172,9 @@ def make_flow(seed: int) -> Flow:
 
 def _python_node(maker: _Maker, ident: str) -> str:
     name = f"n{len(maker.files)}.py"
-    directory = maker.dice.choice(_DIRECTORIES)
-    maker.program(("sub/" if directory == "sub/" else "") + name, _NODE, maker.dice.randint(1, 4))
-    return _custom(maker, ident, directory + name)
+    path, place = maker.dice.choice(list(_DIRECTORIES.items()))
+    maker.program(place + name, _NODE, maker.dice.randint(1, 4))
+    return _custom(maker, ident, path + name)
 
 
 def _tool(maker: _Maker, ident: str) -> str:
@@ -183,7 +184,12 @@ def _tool(maker: _Maker, ident: str) -> str:
 
 
 def _custom(maker: _Maker, ident: str, path: str) -> str:
-    keys = [f"id: {ident}", f"path: {path}", f"args: {maker.args()}", f"env: {maker.env()}"]
+    keys = [
+        f"id: {ident}",
+        f"path: {_quoted(path)}",
+        f"args: {maker.args()}",
+        f"env: {maker.env()}",
+    ]
     keys += ["inputs: {tick: dora/timer/millis/50}", "outputs: [words, said]", maker.restarts()]
     keys += maker.dice.choice(([], [], [], ["send_stdout_as: said"]))
     return f"{{{', '.join(filter(None, keys))}}}"
