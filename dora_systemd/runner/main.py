@@ -19,7 +19,12 @@ from typing import Any
 from dora_systemd.adapters.dora.check import DoraCheck
 from dora_systemd.adapters.dora.control import read_coordinator
 from dora_systemd.adapters.dora.engine import Child
-from dora_systemd.adapters.dora.preparation import Prepared, check_named_nodes, prepare
+from dora_systemd.adapters.dora.preparation import (
+    Prepared,
+    check_named_nodes,
+    prepare,
+    resolved,
+)
 from dora_systemd.adapters.host import fd_store, notify
 from dora_systemd.adapters.journal.socket import JournalSocket
 from dora_systemd.adapters.logs.pipes import LogPipes
@@ -266,7 +271,7 @@ def run_loop(cell: Coroutine[Any, Any, RunnerExit]) -> RunnerExit:
 def run(argv: list[str], begun: Begun | None) -> int:
     """Run the cell that `argv` describes; the exit status. begun: see run_cell."""
     try:
-        options = with_changes(parse_runner_argv(argv), os.environ)
+        options = resolved(with_changes(parse_runner_argv(argv), os.environ))
         directory = os.environ.get("RUNTIME_DIRECTORY")
         if not directory:
             hint = "it is started by systemd: use `doractl start`"

@@ -98,6 +98,17 @@ def test_arguments_directory_and_environment(flow: Path) -> None:
         assert chosen(ours[case], keys) == chosen(bare[case], keys), case
 
 
+@pytest.mark.parametrize("way", ["../link", "seen/.."])
+def test_the_directory_is_resolved(flow: Path, way: str) -> None:
+    (flow.parent.parent / "link").symlink_to(flow.parent)
+    path = flow.parent / way / flow.name
+    bare = seen_with(path, "dora", "run")
+    ours = seen_with(path, "doractl", "run", "--name", "fidelity")
+    assert f"{flow.parent}/probe.py" in bare["args-hash"]["argv"]
+    for case, seen in bare.items():
+        assert (ours[case]["argv"], ours[case]["cwd"]) == (seen["argv"], seen["cwd"]), case
+
+
 def test_infinite_numbers_of_yaml(flow: Path) -> None:
     flow.write_text(
         "nodes: [{id: one, path: probe.py, env: {PROBE: one, A: .inf, B: -.inf, C: .nan}}]\n"

@@ -383,6 +383,18 @@ def test_which_file_is_meant(dora: Dora, cell: Cell, places: Sequence[Project]) 
     assert "doractl start FILE" in error
 
 
+def test_numbers_that_dora_cannot_send(dora: Dora, cell: Cell, places: Sequence[Project]) -> None:
+    place = places[0]
+    shown = "import os\nfrom dora import Node\nNode()\nprint(os.environ['A'], os.environ['B'])\n"
+    place.write("one.py", shown)
+    text = "env: {A: inf, B: '${B}'}\nnodes: [{id: one, path: one.py}]\n"
+    words = ("start", str(place.write("dataflow.yml", text)), "--name", cell.name, "--attach")
+    assert "inf 5" in dora(*words, B="5").stdout
+    refused = dora(*words, check=False, B="nan")
+    assert refused.returncode == 1
+    assert "env 'B' is infinite or not a number" in refused.stderr
+
+
 @pytest.mark.warns("control request failed: node `sonk` not found")
 def test_refusals(dora: Dora, three: list[Cell], places: Sequence[Project]) -> None:
     for words, expected in (

@@ -80,6 +80,19 @@ def test_uv(cell: Cell, project: Project) -> None:
     check(cell, "one", project.root)
 
 
+@pytest.mark.warns("before initializing")
+def test_uv_in_a_workspace(cell: Cell, project: Project) -> None:
+    """uv puts .venv and uv.lock beside the pyproject.toml of the workspace."""
+    project.write("apps/robot/one.py", "import sys\nprint('prefix', sys.prefix)\n")
+    project.write("apps/robot/pyproject.toml", '[project]\nname = "robot"\nversion = "1"\n')
+    project.write("pyproject.toml", '[tool.uv.workspace]\nmembers = ["apps/*"]\n')
+    flow = project.write("apps/robot/dataflow.yml", "nodes: [{id: one, path: one.py}]\n")
+    run("chown", "-R", "alice:alice", str(project.root))
+    words = ("--uv", "--env", "UV_OFFLINE=1", "--env", "UV_CACHE_DIR=/tmp/uv")
+    done = cell.doractl("run", str(flow), "--name", cell.name, *words)
+    assert f"prefix {project.root}/.venv" in done.stdout
+
+
 def test_module(cell: Cell, project: Project) -> None:
     project.write("speaker.py", SPEAKER)
     project.write(

@@ -24,6 +24,7 @@ from dora_systemd.decisions.descriptor.nodes import UNEXPANDED, NodeKind
 from dora_systemd.decisions.dora.errors import parse_dora_error
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.programs import own_account
+from dora_systemd.trust.sight import Sight
 
 PACKAGE = Path(__file__).parents[2]
 
@@ -47,11 +48,13 @@ def prepare(options: RunnerOptions, environment: Mapping[str, str]) -> Prepared:
     """
     dataflow = load_dataflow(options)
     _check_limited(options, dataflow)
+    sight = Sight()
     plan = LaunchPlan(
         options,
         str(PACKAGE / "launcher.pl"),
         environment.get("PATH") or os.defpath,
-        os.path.exists,
+        sight.exists,
+        sight.read,
         _load_session(options),
         environment,
     )
@@ -74,6 +77,16 @@ def _check_limited(options: RunnerOptions, dataflow: Dataflow) -> None:
     dynamic = [node.id for node in dataflow.nodes if node.kind is NodeKind.DYNAMIC]
     check_nodes(options.node_limits, ids, dynamic)
     check_restart_nodes(options.node_restarts, ids)
+
+
+def resolved(options: RunnerOptions) -> RunnerOptions:
+    """The options with the links and ".." in directories resolved, as dora does: nodes see them.
+
+    The runner does this, because its user may own the links.
+    """
+    dataflow, directory = Path(options.dataflow), os.path.realpath(options.working_directory)
+    file = str(Path(os.path.realpath(dataflow.parent), dataflow.name))
+    return options._replace(dataflow=file, working_directory=directory)
 
 
 def load_dataflow(options: RunnerOptions) -> Dataflow:

@@ -13,6 +13,7 @@ from typing import Any
 from dora_systemd.decisions.cell.log_backlog import with_bounds
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.restarts import DEFAULT, HELD_KEYS
+from dora_systemd.decisions.cell.uv import Read, uv_project
 from dora_systemd.decisions.descriptor.arguments import split_arguments
 from dora_systemd.decisions.descriptor.build_session import BuildSession
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
@@ -36,13 +37,14 @@ class LaunchPlan:
     """The values to rewrite the descriptor with.
 
     launcher: absolute path of launcher.pl. search_path: PATH of the nodes. exists: whether a file
-    with that absolute path exists. environment: for variables in `env:`.
+    with that absolute path exists. read: its content. environment: for variables in `env:`.
     """
 
     options: RunnerOptions
     launcher: str
     search_path: str
     exists: Callable[[str], bool]
+    read: Read
     session: BuildSession = field(default_factory=BuildSession)
     environment: Mapping[str, str] = field(default_factory=dict)
 
@@ -145,7 +147,7 @@ def _command(node: Node, directory: str, source: str, plan: LaunchPlan) -> list[
         if not plan.options.allow_shell_nodes:
             hint = "start with --allow-shell-nodes if you trust the dataflow"
             raise _refusal(source, node, "shell nodes are not allowed by default", hint)
-        return ["/bin/sh", "-c", node.args]
+        return ["sh", "-c", node.args]
     program = _find(node, directory, source, plan)
     arguments = _split(node, source)
     if node.kind is NodeKind.EXECUTABLE:
@@ -188,15 +190,9 @@ def _find(node: Node, directory: str, source: str, plan: LaunchPlan) -> str:
     raise _refusal(source, node, reason, hint)
 
 
-def uv_project(directory: str, exists: Callable[[str], bool]) -> str | None:
-    """The project that `uv run` uses in `directory`: the nearest one with a pyproject.toml."""
-    places = map(str, (PurePath(directory), *PurePath(directory).parents))
-    return next((one for one in places if exists(str(PurePath(one, "pyproject.toml")))), None)
-
-
 def _uv_places(directory: str, plan: LaunchPlan) -> list[str]:
     """Where `uv run which` looks first, by which dora finds programs."""
-    project = uv_project(directory, plan.exists) if plan.options.uv else None
+    project = uv_project(directory, plan.read) if plan.options.uv else None
     return [str(PurePath(project, ".venv", "bin"))] if project else []
 
 

@@ -144,7 +144,8 @@ def _program(node: Mapping[str, Any]) -> dict[str, str]:
     command = words[5:] if words[3:5] == ["uv", "run"] else words[3:]
     if not launcher.endswith(("/launcher.pl", "/launcher.sh")) or not command:
         return {}
-    if command[:2] == ["/bin/sh", "-c"]:
+    # Runners of older versions wrote /bin/sh.
+    if command[0] in ("sh", "/bin/sh") and command[1:2] == ["-c"]:
         return {"path": "shell", "args": " ".join(command[2:])}
     start = 1 + command.index("-u") if "-u" in command else 0
     # A program may have an argument "-u" as well as Python.

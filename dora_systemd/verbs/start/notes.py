@@ -1,4 +1,4 @@
-"""What people have to know about a dataflow that they have started: nodes by hand, an old build."""
+"""What people have to know about a dataflow that they have started: nodes by hand, a build."""
 
 from collections.abc import Iterator
 
@@ -20,14 +20,17 @@ def plan_notes(scope: Scope, dataflow: Dataflow, launch: LaunchPlan, look: Look)
         nodes = f"node{'s' if len(dynamic) > 1 else ''} {', '.join(dynamic)}"
         variables = f'eval "$(doractl {scope.flag} env {launch.options.name})"'
         yield f"start the dynamic {nodes} in another terminal, after: {variables}"
-    if _is_build_old(dataflow, launch, look):
-        path, uv = shown(dataflow.source), "--uv " if launch.options.uv else ""
+    path, uv = shown(dataflow.source), "--uv " if launch.options.uv else ""
+    if not any(one.build or one.git for one in dataflow.nodes):
+        return
+    # `dora run` always builds first.
+    if not launch.session.directories:
+        yield f"no build of {path} is found; to build it: dora build {uv}{path}"
+    elif _is_build_old(dataflow, look):
         yield f"{path} is newer than its last build; to build again: dora build {uv}{path}"
 
 
-def _is_build_old(dataflow: Dataflow, launch: LaunchPlan, look: Look) -> bool:
-    """Whether the dataflow has changed since `dora build`; `dora run` always builds first."""
-    if not launch.session.directories or not any(one.build or one.git for one in dataflow.nodes):
-        return False
+def _is_build_old(dataflow: Dataflow, look: Look) -> bool:
+    """Whether the dataflow has changed since `dora build`."""
     session = str(session_path(dataflow.source))
     return look.sight.modified_ns(dataflow.source) > look.sight.modified_ns(session)

@@ -125,9 +125,8 @@ def _make_plan(
     called = called_variables(dataflow, request.caller)
     environment = unit_environment(search_path, venv, {**called, **variables})
     check_credentials(scope, credential_files(settings))
-    launch = LaunchPlan(
-        options, "", environment["PATH"], look.sight.exists, look.read_session(path)
-    )
+    sight, session = look.sight, look.read_session(path)
+    launch = LaunchPlan(options, "", environment["PATH"], sight.exists, sight.read, session)
     if not any(node.kind in UNEXPANDED for node in dataflow.nodes):
         # The runner repeats this, but an error here needs no unit.
         check_named_nodes(options, dataflow)

@@ -7,8 +7,9 @@ from pathlib import Path
 
 from dora_systemd.adapters.dora.preparation import PACKAGE, Prepared
 from dora_systemd.adapters.host.files import absolute_path
-from dora_systemd.decisions.cell.launch import python_of, uv_project
+from dora_systemd.decisions.cell.launch import python_of
 from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.uv import uv_project
 from dora_systemd.decisions.properties.sandbox import Sandbox, loose_paths, odd_paths, widened_paths
 from dora_systemd.decisions.settings.limits import DEVICE, REALTIME
 from dora_systemd.decisions.settings.resolve import Settings
@@ -160,5 +161,5 @@ def _written_by_uv(
     if options.uv and user is not None:
         directory = options.working_directory
         # `uv run` brings .venv and uv.lock up to date, beside the pyproject.toml.
-        yield from (Path(one) for one in (directory, uv_project(directory, sight.exists)) if one)
+        yield from (Path(one) for one in (directory, uv_project(directory, sight.read)) if one)
         yield from (Path(user.pw_dir, place) for place in _UV_PLACES)

@@ -262,6 +262,7 @@ def test_descriptors() -> None:
         ("uv run /x/tool -n", "/x/tool", "-n"),
         ("/x/tool -u 5", "/x/tool", "-u 5"),
         ("/bin/sh -c 'echo $X | cat'", "shell", "echo $X | cat"),
+        ("sh -c 'exit 3'", "shell", "exit 3"),
     ],
 )
 def test_a_program_that_is_in_no_file(command: str, path: str, args: str) -> None:
@@ -365,6 +366,16 @@ def test_what_the_file_says_is_no_flag() -> None:
     written = {"exit_when_nodes_finish": True, "env": ["no mapping"]}
     body = {"dataflow": {**written, "env": {"A": "b"}}}
     assert sent_flags(Request("x", "Start", body), written) == {"env": ("A=b",)}
+
+
+def test_numbers_that_json_cannot_hold() -> None:
+    """The dora command sends null for them, whoever named them."""
+    written = {"env": {"A": "inf", "B": "-NaN", "C": "${X}"}}
+    body = {"dataflow": {"env": {"A": None, "B": None, "C": 1}}}
+    assert sent_flags(Request("x", "Start", body), written) == {"env": ("C=1",)}
+    for env in ({"C": None}, {"D": None}):
+        with pytest.raises(DoraSystemdError, match=f"env '{next(iter(env))}' is infinite"):
+            sent_flags(Request("x", "Start", {"dataflow": {"env": env}}), written)
 
 
 def talk(*frames: str | bytes) -> list[Any]:

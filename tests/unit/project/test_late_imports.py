@@ -38,6 +38,7 @@ LATE = {
         "adapters.host.files": {"yaml", "adapters.host.yaml_loader", "tempfile"},
         "cli.verbs.look.logs": {"verbs.follow"},
     },
+    "uv only": {"decisions.cell.uv": {"tomllib"}},
     "hot reload only": {
         "adapters.host.watch": {"watchfiles"},
         "decisions.reload.watch_rules": {"pathspec"},

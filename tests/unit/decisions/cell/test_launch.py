@@ -40,8 +40,14 @@ FILES = {
 def plan(session: BuildSession | None = None, **changes: Any) -> LaunchPlan:
     options = RunnerOptions("robot", UUID, "/p/flow.yml", "/p", "/usr/bin/dora", **changes)
     return LaunchPlan(
-        options, "/l.sh", "/usr/bin:/bin", FILES.__contains__, session or BuildSession()
+        options, "/l.sh", "/usr/bin:/bin", FILES.__contains__, read, session or BuildSession()
     )
+
+
+def read(path: str) -> bytes:
+    if path not in FILES:
+        raise FileNotFoundError(path)
+    return b""
 
 
 def launch(node: dict[str, Any], given: LaunchPlan | None = None) -> dict[str, Any]:
@@ -71,7 +77,7 @@ def words(node: dict[str, Any], given: LaunchPlan | None = None) -> list[str]:
         ({"path": "tool", "deploy": {"working_dir": "/repo/flows"}}, {"uv": True},
          ["/repo/flows", "pipe", "uv", "run", "/repo/.venv/bin/tool"]),
         ({"path": "shell", "args": "echo $X | cat"}, {"allow_shell_nodes": True},
-         ["/p", "pipe", "/bin/sh", "-c", "echo $X | cat"]),
+         ["/p", "pipe", "sh", "-c", "echo $X | cat"]),
         ({"path": "a.py", "send_stdout_as": "log", "outputs": ["log"]}, {},
          ["/p", "keep", "/usr/bin/python3", "-u", "/p/a.py"]),
         ({"path": "a.py", "deploy": {"working_dir": "sub"}}, {},

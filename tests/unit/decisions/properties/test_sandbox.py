@@ -21,6 +21,7 @@ from dora_systemd.decisions.unit.versions import MIN_VERSION, drop_unsupported
 from dora_systemd.decisions.why.sandbox_signs import sandbox_remedy
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
+from dora_systemd.trust.sight import Sight
 from dora_systemd.verbs.start import sandbox as sandbox_module
 from dora_systemd.verbs.start.sandbox import _maps_identity, make_sandbox, sandbox_warnings
 from tests.unit.fakes.manager import options
@@ -276,7 +277,7 @@ def made(
         dataflow=f"{tmp_path}/flow.yml", working_directory=str(tmp_path), uv=bool(flags.get("uv"))
     )
     document = {"nodes": [{"id": "a", "path": nodes, "outputs": ["x"]}]}
-    plan = LaunchPlan(own, "/l.sh", "/nowhere", os.path.exists)
+    plan = LaunchPlan(own, "/l.sh", "/nowhere", os.path.exists, Sight().read)
     prepared = Prepared(parse_dataflow(document, "flow.yml"), plan, {})
     return make_sandbox(SYSTEM, resolve_settings(flags, {}, []), user, prepared)
 
@@ -289,6 +290,14 @@ def test_what_a_plan_needs(tmp_path: Path) -> None:
     assert len(set(sandbox.needed)) == len(sandbox.needed)
     assert (sandbox.level, sandbox.network, sandbox.writable) == ("default", "host", ())
     assert str(tmp_path) in made(tmp_path, uv=True).writable
+
+
+def test_a_workspace_of_uv(tmp_path: Path) -> None:
+    """uv writes beside the pyproject.toml of the workspace."""
+    (tmp_path / "robot").mkdir()
+    (tmp_path / "robot/pyproject.toml").touch()
+    (tmp_path / "pyproject.toml").write_text('[tool.uv.workspace]\nmembers = ["robot"]\n')
+    assert str(tmp_path) in made(tmp_path / "robot", uv=True).writable
 
 
 def test_choices_of_a_plan(tmp_path: Path) -> None:

@@ -323,10 +323,12 @@ def test_a_dynamic_node_is_started_by_hand(project: Path) -> None:
     assert plan_of(project, network="private").notes == ()
 
 
-def test_a_build_that_is_older_than_the_dataflow(project: Path) -> None:
+def test_a_build_that_is_missing_or_older_than_the_dataflow(project: Path) -> None:
     flow, session = project / "robot.yml", project / "out/robot.dora-session.yaml"
-    flow.write_text("nodes: [{id: a, path: a.py, build: make}]\n")
     assert plan_of(project).notes == ()
+    flow.write_text("nodes: [{id: a, path: a.py, build: make}]\n")
+    (note,) = plan_of(project).notes
+    assert note == f"no build of {flow} is found; to build it: dora build {flow}"
     session.parent.mkdir()
     session.write_text("local_build: {node_working_dirs: {a: /x}}\n")
     os.utime(flow, (1000, 1000))

@@ -1,0 +1,1 @@
+"""The same dataflows under `dora run` and `doractl run`."""
