@@ -55,7 +55,7 @@ def dataflow_names(ctx: click.Context, incomplete: str) -> list[str]:
     verb = ctx.command.name or ""
     cells = [cell for cell in read_cells(_bus()) if cell.is_up or verb not in _RUNNING_ONLY]
     names = [cell.name for cell in cells] + (
-        JournalReader().known_names() if verb in _OF_THE_PAST else []
+        JournalReader().known_names(current_scope()) if verb in _OF_THE_PAST else []
     )
     if is_uuid_prefix(incomplete) and not any(name.startswith(incomplete) for name in names):
         return [cell.uuid for cell in cells]
@@ -72,7 +72,8 @@ def node_names(ctx: click.Context, incomplete: str) -> list[str]:
     # After an option without its value, click leaves the arguments in ctx.args.
     if ctx.command.name == "logs":
         journal, given = JournalReader(), ctx.params.get("selectors") or ctx.args
-        return [node for one in given for node in journal.known_nodes(one)]
+        scope = current_scope()
+        return [node for one in given for node in journal.known_nodes(scope, one)]
     selector = ctx.params.get("selector") or next(iter(ctx.args), "")
     bus = _bus()
     row = dataflow_row(bus, current_scope(), Selector(selector).find(bus))

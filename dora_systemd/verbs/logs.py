@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from typing import NamedTuple
 
-from dora_systemd.adapters.journal.reader import (
+from dora_systemd.adapters.journal.journalctl import (
     end_journalctl,
     journal_output,
     open_journalctl,

@@ -218,7 +218,7 @@ def _lines(journal: JournalReader, query: LogQuery) -> Lines:
     if not query.output.startswith("short"):
         return ShownLines()
     is_one = bool(query.name) and not query.others
-    known = query.nodes or journal.known_nodes(query.name) if is_one else ()
+    known = query.nodes or journal.known_nodes(query.scope, query.name) if is_one else ()
     return TerminalLines(
         [*known, query.name],
         want_dataflow=not is_one,

@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import AsyncGenerator, AsyncIterator
 from dataclasses import replace
 
-from dora_systemd.adapters.journal.reader import end_journalctl, open_journalctl
+from dora_systemd.adapters.journal.journalctl import end_journalctl, open_journalctl
 from dora_systemd.adapters.journal.stream import open_stream
 from dora_systemd.decisions.gateway.page_messages import LOG_FIELDS, PageMessage, line_values
 from dora_systemd.decisions.logs.fields import ExportReader

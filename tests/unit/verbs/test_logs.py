@@ -20,24 +20,29 @@ from dora_systemd.verbs.logs import FollowedLog, pass_logs
 from tests.unit.fakes.library import fake_journalctl
 
 ROBOT = "550e8400-e29b-41d4-a716-446655440000"
+FORGED = "550e8499-e29b-41d4-a716-446655440000"
 ARM = "550e9999-e29b-41d4-a716-446655440000"
 QUERY = LogQuery(Scope(is_user=False, uid=0))
 
 
 class FakeJournal(JournalReader):
-    def known_names(self) -> list[str]:
+    def known_names(self, scope: Scope) -> list[str]:
+        del scope
         return ["arm", "robot", "550e"]
 
     def known_uuids(self) -> list[str]:
-        return [ROBOT, ARM]
+        return [ROBOT, FORGED, ARM]
 
-    def known_nodes(self, name: str) -> list[str]:
+    def known_nodes(self, scope: Scope, name: str) -> list[str]:
+        del scope
         return ["cam-left", "cam-right", "sink"] if name == "robot" else []
 
-    def name_of(self, uuid: str) -> str:
-        return {ROBOT: "robot", ARM: "arm"}[uuid]
+    def name_of(self, scope: Scope, uuid: str) -> str:
+        del scope
+        return {ROBOT: "robot", ARM: "arm"}.get(uuid, "")
 
-    def has_run(self, name: str, run: str) -> bool:
+    def has_run(self, scope: Scope, name: str, run: str) -> bool:
+        del scope
         return (name, run) == ("robot", "0190-run")
 
     def invocations(self, scope: Scope, name: str, uuid: str) -> Iterator[str]:
@@ -84,7 +89,8 @@ def test_wrong_selector(selector: str, hint: str) -> None:
 
 def test_ambiguous_uuid() -> None:
     class WithoutThatName(FakeJournal):
-        def known_names(self) -> list[str]:
+        def known_names(self, scope: Scope) -> list[str]:
+            del scope
             return ["arm", "robot"]
 
     with pytest.raises(DoraSystemdError) as caught:
