@@ -140,7 +140,10 @@ def reset_cells(manager: Manager, cells: Sequence[Cell]) -> list[Outcome]:
 
 
 def note_stop(cells: Iterable[Cell], command: str = "doractl stop") -> None:
-    """Write the event stop-asked for those dataflows that run. command: by which it is asked."""
+    """Write the event stop-asked for those dataflows that run; a restart stops them, too.
+
+    command: by which it is asked.
+    """
     for cell in cells:
         if cell.is_up:
             note_request("stop-asked", cell.name, cell.uuid, command)
