@@ -205,8 +205,8 @@ def test_one_dataflow() -> None:
     )
 
 
-def test_failed_is_said_once() -> None:
-    row = ROWS[0]._replace(status="Failed", text="failed: node a: exit code 1", nodes=())
+def test_the_reason_stands_behind_the_status() -> None:
+    row = ROWS[0]._replace(status="Failed", text="node a: exit code 1", nodes=())
     assert "Status:   Failed (node a: exit code 1)\n" in format_dataflow(row)
 
 
