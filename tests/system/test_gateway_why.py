@@ -64,6 +64,7 @@ def test_one_that_failed(scheme: str, browser: Browser, cell: Cell, project: Pro
     browser.wait_text("#detail .badge", "Failed")
     browser.wait_text("#detail .why h2", "Why it failed")
     assert "node bad: exit code 1" in browser.text("#detail .why .summary")
+    assert "failed:" not in browser.text("#detail .title"), "the badge says it"
     assert "ago" in browser.text("#detail .why dl")
     assert "taker" in browser.text("#detail .why dl"), "the node without input"
     assert f"doractl restart {cell.name}" in browser.text("#detail .why .remedies code")
