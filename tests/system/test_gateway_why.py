@@ -252,6 +252,24 @@ def test_limits_are_changed(browser: Browser, cell: Cell, project: Project) -> N
     assert browser.failures() == []
 
 
+def test_limits_of_a_node_are_changed(browser: Browser, cell: Cell, project: Project) -> None:
+    cell.start(project.three_nodes())
+    browser.wait_text("#detail dl", "Sandbox")
+    button = "[aria-label='Limits sink']"
+    for given, shown in (("500", "sink:tasks=500"), ("", "\nnone\n")):
+        browser.wait_js(f'!document.querySelector("{button}").disabled')
+        browser.click(button)
+        browser.wait_text("#question", f"Limits of node sink of {cell.name}")
+        browser.js(f"document.querySelector('#tasks_limit').value = '{given}', 0")
+        browser.click("#confirmed")
+        if "pids" not in CONTROLLERS.read_text():
+            browser.wait_text("#said", "tasks")
+            break
+        browser.wait_text("#said", "Limits changed")
+        browser.wait_text("#detail article > dl", shown)
+    assert browser.failures() == []
+
+
 def choose(browser: Browser, action: str) -> None:
     """Choose an action of the menu, as soon as nothing else is being done."""
     button = f"#detail [data-action={action}]"

@@ -8,6 +8,7 @@ from dora_systemd.decisions.cell.limits import (
     CHANGES_VARIABLE,
     LIMITS,
     Limit,
+    NodeLimits,
     format_node_limits,
     merge_node_limits,
     parse_changes,
@@ -37,14 +38,18 @@ def fact_values(options: RunnerOptions, unit: Mapping[str, Any]) -> dict[str, An
     changes = parse_changes(environment.get(CHANGES_VARIABLE, ""))
     switch = environment.get(CHANGE_VARIABLE) or format_bool(options.hot_reload)
     limits = {one: unit[_read_as(one)] for one in LIMITS}
-    nodes = merge_node_limits(options.node_limits, changes)
+    nodes = map(_finite, merge_node_limits(options.node_limits, changes))
     return {
         **{one.key: one.format(value) for one, value in limits.items() if _is_set(value)},
-        "node_limit": list(map(format_node_limits, nodes)),
+        "node_limit": [format_node_limits(one) for one in nodes if one.limits],
         "hot_reload": parse_bool(switch),
         "sandbox": _level(unit),
         "network": _network(unit),
     }
+
+
+def _finite(one: NodeLimits) -> NodeLimits:
+    return one._replace(limits=tuple(pair for pair in one.limits if pair[1] != INFINITY))
 
 
 def _is_set(value: object) -> bool:
