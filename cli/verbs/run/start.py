@@ -25,6 +25,7 @@ from dora_systemd.cli.settingoptions import SettingsCommand, setting_options
 from dora_systemd.cli.stageline import StageLine
 from dora_systemd.decisions.settings.resolve import is_given
 from dora_systemd.decisions.views.outcome import Outcome
+from dora_systemd.decisions.why.signs import known_remedy
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
@@ -156,7 +157,9 @@ def _last_words(bus: Bus, scope: Scope, uuid: str) -> Iterator[None]:
     try:
         yield
     except DoraSystemdError as error:
-        if error.code is ExitCode.FAILURE:
-            for line in words_of_start(bus, scope, uuid):
-                tell(f"  {line}", err=True)
-        raise
+        if error.code is not ExitCode.FAILURE:
+            raise
+        words = words_of_start(bus, scope, uuid)
+        for line in words:
+            tell(f"  {line}", err=True)
+        raise DoraSystemdError(error.message, known_remedy(words) or error.hint) from error

@@ -6,7 +6,7 @@ import select
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import groupby, islice
+from itertools import groupby, islice, takewhile
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from dora_systemd.adapters.journal.journalctl import (
     journal_output,
     open_journalctl,
 )
+from dora_systemd.decisions.cell.exits import KILLED
 from dora_systemd.decisions.logs.query import journal_timestamp, scope_matches
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import is_name, is_node_id, is_uuid, name_from_unit, unit_name
@@ -153,6 +154,13 @@ class JournalReader:
         """Start times of the newest runs of a dataflow's unit, CLOCK_REALTIME µs, newest first."""
         matches = [*scope_matches(scope), f"DORA_DATAFLOW={uuid}", "DORA_EVENT=dataflow-starting"]
         return [int(one["__REALTIME_TIMESTAMP"]) for one in self.newest(matches, limit)]
+
+    def killed_since(self, scope: Scope, name: str, uuid: str, since_us: int) -> list[str]:
+        """The nodes of a dataflow that were killed while it stopped; CLOCK_REALTIME µs."""
+        ends = ("DORA_EVENT=node-exited", f"DORA_EXIT={KILLED}", f"DORA_DATAFLOW={uuid}")
+        records = self.newest([*scope_matches(scope, name), *ends], _MOST_NAMES)
+        new = takewhile(lambda one: int(one["__REALTIME_TIMESTAMP"]) >= since_us, records)
+        return list(filter(is_node_id, (str(one.get("DORA_NODE", "")) for one in new)))[::-1]
 
     def invocations(self, scope: Scope, name: str, uuid: str) -> Iterator[str]:
         """systemd's invocation ids of a dataflow's unit, newest first."""

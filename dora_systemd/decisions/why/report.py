@@ -17,7 +17,7 @@ from dora_systemd.decisions.views.dataflows import (
     zoned_time,
 )
 from dora_systemd.decisions.why.last_lines import Word, shown_last
-from dora_systemd.decisions.why.sandbox_signs import sandbox_remedy
+from dora_systemd.decisions.why.signs import known_remedy
 from dora_systemd.decisions.why.verdict import Restart, Verdict
 from dora_systemd.terminal_text import cut, one_line
 from dora_systemd.values import SECOND, format_duration, format_rounded_size
@@ -96,7 +96,7 @@ class Report:
 def remedies(report: Report) -> list[str]:
     """What to do, one line each."""
     verdict, subject = report.verdict, report.subject
-    hint = sandbox_remedy(one.text for one in report.words) if verdict.node else ""
+    hint = known_remedy(one.text for one in report.words) if verdict.node else ""
     texts = [hint, _AGAIN if verdict.is_passing else _remedy(verdict)]
     if verdict.node and verdict.is_up and verdict.status != RESTARTING and not verdict.is_passing:
         texts.append(_AWAY)

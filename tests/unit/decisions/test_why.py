@@ -158,6 +158,13 @@ CASES: dict[str, tuple[tuple[Record, ...], str, Cause, str, str]] = {
         (*RUNS, event("stop-asked", life="session", by="root (doractl stop)"), JOB, *STOPPED),
         *("Stopped", Cause.STOPPED, "", "stopped by root (doractl stop)"),
     ),
+    "stopped, and a node had to be killed": (
+        (*RUNS, event("node-exited", "camera", exit="signal SIGKILL"), JOB, STOPPED[0],
+         event("node-exited", "plot"), event("node-exited", "deaf", exit="signal SIGKILL"),
+         STOPPED[1]),
+        *("Stopped", Cause.STOPPED, ""),
+        f"stopped by {UNKNOWN_PERSON}; killed after the grace duration: deaf",
+    ),
     "stopped with its terminal": (
         (*RUNS, event("dataflow-stopping", by="terminal"), event("dataflow-stopped")),
         *("Stopped", Cause.STOPPED, ""),

@@ -118,6 +118,16 @@ def test_no_flood_of_forged_names_takes_long(journalctl: Path) -> None:
     assert len(Path(f"{journalctl}.asked").read_text().splitlines()) == 102
 
 
+def test_killed_nodes(journalctl: Path) -> None:
+    found = "".join(
+        f'{{"DORA_NODE":"{node}","__REALTIME_TIMESTAMP":"{at}"}}\n'
+        for node, at in (("b", 9), ("../x", 8), ("a", 7), ("old", 3))
+    )
+    own = "_SYSTEMD_UNIT=dora-robot.service DORA_EVENT=node-exited DORA_EXIT=signal SIGKILL"
+    play_fields(journalctl, {}, {f"{own} DORA_DATAFLOW={UUID}": found.rstrip()})
+    assert JournalReader().killed_since(SYSTEM, "robot", UUID, 5) == ["a", "b"]
+
+
 def test_a_run(journalctl: Path) -> None:
     play_fields(journalctl, {}, {"-- _SYSTEMD_UNIT=dora-robot.service DORA_RUN=r1": ANY})
     assert JournalReader().has_run(SYSTEM, "robot", "r1")
