@@ -5,6 +5,7 @@ https://click.palletsprojects.com/shell-completion. This code must not print or 
 user is in the middle of a command line.
 """
 
+import pwd
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from copy import copy
@@ -17,13 +18,15 @@ from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.cli.group import VERBS, VerbGroup, doractl
 from dora_systemd.cli.parameters import current_scope
+from dora_systemd.decisions.cell.hot_reload import REPLACE_WORDS
+from dora_systemd.decisions.cell.restarts import POLICIES
 from dora_systemd.decisions.properties.sandbox import LEVELS, NETWORKS
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import is_uuid_prefix
 
 VARIABLE = "_DORACTL_COMPLETE"
 
-_OF_THE_PAST = ("logs", "why")
+_OF_THE_PAST = ("list", "logs", "restart", "start", "why")
 """Verbs that also accept dataflows that only the journal knows."""
 
 _RUNNING_ONLY = ("stop", "dora", "env", "top")
@@ -48,8 +51,18 @@ class Live(click.types.StringParamType):
         return [CompletionItem(one) for one in found if one.startswith(incomplete)]
 
 
+class FileOrName(Live):
+    """The type of what `start` takes: names only once there is a word, as bash shows either."""
+
+    def shell_complete(
+        self, ctx: click.Context, param: click.Parameter, incomplete: str
+    ) -> list[CompletionItem]:
+        names = super().shell_complete(ctx, param, incomplete) if incomplete else []
+        return [*names, CompletionItem(incomplete, type="file")]
+
+
 def dataflow_names(ctx: click.Context, incomplete: str) -> list[str]:
-    """The dataflows of systemd and, for logs, of the journal; UUIDs if the word looks like one."""
+    """The dataflows of systemd, for some verbs of the journal; UUIDs if the word looks like one."""
     from dora_systemd.verbs.facts.cells import read_cells
 
     verb = ctx.command.name or ""
@@ -61,6 +74,11 @@ def dataflow_names(ctx: click.Context, incomplete: str) -> list[str]:
         return [cell.uuid for cell in cells]
     given = ctx.params.get("selectors") or ()
     return [name for name in dict.fromkeys(names) if name not in given]
+
+
+def user_names(_ctx: click.Context, _incomplete: str) -> list[str]:
+    """The users of this machine."""
+    return [one.pw_name for one in pwd.getpwall()]
 
 
 def node_names(ctx: click.Context, incomplete: str) -> list[str]:
@@ -89,9 +107,15 @@ TYPES: dict[str, Any] = {
     "pattern": Live(dataflow_names),
     "level": Live(lambda *_: ["error", "warn", "info", "debug", "trace", "stdout"]),
     "run": click.Choice(["CURRENT", "PREVIOUS", "ALL"]),
-    "dataflow": click.File(),
+    "dataflow": FileOrName(
+        lambda ctx, word: dataflow_names(ctx, word) if ctx.command.name == "start" else []
+    ),
     "dora": click.File(),
     "env_file": click.File(),
+    "device": click.File(),
+    "user": Live(user_names),
+    "restart_policy": click.Choice(POLICIES),
+    "replace": click.Choice(REPLACE_WORDS),
     "venv": click.Path(file_okay=False),
     "working_directory": click.Path(file_okay=False),
     "writable": click.Path(),
