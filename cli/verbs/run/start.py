@@ -126,7 +126,7 @@ def command(
 
 def _attach(bus: Bus, claimed: Claim, notes: Sequence[str]) -> int:
     """Print the logs of the dataflow, which goes on if this process ends."""
-    how = Foreground(signals=(signal.SIGINT,), notes=notes)
+    how = Foreground(signals=(signal.SIGINT,), notes=notes, command="doractl start --attach")
     # What is started from a unit file stays loaded if it has failed.
     properties = None if claimed.properties is None else [*claimed.properties, HELD]
     return print_until_end(bus, claimed.plan, properties, how)
