@@ -10,6 +10,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from dora_systemd.adapters.journal.journalctl import (
+    CHUNK,
     end_journalctl,
     journal_output,
     open_journalctl,
@@ -53,12 +54,22 @@ def read_logs(
 
 
 def pass_logs(query: LogQuery, fd: int) -> int:
-    """Let journalctl write the records of a query directly to `fd`; its exit status.
+    """Write the records of a query to `fd` as journalctl prints them; its exit status.
 
-    Raises DoraSystemdError as read_logs does.
+    Raises DoraSystemdError as read_logs does, and OSError for `fd`: journalctl ignores a full disk.
     """
-    with open_journalctl(query_arguments(_oldest_first(query)), stdout=fd) as child:
+    with open_journalctl(query_arguments(_oldest_first(query))) as child:
+        assert child.stdout
+        while data := os.read(child.stdout.fileno(), CHUNK):
+            write_whole(data, fd)
         return end_journalctl(child)
+
+
+def write_whole(data: bytes, fd: int) -> None:
+    """Write all of it. Raises OSError."""
+    rest = memoryview(data)
+    while rest:
+        rest = rest[os.write(fd, rest) :]
 
 
 def _oldest_first(query: LogQuery) -> LogQuery:

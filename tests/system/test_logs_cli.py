@@ -73,6 +73,12 @@ def test_what_is_shown(talking: Cell) -> None:
     assert messages(talking, "--events", "--reverse")[-1] == first
 
 
+def test_a_full_disk_is_an_error(talking: Cell) -> None:
+    done = run("sh", "-c", f"doractl logs {talking.name} >/dev/full", check=False)
+    assert done.returncode == ExitCode.FAILURE
+    assert done.stderr == "doractl: cannot write output: No space left on device\n"
+
+
 def test_letters_mean_what_they_mean_in_journalctl(talking: Cell) -> None:
     assert len(messages(talking, "-n", "3")) == len(messages(talking, "--lines=3")) == 3
     assert len(messages(talking, "-n", "all")) > 10

@@ -25,7 +25,7 @@ from dora_systemd.decisions.logs.terminal import ShownLines, TerminalLines
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import quoted
 from dora_systemd.verbs.facts.recorded import find_query
-from dora_systemd.verbs.logs import pass_logs, read_logs
+from dora_systemd.verbs.logs import pass_logs, read_logs, write_whole
 
 Lines = TerminalLines | ShownLines | None
 """Formats lines for a terminal; None for a pipe."""
@@ -242,9 +242,7 @@ def _exit_status(status: int) -> int:
 
 def _write(chunks: Iterator[bytes], fd: int) -> None:
     for chunk in chunks:
-        rest = memoryview(chunk)
-        while rest:
-            rest = rest[os.write(fd, rest) :]
+        write_whole(chunk, fd)
 
 
 def pager_of(environ: Mapping[str, str]) -> tuple[str, dict[str, str]]:

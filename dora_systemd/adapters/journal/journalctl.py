@@ -23,10 +23,9 @@ _NOTICE = "to turn off this notice."
 def open_journalctl(
     arguments: Sequence[str],
     want_colors: bool = False,
-    stdout: int = subprocess.PIPE,
     outlives_interrupt: bool = False,
 ) -> "Iterator[subprocess.Popen[bytes]]":
-    """A running journalctl, which the block ends. stdout: a pipe, or the descriptor to use.
+    """A running journalctl, which the block ends.
 
     outlives_interrupt: Ctrl+C on the terminal does not reach it, see setpgid(2).
     Raises DoraSystemdError (NO_SYSTEMD) if there is no journalctl.
@@ -36,7 +35,7 @@ def open_journalctl(
         child = subprocess.Popen(
             ["journalctl", "--no-pager", *arguments],
             stdin=subprocess.DEVNULL,
-            stdout=stdout,
+            stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             env=environment,
             process_group=0 if outlives_interrupt else None,

@@ -212,6 +212,13 @@ def test_found_lines_come_in_the_order_of_time(
         assert "--since=@3.000000 --until=@5.000000 --grep=x --" in last
 
 
+def test_a_full_disk_is_an_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Of which journalctl says nothing."""
+    fake_journalctl(monkeypatch, tmp_path, b"a line\n")
+    with Path("/dev/full").open("wb") as full, pytest.raises(OSError, match="No space left"):
+        pass_logs(QUERY, full.fileno())
+
+
 def test_nothing_is_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     calls = fake_journalctl(monkeypatch, tmp_path, b"")
     with (tmp_path / "out").open("wb") as out:
