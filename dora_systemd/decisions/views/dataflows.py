@@ -190,9 +190,11 @@ def _fit(columns: list[list[str]], width: int) -> None:
         if _excess(columns, width) <= slack:
             break
         columns[:] = [one for one in columns if one[0] != title]
-    for column in reversed(columns):
-        if column[0] in _ROOM and (excess := _excess(columns, width)) > 0:
-            column[:] = [cut(cell, max(_width(column) - excess, _LEAST)) for cell in column]
+    for least in (_ROOM, dict.fromkeys(_ROOM, _LEAST)):
+        for column in reversed(columns):
+            if column[0] in least and (excess := _excess(columns, width)) > 0:
+                room = max(_width(column) - excess, least[column[0]])
+                column[:] = [cut(cell, room) for cell in column]
 
 
 def _width(column: Sequence[str]) -> int:
