@@ -12,7 +12,7 @@ LATE = {
         "cli.listing": {
             *("verbs.list", "verbs.facts.ended"),
             *("decisions.views.details", "decisions.views.objects"),
-            *("decisions.views.selection", "cli.colors"),
+            *("decisions.views.selection", "cli.colors", "verbs.facts.selector"),
         },
         "names": {"difflib"},
         "cli.edge": {"decisions.views.objects"},
