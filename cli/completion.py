@@ -5,6 +5,7 @@ https://click.palletsprojects.com/shell-completion. This code must not print or 
 user is in the middle of a command line.
 """
 
+import pwd
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from copy import copy
@@ -17,13 +18,15 @@ from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.cli.group import VERBS, VerbGroup, doractl
 from dora_systemd.cli.parameters import current_scope
+from dora_systemd.decisions.cell.hot_reload import REPLACE_WORDS
+from dora_systemd.decisions.cell.restarts import POLICIES
 from dora_systemd.decisions.properties.sandbox import LEVELS, NETWORKS
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import is_uuid_prefix
 
 VARIABLE = "_DORACTL_COMPLETE"
 
-_OF_THE_PAST = ("logs", "why")
+_OF_THE_PAST = ("list", "logs", "restart", "start", "why")
 """Verbs that also accept dataflows that only the journal knows."""
 
 _RUNNING_ONLY = ("stop", "dora", "env", "top")
@@ -48,19 +51,34 @@ class Live(click.types.StringParamType):
         return [CompletionItem(one) for one in found if one.startswith(incomplete)]
 
 
+class FileOrName(Live):
+    """The type of what `start` takes: names only once there is a word, as bash shows either."""
+
+    def shell_complete(
+        self, ctx: click.Context, param: click.Parameter, incomplete: str
+    ) -> list[CompletionItem]:
+        names = super().shell_complete(ctx, param, incomplete) if incomplete else []
+        return [*names, CompletionItem(incomplete, type="file")]
+
+
 def dataflow_names(ctx: click.Context, incomplete: str) -> list[str]:
-    """The dataflows of systemd and, for logs, of the journal; UUIDs if the word looks like one."""
+    """The dataflows of systemd, for some verbs of the journal; UUIDs if the word looks like one."""
     from dora_systemd.verbs.facts.cells import read_cells
 
     verb = ctx.command.name or ""
     cells = [cell for cell in read_cells(_bus()) if cell.is_up or verb not in _RUNNING_ONLY]
     names = [cell.name for cell in cells] + (
-        JournalReader().known_names() if verb in _OF_THE_PAST else []
+        JournalReader().known_names(current_scope()) if verb in _OF_THE_PAST else []
     )
     if is_uuid_prefix(incomplete) and not any(name.startswith(incomplete) for name in names):
         return [cell.uuid for cell in cells]
     given = ctx.params.get("selectors") or ()
     return [name for name in dict.fromkeys(names) if name not in given]
+
+
+def user_names(_ctx: click.Context, _incomplete: str) -> list[str]:
+    """The users of this machine."""
+    return [one.pw_name for one in pwd.getpwall()]
 
 
 def node_names(ctx: click.Context, incomplete: str) -> list[str]:
@@ -72,7 +90,8 @@ def node_names(ctx: click.Context, incomplete: str) -> list[str]:
     # After an option without its value, click leaves the arguments in ctx.args.
     if ctx.command.name == "logs":
         journal, given = JournalReader(), ctx.params.get("selectors") or ctx.args
-        return [node for one in given for node in journal.known_nodes(one)]
+        scope = current_scope()
+        return [node for one in given for node in journal.known_nodes(scope, one)]
     selector = ctx.params.get("selector") or next(iter(ctx.args), "")
     bus = _bus()
     row = dataflow_row(bus, current_scope(), Selector(selector).find(bus))
@@ -88,9 +107,15 @@ TYPES: dict[str, Any] = {
     "pattern": Live(dataflow_names),
     "level": Live(lambda *_: ["error", "warn", "info", "debug", "trace", "stdout"]),
     "run": click.Choice(["CURRENT", "PREVIOUS", "ALL"]),
-    "dataflow": click.File(),
+    "dataflow": FileOrName(
+        lambda ctx, word: dataflow_names(ctx, word) if ctx.command.name == "start" else []
+    ),
     "dora": click.File(),
     "env_file": click.File(),
+    "device": click.File(),
+    "user": Live(user_names),
+    "restart_policy": click.Choice(POLICIES),
+    "replace": click.Choice(REPLACE_WORDS),
     "venv": click.Path(file_okay=False),
     "working_directory": click.Path(file_okay=False),
     "writable": click.Path(),

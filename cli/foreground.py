@@ -6,6 +6,7 @@ import time
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
+from functools import partial
 
 from dora_systemd.adapters.bus.manager import Property
 from dora_systemd.adapters.bus.systemd import Bus
@@ -17,6 +18,7 @@ from dora_systemd.decisions.logs.records import DoraLines, Record
 from dora_systemd.decisions.logs.terminal import TerminalLines
 from dora_systemd.values import INFINITY
 from dora_systemd.verbs.logs import FollowedLog
+from dora_systemd.verbs.start.asked import note_request
 from dora_systemd.verbs.start.job import start_unit
 from dora_systemd.verbs.start.plan import Plan
 from dora_systemd.verbs.start.run import SIGNALS, follow_unit
@@ -32,7 +34,7 @@ class Foreground:
     """What to print of a dataflow, and what stops it.
 
     form: one of FORMATS. signals, stop_after: as for follow_unit(). notes: for people, printed once
-    the dataflow has been accepted.
+    the dataflow has been accepted. command: of doractl, for the journal.
     """
 
     shown: LogFilter = field(default_factory=LogFilter)
@@ -40,6 +42,7 @@ class Foreground:
     signals: Sequence[signal.Signals] = SIGNALS
     stop_after: int = INFINITY
     notes: Sequence[str] = ()
+    command: str = "doractl run"
 
 
 def print_until_end(
@@ -66,7 +69,8 @@ def print_until_end(
             start_unit(bus, plan.scope, options, properties, stage, wait=False)
             stage.wipe()
             print_warnings(how.notes)
-            return follow_unit(bus, plan.unit, logs, stage, how.signals, how.stop_after)
+            by = partial(note_request, "stop-asked", options.name, options.uuid, how.command)
+            return follow_unit(bus, plan.unit, logs, stage, how.signals, how.stop_after, by)
 
 
 def _lines(form: str, plan: Plan) -> TerminalLines | DoraLines:

@@ -122,7 +122,8 @@ class VerbGroup(click.Group):
 def doractl(ctx: click.Context) -> None:
     """Run dora dataflows as systemd services.
 
-    SELECTOR below is a name, a UUID, the beginning of a UUID or a unit name.
+    SELECTOR below is a name, a UUID, the beginning of a UUID or a unit name; a shell pattern where
+    several are possible.
     """
     if ctx.invoked_subcommand is None:
         click.echo(ctx.get_help())
@@ -144,12 +145,18 @@ def run_verb(arguments: list[str]) -> int:
     return result if isinstance(result, int) else ExitCode.OK
 
 
+def _near(error: click.NoSuchOption) -> list[str]:
+    """The options that click suggests, without those that only have the dashes in common."""
+    word = error.option_name.lstrip("-")
+    return [one for one in error.possibilities or () if get_close_matches(one.lstrip("-"), [word])]
+
+
 def _usage_error(error: click.ClickException) -> DoraSystemdError:
     """An error of click in the form of all other errors."""
     text = error.format_message().rstrip(".")
     context: Any = getattr(error, "ctx", None)
     command = context.command_path if context else "doractl"
-    possible = getattr(error, "possibilities", None)
+    possible = _near(error) if isinstance(error, click.NoSuchOption) else []
     hint = f"did you mean {' or '.join(sorted(possible))}?" if possible else f"see {command} --help"
     words = text.split(". Did you mean")[0]
     words = f"{words[:1].lower()}{words[1:]}".replace("no such command", "unknown command", 1)

@@ -54,6 +54,16 @@ class ListRequest(NamedTuple):
         """Whether it has options that only the list of all dataflows has, and that are rare."""
         return any(one is not None for one in (self.last, self.status, self.pattern, self.sort_by))
 
+    @property
+    def is_pattern(self) -> bool:
+        """Whether the selector stands for all that match it."""
+        if self.selector is None:
+            return False
+        # Imported late: the usual list has no selector.
+        from dora_systemd.verbs.facts.selector import is_pattern
+
+        return is_pattern(self.selector)
+
 
 def parse_list(arguments: list[str]) -> ListRequest | None:
     """The request in `[--all] [-q] [--user|--system] [-o json|table] [SELECTOR]`, else None.
@@ -81,8 +91,8 @@ def print_dataflows(request: ListRequest) -> int:
     _check(request)
     scope = scope_of(request.is_user)
     bus = Bus(scope, for_reading=True)
-    if request.selector is None:
-        _print_all(_rows(bus, scope, request), request)
+    if request.selector is None or request.is_pattern:
+        _print_all(_fitting(_rows(bus, scope, request), request), request)
         return ExitCode.OK
     # Imported late: the table of all dataflows does without it, and is asked for most often.
     from dora_systemd.decisions.views.details import format_dataflow
@@ -101,7 +111,7 @@ def print_dataflows(request: ListRequest) -> int:
 def _check(request: ListRequest) -> None:
     if request.is_quiet and request.output == "json":
         raise DoraSystemdError("cannot use --quiet with JSON", "omit one of them", ExitCode.USAGE)
-    if request.selector is not None and request.is_filtered:
+    if request.selector is not None and request.is_filtered and not request.is_pattern:
         hint = "--last, --status, --name and --sort-by are for the list of all dataflows"
         raise DoraSystemdError("cannot filter a single dataflow", hint, ExitCode.USAGE)
 
@@ -127,6 +137,16 @@ def _rows(bus: Bus, scope: Scope, request: ListRequest) -> list[DataflowRow]:
         past = mark_enabled(bus, scope, past)
         found += matching_rows(past, request.status, request.pattern)[: request.last]
     return sorted_rows(found, request.sort_by)
+
+
+def _fitting(rows: list[DataflowRow], request: ListRequest) -> list[DataflowRow]:
+    """The rows that the selector means, if it is a pattern."""
+    if request.selector is None or not rows:
+        return rows
+    from dora_systemd.verbs.facts.selector import selectors_of
+
+    names = {one.text for one in selectors_of([request.selector], rows)}
+    return [row for row in rows if row.name in names]
 
 
 def _print_all(rows: list[DataflowRow], request: ListRequest) -> None:

@@ -32,8 +32,8 @@ def act_on(
         do(scope, cell, node)
         return f"Node {node} of {cell.name}: {action} begun"
     observer = partial(tell_stage, on_stage)
+    note_stop([cell], by)
     if action == "stop":
-        note_stop([cell], by)
         (outcome,) = stop_cells(manager, scope, [cell], observer)
     else:
         (outcome,) = restart_cells(manager, [cell], observer)

@@ -1,14 +1,16 @@
 """`doractl logs` and `doractl run`: read the records of a dataflow from the journal."""
 
+import math
 import os
 import select
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from typing import NamedTuple
 
-from dora_systemd.adapters.journal.reader import (
+from dora_systemd.adapters.journal.journalctl import (
+    CHUNK,
     end_journalctl,
     journal_output,
     open_journalctl,
@@ -28,6 +30,9 @@ from dora_systemd.scope import Scope
 
 _TURN = 1 << 14
 """Bytes of records between two looks at what else has happened: a terminal may be slow."""
+AGAIN_SECONDS = 1.0
+"""Pause before another journalctl if one dies; it doubles."""
+_MOST_SECONDS = 30.0
 _FIELDS = ",".join((*LOG_FIELDS, "SYSLOG_IDENTIFIER"))
 
 Write = Callable[[bytes], object]
@@ -49,12 +54,22 @@ def read_logs(
 
 
 def pass_logs(query: LogQuery, fd: int) -> int:
-    """Let journalctl write the records of a query directly to `fd`; its exit status.
+    """Write the records of a query to `fd` as journalctl prints them; its exit status.
 
-    Raises DoraSystemdError as read_logs does.
+    Raises DoraSystemdError as read_logs does, and OSError for `fd`: journalctl ignores a full disk.
     """
-    with open_journalctl(query_arguments(_oldest_first(query)), stdout=fd) as child:
+    with open_journalctl(query_arguments(_oldest_first(query))) as child:
+        assert child.stdout
+        while data := os.read(child.stdout.fileno(), CHUNK):
+            write_whole(data, fd)
         return end_journalctl(child)
+
+
+def write_whole(data: bytes, fd: int) -> None:
+    """Write all of it. Raises OSError."""
+    rest = memoryview(data)
+    while rest:
+        rest = rest[os.write(fd, rest) :]
 
 
 def _oldest_first(query: LogQuery) -> LogQuery:
@@ -93,24 +108,49 @@ def find_span(query: LogQuery) -> Span | None:
 
 
 class Follower:
-    """A `journalctl --follow`, for poll(2). Use it with contextlib.closing().
+    """A `journalctl --follow`, for poll(2), and the next one if it dies. Use contextlib.closing().
 
     since_us: CLOCK_REALTIME µs of the first records. outlives_interrupt: see open_journalctl().
     """
 
+    _fd = -1
+
     def __init__(
         self, since_us: int, fields: str, matches: Sequence[str], outlives_interrupt: bool = False
     ) -> None:
-        options = ["--follow", "--quiet", "--output=export", f"--output-fields={fields}"]
-        arguments = [*options, f"--since={journal_timestamp(since_us)}", "--", *matches]
+        self._options = ["--follow", "--quiet", "--output=export", f"--output-fields={fields}"]
+        self._begin = [f"--since={journal_timestamp(since_us)}"]
+        self._matches = matches
+        self._outlives_interrupt = outlives_interrupt
         self._stack = ExitStack()
-        journalctl = open_journalctl(arguments, outlives_interrupt=outlives_interrupt)
-        child = self._stack.enter_context(journalctl)
-        assert child.stdout
-        self._fd = child.stdout.fileno()
-        os.set_blocking(self._fd, False)
+        self._pause = AGAIN_SECONDS
+        self._open()
         self._poll = select.poll()
         self._poll.register(self._fd, select.POLLIN)
+
+    def _open(self) -> None:
+        self._stack.close()
+        self._due = math.inf
+        arguments = [*self._options, *self._begin, "--", *self._matches]
+        journalctl = open_journalctl(arguments, outlives_interrupt=self._outlives_interrupt)
+        child = self._stack.enter_context(journalctl)
+        assert child.stdout
+        self._use(child.stdout.fileno())
+
+    def _use(self, fd: int) -> None:
+        """Read from `fd` under the number that others poll."""
+        self._fd = os.dup(fd) if self._fd < 0 else os.dup2(fd, self._fd, inheritable=False)
+        os.set_blocking(self._fd, False)
+
+    def _lose(self) -> None:
+        """There is nothing to read until the next journalctl, which must not be asked for often."""
+        self._stack.close()
+        idle, other = os.pipe()
+        self._use(idle)
+        os.close(idle)
+        self._stack.callback(os.close, other)
+        self._due = time.monotonic() + self._pause
+        self._pause = min(2 * self._pause, _MOST_SECONDS)
 
     def fileno(self) -> int:
         """For poll(2): readable when there may be records."""
@@ -118,18 +158,26 @@ class Follower:
 
     def is_readable(self, seconds: float) -> bool:
         """Wait at most `seconds`; whether there may be records."""
+        if (pause := max(self._due - time.monotonic(), 0)) <= seconds:
+            time.sleep(pause)
+            self._open()
+            seconds -= pause
         return bool(self._poll.poll(seconds * 1000))
 
     def read(self, size: int) -> bytes | None:
-        """At most `size` bytes, b"" at the end, None if there is nothing to read now."""
-        try:
-            return os.read(self._fd, size)
-        except BlockingIOError:
-            return None
+        """At most `size` bytes, None if there is nothing to read now."""
+        if self._due <= time.monotonic():
+            self._open()
+        with suppress(BlockingIOError):
+            if data := os.read(self._fd, size):
+                return data
+            self._lose()
+        return None
 
     def close(self) -> None:
         """Terminate the journalctl process."""
         self._stack.close()
+        os.close(self._fd)
 
 
 class FollowedLog(Follower):
@@ -156,18 +204,21 @@ class FollowedLog(Follower):
         self._write = write
         self._form = form
         self._records = ExportReader()
-        self._is_closed = False
+
+    def _lose(self) -> None:
+        super()._lose()
+        self._records = ExportReader()  # without half a record
 
     def print_new(self) -> None:
         """Write some of the lines that have come: a flood of them must not keep the caller here."""
-        data = None if self._is_closed else self.read(_TURN)
-        if data is not None:
-            self.has_ended = self._is_closed = not data
+        if data := self.read(_TURN):
             self._print(data)
 
     def _print(self, data: bytes) -> None:
         lines: list[bytes] = []
         for record in self._records.feed(data):
+            if cursor := record.get("__CURSOR", b"").decode():
+                self._begin = ["--no-tail", f"--after-cursor={cursor}"]
             # After an automatic restart more records follow.
             self.has_ended = record.get("MESSAGE_ID", b"").decode() in UNIT_ENDS
             if not self.has_ended:
@@ -178,7 +229,7 @@ class FollowedLog(Follower):
     def finish(self, seconds: float = 3.0) -> None:
         """Write the remaining lines of a unit that has ended; wait at most `seconds`."""
         deadline = time.monotonic() + seconds
-        while (left := deadline - time.monotonic()) > 0 and not self._is_closed:
+        while (left := deadline - time.monotonic()) > 0:
             if not self.is_readable(0 if self.has_ended else left):
                 return
             self.print_new()

@@ -7,10 +7,11 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from dora_systemd.adapters.bus.manager import DOWN, JOB_DONE, Manager, Observer
+from dora_systemd.decisions.life.stop_budget import kill_delay
 from dora_systemd.decisions.views.outcome import Outcome, Subject
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
-from dora_systemd.values import INFINITY, SECOND
+from dora_systemd.values import INFINITY, SECOND, format_duration
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.enabled import enabled_units
 from dora_systemd.verbs.facts.reason import failure_reason, job_reason
@@ -21,6 +22,7 @@ UNBOUNDED_SECONDS = 90.0
 """Timeout for a dataflow with TimeoutStopSec=infinity: systemd's own default."""
 
 _MARGIN_SECONDS = 5.0
+_MICROSECOND_NS = 1000
 KILLED_SECONDS = 10.0
 """Timeout for the end of processes that were killed."""
 POLL_SECONDS = 0.05
@@ -54,8 +56,11 @@ def stop_cells(
     Each has its own grace duration; after that systemd kills what is left.
     """
     up = [cell.unit for cell in cells if cell.is_up]
+    begin = time.time_ns() // _MICROSECOND_NS
     results = manager.run_jobs("StopUnit", up, observer) if up else {}
-    outcomes = [_stop_outcome(manager, cell, results.get(cell.unit)) for cell in cells]
+    outcomes = [
+        _stop_outcome(manager, scope, cell, results.get(cell.unit), begin) for cell in cells
+    ]
     release_enabled(manager, scope, up)
     return outcomes
 
@@ -140,7 +145,10 @@ def reset_cells(manager: Manager, cells: Sequence[Cell]) -> list[Outcome]:
 
 
 def note_stop(cells: Iterable[Cell], command: str = "doractl stop") -> None:
-    """Write the event stop-asked for those dataflows that run. command: by which it is asked."""
+    """Write the event stop-asked for those dataflows that run; a restart stops them, too.
+
+    command: by which it is asked.
+    """
     for cell in cells:
         if cell.is_up:
             note_request("stop-asked", cell.name, cell.uuid, command)
@@ -152,14 +160,32 @@ def not_running(subject: Subject, state: str) -> Outcome:
     return Outcome(subject, text, is_news=False)
 
 
-def _stop_outcome(manager: Manager, cell: Cell, result: str | None) -> Outcome:
+def _stop_outcome(
+    manager: Manager, scope: Scope, cell: Cell, result: str | None, begin: int
+) -> Outcome:
+    """begin: of the stop, CLOCK_REALTIME µs."""
     if result is None:
         return _not_running(cell)
     if result != JOB_DONE:
         return Outcome(cell, "", f"cannot stop {cell.unit}: the job was {result}")
     state = manager.read(cell.unit, ["ActiveState", "Result"])
     is_failed = state["ActiveState"] == "failed"
-    return Outcome(cell, _stopped(cell, failure_reason(manager, cell.unit) if is_failed else ""))
+    note = failure_reason(manager, cell.unit) if is_failed else _killed(scope, cell, begin)
+    return Outcome(cell, _stopped(cell, note))
+
+
+def _killed(scope: Scope, cell: Cell, begin: int) -> str:
+    """The nodes that dora had to kill since then. Only a slow stop needs the journal."""
+    delay = kill_delay(cell.options.grace)
+    if time.time_ns() // _MICROSECOND_NS - begin < delay:
+        return ""
+    # Imported late: most stops are fast.
+    from dora_systemd.adapters.journal.reader import JournalReader
+
+    nodes = []
+    with suppress(DoraSystemdError):
+        nodes = JournalReader().killed_since(scope, cell.name, cell.uuid, begin)
+    return f"killed after {format_duration(delay)}: {', '.join(nodes)}" if nodes else ""
 
 
 def _stopped(cell: Cell, note: str) -> str:

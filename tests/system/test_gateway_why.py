@@ -64,6 +64,7 @@ def test_one_that_failed(scheme: str, browser: Browser, cell: Cell, project: Pro
     browser.wait_text("#detail .badge", "Failed")
     browser.wait_text("#detail .why h2", "Why it failed")
     assert "node bad: exit code 1" in browser.text("#detail .why .summary")
+    assert "failed:" not in browser.text("#detail .title"), "the badge says it"
     assert "ago" in browser.text("#detail .why dl")
     assert "taker" in browser.text("#detail .why dl"), "the node without input"
     assert f"doractl restart {cell.name}" in browser.text("#detail .why .remedies code")
@@ -248,6 +249,24 @@ def test_limits_are_changed(browser: Browser, cell: Cell, project: Project) -> N
         browser.wait_text("#detail article > dl", "memory 3G")
     else:
         browser.wait_text("#said", "memory")
+    assert browser.failures() == []
+
+
+def test_limits_of_a_node_are_changed(browser: Browser, cell: Cell, project: Project) -> None:
+    cell.start(project.three_nodes())
+    browser.wait_text("#detail dl", "Sandbox")
+    button = "[aria-label='Limits sink']"
+    for given, shown in (("500", "sink:tasks=500"), ("", "\nnone\n")):
+        browser.wait_js(f'!document.querySelector("{button}").disabled')
+        browser.click(button)
+        browser.wait_text("#question", f"Limits of node sink of {cell.name}")
+        browser.js(f"document.querySelector('#tasks_limit').value = '{given}', 0")
+        browser.click("#confirmed")
+        if "pids" not in CONTROLLERS.read_text():
+            browser.wait_text("#said", "tasks")
+            break
+        browser.wait_text("#said", "Limits changed")
+        browser.wait_text("#detail article > dl", shown)
     assert browser.failures() == []
 
 

@@ -72,6 +72,14 @@ def test_selectors(cell: Cell, project: Project) -> None:
         assert f"Dataflow: {uuid}" in cell.doractl("list", selector).stdout
 
 
+def test_a_pattern(cell: Cell, project: Project) -> None:
+    cell.start(project.three_nodes())
+    (row,) = json.loads(cell.doractl("list", f"{cell.name[:-1]}*", "-o", "json").stdout)
+    assert row["uuid"]
+    done = cell.doractl("list", f"{cell.name}x*", check=False)
+    assert done.returncode == ExitCode.NOT_FOUND
+
+
 def test_it_needs_nothing_of_ours_alive(cell: Cell, project: Project) -> None:
     cell.start(project.three_nodes())
     pids = list(cell.all_pids())

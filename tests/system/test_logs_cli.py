@@ -3,6 +3,7 @@
 import json
 import re
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -34,6 +35,7 @@ nodes:
 """
 
 pytestmark = pytest.mark.warns("a bad thing")
+UUID = "12345678-e29b-41d4-a716-446655440000"
 
 
 @pytest.fixture
@@ -71,6 +73,12 @@ def test_what_is_shown(talking: Cell) -> None:
     assert first == f"Dataflow {talking.name} is starting"
     assert last == f"Dataflow {talking.name} is running, all nodes are ready"
     assert messages(talking, "--events", "--reverse")[-1] == first
+
+
+def test_a_full_disk_is_an_error(talking: Cell) -> None:
+    done = run("sh", "-c", f"doractl logs {talking.name} >/dev/full", check=False)
+    assert done.returncode == ExitCode.FAILURE
+    assert done.stderr == "doractl: cannot write output: No space left on device\n"
 
 
 def test_letters_mean_what_they_mean_in_journalctl(talking: Cell) -> None:
@@ -221,6 +229,20 @@ def test_pager(talking: Cell, tmp_path: Path) -> None:
     words = ("--tail", "5", "--grep", "^line")
     assert shown("doractl", "logs", talking.name, *words, PAGER=f"tee {seen}")
     assert len(seen.read_text().splitlines()) == 5
+
+
+@pytest.mark.lab
+def test_forged_names_and_nodes_do_not_count(talking: Cell) -> None:
+    """Anybody can write records that look like those of dataflows; journald names their unit."""
+    fields = ("MESSAGE=x", f"DORA_DATAFLOW={UUID}", "DORA_NODE=forged")
+    own = (f"DORA_DATAFLOW_NAME={talking.name}x", f"SYSLOG_IDENTIFIER={talking.name}/forged")
+    send = "import sys; from dora_systemd.adapters.journal.note import send_note as send; "
+    send += "send('\\n'.join([*sys.argv[1:], '']).encode())"
+    run("runuser", "-u", "alice", "--", sys.executable, "-c", send, *fields, *own)
+    wait_for("it", lambda: run("journalctl", "-q", "-o", "cat", f"DORA_DATAFLOW={UUID}").stdout)
+    for words in ((f"{talking.name}x*",), (UUID[:8],), (talking.name, "--node", "forg*")):
+        done = talking.doractl("logs", *words, check=False)
+        assert done.returncode == ExitCode.NOT_FOUND, done.stdout
 
 
 BAD_INPUT = [

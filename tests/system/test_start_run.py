@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.lab.pace import bound
-from tests.system.cells import Cell, Project, is_alive, wait_for
+from tests.system.cells import Cell, Project, is_alive, sync_journal, wait_for
 from tests.system.terminal import Screen
 
 TICK = "inputs: {tick: dora/timer/millis/50}"
@@ -48,6 +48,8 @@ def test_run_ends_with_ctrl_c(cell: Cell, project: Project) -> None:
     assert "got [" in out
     assert "stopped" in out.splitlines()[-1]
     assert cell.is_gone
+    sync_journal()
+    assert "(doractl run)\n" in cell.doractl("why", cell.name).stdout
 
 
 LAST_WORDS = """

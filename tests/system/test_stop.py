@@ -8,7 +8,7 @@ import pytest
 
 from dora_systemd.errors import ExitCode
 from tests.lab.pace import bound
-from tests.system.cells import Cell, Project, is_alive, run, wait_for
+from tests.system.cells import Cell, Project, is_alive, run, sync_journal, wait_for
 
 DEAF = """
 import os, signal, time
@@ -61,9 +61,12 @@ def test_stop_ends_in_time_whatever_the_nodes_do(cell: Cell, project: Project) -
     wait_for("it is deaf", lambda: "deaf" in cell.messages("one"))
     pids = cell.all_pids()
     begin = time.monotonic()
-    cell.doractl("stop", cell.name)
+    done = cell.doractl("stop", cell.name)
     assert time.monotonic() - begin < bound(1.5 + 10)
     assert not [pid for pid in pids if is_alive(pid)]
+    assert "killed after 1s 500ms: one" in done.stdout
+    sync_journal()
+    assert "; killed after the grace duration: one\n" in cell.doractl("why", cell.name).stdout
 
 
 def test_restart_keeps_name_and_uuid(cell: Cell, project: Project) -> None:
@@ -74,6 +77,8 @@ def test_restart_keeps_name_and_uuid(cell: Cell, project: Project) -> None:
     assert not [pid for pid in pids if is_alive(pid)]
     assert started["uuid"] in cell.show("ExecStart")
     cell.wait_exchanging()
+    sync_journal()
+    assert "(doractl restart) (" in cell.doractl("why", cell.name).stdout, "with its time"
 
 
 @pytest.mark.warns("failed to receive reply from daemon", "Signal(15)")

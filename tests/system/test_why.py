@@ -215,7 +215,7 @@ def test_unknown_and_in_a_pipe(cell: Cell, project: Project) -> None:
     assert run("sh", "-c", command).stdout == f"{cell.name}: Running\n"
     # On a terminal, in colours, and no line longer than that.
     text = shown("doractl", "why", cell.name, COLUMNS="60")
-    assert text.startswith("\x1b[32m")
+    assert text.startswith(f"\x1b[1m{cell.name}\x1b[0m: Running")
     assert max(len(line) for line in text.splitlines()[1:]) <= 60 + len("\x1b[1m\x1b[0m")
 
 

@@ -41,7 +41,7 @@ from dora_systemd.decisions.views.selection import SORTS, STATUSES
 @output_option
 @scope_options
 def command(**options: Any) -> int:
-    """List dataflows; with a SELECTOR, one dataflow and its nodes.
+    """List dataflows; with a SELECTOR, one dataflow and its nodes; with a pattern, all that match.
 
     CPU% is the percentage of one processor; limits follow a slash. RESTARTS counts restarts of the
     whole dataflow by systemd; for a node, those of this node by dora. With a SELECTOR the exit
@@ -51,6 +51,7 @@ def command(**options: Any) -> int:
       doractl list                      all that run
       doractl list --last 5             also the five that failed or ended last, and why
       doractl list robot                the nodes of one
+      doractl list 'cam*' --all         those whose name begins so, also what failed or ended
       doractl list --status failed -q   UUIDs of all that failed
       doractl list -o json
     """

@@ -25,7 +25,7 @@ from dora_systemd.decisions.logs.terminal import ShownLines, TerminalLines
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import quoted
 from dora_systemd.verbs.facts.recorded import find_query
-from dora_systemd.verbs.logs import pass_logs, read_logs
+from dora_systemd.verbs.logs import pass_logs, read_logs, write_whole
 
 Lines = TerminalLines | ShownLines | None
 """Formats lines for a terminal; None for a pipe."""
@@ -218,7 +218,7 @@ def _lines(journal: JournalReader, query: LogQuery) -> Lines:
     if not query.output.startswith("short"):
         return ShownLines()
     is_one = bool(query.name) and not query.others
-    known = query.nodes or journal.known_nodes(query.name) if is_one else ()
+    known = query.nodes or journal.known_nodes(query.scope, query.name) if is_one else ()
     return TerminalLines(
         [*known, query.name],
         want_dataflow=not is_one,
@@ -242,9 +242,7 @@ def _exit_status(status: int) -> int:
 
 def _write(chunks: Iterator[bytes], fd: int) -> None:
     for chunk in chunks:
-        rest = memoryview(chunk)
-        while rest:
-            rest = rest[os.write(fd, rest) :]
+        write_whole(chunk, fd)
 
 
 def pager_of(environ: Mapping[str, str]) -> tuple[str, dict[str, str]]:

@@ -12,7 +12,7 @@ from dora_systemd.cli.parameters import acting_options, current_scope, print_out
 from dora_systemd.cli.stageline import StageLine
 from dora_systemd.verbs.restart import restart_asked
 from dora_systemd.verbs.start.again import find_known
-from dora_systemd.verbs.stop import restart_cells
+from dora_systemd.verbs.stop import note_stop, restart_cells
 
 
 @click.command("restart")
@@ -31,6 +31,7 @@ def command(selectors: tuple[str, ...]) -> int:
     scope = current_scope()
     bus = Bus(scope)
     cells, ended = find_known(bus, scope, selectors)
+    note_stop(cells, "doractl restart")
     with StageLine(sys.stderr) as stage:
         outcomes = restart_cells(bus, cells, partial(tell_stage, stage)) if cells else []
         outcomes += [restart_asked(bus, scope, one, os.environ, stage) for one in ended]

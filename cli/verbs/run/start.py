@@ -25,6 +25,7 @@ from dora_systemd.cli.settingoptions import SettingsCommand, setting_options
 from dora_systemd.cli.stageline import StageLine
 from dora_systemd.decisions.settings.resolve import is_given
 from dora_systemd.decisions.views.outcome import Outcome
+from dora_systemd.decisions.why.signs import known_remedy
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
@@ -125,7 +126,7 @@ def command(
 
 def _attach(bus: Bus, claimed: Claim, notes: Sequence[str]) -> int:
     """Print the logs of the dataflow, which goes on if this process ends."""
-    how = Foreground(signals=(signal.SIGINT,), notes=notes)
+    how = Foreground(signals=(signal.SIGINT,), notes=notes, command="doractl start --attach")
     # What is started from a unit file stays loaded if it has failed.
     properties = None if claimed.properties is None else [*claimed.properties, HELD]
     return print_until_end(bus, claimed.plan, properties, how)
@@ -156,7 +157,9 @@ def _last_words(bus: Bus, scope: Scope, uuid: str) -> Iterator[None]:
     try:
         yield
     except DoraSystemdError as error:
-        if error.code is ExitCode.FAILURE:
-            for line in words_of_start(bus, scope, uuid):
-                tell(f"  {line}", err=True)
-        raise
+        if error.code is not ExitCode.FAILURE:
+            raise
+        words = words_of_start(bus, scope, uuid)
+        for line in words:
+            tell(f"  {line}", err=True)
+        raise DoraSystemdError(error.message, known_remedy(words) or error.hint) from error

@@ -1,31 +1,30 @@
-"""Reads the journal with journalctl(1) as a child process.
-
-Every machine with a journal has journalctl, in the journal's own version. It prints 100,000 records
-in the time in which the Python binding reads 5,000.
-"""
+"""Queries of the journal, within limits: every node can write to it."""
 
 import json
 import os
 import select
-import subprocess
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import groupby
+from itertools import groupby, islice, takewhile
 from pathlib import Path
 from typing import Any
 
+from dora_systemd.adapters.journal.journalctl import (
+    CHUNK,
+    JOIN,
+    end_journalctl,
+    journal_output,
+    open_journalctl,
+)
+from dora_systemd.decisions.cell.exits import KILLED
 from dora_systemd.decisions.logs.query import journal_timestamp, scope_matches
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.names import is_name, is_node_id, is_uuid, unit_name
+from dora_systemd.names import is_name, is_node_id, is_uuid, name_from_unit, unit_name
 from dora_systemd.scope import Scope
 
 PERSISTENT = Path("/var/log/journal")
 VOLATILE = Path("/run/log/journal")
-_JOIN = "join the group systemd-journal or adm (usermod -aG) and log in again"
-_NOTICE = "to turn off this notice."
-"""The end of the hint to users who can only see their own records."""
 
 _LIFE_EVENTS = ("starting", "started", "stopping", "finished", "stopped", "failed")
 _LIFE_FIELDS = ("DORA_DATAFLOW", "DORA_EVENT", "DORA_EXIT", "DORA_REASON")
@@ -38,8 +37,8 @@ FIRST_SECONDS = 20.0
 """Timeout for the first record: journalctl may have to open large files on a slow disk."""
 READ_SECONDS = 2.0
 """Timeout after the first record."""
-_CHUNK = 1 << 18
 _MOST_FORGED = 100
+_MOST_NAMES = 1000
 _MOST_DETAIL = 300
 
 
@@ -59,75 +58,6 @@ class LastEvent:
     detail: str
 
 
-@contextmanager
-def open_journalctl(
-    arguments: Sequence[str],
-    want_colors: bool = False,
-    stdout: int = subprocess.PIPE,
-    outlives_interrupt: bool = False,
-) -> "Iterator[subprocess.Popen[bytes]]":
-    """A running journalctl, which the block ends. stdout: a pipe, or the descriptor to use.
-
-    outlives_interrupt: Ctrl+C on the terminal does not reach it, see setpgid(2).
-    Raises DoraSystemdError (NO_SYSTEMD) if there is no journalctl.
-    """
-    environment = {**os.environ, "SYSTEMD_COLORS": "1" if want_colors else "0", "LC_ALL": "C.UTF-8"}
-    try:
-        child = subprocess.Popen(
-            ["journalctl", "--no-pager", *arguments],
-            stdin=subprocess.DEVNULL,
-            stdout=stdout,
-            stderr=subprocess.PIPE,
-            env=environment,
-            process_group=0 if outlives_interrupt else None,
-        )
-    except OSError as error:
-        message = f"cannot execute journalctl: {error.strerror}"
-        raise DoraSystemdError(message, "it is part of systemd", ExitCode.NO_SYSTEMD) from error
-    with child:
-        try:
-            yield child
-        finally:
-            child.kill()
-
-
-def end_journalctl(child: "subprocess.Popen[bytes]") -> int:
-    """The exit status of a journalctl whose output has been read to its end.
-
-    Raises DoraSystemdError for its error message.
-    """
-    complaint = child.stderr.read().decode("utf-8", "replace").strip() if child.stderr else ""
-    status = child.wait()
-    if status and complaint and not complaint.endswith(_NOTICE):
-        raise _complaint_error(complaint.splitlines()[-1])
-    return status
-
-
-def journal_output(arguments: Sequence[str], want_colors: bool = False) -> Iterator[bytes]:
-    """What journalctl prints, in chunks. Raises DoraSystemdError for its error message."""
-    with open_journalctl(arguments, want_colors) as child:
-        assert child.stdout
-        while data := os.read(child.stdout.fileno(), _CHUNK):
-            yield data
-        end_journalctl(child)
-
-
-def _complaint_error(complaint: str) -> DoraSystemdError:
-    if complaint.startswith("Failed to parse timestamp"):
-        hint = 'such as "2026-11-20 18:00", "10 min ago", "today" or "5m", see systemd.time(7)'
-        return DoraSystemdError(f"cannot read the time{complaint[25:]}", hint, ExitCode.USAGE)
-    if complaint.startswith("Bad pattern"):
-        return DoraSystemdError(
-            f"cannot use the {complaint[4:]}", "see pcre2pattern(3)", ExitCode.USAGE
-        )
-    if " boot " in complaint:
-        hint = "journalctl --list-boots shows them"
-        return DoraSystemdError(f"cannot find the boot: {complaint}", hint, ExitCode.NOT_FOUND)
-    if "insufficient permissions" in complaint:
-        return DoraSystemdError("cannot read the journal", _JOIN, ExitCode.NO_PERMISSION)
-    return DoraSystemdError(f"cannot read the journal: {complaint}", "see journalctl(1)")
-
-
 class JournalReader:
     """Queries of the journal."""
 
@@ -136,18 +66,39 @@ class JournalReader:
         lines = _lines([f"--field={field}", "--quiet"])
         return sorted(line.decode("utf-8", "replace").rstrip("\n") for line in lines)
 
-    def known_names(self) -> list[str]:
-        """The names of all dataflows with a record, of all scopes."""
-        return list(filter(is_name, self.unique("DORA_DATAFLOW_NAME")))
+    def known_names(self, scope: Scope) -> list[str]:
+        """The names of all dataflows of `scope` with a record, sorted."""
+        field = "_SYSTEMD_USER_UNIT" if scope.is_user else "_SYSTEMD_UNIT"
+        found = filter(None, map(name_from_unit, self.unique(field)))
+        if not scope.is_user:
+            return list(found)  # only root can make such a unit
+        starts = self.newest([*scope_matches(scope), "DORA_EVENT=dataflow-starting"], _MOST_NAMES)
+        known = set(filter(None, map(_trusted_name, starts)))
+        return self._recorded(known, found, lambda name: scope_matches(scope, name))
 
     def known_uuids(self) -> list[str]:
-        """The UUIDs of all dataflows with a record, of all scopes."""
+        """The UUIDs in all records, sorted: anybody can write more, see name_of()."""
         return list(filter(is_uuid, self.unique("DORA_DATAFLOW")))
 
-    def known_nodes(self, name: str) -> list[str]:
-        """The nodes of the dataflows called `name` with a record."""
-        found = (one.partition("/") for one in self.unique("SYSLOG_IDENTIFIER"))
-        return [node for dataflow, _, node in found if dataflow == name and is_node_id(node)]
+    def known_nodes(self, scope: Scope, name: str) -> list[str]:
+        """The nodes of the dataflows of `scope` called `name` with a record, sorted."""
+        own = scope_matches(scope, name)
+        events = self.newest([*own, "DORA_EVENT=node-ready"], _MOST_NAMES)
+        known = {node for one in events if is_node_id(node := str(one.get("DORA_NODE", "")))}
+        parts = (one.partition("/") for one in self.unique("SYSLOG_IDENTIFIER"))
+        found = (node for dataflow, _, node in parts if dataflow == name and is_node_id(node))
+        return self._recorded(known, found, lambda node: [*own, f"DORA_NODE={node}"])
+
+    def _recorded(
+        self, known: set[str], found: Iterable[str], matches: Callable[[str], list[str]]
+    ) -> list[str]:
+        """`known`, and those of `found` that really have a record, sorted.
+
+        Anybody can write records that look like those of another dataflow. matches: those of a
+        real record.
+        """
+        doubtful = islice((one for one in found if one not in known), _MOST_FORGED)
+        return sorted(known.union(one for one in doubtful if any(self.newest(matches(one), 1))))
 
     def count_own(self, since_us: int, until_us: int) -> int:
         """Number of records of this process between two times, inclusive; CLOCK_REALTIME µs."""
@@ -157,9 +108,9 @@ class JournalReader:
         output = journal_output([*options, "--", f"_PID={os.getpid()}"])
         return sum(data.count(b"\n") for data in output)
 
-    def name_of(self, uuid: str) -> str:
-        """The name of the dataflow `uuid`, "" if it has no record."""
-        records = self.newest([f"DORA_DATAFLOW={uuid}"], _MOST_FORGED)
+    def name_of(self, scope: Scope, uuid: str) -> str:
+        """The name of the dataflow `uuid` of `scope`, "" if it has no record."""
+        records = self.newest([*scope_matches(scope), f"DORA_DATAFLOW={uuid}"], _MOST_FORGED)
         return next(filter(None, map(_trusted_name, records)), "")
 
     def newest(
@@ -195,15 +146,21 @@ class JournalReader:
                 break
         return list(found.values())
 
-    def has_run(self, name: str, run: str) -> bool:
+    def has_run(self, scope: Scope, name: str, run: str) -> bool:
         """Whether there is a record of the run with that id. name: of its dataflow, "" for any."""
-        matches = [f"DORA_RUN={run}", *([f"DORA_DATAFLOW_NAME={name}"] if name else [])]
-        return any(self.newest(matches, 1))
+        return any(self.newest([*scope_matches(scope, name), f"DORA_RUN={run}"], 1))
 
     def starts(self, scope: Scope, uuid: str, limit: int) -> list[int]:
         """Start times of the newest runs of a dataflow's unit, CLOCK_REALTIME µs, newest first."""
         matches = [*scope_matches(scope), f"DORA_DATAFLOW={uuid}", "DORA_EVENT=dataflow-starting"]
         return [int(one["__REALTIME_TIMESTAMP"]) for one in self.newest(matches, limit)]
+
+    def killed_since(self, scope: Scope, name: str, uuid: str, since_us: int) -> list[str]:
+        """The nodes of a dataflow that were killed while it stopped; CLOCK_REALTIME µs."""
+        ends = ("DORA_EVENT=node-exited", f"DORA_EXIT={KILLED}", f"DORA_DATAFLOW={uuid}")
+        records = self.newest([*scope_matches(scope, name), *ends], _MOST_NAMES)
+        new = takewhile(lambda one: int(one["__REALTIME_TIMESTAMP"]) >= since_us, records)
+        return list(filter(is_node_id, (str(one.get("DORA_NODE", "")) for one in new)))[::-1]
 
     def invocations(self, scope: Scope, name: str, uuid: str) -> Iterator[str]:
         """systemd's invocation ids of a dataflow's unit, newest first."""
@@ -228,7 +185,7 @@ def _lines(arguments: Sequence[str]) -> Iterator[bytes]:
         poll = select.poll()
         poll.register(fd, select.POLLIN)
         while left > 0 and poll.poll(max(deadline - time.monotonic(), 0.0) * 1000):
-            if not (data := os.read(fd, _CHUNK)):
+            if not (data := os.read(fd, CHUNK)):
                 if rest and len(rest) <= MAX_LINE:
                     yield rest
                 break
@@ -290,8 +247,8 @@ def check_readable(scope: Scope) -> None:
         hint = "is systemd-journald running?"
         raise DoraSystemdError("cannot find a journal on this machine", hint, ExitCode.NO_SYSTEMD)
     if not scope.is_user:
-        raise DoraSystemdError("cannot read the system's journal", _JOIN, ExitCode.NO_PERMISSION)
+        raise DoraSystemdError("cannot read the system's journal", JOIN, ExitCode.NO_PERMISSION)
     if is_volatile():
-        hint = f"it is volatile: {_JOIN}, or have Storage=persistent set in journald.conf(5)"
+        hint = f"it is volatile: {JOIN}, or have Storage=persistent set in journald.conf(5)"
         message = "cannot read the records of user services in this machine's journal"
         raise DoraSystemdError(message, hint, ExitCode.NO_PERMISSION)

@@ -5,7 +5,7 @@ from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from subprocess import Popen
 
-from dora_systemd.adapters.journal.reader import open_journalctl
+from dora_systemd.adapters.journal.journalctl import open_journalctl
 
 _CHUNK = 1 << 17
 

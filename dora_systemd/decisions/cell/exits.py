@@ -70,6 +70,9 @@ def exit_of(status: int) -> Exit:
     return Exit(ExitKind.CODE, status) if status >= 0 else Exit(ExitKind.SIGNAL, -status)
 
 
+KILLED = exit_of(-signal.SIGKILL)
+
+
 def parse_exit(text: str) -> Exit:
     """The end that `text` describes. A text of another version becomes the `words`."""
     # The owner of a dataflow can write it: no recursion, and no pattern that tries again.

@@ -22,6 +22,8 @@ NODE_STATES = (
     "stopped",
     "dynamic",
 )
+FAILED_BECAUSE = "failed: "
+"""Prefix of STATUS= for the reason why a dataflow failed."""
 HELD = "held"
 """Policy of a node that waits for a reload after it has failed."""
 ALIVE_NODE_STATES = frozenset({"ready", "running", "dynamic"})

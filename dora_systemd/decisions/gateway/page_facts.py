@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from dora_systemd.decisions.cell.environment import with_changes
-from dora_systemd.decisions.cell.limits import LIMITS, Limit, format_node_limits
+from dora_systemd.decisions.cell.limits import LIMITS, Limit, NodeLimits, format_node_limits
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.values import INFINITY
 
@@ -29,13 +29,18 @@ def fact_values(options: RunnerOptions, unit: Mapping[str, Any]) -> dict[str, An
     environment = dict(one.partition("=")[::2] for one in unit["Environment"] or ())
     now = with_changes(options, environment)
     limits = {one: unit[_read_as(one)] for one in LIMITS}
+    nodes = map(_finite, now.node_limits)
     return {
         **{one.key: one.format(value) for one, value in limits.items() if _is_set(value)},
-        "node_limit": list(map(format_node_limits, now.node_limits)),
+        "node_limit": [format_node_limits(one) for one in nodes if one.limits],
         "hot_reload": now.hot_reload,
         "sandbox": _level(unit),
         "network": _network(unit),
     }
+
+
+def _finite(one: NodeLimits) -> NodeLimits:
+    return one._replace(limits=tuple(pair for pair in one.limits if pair[1] != INFINITY))
 
 
 def _is_set(value: object) -> bool:

@@ -40,9 +40,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from dora_systemd.decisions.cell.limits import BY_KEY
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.logs.records import Record, record_text
+from dora_systemd.decisions.settings.limits import LIVE_SETTINGS
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.terminal_text import escaped, one_line, without_sequences
 from dora_systemd.values import format_moment
@@ -60,7 +60,7 @@ MAX_ITEMS = 100
 _MAX_ASKED = 1000
 """Maximum characters of a text in a request."""
 _TEXTS = ("type", "dataflow", "node", "action", "search", "since", "until", "run")
-_SETTINGS = frozenset({*BY_KEY, HOT_RELOAD})
+_SETTINGS = frozenset({*(one.name for one in LIVE_SETTINGS), HOT_RELOAD})
 _DEFAULT_PRIORITY = 6
 _PRIORITIES = frozenset(b"%d" % number for number in range(8))
 

@@ -2,9 +2,8 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from signal import SIGKILL
 
-from dora_systemd.decisions.cell.exits import Exit, ExitKind
+from dora_systemd.decisions.cell.exits import KILLED, Exit, ExitKind
 from dora_systemd.decisions.cell.status import HELD, NodeStatus
 from dora_systemd.decisions.descriptor.wiring import Downstream
 from dora_systemd.decisions.life import events as life
@@ -14,7 +13,6 @@ NodeTable = Mapping[str, NodeStatus]
 Update = tuple[NodeTable, Record | None]
 """The table after an event, and the life event for the journal."""
 
-_KILLED = Exit(ExitKind.SIGNAL, SIGKILL)
 WITH_PROCESS = frozenset({"starting", "ready", "running"})
 
 
@@ -169,7 +167,7 @@ def apply_results(nodes: NodeTable, results: Mapping[str, Exit], at_us: int) -> 
         if ident in nodes and (how.is_failure or nodes[ident].state not in ("failed", "stopped")):
             state = "failed" if how.is_failure else "finished"
             # For an OOM kill, dora only knows the signal.
-            is_known = how == _KILLED and nodes[ident].exit.is_failure
+            is_known = how == KILLED and nodes[ident].exit.is_failure
             exit = nodes[ident].exit if is_known else how
             nodes = _set(nodes, ident, at_us, state=state, exit=exit, pid=0)
     return nodes

@@ -4,12 +4,10 @@ With NotifyAccess=main only the runner can set STATUS=, and it refuses before no
 may have another program in the runner's place, so the text is cleaned and cut, and is only printed.
 """
 
+from dora_systemd.decisions.cell.status import FAILED_BECAUSE
 from dora_systemd.decisions.life.states import RunnerExit
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.terminal_text import short_line
-
-FAILED = "failed: "
-"""Prefix of STATUS= for the reason why a dataflow failed."""
 
 _HINT = "; hint: "
 _LONGEST = 1500
@@ -31,7 +29,7 @@ def refusal_exit(error: DoraSystemdError) -> RunnerExit:
 def format_refusal(error: DoraSystemdError) -> str:
     """STATUS= of a runner that refuses its dataflow."""
     hint = f"{_HINT}{short_line(error.hint, _LONGEST)}" if error.hint else ""
-    return f"{FAILED}{short_line(error.message, _LONGEST)}{hint}"
+    return f"{FAILED_BECAUSE}{short_line(error.message, _LONGEST)}{hint}"
 
 
 def parse_refusal(text: str, status: int) -> DoraSystemdError | None:
@@ -39,9 +37,9 @@ def parse_refusal(text: str, status: int) -> DoraSystemdError | None:
 
     text: its last STATUS=. status: its exit status.
     """
-    if status not in list(_CODES) or not text.startswith(FAILED):
+    if status not in list(_CODES) or not text.startswith(FAILED_BECAUSE):
         return None
-    message, _, hint = text.removeprefix(FAILED).partition(_HINT)
+    message, _, hint = text.removeprefix(FAILED_BECAUSE).partition(_HINT)
     return DoraSystemdError(
         short_line(message, _LONGEST), short_line(hint, _LONGEST), _CODES[RunnerExit(status)]
     )

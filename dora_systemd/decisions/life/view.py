@@ -4,9 +4,15 @@ from collections.abc import Mapping
 from typing import Any
 
 from dora_systemd.decisions.cell.restarts import HELD_SECONDS
-from dora_systemd.decisions.cell.status import HELD, CellStatus, CpuSample, LineCount, NodeStatus
+from dora_systemd.decisions.cell.status import (
+    FAILED_BECAUSE,
+    HELD,
+    CellStatus,
+    CpuSample,
+    LineCount,
+    NodeStatus,
+)
 from dora_systemd.decisions.life.nodes import WITH_PROCESS
-from dora_systemd.decisions.life.refusal import FAILED
 from dora_systemd.decisions.life.states import Cell, State
 from dora_systemd.decisions.life.stop_budget import kill_delay
 from dora_systemd.values import INFINITY, format_duration
@@ -30,7 +36,7 @@ _NAMED = 5
 def format_status(cell: Cell) -> str:
     """One line for STATUS=, see sd_notify(3)."""
     if cell.failure:
-        return f"{FAILED}{cell.failure}"
+        return f"{FAILED_BECAUSE}{cell.failure}"
     if text := _SHOWN[cell.state][1]:
         return text
     if cell.state is State.ENDED:

@@ -190,9 +190,11 @@ def _fit(columns: list[list[str]], width: int) -> None:
         if _excess(columns, width) <= slack:
             break
         columns[:] = [one for one in columns if one[0] != title]
-    for column in reversed(columns):
-        if column[0] in _ROOM and (excess := _excess(columns, width)) > 0:
-            column[:] = [cut(cell, max(_width(column) - excess, _LEAST)) for cell in column]
+    for least in (_ROOM, dict.fromkeys(_ROOM, _LEAST)):
+        for column in reversed(columns):
+            if column[0] in least and (excess := _excess(columns, width)) > 0:
+                room = max(_width(column) - excess, least[column[0]])
+                column[:] = [cut(cell, room) for cell in column]
 
 
 def _width(column: Sequence[str]) -> int:
@@ -251,11 +253,17 @@ def node_count(row: DataflowRow) -> str:
     return f"{row.nodes_alive}/{row.nodes_total}" if row.nodes_total else ""
 
 
-def local_time(moment: int) -> str:
-    """CLOCK_REALTIME µs as "2026-01-15 13:00:00" in the local time zone; 0 is unknown."""
-    if not moment:
-        return UNKNOWN
-    return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(moment / SECOND))
+def local_time(moment: int, form: str = "%Y-%m-%d %H:%M:%S") -> str:
+    """CLOCK_REALTIME µs as "2026-01-15 13:00:00" in the local time zone; 0 is unknown.
+
+    form: as for strftime(3).
+    """
+    return time.strftime(form, time.localtime(moment / SECOND)) if moment else UNKNOWN
+
+
+def zoned_time(moment: int) -> str:
+    """As local_time(), with the name of the zone behind it."""
+    return local_time(moment, "%Y-%m-%d %H:%M:%S %Z")
 
 
 def is_up_word(row: DataflowRow) -> bool:

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 from dora_systemd.decisions.cell.restarts import budget_words
-from dora_systemd.decisions.life.refusal import FAILED as FAILED_BECAUSE
 from dora_systemd.decisions.views.dataflows import (
     DEGRADED,
     FAILED,
@@ -18,7 +17,7 @@ from dora_systemd.decisions.views.dataflows import (
     format_percent,
     format_table,
     format_uptime,
-    local_time,
+    zoned_time,
 )
 from dora_systemd.terminal_text import cut, one_line
 
@@ -69,8 +68,8 @@ def format_dataflow(row: DataflowRow, width: int | None = None, want_colors: boo
         ("File", row.dataflow or UNKNOWN),
         ("Status", _status_words(row)),
         ("Uptime", format_uptime(row.uptime)),
-        ("Started", local_time(row.started)),
-        ("Ended", local_time(row.ended) if row.ended else ""),
+        ("Started", zoned_time(row.started)),
+        ("Ended", zoned_time(row.ended) if row.ended else ""),
         ("Nodes", row.problem),
         ("CPU", _cpu_words(row)),
         ("Memory", _memory_words(row)),
@@ -88,9 +87,7 @@ def format_dataflow(row: DataflowRow, width: int | None = None, want_colors: boo
 
 
 def _status_words(row: DataflowRow) -> str:
-    """The status and STATUS= of the runner, which begins with the same word after a failure."""
-    text = row.text.removeprefix(FAILED_BECAUSE)
-    return f"{row.status} ({text})" if text else row.status
+    return f"{row.status} ({row.text})" if row.text else row.status
 
 
 def _cpu_words(row: DataflowRow) -> str:

@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 
-from dora_systemd.decisions.cell.exits import ExitKind, exit_of, parse_exit
+from dora_systemd.decisions.cell.exits import KILLED, ExitKind, exit_of, parse_exit
 from dora_systemd.decisions.life.causes import UNIT_RESULTS, Cause
 from dora_systemd.decisions.reload.steps import How
 from dora_systemd.decisions.views.dataflows import FAILED, FINISHED, RESTARTING, STOPPED, UP_WORDS
@@ -123,7 +123,7 @@ def _end(life: Life, facts: Facts, shutdowns: Sequence[int]) -> Verdict:
         return _found(Cause.FINISHED, "all nodes ended by themselves", end)
     if (end := life.last("dataflow-stopped", "unit-succeeded")) is not None:
         by = stopped_by(life, shutdowns)
-        return _found(Cause.STOPPED, f"stopped by {by}", end, by=by)
+        return _found(Cause.STOPPED, f"stopped by {by}{_killed_at_stop(life)}", end, by=by)
     return _without_end(life, facts)
 
 
@@ -212,6 +212,14 @@ def stopped_by(life: Life, shutdowns: Sequence[int]) -> str:
     if job is not None:
         return UNKNOWN_PERSON
     return f"the signal {by}" if by else "an unknown caller"
+
+
+def _killed_at_stop(life: Life) -> str:
+    """The nodes that had not ended when their time was up."""
+    begin = life.last("dataflow-stopping")
+    exits = (one for one in life.all("node-exited") if begin and one.at_us >= begin.at_us)
+    nodes = [one.node for one in exits if parse_exit(one.detail("exit")) == KILLED]
+    return f"; killed after the grace duration: {', '.join(nodes)}" if nodes else ""
 
 
 def _starved(found: Verdict, life: Life) -> tuple[str, ...]:

@@ -2,15 +2,22 @@
 
 import re
 import signal
-from collections.abc import Mapping, Sequence
+import textwrap
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from dora_systemd.decisions.cell.exits import ExitKind, parse_exit
 from dora_systemd.decisions.cell.restarts import budget_words
 from dora_systemd.decisions.life.causes import Cause
-from dora_systemd.decisions.views.dataflows import RESTARTING, UNKNOWN, local_time
+from dora_systemd.decisions.views.dataflows import (
+    RESTARTING,
+    UNKNOWN,
+    colored_state,
+    local_time,
+    zoned_time,
+)
 from dora_systemd.decisions.why.last_lines import Word, shown_last
-from dora_systemd.decisions.why.sandbox_signs import sandbox_remedy
+from dora_systemd.decisions.why.signs import known_remedy
 from dora_systemd.decisions.why.verdict import Restart, Verdict
 from dora_systemd.terminal_text import cut, one_line
 from dora_systemd.values import SECOND, format_duration, format_rounded_size
@@ -20,7 +27,7 @@ LINES = 20
 _TIMELINE = 7
 _SIZE = re.compile("[1-9][0-9]{0,18}")
 _TITLE_WIDTH = 10
-_RED, _GREEN, _BOLD, _PLAIN = "\x1b[31m", "\x1b[32m", "\x1b[1m", "\x1b[0m"
+_BOLD, _PLAIN = "\x1b[1m", "\x1b[0m"
 
 _AUTOMATIC = "run: doractl restart {name}; --restart-policy on-failure does this automatically"
 _OVERLOADED = "run: doractl restart {name}; check whether the machine was overloaded"
@@ -89,7 +96,7 @@ class Report:
 def remedies(report: Report) -> list[str]:
     """What to do, one line each."""
     verdict, subject = report.verdict, report.subject
-    hint = sandbox_remedy(one.text for one in report.words) if verdict.node else ""
+    hint = known_remedy(one.text for one in report.words) if verdict.node else ""
     texts = [hint, _AGAIN if verdict.is_passing else _remedy(verdict)]
     if verdict.node and verdict.is_up and verdict.status != RESTARTING and not verdict.is_passing:
         texts.append(_AWAY)
@@ -123,24 +130,47 @@ def _remedy(verdict: Verdict) -> str:
 
 
 def format_report(report: Report, width: int | None = None, want_colors: bool = False) -> str:
-    """The report as at most 45 lines, each cut at `width` characters if that is given."""
-    blocks = [_head(report), _timeline(report), _words(report), _todo(report)]
-    # Texts of nodes must not control the terminal, or add lines to the report.
-    lines = [one_line(line) for block in blocks if block for line in (*block, "")][:-1]
-    shown = [cut(line, width) for line in lines]
-    return "\n".join(_colored(shown, report.verdict) if want_colors else shown)
+    """The report as at most 45 lines, if it need not be wrapped.
 
-
-def _colored(lines: list[str], verdict: Verdict) -> list[str]:
-    color = _RED if verdict.is_failure else _GREEN
-    titles = [
-        f"{_BOLD}{line}{_PLAIN}" if line.endswith(":") and not line.startswith(" ") else line
-        for line in lines[1:]
+    width: of the terminal. What happened and the last lines are cut there, all else is wrapped.
+    """
+    blocks = [
+        [_title(report, width, want_colors), *_wrapped(_facts(report), width, 2 + _TITLE_WIDTH)],
+        _section("What happened:", _cut(_timeline(report), width), want_colors),
+        _section(cut(_words_title(report), width), _cut(_words(report), width), want_colors),
+        _section("What to do:", _wrapped(remedies(report), width, 2), want_colors),
     ]
-    return [f"{color}{_BOLD}{lines[0]}{_PLAIN}", *titles]
+    return "\n\n".join("\n".join(block) for block in blocks if block)
 
 
-def _head(report: Report) -> list[str]:
+def _title(report: Report, width: int | None, want_colors: bool) -> str:
+    status = report.verdict.status
+    name = cut(report.subject.name, None if width is None else width - len(status) - 2)
+    if want_colors:
+        name, status = f"{_BOLD}{name}{_PLAIN}", colored_state(status, status)
+    return f"{name}: {status}"
+
+
+def _section(title: str, lines: list[str], want_colors: bool) -> list[str]:
+    heading = f"{_BOLD}{title}{_PLAIN}" if want_colors else title
+    return [heading, *lines] if lines else []
+
+
+def _cut(lines: Iterable[str], width: int | None) -> list[str]:
+    # Texts of nodes must not control the terminal, or add lines to the report.
+    return [cut(f"  {one_line(line)}", width) for line in lines]
+
+
+def _wrapped(lines: Iterable[str], width: int | None, indent: int) -> list[str]:
+    """Lines of at most `width` characters. indent: of all but the first of those from one line."""
+    shown = _cut(lines, None)
+    if width is None:
+        return shown
+    wrapper = textwrap.TextWrapper(width, subsequent_indent=" " * indent, break_on_hyphens=False)
+    return [piece for line in shown for piece in wrapper.wrap(line)]
+
+
+def _facts(report: Report) -> list[str]:
     verdict, subject = report.verdict, report.subject
     facts = {
         "Why": verdict.summary,
@@ -150,13 +180,11 @@ def _head(report: Report) -> list[str]:
         "Starved": ", ".join(verdict.starved),
         "Restarts": _restart_words(verdict.restarts),
         "Budget": _budget_words(report),
-        "Before": f"{verdict.before} ({local_time(verdict.before_us)})" if verdict.before else "",
+        "Before": f"{verdict.before} ({zoned_time(verdict.before_us)})" if verdict.before else "",
         "Unit": f"{subject.unit} ({subject.uuid})",
         "File": subject.file,
     }
-    title = f"{subject.name}: {verdict.status}"
-    rows = [f"  {key + ':':<{_TITLE_WIDTH}}{text}" for key, text in facts.items() if text]
-    return [title, *rows]
+    return [f"{key + ':':<{_TITLE_WIDTH}}{text}" for key, text in facts.items() if text]
 
 
 def _budget_words(report: Report) -> str:
@@ -167,12 +195,12 @@ def _budget_words(report: Report) -> str:
 
 
 def _when(verdict: Verdict) -> str:
-    since = f"started {local_time(verdict.began_us)}" if verdict.began_us else ""
+    since = f"started {zoned_time(verdict.began_us)}" if verdict.began_us else ""
     if not verdict.at_us:
         return since
     lasted = verdict.at_us - verdict.began_us
     words = f", {_span(lasted)} after its start" if verdict.began_us and lasted >= 0 else ""
-    return f"{local_time(verdict.at_us)}{words}"
+    return f"{zoned_time(verdict.at_us)}{words}"
 
 
 def _span(duration: int) -> str:
@@ -202,32 +230,28 @@ def _restart_words(restarts: Sequence[Restart]) -> str:
 
 def _timeline(report: Report) -> list[str]:
     news = report.verdict.timeline
-    lines = [f"  {_clock(one.at_us)}  {one.text or one.name}" for one in news]
+    lines = [f"{_clock(one.at_us)}  {one.text or one.name}" for one in news]
     left = len(lines) - _TIMELINE
     if left > 0:
-        lines[2 : 2 - _TIMELINE] = [f"  ... {left} more ..."]
-    return ["What happened:", *lines] if lines else []
+        lines[2 : 2 - _TIMELINE] = [f"... {left} more ..."]
+    return lines
 
 
 def _clock(moment: int) -> str:
     return local_time(moment)[5:] if moment else UNKNOWN
 
 
-def _words(report: Report) -> list[str]:
-    if not report.words:
-        return []
+def _words_title(report: Report) -> str:
     node = report.verdict.node
     count = "line" if len(report.words) == 1 else f"{len(report.words)} lines"
     every = f"doractl logs {report.subject.name}" + (f" --node {node}" if node else "")
-    title = f"The last {count} of {node or 'its nodes'} (all: {every}):"
-    shown = shown_last(report.words, LINES)
-    return [title, *(f"  {_clock(one.at_us)[6:]}  {_line(one, node)}" for one in shown)]
+    return f"The last {count} of {node or 'its nodes'} (all: {every}):"
+
+
+def _words(report: Report) -> list[str]:
+    node, shown = report.verdict.node, shown_last(report.words, LINES)
+    return [f"{_clock(one.at_us)[6:]}  {_line(one, node)}" for one in shown]
 
 
 def _line(word: Word, node: str) -> str:
     return word.text if node else f"{word.node}: {word.text}"
-
-
-def _todo(report: Report) -> list[str]:
-    found = remedies(report)
-    return ["What to do:", *(f"  {one}" for one in found)] if found else []

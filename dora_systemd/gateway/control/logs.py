@@ -10,7 +10,8 @@ import time
 from collections.abc import AsyncIterator, Iterator, Sequence
 
 from dora_systemd.adapters.bus.systemd import Bus
-from dora_systemd.adapters.journal.reader import JournalReader, journal_output
+from dora_systemd.adapters.journal.journalctl import journal_output
+from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.adapters.journal.stream import open_stream
 from dora_systemd.decisions.gateway.answers import is_from_systemd, is_wanted, log_line
 from dora_systemd.decisions.gateway.frames import LOGS_LIMIT, Request, format_event, logs_parts
@@ -81,7 +82,8 @@ def _uuid_of(scope: Scope, request: Request) -> str:
 def _check_node(scope: Scope, uuid: str, name: str, node: str) -> None:
     """Refuse an unknown node; a known node without records is fine."""
     cell = find_if_loaded(scope, uuid)
-    known = [*JournalReader().known_nodes(name), *(read_status(scope, cell).nodes if cell else ())]
+    known = JournalReader().known_nodes(scope, name)
+    known += read_status(scope, cell).nodes if cell else ()
     if node in known:
         return
     raise DoraSystemdError(

@@ -72,13 +72,13 @@ def ended_descriptor(scope: Scope, uuid: str) -> tuple[str, dict[str, Any]]:
         with suppress(DoraSystemdError):
             return cell.name, dict(written_dataflow(cell.options.dataflow).raw)
     name = find_name(scope, uuid)
-    return name, bare_descriptor(JournalReader().known_nodes(name))
+    return name, bare_descriptor(JournalReader().known_nodes(scope, name))
 
 
 def find_name(scope: Scope, uuid: str) -> str:
     """The name of a dataflow that is running or ever ran. Raises DoraSystemdError (NOT_FOUND)."""
     cell = find_if_loaded(scope, uuid)
-    name = cell.name if cell else JournalReader().name_of(uuid)
+    name = cell.name if cell else JournalReader().name_of(scope, uuid)
     return name or find_by_uuid(scope, uuid).name
 
 

@@ -44,6 +44,7 @@ async def stop(talk: Talk, request: Request) -> dict[str, Any]:
 async def restart(talk: Talk, request: Request) -> dict[str, Any]:
     """Restart and RestartByName. Raises DoraSystemdError."""
     scope, cell = talk.scope, await _find(talk, request)
+    await asyncio.to_thread(note_stop, [cell], "dora restart")
     outcome = await _within(scope, cell, request, lambda: restart_cells(Bus(scope), [cell])[0])
     if outcome.problem:
         raise DoraSystemdError(outcome.problem, f"doractl {scope.flag} why {cell.name} tells more")

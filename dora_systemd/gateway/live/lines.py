@@ -9,7 +9,8 @@ from dataclasses import replace
 from typing import Any
 
 from dora_systemd.adapters.bus.systemd import Bus
-from dora_systemd.adapters.journal.reader import JournalReader, check_readable, end_journalctl
+from dora_systemd.adapters.journal.journalctl import end_journalctl
+from dora_systemd.adapters.journal.reader import JournalReader, check_readable
 from dora_systemd.adapters.journal.stream import open_stream
 from dora_systemd.decisions.gateway.page_messages import LOG_FIELDS, PageMessage, line_values
 from dora_systemd.decisions.logs.fields import ExportReader

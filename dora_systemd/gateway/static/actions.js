@@ -7,6 +7,9 @@ const SAID_MS = 8000;
 
 const by = (id) => document.getElementById(id);
 
+const SET = ["Limits", "They take effect at once, and last until the dataflow is stopped or disabled. "
+  + "An empty field means no limit.", "changing"];
+
 // Word on the button, what it does, and the word while it is done.
 const ACTIONS = {
   start: ["Start", "All nodes start, with the settings that it had.", "starting"],
@@ -17,9 +20,9 @@ const ACTIONS = {
     "reloading"],
   enable: ["Start at boot", "It starts at every boot, as it runs now.", "enabling"],
   disable: ["Not at boot", "It no longer starts at boot; if it runs, it keeps running.", "disabling"],
-  set: ["Limits", "They take effect at once, and last until the dataflow is stopped or disabled. "
-    + "An empty field means no limit.", "changing"],
+  set: SET,
   "hot-reload": ["Hot reload", "While it is on, nodes restart when their files change.", "changing"],
+  "set node": SET,
   "stop node": ["Stop", "It stays down until the dataflow is restarted; the other nodes keep running.",
     "stopping"],
   "restart node": ["Restart", "The other nodes keep running.", "restarting"],
@@ -29,6 +32,27 @@ const LIMITS = {
   memory_limit: ["Memory", "4G"], memory_high: ["Memory, slowed down beyond", "3G"],
   cpu_limit: ["CPU, in cores or percent of one", "1.5"], tasks_limit: ["Processes and threads", "500"],
 };
+
+// In texts such as "camera:memory=2G,cpu=150%", as doractl set --node-limit takes them.
+const WORDS = {
+  memory_limit: "memory", memory_high: "memory-high", cpu_limit: "cpu", tasks_limit: "tasks",
+};
+
+/** The limits of a dataflow, or of one of its nodes, by the same keys. */
+function limitsOf(node, facts) {
+  if (!node) return facts;
+  const text = facts.node_limit?.find((one) => one.startsWith(`${node}:`)) ?? "";
+  const known = new Map(text.slice(node.length + 1).split(",").map((one) => one.split("=")));
+  return Object.fromEntries(Object.entries(WORDS)
+    .filter(([, word]) => known.has(word))
+    .map(([key, word]) => [key, known.get(word)]));
+}
+
+/** The new limits as the values of "set". */
+function asSettings(node, limits) {
+  const pairs = Object.entries(limits).map(([key, text]) => `${WORDS[key]}=${text}`);
+  return node && pairs.length ? { node_limit: `${node}:${pairs.join(",")}` } : limits;
+}
 
 /** The buttons of a dataflow. ask: is called with an action. */
 export class Buttons {
@@ -89,17 +113,18 @@ export function askFirst(action, node, flow, facts, act) {
   const isSet = action === "set";
   const hotReload = { hot_reload: facts.hot_reload ? "off" : "on" };
   const title = action === "hot-reload" ? `${word} ${hotReload.hot_reload}` : word;
-  say(by("question"), isSet ? `Limits of ${flow.name}`
+  const limits = limitsOf(node, facts);
+  say(by("question"), isSet ? `Limits of ${node ? `node ${node} of ` : ""}${flow.name}`
     : `${title} ${node ? `node ${node} of ${flow.name}` : flow.name}?`);
   say(by("consequence"), consequence);
   say(by("confirmed"), isSet ? "Set" : title);
   by("confirmed").dataset.action = action;
-  by("limits").replaceChildren(...(isSet ? Object.keys(LIMITS).map((k) => limitField(k, facts)) : []));
+  by("limits").replaceChildren(...(isSet ? Object.keys(LIMITS).map((k) => limitField(k, limits)) : []));
   const dialog = by("confirm");
   dialog.returnValue = "";
   dialog.onclose = () => {
     if (dialog.returnValue !== "yes") return;
-    const values = isSet ? limitsGiven(facts) : hotReload;
+    const values = isSet ? asSettings(node, limitsGiven(limits)) : hotReload;
     if (action === "hot-reload") act("set", "", values);
     else if (!isSet || Object.keys(values).length) act(action, node, isSet ? values : {});
   };

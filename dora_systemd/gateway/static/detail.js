@@ -89,7 +89,8 @@ export class Detail {
     this.logs.name = flow.name;
     say(this.title, flow.name);
     showState(this.badge, flow.status);
-    say(this.text, flow.text);
+    // Below, it is the summary of why.
+    say(this.text, flow.text === this.about?.why?.summary ? "" : flow.text);
     this.why.tick();
     const own = history.of(flow.uuid);
     showUse(this.charts, own, flow);

@@ -19,13 +19,14 @@ export class NodeRow {
     const act = (action, text) => el("button", { type: "button", class: "small",
       "aria-label": `${text} ${name}`, onclick: () => ask(action, name) }, text);
     this.buttons = { restart: act("restart", "Restart"), stop: act("stop", "Stop") };
+    this.limits = act("set", "Limits");
     this.choose = el("button", { type: "button", class: "plain name", "aria-pressed": "false",
       title: `Show the logs of ${name}`, onclick: () => choose(name) }, name);
     this.node = el("li", { "data-node": name },
       el("div", { class: "what" }, this.choose, this.badge, this.exit),
       el("div", { class: "facts muted" }, this.up, this.restarts, this.waits),
       this.charts.cpu.node, this.charts.memory.node,
-      el("div", { class: "buttons" }, this.buttons.restart, this.buttons.stop));
+      el("div", { class: "buttons" }, this.buttons.restart, this.buttons.stop, this.limits));
   }
 
   /** isFree: whether its dataflow is up and nobody acts on it. */
@@ -41,5 +42,6 @@ export class NodeRow {
     showUse(this.charts, history, facts);
     this.choose.setAttribute("aria-pressed", String(isChosen));
     for (const button of Object.values(this.buttons)) button.disabled = !isFree || !isAlive;
+    this.limits.disabled = !isFree;
   }
 }

@@ -6,6 +6,7 @@ from typing import Any
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.decisions.cell.status import (
+    FAILED_BECAUSE,
     WHOLE_CELL,
     CpuSample,
     NodeStatus,
@@ -41,7 +42,8 @@ def row_of(reading: Reading, before: Reading | None = None) -> DataflowRow:
         "unit": cell.unit,
         "status": status_word(cell.state.active, cell.state.sub, status.stage),
         "dataflow": cell.options.dataflow,
-        "text": unit.get("StatusText", ""),
+        # The status says "failed" already.
+        "text": unit.get("StatusText", "").removeprefix(FAILED_BECAUSE),
         "restarts": unit["NRestarts"],
         "problem": reading.problem,
     }

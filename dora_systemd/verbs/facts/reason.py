@@ -4,8 +4,9 @@ from typing import Any
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.decisions.cell.exits import exit_of
+from dora_systemd.decisions.cell.status import FAILED_BECAUSE
 from dora_systemd.decisions.life.causes import UNIT_RESULTS
-from dora_systemd.decisions.life.refusal import FAILED, parse_refusal
+from dora_systemd.decisions.life.refusal import parse_refusal
 from dora_systemd.errors import DoraSystemdError
 
 _PROPERTIES = ("Result", "StatusText", "ExecMainCode", "ExecMainStatus")
@@ -56,7 +57,7 @@ def failure_reason(manager: Manager, unit: str) -> str:
     """One line about the end of `unit`: the runner's last STATUS=, else systemd's result."""
     facts = manager.read(unit, _PROPERTIES)
     special = _WORDS.get(facts["Result"], "")
-    last_words = str(facts["StatusText"]).removeprefix(FAILED)
+    last_words = str(facts["StatusText"]).removeprefix(FAILED_BECAUSE)
     if not last_words:
         return special or _exit_words(facts)
     # The runner's own message says more than its exit status.

@@ -9,9 +9,13 @@ from typing import NamedTuple
 from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.decisions.logs.query import LogQuery
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.scope import Scope
 from dora_systemd.values import quoted
 from dora_systemd.verbs.facts.ended import not_recorded
 from dora_systemd.verbs.facts.selector import Selector, is_pattern, selectors_of
+
+_MOST_FITTING = 100
+"""Maximum UUIDs with the same beginning: anybody can write records with more."""
 
 
 class _Recorded(NamedTuple):
@@ -37,27 +41,30 @@ def find_query(
     named = list(filter(None, selectors))
     found = [query]
     if named:
-        found = [replace(query, **one._asdict()) for one in _dataflows(journal, named)]
+        found = [replace(query, **one._asdict()) for one in _dataflows(journal, query.scope, named)]
     if nodes or query.levels:
         found = _with_nodes(journal, found, nodes)
     first, *others = (_select_run(journal, one, run) for one in found)
     return replace(first, others=tuple(others))
 
 
-def _dataflows(journal: JournalReader, texts: Sequence[str]) -> list[_Recorded]:
-    names = [_Recorded(name) for name in journal.known_names()]
+def _dataflows(journal: JournalReader, scope: Scope, texts: Sequence[str]) -> list[_Recorded]:
+    names = [_Recorded(name) for name in journal.known_names(scope)]
     try:
-        found = [_dataflow(journal, one, names) for one in selectors_of(texts, names)]
+        found = [_dataflow(journal, scope, one, names) for one in selectors_of(texts, names)]
     except DoraSystemdError as error:
         raise not_recorded(error) from error
     return list(dict.fromkeys(found))
 
 
-def _dataflow(journal: JournalReader, wanted: Selector, names: list[_Recorded]) -> _Recorded:
+def _dataflow(
+    journal: JournalReader, scope: Scope, wanted: Selector, names: list[_Recorded]
+) -> _Recorded:
     if named := wanted.only(names):
         return named
     fitting = wanted.meant(_Recorded("", uuid) for uuid in journal.known_uuids())
-    found = wanted.only(_Recorded(journal.name_of(one.uuid), one.uuid) for one in fitting)
+    named_ones = ((journal.name_of(scope, one.uuid), one.uuid) for one in fitting[:_MOST_FITTING])
+    found = wanted.only(_Recorded(name, uuid) for name, uuid in named_ones if name)
     if found is None:
         raise wanted.missing(one.name for one in names)
     return found
@@ -70,7 +77,7 @@ def _with_nodes(
     if not queries[0].name:
         hint = "say which dataflow: doractl logs NAME --node NODE"
         raise DoraSystemdError("cannot select nodes of all dataflows", hint, ExitCode.USAGE)
-    known = [journal.known_nodes(one.name) for one in queries]
+    known = [journal.known_nodes(one.scope, one.name) for one in queries]
     if not patterns:
         every = zip(queries, known, strict=True)
         return [replace(one, nodes=("", *nodes)) for one, nodes in every]
@@ -101,7 +108,7 @@ def _select_run(journal: JournalReader, query: LogQuery, run: str) -> LogQuery:
     if run == "ALL":
         return query
     if run not in ("CURRENT", "PREVIOUS"):
-        if run and not journal.has_run(query.name, run):
+        if run and not journal.has_run(query.scope, query.name, run):
             message = f"cannot find the run {quoted(run)}"
             hint = "doractl list --all, or journalctl --field=DORA_RUN"
             raise DoraSystemdError(message, hint, ExitCode.NOT_FOUND)

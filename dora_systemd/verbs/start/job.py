@@ -16,7 +16,7 @@ from dora_systemd.adapters.bus.manager import (
     tell_stage,
 )
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.life.refusal import FAILED
+from dora_systemd.decisions.cell.status import FAILED_BECAUSE
 from dora_systemd.decisions.unit.versions import transient_commands
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import unit_name
@@ -122,7 +122,7 @@ def _wait_until_checked(manager: Manager, unit: str) -> None:
     while True:
         state = manager.read(unit, ["ActiveState", "Job", "StatusText"])
         is_on_the_way = state["ActiveState"] in ON_THE_WAY or (state["Job"] or (0,))[0]
-        goes_on = state["StatusText"] and not state["StatusText"].startswith(FAILED)
+        goes_on = state["StatusText"] and not state["StatusText"].startswith(FAILED_BECAUSE)
         if goes_on or not is_on_the_way:
             return
         select.select([manager.fileno()], [], [], _POLL_SECONDS)

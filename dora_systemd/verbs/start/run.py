@@ -5,7 +5,7 @@ import os
 import select
 import signal
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Protocol
 
@@ -73,13 +73,14 @@ def follow_unit(
     on_stage: StageObserver | None,
     signals: Sequence[signal.Signals] = SIGNALS,
     stop_after: int = INFINITY,
+    on_stop: Callable[[], object] = lambda: None,
 ) -> int:
     """Print the logs of a started unit until it has ended; its exit status.
 
     The first of `signals` stops the dataflow gracefully, a later one kills it. stop_after: µs from
-    now; then it is stopped gracefully as well.
+    now; then it is stopped gracefully as well. on_stop: called before that.
     """
-    stop = _Stop(manager, unit, time.monotonic() + stop_after / SECOND)
+    stop = _Stop(manager, unit, time.monotonic() + stop_after / SECOND, on_stop)
     with _interrupts(signals) as wakeup:
         poll = select.poll()
         for source in (manager.fileno(), logs.fileno(), wakeup):
@@ -105,14 +106,22 @@ def follow_unit(
 class _Stop:
     """What signals ask for: to stop the unit, then to kill it.
 
-    due: seconds of the monotonic clock, when it is stopped without a signal.
+    due: seconds of the monotonic clock, when it is stopped without a signal. on_stop: called before
+    that.
     """
 
-    def __init__(self, manager: Manager, unit: str, due: float = math.inf) -> None:
+    def __init__(
+        self,
+        manager: Manager,
+        unit: str,
+        due: float = math.inf,
+        on_stop: Callable[[], object] = lambda: None,
+    ) -> None:
         self._manager = manager
         self._unit = unit
         self._asked: float | None = None
         self._due = due
+        self._on_stop = on_stop
 
     @property
     def seconds_left(self) -> float:
@@ -122,6 +131,7 @@ class _Stop:
     def ask(self) -> None:
         """A signal has come, or the time is up."""
         if self._asked is None:
+            self._on_stop()
             self._manager.queue_job("StopUnit", self._unit)
             self._asked = time.monotonic()
         # timeout(1) sends its signal to us and to our process group: that is one request.

@@ -64,12 +64,25 @@ def test_dataflows(verb: str, complete: Complete) -> None:
         ("doractl list -o j", ["plain,json"]),
         ("doractl start data", ["file,data"]),
         ("doractl start --venv .v", ["dir,.v"]),
+        ("doractl start --uid roo", ["plain,root"]),
+        ("doractl start --restart-policy on", ["plain,on-failure"]),
+        ("doractl run --replace sta", ["plain,start-first"]),
+        ("doractl run --device /dev/v", ["file,/dev/v"]),
         ("doractl nonsense x", []),
         ("doractl logs --nonsense", []),
     ],
 )
 def test_words(words: str, answer: list[str], complete: Complete) -> None:
     assert complete(words) == answer
+
+
+def test_start_takes_a_file_or_what_has_ended(
+    complete: Complete, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(completion, "dataflow_names", lambda *_: ["robot", "vision"])
+    assert complete("doractl start ro") == ["plain,robot", "file,ro"]
+    assert complete("doractl start ") == ["file,"]
+    assert complete("doractl run ro") == ["file,ro"]
 
 
 def test_what_cannot_be_found_out_is_no_error(

@@ -9,6 +9,7 @@ from dora_systemd.adapters.journal.reader import JournalReader, LastEvent
 from dora_systemd.cli import listing
 from dora_systemd.cli.listing import ListRequest
 from dora_systemd.decisions.views.dataflows import DataflowRow
+from dora_systemd.errors import DoraSystemdError
 from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
 
 OTHER = UUID[:-1] + "1"
@@ -66,6 +67,17 @@ ROWS = [
     DataflowRow(UUID, "robot", "dora-robot.service", "Running"),
     DataflowRow(OTHER, "old", "dora-old.service", "Failed", text="it broke"),
 ]
+
+
+def test_a_pattern_stands_for_all_that_match() -> None:
+    assert ListRequest("r*").is_pattern
+    assert not ListRequest("robot").is_pattern
+    assert listing._fitting(ROWS, ListRequest("r*")) == ROWS[:1]
+    assert listing._fitting(ROWS, ListRequest("*o*")) == ROWS
+    assert listing._fitting(ROWS, ListRequest()) == ROWS
+    listing._check(ListRequest("r*", status="failed"))
+    with pytest.raises(DoraSystemdError, match="no dataflow named 'x"):
+        listing._fitting(ROWS, ListRequest("x*"))
 
 
 def test_uuids_alone(capsys: pytest.CaptureFixture[str]) -> None:

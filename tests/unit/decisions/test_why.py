@@ -1,6 +1,8 @@
 """Verdicts: each cause from the records that tell it, and from any part of them."""
 
+import re
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -156,6 +158,13 @@ CASES: dict[str, tuple[tuple[Record, ...], str, Cause, str, str]] = {
         (*RUNS, event("stop-asked", life="session", by="root (doractl stop)"), JOB, *STOPPED),
         *("Stopped", Cause.STOPPED, "", "stopped by root (doractl stop)"),
     ),
+    "stopped, and a node had to be killed": (
+        (*RUNS, event("node-exited", "camera", exit="signal SIGKILL"), JOB, STOPPED[0],
+         event("node-exited", "plot"), event("node-exited", "deaf", exit="signal SIGKILL"),
+         STOPPED[1]),
+        *("Stopped", Cause.STOPPED, ""),
+        f"stopped by {UNKNOWN_PERSON}; killed after the grace duration: deaf",
+    ),
     "stopped with its terminal": (
         (*RUNS, event("dataflow-stopping", by="terminal"), event("dataflow-stopped")),
         *("Stopped", Cause.STOPPED, ""),
@@ -306,7 +315,23 @@ def test_one_screen() -> None:
     assert "\x1b" not in text
     assert "... 97 more ..." in text
     colored = format_report(Report(SUBJECT, verdict, words, budget), 80, want_colors=True)
-    assert colored.startswith("\x1b[31m")
+    assert colored.startswith("\x1b[1mrobot\x1b[0m: \x1b[31mFailed\x1b[0m\n"), "as in list"
+    assert re.sub(r"\x1b\[\d*m", "", colored) == text
+
+
+@pytest.mark.parametrize("width", [60, 80, 200])
+def test_what_to_do_is_whole_at_any_width(width: int) -> None:
+    verdict = judge(*RUNS, OOM, NODE_FAILED)
+    subject = replace(SUBJECT, name="a" * 150)
+    words = tuple(Word(n, "camera", "x" * 300) for n in range(20))
+    text = format_report(Report(subject, verdict, words), width)
+    lines = text.splitlines()
+    assert max(map(len, lines)) <= width
+    assert lines[0].endswith(": Failed")
+    whole = " ".join(text.partition("What to do:")[2].split())
+    assert "look for a leak in camera, or run: doractl set" in whole
+    assert "--node-limit camera:memory=SIZE" in whole
+    assert UUID in text
 
 
 def test_values_of_fields() -> None:

@@ -77,7 +77,7 @@ def test_the_page_stops_a_dataflow_and_says_who_asked(bench: Bench) -> None:
 def test_the_page_restarts_a_dataflow(bench: Bench) -> None:
     assert bench.act("restart") == f"Dataflow restarted: {UUID} (robot)"
     assert bench.jobs == ["RestartUnit"]
-    assert not bench.notes, "a restart is no stop"
+    assert b"(status page)" in bench.notes[0]
 
 
 def test_a_restart_that_fails_is_told_with_where_to_look(bench: Bench) -> None:
@@ -132,6 +132,8 @@ def test_the_page_starts_what_has_ended(
     [
         ("set", {}, "cannot change the limits of robot: none is given"),
         ("set", {"memory_limit": "much"}, "cannot read 'much' as a size"),
+        ("set", {"node_limit": "a:memory=much"}, "cannot read 'much' as a size"),
+        ("set", {"node_limit": "nobody:memory=2G"}, "cannot limit the node 'nobody'"),
         ("set", {"hot_reload": "on"}, "robot"),
         ("reload", {}, "robot"),
     ],

@@ -12,7 +12,7 @@ LATE = {
         "cli.listing": {
             *("verbs.list", "verbs.facts.ended"),
             *("decisions.views.details", "decisions.views.objects"),
-            *("decisions.views.selection", "cli.colors"),
+            *("decisions.views.selection", "cli.colors", "verbs.facts.selector"),
         },
         "names": {"difflib"},
         "cli.edge": {"decisions.views.objects"},
@@ -20,11 +20,12 @@ LATE = {
     "a Tab after a verb or an option does not ask for a dataflow": {
         "cli.completion": {"verbs.facts.cells", "verbs.facts.list", "verbs.facts.selector"},
     },
-    "the journal reader: only what is not in systemd, or has restarted, needs it": {
+    "the journal reader: only what is not in systemd, has restarted or was killed, needs it": {
         "verbs.facts.budget": {"adapters.journal.reader"},
         "verbs.facts.selector": {"verbs.facts.ended"},
         "verbs.list": {"verbs.facts.ended"},
         "runner.nodes.losses": {"adapters.journal.reader"},
+        "verbs.stop": {"adapters.journal.reader"},
     },
     "pydantic: only a settings file needs it": {
         "decisions.settings.resolve": {"decisions.settings.schema"},

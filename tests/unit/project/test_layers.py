@@ -241,7 +241,7 @@ def test_short_lived_verbs_load_little(verb: str, tmp_path: Path) -> None:
 STARTS_PROGRAMS = {
     "trust.programs": "for others",
     "adapters.dora.engine": "dora's, in a cell",
-    "adapters.journal.reader": "journalctl",
+    "adapters.journal.journalctl": "journalctl",
     "verbs.node": "dora, as the caller",
     "cli.verbs.look.logs": "the caller's own pager",
     "adapters.runner_socket.relay": "itself, as the user of the dataflow",

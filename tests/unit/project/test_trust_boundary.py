@@ -55,8 +55,9 @@ _TABLE = {
     """,
     ROOTS: """
         adapters.bus.connection adapters.bus.errors adapters.host.unit_files
-        adapters.journal.reader adapters.journal.socket verbs.doctor verbs.facts.enabled
-        verbs.follow verbs.gateway verbs.setup verbs.show verbs.start.enable verbs.up
+        adapters.journal.journalctl adapters.journal.reader adapters.journal.socket verbs.doctor
+        verbs.facts.enabled verbs.follow verbs.gateway verbs.setup verbs.show
+        verbs.start.enable verbs.up
     """,
     INSTALLED: """
         cli.group gateway.page

@@ -30,7 +30,9 @@ def test_a_dataflow(
     done = act_on(manager, scope, cell, "", action, by="doractl top", on_stage=print)
     assert done.endswith(f"{UUID} (robot)")
     assert [call[0] for call in manager.calls if "Unit" in call[0]] == [f"{action.title()}Unit"]
-    assert [b"(doractl top)" in note for note in notes] == [True] * (action == "stop")
+    (note,) = notes
+    assert b"stop-asked" in note
+    assert b"(doractl top)" in note, "a restart stops it, too"
 
 
 def test_a_node_of_a_dataflow_whose_runner_is_gone(manager: FakeManager, tmp_path: Path) -> None:

@@ -1,6 +1,8 @@
 """Selectors, nodes and runs, looked up in a journal of our own."""
 
 import os
+import select
+import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
@@ -16,28 +18,34 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs import logs
 from dora_systemd.verbs.facts.recorded import find_query
+from dora_systemd.verbs.follow import UnitWatch
 from dora_systemd.verbs.logs import FollowedLog, pass_logs
 from tests.unit.fakes.library import fake_journalctl
 
 ROBOT = "550e8400-e29b-41d4-a716-446655440000"
+FORGED = "550e8499-e29b-41d4-a716-446655440000"
 ARM = "550e9999-e29b-41d4-a716-446655440000"
 QUERY = LogQuery(Scope(is_user=False, uid=0))
 
 
 class FakeJournal(JournalReader):
-    def known_names(self) -> list[str]:
+    def known_names(self, scope: Scope) -> list[str]:
+        del scope
         return ["arm", "robot", "550e"]
 
     def known_uuids(self) -> list[str]:
-        return [ROBOT, ARM]
+        return [ROBOT, FORGED, ARM]
 
-    def known_nodes(self, name: str) -> list[str]:
+    def known_nodes(self, scope: Scope, name: str) -> list[str]:
+        del scope
         return ["cam-left", "cam-right", "sink"] if name == "robot" else []
 
-    def name_of(self, uuid: str) -> str:
-        return {ROBOT: "robot", ARM: "arm"}[uuid]
+    def name_of(self, scope: Scope, uuid: str) -> str:
+        del scope
+        return {ROBOT: "robot", ARM: "arm"}.get(uuid, "")
 
-    def has_run(self, name: str, run: str) -> bool:
+    def has_run(self, scope: Scope, name: str, run: str) -> bool:
+        del scope
         return (name, run) == ("robot", "0190-run")
 
     def invocations(self, scope: Scope, name: str, uuid: str) -> Iterator[str]:
@@ -84,7 +92,8 @@ def test_wrong_selector(selector: str, hint: str) -> None:
 
 def test_ambiguous_uuid() -> None:
     class WithoutThatName(FakeJournal):
-        def known_names(self) -> list[str]:
+        def known_names(self, scope: Scope) -> list[str]:
+            del scope
             return ["arm", "robot"]
 
     with pytest.raises(DoraSystemdError) as caught:
@@ -203,11 +212,66 @@ def test_found_lines_come_in_the_order_of_time(
         assert "--since=@3.000000 --until=@5.000000 --grep=x --" in last
 
 
+def test_a_full_disk_is_an_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Of which journalctl says nothing."""
+    fake_journalctl(monkeypatch, tmp_path, b"a line\n")
+    with Path("/dev/full").open("wb") as full, pytest.raises(OSError, match="No space left"):
+        pass_logs(QUERY, full.fileno())
+
+
 def test_nothing_is_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     calls = fake_journalctl(monkeypatch, tmp_path, b"")
     with (tmp_path / "out").open("wb") as out:
         pass_logs(replace(QUERY, grep="x", tail="2"), out.fileno())
     assert "--grep=x --lines=2 --" in calls.read_text().splitlines()[-1]
+
+
+def test_lines_go_on_after_journalctl_has_died(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """With the record after the last whole one; and nothing is asked meanwhile."""
+    monkeypatch.setattr(logs, "AGAIN_SECONDS", 0.5)
+    calls, script = tmp_path / "calls", tmp_path / "journalctl"
+    script.write_text(
+        f"""#!/bin/sh
+echo "$@" >>{calls}
+case "$*" in
+*--after-cursor=s=1*) printf 'MESSAGE=two\\n\\n'; exec sleep 60;;
+*) printf '__CURSOR=s=1\\nMESSAGE=one\\n\\nMESSAGE=hal';;
+esac
+"""
+    )
+    script.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    printed: list[bytes] = []
+    log = FollowedLog(QUERY.scope, "robot", ROBOT, 0, printed.append, lambda one: one["MESSAGE"])
+    with closing(log):
+        number, turns, end = log.fileno(), 0, time.monotonic() + 20
+        poll = select.poll()
+        poll.register(number, select.POLLIN)
+        while b"two" not in printed and time.monotonic() < end:
+            poll.poll(50)
+            log.print_new()
+            turns += 1
+        assert log.fileno() == number
+    assert printed == [b"one", b"two"]
+    assert turns < 200, "it spins"
+    assert len(calls.read_text().splitlines()) == 2
+
+
+def test_a_watch_goes_on_after_journalctl_has_died(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Nothing is new then: `logs --until-end` asks systemd instead."""
+    calls = fake_journalctl(monkeypatch, tmp_path, b"")
+    with closing(UnitWatch(QUERY.scope, "robot", 0)) as watch:
+        watch.wait(20)
+        assert not watch.wait(0)
+        assert not watch.wait(0.1)
+        assert len(calls.read_text().splitlines()) == 1
+        watch._due = 0  # the pause is over
+        watch.wait(20)
+        assert len(calls.read_text().splitlines()) == 2
 
 
 def test_lines_go_on_after_an_automatic_restart(monkeypatch: pytest.MonkeyPatch) -> None:

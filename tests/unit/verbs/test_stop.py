@@ -25,6 +25,7 @@ from dora_systemd.verbs.stop import (
     stop_cells,
     stop_cells_within,
 )
+from tests.unit.fakes.library import fake_journalctl
 from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
 
 UNIT = "dora-robot.service"
@@ -49,6 +50,19 @@ def test_several_stop_in_one_call() -> None:
     assert manager.calls == [("StopUnit", "dora-a.service", "dora-c.service")]
     assert [one.problem for one in outcomes] == ["", "", ""]
     assert outcomes[1].text == f"Dataflow not running: {UUID} (b has failed)"
+
+
+def test_nodes_that_had_to_be_killed_are_named(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Only a stop that took so long asks the journal."""
+    record = b'{"DORA_NODE":"deaf","__REALTIME_TIMESTAMP":"99999999999999999"}\n'
+    calls = fake_journalctl(monkeypatch, tmp_path, record)
+    manager = FakeManager()
+    manager.add(options(grace=0))
+    (outcome,) = stop_cells(manager, SCOPE, read_cells(manager))
+    assert outcome.text.endswith("(robot): killed after 0: deaf")
+    assert "DORA_EXIT=signal SIGKILL" in calls.read_text()
 
 
 def test_stop_that_had_to_kill_says_so() -> None:

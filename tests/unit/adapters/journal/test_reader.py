@@ -51,26 +51,87 @@ def play(script: Path, text: str) -> None:
 def test_complaints(journalctl: Path, complaint: str, message: str, code: ExitCode) -> None:
     play(journalctl, f"echo 'Hint: x' >&2; echo '{complaint}' >&2; exit 1")
     with pytest.raises(DoraSystemdError) as caught:
-        JournalReader().known_names()
+        JournalReader().known_names(SYSTEM)
     assert (caught.value.message, caught.value.code) == (message, code)
 
 
 def test_a_notice_is_no_complaint(journalctl: Path) -> None:
     notice = "      Pass -q to turn off this notice."
     play(journalctl, f"echo 'Hint: only your own' >&2; echo '{notice}' >&2; exit 1")
-    assert JournalReader().known_names() == []
+    assert JournalReader().known_names(SYSTEM) == []
 
 
 def test_no_journalctl(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(DoraSystemdError) as caught:
-        JournalReader().known_names()
+        JournalReader().known_names(SYSTEM)
     assert caught.value.code is ExitCode.NO_SYSTEMD
 
 
+def play_fields(script: Path, fields: dict[str, list[str]], records: dict[str, str]) -> None:
+    """fields: values for --field. records: the output for the matches that end so."""
+    cases = [
+        f"*--field={field}*) printf '%s\\n' {' '.join(map(shlex.quote, values))};;"
+        for field, values in fields.items()
+    ]
+    cases += [f"*'{matches}') echo '{text}';;" for matches, text in records.items()]
+    play(script, f"""echo "$*" >>'{script}.asked'; case "$*" in\n""" + "\n".join(cases) + "\nesac")
+
+
+READY = '{"DORA_NODE":"a","DORA_EVENT":"node-ready"}'
+ANY = '{"MESSAGE":"x"}'
+
+
 def test_nodes(journalctl: Path) -> None:
-    play(journalctl, "printf '%s\\n' robot robot/b robot/a robot2/c systemd")
-    assert JournalReader().known_nodes("robot") == ["a", "b"]
+    own = "-- _SYSTEMD_UNIT=dora-robot.service"
+    names = ["robot", "robot/b", "robot/a", "robot/forged", "robot2/c", "systemd", "robot/a\x1b"]
+    records = {f"{own} DORA_EVENT=node-ready": READY, f"{own} DORA_NODE=b": ANY}
+    play_fields(journalctl, {"SYSLOG_IDENTIFIER": names}, records)
+    assert JournalReader().known_nodes(SYSTEM, "robot") == ["a", "b"]
+
+
+def test_names_come_from_what_journald_says(journalctl: Path) -> None:
+    """Anybody can write a DORA_DATAFLOW_NAME; the system's units are root's."""
+    units = ["dora-robot.service", "dora-gateway.service", "ssh.service", "dora-a b.service"]
+    forged = ["a", "x1", "x2"]
+    fields = {"_SYSTEMD_UNIT": [*units, "x"], "DORA_DATAFLOW_NAME": forged}
+    play_fields(journalctl, fields, {})
+    assert JournalReader().known_names(SYSTEM) == ["robot"]
+
+
+def test_names_of_a_user(journalctl: Path) -> None:
+    """Another user can have a unit of the same form."""
+    units = [f"dora-{name}.service" for name in ("arm", "other", "robot")]
+    event = {"DORA_DATAFLOW_NAME": "robot", "_SYSTEMD_USER_UNIT": units[2]}
+    records = {
+        "DORA_EVENT=dataflow-starting": json.dumps(event),
+        f"-- _SYSTEMD_USER_UNIT={units[0]} _UID=1000": ANY,
+    }
+    play_fields(journalctl, {"_SYSTEMD_USER_UNIT": units}, records)
+    assert JournalReader().known_names(USER) == ["arm", "robot"]
+
+
+def test_no_flood_of_forged_names_takes_long(journalctl: Path) -> None:
+    many = [f"robot/x{number}" for number in range(2000)]
+    play_fields(journalctl, {"SYSLOG_IDENTIFIER": many}, {"DORA_EVENT=node-ready": READY})
+    assert JournalReader().known_nodes(SYSTEM, "robot") == ["a"]
+    assert len(Path(f"{journalctl}.asked").read_text().splitlines()) == 102
+
+
+def test_killed_nodes(journalctl: Path) -> None:
+    found = "".join(
+        f'{{"DORA_NODE":"{node}","__REALTIME_TIMESTAMP":"{at}"}}\n'
+        for node, at in (("b", 9), ("../x", 8), ("a", 7), ("old", 3))
+    )
+    own = "_SYSTEMD_UNIT=dora-robot.service DORA_EVENT=node-exited DORA_EXIT=signal SIGKILL"
+    play_fields(journalctl, {}, {f"{own} DORA_DATAFLOW={UUID}": found.rstrip()})
+    assert JournalReader().killed_since(SYSTEM, "robot", UUID, 5) == ["a", "b"]
+
+
+def test_a_run(journalctl: Path) -> None:
+    play_fields(journalctl, {}, {"-- _SYSTEMD_UNIT=dora-robot.service DORA_RUN=r1": ANY})
+    assert JournalReader().has_run(SYSTEM, "robot", "r1")
+    assert not JournalReader().has_run(SYSTEM, "robot", "r2")
 
 
 def test_last_event_of_each_dataflow(journalctl: Path) -> None:
@@ -172,7 +233,7 @@ def test_records_in_the_name_of_others_are_left_out(journalctl: Path) -> None:
     play(journalctl, f"cat <<'E'\n{lines}\nE")
     (event,) = JournalReader().last_events(SYSTEM)
     assert (event.name, event.uuid) == ("a", UUID)
-    assert JournalReader().name_of(UUID) == "a"
+    assert JournalReader().name_of(SYSTEM, UUID) == "a"
 
 
 def test_an_endless_journal_has_an_end(journalctl: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -196,9 +257,6 @@ def test_a_record_that_is_too_long_is_left_out(journalctl: Path) -> None:
     assert found == ["a", "b"]
 
 
-def test_values_that_can_be_no_names(journalctl: Path) -> None:
-    names = ("robot", "../x", "\x1b]0;x", "a b", "robot/a\x1b")
-    play(journalctl, f"printf '%s\\n' {' '.join(map(shlex.quote, names))} {UUID} robot/a")
-    assert JournalReader().known_names() == [UUID, "robot"]
+def test_values_that_can_be_no_uuids(journalctl: Path) -> None:
+    play(journalctl, f"printf '%s\\n' robot ../x '\x1b]0;x' 'a b' {UUID}")
     assert JournalReader().known_uuids() == [UUID]
-    assert JournalReader().known_nodes("robot") == ["a"]

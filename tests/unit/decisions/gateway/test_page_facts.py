@@ -43,7 +43,8 @@ def test_changes_of_set_take_precedence() -> None:
     own = options(
         node_limits=(parse_node_limits("a:memory=1G,cpu=2"),), reload=HotReload(is_on=True)
     )
-    changes = [f"{CHANGES_VARIABLE}=a:memory=2G b:tasks=9", f"{CHANGE_VARIABLE}=no"]
+    changes = [f"{CHANGES_VARIABLE}=a:memory=2G b:tasks=9 c:tasks=infinity"]
+    changes += [f"{CHANGE_VARIABLE}=no"]
     found = fact_values(own, {**UNSET, "Environment": changes})
     assert found["node_limit"] == ["a:cpu=200%,memory=2G", "b:tasks=9"]
     assert found["hot_reload"] is False

@@ -29,6 +29,8 @@ def test_messages() -> None:
     text = '{"type": "act", "action": "set", "values": {"memory_limit": "6G", "hot_reload": "on"}}'
     values = {"memory_limit": "6G", "hot_reload": "on"}
     assert parse_message(text) == PageMessage("act", action="set", values=values)
+    text = '{"type": "act", "action": "set", "values": {"node_limit": "a:memory=2G"}}'
+    assert parse_message(text).values == {"node_limit": "a:memory=2G"}
     text = '{"type": "find", "search": "b\u00f6se", "run": "PREVIOUS", "since": "@7"}'
     assert parse_message(text) == PageMessage("find", search="böse", run="PREVIOUS", since="@7")
 

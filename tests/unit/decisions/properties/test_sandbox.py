@@ -18,7 +18,7 @@ from dora_systemd.decisions.properties.table import TABLE
 from dora_systemd.decisions.settings.resolve import resolve_settings
 from dora_systemd.decisions.unit.properties import UnitContext, format_unit, unit_properties
 from dora_systemd.decisions.unit.versions import MIN_VERSION, drop_unsupported
-from dora_systemd.decisions.why.sandbox_signs import sandbox_remedy
+from dora_systemd.decisions.why.signs import known_remedy
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.trust.sight import Sight
@@ -368,9 +368,11 @@ def test_absolute_paths(tmp_path: Path) -> None:
         ("PermissionError: [Errno 1] Operation not permitted", "--sandbox none"),
         ("OSError: [Errno 97] Address family not supported by protocol", "--sandbox none"),
         ("FileNotFoundError: [Errno 2] No such file or directory: 'model.pt'", ""),
+        ("ModuleNotFoundError: No module named 'dora'", "pip install dora-rs"),
+        ("ModuleNotFoundError: No module named 'dora_extra'", ""),
         ("", ""),
     ],
 )
 def test_signs_of_the_sandbox(line: str, words: str) -> None:
-    found = sandbox_remedy(["Traceback (most recent call last):", line])
+    found = known_remedy(["Traceback (most recent call last):", line])
     assert (words in found) if words else found == ""

@@ -161,6 +161,13 @@ def test_one_dataflow_on_a_narrow_terminal(width: int) -> None:
     assert shown[-3].split()[-1] == "EXIT"
 
 
+def test_a_long_name_leaves_room_for_the_reason() -> None:
+    long = ENDED._replace(name="x" * 150, text="node detector: exit code 1")
+    text = format_dataflows([ROWS[0], long], 80)
+    assert max(map(len, text.split("\n"))) <= 80
+    assert "node detector: exit" in text
+
+
 def test_a_narrow_terminal() -> None:
     long = ROWS[0]._replace(uuid=C, name="a-very-long-name-of-a-dataflow-that-fits-nowhere")
     rows = [ROWS[0], ROWS[1]._replace(status="Degraded"), long]
@@ -205,8 +212,8 @@ def test_one_dataflow() -> None:
     )
 
 
-def test_failed_is_said_once() -> None:
-    row = ROWS[0]._replace(status="Failed", text="failed: node a: exit code 1", nodes=())
+def test_the_reason_stands_behind_the_status() -> None:
+    row = ROWS[0]._replace(status="Failed", text="node a: exit code 1", nodes=())
     assert "Status:   Failed (node a: exit code 1)\n" in format_dataflow(row)
 
 

@@ -272,6 +272,8 @@ def test_failed_dataflow(scope: Scope) -> None:
     row = row_of(manager, scope)
     assert (row.status, row.text, row.uptime) == ("Failed", "node camera failed", None)
     assert (row.ended, row.restarts) == (SECOND, 2)
+    manager.units["dora-robot.service"]["StatusText"] = "failed: node a: exit code 1"
+    assert row_of(manager, scope).text == "node a: exit code 1", "the status says it already"
     manager.units["dora-robot.service"] |= {"ActiveState": "activating", "SubState": "auto-restart"}
     assert row_of(manager, scope).ended == 0
 

@@ -5,6 +5,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator, Mapping
+from functools import partial
 from typing import Any
 
 import pytest
@@ -140,9 +141,11 @@ def test_another_signal_is_left_alone(logs: Lines) -> None:
 
 @pytest.mark.parametrize(("after", "calls"), [(0, [("StopUnit", UNIT)]), (3600 * SECOND, [])])
 def test_it_stops_after_a_time(logs: Lines, after: int, calls: list[Any]) -> None:
-    manager = Life([ENDED])
-    assert follow_unit(manager, UNIT, logs, None, stop_after=after) == 0
+    manager, asked = Life([ENDED]), list[int]()
+    on_stop = partial(asked.append, 1)
+    assert follow_unit(manager, UNIT, logs, None, stop_after=after, on_stop=on_stop) == 0
     assert manager.calls == calls
+    assert len(asked) == len(calls), "the journal says who has stopped it"
 
 
 def test_the_life_line_is_closed_with_the_block() -> None:

@@ -1,9 +1,13 @@
-"""Recognizes failures of nodes that the sandbox causes, and suggests a remedy."""
+"""Recognizes failures of nodes by their last lines, and suggests a remedy."""
 
 from collections.abc import Iterable, Sequence
 
 _MORE = "see SANDBOX in dora-systemd(7)"
 _SIGNS: Sequence[tuple[tuple[str, ...], str]] = (
+    (
+        ("No module named 'dora'",),
+        "its Python has no dora-rs: pip install dora-rs there, or give its environment with --venv",
+    ),
     (
         ("Read-only file system", "EROFS"),
         f"files are read-only in the sandbox: --writable PATH allows one, {_MORE}",
@@ -24,7 +28,7 @@ _SIGNS: Sequence[tuple[tuple[str, ...], str]] = (
 """Parts of lines of the C library, Python and Rust, the clearest signs first."""
 
 
-def sandbox_remedy(lines: Iterable[str]) -> str:
-    """The remedy for a node with these last lines, or "" if they do not point to the sandbox."""
+def known_remedy(lines: Iterable[str]) -> str:
+    """The remedy for a node with these last lines, or "" if they do not tell."""
     text = "\n".join(lines)
     return next((help_ for signs, help_ in _SIGNS if any(one in text for one in signs)), "")
