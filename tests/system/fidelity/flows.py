@@ -92,7 +92,7 @@ class _Maker:
         lines = self.dice.choices(_LINES, k=self.dice.randint(0, 6))
         marked = [self.dice.choice(((1, b"out: "), (2, b"err: "))) for _ in lines]
         said = [(fd, mark + line + b"\n") for (fd, mark), line in zip(marked, lines, strict=True)]
-        exit_status, failures = self.dice.choice(_EXITS), self.dice.choice((0, 0, 0, 0, 1, 2))
+        exit_status, failures = self.dice.choice(_EXITS), self.dice.choice((0, 0, 0, 0, 0, 0, 1, 2))
         constants = {"TICKS": ticks, "LINES": said, "EXIT": exit_status, "FAILURES": failures}
         given = "".join(f"{key} = {value!r}\n" for key, value in constants.items())
         first, _, rest = _SAY.partition("\n")
@@ -160,7 +160,7 @@ def make_flow(seed: int) -> Flow:
     maker = _Maker(dice, dice.random() < 0.4, {})
     idents = dice.sample(_IDENTS, dice.randint(2, 4))
     other = _operator if maker.is_plain else _tool
-    kinds = [_python_node, *dice.choices((_python_node, _shell, other), k=3)]
+    kinds = [_python_node, other, *dice.choices((_python_node, _shell, other), k=2)]
     nodes = [kind(maker, ident) for kind, ident in zip(kinds, idents, strict=False)]
     if dice.random() < 0.6:
         nodes.append(_listener(maker, idents[0]))
