@@ -90,7 +90,9 @@ class Dialogue(Tasks):
         event = life.ChildExited(
             now_us(), label, exit if oom is None else Exit(words=oom.text), oom
         )
-        self._loop.call_later(_SETTLE_SECONDS, self._pump.push, event)
+        # While leaving, every child ends because the runner wants it: no signal can explain more.
+        is_wanted = self._pump.cell.state is State.LEAVING
+        self._loop.call_later(0 if is_wanted else _SETTLE_SECONDS, self._pump.push, event)
 
     def read_coordinator(self, line: str) -> None:
         """Handle a line that the coordinator printed; one of them has its port."""
