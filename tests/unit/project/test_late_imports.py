@@ -38,6 +38,9 @@ LATE = {
         "adapters.host.files": {"yaml", "adapters.host.yaml_loader", "tempfile"},
         "cli.verbs.look.logs": {"verbs.follow"},
     },
+    "the unit file: only a dataflow that was enabled while it ran needs it at its end": {
+        "verbs.stop": {"verbs.start.enable"},
+    },
     "hot reload only": {
         "adapters.host.watch": {"watchfiles"},
         "decisions.reload.watch_rules": {"pathspec"},
