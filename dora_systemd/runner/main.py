@@ -276,8 +276,9 @@ def run(argv: list[str], begun: Begun | None) -> int:
         if not directory:
             hint = "it is started by systemd: use `doractl start`"
             raise DoraSystemdError("cannot run without RUNTIME_DIRECTORY", hint, ExitCode.USAGE)
-        hold_back()
-        return run_loop(run_cell(options, CellPaths(Path(directory)), begun))
+        paths = CellPaths(Path(directory))
+        hold_back(options, paths)
+        return run_loop(run_cell(options, paths, begun))
     except DoraSystemdError as error:
         print(f"{error.message}\n{error.hint}".strip(), file=sys.stderr)
         return refusal_exit(error)

@@ -17,9 +17,10 @@ POLICIES = ("no", "on-failure", "always")
 MIN_DELAY = SECOND // 2
 """µs. dora's default is 0, and restarted a node that cannot start 37 times a second."""
 
-HEAD_START = SECOND // 4
+HEAD_START = 2 * SECOND // 5
 """µs. systemd starts the runner this long before the delay of a restart is over, and the runner
-holds the nodes back: the sandbox, Python and dora's coordinator are ready by then."""
+holds the nodes back: the sandbox, Python and dora's coordinator are ready by then. What is left of
+the shortest delay is systemd's own default, for a runner that does not get that far."""
 
 MAX_RESTARTS = 1_000_000
 

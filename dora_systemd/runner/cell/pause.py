@@ -21,6 +21,8 @@ from dora_systemd.paths import CellPaths
 from dora_systemd.values import INFINITY, SECOND, format_duration
 
 _ASK_SECONDS = 5.0
+_MOST_SECONDS = 1.0
+"""What systemd and ExecStopPost= may take between the end of a life and the next."""
 
 
 def pause(options: RunnerOptions, paths: CellPaths) -> None:
@@ -29,7 +31,7 @@ def pause(options: RunnerOptions, paths: CellPaths) -> None:
     if policy.policy == "no":
         return
     if (restart := fd_store.lives()) > 1:
-        restart = min(restart, counted_restarts(options.name, paths.is_of_user, restart))
+        restart = min(restart, asked("NRestarts", options.name, paths.is_of_user, restart))
         if (delay := policy.delay_before(restart)) > policy.delay:
             seconds = (delay - policy.unit_delay) / SECOND
             show(options.uuid, paths, seconds)
@@ -37,13 +39,19 @@ def pause(options: RunnerOptions, paths: CellPaths) -> None:
     fd_store.count_life()
 
 
-def hold_back() -> None:
-    """Wait for the rest of a short delay: HEAD_START, from when systemd began this process.
+def hold_back(options: RunnerOptions, paths: CellPaths) -> None:
+    """Wait for the rest of a short delay: at most HEAD_START, from when systemd began this process.
 
     A start, also after a requested stop, has no lives before it, and waits for nothing.
     """
     if fd_store.lives() and (seconds := HEAD_START / SECOND - age()) > 0:
-        time.sleep(seconds)
+        # systemd's timers are up to 250 ms late, and the delay begins before ExecStopPost=.
+        ended = asked("ActiveExitTimestampMonotonic", options.name, paths.is_of_user, 0)
+        since = time.clock_gettime(time.CLOCK_MONOTONIC) - ended / SECOND
+        delay = options.restart.delay / SECOND
+        # After more than that it was another life, and the last one never became active.
+        known = delay - since if since < delay + _MOST_SECONDS else seconds
+        time.sleep(max(min(seconds, known), 0))
 
 
 def age() -> float:
@@ -52,12 +60,15 @@ def age() -> float:
     return time.clock_gettime(time.CLOCK_BOOTTIME) - int(start) / os.sysconf("SC_CLK_TCK")
 
 
-def counted_restarts(name: str, is_user: bool, otherwise: int) -> int:
-    """NRestarts= of the unit, which a reset or a restart of the unit sets to 0."""
+def asked(what: str, name: str, is_user: bool, otherwise: int) -> int:
+    """A number that systemd has of the unit.
+
+    A reset or a restart of the unit sets NRestarts to 0.
+    """
     from dora_systemd.adapters.host import process
 
     scope = ["--user"] if is_user else []
-    command = ["systemctl", *scope, "show", "--value", "--property=NRestarts", unit_name(name)]
+    command = ["systemctl", *scope, "show", "--value", f"--property={what}", unit_name(name)]
     with contextlib.suppress(DoraSystemdError, ValueError):
         return int(process.run_command(command, _ASK_SECONDS).stdout)
     return otherwise

@@ -46,10 +46,10 @@ def test_the_runner_is_found_again(dataflow: str, directory: str, value: str) ->
 
 def test_a_unit_whose_runner_has_no_head_start_says_the_same() -> None:
     text = persistent(options(restart=RestartPolicy("always")))
-    older = text.replace("RestartSec=250ms", "RestartSec=500ms")
+    older = text.replace("RestartSec=100ms", "RestartSec=500ms")
     assert older != text
     assert says_the_same(text, older)
-    assert not says_the_same(text, text.replace("RestartSec=250ms", "RestartSec=2s"))
+    assert not says_the_same(text, text.replace("RestartSec=100ms", "RestartSec=2s"))
 
 
 def test_sections_are_one_of_a_kind() -> None:

@@ -21,7 +21,7 @@ from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell import pause as pause_module
 from dora_systemd.runner.cell.pause import (
-    counted_restarts,
+    asked,
     forget_restarts,
     hold_back,
     pause,
@@ -38,6 +38,7 @@ class Unit:
     def __init__(self, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.paths, self.slept = CellPaths(root), 0.0
         self.monkeypatch = monkeypatch
+        self.end(1000)
         self.server = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
         self.server.bind(str(root / "notify"))
         monkeypatch.setenv("NOTIFY_SOCKET", str(root / "notify"))
@@ -49,12 +50,26 @@ class Unit:
         monkeypatch.setitem(sys.modules, "systemd.daemon", library)
         self.store: Counter[str] = Counter({"dora-log-a": 2})
         systemctl = root / "systemctl"
-        systemctl.write_text(f'#!/bin/sh\necho "$@" >{root}/asked\ncat {root}/restarts\n')
+        systemctl.write_text(
+            f'#!/bin/sh\necho "$@" >>{root}/asked\ncase "$*" in *NRestarts*) cat {root}/restarts\n'
+            f";; *) cat {root}/ended; esac\n"
+        )
+        (root / "asked").touch()
         systemctl.chmod(0o755)
         monkeypatch.setenv("PATH", f"{root}:{os.environ['PATH']}")
 
     def sleep(self, seconds: float) -> None:
         self.slept += seconds
+
+    def end(self, seconds: float) -> None:
+        """The last life that was active has ended so long ago."""
+        ended = time.clock_gettime(time.CLOCK_MONOTONIC) - seconds
+        (self.paths.root / "ended").write_text(f"{round(ended * SECOND)}\n")
+
+    @property
+    def asked(self) -> str:
+        """What systemctl was asked so far."""
+        return (self.paths.root / "asked").read_text()
 
     def keep_store(self) -> None:
         while True:
@@ -76,7 +91,7 @@ class Unit:
         (self.paths.root / "restarts").write_text(f"{restarts}\n")
         self.slept = 0.0
         pause(self.options(policy), self.paths)
-        hold_back()
+        hold_back(self.options(policy), self.paths)
         self.keep_store()
         return self.slept
 
@@ -92,9 +107,9 @@ def unit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Unit]:
 
 
 def test_it_doubles_up_to_the_longest(unit: Unit) -> None:
-    assert POLICY.unit_delay / SECOND == 0.25
-    pauses = [0.25 + unit.start(restarts) for restarts in range(9)]
-    assert pauses == [0.25, 0.5, 1, 2, 4, 8, 16, 30, 30]
+    assert POLICY.unit_delay / SECOND == 0.1
+    pauses = [round(0.1 + unit.start(restarts), 6) for restarts in range(9)]
+    assert pauses == [0.1, 0.5, 1, 2, 4, 8, 16, 30, 30]
 
 
 def test_a_quiet_window_is_forgotten(unit: Unit) -> None:
@@ -106,16 +121,14 @@ def test_a_quiet_window_is_forgotten(unit: Unit) -> None:
 
     asyncio.run(wait())
     unit.keep_store()
-    assert [unit.start(restarts) for restarts in (8, 9)] == [0.25, 0.75]
+    assert [unit.start(restarts) for restarts in (8, 9)] == [0.4, 0.9]
 
 
 def test_what_is_reset_or_restarted_by_hand_is_forgotten(unit: Unit) -> None:
     for restarts in range(8):
         unit.start(restarts)
-    assert [unit.start(restarts) for restarts in (0, 1, 2)] == [0.25, 0.25, 0.75]
-    assert (unit.paths.root / "asked").read_text() == (
-        "show --value --property=NRestarts dora-robot.service\n"
-    )
+    assert [unit.start(restarts) for restarts in (0, 1, 2)] == [0.4, 0.4, 0.9]
+    assert "show --value --property=NRestarts dora-robot.service\n" in unit.asked
 
 
 def test_a_requested_stop_is_no_life_to_wait_after(unit: Unit) -> None:
@@ -130,10 +143,25 @@ def test_only_what_is_left_of_the_delay_is_waited_for(
     unit: Unit, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     unit.start(0)
-    monkeypatch.setattr(pause_module, "age", lambda: 0.125)
-    assert unit.start(1) == 0.125
-    monkeypatch.setattr(pause_module, "age", lambda: 0.3)
+    monkeypatch.setattr(pause_module, "age", lambda: 0.5)
     assert unit.start(1) == 0
+    assert not unit.asked
+    monkeypatch.setattr(pause_module, "age", lambda: 0.25)
+    assert unit.start(0) == pytest.approx(0.15)
+
+
+@pytest.mark.parametrize(
+    ("since", "least", "most"),
+    [(0.42, 0.0, 0.08), (0.1, 0.15, 0.15), (0.9, 0, 0), (60, 0.15, 0.15)],
+)
+def test_the_delay_begins_when_the_last_life_has_ended(
+    unit: Unit, monkeypatch: pytest.MonkeyPatch, since: float, least: float, most: float
+) -> None:
+    """systemd was late, or ExecStopPost= took its time; but 60 s ago was another life."""
+    unit.start(0)
+    monkeypatch.setattr(pause_module, "age", lambda: 0.25)
+    unit.end(since)
+    assert least <= round(unit.start(0), 6) <= most
 
 
 def test_the_age_of_a_process() -> None:
@@ -165,7 +193,7 @@ def test_the_store_does_not_fill(unit: Unit) -> None:
 
 def test_systemd_does_not_answer(unit: Unit) -> None:
     (unit.paths.root / "systemctl").write_text("#!/bin/sh\nexit 1\n")
-    assert counted_restarts("robot", True, 7) == 7
+    assert asked("NRestarts", "robot", True, 7) == 7
 
 
 def test_without_systemd(monkeypatch: pytest.MonkeyPatch) -> None:
