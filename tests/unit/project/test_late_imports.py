@@ -38,6 +38,10 @@ LATE = {
         "adapters.host.files": {"yaml", "adapters.host.yaml_loader", "tempfile"},
         "cli.verbs.look.logs": {"verbs.follow"},
     },
+    "JSON is for programs, and most who do something are people": {
+        "cli.parameters": {"decisions.views.objects"},
+        "decisions.views.outcome": {"decisions.views.objects"},
+    },
     "the unit file: only a dataflow that was enabled while it ran needs it at its end": {
         "verbs.stop": {"verbs.start.enable"},
     },
