@@ -2,7 +2,7 @@
 
 import asyncio
 import os
-import time
+import signal
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +16,6 @@ from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Do, RunnerExit, State
 from dora_systemd.decisions.resources.oom import Oom, Owner
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.runner.cell import dialogue
 from tests.unit.fakes.dialogue import DESCRIPTOR, Bench
 from tests.unit.fakes.libraries import hear_notifications
 from tests.unit.fakes.loop import live, settle
@@ -230,23 +229,24 @@ def test_the_daemon_from_its_start_to_its_end(tmp_path: Path, oom: Oom | None) -
     asyncio.run(work())
 
 
-@pytest.mark.parametrize("state", [State.LEAVING, State.RUNNING])
-def test_nothing_is_waited_for_after_a_daemon_that_was_told_to_end(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, state: State
+def test_a_signal_is_heard_before_the_exit_of_a_child_that_it_has_killed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(dialogue, "_SETTLE_SECONDS", 0.05 if state is State.RUNNING else 3600.0)
+    killed = exit_of(-signal.SIGTERM)
+    monkeypatch.setattr(engine, "watch", lambda _, child, tell: tell(child.label, killed))
 
     async def work() -> None:
-        bench = Bench(tmp_path, state)
+        bench = Bench(tmp_path)
         child = engine.spawn("daemon", ["/bin/true"], {}, tmp_path)
-        began = time.monotonic()
-        bench.dialogue.watch(child)
-        async with asyncio.timeout(20):
-            while not bench.heard:
-                await asyncio.sleep(0.001)
-        assert bench.heard == [life.ChildExited(0, "daemon", exit_of(0))]
-        assert state is State.LEAVING or time.monotonic() - began > 0.05
-        child.close(asyncio.get_running_loop(), 5)
+        loop, stop = asyncio.get_running_loop(), life.StopAsked(0, "SIGTERM")
+        loop.add_signal_handler(signal.SIGTERM, bench.pump.push, stop)
+        os.kill(os.getpid(), signal.SIGTERM)
+        bench.dialogue.watch(child)  # in the same turn of the loop, which reads the signal later
+        await settle()
+        assert bench.heard == [stop, life.ChildExited(0, "daemon", killed)]
+        loop.remove_signal_handler(signal.SIGTERM)
+        child.popen.wait()
+        os.close(child.pidfd)
         os.close(child.output)
 
     asyncio.run(work())
