@@ -6,7 +6,6 @@ from typing import Any, TypeVar
 import click
 
 from dora_systemd.cli.edge import print_warning
-from dora_systemd.decisions.views.objects import format_json
 from dora_systemd.decisions.views.outcome import Outcome, outcome_object
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope, scope_of
@@ -107,6 +106,8 @@ def wants_json() -> bool:
 
 def print_json(value: Any) -> None:
     """An object or a list of objects as JSON, indented."""
+    from dora_systemd.decisions.views.objects import format_json  # imported late: for JSON only
+
     click.echo(format_json(value, indent=2))
 
 
@@ -134,6 +135,8 @@ def print_outcomes(outcomes: Iterable[Outcome]) -> ExitCode:
 
 def _print_outcome(one: Outcome) -> None:
     if wants_json():
+        from dora_systemd.decisions.views.objects import format_json
+
         _, _, action = click.get_current_context().command_path.partition(" ")
         click.echo(format_json(outcome_object(one, action)))
     elif one.problem:

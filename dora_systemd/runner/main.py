@@ -47,7 +47,7 @@ from dora_systemd.runner.cell.clock import StopClock
 from dora_systemd.runner.cell.dialogue import Dialogue
 from dora_systemd.runner.cell.engine import Engine, daemon_variables
 from dora_systemd.runner.cell.failure import Beside, words
-from dora_systemd.runner.cell.pause import forget_restarts
+from dora_systemd.runner.cell.pause import forget_restarts, hold_back
 from dora_systemd.runner.cell.pump import Pump, now_us
 from dora_systemd.runner.nodes.losses import LossWatch, losses_of_user
 from dora_systemd.runner.nodes.nodes import Nodes, wait_eof
@@ -276,7 +276,9 @@ def run(argv: list[str], begun: Begun | None) -> int:
         if not directory:
             hint = "it is started by systemd: use `doractl start`"
             raise DoraSystemdError("cannot run without RUNTIME_DIRECTORY", hint, ExitCode.USAGE)
-        return run_loop(run_cell(options, CellPaths(Path(directory)), begun))
+        paths = CellPaths(Path(directory))
+        hold_back(options, paths)
+        return run_loop(run_cell(options, paths, begun))
     except DoraSystemdError as error:
         print(f"{error.message}\n{error.hint}".strip(), file=sys.stderr)
         return refusal_exit(error)

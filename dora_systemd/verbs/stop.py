@@ -16,7 +16,6 @@ from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.enabled import enabled_units
 from dora_systemd.verbs.facts.reason import failure_reason, job_reason
 from dora_systemd.verbs.start.asked import note_request
-from dora_systemd.verbs.start.enable import read_boot_unit, release_transient
 
 UNBOUNDED_SECONDS = 90.0
 """Timeout for a dataflow with TimeoutStopSec=infinity: systemd's own default."""
@@ -108,8 +107,14 @@ def stop_within(
 
 def release_enabled(manager: Manager, scope: Scope, units: Sequence[str]) -> None:
     """For dataflows that were enabled while running: let the unit file take effect."""
+    enabled = enabled_units(manager, scope).intersection(units)
+    if not enabled:
+        return
+    # Imported late: it takes as long as all that stops a dataflow which is not enabled.
+    from dora_systemd.verbs.start.enable import read_boot_unit, release_transient
+
     is_one_lost = False
-    for unit in sorted(enabled_units(manager, scope).intersection(units)):
+    for unit in sorted(enabled):
         state = manager.read(unit, ["LoadState", "Transient", "ActiveState"])
         is_one_lost |= state["LoadState"] == "not-found"
         if state["Transient"] and state["ActiveState"] == "inactive":

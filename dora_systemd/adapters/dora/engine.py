@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import select
 import signal
 import socket
 import subprocess
@@ -58,8 +59,11 @@ class Child:
 
     def close(self, loop: "asyncio.AbstractEventLoop", seconds: float) -> None:
         """Reap the child if it exits within `seconds`, and close its file descriptor."""
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self.popen.wait(seconds)
+        # Not popen.wait(seconds), which sleeps up to 50 ms between two looks.
+        poll = select.poll()
+        poll.register(self.pidfd, select.POLLIN)
+        if poll.poll(seconds * 1000):
+            self.popen.wait()
         loop.remove_reader(self.pidfd)
         os.close(self.pidfd)
 

@@ -51,9 +51,8 @@ def count_life() -> None:
 
 
 def forget_lives() -> None:
-    """Restart the count, with this life as the first."""
+    """Restart the count."""
     _forget(LIFE)
-    count_life()
 
 
 def forget_inherited() -> None:

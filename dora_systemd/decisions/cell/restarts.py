@@ -17,6 +17,11 @@ POLICIES = ("no", "on-failure", "always")
 MIN_DELAY = SECOND // 2
 """µs. dora's default is 0, and restarted a node that cannot start 37 times a second."""
 
+HEAD_START = 2 * SECOND // 5
+"""µs. systemd starts the runner this long before the delay of a restart is over, and the runner
+holds the nodes back: the sandbox, Python and dora's coordinator are ready by then. What is left of
+the shortest delay is systemd's own default, for a runner that does not get that far."""
+
 MAX_RESTARTS = 1_000_000
 
 
@@ -50,6 +55,11 @@ class RestartPolicy(NamedTuple):
     def delay_before(self, restart: int) -> int:
         """The delay before a restart, counted from 1 since the last quiet window, in µs."""
         return min(self.delay << min(max(restart - 1, 0), 64), self.max_delay)
+
+    @property
+    def unit_delay(self) -> int:
+        """RestartSec= of the unit, in µs."""
+        return max(self.delay - HEAD_START, 0)
 
 
 DEFAULT = RestartPolicy()

@@ -3,10 +3,13 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum, IntEnum
+from typing import TYPE_CHECKING
 
-from dora_systemd.decisions.cell.status import NodeStatus
-from dora_systemd.decisions.descriptor.wiring import Downstream
 from dora_systemd.decisions.life.causes import Cause
+
+if TYPE_CHECKING:  # doractl needs only RunnerExit
+    from dora_systemd.decisions.cell.status import NodeStatus
+    from dora_systemd.decisions.descriptor.wiring import Downstream
 
 
 class RunnerExit(IntEnum):
@@ -84,7 +87,7 @@ class Cell:
 
     grace: int
     started_us: int
-    nodes: Mapping[str, NodeStatus]
+    nodes: "Mapping[str, NodeStatus]"
     state: State = State.BOOTING
     run: str = ""
     ready_us: int = 0
@@ -93,7 +96,7 @@ class Cell:
     exit: RunnerExit = RunnerExit.OK
     cause: Cause = Cause.NONE
     culprits: tuple[str, ...] = ()
-    downstream: Downstream = field(default_factory=dict)
+    downstream: "Downstream" = field(default_factory=dict)
     is_again: bool = False
     is_trial: bool = False
     reload: bool = False

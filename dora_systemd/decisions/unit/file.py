@@ -105,6 +105,9 @@ def _properties(text: str) -> dict[str, Property] | None:
         except (KeyError, DoraSystemdError):
             return None
         properties = with_properties(properties, change)
+    runner, delay = runner_of(text), properties.get("RestartSec")
+    if runner and delay and delay.value == runner.restart.delay:  # as written before HEAD_START
+        properties["RestartSec"] = delay._replace(value=runner.restart.unit_delay)
     return {slot: _ordered(one) for slot, one in properties.items()}
 
 

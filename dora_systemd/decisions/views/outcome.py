@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
-from dora_systemd.decisions.views.objects import error_object
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import Named
 
@@ -45,6 +44,8 @@ class Outcome:
 
 def outcome_object(one: Outcome, action: str) -> dict[str, Any]:
     """The outcome for JSON. action: the verb, such as "stop" or "node restart"."""
+    from dora_systemd.decisions.views.objects import error_object  # imported late: for JSON only
+
     result = FAILED if one.problem else DONE if one.is_news else UNCHANGED
     return {
         "action": action,

@@ -26,8 +26,11 @@ from dora_systemd.values import SECOND
 
 _LISTENING = "Listening on port "
 _SETTLE_SECONDS = 0.02
-"""`systemctl kill` signals all processes of the cell at once. The pump must see the runner's own
-signal before the exit of a child that the same signal has killed."""
+"""Time for the exit of a child to be seen, which explains a connection that is lost."""
+_TURNS = 5
+"""Turns of the loop in which a signal of the runner is heard that came before the exit of a child:
+one reads it, the next handles it. `systemctl kill` signals all processes of the cell, the runner
+first, and the pump must see that signal before the exit of a child that the same one has killed."""
 _AGAIN_SECONDS = 0.02
 _QUIET_SECONDS = 0.1
 _LONG_SECONDS = 3600.0 * 24 * 365
@@ -90,7 +93,12 @@ class Dialogue(Tasks):
         event = life.ChildExited(
             now_us(), label, exit if oom is None else Exit(words=oom.text), oom
         )
-        self._loop.call_later(_SETTLE_SECONDS, self._pump.push, event)
+        self.spawn(f"tell that the {label} has exited", self._push_after_signals(event))
+
+    async def _push_after_signals(self, event: life.Event) -> None:
+        for _ in range(_TURNS):
+            await asyncio.sleep(0)
+        self._pump.push(event)
 
     def read_coordinator(self, line: str) -> None:
         """Handle a line that the coordinator printed; one of them has its port."""

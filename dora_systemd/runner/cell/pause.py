@@ -1,44 +1,74 @@
 """Delays a restart: the delay grows with each restart, until a quiet window resets it.
 
 RestartSteps= of systemd.service(5) counts all restarts since the unit was started, so two failures
-months apart would lengthen the delay. Therefore RestartSec= is the shortest delay, and the runner
-waits for the rest before it does anything else. systemd keeps the number of restarts, see lives()
-in dora_systemd.adapters.host.fd_store.
+months apart would lengthen the delay. Therefore RestartSec= is the shortest delay without
+HEAD_START. The runner waits for the rest: before it does anything else if the delay is longer than
+the shortest, else when it has prepared all that comes before the nodes. systemd keeps the number of
+restarts, see lives() in dora_systemd.adapters.host.fd_store.
 """
 
 import contextlib
+import os
 import time
+from pathlib import Path
 
 from dora_systemd.adapters.host import fd_store
 from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.restarts import HEAD_START
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import unit_name
 from dora_systemd.paths import CellPaths
 from dora_systemd.values import INFINITY, SECOND, format_duration
 
 _ASK_SECONDS = 5.0
+_MOST_SECONDS = 1.0
+"""What systemd and ExecStopPost= may take between the end of a life and the next."""
 
 
 def pause(options: RunnerOptions, paths: CellPaths) -> None:
-    """Wait for the rest of the delay; SIGTERM ends the process meanwhile. Raises OSError."""
+    """Wait for the rest of a long delay; SIGTERM ends the process meanwhile. Raises OSError."""
     policy = options.restart
     if policy.policy == "no":
         return
     if (restart := fd_store.lives()) > 1:
-        restart = min(restart, counted_restarts(options.name, paths.is_of_user, restart))
-        seconds = (policy.delay_before(restart) - policy.delay) / SECOND
-        if seconds > 0:
+        restart = min(restart, asked("NRestarts", options.name, paths.is_of_user, restart))
+        if (delay := policy.delay_before(restart)) > policy.delay:
+            seconds = (delay - policy.unit_delay) / SECOND
             show(options.uuid, paths, seconds)
             time.sleep(seconds)
     fd_store.count_life()
 
 
-def counted_restarts(name: str, is_user: bool, otherwise: int) -> int:
-    """NRestarts= of the unit, which a reset or a restart of the unit sets to 0."""
+def hold_back(options: RunnerOptions, paths: CellPaths) -> None:
+    """Wait for the rest of a short delay: at most HEAD_START, from when systemd began this process.
+
+    A start, also after a requested stop, has no lives before it, and waits for nothing.
+    """
+    if fd_store.lives() and (seconds := HEAD_START / SECOND - age()) > 0:
+        # systemd's timers are up to 250 ms late, and the delay begins before ExecStopPost=.
+        ended = asked("ActiveExitTimestampMonotonic", options.name, paths.is_of_user, 0)
+        since = time.clock_gettime(time.CLOCK_MONOTONIC) - ended / SECOND
+        delay = options.restart.delay / SECOND
+        # After more than that it was another life, and the last one never became active.
+        known = delay - since if since < delay + _MOST_SECONDS else seconds
+        time.sleep(max(min(seconds, known), 0))
+
+
+def age() -> float:
+    """Seconds since systemd began this process, which was before it set up the sandbox."""
+    start = Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19]
+    return time.clock_gettime(time.CLOCK_BOOTTIME) - int(start) / os.sysconf("SC_CLK_TCK")
+
+
+def asked(what: str, name: str, is_user: bool, otherwise: int) -> int:
+    """A number that systemd has of the unit.
+
+    A reset or a restart of the unit sets NRestarts to 0.
+    """
     from dora_systemd.adapters.host import process
 
     scope = ["--user"] if is_user else []
-    command = ["systemctl", *scope, "show", "--value", "--property=NRestarts", unit_name(name)]
+    command = ["systemctl", *scope, "show", "--value", f"--property={what}", unit_name(name)]
     with contextlib.suppress(DoraSystemdError, ValueError):
         return int(process.run_command(command, _ASK_SECONDS).stdout)
     return otherwise
@@ -64,3 +94,4 @@ async def forget_restarts(options: RunnerOptions) -> None:
     if options.restart.policy != "no" and options.restart.window != INFINITY:
         await asyncio.sleep(options.restart.window / SECOND)
         fd_store.forget_lives()
+        fd_store.count_life()

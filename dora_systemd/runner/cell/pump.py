@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from dora_systemd.adapters.host import files, notify
+from dora_systemd.adapters.host import fd_store, files, notify
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.decisions.cell.status import CpuSample, add_sample
 from dora_systemd.decisions.life import events as life
@@ -152,6 +152,7 @@ class Pump:
             self._nodes.drain([record.node])
         elif record.event == "dataflow-stopping":
             notify.send_stopping()
+            fd_store.forget_lives()  # a restart that a person asks for has no delay
 
     async def wait(self, is_so: Callable[[Cell], bool], seconds: float | None) -> bool:
         """Wait until `is_so` holds for the cell; False if it does not within `seconds`."""

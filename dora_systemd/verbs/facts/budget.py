@@ -76,4 +76,6 @@ def _next(manager: Manager, cell: Cell, status: CellStatus) -> int | None:
         return max(status.started_us - time.time_ns() // 1000, 0)
     facts: dict[str, Any] = manager.read(cell.unit, _WAITING)
     now = time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000
-    return max(int(facts["StateChangeTimestampMonotonic"]) + int(facts["RestartUSec"]) - now, 0)
+    policy = cell.options.restart
+    delay = max(int(facts["RestartUSec"]), 0 if policy.policy == "no" else policy.delay)
+    return max(int(facts["StateChangeTimestampMonotonic"]) + delay - now, 0)

@@ -8,10 +8,9 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from dora_systemd.adapters.bus.manager import Manager
-from dora_systemd.decisions.views.dataflows import DataflowRow
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import (
     MIN_PREFIX,
@@ -28,6 +27,9 @@ from dora_systemd.scope import Scope
 from dora_systemd.values import quoted
 from dora_systemd.verbs.facts.cells import Cell, read_cell, read_cells
 from dora_systemd.verbs.facts.enabled import lost_units
+
+if TYPE_CHECKING:
+    from dora_systemd.decisions.views.dataflows import DataflowRow
 
 _SHOWN = 10
 _PATTERN = re.compile(r"[*?\[]")
@@ -119,7 +121,7 @@ class Selector:
         manager.reload()
         return self.find(manager)
 
-    def ended(self, scope: Scope) -> DataflowRow | None:
+    def ended(self, scope: Scope) -> "DataflowRow | None":
         """The newest one of which the journal has an end; None if there is none."""
         # Imported late: the journal is slow, and dataflows that systemd knows do not need it.
         from dora_systemd.verbs.facts.ended import ended_rows

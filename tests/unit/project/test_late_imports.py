@@ -40,6 +40,13 @@ LATE = {
         "cli.verbs.look.logs": {"verbs.follow"},
     },
     "uv only": {"decisions.cell.uv": {"tomllib"}},
+    "JSON is for programs, and most who do something are people": {
+        "cli.parameters": {"decisions.views.objects"},
+        "decisions.views.outcome": {"decisions.views.objects"},
+    },
+    "the unit file: only a dataflow that was enabled while it ran needs it at its end": {
+        "verbs.stop": {"verbs.start.enable"},
+    },
     "hot reload only": {
         "adapters.host.watch": {"watchfiles"},
         "decisions.reload.watch_rules": {"pathspec"},

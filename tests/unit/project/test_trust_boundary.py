@@ -50,7 +50,7 @@ _TABLE = {
         decisions.cell.launch verbs.start.credentials verbs.start.limits
     """,
     KERNEL: """
-        adapters.cgroup.groups adapters.host.machine adapters.host.process_table
+        adapters.cgroup.groups adapters.host.machine adapters.host.process_table runner.cell.pause
         trust.socket_table verbs.destroy verbs.facts.reading verbs.start.sandbox verbs.why
     """,
     ROOTS: """

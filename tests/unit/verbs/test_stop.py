@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from dora_systemd.adapters.journal.note import send_note
+from dora_systemd.decisions.cell.restarts import RestartPolicy
 from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.scope import Scope
 from dora_systemd.values import SECOND
@@ -201,6 +202,27 @@ def test_budget(monkeypatch: pytest.MonkeyPatch) -> None:
         "next_us": 0,
         "resets_us": None,
     }
+
+
+def test_the_end_of_the_shortest_delay_is_the_runners() -> None:
+    manager = FakeManager()
+    facts = {"Restart": "on-failure", "StartLimitBurst": 4, "StartLimitIntervalUSec": 60 * SECOND}
+    policy = RestartPolicy("on-failure", delay=60 * SECOND)
+    now = time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000
+    manager.add(
+        options(restart=policy),
+        active="activating",
+        SubState="auto-restart",
+        NRestarts=0,
+        RestartUSec=policy.unit_delay,
+        StateChangeTimestampMonotonic=now,
+        **facts,
+    )
+    (cell,) = read_cells(manager)
+    budget = restart_budget(manager, ScopeIn(True, 1000), cell, CellStatus())
+    assert budget is not None
+    assert budget["next_us"] is not None
+    assert policy.unit_delay < budget["next_us"] <= policy.delay
 
 
 def test_the_runner_waits_for_the_rest_of_a_long_delay() -> None:

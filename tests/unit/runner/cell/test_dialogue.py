@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import signal
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -224,6 +225,29 @@ def test_the_daemon_from_its_start_to_its_end(tmp_path: Path, oom: Oom | None) -
         assert given == [{"ADDED": "1"}]
         children[0].close(asyncio.get_running_loop(), 5)
         os.close(children[0].output)
+
+    asyncio.run(work())
+
+
+def test_a_signal_is_heard_before_the_exit_of_a_child_that_it_has_killed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    killed = exit_of(-signal.SIGTERM)
+    monkeypatch.setattr(engine, "watch", lambda _, child, tell: tell(child.label, killed))
+
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        child = engine.spawn("daemon", ["/bin/true"], {}, tmp_path)
+        loop, stop = asyncio.get_running_loop(), life.StopAsked(0, "SIGTERM")
+        loop.add_signal_handler(signal.SIGTERM, bench.pump.push, stop)
+        os.kill(os.getpid(), signal.SIGTERM)
+        bench.dialogue.watch(child)  # in the same turn of the loop, which reads the signal later
+        await settle()
+        assert bench.heard == [stop, life.ChildExited(0, "daemon", killed)]
+        loop.remove_signal_handler(signal.SIGTERM)
+        child.popen.wait()
+        os.close(child.pidfd)
+        os.close(child.output)
 
     asyncio.run(work())
 

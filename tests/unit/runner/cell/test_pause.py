@@ -3,6 +3,7 @@
 import asyncio
 import os
 import socket
+import subprocess
 import sys
 import time
 from collections import Counter
@@ -18,7 +19,13 @@ from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.restarts import RestartPolicy
 from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.paths import CellPaths
-from dora_systemd.runner.cell.pause import counted_restarts, forget_restarts, pause
+from dora_systemd.runner.cell import pause as pause_module
+from dora_systemd.runner.cell.pause import (
+    asked,
+    forget_restarts,
+    hold_back,
+    pause,
+)
 from dora_systemd.values import SECOND
 
 DELAY = SECOND // 2
@@ -29,25 +36,40 @@ class Unit:
     """A unit that is restarted: systemd's store of descriptors, NRestarts=, and who sleeps."""
 
     def __init__(self, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.paths = CellPaths(root)
+        self.paths, self.slept = CellPaths(root), 0.0
         self.monkeypatch = monkeypatch
+        self.end(1000)
         self.server = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
         self.server.bind(str(root / "notify"))
         monkeypatch.setenv("NOTIFY_SOCKET", str(root / "notify"))
         monkeypatch.setenv("LISTEN_PID", str(os.getpid()))
         monkeypatch.setattr(time, "sleep", self.sleep)
+        monkeypatch.setattr(pause_module, "age", lambda: self.slept)
         library = SimpleNamespace(notify=lambda _: None)
         monkeypatch.setitem(sys.modules, "systemd", SimpleNamespace(daemon=library))
         monkeypatch.setitem(sys.modules, "systemd.daemon", library)
         self.store: Counter[str] = Counter({"dora-log-a": 2})
-        self.slept = 0.0
         systemctl = root / "systemctl"
-        systemctl.write_text(f'#!/bin/sh\necho "$@" >{root}/asked\ncat {root}/restarts\n')
+        systemctl.write_text(
+            f'#!/bin/sh\necho "$@" >>{root}/asked\ncase "$*" in *NRestarts*) cat {root}/restarts\n'
+            f";; *) cat {root}/ended; esac\n"
+        )
+        (root / "asked").touch()
         systemctl.chmod(0o755)
         monkeypatch.setenv("PATH", f"{root}:{os.environ['PATH']}")
 
     def sleep(self, seconds: float) -> None:
         self.slept += seconds
+
+    def end(self, seconds: float) -> None:
+        """The last life that was active has ended so long ago."""
+        ended = time.clock_gettime(time.CLOCK_MONOTONIC) - seconds
+        (self.paths.root / "ended").write_text(f"{round(ended * SECOND)}\n")
+
+    @property
+    def asked(self) -> str:
+        """What systemctl was asked so far."""
+        return (self.paths.root / "asked").read_text()
 
     def keep_store(self) -> None:
         while True:
@@ -64,11 +86,12 @@ class Unit:
                 os.close(fd)
 
     def start(self, restarts: int, policy: RestartPolicy = POLICY) -> float:
-        """One life begins: how long it is after systemd's own delay."""
+        """One life begins: how long its nodes wait after systemd's own delay."""
         self.monkeypatch.setenv("LISTEN_FDNAMES", ":".join(self.store.elements()))
         (self.paths.root / "restarts").write_text(f"{restarts}\n")
         self.slept = 0.0
         pause(self.options(policy), self.paths)
+        hold_back(self.options(policy), self.paths)
         self.keep_store()
         return self.slept
 
@@ -84,8 +107,9 @@ def unit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Unit]:
 
 
 def test_it_doubles_up_to_the_longest(unit: Unit) -> None:
-    pauses = [0.5 + unit.start(restarts) for restarts in range(9)]
-    assert pauses == [0.5, 0.5, 1, 2, 4, 8, 16, 30, 30]
+    assert POLICY.unit_delay / SECOND == 0.1
+    pauses = [round(0.1 + unit.start(restarts), 6) for restarts in range(9)]
+    assert pauses == [0.1, 0.5, 1, 2, 4, 8, 16, 30, 30]
 
 
 def test_a_quiet_window_is_forgotten(unit: Unit) -> None:
@@ -97,16 +121,54 @@ def test_a_quiet_window_is_forgotten(unit: Unit) -> None:
 
     asyncio.run(wait())
     unit.keep_store()
-    assert [unit.start(restarts) for restarts in (8, 9)] == [0, 0.5]
+    assert [unit.start(restarts) for restarts in (8, 9)] == [0.4, 0.9]
 
 
 def test_what_is_reset_or_restarted_by_hand_is_forgotten(unit: Unit) -> None:
     for restarts in range(8):
         unit.start(restarts)
-    assert [unit.start(restarts) for restarts in (0, 1, 2)] == [0, 0, 0.5]
-    assert (unit.paths.root / "asked").read_text() == (
-        "show --value --property=NRestarts dora-robot.service\n"
-    )
+    assert [unit.start(restarts) for restarts in (0, 1, 2)] == [0.4, 0.4, 0.9]
+    assert "show --value --property=NRestarts dora-robot.service\n" in unit.asked
+
+
+def test_a_requested_stop_is_no_life_to_wait_after(unit: Unit) -> None:
+    for restarts in range(5):
+        unit.start(restarts)
+    fd_store.forget_lives()
+    unit.keep_store()
+    assert unit.start(5) == 0
+
+
+def test_only_what_is_left_of_the_delay_is_waited_for(
+    unit: Unit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    unit.start(0)
+    monkeypatch.setattr(pause_module, "age", lambda: 0.5)
+    assert unit.start(1) == 0
+    assert not unit.asked
+    monkeypatch.setattr(pause_module, "age", lambda: 0.25)
+    assert unit.start(0) == pytest.approx(0.15)
+
+
+@pytest.mark.parametrize(
+    ("since", "least", "most"),
+    [(0.42, 0.0, 0.08), (0.1, 0.15, 0.15), (0.9, 0, 0), (60, 0.15, 0.15)],
+)
+def test_the_delay_begins_when_the_last_life_has_ended(
+    unit: Unit, monkeypatch: pytest.MonkeyPatch, since: float, least: float, most: float
+) -> None:
+    """systemd was late, or ExecStopPost= took its time; but 60 s ago was another life."""
+    unit.start(0)
+    monkeypatch.setattr(pause_module, "age", lambda: 0.25)
+    unit.end(since)
+    assert least <= round(unit.start(0), 6) <= most
+
+
+def test_the_age_of_a_process() -> None:
+    code = "import time; from dora_systemd.runner.cell.pause import age; print(age())"
+    began = time.monotonic()
+    printed = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout
+    assert -0.02 < float(printed) < time.monotonic() - began + 0.02
 
 
 def test_it_is_seen(unit: Unit) -> None:
@@ -131,7 +193,7 @@ def test_the_store_does_not_fill(unit: Unit) -> None:
 
 def test_systemd_does_not_answer(unit: Unit) -> None:
     (unit.paths.root / "systemctl").write_text("#!/bin/sh\nexit 1\n")
-    assert counted_restarts("robot", True, 7) == 7
+    assert asked("NRestarts", "robot", True, 7) == 7
 
 
 def test_without_systemd(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from dora_systemd.adapters.host import fd_store
 from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.life import events as life
@@ -163,6 +164,7 @@ def test_a_state_without_deadline_has_that_of_no_other(tmp_path: Path) -> None:
 
 def test_systemd_is_told_each_state_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     told = hear_notifications(monkeypatch)
+    monkeypatch.setattr(fd_store, "forget_lives", lambda: told.append("no lives"))
 
     async def work() -> None:
         bench = Bench(tmp_path, State.WAITING, ready_us=0)
@@ -171,9 +173,9 @@ def test_systemd_is_told_each_state_once(tmp_path: Path, monkeypatch: pytest.Mon
         assert told.pop() == "READY=1"
         bench.push(life.ReloadNoted(6, "not reloaded: x"), life.ReloadNoted(7, ""))
         assert "READY=1" not in told
-        assert "STOPPING=1" not in told
+        assert "STOPPING=1" not in told and "no lives" not in told
         bench.push(life.StopAsked(8, "SIGTERM"))
-        assert "STOPPING=1" in told
+        assert "STOPPING=1" in told and "no lives" in told
 
     live(work)
 
