@@ -1,6 +1,5 @@
 """The verbs of doractl as a click group that imports only the verb that runs."""
 
-from difflib import get_close_matches
 from importlib import import_module
 from inspect import cleandoc
 from pathlib import Path
@@ -94,6 +93,8 @@ class VerbGroup(click.Group):
         name = args[0]
         if name.startswith("-") or self.get_command(ctx, name):
             return super().resolve_command(ctx, args)
+        from difflib import get_close_matches
+
         near = get_close_matches(name, [*VERBS, *ALIASES], n=1)
         hint = f"did you mean doractl {near[0]}?" if near else "doractl --help lists all commands"
         raise DoraSystemdError(f"unknown command {name!r}", hint, ExitCode.USAGE)

@@ -11,7 +11,6 @@ import click
 
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.edge import write_exactly
-from dora_systemd.cli.foreground import Foreground, print_until_end
 from dora_systemd.cli.parameters import (
     acting_options,
     current_scope,
@@ -37,10 +36,8 @@ from dora_systemd.verbs.start.launch import Claim, claim
 from dora_systemd.verbs.start.linger import ensure_linger
 from dora_systemd.verbs.start.logins import start_notes
 from dora_systemd.verbs.start.plan import DEFAULT_FILE, StartRequest, make_plan
-from dora_systemd.verbs.start.run import HELD
 from dora_systemd.verbs.start.unit import format_plan
 from dora_systemd.verbs.start.watch import watched_patterns
-from dora_systemd.verbs.why import words_of_start
 
 
 @click.command("start", cls=SettingsCommand)
@@ -125,6 +122,9 @@ def command(
 
 def _attach(bus: Bus, claimed: Claim, notes: Sequence[str]) -> int:
     """Print the logs of the dataflow, which goes on if this process ends."""
+    from dora_systemd.cli.foreground import Foreground, print_until_end
+    from dora_systemd.verbs.start.run import HELD
+
     how = Foreground(signals=(signal.SIGINT,), notes=notes)
     # What is started from a unit file stays loaded if it has failed.
     properties = None if claimed.properties is None else [*claimed.properties, HELD]
@@ -157,6 +157,8 @@ def _last_words(bus: Bus, scope: Scope, uuid: str) -> Iterator[None]:
         yield
     except DoraSystemdError as error:
         if error.code is ExitCode.FAILURE:
+            from dora_systemd.verbs.why import words_of_start
+
             for line in words_of_start(bus, scope, uuid):
                 tell(f"  {line}", err=True)
         raise

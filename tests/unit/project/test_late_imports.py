@@ -17,6 +17,12 @@ LATE = {
         "names": {"difflib"},
         "cli.edge": {"decisions.views.objects"},
     },
+    "a start that succeeds has no last words, and most follow no log": {
+        "cli.verbs.run.start": {"cli.foreground", "verbs.start.run", "verbs.why"},
+    },
+    "only an unknown command has a similar one": {
+        "cli.group": {"difflib"},
+    },
     "a Tab after a verb or an option does not ask for a dataflow": {
         "cli.completion": {"verbs.facts.cells", "verbs.facts.list", "verbs.facts.selector"},
     },
