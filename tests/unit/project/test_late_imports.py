@@ -20,6 +20,9 @@ LATE = {
     "a start that succeeds has no last words, and most follow no log": {
         "cli.verbs.run.start": {"cli.foreground", "verbs.start.run", "verbs.why"},
     },
+    "a restart of what runs makes no plan": {
+        "cli.verbs.run.restart": {"verbs.restart"},
+    },
     "only an unknown command has a similar one": {
         "cli.group": {"difflib"},
     },
