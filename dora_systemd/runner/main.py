@@ -42,10 +42,10 @@ from dora_systemd.decisions.logs.lines import Origin
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import settings_path
 from dora_systemd.paths import CellPaths
-from dora_systemd.runner.cell.begin import enter_supervisor
+from dora_systemd.runner.cell.begin import daemon_variables, enter_supervisor
 from dora_systemd.runner.cell.clock import StopClock
 from dora_systemd.runner.cell.dialogue import Dialogue
-from dora_systemd.runner.cell.engine import Engine, daemon_variables
+from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.cell.failure import Beside, words
 from dora_systemd.runner.cell.pause import forget_restarts
 from dora_systemd.runner.cell.pump import Pump, now_us
@@ -186,7 +186,7 @@ async def run_once(runs: Runs, is_again: bool) -> Cell:
         )
         pump = Pump(cell, options.uuid, runs.paths, runs.nodes, runs.pipes)
         dialogue = Dialogue(options, pump, dora, runs.nodes, runs.pipes)
-        variables = daemon_variables(prepared, runs.paths, runs.unit)
+        variables = daemon_variables(options, runs.paths, runs.unit, runs.environment)
         pump.connect(dialogue.actions(prepared.descriptor, variables))
         runs.pipes.mute()
         listen(options, pump, dialogue, runs.clock)

@@ -1,13 +1,17 @@
 """Starts a cell: its cgroup and its coordinator. Imports only what loads quickly."""
 
+import os
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.dora import engine
+from dora_systemd.decisions.cell.environment import find_python
+from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.paths import CellPaths
 
+LIBEXEC = Path(__file__).parents[2] / "libexec"
 OPENSSL = ("ssl", "_ssl", "_hashlib")
 
 
@@ -44,3 +48,26 @@ def start_coordinator(dora: str, paths: CellPaths, environment: Mapping[str, str
     paths.coordinator.mkdir(mode=0o700, exist_ok=True)
     own = engine.coordinator_environment(environment, paths.coordinator)
     return engine.spawn("coordinator", engine.coordinator_command(dora), own, paths.coordinator)
+
+
+def daemon_variables(
+    options: RunnerOptions, paths: CellPaths, unit: Path, environment: Mapping[str, str]
+) -> dict[str, str]:
+    """Variables of the daemon that nodes do not get; launcher.pl removes them.
+
+    unit: cgroup directory. environment: of the nodes.
+    """
+    search_path = environment.get("PATH") or os.defpath
+    # Perl, which runs the launcher, would complain about every unknown LANG.
+    own = {"DORA_QUIET": "1", "RUST_BACKTRACE": "0", "PERL_BADLANG": "0"}
+    added = {key: text for key, text in own.items() if key not in os.environ}
+    return {
+        **added,
+        "DORA_SYSTEMD_UNSET": " ".join(("DORA_QUIET", *added)),
+        "DORA_SYSTEMD_CELL": str(paths.root),
+        "DORA_SYSTEMD_GROUP": str(unit),
+        "DORA_SYSTEMD_LIBEXEC": str(LIBEXEC),
+        "DORA_SYSTEMD_DIRECTORY": options.working_directory,
+        "DORA_SYSTEMD_PYTHON": find_python(options.venv, search_path, os.path.exists),
+        "PATH": f"{LIBEXEC}:{search_path}",
+    }

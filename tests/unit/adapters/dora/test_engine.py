@@ -5,10 +5,15 @@ import os
 import time
 from pathlib import Path
 
+import pytest
+
 from dora_systemd.adapters.dora import engine
 from dora_systemd.decisions.cell.environment import node_environment
+from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.paths import CellPaths
+from dora_systemd.runner.cell.begin import LIBEXEC, daemon_variables
 from dora_systemd.runner.cell.engine import Engine
+from tests.unit.fakes.manager import UUID
 
 
 def test_what_is_systemds_stays_with_the_runner() -> None:
@@ -28,6 +33,22 @@ def test_everything_listens_on_loopback_and_with_a_token() -> None:
 def test_the_users_own_token_is_not_overwritten() -> None:
     made = engine.coordinator_environment({"HOME": "/h", "XDG_CONFIG_HOME": "/h/c"}, Path("/run/c"))
     assert made["XDG_CONFIG_HOME"] == made["TMPDIR"] == "/run/c"
+
+
+def test_what_the_daemon_is_told_beside_the_variables_of_the_nodes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RUST_BACKTRACE", "1")
+    options = RunnerOptions("robot", UUID, "/p/d.yml", "/p", "/dora", venv="/p/.venv")
+    unit = Path("/sys/fs/cgroup/unit")
+    given = daemon_variables(options, CellPaths(tmp_path), unit, {"PATH": "/bin"})
+    assert given["PATH"] == f"{LIBEXEC}:/bin"
+    assert (LIBEXEC / "python").is_file()
+    assert given["DORA_SYSTEMD_PYTHON"] == "/p/.venv/bin/python"
+    assert given["DORA_SYSTEMD_DIRECTORY"] == "/p"
+    assert given["DORA_SYSTEMD_GROUP"] == str(unit)
+    assert "RUST_BACKTRACE" not in given
+    assert given["DORA_SYSTEMD_UNSET"].split() == ["DORA_QUIET", "DORA_QUIET", "PERL_BADLANG"]
 
 
 def test_children_and_their_ends(tmp_path: Path) -> None:
