@@ -19,11 +19,11 @@ from dora_systemd.runner.cell.pause import pause
 
 if TYPE_CHECKING:
     from dora_systemd.adapters.dora.check import DoraCheck
-    from dora_systemd.adapters.dora.engine import Child
+    from dora_systemd.runner.cell.boot import Boot
 
 
-def begin(argv: list[str]) -> "tuple[Child, DoraCheck] | None":
-    """Start the coordinator of the first run, and dora's checks in parallel.
+def begin(argv: list[str]) -> "tuple[Boot, DoraCheck] | None":
+    """Start the coordinator of the first run; its daemon and dora's checks follow in parallel.
 
     Returns None if that fails: run_cell() tries again and reports the error.
     """
@@ -31,14 +31,16 @@ def begin(argv: list[str]) -> "tuple[Child, DoraCheck] | None":
     if directory:
         with contextlib.suppress(OSError, DoraSystemdError):
             options = parse_runner_argv(argv)
-            enter_supervisor()
+            unit = enter_supervisor()
             paths = CellPaths(Path(directory))
             pause(options, paths)
             environment = node_environment(os.environ)
             coordinator = start_coordinator(options.dora, paths, environment)
             from dora_systemd.adapters.dora.check import DoraCheck
+            from dora_systemd.runner.cell.boot import Boot
 
-            return coordinator, DoraCheck(options, environment)
+            boot = Boot(coordinator, options, paths, unit, environment)
+            return boot, DoraCheck(options, environment)
     return None
 
 

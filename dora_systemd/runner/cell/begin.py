@@ -4,6 +4,7 @@ import os
 import sys
 from collections.abc import Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.dora import engine
@@ -71,3 +72,27 @@ def daemon_variables(
         "DORA_SYSTEMD_PYTHON": find_python(options.venv, search_path, os.path.exists),
         "PATH": f"{LIBEXEC}:{search_path}",
     }
+
+
+class Daemon(NamedTuple):
+    """A daemon. listen: its port for dynamic nodes."""
+
+    child: engine.Child
+    listen: int
+
+
+def start_daemon(dora: str, paths: CellPaths, port: int, environment: Mapping[str, str]) -> Daemon:
+    """Start a daemon for the coordinator on `port`. Raises OSError.
+
+    environment: of the nodes, with daemon_variables.
+    """
+    paths.daemon.mkdir(mode=0o700, exist_ok=True)
+    listen = engine.free_port()
+    own = {**environment, "DORA_AUTH_TOKEN": read_token(paths)}
+    command = engine.daemon_command(dora, port, listen)
+    return Daemon(engine.spawn("daemon", command, own, paths.daemon), listen)
+
+
+def read_token(paths: CellPaths) -> str:
+    """The token that the listening coordinator has written. Raises OSError."""
+    return (paths.coordinator / ".dora-token").read_text().strip()

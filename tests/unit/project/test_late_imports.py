@@ -61,7 +61,7 @@ LATE = {
         "adapters.host.notify": {"systemd.daemon"},
     },
     "the coordinator boots while the rest of the runner is imported": {
-        "runner.__main__": {"adapters.dora.check", "runner.main"},
+        "runner.__main__": {"adapters.dora.check", "runner.cell.boot", "runner.main"},
         "runner.cell.pause": {
             *("adapters.host.process", "adapters.host.files", "adapters.host.notify"),
             *("decisions.cell.status", "asyncio"),

@@ -71,6 +71,26 @@ def test_a_free_port_is_free() -> None:
     assert 0 < engine.free_port() < 65536
 
 
+PORT = "echo first; printf 'Listening on port 47'; echo 11; echo more; exec sleep 1000"
+
+
+@pytest.mark.parametrize(
+    ("script", "port"),
+    [(PORT, 4711), ("echo no", 0), ("exec sleep 1000", 0), ("echo is not Listening on port 1", 0)],
+)
+def test_the_port_of_a_coordinator_is_read_as_soon_as_it_is_printed(
+    tmp_path: Path, script: str, port: int
+) -> None:
+    child = engine.spawn("coordinator", ["/bin/sh", "-c", script], {}, tmp_path)
+    assert engine.read_port(child, 0.1 if "sleep" in script and not port else 20) == port
+    if port:
+        assert child.said.startswith(b"first\nListening on port 4711\n")
+    child.popen.kill()
+    child.popen.wait()
+    os.close(child.output)
+    os.close(child.pidfd)
+
+
 def open_files() -> set[str]:
     return {name for name in map(str, range(256)) if Path(f"/proc/self/fd/{name}").is_symlink()}
 

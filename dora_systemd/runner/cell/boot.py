@@ -1,0 +1,49 @@
+"""The dora of the first run boots in a thread, while the rest of the runner is imported."""
+
+import contextlib
+from collections.abc import Mapping
+from pathlib import Path
+
+from dora_systemd.adapters.dora import engine
+from dora_systemd.adapters.host.process import Beside
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.paths import CellPaths
+from dora_systemd.runner.cell.begin import Daemon, daemon_variables, start_daemon
+
+LISTEN_SECONDS = 1.0
+"""Time for the coordinator to listen. If it takes longer, the daemon is started after the imports,
+and the checks need not wait for a coordinator that hangs."""
+
+
+class Boot:
+    """Starts the daemon once the coordinator listens.
+
+    coordinator: has been started. unit: cgroup directory. environment: of the nodes.
+    """
+
+    def __init__(
+        self,
+        coordinator: engine.Child,
+        options: RunnerOptions,
+        paths: CellPaths,
+        unit: Path,
+        environment: Mapping[str, str],
+    ) -> None:
+        self.coordinator = coordinator
+        self._dora, self._paths = options.dora, paths
+        self._environment = {
+            **environment,
+            **daemon_variables(options, paths, unit, environment),
+        }
+        self._work = Beside(self._start_daemon)
+
+    def _start_daemon(self) -> Daemon | None:
+        port = engine.read_port(self.coordinator, LISTEN_SECONDS)
+        with contextlib.suppress(OSError):  # Engine tries again, and reports it
+            if port:
+                return start_daemon(self._dora, self._paths, port, self._environment)
+        return None
+
+    def daemon(self) -> Daemon | None:
+        """Wait for the daemon to be started; None if it is not, or not yet."""
+        return self._work.result()
