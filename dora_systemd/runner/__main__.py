@@ -40,7 +40,7 @@ def begin(argv: list[str]) -> "tuple[Boot, DoraCheck] | None":
             from dora_systemd.runner.cell.boot import Boot
 
             boot = Boot(coordinator, options, paths, unit, environment)
-            return boot, DoraCheck(options, environment)
+            return boot, DoraCheck(options, environment, boot.listens)
     return None
 
 

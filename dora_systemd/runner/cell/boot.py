@@ -35,14 +35,20 @@ class Boot:
             **environment,
             **daemon_variables(options, paths, unit, environment),
         }
+        self._port = 0
         self._work = Beside(self._start_daemon)
 
     def _start_daemon(self) -> Daemon | None:
-        port = engine.read_port(self.coordinator, LISTEN_SECONDS)
+        self._port = engine.read_port(self.coordinator, LISTEN_SECONDS)
         with contextlib.suppress(OSError):  # Engine tries again, and reports it
-            if port:
-                return start_daemon(self._dora, self._paths, port, self._environment)
+            if self._port:
+                return start_daemon(self._dora, self._paths, self._port, self._environment)
         return None
+
+    def listens(self) -> bool:
+        """Wait for the coordinator; False if it does not listen, or not yet."""
+        self._work.result()
+        return self._port > 0
 
     def daemon(self) -> Daemon | None:
         """Wait for the daemon to be started; None if it is not, or not yet."""

@@ -126,6 +126,7 @@ def test_what_boots_already_is_not_started_again(tmp_path: Path) -> None:
         boot = booting(bench)
         daemon = boot.daemon()
         assert daemon
+        assert boot.listens()
         assert boot.coordinator.said == b"Listening on port 4711\n"
         assert bench.engine.start_coordinator() is boot.coordinator
         bench.engine.set_port(4711)
@@ -159,6 +160,7 @@ def test_a_boot_that_fails_leaves_the_daemon_to_the_engine(tmp_path: Path, scrip
     async def work(bench: Bench) -> None:
         boot = booting(bench, script)
         assert boot.daemon() is None
+        assert boot.listens() == ("Listening" in script)
         assert bench.engine.start_coordinator() is boot.coordinator
         assert boot.coordinator.said
 
