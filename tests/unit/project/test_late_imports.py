@@ -17,6 +17,9 @@ LATE = {
         "names": {"difflib"},
         "cli.edge": {"decisions.views.objects"},
     },
+    "shutil imports every compressor: only a terminal has a width": {
+        "cli.stageline": {"shutil"},
+    },
     "a start that succeeds has no last words, and most follow no log": {
         "cli.verbs.run.start": {"cli.foreground", "verbs.start.run", "verbs.why"},
     },
