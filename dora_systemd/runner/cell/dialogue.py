@@ -111,6 +111,7 @@ class Dialogue(Tasks):
         self._pump.push(life.DaemonConnected(now_us()))
 
     async def _send_start(self, descriptor: Mapping[str, Any]) -> None:
+        self._nodes.expect()
         run = await self._engine.start_run(descriptor, self._options.name)
         self._pipes.set_run(run)
         self._pump.push(life.RunStarted(now_us(), run))

@@ -46,6 +46,9 @@ class FakeNodes(Nodes):
         self.living: set[tuple[str, int]] = set()
         self.ooms: dict[str, Oom] = {}
 
+    def expect(self) -> None:
+        self.calls.append(("expect",))
+
     def listen(self, run: str) -> None:
         self.calls.append(("listen", run))
 
