@@ -4,6 +4,7 @@ import contextlib
 from collections.abc import Mapping
 from pathlib import Path
 
+from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.dora import engine
 from dora_systemd.adapters.host.process import Beside
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -16,7 +17,7 @@ and the checks need not wait for a coordinator that hangs."""
 
 
 class Boot:
-    """Starts the daemon once the coordinator listens.
+    """Enables the controllers for the nodes, and starts the daemon once the coordinator listens.
 
     coordinator: has been started. unit: cgroup directory. environment: of the nodes.
     """
@@ -30,7 +31,7 @@ class Boot:
         environment: Mapping[str, str],
     ) -> None:
         self.coordinator = coordinator
-        self._dora, self._paths = options.dora, paths
+        self._dora, self._paths, self._unit = options.dora, paths, unit
         self._environment = {
             **environment,
             **daemon_variables(options, paths, unit, environment),
@@ -39,6 +40,9 @@ class Boot:
         self._work = Beside(self._start_daemon)
 
     def _start_daemon(self) -> Daemon | None:
+        # The kernel lets this wait for some 10 ms. Nodes does it too, and reports errors.
+        with contextlib.suppress(OSError):
+            cgroup.enable_controllers(self._unit)
         self._port = engine.read_port(self.coordinator, LISTEN_SECONDS)
         with contextlib.suppress(OSError):  # Engine tries again, and reports it
             if self._port:

@@ -123,10 +123,13 @@ def booting(bench: Bench, script: str = BOOTS) -> Boot:
 
 def test_what_boots_already_is_not_started_again(tmp_path: Path) -> None:
     async def work(bench: Bench) -> None:
+        (tmp_path / "cgroup.controllers").write_text("cpu\n")
+        (tmp_path / "cgroup.subtree_control").write_text("")
         boot = booting(bench)
         daemon = boot.daemon()
         assert daemon
         assert boot.listens()
+        assert (tmp_path / "cgroup.subtree_control").read_text() == "+cpu"
         assert boot.coordinator.said == b"Listening on port 4711\n"
         assert bench.engine.start_coordinator() is boot.coordinator
         bench.engine.set_port(4711)
