@@ -5,6 +5,7 @@ it imports the rest of the runner: the imports take longer than the coordinator 
 """
 
 import contextlib
+import gc
 import os
 import sys
 from pathlib import Path
@@ -46,10 +47,13 @@ def begin(argv: list[str]) -> "tuple[Boot, DoraCheck] | None":
 
 def main(argv: list[str]) -> int:
     """Run the cell that `argv` describes; the exit status."""
+    gc.disable()  # what is imported is no garbage, and Python would search it fifty times
     begun = begin(argv)
     leave_out_openssl()
     from dora_systemd.runner.main import run
 
+    gc.freeze()
+    gc.enable()
     return run(argv, begun)
 
 
