@@ -1,6 +1,5 @@
 """The verbs of doractl as a click group that imports only the verb that runs."""
 
-from difflib import get_close_matches
 from importlib import import_module
 from inspect import cleandoc
 from pathlib import Path
@@ -94,6 +93,8 @@ class VerbGroup(click.Group):
         name = args[0]
         if name.startswith("-") or self.get_command(ctx, name):
             return super().resolve_command(ctx, args)
+        from difflib import get_close_matches
+
         near = get_close_matches(name, [*VERBS, *ALIASES], n=1)
         hint = f"did you mean doractl {near[0]}?" if near else "doractl --help lists all commands"
         raise DoraSystemdError(f"unknown command {name!r}", hint, ExitCode.USAGE)
@@ -147,6 +148,8 @@ def run_verb(arguments: list[str]) -> int:
 
 def _near(error: click.NoSuchOption) -> list[str]:
     """The options that click suggests, without those that only have the dashes in common."""
+    from difflib import get_close_matches
+
     word = error.option_name.lstrip("-")
     return [one for one in error.possibilities or () if get_close_matches(one.lstrip("-"), [word])]
 

@@ -1,6 +1,5 @@
 """One status line on a terminal that is rewritten during a wait; no output to a pipe."""
 
-import shutil
 from contextlib import AbstractContextManager
 from typing import TextIO
 
@@ -19,8 +18,12 @@ class StageLine(AbstractContextManager["StageLine"]):
         self._shown = ""
 
     def __call__(self, text: str) -> None:
-        shown = one_line(text)[: shutil.get_terminal_size().columns - 1]
-        if self._is_terminal and shown != self._shown:
+        if not self._is_terminal:
+            return
+        from shutil import get_terminal_size
+
+        shown = one_line(text)[: get_terminal_size().columns - 1]
+        if shown != self._shown:
             self._write(f"{_BACK_AND_CLEAR}{shown}")
             self._shown = shown
 

@@ -31,11 +31,13 @@ sub note {
 }
 
 note("$cell/io/$node.pid", "$$\n");
+# Before the pipes: the kernel lets this move wait for some 10 ms, and the runner needs them to get
+# ready for the pipes.
+note("$group/node-$node/cgroup.procs", "0\n");
 if ($output eq 'pipe') {
     open STDOUT, '>', "$cell/io/$node.out" or fail(126, "$node.out");
     open STDERR, '>', "$cell/io/$node.err" or fail(126, "$node.err");
 }
-note("$group/node-$node/cgroup.procs", "0\n");
 chdir $directory or fail(126, $directory);
 $ENV{PATH} =~ s/^\Q$libexec\E://;
 # A zenoh configuration of the user's takes precedence. Dora refuses two, and a file that it cannot

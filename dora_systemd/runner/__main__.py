@@ -5,6 +5,7 @@ it imports the rest of the runner: the imports take longer than the coordinator 
 """
 
 import contextlib
+import gc
 import os
 import sys
 from pathlib import Path
@@ -19,11 +20,11 @@ from dora_systemd.runner.cell.pause import pause
 
 if TYPE_CHECKING:
     from dora_systemd.adapters.dora.check import DoraCheck
-    from dora_systemd.adapters.dora.engine import Child
+    from dora_systemd.runner.cell.boot import Boot
 
 
-def begin(argv: list[str]) -> "tuple[Child, DoraCheck] | None":
-    """Start the coordinator of the first run, and dora's checks in parallel.
+def begin(argv: list[str]) -> "tuple[Boot, DoraCheck] | None":
+    """Start the coordinator of the first run; its daemon and dora's checks follow in parallel.
 
     Returns None if that fails: run_cell() tries again and reports the error.
     """
@@ -31,23 +32,28 @@ def begin(argv: list[str]) -> "tuple[Child, DoraCheck] | None":
     if directory:
         with contextlib.suppress(OSError, DoraSystemdError):
             options = parse_runner_argv(argv)
-            enter_supervisor()
+            unit = enter_supervisor()
             paths = CellPaths(Path(directory))
             pause(options, paths)
             environment = node_environment(os.environ)
             coordinator = start_coordinator(options.dora, paths, environment)
             from dora_systemd.adapters.dora.check import DoraCheck
+            from dora_systemd.runner.cell.boot import Boot
 
-            return coordinator, DoraCheck(options, environment)
+            boot = Boot(coordinator, options, paths, unit, environment)
+            return boot, DoraCheck(options, environment, boot.listens)
     return None
 
 
 def main(argv: list[str]) -> int:
     """Run the cell that `argv` describes; the exit status."""
+    gc.disable()  # what is imported is no garbage, and Python would search it fifty times
     begun = begin(argv)
     leave_out_openssl()
     from dora_systemd.runner.main import run
 
+    gc.freeze()
+    gc.enable()
     return run(argv, begun)
 
 

@@ -18,7 +18,6 @@ from typing import Any
 
 from dora_systemd.adapters.dora.check import DoraCheck
 from dora_systemd.adapters.dora.control import read_coordinator
-from dora_systemd.adapters.dora.engine import Child
 from dora_systemd.adapters.dora.preparation import (
     Prepared,
     check_named_nodes,
@@ -42,10 +41,11 @@ from dora_systemd.decisions.logs.lines import Origin
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import settings_path
 from dora_systemd.paths import CellPaths
-from dora_systemd.runner.cell.begin import enter_supervisor
+from dora_systemd.runner.cell.begin import daemon_variables, enter_supervisor
+from dora_systemd.runner.cell.boot import Boot
 from dora_systemd.runner.cell.clock import StopClock
 from dora_systemd.runner.cell.dialogue import Dialogue
-from dora_systemd.runner.cell.engine import Engine, daemon_variables
+from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.cell.failure import Beside, words
 from dora_systemd.runner.cell.pause import forget_restarts, hold_back
 from dora_systemd.runner.cell.pump import Pump, now_us
@@ -63,8 +63,8 @@ CLOSE_SECONDS = 7.0
 LOSSES_SECONDS = 10.0
 CANCEL_SECONDS = 0.5
 
-Begun = tuple[Child, DoraCheck]
-"""A coordinator that is starting, and dora's checks that run in parallel."""
+Begun = tuple[Boot, DoraCheck]
+"""Dora's processes that are starting, and dora's checks that run in parallel."""
 
 
 async def run_cell(
@@ -106,8 +106,8 @@ class Runs:
     """What all runs of the dataflow share. Raises OSError if the unit's cgroup is not ours.
 
     unit: cgroup directory. environment: that of the nodes. check: dora's, for the first run.
-    beside: tasks that outlast a run. clock: that of the stop that ends the last run. coordinator:
-    that of the first run, if it exists already.
+    beside: tasks that outlast a run. clock: that of the stop that ends the last run. boot: dora's
+    processes of the first run, if they exist already.
     """
 
     def __init__(
@@ -120,14 +120,14 @@ class Runs:
     ) -> None:
         self.paths, self.pipes, self.clock = paths, pipes, clock
         self.unit = enter_supervisor()
-        for path in (paths.daemon, paths.work, paths.io):
+        for path in (paths.work, paths.io):
             path.mkdir(mode=0o700, exist_ok=True)
         self.environment = node_environment(os.environ)
         settings = SettingsFile(settings_path(options.dataflow), paths.settings)
         self.reloader = Reloader(options, self.environment, settings)
         self.nodes = Nodes(self.unit, paths, pipes)
         self.beside = Beside(asyncio.get_running_loop())
-        self.coordinator = begun[0] if begun else None
+        self.boot = begun[0] if begun else None
         self.check = begun[1] if begun else DoraCheck(options, self.environment)
 
 
@@ -168,9 +168,10 @@ def goes_on(runs: Runs, last: Cell) -> bool:
 async def run_once(runs: Runs, is_again: bool) -> Cell:
     """One run of the dataflow with its own dora; the cell at the end. Raises DoraSystemdError."""
     started_us, options, reloader = now_us(), runs.reloader.options, runs.reloader
-    dora = Engine(options.dora, runs.paths, runs.environment)
+    boot = None if is_again else runs.boot
+    dora = Engine(options.dora, runs.paths, runs.environment, boot)
     try:
-        coordinator = dora.start_coordinator(None if is_again else runs.coordinator)
+        coordinator = dora.start_coordinator()
         prepared = reloader.current or prepare_first(runs, options)
         runs.nodes.prepare(prepared.dataflow, options.log_rates, options.node_limits)
         table = initial_nodes(
@@ -186,7 +187,7 @@ async def run_once(runs: Runs, is_again: bool) -> Cell:
         )
         pump = Pump(cell, options.uuid, runs.paths, runs.nodes, runs.pipes)
         dialogue = Dialogue(options, pump, dora, runs.nodes, runs.pipes)
-        variables = daemon_variables(prepared, runs.paths, runs.unit)
+        variables = daemon_variables(options, runs.paths, runs.unit, runs.environment)
         pump.connect(dialogue.actions(prepared.descriptor, variables))
         runs.pipes.mute()
         listen(options, pump, dialogue, runs.clock)

@@ -218,3 +218,14 @@ def test_ctrl_c_while_it_starts_ends_the_waiting_only(cell: Cell, project: Proje
     assert child.returncode == ExitCode.INTERRUPTED, said
     assert f"doractl: interrupted; {cell.name} is still starting\nhint: " in said
     assert cell.show("ActiveState") == "activating"
+
+
+@pytest.mark.parametrize("seconds", [0, 2])
+def test_the_daemon_is_started_ahead_and_once(cell: Cell, project: Project, seconds: int) -> None:
+    """Also after a coordinator that takes longer to listen than the daemon is held ready for."""
+    slow = f'[ "$1" = coordinator ] && sleep {seconds}\nexec {shutil.which("dora")} "$@"\n'
+    dora = project.write("dora", f"#!/bin/sh\n{slow}")
+    dora.chmod(0o755)
+    cell.start(project.three_nodes(), f"--dora={dora}")
+    assert cell.supervisor_pid("daemon")
+    assert len(cell.pids("supervisor")) == 3

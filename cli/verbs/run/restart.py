@@ -10,7 +10,6 @@ from dora_systemd.adapters.bus.manager import tell_stage
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import acting_options, current_scope, print_outcomes
 from dora_systemd.cli.stageline import StageLine
-from dora_systemd.verbs.restart import restart_asked
 from dora_systemd.verbs.start.again import find_known
 from dora_systemd.verbs.stop import note_stop, restart_cells
 
@@ -34,5 +33,8 @@ def command(selectors: tuple[str, ...]) -> int:
     note_stop(cells, "doractl restart")
     with StageLine(sys.stderr) as stage:
         outcomes = restart_cells(bus, cells, partial(tell_stage, stage)) if cells else []
-        outcomes += [restart_asked(bus, scope, one, os.environ, stage) for one in ended]
+        if ended:
+            from dora_systemd.verbs.restart import restart_asked
+
+            outcomes += [restart_asked(bus, scope, one, os.environ, stage) for one in ended]
     return print_outcomes(outcomes)

@@ -11,7 +11,6 @@ import click
 
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.edge import write_exactly
-from dora_systemd.cli.foreground import Foreground, print_until_end
 from dora_systemd.cli.parameters import (
     acting_options,
     current_scope,
@@ -25,7 +24,6 @@ from dora_systemd.cli.settingoptions import SettingsCommand, setting_options
 from dora_systemd.cli.stageline import StageLine
 from dora_systemd.decisions.settings.resolve import is_given
 from dora_systemd.decisions.views.outcome import Outcome
-from dora_systemd.decisions.why.signs import known_remedy
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
@@ -38,10 +36,8 @@ from dora_systemd.verbs.start.launch import Claim, claim
 from dora_systemd.verbs.start.linger import ensure_linger
 from dora_systemd.verbs.start.logins import start_notes
 from dora_systemd.verbs.start.plan import DEFAULT_FILE, StartRequest, make_plan
-from dora_systemd.verbs.start.run import HELD
 from dora_systemd.verbs.start.unit import format_plan
 from dora_systemd.verbs.start.watch import watched_patterns
-from dora_systemd.verbs.why import words_of_start
 
 
 @click.command("start", cls=SettingsCommand)
@@ -126,6 +122,9 @@ def command(
 
 def _attach(bus: Bus, claimed: Claim, notes: Sequence[str]) -> int:
     """Print the logs of the dataflow, which goes on if this process ends."""
+    from dora_systemd.cli.foreground import Foreground, print_until_end
+    from dora_systemd.verbs.start.run import HELD
+
     how = Foreground(signals=(signal.SIGINT,), notes=notes, command="doractl start --attach")
     # What is started from a unit file stays loaded if it has failed.
     properties = None if claimed.properties is None else [*claimed.properties, HELD]
@@ -159,6 +158,9 @@ def _last_words(bus: Bus, scope: Scope, uuid: str) -> Iterator[None]:
     except DoraSystemdError as error:
         if error.code is not ExitCode.FAILURE:
             raise
+        from dora_systemd.decisions.why.signs import known_remedy
+        from dora_systemd.verbs.why import words_of_start
+
         words = words_of_start(bus, scope, uuid)
         for line in words:
             tell(f"  {line}", err=True)

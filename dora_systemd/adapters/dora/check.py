@@ -22,12 +22,23 @@ T = TypeVar("T")
 class DoraCheck:
     """Starts the checks when it is created. They run in parallel because each starts a process.
 
-    environment: that of the nodes.
+    environment: that of the nodes. listens: waits for a coordinator of this dora, and returns
+    whether it listens. Then no process is started for the version: OLDEST_DORA was the first one
+    with the arguments of coordinator_command().
     """
 
-    def __init__(self, options: RunnerOptions, environment: Mapping[str, str]) -> None:
+    def __init__(
+        self,
+        options: RunnerOptions,
+        environment: Mapping[str, str],
+        listens: Callable[[], bool] = lambda: False,
+    ) -> None:
+        def check_version() -> None:
+            if not listens():
+                dora_version(options.dora, own_account(), environment)
+
         self._options = options
-        self._version = beside(lambda: dora_version(options.dora, own_account(), environment))
+        self._version = beside(check_version)
         self._refusal = beside(lambda: refusal_of_dora(options, environment))
 
     def beside(self, call: Callable[[], T]) -> T:

@@ -2,12 +2,14 @@
 
 import contextlib
 import os
+import re
 import select
 import signal
 import socket
 import subprocess
+import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +17,11 @@ from dora_systemd.decisions.cell.exits import Exit, exit_of
 
 if TYPE_CHECKING:
     import asyncio
+
+LISTENING = "Listening on port "
+"""What a coordinator prints before its port, once it has written its token."""
+_PORT = re.compile(rf"^{LISTENING}(\d+)\n".encode(), re.MULTILINE)
+_CHUNK = 4096
 
 
 def coordinator_command(dora: str) -> list[str]:
@@ -45,12 +52,13 @@ def free_port() -> int:
 
 @dataclass(frozen=True)
 class Child:
-    """One child process. output: the read end of its stdout and stderr."""
+    """One child process. output: the read end of its stdout and stderr. said: read of it so far."""
 
     label: str
     popen: "subprocess.Popen[bytes]"
     pidfd: int
     output: int
+    said: bytearray = field(default_factory=bytearray)
 
     def send_signal(self, number: signal.Signals) -> None:
         """Send it a signal, but never to another process that has reused its pid."""
@@ -88,6 +96,20 @@ def spawn(
     finally:
         os.close(writing)
     return Child(label, popen, os.pidfd_open(popen.pid), reading)
+
+
+def read_port(coordinator: Child, seconds: float) -> int:
+    """The port of a coordinator; 0 if it ends, or prints none within `seconds`."""
+    deadline = time.monotonic() + seconds
+    poll = select.poll()
+    poll.register(coordinator.output, select.POLLIN)
+    while poll.poll(max(deadline - time.monotonic(), 0) * 1000):
+        chunk = os.read(coordinator.output, _CHUNK)
+        coordinator.said.extend(chunk)
+        found = _PORT.search(coordinator.said)
+        if found or not chunk:
+            return int(found[1]) if found else 0
+    return 0
 
 
 def watch(

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from dora_systemd.adapters.logs.held import HeldLines, held_path, read_held
 from dora_systemd.adapters.logs.queue import Journal, LogQueue
-from dora_systemd.adapters.logs.source import CHUNK, PIPE_SIZE, Pipe, Source, fifos
+from dora_systemd.adapters.logs.source import CHUNK, PIPE_SIZE, OnLine, Pipe, Source, fifos
 from dora_systemd.decisions.cell.line_rates import RateLimit, format_rate
 from dora_systemd.decisions.cell.status import WHOLE_CELL, LineCount
 from dora_systemd.decisions.logs.events import event_fields
@@ -185,14 +185,16 @@ class LogPipes:
         """Whether entries of the node still wait for journald."""
         return self._queue.waiting(node) > 0
 
-    def add_output(self, label: str, fd: int, on_line: Callable[[str], None] | None = None) -> None:
-        """Read what coordinator or daemon prints, and close `fd` at the end of the file.
+    def add_output(self, label: str, fd: int, on_line: OnLine = None, said: bytes = b"") -> None:
+        """Read what coordinator or daemon prints after `said`, and close `fd` at the end of it.
 
         Warnings and errors become records of `label`; on_line gets every line, without newline.
         """
         os.set_blocking(fd, False)
         self._outputs[fd] = LineSplitter()
         self._loop.add_reader(fd, self._read_output, label, fd, on_line)
+        if said:
+            self._loop.call_soon(self._read_output, label, fd, on_line, said)
 
     def mute(self, *labels: str) -> None:
         """Write no records of what these children print; replaces the labels given before."""
@@ -278,13 +280,12 @@ class LogPipes:
             limit = format_rate(limiter.limit)
             self.write_event("lines-suppressed", node_id, count=count, limit=limit)
 
-    def _read_output(self, label: str, fd: int, on_line: Callable[[str], None] | None) -> None:
+    def _read_output(self, label: str, fd: int, on_line: OnLine, said: bytes = b"") -> None:
         try:
-            data = os.read(fd, CHUNK)
+            data = said or os.read(fd, CHUNK)
         except BlockingIOError:
             return
-        lines = self._outputs[fd].feed(data) if data else self._outputs[fd].flush()
-        for line in lines:
+        for line in self._outputs[fd].feed(data) if data else self._outputs[fd].flush():
             if label not in self._muted and (fields := dora_log_fields(line)):
                 self._queue.put_record(label, self._entry(fields, label))
             if on_line is not None:

@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,9 @@ CHUNK = 1 << 13
 # A pipe with more bytes than this in so many seconds counts as a flood, and yields to others.
 FLOOD_BYTES = 1 << 14
 FLOOD_SECONDS = 0.1
+
+OnLine = Callable[[str], None] | None
+"""Gets every line of an output, without newline."""
 
 
 @dataclass

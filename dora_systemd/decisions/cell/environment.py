@@ -1,7 +1,8 @@
 """Environment variables of a dataflow: parses `KEY=VALUE` from flags and files, and checks them."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from pathlib import PurePath
 
 from dora_systemd.decisions.cell.hot_reload import CHANGE_VARIABLE
 from dora_systemd.decisions.cell.limits import CHANGES_VARIABLE, merge_node_limits, parse_changes
@@ -108,6 +109,15 @@ def unit_environment(
         return {"PATH": ":".join(entries), **variables}
     path = ":".join([f"{venv}/bin", *entries])
     return {"PATH": path, "VIRTUAL_ENV": venv, **variables}
+
+
+def find_python(venv: str | None, search_path: str, exists: Callable[[str], bool]) -> str:
+    """The interpreter of the nodes, as dora finds it: that of `venv`, else the first on PATH."""
+    if venv is not None:
+        return str(PurePath(venv, "bin", "python"))
+    places = [place for place in search_path.split(":") if place]
+    found = (str(PurePath(p, name)) for name in ("python", "python3") for p in places)
+    return next(filter(exists, found), "python3")
 
 
 def environment_entries(variables: Mapping[str, str]) -> tuple[str, ...]:

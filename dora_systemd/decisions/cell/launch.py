@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import PurePath
 from typing import Any
 
+from dora_systemd.decisions.cell.environment import find_python
 from dora_systemd.decisions.cell.log_backlog import with_bounds
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.restarts import DEFAULT, HELD_KEYS
@@ -211,12 +212,8 @@ def _env_python(node: Node, plan: LaunchPlan) -> str | None:
 
 
 def python_of(plan: LaunchPlan) -> str:
-    """The interpreter of the nodes, as dora finds it: that of --venv, else the first on PATH."""
-    if plan.options.venv is not None:
-        return str(PurePath(plan.options.venv, "bin", "python"))
-    places = [place for place in plan.search_path.split(":") if place]
-    found = (str(PurePath(p, name)) for name in ("python", "python3") for p in places)
-    return next(filter(plan.exists, found), "python3")
+    """The interpreter of the nodes."""
+    return find_python(plan.options.venv, plan.search_path, plan.exists)
 
 
 def _launch_operators(node: Node, raw: dict[str, Any], directory: str) -> dict[str, Any]:

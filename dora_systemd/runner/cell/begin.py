@@ -1,13 +1,18 @@
 """Starts a cell: its cgroup and its coordinator. Imports only what loads quickly."""
 
+import os
 import sys
 from collections.abc import Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.dora import engine
+from dora_systemd.decisions.cell.environment import find_python
+from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.paths import CellPaths
 
+LIBEXEC = Path(__file__).parents[2] / "libexec"
 OPENSSL = ("ssl", "_ssl", "_hashlib")
 
 
@@ -44,3 +49,50 @@ def start_coordinator(dora: str, paths: CellPaths, environment: Mapping[str, str
     paths.coordinator.mkdir(mode=0o700, exist_ok=True)
     own = engine.coordinator_environment(environment, paths.coordinator)
     return engine.spawn("coordinator", engine.coordinator_command(dora), own, paths.coordinator)
+
+
+def daemon_variables(
+    options: RunnerOptions, paths: CellPaths, unit: Path, environment: Mapping[str, str]
+) -> dict[str, str]:
+    """Variables of the daemon that nodes do not get; launcher.pl removes them.
+
+    unit: cgroup directory. environment: of the nodes.
+    """
+    search_path = environment.get("PATH") or os.defpath
+    # Perl, which runs the launcher, would complain about every unknown LANG.
+    own = {"DORA_QUIET": "1", "RUST_BACKTRACE": "0", "PERL_BADLANG": "0"}
+    added = {key: text for key, text in own.items() if key not in os.environ}
+    return {
+        **added,
+        "DORA_SYSTEMD_UNSET": " ".join(("DORA_QUIET", *added)),
+        "DORA_SYSTEMD_CELL": str(paths.root),
+        "DORA_SYSTEMD_GROUP": str(unit),
+        "DORA_SYSTEMD_LIBEXEC": str(LIBEXEC),
+        "DORA_SYSTEMD_DIRECTORY": options.working_directory,
+        "DORA_SYSTEMD_PYTHON": find_python(options.venv, search_path, os.path.exists),
+        "PATH": f"{LIBEXEC}:{search_path}",
+    }
+
+
+class Daemon(NamedTuple):
+    """A daemon. listen: its port for dynamic nodes."""
+
+    child: engine.Child
+    listen: int
+
+
+def start_daemon(dora: str, paths: CellPaths, port: int, environment: Mapping[str, str]) -> Daemon:
+    """Start a daemon for the coordinator on `port`. Raises OSError.
+
+    environment: of the nodes, with daemon_variables.
+    """
+    paths.daemon.mkdir(mode=0o700, exist_ok=True)
+    listen = engine.free_port()
+    own = {**environment, "DORA_AUTH_TOKEN": read_token(paths)}
+    command = engine.daemon_command(dora, port, listen)
+    return Daemon(engine.spawn("daemon", command, own, paths.daemon), listen)
+
+
+def read_token(paths: CellPaths) -> str:
+    """The token that the listening coordinator has written. Raises OSError."""
+    return (paths.coordinator / ".dora-token").read_text().strip()

@@ -24,7 +24,6 @@ from dora_systemd.runner.cell.pump import Pump, now_us
 from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.values import SECOND
 
-_LISTENING = "Listening on port "
 _SETTLE_SECONDS = 0.02
 """Time for the exit of a child to be seen, which explains a connection that is lost."""
 _TURNS = 5
@@ -85,7 +84,7 @@ class Dialogue(Tasks):
 
     def watch(self, child: engine.Child, on_line: Callable[[str], None] | None = None) -> None:
         """Read the output of a child process, and report its exit."""
-        self._pipes.add_output(child.label, child.output, on_line)
+        self._pipes.add_output(child.label, child.output, on_line, bytes(child.said))
         engine.watch(self._loop, child, self._child_exited)
 
     def _child_exited(self, label: str, exit: Exit) -> None:
@@ -102,8 +101,8 @@ class Dialogue(Tasks):
 
     def read_coordinator(self, line: str) -> None:
         """Handle a line that the coordinator printed; one of them has its port."""
-        if line.startswith(_LISTENING) and self._pump.cell.state is State.BOOTING:
-            self._engine.set_port(int(line.removeprefix(_LISTENING)))
+        if line.startswith(engine.LISTENING) and self._pump.cell.state is State.BOOTING:
+            self._engine.set_port(int(line.removeprefix(engine.LISTENING)))
             self._pump.push(life.CoordinatorListening(now_us()))
 
     def _start_daemon(self, variables: Mapping[str, str]) -> None:
@@ -120,6 +119,7 @@ class Dialogue(Tasks):
         self._pump.push(life.DaemonConnected(now_us()))
 
     async def _send_start(self, descriptor: Mapping[str, Any]) -> None:
+        self._nodes.expect()
         run = await self._engine.start_run(descriptor, self._options.name)
         self._pipes.set_run(run)
         self._pump.push(life.RunStarted(now_us(), run))

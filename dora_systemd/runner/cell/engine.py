@@ -2,21 +2,18 @@
 
 import asyncio
 import json
-import os
 import signal
 from collections.abc import Callable, Mapping
 from contextlib import closing
-from pathlib import Path
 from typing import Any
 
 from dora_systemd.adapters.dora import control, engine
-from dora_systemd.adapters.dora.preparation import PACKAGE, Prepared
 from dora_systemd.adapters.host import files
-from dora_systemd.decisions.cell.launch import has_pipes, python_of
 from dora_systemd.decisions.dora import protocol
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
-from dora_systemd.runner.cell.begin import start_coordinator
+from dora_systemd.runner.cell.begin import read_token, start_coordinator, start_daemon
+from dora_systemd.runner.cell.boot import Boot
 from dora_systemd.values import SECOND
 
 POLL_SECONDS = 0.002
@@ -36,10 +33,17 @@ OnRecord = Callable[[protocol.LogRecord], None]
 class Engine:
     """The coordinator and daemon of a cell, and requests to them.
 
-    environment: that of the nodes, without systemd's own variables.
+    environment: that of the nodes, without systemd's own variables. boot: of the first run.
     """
 
-    def __init__(self, dora: str, paths: CellPaths, environment: Mapping[str, str]) -> None:
+    def __init__(
+        self,
+        dora: str,
+        paths: CellPaths,
+        environment: Mapping[str, str],
+        boot: Boot | None = None,
+    ) -> None:
+        self._boot = boot
         self._dora = dora
         self._paths = paths
         self._environment = dict(environment)
@@ -49,27 +53,32 @@ class Engine:
         self._port = 0
         self._token = ""
 
-    def start_coordinator(self, early: engine.Child | None = None) -> engine.Child:
-        """Start the coordinator, unless `early` is one; it prints its port. Raises OSError."""
-        child = early or start_coordinator(self._dora, self._paths, self._environment)
+    def start_coordinator(self) -> engine.Child:
+        """Start the coordinator, unless it boots already; it prints its port. Raises OSError."""
+        if self._boot is None:
+            child = start_coordinator(self._dora, self._paths, self._environment)
+        else:
+            child = self._boot.coordinator
         self._children[child.label] = child
         return child
 
     def set_port(self, port: int) -> None:
         """Set the port of the coordinator, which has written its token by now. Raises OSError."""
-        self._port = port
-        self._token = (self._paths.coordinator / ".dora-token").read_text().strip()
+        self._port, self._token = port, read_token(self._paths)
 
     def start_daemon(self, added: Mapping[str, str]) -> engine.Child:
-        """Start the daemon with `added` variables, and write the control file. Raises OSError."""
-        listen = engine.free_port()
-        access = {"port": self._port, "token": self._token, "local_listen_port": listen}
+        """Start the daemon with `added` variables, unless it boots already; write the control file.
+
+        Raises OSError.
+        """
+        daemon = self._boot.daemon() if self._boot else None
+        if daemon is None:
+            environment = {**self._environment, **added}
+            daemon = start_daemon(self._dora, self._paths, self._port, environment)
+        self._children[daemon.child.label] = daemon.child
+        access = {"port": self._port, "token": self._token, "local_listen_port": daemon.listen}
         files.write_atomic(self._paths.control, json.dumps(access), 0o600)
-        environment = {**self._environment, **added, "DORA_AUTH_TOKEN": self._token}
-        command = engine.daemon_command(self._dora, self._port, listen)
-        daemon = engine.spawn("daemon", command, environment, self._paths.daemon)
-        self._children[daemon.label] = daemon
-        return daemon
+        return daemon.child
 
     async def wait_joined(self) -> None:
         """Connect to the coordinator, and return once the daemon has registered."""
@@ -144,28 +153,11 @@ class Engine:
         """Kill and reap coordinator and daemon, and close the connection."""
         if self._requests is not None:
             self._requests.close()
+        boot, self._boot = self._boot, None
+        if boot and (daemon := boot.daemon()):
+            self._children[daemon.child.label] = daemon.child
         for child in self._children.values():
             child.send_signal(signal.SIGKILL)
         for child in self._children.values():
             child.close(asyncio.get_running_loop(), KILL_SECONDS)
         self._children.clear()
-
-
-def daemon_variables(prepared: Prepared, paths: CellPaths, unit: Path) -> dict[str, str]:
-    """Variables of the daemon that nodes do not get; launcher.pl removes them."""
-    libexec = str(PACKAGE / "libexec")
-    # Perl, which runs the launcher, would complain about every unknown LANG.
-    own = {"DORA_QUIET": "1", "RUST_BACKTRACE": "0", "PERL_BADLANG": "0"}
-    added = {key: text for key, text in own.items() if key not in os.environ}
-    kept = [node.id for node in prepared.dataflow.nodes if not has_pipes(node)]
-    return {
-        **added,
-        "DORA_SYSTEMD_UNSET": " ".join(("DORA_QUIET", *added)),
-        "DORA_SYSTEMD_CELL": str(paths.root),
-        "DORA_SYSTEMD_GROUP": str(unit),
-        "DORA_SYSTEMD_LIBEXEC": libexec,
-        "DORA_SYSTEMD_DIRECTORY": prepared.plan.options.working_directory,
-        "DORA_SYSTEMD_PYTHON": python_of(prepared.plan),
-        "DORA_SYSTEMD_KEEP": " ".join(kept),
-        "PATH": f"{libexec}:{prepared.plan.search_path}",
-    }

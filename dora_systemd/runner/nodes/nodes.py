@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from dora_systemd.adapters.cgroup import groups as cgroup
+from dora_systemd.adapters.host.process import beside
 from dora_systemd.adapters.logs.jsonl import JsonlTail
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.decisions.cell.launch import has_pipes, is_launched
@@ -101,6 +102,14 @@ class Nodes:
 
     def _group(self, node: str) -> Path:
         return self._unit / f"{cgroup.NODE_PREFIX}{node}"
+
+    def expect(self) -> None:
+        """The nodes are about to be started: each launcher moves itself into its group.
+
+        The kernel lets the first move in a while wait for some 10 ms. Have a move that changes
+        nothing wait for that now, in a thread.
+        """
+        beside(partial(cgroup.move_process, self._unit / cgroup.SUPERVISOR, 0))
 
     def listen(self, run: str) -> None:
         """Start reading the output of the nodes of `run`, which lets the launchers go on."""

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.journal.reader import JournalReader
@@ -23,7 +23,9 @@ from dora_systemd.values import quoted
 from dora_systemd.verbs.facts.cells import Cell, read_cells
 from dora_systemd.verbs.facts.selector import Selector, selectors_of
 from dora_systemd.verbs.start.asked import note_request
-from dora_systemd.verbs.start.plan import Plan, StartRequest
+
+if TYPE_CHECKING:
+    from dora_systemd.verbs.start.plan import Plan, StartRequest
 
 EVENT = "start-asked"
 _INIT = "1"
@@ -44,7 +46,7 @@ class Asked:
         """The name of the unit."""
         return unit_name(self.name)
 
-    def request(self, wanted: StartRequest) -> StartRequest:
+    def request(self, wanted: "StartRequest") -> "StartRequest":
         """The same start once more; what `wanted` gives has precedence over the flags it had.
 
         Raises DoraSystemdError (USAGE) for another name.
@@ -66,7 +68,7 @@ def means_name(text: str) -> bool:
     return is_directory(path) or not exists(path)
 
 
-def note_start(plan: Plan, request: StartRequest, command: str) -> None:
+def note_start(plan: "Plan", request: "StartRequest", command: str) -> None:
     """Write what was asked for to the journal. command: by which, such as "doractl start"."""
     options = plan.options
     note_request(

@@ -6,7 +6,6 @@ directly.
 """
 
 import os
-import secrets
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -54,7 +53,7 @@ def run_beside(connect: Callable[[], Manager], plan: Plan, command: Sequence[str
 
 
 def _run_unit(manager: Manager, plan: Plan, command: Sequence[str]) -> Completed:
-    unit = f"doractl-check-{secrets.token_hex(8)}.service"
+    unit = f"doractl-check-{os.urandom(8).hex()}.service"
     reading, writing = zip(*(os.pipe2(os.O_CLOEXEC) for _ in range(2)), strict=True)
     streams = beside(lambda: read_streams(reading, DORA_SECONDS + 5))
     try:

@@ -90,12 +90,13 @@ def make_plan(scope: Scope, request: StartRequest) -> Plan:
     path = Path(request.dataflow).absolute()
     request_name(request)
     written = read_file(path)
-    dataflow = parse_dataflow(parse_yaml(decoded(written.data, path), path), str(path))
     settings = read_settings(scope, path, request.flags, request.environment)
     given = settings[WORKING_DIRECTORY]
     directory = path.parent if given is None else Path(given).absolute()
     user = choose_user(scope, settings[USER], written.place, str(directory))
     with sight_of(account_of(user)) as sight:
+        # The process that looks for another user boots meanwhile.
+        dataflow = parse_dataflow(parse_yaml(decoded(written.data, path), path), str(path))
         look = Look(sight, settings, user)
         # Root's variables are not for the file of another user, which could read them out.
         is_own = scope.is_user or written.place.uid == os.geteuid()

@@ -8,6 +8,7 @@ from typing import Any
 
 from dora_systemd.adapters.dora.engine import Child
 from dora_systemd.adapters.logs.pipes import LogPipes
+from dora_systemd.adapters.logs.source import OnLine
 from dora_systemd.decisions.cell.limits import NodeLimits
 from dora_systemd.decisions.cell.line_rates import RateLimits
 from dora_systemd.decisions.cell.status import CpuSample, LineCount
@@ -44,6 +45,9 @@ class FakeNodes(Nodes):
         self.resources: FakeResources = FakeResources()
         self.living: set[tuple[str, int]] = set()
         self.ooms: dict[str, Oom] = {}
+
+    def expect(self) -> None:
+        self.calls.append(("expect",))
 
     def listen(self, run: str) -> None:
         self.calls.append(("listen", run))
@@ -108,7 +112,7 @@ class FakePipes(LogPipes):
         self.calls: Calls = [] if calls is None else calls
         self.events: list[tuple[str, str | None, dict[str, Value]]] = []
         self.broken: set[str] = set()
-        self.outputs: dict[str, Callable[[str], None] | None] = {}
+        self.outputs: dict[str, OnLine] = {}
 
     def write_event(self, name: str, node: str | None = None, **details: Value) -> None:
         if name in self.broken:
@@ -119,8 +123,8 @@ class FakePipes(LogPipes):
     def line_counts(self) -> dict[str, LineCount]:
         return {}
 
-    def add_output(self, label: str, fd: int, on_line: Callable[[str], None] | None = None) -> None:
-        del fd
+    def add_output(self, label: str, fd: int, on_line: OnLine = None, said: bytes = b"") -> None:
+        del fd, said
         self.outputs[label] = on_line
 
     def mute(self, *labels: str) -> None:

@@ -17,6 +17,18 @@ LATE = {
         "names": {"difflib"},
         "cli.edge": {"decisions.views.objects"},
     },
+    "shutil imports every compressor: only a terminal has a width": {
+        "cli.stageline": {"shutil"},
+    },
+    "a start that succeeds has no last words, and most follow no log": {
+        "cli.verbs.run.start": {"cli.foreground", "verbs.start.run", "verbs.why"},
+    },
+    "a restart of what runs makes no plan": {
+        "cli.verbs.run.restart": {"verbs.restart"},
+    },
+    "only an unknown command has a similar one": {
+        "cli.group": {"difflib"},
+    },
     "a Tab after a verb or an option does not ask for a dataflow": {
         "cli.completion": {"verbs.facts.cells", "verbs.facts.list", "verbs.facts.selector"},
     },
@@ -61,7 +73,7 @@ LATE = {
         "adapters.host.notify": {"systemd.daemon"},
     },
     "the coordinator boots while the rest of the runner is imported": {
-        "runner.__main__": {"adapters.dora.check", "runner.main"},
+        "runner.__main__": {"adapters.dora.check", "runner.cell.boot", "runner.main"},
         "runner.cell.pause": {
             *("adapters.host.process", "adapters.host.files", "adapters.host.notify"),
             *("decisions.cell.status", "asyncio"),

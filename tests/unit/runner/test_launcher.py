@@ -3,6 +3,7 @@
 import ast
 import os
 import subprocess
+import time
 from pathlib import Path
 
 import pytest
@@ -29,7 +30,6 @@ def environment(tmp_path: Path) -> dict[str, str]:
         "DORA_SYSTEMD_LIBEXEC": LIBEXEC,
         "DORA_SYSTEMD_DIRECTORY": str(tmp_path / "project"),
         "DORA_SYSTEMD_PYTHON": "/bin/echo",
-        "DORA_SYSTEMD_KEEP": "kept other",
     }
 
 
@@ -58,6 +58,22 @@ def test_the_node_gets_group_pipes_directory_and_environment(
     assert "PATH=/usr/bin:/bin" in said
     left = [line for line in said if line.startswith(("DORA_", "RUST_"))]
     assert left == [f"DORA_ZENOH_CONFIG_OVERLAY={PACKAGE}/zenoh.json5"]
+
+
+def test_the_node_is_in_its_group_while_it_waits_for_its_pipes(
+    environment: dict[str, str], tmp_path: Path
+) -> None:
+    os.mkfifo(tmp_path / "io/one.out")
+    command = ("/usr/bin/perl", str(PACKAGE / "launcher.pl"), "one", str(tmp_path), "pipe", "true")
+    group = tmp_path / "node-one/cgroup.procs"
+    with subprocess.Popen(command, env=environment) as waiting:
+        deadline = time.monotonic() + 60
+        while not group.exists() and time.monotonic() < deadline:
+            time.sleep(0.001)
+        assert group.exists()
+        assert waiting.poll() is None
+        (tmp_path / "io/one.out").read_bytes()
+        assert waiting.wait(60) == 0
 
 
 ODD = {
@@ -131,9 +147,12 @@ def test_a_directory_that_is_gone_and_a_group_that_is_gone(
 
 @pytest.mark.parametrize("node", ["one", "kept"])
 def test_operators_are_recognised(environment: dict[str, str], tmp_path: Path, node: str) -> None:
+    os.mkfifo(tmp_path / "io/one.out")
+    pipe = os.open(tmp_path / "io/one.out", os.O_RDWR)
     words = ("-uc", f"import dora; dora.start_runtime() # {node}")
     done = launch(environment, f"{LIBEXEC}/python", *words)
-    output = done.stdout if node == "kept" else (tmp_path / "io/one.out").read_text()
+    output = done.stdout if node == "kept" else os.read(pipe, 1000).decode()
+    os.close(pipe)
     assert output == " ".join(words) + "\n"
     assert (tmp_path / f"node-{node}/cgroup.procs").exists()
 

@@ -5,10 +5,15 @@ import os
 import time
 from pathlib import Path
 
+import pytest
+
 from dora_systemd.adapters.dora import engine
 from dora_systemd.decisions.cell.environment import node_environment
+from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.paths import CellPaths
+from dora_systemd.runner.cell.begin import LIBEXEC, daemon_variables
 from dora_systemd.runner.cell.engine import Engine
+from tests.unit.fakes.manager import UUID
 
 
 def test_what_is_systemds_stays_with_the_runner() -> None:
@@ -30,6 +35,22 @@ def test_the_users_own_token_is_not_overwritten() -> None:
     assert made["XDG_CONFIG_HOME"] == made["TMPDIR"] == "/run/c"
 
 
+def test_what_the_daemon_is_told_beside_the_variables_of_the_nodes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RUST_BACKTRACE", "1")
+    options = RunnerOptions("robot", UUID, "/p/d.yml", "/p", "/dora", venv="/p/.venv")
+    unit = Path("/sys/fs/cgroup/unit")
+    given = daemon_variables(options, CellPaths(tmp_path), unit, {"PATH": "/bin"})
+    assert given["PATH"] == f"{LIBEXEC}:/bin"
+    assert (LIBEXEC / "python").is_file()
+    assert given["DORA_SYSTEMD_PYTHON"] == "/p/.venv/bin/python"
+    assert given["DORA_SYSTEMD_DIRECTORY"] == "/p"
+    assert given["DORA_SYSTEMD_GROUP"] == str(unit)
+    assert "RUST_BACKTRACE" not in given
+    assert given["DORA_SYSTEMD_UNSET"].split() == ["DORA_QUIET", "DORA_QUIET", "PERL_BADLANG"]
+
+
 def test_children_and_their_ends(tmp_path: Path) -> None:
     child = engine.spawn("x", ["/bin/sh", "-c", "echo out; echo err >&2; exit 3"], {}, tmp_path)
     with os.fdopen(child.output) as output:
@@ -48,6 +69,26 @@ def test_a_program_that_is_not_there(tmp_path: Path) -> None:
 
 def test_a_free_port_is_free() -> None:
     assert 0 < engine.free_port() < 65536
+
+
+PORT = "echo first; printf 'Listening on port 47'; echo 11; echo more; exec sleep 1000"
+
+
+@pytest.mark.parametrize(
+    ("script", "port"),
+    [(PORT, 4711), ("echo no", 0), ("exec sleep 1000", 0), ("echo is not Listening on port 1", 0)],
+)
+def test_the_port_of_a_coordinator_is_read_as_soon_as_it_is_printed(
+    tmp_path: Path, script: str, port: int
+) -> None:
+    child = engine.spawn("coordinator", ["/bin/sh", "-c", script], {}, tmp_path)
+    assert engine.read_port(child, 0.1 if "sleep" in script and not port else 20) == port
+    if port:
+        assert child.said.startswith(b"first\nListening on port 4711\n")
+    child.popen.kill()
+    child.popen.wait()
+    os.close(child.output)
+    os.close(child.pidfd)
 
 
 def open_files() -> set[str]:

@@ -250,6 +250,22 @@ def test_output_of_the_coordinator(tmp_path: Path) -> None:
     run(tmp_path, scenario)
 
 
+def test_output_that_was_read_before_comes_first(tmp_path: Path) -> None:
+    async def scenario(cell: Cell) -> None:
+        reader, writer = os.pipe()
+        lines: list[str] = []
+        os.write(writer, b" WARN dora: b\nc\n")
+        said = b"Listening on port 1\n2026-11-20T22:11:40.6Z"
+        cell.pipes.add_output("coordinator", reader, lines.append, said)
+        assert not lines, "it is read in the loop"
+        (entry,) = await cell.entries(1)
+        assert entry["MESSAGE"] == "dora: b"
+        assert lines == ["Listening on port 1", "2026-11-20T22:11:40.6Z WARN dora: b", "c"]
+        os.close(writer)
+
+    run(tmp_path, scenario)
+
+
 def test_close_counts_what_it_cannot_write(tmp_path: Path) -> None:
     async def scenario(cell: Cell) -> None:
         cell.node("a")

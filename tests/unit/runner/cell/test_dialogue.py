@@ -29,6 +29,7 @@ def test_a_descriptor_that_dora_takes(tmp_path: Path) -> None:
         bench.dora.answers["Start"].append("run-1")
         assert await bench.do(Do.SEND_START) == [life.RunStarted(0, "run-1")]
         assert bench.dora.asked == [{"Start": {"dataflow": DESCRIPTOR, "name": "robot"}}]
+        assert bench.calls[0] == ("expect",)
         run, push = bench.calls.index(("run is", "run-1")), ("push", "RunStarted")
         assert run < bench.calls.index(push), "lines have the run before anything follows"
 

@@ -14,9 +14,12 @@ from websockets.asyncio.server import ServerConnection, serve
 
 from dora_systemd.adapters.dora import engine
 from dora_systemd.decisions.cell.exits import Exit, exit_of
+from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.dora.protocol import LogRecord
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
+from dora_systemd.runner.cell.begin import start_coordinator
+from dora_systemd.runner.cell.boot import Boot
 from dora_systemd.runner.cell.engine import Engine
 from tests.unit.fakes.loop import settle
 
@@ -38,8 +41,7 @@ class Bench:
         dora = root / "dora"
         dora.write_text(SCRIPT)
         dora.chmod(0o755)
-        for path in (self.paths.daemon, self.paths.work):
-            path.mkdir()
+        self.paths.work.mkdir()
         self.children: list[engine.Child] = []
         self.engine = Engine(str(dora), self.paths, {"PATH": "/usr/bin:/bin", "MODEL": "yolo"})
 
@@ -98,14 +100,72 @@ def test_the_coordinator_writes_its_token_in_a_directory_of_its_own(
     live(tmp_path, work)
 
 
-def test_a_coordinator_that_boots_already_is_not_started_again(tmp_path: Path) -> None:
+BOOTS = """#!/bin/sh
+[ "$1" = daemon ] && exec sleep 1000
+echo secret > .dora-token
+echo "Listening on port 4711"
+exec sleep 1000
+"""
+
+
+def booting(bench: Bench, script: str = BOOTS) -> Boot:
+    """A dora that boots before there is an engine, which is told of it."""
+    dora = bench.paths.root / "dora"
+    dora.write_text(script)
+    environment = {"PATH": "/usr/bin:/bin"}
+    coordinator = start_coordinator(str(dora), bench.paths, environment)
+    options = RunnerOptions("robot", "uuid", "/p/d.yml", "/p", str(dora))
+    boot = Boot(coordinator, options, bench.paths, bench.paths.root, environment)
+    bench.engine = Engine(str(dora), bench.paths, environment, boot)
+    bench.children.append(coordinator)
+    return boot
+
+
+def test_what_boots_already_is_not_started_again(tmp_path: Path) -> None:
     async def work(bench: Bench) -> None:
-        early = engine.spawn("coordinator", ["/bin/sleep", "1000"], {}, tmp_path)
-        os.close(early.output)
-        assert bench.engine.start_coordinator(early) is early
-        assert not bench.paths.coordinator.exists()
+        (tmp_path / "cgroup.controllers").write_text("cpu\n")
+        (tmp_path / "cgroup.subtree_control").write_text("")
+        boot = booting(bench)
+        daemon = boot.daemon()
+        assert daemon
+        assert boot.listens()
+        assert (tmp_path / "cgroup.subtree_control").read_text() == "+cpu"
+        assert boot.coordinator.said == b"Listening on port 4711\n"
+        assert bench.engine.start_coordinator() is boot.coordinator
+        bench.engine.set_port(4711)
+        assert bench.engine.start_daemon({}) is daemon.child
+        access = json.loads(bench.paths.control.read_text())
+        assert access == {"port": 4711, "token": "secret", "local_listen_port": daemon.listen}
+        bench.children.append(daemon.child)
         bench.engine.kill()
-        assert early.popen.wait(20) == -signal.SIGKILL
+        ends = [one.popen.wait(20) for one in (boot.coordinator, daemon.child)]
+        assert ends == [-signal.SIGKILL] * 2
+
+    live(tmp_path, work)
+
+
+def test_a_daemon_that_nobody_has_asked_for_yet_is_killed_too(tmp_path: Path) -> None:
+    async def work(bench: Bench) -> None:
+        boot = booting(bench)
+        bench.engine.kill()
+        daemon = boot.daemon()
+        assert daemon
+        assert daemon.child.popen.wait(20) == -signal.SIGKILL
+        bench.children.append(daemon.child)
+        boot.coordinator.popen.kill()
+        os.close(boot.coordinator.pidfd)
+
+    live(tmp_path, work)
+
+
+@pytest.mark.parametrize("script", ["#!/bin/sh\necho failed\n", BOOTS.replace("secret >", ">&2 ")])
+def test_a_boot_that_fails_leaves_the_daemon_to_the_engine(tmp_path: Path, script: str) -> None:
+    async def work(bench: Bench) -> None:
+        boot = booting(bench, script)
+        assert boot.daemon() is None
+        assert boot.listens() == ("Listening" in script)
+        assert bench.engine.start_coordinator() is boot.coordinator
+        assert boot.coordinator.said
 
     live(tmp_path, work)
 

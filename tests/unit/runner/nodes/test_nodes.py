@@ -3,15 +3,17 @@
 import asyncio
 import os
 import resource
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
+from dora_systemd.adapters.host import process
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
 from dora_systemd.decisions.logs.lines import Origin
 from dora_systemd.paths import CellPaths
+from dora_systemd.runner.nodes import nodes as nodes_module
 from dora_systemd.runner.nodes.nodes import Nodes, _with_descendants, raise_file_limit
 from tests.unit.adapters.logs.test_queue import SlowJournal
 
@@ -29,6 +31,32 @@ def test_more_nodes_than_a_process_has_files() -> None:
     raise_file_limit()
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     assert soft == hard
+
+
+@pytest.mark.parametrize("is_there", [True, False])
+def test_the_kernel_is_told_before_the_nodes_move(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_there: bool
+) -> None:
+    """It moves the runner to where it is, and no error of that is one of the cell."""
+    threads: list[process.Beside[None]] = []
+
+    def beside(call: Callable[[], None]) -> None:
+        threads.append(process.Beside(call))
+
+    monkeypatch.setattr(nodes_module, "Beside", beside)
+    procs = tmp_path / "supervisor/cgroup.procs"
+    if is_there:
+        procs.parent.mkdir()
+        procs.write_text("")
+
+    async def live() -> None:
+        pipes = LogPipes(asyncio.get_running_loop(), SlowJournal(), Origin("robot", "uuid"))
+        Nodes(tmp_path, CellPaths(tmp_path), pipes).expect()
+
+    asyncio.run(live())
+    if is_there:
+        threads[0].result()
+        assert procs.read_text() == "0"
 
 
 def test_a_node_that_dora_reads_is_removed_and_taken_back(tmp_path: Path) -> None:

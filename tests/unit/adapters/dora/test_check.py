@@ -1,0 +1,59 @@
+"""Dora's own checks, with a dora that is a script and counts what it is asked."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.adapters.dora.check import DoraCheck
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.errors import DoraSystemdError, ExitCode
+
+SCRIPT = """#!/bin/sh
+echo "$1" >> "$0.asked"
+case $1 in
+    --version) echo dora-cli 0.4.1;;
+    validate) grep -q refused "$2" && { echo "[ERROR]"; echo "it is refused" >&2; exit 1; };;
+esac
+exit 0
+"""
+
+
+@pytest.fixture
+def options(tmp_path: Path) -> RunnerOptions:
+    dora, flow = tmp_path / "dora", tmp_path / "d.yml"
+    dora.write_text(SCRIPT)
+    dora.chmod(0o755)
+    flow.write_text("nodes: []")
+    return RunnerOptions("robot", "uuid", str(flow), str(tmp_path), str(dora))
+
+
+def asked(options: RunnerOptions) -> set[str]:
+    return set(Path(f"{options.dora}.asked").read_text().split())
+
+
+def test_a_coordinator_that_listens_proves_the_version(options: RunnerOptions) -> None:
+    check = DoraCheck(options, os.environ, lambda: True)
+    assert check.beside(lambda: 7) == 7
+    assert asked(options) == {"validate"}
+
+
+def test_without_a_coordinator_the_version_is_asked_for(options: RunnerOptions) -> None:
+    for check in (DoraCheck(options, os.environ), DoraCheck(options, os.environ, lambda: False)):
+        with pytest.raises(DoraSystemdError, match=r"it is dora 0\.4\.1") as caught:
+            check.result()
+        assert caught.value.code is ExitCode.NO_DORA
+
+
+@pytest.mark.parametrize("is_ours_refused", [False, True])
+def test_what_dora_refuses_comes_before_what_we_refuse(
+    options: RunnerOptions, is_ours_refused: bool
+) -> None:
+    def prepare() -> None:
+        if is_ours_refused:
+            raise DoraSystemdError("ours")
+
+    Path(options.dataflow).write_text("refused")
+    check = DoraCheck(options, os.environ, lambda: True)
+    with pytest.raises(DoraSystemdError, match="it is refused"):
+        check.beside(prepare)
