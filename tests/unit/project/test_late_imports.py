@@ -21,7 +21,9 @@ LATE = {
         "cli.stageline": {"shutil"},
     },
     "a start that succeeds has no last words, and most follow no log": {
-        "cli.verbs.run.start": {"cli.foreground", "verbs.start.run", "verbs.why"},
+        "cli.verbs.run.start": {
+            *("cli.foreground", "verbs.start.run", "verbs.why", "decisions.why.signs"),
+        },
     },
     "a restart of what runs makes no plan": {
         "cli.verbs.run.restart": {"verbs.restart"},
@@ -32,12 +34,12 @@ LATE = {
     "a Tab after a verb or an option does not ask for a dataflow": {
         "cli.completion": {"verbs.facts.cells", "verbs.facts.list", "verbs.facts.selector"},
     },
-    "the journal reader: only what is not in systemd, has restarted or was killed, needs it": {
+    "seldom: what is not in systemd, has restarted, was killed, or enabled while it ran": {
         "verbs.facts.budget": {"adapters.journal.reader"},
         "verbs.facts.selector": {"verbs.facts.ended"},
         "verbs.list": {"verbs.facts.ended"},
         "runner.nodes.losses": {"adapters.journal.reader"},
-        "verbs.stop": {"adapters.journal.reader"},
+        "verbs.stop": {"adapters.journal.reader", "verbs.start.enable"},
     },
     "pydantic: only a settings file needs it": {
         "decisions.settings.resolve": {"decisions.settings.schema"},
@@ -55,9 +57,6 @@ LATE = {
     "JSON is for programs, and most who do something are people": {
         "cli.parameters": {"decisions.views.objects"},
         "decisions.views.outcome": {"decisions.views.objects"},
-    },
-    "the unit file: only a dataflow that was enabled while it ran needs it at its end": {
-        "verbs.stop": {"verbs.start.enable"},
     },
     "hot reload only": {
         "adapters.host.watch": {"watchfiles"},

@@ -4,6 +4,7 @@ import asyncio
 import os
 import resource
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from pathlib import Path
 
 import pytest
@@ -38,12 +39,12 @@ def test_the_kernel_is_told_before_the_nodes_move(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_there: bool
 ) -> None:
     """It moves the runner to where it is, and no error of that is one of the cell."""
-    threads: list[process.Beside[None]] = []
+    threads: list[Future[None]] = []
 
     def beside(call: Callable[[], None]) -> None:
-        threads.append(process.Beside(call))
+        threads.append(process.beside(call))
 
-    monkeypatch.setattr(nodes_module, "Beside", beside)
+    monkeypatch.setattr(nodes_module, "beside", beside)
     procs = tmp_path / "supervisor/cgroup.procs"
     if is_there:
         procs.parent.mkdir()
