@@ -8,7 +8,6 @@
 
 import os
 import pwd
-import shutil
 import subprocess
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -123,13 +122,19 @@ def check_program(program: str) -> None:
         return
     found: str | None = program
     for _ in range(3):  # a script, "env" in its first line, and the program that env finds
-        found = found if found and "/" in found else shutil.which(found or "")
+        found = found if found and "/" in found else _which(found or "")
         if found is None or not os.path.lexists(found):
             return
         found = _interpreter(str(Path(found).absolute()))
         if found is None:
             return
     raise _refusal(program, "its interpreter is a script of a script")
+
+
+def _which(name: str) -> str | None:
+    """The program that execvp(3) would run. Not shutil.which(), which loads every compressor."""
+    paths = (str(Path(place, name)) for place in os.get_exec_path())
+    return next((one for one in paths if Path(one).is_file() and os.access(one, os.X_OK)), None)
 
 
 def _interpreter(program: str) -> str | None:

@@ -16,6 +16,7 @@ MAX_DEPTH = 64
 MAX_VALUES = 100_000
 """Maximum values in a YAML file: a small file can have enough of them to take seconds."""
 
+_NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 REFUSED = (errno.EACCES, errno.EPERM, errno.EROFS)
 """Errors of writing where the caller may not write."""
 _WRITE_HINTS = {
@@ -88,22 +89,21 @@ def write_atomic(
     `mode` applies from the first byte on, whatever the umask is. is_durable: this holds after a
     power failure as well. On failure raises DoraSystemdError and leaves no temporary file.
     """
-    from tempfile import mkstemp  # it imports every compressor, and most commands write nothing
-
     content = data.encode() if isinstance(data, str) else data
-    temporary = ""
+    # Not tempfile, which loads every compressor and random numbers.
+    temporary = path.with_name(f".{path.name}.{os.urandom(4).hex()}")
     try:
-        descriptor, temporary = mkstemp(prefix=f".{path.name}.", dir=path.parent)
+        descriptor = os.open(temporary, _NEW, 0o600)
         with os.fdopen(descriptor, "wb") as file:
             os.fchmod(file.fileno(), mode)
             file.write(content)
             if is_durable:
                 file.flush()
                 os.fsync(file.fileno())
-        Path(temporary).replace(path)
+        temporary.replace(path)
     except OSError as error:
         with contextlib.suppress(OSError):
-            Path(temporary).unlink()
+            temporary.unlink()
         code = ExitCode.NO_PERMISSION if error.errno in REFUSED else ExitCode.FAILURE
         message = f"cannot write {shown(str(path))}: {error.strerror}"
         raise DoraSystemdError(message, _WRITE_HINTS.get(error.errno or 0, ""), code) from error

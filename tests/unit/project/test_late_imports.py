@@ -50,7 +50,7 @@ LATE = {
         },
     },
     "YAML, and every compressor: most who read a file need neither": {
-        "adapters.host.files": {"yaml", "adapters.host.yaml_loader", "tempfile"},
+        "adapters.host.files": {"yaml", "adapters.host.yaml_loader"},
         "cli.verbs.look.logs": {"verbs.follow"},
     },
     "uv only": {"decisions.cell.uv": {"tomllib"}},

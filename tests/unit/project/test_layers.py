@@ -69,6 +69,12 @@ CLOCKS = {"time", "time_ns", "monotonic", "monotonic_ns", "sleep", "now", "utcno
 
 NOT_IN_SHORT_LIVED_VERBS = {"tempfile", "pydantic", "websockets", "watchfiles", "asyncio"}
 
+NOT_IN_RUNNERS = {
+    *("click", "pathspec", "pydantic", "pystemd", "systemd", "watchfiles", "websockets", "yaml"),
+    *("bz2", "email", "hashlib", "http", "lzma", "random", "shutil", "tempfile", "zipfile"),
+}
+"""What no runner loads to begin with. Each dataflow has a runner, and each of these is memory."""
+
 
 def house_of(name: str) -> str:
     """The folder in dora_systemd/ that a module is in."""
@@ -221,21 +227,33 @@ def test_decisions_are_pure(name: str) -> None:
     assert not impure | clocks, f"{name} uses {', '.join(sorted(impure | clocks))}"
 
 
-@pytest.mark.parametrize("verb", ["look.list", "run.stop", "look.logs", "look.why"])
-def test_short_lived_verbs_load_little(verb: str, tmp_path: Path) -> None:
-    wanted = f"dora_systemd.cli.main, dora_systemd.cli.verbs.{verb}"
-    code = f"import sys, {wanted}; print(*sys.modules)"
-    environment = {**os.environ, "PYTHONPATH": str(linked_package(tmp_path))}
+def loaded_by(code: str, directory: Path) -> set[str]:
+    """The names before the first dot of all modules that `code` loads."""
+    environment = {**os.environ, "PYTHONPATH": str(linked_package(directory))}
     done = subprocess.run(
-        [sys.executable, "-P", "-c", code],
+        [sys.executable, "-P", "-c", f"import sys\n{code}\nprint(*sys.modules)"],
         env=environment,
         capture_output=True,
         text=True,
         check=False,
     )
     assert not done.returncode, done.stderr
-    loaded = {module.partition(".")[0] for module in done.stdout.split()}
+    return {module.partition(".")[0] for module in done.stdout.split()}
+
+
+@pytest.mark.parametrize("verb", ["look.list", "run.stop", "look.logs", "look.why"])
+def test_short_lived_verbs_load_little(verb: str, tmp_path: Path) -> None:
+    loaded = loaded_by(f"import dora_systemd.cli.main, dora_systemd.cli.verbs.{verb}", tmp_path)
     assert not loaded & NOT_IN_SHORT_LIVED_VERBS
+
+
+def test_runners_load_little(tmp_path: Path) -> None:
+    code = (
+        "import dora_systemd.runner.__main__ as main\nmain.leave_out_openssl()\n"
+        "import dora_systemd.adapters.dora.check, dora_systemd.runner.main"
+    )
+    before = loaded_by("", tmp_path)  # what `site` loads, such as a finder of pip's
+    assert not (loaded_by(code, tmp_path) - before) & NOT_IN_RUNNERS
 
 
 STARTS_PROGRAMS = {

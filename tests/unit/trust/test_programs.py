@@ -79,6 +79,20 @@ def test_root_runs_only_its_own(place: Path) -> None:
 
 
 @root_only
+def test_the_program_that_would_run(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first one on PATH that can be executed; a directory and other files are no programs."""
+    for name in ("first", "second", "third"):
+        (place / name).mkdir()
+    (place / "first/tool").mkdir()
+    (place / "second/tool").write_text("no program")
+    script(place / "third/tool", owner=NOBODY)
+    monkeypatch.setenv("PATH", ":".join(f"{place}/{name}" for name in ("first", "second", "third")))
+    with pytest.raises(DoraSystemdError, match=r"/third/tool as root: nobody can"):
+        check_program("tool")
+    check_program("missing")
+
+
+@root_only
 def test_a_directory_of_others_is_enough(place: Path) -> None:
     below = place / "below"
     below.mkdir()
