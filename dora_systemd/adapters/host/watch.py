@@ -15,6 +15,8 @@ from dora_systemd.trust.files import read_file
 DEBOUNCE_MS = 400
 """Maximum time to collect changes that follow each other quickly."""
 _STEP_MS = 100
+_IDLE_MS = 5000
+"""Time after which watchfiles reports that nothing has changed. Its watches exist by then."""
 _GONE_SECONDS = 0.25
 
 
@@ -32,21 +34,33 @@ async def changed_files(rules: WatchRules) -> AsyncIterator[frozenset[str]]:
     Watches directories, not files, because editors save by renaming. Ignored directories cost
     nothing. Raises DoraSystemdError if the kernel refuses more watches.
     """
-    # In a thread: a large tree takes seconds, and the loop of the runner feeds the watchdog.
-    seen = await asyncio.to_thread(watched_files, rules)
+    seen: dict[str, int] = {}
+
+    async def missed() -> frozenset[str]:
+        """The files that have changed since they were seen last."""
+        # In a thread: a large tree takes seconds, and the loop of the runner feeds the watchdog.
+        now = await asyncio.to_thread(watched_files, rules)
+        changed = frozenset(path for path in {*seen, *now} if seen.get(path) != now.get(path))
+        seen.clear()
+        seen.update(now)
+        return changed
+
+    await missed()
     while True:
         await _wait_root(rules.root)
+        is_first = True
         async for paths in _bursts(rules):
             files = frozenset(path for path in paths if rules.has(path))
+            seen.update((path, change_time(path)) for path in files)
+            if is_first:
+                # Changes before the new watches are found by their time.
+                files |= await missed()
+            is_first = False
             if files:
-                seen.update((path, change_time(path)) for path in files)
                 yield files
-        # Directories came or went. Changes before the new watches are found by their time.
-        now = await asyncio.to_thread(watched_files, rules)
-        missed = frozenset(path for path in {*seen, *now} if seen.get(path) != now.get(path))
-        seen = now
-        if missed:
-            yield missed
+        # Directories came or went.
+        if files := await missed():
+            yield files
 
 
 def watched_files(rules: WatchRules) -> dict[str, int]:
@@ -93,7 +107,7 @@ def change_time(path: str) -> int:
 
 
 async def _bursts(rules: WatchRules) -> AsyncIterator[frozenset[str]]:
-    """Paths of changed files, until a directory is created or deleted."""
+    """Paths of changed files, until a directory is created or deleted; none after _IDLE_MS."""
     # Imported late: only hot reload needs it.
     from watchfiles import Change, awatch
 
@@ -104,6 +118,8 @@ async def _bursts(rules: WatchRules) -> AsyncIterator[frozenset[str]]:
             watch_filter=None,
             debounce=DEBOUNCE_MS,
             step=_STEP_MS,
+            rust_timeout=_IDLE_MS,
+            yield_on_timeout=True,
             recursive=False,
         ):
             yield frozenset(path for _, path in changes)

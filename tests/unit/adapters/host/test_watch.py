@@ -1,0 +1,56 @@
+"""Watched files, with the real inotify."""
+
+import asyncio
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import watchfiles
+
+from dora_systemd.adapters.host import watch
+from dora_systemd.decisions.reload.watch_rules import WatchRules
+
+SECONDS = 20.0
+
+
+async def first(rules: WatchRules) -> frozenset[str]:
+    """The first batch of changed files."""
+    async with asyncio.timeout(SECONDS):
+        async for files in watch.changed_files(rules):
+            return files
+    raise AssertionError
+
+
+@pytest.mark.parametrize("others", [(), ("other.py",)])
+def test_a_save_before_the_watches_exist_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, others: tuple[str, ...]
+) -> None:
+    """watchfiles takes a while to load: on a slow machine somebody saves meanwhile."""
+    real = watchfiles.awatch
+    saved = tmp_path / "node.py"
+    saved.write_text("")
+
+    async def late(*directories: str, **options: Any) -> AsyncIterator[Any]:
+        saved.unlink()
+        saved.write_text("changed")
+        asyncio.get_running_loop().call_later(0.2, save, *others)
+        async for changes in real(*directories, **options):
+            yield changes
+
+    def save(*names: str) -> None:
+        for name in names:
+            (tmp_path / name).write_text("")
+
+    monkeypatch.setattr(watchfiles, "awatch", late)
+    monkeypatch.setattr(watch, "_IDLE_MS", 1000)
+    found = asyncio.run(first(WatchRules(str(tmp_path), ("*.py",))))
+    assert found == {str(saved), *(str(tmp_path / name) for name in others)}
+
+
+def test_what_is_unchanged_is_not_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "node.py").write_text("")
+    monkeypatch.setattr(watch, "_IDLE_MS", 100)
+    monkeypatch.setattr("tests.unit.adapters.host.test_watch.SECONDS", 1.0)
+    with pytest.raises(TimeoutError):
+        asyncio.run(first(WatchRules(str(tmp_path), ("*.py",))))
