@@ -32,6 +32,8 @@ def readme_lines() -> Iterator[Typed]:
 
 @pytest.fixture(scope="module")
 def shell() -> Iterator[Shell]:
+    # No connection of a dataflow may happen to take the gateway's port.
+    Path("/proc/sys/net/ipv4/ip_local_reserved_ports").write_text("53290-53299")
     packages.install()
     if not EXAMPLE.exists():
         # The image leaves out /usr/share/doc, as images of containers do.
