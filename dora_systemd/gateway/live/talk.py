@@ -78,7 +78,8 @@ class _Page:
             self._is_due.clear()
             await self._send_snapshot()
             with suppress(TimeoutError):
-                await asyncio.wait_for(self._is_due.wait(), INTERVAL_SECONDS)
+                async with asyncio.timeout(INTERVAL_SECONDS):
+                    await self._is_due.wait()
 
     async def listen(self) -> None:
         """Handle the messages of the page until it disconnects."""

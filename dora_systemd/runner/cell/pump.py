@@ -161,7 +161,8 @@ class Pump:
         future: asyncio.Future[None] = self._loop.create_future()
         self._waiting.append((is_so, future))
         with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(future, seconds)
+            async with asyncio.timeout(seconds):
+                await future
         return is_so(self.cell)
 
     def _tell_waiting(self) -> None:

@@ -30,7 +30,8 @@ def live(work: Callable[[], Coroutine[Any, Any, None]]) -> None:
     """Run `work` on such a loop, which fails at once if it waits for what cannot come."""
 
     async def bounded() -> None:
-        await asyncio.wait_for(work(), 3600)
+        async with asyncio.timeout(3600):
+            await work()
 
     with asyncio.Runner(loop_factory=ImpatientLoop) as runner:
         runner.run(bounded())

@@ -68,7 +68,8 @@ def play(story: Story) -> Browser:
         talking = asyncio.ensure_future(talk(browser, REQUEST))
         await story(browser)
         browser.leave()
-        await asyncio.wait_for(talking, 10)
+        async with asyncio.timeout(10):
+            await talking
         assert len(asyncio.all_tasks()) == 1
         return browser
 
@@ -228,6 +229,28 @@ def test_a_page_that_takes_nothing_is_given_up(monkeypatch: pytest.MonkeyPatch) 
     async def both() -> None:
         browser = Browser()
         browser.is_stuck = True
-        await asyncio.wait_for(talk(browser, REQUEST), 10)
+        async with asyncio.timeout(10):
+            await talk(browser, REQUEST)
+
+    asyncio.run(both())
+
+
+@pytest.mark.parametrize("turns", range(6))
+def test_a_page_that_leaves_at_the_moment_of_a_change_ends(
+    monkeypatch: pytest.MonkeyPatch, turns: int
+) -> None:
+    monkeypatch.setattr(live_talk, "INTERVAL_SECONDS", 60)
+
+    async def both() -> None:
+        browser = Browser()
+        page = live_talk._Page(browser, REQUEST.scope)
+        showing = asyncio.ensure_future(page.show())
+        await browser.wait_for("snapshot")
+        page._is_due.set()
+        for _ in range(turns):
+            await asyncio.sleep(0)
+        showing.cancel()
+        await asyncio.wait({showing}, timeout=10)
+        assert showing.cancelled()
 
     asyncio.run(both())

@@ -117,9 +117,11 @@ def test_callback_when_there_is_room(journal: JournalSocket, journald: Journald)
         ready = asyncio.Event()
         journal.call_when_ready(asyncio.get_running_loop(), ready.set)
         with pytest.raises(TimeoutError):
-            await asyncio.wait_for(ready.wait(), 0.1)
+            async with asyncio.timeout(0.1):
+                await ready.wait()
         journald.all()
-        await asyncio.wait_for(ready.wait(), 1)
+        async with asyncio.timeout(1):
+            await ready.wait()
 
     asyncio.run(scenario())
 
@@ -139,7 +141,8 @@ def test_callback_when_journald_is_back(journal: JournalSocket, journald: Journa
                 journal.call_when_ready(loop, again)
 
         journal.call_when_ready(loop, again)
-        await asyncio.wait_for(done.wait(), 2)
+        async with asyncio.timeout(2):
+            await done.wait()
 
     asyncio.run(scenario())
     assert journald.all() == [b"A=1\n"]
@@ -155,7 +158,8 @@ def test_callback_outlives_a_reconnection(journal: JournalSocket, journald: Jour
         journald.stop()
         journald.start()
         assert journal.send_bulk(b"A=1\n")
-        await asyncio.wait_for(ready.wait(), 1)
+        async with asyncio.timeout(1):
+            await ready.wait()
 
     asyncio.run(scenario())
 

@@ -70,7 +70,8 @@ def live(root: Path, work: Callable[[Bench], Coroutine[Any, Any, None]]) -> None
     async def bounded() -> None:
         bench = Bench(root)
         try:
-            await asyncio.wait_for(work(bench), 20)
+            async with asyncio.timeout(20):
+                await work(bench)
         finally:
             bench.end()
 

@@ -216,7 +216,8 @@ def test_what_lies_ends_the_cell(
         bench.side.replies = [reply] * 9
         bench.connect()
         bench.pump.push(event)
-        await asyncio.wait_for(bench.pump.end, 60)
+        async with asyncio.timeout(60):
+            await bench.pump.end
         assert bench.reasons
 
     live(work)
@@ -243,7 +244,8 @@ async def beside(bench: Bench, cause: Callable[[Beside], Awaitable[None]]) -> No
     every.attach(bench.pump.push)
     bench.connect()
     await cause(every)
-    assert await asyncio.wait_for(bench.pump.end, 60) is RunnerExit.FAILED
+    async with asyncio.timeout(60):
+        assert await bench.pump.end is RunnerExit.FAILED
     every.cancel()
 
 

@@ -46,7 +46,11 @@ async def until(is_so: Callable[[], object]) -> None:
 
 
 def live(work: Callable[[], Coroutine[Any, Any, None]]) -> None:
-    asyncio.run(asyncio.wait_for(work(), 20))
+    async def bounded() -> None:
+        async with asyncio.timeout(20):
+            await work()
+
+    asyncio.run(bounded())
 
 
 def test_a_save_while_a_reload_is_under_way_is_not_lost(tmp_path: Path) -> None:
