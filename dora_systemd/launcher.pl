@@ -16,6 +16,7 @@
 my ($node, $directory, $output, @command) = @ARGV;
 my ($cell, $group, $libexec, $unset) =
     delete @ENV{map "DORA_SYSTEMD_$_", qw(CELL GROUP LIBEXEC UNSET)};
+# KEEP is from runners of older versions.
 delete @ENV{split(' ', $unset), map "DORA_SYSTEMD_$_", qw(DIRECTORY PYTHON KEEP)};
 
 sub fail {

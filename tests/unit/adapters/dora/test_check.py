@@ -8,24 +8,15 @@ import pytest
 from dora_systemd.adapters.dora.check import DoraCheck
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.errors import DoraSystemdError, ExitCode
-
-SCRIPT = """#!/bin/sh
-echo "$1" >> "$0.asked"
-case $1 in
-    --version) echo dora-cli 0.4.1;;
-    validate) grep -q refused "$2" && { echo "[ERROR]"; echo "it is refused" >&2; exit 1; };;
-esac
-exit 0
-"""
+from tests.unit.fakes.programs import make_dora
 
 
 @pytest.fixture
 def options(tmp_path: Path) -> RunnerOptions:
-    dora, flow = tmp_path / "dora", tmp_path / "d.yml"
-    dora.write_text(SCRIPT)
-    dora.chmod(0o755)
+    flow = tmp_path / "d.yml"
     flow.write_text("nodes: []")
-    return RunnerOptions("robot", "uuid", str(flow), str(tmp_path), str(dora))
+    dora = make_dora(tmp_path / "dora", "0.4.1")
+    return RunnerOptions("robot", "uuid", str(flow), str(tmp_path), dora)
 
 
 def asked(options: RunnerOptions) -> set[str]:

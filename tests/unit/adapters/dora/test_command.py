@@ -8,13 +8,7 @@ from hypothesis import strategies as st
 
 from dora_systemd.adapters.dora import command
 from dora_systemd.errors import DoraSystemdError, ExitCode
-
-
-def make_program(path: Path, text: str) -> str:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(f"#!/bin/sh\n{text}\n")
-    path.chmod(0o755)
-    return str(path)
+from tests.unit.fakes.programs import make_program
 
 
 def test_dora_is_told_to_print_plainly(tmp_path: Path) -> None:

@@ -21,31 +21,19 @@ from dora_systemd.verbs.start.account import account_of, choose_user
 from dora_systemd.verbs.start.check import check_plan
 from dora_systemd.verbs.start.plan import Plan, StartRequest, make_plan, request_name
 from dora_systemd.verbs.start.settings import read_settings, settings_files
+from tests.unit.fakes.programs import make_dora, make_program
 
 USER = Scope(is_user=True, uid=os.getuid())
 SYSTEM = Scope(is_user=False, uid=os.getuid())
 FLOW = "nodes: [{id: a, path: a.py, inputs: {t: dora/timer/millis/100}}]\n"
-DORA = """#!/bin/sh
-case $1 in
-    --version) echo dora-cli 1.1.0;;
-    validate) grep -q refused "$2" && { echo "[ERROR]"; echo "it is refused" >&2; exit 1; };;
-esac
-exit 0
-"""
 
 
 @pytest.fixture
 def project(tmp_path: Path) -> Path:
     (tmp_path / "robot.yml").write_text(FLOW)
     (tmp_path / "a.py").write_text("")
-    make_program(tmp_path / "bin" / "dora", DORA)
+    make_dora(tmp_path / "bin" / "dora", "1.1.0")
     return tmp_path
-
-
-def make_program(path: Path, text: str = "#!/bin/sh\n") -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text)
-    path.chmod(0o755)
 
 
 def plan_of(project: Path, environment: dict[str, str] | None = None, **flags: Any) -> Plan:
