@@ -54,7 +54,7 @@ from dora_systemd.runner.nodes.nodes import Nodes, wait_eof
 from dora_systemd.runner.reload.apply import Run
 from dora_systemd.runner.reload.reloader import Reloader
 from dora_systemd.runner.reload.settings_file import SettingsFile
-from dora_systemd.runner.reload.swap import READY_SECONDS, Swapper
+from dora_systemd.runner.reload.swap import Swapper
 from dora_systemd.values import INFINITY, SECOND
 
 SAMPLE_SECONDS = 5.0
@@ -190,7 +190,7 @@ async def run_once(runs: Runs, is_again: bool) -> Cell:
         variables = daemon_variables(options, runs.paths, runs.unit, runs.environment)
         pump.connect(dialogue.actions(prepared.descriptor, variables))
         runs.pipes.mute()
-        listen(options, pump, dialogue, runs.clock)
+        listen(runs, pump, dialogue)
         dialogue.watch(coordinator, dialogue.read_coordinator)
         run = Run(pump, runs.nodes, runs.pipes, Swapper(pump, dora))
         reloader.begin(run, prepared, started_us * 1000)
@@ -223,9 +223,9 @@ async def tell_started(pump: Pump, reloader: Reloader) -> None:
         reloader.has_started()
 
 
-def listen(options: RunnerOptions, pump: Pump, dialogue: Dialogue, clock: StopClock) -> None:
+def listen(runs: Runs, pump: Pump, dialogue: Dialogue) -> None:
     """Connect signals, timers and standard input to the pump."""
-    loop = asyncio.get_running_loop()
+    loop, options, clock = asyncio.get_running_loop(), runs.reloader.options, runs.clock
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         loop.add_signal_handler(number, partial(stop, pump, clock, number.name))
     if clock.by:  # the signal came between two runs
@@ -237,7 +237,7 @@ def listen(options: RunnerOptions, pump: Pump, dialogue: Dialogue, clock: StopCl
         dialogue.spawn("watch dora", dialogue.watch_dora(seconds))
     timeout = options.start_timeout
     if pump.cell.is_trial:
-        timeout = min(timeout, round(READY_SECONDS * SECOND))
+        timeout = min(timeout, runs.reloader.patience * SECOND)
     if timeout != INFINITY:
         late = life.StartTimedOut(now_us(), timeout)
         loop.call_later(timeout / SECOND, pump.push, late)

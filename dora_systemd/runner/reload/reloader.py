@@ -26,7 +26,7 @@ from dora_systemd.runner.cell.pump import now_us
 from dora_systemd.runner.reload.apply import Applier, Run
 from dora_systemd.runner.reload.settings_file import SettingsFile
 from dora_systemd.runner.reload.sources import Change, Sources
-from dora_systemd.runner.reload.swap import NotReady
+from dora_systemd.runner.reload.swap import NotReady, patience
 from dora_systemd.values import quoted
 
 PAUSE_SECONDS = 1.0
@@ -40,7 +40,8 @@ class Reloader:
 
     settings: the settings file beside the dataflow. current: the version that runs. before: the
     version before a reload of the whole dataflow whose nodes are not all ready yet, or None.
-    notice: what the last reload reports, as long as it is true.
+    patience: seconds that the current version may take to be ready. notice: what the last reload
+    reports, as long as it is true.
     """
 
     def __init__(
@@ -63,6 +64,7 @@ class Reloader:
         self._taken: dict[str, int] = {}
         self.current: Prepared | None = None
         self.before: Prepared | None = None
+        self.patience = 0
         self.notice = ""
 
     def begin(self, run: Run, prepared: Prepared, read_ns: int) -> None:
@@ -210,7 +212,7 @@ class Reloader:
         """End this run, and let the next one begin with the new version."""
         begun = time.monotonic()
         self.before = self.current if change.prepared is not self.current else None
-        self.current = change.prepared
+        self.current, self.patience = change.prepared, patience(run.pump.cell)
         self._outcome = asyncio.get_running_loop().create_future()
         run.pump.push(life.ReloadAsked(now_us()))
         if failure := await self._outcome:

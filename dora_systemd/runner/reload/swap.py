@@ -26,12 +26,24 @@ from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.cell.pump import Pump, now_us
 from dora_systemd.values import SECOND, format_duration
 
-READY_SECONDS = 30.0
-"""How long dora may take to answer, and then a reloaded node to be ready, before it fails."""
+ANSWER_SECONDS = 30.0
+"""Timeout for an answer of dora's."""
+_READY_SECONDS = 30
+_MOST_SECONDS = 600
+_STARTS = 4
 
 
 class NotReady(Exception):
     """The new node has failed or is not ready in time; the message says which."""
+
+
+def patience(cell: Cell) -> int:
+    """Seconds that a new version may take to be ready.
+
+    A machine or a node that is slow needs longer, so it depends on how long `cell` took to start.
+    """
+    start = (cell.ready_us - cell.started_us) // SECOND
+    return min(max(_READY_SECONDS, _STARTS * start), _MOST_SECONDS)
 
 
 class Swapper:
@@ -86,7 +98,7 @@ class Swapper:
         return self._pump.cell.run
 
     async def _ask(self, params: protocol.Params) -> None:
-        reply = await self._engine.ask_apart(params, READY_SECONDS)
+        reply = await self._engine.ask_apart(params, ANSWER_SECONDS)
         if reply.error:
             raise DoraSystemdError(f"cannot do that in dora: {protocol.first_line(reply.error)}")
 
@@ -96,10 +108,11 @@ class Swapper:
         await self._pump.wait(_of(node, lambda one: not one.pid), stop_timeout(grace) / SECOND)
 
     async def _wait_ready(self, node: str) -> None:
-        await self._pump.wait(_of(node, _is_settled), READY_SECONDS)
+        seconds = patience(self._pump.cell)
+        await self._pump.wait(_of(node, _is_settled), seconds)
         state = self._pump.cell.nodes[node]
         if not state.is_alive:
-            late = f"not ready within {format_duration(int(READY_SECONDS * SECOND))}"
+            late = f"not ready within {format_duration(seconds * SECOND)}"
             raise NotReady(f"node {node}: {str(state.exit) or late}")
 
 

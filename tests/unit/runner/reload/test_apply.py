@@ -1,6 +1,7 @@
 """One reload of single nodes: its steps, what dora is asked in which order, and the way back."""
 
 import asyncio
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from dora_systemd.decisions.life.states import State
 from dora_systemd.decisions.reload.steps import How
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.runner.reload.swap import NotReady
+from dora_systemd.values import SECOND
 from tests.unit.fakes.loop import live
 from tests.unit.fakes.reload import RUNNING
 from tests.unit.fakes.reload import ReloadBench as Bench
@@ -119,6 +121,24 @@ def test_a_node_that_does_not_get_ready(tmp_path: Path, then: str, words: str) -
         assert "b" not in {node for _, node in bench.asked}, "nothing follows"
         waited = asyncio.get_running_loop().time() - began
         assert round(waited) == (0 if then == "crash" else 30)
+
+    live(work)
+
+
+@pytest.mark.parametrize(
+    ("start", "seconds"), [(-50, 30), (0.5, 30), (7, 30), (20, 80), (3600, 600)]
+)
+def test_a_slow_start_gives_a_new_version_more_time(
+    tmp_path: Path, start: float, seconds: int
+) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        bench.pump.cell = replace(bench.pump.cell, ready_us=round(start * SECOND))
+        bench.dora.then["ReplaceNode"] = lambda: None
+        began = asyncio.get_running_loop().time()
+        with pytest.raises(NotReady):
+            await bench.applier((How.SWAP, "a")).apply()
+        assert round(asyncio.get_running_loop().time() - began) == seconds
 
     live(work)
 

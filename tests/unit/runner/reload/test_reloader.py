@@ -220,6 +220,7 @@ def test_the_version_before_comes_back_when_the_next_run_fails(tmp_path: Path) -
         task = await whole(bench)
         before = bench.reloader.before
         assert before is not None
+        assert bench.reloader.patience == 30
         assert bench.reloader.go_back("node c: exit code 1")
         assert bench.reloader.current is before
         with pytest.raises(DoraSystemdError, match=r"cannot use .*: node c: exit code 1$"):
