@@ -12,6 +12,7 @@ import pytest
 
 from tests.deb import packages
 from tests.deb.packages import sh
+from tests.system.ports import reserve_ports
 from tests.system.typed import Shell, Typed, as_text, typed_lines
 
 NO_MEMORY = not Path("/sys/fs/cgroup/cgroup.controllers").read_text().count("memory")
@@ -32,8 +33,7 @@ def readme_lines() -> Iterator[Typed]:
 
 @pytest.fixture(scope="module")
 def shell() -> Iterator[Shell]:
-    # No connection of a dataflow may happen to take the gateway's port.
-    Path("/proc/sys/net/ipv4/ip_local_reserved_ports").write_text("53290-53299")
+    reserve_ports()
     packages.install()
     if not EXAMPLE.exists():
         # The image leaves out /usr/share/doc, as images of containers do.

@@ -11,6 +11,7 @@ import pytest
 from tests.system.cells import Cell, Project, dora_processes, run, wait_for
 from tests.system.chromium import Browser
 from tests.system.gateways import Front
+from tests.system.ports import reserve_ports
 from tests.system.tolerated import is_tolerated
 
 FIRST_HALF = (
@@ -58,8 +59,8 @@ def cell(request: pytest.FixtureRequest, project: Project) -> Iterator[Cell]:
 
 @pytest.fixture(scope="session")
 def reserved_ports() -> None:
-    """No connection of a dataflow may happen to take a gateway's port: see ip-sysctl, tcp(7)."""
-    Path("/proc/sys/net/ipv4/ip_local_reserved_ports").write_text("53290-53299")
+    """See reserve_ports()."""
+    reserve_ports()
 
 
 @pytest.fixture

@@ -26,7 +26,7 @@ from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.cell.pump import Pump, now_us
 from dora_systemd.values import SECOND, format_duration
 
-ANSWER_SECONDS = 30.0
+_ANSWER_SECONDS = 30.0
 """Timeout for an answer of dora's."""
 _READY_SECONDS = 30
 _MOST_SECONDS = 600
@@ -98,7 +98,7 @@ class Swapper:
         return self._pump.cell.run
 
     async def _ask(self, params: protocol.Params) -> None:
-        reply = await self._engine.ask_apart(params, ANSWER_SECONDS)
+        reply = await self._engine.ask_apart(params, _ANSWER_SECONDS)
         if reply.error:
             raise DoraSystemdError(f"cannot do that in dora: {protocol.first_line(reply.error)}")
 

@@ -12,6 +12,7 @@ from dora_systemd.cli.completion import TYPES, VARIABLE, Live
 from dora_systemd.cli.group import VERBS, doractl
 from dora_systemd.errors import DoraSystemdError
 from tests.unit.checkout import CHECKOUT
+from tests.unit.fakes.programs import make_program
 from tests.unit.tools import require
 
 SCRIPTS = {"bash": "doractl", "zsh": "_doractl", "fish": "doractl.fish"}
@@ -122,9 +123,8 @@ printf '%s\\n' "${{COMPREPLY[@]}}"
 
 def test_bash_takes_the_answer(tmp_path: Path) -> None:
     """A value is one word, whatever characters are in it."""
-    fake = tmp_path / "doractl"
-    fake.write_text('#!/bin/sh\necho "plain,$COMP_WORDS|$COMP_CWORD"\necho "plain,a b"\n')
-    fake.chmod(0o755)
+    answer = 'echo "plain,$COMP_WORDS|$COMP_CWORD"\necho "plain,a b"'
+    make_program(tmp_path / "doractl", answer)
     script = BASH.format(script=CHECKOUT / "packaging/completions/doractl", word="ro")
     done = subprocess.run(
         ["bash", "-c", script],

@@ -16,6 +16,7 @@ import pytest
 
 from tests.unit.fakes.libraries import install
 from tests.unit.fakes.manager import FakeManager
+from tests.unit.fakes.programs import make_program
 
 JOBS = ("StartUnit", "StopUnit", "RestartUnit")
 
@@ -160,8 +161,7 @@ def fake_systemd(patch: pytest.MonkeyPatch, manager: FakeManager) -> FakeSystemd
 def fake_journalctl(patch: pytest.MonkeyPatch, directory: Path, records: bytes) -> Path:
     """From now on journalctl prints `records`; the file with the arguments of each call."""
     (directory / "records").write_bytes(records)
-    script, calls = directory / "journalctl", directory / "calls"
-    script.write_text(f'#!/bin/sh\necho "$@" >> {calls}\ncat {directory}/records\n')
-    script.chmod(0o755)
+    calls = directory / "calls"
+    make_program(directory / "journalctl", f'echo "$@" >> {calls}\ncat {directory}/records')
     patch.setenv("PATH", f"{directory}:{os.environ['PATH']}")
     return calls

@@ -2,7 +2,7 @@
 
 import asyncio
 from collections import deque
-from collections.abc import Callable, Coroutine
+from collections.abc import Awaitable, Callable, Coroutine
 from typing import Any
 
 
@@ -29,12 +29,14 @@ class ImpatientLoop(asyncio.SelectorEventLoop):
 def live(work: Callable[[], Coroutine[Any, Any, None]]) -> None:
     """Run `work` on such a loop, which fails at once if it waits for what cannot come."""
 
-    async def bounded() -> None:
-        async with asyncio.timeout(3600):
-            await work()
-
     with asyncio.Runner(loop_factory=ImpatientLoop) as runner:
-        runner.run(bounded())
+        runner.run(within(3600, work()))
+
+
+async def within(seconds: float, work: Awaitable[None]) -> None:
+    """Wait for `work`. Raises TimeoutError if that takes longer."""
+    async with asyncio.timeout(seconds):
+        await work
 
 
 async def settle() -> None:

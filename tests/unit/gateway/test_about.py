@@ -17,6 +17,7 @@ from dora_systemd.gateway.live.lines import find_lines
 from dora_systemd.scope import Scope
 from tests.unit.fakes.library import fake_journalctl, fake_systemd
 from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
+from tests.unit.fakes.programs import make_program
 
 GONE = "11111111-2222-4333-8444-555555555555"
 
@@ -167,8 +168,7 @@ def test_the_logs_of_an_ended_one_are_its_own(bench: Bench) -> None:
 
 def test_a_time_that_journalctl_does_not_take(bench: Bench, tmp_path: Path) -> None:
     bench.journal()
-    script = tmp_path / "journalctl"
-    script.write_text('#!/bin/sh\necho "Failed to parse timestamp: x" >&2\nexit 1\n')
+    make_program(tmp_path / "journalctl", 'echo "Failed to parse timestamp: x" >&2\nexit 1')
     with pytest.raises(DoraSystemdError, match="cannot read the time") as caught:
         search(bench, since="x")
     assert caught.value.code is ExitCode.USAGE

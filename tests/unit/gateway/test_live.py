@@ -16,6 +16,7 @@ from dora_systemd.gateway.live.lines import MAX_LINES
 from dora_systemd.gateway.live.talk import MAX_TASKS, talk
 from dora_systemd.scope import Scope
 from tests.unit.fakes.library import FakeSystemd, fake_systemd
+from tests.unit.fakes.loop import within
 from tests.unit.fakes.manager import UUID, FakeManager, options
 
 REQUEST = Request("/api/live", Scope(True, 1000))
@@ -68,8 +69,7 @@ def play(story: Story) -> Browser:
         talking = asyncio.ensure_future(talk(browser, REQUEST))
         await story(browser)
         browser.leave()
-        async with asyncio.timeout(10):
-            await talking
+        await within(10, talking)
         assert len(asyncio.all_tasks()) == 1
         return browser
 
@@ -229,8 +229,7 @@ def test_a_page_that_takes_nothing_is_given_up(monkeypatch: pytest.MonkeyPatch) 
     async def both() -> None:
         browser = Browser()
         browser.is_stuck = True
-        async with asyncio.timeout(10):
-            await talk(browser, REQUEST)
+        await within(10, talk(browser, REQUEST))
 
     asyncio.run(both())
 

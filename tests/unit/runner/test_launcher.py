@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import dora_systemd
+from tests.unit.fakes.programs import make_program
 
 PACKAGE = Path(dora_systemd.__file__).parent
 LIBEXEC = str(PACKAGE / "libexec")
@@ -165,9 +166,7 @@ def test_other_uses_of_python_go_to_the_real_one(environment: dict[str, str]) ->
 def test_uv_finds_our_python_and_is_uv_otherwise(
     environment: dict[str, str], tmp_path: Path
 ) -> None:
-    uv = tmp_path / "uv"
-    uv.write_text('#!/bin/sh\necho real "$@"\n')
-    uv.chmod(0o755)
+    make_program(tmp_path / "uv", 'echo real "$@"')
     environment["PATH"] = f"{LIBEXEC}:{tmp_path}:/usr/bin:/bin"
     assert launch(environment, f"{LIBEXEC}/uv", "python", "find").stdout == f"{LIBEXEC}/python\n"
     assert launch(environment, f"{LIBEXEC}/uv", "run", "x").stdout == "real run x\n"

@@ -21,6 +21,7 @@ from dora_systemd.verbs.facts.recorded import find_query
 from dora_systemd.verbs.follow import UnitWatch
 from dora_systemd.verbs.logs import FollowedLog, pass_logs
 from tests.unit.fakes.library import fake_journalctl
+from tests.unit.fakes.programs import make_program
 
 ROBOT = "550e8400-e29b-41d4-a716-446655440000"
 FORGED = "550e8499-e29b-41d4-a716-446655440000"
@@ -232,16 +233,15 @@ def test_lines_go_on_after_journalctl_has_died(
     """With the record after the last whole one; and nothing is asked meanwhile."""
     monkeypatch.setattr(logs, "AGAIN_SECONDS", 0.5)
     calls, script = tmp_path / "calls", tmp_path / "journalctl"
-    script.write_text(
-        f"""#!/bin/sh
-echo "$@" >>{calls}
+    make_program(
+        script,
+        f"""echo "$@" >>{calls}
 case "$*" in
 *--after-cursor=s=1*) printf 'MESSAGE=two\\n\\n'; exec sleep 60;;
 *) printf '__CURSOR=s=1\\nMESSAGE=one\\n\\nMESSAGE=hal';;
 esac
-"""
+""",
     )
-    script.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
     printed: list[bytes] = []
     log = FollowedLog(QUERY.scope, "robot", ROBOT, 0, printed.append, lambda one: one["MESSAGE"])

@@ -8,6 +8,7 @@ import pytest
 
 from dora_systemd.verbs.why import words_of_start
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options
+from tests.unit.fakes.programs import make_program
 
 UUID = options().uuid
 ORIGIN = {"DORA_DATAFLOW": UUID, "_SYSTEMD_INVOCATION_ID": "1", "_BOOT_ID": "b"}
@@ -42,12 +43,11 @@ def play(patch: pytest.MonkeyPatch, place: Path, camera: list[dict[str, Any]]) -
     for name, records in answers.items():
         lines = [f"{json.dumps(one)}\n" for one in reversed(records)]
         (place / name).write_text("".join(lines))
-    script = place / "journalctl"
-    script.write_text(
-        f'#!/bin/sh\ncd {place}\ncase "$*" in\n*DORA_EVENT=stop-asked*) cat events;;\n'
-        "*DORA_NODE=camera*) cat camera;;\n*_UID=0*) ;;\n*) cat all;;\nesac\n"
+    make_program(
+        place / "journalctl",
+        f'cd {place}\ncase "$*" in\n*DORA_EVENT=stop-asked*) cat events;;\n'
+        "*DORA_NODE=camera*) cat camera;;\n*_UID=0*) ;;\n*) cat all;;\nesac",
     )
-    script.chmod(0o755)
     patch.setenv("PATH", f"{place}:/usr/bin:/bin")
 
 

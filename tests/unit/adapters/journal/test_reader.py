@@ -10,6 +10,7 @@ from dora_systemd.adapters.journal import reader as journal_reader
 from dora_systemd.adapters.journal.reader import JournalReader, check_readable
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
+from tests.unit.fakes.programs import make_program
 
 SYSTEM = Scope(is_user=False, uid=0)
 USER = Scope(is_user=True, uid=1000)
@@ -22,11 +23,6 @@ def journalctl(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     script.parent.mkdir()
     monkeypatch.setenv("PATH", f"{script.parent}:/usr/bin:/bin")
     return script
-
-
-def play(script: Path, text: str) -> None:
-    script.write_text(f"#!/bin/sh\n{text}\n")
-    script.chmod(0o755)
 
 
 @pytest.mark.parametrize(
@@ -49,7 +45,7 @@ def play(script: Path, text: str) -> None:
     ],
 )
 def test_complaints(journalctl: Path, complaint: str, message: str, code: ExitCode) -> None:
-    play(journalctl, f"echo 'Hint: x' >&2; echo '{complaint}' >&2; exit 1")
+    make_program(journalctl, f"echo 'Hint: x' >&2; echo '{complaint}' >&2; exit 1")
     with pytest.raises(DoraSystemdError) as caught:
         JournalReader().known_names(SYSTEM)
     assert (caught.value.message, caught.value.code) == (message, code)
@@ -57,7 +53,7 @@ def test_complaints(journalctl: Path, complaint: str, message: str, code: ExitCo
 
 def test_a_notice_is_no_complaint(journalctl: Path) -> None:
     notice = "      Pass -q to turn off this notice."
-    play(journalctl, f"echo 'Hint: only your own' >&2; echo '{notice}' >&2; exit 1")
+    make_program(journalctl, f"echo 'Hint: only your own' >&2; echo '{notice}' >&2; exit 1")
     assert JournalReader().known_names(SYSTEM) == []
 
 
@@ -75,7 +71,9 @@ def play_fields(script: Path, fields: dict[str, list[str]], records: dict[str, s
         for field, values in fields.items()
     ]
     cases += [f"*'{matches}') echo '{text}';;" for matches, text in records.items()]
-    play(script, f"""echo "$*" >>'{script}.asked'; case "$*" in\n""" + "\n".join(cases) + "\nesac")
+    make_program(
+        script, f"""echo "$*" >>'{script}.asked'; case "$*" in\n""" + "\n".join(cases) + "\nesac"
+    )
 
 
 READY = '{"DORA_NODE":"a","DORA_EVENT":"node-ready"}'
@@ -143,7 +141,7 @@ def test_last_event_of_each_dataflow(journalctl: Path) -> None:
         '{"DORA_DATAFLOW":"22222222-2222-2222-2222-222222222222","DORA_DATAFLOW_NAME":"b","_SYSTEMD_UNIT":"dora-b.service","DORA_EVENT":"dataflow-started",'
         '"__REALTIME_TIMESTAMP":"10"}',
     ]
-    play(journalctl, "cat <<'E'\n" + "\n".join(records) + "\nE")
+    make_program(journalctl, "cat <<'E'\n" + "\n".join(records) + "\nE")
     first, second = JournalReader().last_events(SYSTEM)
     assert (first.name, first.event, first.detail) == ("b", "dataflow-failed", "daemon lost")
     assert (second.name, second.event, second.at_us) == ("a", "dataflow-stopped", 20)
@@ -161,7 +159,7 @@ def test_last_event_of_each_name(journalctl: Path) -> None:
         for name, uuid, at in runs
     ]
     lines = "\n".join(map(json.dumps, records))
-    play(journalctl, f"""echo "$@" >'{journalctl}.asked'; cat <<'E'\n{lines}\nE""")
+    make_program(journalctl, f"""echo "$@" >'{journalctl}.asked'; cat <<'E'\n{lines}\nE""")
     found = JournalReader().last_events(SYSTEM, is_by_name=True)
     assert [(one.name, one.at_us) for one in found] == [("a", 30), ("b", 10)]
     assert len(JournalReader().last_events(SYSTEM)) == 3
@@ -171,12 +169,14 @@ def test_last_event_of_each_name(journalctl: Path) -> None:
 
 def test_lives_of_a_unit(journalctl: Path) -> None:
     lines = [f'{{"_SYSTEMD_INVOCATION_ID":"{one}"}}' for one in ("i2", "i2", "i1")]
-    play(journalctl, "cat <<'E'\n" + "\n".join(lines) + "\nE")
+    make_program(journalctl, "cat <<'E'\n" + "\n".join(lines) + "\nE")
     assert list(JournalReader().invocations(SYSTEM, "robot", "")) == ["i2", "i1"]
 
 
 def test_count(journalctl: Path) -> None:
-    play(journalctl, 'echo "$@" | grep -q -- "--since=@1.000002 --until=@3.000000" && seq 5')
+    make_program(
+        journalctl, 'echo "$@" | grep -q -- "--since=@1.000002 --until=@3.000000" && seq 5'
+    )
     assert JournalReader().count_own(1_000_002, 3_000_000) == 5
 
 
@@ -230,7 +230,7 @@ def test_records_in_the_name_of_others_are_left_out(journalctl: Path) -> None:
         {**good, "DORA_EVENT": ["dataflow-failed"]},
     ]
     lines = "\n".join(map(json.dumps, [*bad, good]))
-    play(journalctl, f"cat <<'E'\n{lines}\nE")
+    make_program(journalctl, f"cat <<'E'\n{lines}\nE")
     (event,) = JournalReader().last_events(SYSTEM)
     assert (event.name, event.uuid) == ("a", UUID)
     assert JournalReader().name_of(SYSTEM, UUID) == "a"
@@ -238,7 +238,7 @@ def test_records_in_the_name_of_others_are_left_out(journalctl: Path) -> None:
 
 def test_an_endless_journal_has_an_end(journalctl: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(journal_reader, "MAX_BYTES", 1 << 20)
-    play(journalctl, """while :; do printf '{"MESSAGE":"%02000d"}\\n' 7; done""")
+    make_program(journalctl, """while :; do printf '{"MESSAGE":"%02000d"}\\n' 7; done""")
     assert 0 < len(list(JournalReader().newest([], None))) < 600
 
 
@@ -246,17 +246,17 @@ def test_a_journal_that_stops_in_the_middle(
     journalctl: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(journal_reader, "READ_SECONDS", 0.3)
-    play(journalctl, """echo '{"MESSAGE":"x"}'; exec sleep 60""")
+    make_program(journalctl, """echo '{"MESSAGE":"x"}'; exec sleep 60""")
     assert list(JournalReader().newest([], None)) == [{"MESSAGE": "x"}]
 
 
 def test_a_record_that_is_too_long_is_left_out(journalctl: Path) -> None:
     long = """printf '{"MESSAGE":"'; head -c 3000000 /dev/zero | tr '\\0' 7; echo '"}'"""
-    play(journalctl, f"""echo '{{"MESSAGE":"a"}}'; {long}; echo '{{"MESSAGE":"b"}}'""")
+    make_program(journalctl, f"""echo '{{"MESSAGE":"a"}}'; {long}; echo '{{"MESSAGE":"b"}}'""")
     found = [one["MESSAGE"] for one in JournalReader().newest([], None)]
     assert found == ["a", "b"]
 
 
 def test_values_that_can_be_no_uuids(journalctl: Path) -> None:
-    play(journalctl, f"printf '%s\\n' robot ../x '\x1b]0;x' 'a b' {UUID}")
+    make_program(journalctl, f"printf '%s\\n' robot ../x '\x1b]0;x' 'a b' {UUID}")
     assert JournalReader().known_uuids() == [UUID]

@@ -21,9 +21,10 @@ from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.begin import start_coordinator
 from dora_systemd.runner.cell.boot import Boot
 from dora_systemd.runner.cell.engine import Engine
-from tests.unit.fakes.loop import settle
+from tests.unit.fakes.loop import settle, within
+from tests.unit.fakes.programs import make_program
 
-SCRIPT = """#!/bin/sh
+SCRIPT = """
 env > "$1.env"
 echo "$*" > "$1.arguments"
 pwd -P > "$1.directory"
@@ -39,8 +40,7 @@ class Bench:
     def __init__(self, root: Path) -> None:
         self.paths = CellPaths(root)
         dora = root / "dora"
-        dora.write_text(SCRIPT)
-        dora.chmod(0o755)
+        make_program(dora, SCRIPT)
         self.paths.work.mkdir()
         self.children: list[engine.Child] = []
         self.engine = Engine(str(dora), self.paths, {"PATH": "/usr/bin:/bin", "MODEL": "yolo"})
@@ -70,8 +70,7 @@ def live(root: Path, work: Callable[[Bench], Coroutine[Any, Any, None]]) -> None
     async def bounded() -> None:
         bench = Bench(root)
         try:
-            async with asyncio.timeout(20):
-                await work(bench)
+            await within(20, work(bench))
         finally:
             bench.end()
 
@@ -101,7 +100,7 @@ def test_the_coordinator_writes_its_token_in_a_directory_of_its_own(
     live(tmp_path, work)
 
 
-BOOTS = """#!/bin/sh
+BOOTS = """
 [ "$1" = daemon ] && exec sleep 1000
 echo secret > .dora-token
 echo "Listening on port 4711"
@@ -112,7 +111,7 @@ exec sleep 1000
 def booting(bench: Bench, script: str = BOOTS) -> Boot:
     """A dora that boots before there is an engine, which is told of it."""
     dora = bench.paths.root / "dora"
-    dora.write_text(script)
+    make_program(dora, script)
     environment = {"PATH": "/usr/bin:/bin"}
     coordinator = start_coordinator(str(dora), bench.paths, environment)
     options = RunnerOptions("robot", "uuid", "/p/d.yml", "/p", str(dora))
@@ -159,7 +158,7 @@ def test_a_daemon_that_nobody_has_asked_for_yet_is_killed_too(tmp_path: Path) ->
     live(tmp_path, work)
 
 
-@pytest.mark.parametrize("script", ["#!/bin/sh\necho failed\n", BOOTS.replace("secret >", ">&2 ")])
+@pytest.mark.parametrize("script", ["echo failed", BOOTS.replace("secret >", ">&2 ")])
 def test_a_boot_that_fails_leaves_the_daemon_to_the_engine(tmp_path: Path, script: str) -> None:
     async def work(bench: Bench) -> None:
         boot = booting(bench, script)

@@ -27,6 +27,7 @@ from dora_systemd.runner.cell.pause import (
     pause,
 )
 from dora_systemd.values import SECOND
+from tests.unit.fakes.programs import make_program
 
 DELAY = SECOND // 2
 POLICY = RestartPolicy("always", 1000, 600 * SECOND, DELAY, 30 * SECOND)
@@ -49,13 +50,12 @@ class Unit:
         monkeypatch.setitem(sys.modules, "systemd", SimpleNamespace(daemon=library))
         monkeypatch.setitem(sys.modules, "systemd.daemon", library)
         self.store: Counter[str] = Counter({"dora-log-a": 2})
-        systemctl = root / "systemctl"
-        systemctl.write_text(
-            f'#!/bin/sh\necho "$@" >>{root}/asked\ncase "$*" in *NRestarts*) cat {root}/restarts\n'
-            f";; *) cat {root}/ended; esac\n"
+        make_program(
+            root / "systemctl",
+            f'echo "$@" >>{root}/asked\ncase "$*" in *NRestarts*) cat {root}/restarts\n'
+            f";; *) cat {root}/ended; esac",
         )
         (root / "asked").touch()
-        systemctl.chmod(0o755)
         monkeypatch.setenv("PATH", f"{root}:{os.environ['PATH']}")
 
     def sleep(self, seconds: float) -> None:
@@ -192,7 +192,7 @@ def test_the_store_does_not_fill(unit: Unit) -> None:
 
 
 def test_systemd_does_not_answer(unit: Unit) -> None:
-    (unit.paths.root / "systemctl").write_text("#!/bin/sh\nexit 1\n")
+    make_program(unit.paths.root / "systemctl", "exit 1")
     assert asked("NRestarts", "robot", True, 7) == 7
 
 

@@ -12,6 +12,7 @@ from dora_systemd.decisions.life.states import State
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.runner.reload.reloader import Reloader
 from dora_systemd.runner.reload.settings_file import SettingsFile
+from tests.unit.fakes.loop import within
 from tests.unit.fakes.reload import ReloadBench
 
 
@@ -46,11 +47,7 @@ async def until(is_so: Callable[[], object]) -> None:
 
 
 def live(work: Callable[[], Coroutine[Any, Any, None]]) -> None:
-    async def bounded() -> None:
-        async with asyncio.timeout(20):
-            await work()
-
-    asyncio.run(bounded())
+    asyncio.run(within(20, work()))
 
 
 def test_a_save_while_a_reload_is_under_way_is_not_lost(tmp_path: Path) -> None:

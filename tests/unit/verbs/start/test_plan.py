@@ -123,7 +123,7 @@ def no_manager() -> Any:
 
 
 def test_no_dora_runs_while_a_plan_is_made(project: Path) -> None:
-    make_program(project / "bin" / "dora", f"#!/bin/sh\ntouch {project}/proof\n")
+    make_program(project / "bin" / "dora", f"touch {project}/proof")
     (project / "mod.yml").write_text("module: {name: m}\n" + FLOW)
     (project / "robot.yml").write_text("nodes: [{id: m, module: mod.yml}]\n")
     plan_of(project)
