@@ -8,7 +8,7 @@ from dora_systemd.decisions.cell.exits import Exit
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.life.states import Action, Cell, Deadline, Do, Record, RunnerExit, State
-from dora_systemd.decisions.resources.oom import Owner
+from dora_systemd.decisions.resources.oom import Oom, Owner
 from dora_systemd.values import SECOND
 
 Next = tuple[Cell, tuple[Action, ...]]
@@ -44,20 +44,20 @@ def broken(cell: Cell, event: life.Failed) -> Next:
     return fail(because(cell, Cause.RUNNER_BROKEN), reason, RunnerExit.FAILED)
 
 
-def fail(cell: Cell, reason: str, code: RunnerExit) -> Next:
-    """End at once, and record the reason."""
+def fail(cell: Cell, reason: str, code: RunnerExit, **more: str) -> Next:
+    """End at once, and record the reason. more: details of that record."""
     cell = replace(cell, failure=reason, exit=code)
     is_trial = cell.is_trial and not cell.ready_us and not cell.stop_by
     name = "reload-failed" if is_trial else "dataflow-failed"
     details = {"reason": reason, "cause": str(cell.cause), "nodes": " ".join(cell.culprits)}
-    known = {key: text for key, text in details.items() if text}
+    known = {key: text for key, text in details.items() if text} | more
     return to(cell, State.ENDED, Record(name, "", known), Do.EXIT)
 
 
 def child_exited(cell: Cell, event: life.ChildExited) -> Next:
     """A dataflow cannot run without coordinator or daemon."""
     reason = f"the dora {event.child} is gone ({event.exit})"
-    cell, actions = _lose(cell, event.child, reason, event.exit)
+    cell, actions = _lose(cell, event.child, reason, event.exit, event.oom)
     return cell, (*oom_of_all(event), *actions)
 
 
@@ -66,9 +66,10 @@ def connection_lost(cell: Cell, event: life.ConnectionLost) -> Next:
     return _lose(cell, event.child, event.reason, Exit())
 
 
-def _lose(cell: Cell, child: str, reason: str, exit: Exit) -> Next:
-    cell = because(cell, Cause(f"{child}-lost"))
-    cell, actions = fail(cell, reason, RunnerExit.ENGINE_LOST)
+def _lose(cell: Cell, child: str, reason: str, exit: Exit, oom: Oom | None = None) -> Next:
+    cell = because(cell, Cause(f"{child}-lost") if oom is None else Cause.OUT_OF_MEMORY)
+    more = {} if oom is None else oom.owner_details()
+    cell, actions = fail(cell, reason, RunnerExit.ENGINE_LOST, **more)
     return cell, (Record(f"{child}-lost", "", exit.details()), *actions)
 
 

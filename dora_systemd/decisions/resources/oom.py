@@ -57,8 +57,12 @@ class Oom:
 
     def node_details(self) -> dict[str, str]:
         """Details of the event node-oom."""
-        details = {"exit": self.text, "peak": str(self.peak), "owner": self.owner.value}
-        return {**details, "limit": str(self.limit)} if self.limit else details
+        return {"exit": self.text, "peak": str(self.peak), **self.owner_details()}
+
+    def owner_details(self) -> dict[str, str]:
+        """Whose memory was used up, in both that event and dataflow-failed."""
+        limit = {"limit": str(self.limit)} if self.limit else {}
+        return {"owner": self.owner.value, **limit}
 
     def dataflow_details(self) -> dict[str, str]:
         """Details of the event dataflow-oom."""

@@ -6,6 +6,7 @@ from dora_systemd.decisions.cell.exits import Exit, exit_of
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.dora.life_events import with_facts
 from dora_systemd.decisions.life import events as life
+from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.life.states import Cell, Record, State
 from dora_systemd.decisions.life.table import step
 from dora_systemd.decisions.resources.oom import Oom, OomCounts, Owner, find_owner, largest
@@ -85,6 +86,13 @@ def test_the_dataflow_without_its_daemon() -> None:
     assert after.failure == (
         "the dora daemon is gone (out of memory, peak 19M, limit of the dataflow 700M)"
     )
+    assert after.cause is Cause.OUT_OF_MEMORY
+    assert said[-1].details == {
+        "reason": after.failure,
+        "cause": "out-of-memory",
+        "owner": "dataflow",
+        "limit": str(700 * MIB),
+    }
 
 
 def test_doras_verdict_does_not_hide_it() -> None:
