@@ -193,6 +193,17 @@ class Cell:
         command = ("journalctl", "-o", "json", "--all", which, self.unit, *matches)
         return [json.loads(line) for line in run(*command).stdout.splitlines()]
 
+    def last_words(self) -> str:
+        """The live table, and the newest lines of the journal that no node has printed."""
+        path = self.paths.status
+        table = path.read_text() if path.exists() else "no live table"
+        lines = [
+            f"{int(one['__REALTIME_TIMESTAMP']) / 1e6:.1f} {one.get('MESSAGE')}"
+            for one in self.journal()
+            if "DORA_NODE" not in one or "DORA_EVENT" in one
+        ]
+        return "\n".join([table, *lines[-50:]])
+
     def messages(self, node: str) -> list[str]:
         """What a node has printed so far, without what dora says of a slow machine."""
         found = self.journal(f"DORA_NODE={node}")

@@ -3,7 +3,7 @@
 import json
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 
 import pytest
@@ -33,6 +33,18 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.add_marker(pytest.mark.system)
     if half:
         items[:] = [item for item in items if (item.path.stem in FIRST_HALF) == (half == "1")]
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item, call: pytest.CallInfo[None]
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """With a failure, what a person would look at next."""
+    report = yield
+    cell = getattr(item, "funcargs", {}).get("cell")
+    if call.when == "call" and report.failed and isinstance(cell, Cell):
+        report.sections.append(("the dataflow", cell.last_words()))
+    return report
 
 
 @pytest.fixture
