@@ -43,7 +43,11 @@ def pytest_runtest_makereport(
     report = yield
     cell = getattr(item, "funcargs", {}).get("cell")
     if call.when == "call" and report.failed and isinstance(cell, Cell):
-        report.sections.append(("the dataflow", cell.last_words()))
+        try:
+            words = cell.last_words()
+        except Exception as error:  # an exception here would end the whole session
+            words = repr(error)
+        report.sections.append(("the dataflow", words))
     return report
 
 
