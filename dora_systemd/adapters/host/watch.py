@@ -48,14 +48,15 @@ async def changed_files(rules: WatchRules) -> AsyncIterator[frozenset[str]]:
     await missed()
     while True:
         await _wait_root(rules.root)
-        is_first = True
+        is_first = is_unsure = True
         async for paths in _bursts(rules):
             files = frozenset(path for path in paths if rules.has(path))
             seen.update((path, change_time(path)) for path in files)
-            if is_first:
-                # Changes before the new watches are found by their time.
+            # Found by their time: changes before the new watches, and those that watchfiles drops
+            # because they arrive between its copy of others and the clearing of its list.
+            if is_first or (is_unsure and not paths):
                 files |= await missed()
-            is_first = False
+            is_first, is_unsure = False, bool(paths)
             if files:
                 yield files
         # Directories came or went.
@@ -107,7 +108,7 @@ def change_time(path: str) -> int:
 
 
 async def _bursts(rules: WatchRules) -> AsyncIterator[frozenset[str]]:
-    """Paths of changed files, until a directory is created or deleted; none after _IDLE_MS."""
+    """Paths of changed files, until a directory is created or deleted; none each _IDLE_MS."""
     # Imported late: only hot reload needs it.
     from watchfiles import Change, awatch
 

@@ -16,7 +16,9 @@ from dora_systemd.decisions.cell.limits import format_node_limits, parse_node_li
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.programs import own_account
 
-_SECONDS = 120.0
+_SECONDS = 600.0
+"""Timeout of the child, which takes 0.3 s. A machine under load can need a hundred times that, and
+a refusal would be wrong: nobody saves a file again that is already right."""
 
 
 class SettingsFile:

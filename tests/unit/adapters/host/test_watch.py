@@ -54,3 +54,30 @@ def test_what_is_unchanged_is_not_told(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr("tests.unit.adapters.host.test_watch.SECONDS", 1.0)
     with pytest.raises(TimeoutError):
         asyncio.run(first(WatchRules(str(tmp_path), ("*.py",))))
+
+
+def test_a_change_that_watchfiles_drops_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It arrives between a copy and the clearing of the original."""
+    given, dropped = tmp_path / "given.py", tmp_path / "dropped.py"
+
+    async def drops(*_: str, **__: Any) -> AsyncIterator[Any]:
+        yield set()
+        given.write_text("")
+        yield {(watchfiles.Change.added, str(given))}
+        dropped.write_text("")
+        yield set()
+        await asyncio.Event().wait()
+
+    async def batches() -> list[frozenset[str]]:
+        found = []
+        async with asyncio.timeout(SECONDS):
+            async for files in watch.changed_files(WatchRules(str(tmp_path), ("*.py",))):
+                found.append(files)
+                if len(found) == 2:
+                    break
+        return found
+
+    monkeypatch.setattr(watchfiles, "awatch", drops)
+    assert asyncio.run(batches()) == [{str(given)}, {str(dropped)}]
