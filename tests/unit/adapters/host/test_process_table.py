@@ -23,14 +23,17 @@ def test_ourselves() -> None:
 
 
 def test_a_node_is_known_by_its_environment() -> None:
-    child = subprocess.Popen(["sleep", "60"], env={"DORA_NODE_CONFIG": "x"})
-    try:
+    env, pipe = {"DORA_NODE_CONFIG": "x"}, subprocess.PIPE
+    with subprocess.Popen(["cat"], env=env, stdin=pipe, stdout=pipe) as child:
+        assert child.stdin is not None and child.stdout is not None
+        # After execve(2) has returned: before, it looks like us, or has no command line.
+        child.stdin.write(b"\n")
+        child.stdin.flush()
+        child.stdout.readline()
         (found,) = [one for one in read_processes() if one.pid == child.pid]
-    finally:
-        child.kill()
-        child.wait()
-    # Between fork and exec it still looks like us.
-    assert found.is_node or "sleep" not in found.command
+        child.stdin.close()
+    assert found.is_node
+    assert found.command == ("cat",)
 
 
 def test_who_listens() -> None:
