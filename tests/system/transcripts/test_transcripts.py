@@ -1,4 +1,4 @@
-"""Tasks as a person types them, from the first start to the end.
+"""Twelve tasks as a person types them, from the first start to the end.
 
 Each is a text: tests/system/typed.py says how it is read. Where one differs, the whole of it is
 printed as it was really shown. Two of them need another lab: reboot.txt is replayed by tests/boot,
@@ -41,7 +41,14 @@ def shell() -> Iterator[Shell]:
     wait_for("no process is left", lambda: not dora_processes())
 
 
-@pytest.mark.parametrize("path", [pytest.param(one, id=one.stem) for one in TASKS])
+def needs(path: Path) -> list[pytest.MarkDecorator]:
+    """The lab that a task needs."""
+    return [pytest.mark.vm] if "Needs memory limits." in path.read_text() else []
+
+
+@pytest.mark.parametrize(
+    "path", [pytest.param(one, marks=needs(one), id=one.stem) for one in TASKS]
+)
 def test_task(path: Path, shell: Shell) -> None:
     wrong = replay(shell, path.read_text())
     assert not wrong, f"{path.name} differs:\n" + "".join(wrong)

@@ -144,6 +144,10 @@ def test_transcripts(path: Path) -> None:
     check(line for line in wanted if "doractl" in line)
 
 
+def test_there_are_twelve_transcripts() -> None:
+    assert len(TASKS) == 12
+
+
 def test_commands_in_messages() -> None:
     texts = [text for path in MODULES for text in strings(path.read_text())]
     found = {one for text in [*texts, CATALOG.read_text()] for one in PROSE.findall(text)}
