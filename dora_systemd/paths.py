@@ -21,6 +21,8 @@ class CellPaths:
         """The socket where the runner answers doractl, and relays to the coordinator."""
         self.settings = root / "settings.yml"
         """The version of the dataflow's settings file that is in use."""
+        self.lock = root / "inhibit.lock"
+        """The file that nodes and `doractl inhibit` lock to inhibit restarts, see flock(2)."""
         self.coordinator = root / "coordinator"
         """Working directory of the coordinator, which writes its token and log there."""
         self.daemon = root / "daemon"

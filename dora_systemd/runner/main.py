@@ -41,7 +41,7 @@ from dora_systemd.decisions.logs.lines import Origin
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import settings_path
 from dora_systemd.paths import CellPaths
-from dora_systemd.runner.cell.begin import daemon_variables, enter_supervisor
+from dora_systemd.runner.cell.begin import daemon_variables, enter_supervisor, make_lock
 from dora_systemd.runner.cell.boot import Boot
 from dora_systemd.runner.cell.clock import StopClock
 from dora_systemd.runner.cell.dialogue import Dialogue
@@ -122,6 +122,7 @@ class Runs:
         self.unit = enter_supervisor()
         for path in (paths.work, paths.io):
             path.mkdir(mode=0o700, exist_ok=True)
+        make_lock(paths.lock)
         self.environment = node_environment(os.environ)
         settings = SettingsFile(settings_path(options.dataflow), paths.settings)
         self.reloader = Reloader(options, self.environment, settings)

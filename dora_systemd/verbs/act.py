@@ -7,6 +7,7 @@ from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
+from dora_systemd.verbs.inhibit.guard import uninhibited
 from dora_systemd.verbs.node import restart_node, stop_node
 from dora_systemd.verbs.stop import note_stop, restart_cells, stop_cells
 
@@ -32,10 +33,12 @@ def act_on(
         do(scope, cell, node)
         return f"Node {node} of {cell.name}: {action} begun"
     observer = partial(tell_stage, on_stage)
-    note_stop([cell], by)
     if action == "stop":
+        note_stop([cell], by)
         (outcome,) = stop_cells(manager, scope, [cell], observer)
-    else:
+        return told(outcome)
+    with uninhibited(scope, [cell], "restart"):
+        note_stop([cell], by)
         (outcome,) = restart_cells(manager, [cell], observer)
     return told(outcome)
 

@@ -22,6 +22,7 @@ from dora_systemd.verbs.facts.budget import restart_budget
 from dora_systemd.verbs.facts.cells import Cell, read_cell, read_cells
 from dora_systemd.verbs.facts.ended import not_recorded
 from dora_systemd.verbs.facts.list import mark_enabled
+from dora_systemd.verbs.facts.locks import read_holders
 from dora_systemd.verbs.facts.reading import look_at_table, read_status
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.facts.whole import read_whole_rows
@@ -46,7 +47,9 @@ def explain(manager: Manager, scope: Scope, selector: str, journal: JournalReade
     budget = None
     if cell and not verdict.is_given_up:
         budget = restart_budget(manager, scope, cell, read_status(scope, cell))
-    return Report(subject, verdict, _last_words(journal, scope, subject, verdict), budget)
+    words = _last_words(journal, scope, subject, verdict)
+    inhibitors = read_holders(scope, [cell.name]).get(cell.name, ()) if cell else ()
+    return Report(subject, verdict, words, budget, inhibitors)
 
 
 def _select(manager: Manager, scope: Scope, selector: str) -> tuple[Cell | None, Subject]:

@@ -18,8 +18,13 @@ from dora_systemd.verbs.start.linger import ensure_linger
 
 @click.command("enable")
 @click.argument("selectors", nargs=-1, required=True, metavar="SELECTOR...")
+@click.option(
+    "--boot-check",
+    is_flag=True,
+    help="A boot is good only if they come up (boot-complete.target).",
+)
 @acting_options
-def command(selectors: tuple[str, ...]) -> int:
+def command(selectors: tuple[str, ...], boot_check: bool) -> int:
     """Start dataflows at every boot, as they run now.
 
     UUID and settings stay, and running dataflows keep running. The unit becomes a file that
@@ -28,11 +33,14 @@ def command(selectors: tuple[str, ...]) -> int:
     Examples:
       doractl enable robot
       doractl enable robot vision
+      doractl enable robot --boot-check
     """
     scope = current_scope()
     bus = Bus(scope)
     chosen = find_all(bus, scope, selectors)
-    status = print_outcomes(_enabled(cell, *enable_cell(bus, scope, cell)) for cell in chosen)
+    status = print_outcomes(
+        _enabled(cell, *enable_cell(bus, scope, cell, boot_check)) for cell in chosen
+    )
     print_warnings([ensure_linger(scope)])
     return status
 

@@ -3,28 +3,34 @@
 import click
 
 from dora_systemd.adapters.bus.systemd import Bus
+from dora_systemd.cli.inhibit_options import if_inhibited, inhibit_options, tell_waiting
 from dora_systemd.cli.parameters import acting_options, current_scope, print_outcomes
 from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.verbs.facts.selector import Selector
+from dora_systemd.verbs.inhibit.guard import require_uninhibited
 from dora_systemd.verbs.reload import reload_cell
 
 
 @click.command("reload")
 @click.argument("selector")
 @click.option("--node", metavar="NODE", help="Reload this node, whether it has changed or not.")
+@inhibit_options
 @acting_options
-def command(selector: str, node: str | None) -> int:
+def command(selector: str, node: str | None, force: bool, wait: bool) -> int:
     """Apply files that have changed since a running dataflow read them.
 
     Like hot reload when a file is saved: only the affected nodes restart, and a change that cannot
-    be used has no effect. See HOT RELOAD in dora-systemd(7).
+    be used has no effect. Refused while doractl inhibit or a node inhibits it. See HOT RELOAD in
+    dora-systemd(7).
 
     Examples:
       doractl reload robot
       doractl reload robot --node detector
     """
+    how = if_inhibited(force, wait)
     scope = current_scope()
     cell = Selector(selector).find(Bus(scope))
+    require_uninhibited(scope, [cell], "reload", how, tell_waiting)
     done = [f"{line[:1].upper()}{line[1:]}" for line in reload_cell(scope, cell, node)]
     text = "\n".join(done) or "Nothing has changed"
     outcome = Outcome(cell, text, is_news=bool(done), node=node or "", details={"changes": done})

@@ -8,30 +8,34 @@ import click
 
 from dora_systemd.adapters.bus.manager import tell_stage
 from dora_systemd.adapters.bus.systemd import Bus
+from dora_systemd.cli.inhibit_options import if_inhibited, inhibit_options, tell_waiting
 from dora_systemd.cli.parameters import acting_options, current_scope, print_outcomes
 from dora_systemd.cli.stageline import StageLine
+from dora_systemd.verbs.inhibit.guard import uninhibited
 from dora_systemd.verbs.start.again import find_known
 from dora_systemd.verbs.stop import note_stop, restart_cells
 
 
 @click.command("restart")
 @click.argument("selectors", nargs=-1, required=True, metavar="SELECTOR...")
+@inhibit_options
 @acting_options
-def command(selectors: tuple[str, ...]) -> int:
+def command(selectors: tuple[str, ...], force: bool, wait: bool) -> int:
     """Restart dataflows and wait until all their nodes are ready again.
 
     Name, UUID and settings stay; the dataflow file is read again. A dataflow that has failed or
-    ended is started again.
+    ended is started again. Refused while doractl inhibit or a node inhibits it.
 
     Examples:
       doractl restart robot
       doractl restart robot vision
     """
+    how = if_inhibited(force, wait)
     scope = current_scope()
     bus = Bus(scope)
     cells, ended = find_known(bus, scope, selectors)
-    note_stop(cells, "doractl restart")
-    with StageLine(sys.stderr) as stage:
+    with uninhibited(scope, cells, "restart", how, tell_waiting), StageLine(sys.stderr) as stage:
+        note_stop(cells, "doractl restart")
         outcomes = restart_cells(bus, cells, partial(tell_stage, stage)) if cells else []
         if ended:
             from dora_systemd.verbs.restart import restart_asked

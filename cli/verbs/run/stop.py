@@ -18,10 +18,12 @@ from dora_systemd.cli.parameters import (
 )
 from dora_systemd.cli.stageline import StageLine
 from dora_systemd.decisions.life.stop_budget import kill_delay
+from dora_systemd.decisions.views.inhibitors import format_holders
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.values import INFINITY
 from dora_systemd.verbs.facts.cells import Cell, read_cells
+from dora_systemd.verbs.facts.locks import read_holders
 from dora_systemd.verbs.facts.selector import Selector, selectors_of
 from dora_systemd.verbs.stop import not_running, note_stop, stop_cells, stop_cells_within
 
@@ -42,7 +44,8 @@ def command(
     """Stop dataflows and wait until they have ended.
 
     Nodes are told to stop; those still running after the grace duration of the dataflow are
-    killed. Several dataflows stop at the same time. Without SELECTOR, a terminal is asked which
+    killed. Several dataflows stop at the same time. On a terminal it asks before it stops one that
+    doractl inhibit or a node inhibits. Without SELECTOR, a terminal is asked which
     one; the only one that runs is stopped.
 
     Examples:
@@ -97,7 +100,18 @@ def _asked(cells: Sequence[Cell]) -> Cell:
     return by_text.get(text) or Selector(text).loaded(cells)
 
 
+def _ask_inhibited(scope: Scope, cells: Sequence[Cell]) -> None:
+    """Ask on the terminal before a dataflow stops whose restart is inhibited."""
+    for name, holders in read_holders(scope, [cell.name for cell in cells if cell.is_up]).items():
+        click.echo(f"{name} is inhibited by {format_holders(holders)}", err=True)
+        if not click.confirm(f"Stop {name} anyway?", err=True):
+            hint = "--force kills it at once, without a question"
+            raise DoraSystemdError(f"{name} was not stopped", hint, ExitCode.INHIBITED)
+
+
 def _stop(bus: Bus, scope: Scope, cells: list[Cell], most: int) -> int:
+    if most > 0 and sys.stdin.isatty():
+        _ask_inhibited(scope, cells)
     note_stop(cells)
     if most != INFINITY:
         return print_outcomes(stop_cells_within(bus, scope, cells, most))

@@ -2,12 +2,13 @@
 
 import re
 from collections.abc import Callable, Mapping
-from pathlib import PurePath
+from pathlib import Path, PurePath
 
 from dora_systemd.decisions.cell.hot_reload import CHANGE_VARIABLE
 from dora_systemd.decisions.cell.limits import CHANGES_VARIABLE, merge_node_limits, parse_changes
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.paths import CellPaths
 from dora_systemd.values import format_bool, parse_bool, quoted, shown
 
 MAX_ENTRY = 128 * 1024 - 1
@@ -16,12 +17,15 @@ MAX_ENTRY = 128 * 1024 - 1
 
 _KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _CONTROL = re.compile(r"[\x00-\x08\x0a-\x1f\x7f]")
+LOCK_VARIABLE = "DORA_INHIBIT_LOCK"
+"""In the environment of the nodes: the path of the file that they lock to inhibit restarts."""
 MANAGER_VARIABLES = frozenset(
     {
         *("NOTIFY_SOCKET", "JOURNAL_STREAM", "INVOCATION_ID", "SYSTEMD_EXEC_PID", "MAINPID"),
         *("MANAGERPID", "MANAGERPIDFDID", "WATCHDOG_PID", "WATCHDOG_USEC", "RUNTIME_DIRECTORY"),
         *("LISTEN_FDS", "LISTEN_FDNAMES", "LISTEN_PID", "LISTEN_PIDFDID", "FDSTORE"),
         *("MEMORY_PRESSURE_WATCH", "MEMORY_PRESSURE_WRITE", CHANGES_VARIABLE, CHANGE_VARIABLE),
+        LOCK_VARIABLE,
     }
 )
 """Variables that systemd sets for the runner only, see systemd.exec(5). A node that uses sd_notify
@@ -36,8 +40,10 @@ _QUOTED = re.compile(r"""'(?P<single>[^']*)'|"(?P<double>(?:[^"\\]|\\.)*)"|\\(?P
 
 
 def node_environment(environment: Mapping[str, str]) -> dict[str, str]:
-    """The runner's environment without the variables that systemd sets."""
-    return {key: text for key, text in environment.items() if key not in MANAGER_VARIABLES}
+    """The runner's environment without the variables that systemd sets, with the lock file."""
+    kept = {key: text for key, text in environment.items() if key not in MANAGER_VARIABLES}
+    directory = environment.get("RUNTIME_DIRECTORY")
+    return {**kept, LOCK_VARIABLE: str(CellPaths(Path(directory)).lock)} if directory else kept
 
 
 def with_changes(options: RunnerOptions, environment: Mapping[str, str]) -> RunnerOptions:

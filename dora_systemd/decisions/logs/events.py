@@ -35,6 +35,9 @@ EVENTS = {
     "stop-asked": EventKind(
         "958c39b63a3d47cd9dd585937d57d927", INFO, "Stop of dataflow {dataflow} requested by {by}"
     ),
+    "inhibited": EventKind(
+        "6e439f1e51f147df87eb35cdd8e61cb1", INFO, "Dataflow {dataflow} inhibited by {by}"
+    ),
     "dataflow-finished": _dataflow("61a9895e49214871ae2381a42f2a1968", NOTICE, "finished"),
     "dataflow-stopped": _dataflow("5e9f54e3c8fa448fab7d9114ae8f8e87", NOTICE, "was stopped"),
     "dataflow-failed": _dataflow("99f4f6038d0146de8190e12fc9726881", ERR, "failed"),

@@ -22,6 +22,9 @@ from dora_systemd.errors import DoraSystemdError
 BOOT_TARGET = "dora.target"
 """Starts the enabled dataflows at boot, if it is installed; no other unit waits for it."""
 
+BOOT_CHECK = "boot-complete.target"
+"""Reached when a boot is good, see systemd-bless-boot.service(8)."""
+
 HEADER = "# Written by doractl(1). To change something: systemctl edit, see dora-systemd(7).\n"
 
 _SECTION = re.compile(r"\[([^\]]+)\]")
@@ -29,7 +32,8 @@ _BLANKS = " \t\r"
 _COMMENT = re.compile(rf"^[{_BLANKS}]*[#;].*\n?", re.MULTILINE)
 _CONTINUED = re.compile(rf"\\[{_BLANKS}]*(?:\n[{_BLANKS}]*|\Z)")
 _SPECIFIER = re.compile(r"%[a-zA-Z]")
-_ORDERS = ("After=default.target", "After=multi-user.target")
+_BOOT_CHECK_ORDER = f"Before={BOOT_CHECK}"
+_ORDERS = ("After=default.target", "After=multi-user.target", _BOOT_CHECK_ORDER)
 _MOUNTABLE = re.compile(r"[^\x00-\x1f\x7f\"'\\]+")
 _TRANSIENT = "# This is a transient unit file"
 # A bind mount as systemd 257 writes it into such a file. systemd quotes nothing there, and would
@@ -49,24 +53,38 @@ def plain_target(is_user: bool) -> str:
 
 
 def persistent_unit(
-    texts: Sequence[str], options: RunnerOptions, is_user: bool, target: str
+    texts: Sequence[str],
+    options: RunnerOptions,
+    is_user: bool,
+    target: str,
+    is_checked: bool = False,
 ) -> str:
     """One unit file equivalent to `texts` (a fragment and its drop-ins), wanted by `target`.
 
-    A plain target does not wait for the dataflow: the dataflow starts after it.
+    A plain target does not wait for the dataflow: the dataflow starts after it. is_checked: a boot
+    is good only if the dataflow comes up.
     """
     sections = _sections(texts)
     unit = sections.setdefault("Unit", [])
     boot = [] if target == BOOT_TARGET else [f"After={target}"]
     boot += [] if is_user else _mounts(options)
+    boot += [_BOOT_CHECK_ORDER] if is_checked else []
     unit += [line for line in boot if line not in unit]
     sections["Install"] = [f"WantedBy={target}"]
+    sections["Install"] += [f"RequiredBy={BOOT_CHECK}"] if is_checked else []
     return HEADER + format_sections(sections)
 
 
 def without_install(text: str) -> str:
-    """The unit file without its [Install] section."""
-    return HEADER + format_sections(_sections([text]))
+    """The unit file without its [Install] section, and without what a boot check adds."""
+    sections = _sections([text])
+    sections["Unit"] = [line for line in sections["Unit"] if line != _BOOT_CHECK_ORDER]
+    return HEADER + format_sections(sections)
+
+
+def is_boot_checked(text: str) -> bool:
+    """Whether a boot is good only if the dataflow of this unit file comes up."""
+    return f"RequiredBy={BOOT_CHECK}" in _logical_lines(text)
 
 
 def runner_of(text: str) -> RunnerOptions | None:

@@ -53,11 +53,25 @@ class NodeRow(NamedTuple):
     since: int = 0
 
 
+class Holder(NamedTuple):
+    """A process that inhibits restarts of a dataflow. pid: 0 if it is not known.
+
+    node: of the dataflow to which the process belongs, or "". why: the reason that the process has
+    written, or "".
+    """
+
+    pid: int
+    user: str = ""
+    command: str = ""
+    node: str = ""
+    why: str = ""
+
+
 class DataflowRow(NamedTuple):
     """One row of `list`. uptime in µs; started, ended in CLOCK_REALTIME µs, 0: unknown.
 
     Other fields are as in NodeRow, for the whole dataflow. enabled: whether it is started at boot.
-    problem: why its node table is not valid, or "".
+    problem: why its node table is not valid, or "". inhibitors: who inhibits its restart.
     """
 
     uuid: str
@@ -82,6 +96,7 @@ class DataflowRow(NamedTuple):
     nodes: tuple[NodeRow, ...] = ()
     enabled: bool = False
     problem: str = ""
+    inhibitors: tuple[Holder, ...] = ()
 
 
 def status_word(active: str, sub: str, stage: str = "") -> str:

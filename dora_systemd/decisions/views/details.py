@@ -19,6 +19,7 @@ from dora_systemd.decisions.views.dataflows import (
     format_uptime,
     zoned_time,
 )
+from dora_systemd.decisions.views.inhibitors import format_holders
 from dora_systemd.terminal_text import cut, one_line
 
 
@@ -75,6 +76,7 @@ def format_dataflow(row: DataflowRow, width: int | None = None, want_colors: boo
         ("Memory", _memory_words(row)),
         ("Restarts", format_count(row.restarts)),
         ("Budget", budget_words(row.restart_budget) if row.restart_budget else ""),
+        ("Inhibit", format_holders(row.inhibitors) if row.inhibitors else ""),
         ("At boot", "started" if row.enabled else ""),
         ("Reason", f"doractl why {row.name}" if row.status in _WITH_REASON else ""),
     )

@@ -10,6 +10,7 @@ from typing import Any
 
 from dora_systemd.decisions.cell.status import WHOLE_CELL
 from dora_systemd.decisions.views.dataflows import DataflowRow, NodeRow
+from dora_systemd.decisions.views.inhibitors import holder_object
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.values import format_moment
 
@@ -53,6 +54,7 @@ def dataflow_object(row: DataflowRow, waits: Mapping[str, Shares] | None = None)
         "text": row.text or None,
         "problem": row.problem or None,
         "enabled": row.enabled,
+        "inhibitors": list(map(holder_object, row.inhibitors)),
         "uptime_us": row.uptime,
         **moment("started", row.started),
         **moment("ended", row.ended),

@@ -12,10 +12,12 @@ from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.views.dataflows import (
     RESTARTING,
     UNKNOWN,
+    Holder,
     colored_state,
     local_time,
     zoned_time,
 )
+from dora_systemd.decisions.views.inhibitors import format_holders
 from dora_systemd.decisions.why.last_lines import Word, shown_last
 from dora_systemd.decisions.why.signs import known_remedy
 from dora_systemd.decisions.why.verdict import Restart, Verdict
@@ -85,12 +87,16 @@ class Subject:
 
 @dataclass(frozen=True)
 class Report:
-    """The output of `doractl why`. words: the last lines, of verdict.node or of all nodes."""
+    """The output of `doractl why`. words: the last lines, of verdict.node or of all nodes.
+
+    inhibitors: who inhibits a restart now.
+    """
 
     subject: Subject
     verdict: Verdict
     words: tuple[Word, ...] = ()
     budget: Mapping[str, int | None] | None = None
+    inhibitors: tuple[Holder, ...] = ()
 
 
 def remedies(report: Report) -> list[str]:
@@ -180,6 +186,7 @@ def _facts(report: Report) -> list[str]:
         "Starved": ", ".join(verdict.starved),
         "Restarts": _restart_words(verdict.restarts),
         "Budget": _budget_words(report),
+        "Inhibit": format_holders(report.inhibitors) if report.inhibitors else "",
         "Before": f"{verdict.before} ({zoned_time(verdict.before_us)})" if verdict.before else "",
         "Unit": f"{subject.unit} ({subject.uuid})",
         "File": subject.file,

@@ -16,6 +16,7 @@ from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.nodes import written_dataflow
 from dora_systemd.verbs.facts.reading import read_status
 from dora_systemd.verbs.facts.selector import Selector
+from dora_systemd.verbs.inhibit.guard import require_uninhibited
 from dora_systemd.verbs.node import ask_coordinator
 from dora_systemd.verbs.reload import reload_cell, switch_hot_reload
 from dora_systemd.verbs.restart import restart_asked
@@ -60,6 +61,7 @@ def _disable(manager: Manager, scope: Scope, cell: Cell, _message: PageMessage) 
 
 
 def _reload(_manager: Manager, scope: Scope, cell: Cell, message: PageMessage) -> str:
+    require_uninhibited(scope, [cell], "reload")
     return _joined(*reload_cell(scope, cell, message.node or None)) or "Nothing has changed"
 
 

@@ -20,6 +20,9 @@ const limitWords = (facts) => [
   ...(facts.node_limit ?? []),
 ].join(", ") || "none";
 
+const inhibitorWords = ({ node, pid, user, why }) =>
+  `${node ? `node ${node}` : `PID ${pid ?? "unknown"}, user ${user ?? "unknown"}`}${why ? `: ${why}` : ""}`;
+
 const sandboxWords = ({ sandbox, network }) =>
   (network === "host" ? sandbox : `${sandbox}, network ${network}`);
 
@@ -154,6 +157,7 @@ export class Detail {
     facts.show("Hot reload", isKnown ? (known.hot_reload ? "on" : "off") : "");
     facts.show("Sandbox", isKnown ? sandboxWords(known) : "");
     facts.show("At boot", isKnown && row ? (row.enabled ? "started" : "not started") : "");
+    facts.show("Inhibited", (row?.inhibitors ?? []).map(inhibitorWords).join("; "));
     facts.show("Unit", flow.unit);
     facts.show("UUID", flow.uuid);
     facts.show("File", flow.file);

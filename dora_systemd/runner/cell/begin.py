@@ -44,6 +44,16 @@ def enter_supervisor() -> Path:
     return own
 
 
+def make_lock(path: Path) -> None:
+    """Create the file that inhibits restarts while it is locked.
+
+    Always a new one: a node that starts must not wait for a restart that still holds the old one.
+    Raises OSError.
+    """
+    path.unlink(missing_ok=True)
+    os.close(os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600))
+
+
 def start_coordinator(dora: str, paths: CellPaths, environment: Mapping[str, str]) -> engine.Child:
     """Start a coordinator, which prints its port. environment: of the nodes. Raises OSError."""
     paths.coordinator.mkdir(mode=0o700, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Adds to rows what the table of `list` does without: the restarts left, and the boot."""
+"""Adds to rows what the table of `list` does without: the restarts left, locks, and the boot."""
 
 from collections.abc import Iterable, Sequence
 
@@ -8,6 +8,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.budget import restart_budget
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.list import mark_enabled, row_of
+from dora_systemd.verbs.facts.locks import mark_inhibited
 from dora_systemd.verbs.facts.reading import Reading, read_dataflow
 
 
@@ -25,4 +26,4 @@ def whole_rows(
         row._replace(restart_budget=restart_budget(manager, scope, one.cell, one.status))
         for one, row in zip(readings, rows, strict=True)
     ]
-    return mark_enabled(manager, scope, found) if found else []
+    return mark_inhibited(scope, mark_enabled(manager, scope, found)) if found else []

@@ -75,7 +75,9 @@ def place_unit_file(
     """
     scope = plan.scope
     target = boot_target(manager, scope)
-    text = persistent_unit([format_unit(properties)], plan.options, scope.is_user, target)
+    text = persistent_unit(
+        [format_unit(properties)], plan.options, scope.is_user, target, boot.is_checked
+    )
     if want_boot:
         install_unit_file(manager, boot, text)
         remove_changes(boot.path)

@@ -6,8 +6,10 @@ loaded: systemd would delete the file in /etc instead when it unloads the unit.
 """
 
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.host.unit_files import (
@@ -22,6 +24,7 @@ from dora_systemd.adapters.host.unit_files import (
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.unit.file import (
     BOOT_TARGET,
+    is_boot_checked,
     persistent_unit,
     plain_target,
     runner_of,
@@ -57,6 +60,11 @@ class BootUnit:
         """Whether the dataflow is started at boot."""
         return self.is_wanted and self.text is not None
 
+    @property
+    def is_checked(self) -> bool:
+        """Whether a boot is good only if the dataflow comes up."""
+        return self.is_enabled and is_boot_checked(self.text or "")
+
 
 def read_boot_unit(manager: Manager, scope: Scope, unit: str) -> BootUnit:
     """The files of `unit`. Raises DoraSystemdError (NAME_IN_USE) for foreign files."""
@@ -76,23 +84,26 @@ def boot_target(manager: Manager, scope: Scope) -> str:
     return BOOT_TARGET if is_there else plain_target(scope.is_user)
 
 
-def enable_cell(manager: Manager, scope: Scope, cell: Cell) -> tuple[BootUnit, bool]:
+def enable_cell(
+    manager: Manager, scope: Scope, cell: Cell, is_checked: bool = False
+) -> tuple[BootUnit, bool]:
     """Start this dataflow at every boot; its unit file, and whether that is a change.
 
-    Raises DoraSystemdError; then nothing has changed.
+    is_checked: from now on a boot is good only if the dataflow comes up; False leaves that as it
+    is. Raises DoraSystemdError; then nothing has changed.
     """
     refuse_attached(cell)
+    if is_checked and scope.is_user:
+        message = "cannot check the boot with a dataflow of a user"
+        raise DoraSystemdError(message, "use --system", ExitCode.USAGE)
     boot = read_boot_unit(manager, scope, cell.unit)
-    if boot.is_enabled:
+    if boot.is_enabled and (boot.is_checked or not is_checked):
         return boot, False
     facts = manager.read(cell.unit, ["FragmentPath", "DropInPaths", "Transient"])
-    fragment = Path(facts["FragmentPath"])
-    if facts["Transient"] or fragment == boot.runtime:
-        # Changes by doractl set are in drop-ins that a reboot removes: include them.
-        drop_ins = [one for one in map(Path, facts["DropInPaths"]) if one.is_relative_to("/run")]
-        texts = [read_unit_file(path) or "" for path in (fragment, *drop_ins)]
+    texts = _present_texts(boot, facts, is_checked)
+    if texts:
         target = boot_target(manager, scope)
-        text = persistent_unit(texts, cell.options, scope.is_user, target)
+        text = persistent_unit(texts, cell.options, scope.is_user, target, is_checked)
         install_unit_file(manager, boot, text)
     else:
         _link(manager, cell.unit, cell.unit)
@@ -100,6 +111,24 @@ def enable_cell(manager: Manager, scope: Scope, cell: Cell) -> tuple[BootUnit, b
         remove_unit_file(boot.runtime)
         manager.reload()
     return boot, True
+
+
+def _present_texts(boot: BootUnit, facts: Mapping[str, Any], is_checked: bool) -> list[str]:
+    """The unit as it is, from which its unit file is made; [] to use the file that exists.
+
+    facts: FragmentPath, DropInPaths and Transient. Raises DoraSystemdError (NAME_IN_USE) for a
+    foreign file that would have to be changed.
+    """
+    fragment = Path(facts["FragmentPath"])
+    if not boot.is_enabled and (facts["Transient"] or fragment == boot.runtime):
+        # Changes by doractl set are in drop-ins that a reboot removes: include them.
+        drop_ins = [one for one in map(Path, facts["DropInPaths"]) if one.is_relative_to("/run")]
+        return [read_unit_file(path) or "" for path in (fragment, *drop_ins)]
+    if not is_checked:
+        return []
+    if boot.text is None:
+        raise foreign_file(fragment)
+    return [boot.text]
 
 
 def refuse_attached(cell: Cell) -> None:

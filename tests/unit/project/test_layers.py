@@ -261,6 +261,7 @@ STARTS_PROGRAMS = {
     "adapters.dora.engine": "dora's, in a cell",
     "adapters.journal.journalctl": "journalctl",
     "verbs.node": "dora, as the caller",
+    "verbs.inhibit.hold": "what the caller has typed, as the caller",
     "cli.verbs.look.logs": "the caller's own pager",
     "adapters.runner_socket.relay": "itself, as the user of the dataflow",
     "trust.terminals": "another user's program, on a terminal of its own",

@@ -43,20 +43,21 @@ OTHERWISE = (
 
 _TABLE = {
     DOOR: """
-        trust.eyes trust.paths trust.programs trust.sight trust.sockets trust.terminals
+        trust.eyes trust.locks trust.paths trust.programs trust.sight trust.sockets trust.terminals
     """,
     OWN: """
         adapters.dora.preparation adapters.host.files cli.main cli.verbs.look.logs
-        decisions.cell.launch verbs.start.credentials verbs.start.limits
+        decisions.cell.launch verbs.inhibit.hold verbs.start.credentials verbs.start.limits
     """,
     KERNEL: """
-        adapters.cgroup.groups adapters.host.machine adapters.host.process_table runner.cell.pause
-        trust.socket_table verbs.destroy verbs.facts.reading verbs.start.sandbox verbs.why
+        adapters.cgroup.groups adapters.host.lock_table adapters.host.machine
+        adapters.host.process_table runner.cell.pause trust.socket_table verbs.destroy
+        verbs.facts.reading verbs.start.sandbox verbs.why
     """,
     ROOTS: """
         adapters.bus.connection adapters.bus.errors adapters.host.unit_files
         adapters.journal.journalctl adapters.journal.reader adapters.journal.socket verbs.doctor
-        verbs.facts.enabled verbs.follow verbs.gateway verbs.setup verbs.show
+        verbs.facts.enabled verbs.facts.locks verbs.follow verbs.gateway verbs.setup verbs.show
         verbs.start.enable verbs.up
     """,
     INSTALLED: """

@@ -10,7 +10,7 @@ from dora_systemd.decisions.views.outcome import Outcome, Thing, outcome_object
 from dora_systemd.values import SECOND
 
 UNKNOWN = DataflowRow("u", "robot", "dora-robot.service", "Failed", nodes=(NodeRow("a", "failed"),))
-KNOWN_OF_IT = {"name", "uuid", "unit", "status", "enabled", "nodes"}
+KNOWN_OF_IT = {"name", "uuid", "unit", "status", "enabled", "nodes", "inhibitors"}
 
 
 def test_what_is_unknown_is_null() -> None:

@@ -6,6 +6,7 @@ import pytest
 
 from dora_systemd.adapters.host.process import Completed
 from dora_systemd.decisions.settings.resolve import resolve_settings
+from dora_systemd.decisions.unit.file import says_the_same
 from dora_systemd.decisions.unit.properties import UnitContext, format_unit, unit_properties
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
@@ -214,3 +215,41 @@ def test_linger(answers: list[str | int], note: str, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(linger, "run_command", run)
     assert note in ensure_linger(Scope(is_user=True, uid=0))
     assert (note == "") == (ensure_linger(Scope(is_user=False, uid=0)) == note)
+
+
+CHECKED = "[Install]\nWantedBy=multi-user.target\nRequiredBy=boot-complete.target\n"
+
+
+def test_a_boot_check_comes_and_goes(manager: FakeManager, scope: Scope) -> None:
+    cell = started(manager)
+    boot, is_news = enable_cell(manager, scope, cell, is_checked=True)
+    text = path_of(manager).read_text()
+    assert is_news
+    assert "\nBefore=boot-complete.target\n" in text
+    assert text.endswith(CHECKED)
+    assert not enable_cell(manager, scope, cell, is_checked=True)[1]
+    assert not enable_cell(manager, scope, cell)[1], "it stays until it is disabled"
+    assert path_of(manager).read_text() == text
+    manager.units[UNIT] |= {"FragmentPath": str(boot.path), "Transient": False}
+    disable_cell(manager, scope, cell)
+    assert "boot-complete" not in boot.runtime.read_text()
+    assert not path_of(manager).exists()
+
+
+def test_what_is_enabled_gets_a_boot_check(manager: FakeManager, scope: Scope) -> None:
+    cell = started(manager)
+    boot, _ = enable_cell(manager, scope, cell)
+    before = boot.path.read_text()
+    _, is_news = enable_cell(manager, scope, cell, is_checked=True)
+    assert is_news
+    assert boot.path.read_text().endswith(CHECKED)
+    assert says_the_same(boot.path.read_text(), before), "a start uses the file as it is"
+
+
+def test_no_boot_check_for_users(manager: FakeManager, tmp_path: Path) -> None:
+    cell = started(manager)
+    user = ScopeIn(is_user=True, uid=1000, root=tmp_path)
+    with pytest.raises(DoraSystemdError, match="cannot check the boot") as caught:
+        enable_cell(manager, user, cell, is_checked=True)
+    assert caught.value.code is ExitCode.USAGE
+    assert not path_of(manager).exists()

@@ -1,0 +1,34 @@
+"""`--force` and `--wait` of the verbs that a lock inhibits."""
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import click
+
+from dora_systemd.cli.parameters import tell
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.verbs.inhibit.guard import IfInhibited
+
+C = TypeVar("C", bound=Callable[..., Any])
+
+
+def inhibit_options(command: C) -> C:
+    """Add the options `force` and `wait`, see if_inhibited()."""
+    force = click.option("--force", is_flag=True, help="Do it even if a lock inhibits it.")
+    wait = click.option("--wait", is_flag=True, help="Wait while a lock inhibits it.")
+    return force(wait(command))
+
+
+def if_inhibited(force: bool, wait: bool) -> IfInhibited:
+    """What the two options ask for. Raises DoraSystemdError (USAGE) for both."""
+    if force and wait:
+        message = "cannot use --force with --wait"
+        raise DoraSystemdError(message, "give one of them", ExitCode.USAGE)
+    if force:
+        return IfInhibited.FORCE
+    return IfInhibited.WAIT if wait else IfInhibited.REFUSE
+
+
+def tell_waiting(text: str) -> None:
+    """Tell a person what is waited for."""
+    tell(f"doractl: {text}", err=True)

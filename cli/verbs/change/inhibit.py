@@ -1,0 +1,81 @@
+"""Inhibit restarts of a dataflow, or list who does."""
+
+import shutil
+import sys
+
+import click
+
+from dora_systemd.adapters.bus.systemd import Bus
+from dora_systemd.cli.colors import wants_colors
+from dora_systemd.cli.edge import write_own
+from dora_systemd.cli.parameters import (
+    acting_options,
+    current_scope,
+    print_json,
+    print_outcomes,
+    tell,
+    wants_json,
+)
+from dora_systemd.decisions.cell.inhibit import parse_reason
+from dora_systemd.decisions.views.inhibitors import (
+    Inhibited,
+    format_inhibited,
+    inhibited_objects,
+)
+from dora_systemd.decisions.views.outcome import Outcome
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.verbs.facts.selector import Selector
+from dora_systemd.verbs.inhibit.hold import hold, take_inhibiting
+from dora_systemd.verbs.inhibit.list import inhibited_dataflows
+
+
+@click.command("inhibit")
+@click.argument("selector", required=False)
+@click.argument("arguments", nargs=-1, type=click.UNPROCESSED, metavar="[-- COMMAND...]")
+@click.option("--why", metavar="TEXT", help="The reason, shown to whoever is refused.")
+@acting_options
+def command(selector: str | None, arguments: tuple[str, ...], why: str | None) -> int:
+    """Inhibit restart and reload of a running dataflow while COMMAND runs.
+
+    Without COMMAND, until it is interrupted with Ctrl+C. The lock ends with this process, however
+    that ends. Without SELECTOR, list all locks, including those of nodes, which lock the file
+    $DORA_INHIBIT_LOCK. The exit status is that of COMMAND.
+
+    Examples:
+      doractl inhibit robot --why 'it is driving'
+      doractl inhibit robot --why 'mission 12' -- ./mission.sh
+      doractl inhibit
+    """
+    if selector is None:
+        return _list(why)
+    if why is None:
+        hint = f"doractl inhibit {selector} --why TEXT; doractl inhibit lists all locks"
+        raise DoraSystemdError("cannot inhibit without a reason", hint, ExitCode.USAGE)
+    reason, scope = parse_reason(why), current_scope()
+    cell = Selector(selector).find(Bus(scope))
+    lock = take_inhibiting(scope, cell, reason)
+    if not arguments:
+        print_outcomes([Outcome(cell, f"Dataflow inhibited: {cell.uuid} ({cell.name})")])
+        sys.stdout.flush()
+        tell("Ctrl+C ends it.", err=True)
+    return hold(lock, arguments)
+
+
+def _list(why: str | None) -> int:
+    if why is not None:
+        hint = "doractl inhibit NAME --why TEXT"
+        raise DoraSystemdError("cannot inhibit: give a dataflow", hint, ExitCode.USAGE)
+    scope = current_scope()
+    found = inhibited_dataflows(Bus(scope, for_reading=True), scope)
+    if wants_json():
+        print_json(inhibited_objects(found))
+    elif found:
+        _print_table(found)
+    else:
+        click.echo("No dataflow is inhibited.")
+    return ExitCode.OK
+
+
+def _print_table(found: list[Inhibited]) -> None:
+    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
+    write_own(sys.stdout, f"{format_inhibited(found, width, wants_colors(sys.stdout))}\n")
