@@ -79,8 +79,9 @@ class Browser:
         return done["result"].get("value")
 
     def wait_js(self, expression: str, seconds: float = 30.0) -> Any:
-        """Its value as soon as that is true."""
-        return wait_for(expression, lambda: self.js(expression), seconds)
+        """Its value as soon as that is true; what it looks at may be missing until then."""
+        script = f"(() => {{try {{return {expression}}} catch {{return null}}}})()"
+        return wait_for(expression, lambda: self.js(script), seconds)
 
     def text(self, selector: str) -> str:
         """What people read in an element, "" where there is none."""
@@ -92,7 +93,8 @@ class Browser:
         self.wait_js(f"{found}?.includes({json.dumps(part)})", seconds)
 
     def click(self, selector: str) -> None:
-        """A click with the mouse in the middle of an element."""
+        """A click with the mouse in the middle of an element, as soon as it is there."""
+        self.wait_js(f"document.querySelector({json.dumps(selector)}) !== null")
         script = (
             f"(() => {{const e = document.querySelector({json.dumps(selector)});"
             "e.scrollIntoView({block: 'center'}); const r = e.getBoundingClientRect();"
