@@ -14,7 +14,7 @@ from dora_systemd.decisions.views.dataflows import (
 )
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope, scope_of
-from dora_systemd.verbs.facts.list import mark_enabled, read_rows
+from dora_systemd.verbs.facts.list import mark_enabled, read_table_rows
 
 _FLAGS: dict[str, dict[str, Any]] = {
     "-a": {"want_all": True},
@@ -117,14 +117,15 @@ def _check(request: ListRequest) -> None:
 
 
 def _rows(bus: Bus, scope: Scope, request: ListRequest) -> list[DataflowRow]:
+    is_plain = not request.want_all and not request.is_filtered
     if request.output == "json":
         from dora_systemd.verbs.list import all_rows
 
         rows = all_rows(bus, scope)
     else:
-        rows = read_rows(bus, scope, with_details=False)
+        rows = read_table_rows(bus, scope, want_down=not is_plain)
     found = [row for row in rows if is_up_word(row)]
-    if not request.want_all and not request.is_filtered:
+    if is_plain:
         return found
     # Only dataflows that have ended need the journal, and few commands select some rows.
     from dora_systemd.decisions.views.selection import is_of_the_past, matching_rows, sorted_rows

@@ -21,7 +21,7 @@ from dora_systemd.decisions.life.stop_budget import kill_delay
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.values import INFINITY
-from dora_systemd.verbs.facts.cells import Cell, read_cells
+from dora_systemd.verbs.facts.cells import Cell, proven, read_cells
 from dora_systemd.verbs.facts.selector import Selector, selectors_of
 from dora_systemd.verbs.stop import not_running, note_stop, stop_cells, stop_cells_within
 
@@ -64,7 +64,7 @@ def command(
     bus = Bus(scope)
     cells = read_cells(bus)
     chosen = _named(scope, cells, texts) if texts else _running(cells, want_all)
-    return _stop(bus, scope, chosen, most)
+    return _stop(bus, scope, proven(chosen), most)
 
 
 def _running(cells: Sequence[Cell], want_all: bool) -> list[Cell]:

@@ -94,22 +94,19 @@ class Selector:
         return DoraSystemdError(f"no dataflow named {quoted(self.text)}", hint, ExitCode.NOT_FOUND)
 
     def loaded(self, cells: Iterable[Cell]) -> Cell:
-        """The one of `cells`, from read_cells()."""
+        """The one of `cells`, from read_cells(), with its options."""
         known = list(cells)
         cell = self.only(known)
-        if cell is None:
+        if cell is None or not cell.has_options:
             raise self.missing(one.name for one in known)
         return cell
 
     def find(self, manager: Manager) -> Cell:
         """One that systemd has loaded, or can load from a unit file."""
         cells = read_cells(manager)
-        cell = self.only(cells)
-        names = filter(is_name, self.names if cell is None else ())
-        cell = cell or next(
-            filter(None, (read_cell(manager, unit_name(one)) for one in names)), None
-        )
-        return self.loaded(cells) if cell is None else cell
+        names = () if self.only(cells) else filter(is_name, self.names)
+        files = filter(None, (read_cell(manager, unit_name(one)) for one in names))
+        return next(files, None) or self.loaded(cells)
 
     def find_enabled(self, manager: Manager, scope: Scope) -> Cell:
         """As find(), also an enabled one that systemd has lost, see lost_units()."""
@@ -146,10 +143,13 @@ def is_pattern(text: str) -> bool:
 def find_all(manager: Manager, scope: Scope, texts: Sequence[str]) -> list[Cell]:
     """The dataflows that `texts` mean, each once; as selectors_of() and find_enabled()."""
     cells = read_cells(manager)
-    found = (
-        one.only(cells) or one.find_enabled(manager, scope) for one in selectors_of(texts, cells)
+    found = ((one, one.only(cells)) for one in selectors_of(texts, cells))
+    return list(
+        dict.fromkeys(
+            cell if cell and cell.has_options else one.find_enabled(manager, scope)
+            for one, cell in found
+        )
     )
-    return list(dict.fromkeys(found))
 
 
 def _expanded(text: str, known: Sequence[Named]) -> list[Selector]:
