@@ -10,7 +10,8 @@ import pytest
 
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.decisions.views.dataflows import DataflowRow
-from dora_systemd.verbs.facts.list import read_table_rows
+from dora_systemd.verbs.facts.cells import read_cells
+from dora_systemd.verbs.facts.list import table_rows
 from tests.system.cells import Cell, Project, is_alive, run, wait_for
 
 
@@ -27,7 +28,7 @@ class CountingBus(Bus):
 def table_of(cell: Cell) -> tuple[int, dict[str, DataflowRow]]:
     """The number of questions that the table takes, and its rows by name."""
     bus = CountingBus(cell.scope, for_reading=True)
-    rows = read_table_rows(bus, cell.scope, want_down=False)
+    rows = table_rows(bus, cell.scope, [one for one in read_cells(bus) if one.is_up])
     return bus.questions, {row.name: row for row in rows}
 
 

@@ -1,10 +1,9 @@
 """Finds the dataflows of one systemd manager. `list` uses it: imports only what loads quickly."""
 
 from collections.abc import Iterable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from dora_systemd.adapters.bus.manager import UP, Manager, UnitState
-from dora_systemd.decisions.cell.options import RunnerOptions, options_from_command
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import (
     UNIT_PREFIX,
@@ -12,6 +11,9 @@ from dora_systemd.names import (
     name_from_unit,
     uuid_from_description,
 )
+
+if TYPE_CHECKING:
+    from dora_systemd.decisions.cell.options import RunnerOptions
 
 _PATTERN = f"{UNIT_PREFIX}*{UNIT_SUFFIX}"
 
@@ -23,7 +25,7 @@ class Cell:
     """
 
     def __init__(
-        self, state: UnitState, uuid: str, manager: Manager, options: RunnerOptions | None = None
+        self, state: UnitState, uuid: str, manager: Manager, options: "RunnerOptions | None" = None
     ) -> None:
         self.state = state
         self.uuid = uuid
@@ -53,7 +55,7 @@ class Cell:
         return self.state.active in UP
 
     @property
-    def options(self) -> RunnerOptions:
+    def options(self) -> "RunnerOptions":
         """The options in ExecStart= of the unit.
 
         Raises DoraSystemdError (NOT_FOUND) if it is not a dataflow of ours (any more).
@@ -120,7 +122,10 @@ def _asked(manager: Manager, state: UnitState) -> Cell | None:
     return Cell(state, options.uuid, manager, options) if options else None
 
 
-def _read_options(manager: Manager, unit: str) -> RunnerOptions | None:
+def _read_options(manager: Manager, unit: str) -> "RunnerOptions | None":
+    # Imported late: the list of what runs has all it needs from systemd's own list.
+    from dora_systemd.decisions.cell.options import options_from_command
+
     commands: Any = manager.read(unit, ["ExecStart"])["ExecStart"]
     try:
         options = options_from_command(commands[0][1])

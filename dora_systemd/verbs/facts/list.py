@@ -67,13 +67,12 @@ def read_rows(manager: Manager, scope: Scope) -> list[DataflowRow]:
     return mark_enabled(manager, scope, rows) if rows else []
 
 
-def read_table_rows(manager: Manager, scope: Scope, want_down: bool) -> list[DataflowRow]:
+def table_rows(manager: Manager, scope: Scope, cells: Sequence[Cell]) -> list[DataflowRow]:
     """The rows of the table, by a number of questions that does not depend on theirs.
 
-    A dataflow that is on its way up or down, has been restarted, or was started by an older version
-    has some questions of its own. want_down: also what is not up, but still loaded.
+    Except for dataflows that are down, on their way up or down, or have been restarted, and for
+    those of an older version: each of them has some questions of its own.
     """
-    cells = [cell for cell in read_cells(manager) if want_down or cell.is_up]
     slice_path = slice_group(manager) if cells else None
     rows = [row_of(read_dataflow(manager, scope, cell, slice_path)) for cell in cells]
     return mark_enabled(manager, scope, rows) if rows else []

@@ -3,7 +3,6 @@
 import os
 import time
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.trust.cells import MAX_TABLE, read_table
 from dora_systemd.verbs import why
 from dora_systemd.verbs.facts.cells import read_cells
-from dora_systemd.verbs.facts.list import dataflow_row, read_rows, read_table_rows
+from dora_systemd.verbs.facts.list import dataflow_row, read_rows, table_rows
 from dora_systemd.verbs.facts.reading import read_dataflow, read_status
 from dora_systemd.verbs.facts.snapshot import read_snapshot
 from dora_systemd.verbs.list import find_row
@@ -30,6 +29,11 @@ from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
 
 GROUP = "/dora.slice/dora-robot.service"
 SECOND = 1_000_000
+
+
+def table_of(manager: FakeManager, scope: Scope) -> list[DataflowRow]:
+    """The rows of the table of `list`."""
+    return table_rows(manager, scope, read_cells(manager))
 
 
 @pytest.fixture
@@ -110,9 +114,8 @@ def test_the_table_asks_for_less_and_says_the_same(
     status = CellStatus(nodes={"camera": NodeStatus("running", 42)}, samples=samples)
     write_status(scope, status)
     (all_of_it,) = read_rows(manager, scope)
-    (line,) = read_table_rows(manager, scope, want_down=True)
+    (line,) = table_of(manager, scope)
     assert (line.memory is None) == (active == "failed")
-    assert len(read_table_rows(manager, scope, want_down=False)) == (active != "failed")
     now: dict[str, Any] = {"uptime": None, "cpu_percent": None, "nodes": (), "dataflow": ""}
     assert line._replace(**now) == all_of_it._replace(**now)
     for mine, other in ((line.uptime, all_of_it.uptime), (line.cpu_percent, all_of_it.cpu_percent)):
@@ -155,7 +158,7 @@ DAMAGE: dict[str, Callable[[Path], object]] = {
 
 @pytest.mark.usefixtures("unit_group")
 @pytest.mark.parametrize("what", DAMAGE)
-@pytest.mark.parametrize("read", [read_rows, partial(read_table_rows, want_down=False)])
+@pytest.mark.parametrize("read", [read_rows, table_of])
 def test_damaged_node_table(
     scope: Scope, what: str, read: Callable[[FakeManager, Scope], list[DataflowRow]]
 ) -> None:
@@ -325,14 +328,13 @@ def manager(unit_group: Path) -> FakeManager:
 def asked(manager: FakeManager, scope: Scope) -> tuple[int, list[DataflowRow]]:
     """How many questions the table takes, and its rows."""
     manager.questions = 0
-    rows = read_table_rows(manager, scope, want_down=False)
+    rows = table_of(manager, scope)
     return manager.questions, rows
 
 
 def test_the_table_of_200_takes_as_many_questions_as_that_of_1(
     manager: FakeManager, scope: Scope
 ) -> None:
-    assert asked(manager, scope)[0] == 1
     add_ready(manager, scope, 0)
     questions, (row,) = asked(manager, scope)
     assert questions == 3
