@@ -77,7 +77,7 @@ def _running(cells: Sequence[Cell], want_all: bool) -> list[Cell]:
 
 def _named(scope: Scope, cells: Sequence[Cell], texts: Sequence[str]) -> list[Cell]:
     """The dataflows to stop; prints those that have ended."""
-    found = {one: one.only(cells) for one in selectors_of(texts, cells)}
+    found = {one: one.proven(cells) for one in selectors_of(texts, cells)}
     for one in [one for one, cell in found.items() if cell is None]:
         row = one.ended(scope)
         if row is None:

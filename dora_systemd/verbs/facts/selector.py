@@ -42,9 +42,9 @@ N = TypeVar("N", bound=Named)
 class Selector:
     """The text that a user has typed: a name, a unit, a UUID, or the beginning of a UUID.
 
-    Only meant() decides what a text means. only(), loaded(), find(), find_enabled() and ended()
-    differ in where they look. They raise DoraSystemdError: USAGE if several dataflows match, and
-    those that return no None, NOT_FOUND if none does.
+    Only meant() decides what a text means. only(), proven(), loaded(), find(), find_enabled() and
+    ended() differ in where they look. They raise DoraSystemdError: USAGE if several dataflows
+    match, and those that return no None, NOT_FOUND if none does.
     """
 
     text: str
@@ -93,11 +93,16 @@ class Selector:
         hint = hint or "nothing is running; ended ones: doractl list --all"
         return DoraSystemdError(f"no dataflow named {quoted(self.text)}", hint, ExitCode.NOT_FOUND)
 
+    def proven(self, cells: Iterable[Cell]) -> Cell | None:
+        """As only(), with its options; None for a unit that only has a Description= like ours."""
+        cell = self.only(cells)
+        return cell if cell and cell.has_options else None
+
     def loaded(self, cells: Iterable[Cell]) -> Cell:
         """The one of `cells`, from read_cells(), with its options."""
         known = list(cells)
-        cell = self.only(known)
-        if cell is None or not cell.has_options:
+        cell = self.proven(known)
+        if cell is None:
             raise self.missing(one.name for one in known)
         return cell
 
@@ -143,13 +148,10 @@ def is_pattern(text: str) -> bool:
 def find_all(manager: Manager, scope: Scope, texts: Sequence[str]) -> list[Cell]:
     """The dataflows that `texts` mean, each once; as selectors_of() and find_enabled()."""
     cells = read_cells(manager)
-    found = ((one, one.only(cells)) for one in selectors_of(texts, cells))
-    return list(
-        dict.fromkeys(
-            cell if cell and cell.has_options else one.find_enabled(manager, scope)
-            for one, cell in found
-        )
+    found = (
+        one.proven(cells) or one.find_enabled(manager, scope) for one in selectors_of(texts, cells)
     )
+    return list(dict.fromkeys(found))
 
 
 def _expanded(text: str, known: Sequence[Named]) -> list[Selector]:
