@@ -309,7 +309,7 @@ def test_a_row_is_found_by_selector(scope: Scope, monkeypatch: pytest.MonkeyPatc
 def add_ready(manager: FakeManager, scope: Scope, number: int, **table: Any) -> None:
     """A dataflow that is up, and the table of its runner."""
     name = f"robot{number}"
-    facts = {"ActiveEnterTimestampMonotonic": now_us() - 9 * SECOND, "NRestarts": 0}
+    facts: dict[str, Any] = {"ActiveEnterTimestampMonotonic": now_us() - 9 * SECOND, "NRestarts": 0}
     manager.add(options(name, UUID[:-3] + f"{number:03}"), **facts)
     (manager.group / f"dora-{name}.service").mkdir(parents=True)  # type: ignore[attr-defined]
     samples = (CpuSample(now_us() - 4 * SECOND, {"": 2 * SECOND}),)
