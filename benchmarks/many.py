@@ -1,4 +1,4 @@
-"""`list`, the start of one more, memory, with up to 200.  `python -m benchmarks.many [N]`"""
+"""`list`, one more start, memory, the gateway, with up to 200.  `python -m benchmarks.many [N]`"""
 
 import sys
 from functools import partial
@@ -7,6 +7,7 @@ from benchmarks.contestants import Contestant, Doractl, DoraRun, SystemdRun, pre
 from benchmarks.cost import private_mb
 from benchmarks.crowd import Crowd, crowd
 from benchmarks.flows import make_home
+from benchmarks.gateway import front, look_figure, scrape_figure
 from benchmarks.rounds import OURS, Figure, alternate, keep, shown
 from benchmarks.start import start_ms
 from benchmarks.startup import listings
@@ -32,8 +33,8 @@ def memory_figure(all_of_them: Crowd, count: int) -> Figure:
 def measure(rounds: int, counts: tuple[int, ...] = COUNTS) -> list[Figure]:
     """All of them at each number."""
     project = make_home()
-    lists, starts, memory = [], [], []
-    with crowd(project) as everyone:
+    lists, starts, memory, scrapes, looks = [], [], [], [], []
+    with crowd(project) as everyone, front() as gateway:
         for count in counts:
             everyone.grow(count)
             commands = listings(everyone.rivals)
@@ -44,7 +45,9 @@ def measure(rounds: int, counts: tuple[int, ...] = COUNTS) -> list[Figure]:
             with prepared((Doractl, SystemdRun, DoraRun), everyone.flow) as contestants:
                 starts.append(start_figure(contestants, count, max(rounds // 2, 1)))
             memory.append(memory_figure(everyone, count))
-    return [*lists, *starts, *memory]
+            scrapes.append(scrape_figure(gateway, count, rounds))
+            looks.append(look_figure(gateway, count, max(rounds // 2, 1)))
+    return [*lists, *starts, *memory, *scrapes, *looks]
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from dora_systemd.decisions.views.dataflows import (
 )
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope, scope_of
-from dora_systemd.verbs.facts.list import mark_enabled, read_rows
+from dora_systemd.verbs.facts.cells import read_cells
 
 _FLAGS: dict[str, dict[str, Any]] = {
     "-a": {"want_all": True},
@@ -117,14 +117,21 @@ def _check(request: ListRequest) -> None:
 
 
 def _rows(bus: Bus, scope: Scope, request: ListRequest) -> list[DataflowRow]:
+    is_plain = not request.want_all and not request.is_filtered
+    cells = [cell for cell in read_cells(bus) if cell.is_up or not is_plain]
+    if is_plain and not cells:
+        return []
+    # Where nothing runs, a script that asks each second waits for none of these.
+    from dora_systemd.verbs.facts.list import mark_enabled, table_rows
+
     if request.output == "json":
         from dora_systemd.verbs.list import all_rows
 
-        rows = all_rows(bus, scope)
+        rows = all_rows(bus, scope, cells)
     else:
-        rows = read_rows(bus, scope, with_details=False)
+        rows = table_rows(bus, scope, cells)
     found = [row for row in rows if is_up_word(row)]
-    if not request.want_all and not request.is_filtered:
+    if is_plain:
         return found
     # Only dataflows that have ended need the journal, and few commands select some rows.
     from dora_systemd.decisions.views.selection import is_of_the_past, matching_rows, sorted_rows

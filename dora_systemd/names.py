@@ -34,6 +34,7 @@ _UNIT_SUFFIXES = (
 )
 _UUID = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}")
 _ZERO_UUID = "00000000-0000-0000-0000-000000000000"
+_UUID_LENGTH = len(_ZERO_UUID)
 MIN_PREFIX = 4
 """Minimum characters of the beginning of a UUID."""
 _HINT = (
@@ -110,6 +111,19 @@ def name_from_unit(unit: str) -> str | None:
     """The dataflow of `unit`, or None if it is not a unit of ours."""
     name = unit.removeprefix(UNIT_PREFIX).removesuffix(UNIT_SUFFIX)
     return name if unit == unit_name(name) and is_name(name) else None
+
+
+def unit_description(name: str, uuid: str) -> str:
+    """Description= of the unit: systemd lists it with the units, so `list` need not ask for it."""
+    return f"dora dataflow {name} ({uuid})"
+
+
+def uuid_from_description(unit: str, description: str) -> str | None:
+    """The UUID in the Description= of a unit of ours; None for any other text."""
+    name = name_from_unit(unit)
+    uuid = description[-_UUID_LENGTH - 1 : -1]
+    is_ours = name is not None and is_uuid(uuid) and description == unit_description(name, uuid)
+    return uuid if is_ours else None
 
 
 def is_node_id(text: str) -> bool:

@@ -47,6 +47,7 @@ from dora_systemd.runner.cell.clock import StopClock
 from dora_systemd.runner.cell.dialogue import Dialogue
 from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.cell.failure import Beside, words
+from dora_systemd.runner.cell.life import Life
 from dora_systemd.runner.cell.pause import forget_restarts, hold_back
 from dora_systemd.runner.cell.pump import Pump, now_us
 from dora_systemd.runner.nodes.losses import LossWatch, losses_of_user
@@ -77,12 +78,13 @@ async def run_cell(
     loop = asyncio.get_running_loop()
     journal, clock = JournalSocket(), StopClock(options.grace)
     # systemd holds the pipes too, so their content survives a kill of this process.
+    this_life = Life(options.uuid, fd_store.is_first_life())
     fd_store.forget_inherited()
     origin = Origin(options.name, options.uuid)
     pipes = LogPipes(loop, journal, origin, fd_store.store, fd_store.forget)
     try:
         pipes.write_event("dataflow-starting")
-        runs = Runs(options, paths, pipes, clock, begun)
+        runs = Runs(options, paths, pipes, clock, begun, this_life)
         return await live(runs, losses_of_user(journal, pipes) if paths.is_of_user else None)
     except DoraSystemdError as error:
         tell_failure(pipes, error, Cause.BAD_DATAFLOW)
@@ -117,7 +119,9 @@ class Runs:
         pipes: LogPipes,
         clock: StopClock,
         begun: Begun | None,
+        this_life: Life,
     ) -> None:
+        self.this_life = this_life
         self.paths, self.pipes, self.clock = paths, pipes, clock
         self.unit = enter_supervisor()
         for path in (paths.work, paths.io):
@@ -186,7 +190,7 @@ async def run_once(runs: Runs, is_again: bool) -> Cell:
             notice=reloader.notice,
             is_attached=options.attached,
         )
-        pump = Pump(cell, options.uuid, runs.paths, runs.nodes, runs.pipes)
+        pump = Pump(cell, runs.this_life, runs.paths, runs.nodes, runs.pipes)
         dialogue = Dialogue(options, pump, dora, runs.nodes, runs.pipes)
         variables = daemon_variables(options, runs.paths, runs.unit, runs.environment)
         pump.connect(dialogue.actions(prepared.descriptor, variables))

@@ -19,7 +19,7 @@ from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import SLICE, name_from_unit
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.facts.cells import Cell, read_cell, read_cells
+from dora_systemd.verbs.facts.cells import Cell, proven, read_cell, read_cells
 from dora_systemd.verbs.facts.reading import slice_group
 from dora_systemd.verbs.stop import (
     KILLED_SECONDS,
@@ -37,7 +37,7 @@ _GATEWAY = (SOCKET_UNIT, SERVICE_UNIT)
 
 def running_cells(manager: Manager) -> list[Cell]:
     """The dataflows to stop."""
-    return [cell for cell in read_cells(manager) if cell.is_up]
+    return proven(cell for cell in read_cells(manager) if cell.is_up)
 
 
 def stop_all(

@@ -1,17 +1,19 @@
 """`doractl list NAME` and JSON: all that is known of dataflows. The table does not load this."""
 
+from collections.abc import Iterable
+
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.decisions.views.dataflows import DataflowRow, is_up_word
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.facts.cells import read_cells
+from dora_systemd.verbs.facts.cells import Cell, proven, read_cells
 from dora_systemd.verbs.facts.list import mark_enabled
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.facts.whole import read_whole_rows
 
 
-def all_rows(manager: Manager, scope: Scope) -> list[DataflowRow]:
-    """All dataflows that systemd has loaded."""
-    return read_whole_rows(manager, scope, read_cells(manager))
+def all_rows(manager: Manager, scope: Scope, cells: Iterable[Cell]) -> list[DataflowRow]:
+    """All that is known of those `cells` that are ours."""
+    return read_whole_rows(manager, scope, proven(cells))
 
 
 def find_row(manager: Manager, scope: Scope, selector: str) -> DataflowRow:

@@ -8,7 +8,7 @@ from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.decisions.resources.usage import Strain, waits
 from dora_systemd.decisions.views.top import Look, TopEntry
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.facts.cells import read_cells
+from dora_systemd.verbs.facts.cells import proven, read_cells
 from dora_systemd.verbs.facts.list import row_of
 from dora_systemd.verbs.facts.reading import Reading, read_dataflow
 from dora_systemd.verbs.facts.selector import Selector
@@ -39,7 +39,7 @@ class Top:
     def look(self) -> Look:
         """A snapshot of what is running; rates are since the last snapshot."""
         cells = [cell for cell in read_cells(self._manager) if cell.is_up]
-        wanted = [cell for cell in cells if not self._units or cell.unit in self._units]
+        wanted = proven(one for one in cells if not self._units or one.unit in self._units)
         readings = [read_dataflow(self._manager, self._scope, cell) for cell in wanted]
         seen = {one.cell.unit: (one, read_strains(one)) for one in readings}
         entries = [_entry(now, self._before.get(unit)) for unit, now in seen.items()]

@@ -10,7 +10,7 @@ from dora_systemd.cli.parameters import (
     require_names_or_all,
     tell,
 )
-from dora_systemd.verbs.facts.cells import read_cells
+from dora_systemd.verbs.facts.cells import proven, read_cells
 from dora_systemd.verbs.facts.selector import selectors_of
 from dora_systemd.verbs.stop import reset_cells
 
@@ -32,7 +32,8 @@ def command(selectors: tuple[str, ...], want_all: bool) -> int:
     require_names_or_all("reset", selectors, want_all)
     bus = Bus(current_scope())
     cells = read_cells(bus)
-    chosen = cells if want_all else [one.loaded(cells) for one in selectors_of(selectors, cells)]
+    named = (one.loaded(cells) for one in selectors_of(selectors, cells))
+    chosen = proven(cells) if want_all else list(named)
     if want_all and not chosen:
         tell("No dataflow.")
     return print_outcomes(reset_cells(bus, list(dict.fromkeys(chosen))))

@@ -22,7 +22,7 @@ from dora_systemd.decisions.views.inhibitors import format_holders
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.values import INFINITY
-from dora_systemd.verbs.facts.cells import Cell, read_cells
+from dora_systemd.verbs.facts.cells import Cell, proven, read_cells
 from dora_systemd.verbs.facts.locks import read_holders
 from dora_systemd.verbs.facts.selector import Selector, selectors_of
 from dora_systemd.verbs.stop import not_running, note_stop, stop_cells, stop_cells_within
@@ -67,7 +67,7 @@ def command(
     bus = Bus(scope)
     cells = read_cells(bus)
     chosen = _named(scope, cells, texts) if texts else _running(cells, want_all)
-    return _stop(bus, scope, chosen, most)
+    return _stop(bus, scope, proven(chosen), most)
 
 
 def _running(cells: Sequence[Cell], want_all: bool) -> list[Cell]:
@@ -80,7 +80,7 @@ def _running(cells: Sequence[Cell], want_all: bool) -> list[Cell]:
 
 def _named(scope: Scope, cells: Sequence[Cell], texts: Sequence[str]) -> list[Cell]:
     """The dataflows to stop; prints those that have ended."""
-    found = {one: one.only(cells) for one in selectors_of(texts, cells)}
+    found = {one: one.proven(cells) for one in selectors_of(texts, cells)}
     for one in [one for one, cell in found.items() if cell is None]:
         row = one.ended(scope)
         if row is None:

@@ -27,6 +27,7 @@ class UnitState(NamedTuple):
     load: str
     active: str
     sub: str
+    description: str = ""
 
 
 class Manager(Protocol):

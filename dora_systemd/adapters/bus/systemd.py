@@ -65,7 +65,7 @@ class Bus:
 
     def list_units(self, pattern: str) -> list[UnitState]:
         rows = self._call("list units", "ListUnitsByPatterns", ("as", []), ("as", [pattern]))
-        return [UnitState(row[0], *row[2:5]) for row in rows or ()]
+        return [UnitState(row[0], row[2], row[3], row[4], row[1]) for row in rows or ()]
 
     def read(self, unit: str, names: Sequence[str]) -> dict[str, Any]:
         return {name: self._read_one(unit, name) for name in names}

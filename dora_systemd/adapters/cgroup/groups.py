@@ -99,26 +99,27 @@ def read_usage(path: Path) -> Usage:
 
     Without a memory controller, memory is the sum of the processes' resident sets.
     """
-    memory = read_number(path / "memory.current")
+    # Texts for paths, here and below: a Path takes longer than the kernel does for a file.
+    memory = read_number(f"{path}/memory.current")
     if memory is None:
         some = islice(_pids(islice(_tree(path), MAX_GROUPS)), MAX_PROCESSES)
         memory = sum(map(_resident_bytes, some))
     return read_cpu(path)._replace(
         memory=memory,
-        memory_peak=read_number(path / "memory.peak"),
-        memory_max=read_number(path / "memory.max"),
-        cpu_max=_read_share(path / "cpu.max"),
+        memory_peak=read_number(f"{path}/memory.peak"),
+        memory_max=read_number(f"{path}/memory.max"),
+        cpu_max=_read_share(f"{path}/cpu.max"),
     )
 
 
 def read_cpu(path: Path) -> Usage:
     """CPU time and throttling of a group; exists even without a cpu controller."""
-    numbers = read_numbers(path / "cpu.stat")
+    numbers = read_numbers(f"{path}/cpu.stat")
     throttling = numbers.get("nr_periods", 0), numbers.get("nr_throttled", 0)
     return Usage(numbers.get("usage_usec", 0), throttling=throttling)
 
 
-def read_numbers(path: Path) -> dict[str, int]:
+def read_numbers(path: str | Path) -> dict[str, int]:
     """The numbers of a control file with lines KEY NUMBER; {} if it does not exist."""
     pairs = (line.partition(" ") for line in read_text(path).splitlines())
     return {key: int(value) for key, _, value in pairs}
@@ -129,13 +130,13 @@ def pids(path: Path) -> list[int]:
     return list(_pids(_tree(path)))
 
 
-def _pids(groups: Iterable[Path]) -> Iterator[int]:
-    return (int(pid) for one in groups for pid in read_text(one / "cgroup.procs").split())
+def _pids(groups: Iterable[str]) -> Iterator[int]:
+    return (int(pid) for one in groups for pid in read_text(f"{one}/cgroup.procs").split())
 
 
 def is_populated(path: Path) -> bool:
     """Whether the group or one below it has a process."""
-    return "populated 1" in read_text(path / "cgroup.events").splitlines()
+    return "populated 1" in read_text(f"{path}/cgroup.events").splitlines()
 
 
 def make_group(path: Path) -> None:
@@ -223,13 +224,13 @@ def freeze_group(path: Path, is_frozen: bool) -> bool:
     return False
 
 
-def _tree(path: Path) -> Iterator[Path]:
+def _tree(path: Path) -> Iterator[str]:
     """The group and all groups below it; not recursive, as users can nest them deeply."""
-    left = deque([path])
+    left = deque([str(path)])
     while left:
         yield (group := left.popleft())
         with contextlib.suppress(OSError), os.scandir(group) as entries:
-            left.extend(Path(one.path) for one in entries if one.is_dir(follow_symlinks=False))
+            left.extend(one.path for one in entries if one.is_dir(follow_symlinks=False))
 
 
 def _write(path: Path, text: str) -> bool:
@@ -249,7 +250,7 @@ def _put(path: Path, text: str) -> None:
         control.write(text.encode())
 
 
-def read_text(path: Path) -> str:
+def read_text(path: str | Path) -> str:
     """The text of a control file; "" if the file or the group does not exist."""
     # A group can disappear at any moment, which counts as empty. FileIO: there are many of these
     # files, and Python's text layer takes longer than the kernel.
@@ -258,7 +259,7 @@ def read_text(path: Path) -> str:
     return ""
 
 
-def read_number(path: Path) -> int | None:
+def read_number(path: str | Path) -> int | None:
     """The number in a control file, INFINITY for "max", None where there is none."""
     text = read_text(path).strip()
     if not text:
@@ -266,7 +267,7 @@ def read_number(path: Path) -> int | None:
     return INFINITY if text == "max" else int(text)
 
 
-def _read_share(path: Path) -> int | None:
+def _read_share(path: str | Path) -> int | None:
     """The quota of cpu.max as µs per second."""
     quota, _, period = read_text(path).strip().partition(" ")
     if not period:
@@ -276,5 +277,5 @@ def _read_share(path: Path) -> int | None:
 
 def _resident_bytes(pid: int) -> int:
     """The resident set in bytes: the second number of /proc/PID/statm, see proc_pid_statm(5)."""
-    numbers = read_text(Path(f"/proc/{pid}/statm")).split()
+    numbers = read_text(f"/proc/{pid}/statm").split()
     return int(numbers[1]) * os.sysconf("SC_PAGE_SIZE") if len(numbers) > 1 else 0

@@ -50,8 +50,20 @@ def count_life() -> None:
         os.close(fd)
 
 
+def is_first_life() -> bool:
+    """Whether this is the first life since systemd loaded the unit, so that NRestarts= is 0.
+
+    False also if systemd, older than 254, does not tell whether it keeps descriptors: $FDSTORE in
+    systemd.exec(5).
+    """
+    return "FDSTORE" in os.environ and not os.environ.get("LISTEN_FDNAMES")
+
+
 def forget_lives() -> None:
-    """Restart the count."""
+    """Restart the count. A file without a node tells the next life that it is not the first."""
+    fd = os.memfd_create(PREFIX, os.MFD_CLOEXEC)
+    store(fd, "")
+    os.close(fd)
     _forget(LIFE)
 
 

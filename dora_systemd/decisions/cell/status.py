@@ -95,6 +95,8 @@ class CellStatus(NamedTuple):
     run: dora's own id of this run, or "". stage: one of STAGES. text: the unit's STATUS=.
     started_us, ready_us: CLOCK_REALTIME µs, 0 if that has not happened. samples: the last
     SAMPLES_KEPT CPU samples, oldest first. lines: by node; lost ones count for WHOLE_CELL.
+    up_us: CLOCK_MONOTONIC µs of READY=1, 0 before it, and in tables of older versions. is_first:
+    whether NRestarts= of the unit is certainly 0.
     """
 
     uuid: str = ""
@@ -106,6 +108,8 @@ class CellStatus(NamedTuple):
     nodes: Mapping[str, NodeStatus] = {}
     samples: tuple[CpuSample, ...] = ()
     lines: Mapping[str, LineCount] = {}
+    up_us: int = 0
+    is_first: bool = False
 
     @property
     def alive_count(self) -> int:
@@ -209,6 +213,8 @@ def _parse_cell(raw: Any) -> CellStatus:
         nodes=nodes,
         samples=tuple(map(_parse_sample, samples)),
         lines=_by_node(known.get("lines", {}), lambda one: LineCount(*_numbers(one, 3))),
+        up_us=_number(known, "up_us"),
+        is_first=known.get("is_first") is True,
     )
 
 

@@ -33,7 +33,7 @@ from dora_systemd.decisions.settings.resolve import Settings
 from dora_systemd.decisions.settings.table import PROPERTY
 from dora_systemd.decisions.unit.file import format_sections
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.names import SLICE
+from dora_systemd.names import SLICE, unit_description
 from dora_systemd.scope import RUNTIME_NAME
 from dora_systemd.values import INFINITY, SECOND, quoted
 
@@ -110,7 +110,7 @@ def service_properties(options: RunnerOptions, context: UnitContext) -> dict[str
     # The runner reports late nodes itself; systemd's timeout is for a runner that hangs.
     most = min(pause + options.start_timeout + START_MARGIN, INFINITY)
     return typed(
-        Description=f"dora dataflow {options.name}",
+        Description=unit_description(options.name, options.uuid),
         Slice=SLICE,
         Type="notify",
         NotifyAccess="main",

@@ -72,7 +72,7 @@ class Talk:
 def find_by_uuid(scope: Scope, uuid: str) -> Cell:
     """The dataflow with this UUID that systemd has loaded. Raises DoraSystemdError (NOT_FOUND)."""
     for cell in read_cells(Bus(scope, for_reading=True)):
-        if cell.uuid == uuid:
+        if cell.uuid == uuid and cell.has_options:
             return cell
     raise DoraSystemdError(
         f"no dataflow with the UUID {uuid}",

@@ -33,6 +33,7 @@ from dora_systemd.decisions.logs.events import END_EVENTS
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.failure import failed
+from dora_systemd.runner.cell.life import Life
 from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.values import SECOND
 
@@ -53,15 +54,15 @@ def is_deleted(directory: Path) -> bool:
 class Pump:
     """Holds the cell, changes it by events, and publishes its state.
 
-    uuid: of the dataflow. Call connect() before the first push().
+    this_life: the same for all runs of a life. Call connect() before the first push().
     end: resolves to the exit status, even if the action EXIT fails.
     """
 
     def __init__(
-        self, cell: Cell, uuid: str, paths: CellPaths, nodes: Nodes, pipes: LogPipes
+        self, cell: Cell, this_life: Life, paths: CellPaths, nodes: Nodes, pipes: LogPipes
     ) -> None:
         self.cell = cell
-        self._uuid = uuid
+        self._life = this_life
         self._paths = paths
         self._nodes = nodes
         self._pipes = pipes
@@ -185,10 +186,13 @@ class Pump:
         if text != self._text:
             self._text = text
             notify.send_status(text)
+        becomes_ready = self.cell.state is State.RUNNING and not self._is_ready
+        if becomes_ready:
+            self._is_ready = True
+            self._life.become_up()
         # The table comes first: a client that waited for READY=1 may read it at once.
         self._write_table()
-        if self.cell.state is State.RUNNING and not self._is_ready:
-            self._is_ready = True
+        if becomes_ready:
             notify.send_ready()
 
     def sample(self) -> None:
@@ -204,7 +208,9 @@ class Pump:
         self._write_table()
 
     def _write_table(self) -> None:
-        table = cell_status(self.cell, self._uuid, self._samples, self._pipes.line_counts())
+        own, lines = self._life, self._pipes.line_counts()
+        table = cell_status(self.cell, own.uuid, self._samples, lines)
+        table = table._replace(up_us=own.up_us, is_first=own.is_first)
         try:
             files.write_atomic(self._paths.status, table.to_json(), 0o600)
         except DoraSystemdError as error:

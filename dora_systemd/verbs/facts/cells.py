@@ -1,30 +1,48 @@
-"""Finds the dataflows of one systemd manager."""
+"""Finds the dataflows of one systemd manager. `list` uses it: imports only what loads quickly."""
 
-from typing import Any, NamedTuple
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
 
 from dora_systemd.adapters.bus.manager import UP, Manager, UnitState
-from dora_systemd.decisions.cell.options import RunnerOptions, options_from_command
-from dora_systemd.errors import DoraSystemdError
-from dora_systemd.names import UNIT_PREFIX, UNIT_SUFFIX, name_from_unit
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import (
+    UNIT_PREFIX,
+    UNIT_SUFFIX,
+    name_from_unit,
+    uuid_from_description,
+)
+
+if TYPE_CHECKING:
+    from dora_systemd.decisions.cell.options import RunnerOptions
 
 _PATTERN = f"{UNIT_PREFIX}*{UNIT_SUFFIX}"
 
 
-class Cell(NamedTuple):
-    """One dataflow that systemd has loaded: the state of its unit, and its runner's options."""
+class Cell:
+    """One dataflow that systemd has loaded: the state of its unit, and its runner's options.
 
-    state: UnitState
-    options: RunnerOptions
+    manager: is asked for the options at their first use. options: those that are known already.
+    """
+
+    def __init__(
+        self, state: UnitState, uuid: str, manager: Manager, options: "RunnerOptions | None" = None
+    ) -> None:
+        self.state = state
+        self.uuid = uuid
+        """The UUID of the dataflow, which restarts keep."""
+        self._manager: Manager | None = None if options else manager
+        self._options = options
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Cell) and (self.state, self.uuid) == (other.state, other.uuid)
+
+    def __hash__(self) -> int:
+        return hash(self.uuid)
 
     @property
     def name(self) -> str:
         """The name of the dataflow."""
-        return self.options.name
-
-    @property
-    def uuid(self) -> str:
-        """The UUID of the dataflow, which restarts keep."""
-        return self.options.uuid
+        return self.unit.removeprefix(UNIT_PREFIX).removesuffix(UNIT_SUFFIX)
 
     @property
     def unit(self) -> str:
@@ -36,12 +54,52 @@ class Cell(NamedTuple):
         """Whether it runs, or is on its way up or down."""
         return self.state.active in UP
 
+    @property
+    def options(self) -> "RunnerOptions":
+        """The options in ExecStart= of the unit.
+
+        Raises DoraSystemdError (NOT_FOUND) if it is not a dataflow of ours (any more).
+        """
+        if self._options is None and self._manager is not None:
+            self._options = _read_options(self._manager, self.unit)
+            self._manager = None  # the gateway keeps cells, and must not keep their connections
+        if self._options is None:
+            message = f"cannot read {self.unit}: it has ended, or is no dataflow"
+            raise DoraSystemdError(message, "see doractl list --all", ExitCode.NOT_FOUND)
+        return self._options
+
+    @property
+    def dataflow(self) -> str:
+        """The path of the descriptor, or "" as long as nobody has asked for the options."""
+        return self._options.dataflow if self._options else ""
+
+    @property
+    def has_options(self) -> bool:
+        """Whether it is ours by its ExecStart=, which its Description= alone does not prove."""
+        try:
+            return bool(self.options)
+        except DoraSystemdError as error:
+            if error.code is not ExitCode.NOT_FOUND:
+                raise
+            return False
+
 
 def read_cells(manager: Manager) -> list[Cell]:
-    """All dataflows that systemd has loaded, by name, without foreign units of such names."""
+    """All dataflows that systemd has loaded, by name, without foreign units of such names.
+
+    One question, if all have the Description= of this version.
+    """
     states = [one for one in manager.list_units(_PATTERN) if one.load == "loaded"]
-    cells = (_cell(manager, state) for state in states if name_from_unit(state.unit))
+    cells = (_listed(manager, state) for state in states if name_from_unit(state.unit))
     return sorted((cell for cell in cells if cell), key=lambda cell: cell.name)
+
+
+def proven(cells: Iterable[Cell]) -> list[Cell]:
+    """Those that are ours by their ExecStart=, with their options: one question for each.
+
+    For all who act on them, or need the options: systemd forgets them with the unit.
+    """
+    return [cell for cell in cells if cell.has_options]
 
 
 def read_cell(manager: Manager, unit: str) -> Cell | None:
@@ -50,13 +108,27 @@ def read_cell(manager: Manager, unit: str) -> Cell | None:
     if state["LoadState"] != "loaded":
         return None
     found = UnitState(unit, state["LoadState"], state["ActiveState"], state["SubState"])
-    return _cell(manager, found)
+    return _asked(manager, found)
 
 
-def _cell(manager: Manager, state: UnitState) -> Cell | None:
-    commands: Any = manager.read(state.unit, ["ExecStart"])["ExecStart"]
+def _listed(manager: Manager, state: UnitState) -> Cell | None:
+    uuid = uuid_from_description(state.unit, state.description)
+    return Cell(state, uuid, manager) if uuid else _asked(manager, state)
+
+
+def _asked(manager: Manager, state: UnitState) -> Cell | None:
+    """The dataflow of a unit by its ExecStart=: a Description= can be an older version's."""
+    options = _read_options(manager, state.unit)
+    return Cell(state, options.uuid, manager, options) if options else None
+
+
+def _read_options(manager: Manager, unit: str) -> "RunnerOptions | None":
+    # Imported late: the list of what runs has all it needs from systemd's own list.
+    from dora_systemd.decisions.cell.options import options_from_command
+
+    commands: Any = manager.read(unit, ["ExecStart"])["ExecStart"]
     try:
         options = options_from_command(commands[0][1])
     except (DoraSystemdError, IndexError):
         return None
-    return Cell(state, options) if name_from_unit(state.unit) == options.name else None
+    return options if name_from_unit(unit) == options.name else None

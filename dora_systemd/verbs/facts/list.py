@@ -17,7 +17,7 @@ from dora_systemd.decisions.resources.usage import Usage
 from dora_systemd.decisions.views.dataflows import DataflowRow, NodeRow, status_word
 from dora_systemd.scope import Scope
 from dora_systemd.values import INFINITY, SECOND
-from dora_systemd.verbs.facts.cells import Cell, read_cells
+from dora_systemd.verbs.facts.cells import Cell, proven, read_cells
 from dora_systemd.verbs.facts.enabled import enabled_units
 from dora_systemd.verbs.facts.reading import (
     ENDED,
@@ -41,7 +41,7 @@ def row_of(reading: Reading, before: Reading | None = None) -> DataflowRow:
         "name": cell.name,
         "unit": cell.unit,
         "status": status_word(cell.state.active, cell.state.sub, status.stage),
-        "dataflow": cell.options.dataflow,
+        "dataflow": cell.dataflow,
         # The status says "failed" already.
         "text": unit.get("StatusText", "").removeprefix(FAILED_BECAUSE),
         "restarts": unit["NRestarts"],
@@ -60,10 +60,20 @@ def dataflow_row(manager: Manager, scope: Scope, cell: Cell) -> DataflowRow:
     return row_of(read_dataflow(manager, scope, cell))
 
 
-def read_rows(manager: Manager, scope: Scope, with_details: bool = True) -> list[DataflowRow]:
-    """All dataflows that systemd has loaded. with_details: for more than the table."""
-    cells = read_cells(manager)
-    slice_path = None if with_details or not cells else slice_group(manager)
+def read_rows(manager: Manager, scope: Scope) -> list[DataflowRow]:
+    """All dataflows that systemd has loaded."""
+    cells = proven(read_cells(manager))
+    rows = [dataflow_row(manager, scope, cell) for cell in cells]
+    return mark_enabled(manager, scope, rows) if rows else []
+
+
+def table_rows(manager: Manager, scope: Scope, cells: Sequence[Cell]) -> list[DataflowRow]:
+    """The rows of the table, by a number of questions that does not depend on theirs.
+
+    Except for dataflows that are down, on their way up or down, or have been restarted, and for
+    those of an older version: each of them has some questions of its own.
+    """
+    slice_path = slice_group(manager) if cells else None
     rows = [row_of(read_dataflow(manager, scope, cell, slice_path)) for cell in cells]
     return mark_enabled(manager, scope, rows) if rows else []
 

@@ -4,11 +4,11 @@ It needs no running process of ours.
 """
 
 import time
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.bus.manager import SETTLED, Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.decisions.cell.status import WHOLE_CELL, CellStatus, CpuSample
 from dora_systemd.decisions.resources.usage import Usage
@@ -61,8 +61,11 @@ def read_dataflow(
     status, problem = look_at_table(scope, cell) if cell.is_up else (CellStatus(), "")
     path = slice_path / cell.unit if slice_path else None
     path = path if path and path.is_dir() else None
-    every = _ALL if cell.is_up else (*_ALL, ENDED)
-    unit = manager.read(cell.unit, _few(cell, status, path) if slice_path else every)
+    if slice_path:
+        known = _known(cell, status)
+        unit = known | manager.read(cell.unit, _missing(cell, status, path, known))
+    else:
+        unit = manager.read(cell.unit, _ALL if cell.is_up else (*_ALL, ENDED))
     if not cell.is_up or not (path or unit["ControlGroup"]):
         return Reading(cell, unit, status, problem)
     path = path or cgroup.group_path(unit["ControlGroup"])
@@ -74,14 +77,28 @@ def read_dataflow(
     return Reading(cell, unit, status, problem, groups, usage, _monotonic_us())
 
 
-def _few(cell: Cell, status: CellStatus, path: Path | None) -> list[str]:
-    """The properties that a row of the table needs: reading each one costs as much as a file."""
-    names = ["NRestarts"]
-    if cell.is_up:
-        names += [UP_SINCE] if path else [UP_SINCE, "ControlGroup"]
-        # Not needed for a running unit whose runner has samples, which are younger.
-        names += [] if cell.state.active == "active" and status.samples else [STARTED]
-    return names
+def _known(cell: Cell, status: CellStatus) -> dict[str, Any]:
+    """The properties that systemd need not be asked for, because the runner has them in its table.
+
+    The dataflow's user can lie in the table, about the own row only.
+    """
+    known: dict[str, Any] = {}
+    if cell.state.active in SETTLED:
+        if status.is_first:
+            known["NRestarts"] = 0  # the next restart begins another life, with another table
+        if 0 < status.up_us <= _monotonic_us():
+            known[UP_SINCE] = status.up_us
+    return known
+
+
+def _missing(cell: Cell, status: CellStatus, path: Path | None, known: Container[str]) -> list[str]:
+    """The properties that a row of the table still needs: each one is a question to systemd."""
+    if not cell.is_up:
+        return ["NRestarts", ENDED]
+    names = ["NRestarts", UP_SINCE] if path else ["NRestarts", UP_SINCE, "ControlGroup"]
+    # Not needed for a running unit whose runner has samples, which are younger.
+    names += [] if cell.state.active in SETTLED and status.samples else [STARTED]
+    return [name for name in names if name not in known]
 
 
 def read_status(scope: Scope, cell: Cell) -> CellStatus:

@@ -42,9 +42,9 @@ N = TypeVar("N", bound=Named)
 class Selector:
     """The text that a user has typed: a name, a unit, a UUID, or the beginning of a UUID.
 
-    Only meant() decides what a text means. only(), loaded(), find(), find_enabled() and ended()
-    differ in where they look. They raise DoraSystemdError: USAGE if several dataflows match, and
-    those that return no None, NOT_FOUND if none does.
+    Only meant() decides what a text means. only(), proven(), loaded(), find(), find_enabled() and
+    ended() differ in where they look. They raise DoraSystemdError: USAGE if several dataflows
+    match, and those that return no None, NOT_FOUND if none does.
     """
 
     text: str
@@ -93,10 +93,15 @@ class Selector:
         hint = hint or "nothing is running; ended ones: doractl list --all"
         return DoraSystemdError(f"no dataflow named {quoted(self.text)}", hint, ExitCode.NOT_FOUND)
 
+    def proven(self, cells: Iterable[Cell]) -> Cell | None:
+        """As only(), with its options; None for a unit that only has a Description= like ours."""
+        cell = self.only(cells)
+        return cell if cell and cell.has_options else None
+
     def loaded(self, cells: Iterable[Cell]) -> Cell:
-        """The one of `cells`, from read_cells()."""
+        """The one of `cells`, from read_cells(), with its options."""
         known = list(cells)
-        cell = self.only(known)
+        cell = self.proven(known)
         if cell is None:
             raise self.missing(one.name for one in known)
         return cell
@@ -104,12 +109,9 @@ class Selector:
     def find(self, manager: Manager) -> Cell:
         """One that systemd has loaded, or can load from a unit file."""
         cells = read_cells(manager)
-        cell = self.only(cells)
-        names = filter(is_name, self.names if cell is None else ())
-        cell = cell or next(
-            filter(None, (read_cell(manager, unit_name(one)) for one in names)), None
-        )
-        return self.loaded(cells) if cell is None else cell
+        names = () if self.only(cells) else filter(is_name, self.names)
+        files = filter(None, (read_cell(manager, unit_name(one)) for one in names))
+        return next(files, None) or self.loaded(cells)
 
     def find_enabled(self, manager: Manager, scope: Scope) -> Cell:
         """As find(), also an enabled one that systemd has lost, see lost_units()."""
@@ -147,7 +149,7 @@ def find_all(manager: Manager, scope: Scope, texts: Sequence[str]) -> list[Cell]
     """The dataflows that `texts` mean, each once; as selectors_of() and find_enabled()."""
     cells = read_cells(manager)
     found = (
-        one.only(cells) or one.find_enabled(manager, scope) for one in selectors_of(texts, cells)
+        one.proven(cells) or one.find_enabled(manager, scope) for one in selectors_of(texts, cells)
     )
     return list(dict.fromkeys(found))
 

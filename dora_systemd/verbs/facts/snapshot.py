@@ -8,7 +8,7 @@ from dora_systemd.decisions.resources.usage import Strain
 from dora_systemd.decisions.views.dataflows import DataflowRow
 from dora_systemd.decisions.views.snapshot import Observed
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.facts.cells import read_cells
+from dora_systemd.verbs.facts.cells import proven, read_cells
 from dora_systemd.verbs.facts.list import row_of
 from dora_systemd.verbs.facts.reading import Reading, read_dataflow
 from dora_systemd.verbs.facts.whole import whole_rows
@@ -19,7 +19,7 @@ def read_snapshot(manager: Manager, scope: Scope, is_whole: bool = False) -> lis
 
     is_whole: with all that `list` knows of them, and not only what a reading shows.
     """
-    readings = [read_dataflow(manager, scope, cell) for cell in read_cells(manager)]
+    readings = [read_dataflow(manager, scope, cell) for cell in proven(read_cells(manager))]
     rows = list(map(row_of, readings))
     if is_whole:
         rows = whole_rows(manager, scope, readings, rows)

@@ -10,6 +10,7 @@ from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Cell, Do, State
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.dialogue import Dialogue
+from dora_systemd.runner.cell.life import Life
 from dora_systemd.runner.cell.pump import Pump
 from dora_systemd.values import SECOND
 from tests.unit.fakes.run import Calls, FakeDora, FakeNodes, FakePipes
@@ -37,7 +38,7 @@ class Bench:
         self.nodes, self.pipes = FakeNodes(self.calls), FakePipes(self.calls)
         self.dora = FakeDora(self.calls)
         cell = Cell(2 * SECOND, 0, {"a": NodeStatus("running", 7)}, state, run="run")
-        self.pump = Heard(cell, "uuid", CellPaths(root), self.nodes, self.pipes)
+        self.pump = Heard(cell, Life("uuid"), CellPaths(root), self.nodes, self.pipes)
         self.pump.heard, self.pump.calls = [], self.calls
         self.dialogue = Dialogue(OPTIONS, self.pump, self.dora, self.nodes, self.pipes)
         self.actions = self.dialogue.actions(DESCRIPTOR, {"ADDED": "1"})

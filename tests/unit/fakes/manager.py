@@ -8,7 +8,7 @@ from typing import Any, Self
 from dora_systemd.adapters.bus.manager import JOB_DONE, Observer, Property, UnitState
 from dora_systemd.decisions.cell.options import RunnerOptions, runner_command
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.names import unit_name
+from dora_systemd.names import unit_description, unit_name
 from dora_systemd.scope import Scope
 
 
@@ -39,7 +39,8 @@ def options(name: str = "robot", uuid: str = UUID, **more: Any) -> RunnerOptions
 class FakeManager:
     """Units by name with their properties; every change that is asked for is in `calls`.
 
-    job_results: by unit, what its jobs end with. on_start: is called with each new unit's facts.
+    questions: how many a Bus would have asked. job_results: by unit, what its jobs end with.
+    on_start: is called with each new unit's facts.
     """
 
     def __init__(self) -> None:
@@ -50,6 +51,7 @@ class FakeManager:
         self.held: set[str] = set()
         self.after_job: dict[str, dict[str, Any]] = {}
         self.systemd = "257.13-1"
+        self.questions = 0
         self.etc = Path("/nowhere/etc")
 
     def add(self, runner: RunnerOptions, active: str = "active", **facts: Any) -> str:
@@ -60,6 +62,7 @@ class FakeManager:
             "LoadState": "loaded",
             "ActiveState": active,
             "SubState": "running",
+            "Description": unit_description(runner.name, runner.uuid),
             "Transient": True,
             "FragmentPath": f"/run/systemd/transient/{unit}",
             "ExecStart": [[command[0], command, False, 0, 0, 0, 0, 0, 0, 0]],
@@ -84,8 +87,12 @@ class FakeManager:
         return unit
 
     def list_units(self, pattern: str) -> list[UnitState]:
+        self.questions += 1
         return [
-            UnitState(unit, facts["LoadState"], facts["ActiveState"], facts["SubState"])
+            UnitState(
+                *(unit, facts["LoadState"], facts["ActiveState"], facts["SubState"]),
+                facts["Description"],
+            )
             for unit, facts in self.units.items()
             if fnmatch(unit, pattern)
         ]
@@ -93,6 +100,7 @@ class FakeManager:
     def read(self, unit: str, names: Sequence[str]) -> dict[str, Any]:
         unknown: dict[str, Any] = {"LoadState": "not-found", "ActiveState": "inactive"}
         facts = self.units.get(unit, unknown)
+        self.questions += len(names)
         return {name: facts.get(name, "") for name in names}
 
     def start_transient(
@@ -140,12 +148,14 @@ class FakeManager:
         return []
 
     def control_group(self) -> str:
+        self.questions += 1
         return ""
 
     def reload(self) -> None:
         self.calls.append(("reload",))
 
     def unit_path(self) -> list[str]:
+        self.questions += 1
         return [f"{self.etc}/systemd/{kind}" for kind in ("system", "user")]
 
     def enable_unit_files(self, names: Sequence[str]) -> bool:

@@ -12,6 +12,7 @@ from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Cell, Do, State
 from dora_systemd.decisions.reload.steps import How, Step
 from dora_systemd.paths import CellPaths
+from dora_systemd.runner.cell.life import Life
 from dora_systemd.runner.cell.pump import Pump
 from dora_systemd.runner.reload.apply import Applier, Run
 from dora_systemd.runner.reload.sources import Change
@@ -32,7 +33,7 @@ class ReloadBench:
         self.dora = FakeDora(self.calls)
         table = {"a": RUNNING, "b": RUNNING, **nodes}
         cell = Cell(2 * SECOND, 0, table, state, run="run", ready_us=1)
-        self.pump = Pump(cell, "uuid", CellPaths(root), self.nodes, self.pipes)
+        self.pump = Pump(cell, Life("uuid"), CellPaths(root), self.nodes, self.pipes)
         self.pump.connect({do: lambda: None for do in Do})
         self.run = Run(self.pump, self.nodes, self.pipes, Swapper(self.pump, self.dora))
         for name, then in (

@@ -8,9 +8,12 @@ LATE = {
     "click takes 35 ms: no --version, and no usual list, waits for it": {
         "cli.main": {"cli.group", "cli.completion", "cli.listing"},
     },
+    "a list of nothing, or of what has this version's Description=, does without it": {
+        "verbs.facts.cells": {"decisions.cell.options"},
+    },
     "the table of list does without it": {
         "cli.listing": {
-            *("verbs.list", "verbs.facts.ended"),
+            *("verbs.list", "verbs.facts.ended", "verbs.facts.list"),
             *("decisions.views.details", "decisions.views.objects"),
             *("decisions.views.selection", "cli.colors", "verbs.facts.selector"),
         },

@@ -43,6 +43,26 @@ def test_without_systemd(monkeypatch: pytest.MonkeyPatch) -> None:
     fd_store.forget_inherited()
 
 
+def test_the_first_life(monkeypatch: pytest.MonkeyPatch) -> None:
+    for key in ("FDSTORE", "LISTEN_FDNAMES"):
+        monkeypatch.delenv(key, raising=False)
+    assert not fd_store.is_first_life()  # systemd 252 does not tell that it has a store
+    monkeypatch.setenv("FDSTORE", "4096")
+    assert fd_store.is_first_life()
+    monkeypatch.setenv("LISTEN_FDNAMES", "dora-log-camera:dora-log-camera")
+    assert not fd_store.is_first_life()
+
+
+def test_lives_that_are_forgotten_leave_a_trace(manager: socket.socket) -> None:
+    """First the trace: between two messages the process can be killed."""
+    fd_store.forget_lives()
+    text, fds, _, _ = socket.recv_fds(manager, 100, 1)
+    assert text.decode().splitlines() == ["FDSTORE=1", "FDNAME=dora-log-", "FDPOLL=0"]
+    assert manager.recv(100) == b"FDSTOREREMOVE=1\nFDNAME=dora-life"
+    os.close(*fds)
+    manager.close()
+
+
 CHILD = """
 import os
 from dora_systemd.adapters.host import fd_store

@@ -42,6 +42,7 @@ cells = st.builds(
     st.dictionaries(ids, nodes),
     st.lists(samples, max_size=2).map(tuple),
     st.dictionaries(ids, st.builds(LineCount, counts, counts, counts)),
+    *(counts, st.booleans()),
 )
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.text(),
@@ -73,6 +74,7 @@ def test_any_json_is_a_table_or_an_error(value: Any) -> None:
         json.dumps({"samples": value}),
         json.dumps({"samples": [{"at_us": 1, "throttling": value, "cpu_us": value}]}),
         json.dumps({"lines": value, "stage": value}),
+        json.dumps({"up_us": value, "is_first": value}),
         json.dumps({"nodes": {"a": {"pid": value, "state": value}}}),
     ):
         try:

@@ -52,6 +52,14 @@ def test_a_unit_whose_runner_has_no_head_start_says_the_same() -> None:
     assert not says_the_same(text, text.replace("RestartSec=100ms", "RestartSec=2s"))
 
 
+def test_a_unit_without_the_uuid_in_its_description_says_the_same() -> None:
+    text = persistent(options())
+    older = text.replace(f"dora dataflow robot ({UUID})\n", "dora dataflow robot\n")
+    assert older != text
+    assert says_the_same(text, older)
+    assert not says_the_same(text, text.replace(f"robot ({UUID})\n", "my robot\n"))
+
+
 def test_sections_are_one_of_a_kind() -> None:
     drop_in = "# ours\n[Service]\nNice=5\n;x\n[Unit]\nAfter=a.service \\\n  b.service\n"
     text = persistent(options(), drop_in, "[Install]\nAlias=x.service\n", "ignored=1\n")

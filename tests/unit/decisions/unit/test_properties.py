@@ -30,7 +30,7 @@ USER = UnitContext("/usr/bin/python3", True, None, ENVIRONMENT)
 STOP_POST = CHECKOUT / "dora_systemd/stoppost.sh"
 UNIT = f"""\
 [Unit]
-Description=dora dataflow robot
+Description=dora dataflow robot (550e8400-e29b-41d4-a716-446655440000)
 
 [Service]
 Slice=dora.slice

@@ -19,6 +19,7 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.dialogue import Dialogue
 from dora_systemd.runner.cell.failure import Beside
+from dora_systemd.runner.cell.life import Life
 from dora_systemd.runner.cell.pump import Pump, is_deleted
 from dora_systemd.values import SECOND
 from tests.unit.fakes.loop import live
@@ -76,7 +77,7 @@ class Bench:
         side_: Any = side
         nodes = {"a": NodeStatus("running", 7)}
         cell = Cell(2 * SECOND, 0, nodes, state, run="run", ready_us=1, **changes)
-        self.pump = Pump(cell, "uuid", CellPaths(root), side_, side_)
+        self.pump = Pump(cell, Life("uuid"), CellPaths(root), side_, side_)
         self.dialogue = Dialogue(OPTIONS, self.pump, side_, side_, side_)
 
     def connect(self, **others: Callable[[], None]) -> None:

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import time
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.life.states import Cell, Do, Record, RunnerExit, State
 from dora_systemd.paths import CellPaths
+from dora_systemd.runner.cell.life import Life
 from dora_systemd.runner.cell.pump import Pump
 from dora_systemd.values import SECOND
 from tests.unit.fakes.libraries import hear_notifications, install
@@ -26,12 +28,15 @@ RUNS = {"a": NodeStatus("running", 7)}
 class Bench:
     """A pump whose actions only note that they were taken."""
 
-    def __init__(self, root: Path, state: State, **changes: Any) -> None:
+    def __init__(
+        self, root: Path, state: State, this_life: Life | None = None, **changes: Any
+    ) -> None:
         self.calls: Calls = []
+        self.this_life = this_life or Life("uuid")
         self.nodes, self.pipes = FakeNodes(self.calls), FakePipes(self.calls)
         self.paths = CellPaths(root)
         cell = Cell(2 * SECOND, 0, RUNS, state, **{"run": "run", "ready_us": 1, **changes})
-        self.pump = Pump(cell, "uuid", self.paths, self.nodes, self.pipes)
+        self.pump = Pump(cell, self.this_life, self.paths, self.nodes, self.pipes)
         self.pump.connect({do: self.note(do) for do in Do})
 
     def note(self, do: Do) -> Any:
@@ -196,6 +201,23 @@ def test_the_table_is_there_before_anybody_hears_that_it_runs(
         install(monkeypatch, "systemd.daemon", notify=notify)
         bench.push(life.AllReady(5))
         assert tables["READY=1"] == "running"
+
+    live(work)
+
+
+def test_the_table_tells_since_when_the_unit_is_up(tmp_path: Path) -> None:
+    """From READY=1 on; a reload's next run in the same life changes nothing, as in systemd."""
+
+    async def work() -> None:
+        bench = Bench(tmp_path, State.WAITING, ready_us=0)
+        assert (bench.table["up_us"], bench.table["is_first"]) == (0, False)
+        before = time.monotonic_ns() // 1000
+        bench.push(life.AllReady(5))
+        up_us = bench.table["up_us"]
+        assert before <= up_us <= time.monotonic_ns() // 1000
+        again = Bench(tmp_path, State.WAITING, this_life=bench.this_life, ready_us=0)
+        again.push(life.AllReady(6))
+        assert again.table["up_us"] == up_us
 
     live(work)
 

@@ -21,7 +21,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.trust.cells import MAX_TABLE, read_table
 from dora_systemd.verbs import why
 from dora_systemd.verbs.facts.cells import read_cells
-from dora_systemd.verbs.facts.list import dataflow_row, read_rows
+from dora_systemd.verbs.facts.list import dataflow_row, read_rows, table_rows
 from dora_systemd.verbs.facts.reading import read_dataflow, read_status
 from dora_systemd.verbs.facts.snapshot import read_snapshot
 from dora_systemd.verbs.list import find_row
@@ -29,6 +29,11 @@ from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
 
 GROUP = "/dora.slice/dora-robot.service"
 SECOND = 1_000_000
+
+
+def table_of(manager: FakeManager, scope: Scope) -> list[DataflowRow]:
+    """The rows of the table of `list`."""
+    return table_rows(manager, scope, read_cells(manager))
 
 
 @pytest.fixture
@@ -58,8 +63,8 @@ def now_us() -> int:
     return time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000
 
 
-def write_status(scope: Scope, status: CellStatus) -> None:
-    directory = scope.cell_directory("robot")
+def write_status(scope: Scope, status: CellStatus, name: str = "robot") -> None:
+    directory = scope.cell_directory(name)
     directory.mkdir(parents=True)
     (directory / "status.json").write_text(status.to_json())
 
@@ -109,9 +114,9 @@ def test_the_table_asks_for_less_and_says_the_same(
     status = CellStatus(nodes={"camera": NodeStatus("running", 42)}, samples=samples)
     write_status(scope, status)
     (all_of_it,) = read_rows(manager, scope)
-    (line,) = read_rows(manager, scope, with_details=False)
+    (line,) = table_of(manager, scope)
     assert (line.memory is None) == (active == "failed")
-    now: dict[str, Any] = {"uptime": None, "cpu_percent": None, "nodes": ()}
+    now: dict[str, Any] = {"uptime": None, "cpu_percent": None, "nodes": (), "dataflow": ""}
     assert line._replace(**now) == all_of_it._replace(**now)
     for mine, other in ((line.uptime, all_of_it.uptime), (line.cpu_percent, all_of_it.cpu_percent)):
         assert mine == (other and pytest.approx(other, rel=0.1))
@@ -153,8 +158,10 @@ DAMAGE: dict[str, Callable[[Path], object]] = {
 
 @pytest.mark.usefixtures("unit_group")
 @pytest.mark.parametrize("what", DAMAGE)
-@pytest.mark.parametrize("with_details", [True, False])
-def test_damaged_node_table(scope: Scope, what: str, with_details: bool) -> None:
+@pytest.mark.parametrize("read", [read_rows, table_of])
+def test_damaged_node_table(
+    scope: Scope, what: str, read: Callable[[FakeManager, Scope], list[DataflowRow]]
+) -> None:
     """It is a word in its own row, and the others are shown."""
     directory = scope.cell_directory("robot")
     directory.mkdir(parents=True)
@@ -167,7 +174,7 @@ def test_damaged_node_table(scope: Scope, what: str, with_details: bool) -> None
     }
     manager.add(options(), ControlGroup=GROUP, **times)
     manager.add(options("other", UUID[:-1] + "1"), ControlGroup=GROUP, **times)
-    other, row = read_rows(manager, scope, with_details)
+    other, row = read(manager, scope)
     assert (row.status, bool(row.problem)) == ("Running", True)
     assert (other.status, other.problem) == ("Running", "")
     assert " ?  " in format_dataflows([row])
@@ -297,3 +304,68 @@ def test_a_row_is_found_by_selector(scope: Scope, monkeypatch: pytest.MonkeyPatc
     assert (row.name, row.text, row.ended) == ("robot", "node a: exit code 1", 7)
     assert asked == [{"limit": 1, "name": "robot"}]
     assert read_status(scope, read_cells(manager)[0]) == CellStatus()
+
+
+def add_ready(manager: FakeManager, scope: Scope, number: int, **table: Any) -> None:
+    """A dataflow that is up, and the table of its runner."""
+    name = f"robot{number}"
+    facts: dict[str, Any] = {"ActiveEnterTimestampMonotonic": now_us() - 9 * SECOND, "NRestarts": 0}
+    manager.add(options(name, UUID[:-3] + f"{number:03}"), **facts)
+    (manager.group / f"dora-{name}.service").mkdir(parents=True)  # type: ignore[attr-defined]
+    samples = (CpuSample(now_us() - 4 * SECOND, {"": 2 * SECOND}),)
+    known = {"up_us": now_us() - 9 * SECOND, "is_first": True, "samples": samples, **table}
+    write_status(scope, CellStatus(**known), name)
+
+
+@pytest.fixture
+def manager(unit_group: Path) -> FakeManager:
+    """A manager without units, whose dora.slice is a directory."""
+    manager = FakeManager()
+    manager.group = unit_group.parent  # type: ignore[attr-defined]
+    return manager
+
+
+def asked(manager: FakeManager, scope: Scope) -> tuple[int, list[DataflowRow]]:
+    """How many questions the table takes, and its rows."""
+    manager.questions = 0
+    rows = table_of(manager, scope)
+    return manager.questions, rows
+
+
+def test_the_table_of_200_takes_as_many_questions_as_that_of_1(
+    manager: FakeManager, scope: Scope
+) -> None:
+    add_ready(manager, scope, 0)
+    questions, (row,) = asked(manager, scope)
+    assert questions == 3
+    assert row.uptime == pytest.approx(9 * SECOND, rel=0.1)
+    assert (row.status, row.restarts, row.uuid) == ("Running", 0, UUID[:-3] + "000")
+    for number in range(1, 200):
+        add_ready(manager, scope, number)
+    assert (asked(manager, scope)[0], len(asked(manager, scope)[1])) == (3, 200)
+
+
+@pytest.mark.parametrize(
+    ("table", "questions"),
+    [({"is_first": False}, 1), ({"up_us": 0}, 1), ({"up_us": 2**62}, 1), ({"samples": ()}, 1)],
+)
+def test_what_a_table_does_not_tell_is_asked_of_its_unit_alone(
+    manager: FakeManager, scope: Scope, table: dict[str, Any], questions: int
+) -> None:
+    """A restarted dataflow, whose count may be reset; the table of an older version; a lie."""
+    add_ready(manager, scope, 0)
+    add_ready(manager, scope, 1, **table)
+    manager.units["dora-robot1.service"]["NRestarts"] = 0 if "is_first" not in table else 3
+    found, (_, row) = asked(manager, scope)
+    assert found == 3 + questions
+    assert row.uptime == pytest.approx(9 * SECOND, rel=0.1)
+    assert row.restarts == manager.units["dora-robot1.service"]["NRestarts"]
+
+
+def test_a_table_of_a_life_that_is_over_tells_nothing(manager: FakeManager, scope: Scope) -> None:
+    """RuntimeDirectoryPreserve= keeps it; systemd waits for the next start meanwhile."""
+    add_ready(manager, scope, 0)
+    waiting = {"ActiveState": "activating", "SubState": "auto-restart", "NRestarts": 1}
+    manager.units["dora-robot0.service"] |= waiting
+    _, (row,) = asked(manager, scope)
+    assert (row.status, row.restarts) == ("Restarting", 1)

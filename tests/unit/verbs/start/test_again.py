@@ -78,6 +78,7 @@ def test_a_start_is_noted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> No
 def test_the_last_start(text: str, journal: list[dict[str, Any]]) -> None:
     journal += [record("other", UUID.replace("5", "6")), record(), record(DORA_FILE="/srv/old.yml")]
     found = find_start(FakeManager(), SCOPE, Selector(text))
+    assert isinstance(found, Asked)
     assert found == Asked("robot", UUID, "/srv/robot.yml", KEPT)
     wanted = StartRequest(text, flags={"env": ("C=3",), "debug": None, "writable": ()})
     again = found.request(wanted)

@@ -1,0 +1,120 @@
+"""The table of `list` asks systemd little, and tells what systemd would have told."""
+
+import json
+import os
+import signal
+import time
+from typing import Any
+
+import pytest
+
+from dora_systemd.adapters.bus.systemd import Bus
+from dora_systemd.decisions.views.dataflows import DataflowRow
+from dora_systemd.verbs.facts.cells import read_cells
+from dora_systemd.verbs.facts.list import table_rows
+from tests.system.cells import Cell, Project, is_alive, run, wait_for
+
+
+class CountingBus(Bus):
+    """A connection to systemd that counts its questions."""
+
+    questions = 0
+
+    def _call(self, *words: Any, **more: Any) -> Any:
+        self.questions += 1
+        return super()._call(*words, **more)
+
+
+def table_of(cell: Cell) -> tuple[int, dict[str, DataflowRow]]:
+    """The number of questions that the table takes, and its rows by name."""
+    bus = CountingBus(cell.scope, for_reading=True)
+    rows = table_rows(bus, cell.scope, [one for one in read_cells(bus) if one.is_up])
+    return bus.questions, {row.name: row for row in rows}
+
+
+def row_of(cell: Cell) -> DataflowRow | None:
+    return table_of(cell)[1].get(cell.name)
+
+
+def check_truth(cell: Cell) -> None:
+    """The row has what systemd has."""
+    before = time.monotonic_ns() // 1000
+    row = row_of(cell)
+    after = time.monotonic_ns() // 1000
+    assert row is not None and row.uptime is not None
+    # The runner notes the time right before it tells systemd.
+    assert before - row.uptime <= int(cell.show("ActiveEnterTimestampMonotonic"))
+    assert after - row.uptime > int(cell.show("InactiveExitTimestampMonotonic"))
+    assert row.restarts == int(cell.show("NRestarts"))
+    assert f"--uuid={row.uuid}" in cell.show("ExecStart")
+
+
+def is_running(cell: Cell) -> bool:
+    row = row_of(cell)
+    return row is not None and row.status == "Running" and row.nodes_alive == 3
+
+
+@pytest.fixture
+def other(cell: Cell) -> Any:
+    other = Cell(f"{cell.name}-other", cell.scope)
+    yield other
+    other.end()
+
+
+@pytest.mark.warns("code=killed", "Failed with result", "status=69", "process was killed (")
+def test_two_dataflows_take_as_many_questions_as_one(
+    cell: Cell, other: Cell, project: Project
+) -> None:
+    flow = project.three_nodes()
+    cell.start(flow, "--restart-policy", "always")
+    first, rows = table_of(cell)
+    other.start(flow)
+    second, both = table_of(cell)
+    assert (first, second) == (3, 3)
+    assert set(both) - set(rows) == {other.name}
+    check_truth(cell)
+    check_truth(other)
+    assert f"({both[other.name].uuid})" in other.show("Description")
+    # A run after a reload is the same life; a restart is another one.
+    cell.doractl("reload", cell.name)
+    check_truth(cell)
+    for number, sign in enumerate((signal.SIGTERM, signal.SIGKILL), 1):
+        runner = cell.supervisor_pid("runner")
+        os.kill(runner, sign)
+        wait_for("it is back", lambda dead=runner: not is_alive(dead) and is_running(cell))  # type: ignore[misc]
+        assert int(cell.show("NRestarts")) == number
+        check_truth(cell)
+    cell.doractl("reset", cell.name)
+    check_truth(cell)
+    cell.doractl("restart", cell.name)
+    check_truth(cell)
+
+
+def test_a_dataflow_of_an_older_version(cell: Cell, project: Project) -> None:
+    """Its Description= has no UUID."""
+    words = ("--property", f"Description=dora dataflow {cell.name}", "-o", "json")
+    uuid = json.loads(cell.start(project.three_nodes(), *words).stdout)["uuid"]
+    assert cell.show("Description") == f"dora dataflow {cell.name}"
+    check_truth(cell)
+    assert f"Dataflow: {uuid}" in cell.doractl("list", uuid[:8]).stdout
+    assert uuid in cell.doractl("stop", cell.name).stdout
+
+
+def test_a_foreign_unit_with_our_description(cell: Cell, project: Project) -> None:
+    """Nobody acts on it, and it is no dataflow for programs."""
+    cell.start(project.three_nodes())
+    uuid = "550e8400-e29b-41d4-a716-446655440000"
+    fake = Cell(f"{cell.name}-fake", cell.scope)
+    words = (f"--description=dora dataflow {fake.name} ({uuid})", f"--unit={fake.unit}")
+    flag = cell.scope.flag
+    run("systemd-run", flag, "--quiet", *words, "sleep", "infinity")
+    try:
+        for verb in ("stop", "list", "restart", "reset", "why"):
+            done = fake.doractl(verb, fake.name, check=False)
+            assert f"no dataflow named '{fake.name}'" in done.stderr, verb
+        names = [one["name"] for one in json.loads(cell.doractl("list", "-o", "json").stdout)]
+        assert names == [cell.name]
+        cell.doractl("stop", "--all")
+        assert fake.show("ActiveState") == "active"
+    finally:
+        run("systemctl", flag, "stop", fake.unit)
