@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 from dora_systemd.decisions.cell.exits import Exit, parse_exit
+from dora_systemd.decisions.signs.table import Sign, parse_sign
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import is_node_id
 
@@ -50,7 +51,7 @@ class NodeStatus(NamedTuple):
     in this run. since_us: CLOCK_REALTIME µs of the last change of state. exit: how its last process
     ended. kind: how dora starts it (python, executable, shell, uv, operator, ros2, dynamic, url).
     policy: dora's restart policy, "never" if it has none, or HELD. max_restarts: in one window, 0
-    without limit. hung: the message of dora's health check before it ended the process, or "".
+    without limit. hung: why dora's health check or its watchdog ended the process, or "".
     """
 
     state: str = "starting"
@@ -94,7 +95,8 @@ class CellStatus(NamedTuple):
 
     run: dora's own id of this run, or "". stage: one of STAGES. text: the unit's STATUS=.
     started_us, ready_us: CLOCK_REALTIME µs, 0 if that has not happened. samples: the last
-    SAMPLES_KEPT CPU samples, oldest first. lines: by node; lost ones count for WHOLE_CELL.
+    SAMPLES_KEPT CPU samples, oldest first. lines: by node; lost ones count for WHOLE_CELL. signs:
+    of the nodes with a notify socket.
     """
 
     uuid: str = ""
@@ -106,6 +108,7 @@ class CellStatus(NamedTuple):
     nodes: Mapping[str, NodeStatus] = {}
     samples: tuple[CpuSample, ...] = ()
     lines: Mapping[str, LineCount] = {}
+    signs: Mapping[str, Sign] = {}
 
     @property
     def alive_count(self) -> int:
@@ -209,6 +212,7 @@ def _parse_cell(raw: Any) -> CellStatus:
         nodes=nodes,
         samples=tuple(map(_parse_sample, samples)),
         lines=_by_node(known.get("lines", {}), lambda one: LineCount(*_numbers(one, 3))),
+        signs=_by_node(known.get("signs", {}), parse_sign),
     )
 
 

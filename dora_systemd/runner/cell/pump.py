@@ -203,8 +203,13 @@ class Pump:
         self._samples = add_sample(self._samples, sample)
         self._write_table()
 
+    def refresh(self) -> None:
+        """Write the table again, because what the nodes say of themselves has changed."""
+        self._write_table()
+
     def _write_table(self) -> None:
-        table = cell_status(self.cell, self._uuid, self._samples, self._pipes.line_counts())
+        signs = self._nodes.signs.table()
+        table = cell_status(self.cell, self._uuid, self._samples, self._pipes.line_counts(), signs)
         try:
             files.write_atomic(self._paths.status, table.to_json(), 0o600)
         except DoraSystemdError as error:

@@ -43,6 +43,7 @@ class FakeNodes(Nodes):
     def __init__(self, calls: Calls | None = None) -> None:
         self.calls: Calls = [] if calls is None else calls
         self.resources: FakeResources = FakeResources()
+        self.signs = NoSigns()
         self.living: set[tuple[str, int]] = set()
         self.ooms: dict[str, Oom] = {}
 

@@ -55,5 +55,5 @@ def test_stages_and_table() -> None:
     assert [node.state for node in nodes.values()] == ["starting", "dynamic"]
     assert [node.policy for node in nodes.values()] == ["always", "never"]
     assert [node.max_restarts for node in nodes.values()] == [3, 0]
-    table = cell_status(Cell(0, 3, nodes), "uuid", (), {"a": LineCount(3)})
+    table = cell_status(Cell(0, 3, nodes), "uuid", (), {"a": LineCount(3)}, {"a": Sign("up")})
     assert CellStatus.from_json(table.to_json()) == table
