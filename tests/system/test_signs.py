@@ -93,7 +93,7 @@ def test_a_node_that_falls_silent_is_restarted(cell: Cell, project: Project) -> 
     flow = project.root / write_flow(project, feeder=FEEDER, **others)
     environment = ("--env", "PYTHONFAULTHANDLER=1")
     cell.start(flow, f"--watchdog={LIMIT}s", *ON_FAILURE, *environment)
-    said = {"feeder": "[31m 2000000 us", "shell": "by a program", "library": "by a library"}
+    said = {"feeder": "[31m2000000 us", "shell": "by a program", "library": "by a library"}
     wait_for("all say what they do", lambda: texts(cell) == said)
     before = {node: cell.pids(f"node-{node}")[0] for node in said}
 
@@ -132,7 +132,7 @@ def test_no_node_speaks_for_another(cell: Cell, project: Project) -> None:
     (feeder,) = cell.pids("node-feeder")
     wait_for("it is ended", lambda: ("node-watchdog", "victim") in cell.events())
     wait_for("it is killed", lambda: ("node-restarted", "victim") in cell.events())
-    assert texts(cell) == {"liar": "I am fine", "victim": None, "feeder": "[31m 2000000 us"}
+    assert texts(cell) == {"liar": "I am fine", "victim": None, "feeder": "[31m2000000 us"}
     refused = [node for event, node in cell.events() if event == "notify-refused"]
     assert sorted(refused) == ["feeder", "victim"], "each is reported once a minute"
     (record, *_) = cell.journal("DORA_EVENT=notify-refused")

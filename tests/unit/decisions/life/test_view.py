@@ -6,6 +6,7 @@ from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.cell.status import CellStatus, LineCount, NodeStatus
 from dora_systemd.decisions.life.states import Cell, State
 from dora_systemd.decisions.life.view import cell_status, format_status, initial_nodes, stage
+from dora_systemd.decisions.signs.table import Sign
 
 
 def cell(state: State, **states: str) -> Cell:
