@@ -6,8 +6,6 @@ from typing import Any, NamedTuple
 from dora_systemd.decisions.signs.messages import MAX_STATUS
 from dora_systemd.values import INFINITY, SECOND, format_duration
 
-_TENTH = SECOND // 10
-
 
 class Sign(NamedTuple):
     """What one node has said of itself.
@@ -49,5 +47,5 @@ def format_watchdog(age: int | None, limit: int | None) -> str:
     """As in "1.2s/5s": the age of the last sign, and the watchdog; "" without any."""
     if age is None and limit is None:
         return ""
-    known = "-" if age is None else format_duration(age // _TENTH * _TENTH or _TENTH)
+    known = "-" if age is None else f"{age / SECOND:.1f}s"
     return known if limit is None else f"{known}/{format_duration(limit)}"

@@ -48,6 +48,6 @@ def test_signs_for_rows() -> None:
     assert sign_facts(signs, "cam", 0)["sign_age"] == 0
     assert sign_facts(signs, "plot", 9) == {"text": "idle", "watchdog": None, "sign_age": None}
     assert sign_facts(signs, "other", 9) == {}
-    assert format_watchdog(1_234_567, 5 * SECOND) == "1s 200ms/5s"
+    assert format_watchdog(1_234_567, 5 * SECOND) == "1.2s/5s"
     assert format_watchdog(None, 5 * SECOND) == "-/5s"
     assert format_watchdog(None, None) == ""
