@@ -74,7 +74,8 @@ class Dialogue(Tasks):
         if self._nodes.signs.is_used:
             from dora_systemd.runner.signs.watch import watch_nodes
 
-            work = watch_nodes(self._nodes, self._pump, self._options)
+            signs, is_blocked = self._nodes.signs, self._nodes.is_blocked
+            work = watch_nodes(signs, self._pump, is_blocked, self._options)
             self.spawn("watch over its nodes", work)
 
     def _ask(self, what: Do, work: Coroutine[Any, Any, None]) -> None:

@@ -18,7 +18,7 @@ from dora_systemd.decisions.signs.messages import Message, parse_message
 from dora_systemd.decisions.signs.table import Sign
 from dora_systemd.decisions.signs.watchdogs import Watchdogs, watchdog_of
 from dora_systemd.paths import CellPaths
-from dora_systemd.runner.signs.hook import NoSigns
+from dora_systemd.runner.signs.none import NoSigns
 from dora_systemd.values import INFINITY, SECOND
 
 _AT_ONCE = 32

@@ -4,18 +4,20 @@ dora then restarts the node by its policy, as after any other crash.
 """
 
 import asyncio
+import time
+from collections.abc import Callable
 from signal import SIGABRT
+from typing import Protocol
 
 from dora_systemd.adapters.cgroup.groups import kill_group
 from dora_systemd.adapters.cgroup.members import signal_group
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.life import events as life
-from dora_systemd.decisions.life.states import State
+from dora_systemd.decisions.life.states import Cell, State
 from dora_systemd.decisions.signs.judge import Act, Phase, Watch, limit_in
 from dora_systemd.decisions.signs.words import TRIGGERED, missed
-from dora_systemd.runner.cell.pump import Pump, now_us
-from dora_systemd.runner.nodes.nodes import Nodes
+from dora_systemd.runner.signs.none import NoSigns
 from dora_systemd.runner.signs.sockets import Ear, Signs
 from dora_systemd.values import SECOND
 
@@ -23,19 +25,39 @@ _PUBLISH_SECONDS = 1.0
 """Shortest time between two tables that are written because of what nodes say."""
 
 
-async def watch_nodes(nodes: Nodes, pump: Pump, options: RunnerOptions) -> None:
+IsBlocked = Callable[[str], bool]
+"""Whether a node may have to wait for the journal."""
+
+
+class Pump(Protocol):
+    """The part of dora_systemd.runner.cell.pump.Pump that SignWatch uses."""
+
+    cell: Cell
+
+    def push(self, event: life.Event) -> None:
+        """Take one event through the table."""
+
+    def refresh(self) -> None:
+        """Write the table that `list` reads."""
+
+
+async def watch_nodes(
+    signs: NoSigns, pump: Pump, is_blocked: IsBlocked, options: RunnerOptions
+) -> None:
     """Watch over the nodes of one run of the dataflow, until this task is cancelled."""
-    if isinstance(nodes.signs, Signs):
-        await SignWatch(nodes.signs, pump, nodes, options).run()
+    if isinstance(signs, Signs):
+        await SignWatch(signs, pump, is_blocked, options).run()
 
 
 class SignWatch:
     """Watches over the nodes of one run of the dataflow."""
 
-    def __init__(self, signs: Signs, pump: Pump, nodes: Nodes, options: RunnerOptions) -> None:
+    def __init__(
+        self, signs: Signs, pump: Pump, is_blocked: IsBlocked, options: RunnerOptions
+    ) -> None:
         self._signs = signs
         self._pump = pump
-        self._nodes = nodes
+        self._is_blocked = is_blocked
         self._options = options
         self._loop = asyncio.get_running_loop()
         self._watches: dict[str, Watch] = {}
@@ -73,7 +95,7 @@ class SignWatch:
     def _look_at(self, node: str, ear: Ear, now: int) -> None:
         phase, pid = self._phase(self._pump.cell.nodes.get(node))
         watch = self._watches.get(node, Watch()).of(phase, pid, ear.signed, now)
-        if self._nodes.is_blocked(node):
+        if self._is_blocked(node):
             watch = watch.excused(now)
         limit = limit_in(phase, ear.limit, self._options.start_timeout)
         act = watch.act(limit, self._options.grace, now)
@@ -100,5 +122,6 @@ class SignWatch:
 
     def _abort(self, node: str, ear: Ear, pid: int, reason: str) -> None:
         details = {"status": ear.status} if ear.status else {}
-        self._pump.push(life.NodeHung(now_us(), node, reason, "node-watchdog", details))
+        at_us = time.time_ns() // 1000
+        self._pump.push(life.NodeHung(at_us, node, reason, "node-watchdog", details))
         signal_group(self._signs.group(node), SIGABRT, pid)

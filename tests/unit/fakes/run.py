@@ -21,7 +21,7 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.runner.nodes.resources import Resources
-from dora_systemd.runner.signs.hook import NoSigns
+from dora_systemd.runner.signs.none import NoSigns
 
 Calls = list[tuple[Any, ...]]
 """What the fakes of one run were asked to do, in its order."""

@@ -38,9 +38,8 @@ class Watched(Bench):
         signs = Signs({"a": LIMIT}, root, paths, self.pipes.write_event)
         signs.make("a")
         self.signs, self.nodes.signs, self.is_blocked = signs, signs, False
-        self.nodes.is_blocked = lambda _: self.is_blocked  # type: ignore[method-assign]
         options = OPTIONS._replace(grace=2 * SECOND)
-        self.watch = SignWatch(signs, self.pump, self.nodes, options)
+        self.watch = SignWatch(signs, self.pump, lambda _: self.is_blocked, options)
         ((_, self.ear),) = signs.ears()
 
     def close(self) -> None:
