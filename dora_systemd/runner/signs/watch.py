@@ -72,7 +72,8 @@ class SignWatch:
                 await asyncio.sleep(self._signs.clock.period / SECOND)
                 self._look()
         finally:
-            self._signs.on_news = lambda: None
+            if self._signs.on_news == self._hear_news:  # else the watch of the next run has begun
+                self._signs.on_news = lambda: None
             if self._timer is not None:
                 self._timer.cancel()
 

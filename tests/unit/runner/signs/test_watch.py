@@ -11,6 +11,7 @@ import pytest
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import State
+from dora_systemd.decisions.signs.messages import parse_message
 from dora_systemd.decisions.signs.table import Sign
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.signs import sockets, watch
@@ -63,7 +64,7 @@ def test_a_silent_node_is_ended_then_killed(
     async def work() -> None:
         with bench(tmp_path, monkeypatch) as one:
             one.passes(1)
-            one.ear.hear(sockets.parse_message(b"WATCHDOG=1\nSTATUS=up"), one.signs.clock)
+            one.ear.hear(parse_message(b"WATCHDOG=1\nSTATUS=up"), one.signs.clock)
             one.passes(3.5)
             assert one.done == []
             one.passes(1)
@@ -137,7 +138,7 @@ def test_it_asks_for_its_end_and_the_table_is_written(
     async def work() -> None:
         with bench(tmp_path, monkeypatch) as one:
             one.passes(1)
-            one.ear.hear(sockets.parse_message(b"WATCHDOG=trigger\nSTATUS=bye"), one.signs.clock)
+            one.ear.hear(parse_message(b"WATCHDOG=trigger\nSTATUS=bye"), one.signs.clock)
             one.watch._hear_news()
             one.watch._hear_news()
             one.watch._publish()
