@@ -8,7 +8,8 @@ import pytest
 
 from dora_systemd.errors import ExitCode
 from tests.lab.pace import bound
-from tests.system.cells import Cell, Project, wait_for
+from tests.system.cells import Cell, Project, run, wait_for
+from tests.system.gateways import Front
 from tests.system.refusals import Refusal, check_refusals
 
 ON_FAILURE = ("--restart-policy", "on-failure", "--max-restarts", "3")
@@ -94,7 +95,9 @@ def signs(cell: Cell, node: str) -> int:
 
 
 @pytest.mark.warns(*ENDED)
-def test_a_node_that_falls_silent_is_restarted(cell: Cell, project: Project) -> None:
+@pytest.mark.lab
+@pytest.mark.usefixtures("gateway_up")
+def test_a_node_that_falls_silent_is_restarted(front: Front, cell: Cell, project: Project) -> None:
     others = {name: OTHER.format(line) for name, line in OTHERS.items()}
     flow = project.root / write_flow(project, feeder=FEEDER, **others)
     environment = ("--env", "PYTHONFAULTHANDLER=1")
@@ -134,6 +137,18 @@ def test_a_node_that_falls_silent_is_restarted(cell: Cell, project: Project) -> 
     table = cell.doractl("list", cell.name).stdout
     assert "STATUS TEXT" in table
     assert f"s/{seconds}s  by a library" in table
+
+    labels = f'{{dataflow="{cell.name}",node="shell"}}'
+    metrics = dict(line.rsplit(" ", 1) for line in front.get("/metrics")[1].splitlines())
+    assert float(metrics[f"dora_node_watchdog_seconds{labels}"]) == seconds
+    assert 0 <= float(metrics[f"dora_node_watchdog_age_seconds{labels}"]) < seconds
+    explained = run("journalctl", "--catalog", f"--unit={cell.unit}", "DORA_EVENT=node-watchdog")
+    assert "sent WATCHDOG=1 to its notify socket" in explained.stdout
+
+    cell.doractl("node", "restart", cell.name, "feeder")
+    wait_for("it says so", lambda: texts(cell) == said)
+    assert dict(cell.events()).get("node-watchdog") == "feeder"
+    assert [name for name, _ in cell.events()].count("node-watchdog") == 1
 
 
 @pytest.mark.warns(*ENDED, "got a message from another process")

@@ -152,7 +152,9 @@ _OPTIONAL = (
 _LEAST = 12
 _ROOM = {"NAME": _LEAST, "NODE": _LEAST, "WHY": 24, "EXIT": _LEAST, "STATUS TEXT": 24}
 """Columns whose cells may be cut to _LEAST, and the width for which other columns are left out."""
-_RIGHT_ALIGNED = frozenset({"CPU%", "THROTTLED%", "MEM", "PEAK", "RESTARTS", "PID", "UPTIME"})
+_RIGHT_ALIGNED = frozenset(
+    {"CPU%", "THROTTLED%", "MEM", "PEAK", "RESTARTS", "PID", "UPTIME", "WATCHDOG"}
+)
 _ANSI = {"red": "\x1b[31m", "yellow": "\x1b[33m"}
 _UNDERLINED, _PLAIN = "\x1b[4m", "\x1b[0m"
 STATE_COLORS = {
