@@ -6,6 +6,8 @@
 # launcher.pl NODE DIRECTORY pipe|keep COMMAND [ARGUMENT...]
 #   pipe: stdout and stderr become the node's FIFOs; opening them waits for the runner.
 #   keep: dora itself reads the output (send_stdout_as, send_logs_as).
+#   :USEC behind it: the node has a notify socket, and if not 0 a watchdog, see
+#   sd_watchdog_enabled(3); :any behind that: another process of the node may feed it.
 # Environment: DORA_SYSTEMD_CELL (RuntimeDirectory), DORA_SYSTEMD_GROUP (cgroup of the unit),
 # DORA_SYSTEMD_LIBEXEC (first entry of PATH), DORA_SYSTEMD_UNSET (names).
 #
@@ -35,6 +37,13 @@ note("$cell/io/$node.pid", "$$\n");
 # Before the pipes: the kernel lets this move wait for some 10 ms, and the runner needs them to get
 # ready for the pipes.
 note("$group/node-$node/cgroup.procs", "0\n");
+($output, my ($usec, $any)) = split /:/, $output;
+if (defined $usec) {
+    $ENV{NOTIFY_SOCKET} = "$cell/io/$node.notify";
+    delete @ENV{qw(WATCHDOG_USEC WATCHDOG_PID)};
+    $ENV{WATCHDOG_USEC} = $usec if $usec;
+    $ENV{WATCHDOG_PID} = $$ if $usec and not $any;
+}
 if ($output eq 'pipe') {
     open STDOUT, '>', "$cell/io/$node.out" or fail(126, "$node.out");
     open STDERR, '>', "$cell/io/$node.err" or fail(126, "$node.err");

@@ -49,6 +49,10 @@ class CellPaths:
         """The position up to which dora's log file of `node` is in the journal."""
         return self.io / f"{node}.place"
 
+    def node_notify(self, node: str) -> Path:
+        """The notify socket of `node`, if it has one."""
+        return self.io / f"{node}.notify"
+
     def node_pid(self, node: str) -> Path:
         """The file where the launcher of `node` first writes its pid."""
         return self.io / f"{node}.pid"

@@ -130,7 +130,7 @@ class Runs:
         self.environment = node_environment(os.environ)
         settings = SettingsFile(settings_path(options.dataflow), paths.settings)
         self.reloader = Reloader(options, self.environment, settings)
-        self.nodes = Nodes(self.unit, paths, pipes)
+        self.nodes = Nodes(self.unit, paths, pipes, options.watchdogs)
         self.beside = Beside(asyncio.get_running_loop())
         self.boot = begun[0] if begun else None
         self.check = begun[1] if begun else DoraCheck(options, self.environment)

@@ -55,8 +55,16 @@ def group_path(group: str) -> Path:
 
 
 def own_group() -> str:
-    """The group of this process: the "0::" line of /proc/self/cgroup, see cgroups(7)."""
-    for line in Path("/proc/self/cgroup").read_text().splitlines():
+    """The group of this process."""
+    return group_of("self")
+
+
+def group_of(process: int | str) -> str:
+    """The group of a process: the "0::" line of /proc/PID/cgroup, see cgroups(7).
+
+    "/" if the process has exited.
+    """
+    for line in read_text(Path(f"/proc/{process}/cgroup")).splitlines():
         if line.startswith("0::"):
             return line[3:]
     return "/"

@@ -20,8 +20,9 @@ from dora_systemd.decisions.descriptor.build_session import BuildSession
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.descriptor.expansion import expanded
 from dora_systemd.decisions.descriptor.nodes import Node, NodeKind
+from dora_systemd.decisions.signs.watchdogs import watchdog_of
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.values import SECOND, quoted
+from dora_systemd.values import INFINITY, SECOND, quoted
 
 LAUNCHED = frozenset({NodeKind.PYTHON, NodeKind.EXECUTABLE, NodeKind.SHELL})
 PROGRAM_KEYS = ("path", "args", "build", "git", "branch", "tag", "rev")
@@ -101,11 +102,24 @@ def _launch_node(node: Node, source: str, plan: LaunchPlan) -> dict[str, Any]:
         return raw
     output = "keep" if node.keeps_output else "pipe"
     directory = _directory(node, source, plan)
+    output += _notify_words(node, plan)
     words = [plan.launcher, node.id, directory, output, *_command(node, directory, source, plan)]
     kept = {key: value for key, value in raw.items() if key not in PROGRAM_KEYS}
     if isinstance(kept.get("deploy"), Mapping):
         kept["deploy"] = {**kept["deploy"], "working_dir": None}
     return {**kept, "path": PERL, "args": shlex.join(words)}
+
+
+def _notify_words(node: Node, plan: LaunchPlan) -> str:
+    """ ":USEC" if the node has a notify socket, 0 without a watchdog.
+
+    The program of a node whose process is uv or a shell has another pid: ":any" is no WATCHDOG_PID.
+    """
+    limit = watchdog_of(plan.options.watchdogs, node.id)
+    if not limit:
+        return ""
+    is_wrapped = plan.options.uv or node.kind is NodeKind.SHELL
+    return f":{limit if limit < INFINITY else 0}" + (":any" if is_wrapped else "")
 
 
 def _restart_keys(node: Node, options: RunnerOptions) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 from dora_systemd.decisions.cell.exits import Exit, parse_exit
+from dora_systemd.decisions.signs.table import Sign, parse_sign
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import is_node_id
 
@@ -50,7 +51,7 @@ class NodeStatus(NamedTuple):
     in this run. since_us: CLOCK_REALTIME µs of the last change of state. exit: how its last process
     ended. kind: how dora starts it (python, executable, shell, uv, operator, ros2, dynamic, url).
     policy: dora's restart policy, "never" if it has none, or HELD. max_restarts: in one window, 0
-    without limit. hung: the message of dora's health check before it ended the process, or "".
+    without limit. hung: why dora's health check or its watchdog ended the process, or "".
     """
 
     state: str = "starting"
@@ -96,7 +97,7 @@ class CellStatus(NamedTuple):
     started_us, ready_us: CLOCK_REALTIME µs, 0 if that has not happened. samples: the last
     SAMPLES_KEPT CPU samples, oldest first. lines: by node; lost ones count for WHOLE_CELL.
     up_us: CLOCK_MONOTONIC µs of READY=1, 0 before it, and in tables of older versions. is_first:
-    whether NRestarts= of the unit is certainly 0.
+    whether NRestarts= of the unit is certainly 0. signs: of the nodes with a notify socket.
     """
 
     uuid: str = ""
@@ -110,6 +111,7 @@ class CellStatus(NamedTuple):
     lines: Mapping[str, LineCount] = {}
     up_us: int = 0
     is_first: bool = False
+    signs: Mapping[str, Sign] = {}
 
     @property
     def alive_count(self) -> int:
@@ -215,6 +217,7 @@ def _parse_cell(raw: Any) -> CellStatus:
         lines=_by_node(known.get("lines", {}), lambda one: LineCount(*_numbers(one, 3))),
         up_us=_number(known, "up_us"),
         is_first=known.get("is_first") is True,
+        signs=_by_node(known.get("signs", {}), parse_sign),
     )
 
 

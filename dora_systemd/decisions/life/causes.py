@@ -21,6 +21,7 @@ class Cause(StrEnum):
     OUT_OF_MEMORY = "out-of-memory"
 
     NODE_HUNG = "node-hung"
+    NODE_WATCHDOG = "node-watchdog"
     NODE_OUT_OF_MEMORY = "node-out-of-memory"
     UNIT_FAILED = "unit-failed"
     NO_END = "no-end"

@@ -103,10 +103,15 @@ class NodeCascaded(Event):
 
 @dataclass(frozen=True)
 class NodeHung(Event):
-    """dora's health check ends the node. reason: such as "unresponsive for 5322ms"."""
+    """dora's health check, or the node's watchdog, ends the node.
+
+    reason: such as "unresponsive for 5322ms". record, details: the life event.
+    """
 
     node: str
     reason: str
+    record: str = "node-hung"
+    details: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -78,7 +78,7 @@ def _hung(nodes: NodeTable, event: life.NodeHung) -> Update:
     if event.node not in nodes:
         return nodes, None
     nodes = {**nodes, event.node: nodes[event.node]._replace(hung=event.reason)}
-    return nodes, Record("node-hung", event.node, {"reason": event.reason})
+    return nodes, Record(event.record, event.node, {"reason": event.reason, **event.details})
 
 
 def _spawned(nodes: NodeTable, event: life.NodeSpawned) -> Update:

@@ -15,6 +15,7 @@ from dora_systemd.decisions.cell.status import (
 from dora_systemd.decisions.life.nodes import WITH_PROCESS
 from dora_systemd.decisions.life.states import Cell, State
 from dora_systemd.decisions.life.stop_budget import kill_delay
+from dora_systemd.decisions.signs.table import Sign
 from dora_systemd.values import INFINITY, format_duration
 
 _SHOWN = {
@@ -101,6 +102,7 @@ def cell_status(
     uuid: str,
     samples: tuple[CpuSample, ...],
     lines: Mapping[str, LineCount],
+    signs: Mapping[str, Sign],
 ) -> CellStatus:
     """The table for status.json."""
     return CellStatus(
@@ -113,6 +115,7 @@ def cell_status(
         nodes=dict(cell.nodes),
         samples=samples,
         lines=lines,
+        signs=signs,
     )
 
 

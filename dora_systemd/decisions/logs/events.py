@@ -58,6 +58,14 @@ EVENTS = {
         "1c40798a51c14a89a416ed625e0afc1a", NOTICE, "is throttled by a CPU limit"
     ),
     "node-hung": EventKind("6bb24464fee34a848c077fc1b20c1802", ERR, "Node {node} hangs"),
+    "node-watchdog": EventKind(
+        "5bec2bc650014ae7bb1424da4204438f", ERR, "Node {node} is ended by its watchdog"
+    ),
+    "notify-refused": EventKind(
+        "1bd51be61e0640ab97f9b364c5014cf0",
+        WARNING,
+        "Notify socket of node {node} got a message from another process",
+    ),
     "coordinator-lost": EventKind(
         "11b7330be3fb484584286f274012f05a", ERR, "The coordinator of dataflow {dataflow} is lost"
     ),

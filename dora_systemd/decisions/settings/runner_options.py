@@ -14,6 +14,7 @@ from dora_systemd.decisions.settings.limits import NODE_LIMIT
 from dora_systemd.decisions.settings.reload import HOT_RELOAD, IGNORE, REPLACE, WATCH
 from dora_systemd.decisions.settings.resolve import Settings
 from dora_systemd.decisions.settings.restarts import POLICY_SETTINGS, RESTART_POLICY, START_TIMEOUT
+from dora_systemd.decisions.settings.signs import NOTIFY, WATCHDOG
 from dora_systemd.decisions.settings.table import (
     ALLOW_SHELL_NODES,
     DEBUG,
@@ -22,6 +23,7 @@ from dora_systemd.decisions.settings.table import (
     LOG_RATE_LIMIT,
     UV,
 )
+from dora_systemd.decisions.signs.watchdogs import ALL_NODES, Watchdogs, merge_watchdogs
 
 _FIELDS = {
     setting.name: field
@@ -42,6 +44,7 @@ def with_settings(options: RunnerOptions, settings: Settings) -> RunnerOptions:
         restart=restart_policy(settings),
         node_restarts=node_policies(settings),
         start_timeout=settings[START_TIMEOUT],
+        watchdogs=watchdogs(settings),
         reload=hot_reload(settings, options.working_directory),
     )
 
@@ -52,6 +55,12 @@ def log_rates(settings: Settings) -> RateLimits:
     Raises DoraSystemdError (BAD_INPUT).
     """
     return merge_rates(settings.by_node(LOG_RATE_LIMIT), settings[LOG_RATE_LIMIT])
+
+
+def watchdogs(settings: Settings) -> Watchdogs:
+    """Which nodes have a watchdog or a notify socket. Raises DoraSystemdError (BAD_INPUT)."""
+    sockets = {ALL_NODES: settings[NOTIFY], **settings.by_node(NOTIFY)}
+    return merge_watchdogs(settings.by_node(WATCHDOG), settings[WATCHDOG], sockets)
 
 
 def settings_node_limits(settings: Settings) -> tuple[NodeLimits, ...]:

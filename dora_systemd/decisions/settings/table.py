@@ -26,6 +26,7 @@ from dora_systemd.decisions.settings.limits import LIMIT_SETTINGS
 from dora_systemd.decisions.settings.reload import RELOAD_SETTINGS
 from dora_systemd.decisions.settings.restarts import RESTART_SETTINGS
 from dora_systemd.decisions.settings.sandbox import SANDBOX_SETTINGS
+from dora_systemd.decisions.settings.signs import SIGN_SETTINGS
 
 ENV = Setting[Mapping[str, str]]("env", ENVIRONMENT, {}, "Environment variable of all nodes.")
 ENV_FILE = Setting[tuple[str, ...]](
@@ -95,6 +96,7 @@ SECTIONS: dict[str, tuple[Setting[Any], ...]] = {
     "Nodes": tuple(value for value in list(globals().values()) if isinstance(value, Setting)),
     "Limits": LIMIT_SETTINGS,
     "Restarts": RESTART_SETTINGS,
+    "Signs of life": SIGN_SETTINGS,
     "Sandbox and secrets": (*CREDENTIAL_SETTINGS, *SANDBOX_SETTINGS),
     "Hot reload": RELOAD_SETTINGS,
 }

@@ -35,7 +35,8 @@ class NodeRow(NamedTuple):
 
     cpu_limit, memory_limit: the group's own, or None. throttled: the percentage of the time in
     which its CPU limit throttled it, None without one. since: time of its last change of state,
-    CLOCK_REALTIME µs, 0: unknown.
+    CLOCK_REALTIME µs, 0: unknown. text: its own STATUS=. watchdog, sign_age: the time in which it
+    must send WATCHDOG=1, and how long ago it did, in µs.
     """
 
     node: str
@@ -51,6 +52,9 @@ class NodeRow(NamedTuple):
     memory_limit: int | None = None
     throttled: float | None = None
     since: int = 0
+    text: str = ""
+    watchdog: int | None = None
+    sign_age: int | None = None
 
 
 class Holder(NamedTuple):
@@ -157,13 +161,15 @@ def _prefix(uuid: str, others: Sequence[str]) -> str:
 
 _OPTIONAL = (
     *("BOOT", "PEAK", "PID", "THROTTLED%", "RESTARTS", "UPTIME", "WAITS FOR", "MEM", "CPU%"),
-    *("NODES", "UUID"),
+    *("WATCHDOG", "NODES", "UUID"),
 )
 """Columns that a narrow terminal does without, in this order."""
 _LEAST = 12
-_ROOM = {"NAME": _LEAST, "NODE": _LEAST, "WHY": 24, "EXIT": _LEAST}
+_ROOM = {"NAME": _LEAST, "NODE": _LEAST, "WHY": 24, "EXIT": _LEAST, "STATUS TEXT": 24}
 """Columns whose cells may be cut to _LEAST, and the width for which other columns are left out."""
-_RIGHT_ALIGNED = frozenset({"CPU%", "THROTTLED%", "MEM", "PEAK", "RESTARTS", "PID", "UPTIME"})
+_RIGHT_ALIGNED = frozenset(
+    {"CPU%", "THROTTLED%", "MEM", "PEAK", "RESTARTS", "PID", "UPTIME", "WATCHDOG"}
+)
 _ANSI = {"red": "\x1b[31m", "yellow": "\x1b[33m"}
 _UNDERLINED, _PLAIN = "\x1b[4m", "\x1b[0m"
 STATE_COLORS = {

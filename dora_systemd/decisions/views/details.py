@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 from dora_systemd.decisions.cell.restarts import budget_words
+from dora_systemd.decisions.signs.table import format_watchdog
 from dora_systemd.decisions.views.dataflows import (
     DEGRADED,
     FAILED,
@@ -24,15 +25,18 @@ from dora_systemd.terminal_text import cut, one_line
 
 
 def _format_nodes(rows: Sequence[NodeRow], width: int | None, want_colors: bool) -> str:
-    """The node table; with THROTTLED% if any node has a CPU limit."""
+    """The node table; with THROTTLED% if any node has a CPU limit, and with what nodes say."""
     cells = [_node_cells(row) for row in rows]
     is_limited = any(row.cpu_limit is not None for row in rows)
-    header = [title for title in cells[0] if is_limited or title != _THROTTLED]
+    idle = {title for title in _SIGNS if not any(row[title] for row in cells)}
+    idle |= set() if is_limited else {_THROTTLED}
+    header = [title for title in cells[0] if title not in idle]
     lines = [[row[title] for title in header] for row in cells]
     return format_table(header, lines, width, want_colors)
 
 
 _THROTTLED = "THROTTLED%"
+_SIGNS = ("WATCHDOG", "STATUS TEXT")
 
 
 def _node_cells(row: NodeRow) -> dict[str, str]:
@@ -46,6 +50,8 @@ def _node_cells(row: NodeRow) -> dict[str, str]:
         "PEAK": format_memory(row.memory_peak),
         "RESTARTS": _restarts_of(row),
         "EXIT": row.exit or UNKNOWN,
+        "WATCHDOG": format_watchdog(row.sign_age, row.watchdog),
+        "STATUS TEXT": row.text,
     }
 
 

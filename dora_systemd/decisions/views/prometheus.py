@@ -72,6 +72,8 @@ STATE = Family("state", "1 for the current state, 0 for all others.")
 RESTARTS = Family("restarts_total", "Automatic restarts.")
 START = Family("start_time_seconds", "When all nodes were ready, in Unix time.")
 NODE_START = Family("start_time_seconds", "When it became ready, in Unix time.")
+WATCHDOG = Family("watchdog_seconds", "Time in which it must send WATCHDOG=1.")
+SIGN_AGE = Family("watchdog_age_seconds", "Time since its last WATCHDOG=1.")
 INFO = Family("info", "UUID and unit of a dataflow; the value is always 1.")
 NODES = Family("nodes", "Nodes that the dataflow has.")
 ALIVE = Family("nodes_alive", "Nodes that are running.")
@@ -118,6 +120,9 @@ def _node_samples(observed: Sequence[Observed]) -> Iterator[tuple[Family, list[S
     restarts = [(own, node.restarts) for own, _, node in places]
     yield RESTARTS, [(own, count) for own, count in restarts if count is not None]
     yield NODE_START, [(own, node.since / SECOND) for own, _, node in places if _is_there(node)]
+    yield WATCHDOG, [(own, n.watchdog / SECOND) for own, _, n in places if n.watchdog]
+    ages = [(own, node.sign_age) for own, _, node in places]
+    yield SIGN_AGE, [(own, age / SECOND) for own, age in ages if age is not None]
     counts = [(own, o.lines[node.node]) for own, o, node in places if node.node in o.lines]
     yield LINES, [(own, count.written) for own, count in counts]
     yield SUPPRESSED, [(own, count.suppressed) for own, count in counts]

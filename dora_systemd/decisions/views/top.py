@@ -18,10 +18,13 @@ from dora_systemd.decisions.views.dataflows import (
     node_count,
 )
 from dora_systemd.decisions.views.objects import Shares, dataflow_object, moment
+from dora_systemd.terminal_text import cut
 
 SORTS = ("cpu", "memory", "name")
 HEADER = ("NAME", "STATE", "UPTIME", "CPU%", "MEM", "PEAK", "RESTARTS", "WAITS FOR")
 NOTHING = "No dataflow is running."
+_MOST_WORDS = 40
+"""Characters of a node's own STATUS=."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +102,8 @@ def _node_row(node: NodeRow, entry: TopEntry, look: Look) -> TopRow:
     is_alive = node.state in ALIVE_NODE_STATES and node.since
     uptime = format_uptime(max(look.at_us - node.since, 0)) if is_alive else UNKNOWN
     word = node.state.capitalize()
-    state = f"{word} ({node.exit})" if node.exit and not is_alive else word
+    words = cut(node.text, _MOST_WORDS) if is_alive else node.exit
+    state = f"{word} ({words})" if words else word
     cells = (f"  {node.node}", state, uptime, *_numbers(node, entry.waits, node.node))
     whole = entry.row
     return TopRow(whole.uuid, whole.name, node.node, word, cells)

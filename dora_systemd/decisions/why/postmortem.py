@@ -10,6 +10,7 @@ from dataclasses import replace
 from dora_systemd.decisions.cell.exits import KILLED, ExitKind, exit_of, parse_exit
 from dora_systemd.decisions.life.causes import UNIT_RESULTS, Cause
 from dora_systemd.decisions.reload.steps import How
+from dora_systemd.decisions.signs.words import by_watchdog
 from dora_systemd.decisions.views.dataflows import FAILED, FINISHED, RESTARTING, STOPPED, UP_WORDS
 from dora_systemd.decisions.why.lives import Happening, Life, with_restarts
 from dora_systemd.decisions.why.nodes import ended_nodes
@@ -109,7 +110,7 @@ def _crash(crash: Happening) -> Verdict:
     if crash.name == "node-oom":
         cause = Cause.NODE_OUT_OF_MEMORY
     elif exit.kind is ExitKind.HUNG:
-        cause = Cause.NODE_HUNG
+        cause = Cause.NODE_WATCHDOG if by_watchdog(exit.words) else Cause.NODE_HUNG
     how = str(exit) or "ended, how is not recorded"
     return _found(cause, f"node {crash.node}: {how}", crash, crash.node)
 

@@ -37,6 +37,8 @@ _MORE_MEMORY = "doractl set {name} --memory-limit SIZE, or limit single nodes (-
 _REMEDIES = {
     Cause.NODE_FAILED: "fix {node}, then run: doractl restart {name}",
     Cause.NODE_HUNG: "find out what {node} waited for, or raise health_check_timeout: in its YAML",
+    Cause.NODE_WATCHDOG: "find out what {node} waited for (PYTHONFAULTHANDLER=1 prints that for "
+    "Python), or raise watchdog: in its settings",
     Cause.NODE_OUT_OF_MEMORY: "look for a leak in {node}, or run: "
     "doractl set {name} --node-limit {node}:memory=SIZE",
     Cause.START_TIMEOUT: "find out why {node} does not call Node(), or raise --start-timeout",

@@ -7,11 +7,20 @@ import { plural, since, uptime } from "./words.js";
 
 const ALIVE = ["ready", "running", "dynamic"];
 
+/** How long ago the node has sent WATCHDOG=1, and how long it may take. */
+function signWords({ watchdog_us: limit, watchdog_age_us: age }) {
+  if (!limit) return "";
+  const seconds = (us) => (us / 1e6).toFixed(1);
+  return `watchdog ${age === null ? "-" : seconds(age)} of ${seconds(limit)} s`;
+}
+
 export class NodeRow {
   /** ask: is called with an action and the node. choose: with the node whose logs are wanted. */
   constructor(name, ask, choose) {
     this.badge = el("span", { class: "badge" });
     this.exit = el("span", { class: "exit" });
+    this.said = el("span", { class: "said muted" });
+    this.sign = el("span", { class: "sign" });
     this.up = el("span", { class: "up" });
     this.restarts = el("span", { class: "restarts" });
     this.charts = { cpu: cpuChart("small"), memory: memoryChart("small") };
@@ -23,8 +32,8 @@ export class NodeRow {
     this.choose = el("button", { type: "button", class: "plain name", "aria-pressed": "false",
       title: `Show the logs of ${name}`, onclick: () => choose(name) }, name);
     this.node = el("li", { "data-node": name },
-      el("div", { class: "what" }, this.choose, this.badge, this.exit),
-      el("div", { class: "facts muted" }, this.up, this.restarts, this.waits),
+      el("div", { class: "what" }, this.choose, this.badge, this.exit, this.said),
+      el("div", { class: "facts muted" }, this.up, this.restarts, this.sign, this.waits),
       this.charts.cpu.node, this.charts.memory.node,
       el("div", { class: "buttons" }, this.buttons.restart, this.buttons.stop, this.limits));
   }
@@ -35,6 +44,8 @@ export class NodeRow {
     const isAlive = ALIVE.includes(state);
     showState(this.badge, state);
     say(this.exit, isAlive ? "" : exit);
+    say(this.said, isAlive ? facts.text : "");
+    say(this.sign, isAlive ? signWords(facts) : "");
     const ended = at ? since(at) : "";
     say(this.up, isAlive ? `up ${uptime(at ? Date.now() * 1000 - at : null)}` : ended);
     say(this.restarts, restarts ? plural(restarts, "restart") : "");

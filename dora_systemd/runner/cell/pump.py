@@ -207,9 +207,13 @@ class Pump:
         self._samples = add_sample(self._samples, sample)
         self._write_table()
 
+    def refresh(self) -> None:
+        """Write the table again, because what the nodes say of themselves has changed."""
+        self._write_table()
+
     def _write_table(self) -> None:
-        own, lines = self._life, self._pipes.line_counts()
-        table = cell_status(self.cell, own.uuid, self._samples, lines)
+        own, lines, signs = self._life, self._pipes.line_counts(), self._nodes.signs.table()
+        table = cell_status(self.cell, own.uuid, self._samples, lines, signs)
         table = table._replace(up_us=own.up_us, is_first=own.is_first)
         try:
             files.write_atomic(self._paths.status, table.to_json(), 0o600)

@@ -21,15 +21,22 @@ from dora_systemd.decisions.cell.status import WHOLE_CELL, CpuSample
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.descriptor.nodes import Node, NodeKind
 from dora_systemd.decisions.resources.oom import Oom
+from dora_systemd.decisions.signs.watchdogs import NO_WATCHDOGS, Watchdogs
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.nodes.hold import Hold
 from dora_systemd.runner.nodes.resources import Resources
+from dora_systemd.runner.signs.hook import signs_of
 
 
 class Nodes:
-    """The node groups below `unit`, the cgroup directory of the unit, and the nodes' pipes."""
+    """The node groups below `unit`, the cgroup directory of the unit, and the nodes' pipes.
 
-    def __init__(self, unit: Path, paths: CellPaths, pipes: LogPipes) -> None:
+    signs: the notify sockets of those that `watchdogs` gives one.
+    """
+
+    def __init__(
+        self, unit: Path, paths: CellPaths, pipes: LogPipes, watchdogs: Watchdogs = NO_WATCHDOGS
+    ) -> None:
         self._unit = unit
         self._paths = paths
         self._pipes = pipes
@@ -38,6 +45,7 @@ class Nodes:
         self._tails: dict[str, JsonlTail | None] = {}
         self._holds: dict[str, Hold] = {}
         self.resources = Resources(unit)
+        self.signs = signs_of(watchdogs, unit, paths, pipes.write_event)
 
     def prepare(self, dataflow: Dataflow, rates: RateLimits, limits: Iterable[NodeLimits]) -> None:
         """Create a group for every node, with its limits, and pipes for the nodes that use them.
@@ -63,6 +71,7 @@ class Nodes:
         cgroup.kill_as_one(self._group(node.id))
         if is_launched(node):
             self._launched.add(node.id)
+            self.signs.make(node.id)
         if has_pipes(node):
             self._pipes.make(node.id, self._paths)
             self._piped.add(node.id)
@@ -93,6 +102,7 @@ class Nodes:
         if hold := self._holds.pop(node, None):
             hold.end()
         cgroup.kill_group(self._group(node))
+        self.signs.remove(node)
         if node in self._piped:
             self._pipes.forget(node)
         self._piped.discard(node)
@@ -157,8 +167,14 @@ class Nodes:
         return nullcontext() if hold is None else hold.paused()
 
     def forget(self, node: str) -> None:
-        """The node's process has ended: later lines come from its next process."""
+        """The node's process has ended: later lines and signs come from its next process."""
         self._pipes.set_pid(node, 0)
+        self.signs.forget(node)
+
+    def is_blocked(self, node: str) -> bool:
+        """Whether the node may have to wait, because journald does not take its lines."""
+        hold = self._holds.get(node)
+        return self._pipes.is_busy(node) or (hold is not None and hold.is_held)
 
     def has_process(self, node: str, pid: int) -> bool:
         """Whether `pid` is a live process of the node. Zombies do not count.

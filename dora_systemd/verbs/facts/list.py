@@ -14,6 +14,7 @@ from dora_systemd.decisions.cell.status import (
     throttled_percent,
 )
 from dora_systemd.decisions.resources.usage import Usage
+from dora_systemd.decisions.signs.table import sign_facts
 from dora_systemd.decisions.views.dataflows import DataflowRow, NodeRow, status_word
 from dora_systemd.scope import Scope
 from dora_systemd.values import INFINITY, SECOND
@@ -114,7 +115,10 @@ def _usage(reading: Reading, known: tuple[CpuSample, ...]) -> dict[str, Any]:
             _node_row(
                 node,
                 status.nodes.get(node),
-                _numbers(use[node], samples, now, node) if node in use else {},
+                {
+                    **(_numbers(use[node], samples, now, node) if node in use else {}),
+                    **sign_facts(status.signs, node, now.at_us),
+                },
             )
             for node in names
         ),

@@ -87,6 +87,10 @@ CASES: dict[str, tuple[tuple[Record, ...], str, Cause, str, str]] = {
         (*RUNS, event("node-crashed", "camera", exit="hung, unresponsive"), NODE_FAILED),
         *("Failed", Cause.NODE_HUNG, "camera", "node camera: hung, unresponsive"),
     ),
+    "missed its watchdog": (
+        (*RUNS, event("node-crashed", "camera", exit="hung, no WATCHDOG=1 for 5s"), NODE_FAILED),
+        *("Failed", Cause.NODE_WATCHDOG, "camera", "node camera: hung, no WATCHDOG=1 for 5s"),
+    ),
     "out of memory": (
         (*RUNS, OOM, NODE_FAILED),
         *("Failed", Cause.NODE_OUT_OF_MEMORY, "camera"),

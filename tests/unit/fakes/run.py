@@ -21,6 +21,7 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.runner.nodes.resources import Resources
+from dora_systemd.runner.signs.none import NoSigns
 
 Calls = list[tuple[Any, ...]]
 """What the fakes of one run were asked to do, in its order."""
@@ -43,6 +44,7 @@ class FakeNodes(Nodes):
     def __init__(self, calls: Calls | None = None) -> None:
         self.calls: Calls = [] if calls is None else calls
         self.resources: FakeResources = FakeResources()
+        self.signs = NoSigns()
         self.living: set[tuple[str, int]] = set()
         self.ooms: dict[str, Oom] = {}
 

@@ -59,7 +59,13 @@ ROBOT = DataflowRow(
     restarts=1,
     restart_budget={"used": 0, "max": 5, "next_us": None, "resets_us": None},
     nodes=(
-        NodeRow("camera", "running", 4211, 12.5, 134217728, 167772160, 0, since=READY),
+        NodeRow(
+            *("camera", "running", 4211, 12.5, 134217728, 167772160, 0),
+            since=READY,
+            text="30 frames/s",
+            watchdog=5_000_000,
+            sign_age=1_200_000,
+        ),
         NodeRow("detector", "failed", restarts=1, exit="exit code 1", since=CRASHED),
     ),
     enabled=True,

@@ -66,6 +66,10 @@ LATE = {
         "decisions.reload.watch_rules": {"pathspec"},
         "verbs.start.watch": {"adapters.host.watch"},
     },
+    "most dataflows have no notify sockets": {
+        "runner.signs.hook": {"runner.signs.sockets"},
+        "runner.cell.dialogue": {"runner.signs.watch"},
+    },
     "asyncio and WebSockets: of all verbs, a few need one of them": {
         "verbs.node": {"adapters.dora.control", "adapters.runner_socket.relay"},
         "adapters.dora.control": {"adapters.dora.websocket"},

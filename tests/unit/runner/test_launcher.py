@@ -100,6 +100,29 @@ def test_no_other_variable_is_touched(environment: dict[str, str], tmp_path: Pat
     }
 
 
+NOTIFY = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
+
+
+@pytest.mark.parametrize(
+    ("output", "expected"),
+    [
+        ("keep", {"WATCHDOG_USEC": "old"}),
+        ("keep:0", {"NOTIFY_SOCKET": "io/kept.notify"}),
+        ("keep:5", {"NOTIFY_SOCKET": "io/kept.notify", "WATCHDOG_USEC": "5", "WATCHDOG_PID": "$"}),
+        ("keep:5:any", {"NOTIFY_SOCKET": "io/kept.notify", "WATCHDOG_USEC": "5"}),
+    ],
+)
+def test_the_notify_socket(
+    environment: dict[str, str], tmp_path: Path, output: str, expected: dict[str, str]
+) -> None:
+    environment["WATCHDOG_USEC"] = "old"
+    script = "echo pid=$$; env"
+    done = launcher(environment, "kept", str(tmp_path), output, "/bin/sh", "-c", script)
+    said = dict(line.split("=", 1) for line in done.stdout.splitlines() if "=" in line)
+    texts = {key: said[key].replace(f"{tmp_path}/", "") for key in NOTIFY if key in said}
+    assert {key: "$" if text == said["pid"] else text for key, text in texts.items()} == expected
+
+
 def test_signals_are_as_they_were(environment: dict[str, str], tmp_path: Path) -> None:
     words = ("/usr/bin/grep", "Sig", "/proc/self/status")
     here = launch(environment, *words).stdout

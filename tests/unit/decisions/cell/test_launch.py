@@ -22,6 +22,7 @@ from dora_systemd.decisions.descriptor.build_session import (
 )
 from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
 from dora_systemd.errors import DoraSystemdError
+from dora_systemd.values import INFINITY
 
 UUID = "550e8400-e29b-41d4-a716-446655440000"
 FILES = {
@@ -72,6 +73,13 @@ def words(node: dict[str, Any], given: LaunchPlan | None = None) -> list[str]:
         ({"path": "bin/detector", "args": "-x 'a b' $HOME"}, {},
          ["/p", "pipe", "/p/bin/detector", "-x", "a b", "$HOME"]),
         ({"path": "cat"}, {}, ["/p", "pipe", "/usr/bin/cat"]),
+        ({"path": "cat"}, {"watchdogs": {"other": 5}}, ["/p", "pipe", "/usr/bin/cat"]),
+        ({"path": "cat"}, {"watchdogs": {"n": 5}}, ["/p", "pipe:5", "/usr/bin/cat"]),
+        ({"path": "cat"}, {"watchdogs": {"": 5, "n": INFINITY}}, ["/p", "pipe:0", "/usr/bin/cat"]),
+        ({"path": "shell", "args": "x"}, {"allow_shell_nodes": True, "watchdogs": {"": 5}},
+         ["/p", "pipe:5:any", "sh", "-c", "x"]),
+        ({"path": "cat", "send_stdout_as": "log", "outputs": ["log"]}, {"watchdogs": {"n": 5}},
+         ["/p", "keep:5", "/usr/bin/cat"]),
         ({"path": "cat", "args": "-n"}, {"uv": True},
          ["/p", "pipe", "uv", "run", "/usr/bin/cat", "-n"]),
         ({"path": "tool", "deploy": {"working_dir": "/repo/flows"}}, {"uv": True},

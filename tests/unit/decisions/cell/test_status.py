@@ -19,6 +19,8 @@ from dora_systemd.decisions.cell.status import (
     cpu_percent,
     throttled_percent,
 )
+from dora_systemd.decisions.signs.messages import MAX_STATUS
+from dora_systemd.decisions.signs.table import Sign
 from dora_systemd.errors import DoraSystemdError
 
 counts = st.integers(0, 2**63 - 1)
@@ -43,6 +45,7 @@ cells = st.builds(
     st.lists(samples, max_size=2).map(tuple),
     st.dictionaries(ids, st.builds(LineCount, counts, counts, counts)),
     *(counts, st.booleans()),
+    st.dictionaries(ids, st.builds(Sign, st.text(max_size=MAX_STATUS), times, times)),
 )
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.text(),

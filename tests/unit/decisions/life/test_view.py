@@ -6,6 +6,7 @@ from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.cell.status import CellStatus, LineCount, NodeStatus
 from dora_systemd.decisions.life.states import Cell, State
 from dora_systemd.decisions.life.view import cell_status, format_status, initial_nodes, stage
+from dora_systemd.decisions.signs.table import Sign
 
 
 def cell(state: State, **states: str) -> Cell:
@@ -55,5 +56,5 @@ def test_stages_and_table() -> None:
     assert [node.state for node in nodes.values()] == ["starting", "dynamic"]
     assert [node.policy for node in nodes.values()] == ["always", "never"]
     assert [node.max_restarts for node in nodes.values()] == [3, 0]
-    table = cell_status(Cell(0, 3, nodes), "uuid", (), {"a": LineCount(3)})
+    table = cell_status(Cell(0, 3, nodes), "uuid", (), {"a": LineCount(3)}, {"a": Sign("up")})
     assert CellStatus.from_json(table.to_json()) == table

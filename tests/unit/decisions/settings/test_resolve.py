@@ -31,8 +31,9 @@ from dora_systemd.decisions.settings.table import (
     VENV,
     WORKING_DIRECTORY,
 )
+from dora_systemd.decisions.signs.watchdogs import SHORTEST
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.values import SECOND
+from dora_systemd.values import INFINITY, SECOND
 from tests.unit.fakes.limit_values import LIMIT_VALUES, RESTART_VALUES
 
 BESIDE = "/srv/robot.systemd.yml"
@@ -214,6 +215,9 @@ def test_values_and_back(data: st.DataObject) -> None:
         "grace_duration": st.integers(0, 2**64 - 1),
         "log_rate_limit": st.dictionaries(
             st.sampled_from(["", "cam"]), st.none() | st.just(RateLimit(5, SECOND))
+        ),
+        "watchdog": st.dictionaries(
+            st.sampled_from(["", "cam"]), st.just(INFINITY) | st.integers(SHORTEST, 2**60)
         ),
         "sandbox": st.sampled_from(LEVELS),
         "network": st.sampled_from(NETWORKS),

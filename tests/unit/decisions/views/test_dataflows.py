@@ -161,6 +161,22 @@ def test_one_dataflow_on_a_narrow_terminal(width: int) -> None:
     assert shown[-3].split()[-1] == "EXIT"
 
 
+@pytest.mark.parametrize("width", [60, 80, 120])
+def test_what_nodes_say_of_themselves(width: int) -> None:
+    camera = ROWS[0].nodes[0]._replace(text="t" * 200, watchdog=5 * SECOND, sign_age=1_200_000)
+    row = ROWS[0]._replace(nodes=(camera, ROWS[0].nodes[1]))
+    *_, title, shown, other = format_dataflow(row, width).splitlines()
+    assert max(map(len, (title, shown))) <= width
+    assert title.endswith("STATUS TEXT")
+    assert shown.endswith("tt…")
+    assert not other.endswith("t")
+    assert ("1.2s/5s" in shown) == (width > 60)
+    object_ = dataflow_object(row)["nodes"][0]
+    assert (object_["watchdog_us"], object_["watchdog_age_us"]) == (5_000_000, 1_200_000)
+    assert object_["text"] == "t" * 200
+    assert dataflow_object(row)["nodes"][1]["text"] is None
+
+
 def test_a_long_name_leaves_room_for_the_reason() -> None:
     long = ENDED._replace(name="x" * 150, text="node detector: exit code 1")
     text = format_dataflows([ROWS[0], long], 80)

@@ -30,7 +30,14 @@ ROBOT = Observed(
         nodes_alive=1,
         nodes_total=2,
         nodes=(
-            NodeRow("camera", "running", 7, restarts=3, since=1_700_000_001_000_000),
+            NodeRow(
+                *("camera", "running", 7),
+                restarts=3,
+                since=1_700_000_001_000_000,
+                text="12 frames/s",
+                watchdog=5 * SECOND,
+                sign_age=1_500_000,
+            ),
             NodeRow("plot", "failed", exit="exit code 1", restarts=0, since=5),
         ),
     ),
@@ -102,6 +109,14 @@ def test_numbers_of_nodes() -> None:
     assert "dora_node_memory_limit_bytes" not in found
     assert "dora_node_memory_peak_bytes" not in found
     assert len(found["dora_node_start_time_seconds"].samples) == 1
+
+
+def test_signs_of_life() -> None:
+    found = families(ROBOT)
+    camera = {"dataflow": "robot", "node": "camera"}
+    assert value(found, "dora_node_watchdog_seconds", **camera) == 5
+    assert value(found, "dora_node_watchdog_age_seconds", **camera) == 1.5
+    assert len(found["dora_node_watchdog_age_seconds"].samples) == 1, "plot has no watchdog"
 
 
 def test_pressure() -> None:

@@ -47,6 +47,14 @@ ARM = TopEntry(
 LOOK = Look(NOW, (ROBOT, ARM))
 
 
+def test_what_a_node_says_of_itself() -> None:
+    (camera, _, plot) = ROBOT.row.nodes
+    nodes = (camera._replace(text="12 frames/s"), plot._replace(text="old"))
+    shown = format_top(Look(NOW, (TopEntry(ROBOT.row._replace(nodes=nodes)),)), "cpu")
+    assert "  camera  Running (12 frames/s)" in shown
+    assert "Failed (exit code 1)" in shown
+
+
 def test_table_by_cpu() -> None:
     assert format_top(LOOK, "cpu").splitlines() == [
         "NAME        STATE                   UPTIME       CPU%      MEM  PEAK  RESTARTS  WAITS FOR",

@@ -1,0 +1,184 @@
+"""Notify sockets with real datagrams; the cgroups are pretended."""
+
+import asyncio
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import AbstractContextManager, closing
+from pathlib import Path
+from signal import SIGABRT
+
+import pytest
+
+from dora_systemd.adapters.cgroup import members
+from dora_systemd.adapters.host.notify_socket import NotifySocket
+from dora_systemd.decisions.signs.table import Sign
+from dora_systemd.decisions.signs.watchdogs import Watchdogs
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.paths import CellPaths
+from dora_systemd.runner.signs import sockets
+from dora_systemd.runner.signs.hook import signs_of
+from dora_systemd.runner.signs.sockets import Signs
+from dora_systemd.values import INFINITY, SECOND
+
+WATCHDOGS: Watchdogs = {"cam": 5 * SECOND, "plot": INFINITY}
+
+
+class Bench:
+    """Two nodes with sockets. own: pids of the node cam. told: life events."""
+
+    def __init__(self, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.own = {os.getpid()}
+        self.told: list[tuple[str, str, str]] = []
+        self.news = 0
+        paths = CellPaths(root)
+        paths.io.mkdir()
+        monkeypatch.setattr(sockets, "is_member", self.is_member)
+        signs = signs_of(WATCHDOGS, root, paths, self.tell)
+        assert isinstance(signs, Signs)
+        self.signs, self.place = signs, str(paths.node_notify("cam"))
+        for node in ("cam", "plot", "other"):
+            signs.make(node)
+        signs.on_news = self.count
+
+    def is_member(self, path: Path, pid: int) -> bool:
+        return path.name == "node-cam" and pid in self.own
+
+    def tell(self, name: str, node: str, **details: str) -> None:
+        self.told.append((name, node, details["reason"]))
+
+    def count(self) -> None:
+        self.news += 1
+
+    def send(self, *texts: bytes) -> None:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify:
+            for text in texts:
+                notify.sendto(text, self.place)
+
+    def close(self) -> None:
+        """Leave no socket."""
+        for node, _ in self.signs.ears():
+            self.signs.remove(node)
+
+    async def until(self, is_so: Callable[[], object]) -> None:
+        async with asyncio.timeout(60):
+            while not is_so():
+                await asyncio.sleep(0.001)
+
+
+Open = Callable[[], AbstractContextManager[Bench]]
+
+
+@pytest.fixture
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Open:
+    return lambda: closing(Bench(tmp_path, monkeypatch))
+
+
+def test_what_a_node_says(bench: Open, tmp_path: Path) -> None:
+    async def live() -> None:
+        with bench() as one:
+            assert one.signs.table() == {"cam": Sign(watchdog=5 * SECOND), "plot": Sign()}
+            one.send(b"STATUS=up\nWATCHDOG=1")
+            await one.until(lambda: one.news)
+            sign = one.signs.table()["cam"]
+            assert (sign.status, sign.at_us > 0) == ("up", True)
+            one.send(b"WATCHDOG=trigger")
+            await one.until(lambda: one.news == 2)
+            assert [ear.is_triggered for _, ear in one.signs.ears()] == [True, False]
+            one.signs.forget("cam")
+            assert one.signs.table()["cam"] == Sign(watchdog=5 * SECOND)
+            assert [ear.is_triggered for _, ear in one.signs.ears()] == [False, False]
+            one.signs.remove("cam")
+            one.signs.remove("cam")
+            assert sorted(path.name for path in (tmp_path / "io").iterdir()) == ["plot.notify"]
+            one.signs.make("cam")
+            one.send(b"STATUS=again")
+            await one.until(lambda: one.news == 3)
+
+    asyncio.run(live())
+
+
+def test_another_process_is_not_believed(bench: Open) -> None:
+    async def live() -> None:
+        with bench() as one:
+            one.own.clear()
+            one.send(b"WATCHDOG=1\nSTATUS=fake", b"WATCHDOG=trigger")
+            await one.until(lambda: one.told)
+            one.signs.drain("cam", next(iter(one.signs.ears()))[1])
+            reason = f"process {os.getpid()} is not in the cgroup of the node"
+            assert one.told == [("notify-refused", "cam", reason)], "reported once"
+            assert one.news == 0
+            assert one.signs.table()["cam"] == Sign(watchdog=5 * SECOND)
+
+    asyncio.run(live())
+
+
+def test_a_sender_that_has_exited_is_not_believed(bench: Open) -> None:
+    script = "import socket, sys; s = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM); "
+    script += "s.sendto(b'WATCHDOG=1', sys.argv[1])"
+
+    async def live() -> None:
+        with bench() as one:
+            one.own = set(range(1, 2**22))  # whatever its pid: a later process may have it
+            subprocess.run([sys.executable, "-I", "-S", "-c", script, one.place], check=True)
+            await one.until(lambda: one.told or one.news)
+            assert one.news == 0
+            assert one.told[0][2].startswith("its sender had exited")
+
+    asyncio.run(live())
+
+
+def test_a_flood_leaves_time_for_others(bench: Open) -> None:
+    async def live() -> None:
+        with bench() as one:
+            flood = asyncio.create_task(asyncio.to_thread(one.send, *[b"STATUS=x"] * 500))
+            await one.until(lambda: one.news == 500)
+            await flood
+
+    asyncio.run(live())
+
+
+def test_descriptors_and_barriers(tmp_path: Path) -> None:
+    """A descriptor that comes along is closed: a sender waits for that."""
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    ear = NotifySocket(tmp_path / "n")
+    read, write = os.pipe()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify:
+        notify.connect(str(tmp_path / "n"))
+        socket.send_fds(notify, [b"BARRIER=1"], [write])
+        socket.send_fds(notify, [b"FDSTORE=1"], [write] * 50)
+        notify.send(b"x" * 5000)
+    os.close(write)
+    for text in (b"BARRIER=1", b"FDSTORE=1", b""):
+        pending = ear.receive()
+        assert pending is not None
+        with pending:
+            assert (pending.data, pending.pid, pending.is_there()) == (text, os.getpid(), True)
+    assert ear.receive() is None
+    assert os.read(read, 1) == b"", "all copies are closed"
+    os.close(read)
+    ear.close()
+    ear.close()
+    assert len(list(Path("/proc/self/fd").iterdir())) == before
+
+
+def test_a_path_that_is_too_long(tmp_path: Path) -> None:
+    with pytest.raises(DoraSystemdError, match="a path has at most 107 bytes"):
+        NotifySocket(tmp_path / ("n" * 107))
+
+
+def test_members(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Who is in a group gets a signal, the main process first; who has left it gets none."""
+    groups = {3: "/u/node-a", 5: "/u/node-a/below", 7: "/u/node-ab"}
+    sent: list[int] = []
+    monkeypatch.setattr(members, "group_of", lambda pid: groups.get(pid, "/"))
+    monkeypatch.setattr(members, "group_path", lambda group: tmp_path / group.lstrip("/"))
+    monkeypatch.setattr(members, "pids", lambda _: [3, 5, 7, 9])
+    monkeypatch.setattr(os, "pidfd_open", lambda pid: os.dup(0) if pid != 9 else os.dup(-1))
+    monkeypatch.setattr(members, "pidfd_send_signal", lambda _, number: sent.append(number))
+    group = tmp_path / "u/node-a"
+    assert [members.is_member(group, pid) for pid in (3, 5, 7, 9)] == [True, True, False, False]
+    members.signal_group(group, SIGABRT, 5)
+    assert sent == [6, 6]
