@@ -66,6 +66,9 @@ class Setting(Generic[T]):
     property: the systemd property with the same value, as in a unit file, or "".
     root_only: the setting makes root read, run or grant something. In system scope it is only valid
     in a settings file that root alone can have written.
+    only_nodes: only valid below `nodes: NODE:`, so there is no flag and no variable.
+    raises: whether a value, of a node or of the dataflow, gives more than the user of the dataflow
+    has. In system scope such a value is only valid where root_only settings are.
     """
 
     name: str
@@ -78,10 +81,15 @@ class Setting(Generic[T]):
     per_node: bool = False
     property: str = ""
     root_only: bool = False
+    only_nodes: bool = False
+    raises: Callable[[Any], bool] | None = None
 
     def __post_init__(self) -> None:
         word = self.name.replace("_", "-")
         variable = "" if self.kind.is_repeatable else f"DORA_{self.name.upper()}"
+        if self.only_nodes:
+            object.__setattr__(self, "per_node", True)
+            return
         object.__setattr__(self, "flags", self.flags or (f"--{word}",))
         object.__setattr__(self, "variable", self.variable or variable)
         object.__setattr__(self, "metavar", self.metavar or self.kind.metavar)

@@ -50,7 +50,8 @@ _TABLE = {
         decisions.cell.launch verbs.start.credentials verbs.start.limits
     """,
     KERNEL: """
-        adapters.cgroup.groups adapters.host.machine adapters.host.process_table runner.cell.pause
+        adapters.cgroup.groups adapters.host.machine adapters.host.process_table
+        adapters.host.real_time adapters.host.rights runner.cell.pause
         trust.socket_table verbs.destroy verbs.facts.reading verbs.start.sandbox verbs.why
     """,
     ROOTS: """
