@@ -1,6 +1,6 @@
 """Defines settings, and the kinds of their values."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from operator import add, or_
 from pathlib import PurePath
@@ -135,6 +135,25 @@ def many_texts(
         expected,
         lambda value, _: parse(texts_of(value)),
         to_texts,
+        is_repeatable=True,
+        merge=merge,
+        metavar=metavar,
+    )
+
+
+def texts_of_nodes(
+    example: str,
+    metavar: str,
+    parse: Callable[[str], T],
+    to_text: Callable[[T], str],
+    merge: Callable[[Iterable[T], Iterable[T]], tuple[T, ...]],
+) -> Kind[tuple[T, ...]]:
+    """A repeatable kind of texts about one node each. merge: joins what is about the same node."""
+    return Kind(
+        str | list[str],
+        f"{example} or a list of such texts",
+        lambda value, _: merge((), map(parse, texts_of(value))),
+        lambda values: list(map(to_text, values)),
         is_repeatable=True,
         merge=merge,
         metavar=metavar,

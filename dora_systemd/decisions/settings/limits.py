@@ -13,7 +13,7 @@ from dora_systemd.decisions.cell.limits import (
     parse_node_limits,
 )
 from dora_systemd.decisions.rights.node_rights import is_negative, parse_nice
-from dora_systemd.decisions.settings.kinds import Setting, many_texts, one_text
+from dora_systemd.decisions.settings.kinds import Setting, many_texts, one_text, texts_of_nodes
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import quoted
 
@@ -76,11 +76,11 @@ def _parse_device(text: str) -> str:
 
 NODE_LIMIT = Setting[tuple[NodeLimits, ...]](
     "node_limit",
-    many_texts(
-        "NODE:memory=1G,cpu=1.5 or a list of such texts",
+    texts_of_nodes(
+        "NODE:memory=1G,cpu=1.5",
         "NODE:LIMIT=VALUE,...",
-        lambda texts: merge_node_limits(map(parse_node_limits, texts)),
-        lambda limits: list(map(format_node_limits, limits)),
+        parse_node_limits,
+        format_node_limits,
         merge_node_limits,
     ),
     (),
