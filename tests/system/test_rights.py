@@ -66,6 +66,7 @@ def hard_limit(pid: int, name: str) -> str:
     return line.removeprefix(name).split()[1]
 
 
+@pytest.mark.warns("is being restarted")
 def test_rights_of_one_node_and_of_the_others(cell: Cell, project: Project) -> None:
     cell.start(
         project.three_nodes(),
@@ -164,12 +165,11 @@ def test_bad_rights(cell: Cell, project: Project) -> None:
 def test_what_only_root_gives(cell: Cell, project: Project) -> None:
     """The owner of the dataflow may bind and lower nodes, and say which one is essential."""
     flow = project.three_nodes()
-    os.chown(project.root, 1000, 1000)
-    refused = project.write("dataflow.systemd.yml", "nodes: {sink: {nice: -5, essential: true}}")
+    run("chown", "-R", "alice:alice", str(project.root))
+    project.write("dataflow.systemd.yml", "nodes: {sink: {nice: -5, essential: true}}")
     done = cell.start(flow, check=False)
     assert done.returncode == ExitCode.NO_PERMISSION
     assert "nodes.sink.nice is set there, and the file is not root's" in done.stderr
-    os.chown(refused, 1000, 1000)
     project.write("dataflow.systemd.yml", "nodes: {sink: {nice: 5, essential: true, cpus: 0}}")
     cell.start(flow)
     cell.wait_exchanging()
