@@ -3,6 +3,7 @@
 import contextlib
 import os
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 
 from dora_systemd.adapters.host.process import run_command
@@ -15,12 +16,19 @@ _OPTION = "CONFIG_RT_GROUP_SCHED"
 _MOST_BYTES = 4 * 1024 * 1024
 _GZIP = 16 + zlib.MAX_WBITS
 _SECONDS = 10.0
-_TRY = ("/usr/bin/prlimit", "--rtprio=1:1", "/usr/bin/chrt", "--fifo", "1", "/bin/true")
+_REALTIME = ("/usr/bin/chrt", "--fifo", "1", "/bin/true")
+_LIMIT = ("/usr/bin/prlimit", "--rtprio=99:99", "/bin/true")
 
 
 def read_real_time() -> RealTime:
-    """All facts. As root it tries to get a realtime priority, in a child that ends at once."""
-    return RealTime(_has_groups(), _is_granted(), _text(_CPUS / "isolated"), _governors())
+    """All facts. As root it tries to get rights, in children that end at once."""
+    return RealTime(
+        has_groups=_has_groups(),
+        is_granted=_can_run(_REALTIME),
+        can_raise=_can_run(_LIMIT),
+        isolated=_text(_CPUS / "isolated"),
+        governors=_governors(),
+    )
 
 
 def _has_groups() -> bool | None:
@@ -37,11 +45,12 @@ def _config(path: str) -> str:
     return ""
 
 
-def _is_granted() -> bool | None:
+def _can_run(command: Sequence[str]) -> bool | None:
+    """Whether root can; None for others, and if the program is not there."""
     if os.geteuid() != 0:
         return None
     try:
-        return run_command(_TRY, _SECONDS).status == 0
+        return run_command(command, _SECONDS).status == 0
     except DoraSystemdError:
         return None
 

@@ -35,7 +35,7 @@ class NodeRow(NamedTuple):
 
     cpu_limit, memory_limit: the group's own, or None. throttled: the percentage of the time in
     which its CPU limit throttled it, None without one. since: time of its last change of state,
-    CLOCK_REALTIME µs, 0: unknown.
+    CLOCK_REALTIME µs, 0: unknown. essential: whether its final failure ends the dataflow.
     """
 
     node: str
@@ -51,6 +51,7 @@ class NodeRow(NamedTuple):
     memory_limit: int | None = None
     throttled: float | None = None
     since: int = 0
+    essential: bool | None = None
 
 
 class DataflowRow(NamedTuple):

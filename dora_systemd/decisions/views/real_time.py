@@ -16,11 +16,13 @@ class RealTime:
 
     has_groups: whether the kernel was built with CONFIG_RT_GROUP_SCHED; None: not known.
     is_granted: whether root could have a realtime priority; None: nobody tried, or not as root.
+    can_raise: the same for higher limits.
     isolated: list of isolated CPUs, or "". governors: of the CPU frequency, without double ones.
     """
 
     has_groups: bool | None = None
     is_granted: bool | None = None
+    can_raise: bool | None = None
     isolated: str = ""
     governors: tuple[str, ...] = ()
 
@@ -28,6 +30,10 @@ class RealTime:
 def judge_real_time(facts: RealTime) -> Iterator[Finding]:
     """What a node with a realtime priority would meet, and what would slow it down."""
     yield _scheduling(facts)
+    if facts.can_raise is False:
+        text = "not even root can raise limits: no lock_memory, no nice or OOM score below 0"
+        remedy = "a container needs CAP_SYS_RESOURCE for it"
+        yield Finding("rights", State.NOTE, text, remedy)
     if facts.isolated:
         text = f"cpus {facts.isolated} run only what is bound to them"
         remedy = "bind a node: cpus below nodes: in its settings, see dora-systemd.yml(5)"
@@ -47,7 +53,7 @@ def _scheduling(facts: RealTime) -> Finding:
         remedy = "boot with rt_group_sched=0 (Linux 6.16 and newer), or use another kernel"
     else:
         text = f"this machine refuses realtime scheduling even to root: {_REFUSED}"
-        remedy = "a container needs CAP_SYS_NICE and CAP_SYS_RESOURCE for it"
+        remedy = "a container needs CAP_SYS_NICE for it"
     return Finding(TOPIC, State.NOTE, text, remedy)
 
 

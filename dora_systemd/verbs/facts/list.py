@@ -92,6 +92,7 @@ def _life(reading: Reading) -> dict[str, Any]:
 
 def _usage(reading: Reading, known: tuple[CpuSample, ...]) -> dict[str, Any]:
     status, use, now = reading.status, reading.usage, reading.sample
+    essential = {one.node for one in reading.cell.options.node_rights if one.essential}
     samples = known or (CpuSample(reading.unit[STARTED]),)
     groups = {key: path for key, path in reading.groups.items() if key != WHOLE_CELL}
     names = status.nodes or dict.fromkeys(groups)
@@ -105,7 +106,7 @@ def _usage(reading: Reading, known: tuple[CpuSample, ...]) -> dict[str, Any]:
                 node,
                 status.nodes.get(node),
                 _numbers(use[node], samples, now, node) if node in use else {},
-            )
+            )._replace(essential=node in essential)
             for node in names
         ),
     }

@@ -59,8 +59,18 @@ ROBOT = DataflowRow(
     restarts=1,
     restart_budget={"used": 0, "max": 5, "next_us": None, "resets_us": None},
     nodes=(
-        NodeRow("camera", "running", 4211, 12.5, 134217728, 167772160, 0, since=READY),
-        NodeRow("detector", "failed", restarts=1, exit="exit code 1", since=CRASHED),
+        NodeRow(
+            *("camera", "running", 4211, 12.5, 134217728, 167772160, 0),
+            since=READY,
+            essential=True,
+        ),
+        NodeRow(
+            *("detector", "failed"),
+            restarts=1,
+            exit="exit code 1",
+            since=CRASHED,
+            essential=False,
+        ),
     ),
     enabled=True,
 )

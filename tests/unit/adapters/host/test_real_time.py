@@ -24,10 +24,10 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_a_machine_that_says_nothing(machine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert read_real_time() == RealTime(None, False)
+    assert read_real_time() == RealTime(None, False, False)
     (machine / "config.gz").write_bytes(b"no gzip")
     monkeypatch.setattr("os.geteuid", lambda: 1000)
-    assert read_real_time() == RealTime(None, None)
+    assert read_real_time() == RealTime()
 
 
 @pytest.mark.parametrize("name", ["config.gz", "config"])

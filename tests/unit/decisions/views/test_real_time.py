@@ -23,6 +23,12 @@ def test_scheduling(facts: RealTime, state: State, words: str) -> None:
     assert bool(finding.remedy) == (state is not State.OK)
 
 
+def test_a_container_without_the_capability() -> None:
+    _, rights = judge_real_time(RealTime(can_raise=False))
+    assert (rights.topic, rights.state) == ("rights", State.NOTE)
+    assert len(list(judge_real_time(RealTime(can_raise=True)))) == 1
+
+
 def test_what_slows_down() -> None:
     facts = RealTime(isolated="2-3", governors=("performance", "powersave"))
     _, isolated, governor = judge_real_time(facts)
