@@ -1,5 +1,6 @@
 """The failure of an essential node ends the dataflow, and by which exit status."""
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -76,6 +77,17 @@ def test_the_others_are_stopped_and_the_dataflow_has_failed(
 def test_what_ends_nothing(of_a: dict[str, Any], event: life.NodeExited) -> None:
     cell, _ = live(running(**of_a), event)
     assert (cell.state, cell.failure) == (State.RUNNING, "")
+
+
+@pytest.mark.parametrize(("restarts", "is_ended"), [(0, False), (1, True)])
+def test_a_new_version_that_fails_is_taken_back_by_the_reloader(
+    restarts: int, is_ended: bool
+) -> None:
+    """Only the first process after a reload; dora's restarts of it count as always."""
+    reloaded = NodeStatus("starting", 9, restarts=restarts, policy="on-failure", max_restarts=1)
+    cell, _ = live(replace(running(), nodes={**running().nodes, "a": reloaded}), exited("a"))
+    assert cell.nodes["a"].state == "failed"
+    assert bool(cell.failure) is is_ended
 
 
 def test_a_stop_meanwhile_is_a_stop() -> None:
