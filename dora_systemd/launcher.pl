@@ -9,15 +9,16 @@
 #   :USEC behind it: the node has a notify socket, and if not 0 a watchdog, see
 #   sd_watchdog_enabled(3); :any behind that: another process of the node may feed it.
 # Environment: DORA_SYSTEMD_CELL (RuntimeDirectory), DORA_SYSTEMD_GROUP (cgroup of the unit),
-# DORA_SYSTEMD_LIBEXEC (first entry of PATH), DORA_SYSTEMD_UNSET (names).
+# DORA_SYSTEMD_LIBEXEC (first entry of PATH), DORA_SYSTEMD_UNSET (names), DORA_SYSTEMD_RIGHTS (lines
+# NODE WORD..., the programs that set the rights of the node or of "*", all others).
 #
 # Perl, because a shell drops variables with names such as "my.var" and sets others (PWD, OLDPWD),
 # and because Python takes six times as long and ignores signals. No modules: "use strict" would
 # double the time.
 
 my ($node, $directory, $output, @command) = @ARGV;
-my ($cell, $group, $libexec, $unset) =
-    delete @ENV{map "DORA_SYSTEMD_$_", qw(CELL GROUP LIBEXEC UNSET)};
+my ($cell, $group, $libexec, $unset, $rights) =
+    delete @ENV{map "DORA_SYSTEMD_$_", qw(CELL GROUP LIBEXEC UNSET RIGHTS)};
 # KEEP is from runners of older versions.
 delete @ENV{split(' ', $unset), map "DORA_SYSTEMD_$_", qw(DIRECTORY PYTHON KEEP)};
 
@@ -55,6 +56,9 @@ $ENV{PATH} =~ s/^\Q$libexec\E://;
 (my $zenoh = $0) =~ s{[^/]*$}{zenoh.json5};
 unless (exists $ENV{ZENOH_CONFIG} or exists $ENV{DORA_ZENOH_CONFIG_OVERLAY} or not -r $zenoh) {
     $ENV{DORA_ZENOH_CONFIG_OVERLAY} = $zenoh;
+}
+if (defined $rights and ($rights =~ /^\Q$node\E (.*)$/m or $rights =~ /^\* (.*)$/m)) {
+    unshift @command, split ' ', $1;
 }
 exec { $command[0] } @command;
 fail($! == 2 ? 127 : 126, $command[0]);  # ENOENT, as in a shell

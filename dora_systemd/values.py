@@ -7,6 +7,7 @@ message, and keep the hint.
 
 import re
 import time
+from collections.abc import Iterable
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
 
@@ -179,3 +180,52 @@ def _scaled(whole: str, fraction: str | None, factor: int) -> int | None:
 
 def _refusal(what: str, text: str, hint: str) -> DoraSystemdError:
     return DoraSystemdError(f"cannot read {quoted(text)} as a {what}", hint, ExitCode.USAGE)
+
+
+_FIRST_CPU = INFINITY.bit_length()
+"""CPUs are bits of a number, as limits are numbers. The first bit is above INFINITY: no limit."""
+MOST_CPUS = 8192
+"""What Linux can be built for."""
+_CPU_RANGE = re.compile(r"([0-9]{1,4})(?:-([0-9]{1,4}))?")
+
+
+def cpu_bits(cpus: Iterable[int]) -> int:
+    """The number for these CPUs."""
+    return sum(1 << (_FIRST_CPU + cpu) for cpu in set(cpus))
+
+
+def parse_cpus(text: str) -> int:
+    """The CPUs of a list, or INFINITY for all. Raises DoraSystemdError (USAGE)."""
+    if text.strip() == "infinity":
+        return INFINITY
+    cpus: set[int] = set()
+    for part in text.split(","):
+        match = _CPU_RANGE.fullmatch(part.strip())
+        first, last = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
+        if not first <= last < MOST_CPUS:
+            hint = "write numbers and ranges such as 2-3 or 0,2; or infinity for all"
+            raise DoraSystemdError(f"cannot use {quoted(text)} as cpus", hint, ExitCode.USAGE)
+        cpus.update(range(first, last + 1))
+    return cpu_bits(cpus)
+
+
+def cpu_numbers(value: int) -> list[int]:
+    """The CPUs of a number, in order; none for INFINITY."""
+    bits = value >> _FIRST_CPU
+    return [cpu for cpu in range(bits.bit_length()) if bits >> cpu & 1]
+
+
+def format_cpus(value: int) -> str:
+    """The list, or "infinity"."""
+    return cpus_file(value).strip() or "infinity"
+
+
+def cpus_file(value: int) -> str:
+    """The list as the kernel takes it; an empty line for all."""
+    ranges: list[list[int]] = []
+    for cpu in cpu_numbers(value):
+        if ranges and ranges[-1][-1] == cpu - 1:
+            ranges[-1][1:] = [cpu]
+        else:
+            ranges.append([cpu])
+    return ",".join("-".join(map(str, one)) for one in ranges) or "\n"

@@ -8,11 +8,12 @@ import os
 import sys
 
 from dora_systemd.adapters.dora.check import DoraCheck
-from dora_systemd.adapters.dora.preparation import check_named_nodes, prepare
+from dora_systemd.adapters.dora.preparation import prepare
 from dora_systemd.decisions.cell.environment import node_environment
 from dora_systemd.decisions.cell.options import parse_runner_argv
 from dora_systemd.decisions.life.refusal import format_refusal, refusal_exit
 from dora_systemd.errors import DoraSystemdError
+from dora_systemd.runner.nodes.rights import check_first
 
 
 def main(argv: list[str]) -> int:
@@ -22,7 +23,7 @@ def main(argv: list[str]) -> int:
         environment = node_environment(os.environ)
         check = DoraCheck(options, environment)
         prepared = check.beside(lambda: prepare(options, environment))
-        check_named_nodes(options, prepared.dataflow)
+        check_first(options, prepared.dataflow)
     except DoraSystemdError as error:
         print(format_refusal(error))
         return refusal_exit(error)

@@ -18,12 +18,7 @@ from typing import Any
 
 from dora_systemd.adapters.dora.check import DoraCheck
 from dora_systemd.adapters.dora.control import read_coordinator
-from dora_systemd.adapters.dora.preparation import (
-    Prepared,
-    check_named_nodes,
-    prepare,
-    resolved,
-)
+from dora_systemd.adapters.dora.preparation import Prepared, prepare, resolved
 from dora_systemd.adapters.host import fd_store, notify
 from dora_systemd.adapters.journal.socket import JournalSocket
 from dora_systemd.adapters.logs.pipes import LogPipes
@@ -52,6 +47,7 @@ from dora_systemd.runner.cell.pause import forget_restarts, hold_back
 from dora_systemd.runner.cell.pump import Pump, now_us
 from dora_systemd.runner.nodes.losses import LossWatch, losses_of_user
 from dora_systemd.runner.nodes.nodes import Nodes, wait_eof
+from dora_systemd.runner.nodes.rights import check_first
 from dora_systemd.runner.reload.apply import Run
 from dora_systemd.runner.reload.reloader import Reloader
 from dora_systemd.runner.reload.settings_file import SettingsFile
@@ -218,7 +214,7 @@ async def run_once(runs: Runs, is_again: bool) -> Cell:
 def prepare_first(runs: Runs, options: RunnerOptions) -> Prepared:
     """Read the dataflow for the first run. Raises DoraSystemdError if it is refused."""
     prepared = runs.check.beside(lambda: prepare(options, runs.environment))
-    check_named_nodes(options, prepared.dataflow)
+    check_first(options, prepared.dataflow)
     return prepared
 
 

@@ -19,6 +19,7 @@ from dora_systemd.adapters.dora.command import (
 from dora_systemd.adapters.host.files import read_yaml
 from dora_systemd.adapters.host.process import run_command
 from dora_systemd.adapters.host.process_table import read_processes, socket_owners
+from dora_systemd.adapters.host.real_time import read_real_time
 from dora_systemd.adapters.host.unit_files import read_unit_file
 from dora_systemd.adapters.journal import reader as journal_reader
 from dora_systemd.decisions.unit.file import BOOT_TARGET, runner_of
@@ -32,6 +33,7 @@ from dora_systemd.decisions.views.diagnosis import (
     judge_systemd,
 )
 from dora_systemd.decisions.views.findings import Finding, State
+from dora_systemd.decisions.views.real_time import judge_cpuset, judge_real_time
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import unit_name
 from dora_systemd.scope import RUNTIME_NAME, Scope
@@ -76,7 +78,9 @@ def _guarded(
 
 def _controllers(manager: Manager, scope: Scope) -> Iterator[Finding]:
     group = cgroup.group_path(manager.control_group())
-    yield judge_controllers(cgroup.read_controllers(group), scope.is_user)
+    available = cgroup.read_controllers(group)
+    yield judge_controllers(available, scope.is_user)
+    yield judge_cpuset(available, scope.is_user)
 
 
 def _linger(_manager: Manager, scope: Scope) -> Iterator[Finding]:
@@ -235,5 +239,9 @@ def _processes(_scope: Scope) -> Iterator[Finding]:
     yield from judge_processes(read_processes())
 
 
+def _real_time(_scope: Scope) -> Iterator[Finding]:
+    yield from judge_real_time(read_real_time())
+
+
 _WITH_SYSTEMD = (_controllers, _linger, _boot, _units, _leftovers, _ports)
-_WITHOUT = (_journal, _dora, _user, judge_logins, _settings, _processes)
+_WITHOUT = (_journal, _dora, _user, judge_logins, _settings, _processes, _real_time)

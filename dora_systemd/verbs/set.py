@@ -33,7 +33,7 @@ from dora_systemd.decisions.cell.limits import (
 )
 from dora_systemd.decisions.descriptor.nodes import UNEXPANDED
 from dora_systemd.decisions.properties.assignments import typed
-from dora_systemd.decisions.settings.limit_checks import check_use, size_warnings
+from dora_systemd.decisions.settings.limit_checks import check_cpus, check_use, size_warnings
 from dora_systemd.decisions.settings.limits import LIVE_SETTINGS, NODE_LIMIT
 from dora_systemd.decisions.settings.resolve import resolve_settings
 from dora_systemd.decisions.unit.properties import format_unit, settings_properties
@@ -70,6 +70,7 @@ def set_limits(
         message = f"cannot change the limits of {cell.name}: permission denied"
         raise DoraSystemdError(message, "use sudo", ExitCode.NO_PERMISSION)
     _check_nodes(scope, cell, nodes)
+    check_cpus(nodes, read_machine())
     require_controllers(manager, scope, properties, nodes)
     unit = manager.read(cell.unit, _PROPERTIES)
     values = {limit.word: settings.values[key] for key, limit in BY_KEY.items()}

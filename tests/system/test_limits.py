@@ -34,7 +34,7 @@ def test_bad_limits_in_the_settings_file(cell: Cell, project: Project) -> None:
         ("memory_limit: 0", "memory_limit in"),
         ("nodes: {sink: {memory_limit: 4 gigs}}", "nodes.sink.memory_limit in"),
         ("nodes: {snik: {memory_limit: 1G}}", "did you mean sink?"),
-        ("nodes: {sink: {nice: 5}}", "unknown key 'nice'"),
+        ("nodes: {sink: {realtime: 5}}", "unknown key 'realtime'"),
         ("nodes: {sink: {memory: 1G}}", "did you mean memory_"),
     ):
         project.write("dataflow.systemd.yml", text)

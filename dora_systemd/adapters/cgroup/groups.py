@@ -21,6 +21,9 @@ from dora_systemd.names import is_node_id
 from dora_systemd.values import INFINITY, SECOND
 
 NODE_PREFIX = "node-"
+CPUSET = "cpuset"
+"""The controller that keeps processes on some CPUs."""
+CPUS_FILE = f"{CPUSET}.cpus"
 SUPERVISOR = "supervisor"
 """The group of the runner and of dora's own processes, below that of the unit."""
 MAX_GROUPS = 300
@@ -185,7 +188,10 @@ def limit_group(path: Path, limits: NodeLimits) -> None:
             reason = f"its group has no {file}"
         except OSError as error:
             is_limited, reason = False, f"{error.strerror} ({file}: {text})"
-        if not is_limited and not text.startswith("max"):
+        if is_limited and file == CPUS_FILE and text.strip():
+            used = read_text(path / f"{file}.effective").strip()
+            is_limited, reason = used == text, f"of the cpus {text} it may use {used}"
+        if not is_limited and text.strip() and not text.startswith("max"):
             raise DoraSystemdError(
                 f"cannot limit the node {limits.node}: {reason}",
                 "the kernel or the container does not provide it to this dataflow",
@@ -202,7 +208,8 @@ def restore_group(path: Path, texts: Mapping[str, str]) -> None:
     """Write back what read_files() has read, as far as the kernel accepts it."""
     for name, text in texts.items():
         with contextlib.suppress(OSError):
-            _write(path / name, text.strip())
+            # An empty line removes the CPUs of cpuset.cpus; nothing written changes nothing.
+            _write(path / name, text.strip() or "\n")
 
 
 def move_process(path: Path, pid: int) -> None:

@@ -9,7 +9,12 @@ from typing import Any
 from dora_systemd.adapters.dora.command import run_dora
 from dora_systemd.adapters.host import files
 from dora_systemd.decisions.cell.hot_reload import check_reload_nodes
-from dora_systemd.decisions.cell.launch import LaunchPlan, is_launched, launch_descriptor
+from dora_systemd.decisions.cell.launch import (
+    LaunchPlan,
+    has_launcher,
+    is_launched,
+    launch_descriptor,
+)
 from dora_systemd.decisions.cell.limits import check_nodes
 from dora_systemd.decisions.cell.line_rates import check_rates
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -22,6 +27,7 @@ from dora_systemd.decisions.descriptor.build_session import (
 from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
 from dora_systemd.decisions.descriptor.nodes import UNEXPANDED, NodeKind
 from dora_systemd.decisions.dora.errors import parse_dora_error
+from dora_systemd.decisions.rights.node_rights import check_rights_nodes
 from dora_systemd.decisions.signs.watchdogs import check_watchdogs
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.programs import own_account
@@ -80,6 +86,8 @@ def _check_limited(options: RunnerOptions, dataflow: Dataflow) -> None:
     dynamic = [node.id for node in dataflow.nodes if node.kind is NodeKind.DYNAMIC]
     check_nodes(options.node_limits, ids, dynamic)
     check_restart_nodes(options.node_restarts, ids)
+    launched = {node.id for node in dataflow.nodes if has_launcher(node)}
+    check_rights_nodes(options.node_rights, ids, launched)
 
 
 def resolved(options: RunnerOptions) -> RunnerOptions:

@@ -75,7 +75,12 @@ def is_launched(node: Node) -> bool:
 
 def has_pipes(node: Node) -> bool:
     """Whether the node's output goes through our pipes, and not through dora's log files."""
-    return not node.keeps_output and (is_launched(node) or node.kind is NodeKind.OPERATOR)
+    return not node.keeps_output and has_launcher(node)
+
+
+def has_launcher(node: Node) -> bool:
+    """Whether launcher.pl runs before the node's program; for operators libexec/python runs it."""
+    return is_launched(node) or node.kind is NodeKind.OPERATOR
 
 
 def kinds(dataflow: Dataflow, plan: LaunchPlan) -> dict[str, str]:

@@ -9,13 +9,16 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import NamedTuple
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.names import check_known, did_you_mean
+from dora_systemd.names import check_known
 from dora_systemd.values import (
     INFINITY,
     SECOND,
+    cpus_file,
     format_cpu,
+    format_cpus,
     format_size,
     parse_cpu,
+    parse_cpus,
     parse_size,
     quoted,
 )
@@ -32,6 +35,9 @@ _PERIOD = 100_000
 """µs: the kernel's default period of cpu.max."""
 
 _NUMBER = re.compile(r"[0-9]{1,18}")
+
+CPUS = "cpus"
+"""The limit that is no amount: which CPUs, see dora_systemd.values."""
 
 
 def parse_memory(text: str) -> int:
@@ -120,6 +126,7 @@ LIMITS = (
     Limit("tasks", "tasks_limit", "TasksMax", "pids.max", parse_tasks),
     Limit("cpu-weight", "cpu_weight", "CPUWeight", "cpu.weight", parse_weight),
     Limit("io-weight", "io_weight", "IOWeight", "io.weight", parse_weight, file_text=_weight_file),
+    Limit(CPUS, "cpus", "AllowedCPUs", "cpuset.cpus", parse_cpus, format_cpus, cpus_file),
 )
 BY_WORD: Mapping[str, Limit] = {limit.word: limit for limit in LIMITS}
 BY_KEY: Mapping[str, Limit] = {limit.key: limit for limit in LIMITS}
@@ -141,21 +148,24 @@ def node_limits(node: str, limits: Mapping[str, int]) -> NodeLimits:
     return NodeLimits(node, tuple((word, limits[word]) for word in BY_WORD if word in limits))
 
 
+def has_cpus(limits: NodeLimits) -> bool:
+    """Whether the node is bound to some CPUs."""
+    return dict(limits.limits).get(CPUS, INFINITY) != INFINITY
+
+
+def without_cpus(limits: NodeLimits) -> NodeLimits:
+    """The limits that need no cpuset controller."""
+    kept = tuple(pair for pair in limits.limits if pair[0] != CPUS)
+    return limits._replace(limits=kept)
+
+
 def parse_node_limits(text: str) -> NodeLimits:
     """The limits in NODE:WORD=VALUE,WORD=VALUE. Raises DoraSystemdError (USAGE)."""
-    node, colon, assignments = text.rpartition(":")
-    if not colon or not node or not assignments:
-        raise _refusal(f"{quoted(text)} as limits of a node", "write NODE:memory=1G,cpu=1.5")
-    limits: dict[str, int] = {}
-    for assignment in assignments.split(","):
-        word, _, value = assignment.partition("=")
-        if word not in BY_WORD:
-            hint = did_you_mean(word, BY_WORD) or f"valid values: {', '.join(BY_WORD)}"
-            raise _refusal(f"{quoted(assignment)} as a limit of the node {quoted(node)}", hint)
-        if word in limits:
-            raise _refusal(f"{quoted(text)}: {word} is given twice", "leave one of them out")
-        limits[word] = BY_WORD[word].parse(value)
-    return node_limits(node, limits)
+    # Imported late: most dataflows limit no node.
+    from dora_systemd.node_words import NodeWords, parse_node_words
+
+    about = NodeWords("a limit", "limits", "memory=1G,cpu=1.5")
+    return node_limits(*parse_node_words(text, about, {one.word: one.parse for one in LIMITS}))
 
 
 def format_node_limits(limits: NodeLimits) -> str:

@@ -7,7 +7,7 @@ module imports only what loads quickly.
 from collections.abc import Callable, Sequence
 from operator import attrgetter
 from pathlib import PurePath
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from dora_systemd.decisions.cell.hot_reload import DEFAULT_RELOAD, HotReload, parse_of_node
 from dora_systemd.decisions.cell.limits import NodeLimits, format_node_limits, parse_node_limits
@@ -38,6 +38,9 @@ from dora_systemd.values import (
     quoted,
 )
 
+if TYPE_CHECKING:
+    from dora_systemd.decisions.rights.node_rights import NodeRights
+
 RUNNER_MODULE = "dora_systemd.runner"
 DEFAULT_GRACE = 10 * SECOND
 """µs."""
@@ -61,6 +64,7 @@ class RunnerOptions(NamedTuple):
     env_keys: names of the variables that override the descriptor's `env:`.
     log_rates: rate limits of log lines, see dora_systemd.decisions.cell.line_rates.
     node_limits: limits of single nodes.
+    node_rights: rights of single nodes.
     restart: policy of nodes without one in the descriptor.
     node_restarts: policies of single nodes.
     start_timeout: µs for all nodes to become ready, or INFINITY.
@@ -88,6 +92,7 @@ class RunnerOptions(NamedTuple):
     start_timeout: int = INFINITY
     reload: HotReload = DEFAULT_RELOAD
     watchdogs: Watchdogs = NO_WATCHDOGS
+    node_rights: "tuple[NodeRights, ...]" = ()
 
     def __hash__(self) -> int:
         return hash(self.uuid)
@@ -137,6 +142,19 @@ def _flag(key: str, field: str) -> Option:
     return Option(key, field, lambda _: True, lambda value: [""] * value, is_flag=True)
 
 
+def _parse_rights(text: str) -> "NodeRights":
+    # Imported late: few dataflows have any.
+    from dora_systemd.decisions.rights.node_rights import parse_node_rights
+
+    return parse_node_rights(text)
+
+
+def _format_rights(rights: "NodeRights") -> str:
+    from dora_systemd.decisions.rights.node_rights import format_node_rights
+
+    return format_node_rights(rights)
+
+
 _REQUIRED = ("name", "uuid", "working-directory", "dora")
 _OPTIONS = (
     _always("name", "name", parse_name),
@@ -151,6 +169,7 @@ _OPTIONS = (
     _each("env-key", "env_keys"),
     Option("log-rate-limit", "log_rates", parse_rates, format_rates, is_repeated=True),
     _each("node-limit", "node_limits", parse_node_limits, format_node_limits),
+    _each("node-rights", "node_rights", _parse_rights, _format_rights),
     _each("node-restart", "node_restarts", parse_node_policy, format_node_policy),
     Option("watchdog", "watchdogs", parse_sockets, format_watchdogs, is_repeated=True),
     _each("watch", "reload.watch"),

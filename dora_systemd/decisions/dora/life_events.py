@@ -49,11 +49,14 @@ def parse_daemon_line(line: str, at_us: int) -> life.Event | None:
     return life.NodeHung(at_us, match[1], match[2]) if match else None
 
 
-def with_facts(event: life.NodeExited, is_stale: bool, oom: Oom | None) -> life.NodeExited:
+def with_facts(
+    event: life.NodeExited, is_stale: bool, oom: Oom | None, is_essential: bool = False
+) -> life.NodeExited:
     """The event with facts that only the runner knows.
 
     is_stale: whether the node's current process is alive. oom: the OOM kill that ended it.
+    is_essential: whether the dataflow needs the node.
     """
     oom = oom if event.exit.is_failure else None
     how = event.exit if oom is None else Exit(words=oom.text)
-    return replace(event, exit=how, is_stale=is_stale, oom=oom)
+    return replace(event, exit=how, is_stale=is_stale, oom=oom, is_essential=is_essential)

@@ -2,6 +2,9 @@
 
 from enum import StrEnum
 
+ESSENTIAL = "essential "
+"""Begins the reason of dataflow-failed if the failure of one node has ended all. `why` reads it."""
+
 
 class Cause(StrEnum):
     """One reason for an end; those up to OUT_OF_MEMORY occur in the event dataflow-failed."""

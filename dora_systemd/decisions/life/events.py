@@ -84,6 +84,7 @@ class NodeExited(Event):
     will_restart: dora is going to execute it again.
     is_stale: a newer process of the node is already running.
     oom: the OOM kill, if the kernel killed it because of memory.
+    is_essential: the dataflow ends if the node has failed for good.
     """
 
     node: str
@@ -91,6 +92,7 @@ class NodeExited(Event):
     will_restart: bool
     is_stale: bool = False
     oom: Oom | None = None
+    is_essential: bool = False
 
 
 @dataclass(frozen=True)

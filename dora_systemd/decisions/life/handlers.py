@@ -13,10 +13,10 @@ events came before: dora's events and the ends of its processes arrive in any or
 
 from dataclasses import replace
 
-from dora_systemd.decisions.cell.status import HELD
+from dora_systemd.decisions.cell.status import HELD, NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life import nodes as table
-from dora_systemd.decisions.life.causes import Cause
+from dora_systemd.decisions.life.causes import ESSENTIAL, Cause
 from dora_systemd.decisions.life.failures import ENGINE_TIMEOUT, Next, because, fail, oom_of_all, to
 from dora_systemd.decisions.life.states import Action, Cell, Deadline, Do, Record, RunnerExit, State
 from dora_systemd.decisions.life.stop_budget import LEAVE_TIMEOUT, stop_timeout
@@ -97,8 +97,35 @@ def node_event(cell: Cell, event: life.Event) -> Next:
     return replace(cell, nodes=nodes), (*oom_of_all(event), *actions)
 
 
+def node_event_running(cell: Cell, event: life.NodeExited) -> Next:
+    """A node exited: end the dataflow if it is essential and has failed for good.
+
+    A node with the policy HELD waits for a reload. Without restarts left the unit is not restarted
+    either: that would be more than the policy says.
+    """
+    after, actions = node_event(cell, event)
+    before, node = cell.nodes.get(event.node), after.nodes.get(event.node)
+    if before is None or node is None or not event.is_essential or _is_replaced(before):
+        return after, actions
+    if node.state != "failed" or node.policy == HELD:
+        return after, actions
+    spent = table.spent(after.nodes)
+    reason = f"{ESSENTIAL}node {event.node}: {spent.get(event.node) or node.exit}"
+    code = RunnerExit.NODES_FAILED if event.node in spent else RunnerExit.FAILED
+    after = because(after, Cause.NODE_FAILED, [event.node])
+    return _wind_down(replace(after, failure=reason, exit=code), *actions)
+
+
+def _is_replaced(node: NodeStatus) -> bool:
+    """Whether this is the first process after a reload: the reloader goes back if it fails.
+
+    While the dataflow runs, only such a process has never been ready and is no restart of dora's.
+    """
+    return node.state == "starting" and not node.restarts
+
+
 def _is_stopping(cell: Cell) -> bool:
-    return bool(cell.stop_by) or cell.reload or (cell.is_trial and bool(cell.failure))
+    return bool(cell.stop_by) or cell.reload or bool(cell.failure)
 
 
 def stop_early(cell: Cell, event: life.StopAsked) -> Next:

@@ -72,7 +72,7 @@ TABLE: Mapping[State, Mapping[type[life.Event], Handler]] = {
         DeadlinePassed=handle.run,
         StartTimedOut=handle.start_timed_out,
     ),
-    State.RUNNING: _row(**_ALIVE, **_RELOADS),
+    State.RUNNING: _row(**{**_ALIVE, **_RELOADS, "NodeExited": handle.node_event_running}),
     State.STOPPING: _row(**_STOPPING),
     State.CLOSING: _row(
         **{**_LOST, **_NODES},

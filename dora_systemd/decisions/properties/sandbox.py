@@ -63,11 +63,12 @@ _MOUNTABLE = re.compile(r"[^\s\x00-\x1f\x7f\"'\\:]+")
 class Sandbox:
     """The options of a sandbox.
 
-    level: one of LEVELS. network: one of NETWORKS. is_user: of a user's manager. is_root: the nodes
-    run as root. has_devices: some devices are allowed by name. is_realtime: the nodes have realtime
-    scheduling. has_identity: the user fits into a namespace with the first 65536 ids. needed:
-    absolute paths to read, such as the project. writable: paths to write. firm: by path of these
-    two, the part that only root can replace; without an entry all of it. directory: the
+    level: one of LEVELS. network: one of NETWORKS. is_user: of a user's manager. is_root: the
+    nodes run as root. has_devices: some devices are allowed by name. is_realtime: the nodes
+    have realtime scheduling. has_rights: some node has rights that a program sets before it.
+    has_identity: the user fits into a namespace with the first 65536 ids. needed: absolute
+    paths to read, such as the project. writable: paths to write. firm: by path of these two,
+    the part that only root can replace; without an entry all of it. directory: the
     RuntimeDirectory of the unit, the only one that nodes see; "": all are visible.
     """
 
@@ -77,6 +78,7 @@ class Sandbox:
     is_root: bool = False
     has_devices: bool = False
     is_realtime: bool = False
+    has_rights: bool = False
     has_identity: bool = True
     needed: Sequence[str] = ()
     writable: Sequence[str] = ()
@@ -139,7 +141,7 @@ def _assignments(sandbox: Sandbox) -> list[str]:
     if not sandbox.is_realtime:
         # A realtime dataflow may change the scheduling of its threads.
         found += ["RestrictRealtime=yes"]
-        found += ["SystemCallFilter=~@resources"] if is_strict else []
+        found += ["SystemCallFilter=~@resources"] if is_strict and not sandbox.has_rights else []
     if not sandbox.is_user:
         # PrivateDevices= hides all devices but /dev/null and similar ones, even allowed devices.
         devices = "DevicePolicy=closed" if sandbox.has_devices else "PrivateDevices=yes"

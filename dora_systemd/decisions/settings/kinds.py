@@ -1,6 +1,6 @@
 """Defines settings, and the kinds of their values."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from operator import add, or_
 from pathlib import PurePath
@@ -66,6 +66,9 @@ class Setting(Generic[T]):
     property: the systemd property with the same value, as in a unit file, or "".
     root_only: the setting makes root read, run or grant something. In system scope it is only valid
     in a settings file that root alone can have written.
+    only_nodes: only valid below `nodes: NODE:`, so there is no flag and no variable.
+    raises: whether a value, of a node or of the dataflow, gives more than the user of the dataflow
+    has. In system scope such a value is only valid where root_only settings are.
     """
 
     name: str
@@ -78,10 +81,15 @@ class Setting(Generic[T]):
     per_node: bool = False
     property: str = ""
     root_only: bool = False
+    only_nodes: bool = False
+    raises: Callable[[Any], bool] | None = None
 
     def __post_init__(self) -> None:
         word = self.name.replace("_", "-")
         variable = "" if self.kind.is_repeatable else f"DORA_{self.name.upper()}"
+        if self.only_nodes:
+            object.__setattr__(self, "per_node", True)
+            return
         object.__setattr__(self, "flags", self.flags or (f"--{word}",))
         object.__setattr__(self, "variable", self.variable or variable)
         object.__setattr__(self, "metavar", self.metavar or self.kind.metavar)
@@ -127,6 +135,25 @@ def many_texts(
         expected,
         lambda value, _: parse(texts_of(value)),
         to_texts,
+        is_repeatable=True,
+        merge=merge,
+        metavar=metavar,
+    )
+
+
+def texts_of_nodes(
+    example: str,
+    metavar: str,
+    parse: Callable[[str], T],
+    to_text: Callable[[T], str],
+    merge: Callable[[Iterable[T], Iterable[T]], tuple[T, ...]],
+) -> Kind[tuple[T, ...]]:
+    """A repeatable kind of texts about one node each. merge: joins what is about the same node."""
+    return Kind(
+        str | list[str],
+        f"{example} or a list of such texts",
+        lambda value, _: merge((), map(parse, texts_of(value))),
+        lambda values: list(map(to_text, values)),
         is_repeatable=True,
         merge=merge,
         metavar=metavar,

@@ -3,10 +3,17 @@
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
-from dora_systemd.decisions.cell.limits import BY_WORD, LIMITS, NodeLimits
+from dora_systemd.decisions.cell.limits import BY_WORD, CPUS, LIMITS, NodeLimits
 from dora_systemd.decisions.properties.assignments import Properties
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.values import INFINITY, SECOND, format_rounded_size
+from dora_systemd.values import (
+    INFINITY,
+    SECOND,
+    cpu_bits,
+    cpu_numbers,
+    format_cpus,
+    format_rounded_size,
+)
 
 _CONTROLLERS = {
     **{limit.property: limit.controller() for limit in LIMITS},
@@ -21,11 +28,15 @@ _CONTROLLERS = {
 
 @dataclass(frozen=True)
 class Machine:
-    """The machine's size: memory in bytes, number of processors, and maximum tasks."""
+    """The machine's size: memory in bytes, number of processors, maximum tasks, and online CPUs.
+
+    cpus: None if they are not known.
+    """
 
     memory: int
     cores: int
     tasks: int
+    cpus: frozenset[int] | None = None
 
 
 def needed_controllers(properties: Properties, nodes: Iterable[NodeLimits]) -> dict[str, str]:
@@ -40,6 +51,23 @@ def needed_controllers(properties: Properties, nodes: Iterable[NodeLimits]) -> d
             if value != INFINITY:
                 needed.setdefault(BY_WORD[word].controller(), f"{word} of the node {one.node}")
     return needed
+
+
+def check_cpus(nodes: Iterable[NodeLimits], machine: Machine) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) for CPUs that the machine lacks."""
+    for one in nodes:
+        wanted = set(cpu_numbers(dict(one.limits).get(CPUS, 0)))
+        if machine.cpus is not None and (missing := wanted - machine.cpus):
+            raise DoraSystemdError(
+                f"cannot bind the node {one.node} to the cpus {_cpu_list(missing)}: "
+                "this machine has none with that number",
+                f"its cpus are {_cpu_list(machine.cpus)}",
+                ExitCode.BAD_INPUT,
+            )
+
+
+def _cpu_list(cpus: Iterable[int]) -> str:
+    return format_cpus(cpu_bits(cpus))
 
 
 def check_controllers(needed: Mapping[str, str], available: Collection[str], is_user: bool) -> None:

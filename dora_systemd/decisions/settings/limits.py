@@ -12,13 +12,13 @@ from dora_systemd.decisions.cell.limits import (
     merge_node_limits,
     parse_node_limits,
 )
-from dora_systemd.decisions.settings.kinds import Setting, many_texts, one_text
+from dora_systemd.decisions.rights.node_rights import is_negative, parse_nice
+from dora_systemd.decisions.settings.kinds import Setting, many_texts, one_text, texts_of_nodes
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import quoted
 
 _DEVICE = re.compile(r"(/dev/\S+?|(?:char|block)-\S+?)(?:[: ]([rwm]+))?")
 _REALTIME = re.compile(r"(?:(rr|fifo):)?([0-9]{1,2})")
-_LOWEST_NICE, _HIGHEST_NICE = -20, 19
 _DEFAULT_ACCESS = "rw"
 
 _EXPECTED = {
@@ -54,14 +54,6 @@ def _limit_setting(key: str, help_text: str) -> Setting[int | None]:
     )
 
 
-def _parse_nice(given: str) -> int:
-    text = given.strip()
-    if not re.fullmatch(r"[-+]?[0-9]{1,2}", text) or not _LOWEST_NICE <= int(text) <= _HIGHEST_NICE:
-        hint = f"write a number from {_LOWEST_NICE}, most important, to {_HIGHEST_NICE}"
-        raise DoraSystemdError(f"cannot use {quoted(text)} as nice value", hint, ExitCode.USAGE)
-    return int(text)
-
-
 def _parse_realtime(given: str) -> str:
     """POLICY:PRIORITY, or PRIORITY, see sched(7)."""
     text = given.strip()
@@ -84,11 +76,11 @@ def _parse_device(text: str) -> str:
 
 NODE_LIMIT = Setting[tuple[NodeLimits, ...]](
     "node_limit",
-    many_texts(
-        "NODE:memory=1G,cpu=1.5 or a list of such texts",
+    texts_of_nodes(
+        "NODE:memory=1G,cpu=1.5",
         "NODE:LIMIT=VALUE,...",
-        lambda texts: merge_node_limits(map(parse_node_limits, texts)),
-        lambda limits: list(map(format_node_limits, limits)),
+        parse_node_limits,
+        format_node_limits,
         merge_node_limits,
     ),
     (),
@@ -96,11 +88,13 @@ NODE_LIMIT = Setting[tuple[NodeLimits, ...]](
 )
 NICE = Setting[int | None](
     "nice",
-    one_text(int | str, "a number from -20 to 19", "N", _parse_nice),
+    one_text(int | str, "a number from -20 to 19", "N", parse_nice),
     None,
     "Nice value of all processes, see nice(1).",
+    per_node=True,
     property="Nice",
     root_only=True,
+    raises=is_negative,
 )
 REALTIME = Setting[str | None](
     "realtime",
@@ -122,8 +116,18 @@ DEVICE = Setting[tuple[str, ...]](
     "Device that the nodes may use; all other devices are then blocked.",
     property="DeviceAllow",
 )
+CPUS = Setting[int | None](
+    "cpus",
+    one_text(
+        int | str, "CPUs such as 2-3 or 0,2", "LIST", BY_KEY["cpus"].parse, BY_KEY["cpus"].format
+    ),
+    None,
+    "CPUs that the node may use, such as 2-3 or 0,2.",
+    only_nodes=True,
+)
 LIVE_SETTINGS: tuple[Setting[Any], ...] = (
     *(_limit_setting(key, help_text) for key, help_text in _HELPS.items()),
+    CPUS,
     NODE_LIMIT,
 )
 """Settings that can be changed while the dataflow is running."""

@@ -9,11 +9,14 @@ from dora_systemd.decisions.cell.line_rates import RateLimits, merge_rates
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.restarts import DEFAULT, RestartPolicy, with_values
 from dora_systemd.decisions.reload.watch_rules import relative_patterns
+from dora_systemd.decisions.rights.node_rights import BY_KEY as RIGHTS
+from dora_systemd.decisions.rights.node_rights import NodeRights, merge_node_rights
 from dora_systemd.decisions.settings.kinds import Setting
 from dora_systemd.decisions.settings.limits import NODE_LIMIT
 from dora_systemd.decisions.settings.reload import HOT_RELOAD, IGNORE, REPLACE, WATCH
 from dora_systemd.decisions.settings.resolve import Settings
 from dora_systemd.decisions.settings.restarts import POLICY_SETTINGS, RESTART_POLICY, START_TIMEOUT
+from dora_systemd.decisions.settings.rights import NODE_RIGHTS
 from dora_systemd.decisions.settings.signs import NOTIFY, WATCHDOG
 from dora_systemd.decisions.settings.table import (
     ALLOW_SHELL_NODES,
@@ -41,6 +44,7 @@ def with_settings(options: RunnerOptions, settings: Settings) -> RunnerOptions:
         exit_when_nodes_finish=settings[EXIT_WHEN_NODES_FINISH],
         log_rates=log_rates(settings),
         node_limits=settings_node_limits(settings),
+        node_rights=settings_node_rights(settings),
         restart=restart_policy(settings),
         node_restarts=node_policies(settings),
         start_timeout=settings[START_TIMEOUT],
@@ -71,6 +75,17 @@ def settings_node_limits(settings: Settings) -> tuple[NodeLimits, ...]:
         for node, values in settings.nodes.items()
     )
     return merge_node_limits(of_files, given)
+
+
+def settings_node_rights(settings: Settings) -> tuple[NodeRights, ...]:
+    """The rights of all nodes: those of settings files, overridden by `node_rights`."""
+    given = settings[NODE_RIGHTS]
+    of_files = (
+        NodeRights(node, **{key: values[key] for key in values.keys() & RIGHTS})
+        for node, values in settings.nodes.items()
+        if values.keys() & RIGHTS
+    )
+    return merge_node_rights(of_files, given)
 
 
 def restart_policy(settings: Settings) -> RestartPolicy:

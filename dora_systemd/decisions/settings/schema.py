@@ -20,7 +20,7 @@ _CONFIG = ConfigDict(extra="forbid", strict=True)
 
 def settings_model(table: Sequence[Setting[Any]]) -> type[BaseModel]:
     """The model of a settings file: every key is optional, unknown keys are errors."""
-    fields = _fields(table)
+    fields = _fields([setting for setting in table if not setting.only_nodes])
     of_nodes = [setting for setting in table if setting.per_node]
     if of_nodes:
         node = create_model("NodeSettings", __config__=_CONFIG, **_fields(of_nodes))
@@ -55,4 +55,4 @@ def _fields(table: Sequence[Setting[Any]]) -> dict[str, Any]:
 
 def _known(place: Sequence[str], table: Sequence[Setting[Any]]) -> list[str]:
     inside_node = len(place) > 1
-    return [setting.name for setting in table if setting.per_node or not inside_node]
+    return [one.name for one in table if (one.per_node if inside_node else not one.only_nodes)]

@@ -25,6 +25,7 @@ from dora_systemd.decisions.settings.kinds import (
 from dora_systemd.decisions.settings.limits import LIMIT_SETTINGS
 from dora_systemd.decisions.settings.reload import RELOAD_SETTINGS
 from dora_systemd.decisions.settings.restarts import RESTART_SETTINGS
+from dora_systemd.decisions.settings.rights import RIGHTS_SETTINGS
 from dora_systemd.decisions.settings.sandbox import SANDBOX_SETTINGS
 from dora_systemd.decisions.settings.signs import SIGN_SETTINGS
 
@@ -95,6 +96,7 @@ SECTIONS: dict[str, tuple[Setting[Any], ...]] = {
     # All settings above, in this order, so that a setting is declared in one place only.
     "Nodes": tuple(value for value in list(globals().values()) if isinstance(value, Setting)),
     "Limits": LIMIT_SETTINGS,
+    "Rights of nodes": RIGHTS_SETTINGS,
     "Restarts": RESTART_SETTINGS,
     "Signs of life": SIGN_SETTINGS,
     "Sandbox and secrets": (*CREDENTIAL_SETTINGS, *SANDBOX_SETTINGS),

@@ -32,6 +32,7 @@ from dora_systemd.decisions.settings.limits import REALTIME
 from dora_systemd.decisions.settings.resolve import Settings
 from dora_systemd.decisions.settings.table import PROPERTY
 from dora_systemd.decisions.unit.file import format_sections
+from dora_systemd.decisions.unit.rights import rights_properties
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import SLICE, unit_description
 from dora_systemd.scope import RUNTIME_NAME
@@ -84,6 +85,7 @@ def unit_properties(
         **log_properties(options, context),
         **(sandbox_properties(context.sandbox) if context.sandbox else {}),
         **realtime_properties(settings),
+        **rights_properties(options.node_rights),
     }
     properties = with_properties(own, settings_properties(settings))
     assignments = settings[PROPERTY]

@@ -36,7 +36,8 @@ class NodeRow(NamedTuple):
     cpu_limit, memory_limit: the group's own, or None. throttled: the percentage of the time in
     which its CPU limit throttled it, None without one. since: time of its last change of state,
     CLOCK_REALTIME µs, 0: unknown. text: its own STATUS=. watchdog, sign_age: the time in which it
-    must send WATCHDOG=1, and how long ago it did, in µs.
+    must send WATCHDOG=1, and how long ago it did, in µs. essential: whether its final failure ends
+    the dataflow.
     """
 
     node: str
@@ -55,6 +56,7 @@ class NodeRow(NamedTuple):
     text: str = ""
     watchdog: int | None = None
     sign_age: int | None = None
+    essential: bool | None = None
 
 
 class Holder(NamedTuple):

@@ -80,6 +80,7 @@ def _node_object(row: NodeRow, shares: Shares | None) -> dict[str, Any]:
         **_usage(row, shares),
         "restarts": row.restarts,
         "max_restarts": row.max_restarts,
+        "essential": row.essential,
     }
 
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from dora_systemd.decisions.cell.exits import KILLED, ExitKind, exit_of, parse_exit
-from dora_systemd.decisions.life.causes import UNIT_RESULTS, Cause
+from dora_systemd.decisions.life.causes import ESSENTIAL, UNIT_RESULTS, Cause
 from dora_systemd.decisions.reload.steps import How
 from dora_systemd.decisions.signs.words import by_watchdog
 from dora_systemd.decisions.views.dataflows import FAILED, FINISHED, RESTARTING, STOPPED, UP_WORDS
@@ -135,6 +135,8 @@ def _failure(life: Life, end: Happening) -> Verdict:
     cause = _cause_of(life, end)
     if cause is Cause.NODE_FAILED and crashes:
         found = _crash(crashes[0])
+        if reason.startswith(ESSENTIAL):
+            return replace(found, summary=reason)
         return replace(found, summary=_with_tail(found, reason))
     node = named[0] if named else ""
     lost = life.last(*_LOSSES)

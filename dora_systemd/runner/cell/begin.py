@@ -9,6 +9,7 @@ from typing import NamedTuple
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.dora import engine
 from dora_systemd.decisions.cell.environment import find_python
+from dora_systemd.decisions.cell.limits import has_cpus
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.paths import CellPaths
 
@@ -81,7 +82,17 @@ def daemon_variables(
         "DORA_SYSTEMD_DIRECTORY": options.working_directory,
         "DORA_SYSTEMD_PYTHON": find_python(options.venv, search_path, os.path.exists),
         "PATH": f"{LIBEXEC}:{search_path}",
+        **_rights(options, unit),
     }
+
+
+def _rights(options: RunnerOptions, unit: Path) -> dict[str, str]:
+    if not options.node_rights and not any(map(has_cpus, options.node_limits)):
+        return {}
+    # Imported late: most dataflows have neither.
+    from dora_systemd.runner.nodes.rights import launcher_rights
+
+    return {"DORA_SYSTEMD_RIGHTS": launcher_rights(options, unit)}
 
 
 class Daemon(NamedTuple):

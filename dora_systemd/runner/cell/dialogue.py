@@ -17,6 +17,7 @@ from dora_systemd.decisions.dora import life_events, protocol
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Do, State
 from dora_systemd.decisions.life.stop_budget import stop_timeout
+from dora_systemd.decisions.rights.node_rights import is_essential
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.cell.failure import Tasks, failed
@@ -145,11 +146,13 @@ class Dialogue(Tasks):
     def _hear(self, record: protocol.LogRecord) -> None:
         event = life_events.parse_life_event(record, now_us())
         if isinstance(event, life.NodeSpawned):
-            self._nodes.adopt(event.node, event.pid)
+            self._nodes.adopt(event.node, event.pid, self._options.node_rights)
         if isinstance(event, life.NodeExited):
             node = self._pump.cell.nodes.get(event.node)
             is_stale = node is not None and self._nodes.has_process(event.node, node.pid)
-            event = life_events.with_facts(event, is_stale, self._nodes.find_oom(event.node))
+            essential = is_essential(self._options.node_rights, event.node)
+            oom = self._nodes.find_oom(event.node)
+            event = life_events.with_facts(event, is_stale, oom, essential)
             if node is not None and event.exit.is_failure and event.will_restart and not is_stale:
                 self._nodes.clear(event.node, node.pid)
         if event is not None:

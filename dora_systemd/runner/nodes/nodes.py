@@ -4,23 +4,25 @@ import asyncio
 import contextlib
 import os
 import resource
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
 
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.host.process import beside
+from dora_systemd.adapters.host.rights import lower_rights
 from dora_systemd.adapters.logs.jsonl import JsonlTail
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.decisions.cell.launch import has_pipes, is_launched
-from dora_systemd.decisions.cell.limits import NodeLimits
+from dora_systemd.decisions.cell.limits import NodeLimits, without_cpus
 from dora_systemd.decisions.cell.line_rates import RateLimits, rate_of
 from dora_systemd.decisions.cell.log_backlog import marks_of
 from dora_systemd.decisions.cell.status import WHOLE_CELL, CpuSample
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.descriptor.nodes import Node, NodeKind
 from dora_systemd.decisions.resources.oom import Oom
+from dora_systemd.decisions.rights.node_rights import NodeRights
 from dora_systemd.decisions.signs.watchdogs import NO_WATCHDOGS, Watchdogs
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.nodes.hold import Hold
@@ -62,7 +64,12 @@ class Nodes:
         self._launched.clear()
         for node in dataflow.nodes:
             self._make(node, rates)
-        self.limit(limits)
+        self._limit_first(limits)
+
+    def _limit_first(self, limits: Iterable[NodeLimits]) -> None:
+        """Set the limits of nodes that have not started, but not CPUs that launchers bind to."""
+        has_cpuset = cgroup.CPUSET in cgroup.read_controllers(self._unit)
+        self.limit(limits if has_cpuset else map(without_cpus, limits))
 
     def _make(self, node: Node, rates: RateLimits) -> None:
         cgroup.make_group(self._group(node.id))
@@ -86,7 +93,7 @@ class Nodes:
         """
         tail = self._tails.get(node.id)
         self._make(node, rates)
-        self.limit(one for one in limits if one.node == node.id)
+        self._limit_first(one for one in limits if one.node == node.id)
         if tail is not None:
             self._tails[node.id] = tail
         elif node.id in self._piped:
@@ -136,13 +143,18 @@ class Nodes:
             self._tails[node] = tail
             tail.start()
 
-    def adopt(self, node: str, pid: int) -> None:
-        """Dora has executed `node`: name its lines, and move it unless its launcher has done so."""
+    def adopt(self, node: str, pid: int, rights: Sequence[NodeRights] = ()) -> None:
+        """Dora has executed `node`: name its lines, and move it unless its launcher has done so.
+
+        rights: of the nodes that have some.
+        """
         self._pipes.set_pid(node, pid)
         if node not in self._launched:
             for process in _with_descendants(pid):
                 with contextlib.suppress(OSError):  # the process may have exited already
                     cgroup.move_process(self._group(node), process)
+                if rights:
+                    lower_rights(process, node, rights)
 
     def clear(self, node: str, pid: int) -> None:
         """Kill what the crashed process `pid` has left of the node, before its next process starts.

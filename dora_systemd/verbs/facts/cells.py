@@ -69,6 +69,11 @@ class Cell:
         return self._options
 
     @property
+    def known_options(self) -> RunnerOptions | None:
+        """The options, if something has asked for them already."""
+        return self._options
+
+    @property
     def dataflow(self) -> str:
         """The path of the descriptor, or "" as long as nobody has asked for the options."""
         return self._options.dataflow if self._options else ""

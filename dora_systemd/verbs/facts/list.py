@@ -5,6 +5,7 @@ from typing import Any
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
+from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import (
     FAILED_BECAUSE,
     WHOLE_CELL,
@@ -103,6 +104,7 @@ def _life(reading: Reading) -> dict[str, Any]:
 
 def _usage(reading: Reading, known: tuple[CpuSample, ...]) -> dict[str, Any]:
     status, use, now = reading.status, reading.usage, reading.sample
+    essential = _essential(reading.cell.known_options)
     samples = known or (CpuSample(reading.unit[STARTED]),)
     groups = {key: path for key, path in reading.groups.items() if key != WHOLE_CELL}
     names = status.nodes or dict.fromkeys(groups)
@@ -119,10 +121,15 @@ def _usage(reading: Reading, known: tuple[CpuSample, ...]) -> dict[str, Any]:
                     **(_numbers(use[node], samples, now, node) if node in use else {}),
                     **sign_facts(status.signs, node, now.at_us),
                 },
-            )
+            )._replace(essential=None if essential is None else node in essential)
             for node in names
         ),
     }
+
+
+def _essential(options: RunnerOptions | None) -> set[str] | None:
+    """The essential nodes; None in the table, for which nobody has asked for the options."""
+    return options and {one.node for one in options.node_rights if one.essential}
 
 
 def _numbers(

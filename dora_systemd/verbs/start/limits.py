@@ -5,10 +5,11 @@ from pathlib import Path
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.host.machine import read_machine
-from dora_systemd.decisions.cell.limits import BY_KEY, NodeLimits
+from dora_systemd.decisions.cell.limits import BY_KEY, NodeLimits, has_cpus, without_cpus
 from dora_systemd.decisions.properties.assignments import Properties
 from dora_systemd.decisions.settings.limit_checks import (
     check_controllers,
+    check_cpus,
     needed_controllers,
     size_warnings,
 )
@@ -22,11 +23,24 @@ def check_limits(manager: Manager, plan: Plan, properties: Properties) -> tuple[
 
     Raises DoraSystemdError (NO_SYSTEMD) for a limit that nothing would enforce.
     """
-    nodes = plan.options.node_limits
-    require_controllers(manager, plan.scope, properties, nodes)
+    nodes, machine = plan.options.node_limits, read_machine()
+    check_cpus(nodes, machine)
+    # Without a cpuset controller the launcher binds nodes to their CPUs.
+    require_controllers(manager, plan.scope, properties, tuple(map(without_cpus, nodes)))
     values = {limit.word: plan.settings.values[key] for key, limit in BY_KEY.items()}
-    sizes = size_warnings(values, nodes, read_machine())
-    return (*sizes, *_missing_devices(plan), *_powerless(plan))
+    sizes = size_warnings(values, nodes, machine)
+    return (*sizes, *_missing_devices(plan), *_powerless(plan), *_unbound(manager, nodes))
+
+
+def _unbound(manager: Manager, nodes: tuple[NodeLimits, ...]) -> list[str]:
+    """Nodes that nothing keeps on their CPUs but their own good will."""
+    bound = [one.node for one in nodes if has_cpus(one)]
+    if not bound or cgroup.CPUSET in cgroup.read_controllers(
+        cgroup.group_path(manager.control_group())
+    ):
+        return []
+    names = ", ".join(bound)
+    return [f"systemd has no cpuset controller here: {names} can leave the CPUs of `cpus`"]
 
 
 def require_controllers(

@@ -8,9 +8,11 @@ from pathlib import Path
 from dora_systemd.adapters.dora.preparation import PACKAGE, Prepared
 from dora_systemd.adapters.host.files import absolute_path
 from dora_systemd.decisions.cell.launch import python_of
+from dora_systemd.decisions.cell.limits import has_cpus
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.uv import uv_project
 from dora_systemd.decisions.properties.sandbox import Sandbox, loose_paths, odd_paths, widened_paths
+from dora_systemd.decisions.rights.node_rights import has_process_rights
 from dora_systemd.decisions.settings.limits import DEVICE, REALTIME
 from dora_systemd.decisions.settings.resolve import Settings
 from dora_systemd.decisions.settings.sandbox import NETWORK, SANDBOX, WRITABLE
@@ -43,6 +45,7 @@ def make_sandbox(
     """
     sight = sight or Sight()
     options = prepared.plan.options
+    rights = options.node_rights
     given = [_checked(path, sight) for path in settings[WRITABLE]]
     needed = tuple(dict.fromkeys(_existing(_needed(prepared, sight), sight)))
     writable = (*given, *_existing(_written_by_uv(options, user, sight), sight))
@@ -52,7 +55,8 @@ def make_sandbox(
         is_user=scope.is_user,
         is_root=user is not None and user.pw_uid == 0,
         has_devices=bool(settings[DEVICE]) or _names(settings, "DeviceAllow"),
-        is_realtime=settings[REALTIME] is not None,
+        is_realtime=settings[REALTIME] is not None or any(one.priority for one in rights),
+        has_rights=has_process_rights(rights) or any(map(has_cpus, options.node_limits)),
         # In a user namespace the given capabilities would have no effect.
         has_identity=_has_identity(user) and not _names(settings, *_CAPABILITIES),
         needed=needed,

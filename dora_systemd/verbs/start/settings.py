@@ -6,6 +6,7 @@ from pathlib import Path
 
 from dora_systemd.adapters.host.files import decoded, parse_yaml
 from dora_systemd.decisions.settings.resolve import Settings, resolve_settings
+from dora_systemd.decisions.settings.rights import NODE_RIGHTS
 from dora_systemd.decisions.settings.table import ENV_FILE, SETTINGS
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import settings_path
@@ -58,6 +59,7 @@ def read_settings(
     others = [] if scope.is_user else [one for one in found if not one.is_roots]
     for one in others:
         _check_trust(one)
+        _check_rights(one)
     settings = resolve_settings(flags, environment, documents, SETTINGS)
     if not any(ENV_FILE.name in one.words() for one in others):
         return settings
@@ -73,16 +75,32 @@ def _read(path: Path) -> _Read:
     return _Read(path, text.place, document)
 
 
+def _check_rights(read: _Read) -> None:
+    """Refuse values by which another user's file would give a node more than that user has."""
+    own = resolve_settings({}, {}, [(str(read.path), read.document)], SETTINGS)
+    for setting in SETTINGS:
+        values = {"": own[setting], **own.by_node(setting)}
+        for node, value in values.items() if setting.raises else ():
+            is_default = not node and not own.is_given(setting)
+            if not is_default and setting.raises and setting.raises(value):
+                key = f"nodes.{node}.{setting.name}" if node else setting.name
+                hint = f"give {NODE_RIGHTS.flags[0]} on the command line"
+                raise _untrusted(read, key, hint)
+
+
 def _check_trust(read: _Read) -> None:
     """Refuse keys by which another user's file could make root read, run or grant something."""
     only = {setting.name: setting for setting in SETTINGS if setting.root_only}
     dangerous = [only[key] for key in read.words() if key in only]
     if dangerous:
-        setting, path = dangerous[0], shown(str(read.path))
-        is_his = read.place.uid != 0
-        reason = "the file is not root's" if is_his else read.place.borrowed
-        raise DoraSystemdError(
-            f"cannot use {path}: {setting.name} is set there, and {reason}",
-            f"give {setting.flags[0]} on the command line, or set it in {SYSTEM_FILE}",
-            ExitCode.NO_PERMISSION,
-        )
+        setting = dangerous[0]
+        raise _untrusted(read, setting.name, f"give {setting.flags[0]} on the command line")
+
+
+def _untrusted(read: _Read, key: str, hint: str) -> DoraSystemdError:
+    reason = "the file is not root's" if read.place.uid != 0 else read.place.borrowed
+    return DoraSystemdError(
+        f"cannot use {shown(str(read.path))}: {key} is set there, and {reason}",
+        f"{hint}, or set it in {SYSTEM_FILE}",
+        ExitCode.NO_PERMISSION,
+    )

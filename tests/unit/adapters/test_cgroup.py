@@ -63,6 +63,25 @@ def test_a_limit_that_nothing_holds_up_is_an_error(unit: Path) -> None:
     assert caught.value.message == "cannot limit the node camera: its group has no pids.max"
 
 
+@pytest.mark.parametrize("used", ["2-3", "0"])
+def test_cpus_of_a_node_are_those_that_the_kernel_uses(unit: Path, used: str) -> None:
+    group = unit / "node-camera"
+    (group / "cpuset.cpus").write_text("")
+    (group / "cpuset.cpus.effective").write_text(f"{used}\n")
+    limits = parse_node_limits("camera:cpus=2-3")
+    if used == "2-3":
+        cgroup.limit_group(group, limits)
+        assert (group / "cpuset.cpus").read_text() == "2-3"
+        before = cgroup.read_files(group, ["cpuset.cpus"])
+        cgroup.limit_group(group, parse_node_limits("camera:cpus=infinity"))
+        cgroup.restore_group(group, before)
+        assert (group / "cpuset.cpus").read_text().startswith("2-3")
+        return
+    with pytest.raises(DoraSystemdError) as caught:
+        cgroup.limit_group(group, limits)
+    assert caught.value.message == ("cannot limit the node camera: of the cpus 2-3 it may use 0")
+
+
 def test_usage_of_a_group_that_has_gone(tmp_path: Path) -> None:
     assert cgroup.read_usage(tmp_path / "gone") == Usage(0, 0)
 

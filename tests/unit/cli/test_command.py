@@ -292,11 +292,12 @@ def test_settings_stand_by_concern_with_their_defaults(
 ) -> None:
     assert main.run([verb, "--help"]) == 0
     shown = " ".join(capsys.readouterr().out.split())
-    titles = ["Options:", "Nodes:", "Limits:", "Restarts:", "Sandbox and secrets:", "Hot reload:"]
+    titles = ["Options:", "Nodes:", "Limits:", "Rights of nodes:", "Restarts:"]
+    titles += ["Sandbox and secrets:", "Hot reload:"]
     places = [shown.index(f" {title} -") for title in titles]
     assert places == sorted(places)
     for setting in SETTINGS:
-        assert shown.count(f" {setting.flags[0]}") >= 1
+        assert setting.only_nodes or shown.count(f" {setting.flags[0]}") >= 1
     assert "Maximum restarts per window; default: 5." in shown
 
 

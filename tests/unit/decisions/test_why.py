@@ -74,6 +74,16 @@ CASES: dict[str, tuple[tuple[Record, ...], str, Cause, str, str]] = {
          failed("node-failed", "node camera: exit code 1 after 1 restart", "camera")),
         *("Failed", Cause.NODE_FAILED, "camera", "node camera: exit code 1 after 1 restart"),
     ),
+    "essential": (
+        (*RUNS, CRASH, event("node-crashed", "plot", exit="signal SIGKILL"),
+         failed("node-failed", "essential node camera: exit code 1 after 2 restarts", "camera")),
+        *("Failed", Cause.NODE_FAILED, "camera"),
+        "essential node camera: exit code 1 after 2 restarts",
+    ),
+    "essential, out of memory": (
+        (*RUNS, OOM, failed("node-failed", "essential node camera: out of memory", "camera")),
+        *("Failed", Cause.NODE_OUT_OF_MEMORY, "camera", "essential node camera: out of memory"),
+    ),
     "the first to go is the one": (
         (*RUNS, event("node-crashed", "plot", exit="exit code 9"), CRASH,
          failed("node-failed", "node camera: x, node plot: exit code 9", "camera plot")),

@@ -5,12 +5,13 @@ from typing import Any
 from hypothesis import strategies as st
 
 from dora_systemd.decisions.cell.limits import BY_WORD, NodeLimits, node_limits
-from dora_systemd.values import INFINITY
+from dora_systemd.values import INFINITY, cpu_bits
 
 MEMORY = st.integers(1 << 20, INFINITY)
 CPU = st.integers(100, 10**7).map(lambda hundredths: hundredths * 100) | st.just(INFINITY)
 TASKS = st.integers(1, 2**32 - 1) | st.just(INFINITY)
 WEIGHT = st.integers(1, 10000)
+CPUS = st.sets(st.integers(0, 200), min_size=1).map(cpu_bits) | st.just(INFINITY)
 BY_NAME: dict[str, st.SearchStrategy[int]] = {
     "cpu": CPU,
     "memory": MEMORY,
@@ -19,6 +20,7 @@ BY_NAME: dict[str, st.SearchStrategy[int]] = {
     "tasks": TASKS,
     "cpu-weight": WEIGHT,
     "io-weight": WEIGHT,
+    "cpus": CPUS,
 }
 IDS = st.from_regex(r"(?!\.)[A-Za-z0-9_.-]{1,20}", fullmatch=True)
 
@@ -49,6 +51,7 @@ LIMIT_VALUES: dict[str, st.SearchStrategy[Any]] = {
     "tasks_limit": TASKS,
     "cpu_weight": WEIGHT,
     "io_weight": WEIGHT,
+    "cpus": CPUS,
     "node_limit": st.lists(limits_of_a_node(), unique_by=lambda one: one.node).map(tuple),
     "nice": st.integers(-20, 19),
     "realtime": st.builds("{}:{}".format, st.sampled_from(["rr", "fifo"]), st.integers(1, 99)),

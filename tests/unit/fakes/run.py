@@ -2,7 +2,7 @@
 
 import asyncio
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -17,6 +17,7 @@ from dora_systemd.decisions.dora.protocol import LogRecord, Params, Reply
 from dora_systemd.decisions.life.states import Record
 from dora_systemd.decisions.logs.fields import Value
 from dora_systemd.decisions.resources.oom import Oom
+from dora_systemd.decisions.rights.node_rights import NodeRights
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.nodes.nodes import Nodes
@@ -54,7 +55,8 @@ class FakeNodes(Nodes):
     def listen(self, run: str) -> None:
         self.calls.append(("listen", run))
 
-    def adopt(self, node: str, pid: int) -> None:
+    def adopt(self, node: str, pid: int, rights: Sequence[NodeRights] = ()) -> None:
+        assert not rights
         self.calls.append(("adopt", node, pid))
 
     def clear(self, node: str, pid: int) -> None:

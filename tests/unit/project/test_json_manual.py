@@ -65,8 +65,15 @@ ROBOT = DataflowRow(
             text="30 frames/s",
             watchdog=5_000_000,
             sign_age=1_200_000,
+            essential=True,
         ),
-        NodeRow("detector", "failed", restarts=1, exit="exit code 1", since=CRASHED),
+        NodeRow(
+            *("detector", "failed"),
+            restarts=1,
+            exit="exit code 1",
+            since=CRASHED,
+            essential=False,
+        ),
     ),
     enabled=True,
 )

@@ -56,6 +56,11 @@ LATE = {
         "adapters.host.files": {"yaml", "adapters.host.yaml_loader"},
         "cli.verbs.look.logs": {"verbs.follow"},
     },
+    "limits, CPUs or rights of single nodes only": {
+        "decisions.cell.limits": {"node_words"},
+        "decisions.cell.options": {"decisions.rights.node_rights"},
+        "runner.cell.begin": {"runner.nodes.rights"},
+    },
     "uv only": {"decisions.cell.uv": {"tomllib"}},
     "JSON is for programs, and most who do something are people": {
         "cli.parameters": {"decisions.views.objects"},

@@ -51,7 +51,8 @@ _TABLE = {
     """,
     KERNEL: """
         adapters.cgroup.groups adapters.host.lock_table adapters.host.machine
-        adapters.host.process_table runner.cell.pause trust.socket_table verbs.destroy
+        adapters.host.process_table adapters.host.real_time adapters.host.rights
+        runner.cell.pause trust.socket_table verbs.destroy
         verbs.facts.reading verbs.start.sandbox verbs.why
     """,
     ROOTS: """

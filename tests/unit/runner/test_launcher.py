@@ -77,6 +77,22 @@ def test_the_node_is_in_its_group_while_it_waits_for_its_pipes(
         assert waiting.wait(60) == 0
 
 
+RIGHTS = "one.x /bin/false\none /usr/bin/nice -n 3 /usr/bin/chrt --batch 0\n* /usr/bin/nice -n 5\n"
+
+
+@pytest.mark.parametrize(("node", "nice"), [("one", 3), ("kept", 5)])
+def test_rights_of_the_node_and_of_all_others(
+    environment: dict[str, str], tmp_path: Path, node: str, nice: int
+) -> None:
+    base = os.getpriority(os.PRIO_PROCESS, 0)
+    words = (node, str(tmp_path), "keep", "/bin/sh", "-c", "nice; env")
+    done = launcher({**environment, "DORA_SYSTEMD_RIGHTS": RIGHTS}, *words)
+    assert (done.returncode, done.stderr) == (0, "")
+    first, *variables = done.stdout.splitlines()
+    assert int(first) == min(base + nice, 19)
+    assert not [line for line in variables if line.startswith("DORA_SYSTEMD")]
+
+
 ODD = {
     **{"node": "camera", "directory": "/d", "output": "o", "last": "l", "IFS": "x", "OPTIND": "7"},
     **{"my.var": "1", "MY-VAR": "2", "a b": "3", "OLDPWD": "/old", "PWD": "/here", "_": "me"},

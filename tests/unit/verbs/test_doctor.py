@@ -11,6 +11,7 @@ from dora_systemd.adapters.host.process import Completed
 from dora_systemd.adapters.journal import reader as journal_reader
 from dora_systemd.decisions.gateway.place import SOCKET_UNIT
 from dora_systemd.decisions.views.findings import Finding, State
+from dora_systemd.decisions.views.real_time import RealTime
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs import doctor
@@ -25,7 +26,7 @@ def manager(manager: FakeManager, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     """A machine where all is well."""
     manager.units["dora.target"] = {"LoadState": "loaded", "WantedBy": ["multi-user.target"]}
     (tmp_path / "cgroup").mkdir()
-    (tmp_path / "cgroup/cgroup.controllers").write_text("cpu io memory pids\n")
+    (tmp_path / "cgroup/cgroup.controllers").write_text("cpu cpuset io memory pids\n")
     monkeypatch.setattr(cgroup, "mount_point", lambda: tmp_path / "cgroup")
     monkeypatch.setattr(journal_reader, "check_readable", lambda _scope: None)
     monkeypatch.setattr(journal_reader, "is_volatile", lambda: False)
@@ -35,6 +36,7 @@ def manager(manager: FakeManager, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(doctor, "DEFAULT_USER", "root")
     monkeypatch.setattr(doctor, "settings_files", lambda *_: [Path("/x")])
     monkeypatch.setattr(doctor, "read_processes", list)
+    monkeypatch.setattr(doctor, "read_real_time", RealTime)
     monkeypatch.setattr(logins, "_logins", lambda _passwd: [])
     monkeypatch.setattr(doctor, "listening_sockets", lambda _port: frozenset())
     return manager
@@ -51,7 +53,7 @@ def test_all_is_well(manager: FakeManager, scope: Scope) -> None:
     assert {one.state for one in findings} == {State.OK}
     assert {one.topic for one in findings} == {
         *("systemd", "cgroup", "boot", "left over", "journal", "log rate", "dora", "user"),
-        *("port 6013", "port 53290", "bare dora"),
+        *("port 6013", "port 53290", "bare dora", "real time", "cpuset"),
     }
     assert not any(one.remedy for one in findings)
 

@@ -19,9 +19,11 @@ from dora_systemd.decisions.cell.options import (
     runner_command,
 )
 from dora_systemd.decisions.cell.restarts import POLICIES, RestartPolicy
+from dora_systemd.decisions.rights.node_rights import parse_node_rights
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.values import INFINITY, SECOND
 from tests.unit.fakes.limit_values import limits_of_a_node
+from tests.unit.fakes.rights_values import rights_of_a_node
 
 UUID = "550e8400-e29b-41d4-a716-446655440000"
 OPTIONS = RunnerOptions("robot", UUID, "/srv/robot.yml", "/srv", "/usr/bin/dora")
@@ -58,6 +60,7 @@ options = st.builds(
     log_rates=st.dictionaries(nodes, st.none() | rates),
     node_limits=st.lists(limits_of_a_node()).map(tuple),
     restart=policies,
+    node_rights=st.lists(rights_of_a_node()).map(tuple),
     node_restarts=st.lists(st.tuples(st.text(min_size=1), policies)).map(tuple),
     start_timeout=st.integers(min_value=1, max_value=10**12) | st.just(INFINITY),
     watchdogs=st.dictionaries(nodes, st.integers(0, INFINITY)),
@@ -91,6 +94,7 @@ ALL = RunnerOptions(
     log_rates={ALL_NODES: RateLimit(1000, SECOND), "camera": None},
     node_limits=(parse_node_limits("camera:cpu=1.5,memory=1G"),),
     restart=RestartPolicy("on-failure"),
+    node_rights=(parse_node_rights("camera:nice=5,essential"),),
     node_restarts=(("a:b", RestartPolicy("always", INFINITY, INFINITY, SECOND, SECOND)),),
     start_timeout=90 * SECOND,
     reload=HotReload(
@@ -102,7 +106,7 @@ ARGUMENTS = f"""\
 --venv=/srv/venv --exit-when-nodes-finish=no
 --restart=on-failure,max=5,window=10min,delay=500ms,max-delay=30s '--start-timeout=1min 30s'
 --env-key=MODEL --env-key=RATE --log-rate-limit=1000/1s --log-rate-limit=camera=infinity
---node-limit=camera:cpu=150%,memory=1G
+--node-limit=camera:cpu=150%,memory=1G --node-rights=camera:nice=5,essential=yes
 --node-restart=a:b:always,max=infinity,window=infinity,delay=1s,max-delay=1s
 --watch=*.py --watch=a=b --ignore=tmp_* --node-watch=camera=x=y --replace==start-first --replace=a=b
 --uv --debug --allow-shell-nodes --attached --hot-reload /srv/robot.yml

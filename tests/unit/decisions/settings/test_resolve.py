@@ -35,6 +35,7 @@ from dora_systemd.decisions.signs.watchdogs import SHORTEST
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import INFINITY, SECOND
 from tests.unit.fakes.limit_values import LIMIT_VALUES, RESTART_VALUES
+from tests.unit.fakes.rights_values import RIGHTS_VALUES
 
 BESIDE = "/srv/robot.systemd.yml"
 HOME = "/home/me/.config/dora-systemd/config.yml"
@@ -227,6 +228,7 @@ def test_values_and_back(data: st.DataObject) -> None:
         ),
         **LIMIT_VALUES,
         **RESTART_VALUES,
+        **RIGHTS_VALUES,
         "watch": st.just(("*.py", "config/*")),
         "ignore": st.just(("draft_*",)),
         "replace": st.sampled_from(REPLACE_WORDS),
@@ -242,6 +244,11 @@ def test_values_and_back(data: st.DataObject) -> None:
 def test_every_setting_can_be_set_everywhere() -> None:
     for setting in SETTINGS:
         assert setting.help.endswith(".")
+        if setting.only_nodes:
+            assert setting.per_node
+            assert not setting.flags
+            assert not setting.variable
+            continue
         assert setting.flags[0].startswith("--")
         assert setting.variable.startswith("DORA_") or setting.kind.is_repeatable
         assert setting.metavar or setting.kind.is_flag

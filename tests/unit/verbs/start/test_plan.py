@@ -187,6 +187,37 @@ def test_whom_to_believe(project: Path, key: str) -> None:
         read_settings(SYSTEM, project / "robot.yml", {}, {})
 
 
+RAISING = {
+    "nodes: {a: {scheduling: fifo:5}}": "nodes.a.scheduling",
+    "nodes: {a: {nice: -1}}": "nodes.a.nice",
+    "nodes: {a: {nice: 5, oom_score_adjust: -1}}": "nodes.a.oom_score_adjust",
+    "nodes: {b: {essential: true}, a: {lock_memory: true}}": "nodes.a.lock_memory",
+    "node_rights: ['a:nice=1', 'b:scheduling=rr:1']": "node_rights",
+    "nodes: {a: {nice: 5, scheduling: idle, essential: true, cpus: 0, lock_memory: no}}": "",
+    "node_rights: a:oom-score-adjust=9": "",
+}
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="gives files to somebody else")
+@pytest.mark.parametrize("text", RAISING)
+def test_rights_that_only_root_gives(project: Path, text: str) -> None:
+    beside = project / "robot.systemd.yml"
+    beside.write_text(text)
+    read_settings(SYSTEM, project / "robot.yml", {}, {})
+    os.chown(beside, 65534, 65534)
+    read_settings(USER, project / "robot.yml", {}, {})
+    if not RAISING[text]:
+        read_settings(SYSTEM, project / "robot.yml", {}, {})
+        return
+    with pytest.raises(DoraSystemdError) as caught:
+        read_settings(SYSTEM, project / "robot.yml", {}, {})
+    assert caught.value.message == (
+        f"cannot use {beside}: {RAISING[text]} is set there, and the file is not root's"
+    )
+    assert caught.value.hint.startswith("give --node-rights on the command line, or set it in ")
+    assert caught.value.code is ExitCode.NO_PERMISSION
+
+
 @pytest.mark.skipif(os.getuid() != 0, reason="gives files to somebody else")
 def test_environment_files_of_others_are_lent(project: Path) -> None:
     flow, beside = project / "robot.yml", project / "robot.systemd.yml"

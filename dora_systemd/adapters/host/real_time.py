@@ -1,0 +1,66 @@
+"""What this machine offers for real time: its kernel, its CPUs, and whether root may have it."""
+
+import contextlib
+import os
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+
+from dora_systemd.adapters.host.process import run_command
+from dora_systemd.decisions.views.real_time import RealTime
+from dora_systemd.errors import DoraSystemdError
+
+_CPUS = Path("/sys/devices/system/cpu")
+_CONFIGS = ("/proc/config.gz", f"/boot/config-{os.uname().release}")
+_OPTION = "CONFIG_RT_GROUP_SCHED"
+_MOST_BYTES = 4 * 1024 * 1024
+_GZIP = 16 + zlib.MAX_WBITS
+_SECONDS = 10.0
+_REALTIME = ("/usr/bin/chrt", "--fifo", "1", "/bin/true")
+_LIMIT = ("/usr/bin/prlimit", "--rtprio=99:99", "/bin/true")
+
+
+def read_real_time() -> RealTime:
+    """All facts. As root it tries to get rights, in children that end at once."""
+    return RealTime(
+        has_groups=_has_groups(),
+        is_granted=_can_run(_REALTIME),
+        can_raise=_can_run(_LIMIT),
+        isolated=_text(_CPUS / "isolated"),
+        governors=_governors(),
+    )
+
+
+def _has_groups() -> bool | None:
+    lines = next(filter(None, map(_config, _CONFIGS)), "").splitlines()
+    return f"{_OPTION}=y" in lines if lines else None
+
+
+def _config(path: str) -> str:
+    """The configuration of the kernel, compressed or not; "" if it is not there."""
+    with contextlib.suppress(OSError, zlib.error), Path(path).open("rb") as file:
+        data = file.read(_MOST_BYTES)
+        plain = zlib.decompressobj(_GZIP).decompress(data, _MOST_BYTES) if "gz" in path else data
+        return plain.decode(errors="replace")
+    return ""
+
+
+def _can_run(command: Sequence[str]) -> bool | None:
+    """Whether root can; None for others, and if the program is not there."""
+    if os.geteuid() != 0:
+        return None
+    try:
+        return run_command(command, _SECONDS).status == 0
+    except DoraSystemdError:
+        return None
+
+
+def _governors() -> tuple[str, ...]:
+    found = {_text(path) for path in _CPUS.glob("cpu[0-9]*/cpufreq/scaling_governor")}
+    return tuple(sorted(filter(None, found)))
+
+
+def _text(path: Path) -> str:
+    with contextlib.suppress(OSError):
+        return path.read_text().strip()
+    return ""

@@ -1,0 +1,181 @@
+"""What single nodes may do that the others may not: real time, priority, memory that goes last.
+
+The runner's command line contains these rights, so this module imports only what loads quickly.
+"""
+
+import re
+from collections.abc import Callable, Container, Iterable, Mapping
+from functools import reduce
+from operator import or_
+from typing import Any, NamedTuple
+
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import check_known, did_you_mean
+from dora_systemd.node_words import NodeWords, parse_node_words, refusal
+from dora_systemd.values import format_bool, parse_bool, quoted
+
+LOWEST_NICE, HIGHEST_NICE = -20, 19
+MOST_OOM = 1000
+"""The range of an OOM score adjustment, and of proc_pid_oom_score_adj(5), is from minus this."""
+REALTIME = ("fifo", "rr")
+_SHARING = ("batch", "idle", "other")
+_POLICIES = (*(f"{policy}:PRIORITY" for policy in REALTIME), *_SHARING)
+_ABOUT = NodeWords("a right", "rights", "scheduling=fifo:50,nice=-5")
+_PRIORITY = re.compile(r"0*([1-9][0-9]?)")
+_INTEGER = re.compile(r"[-+]?[0-9]{1,4}")
+
+
+def parse_scheduling(given: str) -> str:
+    """A policy of sched(7), with a priority if it is a realtime one. Raises as parse_nice does."""
+    policy, colon, priority = given.strip().partition(":")
+    if policy in _SHARING and not colon:
+        return policy
+    number = _PRIORITY.fullmatch(priority)
+    if policy in REALTIME and number:
+        return f"{policy}:{number[1]}"
+    hint = f"write {policy}:PRIORITY with 1 to 99, such as {policy}:50"
+    if policy not in REALTIME:
+        hint = did_you_mean(policy, _SHARING) or f"valid values: {', '.join(_POLICIES)}"
+    raise refusal(f"{quoted(given)} as scheduling", hint)
+
+
+def parse_nice(given: str) -> int:
+    """A nice value, see nice(1). Raises DoraSystemdError (USAGE)."""
+    hint = f"write a number from {LOWEST_NICE}, most important, to {HIGHEST_NICE}"
+    return _parse_integer(given, LOWEST_NICE, HIGHEST_NICE, "nice value", hint)
+
+
+def parse_oom(given: str) -> int:
+    """A value for OOMScoreAdjust= of systemd.exec(5). Raises DoraSystemdError (USAGE)."""
+    hint = f"write a number from {-MOST_OOM}, never killed, to {MOST_OOM}, killed first"
+    return _parse_integer(given, -MOST_OOM, MOST_OOM, "OOM score adjustment", hint)
+
+
+def _parse_integer(given: str, lowest: int, highest: int, what: str, hint: str) -> int:
+    text = given.strip()
+    if not _INTEGER.fullmatch(text) or not lowest <= int(text) <= highest:
+        raise refusal(f"{quoted(given)} as {what}", hint)
+    return int(text)
+
+
+def _parse_yes(text: str) -> bool:
+    """A boolean; the word alone means yes."""
+    return parse_bool(text or "yes")
+
+
+def is_realtime(scheduling: str) -> bool:
+    """Whether it comes before all processes without a realtime policy."""
+    return scheduling.partition(":")[0] in REALTIME
+
+
+def is_negative(value: int) -> bool:
+    """Whether it favours the node over other processes of the machine."""
+    return value < 0
+
+
+def _never(_: object) -> bool:
+    return False
+
+
+class Right(NamedTuple):
+    """One right of a node.
+
+    word: in `--node-rights NODE:WORD=VALUE`. key: the setting, below `nodes: NODE:`. parse, format:
+    text to value and back. raises: whether a value gives the node more than its user has.
+    """
+
+    word: str
+    key: str
+    parse: Callable[[str], Any]
+    format: Callable[[Any], str] = str
+    raises: Callable[[Any], bool] = _never
+
+
+RIGHTS = (
+    Right("scheduling", "scheduling", parse_scheduling, raises=is_realtime),
+    Right("nice", "nice", parse_nice, raises=is_negative),
+    Right("lock-memory", "lock_memory", _parse_yes, format_bool, raises=bool),
+    Right("oom-score-adjust", "oom_score_adjust", parse_oom, raises=is_negative),
+    Right("essential", "essential", _parse_yes, format_bool),
+)
+BY_WORD: Mapping[str, Right] = {right.word: right for right in RIGHTS}
+BY_KEY: Mapping[str, Right] = {right.key: right for right in RIGHTS}
+
+
+class NodeRights(NamedTuple):
+    """The rights of one node; None: not given, so as the other nodes.
+
+    The fields are the keys of RIGHTS. scheduling: as parse_scheduling() returns it. lock_memory: it
+    may lock all of its memory. essential: its final failure ends the dataflow.
+    """
+
+    node: str
+    scheduling: str | None = None
+    nice: int | None = None
+    lock_memory: bool | None = None
+    oom_score_adjust: int | None = None
+    essential: bool | None = None
+
+    @property
+    def priority(self) -> int:
+        """Its realtime priority, 0 without one."""
+        policy, _, priority = (self.scheduling or "").partition(":")
+        return int(priority) if policy in REALTIME else 0
+
+
+def given_rights(rights: NodeRights) -> dict[str, Any]:
+    """The values that are given, by key."""
+    return {key: value for key in BY_KEY if (value := getattr(rights, key)) is not None}
+
+
+def raises_rights(rights: NodeRights) -> bool:
+    """Whether only root may give them in system scope."""
+    return any(BY_KEY[key].raises(value) for key, value in given_rights(rights).items())
+
+
+def parse_node_rights(text: str) -> NodeRights:
+    """The rights in NODE:WORD=VALUE,WORD=VALUE. Raises DoraSystemdError (USAGE)."""
+    node, values = parse_node_words(text, _ABOUT, {right.word: right.parse for right in RIGHTS})
+    return NodeRights(node, **{BY_WORD[word].key: value for word, value in values.items()})
+
+
+def format_node_rights(rights: NodeRights) -> str:
+    """The inverse of parse_node_rights, for a node with rights."""
+    given = given_rights(rights).items()
+    pairs = (f"{BY_KEY[key].word}={BY_KEY[key].format(value)}" for key, value in given)
+    return f"{rights.node}:{','.join(pairs)}"
+
+
+def merge_node_rights(*sources: Iterable[NodeRights]) -> tuple[NodeRights, ...]:
+    """The rights of several sources; later ones take precedence."""
+    by_node: dict[str, list[dict[str, Any]]] = {}
+    for source in sources:
+        for one in source:
+            by_node.setdefault(one.node, []).append(given_rights(one))
+    return tuple(NodeRights(node, **reduce(or_, given)) for node, given in by_node.items())
+
+
+def is_essential(rights: Iterable[NodeRights], node: str) -> bool:
+    """Whether the final failure of `node` ends the dataflow."""
+    return any(bool(one.essential) for one in rights if one.node == node)
+
+
+def has_process_rights(rights: Iterable[NodeRights]) -> bool:
+    """Whether a program has to set something for a node before it runs."""
+    return any(given_rights(one).keys() - {"essential", "oom_score_adjust"} for one in rights)
+
+
+def check_rights_nodes(
+    rights: Iterable[NodeRights], nodes: Iterable[str], launched: Container[str]
+) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) for rights of a node that cannot have them.
+
+    nodes: all ids. launched: nodes that our launcher starts, which sets their rights.
+    """
+    given = list(rights)
+    check_known("cannot give rights to", [one.node for one in given], nodes)
+    for one in given:
+        if one.node not in launched and given_rights(one).keys() - {"essential"}:
+            message = f"cannot give rights to the node {quoted(one.node)}: something else starts it"
+            hint = "what starts a dynamic or ROS 2 node gives it its rights"
+            raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)

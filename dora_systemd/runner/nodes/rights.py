@@ -1,0 +1,40 @@
+"""The rights of single nodes in the cell: what the launcher sets, and proof that it can."""
+
+import re
+from pathlib import Path
+
+from dora_systemd.adapters.cgroup import groups as cgroup
+from dora_systemd.adapters.dora.preparation import check_named_nodes
+from dora_systemd.adapters.host.rights import check_cpus, prove_rights, read_base
+from dora_systemd.decisions.cell.limits import CPUS, has_cpus
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.descriptor.dataflow import Dataflow
+from dora_systemd.decisions.rights.commands import format_commands, rights_commands
+from dora_systemd.values import format_cpus
+
+_OF_UNITS = re.compile(r"/(dora-|doractl-check-)[^/]+\.service(/|$)")
+
+
+def launcher_rights(options: RunnerOptions, unit: Path) -> str:
+    """The programs through which launcher.pl executes the nodes, one line for each node.
+
+    unit: cgroup directory. Without a cpuset controller the launcher binds nodes to their CPUs.
+    """
+    has_cpuset = cgroup.CPUSET in cgroup.read_controllers(unit)
+    loose = () if has_cpuset else filter(has_cpus, options.node_limits)
+    bound = {one.node: format_cpus(dict(one.limits)[CPUS]) for one in loose}
+    if not options.node_rights and not bound:
+        return ""
+    return format_commands(rights_commands(options.node_rights, read_base(bound)))
+
+
+def check_first(options: RunnerOptions, dataflow: Dataflow) -> None:
+    """Check what the options say of single nodes, and prove that this machine grants their rights.
+
+    Raises DoraSystemdError. dataflow: with modules expanded.
+    """
+    check_named_nodes(options, dataflow)
+    # A dry run of a user is in no unit, and has the rights of that shell.
+    if _OF_UNITS.search(cgroup.own_group()):
+        check_cpus(options.node_limits)
+        prove_rights(options.node_rights)

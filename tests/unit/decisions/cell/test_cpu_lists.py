@@ -1,0 +1,83 @@
+"""CPUs as lists and as bits."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dora_systemd.decisions.cell.limits import (
+    format_node_limits,
+    has_cpus,
+    parse_node_limits,
+    without_cpus,
+)
+from dora_systemd.decisions.settings.limit_checks import (
+    Machine,
+    check_cpus,
+    needed_controllers,
+    size_warnings,
+)
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.values import (
+    INFINITY,
+    MOST_CPUS,
+    cpu_bits,
+    cpu_numbers,
+    cpus_file,
+    format_cpus,
+    parse_cpus,
+)
+
+
+@given(st.sets(st.integers(0, MOST_CPUS - 1), min_size=1, max_size=50))
+def test_there_and_back(cpus: set[int]) -> None:
+    value = cpu_bits(cpus)
+    assert cpu_numbers(value) == sorted(cpus)
+    assert parse_cpus(format_cpus(value)) == value > INFINITY
+
+
+@pytest.mark.parametrize(
+    ("text", "cpus", "formatted"),
+    [
+        ("3", [3], "3"),
+        (" 2-3 ", [2, 3], "2-3"),
+        ("4,0, 1-2", [0, 1, 2, 4], "0-2,4"),
+        ("0-63", list(range(64)), "0-63"),
+        ("infinity", [], "infinity"),
+    ],
+)
+def test_lists(text: str, cpus: list[int], formatted: str) -> None:
+    value = parse_cpus(text)
+    assert (cpu_numbers(value), format_cpus(value)) == (cpus, formatted)
+    assert cpus_file(value) == ("\n" if value == INFINITY else formatted)
+
+
+@pytest.mark.parametrize("text", ["", "-1", "3-2", "a", "1,", "0-8192", "8192", "1-2-3", "99999"])
+def test_bad_lists(text: str) -> None:
+    with pytest.raises(DoraSystemdError, match=r"^cannot use .* as cpus$") as caught:
+        parse_cpus(text)
+    assert caught.value.code is ExitCode.USAGE
+
+
+def test_as_a_limit_of_a_node() -> None:
+    limits = parse_node_limits("a:memory=1G,cpus=0,2-3,cpu=1.5")
+    assert format_node_limits(limits) == "a:cpu=150%,memory=1G,cpus=0,2-3"
+    assert limits.files()["cpuset.cpus"] == "0,2-3"
+    assert has_cpus(limits)
+    assert format_node_limits(without_cpus(limits)) == "a:cpu=150%,memory=1G"
+    assert "cpuset" in needed_controllers({}, [limits])
+    lifted = parse_node_limits("a:cpus=infinity")
+    assert not has_cpus(lifted)
+    assert needed_controllers({}, [lifted]) == {}
+
+
+def test_cpus_that_the_machine_lacks() -> None:
+    machine = Machine(1 << 30, 2, 1000, frozenset({0, 1}))
+    limits = [parse_node_limits("a:cpus=1"), parse_node_limits("b:cpus=1-3")]
+    with pytest.raises(DoraSystemdError) as caught:
+        check_cpus(limits, machine)
+    assert caught.value.message == (
+        "cannot bind the node b to the cpus 2-3: this machine has none with that number"
+    )
+    assert (caught.value.hint, caught.value.code) == ("its cpus are 0-1", ExitCode.BAD_INPUT)
+    check_cpus(limits, Machine(1 << 30, 2, 1000))
+    assert size_warnings({}, limits, machine) == ()

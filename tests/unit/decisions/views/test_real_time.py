@@ -1,0 +1,43 @@
+"""What doctor finds about real time."""
+
+import pytest
+
+from dora_systemd.decisions.views.findings import State
+from dora_systemd.decisions.views.real_time import RealTime, judge_cpuset, judge_real_time
+
+
+@pytest.mark.parametrize(
+    ("facts", "state", "words"),
+    [
+        (RealTime(), State.OK, "if root gives it"),
+        (RealTime(has_groups=True, is_granted=True), State.OK, "if root gives it"),
+        (RealTime(has_groups=True), State.NOTE, "CONFIG_RT_GROUP_SCHED"),
+        (RealTime(has_groups=True, is_granted=False), State.NOTE, "CONFIG_RT_GROUP_SCHED"),
+        (RealTime(has_groups=False, is_granted=False), State.NOTE, "even to root"),
+    ],
+)
+def test_scheduling(facts: RealTime, state: State, words: str) -> None:
+    (finding,) = judge_real_time(facts)
+    assert (finding.topic, finding.state) == ("real time", state)
+    assert words in finding.text
+    assert bool(finding.remedy) == (state is not State.OK)
+
+
+def test_a_container_without_the_capability() -> None:
+    _, rights = judge_real_time(RealTime(can_raise=False))
+    assert (rights.topic, rights.state) == ("rights", State.NOTE)
+    assert len(list(judge_real_time(RealTime(can_raise=True)))) == 1
+
+
+def test_what_slows_down() -> None:
+    facts = RealTime(isolated="2-3", governors=("performance", "powersave"))
+    _, isolated, governor = judge_real_time(facts)
+    assert isolated.text == "cpus 2-3 run only what is bound to them"
+    assert "(powersave)" in governor.text
+    assert len(list(judge_real_time(RealTime(governors=("performance",))))) == 1
+
+
+def test_cpusets() -> None:
+    assert judge_cpuset({"cpu", "cpuset"}, is_user=True).state is State.OK
+    assert "Delegate=cpu cpuset" in judge_cpuset({"cpu"}, is_user=True).remedy
+    assert "container" in judge_cpuset({"cpu"}, is_user=False).remedy

@@ -1,0 +1,67 @@
+"""The rights of nodes in the cell: what the launcher gets, and when they are proved."""
+
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.adapters.cgroup import groups as cgroup
+from dora_systemd.decisions.cell.limits import parse_node_limits
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
+from dora_systemd.decisions.rights.node_rights import parse_node_rights
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.paths import CellPaths
+from dora_systemd.runner.cell.begin import daemon_variables
+from dora_systemd.runner.nodes import rights as module
+from dora_systemd.runner.nodes.rights import check_first, launcher_rights
+from tests.unit.fakes.manager import options
+
+FLOW = parse_dataflow({"nodes": [{"id": "camera", "path": "camera.py"}]}, "robot.yml")
+
+
+def with_cpus(**more: object) -> RunnerOptions:
+    return options(node_limits=(parse_node_limits("camera:cpus=0,memory=1G"),), **more)
+
+
+def variables(unit: Path, given: RunnerOptions) -> dict[str, str]:
+    return daemon_variables(given, CellPaths(unit), unit, {})
+
+
+def test_most_dataflows_have_none(tmp_path: Path) -> None:
+    limited = options(node_limits=(parse_node_limits("camera:memory=1G"),))
+    for given in (options(), limited):
+        assert "DORA_SYSTEMD_RIGHTS" not in variables(tmp_path, given)
+
+
+def test_the_launcher_binds_nodes_only_where_no_cgroup_does(tmp_path: Path) -> None:
+    expected = "camera /usr/bin/taskset -c 0\n* \n"
+    assert variables(tmp_path, with_cpus())["DORA_SYSTEMD_RIGHTS"] == expected
+    (tmp_path / "cgroup.controllers").write_text("cpu cpuset\n")
+    assert launcher_rights(with_cpus(), tmp_path) == ""
+    rights = (parse_node_rights("camera:scheduling=idle"),)
+    line = "camera /usr/bin/chrt --idle 0\n* \n"
+    assert launcher_rights(with_cpus(node_rights=rights), tmp_path) == line
+
+
+@pytest.mark.parametrize(
+    ("group", "is_proved"),
+    [
+        ("/dora.slice/dora-robot.service/supervisor", True),
+        ("/system.slice/doractl-check-0123.service", True),
+        ("/user.slice/user-1000.slice/session-1.scope", False),
+    ],
+)
+def test_rights_are_proved_in_a_unit(
+    monkeypatch: pytest.MonkeyPatch, group: str, is_proved: bool
+) -> None:
+    proved: list[object] = []
+    monkeypatch.setattr(module, "prove_rights", proved.append)
+    monkeypatch.setattr(cgroup, "own_group", lambda: group)
+    rights = (parse_node_rights("camera:nice=5"),)
+    check_first(options(node_rights=rights), FLOW)
+    assert proved == [rights] * is_proved
+
+
+def test_rights_of_a_node_that_is_not_there() -> None:
+    with pytest.raises(DoraSystemdError, match="the node 'radar': no such node"):
+        check_first(options(node_rights=(parse_node_rights("radar:essential"),)), FLOW)
