@@ -22,6 +22,7 @@ from dora_systemd.decisions.descriptor.build_session import (
 from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
 from dora_systemd.decisions.descriptor.nodes import UNEXPANDED, NodeKind
 from dora_systemd.decisions.dora.errors import parse_dora_error
+from dora_systemd.decisions.owes.check import check_owes
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.programs import own_account
 from dora_systemd.trust.sight import Sight
@@ -58,6 +59,10 @@ def prepare(options: RunnerOptions, environment: Mapping[str, str]) -> Prepared:
         _load_session(options),
         environment,
     )
+    if options.owes:
+        from dora_systemd.adapters.dora.probe import probe_python
+
+        probe_python(plan)
     return Prepared(dataflow, plan, launch_descriptor(dataflow, plan))
 
 
@@ -77,6 +82,7 @@ def _check_limited(options: RunnerOptions, dataflow: Dataflow) -> None:
     dynamic = [node.id for node in dataflow.nodes if node.kind is NodeKind.DYNAMIC]
     check_nodes(options.node_limits, ids, dynamic)
     check_restart_nodes(options.node_restarts, ids)
+    check_owes(options, dataflow.nodes)
 
 
 def resolved(options: RunnerOptions) -> RunnerOptions:

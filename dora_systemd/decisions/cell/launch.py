@@ -20,6 +20,7 @@ from dora_systemd.decisions.descriptor.build_session import BuildSession
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.descriptor.expansion import expanded
 from dora_systemd.decisions.descriptor.nodes import Node, NodeKind
+from dora_systemd.decisions.owes.owed import owes_restart
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import SECOND, quoted
 
@@ -117,7 +118,10 @@ def _restart_keys(node: Node, options: RunnerOptions) -> dict[str, Any]:
         return _restart_bounds(node)
     # dora does not restart nodes made of operators, nor dynamic nodes.
     is_restarted = node.kind not in (NodeKind.OPERATOR, NodeKind.DYNAMIC)
-    return options.restart.dora_keys() if is_restarted and options.restart.policy != "no" else {}
+    policy = options.restart
+    if policy.policy == "no" and owes_restart(options.owes, node.id):
+        policy = policy._replace(policy="on-failure")
+    return policy.dora_keys() if is_restarted and policy.policy != "no" else {}
 
 
 def _restart_bounds(node: Node) -> dict[str, Any]:

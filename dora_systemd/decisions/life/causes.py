@@ -4,7 +4,9 @@ from enum import StrEnum
 
 
 class Cause(StrEnum):
-    """One reason for an end; those up to OUT_OF_MEMORY occur in the event dataflow-failed."""
+    """One reason for an end; those up to OUT_OF_MEMORY, and
+    NODE_SILENT, occur in the event dataflow-failed.
+    """
 
     NODE_FAILED = "node-failed"
     START_TIMEOUT = "start-timeout"
@@ -21,6 +23,7 @@ class Cause(StrEnum):
     OUT_OF_MEMORY = "out-of-memory"
 
     NODE_HUNG = "node-hung"
+    NODE_SILENT = "node-silent"
     NODE_OUT_OF_MEMORY = "node-out-of-memory"
     UNIT_FAILED = "unit-failed"
     NO_END = "no-end"

@@ -20,6 +20,7 @@ from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.life.failures import ENGINE_TIMEOUT, Next, because, fail, oom_of_all, to
 from dora_systemd.decisions.life.states import Action, Cell, Deadline, Do, Record, RunnerExit, State
 from dora_systemd.decisions.life.stop_budget import LEAVE_TIMEOUT, stop_timeout
+from dora_systemd.decisions.owes.owed import FAIL
 from dora_systemd.values import SECOND, format_duration
 
 _NOT_READY = ("starting", "restarting")
@@ -97,8 +98,19 @@ def node_event(cell: Cell, event: life.Event) -> Next:
     return replace(cell, nodes=nodes), (*oom_of_all(event), *actions)
 
 
+def silent(cell: Cell, event: life.NodeSilent) -> Next:
+    """A node owes an output: record it, and end the dataflow if that is asked."""
+    cell, actions = node_event(cell, event)
+    if event.then != FAIL:
+        return cell, actions
+    reason = f"node {event.node}: {event.reason}"
+    cell = replace(because(cell, Cause.NODE_SILENT, [event.node]), failure=reason)
+    cell = replace(cell, exit=RunnerExit.FAILED)
+    return to(cell, State.STOPPING, *actions, Do.ASK_STOP, after=stop_timeout(cell.grace))
+
+
 def _is_stopping(cell: Cell) -> bool:
-    return bool(cell.stop_by) or cell.reload or (cell.is_trial and bool(cell.failure))
+    return bool(cell.stop_by or cell.failure) or cell.reload
 
 
 def stop_early(cell: Cell, event: life.StopAsked) -> Next:

@@ -11,6 +11,7 @@ from dora_systemd.decisions.cell.restarts import DEFAULT, RestartPolicy, with_va
 from dora_systemd.decisions.reload.watch_rules import relative_patterns
 from dora_systemd.decisions.settings.kinds import Setting
 from dora_systemd.decisions.settings.limits import NODE_LIMIT
+from dora_systemd.decisions.settings.owes import OWES, owes_of
 from dora_systemd.decisions.settings.reload import HOT_RELOAD, IGNORE, REPLACE, WATCH
 from dora_systemd.decisions.settings.resolve import Settings
 from dora_systemd.decisions.settings.restarts import POLICY_SETTINGS, RESTART_POLICY, START_TIMEOUT
@@ -43,6 +44,7 @@ def with_settings(options: RunnerOptions, settings: Settings) -> RunnerOptions:
         node_restarts=node_policies(settings),
         start_timeout=settings[START_TIMEOUT],
         reload=hot_reload(settings, options.working_directory),
+        owes=owes_of(settings.by_node(OWES), settings[OWES]),
     )
 
 

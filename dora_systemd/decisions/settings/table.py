@@ -23,6 +23,7 @@ from dora_systemd.decisions.settings.kinds import (
     Setting,
 )
 from dora_systemd.decisions.settings.limits import LIMIT_SETTINGS
+from dora_systemd.decisions.settings.owes import OWES_SETTINGS
 from dora_systemd.decisions.settings.reload import RELOAD_SETTINGS
 from dora_systemd.decisions.settings.restarts import RESTART_SETTINGS
 from dora_systemd.decisions.settings.sandbox import SANDBOX_SETTINGS
@@ -95,6 +96,7 @@ SECTIONS: dict[str, tuple[Setting[Any], ...]] = {
     "Nodes": tuple(value for value in list(globals().values()) if isinstance(value, Setting)),
     "Limits": LIMIT_SETTINGS,
     "Restarts": RESTART_SETTINGS,
+    "Owed outputs": OWES_SETTINGS,
     "Sandbox and secrets": (*CREDENTIAL_SETTINGS, *SANDBOX_SETTINGS),
     "Hot reload": RELOAD_SETTINGS,
 }

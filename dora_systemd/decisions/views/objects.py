@@ -75,6 +75,11 @@ def _node_object(row: NodeRow, shares: Shares | None) -> dict[str, Any]:
         **_usage(row, shares),
         "restarts": row.restarts,
         "max_restarts": row.max_restarts,
+        "silent": row.silent or None,
+        "outputs": [
+            {"output": one.output, "age_us": one.age, "within_us": one.within, "then": one.then}
+            for one in row.outputs
+        ],
     }
 
 

@@ -72,6 +72,8 @@ STATE = Family("state", "1 for the current state, 0 for all others.")
 RESTARTS = Family("restarts_total", "Automatic restarts.")
 START = Family("start_time_seconds", "When all nodes were ready, in Unix time.")
 NODE_START = Family("start_time_seconds", "When it became ready, in Unix time.")
+SILENT = Family("silent", "1 while an output that it owes is missing.")
+LAST_OUTPUT = Family("last_output_age_seconds", "Time since the last message of an owed output.")
 INFO = Family("info", "UUID and unit of a dataflow; the value is always 1.")
 NODES = Family("nodes", "Nodes that the dataflow has.")
 ALIVE = Family("nodes_alive", "Nodes that are running.")
@@ -118,10 +120,19 @@ def _node_samples(observed: Sequence[Observed]) -> Iterator[tuple[Family, list[S
     restarts = [(own, node.restarts) for own, _, node in places]
     yield RESTARTS, [(own, count) for own, count in restarts if count is not None]
     yield NODE_START, [(own, node.since / SECOND) for own, _, node in places if _is_there(node)]
+    owing = [(own, node) for own, _, node in places if node.outputs]
+    yield SILENT, [(own, int(bool(node.silent))) for own, node in owing]
+    yield LAST_OUTPUT, [sample for own, node in owing for sample in _ages(own, node)]
     counts = [(own, o.lines[node.node]) for own, o, node in places if node.node in o.lines]
     yield LINES, [(own, count.written) for own, count in counts]
     yield SUPPRESSED, [(own, count.suppressed) for own, count in counts]
     yield from _group_samples([(own, one, node.node) for own, one, node in places])
+
+
+def _ages(own: Labels, node: NodeRow) -> Iterator[Sample]:
+    for one in node.outputs:
+        if one.age is not None:
+            yield {**own, "output": one.output}, one.age / SECOND
 
 
 def _is_there(node: NodeRow) -> bool:

@@ -98,8 +98,9 @@ def _rows(entry: TopEntry, look: Look, by: str, is_reversed: bool) -> list[TopRo
 def _node_row(node: NodeRow, entry: TopEntry, look: Look) -> TopRow:
     is_alive = node.state in ALIVE_NODE_STATES and node.since
     uptime = format_uptime(max(look.at_us - node.since, 0)) if is_alive else UNKNOWN
-    word = node.state.capitalize()
-    state = f"{word} ({node.exit})" if node.exit and not is_alive else word
+    word = node.word
+    more = node.silent or ("" if is_alive else node.exit)
+    state = f"{word} ({more})" if more else word
     cells = (f"  {node.node}", state, uptime, *_numbers(node, entry.waits, node.node))
     whole = entry.row
     return TopRow(whole.uuid, whole.name, node.node, word, cells)

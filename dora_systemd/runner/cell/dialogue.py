@@ -17,6 +17,7 @@ from dora_systemd.decisions.dora import life_events, protocol
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Do, State
 from dora_systemd.decisions.life.stop_budget import stop_timeout
+from dora_systemd.decisions.owes.probe import is_probe
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.cell.failure import Tasks, failed
@@ -132,7 +133,13 @@ class Dialogue(Tasks):
         await asyncio.sleep(2 * _SETTLE_SECONDS)  # let ChildExited of the coordinator come first
         self._pump.push(life.ConnectionLost(now_us()))
 
+    def _is_own(self, node: str) -> bool:
+        """Whether it is no node of the dataflow, but one that this runner has added."""
+        return bool(self._options.owes) and is_probe(node)
+
     def _hear(self, record: protocol.LogRecord) -> None:
+        if self._is_own(record.node):
+            return
         event = life_events.parse_life_event(record, now_us())
         if isinstance(event, life.NodeSpawned):
             self._nodes.adopt(event.node, event.pid)
@@ -159,6 +166,7 @@ class Dialogue(Tasks):
             reply = await self._engine.ask(protocol.check_params(self._pump.cell.run))
             results = protocol.parse_results(reply)
             if results is not None:
+                results = {node: how for node, how in results.items() if not self._is_own(node)}
                 return self._pump.push(life.ResultKnown(now_us(), results))
             if self._pump.cell.state is not State.CLOSING:
                 return None  # the run goes on, which answers ASK_RESULT in WAITING

@@ -36,6 +36,11 @@ class Hold:
             self._is_held = cgroup.freeze_group(self._group, is_held) and is_held
             self._since = now
 
+    @property
+    def is_held(self) -> bool:
+        """Whether the group is frozen now."""
+        return self._is_held
+
     @contextmanager
     def paused(self) -> Iterator[None]:
         """Thaw the node meanwhile: it must get dora's message that another process replaces it."""

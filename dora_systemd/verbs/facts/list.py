@@ -14,7 +14,12 @@ from dora_systemd.decisions.cell.status import (
     throttled_percent,
 )
 from dora_systemd.decisions.resources.usage import Usage
-from dora_systemd.decisions.views.dataflows import DataflowRow, NodeRow, status_word
+from dora_systemd.decisions.views.dataflows import (
+    DataflowRow,
+    NodeRow,
+    OutputRow,
+    status_word,
+)
 from dora_systemd.scope import Scope
 from dora_systemd.values import INFINITY, SECOND
 from dora_systemd.verbs.facts.cells import Cell, read_cells
@@ -105,10 +110,19 @@ def _usage(reading: Reading, known: tuple[CpuSample, ...]) -> dict[str, Any]:
                 node,
                 status.nodes.get(node),
                 _numbers(use[node], samples, now, node) if node in use else {},
-            )
+            )._replace(outputs=_outputs(reading, node))
             for node in names
         ),
     }
+
+
+def _outputs(reading: Reading, node: str) -> tuple[OutputRow, ...]:
+    """The outputs that the node owes."""
+    return tuple(
+        OutputRow(owed.output, owed.within, owed.then, max(reading.at_us - at, 0) if at else None)
+        for owed, at in zip(reading.cell.options.owes, reading.heard, strict=False)
+        if owed.node == node
+    )
 
 
 def _numbers(
@@ -139,5 +153,6 @@ def _node_row(node: str, status: NodeStatus | None, numbers: dict[str, Any]) -> 
         "max_restarts": status.max_restarts or None,
         "exit": str(status.exit),
         "since": status.since_us,
+        "silent": status.silent,
     }
     return NodeRow(node, status.state, **facts, **numbers)  # type: ignore[arg-type]
