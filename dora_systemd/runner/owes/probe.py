@@ -1,11 +1,10 @@
 """Keeps one probe among the nodes of a run, see decisions/owes/probe.py."""
 
-import asyncio
+from collections.abc import Awaitable, Callable
 from typing import Any
 
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.dora.preparation import PACKAGE
-from dora_systemd.adapters.dora.probe import probe_python
 from dora_systemd.decisions.cell.launch import PERL, LaunchPlan
 from dora_systemd.decisions.cell.status import HELD, NodeStatus
 from dora_systemd.decisions.dora import protocol
@@ -16,6 +15,8 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.reload.apply import Run
 from dora_systemd.values import SECOND
+
+FindPython = Callable[[], Awaitable[str]]
 
 _SOON, _LATE = SECOND, 32 * SECOND
 """µs between two probes; the pause doubles while none lives for _LATE."""
@@ -28,13 +29,19 @@ _TRIES = 2
 
 
 class Probe:
-    """The probe of one run. plan: of the dataflow. tick: µs between two calls of tend()."""
+    """The probe of one run. plan: of the dataflow. tick: µs between two calls of tend().
 
-    def __init__(self, run: Run, dora: Engine, plan: LaunchPlan, tick: int) -> None:
+    find_python: the interpreter with dora-rs; raises DoraSystemdError if there is none.
+    """
+
+    def __init__(
+        self, run: Run, dora: Engine, plan: LaunchPlan, tick: int, find_python: FindPython
+    ) -> None:
         unit, paths = run.nodes.places
         self._run = run
         self._engine = dora
         self._plan = plan
+        self._find_python = find_python
         self._tick = tick
         self._path = paths.times
         self._group = unit / f"{cgroup.NODE_PREFIX}{PROBE}"
@@ -77,7 +84,7 @@ class Probe:
 
     async def _add(self, inputs: list[tuple[int, Owed]]) -> None:
         try:
-            python = await asyncio.to_thread(probe_python, self._plan)
+            python = await self._find_python()
             cgroup.make_group(self._group)
             cgroup.kill_as_one(self._group)
             params = protocol.add_params(self._run.pump.cell.run, self._define(python, inputs))

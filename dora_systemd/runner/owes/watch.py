@@ -4,10 +4,11 @@ Nobody else restarts a node for this: dora does, by its RestartNode, within the 
 """
 
 import asyncio
-import time
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
 
+from dora_systemd.adapters.dora.probe import probe_python
 from dora_systemd.adapters.host.shared_times import SharedTimes
 from dora_systemd.decisions.cell.launch import LaunchPlan
 from dora_systemd.decisions.cell.status import NodeStatus
@@ -19,45 +20,45 @@ from dora_systemd.decisions.owes.judge import Judge, Look, Verdict, look
 from dora_systemd.decisions.owes.owed import RESTART, WARN
 from dora_systemd.decisions.owes.probe import parse_times, size_of_times
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.runner.cell.dialogue import Dialogue
 from dora_systemd.runner.cell.engine import Engine
+from dora_systemd.runner.cell.failure import Tasks
 from dora_systemd.runner.cell.pump import now_us
-from dora_systemd.runner.owes.probe import Probe
+from dora_systemd.runner.owes.probe import FindPython, Probe
 from dora_systemd.runner.reload.apply import Run
 from dora_systemd.values import SECOND
 
 _ANSWER_SECONDS = 30.0
 
 
-def monotonic_us() -> int:
-    """CLOCK_MONOTONIC in µs: it stands while the machine is suspended, and nobody sets it."""
-    return time.monotonic_ns() // 1000
-
-
-async def watch_owes(run: Run, plan: LaunchPlan, dora: Engine, dialogue: Dialogue) -> None:
+async def watch_owes(run: Run, plan: LaunchPlan, dora: Engine, dialogue: Tasks) -> None:
     """Watch the outputs that the options of `plan` name, from the start of all nodes on."""
     await run.pump.wait(lambda cell: cell.state is State.RUNNING, None)
-    with closing(Watch(run, plan, dora, dialogue)) as watch:
+    find_python = partial(asyncio.to_thread, probe_python, plan)
+    with closing(Watch(run, plan, dora, dialogue, find_python)) as watch:
         await watch.work()
 
 
 class Watch:
-    """The watch over one run of a dataflow."""
+    """The watch over one run of a dataflow. find_python: see Probe."""
 
-    def __init__(self, run: Run, plan: LaunchPlan, dora: Engine, dialogue: Dialogue) -> None:
+    def __init__(
+        self, run: Run, plan: LaunchPlan, dora: Engine, dialogue: Tasks, find_python: FindPython
+    ) -> None:
         self._run = run
         self._engine = dora
         self._dialogue = dialogue
         self._judge = Judge(plan.options.owes)
         size = size_of_times(plan.options.owes)
         self._times = SharedTimes(run.nodes.places[1].times, size)
-        self._probe = Probe(run, dora, plan, self._judge.tick)
+        self._probe = Probe(run, dora, plan, self._judge.tick, find_python)
         self._ready: dict[str, tuple[int, int]] = {}
 
     async def work(self) -> None:
         """Look again and again; the probe is started, and again if it has ended."""
+        loop = asyncio.get_running_loop()
         while True:
-            now = monotonic_us()
+            # CLOCK_MONOTONIC: it stands while the machine is suspended, and nobody sets it.
+            now = int(loop.time() * SECOND)
             beat, heard = parse_times(self._times.read(), self._judge.owes, now)
             self._look(Look(now, beat, heard, self._lives(now)))
             await self._probe.tend(beat, now)
@@ -86,7 +87,7 @@ class Watch:
         }
         for node, status in there.items():
             # The difference is taken once: the other clock may be set at any moment.
-            if self._ready.get(node, (0, 0))[0] != status.since_us:
+            if self._ready.get(node, (-1, 0))[0] != status.since_us:
                 ready = max(now - max(now_us() - status.since_us, 0), 1)
                 self._ready[node] = status.since_us, ready
         return {node: self._ready[node][1] for node in there}

@@ -58,6 +58,13 @@ LATE = {
         "cli.parameters": {"decisions.views.objects"},
         "decisions.views.outcome": {"decisions.views.objects"},
     },
+    "most dataflows owe nothing": {
+        "adapters.dora.preparation": {"adapters.dora.probe"},
+        "runner.owes.begin": {"runner.owes.watch"},
+    },
+    "a program of its own: it makes room first, and it runs with the Python of the nodes": {
+        "libexec.probe": {"dora"},
+    },
     "hot reload only": {
         "adapters.host.watch": {"watchfiles"},
         "decisions.reload.watch_rules": {"pathspec"},
