@@ -83,8 +83,7 @@ def test_a_silent_node_is_restarted(cell: Cell, project: Project) -> None:
 def test_a_spent_budget_is_the_end_of_the_node(cell: Cell, project: Project) -> None:
     """A node that does not respond is killed after its grace, and counted by dora."""
     path = flow(project, "{output: image, within: 1s, first: 1s}", STUBBORN)
-    words = ("--max-restarts", "1", "--grace-duration", "200ms")
-    cell.start(path, *words)
+    cell.start(path, "--max-restarts", "1", "--grace-duration", "200ms")
     wait_for("it is heard", lambda: camera_of(cell)["outputs"][0]["age_us"] is not None)
     project.write("quiet", "")
     wait_for("its restart is used up", lambda: cell.status.nodes["camera"].state == "failed", 40)

@@ -13,6 +13,7 @@ from typing import Any
 from dora_systemd.decisions.cell.environment import find_python
 from dora_systemd.decisions.cell.log_backlog import with_bounds
 from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.owed import owes_restart
 from dora_systemd.decisions.cell.restarts import DEFAULT, HELD_KEYS
 from dora_systemd.decisions.cell.uv import Read, uv_project
 from dora_systemd.decisions.descriptor.arguments import split_arguments
@@ -20,7 +21,6 @@ from dora_systemd.decisions.descriptor.build_session import BuildSession
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.descriptor.expansion import expanded
 from dora_systemd.decisions.descriptor.nodes import Node, NodeKind
-from dora_systemd.decisions.owes.owed import owes_restart
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import SECOND, quoted
 

@@ -113,7 +113,7 @@ class NodeHung(Event):
 class NodeSilent(Event):
     """An output that the node owes has not come. reason: such as "no image for 2s".
 
-    then: one of dora_systemd.decisions.owes.owed.THEN. silent: all that is missing of the node.
+    then: one of dora_systemd.decisions.cell.owed.THEN. silent: all that is missing of the node.
     """
 
     node: str

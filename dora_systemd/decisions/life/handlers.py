@@ -13,6 +13,7 @@ events came before: dora's events and the ends of its processes arrive in any or
 
 from dataclasses import replace
 
+from dora_systemd.decisions.cell.owed import FAIL
 from dora_systemd.decisions.cell.status import HELD
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life import nodes as table
@@ -20,7 +21,6 @@ from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.life.failures import ENGINE_TIMEOUT, Next, because, fail, oom_of_all, to
 from dora_systemd.decisions.life.states import Action, Cell, Deadline, Do, Record, RunnerExit, State
 from dora_systemd.decisions.life.stop_budget import LEAVE_TIMEOUT, stop_timeout
-from dora_systemd.decisions.owes.owed import FAIL
 from dora_systemd.values import SECOND, format_duration
 
 _NOT_READY = ("starting", "restarting")

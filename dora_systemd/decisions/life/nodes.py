@@ -4,11 +4,11 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from dora_systemd.decisions.cell.exits import KILLED, Exit, ExitKind
+from dora_systemd.decisions.cell.owed import RESTART
 from dora_systemd.decisions.cell.status import HELD, NodeStatus
 from dora_systemd.decisions.descriptor.wiring import Downstream
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Record
-from dora_systemd.decisions.owes.owed import RESTART
 
 NodeTable = Mapping[str, NodeStatus]
 Update = tuple[NodeTable, Record | None]

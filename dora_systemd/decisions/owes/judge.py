@@ -10,7 +10,7 @@ a runner or a probe that gets no CPU time.
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from dora_systemd.decisions.owes.owed import Owed
+from dora_systemd.decisions.cell.owed import Owed
 from dora_systemd.values import SECOND, format_duration
 
 _LOOKS = 8

@@ -15,7 +15,7 @@ import struct
 from collections.abc import Sequence
 from typing import Any
 
-from dora_systemd.decisions.owes.owed import Owed
+from dora_systemd.decisions.cell.owed import Owed
 from dora_systemd.values import SECOND
 
 PROBE = "dora-systemd-probe"

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from dora_systemd.decisions.owes.owed import (
+from dora_systemd.decisions.cell.owed import (
     Owed,
     format_owed,
     merge_owed,

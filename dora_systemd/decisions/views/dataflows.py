@@ -35,7 +35,7 @@ SHORTEST_PREFIX = 8
 class OutputRow(NamedTuple):
     """An output that a node owes. within: µs. age: µs since its last message, None: none yet.
 
-    then: one of dora_systemd.decisions.owes.owed.THEN.
+    then: one of dora_systemd.decisions.cell.owed.THEN.
     """
 
     output: str

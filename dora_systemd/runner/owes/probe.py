@@ -6,10 +6,10 @@ from typing import Any
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.dora.preparation import PACKAGE
 from dora_systemd.decisions.cell.launch import PERL, LaunchPlan
+from dora_systemd.decisions.cell.owed import Owed
 from dora_systemd.decisions.cell.status import HELD, NodeStatus
 from dora_systemd.decisions.dora import protocol
 from dora_systemd.decisions.life.states import State
-from dora_systemd.decisions.owes.owed import Owed
 from dora_systemd.decisions.owes.probe import PROBE, probe_definition
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.runner.cell.engine import Engine
@@ -97,7 +97,7 @@ class Probe:
             self._tell(f"its group: {error.strerror}")
 
     def _define(self, python: str, inputs: list[tuple[int, Owed]]) -> dict[str, Any]:
-        script, seconds = PACKAGE / "libexec" / "probe.py", self._tick / SECOND / 2
+        script, seconds = PACKAGE / "runner" / "owes" / "listen.py", self._tick / SECOND / 2
         command = [python, "-u", str(script), str(self._path), f"{seconds:g}"]
         self._count += 1
         return probe_definition(self._count, command, (PERL, self._plan.launcher), inputs)

@@ -63,7 +63,7 @@ LATE = {
         "runner.owes.begin": {"runner.owes.watch"},
     },
     "a program of its own: it makes room first, and it runs with the Python of the nodes": {
-        "libexec.probe": {"dora"},
+        "runner.owes.listen": {"dora"},
     },
     "hot reload only": {
         "adapters.host.watch": {"watchfiles"},

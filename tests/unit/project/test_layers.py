@@ -19,7 +19,7 @@ from dora_systemd.cli.group import SECTIONS
 from tests.unit.checkout import CHECKOUT, linked_package, module_paths
 
 LAYERS = (
-    {"words", "libexec"},
+    {"words"},
     {"decisions"},
     {"trust"},
     {"adapters"},

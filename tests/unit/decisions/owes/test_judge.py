@@ -4,8 +4,8 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
+from dora_systemd.decisions.cell.owed import Owed
 from dora_systemd.decisions.owes.judge import Judge, Look, Verdict, look
-from dora_systemd.decisions.owes.owed import Owed
 from dora_systemd.values import SECOND
 
 HOUR, DAY = 3600 * SECOND, 86400 * SECOND

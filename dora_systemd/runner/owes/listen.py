@@ -1,4 +1,4 @@
-"""Notes when messages of nodes arrive: `python probe.py FILE SECONDS`, as a node of dora's.
+"""Notes when messages of nodes arrive: `python listen.py FILE SECONDS`, as a node of dora's.
 
 FILE is the file of times of dora_systemd/decisions/owes/probe.py, and SECONDS the time between two
 beats at most. The input "0" is the first owed output. This runs with the Python of the nodes: it

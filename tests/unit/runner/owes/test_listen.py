@@ -1,4 +1,4 @@
-"""libexec/probe.py: the real program, with a dora that hands it what the test wants."""
+"""runner/owes/listen.py: the real program, with a dora that hands it what the test wants."""
 
 import struct
 import subprocess
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import dora_systemd
 
-SCRIPT = Path(dora_systemd.__file__).parent / "libexec" / "probe.py"
+SCRIPT = Path(dora_systemd.__file__).parent / "runner" / "owes" / "listen.py"
 DORA = """
 import time
 import pyarrow
