@@ -37,9 +37,17 @@ for event in Node():
 FLOW = """
 nodes:
   - {id: camera, path: camera.py, inputs: {tick: dora/timer/millis/20}, outputs: [image]}
-  - {id: sink, path: sink.py, inputs: {image: {source: camera/image, queue_size: 1000}}}
+  - id: sink
+    path: sink.py
+    inputs: {image: {source: camera/image, queue_size: 1000}, tick: dora/timer/secs/1}
+"""
+ALONE = """
+nodes:
+  - {id: camera, path: camera.py, inputs: {tick: dora/timer/millis/20}, outputs: [image]}
+  - {id: sink, path: sink.py, inputs: {tick: dora/timer/secs/1}}
 """
 SILENT = ("is silent", "crashed: silent", "restarted", "after failure")
+KILLED = ("node exited with error",)
 
 
 def flow(project: Project, owes: str, camera: str = CAMERA) -> Any:
@@ -79,7 +87,7 @@ def test_a_silent_node_is_restarted(cell: Cell, project: Project) -> None:
     assert not cell.messages("dora-systemd-probe")
 
 
-@pytest.mark.warns(*SILENT)
+@pytest.mark.warns(*SILENT, *KILLED)
 def test_a_spent_budget_is_the_end_of_the_node(cell: Cell, project: Project) -> None:
     """A node that does not respond is killed after its grace, and counted by dora."""
     path = flow(project, "{output: image, within: 1s, first: 1s}", STUBBORN)
@@ -125,6 +133,7 @@ def test_fail_ends_the_dataflow_by_its_policy(cell: Cell, project: Project) -> N
     assert has(cell, "node-exited", 2)  # they were asked, and had time to exit
 
 
+@pytest.mark.warns(*KILLED)
 def test_a_stopped_cell_is_no_silence(cell: Cell, project: Project) -> None:
     """A cell that is stopped for longer than `within`, and a probe that is killed."""
     cell.start(flow(project, "{output: image, within: 1s, then: warn}"))
@@ -148,9 +157,42 @@ def test_the_probe_keeps_no_dataflow(cell: Cell, project: Project) -> None:
     """The dataflow finishes with its own nodes."""
     over = 'if os.path.exists("over"):\n        break\n    if event'
     camera = CAMERA.replace("if event", over)
-    cell.start(flow(project, "{output: image, within: 5s}", camera))
+    path = flow(project, "{output: image, within: 5s}", camera)
+    path.write_text(path.read_text().replace(", tick: dora/timer/secs/1", ""))
+    cell.start(path)
     wait_for("it is heard", lambda: camera_of(cell)["outputs"][0]["age_us"] is not None)
     assert "2/2 nodes running" in cell.show("StatusText")
     project.write("over", "")
     wait_for("it has finished", lambda: cell.is_gone)
     assert (cell.show("Result"), has(cell, "dataflow-finished")) == ("success", True)
+
+
+def test_hot_reload_leaves_it_watched(cell: Cell, project: Project) -> None:
+    """A node that gets other inputs is removed and added in dora, and so loses who read from it."""
+    path = flow(project, "{output: image, within: 3s}")
+    path.write_text(ALONE)
+    cell.start(path)
+    wait_for("it is heard", lambda: camera_of(cell)["outputs"][0]["age_us"] is not None)
+    (probe,), run_id = cell.pids("node-dora-systemd-probe"), cell.status.run
+    path.write_text(ALONE.replace("millis/20", "millis/10"))
+    assert "camera was reconnected" in cell.doractl("reload", cell.name).stdout
+    wait_for(
+        "another probe listens",
+        lambda: (
+            cell.pids("node-dora-systemd-probe") not in ([], [probe])
+            and camera_of(cell)["outputs"][0]["age_us"] < 500_000
+        ),
+    )
+    assert cell.status.run == run_id
+    assert not has(cell, "node-silent")
+
+
+@pytest.mark.warns("Failed with result", "status=78", "failed: cannot watch", "exited", "start")
+def test_an_output_that_no_node_has(cell: Cell, project: Project) -> None:
+    done = cell.start(flow(project, "{output: imag, within: 3s}"), check=False)
+    words = "cannot watch 'imag' of the node 'camera': no such output"
+    assert words in done.stderr
+    assert "did you mean image?" in done.stderr
+    assert cell.is_gone
+    done = cell.start(flow(project, "{output: image, within: 3}"), check=False)
+    assert "within is '3' (nodes.camera.owes in " in done.stderr

@@ -34,7 +34,12 @@ async def watch_owes(run: Run, plan: LaunchPlan, dora: Engine, dialogue: Tasks) 
     """Watch the outputs that the options of `plan` name, from the start of all nodes on."""
     await run.pump.wait(lambda cell: cell.state is State.RUNNING, None)
     find_python = partial(asyncio.to_thread, probe_python, plan)
-    with closing(Watch(run, plan, dora, dialogue, find_python)) as watch:
+    try:
+        watch = Watch(run, plan, dora, dialogue, find_python)
+    except OSError as error:  # such as a full file system: the nodes run, and need not end for it
+        run.pipes.write_event("outputs-unwatched", reason=f"the file of times: {error.strerror}")
+        return
+    with closing(watch):
         await watch.work()
 
 
@@ -107,8 +112,10 @@ class Watch:
     async def _restart(self, silent: life.NodeSilent) -> None:
         """Have dora restart the node. If it does not, the node counts as merely silent."""
         cell = self._run.pump.cell
-        grace, old = cell.grace, cell.nodes[silent.node]
-        params = protocol.node_params("RestartNode", cell.run, silent.node, grace)
+        old = cell.nodes.get(silent.node, NodeStatus())
+        if cell.state is not State.RUNNING or old.state != "running":
+            return  # it has ended meanwhile, or is being replaced
+        params = protocol.node_params("RestartNode", cell.run, silent.node, cell.grace)
         with self._run.nodes.exchanging(silent.node):
             if error := await self._ask(params):
                 reason = f"{silent.reason}; dora does not restart it: {error}"
@@ -116,7 +123,7 @@ class Watch:
                 return
             await self._run.pump.wait(
                 lambda cell: cell.nodes.get(silent.node, NodeStatus()).pid != old.pid,
-                stop_timeout(grace) / SECOND,
+                stop_timeout(cell.grace) / SECOND,
             )
 
     async def _ask(self, params: protocol.Params) -> str:
