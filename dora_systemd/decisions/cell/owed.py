@@ -10,6 +10,10 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import did_you_mean
 from dora_systemd.values import INFINITY, SECOND, format_duration, parse_duration, quoted
 
+PROBE = "dora-systemd-probe"
+"""The beginning of dora's id of the node that hears the outputs; its cgroup is node-PROBE. See
+decisions/owes/probe.py."""
+
 RESTART, WARN, FAIL = "restart", "warn", "fail"
 THEN = (RESTART, WARN, FAIL)
 KEYS = ("output", "within", "first", "then")
@@ -104,3 +108,8 @@ def merge_owed(*given: Iterable[Owed]) -> tuple[Owed, ...]:
 def owes_restart(owes: Iterable[Owed], node: str) -> bool:
     """Whether `node` is restarted if it is silent."""
     return any(one.node == node and one.then == RESTART for one in owes)
+
+
+def is_probe(node: str) -> bool:
+    """Whether dora's node id is that of a probe."""
+    return node.startswith(PROBE)

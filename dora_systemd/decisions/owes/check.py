@@ -3,9 +3,8 @@
 from collections.abc import Sequence
 
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.cell.owed import RESTART, Owed
+from dora_systemd.decisions.cell.owed import RESTART, Owed, is_probe
 from dora_systemd.decisions.descriptor.nodes import Node, NodeKind
-from dora_systemd.decisions.owes.probe import is_probe
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import check_known, did_you_mean
 from dora_systemd.values import quoted

@@ -15,12 +15,8 @@ import struct
 from collections.abc import Sequence
 from typing import Any
 
-from dora_systemd.decisions.cell.owed import Owed
+from dora_systemd.decisions.cell.owed import PROBE, Owed
 from dora_systemd.values import SECOND
-
-PROBE = "dora-systemd-probe"
-"""Its cgroup is node-PROBE; each probe of a run has an id of its own, because dora adds no node
-again that has ended."""
 
 _SLOT = struct.Struct("=Q")
 _VARIABLES = {
@@ -29,11 +25,6 @@ _VARIABLES = {
     "MALLOC_ARENA_MAX": "1",
     "RUST_LOG": "error",
 }
-
-
-def is_probe(node: str) -> bool:
-    """Whether dora's node id is that of a probe."""
-    return node.startswith(PROBE)
 
 
 def probe_definition(

@@ -13,11 +13,11 @@ from dora_systemd.adapters.host import notify
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.decisions.cell.exits import Exit
 from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.owed import is_probe
 from dora_systemd.decisions.dora import life_events, protocol
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Do, State
 from dora_systemd.decisions.life.stop_budget import stop_timeout
-from dora_systemd.decisions.owes.probe import is_probe
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.cell.failure import Tasks, failed

@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.decisions.cell.status import WHOLE_CELL, CellStatus, CpuSample
-from dora_systemd.decisions.owes.probe import parse_times, size_of_times
 from dora_systemd.decisions.resources.usage import Usage
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import SLICE
@@ -79,6 +78,8 @@ def read_dataflow(
 
 
 def _heard(scope: Scope, cell: Cell) -> tuple[int, ...]:
+    from dora_systemd.decisions.owes.probe import parse_times, size_of_times
+
     owes = cell.options.owes
     data = read_times(scope.cell_directory(cell.name), size_of_times(owes))
     return parse_times(data, owes, _monotonic_us())[1]

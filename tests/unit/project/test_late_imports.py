@@ -61,6 +61,7 @@ LATE = {
     "most dataflows owe nothing": {
         "adapters.dora.preparation": {"adapters.dora.probe"},
         "runner.owes.begin": {"runner.owes.watch"},
+        "verbs.facts.reading": {"decisions.owes.probe"},
     },
     "a program of its own: it makes room first, and it runs with the Python of the nodes": {
         "runner.owes.listen": {"dora"},

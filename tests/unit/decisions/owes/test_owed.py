@@ -8,12 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as some
 
 from dora_systemd.decisions.cell.launch import launch_descriptor
-from dora_systemd.decisions.cell.owed import SHORTEST, THEN, Owed, format_owed, parse_owed
+from dora_systemd.decisions.cell.owed import SHORTEST, THEN, Owed, format_owed, is_probe, parse_owed
 from dora_systemd.decisions.cell.restarts import RestartPolicy
 from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
 from dora_systemd.decisions.owes.check import check_owes
 from dora_systemd.decisions.owes.probe import (
-    is_probe,
     parse_times,
     probe_definition,
     size_of_times,

@@ -6,11 +6,10 @@ from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any
 
-from dora_systemd.decisions.cell.owed import Owed
+from dora_systemd.decisions.cell.owed import PROBE, Owed
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import State
-from dora_systemd.decisions.owes.probe import PROBE
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.failure import Tasks
