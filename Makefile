@@ -40,7 +40,7 @@ browser:  ## the status page in headless Chromium; LAB_OUT=DIR keeps pictures of
 	@$(PREPARE) container
 	@$(CHECK) browser
 
-BENCHMARKS := start stop recovery startup many cost logs messages reload
+BENCHMARKS := start stop recovery startup many cost logs messages reload owes
 
 bench:  ## what supervision costs, against named rivals; WHAT="start ...", ROUNDS=n
 	@$(PREPARE) container

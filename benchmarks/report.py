@@ -27,6 +27,7 @@ TITLES = {
     "logs": "Log path",
     "messages": "Messages",
     "reload": "Hot reload",
+    "owes": "Owed outputs",
 }
 """The records in their order."""
 

@@ -19,6 +19,8 @@ class CellPaths:
         """Port and token of the cell's coordinator, mode 0600; only the runner reads it."""
         self.socket = root / "runner.sock"
         """The socket where the runner answers doractl, and relays to the coordinator."""
+        self.times = root / "times"
+        """When the owed outputs of nodes were heard, see decisions/owes/probe.py."""
         self.settings = root / "settings.yml"
         """The version of the dataflow's settings file that is in use."""
         self.lock = root / "inhibit.lock"

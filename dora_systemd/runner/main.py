@@ -30,7 +30,7 @@ from dora_systemd.decisions.descriptor.wiring import downstream_of
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.life.refusal import format_refusal, refusal_exit
-from dora_systemd.decisions.life.states import Cell, RunnerExit, State
+from dora_systemd.decisions.life.states import Cell, RunnerExit
 from dora_systemd.decisions.life.view import initial_nodes
 from dora_systemd.decisions.logs.lines import Origin
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -48,7 +48,8 @@ from dora_systemd.runner.cell.pump import Pump, now_us
 from dora_systemd.runner.nodes.losses import LossWatch, losses_of_user
 from dora_systemd.runner.nodes.nodes import Nodes, wait_eof
 from dora_systemd.runner.nodes.rights import check_first
-from dora_systemd.runner.reload.apply import Run
+from dora_systemd.runner.owes.begin import begin_watch
+from dora_systemd.runner.reload.apply import Run, tell_started
 from dora_systemd.runner.reload.reloader import Reloader
 from dora_systemd.runner.reload.settings_file import SettingsFile
 from dora_systemd.runner.reload.swap import Swapper
@@ -195,7 +196,8 @@ async def run_once(runs: Runs, is_again: bool) -> Cell:
         dialogue.watch(coordinator, dialogue.read_coordinator)
         run = Run(pump, runs.nodes, runs.pipes, Swapper(pump, dora))
         reloader.begin(run, prepared, started_us * 1000)
-        dialogue.spawn("tell that it has started", tell_started(pump, reloader))
+        dialogue.spawn("tell that it has started", tell_started(run, reloader.has_started))
+        begin_watch(run, prepared.plan, dora, dialogue)
         runs.beside.attach(pump.push)
         try:
             await pump.end
@@ -216,12 +218,6 @@ def prepare_first(runs: Runs, options: RunnerOptions) -> Prepared:
     prepared = runs.check.beside(lambda: prepare(options, runs.environment))
     check_first(options, prepared.dataflow)
     return prepared
-
-
-async def tell_started(pump: Pump, reloader: Reloader) -> None:
-    """Tell the reloader when all nodes run: from then on the run is not a trial any more."""
-    if await pump.wait(lambda cell: cell.state is State.RUNNING, None):
-        reloader.has_started()
 
 
 def listen(runs: Runs, pump: Pump, dialogue: Dialogue) -> None:

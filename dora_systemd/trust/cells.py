@@ -23,9 +23,25 @@ def read_table(directory: Path) -> CellStatus | None:
     Raises DoraSystemdError (BAD_INPUT) if the owner of the table does not own the directory, and
     DoraSystemdError for content that no runner writes.
     """
-    path = CellPaths(directory).status
+    data = _read(CellPaths(directory).status, MAX_TABLE)
+    return None if data is None else CellStatus.from_json(data)
+
+
+def read_times(directory: Path, size: int) -> bytes:
+    """The file of times in a RuntimeDirectory; b"" if it is not usable, or has more than `size`.
+
+    decisions/owes/probe.py says what is in it.
+    """
     try:
-        text = read_file(path, MAX_TABLE)
+        return _read(CellPaths(directory).times, size) or b""
+    except DoraSystemdError:
+        return b""
+
+
+def _read(path: Path, most: int) -> bytes | None:
+    """A file that the owner of its directory owns, or None. Raises DoraSystemdError."""
+    try:
+        text = read_file(path, most)
     except DoraSystemdError as error:
         if isinstance(error.__cause__, _NOT_THERE):
             return None
@@ -33,4 +49,4 @@ def read_table(directory: Path) -> CellStatus | None:
     if text.place.borrowed:
         reason = f"it is not of the user whose dataflow it is: {text.place.borrowed}"
         raise refusal(path, reason, "another user put it there")
-    return CellStatus.from_json(text.data)
+    return text.data

@@ -86,6 +86,7 @@ def _facts(manager: Manager, scope: Scope, cell: Cell) -> Facts:
         tuple(key for key, node in nodes if node.state == "restarting"),
         _now_boot(),
         unit["NRestarts"],
+        {key: node.silent for key, node in nodes if node.silent},
     )
 
 

@@ -27,6 +27,7 @@ from dora_systemd.decisions.descriptor.build_session import (
 from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
 from dora_systemd.decisions.descriptor.nodes import UNEXPANDED, NodeKind
 from dora_systemd.decisions.dora.errors import parse_dora_error
+from dora_systemd.decisions.owes.check import check_owes
 from dora_systemd.decisions.rights.node_rights import check_rights_nodes
 from dora_systemd.decisions.signs.watchdogs import check_watchdogs
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -65,6 +66,10 @@ def prepare(options: RunnerOptions, environment: Mapping[str, str]) -> Prepared:
         _load_session(options),
         environment,
     )
+    if options.owes:
+        from dora_systemd.adapters.dora.probe import probe_python
+
+        probe_python(plan)
     return Prepared(dataflow, plan, launch_descriptor(dataflow, plan))
 
 
@@ -88,6 +93,7 @@ def _check_limited(options: RunnerOptions, dataflow: Dataflow) -> None:
     check_restart_nodes(options.node_restarts, ids)
     launched = {node.id for node in dataflow.nodes if has_launcher(node)}
     check_rights_nodes(options.node_rights, ids, launched)
+    check_owes(options, dataflow.nodes)
 
 
 def resolved(options: RunnerOptions) -> RunnerOptions:

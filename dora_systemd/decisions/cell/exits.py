@@ -17,6 +17,7 @@ class ExitKind(Enum):
     CODE = "exit code "
     SIGNAL = "signal "
     HUNG = "hung, "
+    SILENT = "silent, "
 
 
 class Exit(NamedTuple):
@@ -87,8 +88,9 @@ def parse_exit(text: str) -> Exit:
 
 def _parse_own(text: str) -> Exit:
     """The same for a text that names no other node."""
-    if text.startswith(ExitKind.HUNG.value):
-        return Exit(ExitKind.HUNG, words=text.removeprefix(ExitKind.HUNG.value))
+    for kind in (ExitKind.HUNG, ExitKind.SILENT):
+        if text.startswith(kind.value):
+            return Exit(kind, words=text.removeprefix(kind.value))
     if numbered := _NUMBERED.match(text):
         kind, words = ExitKind(numbered[1]), text[numbered.end() :]
         if kind is ExitKind.CODE and not numbered[2].startswith("SIG"):

@@ -13,6 +13,7 @@ from typing import Any
 from dora_systemd.decisions.cell.environment import find_python
 from dora_systemd.decisions.cell.log_backlog import with_bounds
 from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.owed import owes_restart
 from dora_systemd.decisions.cell.restarts import DEFAULT, HELD_KEYS
 from dora_systemd.decisions.cell.uv import Read, uv_project
 from dora_systemd.decisions.descriptor.arguments import split_arguments
@@ -136,7 +137,10 @@ def _restart_keys(node: Node, options: RunnerOptions) -> dict[str, Any]:
         return _restart_bounds(node)
     # dora does not restart nodes made of operators, nor dynamic nodes.
     is_restarted = node.kind not in (NodeKind.OPERATOR, NodeKind.DYNAMIC)
-    return options.restart.dora_keys() if is_restarted and options.restart.policy != "no" else {}
+    policy = options.restart
+    if policy.policy == "no" and owes_restart(options.owes, node.id):
+        policy = policy._replace(policy="on-failure")
+    return policy.dora_keys() if is_restarted and policy.policy != "no" else {}
 
 
 def _restart_bounds(node: Node) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from dora_systemd.decisions.cell.hot_reload import DEFAULT_RELOAD, HotReload, parse_of_node
 from dora_systemd.decisions.cell.limits import NodeLimits, format_node_limits, parse_node_limits
 from dora_systemd.decisions.cell.line_rates import UNLIMITED, RateLimits, format_rates, parse_rates
+from dora_systemd.decisions.cell.owed import Owed, format_owed, parse_owed
 from dora_systemd.decisions.cell.restarts import (
     DEFAULT,
     RestartPolicy,
@@ -70,6 +71,7 @@ class RunnerOptions(NamedTuple):
     start_timeout: µs for all nodes to become ready, or INFINITY.
     reload: files that cause a reload, and how nodes are replaced.
     watchdogs: nodes with a notify socket, see dora_systemd.decisions.signs.watchdogs.
+    owes: outputs of nodes that have to come in time.
     """
 
     name: str
@@ -93,6 +95,7 @@ class RunnerOptions(NamedTuple):
     reload: HotReload = DEFAULT_RELOAD
     watchdogs: Watchdogs = NO_WATCHDOGS
     node_rights: "tuple[NodeRights, ...]" = ()
+    owes: tuple[Owed, ...] = ()
 
     def __hash__(self) -> int:
         return hash(self.uuid)
@@ -172,6 +175,7 @@ _OPTIONS = (
     _each("node-rights", "node_rights", _parse_rights, _format_rights),
     _each("node-restart", "node_restarts", parse_node_policy, format_node_policy),
     Option("watchdog", "watchdogs", parse_sockets, format_watchdogs, is_repeated=True),
+    _each("owes", "owes", parse_owed, format_owed),
     _each("watch", "reload.watch"),
     _each("ignore", "reload.ignore"),
     _each("node-watch", "reload.node_watch", parse_of_node, "=".join),

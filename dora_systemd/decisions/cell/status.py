@@ -52,6 +52,7 @@ class NodeStatus(NamedTuple):
     ended. kind: how dora starts it (python, executable, shell, uv, operator, ros2, dynamic, url).
     policy: dora's restart policy, "never" if it has none, or HELD. max_restarts: in one window, 0
     without limit. hung: why dora's health check or its watchdog ended the process, or "".
+    silent: which output that it owes has not come, or "". is_ended: the runner ends it for that.
     """
 
     state: str = "starting"
@@ -63,6 +64,8 @@ class NodeStatus(NamedTuple):
     policy: str = "never"
     max_restarts: int = 0
     hung: str = ""
+    silent: str = ""
+    is_ended: bool = False
 
     @property
     def is_alive(self) -> bool:
@@ -233,6 +236,8 @@ def _parse_node(raw: Any) -> NodeStatus:
         policy=_text(known, "policy", "never"),
         max_restarts=_number(known, "max_restarts"),
         hung=_text(known, "hung"),
+        silent=_text(known, "silent"),
+        is_ended=known.get("is_ended") is True,
     )
 
 

@@ -7,7 +7,7 @@ ESSENTIAL = "essential "
 
 
 class Cause(StrEnum):
-    """One reason for an end; those up to OUT_OF_MEMORY occur in the event dataflow-failed."""
+    """One reason for an end; NODE_SILENT and those up to OUT_OF_MEMORY occur in dataflow-failed."""
 
     NODE_FAILED = "node-failed"
     START_TIMEOUT = "start-timeout"
@@ -25,6 +25,7 @@ class Cause(StrEnum):
 
     NODE_HUNG = "node-hung"
     NODE_WATCHDOG = "node-watchdog"
+    NODE_SILENT = "node-silent"
     NODE_OUT_OF_MEMORY = "node-out-of-memory"
     UNIT_FAILED = "unit-failed"
     NO_END = "no-end"

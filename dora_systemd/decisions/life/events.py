@@ -117,6 +117,33 @@ class NodeHung(Event):
 
 
 @dataclass(frozen=True)
+class NodeSilent(Event):
+    """An output that the node owes has not come. reason: such as "no image for 2s".
+
+    then: one of dora_systemd.decisions.cell.owed.THEN. silent: all that is missing of the node.
+    """
+
+    node: str
+    output: str
+    reason: str
+    then: str
+    silent: str
+
+
+@dataclass(frozen=True)
+class NodeSpeaks(Event):
+    """An output that was missing has come. reason: such as "image again after 3s".
+
+    silent: what is still missing of the node, or "".
+    """
+
+    node: str
+    output: str
+    reason: str
+    silent: str
+
+
+@dataclass(frozen=True)
 class StartTimedOut(Event):
     """Not all nodes were ready within `after` µs."""
 

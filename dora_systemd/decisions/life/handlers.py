@@ -13,6 +13,7 @@ events came before: dora's events and the ends of its processes arrive in any or
 
 from dataclasses import replace
 
+from dora_systemd.decisions.cell.owed import FAIL
 from dora_systemd.decisions.cell.status import HELD, NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life import nodes as table
@@ -124,8 +125,19 @@ def _is_replaced(node: NodeStatus) -> bool:
     return node.state == "starting" and not node.restarts
 
 
+def silent(cell: Cell, event: life.NodeSilent) -> Next:
+    """A node owes an output: record it, and end the dataflow if that is asked."""
+    cell, actions = node_event(cell, event)
+    if event.then != FAIL:
+        return cell, actions
+    reason = f"node {event.node}: {event.reason}"
+    cell = replace(because(cell, Cause.NODE_SILENT, [event.node]), failure=reason)
+    cell = replace(cell, exit=RunnerExit.FAILED)
+    return _wind_down(cell, *actions)
+
+
 def _is_stopping(cell: Cell) -> bool:
-    return bool(cell.stop_by) or cell.reload or bool(cell.failure)
+    return bool(cell.stop_by or cell.failure) or cell.reload
 
 
 def stop_early(cell: Cell, event: life.StopAsked) -> Next:

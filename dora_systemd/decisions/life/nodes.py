@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from dora_systemd.decisions.cell.exits import KILLED, Exit, ExitKind
+from dora_systemd.decisions.cell.owed import RESTART
 from dora_systemd.decisions.cell.status import HELD, NodeStatus
 from dora_systemd.decisions.descriptor.wiring import Downstream
 from dora_systemd.decisions.life import events as life
@@ -51,6 +52,8 @@ def update(nodes: NodeTable, event: life.Event, *, is_stopping: bool, is_open: b
             nodes = _set(nodes, event.node, event.at_us, state="failed", exit=Exit(by=event.by))
         case life.NodeHung():
             nodes, record = _hung(nodes, event)
+        case life.NodeSilent() | life.NodeSpeaks():
+            nodes, record = _heard(nodes, event)
         case life.NodeReloading():
             nodes = _reloading(nodes, event)
         case life.NodeAdded():
@@ -81,6 +84,19 @@ def _hung(nodes: NodeTable, event: life.NodeHung) -> Update:
     return nodes, Record(event.record, event.node, {"reason": event.reason, **event.details})
 
 
+def _heard(nodes: NodeTable, event: life.NodeSilent | life.NodeSpeaks) -> Update:
+    """An owed output of a node is missing, or has come."""
+    if event.node not in nodes:
+        return nodes, None
+    changed = nodes[event.node]._replace(silent=event.silent)
+    details = {"output": event.output, "reason": event.reason}
+    if isinstance(event, life.NodeSpeaks):
+        return {**nodes, event.node: changed}, Record("node-speaks-again", event.node, details)
+    changed = changed._replace(is_ended=event.then == RESTART)
+    record = Record("node-silent", event.node, {**details, "then": event.then})
+    return {**nodes, event.node: changed}, record
+
+
 def _spawned(nodes: NodeTable, event: life.NodeSpawned) -> Update:
     old = nodes.get(event.node, NodeStatus())
     nodes = _set(nodes, event.node, event.at_us, state="starting", pid=event.pid)
@@ -99,6 +115,8 @@ def _exited(nodes: NodeTable, event: life.NodeExited, is_stopping: bool) -> Upda
         event = replace(event, will_restart=False)
     if old.hung and event.exit.is_failure:  # the signal of the health check explains nothing
         event = replace(event, exit=Exit(ExitKind.HUNG, words=old.hung))
+    elif old.is_ended:  # it may have exited with success, but not by itself
+        event = replace(event, exit=Exit(ExitKind.SILENT, words=old.silent))
     record = _record_of(event, is_stopping)
     if event.is_stale and not event.will_restart:
         return nodes, None  # a newer process has replaced it
@@ -113,6 +131,8 @@ def _exited(nodes: NodeTable, event: life.NodeExited, is_stopping: bool) -> Upda
         pid=0,
         exit=event.exit,
         hung="",
+        silent="",
+        is_ended=False,
         restarts=old.restarts + int(event.will_restart and not is_stopping),
     )
     return nodes, record

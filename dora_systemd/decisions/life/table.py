@@ -72,7 +72,11 @@ TABLE: Mapping[State, Mapping[type[life.Event], Handler]] = {
         DeadlinePassed=handle.run,
         StartTimedOut=handle.start_timed_out,
     ),
-    State.RUNNING: _row(**{**_ALIVE, **_RELOADS, "NodeExited": handle.node_event_running}),
+    State.RUNNING: _row(
+        **{**_ALIVE, **_RELOADS, "NodeExited": handle.node_event_running},
+        NodeSilent=handle.silent,
+        NodeSpeaks=handle.node_event,
+    ),
     State.STOPPING: _row(**_STOPPING),
     State.CLOSING: _row(
         **{**_LOST, **_NODES},

@@ -72,6 +72,9 @@ def _format_running(cell: Cell) -> str:
         nodes = {ident: node for ident, node in cell.nodes.items() if node.state == state}
         if nodes:
             parts.append(f"{state}: {_names([_with_exit(*one) for one in nodes.items()])}")
+    silent = [f"{ident} ({node.silent})" for ident, node in cell.nodes.items() if node.silent]
+    if silent:
+        parts.append(f"silent: {_names(silent)}")
     if cell.notice:
         parts.append(cell.notice)
     return "; ".join(parts)
@@ -92,9 +95,13 @@ def _count(cell: Cell, *states: str) -> int:
 
 def stage(cell: Cell) -> str:
     """One of dora_systemd.decisions.cell.status.STAGES."""
-    if cell.state is State.RUNNING and _count(cell, "failed"):
+    if cell.state is State.RUNNING and any(map(_is_missed, cell.nodes.values())):
         return "degraded"
     return _SHOWN[cell.state][0]
+
+
+def _is_missed(node: NodeStatus) -> bool:
+    return node.state == "failed" or bool(node.silent)
 
 
 def cell_status(

@@ -66,6 +66,13 @@ EVENTS = {
         WARNING,
         "Notify socket of node {node} got a message from another process",
     ),
+    "node-silent": EventKind("0423ade5276f4005ae23065ff68dc1f8", WARNING, "Node {node} is silent"),
+    "node-speaks-again": EventKind(
+        "2111b5e58ac74a9eb7d68402c07184b9", NOTICE, "Node {node} speaks again"
+    ),
+    "outputs-unwatched": _dataflow(
+        "363dd20a3ce94006a65ba740609decd3", WARNING, "has owed outputs that nobody watches"
+    ),
     "coordinator-lost": EventKind(
         "11b7330be3fb484584286f274012f05a", ERR, "The coordinator of dataflow {dataflow} is lost"
     ),

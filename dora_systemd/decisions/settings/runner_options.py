@@ -13,6 +13,7 @@ from dora_systemd.decisions.rights.node_rights import BY_KEY as RIGHTS
 from dora_systemd.decisions.rights.node_rights import NodeRights, merge_node_rights
 from dora_systemd.decisions.settings.kinds import Setting
 from dora_systemd.decisions.settings.limits import NODE_LIMIT
+from dora_systemd.decisions.settings.owes import OWES, owes_of
 from dora_systemd.decisions.settings.reload import HOT_RELOAD, IGNORE, REPLACE, WATCH
 from dora_systemd.decisions.settings.resolve import Settings
 from dora_systemd.decisions.settings.restarts import POLICY_SETTINGS, RESTART_POLICY, START_TIMEOUT
@@ -50,6 +51,7 @@ def with_settings(options: RunnerOptions, settings: Settings) -> RunnerOptions:
         start_timeout=settings[START_TIMEOUT],
         watchdogs=watchdogs(settings),
         reload=hot_reload(settings, options.working_directory),
+        owes=owes_of(settings.by_node(OWES), settings[OWES]),
     )
 
 

@@ -23,6 +23,7 @@ from dora_systemd.decisions.settings.kinds import (
     Setting,
 )
 from dora_systemd.decisions.settings.limits import LIMIT_SETTINGS
+from dora_systemd.decisions.settings.owes import OWES_SETTINGS
 from dora_systemd.decisions.settings.reload import RELOAD_SETTINGS
 from dora_systemd.decisions.settings.restarts import RESTART_SETTINGS
 from dora_systemd.decisions.settings.rights import RIGHTS_SETTINGS
@@ -99,6 +100,7 @@ SECTIONS: dict[str, tuple[Setting[Any], ...]] = {
     "Rights of nodes": RIGHTS_SETTINGS,
     "Restarts": RESTART_SETTINGS,
     "Signs of life": SIGN_SETTINGS,
+    "Owed outputs": OWES_SETTINGS,
     "Sandbox and secrets": (*CREDENTIAL_SETTINGS, *SANDBOX_SETTINGS),
     "Hot reload": RELOAD_SETTINGS,
 }

@@ -10,6 +10,8 @@ from dora_systemd.values import SECOND, format_rounded_size
 STARTING, RUNNING, DEGRADED = "Starting", "Running", "Degraded"
 STOPPING, RESTARTING = "Stopping", "Restarting"
 FINISHED, STOPPED, FAILED = "Finished", "Stopped", "Failed"
+SILENT = "Silent"
+"""A node that runs, and sends no output that it owes."""
 UP_WORDS = frozenset({STARTING, RUNNING, DEGRADED, STOPPING, RESTARTING})
 
 _BY_ACTIVE = {
@@ -30,6 +32,18 @@ UNREADABLE = "?"
 SHORTEST_PREFIX = 8
 
 
+class OutputRow(NamedTuple):
+    """An output that a node owes. within: µs. age: µs since its last message, None: none yet.
+
+    then: one of dora_systemd.decisions.cell.owed.THEN.
+    """
+
+    output: str
+    within: int
+    then: str
+    age: int | None = None
+
+
 class NodeRow(NamedTuple):
     """One row of `list SELECTOR`. Sizes in bytes, cpu in percent of one processor, None: unknown.
 
@@ -37,7 +51,7 @@ class NodeRow(NamedTuple):
     which its CPU limit throttled it, None without one. since: time of its last change of state,
     CLOCK_REALTIME µs, 0: unknown. text: its own STATUS=. watchdog, sign_age: the time in which it
     must send WATCHDOG=1, and how long ago it did, in µs. essential: whether its final failure ends
-    the dataflow.
+    the dataflow. silent: what is missing of the outputs that it owes, or "".
     """
 
     node: str
@@ -57,6 +71,13 @@ class NodeRow(NamedTuple):
     watchdog: int | None = None
     sign_age: int | None = None
     essential: bool | None = None
+    silent: str = ""
+    outputs: tuple[OutputRow, ...] = ()
+
+    @property
+    def word(self) -> str:
+        """Its state as tables have it."""
+        return SILENT if self.silent else self.state.capitalize()
 
 
 class Holder(NamedTuple):
@@ -176,7 +197,7 @@ _ANSI = {"red": "\x1b[31m", "yellow": "\x1b[33m"}
 _UNDERLINED, _PLAIN = "\x1b[4m", "\x1b[0m"
 STATE_COLORS = {
     FAILED: "red",
-    **dict.fromkeys((STARTING, DEGRADED, STOPPING, RESTARTING, "Reloading"), "yellow"),
+    **dict.fromkeys((STARTING, DEGRADED, STOPPING, RESTARTING, SILENT, "Reloading"), "yellow"),
 }
 """By the word for a state, as in systemctl(1); others have none."""
 

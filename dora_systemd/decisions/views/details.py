@@ -42,7 +42,7 @@ _SIGNS = ("WATCHDOG", "STATUS TEXT")
 def _node_cells(row: NodeRow) -> dict[str, str]:
     return {
         "NODE": row.node,
-        "STATE": row.state.capitalize(),
+        "STATE": row.word,
         "PID": str(row.pid) if row.pid else UNKNOWN,
         "CPU%": format_cpu(row),
         _THROTTLED: format_percent(row.throttled),

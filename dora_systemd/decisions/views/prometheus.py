@@ -74,6 +74,8 @@ START = Family("start_time_seconds", "When all nodes were ready, in Unix time.")
 NODE_START = Family("start_time_seconds", "When it became ready, in Unix time.")
 WATCHDOG = Family("watchdog_seconds", "Time in which it must send WATCHDOG=1.")
 SIGN_AGE = Family("watchdog_age_seconds", "Time since its last WATCHDOG=1.")
+SILENT = Family("silent", "1 while an output that it owes is missing.")
+LAST_OUTPUT = Family("last_output_age_seconds", "Time since the last message of an owed output.")
 INFO = Family("info", "UUID and unit of a dataflow; the value is always 1.")
 NODES = Family("nodes", "Nodes that the dataflow has.")
 ALIVE = Family("nodes_alive", "Nodes that are running.")
@@ -123,10 +125,19 @@ def _node_samples(observed: Sequence[Observed]) -> Iterator[tuple[Family, list[S
     yield WATCHDOG, [(own, n.watchdog / SECOND) for own, _, n in places if n.watchdog]
     ages = [(own, node.sign_age) for own, _, node in places]
     yield SIGN_AGE, [(own, age / SECOND) for own, age in ages if age is not None]
+    owing = [(own, node) for own, _, node in places if node.outputs]
+    yield SILENT, [(own, int(bool(node.silent))) for own, node in owing]
+    yield LAST_OUTPUT, [sample for own, node in owing for sample in _ages(own, node)]
     counts = [(own, o.lines[node.node]) for own, o, node in places if node.node in o.lines]
     yield LINES, [(own, count.written) for own, count in counts]
     yield SUPPRESSED, [(own, count.suppressed) for own, count in counts]
     yield from _group_samples([(own, one, node.node) for own, one, node in places])
+
+
+def _ages(own: Labels, node: NodeRow) -> Iterator[Sample]:
+    for one in node.outputs:
+        if one.age is not None:
+            yield {**own, "output": one.output}, one.age / SECOND
 
 
 def _is_there(node: NodeRow) -> bool:

@@ -101,8 +101,8 @@ def _rows(entry: TopEntry, look: Look, by: str, is_reversed: bool) -> list[TopRo
 def _node_row(node: NodeRow, entry: TopEntry, look: Look) -> TopRow:
     is_alive = node.state in ALIVE_NODE_STATES and node.since
     uptime = format_uptime(max(look.at_us - node.since, 0)) if is_alive else UNKNOWN
-    word = node.state.capitalize()
-    words = cut(node.text, _MOST_WORDS) if is_alive else node.exit
+    word = node.word
+    words = node.silent or (cut(node.text, _MOST_WORDS) if is_alive else node.exit)
     state = f"{word} ({words})" if words else word
     cells = (f"  {node.node}", state, uptime, *_numbers(node, entry.waits, node.node))
     whole = entry.row

@@ -95,6 +95,10 @@ def _present(life: Life, facts: Facts) -> Verdict:
     waiting = [one for one in final_crashes(life) if one.node in facts.restarting]
     if waiting:
         return replace(_crash(waiting[-1]), is_passing=True)
+    for node, missing in facts.silent.items():
+        said = [one for one in life.all("node-silent") if one.node == node]
+        at = said[-1] if said else None
+        return _found(Cause.NODE_SILENT, f"node {node}: {missing}", at, node)
     return _found(Cause.NONE, "")
 
 
@@ -111,6 +115,8 @@ def _crash(crash: Happening) -> Verdict:
         cause = Cause.NODE_OUT_OF_MEMORY
     elif exit.kind is ExitKind.HUNG:
         cause = Cause.NODE_WATCHDOG if by_watchdog(exit.words) else Cause.NODE_HUNG
+    elif exit.kind is ExitKind.SILENT:
+        cause = Cause.NODE_SILENT
     how = str(exit) or "ended, how is not recorded"
     return _found(cause, f"node {crash.node}: {how}", crash, crash.node)
 

@@ -39,6 +39,8 @@ _REMEDIES = {
     Cause.NODE_HUNG: "find out what {node} waited for, or raise health_check_timeout: in its YAML",
     Cause.NODE_WATCHDOG: "find out what {node} waited for (PYTHONFAULTHANDLER=1 prints that for "
     "Python), or raise watchdog: in its settings",
+    Cause.NODE_SILENT: "find out why {node} sends nothing, or give it more time: "
+    "owes: in the settings file",
     Cause.NODE_OUT_OF_MEMORY: "look for a leak in {node}, or run: "
     "doractl set {name} --node-limit {node}:memory=SIZE",
     Cause.START_TIMEOUT: "find out why {node} does not call Node(), or raise --start-timeout",
@@ -106,7 +108,7 @@ def remedies(report: Report) -> list[str]:
     verdict, subject = report.verdict, report.subject
     hint = known_remedy(one.text for one in report.words) if verdict.node else ""
     texts = [hint, _AGAIN if verdict.is_passing else _remedy(verdict)]
-    if verdict.node and verdict.is_up and verdict.status != RESTARTING and not verdict.is_passing:
+    if verdict.is_away:
         texts.append(_AWAY)
     if verdict.is_given_up:
         texts.append(_GIVEN_UP)

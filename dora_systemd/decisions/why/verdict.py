@@ -14,7 +14,7 @@ class Facts:
 
     status: a word of `list`. text: STATUS=. failed: nodes that have failed for good. restarting:
     nodes that wait for a restart. now_boot: id of this boot. restarts: NRestarts= of the unit, None
-    if systemd has unloaded it.
+    if systemd has unloaded it. silent: nodes of which an owed output is missing, and which.
     """
 
     status: str = ""
@@ -23,6 +23,7 @@ class Facts:
     restarting: tuple[str, ...] = ()
     now_boot: str = ""
     restarts: int | None = None
+    silent: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,13 @@ class Verdict:
     def is_up(self) -> bool:
         """Whether it is running, starting or stopping."""
         return self.status in UP_WORDS
+
+    @property
+    def is_away(self) -> bool:
+        """Whether a node of a running dataflow has ended for good."""
+        is_there = self.cause is Cause.NODE_SILENT and "exit" not in self.details
+        is_kept = self.is_passing or self.status == RESTARTING or is_there
+        return self.is_up and bool(self.node) and not is_kept
 
     @property
     def is_failure(self) -> bool:

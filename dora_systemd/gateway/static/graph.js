@@ -2,7 +2,7 @@
 
 import { el, say, svg } from "./dom.js";
 import { bundled, layOut } from "./layers.js";
-import { plural, sourceName, tone } from "./words.js";
+import { plural, sourceName, stateOf, tone } from "./words.js";
 
 const HEIGHT = 46;
 const SOURCE_HEIGHT = 28;
@@ -51,7 +51,7 @@ export class Graph {
   /** nodes: those of a row; chosen: an id, or "". rest: the state of all others. */
   mark(nodes, chosen, rest = "unknown") {
     this.marks = { nodes, chosen, rest };
-    const states = new Map(nodes.map((node) => [node.node, node.state]));
+    const states = new Map(nodes.map((node) => [node.node, stateOf(node)]));
     for (const [id, box] of this.boxes) {
       const state = states.get(id) ?? rest;
       box.group.setAttribute("data-tone", tone(state));

@@ -3,7 +3,7 @@
 import { el, say } from "./dom.js";
 import { waitWords } from "./history.js";
 import { cpuChart, memoryChart, showState, showUse } from "./parts.js";
-import { plural, since, uptime } from "./words.js";
+import { plural, since, stateOf, uptime } from "./words.js";
 
 const ALIVE = ["ready", "running", "dynamic"];
 
@@ -40,10 +40,10 @@ export class NodeRow {
 
   /** isFree: whether its dataflow is up and nobody acts on it. */
   show(facts, history, isChosen, isFree) {
-    const { state, exit, restarts, since_us: at } = facts;
+    const { state, exit, restarts, silent, since_us: at } = facts;
     const isAlive = ALIVE.includes(state);
-    showState(this.badge, state);
-    say(this.exit, isAlive ? "" : exit);
+    showState(this.badge, stateOf(facts));
+    say(this.exit, silent ?? (isAlive ? "" : exit));
     say(this.said, isAlive ? facts.text : "");
     say(this.sign, isAlive ? signWords(facts) : "");
     const ended = at ? since(at) : "";

@@ -53,8 +53,11 @@ export const plural = (count, what) => `${count} ${what}${count === 1 ? "" : "s"
 const TONES = {
   running: "good", ready: "good", dynamic: "good", finished: "calm", stopped: "calm",
   starting: "busy", stopping: "busy", restarting: "warn", reloading: "busy", degraded: "warn",
-  failed: "bad",
+  failed: "bad", silent: "warn",
 };
+
+/** The state of a node; one that runs and sends nothing is silent. */
+export const stateOf = (node) => (node.silent ? "silent" : node.state);
 
 /** How a state looks: good, busy, warn, bad or calm. */
 export const tone = (state) => TONES[state.toLowerCase()] ?? "calm";

@@ -13,6 +13,7 @@ from dora_systemd.adapters.host import notify
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.decisions.cell.exits import Exit
 from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.owed import is_probe
 from dora_systemd.decisions.dora import life_events, protocol
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Do, State
@@ -143,7 +144,13 @@ class Dialogue(Tasks):
         await asyncio.sleep(2 * _SETTLE_SECONDS)  # let ChildExited of the coordinator come first
         self._pump.push(life.ConnectionLost(now_us()))
 
+    def _is_own(self, node: str) -> bool:
+        """Whether it is no node of the dataflow, but one that this runner has added."""
+        return bool(self._options.owes) and is_probe(node)
+
     def _hear(self, record: protocol.LogRecord) -> None:
+        if self._is_own(record.node):
+            return
         event = life_events.parse_life_event(record, now_us())
         if isinstance(event, life.NodeSpawned):
             self._nodes.adopt(event.node, event.pid, self._options.node_rights)
@@ -172,6 +179,7 @@ class Dialogue(Tasks):
             reply = await self._engine.ask(protocol.check_params(self._pump.cell.run))
             results = protocol.parse_results(reply)
             if results is not None:
+                results = {node: how for node, how in results.items() if not self._is_own(node)}
                 return self._pump.push(life.ResultKnown(now_us(), results))
             if self._pump.cell.state is not State.CLOSING:
                 return None  # the run goes on, which answers ASK_RESULT in WAITING

@@ -38,7 +38,7 @@ class Hold:
 
     @property
     def is_held(self) -> bool:
-        """Whether the group is frozen."""
+        """Whether the group is frozen now."""
         return self._is_held
 
     @contextmanager

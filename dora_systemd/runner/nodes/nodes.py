@@ -120,6 +120,15 @@ class Nodes:
     def _group(self, node: str) -> Path:
         return self._unit / f"{cgroup.NODE_PREFIX}{node}"
 
+    @property
+    def places(self) -> tuple[Path, CellPaths]:
+        """The cgroup directory of the unit, and the files of the cell."""
+        return self._unit, self._paths
+
+    def is_held(self, node: str) -> bool:
+        """Whether the node is frozen because the journal is behind."""
+        return node in self._holds and self._holds[node].is_held
+
     def expect(self) -> None:
         """The nodes are about to be started: each launcher moves itself into its group.
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.cgroup.strain import read_load, read_oom
+from dora_systemd.decisions.cell.owed import PROBE
 from dora_systemd.decisions.cell.status import WHOLE_CELL, CpuSample, throttled_percent
 from dora_systemd.decisions.life.states import Record
 from dora_systemd.decisions.resources.oom import Oom, OomCounts, Owner, find_owner, largest
@@ -43,7 +44,9 @@ class Resources:
 
     def look(self, samples: tuple[CpuSample, ...], now: CpuSample) -> list[Record]:
         """Events about limits that are close. samples: those before `now`."""
-        groups = {WHOLE_CELL: self._unit, **cgroup.node_groups(self._unit)}
+        nodes = cgroup.node_groups(self._unit)
+        nodes.pop(PROBE, None)  # it is no node of the dataflow
+        groups = {WHOLE_CELL: self._unit, **nodes}
         loads = {key: _load(path, key, samples, now) for key, path in groups.items()}
         self._alarms, reports = look(self._alarms, loads, now.at_us)
         return [Record(*one) for one in reports]

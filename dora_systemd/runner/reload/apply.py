@@ -1,6 +1,7 @@
 """Carries out one reload of single nodes step by step, and can undo it."""
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import PurePath
 from typing import Any
@@ -29,6 +30,12 @@ class Run:
     nodes: Nodes
     pipes: LogPipes
     swapper: Swapper
+
+
+async def tell_started(run: Run, has_started: Callable[[], None]) -> None:
+    """Tell the reloader when all nodes run: from then on the run is not a trial any more."""
+    if await run.pump.wait(lambda cell: cell.state is State.RUNNING, None):
+        has_started()
 
 
 class Applier:

@@ -69,7 +69,7 @@ class Cell:
         return self._options
 
     @property
-    def known_options(self) -> RunnerOptions | None:
+    def known_options(self) -> "RunnerOptions | None":
         """The options, if something has asked for them already."""
         return self._options
 

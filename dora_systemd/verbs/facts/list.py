@@ -5,7 +5,6 @@ from typing import Any
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
-from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import (
     FAILED_BECAUSE,
     WHOLE_CELL,
@@ -16,7 +15,12 @@ from dora_systemd.decisions.cell.status import (
 )
 from dora_systemd.decisions.resources.usage import Usage
 from dora_systemd.decisions.signs.table import sign_facts
-from dora_systemd.decisions.views.dataflows import DataflowRow, NodeRow, status_word
+from dora_systemd.decisions.views.dataflows import (
+    DataflowRow,
+    NodeRow,
+    OutputRow,
+    status_word,
+)
 from dora_systemd.scope import Scope
 from dora_systemd.values import INFINITY, SECOND
 from dora_systemd.verbs.facts.cells import Cell, proven, read_cells
@@ -104,7 +108,7 @@ def _life(reading: Reading) -> dict[str, Any]:
 
 def _usage(reading: Reading, known: tuple[CpuSample, ...]) -> dict[str, Any]:
     status, use, now = reading.status, reading.usage, reading.sample
-    essential = _essential(reading.cell.known_options)
+    essential = _essential(reading.cell)
     samples = known or (CpuSample(reading.unit[STARTED]),)
     groups = {key: path for key, path in reading.groups.items() if key != WHOLE_CELL}
     names = status.nodes or dict.fromkeys(groups)
@@ -121,15 +125,29 @@ def _usage(reading: Reading, known: tuple[CpuSample, ...]) -> dict[str, Any]:
                     **(_numbers(use[node], samples, now, node) if node in use else {}),
                     **sign_facts(status.signs, node, now.at_us),
                 },
-            )._replace(essential=None if essential is None else node in essential)
+            )._replace(
+                essential=None if essential is None else node in essential,
+                outputs=_outputs(reading, node),
+            )
             for node in names
         ),
     }
 
 
-def _essential(options: RunnerOptions | None) -> set[str] | None:
+def _essential(cell: Cell) -> set[str] | None:
     """The essential nodes; None in the table, for which nobody has asked for the options."""
+    options = cell.known_options
     return options and {one.node for one in options.node_rights if one.essential}
+
+
+def _outputs(reading: Reading, node: str) -> tuple[OutputRow, ...]:
+    """The outputs that the node owes; none in the table."""
+    owes = reading.cell.options.owes if reading.heard else ()
+    return tuple(
+        OutputRow(owed.output, owed.within, owed.then, max(reading.at_us - at, 0) if at else None)
+        for owed, at in zip(owes, reading.heard, strict=False)
+        if owed.node == node
+    )
 
 
 def _numbers(
@@ -160,5 +178,6 @@ def _node_row(node: str, status: NodeStatus | None, numbers: dict[str, Any]) -> 
         "max_restarts": status.max_restarts or None,
         "exit": str(status.exit),
         "since": status.since_us,
+        "silent": status.silent,
     }
     return NodeRow(node, status.state, **facts, **numbers)  # type: ignore[arg-type]

@@ -15,7 +15,7 @@ from dora_systemd.decisions.resources.usage import Usage
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import SLICE
 from dora_systemd.scope import Scope
-from dora_systemd.trust.cells import read_table
+from dora_systemd.trust.cells import read_table, read_times
 from dora_systemd.verbs.facts.cells import Cell
 
 UP_SINCE = "ActiveEnterTimestampMonotonic"
@@ -29,7 +29,8 @@ class Reading(NamedTuple):
 
     unit: properties of its unit. problem: why its node table is not usable, or "". groups, usage:
     by node, with the unit's own as WHOLE_CELL; empty for a dataflow that is not running. at_us:
-    time of the reading, CLOCK_MONOTONIC.
+    time of the reading, CLOCK_MONOTONIC. heard: the last message of each owed output, on the same
+    clock, 0 is never.
     """
 
     cell: Cell
@@ -39,6 +40,7 @@ class Reading(NamedTuple):
     groups: Mapping[str, Path] = {}
     usage: Mapping[str, Usage] = {}
     at_us: int = 0
+    heard: tuple[int, ...] = ()
 
     @property
     def sample(self) -> CpuSample:
@@ -74,7 +76,17 @@ def read_dataflow(
     nodes = cgroup.shown_groups(path, status.nodes) if not slice_path or not status.nodes else {}
     groups = {WHOLE_CELL: path, **nodes}
     usage = {key: cgroup.read_usage(group) for key, group in groups.items()}
-    return Reading(cell, unit, status, problem, groups, usage, _monotonic_us())
+    heard = () if slice_path else _heard(scope, cell)
+    return Reading(cell, unit, status, problem, groups, usage, _monotonic_us(), heard)
+
+
+def _heard(scope: Scope, cell: Cell) -> tuple[int, ...]:
+    if not (owes := cell.options.owes):
+        return ()
+    from dora_systemd.decisions.owes.probe import parse_times, size_of_times
+
+    data = read_times(scope.cell_directory(cell.name), size_of_times(owes))
+    return parse_times(data, owes, _monotonic_us())[1]
 
 
 def _known(cell: Cell, status: CellStatus) -> dict[str, Any]:

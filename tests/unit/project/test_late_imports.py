@@ -66,6 +66,14 @@ LATE = {
         "cli.parameters": {"decisions.views.objects"},
         "decisions.views.outcome": {"decisions.views.objects"},
     },
+    "most dataflows owe nothing": {
+        "adapters.dora.preparation": {"adapters.dora.probe"},
+        "runner.owes.begin": {"runner.owes.watch"},
+        "verbs.facts.reading": {"decisions.owes.probe"},
+    },
+    "a program of its own: it makes room first, and it runs with the Python of the nodes": {
+        "runner.owes.listen": {"dora"},
+    },
     "hot reload only": {
         "adapters.host.watch": {"watchfiles"},
         "decisions.reload.watch_rules": {"pathspec"},

@@ -66,11 +66,11 @@ _TABLE = {
     """,
     CELL: """
         adapters.dora.check adapters.dora.engine adapters.dora.websocket adapters.host.fd_store
-        adapters.host.notify_socket adapters.host.watch adapters.logs.held adapters.logs.jsonl
-        adapters.logs.pipes
+        adapters.host.notify_socket adapters.host.shared_times
+        adapters.host.watch adapters.logs.held adapters.logs.jsonl adapters.logs.pipes
         adapters.runner_socket.listener adapters.runner_socket.relay runner.cell.begin
         runner.cell.engine runner.cell.pump runner.main runner.nodes.nodes
-        runner.reload.settings_file runner.reload.sources runner.stop_post
+        runner.owes.listen runner.reload.settings_file runner.reload.sources runner.stop_post
     """,
     OTHERWISE: """
         adapters.dora.control adapters.host.loopback verbs.node verbs.start.places

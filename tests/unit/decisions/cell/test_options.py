@@ -18,6 +18,8 @@ from dora_systemd.decisions.cell.options import (
     parse_runner_argv,
     runner_command,
 )
+from dora_systemd.decisions.cell.owed import SHORTEST as SHORTEST_TIME
+from dora_systemd.decisions.cell.owed import THEN, Owed
 from dora_systemd.decisions.cell.restarts import POLICIES, RestartPolicy
 from dora_systemd.decisions.rights.node_rights import parse_node_rights
 from dora_systemd.errors import DoraSystemdError
@@ -42,6 +44,9 @@ policies = st.builds(
     times,
     times,
 )
+outputs = st.from_regex(r"[a-z][a-z0-9_/:.-]{0,20}", fullmatch=True)
+spans = st.integers(SHORTEST_TIME, 10**12)
+owed = st.builds(Owed, idents, outputs, spans, spans, st.sampled_from(THEN))
 options = st.builds(
     RunnerOptions,
     name=st.from_regex(r"[a-z][a-z0-9_-]{0,20}", fullmatch=True).filter(lambda n: n != "gateway"),
@@ -72,6 +77,7 @@ options = st.builds(
         st.lists(st.tuples(idents, texts)).map(tuple),
         st.lists(st.tuples(st.just("") | idents, st.sampled_from(REPLACE_WORDS))).map(tuple),
     ),
+    owes=st.lists(owed).map(tuple),
 )
 
 
@@ -100,6 +106,7 @@ ALL = RunnerOptions(
     reload=HotReload(
         True, ("*.py", "a=b"), ("tmp_*",), (("camera", "x=y"),), (("", "start-first"), ("a", "b"))
     ),
+    owes=(Owed("camera", "image", 2 * SECOND, 90 * SECOND, "warn"),),
 )
 ARGUMENTS = f"""\
 --name=robot --uuid={UUID} --working-directory=/srv --dora=/usr/bin/dora --grace-duration=5s
@@ -108,6 +115,7 @@ ARGUMENTS = f"""\
 --env-key=MODEL --env-key=RATE --log-rate-limit=1000/1s --log-rate-limit=camera=infinity
 --node-limit=camera:cpu=150%,memory=1G --node-rights=camera:nice=5,essential=yes
 --node-restart=a:b:always,max=infinity,window=infinity,delay=1s,max-delay=1s
+'--owes=camera/image:within=2s,first=1min 30s,then=warn'
 --watch=*.py --watch=a=b --ignore=tmp_* --node-watch=camera=x=y --replace==start-first --replace=a=b
 --uv --debug --allow-shell-nodes --attached --hot-reload /srv/robot.yml
 """

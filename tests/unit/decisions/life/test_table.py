@@ -6,6 +6,7 @@ from typing import get_type_hints
 import pytest
 
 from dora_systemd.decisions.cell.exits import Exit, exit_of
+from dora_systemd.decisions.cell.owed import THEN
 from dora_systemd.decisions.cell.status import HELD, NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.failures import ENGINE_TIMEOUT
@@ -34,6 +35,12 @@ SAMPLES: dict[type[life.Event], tuple[life.Event, ...]] = {
     ),
     life.NodeCascaded: (life.NodeCascaded(1, "a", "b"),),
     life.NodeHung: (life.NodeHung(1, "a", "unresponsive"), life.NodeHung(1, "unknown", "")),
+    life.NodeSilent: tuple(
+        life.NodeSilent(1, node, "image", "no image for 2s", then, "no image for 2s")
+        for node in ("a", "unknown")
+        for then in THEN
+    ),
+    life.NodeSpeaks: (life.NodeSpeaks(1, "a", "image", "image again", ""),),
     life.StartTimedOut: (life.StartTimedOut(1, 1_000_000),),
     life.RunFinished: (life.RunFinished(1),),
     life.ResultKnown: (life.ResultKnown(1), life.ResultKnown(1, {"a": Exit(), "b": exit_of(1)})),

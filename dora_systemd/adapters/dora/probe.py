@@ -1,0 +1,50 @@
+"""Finds a Python that can run the probe, see decisions/owes/probe.py."""
+
+import sys
+from collections.abc import Iterator, Sequence
+
+from dora_systemd.adapters.host.process import run_command
+from dora_systemd.decisions.cell.launch import LaunchPlan, python_of
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.trust.programs import own_account
+
+_SECONDS = 60.0
+_FIND = """
+import importlib.util, sys
+sys.path[:1] = [one for one in sys.path[:1] if one]
+spec = importlib.util.find_spec("dora")
+sys.exit(1) if spec is None or spec.origin is None else print(sys.executable)
+"""
+"""Prints the interpreter if it has dora-rs. It does not import dora, which takes longer."""
+
+
+def probe_python(plan: LaunchPlan) -> str:
+    """The absolute path of a Python with dora-rs: that of the nodes, else that of the runner.
+
+    Blocks for some 20 ms. Raises DoraSystemdError (BAD_INPUT) if there is none.
+    """
+    for command in _interpreters(plan):
+        if found := _with_dora(command, plan):
+            return found
+    python = " ".join(next(_interpreters(plan)))
+    raise DoraSystemdError(
+        f"cannot watch what nodes owe: {python} has no dora-rs",
+        "run: pip install dora-rs there, or give another environment with --venv",
+        ExitCode.BAD_INPUT,
+    )
+
+
+def _interpreters(plan: LaunchPlan) -> Iterator[Sequence[str]]:
+    yield ("uv", "run", "python") if plan.options.uv else (python_of(plan),)
+    yield (sys.executable,)
+
+
+def _with_dora(command: Sequence[str], plan: LaunchPlan) -> str:
+    directory = plan.options.working_directory
+    try:
+        done = run_command(
+            [*command, "-c", _FIND], _SECONDS, plan.environment, directory, own_account()
+        )
+    except DoraSystemdError:
+        return ""  # there is no such program
+    return done.stdout.strip() if done.status == 0 else ""

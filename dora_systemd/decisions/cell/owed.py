@@ -1,0 +1,115 @@
+"""What nodes owe: outputs on which a message has to come in time, and what happens if none does.
+
+They are part of the runner's command line, which `list` parses: imports only what loads quickly.
+"""
+
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple
+
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import did_you_mean
+from dora_systemd.values import INFINITY, SECOND, format_duration, parse_duration, quoted
+
+PROBE = "dora-systemd-probe"
+"""The beginning of dora's id of the node that hears the outputs; its cgroup is node-PROBE. See
+decisions/owes/probe.py."""
+
+RESTART, WARN, FAIL = "restart", "warn", "fail"
+THEN = (RESTART, WARN, FAIL)
+KEYS = ("output", "within", "first", "then")
+
+SHORTEST = SECOND // 5
+"""µs. Whoever watches has to look several times within this."""
+FIRST = 30 * SECOND
+"""µs; the default of `first`, unless `within` is longer."""
+
+_FORM = "NODE/OUTPUT:within=TIME,first=TIME,then=restart|warn|fail"
+_HINT = f"write {_FORM}; within is required"
+
+
+class Owed(NamedTuple):
+    """One output that a node owes. node: "" where the place says which. Times in µs.
+
+    within: between two messages. first: from the start of the node to its first message. then: one
+    of THEN.
+    """
+
+    node: str
+    output: str
+    within: int
+    first: int = FIRST
+    then: str = RESTART
+
+    @property
+    def place(self) -> str:
+        """The output as in the inputs of a descriptor, NODE/OUTPUT."""
+        return f"{self.node}/{self.output}"
+
+
+def parse_owed(text: str) -> Owed:
+    """The exact inverse of format_owed; `first` and `then` may be left out.
+
+    Raises DoraSystemdError (USAGE).
+    """
+    place, colon, rest = text.rpartition(":")
+    node, _, output = place.strip().partition("/")
+    pairs = [part.partition("=") for part in rest.split(",")]
+    if not (colon and node and output and all(equals for _, equals, _ in pairs)):
+        raise _wrong(f"{quoted(text)} is none", _HINT)
+    return owed_of({"output": output, **{key.strip(): value for key, _, value in pairs}}, node)
+
+
+def format_owed(owed: Owed) -> str:
+    """As in the runner's command line: `camera/image:within=2s,first=30s,then=restart`."""
+    within, first = format_duration(owed.within), format_duration(owed.first)
+    return f"{owed.place}:within={within},first={first},then={owed.then}"
+
+
+def owed_of(values: Mapping[str, str], node: str = "") -> Owed:
+    """The output from its KEYS as texts. Raises DoraSystemdError (USAGE)."""
+    for key in values:
+        if key not in KEYS:
+            hint = did_you_mean(key, KEYS) or f"valid keys: {', '.join(KEYS)}"
+            raise _wrong(f"unknown key {quoted(key)}", hint)
+    output, then = values.get("output", "").strip(), values.get("then", RESTART).strip()
+    if not output or not output.isprintable():
+        raise _wrong("it names no output", "write output: NAME, one of the node's outputs")
+    if "within" not in values:
+        raise _wrong(f"it does not say within which time {output} has to come", "write within: 2s")
+    if then not in THEN:
+        hint = did_you_mean(then, THEN) or f"valid values: {', '.join(THEN)}"
+        raise _wrong(f"unknown action {quoted(then)}", hint)
+    within = _time("within", values["within"])
+    first = _time("first", values["first"]) if "first" in values else max(FIRST, within)
+    return Owed(node, output, within, first, then)
+
+
+def _time(key: str, text: str) -> int:
+    hint = f"write a time with its unit such as 500ms or 2s, at least {format_duration(SHORTEST)}"
+    try:
+        time = parse_duration(text)
+    except DoraSystemdError as error:
+        raise _wrong(f"{key} is {quoted(text)}", hint) from error
+    # systemd reads a bare number as seconds, other programs as milliseconds: here it is neither.
+    if text.strip()[-1:].isdigit() or not SHORTEST <= time < INFINITY:
+        raise _wrong(f"{key} is {quoted(text)}", hint)
+    return time
+
+
+def _wrong(reason: str, hint: str) -> DoraSystemdError:
+    return DoraSystemdError(f"cannot read an owed output: {reason}", hint, ExitCode.USAGE)
+
+
+def merge_owed(*given: Iterable[Owed]) -> tuple[Owed, ...]:
+    """All of them; of several for the same output the last one."""
+    return tuple({one.place: one for many in given for one in many}.values())
+
+
+def owes_restart(owes: Iterable[Owed], node: str) -> bool:
+    """Whether `node` is restarted if it is silent."""
+    return any(one.node == node and one.then == RESTART for one in owes)
+
+
+def is_probe(node: str) -> bool:
+    """Whether dora's node id is that of a probe."""
+    return node.startswith(PROBE)

@@ -1,0 +1,138 @@
+"""Decides which nodes are silent. Pure: each look contains its time.
+
+A node is silent when no message of an owed output has come for `within`, or none for `first` after
+its start. Time counts only as far as all have run who could have noticed a message: at most `tick`
+for each look, and nothing while the probe does not note its beat. So none of these is a silence of
+a node: a suspended machine, a cell that a signal or the freezer has stopped, a clock that was set,
+a runner or a probe that gets no CPU time.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from dora_systemd.decisions.cell.owed import Owed
+from dora_systemd.values import SECOND, format_duration
+
+_LOOKS = 8
+"""Looks within the shortest time that any node has."""
+_SHORTEST_TICK, _LONGEST_TICK = SECOND // 40, SECOND
+_EARLY = SECOND // 5
+"""µs. dora tells that a process is ready a moment after its first message can come. It is less than
+the delay before a restart, in which nobody sends any."""
+BEATS = 2
+"""Ticks after which a probe that has not noted its beat counts as stopped."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """What is known at one moment. at_us, beat_us, heard: CLOCK_MONOTONIC, 0 is never.
+
+    beat_us: the last beat of the probe. heard: the last message of each owed output. lives: by
+    node that runs, when its process became ready.
+    """
+
+    at_us: int
+    beat_us: int
+    heard: Sequence[int]
+    lives: Mapping[str, int]
+
+
+@dataclass(frozen=True)
+class Ear:
+    """What is known of one owed output. Times in µs.
+
+    life: when the process that owes it became ready, 0 if none runs. heard: the last message.
+    has_come: whether this process has sent one. quiet: time that counts, without a message.
+    is_judged: this silence has been reported. is_silent: no message has come since a silence was
+    reported. silent_us: when that was.
+    """
+
+    life: int = 0
+    heard: int = 0
+    has_come: bool = False
+    quiet: int = 0
+    is_judged: bool = False
+    is_silent: bool = False
+    silent_us: int = 0
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A node has fallen silent, or it speaks again. words: such as "no image for 2s"."""
+
+    owed: Owed
+    is_silent: bool
+    words: str
+
+
+@dataclass(frozen=True)
+class Judge:
+    """The state of the watch over `owes`. at_us: the last look, 0 before the first."""
+
+    owes: tuple[Owed, ...]
+    ears: tuple[Ear, ...] = ()
+    at_us: int = 0
+
+    @property
+    def tick(self) -> int:
+        """µs between two looks."""
+        shortest = min(min(one.within, one.first) for one in self.owes)
+        return min(max(shortest // _LOOKS, _SHORTEST_TICK), _LONGEST_TICK)
+
+    def silent_of(self, node: str) -> str:
+        """What is missing of a node now, for people, or ""."""
+        pairs = zip(self.owes, self.ears, strict=True)
+        return ", ".join(
+            silence(own, ear) for own, ear in pairs if own.node == node and ear.is_silent
+        )
+
+
+def silence(owed: Owed, ear: Ear) -> str:
+    """What is missing, for people. It says the time that was allowed, so it stays the same."""
+    if ear.has_come:
+        return f"no {owed.output} for {format_duration(owed.within)}"
+    return f"no {owed.output} within {format_duration(owed.first)} of its start"
+
+
+def look(judge: Judge, now: Look) -> tuple[Judge, tuple[Verdict, ...]]:
+    """The judge after a look, and what has changed."""
+    step = min(max(now.at_us - judge.at_us, 0), judge.tick) if judge.at_us else 0
+    if now.at_us - now.beat_us > BEATS * judge.tick:
+        step = 0
+    before = judge.ears or (Ear(),) * len(judge.owes)
+    ears: list[Ear] = []
+    verdicts: list[Verdict] = []
+    for owed, ear, heard in zip(judge.owes, before, now.heard, strict=True):
+        after = _judged(owed, _listen(ear, now.lives.get(owed.node, 0), heard, step), now.at_us)
+        verdicts += _verdicts(owed, ear, after, now.at_us)
+        ears.append(after)
+    return replace(judge, ears=tuple(ears), at_us=now.at_us), tuple(verdicts)
+
+
+def _listen(ear: Ear, life: int, heard: int, step: int) -> Ear:
+    if life != ear.life:  # another process, or none
+        ear = replace(ear, life=life, has_come=False, quiet=-step, is_judged=False)
+        is_new = life > 0 and heard > max(life - _EARLY, 0)
+    else:
+        is_new = life > 0 and heard > ear.heard
+    if is_new:
+        fresh = replace(ear, has_come=True, quiet=0, is_judged=False, is_silent=False)
+        return replace(fresh, heard=heard)
+    return replace(ear, heard=max(heard, ear.heard), quiet=ear.quiet + step if life else 0)
+
+
+def _judged(owed: Owed, ear: Ear, at_us: int) -> Ear:
+    allowed = owed.within if ear.has_come else owed.first
+    if not ear.life or ear.is_judged or ear.quiet <= allowed:
+        return ear
+    since_us = ear.silent_us if ear.is_silent else at_us
+    return replace(ear, is_judged=True, is_silent=True, silent_us=since_us)
+
+
+def _verdicts(owed: Owed, before: Ear, after: Ear, at_us: int) -> Iterator[Verdict]:
+    if after.is_judged and not (before.is_judged and before.life == after.life):
+        yield Verdict(owed, True, silence(owed, after))
+    if before.is_silent and not after.is_silent:
+        lasted = (at_us - before.silent_us) // SECOND * SECOND
+        words = f"{owed.output} again" + (f" after {format_duration(lasted)}" if lasted else "")
+        yield Verdict(owed, False, words)

@@ -1,0 +1,67 @@
+"""The setting for outputs that nodes owe."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from dora_systemd.decisions.cell.owed import (
+    Owed,
+    format_owed,
+    merge_owed,
+    owed_of,
+    parse_owed,
+)
+from dora_systemd.decisions.settings.kinds import Base, Kind, Scalar, Setting, listed
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.values import quoted, scalar_text
+
+
+def _parse(value: Any, _: Base) -> tuple[Owed, ...]:
+    """From texts that name the node, and from mappings in the place of a node."""
+    return merge_owed(map(_parse_one, listed(value)))
+
+
+def _parse_one(value: Any) -> Owed:
+    if isinstance(value, Mapping):
+        return owed_of({key: scalar_text(one) for key, one in value.items()})
+    return parse_owed(scalar_text(value))
+
+
+_OWED = Kind[tuple[Owed, ...]](
+    str | dict[str, Scalar] | list[str | dict[str, Scalar]],
+    "below a node {output: image, within: 2s}, else NODE/OUTPUT:within=2s",
+    _parse,
+    lambda owes: list(map(format_owed, owes)),
+    is_repeatable=True,
+    merge=merge_owed,
+    metavar="NODE/OUTPUT:within=TIME,...",
+)
+OWES = Setting[tuple[Owed, ...]](
+    "owes",
+    _OWED,
+    (),
+    "Output on which messages must come in time; else restart the node, warn, or fail.",
+    per_node=True,
+)
+OWES_SETTINGS: tuple[Setting[Any], ...] = (OWES,)
+
+
+def owes_of(nodes: Mapping[str, tuple[Owed, ...]], given: tuple[Owed, ...]) -> tuple[Owed, ...]:
+    """The outputs of `given`, which take precedence over those that a settings file has for nodes.
+
+    Raises DoraSystemdError (BAD_INPUT) for one that names its node where the place does, or not
+    where it must.
+    """
+    for one in given:
+        if not one.node:
+            hint = f"write it below nodes: NODE:, or as NODE/{one.output}:within=TIME"
+            raise _refusal(f"the output {quoted(one.output)} without its node", hint)
+    for node, owes in nodes.items():
+        if named := [one for one in owes if one.node]:
+            hint = "write {output: NAME, within: TIME} there"
+            raise _refusal(f"{quoted(named[0].place)} below the node {quoted(node)}", hint)
+    of_files = [one._replace(node=node) for node, owes in nodes.items() for one in owes]
+    return merge_owed(of_files, given)
+
+
+def _refusal(what: str, hint: str) -> DoraSystemdError:
+    return DoraSystemdError(f"cannot use {what} as owes", hint, ExitCode.BAD_INPUT)

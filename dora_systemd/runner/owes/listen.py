@@ -1,0 +1,67 @@
+"""Notes when messages of nodes arrive: `python listen.py FILE SECONDS`, as a node of dora's.
+
+FILE is the file of times of dora_systemd/decisions/owes/probe.py, and SECONDS the time between two
+beats at most. The input "0" is the first owed output. This runs with the Python of the nodes: it
+imports nothing of dora_systemd, and of others only dora.
+"""
+
+import mmap
+import sys
+import time
+import types
+from collections.abc import Callable
+from typing import Any
+
+
+class Ignored(type):
+    """The class of a class whose functions all do nothing."""
+
+    def __getattr__(cls, name: str) -> Callable[..., None]:
+        """A function that ignores its arguments."""
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return lambda *_, **__: None
+
+
+def leave_out_arrow() -> None:
+    """Have dora find a pyarrow that makes nothing of the data: nobody looks at it here.
+
+    The real one takes 50 MB, and would copy each message.
+    """
+    arrow = types.ModuleType("pyarrow")
+    vars(arrow)["__getattr__"] = lambda name: Ignored(name, (), {})
+    sys.modules["pyarrow"] = arrow
+
+
+def listen(node: Any, times: memoryview, seconds: float) -> None:
+    """Note beats and messages until the node is stopped, or one of its inputs ends.
+
+    The runner then starts another probe for the inputs that are left.
+    """
+    while True:
+        began = time.monotonic()
+        event = node.next(timeout=seconds)
+        now = time.monotonic_ns() // 1000
+        times[0] = now
+        kind = "" if event is None else event["type"]
+        if kind == "INPUT":
+            times[1 + int(event["id"])] = now
+        elif kind in ("STOP", "INPUT_CLOSED"):
+            return
+        elif time.monotonic() - began < seconds / 2:
+            # It was no timeout: do not ask again at once, whatever it was.
+            time.sleep(seconds / 2)
+
+
+def main(path: str, seconds: float) -> None:
+    """Open the file, and be a node."""
+    with open(path, "r+b") as file:  # noqa: PTH123 - without pathlib, which is more memory
+        times = memoryview(mmap.mmap(file.fileno(), 0)).cast("Q")
+    leave_out_arrow()
+    from dora import Node
+
+    listen(Node(), times, seconds)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], float(sys.argv[2]))

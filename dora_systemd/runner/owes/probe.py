@@ -1,0 +1,115 @@
+"""Keeps one probe among the nodes of a run, see decisions/owes/probe.py."""
+
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from dora_systemd.adapters.cgroup import groups as cgroup
+from dora_systemd.adapters.dora.preparation import PACKAGE
+from dora_systemd.decisions.cell.launch import PERL, LaunchPlan
+from dora_systemd.decisions.cell.owed import PROBE, Owed
+from dora_systemd.decisions.cell.status import HELD, NodeStatus
+from dora_systemd.decisions.dora import protocol
+from dora_systemd.decisions.life.states import State
+from dora_systemd.decisions.owes.probe import probe_definition
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.runner.cell.engine import Engine
+from dora_systemd.runner.reload.apply import Run
+from dora_systemd.values import SECOND
+
+FindPython = Callable[[], Awaitable[str]]
+
+_SOON, _LATE = SECOND, 32 * SECOND
+"""µs between two probes; the pause doubles while none lives for _LATE."""
+_DEAF = 10 * SECOND
+"""µs without a beat, in which this process has run, after which the probe is replaced."""
+_ANSWER_SECONDS = 30.0
+_GONE = ("finished", "stopped")
+_TRIES = 2
+"""Probes that end early, one after the other, before that is reported."""
+
+
+class Probe:
+    """The probe of one run. plan: of the dataflow. tick: µs between two calls of tend().
+
+    find_python: the interpreter with dora-rs; raises DoraSystemdError if there is none.
+    """
+
+    def __init__(
+        self, run: Run, dora: Engine, plan: LaunchPlan, tick: int, find_python: FindPython
+    ) -> None:
+        unit, paths = run.nodes.places
+        self._run = run
+        self._engine = dora
+        self._plan = plan
+        self._find_python = find_python
+        self._tick = tick
+        self._path = paths.times
+        self._group = unit / f"{cgroup.NODE_PREFIX}{PROBE}"
+        self._count = 0
+        self._beat = 0
+        self._quiet = 0
+        self._next_us = 0
+        self._pause = _SOON
+        self._is_told = False
+
+    async def tend(self, beat: int, now: int) -> None:
+        """Start a probe if there is none. beat, now: its last beat, and now; CLOCK_MONOTONIC µs."""
+        inputs = self._inputs()
+        if cgroup.is_populated(self._group):
+            self._check(bool(inputs), beat, now)
+        elif inputs and now >= self._next_us and self._run.pump.cell.state is State.RUNNING:
+            if self._pause > _SOON << _TRIES:
+                self._tell("the probe ended again and again")
+            self._next_us, self._pause = now + self._pause, min(2 * self._pause, _LATE)
+            self._quiet = 0
+            await self._add(inputs)
+
+    def _inputs(self) -> list[tuple[int, Owed]]:
+        """The owed outputs of nodes that have not ended for good, each with its place."""
+        nodes = self._run.pump.cell.nodes
+        owes = enumerate(self._plan.options.owes)
+        return [(at, one) for at, one in owes if _can_come(nodes.get(one.node))]
+
+    def _check(self, is_needed: bool, beat: int, now: int) -> None:
+        """Kill a probe that hangs: the dataflow would not finish without it."""
+        is_well = is_needed and beat != self._beat
+        self._quiet = 0 if is_well else self._quiet + self._tick
+        self._beat = beat
+        if self._quiet > _DEAF:
+            if is_needed:
+                self._tell("the probe does not respond")
+            cgroup.kill_group(self._group)
+        elif is_well and now > self._next_us + _LATE:
+            self._pause, self._is_told = _SOON, False
+
+    async def _add(self, inputs: list[tuple[int, Owed]]) -> None:
+        try:
+            python = await self._find_python()
+            cgroup.make_group(self._group)
+            cgroup.kill_as_one(self._group)
+            params = protocol.add_params(self._run.pump.cell.run, self._define(python, inputs))
+            reply = await self._engine.ask_apart(params, _ANSWER_SECONDS)
+            if reply.error:
+                self._tell(protocol.first_line(reply.error))
+        except DoraSystemdError as error:
+            self._tell(error.message)
+        except OSError as error:
+            self._tell(f"its group: {error.strerror}")
+
+    def _define(self, python: str, inputs: list[tuple[int, Owed]]) -> dict[str, Any]:
+        script, seconds = PACKAGE / "runner" / "owes" / "listen.py", self._tick / SECOND / 2
+        command = [python, "-u", str(script), str(self._path), f"{seconds:g}"]
+        self._count += 1
+        return probe_definition(self._count, command, (PERL, self._plan.launcher), inputs)
+
+    def _tell(self, reason: str) -> None:
+        """Report once that nobody watches, until a probe has lived for a while."""
+        if not self._is_told and self._run.pump.cell.state is State.RUNNING:
+            self._is_told = True
+            self._run.pipes.write_event("outputs-unwatched", reason=reason)
+
+
+def _can_come(node: NodeStatus | None) -> bool:
+    if node is None or node.state in _GONE:
+        return False
+    return node.state != "failed" or node.policy == HELD

@@ -1,0 +1,133 @@
+"""Watches what nodes owe: reads when they were heard, has the judge decide, and acts.
+
+Nobody else restarts a node for this: dora does, by its RestartNode, within the node's own budget.
+"""
+
+import asyncio
+from contextlib import closing
+from dataclasses import replace
+from functools import partial
+
+from dora_systemd.adapters.dora.probe import probe_python
+from dora_systemd.adapters.host.shared_times import SharedTimes
+from dora_systemd.decisions.cell.launch import LaunchPlan
+from dora_systemd.decisions.cell.owed import RESTART, WARN
+from dora_systemd.decisions.cell.status import NodeStatus
+from dora_systemd.decisions.dora import protocol
+from dora_systemd.decisions.life import events as life
+from dora_systemd.decisions.life.states import State
+from dora_systemd.decisions.life.stop_budget import stop_timeout
+from dora_systemd.decisions.owes.judge import Judge, Look, Verdict, look
+from dora_systemd.decisions.owes.probe import parse_times, size_of_times
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.runner.cell.engine import Engine
+from dora_systemd.runner.cell.failure import Tasks
+from dora_systemd.runner.cell.pump import now_us
+from dora_systemd.runner.owes.probe import FindPython, Probe
+from dora_systemd.runner.reload.apply import Run
+from dora_systemd.values import SECOND
+
+_ANSWER_SECONDS = 30.0
+
+
+async def watch_owes(run: Run, plan: LaunchPlan, dora: Engine, dialogue: Tasks) -> None:
+    """Watch the outputs that the options of `plan` name, from the start of all nodes on."""
+    await run.pump.wait(lambda cell: cell.state is State.RUNNING, None)
+    find_python = partial(asyncio.to_thread, probe_python, plan)
+    try:
+        watch = Watch(run, plan, dora, dialogue, find_python)
+    except OSError as error:  # such as a full file system: the nodes run, and need not end for it
+        run.pipes.write_event("outputs-unwatched", reason=f"the file of times: {error.strerror}")
+        return
+    with closing(watch):
+        await watch.work()
+
+
+class Watch:
+    """The watch over one run of a dataflow. find_python: see Probe."""
+
+    def __init__(
+        self, run: Run, plan: LaunchPlan, dora: Engine, dialogue: Tasks, find_python: FindPython
+    ) -> None:
+        self._run = run
+        self._engine = dora
+        self._dialogue = dialogue
+        self._judge = Judge(plan.options.owes)
+        size = size_of_times(plan.options.owes)
+        self._times = SharedTimes(run.nodes.places[1].times, size)
+        self._probe = Probe(run, dora, plan, self._judge.tick, find_python)
+        self._ready: dict[str, tuple[int, int]] = {}
+
+    async def work(self) -> None:
+        """Look again and again; the probe is started, and again if it has ended."""
+        loop = asyncio.get_running_loop()
+        while True:
+            # CLOCK_MONOTONIC: it stands while the machine is suspended, and nobody sets it.
+            now = int(loop.time() * SECOND)
+            beat, heard = parse_times(self._times.read(), self._judge.owes, now)
+            self._look(Look(now, beat, heard, self._lives(now)))
+            await self._probe.tend(beat, now)
+            await asyncio.sleep(self._judge.tick / SECOND)
+
+    def close(self) -> None:
+        """Forget the file of times."""
+        self._times.close()
+
+    def _look(self, now: Look) -> None:
+        self._judge, verdicts = look(self._judge, now)
+        for one in verdicts:
+            self._act(one)
+
+    def _lives(self, now: int) -> dict[str, int]:
+        """When the process of each node that runs became ready, CLOCK_MONOTONIC."""
+        cell = self._run.pump.cell
+        if cell.state is not State.RUNNING:
+            return {}
+        nodes = {one.node: cell.nodes.get(one.node, NodeStatus()) for one in self._judge.owes}
+        # A node that the runner has frozen cannot speak.
+        there = {
+            node: one
+            for node, one in nodes.items()
+            if one.state == "running" and not one.is_ended and not self._run.nodes.is_held(node)
+        }
+        for node, status in there.items():
+            # The difference is taken once: the other clock may be set at any moment.
+            if self._ready.get(node, (-1, 0))[0] != status.since_us:
+                ready = max(now - max(now_us() - status.since_us, 0), 1)
+                self._ready[node] = status.since_us, ready
+        return {node: self._ready[node][1] for node in there}
+
+    def _act(self, verdict: Verdict) -> None:
+        owed, words = verdict.owed, verdict.words
+        left = self._judge.silent_of(owed.node)
+        if not verdict.is_silent:
+            speaks = life.NodeSpeaks(now_us(), owed.node, owed.output, words, left)
+            self._run.pump.push(speaks)
+            return
+        silent = life.NodeSilent(now_us(), owed.node, owed.output, words, owed.then, left)
+        self._run.pump.push(silent)
+        if owed.then == RESTART:
+            self._dialogue.spawn(f"restart the node {owed.node}", self._restart(silent))
+
+    async def _restart(self, silent: life.NodeSilent) -> None:
+        """Have dora restart the node. If it does not, the node counts as merely silent."""
+        cell = self._run.pump.cell
+        old = cell.nodes.get(silent.node, NodeStatus())
+        if cell.state is not State.RUNNING or old.state != "running":
+            return  # it has ended meanwhile, or is being replaced
+        params = protocol.node_params("RestartNode", cell.run, silent.node, cell.grace)
+        with self._run.nodes.exchanging(silent.node):
+            if error := await self._ask(params):
+                reason = f"{silent.reason}; dora does not restart it: {error}"
+                self._run.pump.push(replace(silent, at_us=now_us(), then=WARN, reason=reason))
+                return
+            await self._run.pump.wait(
+                lambda cell: cell.nodes.get(silent.node, NodeStatus()).pid != old.pid,
+                stop_timeout(cell.grace) / SECOND,
+            )
+
+    async def _ask(self, params: protocol.Params) -> str:
+        try:
+            return (await self._engine.ask_apart(params, _ANSWER_SECONDS)).error
+        except DoraSystemdError as error:
+            return error.message
