@@ -6,6 +6,7 @@ import time
 
 import pytest
 
+from dora_systemd.decisions.signs.table import parse_sign
 from dora_systemd.errors import ExitCode
 from tests.lab.pace import bound
 from tests.system.cells import Cell, Project, run, wait_for
@@ -91,7 +92,7 @@ def texts(cell: Cell) -> dict[str, str]:
 
 def signs(cell: Cell, node: str) -> int:
     """CLOCK_MONOTONIC µs of the last sign of life."""
-    return cell.status.signs[node].at_us
+    return parse_sign(cell.status.signs[node]).at_us
 
 
 @pytest.mark.warns(*ENDED)

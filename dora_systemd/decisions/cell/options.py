@@ -4,7 +4,7 @@ There is no registry: `list` reads UUID and path of a dataflow from this command
 module imports only what loads quickly.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from operator import attrgetter
 from pathlib import PurePath
 from typing import Any, NamedTuple
@@ -19,12 +19,6 @@ from dora_systemd.decisions.cell.restarts import (
     format_policy,
     parse_node_policy,
     parse_policy,
-)
-from dora_systemd.decisions.signs.watchdogs import (
-    NO_WATCHDOGS,
-    Watchdogs,
-    format_watchdogs,
-    parse_sockets,
 )
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import parse_name, parse_uuid
@@ -87,7 +81,7 @@ class RunnerOptions(NamedTuple):
     node_restarts: tuple[tuple[str, RestartPolicy], ...] = ()
     start_timeout: int = INFINITY
     reload: HotReload = DEFAULT_RELOAD
-    watchdogs: Watchdogs = NO_WATCHDOGS
+    watchdogs: Mapping[str, int] = {}
 
     def __hash__(self) -> int:
         return hash(self.uuid)
@@ -137,6 +131,20 @@ def _flag(key: str, field: str) -> Option:
     return Option(key, field, lambda _: True, lambda value: [""] * value, is_flag=True)
 
 
+def _parse_watchdogs(texts: list[str]) -> Mapping[str, int]:
+    from dora_systemd.decisions.signs.watchdogs import parse_sockets
+
+    return parse_sockets(texts)
+
+
+def _format_watchdogs(watchdogs: Mapping[str, int]) -> list[str]:
+    if not watchdogs:
+        return []
+    from dora_systemd.decisions.signs.watchdogs import format_watchdogs
+
+    return format_watchdogs(watchdogs)
+
+
 _REQUIRED = ("name", "uuid", "working-directory", "dora")
 _OPTIONS = (
     _always("name", "name", parse_name),
@@ -152,7 +160,7 @@ _OPTIONS = (
     Option("log-rate-limit", "log_rates", parse_rates, format_rates, is_repeated=True),
     _each("node-limit", "node_limits", parse_node_limits, format_node_limits),
     _each("node-restart", "node_restarts", parse_node_policy, format_node_policy),
-    Option("watchdog", "watchdogs", parse_sockets, format_watchdogs, is_repeated=True),
+    Option("watchdog", "watchdogs", _parse_watchdogs, _format_watchdogs, is_repeated=True),
     _each("watch", "reload.watch"),
     _each("ignore", "reload.ignore"),
     _each("node-watch", "reload.node_watch", parse_of_node, "=".join),

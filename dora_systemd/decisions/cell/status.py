@@ -5,7 +5,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 from dora_systemd.decisions.cell.exits import Exit, parse_exit
-from dora_systemd.decisions.signs.table import Sign, parse_sign
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import is_node_id
 
@@ -96,7 +95,7 @@ class CellStatus(NamedTuple):
     run: dora's own id of this run, or "". stage: one of STAGES. text: the unit's STATUS=.
     started_us, ready_us: CLOCK_REALTIME µs, 0 if that has not happened. samples: the last
     SAMPLES_KEPT CPU samples, oldest first. lines: by node; lost ones count for WHOLE_CELL. signs:
-    of the nodes with a notify socket.
+    of nodes with a notify socket, for parse_sign() of dora_systemd.decisions.signs.table.
     """
 
     uuid: str = ""
@@ -108,7 +107,7 @@ class CellStatus(NamedTuple):
     nodes: Mapping[str, NodeStatus] = {}
     samples: tuple[CpuSample, ...] = ()
     lines: Mapping[str, LineCount] = {}
-    signs: Mapping[str, Sign] = {}
+    signs: Mapping[str, tuple[Any, ...]] = {}
 
     @property
     def alive_count(self) -> int:
@@ -212,7 +211,7 @@ def _parse_cell(raw: Any) -> CellStatus:
         nodes=nodes,
         samples=tuple(map(_parse_sample, samples)),
         lines=_by_node(known.get("lines", {}), lambda one: LineCount(*_numbers(one, 3))),
-        signs=_by_node(known.get("signs", {}), parse_sign),
+        signs=_by_node(known.get("signs", {}), tuple),
     )
 
 
