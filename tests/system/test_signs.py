@@ -144,11 +144,6 @@ def test_a_node_that_falls_silent_is_restarted(front: Front, cell: Cell, project
     assert float(metrics[f"dora_node_watchdog_seconds{labels}"]) == seconds
     assert 0 <= float(metrics[f"dora_node_watchdog_age_seconds{labels}"]) < seconds
 
-    cell.doractl("node", "restart", cell.name, "feeder")
-    wait_for("it says so", lambda: texts(cell) == said)
-    assert dict(cell.events()).get("node-watchdog") == "feeder"
-    assert [name for name, _ in cell.events()].count("node-watchdog") == 1
-
 
 @pytest.mark.warns(*ENDED, "got a message from another process")
 def test_no_node_speaks_for_another(cell: Cell, project: Project) -> None:
