@@ -4,7 +4,7 @@ There is no registry: `list` reads UUID and path of a dataflow from this command
 module imports only what loads quickly.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from operator import attrgetter
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -20,12 +20,6 @@ from dora_systemd.decisions.cell.restarts import (
     format_policy,
     parse_node_policy,
     parse_policy,
-)
-from dora_systemd.decisions.signs.watchdogs import (
-    NO_WATCHDOGS,
-    Watchdogs,
-    format_watchdogs,
-    parse_sockets,
 )
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import parse_name, parse_uuid
@@ -93,7 +87,7 @@ class RunnerOptions(NamedTuple):
     node_restarts: tuple[tuple[str, RestartPolicy], ...] = ()
     start_timeout: int = INFINITY
     reload: HotReload = DEFAULT_RELOAD
-    watchdogs: Watchdogs = NO_WATCHDOGS
+    watchdogs: Mapping[str, int] = {}
     node_rights: "tuple[NodeRights, ...]" = ()
     owes: tuple[Owed, ...] = ()
 
@@ -158,6 +152,20 @@ def _format_rights(rights: "NodeRights") -> str:
     return format_node_rights(rights)
 
 
+def _parse_watchdogs(texts: list[str]) -> Mapping[str, int]:
+    from dora_systemd.decisions.signs.watchdogs import parse_sockets
+
+    return parse_sockets(texts)
+
+
+def _format_watchdogs(watchdogs: Mapping[str, int]) -> list[str]:
+    if not watchdogs:
+        return []
+    from dora_systemd.decisions.signs.watchdogs import format_watchdogs
+
+    return format_watchdogs(watchdogs)
+
+
 _REQUIRED = ("name", "uuid", "working-directory", "dora")
 _OPTIONS = (
     _always("name", "name", parse_name),
@@ -174,8 +182,8 @@ _OPTIONS = (
     _each("node-limit", "node_limits", parse_node_limits, format_node_limits),
     _each("node-rights", "node_rights", _parse_rights, _format_rights),
     _each("node-restart", "node_restarts", parse_node_policy, format_node_policy),
-    Option("watchdog", "watchdogs", parse_sockets, format_watchdogs, is_repeated=True),
     _each("owes", "owes", parse_owed, format_owed),
+    Option("watchdog", "watchdogs", _parse_watchdogs, _format_watchdogs, is_repeated=True),
     _each("watch", "reload.watch"),
     _each("ignore", "reload.ignore"),
     _each("node-watch", "reload.node_watch", parse_of_node, "=".join),

@@ -5,7 +5,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 from dora_systemd.decisions.cell.exits import Exit, parse_exit
-from dora_systemd.decisions.signs.table import Sign, parse_sign
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import is_node_id
 
@@ -100,7 +99,8 @@ class CellStatus(NamedTuple):
     started_us, ready_us: CLOCK_REALTIME µs, 0 if that has not happened. samples: the last
     SAMPLES_KEPT CPU samples, oldest first. lines: by node; lost ones count for WHOLE_CELL.
     up_us: CLOCK_MONOTONIC µs of READY=1, 0 before it, and in tables of older versions. is_first:
-    whether NRestarts= of the unit is certainly 0. signs: of the nodes with a notify socket.
+    whether NRestarts= of the unit is certainly 0. signs: of nodes with a notify socket, for
+    parse_sign() of dora_systemd.decisions.signs.table.
     """
 
     uuid: str = ""
@@ -114,7 +114,7 @@ class CellStatus(NamedTuple):
     lines: Mapping[str, LineCount] = {}
     up_us: int = 0
     is_first: bool = False
-    signs: Mapping[str, Sign] = {}
+    signs: Mapping[str, tuple[Any, ...]] = {}
 
     @property
     def alive_count(self) -> int:
@@ -220,7 +220,7 @@ def _parse_cell(raw: Any) -> CellStatus:
         lines=_by_node(known.get("lines", {}), lambda one: LineCount(*_numbers(one, 3))),
         up_us=_number(known, "up_us"),
         is_first=known.get("is_first") is True,
-        signs=_by_node(known.get("signs", {}), parse_sign),
+        signs=_by_node(known.get("signs", {}), tuple),
     )
 
 

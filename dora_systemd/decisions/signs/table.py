@@ -1,6 +1,5 @@
 """The signs of life in the table that a runner writes, as `list` and the metrics show them."""
 
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from dora_systemd.decisions.signs.messages import MAX_STATUS
@@ -31,11 +30,8 @@ def _is_time(*numbers: int) -> bool:
     return all(type(one) is int and 0 <= one < INFINITY // 2 for one in numbers)
 
 
-def sign_facts(signs: Mapping[str, Sign], node: str, now_us: int) -> dict[str, Any]:
+def sign_facts(sign: Sign, now_us: int) -> dict[str, Any]:
     """The fields of a NodeRow. now_us: CLOCK_MONOTONIC."""
-    sign = signs.get(node)
-    if sign is None:
-        return {}
     return {
         "text": sign.status,
         "watchdog": sign.watchdog or None,

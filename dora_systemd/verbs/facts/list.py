@@ -8,13 +8,13 @@ from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.decisions.cell.status import (
     FAILED_BECAUSE,
     WHOLE_CELL,
+    CellStatus,
     CpuSample,
     NodeStatus,
     cpu_percent,
     throttled_percent,
 )
 from dora_systemd.decisions.resources.usage import Usage
-from dora_systemd.decisions.signs.table import sign_facts
 from dora_systemd.decisions.views.dataflows import (
     DataflowRow,
     NodeRow,
@@ -123,7 +123,7 @@ def _usage(reading: Reading, known: tuple[CpuSample, ...]) -> dict[str, Any]:
                 status.nodes.get(node),
                 {
                     **(_numbers(use[node], samples, now, node) if node in use else {}),
-                    **sign_facts(status.signs, node, now.at_us),
+                    **_signs(status, node, now.at_us),
                 },
             )._replace(
                 essential=None if essential is None else node in essential,
@@ -148,6 +148,15 @@ def _outputs(reading: Reading, node: str) -> tuple[OutputRow, ...]:
         for owed, at in zip(owes, reading.heard, strict=False)
         if owed.node == node
     )
+
+
+def _signs(status: CellStatus, node: str, now_us: int) -> dict[str, Any]:
+    """What a node says of itself, as rows have it."""
+    if node not in status.signs:
+        return {}
+    from dora_systemd.decisions.signs.table import parse_sign, sign_facts
+
+    return sign_facts(parse_sign(status.signs[node]), now_us)
 
 
 def _numbers(

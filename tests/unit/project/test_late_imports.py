@@ -82,6 +82,8 @@ LATE = {
     "most dataflows have no notify sockets": {
         "runner.signs.hook": {"runner.signs.sockets"},
         "runner.cell.dialogue": {"runner.signs.watch"},
+        "decisions.cell.options": {"decisions.signs.watchdogs"},
+        "verbs.facts.list": {"decisions.signs.table"},
     },
     "asyncio and WebSockets: of all verbs, a few need one of them": {
         "verbs.node": {"adapters.dora.control", "adapters.runner_socket.relay"},

@@ -42,12 +42,11 @@ def test_any_table_is_read(raw: object) -> None:
 def test_signs_for_rows() -> None:
     assert parse_sign(["up", 5, 7]) == Sign("up", 5, 7)
     assert parse_sign(["up", True, 7]) == parse_sign(["up", -1, 7]) == Sign()
-    signs = {"cam": Sign("up", 2 * SECOND, 5 * SECOND), "plot": Sign("idle")}
+    sign = Sign("up", 2 * SECOND, 5 * SECOND)
     facts = {"text": "up", "watchdog": 5 * SECOND, "sign_age": SECOND}
-    assert sign_facts(signs, "cam", 3 * SECOND) == facts
-    assert sign_facts(signs, "cam", 0)["sign_age"] == 0
-    assert sign_facts(signs, "plot", 9) == {"text": "idle", "watchdog": None, "sign_age": None}
-    assert sign_facts(signs, "other", 9) == {}
+    assert sign_facts(sign, 3 * SECOND) == facts
+    assert sign_facts(sign, 0)["sign_age"] == 0
+    assert sign_facts(Sign("idle"), 9) == {"text": "idle", "watchdog": None, "sign_age": None}
     assert format_watchdog(1_234_567, 5 * SECOND) == "1.2s/5s"
     assert format_watchdog(None, 5 * SECOND) == "-/5s"
     assert format_watchdog(None, None) == ""
