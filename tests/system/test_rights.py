@@ -207,21 +207,6 @@ def test_without_it_the_others_stay(cell: Cell, project: Project) -> None:
     assert cell.status.stage == "degraded"
 
 
-@pytest.mark.warns(*CRASHES, *FAILED, "not reloaded")
-def test_a_failed_reload_of_an_essential_node_ends_nothing(cell: Cell, project: Project) -> None:
-    flow = project.three_nodes()
-    cell.start(flow, "--node-rights=sink:essential")
-    unit = cell.show("InvocationID")
-    good = (project.root / "sink.py").read_text()
-    project.write("sink.py", "raise SystemExit(3)\n")
-    assert cell.doractl("reload", cell.name, check=False).returncode == ExitCode.FAILURE
-    assert cell.show("ActiveState") == "active"
-    project.write("sink.py", good)
-    cell.doractl("reload", cell.name)
-    cell.wait_exchanging()
-    assert cell.show("InvocationID") == unit
-
-
 @pytest.mark.skipif(HAS_CPUSET, reason="the launcher has nothing to do")
 def test_cpus_without_a_controller(cell: Cell, project: Project) -> None:
     done = cell.start(project.three_nodes(), "--node-limit=sink:cpus=0")

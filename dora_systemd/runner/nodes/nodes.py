@@ -14,7 +14,7 @@ from dora_systemd.adapters.host.process import beside
 from dora_systemd.adapters.host.rights import lower_rights
 from dora_systemd.adapters.logs.jsonl import JsonlTail
 from dora_systemd.adapters.logs.pipes import LogPipes
-from dora_systemd.decisions.cell.launch import has_pipes, is_launched
+from dora_systemd.decisions.cell.launch import has_launcher, has_pipes, is_launched
 from dora_systemd.decisions.cell.limits import NodeLimits, without_cpus
 from dora_systemd.decisions.cell.line_rates import RateLimits, rate_of
 from dora_systemd.decisions.cell.log_backlog import marks_of
@@ -44,6 +44,7 @@ class Nodes:
         self._pipes = pipes
         self._piped: set[str] = set()
         self._launched: set[str] = set()
+        self._bare: set[str] = set()
         self._tails: dict[str, JsonlTail | None] = {}
         self._holds: dict[str, Hold] = {}
         self.resources = Resources(unit)
@@ -62,6 +63,7 @@ class Nodes:
         for ident in gone | (self._piped - piped):
             self.remove(ident)
         self._launched.clear()
+        self._bare.clear()
         for node in dataflow.nodes:
             self._make(node, rates)
         self._limit_first(limits)
@@ -79,6 +81,8 @@ class Nodes:
         if is_launched(node):
             self._launched.add(node.id)
             self.signs.make(node.id)
+        if not has_launcher(node):
+            self._bare.add(node.id)
         if has_pipes(node):
             self._pipes.make(node.id, self._paths)
             self._piped.add(node.id)
@@ -114,6 +118,7 @@ class Nodes:
             self._pipes.forget(node)
         self._piped.discard(node)
         self._launched.discard(node)
+        self._bare.discard(node)
         with contextlib.suppress(OSError):  # a dying process keeps the group for a moment
             cgroup.remove_group(self._group(node))
 
@@ -162,7 +167,7 @@ class Nodes:
             for process in _with_descendants(pid):
                 with contextlib.suppress(OSError):  # the process may have exited already
                     cgroup.move_process(self._group(node), process)
-                if rights:
+                if rights and node in self._bare:
                     lower_rights(process, node, rights)
 
     def clear(self, node: str, pid: int) -> None:

@@ -1,6 +1,6 @@
 """Reads the settings of a dataflow that is to be started, and checks whose files to trust."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -78,14 +78,19 @@ def _read(path: Path) -> _Read:
 def _check_rights(read: _Read) -> None:
     """Refuse values by which another user's file would give a node more than that user has."""
     own = resolve_settings({}, {}, [(str(read.path), read.document)], SETTINGS)
+    for key in _raising(own):
+        raise _untrusted(read, key, f"give {NODE_RIGHTS.flags[0]} on the command line")
+
+
+def _raising(settings: Settings) -> Iterator[str]:
+    """The keys of values that only root may give."""
     for setting in SETTINGS:
-        values = {"": own[setting], **own.by_node(setting)}
-        for node, value in values.items() if setting.raises else ():
-            is_default = not node and not own.is_given(setting)
-            if not is_default and setting.raises and setting.raises(value):
-                key = f"nodes.{node}.{setting.name}" if node else setting.name
-                hint = f"give {NODE_RIGHTS.flags[0]} on the command line"
-                raise _untrusted(read, key, hint)
+        if (raises := setting.raises) is not None:
+            if settings.is_given(setting) and raises(settings[setting]):
+                yield setting.name
+            for node, value in settings.by_node(setting).items():
+                if raises(value):
+                    yield f"nodes.{node}.{setting.name}"
 
 
 def _check_trust(read: _Read) -> None:

@@ -13,6 +13,7 @@ from dora_systemd.adapters.host import process
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
 from dora_systemd.decisions.logs.lines import Origin
+from dora_systemd.decisions.rights.node_rights import parse_node_rights
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.nodes import nodes as nodes_module
 from dora_systemd.runner.nodes.nodes import Nodes, _with_descendants, raise_file_limit
@@ -81,6 +82,33 @@ def test_a_node_that_dora_reads_is_removed_and_taken_back(tmp_path: Path) -> Non
 
     asyncio.run(live())
     assert b"MESSAGE=again\n" in b"".join(journal.taken)
+
+
+SHA = {"id": "a", "path": "a", "path_sha256": "0" * 64}
+OPERATOR = {"id": "a", "operator": {"python": "a.py"}}
+
+
+@pytest.mark.parametrize(("raw", "is_lowered"), [(SHA, True), (OPERATOR, False)])
+def test_only_a_node_without_a_launcher_is_lowered_from_outside(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, raw: dict[str, object], is_lowered: bool
+) -> None:
+    """The launcher of an operator takes the limits by itself, once it has used them."""
+    lowered: list[object] = []
+    monkeypatch.setattr(nodes_module, "lower_rights", lambda *given: lowered.append(given))
+    monkeypatch.setattr(nodes_module, "_with_descendants", lambda pid: [pid])
+    rights = (parse_node_rights("b:scheduling=fifo:5"),)
+    (tmp_path / "io").mkdir()
+
+    async def live() -> None:
+        pipes = LogPipes(asyncio.get_running_loop(), SlowJournal(), Origin("robot", "uuid"))
+        nodes = Nodes(tmp_path, CellPaths(tmp_path), pipes)
+        nodes.prepare(parse_dataflow({"nodes": [raw]}, "dataflow.yml"), {}, ())
+        nodes.adopt("a", 7)
+        nodes.adopt("a", 7, rights)
+        nodes.close()
+
+    asyncio.run(live())
+    assert lowered == [(7, "a", rights)] * is_lowered
 
 
 def test_an_operator_that_dies_while_it_is_adopted(monkeypatch: pytest.MonkeyPatch) -> None:

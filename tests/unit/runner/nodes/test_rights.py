@@ -1,6 +1,7 @@
 """The rights of nodes in the cell: what the launcher gets, and when they are proved."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -19,7 +20,7 @@ from tests.unit.fakes.manager import options
 FLOW = parse_dataflow({"nodes": [{"id": "camera", "path": "camera.py"}]}, "robot.yml")
 
 
-def with_cpus(**more: object) -> RunnerOptions:
+def with_cpus(**more: Any) -> RunnerOptions:
     return options(node_limits=(parse_node_limits("camera:cpus=0,memory=1G"),), **more)
 
 
