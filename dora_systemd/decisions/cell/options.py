@@ -7,12 +7,11 @@ module imports only what loads quickly.
 from collections.abc import Callable, Sequence
 from operator import attrgetter
 from pathlib import PurePath
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from dora_systemd.decisions.cell.hot_reload import DEFAULT_RELOAD, HotReload, parse_of_node
 from dora_systemd.decisions.cell.limits import NodeLimits, format_node_limits, parse_node_limits
 from dora_systemd.decisions.cell.line_rates import UNLIMITED, RateLimits, format_rates, parse_rates
-from dora_systemd.decisions.cell.owed import Owed, format_owed, parse_owed
 from dora_systemd.decisions.cell.restarts import (
     DEFAULT,
     RestartPolicy,
@@ -32,6 +31,9 @@ from dora_systemd.values import (
     parse_duration,
     quoted,
 )
+
+if TYPE_CHECKING:  # most dataflows owe nothing, and `list` loads this module
+    from dora_systemd.decisions.cell.owed import Owed
 
 RUNNER_MODULE = "dora_systemd.runner"
 DEFAULT_GRACE = 10 * SECOND
@@ -82,7 +84,7 @@ class RunnerOptions(NamedTuple):
     node_restarts: tuple[tuple[str, RestartPolicy], ...] = ()
     start_timeout: int = INFINITY
     reload: HotReload = DEFAULT_RELOAD
-    owes: tuple[Owed, ...] = ()
+    owes: "tuple[Owed, ...]" = ()
 
     def __hash__(self) -> int:
         return hash(self.uuid)
@@ -132,6 +134,18 @@ def _flag(key: str, field: str) -> Option:
     return Option(key, field, lambda _: True, lambda value: [""] * value, is_flag=True)
 
 
+def _parse_owed(text: str) -> "Owed":
+    from dora_systemd.decisions.cell.owed import parse_owed
+
+    return parse_owed(text)
+
+
+def _format_owed(owed: "Owed") -> str:
+    from dora_systemd.decisions.cell.owed import format_owed
+
+    return format_owed(owed)
+
+
 _REQUIRED = ("name", "uuid", "working-directory", "dora")
 _OPTIONS = (
     _always("name", "name", parse_name),
@@ -147,7 +161,7 @@ _OPTIONS = (
     Option("log-rate-limit", "log_rates", parse_rates, format_rates, is_repeated=True),
     _each("node-limit", "node_limits", parse_node_limits, format_node_limits),
     _each("node-restart", "node_restarts", parse_node_policy, format_node_policy),
-    _each("owes", "owes", parse_owed, format_owed),
+    _each("owes", "owes", _parse_owed, _format_owed),
     _each("watch", "reload.watch"),
     _each("ignore", "reload.ignore"),
     _each("node-watch", "reload.node_watch", parse_of_node, "=".join),
