@@ -5,6 +5,7 @@ module imports only what loads quickly.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
 from operator import attrgetter
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -12,7 +13,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from dora_systemd.decisions.cell.hot_reload import DEFAULT_RELOAD, HotReload, parse_of_node
 from dora_systemd.decisions.cell.limits import NodeLimits, format_node_limits, parse_node_limits
 from dora_systemd.decisions.cell.line_rates import UNLIMITED, RateLimits, format_rates, parse_rates
-from dora_systemd.decisions.cell.owed import Owed, format_owed, parse_owed
 from dora_systemd.decisions.cell.restarts import (
     DEFAULT,
     RestartPolicy,
@@ -33,7 +33,8 @@ from dora_systemd.values import (
     quoted,
 )
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # few dataflows have any, and `list` loads this module
+    from dora_systemd.decisions.cell.owed import Owed
     from dora_systemd.decisions.rights.node_rights import NodeRights
 
 RUNNER_MODULE = "dora_systemd.runner"
@@ -89,7 +90,7 @@ class RunnerOptions(NamedTuple):
     reload: HotReload = DEFAULT_RELOAD
     watchdogs: Mapping[str, int] = {}
     node_rights: "tuple[NodeRights, ...]" = ()
-    owes: tuple[Owed, ...] = ()
+    owes: "tuple[Owed, ...]" = ()
 
     def __hash__(self) -> int:
         return hash(self.uuid)
@@ -139,23 +140,20 @@ def _flag(key: str, field: str) -> Option:
     return Option(key, field, lambda _: True, lambda value: [""] * value, is_flag=True)
 
 
-def _parse_rights(text: str) -> "NodeRights":
-    # Imported late: few dataflows have any.
-    from dora_systemd.decisions.rights.node_rights import parse_node_rights
+def _late(module: str, name: str) -> Callable[[Any], Any]:
+    """A function of a module that few dataflows need: it is imported with the first value."""
 
-    return parse_node_rights(text)
+    def call(value: Any) -> Any:
+        return getattr(import_module(f"dora_systemd.decisions.{module}"), name)(value)
 
-
-def _format_rights(rights: "NodeRights") -> str:
-    from dora_systemd.decisions.rights.node_rights import format_node_rights
-
-    return format_node_rights(rights)
+    return call
 
 
-def _parse_watchdogs(texts: list[str]) -> Mapping[str, int]:
-    from dora_systemd.decisions.signs.watchdogs import parse_sockets
-
-    return parse_sockets(texts)
+_parse_rights, _format_rights = (
+    _late("rights.node_rights", name) for name in ("parse_node_rights", "format_node_rights")
+)
+_parse_owed, _format_owed = (_late("cell.owed", name) for name in ("parse_owed", "format_owed"))
+_parse_watchdogs = _late("signs.watchdogs", "parse_sockets")
 
 
 def _format_watchdogs(watchdogs: Mapping[str, int]) -> list[str]:
@@ -182,7 +180,7 @@ _OPTIONS = (
     _each("node-limit", "node_limits", parse_node_limits, format_node_limits),
     _each("node-rights", "node_rights", _parse_rights, _format_rights),
     _each("node-restart", "node_restarts", parse_node_policy, format_node_policy),
-    _each("owes", "owes", parse_owed, format_owed),
+    _each("owes", "owes", _parse_owed, _format_owed),
     Option("watchdog", "watchdogs", _parse_watchdogs, _format_watchdogs, is_repeated=True),
     _each("watch", "reload.watch"),
     _each("ignore", "reload.ignore"),

@@ -20,8 +20,9 @@ FindPython = Callable[[], Awaitable[str]]
 
 _SOON, _LATE = SECOND, 32 * SECOND
 """µs between two probes; the pause doubles while none lives for _LATE."""
-_DEAF = 10 * SECOND
-"""µs without a beat, in which this process has run, after which the probe is replaced."""
+_DEAF = 30 * SECOND
+"""µs without a beat, in which this process has run, after which the probe is replaced: a machine
+under load takes seconds to start a Python."""
 _ANSWER_SECONDS = 30.0
 _GONE = ("finished", "stopped")
 _TRIES = 2

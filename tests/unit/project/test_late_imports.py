@@ -68,6 +68,7 @@ LATE = {
     },
     "most dataflows owe nothing": {
         "adapters.dora.preparation": {"adapters.dora.probe"},
+        "decisions.cell.options": {"decisions.cell.owed"},
         "runner.owes.begin": {"runner.owes.watch"},
         "verbs.facts.reading": {"decisions.owes.probe"},
     },

@@ -36,6 +36,8 @@ def test_catalog_entry_says_what_and_what_to_do(name: str) -> None:
             "DORA_COUNT",
             "DORA_LIMIT",
             "DORA_MOST",
+            "DORA_OUTPUT",
+            "DORA_THEN",
             "UNIT",
         }
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from dora_systemd.decisions.cell.hot_reload import REPLACE_WORDS
 from dora_systemd.decisions.cell.line_rates import RateLimit
+from dora_systemd.decisions.cell.owed import Owed
 from dora_systemd.decisions.properties.sandbox import LEVELS, NETWORKS
 from dora_systemd.decisions.settings.kinds import DURATION, PATHS, TEXT, Setting
 from dora_systemd.decisions.settings.resolve import (
@@ -214,6 +215,7 @@ def test_values_and_back(data: st.DataObject) -> None:
         "env_file": st.lists(texts).map(tuple),
         "property": st.lists(texts).map(tuple),
         "grace_duration": st.integers(0, 2**64 - 1),
+        "owes": st.just((Owed("cam", "image", 2 * SECOND),)) | st.just(()),
         "log_rate_limit": st.dictionaries(
             st.sampled_from(["", "cam"]), st.none() | st.just(RateLimit(5, SECOND))
         ),

@@ -11,13 +11,14 @@ from dora_systemd.values import SECOND
 
 UNKNOWN = DataflowRow("u", "robot", "dora-robot.service", "Failed", nodes=(NodeRow("a", "failed"),))
 KNOWN_OF_IT = {"name", "uuid", "unit", "status", "enabled", "nodes", "inhibitors"}
+KNOWN_OF_NODE = {"node", "state", "outputs"}
 
 
 def test_what_is_unknown_is_null() -> None:
     values = dataflow_object(UNKNOWN)
     assert {key for key, value in values.items() if value is not None} == KNOWN_OF_IT
     (node,) = values["nodes"]
-    assert {key for key, value in node.items() if value is not None} == {"node", "state"}
+    assert {key for key, value in node.items() if value is not None} == KNOWN_OF_NODE
 
 
 def test_zero_is_not_unknown() -> None:

@@ -223,7 +223,7 @@ def test_a_probe_that_hangs_is_replaced(tmp_path: Path) -> None:
         await bench.work(3)
         bench.listens = False
         (bench.group / "cgroup.kill").touch()
-        await bench.work(12)
+        await bench.work(35)
 
     bench = lived(tmp_path, work)
     assert bench.named("outputs-unwatched")[0][1] == "the probe does not respond"

@@ -1,0 +1,64 @@
+"""Owed outputs as readers outside the cell see them: the file of times is the nodes' user's."""
+
+import os
+import struct
+import time
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.decisions.cell.owed import Owed
+from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
+from dora_systemd.decisions.views.dataflows import OutputRow
+from dora_systemd.scope import Scope
+from dora_systemd.trust.cells import read_times
+from dora_systemd.values import SECOND
+from dora_systemd.verbs.facts.cells import read_cells
+from dora_systemd.verbs.facts.list import dataflow_row
+from tests.unit.fakes.manager import FakeManager, options
+from tests.unit.verbs.facts.test_list import GROUP, scope, unit_group, write_status
+
+__all__ = ["scope", "unit_group"]
+
+OWES = (Owed("camera", "image", 2 * SECOND), Owed("camera", "depth", SECOND, then="warn"))
+
+
+def outputs(scope: Scope, data: bytes) -> tuple[OutputRow, ...]:
+    manager = FakeManager()
+    manager.add(options()._replace(owes=OWES), ControlGroup=GROUP)
+    write_status(scope, CellStatus(nodes={"camera": NodeStatus("running")}))
+    (scope.cell_directory("robot") / "times").write_bytes(data)
+    (camera,) = dataflow_row(manager, scope, read_cells(manager)[0]).nodes
+    return camera.outputs
+
+
+@pytest.mark.usefixtures("unit_group")
+def test_ages(scope: Scope) -> None:
+    now = time.monotonic_ns() // 1000
+    image, depth = outputs(scope, struct.pack("=3Q", now, now - 3 * SECOND, 0))
+    assert image.age is not None
+    assert 3 * SECOND <= image.age < 60 * SECOND
+    assert (depth.output, depth.within, depth.then, depth.age) == ("depth", SECOND, "warn", None)
+
+
+@pytest.mark.usefixtures("unit_group")
+@pytest.mark.parametrize("data", [b"", b"x" * 23, b"\xff" * 24, bytes(25), b"x" * 10_000_000])
+def test_what_no_probe_writes(scope: Scope, data: bytes) -> None:
+    assert [one.age for one in outputs(scope, data)] == [None, None]
+
+
+def test_other_files_in_its_place(tmp_path: Path) -> None:
+    assert read_times(tmp_path, 24) == b""
+    times = tmp_path / "times"
+    os.mkfifo(times)
+    assert read_times(tmp_path, 24) == b""
+    times.unlink()
+    times.mkdir()
+    assert read_times(tmp_path, 24) == b""
+    times.rmdir()
+    (tmp_path / "secret").write_bytes(b"x" * 24)
+    times.symlink_to(tmp_path / "secret")
+    if os.geteuid() == 0:  # links are refused to root alone
+        os.chown(tmp_path, 1000, 1000)
+        os.lchown(times, 1000, 1000)
+        assert read_times(tmp_path, 24) == b""
