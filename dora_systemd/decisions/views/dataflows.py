@@ -10,6 +10,8 @@ from dora_systemd.values import SECOND, format_rounded_size
 STARTING, RUNNING, DEGRADED = "Starting", "Running", "Degraded"
 STOPPING, RESTARTING = "Stopping", "Restarting"
 FINISHED, STOPPED, FAILED = "Finished", "Stopped", "Failed"
+UNREACHABLE = "Unreachable"
+"""In the place of a status: that of a host from which no answer came."""
 UP_WORDS = frozenset({STARTING, RUNNING, DEGRADED, STOPPING, RESTARTING})
 
 _BY_ACTIVE = {
@@ -146,13 +148,13 @@ _OPTIONAL = (
 )
 """Columns that a narrow terminal does without, in this order."""
 _LEAST = 12
-_ROOM = {"NAME": _LEAST, "NODE": _LEAST, "WHY": 24, "EXIT": _LEAST}
+_ROOM = {"HOST": _LEAST, "NAME": _LEAST, "NODE": _LEAST, "WHY": 24, "EXIT": _LEAST}
 """Columns whose cells may be cut to _LEAST, and the width for which other columns are left out."""
 _RIGHT_ALIGNED = frozenset({"CPU%", "THROTTLED%", "MEM", "PEAK", "RESTARTS", "PID", "UPTIME"})
 _ANSI = {"red": "\x1b[31m", "yellow": "\x1b[33m"}
 _UNDERLINED, _PLAIN = "\x1b[4m", "\x1b[0m"
 STATE_COLORS = {
-    FAILED: "red",
+    **dict.fromkeys((FAILED, UNREACHABLE), "red"),
     **dict.fromkeys((STARTING, DEGRADED, STOPPING, RESTARTING, "Reloading"), "yellow"),
 }
 """By the word for a state, as in systemctl(1); others have none."""
@@ -224,10 +226,14 @@ def format_dataflows(
 
     With ENDED and WHY if any of them has ended.
     """
+    return format_table(*dataflow_table(rows), width, want_colors)
+
+
+def dataflow_table(rows: Sequence[DataflowRow]) -> tuple[Sequence[str], list[Sequence[str]]]:
+    """The header of that table, and the cells of each row."""
     prefixes = shortest_prefixes([row.uuid for row in rows])
     header = _HEADER if all(map(is_up_word, rows)) else (*_HEADER, "ENDED", "WHY")
-    cells = [_dataflow_cells(row, prefixes[row.uuid])[: len(header)] for row in rows]
-    return format_table(header, cells, width, want_colors)
+    return header, [_dataflow_cells(row, prefixes[row.uuid])[: len(header)] for row in rows]
 
 
 def _dataflow_cells(row: DataflowRow, prefix: str) -> tuple[str, ...]:

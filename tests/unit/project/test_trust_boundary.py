@@ -46,8 +46,8 @@ _TABLE = {
         trust.eyes trust.paths trust.programs trust.sight trust.sockets trust.terminals
     """,
     OWN: """
-        adapters.dora.preparation adapters.host.files cli.main cli.verbs.look.logs
-        decisions.cell.launch verbs.start.credentials verbs.start.limits
+        adapters.dora.preparation adapters.host.files adapters.ssh.program cli.main
+        cli.verbs.look.logs decisions.cell.launch verbs.start.credentials verbs.start.limits
     """,
     KERNEL: """
         adapters.cgroup.groups adapters.host.machine adapters.host.process_table runner.cell.pause
