@@ -1,18 +1,20 @@
 """doractl -H: click reads the command line here, and the verb runs on the hosts."""
 
 import os
-from collections.abc import Set
+import sys
+from collections.abc import Sequence, Set
 from copy import copy
 from typing import Any
 
 import click
 
 from dora_systemd.cli.group import VerbGroup, doractl, run_verb
-from dora_systemd.cli.remote.plan import check_hosts, plan_of
+from dora_systemd.cli.remote.plan import Plan, check_hosts, plan_of
 from dora_systemd.cli.remote.several import run_on_all
 from dora_systemd.cli.remote.single import is_terminal, pass_through, run_there
-from dora_systemd.decisions.remote.hosts import ALL, given_words
+from dora_systemd.decisions.remote.hosts import ALL, Host, given_words
 from dora_systemd.decisions.remote.words import part_hosts
+from dora_systemd.errors import ExitCode
 from dora_systemd.verbs.remote.hosts import find_hosts
 
 
@@ -85,6 +87,15 @@ def _run(context: click.Context, words: list[str], command_line: list[str]) -> i
     check_hosts(plan, 1)
     hosts = find_hosts(words, os.environ)
     check_hosts(plan, len(hosts))
-    if len(hosts) > 1 or ALL in words:
+    status = _run_on(hosts, plan, is_several=len(hosts) > 1 or ALL in words)
+    if status == ExitCode.BAD_INPUT and plan.has_relative_file and not plan.wants_json:
+        where = "that host" if len(hosts) > 1 else hosts[0].text
+        hint = f"FILE is a path on {where}, and begins in the home directory there"
+        print(f"hint: {hint}", file=sys.stderr)
+    return status
+
+
+def _run_on(hosts: Sequence[Host], plan: Plan, is_several: bool) -> int:
+    if is_several:
         return run_on_all(hosts, plan)
     return run_there(hosts[0], plan) if is_terminal() else pass_through(hosts[0], plan)

@@ -8,6 +8,7 @@ import click
 from dora_systemd.decisions.remote.command import Way
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.verbs.remote.talk import ANSWER_SECONDS
+from dora_systemd.verbs.start.again import means_name
 
 _REFUSED = {
     "env": "its variables lead to 127.0.0.1 there; use doractl -H HOST dora NAME -- ARGUMENT...",
@@ -47,6 +48,12 @@ class Plan(NamedTuple):
     def has_lines(self) -> bool:
         """Whether what it prints is complete after each line."""
         return self.acts or self.is_endless
+
+    @property
+    def has_relative_file(self) -> bool:
+        """Whether it starts a FILE that is not an absolute path."""
+        file = str(self.options.get("dataflow") or "/")
+        return not file.startswith("/") and not means_name(file)
 
     @property
     def most_seconds(self) -> float | None:

@@ -10,12 +10,13 @@ from dora_systemd.values import quoted
 ALL = "all"
 """As a host: all hosts of the hosts file."""
 
+_ADDRESS = r"[0-9A-Fa-f.]*(?::[0-9A-Fa-f.]*){2,}(?:%[A-Za-z0-9_.-]+)?"
 # No host or user begins with a dash: ssh would take it for an option.
 _HOST = re.compile(
     r"(?P<user>[A-Za-z0-9_][A-Za-z0-9_.+-]*@)?"
-    r"(?:(?P<address>[0-9A-Fa-f.]*(?::[0-9A-Fa-f.]*){2,}(?:%[A-Za-z0-9_.-]+)?)"
+    rf"(?:(?P<address>{_ADDRESS})"
     r"|(?:(?P<name>[A-Za-z0-9_][A-Za-z0-9_.-]*)"
-    r"|\[(?P<inner>[0-9A-Fa-f:.]+(?:%[A-Za-z0-9_.-]+)?)\])(?::(?P<port>[0-9]{1,5}))?)"
+    rf"|\[(?P<inner>{_ADDRESS})\])(?::(?P<port>[0-9]{{1,5}}))?)"
 )
 _MAX_LENGTH = 255
 _MAX_PORT = 65535

@@ -99,7 +99,8 @@ class Talk:
         status = self.connection.close()
         complaint = self._complaint if self.is_in else self._errors.noise
         words = (one.decode("utf-8", "replace") for one in (self._output.noise, complaint))
-        yield Ended(self.host, status, ending_error(self.host, status, self.is_in, *words))
+        error = self._refusal or ending_error(self.host, status, self.is_in, *words)
+        yield Ended(self.host, status, error)
 
     def refuse(self, error: DoraSystemdError) -> None:
         """Take no more of its answer."""
@@ -179,8 +180,8 @@ class Talks:
 
     def _ends(self, ended: Sequence[Talk]) -> Iterator[Event]:
         for one in ended:
-            self._live.remove(one)
             yield from one.end()
+            self._live.remove(one)
         now = time.monotonic()
         for one in [one for one in self._live if one.is_over(now)]:
             self._live.remove(one)
