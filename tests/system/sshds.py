@@ -49,10 +49,9 @@ class Servers:
         """Start a server there. more: lines of its configuration."""
         path = self.place / f"sshd-{address}"
         path.write_text(_SERVER.format(address=address, place=self.place, more=more))
-        log = (self.place / f"log-{address}").open("wb")
-        self._children.append(
-            subprocess.Popen(["/usr/sbin/sshd", "-D", "-e", "-f", str(path)], stderr=log)
-        )
+        command = ["/usr/sbin/sshd", "-D", "-e", "-f", str(path)]
+        with (self.place / f"log-{address}").open("wb") as log:
+            self._children.append(subprocess.Popen(command, stderr=log))
         listening = ["ss", "-Hltn", f"src {address}:22"]
         wait_for("sshd", lambda: run(*listening).stdout)
 
