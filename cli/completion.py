@@ -159,7 +159,7 @@ class CompletingGroup(VerbGroup):
 
 def complete(instruction: str) -> int:
     """Print completions for `instruction`: bash_complete, zsh_complete or fish_complete."""
-    group = CompletingGroup("doractl", params=doractl.params)
+    group = CompletingGroup("doractl", params=_typed(doractl.params))
     with suppress(DoraSystemdError):
         return shell_complete(group, {}, "doractl", VARIABLE, instruction)
     return ExitCode.USAGE
@@ -168,12 +168,17 @@ def complete(instruction: str) -> int:
 def _completing(command: click.Command) -> click.Command:
     """A copy with the types above, which would refuse values that the verb takes."""
     command = copy(command)
-    command.params = list(map(copy, command.params))
-    for param in command.params:
-        param.type = TYPES.get(param.name or "", param.type)
+    command.params = _typed(command.params)
     if isinstance(command, click.Group):
         command.commands = {name: _completing(one) for name, one in command.commands.items()}
     return command
+
+
+def _typed(params: Iterable[click.Parameter]) -> list[click.Parameter]:
+    copies = list(map(copy, params))
+    for param in copies:
+        param.type = TYPES.get(param.name or "", param.type)
+    return copies
 
 
 def _bus() -> Bus:

@@ -2,6 +2,7 @@
 
 import signal
 import sys
+from codecs import IncrementalDecoder, getincrementaldecoder
 from types import FrameType
 
 from dora_systemd.adapters.ssh.program import run_on_terminal
@@ -18,6 +19,9 @@ from dora_systemd.decisions.remote.hosts import Host
 from dora_systemd.errors import ExitCode
 from dora_systemd.terminal_text import shown_log
 from dora_systemd.verbs.remote.talk import Ended, Said, Talks
+
+_SIGNALS = 128
+"""The exit status of a program that a signal has ended is above."""
 
 
 def is_terminal() -> bool:
@@ -44,22 +48,24 @@ def pass_through(host: Host, plan: Plan) -> int:
     """
     talks = Talks([host], plan.way, plan.words, plan.most_seconds)
     status: int = ExitCode.OK
-    with ending_by_interrupt(talks, plan):
+    # A character may be in two pieces.
+    decoders = {one: getincrementaldecoder("utf-8")("backslashreplace") for one in (False, True)}
+    with ending_by_interrupt(talks, plan) as interrupt:
         for event in talks.events():
             if isinstance(event, Said):
-                _pass(event)
+                _pass(event, decoders[event.is_error])
             elif isinstance(event, Ended):
                 if event.error:
                     raise event.error
                 status = event.status
-    return status
+    return ExitCode.INTERRUPTED if interrupt.was_interrupted and status > _SIGNALS else status
 
 
-def _pass(said: Said) -> None:
+def _pass(said: Said, decoder: IncrementalDecoder) -> None:
     if said.is_error:
-        print(said.data.decode("utf-8", "replace"), end="", file=sys.stderr)
+        print(decoder.decode(said.data), end="", file=sys.stderr)
     elif sys.stdout.isatty():
-        write_own(sys.stdout, shown_log(said.data).decode())
+        write_own(sys.stdout, shown_log(decoder.decode(said.data).encode()).decode())
         sys.stdout.flush()
     else:
         sys.stdout.flush()
