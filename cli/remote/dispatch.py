@@ -20,7 +20,7 @@ from dora_systemd.verbs.remote.hosts import find_hosts
 
 def run_elsewhere(arguments: list[str]) -> int:
     """Run a command line that may have -H; its exit status. Raises DoraSystemdError."""
-    given, words = part_hosts(arguments, _valued_options)
+    given, words = part_hosts(arguments, valued_options)
     if not given:
         return run_verb(words)
     hosts = given_words(given)
@@ -62,7 +62,7 @@ def _with_callback(command: click.Command, run: Any) -> click.Command:
     return command
 
 
-def _valued_options(verb: str) -> Set[str]:
+def valued_options(verb: str) -> Set[str]:
     """The options of a verb that have a value."""
     command = doractl.get_command(click.Context(doractl), verb)
     members = getattr(command, "commands", {}).values()

@@ -31,9 +31,9 @@ class TablePrinter(Whole):
         text = self.take(host).strip()
         if error or not text:
             return None
-        rows = [row_of(one) for one in objects_of(text, host.text) or [{}]]
-        known = [row for row in rows if row]
-        if len(known) < len(rows):
+        found = objects_of(text, host.text)
+        known = [row for row in map(row_of, found or ()) if row]
+        if found is None or len(known) < len(found):
             return invalid(host)
         self._found[host.text] = known
         return None

@@ -16,7 +16,7 @@ _HINTS = (
     ("timed out", "check that the host is on, and that the network leads to it"),
     ("No route to host", "check that the host is on, and that the network leads to it"),
 )
-_INSTALL = "install dora-systemd there, or link doractl to /usr/local/bin: ssh has its own PATH"
+_INSTALL = "install dora-systemd there, or link it into /usr/local/bin: ssh has a PATH of its own"
 
 
 def unreached(host: Host, words: str) -> DoraSystemdError:

@@ -11,7 +11,7 @@ import pytest
 
 from dora_systemd.cli import main
 from dora_systemd.cli.group import VERBS, doractl
-from dora_systemd.cli.remote.dispatch import _valued_options
+from dora_systemd.cli.remote.dispatch import valued_options
 from dora_systemd.errors import ExitCode
 from dora_systemd.verbs.remote import talk
 from tests.unit.fakes.programs import make_program
@@ -88,6 +88,16 @@ def test_objects(capsys: Printed) -> None:
     problem = json.loads(err)
     assert list(problem) == ["schema", "host", "error"]
     assert (problem["host"], problem["error"]["exit_status"]) == ("dead", ExitCode.NO_HOST)
+
+
+def test_hosts_without_a_dataflow(capsys: Printed) -> None:
+    make_program(Path(os.environ["PATH"].partition(":")[0]) / "doractl", "echo '[]'")
+    assert main.run(["list", "-H", "h1,h2"]) == 0
+    assert capsys.readouterr() == ("No dataflow is running.\n", "")
+    assert main.run(["list", "-H", "h1,dead", "--all"]) == ExitCode.NO_HOST
+    out, err = capsys.readouterr()
+    assert [line.split()[0] for line in out.splitlines()] == ["HOST", "dead"]
+    assert len(err.splitlines()) == 2
 
 
 def test_merged_logs(capsys: Printed) -> None:
@@ -183,7 +193,7 @@ def test_no_verb_takes_a_host_itself() -> None:
 @pytest.mark.parametrize("verb", VERBS)
 def test_options_with_a_value(verb: str) -> None:
     """As click counts words."""
-    valued = _valued_options(verb)
+    valued = valued_options(verb)
     assert {"-H", "--host"} <= valued
     assert not {"--user", "--all", "--force", "-b", "--boot"} & valued
 
