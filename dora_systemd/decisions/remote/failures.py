@@ -1,11 +1,17 @@
 """Why a host did not do what was asked: ssh's own words, and what to do. Pure."""
 
+import re
+
 from dora_systemd.decisions.remote.command import NO_PROGRAM
 from dora_systemd.decisions.remote.hosts import Host
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.terminal_text import short_line, without_sequences
 
 SSH_FAILED = 255
+_OF_SSH = re.compile(
+    rb"(?:Connection to \S+ closed by remote host\.|Timeout, server \S+ not responding\."
+    rb"|client_loop: [^\n]*)\r?\n"
+)
 _MOST = 200
 _HINTS = (
     ("HAS CHANGED", "if the host was installed again: ssh-keygen -R {name}, then ssh {text}"),
@@ -66,6 +72,11 @@ def invalid(host: Host) -> DoraSystemdError:
 def too_much(host: Host) -> DoraSystemdError:
     """The error of a host whose answer is larger than any."""
     return _error(f"the answer of {host.text} is too large", "ask for less")
+
+
+def is_of_ssh(data: bytes) -> bool:
+    """Whether ssh has said this, of a connection that is lost: then the error repeats it."""
+    return _OF_SSH.fullmatch(data) is not None
 
 
 def _error(message: str, hint: str) -> DoraSystemdError:

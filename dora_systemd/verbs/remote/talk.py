@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from dora_systemd.adapters.ssh.connection import Connection
 from dora_systemd.decisions.remote.command import Way, remote_command, ssh_arguments
-from dora_systemd.decisions.remote.failures import ending_error, silent
+from dora_systemd.decisions.remote.failures import ending_error, is_of_ssh, silent
 from dora_systemd.decisions.remote.hosts import Host
 from dora_systemd.decisions.remote.stream import AfterMark
 from dora_systemd.errors import DoraSystemdError
@@ -89,6 +89,7 @@ class Talk:
             self._deadline = time.monotonic() + most
         if is_error:
             self._complaint = (self._complaint + shown)[-_COMPLAINT:]
+            shown = b"" if is_of_ssh(shown) else shown
         return [Said(self.host, shown, is_error)] if shown else []
 
     def end(self) -> Iterator[Said | Ended]:

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dora_systemd.decisions.remote.failures import ending_error, last_line
+from dora_systemd.decisions.remote.failures import ending_error, is_of_ssh, last_line
 from dora_systemd.decisions.remote.hosts import Host
 from dora_systemd.decisions.remote.merge import MOST_HELD, WINDOW_SECONDS, Merge
 from dora_systemd.decisions.remote.stream import MAX_LINE, AfterMark, Lines, objects_of, with_host
@@ -93,6 +93,12 @@ def test_how_a_talk_ends(
     error = ending_error(A, status, is_in, said, complaint)
     assert (error and error.message) == message
     assert error is None or (error.code is ExitCode.NO_HOST and error.hint)
+
+
+def test_what_ssh_says_is_not_repeated() -> None:
+    assert is_of_ssh(b"Connection to 10.0.0.1 closed by remote host.\r\n")
+    assert is_of_ssh(b"client_loop: send disconnect: Broken pipe\r\n")
+    assert not is_of_ssh(b"doractl: Connection to 10.0.0.1 closed by remote host.\n")
 
 
 def test_words_of_a_host_are_one_line() -> None:
