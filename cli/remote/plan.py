@@ -8,7 +8,6 @@ import click
 from dora_systemd.decisions.remote.command import Way
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.verbs.remote.talk import ANSWER_SECONDS
-from dora_systemd.verbs.start.again import means_name
 
 _REFUSED = {
     "env": "its variables lead to 127.0.0.1 there; use doractl -H HOST dora NAME -- ARGUMENT...",
@@ -19,6 +18,7 @@ _ONE_HOST = {
     "dora": "use one host for each command",
 }
 """Verbs that belong to one terminal."""
+_FILES = (".yml", ".yaml", ".json")
 _FOLLOWING = ("is_follow", "until_end", "want_logs")
 """Options by which a verb goes on until somebody ends it."""
 
@@ -51,9 +51,9 @@ class Plan(NamedTuple):
 
     @property
     def has_relative_file(self) -> bool:
-        """Whether it starts a FILE that is not an absolute path."""
+        """Whether it starts a FILE that is not an absolute path; only the host knows its files."""
         file = str(self.options.get("dataflow") or "/")
-        return not file.startswith("/") and not means_name(file)
+        return not file.startswith("/") and ("/" in file or file.endswith(_FILES))
 
     @property
     def most_seconds(self) -> float | None:

@@ -11,7 +11,7 @@ from dora_systemd.cli.remote.printers import (
     LinePrinter,
     Printer,
 )
-from dora_systemd.cli.remote.single import ending_by_interrupt
+from dora_systemd.cli.remote.single import Interrupts
 from dora_systemd.cli.remote.tables import TablePrinter
 from dora_systemd.decisions.remote.hosts import Host
 from dora_systemd.decisions.remote.words import with_output
@@ -28,7 +28,7 @@ def run_on_all(hosts: Sequence[Host], plan: Plan) -> int:
     talks = Talks(hosts, plan.way, words, plan.most_seconds, is_full)
     complaints = Complaints(plan.wants_json)
     statuses: list[int] = []
-    with ending_by_interrupt(talks, plan) as interrupt:
+    with Interrupts(talks, plan) as interrupt:
         for event in talks.events():
             if isinstance(event, Said):
                 _take(talks, printer, complaints, event)

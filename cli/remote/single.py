@@ -50,7 +50,7 @@ def pass_through(host: Host, plan: Plan) -> int:
     status: int = ExitCode.OK
     # A character may be in two pieces.
     decoders = {one: getincrementaldecoder("utf-8")("backslashreplace") for one in (False, True)}
-    with ending_by_interrupt(talks, plan) as interrupt:
+    with Interrupts(talks, plan) as interrupt:
         for event in talks.events():
             if isinstance(event, Said):
                 _pass(event, decoders[event.is_error])
@@ -73,7 +73,7 @@ def _pass(said: Said, decoder: IncrementalDecoder) -> None:
         sys.stdout.buffer.flush()
 
 
-class ending_by_interrupt:
+class Interrupts:
     """During the block, a first Ctrl+C ends what follows over there, and a second one this."""
 
     def __init__(self, talks: Talks, plan: Plan) -> None:
@@ -81,7 +81,7 @@ class ending_by_interrupt:
         self._is_gentle = plan.way is Way.FOLLOWING
         self.was_interrupted = False
 
-    def __enter__(self) -> "ending_by_interrupt":
+    def __enter__(self) -> "Interrupts":
         self._before = signal.signal(signal.SIGINT, self._interrupt)
         return self
 
