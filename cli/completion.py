@@ -5,6 +5,7 @@ https://click.palletsprojects.com/shell-completion. This code must not print or 
 user is in the middle of a command line.
 """
 
+import os
 import pwd
 from collections.abc import Callable, Iterable
 from contextlib import suppress
@@ -17,7 +18,7 @@ from click.shell_completion import CompletionItem, shell_complete
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.cli.group import VERBS, VerbGroup, doractl
-from dora_systemd.cli.parameters import current_scope
+from dora_systemd.cli.parameters import current_scope, is_elsewhere
 from dora_systemd.decisions.cell.hot_reload import REPLACE_WORDS
 from dora_systemd.decisions.cell.restarts import POLICIES
 from dora_systemd.decisions.properties.sandbox import LEVELS, NETWORKS
@@ -65,6 +66,8 @@ def dataflow_names(ctx: click.Context, incomplete: str) -> list[str]:
     """The dataflows of systemd, for some verbs of the journal; UUIDs if the word looks like one."""
     from dora_systemd.verbs.facts.cells import read_cells
 
+    if is_elsewhere():
+        return []
     verb = ctx.command.name or ""
     cells = [cell for cell in read_cells(_bus()) if cell.is_up or verb not in _RUNNING_ONLY]
     names = [cell.name for cell in cells] + (
@@ -81,12 +84,24 @@ def user_names(_ctx: click.Context, _incomplete: str) -> list[str]:
     return [one.pw_name for one in pwd.getpwall()]
 
 
+def host_names(_ctx: click.Context, incomplete: str) -> list[str]:
+    """All hosts of the hosts file, each behind what stands before the last comma."""
+    from dora_systemd.verbs.remote.hosts import listed_hosts
+
+    before, comma, _ = incomplete.rpartition(",")
+    given = before.split(",")
+    words = ["all", *(host.text for host in listed_hosts(os.environ))]
+    return [f"{before}{comma}{one}" for one in words if one not in given]
+
+
 def node_names(ctx: click.Context, incomplete: str) -> list[str]:
     """The nodes of the dataflow that is on the command line."""
     from dora_systemd.verbs.facts.list import dataflow_row
     from dora_systemd.verbs.facts.selector import Selector
 
     del incomplete
+    if is_elsewhere():
+        return []
     # After an option without its value, click leaves the arguments in ctx.args.
     if ctx.command.name == "logs":
         journal, given = JournalReader(), ctx.params.get("selectors") or ctx.args
@@ -114,6 +129,7 @@ TYPES: dict[str, Any] = {
     "env_file": click.File(),
     "device": click.File(),
     "user": Live(user_names),
+    "host": Live(host_names),
     "restart_policy": click.Choice(POLICIES),
     "replace": click.Choice(REPLACE_WORDS),
     "venv": click.Path(file_okay=False),
@@ -143,7 +159,7 @@ class CompletingGroup(VerbGroup):
 
 def complete(instruction: str) -> int:
     """Print completions for `instruction`: bash_complete, zsh_complete or fish_complete."""
-    group = CompletingGroup("doractl", params=doractl.params)
+    group = CompletingGroup("doractl", params=_typed(doractl.params))
     with suppress(DoraSystemdError):
         return shell_complete(group, {}, "doractl", VARIABLE, instruction)
     return ExitCode.USAGE
@@ -152,12 +168,17 @@ def complete(instruction: str) -> int:
 def _completing(command: click.Command) -> click.Command:
     """A copy with the types above, which would refuse values that the verb takes."""
     command = copy(command)
-    command.params = list(map(copy, command.params))
-    for param in command.params:
-        param.type = TYPES.get(param.name or "", param.type)
+    command.params = _typed(command.params)
     if isinstance(command, click.Group):
         command.commands = {name: _completing(one) for name, one in command.commands.items()}
     return command
+
+
+def _typed(params: Iterable[click.Parameter]) -> list[click.Parameter]:
+    copies = list(map(copy, params))
+    for param in copies:
+        param.type = TYPES.get(param.name or "", param.type)
+    return copies
 
 
 def _bus() -> Bus:

@@ -130,12 +130,12 @@ def doractl(ctx: click.Context) -> None:
         click.echo(ctx.get_help())
 
 
-def run_verb(arguments: list[str]) -> int:
+def run_verb(arguments: list[str], group: click.Group = doractl) -> int:
     """Run a command line; its exit status. Raises DoraSystemdError for a wrong one, too."""
     if arguments[:1] == ["help"]:
         arguments = [*arguments[1:2], "--help"]
     try:
-        result = doractl.main(arguments, prog_name="doractl", standalone_mode=False)
+        result = group.main(arguments, prog_name="doractl", standalone_mode=False)
     except click.ClickException as error:
         raise _usage_error(error) from error
     except click.Abort:

@@ -5,6 +5,7 @@ import gc
 import os
 import sys
 from contextlib import suppress
+from importlib import import_module
 from typing import NoReturn
 
 from dora_systemd import __version__
@@ -98,7 +99,17 @@ def _dispatch(arguments: list[str]) -> int:
             return print_dataflows(request)
     from dora_systemd.cli.group import run_verb
 
+    if may_name_hosts(arguments):
+        # As a verb: by its name, because it is above this module.
+        elsewhere = import_module("dora_systemd.cli.remote.dispatch")
+        status: int = elsewhere.run_elsewhere(arguments)
+        return status
     return run_verb(arguments)
+
+
+def may_name_hosts(words: list[str]) -> bool:
+    """Whether a command line may have -H: others need nothing of what follows from it."""
+    return any(word[:1] == "-" and ("H" in word or word.startswith("--host")) for word in words)
 
 
 if __name__ == "__main__":

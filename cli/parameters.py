@@ -17,6 +17,7 @@ T = TypeVar("T")
 
 _SCOPE_KEY = "dora_systemd.is_user"
 _OUTPUT_KEY = "dora_systemd.output"
+_HOST_KEY = "dora_systemd.host"
 
 
 def _remember(ctx: click.Context, param: click.Parameter, value: bool | None) -> None:
@@ -25,7 +26,7 @@ def _remember(ctx: click.Context, param: click.Parameter, value: bool | None) ->
         ctx.meta[_SCOPE_KEY] = value
 
 
-scope_options = click.option(
+_scope_option = click.option(
     # Its own name, because one of the settings is called "user".
     "--user/--system",
     "wants_user",
@@ -34,7 +35,35 @@ scope_options = click.option(
     callback=_remember,
     help="Dataflows of the calling user (default unless root), or of the system.",
 )
-"""`--system` and `--user`, before or after the verb; the last one counts."""
+
+
+def _refuse_host(ctx: click.Context, param: click.Parameter, value: Sequence[str]) -> None:
+    """cli/remote/ takes -H out of a command line: a verb that gets it would act on this machine."""
+    if value and not ctx.resilient_parsing:
+        raise click.UsageError(f"cannot use {param.opts[0]} here", ctx)
+    if value:
+        ctx.meta[_HOST_KEY] = True
+
+
+_host_option = click.option(
+    "-H",
+    "--host",
+    metavar="HOST,...",
+    multiple=True,
+    expose_value=False,
+    callback=_refuse_host,
+    help="Do it on these hosts, by ssh: [user@]HOST, or all of the hosts file.",
+)
+
+
+def scope_options(command: C) -> C:
+    """`--system`, `--user` and -H, before or after the verb; the last scope counts."""
+    return _scope_option(_host_option(command))
+
+
+def is_elsewhere() -> bool:
+    """Whether the command line that is being completed has -H."""
+    return bool(click.get_current_context().meta.get(_HOST_KEY))
 
 
 def _output_option(is_exposed: bool) -> Callable[[C], C]:

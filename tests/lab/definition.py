@@ -18,7 +18,8 @@ PACKAGES = [
     "python3-pydantic", "python3-click", "python3-yaml", "python3-watchfiles",
     "python3-websockets", "python3-pathspec", "bash-completion",
     "ca-certificates", "curl", "fish", "git", "iproute2", "kmod", "less", "lsof", "make", "man-db",
-    "mandoc", "psmisc", "procps", "socat", "strace", "tmux", "udev", "zsh",
+    "mandoc", "openssh-client", "openssh-server", "psmisc", "procps", "socat",
+    "strace", "tmux", "udev", "zsh",
 ]  # fmt: skip
 
 PYPI = [

@@ -36,6 +36,6 @@ systemctl mask \
     ldconfig.service systemd-binfmt.service systemd-firstboot.service \
     systemd-hwdb-update.service systemd-journal-catalog-update.service \
     systemd-modules-load.service systemd-networkd.service systemd-pstore.service \
-    systemd-random-seed.service systemd-timesyncd.service systemd-update-done.service
+    ssh.service ssh.socket systemd-random-seed.service systemd-timesyncd.service systemd-update-done.service
 journalctl --update-catalog
 touch /etc/.updated /var/.updated

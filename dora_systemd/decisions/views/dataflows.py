@@ -12,6 +12,8 @@ STOPPING, RESTARTING = "Stopping", "Restarting"
 FINISHED, STOPPED, FAILED = "Finished", "Stopped", "Failed"
 SILENT = "Silent"
 """A node that runs, and sends no output that it owes."""
+UNREACHABLE = "Unreachable"
+"""In the place of a status: that of a host from which no answer came."""
 UP_WORDS = frozenset({STARTING, RUNNING, DEGRADED, STOPPING, RESTARTING})
 
 _BY_ACTIVE = {
@@ -188,7 +190,10 @@ _OPTIONAL = (
 )
 """Columns that a narrow terminal does without, in this order."""
 _LEAST = 12
-_ROOM = {"NAME": _LEAST, "NODE": _LEAST, "WHY": 24, "EXIT": _LEAST, "STATUS TEXT": 24}
+_ROOM = {
+    **dict.fromkeys(("HOST", "NAME", "NODE", "EXIT"), _LEAST),
+    **dict.fromkeys(("WHY", "STATUS TEXT"), 24),
+}
 """Columns whose cells may be cut to _LEAST, and the width for which other columns are left out."""
 _RIGHT_ALIGNED = frozenset(
     {"CPU%", "THROTTLED%", "MEM", "PEAK", "RESTARTS", "PID", "UPTIME", "WATCHDOG"}
@@ -196,7 +201,7 @@ _RIGHT_ALIGNED = frozenset(
 _ANSI = {"red": "\x1b[31m", "yellow": "\x1b[33m"}
 _UNDERLINED, _PLAIN = "\x1b[4m", "\x1b[0m"
 STATE_COLORS = {
-    FAILED: "red",
+    **dict.fromkeys((FAILED, UNREACHABLE), "red"),
     **dict.fromkeys((STARTING, DEGRADED, STOPPING, RESTARTING, SILENT, "Reloading"), "yellow"),
 }
 """By the word for a state, as in systemctl(1); others have none."""
@@ -268,10 +273,14 @@ def format_dataflows(
 
     With ENDED and WHY if any of them has ended.
     """
+    return format_table(*dataflow_table(rows), width, want_colors)
+
+
+def dataflow_table(rows: Sequence[DataflowRow]) -> tuple[Sequence[str], list[Sequence[str]]]:
+    """The header of that table, and the cells of each row."""
     prefixes = shortest_prefixes([row.uuid for row in rows])
     header = _HEADER if all(map(is_up_word, rows)) else (*_HEADER, "ENDED", "WHY")
-    cells = [_dataflow_cells(row, prefixes[row.uuid])[: len(header)] for row in rows]
-    return format_table(header, cells, width, want_colors)
+    return header, [_dataflow_cells(row, prefixes[row.uuid])[: len(header)] for row in rows]
 
 
 def _dataflow_cells(row: DataflowRow, prefix: str) -> tuple[str, ...]:

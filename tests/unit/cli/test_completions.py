@@ -77,6 +77,28 @@ def test_words(words: str, answer: list[str], complete: Complete) -> None:
     assert complete(words) == answer
 
 
+def test_hosts(complete: Complete, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    hosts = tmp_path / "dora-systemd/hosts"
+    hosts.parent.mkdir()
+    hosts.write_text("base\nalice@arm\n")
+    assert complete("doractl -H ") == ["plain,all", "plain,base", "plain,alice@arm"]
+    assert complete("doractl list --host base,a") == ["plain,base,all", "plain,base,alice@arm"]
+    hosts.write_text("-oX\n")
+    assert complete("doractl -H ") == []
+
+
+def test_dataflows_of_this_machine_are_not_there(
+    complete: Complete, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail() -> None:
+        raise AssertionError("the names are those of this machine")
+
+    monkeypatch.setattr(completion, "_bus", fail)
+    for words in ("-H base stop ", "stop -H base ", "logs --host=base --node "):
+        assert complete(f"doractl {words}") == []
+
+
 def test_start_takes_a_file_or_what_has_ended(
     complete: Complete, monkeypatch: pytest.MonkeyPatch
 ) -> None:

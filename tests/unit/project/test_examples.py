@@ -14,6 +14,8 @@ import click
 import pytest
 
 from dora_systemd.cli.group import VERBS, doractl
+from dora_systemd.cli.remote.dispatch import valued_options
+from dora_systemd.decisions.remote.words import part_hosts
 from dora_systemd.errors import DoraSystemdError
 from tests.system.typed import typed_lines
 from tests.unit.checkout import CHECKOUT
@@ -51,7 +53,7 @@ def problem(arguments: Sequence[str], is_part: bool = False) -> str:
     """What click says about a command line; a part of one may lack arguments."""
     try:
         with redirect_stdout(StringIO()):
-            parse(doractl, "doractl", list(arguments), None)
+            parse(doractl, "doractl", part_hosts(arguments, valued_options).words, None)
     except DoraSystemdError as error:
         return error.message
     except click.MissingParameter as error:

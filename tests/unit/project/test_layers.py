@@ -260,6 +260,7 @@ STARTS_PROGRAMS = {
     "trust.programs": "for others",
     "adapters.dora.engine": "dora's, in a cell",
     "adapters.journal.journalctl": "journalctl",
+    "adapters.ssh.program": "ssh, as the caller",
     "verbs.node": "dora, as the caller",
     "verbs.inhibit.hold": "what the caller has typed, as the caller",
     "cli.verbs.look.logs": "the caller's own pager",

@@ -23,7 +23,7 @@ from tests.unit.tools import require
 
 MAN = CHECKOUT / "packaging/man"
 PAGES = sorted(MAN.iterdir())
-COMMON = {"--system", "--user", "-h", "--help"}
+COMMON = {"--system", "--user", "-H", "--host", "-h", "--help"}
 
 
 def sections(page: str) -> dict[str, str]:
@@ -36,7 +36,7 @@ def sections(page: str) -> dict[str, str]:
 def documented_options(source: str) -> set[str]:
     """What stands behind Fl in the items of a list."""
     items = re.findall(r"^\.It (Fl .+)$", source, flags=re.M)
-    return {f"-{flag}" for item in items for flag in re.findall(r"Fl (-?[a-z][a-z-]*)", item)}
+    return {f"-{flag}" for item in items for flag in re.findall(r"Fl (-?[a-zA-Z][a-z-]*)", item)}
 
 
 def declared_options(command: click.Command) -> set[str]:

@@ -46,8 +46,9 @@ _TABLE = {
         trust.eyes trust.locks trust.paths trust.programs trust.sight trust.sockets trust.terminals
     """,
     OWN: """
-        adapters.dora.preparation adapters.host.files cli.main cli.verbs.look.logs
-        decisions.cell.launch verbs.inhibit.hold verbs.start.credentials verbs.start.limits
+        adapters.dora.preparation adapters.host.files adapters.ssh.program cli.main
+        cli.verbs.look.logs decisions.cell.launch verbs.inhibit.hold verbs.start.credentials
+        verbs.start.limits
     """,
     KERNEL: """
         adapters.cgroup.groups adapters.host.lock_table adapters.host.machine

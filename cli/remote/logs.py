@@ -1,0 +1,116 @@
+"""`doractl logs` of several hosts: one stream, in the order of time, with the host in front."""
+
+import json
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from dora_systemd.cli.colors import wants_colors
+from dora_systemd.cli.edge import write_own
+from dora_systemd.cli.remote.plan import Plan
+from dora_systemd.decisions.logs.fields import ExportReader
+from dora_systemd.decisions.logs.terminal import TerminalLines
+from dora_systemd.decisions.remote.failures import too_much
+from dora_systemd.decisions.remote.hosts import Host
+from dora_systemd.decisions.remote.merge import Merge
+from dora_systemd.decisions.remote.stream import Lines, read_json, with_host
+from dora_systemd.decisions.remote.words import with_output
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.terminal_text import shown_log
+
+FORMS = {"short": "export", "cat": "export", "json": "json"}
+"""By the output that was asked for, the output that the hosts are asked for."""
+_MOST_BYTES = 64 << 20
+"""Of one record that is not complete."""
+_TIME = "__REALTIME_TIMESTAMP"
+
+
+def words_of_logs(plan: Plan) -> list[str]:
+    """What each host is asked for. Raises DoraSystemdError (USAGE)."""
+    form = str(plan.options["output"])
+    if form not in FORMS:
+        hint = f"-o {' or -o '.join(FORMS)}"
+        raise DoraSystemdError(f"cannot merge -o {form} of several hosts", hint, ExitCode.USAGE)
+    return with_output([*plan.words], FORMS[form])
+
+
+class _Records:
+    """The records of one host, from its output. Each has its time and what is printed of it."""
+
+    def __init__(self) -> None:
+        self.pending = 0
+        self._reader = ExportReader()
+        self._lines = Lines()
+
+    def exported(self, data: bytes) -> list[dict[str, bytes]]:
+        found = self._reader.feed(data)
+        self.pending = 0 if found else self.pending + len(data)
+        return found
+
+    def objects(self, data: bytes) -> Iterator[dict[str, Any]]:
+        for line in self._lines.feed(data):
+            if isinstance(value := read_json(line), dict):
+                yield value
+
+
+class LogPrinter:
+    """Merges the records. is_complete of Talks decides when the first ones may be printed."""
+
+    def __init__(self, hosts: Sequence[Host], options: Mapping[str, Any]) -> None:
+        self._form = str(options["output"])
+        is_follow = bool(options["is_follow"] or options["until_end"])
+        names = [one.text for one in hosts]
+        self.merge = Merge(names, is_follow, bool(options["is_reverse"]))
+        self._records = {one: _Records() for one in hosts}
+        self._width = max(map(len, names))
+        is_one = len(options["selectors"]) == 1
+        has_colors = wants_colors(sys.stdout)
+        self._terminal = TerminalLines(want_dataflow=not is_one, want_colors=has_colors)
+        self._is_complete = False
+
+    def said(self, host: Host, data: bytes) -> DoraSystemdError | None:
+        """Take records."""
+        records, now = self._records[host], time.monotonic()
+        if self._form == "json":
+            for value in records.objects(data):
+                line = json.dumps(with_host(value, host.text)).encode() + b"\n"
+                self.merge.add(host.text, _time(value.get(_TIME)), line, now)
+            return None
+        for record in records.exported(data):
+            self.merge.add(host.text, _time(record.get(_TIME)), self._line(host, record), now)
+        return too_much(host) if records.pending > _MOST_BYTES else None
+
+    def ended(self, host: Host, error: DoraSystemdError | None) -> DoraSystemdError | None:
+        """No more of this host."""
+        del error
+        self.merge.end(host.text)
+        return None
+
+    def look(self, is_complete: bool) -> None:
+        """Print what is due. is_complete: every host was reached or given up."""
+        self._is_complete |= is_complete
+        if self.merge.is_empty:
+            return
+        held = self.merge.take(time.monotonic(), self._is_complete)
+        if text := b"".join(one.data for one in held):
+            write_own(sys.stdout, text.decode("utf-8", "backslashreplace"))
+            sys.stdout.flush()
+
+    def finish(self) -> None:
+        """Print the rest."""
+        self.look(is_complete=True)
+
+    def _line(self, host: Host, record: Mapping[str, bytes]) -> bytes:
+        cat = shown_log(record.get("MESSAGE", b"")) + b"\n"
+        text = cat if self._form == "cat" else self._terminal.record(record)
+        start = f"{host.text:<{self._width}} ".encode()
+        return b"".join(start + line + b"\n" for line in text[:-1].split(b"\n"))
+
+
+def _time(value: object) -> int:
+    """A time of the journal as µs; 0 for what is none."""
+    try:
+        return int(value) if isinstance(value, str | bytes) else 0
+    except ValueError:
+        return 0

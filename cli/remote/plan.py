@@ -1,0 +1,100 @@
+"""How a verb runs on other hosts: what it needs there, and where it makes no sense."""
+
+import sys
+from typing import Any, NamedTuple
+
+import click
+
+from dora_systemd.decisions.remote.command import Way
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.verbs.remote.talk import ANSWER_SECONDS
+
+_REFUSED = {
+    "env": "its variables lead to 127.0.0.1 there; use doractl -H HOST dora NAME -- ARGUMENT...",
+}
+"""Verbs whose output means nothing on another host, and what to do instead."""
+_ONE_HOST = {
+    "run": "use start, or one host for each run",
+    "dora": "use one host for each command",
+}
+"""Verbs that belong to one terminal."""
+_FILES = (".yml", ".yaml", ".json")
+_FOLLOWING = ("is_follow", "until_end", "want_logs")
+"""Options by which a verb goes on until somebody ends it."""
+
+
+class Plan(NamedTuple):
+    """A command for other hosts.
+
+    verb: as typed, such as "node restart". acts: it prints an outcome in each line. is_endless:
+    somebody has to end it. options: by name, as click reads them.
+    """
+
+    verb: str
+    words: list[str]
+    options: dict[str, Any]
+    acts: bool
+    wants_json: bool
+    is_endless: bool
+
+    @property
+    def way(self) -> Way:
+        """How it runs over there, without a terminal."""
+        if self.verb == "dora" and not sys.stdin.isatty():
+            return Way.FED
+        return Way.FOLLOWING if self.is_endless else Way.ONCE
+
+    @property
+    def has_lines(self) -> bool:
+        """Whether what it prints is complete after each line."""
+        return self.acts or self.is_endless
+
+    @property
+    def has_relative_file(self) -> bool:
+        """Whether it starts a FILE that is not an absolute path; only the host knows its files."""
+        file = str(self.options.get("dataflow") or "/")
+        return not file.startswith("/") and ("/" in file or file.endswith(_FILES))
+
+    @property
+    def most_seconds(self) -> float | None:
+        """The bound of its answer: what only looks is quick."""
+        return None if self.has_lines or self.verb in ("logs", "dora") else ANSWER_SECONDS
+
+
+def plan_of(context: click.Context, words: list[str]) -> Plan:
+    """The plan of a command line that click has accepted."""
+    verb = _verb(context)
+    options = dict(context.params)
+    wants_json = _value(context, "output") == "json"
+    endless = any(options.get(name) for name in _FOLLOWING) or verb in ("run", "dora")
+    endless |= verb == "top" and wants_json and not options.get("is_once")
+    return Plan(verb, words, options, _acts(context), wants_json, endless)
+
+
+def _verb(context: click.Context) -> str:
+    names: list[str] = []
+    at: click.Context | None = context
+    while at and at.parent:
+        names.insert(0, at.command.name or "")
+        at = at.parent
+    return " ".join(names)
+
+
+def _acts(context: click.Context) -> bool:
+    """Whether it has the options of a verb that does something, see acting_options()."""
+    return any(one.name == "output" and not one.expose_value for one in context.command.params)
+
+
+def _value(context: click.Context, name: str) -> object:
+    return context.params.get(name) or context.meta.get(f"dora_systemd.{name}")
+
+
+def check_hosts(plan: Plan, count: int) -> None:
+    """Raise DoraSystemdError (USAGE) for a verb that makes no sense on that many hosts."""
+    hint = _REFUSED.get(plan.verb, "")
+    if hint:
+        raise DoraSystemdError(f"cannot use {plan.verb} with -H", hint, ExitCode.USAGE)
+    hint = _ONE_HOST.get(plan.verb, "") if count > 1 else ""
+    hint = "leave --attach out" if count > 1 and plan.options.get("want_logs") else hint
+    if hint:
+        raise DoraSystemdError(f"cannot {plan.verb} on several hosts", hint, ExitCode.USAGE)

@@ -1,0 +1,84 @@
+"""A verb on several hosts at the same time."""
+
+from collections.abc import Sequence
+
+from dora_systemd.cli.remote.logs import LogPrinter, words_of_logs
+from dora_systemd.cli.remote.plan import Plan
+from dora_systemd.cli.remote.printers import (
+    BlockPrinter,
+    Complaints,
+    JsonPrinter,
+    LinePrinter,
+    Printer,
+)
+from dora_systemd.cli.remote.single import Interrupts
+from dora_systemd.cli.remote.tables import TablePrinter
+from dora_systemd.decisions.remote.hosts import Host
+from dora_systemd.decisions.remote.words import with_output
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.verbs.facts.selector import is_pattern
+from dora_systemd.verbs.remote.talk import Ended, Said, Talks
+
+
+def run_on_all(hosts: Sequence[Host], plan: Plan) -> int:
+    """Run the verb on all hosts; the highest exit status."""
+    words, printer = _printer(hosts, plan)
+    logs = printer if isinstance(printer, LogPrinter) else None
+    is_full = logs.merge.is_full if logs else lambda _host: False
+    talks = Talks(hosts, plan.way, words, plan.most_seconds, is_full)
+    complaints = Complaints(plan.wants_json)
+    statuses: list[int] = []
+    with Interrupts(talks, plan) as interrupt:
+        for event in talks.events():
+            if isinstance(event, Said):
+                _take(talks, printer, complaints, event)
+            elif isinstance(event, Ended):
+                statuses.append(_end(printer, complaints, event))
+            elif logs:
+                logs.look(talks.is_complete)
+    printer.finish()
+    if interrupt.was_interrupted:
+        return ExitCode.INTERRUPTED
+    return _worst(statuses, has_grep=bool(logs and plan.options.get("grep")))
+
+
+def _printer(hosts: Sequence[Host], plan: Plan) -> tuple[list[str], Printer]:
+    """What the hosts are asked for, and what prints their answers."""
+    if plan.verb == "logs":
+        return words_of_logs(plan), LogPrinter(hosts, plan.options)
+    if plan.verb == "list" and not plan.wants_json:
+        if plan.options["is_quiet"]:
+            return plan.words, LinePrinter(wants_json=False)
+        selector = plan.options["selector"]
+        if selector is None or is_pattern(selector):
+            nothing = "No dataflow." if _is_wide(plan) else "No dataflow is running."
+            table = TablePrinter(hosts, plan.options["sort_by"], nothing)
+            return with_output(plan.words, "json"), table
+    if plan.has_lines and not plan.options.get("dry_run"):
+        return plan.words, LinePrinter(plan.wants_json)
+    return plan.words, JsonPrinter(hosts) if plan.wants_json else BlockPrinter(hosts)
+
+
+def _is_wide(plan: Plan) -> bool:
+    """Whether `list` looks for more than what runs."""
+    return any(plan.options[name] for name in ("want_all", "last", "status", "pattern", "sort_by"))
+
+
+def _take(talks: Talks, printer: Printer, complaints: Complaints, said: Said) -> None:
+    if said.is_error:
+        complaints.said(said.host, said.data)
+    elif error := printer.said(said.host, said.data):
+        talks.give_up(said.host, error)
+
+
+def _end(printer: Printer, complaints: Complaints, ended: Ended) -> int:
+    error: DoraSystemdError | None = printer.ended(ended.host, ended.error)
+    error = ended.error or error
+    complaints.ended(ended.host, error)
+    return error.code if error else ended.status
+
+
+def _worst(statuses: Sequence[int], has_grep: bool) -> int:
+    """The highest; a pattern need not match on all hosts."""
+    worst = max(statuses, default=int(ExitCode.OK))
+    return min(statuses) if has_grep and worst == ExitCode.FAILURE else worst

@@ -1,0 +1,51 @@
+"""An ssh in the background: what comes from it, without waiting, and its end."""
+
+import os
+import subprocess
+from collections.abc import Sequence
+from contextlib import suppress
+
+from dora_systemd.adapters.ssh.program import read_now, start_ssh
+
+
+class Connection:
+    """A running ssh whose output is read when it is there.
+
+    is_fed: it reads our standard input; else its input is empty, and stays open until hang_up().
+    """
+
+    def __init__(self, arguments: Sequence[str], is_fed: bool = False) -> None:
+        # In a process group of its own: Ctrl+C is for doractl, which then says what ends.
+        self._child = start_ssh(
+            arguments,
+            stdin=None if is_fed else subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            process_group=0,
+        )
+        assert self._child.stdout and self._child.stderr
+        self.output = self._child.stdout.fileno()
+        self.errors = self._child.stderr.fileno()
+        for fd in (self.output, self.errors):
+            os.set_blocking(fd, False)
+        self.ended = os.pidfd_open(self._child.pid)
+
+    def read(self, fd: int) -> bytes | None:
+        """As read_now()."""
+        return read_now(fd)
+
+    def hang_up(self) -> None:
+        """End the input: what follows over there then ends, and says its last words."""
+        if self._child.stdin:
+            with suppress(OSError):
+                self._child.stdin.close()
+
+    def close(self) -> int:
+        """End it, if it has not ended; its exit status, negative for a signal."""
+        self._child.kill()
+        with self._child:
+            status = self._child.wait()
+        if self.ended >= 0:
+            os.close(self.ended)
+            self.ended = -1
+        return status

@@ -1,0 +1,46 @@
+"""Starts ssh(1), as the caller and with the caller's keys and configuration."""
+
+import os
+import subprocess
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Any
+
+from dora_systemd.errors import DoraSystemdError, ExitCode
+
+
+def start_ssh(arguments: Sequence[str], **streams: Any) -> "subprocess.Popen[bytes]":
+    """A running ssh. streams: as for subprocess.Popen().
+
+    Raises DoraSystemdError (NO_HOST) if there is no ssh.
+    """
+    try:
+        return subprocess.Popen(["ssh", *arguments], **streams)
+    except OSError as error:
+        message = f"cannot execute ssh: {error.strerror}"
+        raise DoraSystemdError(message, "apt install openssh-client", ExitCode.NO_HOST) from error
+
+
+def read_now(fd: int, size: int = 1 << 16) -> bytes | None:
+    """What can be read without waiting; b"" at the end, None if there is nothing now."""
+    with suppress(BlockingIOError):
+        return os.read(fd, size)
+    return None
+
+
+def run_on_terminal(arguments: Sequence[str]) -> tuple[int, str]:
+    """Run ssh on the terminal of this process; its exit status, and what it has said itself.
+
+    What the host says comes by standard output, because it has a terminal there.
+    """
+    read, write = os.pipe()
+    os.set_blocking(read, False)
+    try:
+        with start_ssh(arguments, stderr=write) as child:
+            status = child.wait()
+        # Not to the end of the file: a connection that is shared, ControlPersist in ssh_config(5),
+        # goes on and keeps it open.
+        return status, (read_now(read) or b"").decode("utf-8", "replace")
+    finally:
+        os.close(read)
+        os.close(write)

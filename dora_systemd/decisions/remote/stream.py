@@ -1,0 +1,70 @@
+"""What comes from a host: bytes after the mark, lines of them, objects with the host. Pure."""
+
+import json
+from typing import Any
+
+_NOISE = 4096
+MAX_LINE = 1 << 20
+"""A line that is longer is taken as several: no host can fill our memory."""
+
+
+class AfterMark:
+    """Drops what a login shell prints before doractl does. noise: the last bytes of that."""
+
+    def __init__(self, mark: str) -> None:
+        self._mark = f"{mark}\n".encode()
+        self.noise = b""
+        self.is_open = False
+
+    def feed(self, data: bytes) -> bytes:
+        """What comes after the mark."""
+        if self.is_open:
+            return data
+        before, mark, after = (self.noise + data).partition(self._mark)
+        self.is_open = bool(mark)
+        self.noise = before[-_NOISE:]
+        return after
+
+
+class Lines:
+    """Splits a stream into lines without their ends."""
+
+    def __init__(self) -> None:
+        self._rest = b""
+
+    def feed(self, data: bytes) -> list[str]:
+        """The lines that `data` completes."""
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        if len(self._rest) > MAX_LINE:
+            lines.append(self._rest)
+            self._rest = b""
+        return [line.decode("utf-8", "replace") for line in lines]
+
+    def flush(self) -> list[str]:
+        """The last line, if it has no end."""
+        rest, self._rest = self._rest, b""
+        return [rest.decode("utf-8", "replace")] if rest else []
+
+
+def read_json(text: str) -> Any:
+    """The value in a text; None if it is not JSON."""
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        return None
+
+
+def with_host(value: dict[str, Any], host: str) -> dict[str, Any]:
+    """An object of -o json with the host that it comes from."""
+    schema = {"schema": value["schema"]} if "schema" in value else {}
+    rest = {key: one for key, one in value.items() if key not in ("schema", "host")}
+    return {**schema, "host": host, **rest}
+
+
+def objects_of(text: str, host: str) -> list[dict[str, Any]] | None:
+    """The object in a text, or those of a list, with their host; None if there are none."""
+    value = read_json(text)
+    found = value if isinstance(value, list) else [value]
+    if not all(isinstance(one, dict) for one in found):
+        return None
+    return [with_host(one, host) for one in found]

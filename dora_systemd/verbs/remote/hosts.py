@@ -1,0 +1,57 @@
+"""The hosts that -H means: those of the command line, or of a hosts file."""
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from dora_systemd.adapters.host.files import decoded
+from dora_systemd.decisions.remote.hosts import ALL, Host, parse_host, parse_hosts_file
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.trust.files import read_file
+from dora_systemd.trust.paths import exists
+
+SYSTEM_HOSTS = Path("/etc/dora-systemd/hosts")
+USER_HOSTS = Path("dora-systemd/hosts")
+
+
+def find_hosts(words: Sequence[str], environment: Mapping[str, str]) -> list[Host]:
+    """The hosts that these words mean, each once. Raises DoraSystemdError."""
+    found: dict[Host, None] = {}
+    for word in words:
+        found |= dict.fromkeys(listed_hosts(environment) if word == ALL else [parse_host(word)])
+    return list(found)
+
+
+def listed_hosts(environment: Mapping[str, str]) -> list[Host]:
+    """The hosts of the user's hosts file, or of the system's if the user has none.
+
+    Raises DoraSystemdError (BAD_INPUT) if there is no host.
+    """
+    places = host_files(environment)
+    for path in filter(exists, places):
+        if hosts := parse_hosts_file(_read(path), str(path)):
+            return hosts
+        raise _no_host(f"{path} names no host", path)
+    raise _no_host(f"there is no {' and no '.join(map(str, places))}", places[0])
+
+
+def host_files(environment: Mapping[str, str]) -> list[Path]:
+    """The files that may list hosts; the first that exists counts."""
+    home = environment.get("HOME", "")
+    config = environment.get("XDG_CONFIG_HOME", "") or (f"{home}/.config" if home else "")
+    return [*([Path(config) / USER_HOSTS] if config.startswith("/") else []), SYSTEM_HOSTS]
+
+
+def _read(path: Path) -> str:
+    """Its text. Root logs in where only root has said so."""
+    text = read_file(path)
+    if os.geteuid() == 0 and (text.place.uid != 0 or text.place.borrowed):
+        reason = text.place.borrowed or "the file is not root's"
+        hint = f"name the hosts on the command line, or list them in {SYSTEM_HOSTS}"
+        raise DoraSystemdError(f"cannot use {path}: {reason}", hint, ExitCode.NO_PERMISSION)
+    return decoded(text.data, path)
+
+
+def _no_host(reason: str, path: Path) -> DoraSystemdError:
+    hint = f"write one [user@]HOST[:PORT] in each line of {path}"
+    return DoraSystemdError(f"cannot use all hosts: {reason}", hint, ExitCode.BAD_INPUT)

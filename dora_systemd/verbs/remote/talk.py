@@ -1,0 +1,189 @@
+"""Runs doractl on hosts by ssh, at the same time: what they say, and how each one ends.
+
+No host can hold up the others, or this process: a login, an answer and an idle connection have
+their bounds.
+"""
+
+import os
+import select
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
+
+from dora_systemd.adapters.ssh.connection import Connection
+from dora_systemd.decisions.remote.command import Way, remote_command, ssh_arguments
+from dora_systemd.decisions.remote.failures import ending_error, is_of_ssh, silent
+from dora_systemd.decisions.remote.hosts import Host
+from dora_systemd.decisions.remote.stream import AfterMark
+from dora_systemd.errors import DoraSystemdError
+
+LOGINS = 8
+"""At the same time: sshd drops connections if more than ten have not logged in, MaxStartups in
+sshd_config(5)."""
+LOGIN_SECONDS = 15.0
+ANSWER_SECONDS = 90.0
+"""For verbs that only look; each of them has shorter bounds of its own."""
+_TURN_SECONDS = 0.2
+_COMPLAINT = 4096
+
+
+class Said(NamedTuple):
+    """Bytes that doractl has written on a host."""
+
+    host: Host
+    data: bytes
+    is_error: bool
+
+
+class Ended(NamedTuple):
+    """The end of doractl on a host. error: why it was not reached, or is lost."""
+
+    host: Host
+    status: int
+    error: DoraSystemdError | None
+
+
+Event = Said | Ended | None
+"""None: nothing has happened for a moment."""
+
+
+class Talk:
+    """The doractl of one host. most_seconds: for its answer, after the login; None: any time."""
+
+    def __init__(
+        self, host: Host, way: Way, words: Sequence[str], most_seconds: float | None
+    ) -> None:
+        mark = f"doractl-{os.urandom(16).hex()}"
+        arguments = ssh_arguments(host, way, remote_command(way, words, mark))
+        self.host = host
+        self.connection = Connection(arguments, is_fed=way is Way.FED)
+        self._most = most_seconds
+        self._deadline = time.monotonic() + LOGIN_SECONDS
+        self._output, self._errors = AfterMark(mark), AfterMark(mark)
+        self._complaint = b""
+        self._refusal: DoraSystemdError | None = None
+        self._at_end = set[int]()
+
+    @property
+    def is_in(self) -> bool:
+        """Whether doractl has begun over there."""
+        return self._output.is_open
+
+    def open_fds(self, is_full: bool) -> set[int]:
+        """What poll(2) has to look at. is_full: its output can wait."""
+        connection = self.connection
+        wanted = {connection.errors, connection.ended, *(() if is_full else (connection.output,))}
+        return wanted - self._at_end
+
+    def take(self, fd: int) -> list[Said] | None:
+        """What `fd` has to say now; None if there is nothing to read."""
+        data = self.connection.read(fd)
+        if not data:
+            self._at_end |= {fd} if data is not None else set()
+            return None
+        is_error, was_in = fd == self.connection.errors, self.is_in
+        shown = (self._errors if is_error else self._output).feed(data)
+        if self.is_in and not was_in:
+            most = float("inf") if self._most is None else self._most
+            self._deadline = time.monotonic() + most
+        if is_error:
+            self._complaint = (self._complaint + shown)[-_COMPLAINT:]
+            shown = b"" if is_of_ssh(shown) else shown
+        return [Said(self.host, shown, is_error)] if shown else []
+
+    def end(self) -> Iterator[Said | Ended]:
+        """What is left, after the end of ssh."""
+        for fd in (self.connection.output, self.connection.errors):
+            while fd not in self._at_end and (said := self.take(fd)) is not None:
+                yield from said
+        status = self.connection.close()
+        complaint = self._complaint if self.is_in else self._errors.noise
+        words = (one.decode("utf-8", "replace") for one in (self._output.noise, complaint))
+        error = self._refusal or ending_error(self.host, status, self.is_in, *words)
+        yield Ended(self.host, status, error)
+
+    def refuse(self, error: DoraSystemdError) -> None:
+        """Take no more of its answer."""
+        self._refusal = error
+
+    def is_over(self, now: float) -> bool:
+        """Whether a bound is reached."""
+        return self._refusal is not None or now > self._deadline
+
+    def give_up(self) -> Ended:
+        """End a talk that has reached a bound."""
+        status = self.connection.close()
+        if self._refusal:
+            return Ended(self.host, status, self._refusal)
+        what = ("no answer", self._most) if self.is_in else ("no login", LOGIN_SECONDS)
+        return Ended(self.host, status, silent(self.host, what[1] or 0, what[0]))
+
+
+class Talks:
+    """The talks with several hosts. is_full: whether the output of a host can wait."""
+
+    def __init__(
+        self,
+        hosts: Sequence[Host],
+        way: Way,
+        words: Sequence[str],
+        most_seconds: float | None = None,
+        is_full: Callable[[str], bool] = lambda _host: False,
+    ) -> None:
+        self._waiting = deque(hosts)
+        self._how = way, words, most_seconds
+        self._is_full = is_full
+        self._live: list[Talk] = []
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether every host was reached or given up."""
+        return not self._waiting and all(one.is_in for one in self._live)
+
+    def hang_up(self) -> None:
+        """End what follows, and let it say its last words."""
+        self._waiting.clear()
+        for one in self._live:
+            one.connection.hang_up()
+
+    def give_up(self, host: Host, error: DoraSystemdError) -> None:
+        """End the talk with a host, with this error."""
+        for one in self._live:
+            if one.host == host:
+                one.refuse(error)
+
+    def events(self) -> Iterator[Event]:
+        """What happens, until all have ended. Raises DoraSystemdError if there is no ssh."""
+        try:
+            while self._waiting or self._live:
+                self._admit()
+                yield from self._turn()
+        finally:
+            for one in self._live:
+                one.connection.close()
+
+    def _admit(self) -> None:
+        while self._waiting and sum(not one.is_in for one in self._live) < LOGINS:
+            self._live.append(Talk(self._waiting.popleft(), *self._how))
+
+    def _turn(self) -> Iterator[Event]:
+        talks = {fd: one for one in self._live for fd in one.open_fds(self._is_full(one.host.text))}
+        poll = select.poll()
+        for fd in talks:
+            poll.register(fd, select.POLLIN)
+        ready = [fd for fd, _ in poll.poll(_TURN_SECONDS * 1000)]
+        for fd in ready:
+            if fd != talks[fd].connection.ended:
+                yield from talks[fd].take(fd) or ()
+        yield from self._ends([one for one in self._live if one.connection.ended in ready])
+        yield None
+
+    def _ends(self, ended: Sequence[Talk]) -> Iterator[Event]:
+        for one in ended:
+            yield from one.end()
+            self._live.remove(one)
+        now = time.monotonic()
+        for one in [one for one in self._live if one.is_over(now)]:
+            self._live.remove(one)
+            yield one.give_up()
