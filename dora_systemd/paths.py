@@ -47,6 +47,10 @@ class CellPaths:
         """The position up to which dora's log file of `node` is in the journal."""
         return self.io / f"{node}.place"
 
+    def node_gate(self, node: str) -> Path:
+        """The FIFO that the launcher of `node` waits at, if the node has needs."""
+        return self.io / f"{node}.gate"
+
     def node_pid(self, node: str) -> Path:
         """The file where the launcher of `node` first writes its pid."""
         return self.io / f"{node}.pid"

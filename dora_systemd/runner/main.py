@@ -35,8 +35,8 @@ from dora_systemd.decisions.descriptor.wiring import downstream_of
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.life.refusal import format_refusal, refusal_exit
-from dora_systemd.decisions.life.states import Cell, RunnerExit, State
-from dora_systemd.decisions.life.view import initial_nodes
+from dora_systemd.decisions.life.states import Cell, RunnerExit
+from dora_systemd.decisions.life.view import has_started, initial_nodes
 from dora_systemd.decisions.logs.lines import Origin
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import settings_path
@@ -49,6 +49,7 @@ from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.cell.failure import Beside, words
 from dora_systemd.runner.cell.pause import forget_restarts, hold_back
 from dora_systemd.runner.cell.pump import Pump, now_us
+from dora_systemd.runner.needs.needs import wait_for_needs
 from dora_systemd.runner.nodes.losses import LossWatch, losses_of_user
 from dora_systemd.runner.nodes.nodes import Nodes, wait_eof
 from dora_systemd.runner.reload.apply import Run
@@ -194,6 +195,7 @@ async def run_once(runs: Runs, is_again: bool) -> Cell:
         dialogue.watch(coordinator, dialogue.read_coordinator)
         run = Run(pump, runs.nodes, runs.pipes, Swapper(pump, dora))
         reloader.begin(run, prepared, started_us * 1000)
+        wait_for_needs(run, options, reloader.definition, dialogue.spawn)
         dialogue.spawn("tell that it has started", tell_started(pump, reloader))
         runs.beside.attach(pump.push)
         try:
@@ -219,7 +221,7 @@ def prepare_first(runs: Runs, options: RunnerOptions) -> Prepared:
 
 async def tell_started(pump: Pump, reloader: Reloader) -> None:
     """Tell the reloader when all nodes run: from then on the run is not a trial any more."""
-    if await pump.wait(lambda cell: cell.state is State.RUNNING, None):
+    if await pump.wait(has_started, None):
         reloader.has_started()
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from dora_systemd.adapters.dora.command import run_dora
 from dora_systemd.adapters.host import files
 from dora_systemd.decisions.cell.hot_reload import check_reload_nodes
-from dora_systemd.decisions.cell.launch import LaunchPlan, launch_descriptor
+from dora_systemd.decisions.cell.launch import LaunchPlan, is_launched, launch_descriptor
 from dora_systemd.decisions.cell.limits import check_nodes
 from dora_systemd.decisions.cell.line_rates import check_rates
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -22,6 +22,7 @@ from dora_systemd.decisions.descriptor.build_session import (
 from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
 from dora_systemd.decisions.descriptor.nodes import UNEXPANDED, NodeKind
 from dora_systemd.decisions.dora.errors import parse_dora_error
+from dora_systemd.decisions.needs.words import check_needs
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.programs import own_account
 from dora_systemd.trust.sight import Sight
@@ -70,6 +71,7 @@ def check_named_nodes(options: RunnerOptions, dataflow: Dataflow) -> None:
     ids = [node.id for node in dataflow.nodes]
     check_rates(options.log_rates, ids)
     check_reload_nodes(options.reload, ids)
+    check_needs(options.needs, {node.id: is_launched(node) for node in dataflow.nodes})
 
 
 def _check_limited(options: RunnerOptions, dataflow: Dataflow) -> None:

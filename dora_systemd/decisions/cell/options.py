@@ -20,6 +20,7 @@ from dora_systemd.decisions.cell.restarts import (
     parse_node_policy,
     parse_policy,
 )
+from dora_systemd.decisions.needs.words import NodeNeed, parse_node_need
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import parse_name, parse_uuid
 from dora_systemd.values import (
@@ -59,6 +60,7 @@ class RunnerOptions(NamedTuple):
     node_restarts: policies of single nodes.
     start_timeout: µs for all nodes to become ready, or INFINITY.
     reload: files that cause a reload, and how nodes are replaced.
+    needs: the paths that single nodes wait for.
     """
 
     name: str
@@ -80,6 +82,7 @@ class RunnerOptions(NamedTuple):
     node_restarts: tuple[tuple[str, RestartPolicy], ...] = ()
     start_timeout: int = INFINITY
     reload: HotReload = DEFAULT_RELOAD
+    needs: tuple[NodeNeed, ...] = ()
 
     def __hash__(self) -> int:
         return hash(self.uuid)
@@ -144,6 +147,7 @@ _OPTIONS = (
     Option("log-rate-limit", "log_rates", parse_rates, format_rates, is_repeated=True),
     _each("node-limit", "node_limits", parse_node_limits, format_node_limits),
     _each("node-restart", "node_restarts", parse_node_policy, format_node_policy),
+    _each("needs", "needs", parse_node_need, "=".join),
     _each("watch", "reload.watch"),
     _each("ignore", "reload.ignore"),
     _each("node-watch", "reload.node_watch", parse_of_node, "=".join),

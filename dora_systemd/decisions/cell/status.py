@@ -10,9 +10,12 @@ from dora_systemd.names import is_node_id
 
 Value = TypeVar("Value")
 
-STAGES = ("starting", "restarting", "waiting", "running", "degraded", "stopping", "ended")
+UNMET = "unmet"
+"""Stage of a dataflow with a node that waits for what it needs."""
+STAGES = ("starting", "restarting", "waiting", UNMET, "running", "degraded", "stopping", "ended")
 NODE_STATES = (
     "starting",
+    "waiting",
     "ready",
     "running",
     "restarting",
@@ -26,6 +29,8 @@ FAILED_BECAUSE = "failed: "
 """Prefix of STATUS= for the reason why a dataflow failed."""
 HELD = "held"
 """Policy of a node that waits for a reload after it has failed."""
+LATCHED = "latched"
+"""Policy of a node without restarts that dora starts once more, only to give it up."""
 ALIVE_NODE_STATES = frozenset({"ready", "running", "dynamic"})
 WHOLE_CELL = ""
 """The key of a CPU sample for the unit's whole cgroup."""
@@ -49,8 +54,9 @@ class NodeStatus(NamedTuple):
     state: one of NODE_STATES. pid: 0 if no process is known. restarts: number of restarts by dora
     in this run. since_us: CLOCK_REALTIME µs of the last change of state. exit: how its last process
     ended. kind: how dora starts it (python, executable, shell, uv, operator, ros2, dynamic, url).
-    policy: dora's restart policy, "never" if it has none, or HELD. max_restarts: in one window, 0
-    without limit. hung: the message of dora's health check before it ended the process, or "".
+    policy: dora's restart policy, "never" if it has none, HELD or LATCHED. max_restarts: in one
+    window, 0 without limit. hung: the message of dora's health check before it ended the process,
+    or "". needs: what it waits for, or "".
     """
 
     state: str = "starting"
@@ -62,6 +68,7 @@ class NodeStatus(NamedTuple):
     policy: str = "never"
     max_restarts: int = 0
     hung: str = ""
+    needs: str = ""
 
     @property
     def is_alive(self) -> bool:
@@ -224,6 +231,7 @@ def _parse_node(raw: Any) -> NodeStatus:
         policy=_text(known, "policy", "never"),
         max_restarts=_number(known, "max_restarts"),
         hung=_text(known, "hung"),
+        needs=_text(known, "needs"),
     )
 
 

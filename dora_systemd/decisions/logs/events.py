@@ -54,6 +54,12 @@ EVENTS = {
     "cpu-throttled": _dataflow(
         "1c40798a51c14a89a416ed625e0afc1a", NOTICE, "is throttled by a CPU limit"
     ),
+    "node-waiting": EventKind(
+        "620e56b40d464810bebfe137b63a04d0", NOTICE, "Node {node} waits for what it needs"
+    ),
+    "node-needs-met": EventKind(
+        "6850a7771eb341d2a6c6b88f29b11c48", NOTICE, "Node {node} has what it needs"
+    ),
     "node-hung": EventKind("6bb24464fee34a848c077fc1b20c1802", ERR, "Node {node} hangs"),
     "coordinator-lost": EventKind(
         "11b7330be3fb484584286f274012f05a", ERR, "The coordinator of dataflow {dataflow} is lost"

@@ -66,6 +66,7 @@ class Setting(Generic[T]):
     property: the systemd property with the same value, as in a unit file, or "".
     root_only: the setting makes root read, run or grant something. In system scope it is only valid
     in a settings file that root alone can have written.
+    roots_words: the same for single values: beginnings of those that only root may give.
     """
 
     name: str
@@ -78,6 +79,7 @@ class Setting(Generic[T]):
     per_node: bool = False
     property: str = ""
     root_only: bool = False
+    roots_words: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         word = self.name.replace("_", "-")

@@ -8,9 +8,11 @@ from dora_systemd.decisions.cell.limits import BY_KEY, NodeLimits, merge_node_li
 from dora_systemd.decisions.cell.line_rates import RateLimits, merge_rates
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.restarts import DEFAULT, RestartPolicy, with_values
+from dora_systemd.decisions.needs.words import split_needs
 from dora_systemd.decisions.reload.watch_rules import relative_patterns
 from dora_systemd.decisions.settings.kinds import Setting
 from dora_systemd.decisions.settings.limits import NODE_LIMIT
+from dora_systemd.decisions.settings.needs import NEEDS
 from dora_systemd.decisions.settings.reload import HOT_RELOAD, IGNORE, REPLACE, WATCH
 from dora_systemd.decisions.settings.resolve import Settings
 from dora_systemd.decisions.settings.restarts import POLICY_SETTINGS, RESTART_POLICY, START_TIMEOUT
@@ -42,6 +44,7 @@ def with_settings(options: RunnerOptions, settings: Settings) -> RunnerOptions:
         restart=restart_policy(settings),
         node_restarts=node_policies(settings),
         start_timeout=settings[START_TIMEOUT],
+        needs=split_needs(settings[NEEDS], settings.by_node(NEEDS))[1],
         reload=hot_reload(settings, options.working_directory),
     )
 

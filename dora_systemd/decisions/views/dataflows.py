@@ -4,13 +4,14 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+from dora_systemd.decisions.cell.status import UNMET
 from dora_systemd.terminal_text import cut, one_line
 from dora_systemd.values import SECOND, format_rounded_size
 
-STARTING, RUNNING, DEGRADED = "Starting", "Running", "Degraded"
+STARTING, WAITING, RUNNING, DEGRADED = "Starting", "Waiting", "Running", "Degraded"
 STOPPING, RESTARTING = "Stopping", "Restarting"
 FINISHED, STOPPED, FAILED = "Finished", "Stopped", "Failed"
-UP_WORDS = frozenset({STARTING, RUNNING, DEGRADED, STOPPING, RESTARTING})
+UP_WORDS = frozenset({STARTING, WAITING, RUNNING, DEGRADED, STOPPING, RESTARTING})
 
 _BY_ACTIVE = {
     "active": RUNNING,
@@ -22,7 +23,7 @@ _BY_ACTIVE = {
     "failed": FAILED,
     "inactive": STOPPED,
 }
-_BY_STAGE = {"degraded": DEGRADED, "stopping": STOPPING}
+_BY_STAGE = {"degraded": DEGRADED, UNMET: WAITING, "stopping": STOPPING}
 
 UNKNOWN = "-"
 UNREADABLE = "?"
@@ -35,7 +36,7 @@ class NodeRow(NamedTuple):
 
     cpu_limit, memory_limit: the group's own, or None. throttled: the percentage of the time in
     which its CPU limit throttled it, None without one. since: time of its last change of state,
-    CLOCK_REALTIME µs, 0: unknown.
+    CLOCK_REALTIME µs, 0: unknown. needs: what it waits for, or "".
     """
 
     node: str
@@ -51,6 +52,7 @@ class NodeRow(NamedTuple):
     memory_limit: int | None = None
     throttled: float | None = None
     since: int = 0
+    needs: str = ""
 
 
 class DataflowRow(NamedTuple):
@@ -153,7 +155,7 @@ _ANSI = {"red": "\x1b[31m", "yellow": "\x1b[33m"}
 _UNDERLINED, _PLAIN = "\x1b[4m", "\x1b[0m"
 STATE_COLORS = {
     FAILED: "red",
-    **dict.fromkeys((STARTING, DEGRADED, STOPPING, RESTARTING, "Reloading"), "yellow"),
+    **dict.fromkeys((STARTING, WAITING, DEGRADED, STOPPING, RESTARTING, "Reloading"), "yellow"),
 }
 """By the word for a state, as in systemctl(1); others have none."""
 

@@ -71,6 +71,7 @@ def _node_object(row: NodeRow, shares: Shares | None) -> dict[str, Any]:
         "state": row.state,
         "pid": row.pid or None,
         "exit": row.exit or None,
+        "waits_for": row.needs or None,
         **moment("since", row.since),
         **_usage(row, shares),
         "restarts": row.restarts,

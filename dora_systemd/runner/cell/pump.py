@@ -28,7 +28,7 @@ from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.life.failures import ENGINE_TIMEOUT
 from dora_systemd.decisions.life.states import Action, Cell, Deadline, Do, Record, RunnerExit, State
 from dora_systemd.decisions.life.table import step
-from dora_systemd.decisions.life.view import cell_status, format_status
+from dora_systemd.decisions.life.view import cell_status, format_status, has_started
 from dora_systemd.decisions.logs.events import END_EVENTS
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
@@ -187,7 +187,7 @@ class Pump:
             notify.send_status(text)
         # The table comes first: a client that waited for READY=1 may read it at once.
         self._write_table()
-        if self.cell.state is State.RUNNING and not self._is_ready:
+        if not self._is_ready and has_started(self.cell):
             self._is_ready = True
             notify.send_ready()
 

@@ -22,8 +22,11 @@ from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.descriptor.nodes import Node, NodeKind
 from dora_systemd.decisions.resources.oom import Oom
 from dora_systemd.paths import CellPaths
+from dora_systemd.runner.needs.gate import Gates
 from dora_systemd.runner.nodes.hold import Hold
 from dora_systemd.runner.nodes.resources import Resources
+
+_GONE_SECONDS = 0.05
 
 
 class Nodes:
@@ -38,6 +41,7 @@ class Nodes:
         self._tails: dict[str, JsonlTail | None] = {}
         self._holds: dict[str, Hold] = {}
         self.resources = Resources(unit)
+        self.gates = Gates(paths)
 
     def prepare(self, dataflow: Dataflow, rates: RateLimits, limits: Iterable[NodeLimits]) -> None:
         """Create a group for every node, with its limits, and pipes for the nodes that use them.
@@ -129,6 +133,7 @@ class Nodes:
     def adopt(self, node: str, pid: int) -> None:
         """Dora has executed `node`: name its lines, and move it unless its launcher has done so."""
         self._pipes.set_pid(node, pid)
+        self.gates.refill(node)
         if node not in self._launched:
             for process in _with_descendants(pid):
                 with contextlib.suppress(OSError):  # the process may have exited already
@@ -147,7 +152,8 @@ class Nodes:
                 cgroup.kill_group(self._group(node))
 
     def let_go(self) -> None:
-        """The nodes are about to end: stop freezing them."""
+        """The nodes are about to end: stop freezing them, and end those that wait."""
+        self.gates.dismiss()
         for hold in self._holds.values():
             hold.end()
 
@@ -168,6 +174,11 @@ class Nodes:
         return any(
             pid in cgroup.pids(one) for one in (self._group(node), self._unit / cgroup.SUPERVISOR)
         )
+
+    async def wait_gone(self, node: str, pid: int) -> None:
+        """Wait until the process `pid` of the node has ended, which dora has told to end."""
+        while pid and self.has_process(node, pid):
+            await asyncio.sleep(_GONE_SECONDS)
 
     def find_oom(self, node: str) -> Oom | None:
         """How the kernel has just killed a process of `node` because of memory, or None."""

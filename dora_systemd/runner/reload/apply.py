@@ -1,7 +1,8 @@
 """Carries out one reload of single nodes step by step, and can undo it."""
 
+import asyncio
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import PurePath
 from typing import Any
 
@@ -23,12 +24,16 @@ _BACK = {How.ADD: How.REMOVE, How.REMOVE: How.ADD}
 
 @dataclass(frozen=True)
 class Run:
-    """The parts of one run of the dataflow that reloads use."""
+    """The parts of one run of the dataflow that reloads use.
+
+    lock: held while nodes are replaced.
+    """
 
     pump: Pump
     nodes: Nodes
     pipes: LogPipes
     swapper: Swapper
+    lock: asyncio.Lock = field(default_factory=asyncio.Lock)
 
 
 class Applier:
@@ -98,8 +103,11 @@ class Applier:
         elif step.how is How.REWIRE:
             await swapper.rewire(definition, kind)
         else:
+            old = self._run.pump.cell.nodes[step.node]
             starts_first = self._options.reload.starts_first(step.node)
             await swapper.swap(definition, kind, starts_first)
+            if old.needs:  # two launchers must not go on
+                await self._run.nodes.wait_gone(step.node, old.pid)
 
     def _tell(self, step: Step, seconds: float) -> None:
         file = self._relative(step.file)

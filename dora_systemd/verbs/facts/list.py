@@ -139,5 +139,6 @@ def _node_row(node: str, status: NodeStatus | None, numbers: dict[str, Any]) -> 
         "max_restarts": status.max_restarts or None,
         "exit": str(status.exit),
         "since": status.since_us,
+        "needs": status.needs,
     }
     return NodeRow(node, status.state, **facts, **numbers)  # type: ignore[arg-type]

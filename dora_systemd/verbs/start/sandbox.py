@@ -10,6 +10,7 @@ from dora_systemd.adapters.host.files import absolute_path
 from dora_systemd.decisions.cell.launch import python_of
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.uv import uv_project
+from dora_systemd.decisions.needs.devices import device_entries
 from dora_systemd.decisions.properties.sandbox import Sandbox, loose_paths, odd_paths, widened_paths
 from dora_systemd.decisions.settings.limits import DEVICE, REALTIME
 from dora_systemd.decisions.settings.resolve import Settings
@@ -51,7 +52,8 @@ def make_sandbox(
         network=settings[NETWORK],
         is_user=scope.is_user,
         is_root=user is not None and user.pw_uid == 0,
-        has_devices=bool(settings[DEVICE]) or _names(settings, "DeviceAllow"),
+        has_devices=bool(settings[DEVICE] or device_entries(options.needs))
+        or _names(settings, "DeviceAllow"),
         is_realtime=settings[REALTIME] is not None,
         # In a user namespace the given capabilities would have no effect.
         has_identity=_has_identity(user) and not _names(settings, *_CAPABILITIES),

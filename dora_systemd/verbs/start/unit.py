@@ -11,6 +11,7 @@ from dora_systemd.decisions.unit.properties import UnitContext, format_unit, uni
 from dora_systemd.decisions.unit.versions import MIN_VERSION, drop_unsupported
 from dora_systemd.verbs.start.credentials import credential_files
 from dora_systemd.verbs.start.limits import check_limits
+from dora_systemd.verbs.start.needs import check_needs, clock_service, needs_warnings
 from dora_systemd.verbs.start.plan import Plan
 from dora_systemd.verbs.start.sandbox import sandbox_warnings
 from dora_systemd.verbs.start.watch import watch_warnings
@@ -22,8 +23,14 @@ def plan_properties(plan: Plan, manager: Manager) -> tuple[dict[str, Property], 
     The warnings are about unsupported properties, and limits above the machine's size. Raises
     DoraSystemdError.
     """
+    check_needs(manager, plan)
     properties, warnings = drop_unsupported(_properties(plan), systemd_number(manager))
-    warnings = (*warnings, *idle_warnings(plan.settings), *watch_warnings(plan))
+    warnings = (
+        *warnings,
+        *idle_warnings(plan.settings),
+        *watch_warnings(plan),
+        *needs_warnings(plan),
+    )
     warnings = (*warnings, *sandbox_warnings(plan.sandbox))
     return properties, (*warnings, *check_limits(manager, plan, properties))
 
@@ -53,5 +60,6 @@ def _properties(plan: Plan) -> dict[str, Property]:
         environment=plan.environment,
         credentials=credential_files(plan.settings),
         sandbox=plan.sandbox,
+        clock=clock_service(),
     )
     return dict(unit_properties(plan.options, context, plan.settings))
