@@ -35,6 +35,7 @@ from dora_systemd.verbs.start.job import Started, format_started, start_unit
 from dora_systemd.verbs.start.launch import Claim, claim
 from dora_systemd.verbs.start.linger import ensure_linger
 from dora_systemd.verbs.start.logins import start_notes
+from dora_systemd.verbs.start.needs import waiting_notes
 from dora_systemd.verbs.start.plan import DEFAULT_FILE, StartRequest, make_plan
 from dora_systemd.verbs.start.unit import format_plan
 from dora_systemd.verbs.start.watch import watched_patterns
@@ -116,7 +117,7 @@ def command(
     with _last_words(bus, scope, options.uuid), StageLine(sys.stderr) as stage:
         started = start_unit(bus, scope, options, claimed.properties, stage, not no_wait)
     # Only after the start: a refusal must be one line and a hint.
-    print_warnings(notes)
+    print_warnings([*notes, *waiting_notes(bus, options)])
     return _print_started(started, options.dataflow, watched_patterns(claimed.plan))
 
 
@@ -142,6 +143,7 @@ def _start_known(bus: Bus, scope: Scope, cell: Cell, wait: bool) -> ExitCode:
     bus.reset_failed(cell.unit)
     with _last_words(bus, scope, cell.uuid), StageLine(sys.stderr) as stage:
         started = start_unit(bus, scope, cell.options, None, stage, wait)
+    print_warnings([*waiting_notes(bus, cell.options)])
     return _print_started(started, file, ())
 
 

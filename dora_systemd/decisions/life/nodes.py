@@ -19,10 +19,16 @@ WITH_PROCESS = frozenset({"starting", "waiting", "ready", "running"})
 
 def has_process(nodes: NodeTable) -> bool:
     """Whether dora has a process of any node, according to the events so far."""
-    return any(
-        node.state in WITH_PROCESS or (node.state == "reloading" and node.pid)
-        for node in nodes.values()
-    )
+    return bool(with_process(nodes))
+
+
+def with_process(nodes: NodeTable) -> list[str]:
+    """The nodes of which dora has a process, according to the events so far."""
+    return [
+        ident
+        for ident, node in nodes.items()
+        if node.state in WITH_PROCESS or (node.state == "reloading" and node.pid)
+    ]
 
 
 def all_ready(nodes: NodeTable, at_us: int) -> NodeTable:

@@ -9,6 +9,7 @@ from dora_systemd.decisions.cell.status import (
     HELD,
     LATCHED,
     UNMET,
+    WAITS,
     CellStatus,
     CpuSample,
     LineCount,
@@ -84,7 +85,7 @@ def _format_running(cell: Cell) -> str:
 def _format_lacking(cell: Cell) -> str:
     """As "camera waits for /dev/video0 since 14:02:11 UTC"."""
     texts = [
-        f"{ident} waits for {node.needs} since {_clock(node.since_us)}"
+        f"{ident}{WAITS}{node.needs} since {_clock(node.since_us)}"
         for ident, node in lacking(cell.nodes).items()
     ]
     return _names(texts)

@@ -152,8 +152,7 @@ class Nodes:
                 cgroup.kill_group(self._group(node))
 
     def let_go(self) -> None:
-        """The nodes are about to end: stop freezing them, and end those that wait."""
-        self.gates.dismiss()
+        """The nodes are about to end: stop freezing them."""
         for hold in self._holds.values():
             hold.end()
 

@@ -4,11 +4,13 @@ from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
 from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.status import WAITS
 from dora_systemd.decisions.needs.units import CLOCK_WAITERS, needed_mounts, required_units
 from dora_systemd.decisions.needs.words import CLOCK, DATAFLOW, MOUNT, NETWORK
 from dora_systemd.decisions.settings.needs import NEEDS
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.names import name_from_unit
+from dora_systemd.names import name_from_unit, unit_name
 from dora_systemd.values import shown
 from dora_systemd.verbs.start.plan import Plan
 
@@ -107,6 +109,14 @@ def needs_warnings(plan: Plan) -> Iterator[str]:
         for node, path in plan.options.needs:
             if path.startswith(_HIDDEN):
                 yield f"node {node} waits for {shown(path)}, but the sandbox has its own /tmp"
+
+
+def waiting_notes(manager: Manager, options: RunnerOptions) -> Iterator[str]:
+    """What a dataflow that has been started waits for, in the words of the runner."""
+    if options.needs:
+        text = str(manager.read(unit_name(options.name), ["StatusText"])["StatusText"])
+        if WAITS in text:
+            yield text
 
 
 def _refusal(plan: Plan, need: str, reason: str, hint: str) -> DoraSystemdError:

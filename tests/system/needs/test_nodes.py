@@ -1,12 +1,11 @@
 """Nodes that wait for a device, lose it and get it back, with real dora and systemd."""
 
-import os
 import time
 from pathlib import Path
 
 import pytest
 
-from tests.system.cells import Cell, Project, wait_for
+from tests.system.cells import Cell, Project
 from tests.system.needs.scene import fragile, node_of, seen, wait_running, wait_waiting, with_needs
 
 
@@ -51,9 +50,7 @@ def test_a_stop_ends_a_waiting_node_at_once(cell: Cell, project: Project, place:
 
 
 @pytest.mark.warns("driver crashed", "failed: driver")
-def test_a_driver_that_ends_by_itself_waits_too(
-    cell: Cell, project: Project, place: Path
-) -> None:
+def test_a_driver_that_ends_by_itself_waits_too(cell: Cell, project: Project, place: Path) -> None:
     device = place / "ttyUSB0"
     device.touch()
     cell.start(fragile(project, device))
