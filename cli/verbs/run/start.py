@@ -28,6 +28,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.selector import Selector
+from dora_systemd.verbs.needs.notes import waiting_notes
 from dora_systemd.verbs.start.again import find_start, means_name
 from dora_systemd.verbs.start.check import check_plan
 from dora_systemd.verbs.start.enable import boot_target
@@ -35,7 +36,6 @@ from dora_systemd.verbs.start.job import Started, format_started, start_unit
 from dora_systemd.verbs.start.launch import Claim, claim
 from dora_systemd.verbs.start.linger import ensure_linger
 from dora_systemd.verbs.start.logins import start_notes
-from dora_systemd.verbs.start.needs import waiting_notes
 from dora_systemd.verbs.start.plan import DEFAULT_FILE, StartRequest, make_plan
 from dora_systemd.verbs.start.unit import format_plan
 from dora_systemd.verbs.start.watch import watched_patterns

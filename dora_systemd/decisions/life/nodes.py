@@ -167,6 +167,7 @@ def _exited(nodes: NodeTable, event: life.NodeExited, is_stopping: bool) -> Upda
         pid=0,
         exit=event.exit,
         hung="",
+        needs="",
         restarts=old.restarts + int(event.will_restart and not is_stopping),
     )
     return nodes, record

@@ -2,7 +2,7 @@
 
 A thread looks at the paths, because a file system may hang. It looks when a directory on the way to
 one of them changes, and every _LOOK_SECONDS: not all file systems tell of changes. The decisions
-are in decisions/needs/steps.py, the gates in gate.py.
+are in decisions/needs/steps.py, the gates in runner/nodes/gate.py.
 """
 
 import asyncio

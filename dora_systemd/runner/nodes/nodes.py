@@ -22,7 +22,7 @@ from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.descriptor.nodes import Node, NodeKind
 from dora_systemd.decisions.resources.oom import Oom
 from dora_systemd.paths import CellPaths
-from dora_systemd.runner.needs.gate import Gates
+from dora_systemd.runner.nodes.gate import Gates
 from dora_systemd.runner.nodes.hold import Hold
 from dora_systemd.runner.nodes.resources import Resources
 

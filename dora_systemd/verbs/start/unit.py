@@ -5,13 +5,15 @@ import sys
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.dora.command import version_numbers
 from dora_systemd.decisions.properties.kinds import Property
+from dora_systemd.decisions.settings.needs import NEEDS
 from dora_systemd.decisions.settings.runner_options import idle_warnings
 from dora_systemd.decisions.unit.file import persistent_unit
 from dora_systemd.decisions.unit.properties import UnitContext, format_unit, unit_properties
 from dora_systemd.decisions.unit.versions import MIN_VERSION, drop_unsupported
+from dora_systemd.verbs.needs.check import Needy, check_needs
+from dora_systemd.verbs.needs.notes import clock_service, needs_warnings
 from dora_systemd.verbs.start.credentials import credential_files
 from dora_systemd.verbs.start.limits import check_limits
-from dora_systemd.verbs.start.needs import check_needs, clock_service, needs_warnings
 from dora_systemd.verbs.start.plan import Plan
 from dora_systemd.verbs.start.sandbox import sandbox_warnings
 from dora_systemd.verbs.start.watch import watch_warnings
@@ -23,13 +25,14 @@ def plan_properties(plan: Plan, manager: Manager) -> tuple[dict[str, Property], 
     The warnings are about unsupported properties, and limits above the machine's size. Raises
     DoraSystemdError.
     """
-    check_needs(manager, plan)
+    needs, has_own_tmp = plan.settings[NEEDS], plan.sandbox.has_mounts
+    check_needs(manager, Needy(plan.options.name, plan.scope.is_user, needs))
     properties, warnings = drop_unsupported(_properties(plan), systemd_number(manager))
     warnings = (
         *warnings,
         *idle_warnings(plan.settings),
         *watch_warnings(plan),
-        *needs_warnings(plan),
+        *needs_warnings(needs, plan.options.needs, has_own_tmp),
     )
     warnings = (*warnings, *sandbox_warnings(plan.sandbox))
     return properties, (*warnings, *check_limits(manager, plan, properties))

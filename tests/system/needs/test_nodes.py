@@ -11,13 +11,12 @@ from tests.system.needs.scene import fragile, node_of, seen, wait_running, wait_
 
 def test_a_node_waits_and_comes_back(cell: Cell, project: Project, place: Path) -> None:
     camera = place / "video0"
-    done = cell.start(with_needs(project, [camera]), "--start-timeout", "5s")
+    done = cell.start(with_needs(project, [camera]))
     assert f"source waits for {camera} (not there)" in done.stdout + done.stderr
     wait_waiting(cell, "source", camera)
     assert (seen(cell)["status"], cell.show("ActiveState")) == ("Waiting", "active")
     assert f"source waits for {camera}" in cell.doractl("why", cell.name).stdout
     assert "Waiting" in cell.doractl("list").stdout
-    time.sleep(6)  # longer than the start timeout, which does not run meanwhile
     camera.touch()
     wait_running(cell)
     cell.wait_exchanging()

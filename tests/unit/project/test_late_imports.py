@@ -8,6 +8,9 @@ LATE = {
     "click takes 35 ms: no --version, and no usual list, waits for it": {
         "cli.main": {"cli.group", "cli.completion", "cli.listing"},
     },
+    "ctypes is memory: only dataflows with needs have it": {
+        "runner.needs.needs": {"runner.needs.watch"},
+    },
     "the table of list does without it": {
         "cli.listing": {
             *("verbs.list", "verbs.facts.ended"),

@@ -19,6 +19,7 @@ from dora_systemd.decisions.cell.options import (
     runner_command,
 )
 from dora_systemd.decisions.cell.restarts import POLICIES, RestartPolicy
+from dora_systemd.decisions.needs.words import NodeNeed
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.values import INFINITY, SECOND
 from tests.unit.fakes.limit_values import limits_of_a_node
@@ -68,6 +69,9 @@ options = st.builds(
         st.lists(st.tuples(idents, texts)).map(tuple),
         st.lists(st.tuples(st.just("") | idents, st.sampled_from(REPLACE_WORDS))).map(tuple),
     ),
+    needs=st.lists(
+        st.builds(NodeNeed, idents, st.sampled_from(["/dev/video0", "/dev/by-id/a=b c", "/é"]))
+    ).map(tuple),
 )
 
 

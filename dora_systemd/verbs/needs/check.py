@@ -1,28 +1,30 @@
 """Checks what a dataflow needs before it starts: the units exist, and do not wait in a circle."""
 
-from collections.abc import Iterator
-from pathlib import Path, PurePosixPath
+from pathlib import PurePosixPath
+from typing import NamedTuple
 
 from dora_systemd.adapters.bus.manager import Manager
-from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.cell.status import WAITS
-from dora_systemd.decisions.needs.units import CLOCK_WAITERS, needed_mounts, required_units
+from dora_systemd.decisions.needs.units import needed_mounts, required_units
 from dora_systemd.decisions.needs.words import CLOCK, DATAFLOW, MOUNT, NETWORK
-from dora_systemd.decisions.settings.needs import NEEDS
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import name_from_unit, unit_name
 from dora_systemd.values import shown
-from dora_systemd.verbs.start.plan import Plan
 
-_UNIT_PATHS = ("/etc/systemd/system", "/usr/lib/systemd/system", "/lib/systemd/system")
-_HIDDEN = ("/tmp/", "/var/tmp/")
 _MOST = 200
 """Units that are looked at for a circle."""
 
 
-def check_needs(manager: Manager, plan: Plan) -> None:
+class Needy(NamedTuple):
+    """A dataflow with needs. name: of the dataflow. is_user: in a user's manager."""
+
+    name: str
+    is_user: bool
+    needs: tuple[str, ...]
+
+
+def check_needs(manager: Manager, plan: Needy) -> None:
     """Raise DoraSystemdError (BAD_INPUT) for a need that can never be met."""
-    needs = plan.settings[NEEDS]
+    needs = plan.needs
     if not needs:
         return
     _check_scope(plan, needs)
@@ -33,15 +35,15 @@ def check_needs(manager: Manager, plan: Plan) -> None:
         _check_mount(manager, plan, path)
 
 
-def _check_scope(plan: Plan, needs: tuple[str, ...]) -> None:
+def _check_scope(plan: Needy, needs: tuple[str, ...]) -> None:
     """A user's manager has no units for the network, the clock and file systems."""
     words = (NETWORK, CLOCK)
     absent = [one for one in needs if one in words or one.startswith(MOUNT)]
-    if plan.scope.is_user and absent:
+    if plan.is_user and absent:
         raise _refusal(plan, absent[0], "a user's manager does not know that", "add --system")
 
 
-def _check_unit(manager: Manager, plan: Plan, need: str, unit: str) -> None:
+def _check_unit(manager: Manager, plan: Needy, need: str, unit: str) -> None:
     state = str(manager.read(unit, ["LoadState"])["LoadState"])
     if state == "loaded":
         return
@@ -52,13 +54,13 @@ def _check_unit(manager: Manager, plan: Plan, need: str, unit: str) -> None:
     raise _refusal(plan, need, f"no dataflow named '{name}'", hint)
 
 
-def _check_circle(manager: Manager, plan: Plan, need: str, unit: str) -> None:
+def _check_circle(manager: Manager, plan: Needy, need: str, unit: str) -> None:
     """Follow the dependencies of dataflows; systemd would drop one of a circle's without a word."""
     chain, left = {unit: [unit]}, [unit]
     while left and len(chain) < _MOST:
         one = left.pop()
-        if one == plan.unit:
-            names = [name_from_unit(each) or each for each in (plan.unit, *chain[one])]
+        if one == unit_name(plan.name):
+            names = [name_from_unit(each) or each for each in (unit_name(plan.name), *chain[one])]
             reason = f"they wait for each other: {' -> '.join(names)}"
             raise _refusal(plan, need, reason, "remove one of these needs")
         needed = manager.read(one, ["Requires"])["Requires"] if name_from_unit(one) else ()
@@ -67,7 +69,7 @@ def _check_circle(manager: Manager, plan: Plan, need: str, unit: str) -> None:
         left += fresh
 
 
-def _check_mount(manager: Manager, plan: Plan, path: str) -> None:
+def _check_mount(manager: Manager, plan: Needy, path: str) -> None:
     """A path needs a unit that mounts it: without one, systemd would wait for nothing."""
     places = [PurePosixPath(path), *PurePosixPath(path).parents][:-1]
     if not any(_is_mount(manager, str(place)) for place in places):
@@ -93,32 +95,6 @@ def _escaped_byte(byte: int) -> str:
     return chr(byte) if is_kept else f"\\x{byte:02x}"
 
 
-def clock_service() -> str:
-    """The service of this machine that waits until the clock is right, or ""."""
-    for one in CLOCK_WAITERS:
-        if any(Path(place, one).exists() for place in _UNIT_PATHS):
-            return one
-    return ""
-
-
-def needs_warnings(plan: Plan) -> Iterator[str]:
-    """Warnings about needs that nothing here meets."""
-    if CLOCK in plan.settings[NEEDS] and not clock_service():
-        yield "nothing waits for the clock: neither systemd-timesyncd nor chrony is installed"
-    if plan.sandbox.has_mounts:
-        for node, path in plan.options.needs:
-            if path.startswith(_HIDDEN):
-                yield f"node {node} waits for {shown(path)}, but the sandbox has its own /tmp"
-
-
-def waiting_notes(manager: Manager, options: RunnerOptions) -> Iterator[str]:
-    """What a dataflow that has been started waits for, in the words of the runner."""
-    if options.needs:
-        text = str(manager.read(unit_name(options.name), ["StatusText"])["StatusText"])
-        if WAITS in text:
-            yield text
-
-
-def _refusal(plan: Plan, need: str, reason: str, hint: str) -> DoraSystemdError:
-    message = f"cannot start {plan.options.name}: it needs {need}: {reason}"
+def _refusal(plan: Needy, need: str, reason: str, hint: str) -> DoraSystemdError:
+    message = f"cannot start {plan.name}: it needs {need}: {reason}"
     return DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
