@@ -14,7 +14,8 @@ NodeTable = Mapping[str, NodeStatus]
 Update = tuple[NodeTable, Record | None]
 """The table after an event, and the life event for the journal."""
 
-WITH_PROCESS = frozenset({"starting", "waiting", "ready", "running"})
+WITH_PROCESS = frozenset({"starting", "ready", "running"})
+_MAYBE = ("reloading", "waiting")
 
 
 def has_process(nodes: NodeTable) -> bool:
@@ -27,7 +28,7 @@ def with_process(nodes: NodeTable) -> list[str]:
     return [
         ident
         for ident, node in nodes.items()
-        if node.state in WITH_PROCESS or (node.state == "reloading" and node.pid)
+        if node.state in WITH_PROCESS or (node.state in _MAYBE and node.pid)
     ]
 
 

@@ -133,6 +133,8 @@ class Needs:
         """End the process `old` of the node, and have the next one wait."""
         with self._until_done(node):
             async with self._run.lock:
+                if node not in self._run.pump.cell.nodes:
+                    return  # a reload has removed it
                 with self._run.nodes.exchanging(node):
                     await self._run.swapper.hold(self._definition(node))
                 await self._run.nodes.wait_gone(node, old)

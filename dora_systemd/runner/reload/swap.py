@@ -19,7 +19,7 @@ from typing import Any
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.dora import protocol
 from dora_systemd.decisions.life import events as life
-from dora_systemd.decisions.life.states import Cell
+from dora_systemd.decisions.life.states import Cell, State
 from dora_systemd.decisions.life.stop_budget import stop_timeout
 from dora_systemd.decisions.life.view import initial_nodes
 from dora_systemd.errors import DoraSystemdError
@@ -79,7 +79,8 @@ class Swapper:
             # Dora refuses this for a node that is just being started.
             with contextlib.suppress(DoraSystemdError):
                 await self._end(node, "RestartNode")
-        await self._ask(protocol.replace_params(self._run, definition))
+        if self._pump.cell.state is State.RUNNING:  # else a stop has come meanwhile
+            await self._ask(protocol.replace_params(self._run, definition))
 
     async def rewire(self, definition: Mapping[str, Any], kind: str) -> None:
         """Replace a node whose inputs or outputs change. Raises DoraSystemdError and NotReady."""
