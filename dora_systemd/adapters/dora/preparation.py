@@ -12,6 +12,7 @@ from dora_systemd.decisions.cell.hot_reload import check_reload_nodes
 from dora_systemd.decisions.cell.launch import LaunchPlan, is_launched, launch_descriptor
 from dora_systemd.decisions.cell.limits import check_nodes
 from dora_systemd.decisions.cell.line_rates import check_rates
+from dora_systemd.decisions.cell.needs import check_needs
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.restarts import check_restart_nodes
 from dora_systemd.decisions.descriptor.build_session import (
@@ -22,7 +23,6 @@ from dora_systemd.decisions.descriptor.build_session import (
 from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
 from dora_systemd.decisions.descriptor.nodes import UNEXPANDED, NodeKind
 from dora_systemd.decisions.dora.errors import parse_dora_error
-from dora_systemd.decisions.needs.words import check_needs
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.programs import own_account
 from dora_systemd.trust.sight import Sight

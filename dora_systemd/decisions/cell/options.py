@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 from dora_systemd.decisions.cell.hot_reload import DEFAULT_RELOAD, HotReload, parse_of_node
 from dora_systemd.decisions.cell.limits import NodeLimits, format_node_limits, parse_node_limits
 from dora_systemd.decisions.cell.line_rates import UNLIMITED, RateLimits, format_rates, parse_rates
+from dora_systemd.decisions.cell.needs import NodeNeed, parse_node_need
 from dora_systemd.decisions.cell.restarts import (
     DEFAULT,
     RestartPolicy,
@@ -20,7 +21,6 @@ from dora_systemd.decisions.cell.restarts import (
     parse_node_policy,
     parse_policy,
 )
-from dora_systemd.decisions.needs.words import NodeNeed, parse_node_need
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import parse_name, parse_uuid
 from dora_systemd.values import (

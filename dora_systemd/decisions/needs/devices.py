@@ -8,7 +8,7 @@ systemd.resource-control(5).
 import re
 from collections.abc import Iterable
 
-from dora_systemd.decisions.needs.words import NodeNeed
+from dora_systemd.decisions.cell.needs import NodeNeed
 
 _SERIAL = ("char-ttyUSB", "char-ttyACM")
 _GROUPS: tuple[tuple[str, tuple[str, ...]], ...] = (

@@ -3,7 +3,7 @@
 systemd waits for them before it starts the runner, so no restart and no timeout is used up.
 """
 
-from dora_systemd.decisions.needs.words import CLOCK, DATAFLOW, MOUNT, NETWORK, UNIT
+from dora_systemd.decisions.cell.needs import CLOCK, DATAFLOW, MOUNT, NETWORK, UNIT
 from dora_systemd.decisions.properties.assignments import typed, with_assignments
 from dora_systemd.decisions.properties.kinds import Property
 from dora_systemd.names import unit_name

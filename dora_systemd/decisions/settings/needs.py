@@ -2,7 +2,7 @@
 
 from operator import add
 
-from dora_systemd.decisions.needs.words import FOREIGN, parse_needs
+from dora_systemd.decisions.cell.needs import FOREIGN, parse_needs
 from dora_systemd.decisions.settings.kinds import Setting, many_texts
 
 NEEDS = Setting[tuple[str, ...]](

@@ -6,9 +6,9 @@ from typing import Any
 from dora_systemd.decisions.cell.hot_reload import HotReload
 from dora_systemd.decisions.cell.limits import BY_KEY, NodeLimits, merge_node_limits, node_limits
 from dora_systemd.decisions.cell.line_rates import RateLimits, merge_rates
+from dora_systemd.decisions.cell.needs import split_needs
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.restarts import DEFAULT, RestartPolicy, with_values
-from dora_systemd.decisions.needs.words import split_needs
 from dora_systemd.decisions.reload.watch_rules import relative_patterns
 from dora_systemd.decisions.settings.kinds import Setting
 from dora_systemd.decisions.settings.limits import NODE_LIMIT

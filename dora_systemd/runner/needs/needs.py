@@ -12,12 +12,12 @@ from typing import Any
 
 from dora_systemd.adapters.host import notify
 from dora_systemd.adapters.host.presence import Presence, look_at, watched_places
+from dora_systemd.decisions.cell.needs import paths_by_node
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import LATCHED
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Cell, State
 from dora_systemd.decisions.needs.steps import Do, NeedStep, need_steps
-from dora_systemd.decisions.needs.words import paths_by_node
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.runner.cell.pump import now_us
 from dora_systemd.runner.reload.apply import Run

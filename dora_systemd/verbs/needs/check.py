@@ -4,8 +4,8 @@ from pathlib import PurePosixPath
 from typing import NamedTuple
 
 from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.decisions.cell.needs import CLOCK, DATAFLOW, MOUNT, NETWORK
 from dora_systemd.decisions.needs.units import needed_mounts, required_units
-from dora_systemd.decisions.needs.words import CLOCK, DATAFLOW, MOUNT, NETWORK
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import name_from_unit, unit_name
 from dora_systemd.values import shown

@@ -4,10 +4,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.decisions.cell.needs import CLOCK, NodeNeed
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import WAITS
 from dora_systemd.decisions.needs.units import CLOCK_WAITERS
-from dora_systemd.decisions.needs.words import CLOCK, NodeNeed
 from dora_systemd.names import unit_name
 from dora_systemd.values import shown
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from dora_systemd.decisions.cell.hot_reload import REPLACE_WORDS, HotReload
 from dora_systemd.decisions.cell.limits import parse_node_limits
 from dora_systemd.decisions.cell.line_rates import ALL_NODES, SHORTEST, RateLimit
+from dora_systemd.decisions.cell.needs import NodeNeed
 from dora_systemd.decisions.cell.options import (
     RunnerOptions,
     format_runner_argv,
@@ -19,7 +20,6 @@ from dora_systemd.decisions.cell.options import (
     runner_command,
 )
 from dora_systemd.decisions.cell.restarts import POLICIES, RestartPolicy
-from dora_systemd.decisions.needs.words import NodeNeed
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.values import INFINITY, SECOND
 from tests.unit.fakes.limit_values import limits_of_a_node

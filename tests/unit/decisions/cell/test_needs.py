@@ -2,8 +2,7 @@
 
 import pytest
 
-from dora_systemd.decisions.needs.units import needs_properties
-from dora_systemd.decisions.needs.words import (
+from dora_systemd.decisions.cell.needs import (
     NodeNeed,
     check_needs,
     parse_needs,
@@ -11,6 +10,7 @@ from dora_systemd.decisions.needs.words import (
     paths_by_node,
     split_needs,
 )
+from dora_systemd.decisions.needs.units import needs_properties
 from dora_systemd.errors import DoraSystemdError
 
 
