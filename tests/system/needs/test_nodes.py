@@ -48,7 +48,7 @@ def test_a_stop_ends_a_waiting_node_at_once(cell: Cell, project: Project, place:
     assert cell.show("Result") == "success"
 
 
-@pytest.mark.warns("driver crashed", "failed: driver")
+@pytest.mark.warns("driver crashed", "the device is gone", "ExitCode(1)", "exited with code 1")
 def test_a_driver_that_ends_by_itself_waits_too(cell: Cell, project: Project, place: Path) -> None:
     device = place / "ttyUSB0"
     device.touch()
