@@ -39,6 +39,8 @@ def test_a_node_waits_and_comes_back(cell: Cell, project: Project, place: Path) 
     assert "node-crashed" not in names
 
 
+# Dora has not opened its start barrier: Node() of the others raises.
+@pytest.mark.warns("ExitCode(1)")
 def test_a_stop_ends_a_waiting_node_at_once(cell: Cell, project: Project, place: Path) -> None:
     cell.start(with_needs(project, [place / "video0"]), "--grace-duration", "60s")
     wait_waiting(cell, "source", place / "video0")
