@@ -57,7 +57,7 @@ _TABLE = {
         adapters.bus.connection adapters.bus.errors adapters.host.unit_files
         adapters.journal.journalctl adapters.journal.reader adapters.journal.socket verbs.doctor
         verbs.facts.enabled verbs.follow verbs.gateway verbs.setup verbs.show
-        verbs.start.enable verbs.up
+        verbs.needs.notes verbs.start.enable verbs.up
     """,
     INSTALLED: """
         cli.group gateway.page
@@ -66,6 +66,7 @@ _TABLE = {
         adapters.dora.check adapters.dora.engine adapters.dora.websocket adapters.host.fd_store
         adapters.host.watch adapters.logs.held adapters.logs.jsonl adapters.logs.pipes
         adapters.runner_socket.listener adapters.runner_socket.relay runner.cell.begin
+        adapters.host.presence runner.needs.needs runner.nodes.gate
         runner.cell.engine runner.cell.pump runner.main runner.nodes.nodes
         runner.reload.settings_file runner.reload.sources runner.stop_post
     """,
