@@ -2,6 +2,8 @@
 
 import asyncio
 import os
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from dora_systemd.adapters.host.presence import look_at, watched_places
@@ -55,14 +57,15 @@ def test_a_change_wakes_wherever_it_is(tmp_path: Path) -> None:
         path = tmp_path / "dev" / "bus" / "video0"
         watch = Watch()
         try:
-            for change in (
+            changes: tuple[Callable[[], object], ...] = (
                 (tmp_path / "dev").mkdir,
                 path.parent.mkdir,
                 path.touch,
-                lambda: path.chmod(0o400),
+                partial(path.chmod, 0o400),
                 path.unlink,
                 path.parent.rmdir,
-            ):
+            )
+            for change in changes:
                 watch.set_places(watched_places([str(path)]))
                 change()
                 assert await woken(watch)

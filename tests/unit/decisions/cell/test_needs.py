@@ -75,9 +75,11 @@ def test_paths_are_for_nodes_and_units_for_the_dataflow() -> None:
     )
     assert needs == (("network",), nodes)
     assert paths_by_node(nodes)["arm"] == ("/dev/ttyUSB0", "/dev/ttyUSB1")
-    for wrong in ((("/dev/video0",), {}), ((), {"a": ("network",)}), ((), {"a": ("b=/x",)})):
+    with pytest.raises(DoraSystemdError):
+        split_needs(("/dev/video0",), {})
+    for texts in (("network",), ("b=/x",)):
         with pytest.raises(DoraSystemdError):
-            split_needs(*wrong)
+            split_needs((), {"a": texts})
 
 
 def test_the_need_of_a_node_survives_the_command_line() -> None:
