@@ -49,6 +49,16 @@ if ($output eq 'pipe') {
     open STDOUT, '>', "$cell/io/$node.out" or fail(126, "$node.out");
     open STDERR, '>', "$cell/io/$node.err" or fail(126, "$node.err");
 }
+# A node with needs has a gate, see runner/nodes/gate.py: the runner writes words of three bytes when
+# the node may go on, or has to end. Without a word the gate was closed again.
+my $gate = "$cell/io/$node.gate";
+while (-p $gate) {
+    open my $fifo, '<', $gate or fail(126, "$node.gate");
+    sysread $fifo, my $word, 3 or next;
+    last if $word eq 'go.';
+    kill hex substr($word, 1), $$ if $word =~ /^s/;
+    exit hex substr($word, 1);
+}
 chdir $directory or fail(126, $directory);
 $ENV{PATH} =~ s/^\Q$libexec\E://;
 # A zenoh configuration of the user's takes precedence. Dora refuses two, and a file that it cannot

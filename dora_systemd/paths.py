@@ -55,6 +55,10 @@ class CellPaths:
         """The notify socket of `node`, if it has one."""
         return self.io / f"{node}.notify"
 
+    def node_gate(self, node: str) -> Path:
+        """The FIFO that the launcher of `node` waits at, if the node has needs."""
+        return self.io / f"{node}.gate"
+
     def node_pid(self, node: str) -> Path:
         """The file where the launcher of `node` first writes its pid."""
         return self.io / f"{node}.pid"

@@ -45,8 +45,10 @@ from dora_systemd.runner.cell.failure import Beside, words
 from dora_systemd.runner.cell.life import Life
 from dora_systemd.runner.cell.pause import forget_restarts, hold_back
 from dora_systemd.runner.cell.pump import Pump, now_us
+from dora_systemd.runner.needs.needs import wait_for_needs
+from dora_systemd.runner.nodes.descriptors import wait_eof
 from dora_systemd.runner.nodes.losses import LossWatch, losses_of_user
-from dora_systemd.runner.nodes.nodes import Nodes, wait_eof
+from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.runner.nodes.rights import check_first
 from dora_systemd.runner.owes.begin import begin_watch
 from dora_systemd.runner.reload.apply import Run, tell_started
@@ -196,6 +198,7 @@ async def run_once(runs: Runs, is_again: bool) -> Cell:
         dialogue.watch(coordinator, dialogue.read_coordinator)
         run = Run(pump, runs.nodes, runs.pipes, Swapper(pump, dora))
         reloader.begin(run, prepared, started_us * 1000)
+        wait_for_needs(run, options, reloader.definition, dialogue.spawn)
         dialogue.spawn("tell that it has started", tell_started(run, reloader.has_started))
         begin_watch(run, prepared.plan, dora, dialogue)
         runs.beside.attach(pump.push)

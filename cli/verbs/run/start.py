@@ -28,6 +28,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.selector import Selector
+from dora_systemd.verbs.needs.notes import waiting_notes
 from dora_systemd.verbs.start.again import find_start, means_name
 from dora_systemd.verbs.start.check import check_plan
 from dora_systemd.verbs.start.enable import boot_target
@@ -116,7 +117,7 @@ def command(
     with _last_words(bus, scope, options.uuid), StageLine(sys.stderr) as stage:
         started = start_unit(bus, scope, options, claimed.properties, stage, not no_wait)
     # Only after the start: a refusal must be one line and a hint.
-    print_warnings(notes)
+    print_warnings([*notes, *waiting_notes(bus, options)])
     return _print_started(started, options.dataflow, watched_patterns(claimed.plan))
 
 
@@ -142,6 +143,7 @@ def _start_known(bus: Bus, scope: Scope, cell: Cell, wait: bool) -> ExitCode:
     bus.reset_failed(cell.unit)
     with _last_words(bus, scope, cell.uuid), StageLine(sys.stderr) as stage:
         started = start_unit(bus, scope, cell.options, None, stage, wait)
+    print_warnings([*waiting_notes(bus, cell.options)])
     return _print_started(started, file, ())
 
 

@@ -40,7 +40,7 @@ _UNIT_PROPERTIES = frozenset(
         *("ActiveEnterTimestamp", "ActiveEnterTimestampMonotonic", "InactiveEnterTimestamp"),
         *("InactiveExitTimestamp", "InactiveExitTimestampMonotonic", "InvocationID", "Job"),
         *("StateChangeTimestamp", "Description", "UnitFileState", "NeedDaemonReload", "WantedBy"),
-        *("RequiredBy",),
+        *("RequiredBy", "Requires"),
         *("StateChangeTimestampMonotonic", "StartLimitBurst", "StartLimitIntervalUSec"),
     )
 )

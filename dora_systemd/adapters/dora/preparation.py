@@ -17,6 +17,7 @@ from dora_systemd.decisions.cell.launch import (
 )
 from dora_systemd.decisions.cell.limits import check_nodes
 from dora_systemd.decisions.cell.line_rates import check_rates
+from dora_systemd.decisions.cell.needs import check_needs
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.restarts import check_restart_nodes
 from dora_systemd.decisions.descriptor.build_session import (
@@ -84,6 +85,7 @@ def check_named_nodes(options: RunnerOptions, dataflow: Dataflow) -> None:
     check_reload_nodes(options.reload, ids)
     launched = [node.id for node in dataflow.nodes if is_launched(node)]
     check_watchdogs(options.watchdogs, ids, launched)
+    check_needs(options.needs, {node.id: is_launched(node) for node in dataflow.nodes})
 
 
 def _check_limited(options: RunnerOptions, dataflow: Dataflow) -> None:

@@ -30,6 +30,11 @@ def send_alive() -> None:
     _notify("WATCHDOG=1")
 
 
+def extend_timeout(duration: int) -> None:
+    """EXTEND_TIMEOUT_USEC=: a start may take `duration` µs from now on."""
+    _notify(f"EXTEND_TIMEOUT_USEC={duration}")
+
+
 def activated_sockets() -> list[socket.socket]:
     """The listening sockets that the manager has passed."""
     from systemd.daemon import listen_fds

@@ -14,7 +14,7 @@ from dora_systemd.decisions.cell.environment import find_python
 from dora_systemd.decisions.cell.log_backlog import with_bounds
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.owed import owes_restart
-from dora_systemd.decisions.cell.restarts import DEFAULT, HELD_KEYS
+from dora_systemd.decisions.cell.restarts import DEFAULT, HELD_KEYS, LATCH_KEYS
 from dora_systemd.decisions.cell.uv import Read, uv_project
 from dora_systemd.decisions.descriptor.arguments import split_arguments
 from dora_systemd.decisions.descriptor.build_session import BuildSession
@@ -98,8 +98,8 @@ def _launch_node(node: Node, source: str, plan: LaunchPlan) -> dict[str, Any]:
     raw = {**node.raw, **_restart_keys(node, plan.options)}
     if node.env:
         raw["env"] = expanded(node.env, plan.environment)
-    if plan.options.hot_reload and raw.get("restart_policy", "never") == "never":
-        raw |= HELD_KEYS if is_launched(node) else {}
+    if raw.get("restart_policy", "never") == "never" and is_launched(node):
+        raw |= _keys_of_kept(node.id, plan.options)
     if node.kind is NodeKind.OPERATOR:
         return _launch_operators(node, raw, plan.options.working_directory)
     if not has_pipes(node):
@@ -126,6 +126,13 @@ def _notify_words(node: Node, plan: LaunchPlan) -> str:
         return ""
     is_wrapped = plan.options.uv or node.kind is NodeKind.SHELL
     return f":{limit if limit < INFINITY else 0}" + (":any" if is_wrapped else "")
+
+
+def _keys_of_kept(node: str, options: RunnerOptions) -> Mapping[str, Any]:
+    """The restart keys of a node without restarts that dora must not give up at once."""
+    if options.hot_reload:
+        return HELD_KEYS
+    return LATCH_KEYS if any(one.node == node for one in options.needs) else {}
 
 
 def _restart_keys(node: Node, options: RunnerOptions) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from dora_systemd.decisions.cell.hot_reload import DEFAULT_RELOAD, HotReload, parse_of_node
 from dora_systemd.decisions.cell.limits import NodeLimits, format_node_limits, parse_node_limits
 from dora_systemd.decisions.cell.line_rates import UNLIMITED, RateLimits, format_rates, parse_rates
+from dora_systemd.decisions.cell.needs import NodeNeed, parse_node_need
 from dora_systemd.decisions.cell.restarts import (
     DEFAULT,
     RestartPolicy,
@@ -67,6 +68,7 @@ class RunnerOptions(NamedTuple):
     reload: files that cause a reload, and how nodes are replaced.
     watchdogs: nodes with a notify socket, see dora_systemd.decisions.signs.watchdogs.
     owes: outputs of nodes that have to come in time.
+    needs: the paths that single nodes wait for.
     """
 
     name: str
@@ -91,6 +93,7 @@ class RunnerOptions(NamedTuple):
     watchdogs: Mapping[str, int] = {}
     node_rights: "tuple[NodeRights, ...]" = ()
     owes: "tuple[Owed, ...]" = ()
+    needs: tuple[NodeNeed, ...] = ()
 
     def __hash__(self) -> int:
         return hash(self.uuid)
@@ -182,6 +185,7 @@ _OPTIONS = (
     _each("node-restart", "node_restarts", parse_node_policy, format_node_policy),
     _each("owes", "owes", _parse_owed, _format_owed),
     Option("watchdog", "watchdogs", _parse_watchdogs, _format_watchdogs, is_repeated=True),
+    _each("needs", "needs", parse_node_need, "=".join),
     _each("watch", "reload.watch"),
     _each("ignore", "reload.ignore"),
     _each("node-watch", "reload.node_watch", parse_of_node, "=".join),

@@ -73,6 +73,17 @@ HELD_KEYS: Mapping[str, Any] = {
 """The keys of a node that waits after a failure. dora can replace such a node at any time, but
 never one that it has given up."""
 
+LATCH_SECONDS = 2.03125
+LATCH_KEYS: Mapping[str, Any] = {
+    "restart_policy": "on-failure",
+    "max_restarts": 1,
+    "restart_delay": LATCH_SECONDS,
+    "max_restart_delay": LATCH_SECONDS,
+}
+"""The keys of a node without restarts that has needs. A driver whose device is unplugged often ends
+by itself, and dora can replace it within this delay. If nothing is missing, the launcher fails in
+the place of the node, and dora gives the node up."""
+
 _KEYS = ("max", "window", "delay", "max-delay")
 
 

@@ -10,9 +10,12 @@ from dora_systemd.names import is_node_id
 
 Value = TypeVar("Value")
 
-STAGES = ("starting", "restarting", "waiting", "running", "degraded", "stopping", "ended")
+UNMET = "unmet"
+"""Stage of a dataflow with a node that waits for what it needs."""
+STAGES = ("starting", "restarting", "waiting", UNMET, "running", "degraded", "stopping", "ended")
 NODE_STATES = (
     "starting",
+    "waiting",
     "ready",
     "running",
     "restarting",
@@ -24,8 +27,12 @@ NODE_STATES = (
 )
 FAILED_BECAUSE = "failed: "
 """Prefix of STATUS= for the reason why a dataflow failed."""
+WAITS = " waits for "
+"""In STATUS=, between a node and what it needs."""
 HELD = "held"
 """Policy of a node that waits for a reload after it has failed."""
+LATCHED = "latched"
+"""Policy of a node without restarts that dora starts once more, only to give it up."""
 ALIVE_NODE_STATES = frozenset({"ready", "running", "dynamic"})
 WHOLE_CELL = ""
 """The key of a CPU sample for the unit's whole cgroup."""
@@ -49,9 +56,10 @@ class NodeStatus(NamedTuple):
     state: one of NODE_STATES. pid: 0 if no process is known. restarts: number of restarts by dora
     in this run. since_us: CLOCK_REALTIME µs of the last change of state. exit: how its last process
     ended. kind: how dora starts it (python, executable, shell, uv, operator, ros2, dynamic, url).
-    policy: dora's restart policy, "never" if it has none, or HELD. max_restarts: in one window, 0
-    without limit. hung: why dora's health check or its watchdog ended the process, or "".
+    policy: dora's restart policy, "never" if it has none, HELD or LATCHED. max_restarts: in one
+    window, 0 without limit. hung: why dora's health check or its watchdog ended the process, or "".
     silent: which output that it owes has not come, or "". is_ended: the runner ends it for that.
+    needs: what it waits for, or "".
     """
 
     state: str = "starting"
@@ -65,6 +73,7 @@ class NodeStatus(NamedTuple):
     hung: str = ""
     silent: str = ""
     is_ended: bool = False
+    needs: str = ""
 
     @property
     def is_alive(self) -> bool:
@@ -238,6 +247,7 @@ def _parse_node(raw: Any) -> NodeStatus:
         hung=_text(known, "hung"),
         silent=_text(known, "silent"),
         is_ended=known.get("is_ended") is True,
+        needs=_text(known, "needs"),
     )
 
 

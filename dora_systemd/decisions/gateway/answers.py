@@ -25,6 +25,7 @@ _NTP_BITS = 32
 _NODE_STATES = {
     **{"failed": "failed", "finished": "stopped", "stopped": "stopped"},
     **{"restarting": "restarting", "reloading": "restarting"},
+    "waiting": "restarting",
 }
 _EXITS = {ExitKind.CODE: "ExitCode", ExitKind.SIGNAL: "Signal"}
 _SYSTEMD_FIELDS = ("UNIT", "USER_UNIT")

@@ -144,6 +144,21 @@ class NodeSpeaks(Event):
 
 
 @dataclass(frozen=True)
+class NodeLacks(Event):
+    """The node must not run: something that it needs is missing. needs: what, for people."""
+
+    node: str
+    needs: str
+
+
+@dataclass(frozen=True)
+class NodeMet(Event):
+    """Everything that the node needs is there: its launcher goes on."""
+
+    node: str
+
+
+@dataclass(frozen=True)
 class StartTimedOut(Event):
     """Not all nodes were ready within `after` µs."""
 

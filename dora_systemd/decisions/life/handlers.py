@@ -14,7 +14,7 @@ events came before: dora's events and the ends of its processes arrive in any or
 from dataclasses import replace
 
 from dora_systemd.decisions.cell.owed import FAIL
-from dora_systemd.decisions.cell.status import HELD, NodeStatus
+from dora_systemd.decisions.cell.status import HELD, LATCHED, NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life import nodes as table
 from dora_systemd.decisions.life.causes import ESSENTIAL, Cause
@@ -71,7 +71,13 @@ def run(cell: Cell, event: life.Event) -> Next:
 
 
 def start_timed_out(cell: Cell, event: life.StartTimedOut) -> Next:
-    """The start fails and names the nodes that are not ready."""
+    """The start fails and names the nodes that are not ready.
+
+    The time in which a node waits for what it needs does not count: the runner starts a new timeout
+    when it goes on.
+    """
+    if table.lacking(cell.nodes) or event.at_us < cell.met_us:
+        return cell, ()
     late = [ident for ident, node in cell.nodes.items() if node.state in _NOT_READY]
     reason = f"{_nodes(late)} not ready within {format_duration(event.after)}"
     return _fail_start(because(cell, Cause.START_TIMEOUT, late), reason)
@@ -134,6 +140,11 @@ def silent(cell: Cell, event: life.NodeSilent) -> Next:
     cell = replace(because(cell, Cause.NODE_SILENT, [event.node]), failure=reason)
     cell = replace(cell, exit=RunnerExit.FAILED)
     return _wind_down(cell, *actions)
+
+
+def node_met(cell: Cell, event: life.NodeMet) -> Next:
+    """The node goes on, and has the whole start timeout again."""
+    return node_event(replace(cell, met_us=event.at_us), event)
 
 
 def _is_stopping(cell: Cell) -> bool:
@@ -212,14 +223,19 @@ def node_event_waiting(cell: Cell, event: life.NodeExited) -> Next:
     can still fail: on the first run, and in a trial, where the version before can come back.
     """
     after, actions = node_event(cell, event)
-    if cell.is_trial or not cell.is_again:
-        node = after.nodes[event.node]
-        if node.state == "failed" and node.policy == HELD:
-            reason = f"node {event.node}: {node.exit} before it was ready"
-            after = because(after, Cause.NODE_FAILED, [event.node])
-            failed, more = _fail_start(after, reason)
-            return failed, (*actions, *more)
+    node = after.nodes[event.node]
+    if node.state == "failed" and node.policy == LATCHED:
+        return _fail_early(after, event.node, actions)
+    is_final = cell.is_trial or not cell.is_again
+    if is_final and node.state == "failed" and node.policy == HELD:
+        return _fail_early(after, event.node, actions)
     return after, actions
+
+
+def _fail_early(cell: Cell, node: str, actions: tuple[Action, ...]) -> Next:
+    reason = f"node {node}: {cell.nodes[node].exit} before it was ready"
+    failed, more = _fail_start(because(cell, Cause.NODE_FAILED, [node]), reason)
+    return failed, (*actions, *more)
 
 
 def run_finished(cell: Cell, event: life.Event) -> Next:

@@ -5,24 +5,32 @@ from dataclasses import replace
 
 from dora_systemd.decisions.cell.exits import KILLED, Exit, ExitKind
 from dora_systemd.decisions.cell.owed import RESTART
-from dora_systemd.decisions.cell.status import HELD, NodeStatus
+from dora_systemd.decisions.cell.status import HELD, LATCHED, NodeStatus
 from dora_systemd.decisions.descriptor.wiring import Downstream
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Record
+from dora_systemd.values import SECOND, format_duration
 
 NodeTable = Mapping[str, NodeStatus]
 Update = tuple[NodeTable, Record | None]
 """The table after an event, and the life event for the journal."""
 
 WITH_PROCESS = frozenset({"starting", "ready", "running"})
+_MAYBE = ("reloading", "waiting")
 
 
 def has_process(nodes: NodeTable) -> bool:
     """Whether dora has a process of any node, according to the events so far."""
-    return any(
-        node.state in WITH_PROCESS or (node.state == "reloading" and node.pid)
-        for node in nodes.values()
-    )
+    return bool(with_process(nodes))
+
+
+def with_process(nodes: NodeTable) -> list[str]:
+    """The nodes of which dora has a process, according to the events so far."""
+    return [
+        ident
+        for ident, node in nodes.items()
+        if node.state in WITH_PROCESS or (node.state in _MAYBE and node.pid)
+    ]
 
 
 def all_ready(nodes: NodeTable, at_us: int) -> NodeTable:
@@ -54,12 +62,13 @@ def update(nodes: NodeTable, event: life.Event, *, is_stopping: bool, is_open: b
             nodes, record = _hung(nodes, event)
         case life.NodeSilent() | life.NodeSpeaks():
             nodes, record = _heard(nodes, event)
+        case life.NodeLacks() | life.NodeMet():
+            nodes, record = _needs(nodes, event)
         case life.NodeReloading():
             nodes = _reloading(nodes, event)
-        case life.NodeAdded():
-            nodes = {**nodes, event.node: event.status}
-        case life.NodeRemoved():
-            nodes = {ident: node for ident, node in nodes.items() if ident != event.node}
+        case life.NodeAdded() | life.NodeRemoved():
+            others = {ident: node for ident, node in nodes.items() if ident != event.node}
+            nodes = {**others, **_added(event)}
     return nodes, record
 
 
@@ -70,11 +79,49 @@ def _set(nodes: NodeTable, ident: str, at_us: int, **changes: str | int | Exit) 
     return {**nodes, ident: old._replace(**changes)}  # type: ignore[arg-type]
 
 
+def _added(event: life.NodeAdded | life.NodeRemoved) -> NodeTable:
+    return {event.node: event.status} if isinstance(event, life.NodeAdded) else {}
+
+
 def _reloading(nodes: NodeTable, event: life.NodeReloading) -> NodeTable:
     """The new process has its own restart counter."""
     old = nodes.get(event.node, NodeStatus())
     status = (event.status or old)._replace(state="reloading", pid=old.pid, since_us=event.at_us)
+    if old.needs:  # the new process waits as well
+        status = status._replace(state=old.state, needs=old.needs, since_us=old.since_us)
     return {**nodes, event.node: status}
+
+
+def lacking(nodes: NodeTable) -> dict[str, NodeStatus]:
+    """The nodes that wait for what they need."""
+    return {ident: node for ident, node in nodes.items() if node.state == "waiting"}
+
+
+def is_held_up(nodes: NodeTable) -> bool:
+    """Whether the start waits for nothing but what nodes need."""
+    done = ("waiting", "ready", "dynamic")
+    return bool(lacking(nodes)) and all(node.state in done for node in nodes.values())
+
+
+def _needs(nodes: NodeTable, event: life.NodeLacks | life.NodeMet) -> Update:
+    return _met(nodes, event) if isinstance(event, life.NodeMet) else _lacks(nodes, event)
+
+
+def _lacks(nodes: NodeTable, event: life.NodeLacks) -> Update:
+    old = nodes.get(event.node, NodeStatus())
+    nodes = _set(nodes, event.node, event.at_us, state="waiting", needs=event.needs, hung="")
+    if old.state == "waiting":
+        return nodes, None
+    return nodes, Record("node-waiting", event.node, {"reason": event.needs})
+
+
+def _met(nodes: NodeTable, event: life.NodeMet) -> Update:
+    old = nodes.get(event.node, NodeStatus())
+    if old.state != "waiting":
+        return nodes, None
+    nodes = _set(nodes, event.node, event.at_us, state="starting", needs="")
+    after = format_duration(max(event.at_us - old.since_us, 0) // SECOND * SECOND)
+    return nodes, Record("node-needs-met", event.node, {"reason": f"after {after}"})
 
 
 def _hung(nodes: NodeTable, event: life.NodeHung) -> Update:
@@ -99,6 +146,11 @@ def _heard(nodes: NodeTable, event: life.NodeSilent | life.NodeSpeaks) -> Update
 
 def _spawned(nodes: NodeTable, event: life.NodeSpawned) -> Update:
     old = nodes.get(event.node, NodeStatus())
+    if old.state == "failed" and old.policy == LATCHED:
+        # Its launcher, which fails in its place: dora gives the node up.
+        return {**nodes, event.node: old._replace(policy="never")}, None
+    if old.state == "waiting":
+        return {**nodes, event.node: old._replace(pid=event.pid)}, None
     nodes = _set(nodes, event.node, event.at_us, state="starting", pid=event.pid)
     if old.state != "restarting":
         return nodes, None
@@ -110,8 +162,14 @@ def _exited(nodes: NodeTable, event: life.NodeExited, is_stopping: bool) -> Upda
     if old.state == "reloading" and not is_stopping and not event.is_stale:
         nodes = {**nodes, event.node: old._replace(pid=0)}
         return nodes, Record("node-exited", event.node, event.exit.details())
-    if event.will_restart and old.policy == HELD:
-        # The long delay in dora keeps this node down until a reload starts it again.
+    if old.state == "waiting" and not is_stopping:
+        # The process before this wait, or a launcher that was replaced: neither is a crash.
+        pid = old.pid if event.is_stale else 0
+        return {**nodes, event.node: old._replace(pid=pid)}, None
+    if old.state == "failed" and old.policy == "never" and event.exit == old.exit:
+        return nodes, None  # its launcher, which ends as the node did
+    if event.will_restart and old.policy in (HELD, LATCHED):
+        # Dora's restart is not one: it waits for a reload, or for what the node needs.
         event = replace(event, will_restart=False)
     if old.hung and event.exit.is_failure:  # the signal of the health check explains nothing
         event = replace(event, exit=Exit(ExitKind.HUNG, words=old.hung))
@@ -133,6 +191,7 @@ def _exited(nodes: NodeTable, event: life.NodeExited, is_stopping: bool) -> Upda
         hung="",
         silent="",
         is_ended=False,
+        needs="",
         restarts=old.restarts + int(event.will_restart and not is_stopping),
     )
     return nodes, record
@@ -172,7 +231,7 @@ def spent(nodes: NodeTable) -> dict[str, str]:
 
 def _is_spent(node: NodeStatus) -> bool:
     if node.state == "failed":
-        return node.policy not in ("never", HELD) and not node.exit.by
+        return node.policy not in ("never", HELD, LATCHED) and not node.exit.by
     is_used_up = 0 < node.max_restarts <= node.restarts
     return node.state == "finished" and node.policy == "always" and is_used_up
 

@@ -82,7 +82,8 @@ class Cell:
     caused it. downstream: the nodes that depend on each node. is_again: whether a reload has
     started this run. is_trial: whether the version before can come back. reload: whether the run
     ends for the next one. notice: the result of the last reload. is_attached: whether it belongs to
-    `doractl run`, which tells how the nodes ended after a stop, too.
+    `doractl run`, which tells how the nodes ended after a stop, too. met_us: when a node
+    last got what it needs, CLOCK_REALTIME µs.
     """
 
     grace: int
@@ -102,3 +103,4 @@ class Cell:
     reload: bool = False
     notice: str = ""
     is_attached: bool = False
+    met_us: int = 0

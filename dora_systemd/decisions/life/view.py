@@ -3,20 +3,23 @@
 from collections.abc import Mapping
 from typing import Any
 
-from dora_systemd.decisions.cell.restarts import HELD_SECONDS
+from dora_systemd.decisions.cell.restarts import HELD_SECONDS, LATCH_SECONDS
 from dora_systemd.decisions.cell.status import (
     FAILED_BECAUSE,
     HELD,
+    LATCHED,
+    UNMET,
+    WAITS,
     CellStatus,
     CpuSample,
     LineCount,
     NodeStatus,
 )
-from dora_systemd.decisions.life.nodes import WITH_PROCESS
+from dora_systemd.decisions.life.nodes import WITH_PROCESS, is_held_up, lacking
 from dora_systemd.decisions.life.states import Cell, State
 from dora_systemd.decisions.life.stop_budget import kill_delay
 from dora_systemd.decisions.signs.table import Sign
-from dora_systemd.values import INFINITY, format_duration
+from dora_systemd.values import INFINITY, format_duration, format_moment
 
 _SHOWN = {
     State.BOOTING: ("starting", "starting the dora coordinator"),
@@ -62,6 +65,7 @@ def _format_waiting(cell: Cell) -> str:
     failed = [_with_exit(*one) for one in cell.nodes.items() if one[1].state == "failed"]
     text = f"{_count(cell, 'ready', 'dynamic')}/{len(cell.nodes)} nodes ready"
     text = f"{text}, waiting for {_names(waiting)}" if waiting else text
+    text = f"{text}; {_format_lacking(cell)}" if lacking(cell.nodes) else text
     return f"{text}; failed: {_names(failed)}" if failed else text
 
 
@@ -75,9 +79,24 @@ def _format_running(cell: Cell) -> str:
     silent = [f"{ident} ({node.silent})" for ident, node in cell.nodes.items() if node.silent]
     if silent:
         parts.append(f"silent: {_names(silent)}")
+    if lacking(cell.nodes):
+        parts.append(_format_lacking(cell))
     if cell.notice:
         parts.append(cell.notice)
     return "; ".join(parts)
+
+
+def _format_lacking(cell: Cell) -> str:
+    """As "camera waits for /dev/video0 since 14:02:11 UTC"."""
+    texts = [
+        f"{ident}{WAITS}{node.needs} since {_clock(node.since_us)}"
+        for ident, node in lacking(cell.nodes).items()
+    ]
+    return _names(texts)
+
+
+def _clock(at_us: int) -> str:
+    return f"{format_moment(at_us)[:19].replace('T', ' ')} UTC"
 
 
 def _with_exit(ident: str, node: NodeStatus) -> str:
@@ -97,11 +116,23 @@ def stage(cell: Cell) -> str:
     """One of dora_systemd.decisions.cell.status.STAGES."""
     if cell.state is State.RUNNING and any(map(_is_missed, cell.nodes.values())):
         return "degraded"
+    if lacking(cell.nodes) and has_started(cell):
+        return UNMET
     return _SHOWN[cell.state][0]
 
 
 def _is_missed(node: NodeStatus) -> bool:
     return node.state == "failed" or bool(node.silent)
+
+
+def is_waiting_only(cell: Cell) -> bool:
+    """Whether the start waits for nothing but what nodes need."""
+    return cell.state is State.WAITING and is_held_up(cell.nodes)
+
+
+def has_started(cell: Cell) -> bool:
+    """Whether the unit counts as started: a wait for a device must not keep the boot waiting."""
+    return cell.state is State.RUNNING or is_waiting_only(cell)
 
 
 def cell_status(
@@ -129,7 +160,13 @@ def cell_status(
 def _policy(raw: Mapping[str, Any]) -> str:
     if raw.get("restart_delay") == HELD_SECONDS:
         return HELD
+    if raw.get("restart_delay") == LATCH_SECONDS:
+        return LATCHED
     return raw.get("restart_policy") or "never"
+
+
+def _max_restarts(raw: Mapping[str, Any]) -> int:
+    return 0 if _policy(raw) == LATCHED else int(raw.get("max_restarts") or 0)
 
 
 def initial_nodes(
@@ -146,7 +183,7 @@ def initial_nodes(
             kind=kind,
             since_us=at_us,
             policy=_policy(raw[ident]),
-            max_restarts=int(raw[ident].get("max_restarts") or 0),
+            max_restarts=_max_restarts(raw[ident]),
         )
         for ident, kind in kinds.items()
     }

@@ -57,6 +57,12 @@ EVENTS = {
     "cpu-throttled": _dataflow(
         "1c40798a51c14a89a416ed625e0afc1a", NOTICE, "is throttled by a CPU limit"
     ),
+    "node-waiting": EventKind(
+        "620e56b40d464810bebfe137b63a04d0", NOTICE, "Node {node} waits for what it needs"
+    ),
+    "node-needs-met": EventKind(
+        "6850a7771eb341d2a6c6b88f29b11c48", NOTICE, "Node {node} has what it needs"
+    ),
     "node-hung": EventKind("6bb24464fee34a848c077fc1b20c1802", ERR, "Node {node} hangs"),
     "node-watchdog": EventKind(
         "5bec2bc650014ae7bb1424da4204438f", ERR, "Node {node} is ended by its watchdog"

@@ -6,6 +6,7 @@ from typing import Any
 from dora_systemd.decisions.cell.hot_reload import HotReload
 from dora_systemd.decisions.cell.limits import BY_KEY, NodeLimits, merge_node_limits, node_limits
 from dora_systemd.decisions.cell.line_rates import RateLimits, merge_rates
+from dora_systemd.decisions.cell.needs import split_needs
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.restarts import DEFAULT, RestartPolicy, with_values
 from dora_systemd.decisions.reload.watch_rules import relative_patterns
@@ -13,6 +14,7 @@ from dora_systemd.decisions.rights.node_rights import BY_KEY as RIGHTS
 from dora_systemd.decisions.rights.node_rights import NodeRights, merge_node_rights
 from dora_systemd.decisions.settings.kinds import Setting
 from dora_systemd.decisions.settings.limits import NODE_LIMIT
+from dora_systemd.decisions.settings.needs import NEEDS
 from dora_systemd.decisions.settings.owes import OWES, owes_of
 from dora_systemd.decisions.settings.reload import HOT_RELOAD, IGNORE, REPLACE, WATCH
 from dora_systemd.decisions.settings.resolve import Settings
@@ -50,6 +52,7 @@ def with_settings(options: RunnerOptions, settings: Settings) -> RunnerOptions:
         node_restarts=node_policies(settings),
         start_timeout=settings[START_TIMEOUT],
         watchdogs=watchdogs(settings),
+        needs=split_needs(settings[NEEDS], settings.by_node(NEEDS))[1],
         reload=hot_reload(settings, options.working_directory),
         owes=owes_of(settings.by_node(OWES), settings[OWES]),
     )

@@ -23,6 +23,7 @@ from dora_systemd.decisions.settings.kinds import (
     Setting,
 )
 from dora_systemd.decisions.settings.limits import LIMIT_SETTINGS
+from dora_systemd.decisions.settings.needs import NEED_SETTINGS
 from dora_systemd.decisions.settings.owes import OWES_SETTINGS
 from dora_systemd.decisions.settings.reload import RELOAD_SETTINGS
 from dora_systemd.decisions.settings.restarts import RESTART_SETTINGS
@@ -96,6 +97,7 @@ LOG_RATE_LIMIT = Setting[RateLimits](
 SECTIONS: dict[str, tuple[Setting[Any], ...]] = {
     # All settings above, in this order, so that a setting is declared in one place only.
     "Nodes": tuple(value for value in list(globals().values()) if isinstance(value, Setting)),
+    "Needs": NEED_SETTINGS,
     "Limits": LIMIT_SETTINGS,
     "Rights of nodes": RIGHTS_SETTINGS,
     "Restarts": RESTART_SETTINGS,

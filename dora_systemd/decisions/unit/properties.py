@@ -15,6 +15,8 @@ from dora_systemd.decisions.cell.options import (
 )
 from dora_systemd.decisions.life.states import RunnerExit
 from dora_systemd.decisions.life.stop_budget import unit_timeout
+from dora_systemd.decisions.needs.devices import device_entries
+from dora_systemd.decisions.needs.units import needs_properties
 from dora_systemd.decisions.properties.assignments import (
     Properties,
     format_property,
@@ -29,6 +31,7 @@ from dora_systemd.decisions.properties.structs import Command
 from dora_systemd.decisions.properties.table import TABLE
 from dora_systemd.decisions.settings.credentials import credential_properties
 from dora_systemd.decisions.settings.limits import REALTIME
+from dora_systemd.decisions.settings.needs import NEEDS
 from dora_systemd.decisions.settings.resolve import Settings
 from dora_systemd.decisions.settings.table import PROPERTY
 from dora_systemd.decisions.unit.file import format_sections
@@ -54,7 +57,7 @@ class UnitContext:
     python: absolute path of the interpreter that runs dora-systemd itself. is_user: whether the
     unit is one of a user's manager. user: User= in system scope; None runs everything as root.
     environment: all of Environment=, see unit_environment. credentials: absolute path by name.
-    sandbox: None for no sandbox.
+    sandbox: None for no sandbox. clock: the service that waits for the right time, or "".
     """
 
     python: str
@@ -63,6 +66,7 @@ class UnitContext:
     environment: Mapping[str, str] = field(default_factory=dict)
     credentials: Mapping[str, str] = field(default_factory=dict)
     sandbox: Sandbox | None = None
+    clock: str = ""
 
 
 def unit_properties(
@@ -86,6 +90,8 @@ def unit_properties(
         **(sandbox_properties(context.sandbox) if context.sandbox else {}),
         **realtime_properties(settings),
         **rights_properties(options.node_rights),
+        **needs_properties(settings[NEEDS], context.clock),
+        **device_properties(options, context),
     }
     properties = with_properties(own, settings_properties(settings))
     assignments = settings[PROPERTY]
@@ -231,6 +237,13 @@ def settings_properties(settings: Settings) -> dict[str, Property]:
     given = [one for one in settings.table if one.property and settings[one] != one.default]
     texts = (f"{one.property}={text}" for one in given for text in one.kind.format(settings[one]))
     return with_assignments({}, texts)
+
+
+def device_properties(options: RunnerOptions, context: UnitContext) -> dict[str, Property]:
+    """DeviceAllow= for the devices that nodes wait for, where the sandbox closes all others."""
+    if context.sandbox is None or not context.sandbox.has_mounts:
+        return {}
+    return with_assignments({}, [f"DeviceAllow={one}" for one in device_entries(options.needs)])
 
 
 def realtime_properties(settings: Settings) -> dict[str, Property]:

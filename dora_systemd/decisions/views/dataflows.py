@@ -4,17 +4,18 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+from dora_systemd.decisions.cell.status import UNMET
 from dora_systemd.terminal_text import cut, one_line
 from dora_systemd.values import SECOND, format_rounded_size
 
-STARTING, RUNNING, DEGRADED = "Starting", "Running", "Degraded"
+STARTING, WAITING, RUNNING, DEGRADED = "Starting", "Waiting", "Running", "Degraded"
 STOPPING, RESTARTING = "Stopping", "Restarting"
 FINISHED, STOPPED, FAILED = "Finished", "Stopped", "Failed"
 SILENT = "Silent"
 """A node that runs, and sends no output that it owes."""
 UNREACHABLE = "Unreachable"
 """In the place of a status: that of a host from which no answer came."""
-UP_WORDS = frozenset({STARTING, RUNNING, DEGRADED, STOPPING, RESTARTING})
+UP_WORDS = frozenset({STARTING, WAITING, RUNNING, DEGRADED, STOPPING, RESTARTING})
 
 _BY_ACTIVE = {
     "active": RUNNING,
@@ -26,7 +27,7 @@ _BY_ACTIVE = {
     "failed": FAILED,
     "inactive": STOPPED,
 }
-_BY_STAGE = {"degraded": DEGRADED, "stopping": STOPPING}
+_BY_STAGE = {"degraded": DEGRADED, UNMET: WAITING, "stopping": STOPPING}
 
 UNKNOWN = "-"
 UNREADABLE = "?"
@@ -53,7 +54,8 @@ class NodeRow(NamedTuple):
     which its CPU limit throttled it, None without one. since: time of its last change of state,
     CLOCK_REALTIME µs, 0: unknown. text: its own STATUS=. watchdog, sign_age: the time in which it
     must send WATCHDOG=1, and how long ago it did, in µs. essential: whether its final failure ends
-    the dataflow. silent: what is missing of the outputs that it owes, or "".
+    the dataflow. silent: what is missing of the outputs that it owes, or "". needs: what it waits
+    for, or "".
     """
 
     node: str
@@ -74,6 +76,7 @@ class NodeRow(NamedTuple):
     sign_age: int | None = None
     essential: bool | None = None
     silent: str = ""
+    needs: str = ""
     outputs: tuple[OutputRow, ...] = ()
 
     @property
@@ -202,7 +205,9 @@ _ANSI = {"red": "\x1b[31m", "yellow": "\x1b[33m"}
 _UNDERLINED, _PLAIN = "\x1b[4m", "\x1b[0m"
 STATE_COLORS = {
     **dict.fromkeys((FAILED, UNREACHABLE), "red"),
-    **dict.fromkeys((STARTING, DEGRADED, STOPPING, RESTARTING, SILENT, "Reloading"), "yellow"),
+    **dict.fromkeys(
+        (STARTING, WAITING, DEGRADED, STOPPING, RESTARTING, SILENT, "Reloading"), "yellow"
+    ),
 }
 """By the word for a state, as in systemctl(1); others have none."""
 

@@ -73,6 +73,7 @@ def _node_object(row: NodeRow, shares: Shares | None) -> dict[str, Any]:
         "state": row.state,
         "pid": row.pid or None,
         "exit": row.exit or None,
+        "waits_for": row.needs or None,
         **moment("since", row.since),
         "text": row.text or None,
         "watchdog_us": row.watchdog,

@@ -12,6 +12,7 @@ from dora_systemd.decisions.views.dataflows import (
     STOPPED,
     STOPPING,
     UP_WORDS,
+    WAITING,
     DataflowRow,
 )
 
@@ -21,7 +22,7 @@ STATUSES: Mapping[str, frozenset[str]] = {
     "failed": frozenset({FAILED}),
     **{
         word.lower(): frozenset({word})
-        for word in (STARTING, DEGRADED, STOPPING, RESTARTING, STOPPED)
+        for word in (STARTING, WAITING, DEGRADED, STOPPING, RESTARTING, STOPPED)
     },
 }
 """The values of --status: dora's three, which leave out none, and other words of the table."""

@@ -16,7 +16,8 @@ from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.owed import is_probe
 from dora_systemd.decisions.dora import life_events, protocol
 from dora_systemd.decisions.life import events as life
-from dora_systemd.decisions.life.states import Do, State
+from dora_systemd.decisions.life.nodes import lacking, with_process
+from dora_systemd.decisions.life.states import Cell, Do, State
 from dora_systemd.decisions.life.stop_budget import stop_timeout
 from dora_systemd.decisions.rights.node_rights import is_essential
 from dora_systemd.errors import DoraSystemdError
@@ -34,6 +35,8 @@ one reads it, the next handles it. `systemctl kill` signals all processes of the
 first, and the pump must see that signal before the exit of a child that the same one has killed."""
 _AGAIN_SECONDS = 0.02
 _QUIET_SECONDS = 0.1
+_WAITING_SECONDS = 1.0
+"""Time for the effect of a stop on other nodes to be seen, if there are any."""
 _LONG_SECONDS = 3600.0 * 24 * 365
 
 
@@ -188,14 +191,26 @@ class Dialogue(Tasks):
     async def _ask_stop(self) -> None:
         self._nodes.let_go()
         cell = self._pump.cell
+        if lacking(cell.nodes):
+            self.spawn("end the nodes that wait", self._end_waiting(cell))
         seconds = stop_timeout(cell.grace) / SECOND
         # A refusal means that dora has ended the run already. Stop sometimes gets no answer at all:
         # the deadline of the state covers that.
         await self._engine.ask_apart(protocol.stop_params(cell.run, cell.grace), seconds)
         self._pump.push(life.StopAnswered(now_us()))
 
+    async def _end_waiting(self, cell: Cell) -> None:
+        """End the launchers that wait at a gate as soon as dora stops the run.
+
+        A node that ends before that has failed, for dora, and takes the others with it.
+        """
+        before = len(with_process(cell.nodes))
+        await self._pump.wait(lambda now: len(with_process(now.nodes)) < before, _WAITING_SECONDS)
+        self._nodes.gates.dismiss()
+
     def _dismiss_daemon(self) -> None:
         self._nodes.let_go()
+        self._nodes.gates.dismiss()
         # Their messages about each other's exit would be noise.
         self._pipes.mute("coordinator", "daemon")
         self._ask(Do.DISMISS_DAEMON, self._dismiss_when_quiet())

@@ -2,8 +2,6 @@
 
 import asyncio
 import contextlib
-import os
-import resource
 from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
@@ -25,9 +23,13 @@ from dora_systemd.decisions.resources.oom import Oom
 from dora_systemd.decisions.rights.node_rights import NodeRights
 from dora_systemd.decisions.signs.watchdogs import NO_WATCHDOGS, Watchdogs
 from dora_systemd.paths import CellPaths
+from dora_systemd.runner.nodes.descriptors import raise_file_limit
+from dora_systemd.runner.nodes.gate import Gates
 from dora_systemd.runner.nodes.hold import Hold
 from dora_systemd.runner.nodes.resources import Resources
 from dora_systemd.runner.signs.hook import signs_of
+
+_GONE_SECONDS = 0.05
 
 
 class Nodes:
@@ -49,6 +51,7 @@ class Nodes:
         self._holds: dict[str, Hold] = {}
         self.resources = Resources(unit)
         self.signs = signs_of(watchdogs, unit, paths, pipes.write_event)
+        self.gates = Gates(paths)
 
     def prepare(self, dataflow: Dataflow, rates: RateLimits, limits: Iterable[NodeLimits]) -> None:
         """Create a group for every node, with its limits, and pipes for the nodes that use them.
@@ -163,6 +166,7 @@ class Nodes:
         rights: of the nodes that have some.
         """
         self._pipes.set_pid(node, pid)
+        self.gates.refill(node)
         if node not in self._launched:
             for process in _with_descendants(pid):
                 with contextlib.suppress(OSError):  # the process may have exited already
@@ -210,6 +214,11 @@ class Nodes:
         return any(
             pid in cgroup.pids(one) for one in (self._group(node), self._unit / cgroup.SUPERVISOR)
         )
+
+    async def wait_gone(self, node: str, pid: int) -> None:
+        """Wait until the process `pid` of the node has ended, which dora has told to end."""
+        while pid and self.has_process(node, pid):
+            await asyncio.sleep(_GONE_SECONDS)
 
     def find_oom(self, node: str) -> Oom | None:
         """How the kernel has just killed a process of `node` because of memory, or None."""
@@ -263,16 +272,6 @@ class Nodes:
         )
 
 
-def raise_file_limit() -> None:
-    """Raise this process's soft limit of open files to the hard one: it needs four for each node.
-
-    Call this after the coordinator and the daemon have started: they should inherit the old limit,
-    and the daemon raises its own.
-    """
-    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
-
-
 def _with_descendants(pid: int) -> list[int]:
     found = [pid]
     for known in found:
@@ -281,18 +280,3 @@ def _with_descendants(pid: int) -> list[int]:
             for task in Path(f"/proc/{known}/task").iterdir():
                 found += map(int, (task / "children").read_text().split())
     return found
-
-
-async def wait_eof(fd: int) -> None:
-    """Read `fd` until the end of file, and discard the input."""
-    loop = asyncio.get_running_loop()
-    done = asyncio.Event()
-
-    def read() -> None:
-        with contextlib.suppress(BlockingIOError):
-            if not os.read(fd, 4096):
-                loop.remove_reader(fd)
-                done.set()
-
-    loop.add_reader(fd, read)
-    await done.wait()

@@ -1,8 +1,9 @@
 """Carries out one reload of single nodes step by step, and can undo it."""
 
+import asyncio
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import PurePath
 from typing import Any
 
@@ -12,6 +13,7 @@ from dora_systemd.decisions.cell.launch import has_pipes, kinds
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import HELD
 from dora_systemd.decisions.life.states import State
+from dora_systemd.decisions.life.view import has_started
 from dora_systemd.decisions.reload.steps import How, Step
 from dora_systemd.runner.cell.pump import Pump
 from dora_systemd.runner.nodes.nodes import Nodes
@@ -24,18 +26,22 @@ _BACK = {How.ADD: How.REMOVE, How.REMOVE: How.ADD}
 
 @dataclass(frozen=True)
 class Run:
-    """The parts of one run of the dataflow that reloads use."""
+    """The parts of one run of the dataflow that reloads use.
+
+    lock: held while nodes are replaced.
+    """
 
     pump: Pump
     nodes: Nodes
     pipes: LogPipes
     swapper: Swapper
+    lock: asyncio.Lock = field(default_factory=asyncio.Lock)
 
 
-async def tell_started(run: Run, has_started: Callable[[], None]) -> None:
+async def tell_started(run: Run, tell: Callable[[], None]) -> None:
     """Tell the reloader when all nodes run: from then on the run is not a trial any more."""
-    if await run.pump.wait(lambda cell: cell.state is State.RUNNING, None):
-        has_started()
+    if await run.pump.wait(has_started, None):
+        tell()
 
 
 class Applier:
@@ -105,8 +111,11 @@ class Applier:
         elif step.how is How.REWIRE:
             await swapper.rewire(definition, kind)
         else:
+            old = self._run.pump.cell.nodes[step.node]
             starts_first = self._options.reload.starts_first(step.node)
             await swapper.swap(definition, kind, starts_first)
+            if old.needs:  # two launchers must not go on
+                await self._run.nodes.wait_gone(step.node, old.pid)
 
     def _tell(self, step: Step, seconds: float) -> None:
         file = self._relative(step.file)

@@ -93,6 +93,11 @@ class Reloader:
         self.notice = f"not reloaded: {reason}"
         return True
 
+    def definition(self, node: str) -> Mapping[str, Any]:
+        """A node of the current version, as dora gets it."""
+        nodes = self.current.descriptor["nodes"] if self.current else []
+        return next(one for one in nodes if one["id"] == node)
+
     def _settle(self, outcome: str) -> None:
         if self._outcome is not None and not self._outcome.done():
             self._outcome.set_result(outcome)
@@ -190,7 +195,8 @@ class Reloader:
         reason = change.whole or applier.obstacle()
         if not reason:
             try:
-                await applier.apply()
+                async with run.lock:
+                    await applier.apply()
                 self.current = change.prepared
                 return applier.done
             except NotReady as error:

@@ -12,13 +12,14 @@ live table, and only then asks dora. In the other order the old state "running" 
 wait for the new process.
 """
 
+import contextlib
 from collections.abc import Callable, Mapping
 from typing import Any
 
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.dora import protocol
 from dora_systemd.decisions.life import events as life
-from dora_systemd.decisions.life.states import Cell
+from dora_systemd.decisions.life.states import Cell, State
 from dora_systemd.decisions.life.stop_budget import stop_timeout
 from dora_systemd.decisions.life.view import initial_nodes
 from dora_systemd.errors import DoraSystemdError
@@ -62,10 +63,24 @@ class Swapper:
         node = str(definition["id"])
         old = self._pump.cell.nodes[node]
         self._pump.push(life.NodeReloading(now_us(), node, _status(definition, kind)))
-        if old.pid and not starts_first and _is_restartable(old):
+        if old.pid and not starts_first and not old.needs and _is_restartable(old):
             await self._end(node, "RestartNode")
         await self._ask(protocol.replace_params(self._run, definition))
         await self._wait_ready(node)
+
+    async def hold(self, definition: Mapping[str, Any]) -> None:
+        """End the process of a node, and have the next one wait at its closed gate.
+
+        Raises DoraSystemdError if dora has given the node up.
+        """
+        node = str(definition["id"])
+        old = self._pump.cell.nodes[node]
+        if old.pid and _is_restartable(old):
+            # Dora refuses this for a node that is just being started.
+            with contextlib.suppress(DoraSystemdError):
+                await self._end(node, "RestartNode")
+        if self._pump.cell.state is State.RUNNING:  # else a stop has come meanwhile
+            await self._ask(protocol.replace_params(self._run, definition))
 
     async def rewire(self, definition: Mapping[str, Any], kind: str) -> None:
         """Replace a node whose inputs or outputs change. Raises DoraSystemdError and NotReady."""
@@ -111,13 +126,13 @@ class Swapper:
         seconds = patience(self._pump.cell)
         await self._pump.wait(_of(node, _is_settled), seconds)
         state = self._pump.cell.nodes[node]
-        if not state.is_alive:
+        if not state.is_alive and not state.needs:
             late = f"not ready within {format_duration(seconds * SECOND)}"
             raise NotReady(f"node {node}: {str(state.exit) or late}")
 
 
 def _is_settled(node: NodeStatus) -> bool:
-    return node.is_alive or node.state in ("failed", "finished")
+    return node.is_alive or node.state in ("failed", "finished", "waiting")
 
 
 def _is_restartable(node: NodeStatus) -> bool:

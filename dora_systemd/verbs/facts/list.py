@@ -188,5 +188,6 @@ def _node_row(node: str, status: NodeStatus | None, numbers: dict[str, Any]) -> 
         "exit": str(status.exit),
         "since": status.since_us,
         "silent": status.silent,
+        "needs": status.needs,
     }
     return NodeRow(node, status.state, **facts, **numbers)  # type: ignore[arg-type]

@@ -11,6 +11,7 @@ from dora_systemd.decisions.cell.launch import python_of
 from dora_systemd.decisions.cell.limits import has_cpus
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.uv import uv_project
+from dora_systemd.decisions.needs.devices import device_entries
 from dora_systemd.decisions.properties.sandbox import Sandbox, loose_paths, odd_paths, widened_paths
 from dora_systemd.decisions.rights.node_rights import has_process_rights
 from dora_systemd.decisions.settings.limits import DEVICE, REALTIME
@@ -54,7 +55,8 @@ def make_sandbox(
         network=settings[NETWORK],
         is_user=scope.is_user,
         is_root=user is not None and user.pw_uid == 0,
-        has_devices=bool(settings[DEVICE]) or _names(settings, "DeviceAllow"),
+        has_devices=bool(settings[DEVICE] or device_entries(options.needs))
+        or _names(settings, "DeviceAllow"),
         is_realtime=settings[REALTIME] is not None or any(one.priority for one in rights),
         has_rights=has_process_rights(rights) or any(map(has_cpus, options.node_limits)),
         # In a user namespace the given capabilities would have no effect.

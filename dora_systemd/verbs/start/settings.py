@@ -3,8 +3,10 @@
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from dora_systemd.adapters.host.files import decoded, parse_yaml
+from dora_systemd.decisions.settings.kinds import Setting, listed
 from dora_systemd.decisions.settings.resolve import Settings, resolve_settings
 from dora_systemd.decisions.settings.rights import NODE_RIGHTS
 from dora_systemd.decisions.settings.table import ENV_FILE, SETTINGS
@@ -93,10 +95,19 @@ def _raising(settings: Settings) -> Iterator[str]:
                     yield f"nodes.{node}.{setting.name}"
 
 
+def _of_root(words: Mapping[object, object]) -> Iterator[Setting[Any]]:
+    """The settings with a value that only root may give."""
+    for setting in SETTINGS:
+        values = (str(one).strip() for one in listed(words.get(setting.name)))
+        if any(one.startswith(setting.roots_words) for one in values):
+            yield setting
+
+
 def _check_trust(read: _Read) -> None:
     """Refuse keys by which another user's file could make root read, run or grant something."""
     only = {setting.name: setting for setting in SETTINGS if setting.root_only}
     dangerous = [only[key] for key in read.words() if key in only]
+    dangerous += _of_root(read.words())
     if dangerous:
         setting = dangerous[0]
         raise _untrusted(read, setting.name, f"give {setting.flags[0]} on the command line")

@@ -5,10 +5,13 @@ import sys
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.dora.command import version_numbers
 from dora_systemd.decisions.properties.kinds import Property
+from dora_systemd.decisions.settings.needs import NEEDS
 from dora_systemd.decisions.settings.runner_options import idle_warnings
 from dora_systemd.decisions.unit.file import persistent_unit
 from dora_systemd.decisions.unit.properties import UnitContext, format_unit, unit_properties
 from dora_systemd.decisions.unit.versions import MIN_VERSION, drop_unsupported
+from dora_systemd.verbs.needs.check import Needy, check_needs
+from dora_systemd.verbs.needs.notes import clock_service, needs_warnings
 from dora_systemd.verbs.start.credentials import credential_files
 from dora_systemd.verbs.start.limits import check_limits
 from dora_systemd.verbs.start.plan import Plan
@@ -22,8 +25,15 @@ def plan_properties(plan: Plan, manager: Manager) -> tuple[dict[str, Property], 
     The warnings are about unsupported properties, and limits above the machine's size. Raises
     DoraSystemdError.
     """
+    needs, has_own_tmp = plan.settings[NEEDS], plan.sandbox.has_mounts
+    check_needs(manager, Needy(plan.options.name, plan.scope.is_user, needs))
     properties, warnings = drop_unsupported(_properties(plan), systemd_number(manager))
-    warnings = (*warnings, *idle_warnings(plan.settings), *watch_warnings(plan))
+    warnings = (
+        *warnings,
+        *idle_warnings(plan.settings),
+        *watch_warnings(plan),
+        *needs_warnings(needs, plan.options.needs, has_own_tmp),
+    )
     warnings = (*warnings, *sandbox_warnings(plan.sandbox))
     return properties, (*warnings, *check_limits(manager, plan, properties))
 
@@ -53,5 +63,6 @@ def _properties(plan: Plan) -> dict[str, Property]:
         environment=plan.environment,
         credentials=credential_files(plan.settings),
         sandbox=plan.sandbox,
+        clock=clock_service(),
     )
     return dict(unit_properties(plan.options, context, plan.settings))

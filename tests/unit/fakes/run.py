@@ -4,6 +4,7 @@ import asyncio
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from dora_systemd.adapters.dora.engine import Child
@@ -19,7 +20,9 @@ from dora_systemd.decisions.logs.fields import Value
 from dora_systemd.decisions.resources.oom import Oom
 from dora_systemd.decisions.rights.node_rights import NodeRights
 from dora_systemd.errors import DoraSystemdError
+from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.engine import Engine
+from dora_systemd.runner.nodes.gate import Gates
 from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.runner.nodes.resources import Resources
 from dora_systemd.runner.signs.none import NoSigns
@@ -46,6 +49,7 @@ class FakeNodes(Nodes):
         self.calls: Calls = [] if calls is None else calls
         self.resources: FakeResources = FakeResources()
         self.signs = NoSigns()
+        self.gates = Gates(CellPaths(Path("/nowhere")))
         self.living: set[tuple[str, int]] = set()
         self.ooms: dict[str, Oom] = {}
 

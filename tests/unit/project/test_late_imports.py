@@ -11,6 +11,9 @@ LATE = {
     "a list of nothing, or of what has this version's Description=, does without it": {
         "verbs.facts.cells": {"decisions.cell.options"},
     },
+    "ctypes is memory: only dataflows with needs have it": {
+        "runner.needs.needs": {"runner.needs.watch"},
+    },
     "the table of list does without it": {
         "cli.listing": {
             *("verbs.list", "verbs.facts.ended", "verbs.facts.list"),

@@ -59,8 +59,8 @@ _TABLE = {
     ROOTS: """
         adapters.bus.connection adapters.bus.errors adapters.host.unit_files
         adapters.journal.journalctl adapters.journal.reader adapters.journal.socket verbs.doctor
-        verbs.facts.enabled verbs.facts.locks verbs.follow verbs.gateway verbs.setup verbs.show
-        verbs.start.enable verbs.up
+        verbs.facts.enabled verbs.facts.locks verbs.follow verbs.gateway verbs.needs.notes
+        verbs.setup verbs.show verbs.start.enable verbs.up
     """,
     INSTALLED: """
         cli.group gateway.page
@@ -70,6 +70,7 @@ _TABLE = {
         adapters.host.notify_socket adapters.host.shared_times
         adapters.host.watch adapters.logs.held adapters.logs.jsonl adapters.logs.pipes
         adapters.runner_socket.listener adapters.runner_socket.relay runner.cell.begin
+        adapters.host.presence runner.needs.needs runner.nodes.gate
         runner.cell.engine runner.cell.pump runner.main runner.nodes.nodes
         runner.owes.listen runner.reload.settings_file runner.reload.sources runner.stop_post
     """,

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from dora_systemd.decisions.cell.hot_reload import REPLACE_WORDS, HotReload
 from dora_systemd.decisions.cell.limits import parse_node_limits
 from dora_systemd.decisions.cell.line_rates import ALL_NODES, SHORTEST, RateLimit
+from dora_systemd.decisions.cell.needs import NodeNeed
 from dora_systemd.decisions.cell.options import (
     RunnerOptions,
     format_runner_argv,
@@ -78,6 +79,9 @@ options = st.builds(
         st.lists(st.tuples(st.just("") | idents, st.sampled_from(REPLACE_WORDS))).map(tuple),
     ),
     owes=st.lists(owed).map(tuple),
+    needs=st.lists(
+        st.builds(NodeNeed, idents, st.sampled_from(["/dev/video0", "/dev/by-id/a=b c", "/é"]))
+    ).map(tuple),
 )
 
 

@@ -34,6 +34,8 @@ SAMPLES: dict[type[life.Event], tuple[life.Event, ...]] = {
         life.NodeExited(1, "unknown", Exit(), True, is_stale=True),
     ),
     life.NodeCascaded: (life.NodeCascaded(1, "a", "b"),),
+    life.NodeLacks: (life.NodeLacks(1, "a", "/dev/video0 (not there)"),),
+    life.NodeMet: (life.NodeMet(1, "a"),),
     life.NodeHung: (life.NodeHung(1, "a", "unresponsive"), life.NodeHung(1, "unknown", "")),
     life.NodeSilent: tuple(
         life.NodeSilent(1, node, "image", "no image for 2s", then, "no image for 2s")

@@ -231,6 +231,7 @@ def test_values_and_back(data: st.DataObject) -> None:
         **LIMIT_VALUES,
         **RESTART_VALUES,
         **RIGHTS_VALUES,
+        "needs": st.sampled_from([("network",), ("mount:/mnt/x", "cam=/dev/video0")]),
         "watch": st.just(("*.py", "config/*")),
         "ignore": st.just(("draft_*",)),
         "replace": st.sampled_from(REPLACE_WORDS),

@@ -16,7 +16,8 @@ from dora_systemd.decisions.logs.lines import Origin
 from dora_systemd.decisions.rights.node_rights import parse_node_rights
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.nodes import nodes as nodes_module
-from dora_systemd.runner.nodes.nodes import Nodes, _with_descendants, raise_file_limit
+from dora_systemd.runner.nodes.descriptors import raise_file_limit
+from dora_systemd.runner.nodes.nodes import Nodes, _with_descendants
 from tests.unit.adapters.logs.test_queue import SlowJournal
 
 

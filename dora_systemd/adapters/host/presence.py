@@ -1,0 +1,75 @@
+"""Looks for paths that nodes need: whether they are there, and which directories to watch.
+
+The runner does this with the rights and the view of its nodes, so nobody gains anything by it.
+"""
+
+import contextlib
+import os
+import stat
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+_MOST_LINKS = 40
+
+
+class Presence(NamedTuple):
+    """What is at a path. reason: why it cannot be used, or "". identity: of a device.
+
+    A device that was unplugged and plugged in between two looks has another identity.
+    """
+
+    reason: str = ""
+    identity: tuple[int, int, int] | None = None
+
+
+def look_at(path: str) -> Presence:
+    """What is at `path`, behind links."""
+    try:
+        found = Path(path).stat()
+    except PermissionError:
+        return Presence("no permission to look there")
+    except OSError:
+        return Presence("not there")
+    # udev sets owner and group of a device after the kernel has made it.
+    if not os.access(path, os.R_OK):
+        return Presence("no permission to read it")
+    is_device = stat.S_ISCHR(found.st_mode) or stat.S_ISBLK(found.st_mode)
+    return Presence("", (found.st_dev, found.st_ino, found.st_rdev) if is_device else None)
+
+
+def watched_places(paths: Iterable[str]) -> set[str]:
+    """The directories in which one of `paths` can appear or disappear.
+
+    These are the nearest existing directories of each path and of the links on the way to it.
+    """
+    return {place for path in paths for place in _places(path)}
+
+
+def _places(path: str) -> set[str]:
+    found: set[str] = set()
+    for _ in range(_MOST_LINKS):
+        found |= _existing(path)
+        link = _first_link(path)
+        if link is None:
+            break
+        path = link
+    return found
+
+
+def _existing(path: str) -> set[str]:
+    """The parent of `path`, or the nearest one that exists, and the parent of that.
+
+    The latter tells when the former is moved away.
+    """
+    parent = next(one for one in Path(path).parents if one.is_dir() or one == one.parent)
+    return {str(parent), str(parent.parent)}
+
+
+def _first_link(path: str) -> str | None:
+    """The path behind the first link in it, or None without one."""
+    for place in [*reversed(Path(path).parents), Path(path)]:
+        with contextlib.suppress(OSError):
+            behind = place.parent / place.readlink() / Path(path).relative_to(place)
+            return os.path.normpath(behind)
+    return None

@@ -1,0 +1,149 @@
+"""What a dataflow and its nodes need before they start: the words of the setting `needs`.
+
+A dataflow needs units, and systemd waits for them. A node needs paths, and the runner waits for
+them. `NODE=PATH` is the need of a node where no key names the node: in a flag.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import PurePosixPath
+from typing import NamedTuple
+
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import check_known, did_you_mean, is_name, is_node_id
+from dora_systemd.values import quoted
+
+NETWORK, CLOCK = "network", "clock"
+DATAFLOW, UNIT, MOUNT = "dataflow:", "unit:", "mount:"
+WORDS = (NETWORK, CLOCK, DATAFLOW, UNIT, MOUNT)
+FOREIGN = (DATAFLOW, UNIT, MOUNT)
+"""Needs that make systemd start what may be another user's."""
+
+_UNIT_NAME = re.compile(r"[A-Za-z0-9:_.\\@-]{1,240}\.(?:service|socket|target|mount|device|path)")
+_HINT = "valid values: network, clock, dataflow:NAME, unit:NAME, mount:PATH, and PATH for a node"
+
+
+class NodeNeed(NamedTuple):
+    """A path that has to be there before the program of `node` is executed."""
+
+    node: str
+    path: str
+
+
+def parse_needs(texts: Sequence[str]) -> tuple[str, ...]:
+    """The needs in their shortest form, each once. Raises DoraSystemdError (USAGE)."""
+    return tuple(dict.fromkeys(_parse_need(text.strip()) for text in texts))
+
+
+def _parse_need(text: str) -> str:
+    if text in (NETWORK, CLOCK):
+        return text
+    kind, colon, value = text.partition(":")
+    if colon and f"{kind}:" in FOREIGN and "=" not in kind:
+        return f"{kind}:{_PARSERS[kind](value, text)}"
+    node, equals, path = text.partition("=")
+    if text.startswith("/"):
+        return _parse_path(text, text)
+    if equals and is_node_id(node) and path.startswith("/"):
+        return f"{node}={_parse_path(path, text)}"
+    raise _refusal(text, did_you_mean(text, WORDS) or _HINT)
+
+
+def _parse_name(value: str, text: str) -> str:
+    if not is_name(value):
+        raise _refusal(text, "write the name of a dataflow, as `doractl list` shows it")
+    return value
+
+
+def _parse_unit(value: str, text: str) -> str:
+    if not _UNIT_NAME.fullmatch(value):
+        raise _refusal(text, "write the whole name of a unit, such as unit:postgresql.service")
+    return value
+
+
+def _parse_path(value: str, text: str) -> str:
+    path = PurePosixPath(value)
+    is_plain = value.isprintable() and ".." not in path.parts and "%" not in value
+    if not is_plain or not path.is_absolute() or str(path) in ("/", "//"):
+        raise _refusal(text, "write an absolute path without '..' and '%', such as /dev/video0")
+    return f"/{str(path).lstrip('/')}"
+
+
+_PARSERS = {"dataflow": _parse_name, "unit": _parse_unit, "mount": _parse_path}
+
+
+def _refusal(text: str, hint: str) -> DoraSystemdError:
+    return DoraSystemdError(f"cannot wait for {quoted(text)}", hint, ExitCode.USAGE)
+
+
+def is_foreign(need: str) -> bool:
+    """Whether the need makes systemd start something that may be another user's."""
+    return need.startswith(FOREIGN)
+
+
+def split_needs(
+    given: tuple[str, ...], by_node: Mapping[str, tuple[str, ...]]
+) -> tuple[tuple[str, ...], tuple[NodeNeed, ...]]:
+    """The needs of the dataflow, and those of nodes.
+
+    given: of the dataflow, and with a node in front. by_node: from `nodes:` in settings files.
+    Raises DoraSystemdError (BAD_INPUT) for a path that the dataflow needs, and for a unit that a
+    node needs.
+    """
+    if lonely := next((one for one in given if one.startswith("/")), None):
+        raise DoraSystemdError(
+            f"cannot wait for {quoted(lonely)}: a path is what a node needs",
+            f"write nodes: NODE: needs: {lonely}, or --needs NODE={lonely}",
+            ExitCode.BAD_INPUT,
+        )
+    for node, texts in by_node.items():
+        _check_paths(node, texts)
+    named = [NodeNeed(*one.split("=", 1)) for one in given if _is_of_node(one)]
+    listed = [NodeNeed(node, path) for node, paths in by_node.items() for path in paths]
+    of_dataflow = tuple(one for one in given if not _is_of_node(one))
+    return of_dataflow, tuple(dict.fromkeys((*listed, *named)))
+
+
+def _is_of_node(need: str) -> bool:
+    return "=/" in need and not is_foreign(need)
+
+
+def _check_paths(node: str, needs: Sequence[str]) -> None:
+    if wrong := next((one for one in needs if not one.startswith("/")), None):
+        raise DoraSystemdError(
+            f"node {node} cannot wait for {quoted(wrong)}: a node needs paths",
+            f"write needs: {wrong} outside of nodes:, for the whole dataflow"
+            if not _is_of_node(wrong)
+            else "write the path alone",
+            ExitCode.BAD_INPUT,
+        )
+
+
+def check_needs(needs: Sequence[NodeNeed], nodes: Mapping[str, bool]) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) for a need of a node that cannot wait.
+
+    nodes: by id, whether our launcher starts the node.
+    """
+    check_known("cannot wait for what is needed by", {one.node: one for one in needs}, [*nodes])
+    if other := next((one for one in needs if not nodes[one.node]), None):
+        raise DoraSystemdError(
+            f"node {other.node} cannot wait for {other.path}: dora itself starts this node",
+            "operators, ros2, dynamic nodes and path_sha256: write needs: for another node",
+            ExitCode.BAD_INPUT,
+        )
+
+
+def parse_node_need(text: str) -> NodeNeed:
+    """The need of a node in the runner's command line. Raises DoraSystemdError (USAGE)."""
+    [need] = parse_needs([text])
+    if not _is_of_node(need):
+        raise _refusal(text, "write NODE=PATH")
+    return NodeNeed(*need.split("=", 1))
+
+
+def paths_by_node(needs: Sequence[NodeNeed]) -> dict[str, tuple[str, ...]]:
+    """All paths that each node needs, in their order."""
+    found: dict[str, tuple[str, ...]] = {}
+    for node, path in needs:
+        found[node] = (*found.get(node, ()), path)
+    return found

@@ -1,0 +1,161 @@
+"""Waits for what nodes need: one task of a run, only if a node has needs.
+
+A thread looks at the paths, because a file system may hang. It looks when a directory on the way to
+one of them changes, and every _LOOK_SECONDS: not all file systems tell of changes. The decisions
+are in decisions/needs/steps.py, the gates in runner/nodes/gate.py.
+"""
+
+import asyncio
+import contextlib
+from collections.abc import Callable, Coroutine, Iterator, Mapping
+from typing import Any
+
+from dora_systemd.adapters.host import notify
+from dora_systemd.adapters.host.presence import Presence, look_at, watched_places
+from dora_systemd.decisions.cell.needs import paths_by_node
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.status import LATCHED
+from dora_systemd.decisions.life import events as life
+from dora_systemd.decisions.life.states import Cell, State
+from dora_systemd.decisions.needs.steps import Do, NeedStep, need_steps
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.runner.cell.pump import now_us
+from dora_systemd.runner.reload.apply import Run
+from dora_systemd.values import INFINITY, SECOND
+
+_LOOK_SECONDS = 2.0
+_AGAIN = "plugged in again"
+_STATES = (State.WAITING, State.RUNNING)
+
+Spawn = Callable[[str, Coroutine[Any, Any, None]], None]
+Definition = Callable[[str], Mapping[str, Any]]
+
+
+def wait_for_needs(run: Run, options: RunnerOptions, definition: Definition, spawn: Spawn) -> None:
+    """Close the gates of nodes with needs, and begin to look for what they need.
+
+    definition: a node as dora gets it. spawn: begins a task of the run. Raises OSError.
+    """
+    run.nodes.gates.make({one.node for one in options.needs})
+    if options.needs:
+        needs = Needs(run, options, definition, spawn)
+        spawn("wait for what nodes need", needs.work())
+        spawn("see whether failed nodes lack something", needs.latch())
+
+
+class Needs:
+    """The nodes with needs of one run. Call work() once."""
+
+    def __init__(
+        self, run: Run, options: RunnerOptions, definition: Definition, spawn: Spawn
+    ) -> None:
+        self._run, self._definition, self._spawn = run, definition, spawn
+        self._paths = paths_by_node(options.needs)
+        self._start_timeout = options.start_timeout
+        self._passed: dict[str, list[Presence]] = {}
+        self._losing: set[str] = set()
+        self._closed: set[str] = set()
+        # Imported late: only dataflows with needs pay for ctypes.
+        from dora_systemd.runner.needs.watch import Watch
+
+        self._watch = Watch()
+
+    async def latch(self) -> None:
+        """Close the gate of a node without restarts that has failed, until it is clear why."""
+        pump = self._run.pump
+        while await pump.wait(lambda cell: bool(self._latched(cell)), None):
+            for node in self._latched(pump.cell):
+                self._run.nodes.gates.close(node)
+                self._closed.add(node)
+            self._watch.wake()
+
+    def _latched(self, cell: Cell) -> set[str]:
+        nodes = ((node, cell.nodes[node]) for node in self._paths.keys() & cell.nodes.keys())
+        down = {node for node, one in nodes if one.policy == LATCHED and one.state == "failed"}
+        return down - self._closed
+
+    async def work(self) -> None:
+        """Look, and act, again and again, until the run ends."""
+        with contextlib.closing(self._watch):
+            while await self._run.pump.wait(lambda cell: cell.state in _STATES, None):
+                self._watch.clear()
+                self._act(await asyncio.to_thread(self._look))
+                await self._watch.wait(_LOOK_SECONDS)
+
+    def _look(self) -> dict[str, list[Presence]]:
+        # Watch first: what changes after the look is not missed then.
+        self._watch.set_places(watched_places(one for many in self._paths.values() for one in many))
+        return {node: [look_at(path) for path in paths] for node, paths in self._paths.items()}
+
+    def _act(self, found: Mapping[str, list[Presence]]) -> None:
+        cell = self._run.pump.cell
+        if cell.state not in _STATES:
+            return
+        missing = {node: self._missing(node, seen) for node, seen in found.items()}
+        is_running, passed = cell.state is State.RUNNING, frozenset(self._passed)
+        for step in list(need_steps(cell.nodes, missing, is_running, passed)):
+            if step.node not in self._losing and not self._run.lock.locked():
+                self._take(step, found[step.node])
+
+    def _missing(self, node: str, seen: list[Presence]) -> str:
+        pairs = zip(self._paths[node], seen, strict=True)
+        reasons = [f"{path} ({one.reason})" for path, one in pairs if one.reason]
+        before = self._passed.get(node, seen)
+        if not reasons and before != seen:
+            changed = zip(self._paths[node], seen, before, strict=True)
+            reasons = [f"{path} ({_AGAIN})" for path, one, old in changed if one != old]
+        return ", ".join(reasons)
+
+    def _take(self, step: NeedStep, seen: list[Presence]) -> None:
+        node, pump, gates = step.node, self._run.pump, self._run.nodes.gates
+        if step.do is Do.LET_GO:
+            self._passed[node] = seen
+            self._closed.discard(node)
+            gates.open(node)
+            pump.push(life.NodeMet(now_us(), node))
+            self._renew_start()
+        elif step.do is Do.HOLD:
+            pump.push(life.NodeLacks(now_us(), node, step.needs))
+        elif step.do is Do.GIVE_UP:
+            gates.end(node, pump.cell.nodes[node].exit)
+        else:
+            self._lose(node, step.needs)
+
+    def _lose(self, node: str, needs: str) -> None:
+        old = self._run.pump.cell.nodes[node].pid
+        self._passed.pop(node, None)
+        self._losing.add(node)
+        self._run.nodes.gates.close(node)
+        self._run.pump.push(life.NodeLacks(now_us(), node, needs))
+        self._spawn(f"make node {node} wait", self._replace(node, old))
+
+    async def _replace(self, node: str, old: int) -> None:
+        """End the process `old` of the node, and have the next one wait."""
+        with self._until_done(node):
+            async with self._run.lock:
+                if node not in self._run.pump.cell.nodes:
+                    return  # a reload has removed it
+                with self._run.nodes.exchanging(node):
+                    await self._run.swapper.hold(self._definition(node))
+                await self._run.nodes.wait_gone(node, old)
+
+    @contextlib.contextmanager
+    def _until_done(self, node: str) -> Iterator[None]:
+        try:
+            yield
+        except DoraSystemdError as error:
+            if self._run.pump.cell.state is State.RUNNING:
+                reason = f"node {node} cannot wait for what it needs: {error.message}"
+                self._run.pump.push(life.Refused(now_us(), reason))
+        finally:
+            self._losing.discard(node)
+            self._watch.wake()
+
+    def _renew_start(self) -> None:
+        """The time of waiting is not part of the start timeout: it begins again."""
+        if self._run.pump.cell.state is not State.WAITING or self._start_timeout == INFINITY:
+            return
+        notify.extend_timeout(2 * self._start_timeout)
+        late = life.StartTimedOut(now_us(), self._start_timeout)
+        loop = asyncio.get_running_loop()
+        loop.call_later(self._start_timeout / SECOND, self._run.pump.push, late)

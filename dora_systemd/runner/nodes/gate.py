@@ -1,0 +1,90 @@
+"""The gates of nodes with needs: a launcher waits at one before it executes the node's program.
+
+A gate is a FIFO. launcher.pl opens it for reading, which waits until the runner has it open, and
+reads one word. So a gate is open for as long as the runner holds its descriptor and words are in
+it, and all launchers that come meanwhile go on: dora may start the node several times. When the
+runner closes the gate, the kernel drops the rest, and the next launcher waits.
+"""
+
+import contextlib
+import os
+from collections.abc import Iterable
+
+from dora_systemd.decisions.cell.exits import Exit, ExitKind
+from dora_systemd.paths import CellPaths
+
+_GO, _LEAVE = b"go.", b"e00"
+_WORDS = 1024
+"""Words that an open gate has at most: dora starts a node less than twice a second."""
+
+
+class Gates:
+    """The gates of all nodes with needs; none of them is open at first."""
+
+    def __init__(self, paths: CellPaths) -> None:
+        self._paths = paths
+        self._open: dict[str, int] = {}
+        self._known: set[str] = set()
+        self._passing: set[str] = set()
+        self._is_over = False
+
+    def make(self, nodes: Iterable[str]) -> None:
+        """Create closed gates for `nodes`, for a new run of the dataflow. Raises OSError."""
+        self._is_over = False
+        self._known = set(nodes)
+        for node in self._known:
+            self.close(node)
+            with contextlib.suppress(FileExistsError):
+                os.mkfifo(self._paths.node_gate(node), 0o600)
+
+    def open(self, node: str) -> None:
+        """Let every launcher of the node go on. Raises OSError."""
+        self._fill(node, _GO)
+        self._passing.add(node)
+
+    def end(self, node: str, exit: Exit) -> None:
+        """Have every launcher of the node end as the node has ended. Raises OSError."""
+        self._passing.discard(node)
+        self._fill(node, _word_of(exit))
+
+    def close(self, node: str) -> None:
+        """Let the launchers of the node wait."""
+        self._passing.discard(node)
+        if (fd := self._open.pop(node, None)) is not None:
+            self._empty(fd)
+            os.close(fd)
+
+    def dismiss(self) -> None:
+        """The run is about to end: end the launchers that wait. Nodes past their gate run on."""
+        self._is_over = True
+        for node in self._known - self._passing:
+            with contextlib.suppress(OSError):  # the whole directory may be gone
+                self._fill(node, _LEAVE, is_last=True)
+
+    def _fill(self, node: str, word: bytes, is_last: bool = False) -> None:
+        if self._is_over and not is_last:
+            return
+        if node not in self._open:
+            # Both ends: that never waits, and there is a reader while no launcher is there.
+            flags = os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOFOLLOW
+            self._open[node] = os.open(self._paths.node_gate(node), flags)
+        fd = self._open[node]
+        self._empty(fd)
+        os.write(fd, word * _WORDS)
+
+    @staticmethod
+    def _empty(fd: int) -> None:
+        with contextlib.suppress(BlockingIOError):
+            while os.read(fd, 3 * _WORDS):
+                pass
+
+    def refill(self, node: str) -> None:
+        """Dora has started the node once more: it has taken a word, if it went on."""
+        if node in self._passing:
+            self.open(node)
+
+
+def _word_of(exit: Exit) -> bytes:
+    letter = b"s" if exit.kind is ExitKind.SIGNAL else b"e"
+    number = exit.number if exit.kind in (ExitKind.SIGNAL, ExitKind.CODE) else 1
+    return b"%c%02x" % (letter, number & 0xFF)

@@ -1,0 +1,100 @@
+"""Checks what a dataflow needs before it starts: the units exist, and do not wait in a circle."""
+
+from pathlib import PurePosixPath
+from typing import NamedTuple
+
+from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.decisions.cell.needs import CLOCK, DATAFLOW, MOUNT, NETWORK
+from dora_systemd.decisions.needs.units import needed_mounts, required_units
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import name_from_unit, unit_name
+from dora_systemd.values import shown
+
+_MOST = 200
+"""Units that are looked at for a circle."""
+
+
+class Needy(NamedTuple):
+    """A dataflow with needs. name: of the dataflow. is_user: in a user's manager."""
+
+    name: str
+    is_user: bool
+    needs: tuple[str, ...]
+
+
+def check_needs(manager: Manager, plan: Needy) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) for a need that can never be met."""
+    needs = plan.needs
+    if not needs:
+        return
+    _check_scope(plan, needs)
+    for need, unit in required_units(needs).items():
+        _check_circle(manager, plan, need, unit)
+        _check_unit(manager, plan, need, unit)
+    for path in needed_mounts(needs):
+        _check_mount(manager, plan, path)
+
+
+def _check_scope(plan: Needy, needs: tuple[str, ...]) -> None:
+    """A user's manager has no units for the network, the clock and file systems."""
+    words = (NETWORK, CLOCK)
+    absent = [one for one in needs if one in words or one.startswith(MOUNT)]
+    if plan.is_user and absent:
+        raise _refusal(plan, absent[0], "a user's manager does not know that", "add --system")
+
+
+def _check_unit(manager: Manager, plan: Needy, need: str, unit: str) -> None:
+    state = str(manager.read(unit, ["LoadState"])["LoadState"])
+    if state == "loaded":
+        return
+    if not need.startswith(DATAFLOW):
+        raise _refusal(plan, need, f"unit {unit} is {state}", "see systemctl list-unit-files")
+    name = need.removeprefix(DATAFLOW)
+    hint = f"start it first, or enable it: doractl enable {name}"
+    raise _refusal(plan, need, f"no dataflow named '{name}'", hint)
+
+
+def _check_circle(manager: Manager, plan: Needy, need: str, unit: str) -> None:
+    """Follow the dependencies of dataflows; systemd would drop one of a circle's without a word."""
+    chain, left = {unit: [unit]}, [unit]
+    while left and len(chain) < _MOST:
+        one = left.pop()
+        if one == unit_name(plan.name):
+            names = [name_from_unit(each) or each for each in (unit_name(plan.name), *chain[one])]
+            reason = f"they wait for each other: {' -> '.join(names)}"
+            raise _refusal(plan, need, reason, "remove one of these needs")
+        needed = manager.read(one, ["Requires"])["Requires"] if name_from_unit(one) else ()
+        fresh = [each for each in needed if name_from_unit(each) and each not in chain]
+        chain |= {each: [*chain[one], each] for each in fresh}
+        left += fresh
+
+
+def _check_mount(manager: Manager, plan: Needy, path: str) -> None:
+    """A path needs a unit that mounts it: without one, systemd would wait for nothing."""
+    places = [PurePosixPath(path), *PurePosixPath(path).parents][:-1]
+    if not any(_is_mount(manager, str(place)) for place in places):
+        reason = f"nothing is mounted at {shown(path)} or above it"
+        raise _refusal(plan, f"{MOUNT}{path}", reason, "add it to /etc/fstab, see fstab(5)")
+
+
+def _is_mount(manager: Manager, path: str) -> bool:
+    unit = f"{_escaped(path)}.mount"
+    return bool(manager.read(unit, ["LoadState"])["LoadState"] == "loaded")
+
+
+def _escaped(path: str) -> str:
+    """As systemd-escape(1) --path."""
+    text = "".join(map(_escaped_byte, path.strip("/").encode()))
+    return f"\\x2e{text[1:]}" if text.startswith(".") else text
+
+
+def _escaped_byte(byte: int) -> str:
+    if byte == ord("/"):
+        return "-"
+    is_kept = byte < 128 and (chr(byte).isalnum() or chr(byte) in ":_.")
+    return chr(byte) if is_kept else f"\\x{byte:02x}"
+
+
+def _refusal(plan: Needy, need: str, reason: str, hint: str) -> DoraSystemdError:
+    message = f"cannot start {plan.name}: it needs {need}: {reason}"
+    return DoraSystemdError(message, hint, ExitCode.BAD_INPUT)

@@ -1,0 +1,42 @@
+"""What people are told about the needs of a dataflow, and which service waits for the clock."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.decisions.cell.needs import CLOCK, NodeNeed
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.status import WAITS
+from dora_systemd.decisions.needs.units import CLOCK_WAITERS
+from dora_systemd.names import unit_name
+from dora_systemd.values import shown
+
+_UNIT_PATHS = ("/etc/systemd/system", "/usr/lib/systemd/system", "/lib/systemd/system")
+_HIDDEN = ("/tmp/", "/var/tmp/")
+
+
+def clock_service() -> str:
+    """The service of this machine that waits until the clock is right, or ""."""
+    for one in CLOCK_WAITERS:
+        if any(Path(place, one).exists() for place in _UNIT_PATHS):
+            return one
+    return ""
+
+
+def needs_warnings(
+    needs: tuple[str, ...], nodes: tuple[NodeNeed, ...], has_own_tmp: bool
+) -> Iterator[str]:
+    """Warnings about needs that nothing here meets. has_own_tmp: the nodes do not see /tmp."""
+    if CLOCK in needs and not clock_service():
+        yield "nothing waits for the clock: neither systemd-timesyncd nor chrony is installed"
+    for node, path in nodes:
+        if has_own_tmp and path.startswith(_HIDDEN):
+            yield f"node {node} waits for {shown(path)}, but the sandbox has its own /tmp"
+
+
+def waiting_notes(manager: Manager, options: RunnerOptions) -> Iterator[str]:
+    """What a dataflow that has been started waits for, in the words of the runner."""
+    if options.needs:
+        text = str(manager.read(unit_name(options.name), ["StatusText"])["StatusText"])
+        if WAITS in text:
+            yield text

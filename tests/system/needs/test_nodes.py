@@ -1,0 +1,64 @@
+"""Nodes that wait for a device, lose it and get it back, with real dora and systemd."""
+
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.system.cells import Cell, Project
+from tests.system.needs.scene import fragile, node_of, seen, wait_running, wait_waiting, with_needs
+
+
+def test_a_node_waits_and_comes_back(cell: Cell, project: Project, place: Path) -> None:
+    camera = place / "video0"
+    done = cell.start(with_needs(project, [camera]))
+    assert f"source waits for {camera} (not there)" in done.stdout + done.stderr
+    wait_waiting(cell, "source", camera)
+    assert (seen(cell)["status"], cell.show("ActiveState")) == ("Waiting", "active")
+    assert f"source waits for {camera}" in cell.doractl("why", cell.name).stdout
+    assert "Waiting" in cell.doractl("list").stdout
+    camera.touch()
+    wait_running(cell)
+    cell.wait_exchanging()
+    others = {node: cell.status.nodes[node].pid for node in ("doubler", "sink")}
+
+    camera.unlink()
+    wait_waiting(cell, "source", camera)
+    assert seen(cell)["status"] == "Waiting"
+    assert {node: cell.status.nodes[node].pid for node in others} == others
+    camera.touch()
+    wait_running(cell)
+    cell.wait_exchanging()
+    assert {node: cell.status.nodes[node].pid for node in others} == others
+    assert (node_of(cell, "source")["restarts"], cell.show("NRestarts")) == (0, "0")
+    names = [name for name, node in cell.events() if node == "source"]
+    assert [one for one in names if "wait" in one or "met" in one] == [
+        *("node-waiting", "node-needs-met"),
+        *("node-waiting", "node-needs-met"),
+    ]
+    assert "node-crashed" not in names
+
+
+# Dora has not opened its start barrier: Node() of the others raises.
+@pytest.mark.warns("ExitCode(1)")
+def test_a_stop_ends_a_waiting_node_at_once(cell: Cell, project: Project, place: Path) -> None:
+    cell.start(with_needs(project, [place / "video0"]), "--grace-duration", "60s")
+    wait_waiting(cell, "source", place / "video0")
+    begun = time.monotonic()
+    cell.doractl("stop", cell.name)
+    assert time.monotonic() - begun < 30
+    assert cell.show("Result") == "success"
+
+
+@pytest.mark.warns("driver crashed", "the device is gone", "ExitCode(1)", "exited with code 1")
+def test_a_driver_that_ends_by_itself_waits_too(cell: Cell, project: Project, place: Path) -> None:
+    device = place / "ttyUSB0"
+    device.touch()
+    cell.start(fragile(project, device))
+    sink = cell.status.nodes["sink"].pid
+    device.unlink()
+    wait_waiting(cell, "driver", device)
+    device.touch()
+    wait_running(cell)
+    assert cell.status.nodes["sink"].pid == sink
+    assert cell.status.nodes["driver"].policy == "latched"

@@ -1,0 +1,109 @@
+"""The words of `needs`: what is accepted, in which form it is kept, and what is refused."""
+
+import pytest
+
+from dora_systemd.decisions.cell.needs import (
+    NodeNeed,
+    check_needs,
+    parse_needs,
+    parse_node_need,
+    paths_by_node,
+    split_needs,
+)
+from dora_systemd.decisions.needs.units import needs_properties
+from dora_systemd.errors import DoraSystemdError
+
+
+def test_each_need_is_kept_once_and_in_its_shortest_form() -> None:
+    texts = ["network", " clock ", "network", "dataflow:base", "unit:a@b.service", "mount:/mnt//x/"]
+    assert parse_needs(texts) == (
+        *("network", "clock", "dataflow:base", "unit:a@b.service", "mount:/mnt/x"),
+    )
+    assert parse_needs(["camera=/dev//video0", "/dev/./video0"]) == (
+        *("camera=/dev/video0", "/dev/video0"),
+    )
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *(
+            "",
+            "net",
+            "dataflow:",
+            "dataflow:a/b",
+            "unit:nginx",
+            "unit:../x.service",
+            "unit:a b.mount",
+        ),
+        *(
+            "mount:mnt",
+            "mount:/",
+            "mount:/a/../b",
+            "mount:/50%",
+            "dev/video0",
+            "camera=dev",
+            "/",
+            "//",
+        ),
+        *("/dev/\x1b[2J", "a b=/x", "=/x", "/dev/../etc", "clock=/x\n", "unit:x.service\nAfter=y"),
+    ],
+)
+def test_other_words_are_refused_in_one_line(text: str) -> None:
+    if text == "clock=/x\n":
+        assert parse_needs([text]) == ("clock=/x",)  # a node may have that name
+        return
+    with pytest.raises(DoraSystemdError) as caught:
+        parse_needs([text])
+    assert "\n" not in caught.value.message + caught.value.hint
+    assert caught.value.hint
+
+
+def test_a_word_that_is_nearly_right_gets_a_hint() -> None:
+    with pytest.raises(DoraSystemdError) as caught:
+        parse_needs(["netwrok"])
+    assert caught.value.hint == "did you mean network?"
+
+
+def test_paths_are_for_nodes_and_units_for_the_dataflow() -> None:
+    given = ("network", "camera=/dev/video0")
+    needs = split_needs(given, {"arm": ("/dev/ttyUSB0", "/dev/ttyUSB1")})
+    nodes = (
+        NodeNeed("arm", "/dev/ttyUSB0"),
+        NodeNeed("arm", "/dev/ttyUSB1"),
+        NodeNeed("camera", "/dev/video0"),
+    )
+    assert needs == (("network",), nodes)
+    assert paths_by_node(nodes)["arm"] == ("/dev/ttyUSB0", "/dev/ttyUSB1")
+    with pytest.raises(DoraSystemdError):
+        split_needs(("/dev/video0",), {})
+    for texts in (("network",), ("b=/x",)):
+        with pytest.raises(DoraSystemdError):
+            split_needs((), {"a": texts})
+
+
+def test_the_need_of_a_node_survives_the_command_line() -> None:
+    need = NodeNeed("camera.left", "/dev/v4l/by-id/a=b")
+    assert parse_node_need("=".join(need)) == need
+    with pytest.raises(DoraSystemdError):
+        parse_node_need("network")
+
+
+def test_a_node_that_dora_starts_itself_cannot_wait() -> None:
+    need = [NodeNeed("camera", "/dev/video0")]
+    check_needs(need, {"camera": True})
+    for nodes in ({"camera": False}, {"camra": True}):
+        with pytest.raises(DoraSystemdError) as caught:
+            check_needs(need, nodes)
+        assert "camera" in caught.value.message
+
+
+def test_needs_become_dependencies_of_the_unit() -> None:
+    needs = ("network", "clock", "dataflow:base", "unit:x.service", "mount:/mnt/a b")
+    found = {key: one.value for key, one in needs_properties(needs, "chrony-wait.service").items()}
+    wanted = ("network-online.target", "time-sync.target", "chrony-wait.service")
+    assert found["Wants"] == wanted
+    assert set(found["Requires"]) == {"x.service", "dora-base.service"}
+    assert set(found["After"]) == {*wanted, *found["Requires"]}
+    assert found["RequiresMountsFor"] == ("/mnt/a b",)
+    assert needs_properties((), "chrony-wait.service") == {}

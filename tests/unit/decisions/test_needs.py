@@ -1,0 +1,72 @@
+"""What happens to nodes whose needs are missing: every state, before and after the start."""
+
+import pytest
+
+from dora_systemd.decisions.cell.needs import NodeNeed
+from dora_systemd.decisions.cell.status import HELD, LATCHED, NODE_STATES, NodeStatus
+from dora_systemd.decisions.needs.devices import device_entries
+from dora_systemd.decisions.needs.steps import Do, NeedStep, need_steps
+
+GONE = "/dev/video0 (not there)"
+OPEN = frozenset({"camera"})
+
+
+def steps(node: NodeStatus, missing: str, is_running: bool, passed: frozenset[str]) -> list[Do]:
+    found = need_steps({"camera": node}, {"camera": missing}, is_running, passed)
+    return [one.do for one in found]
+
+
+def test_before_the_start_all_nodes_wait_for_the_last_need() -> None:
+    nodes = {"camera": NodeStatus(), "arm": NodeStatus(), "sink": NodeStatus()}
+    found = list(need_steps(nodes, {"camera": "", "arm": GONE}, False, frozenset()))
+    assert found == [
+        NeedStep(Do.HOLD, "arm", GONE),
+        NeedStep(Do.HOLD, "camera", "node arm"),
+    ]
+    met = need_steps(nodes, {"camera": "", "arm": ""}, False, frozenset())
+    assert [one.do for one in met] == [Do.LET_GO, Do.LET_GO]
+
+
+def test_a_wait_is_told_once_for_each_reason() -> None:
+    waiting = NodeStatus("waiting", needs=GONE)
+    for is_running in (False, True):
+        assert steps(waiting, GONE, is_running, frozenset()) == []
+        assert steps(waiting, "/dev/video0 (no permission)", is_running, frozenset()) == [Do.HOLD]
+        assert steps(waiting, "", is_running, frozenset()) == [Do.LET_GO]
+
+
+@pytest.mark.parametrize("state", NODE_STATES)
+def test_a_lost_device_ends_only_what_runs(state: str) -> None:
+    ends = state in ("starting", "ready", "running", "restarting")
+    expected = [Do.LOSE] if ends else [Do.HOLD] if state == "waiting" else []
+    assert steps(NodeStatus(state), GONE, True, OPEN) == expected
+
+
+@pytest.mark.parametrize("state", NODE_STATES)
+def test_a_node_that_has_all_runs_on(state: str) -> None:
+    assert steps(NodeStatus(state), "", True, OPEN) == ([Do.LET_GO] if state == "waiting" else [])
+
+
+@pytest.mark.parametrize(
+    ("policy", "missing", "expected"),
+    [
+        *((LATCHED, "", [Do.GIVE_UP]), (LATCHED, GONE, [Do.LOSE])),
+        *((HELD, "", []), (HELD, GONE, [Do.LOSE]), ("never", GONE, []), ("always", GONE, [])),
+    ],
+)
+def test_a_failed_node_waits_only_if_dora_can_still_replace_it(
+    policy: str, missing: str, expected: list[Do]
+) -> None:
+    assert steps(NodeStatus("failed", policy=policy), missing, True, OPEN) == expected
+
+
+def test_a_node_that_was_added_passes_its_gate() -> None:
+    assert steps(NodeStatus("starting"), "", True, frozenset()) == [Do.LET_GO]
+    assert steps(NodeStatus("starting"), GONE, True, frozenset()) == [Do.HOLD]
+
+
+def test_the_sandbox_opens_the_group_of_a_device() -> None:
+    paths = ("/dev/video0", "/dev/v4l/by-id/usb-x", "/dev/serial/by-id/y", "/dev/odd", "/srv/map")
+    assert device_entries(NodeNeed("camera", path) for path in paths) == (
+        *("char-video4linux rw", "char-ttyUSB rw", "char-ttyACM rw", "/dev/odd rw"),
+    )
