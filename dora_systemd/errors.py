@@ -16,6 +16,7 @@ class ExitCode(IntEnum):
     NO_SYSTEMD = 7
     NO_PERMISSION = 8
     NO_DORA = 9
+    ROLLED_BACK = 11
     INTERRUPTED = 130
 
 
