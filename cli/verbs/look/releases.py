@@ -5,7 +5,7 @@ import click
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.listing import print_table
 from dora_systemd.cli.parameters import current_scope, output_option, print_json, scope_options
-from dora_systemd.decisions.releases.rows import format_releases, release_object
+from dora_systemd.decisions.views.releases import format_releases, release_object
 from dora_systemd.verbs.releases.listing import deployed_names, read_releases
 from dora_systemd.verbs.releases.rollback import deployed_name
 

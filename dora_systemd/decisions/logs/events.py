@@ -90,7 +90,8 @@ EVENTS = {
 # Each life of a dataflow ends with one of these, unless the runner was killed.
 END_EVENTS = ("dataflow-finished", "dataflow-stopped", "dataflow-failed")
 
-REQUESTS = ("stop-asked", "release-committed", "release-rolled-back")
+ROLLED_BACK = "release-rolled-back"
+REQUESTS = ("stop-asked", "release-committed", ROLLED_BACK)
 """What doractl writes about a dataflow, outside of its unit."""
 
 # Details for the text only: the origin of the record has the fields for them.

@@ -4,6 +4,7 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+from dora_systemd.decisions.releases.ids import release_of
 from dora_systemd.terminal_text import cut, one_line
 from dora_systemd.values import SECOND, format_rounded_size
 
@@ -83,6 +84,11 @@ class DataflowRow(NamedTuple):
     enabled: bool = False
     problem: str = ""
 
+    @property
+    def release(self) -> str:
+        """The release that it runs, "" if it was not deployed."""
+        return release_of(self.dataflow)
+
 
 def status_word(active: str, sub: str, stage: str = "") -> str:
     """The status of a dataflow in one word.
@@ -141,8 +147,8 @@ def _prefix(uuid: str, others: Sequence[str]) -> str:
 
 
 _OPTIONAL = (
-    *("BOOT", "PEAK", "PID", "THROTTLED%", "RESTARTS", "UPTIME", "WAITS FOR", "MEM", "CPU%"),
-    *("NODES", "UUID"),
+    *("RELEASE", "BOOT", "PEAK", "PID", "THROTTLED%", "RESTARTS", "UPTIME", "WAITS FOR"),
+    *("MEM", "CPU%", "NODES", "UUID"),
 )
 """Columns that a narrow terminal does without, in this order."""
 _LEAST = 12
@@ -222,15 +228,17 @@ def format_dataflows(
 ) -> str:
     """The table of `doractl list`, for a terminal of that width.
 
-    With ENDED and WHY if any of them has ended.
+    With RELEASE if any of them is deployed, with ENDED and WHY if any of them has ended.
     """
     prefixes = shortest_prefixes([row.uuid for row in rows])
-    header = _HEADER if all(map(is_up_word, rows)) else (*_HEADER, "ENDED", "WHY")
-    cells = [_dataflow_cells(row, prefixes[row.uuid])[: len(header)] for row in rows]
+    more = () if all(map(is_up_word, rows)) else ("ENDED", "WHY")
+    is_deployed = any(row.release for row in rows)
+    header = (*_HEADER, *(("RELEASE",) if is_deployed else ()), *more)
+    cells = [_dataflow_cells(row, prefixes[row.uuid], is_deployed)[: len(header)] for row in rows]
     return format_table(header, cells, width, want_colors)
 
 
-def _dataflow_cells(row: DataflowRow, prefix: str) -> tuple[str, ...]:
+def _dataflow_cells(row: DataflowRow, prefix: str, with_release: bool) -> tuple[str, ...]:
     return (
         prefix,
         row.name,
@@ -241,6 +249,7 @@ def _dataflow_cells(row: DataflowRow, prefix: str) -> tuple[str, ...]:
         format_memory(row.memory, row.memory_limit),
         format_count(row.restarts),
         "yes" if row.enabled else UNKNOWN,
+        *((row.release or UNKNOWN,) if with_release else ()),
         local_time(row.ended),
         UNKNOWN if is_up_word(row) else row.text or UNKNOWN,
     )

@@ -8,7 +8,13 @@ from dataclasses import dataclass
 
 from dora_systemd.decisions.cell.status import ALIVE_NODE_STATES, NODE_STATES, WHOLE_CELL
 from dora_systemd.decisions.resources.usage import Strain, Usage
-from dora_systemd.decisions.views.dataflows import FAILED, STOPPED, UP_WORDS, NodeRow
+from dora_systemd.decisions.views.dataflows import (
+    FAILED,
+    STOPPED,
+    UP_WORDS,
+    DataflowRow,
+    NodeRow,
+)
 from dora_systemd.decisions.views.snapshot import Observed
 from dora_systemd.values import INFINITY, SECOND
 
@@ -72,7 +78,7 @@ STATE = Family("state", "1 for the current state, 0 for all others.")
 RESTARTS = Family("restarts_total", "Automatic restarts.")
 START = Family("start_time_seconds", "When all nodes were ready, in Unix time.")
 NODE_START = Family("start_time_seconds", "When it became ready, in Unix time.")
-INFO = Family("info", "UUID and unit of a dataflow; the value is always 1.")
+INFO = Family("info", "UUID, unit and release of a dataflow; the value is always 1.")
 NODES = Family("nodes", "Nodes that the dataflow has.")
 ALIVE = Family("nodes_alive", "Nodes that are running.")
 LINES = Family("log_lines_total", "Lines sent to journald.")
@@ -97,7 +103,7 @@ def format_metrics(observed: Sequence[Observed], version: str) -> str:
 
 def _dataflow_samples(observed: Sequence[Observed]) -> Iterator[tuple[Family, list[Sample]]]:
     labelled = [({"dataflow": one.row.name}, one) for one in observed]
-    yield INFO, [({**own, "uuid": o.row.uuid, "unit": o.row.unit}, 1) for own, o in labelled]
+    yield INFO, [({**own, **_identity(one.row)}, 1) for own, one in labelled]
     yield STATE, [s for own, o in labelled for s in _states(own, o.row.status.lower(), STATES)]
     yield RESTARTS, [(own, one.unit_restarts) for own, one in labelled]
     yield START, [(own, o.row.started / SECOND) for own, o in labelled if o.row.started]
@@ -105,6 +111,11 @@ def _dataflow_samples(observed: Sequence[Observed]) -> Iterator[tuple[Family, li
     yield ALIVE, [(own, one.row.nodes_alive) for own, one in labelled if one.usage]
     yield LOST, [(own, o.lines[WHOLE_CELL].lost) for own, o in labelled if WHOLE_CELL in o.lines]
     yield from _group_samples([(own, one, WHOLE_CELL) for own, one in labelled])
+
+
+def _identity(row: DataflowRow) -> Labels:
+    release = {"release": row.release} if row.release else {}
+    return {"uuid": row.uuid, "unit": row.unit, **release}
 
 
 def _node_samples(observed: Sequence[Observed]) -> Iterator[tuple[Family, list[Sample]]]:

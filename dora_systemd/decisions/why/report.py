@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from dora_systemd.decisions.cell.exits import ExitKind, parse_exit
 from dora_systemd.decisions.cell.restarts import budget_words
 from dora_systemd.decisions.life.causes import Cause
+from dora_systemd.decisions.logs.events import ROLLED_BACK
+from dora_systemd.decisions.releases.ids import release_of
 from dora_systemd.decisions.views.dataflows import (
     RESTARTING,
     UNKNOWN,
@@ -113,6 +115,12 @@ def remedies(report: Report) -> list[str]:
         "pid": verdict.details.get("node_pid", "PID"),
     }
     filled = [text.format(**values) for text in texts if text]
+    if release_of(subject.file) or any(one.name == ROLLED_BACK for one in verdict.timeline):
+        fixed = f"doractl deploy --name {subject.name}"
+        return [
+            text.replace(f", then run: doractl restart {subject.name}", f", then run: {fixed}")
+            for text in filled
+        ]
     if subject.is_loaded:
         return filled
     again = f"doractl start {values['file']} --name {subject.name}"
@@ -183,8 +191,19 @@ def _facts(report: Report) -> list[str]:
         "Before": f"{verdict.before} ({zoned_time(verdict.before_us)})" if verdict.before else "",
         "Unit": f"{subject.unit} ({subject.uuid})",
         "File": subject.file,
+        "Release": release_of(subject.file),
+        "Undone": _undone(verdict),
     }
     return [f"{key + ':':<{_TITLE_WIDTH}}{text}" for key, text in facts.items() if text]
+
+
+def _undone(verdict: Verdict) -> str:
+    """The last release that failed its trial before this life, if it is recorded."""
+    found = [one for one in verdict.timeline if one.name == ROLLED_BACK]
+    if not found:
+        return ""
+    one = found[-1]
+    return f"{one.detail('release')} at {zoned_time(one.at_us)}: {one.detail('reason')}"
 
 
 def _budget_words(report: Report) -> str:

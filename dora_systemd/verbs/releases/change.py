@@ -12,7 +12,8 @@ from dora_systemd.adapters.bus.manager import SETTLED, Manager
 from dora_systemd.adapters.host.unit_files import remove_unit_file
 from dora_systemd.adapters.releases.store import Store, unusable
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.releases.gate import Fault
+from dora_systemd.decisions.logs.events import ROLLED_BACK
+from dora_systemd.decisions.why.faults import Fault
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.values import INFINITY
@@ -25,7 +26,6 @@ from dora_systemd.verbs.releases.trial import (
     go_back,
 )
 from dora_systemd.verbs.start.asked import note_request
-from dora_systemd.verbs.stop import note_stop
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -51,8 +51,8 @@ def change_release(
     back, too.
     """
     name = change.options.name
-    if standing.cell is not None:
-        note_stop([standing.cell], change.command)
+    if standing.cell is not None and standing.cell.is_up:
+        note_request("stop-asked", name, standing.cell.uuid, change.command)
     # After this nothing is certain but what the journal and systemd say: undo it in any case.
     with _interruptible():
         try:
@@ -102,7 +102,7 @@ def _roll_back(
         now = f"the way back has failed, too: {error.message}"
     details = {"release": change.release, "former": former, "nodes": fault.node}
     note_request(
-        "release-rolled-back",
+        ROLLED_BACK,
         name,
         change.options.uuid,
         change.command,

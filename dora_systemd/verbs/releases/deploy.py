@@ -103,6 +103,8 @@ def deploy(
             store.write_unit(release, text)
         except BaseException as error:
             store.remove(release)
+            if isinstance(error, DoraSystemdError):
+                raise _at_source(error, store, release, source) from error
             if isinstance(error, OSError):
                 raise unusable(store.path, error) from error
             raise
@@ -218,6 +220,15 @@ def _unit_text(
     for warning in warnings:
         warn(warning)
     return _persistent(manager, scope, plan, format_unit(properties))
+
+
+def _at_source(
+    error: DoraSystemdError, store: Store, release: str, source: Source
+) -> DoraSystemdError:
+    """The error with the paths of the project: those of the copy are gone."""
+    tree = str(store.tree(release))
+    message, hint = (text.replace(tree, source.root) for text in (error.message, error.hint))
+    return DoraSystemdError(message, hint, error.code)
 
 
 def _persistent(manager: Manager, scope: Scope, plan: Plan, text: str) -> str:

@@ -1,7 +1,7 @@
 """`doractl releases`: the releases in the store, and which of them runs."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -9,8 +9,8 @@ from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.releases.store import Store, store_root
 from dora_systemd.decisions.releases.choice import Known, state_of
 from dora_systemd.decisions.releases.manifest import Manifest
-from dora_systemd.decisions.releases.rows import ReleaseRow
 from dora_systemd.decisions.views.findings import Finding, State
+from dora_systemd.decisions.views.releases import ReleaseRow
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import is_name, unit_name
 from dora_systemd.scope import Scope
@@ -55,16 +55,14 @@ def _row(store: Store, standing: Standing, one: Known) -> ReleaseRow:
     return ReleaseRow(store.name, one.id, state, str(store.tree(one.id)), manifest)
 
 
-def judge_releases(manager: Manager, scope: Scope) -> list[Finding]:
+def judge_releases(manager: Manager, scope: Scope) -> Iterator[Finding]:
     """The findings of `doractl doctor` about what a killed deploy has left."""
-    found = []
     for name in deployed_names(scope):
         store, standing = store_of(scope, name), read_standing(manager, scope, unit_name(name))
         if standing.trial:
             text = f"{name} runs release {standing.trial} on trial, and the next boot does not"
             remedy = f"doractl deploy --name {name}, or doractl rollback {name}"
-            found.append(Finding("releases", State.WARNING, text, remedy))
+            yield Finding("releases", State.WARNING, text, remedy)
         for path in store.unfinished():
             text = f"{path} is the rest of a deploy that was killed"
-            found.append(Finding("releases", State.NOTE, text, "the next deploy removes it"))
-    return found
+            yield Finding("releases", State.NOTE, text, "the next deploy removes it")

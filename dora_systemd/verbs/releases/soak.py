@@ -11,7 +11,7 @@ from contextlib import suppress
 from dora_systemd.adapters.bus.manager import ON_THE_WAY, SETTLED, Manager
 from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.decisions.logs.query import scope_matches
-from dora_systemd.decisions.releases.gate import FAULT_IDS, Fault, find_fault, is_finished
+from dora_systemd.decisions.why.faults import FAULT_IDS, Fault, find_fault, is_finished
 from dora_systemd.decisions.why.lives import Happening, parse_happening
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import unit_name
@@ -100,9 +100,9 @@ class Gate:
         """What its end means: a dataflow may finish, everything else is a fault."""
         found = self._happenings()
         if fault := find_fault(found, self._since_us, self._before):
-            # The runner's own words have the number of restarts.
+            # The runner's own words have the number of restarts, and may name other nodes, too.
             words = failure_reason(self._manager, self._unit)
-            is_same = fault.node and f"node {fault.node}:" in words
+            is_same = words.startswith(f"node {fault.node}: ") and ", node " not in words
             return fault._replace(reason=words) if is_same else fault
         if refusal := runners_refusal(self._manager, self._unit):
             return Fault(refusal.message)

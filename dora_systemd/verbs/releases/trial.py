@@ -24,6 +24,9 @@ from dora_systemd.verbs.facts.cells import Cell, read_cell
 from dora_systemd.verbs.start.claim import require_free_name
 from dora_systemd.verbs.start.enable import BootUnit, install_unit_file, read_boot_unit
 
+_RELOADS = 2
+"""Tries to reload systemd before the one whose failure counts."""
+
 
 @dataclass(frozen=True)
 class Standing:
@@ -96,7 +99,7 @@ def require_deployable(manager: Manager, scope: Scope, standing: Standing) -> No
 def begin_trial(manager: Manager, standing: Standing, text: str) -> None:
     """Let the next start of the unit be that of the release. Raises DoraSystemdError."""
     write_unit_file(standing.path, text)
-    manager.reload()
+    _reload(manager)
 
 
 def commit(manager: Manager, standing: Standing, text: str, want_boot: bool) -> None:
@@ -113,7 +116,7 @@ def commit(manager: Manager, standing: Standing, text: str, want_boot: bool) -> 
 def end_trial(manager: Manager, standing: Standing) -> None:
     """Let the unit file on the disk take effect again. Raises DoraSystemdError."""
     remove_unit_file(standing.path)
-    manager.reload()
+    _reload(manager)
 
 
 def go_back(manager: Manager, standing: Standing, want_start: bool) -> None:
@@ -129,3 +132,12 @@ def go_back(manager: Manager, standing: Standing, want_start: bool) -> None:
         manager.reset_failed(unit)
     if want_start:
         manager.queue_job("RestartUnit", unit)
+
+
+def _reload(manager: Manager) -> None:
+    """Have systemd load its unit files; on a loaded machine that can take longer than a call."""
+    for _ in range(_RELOADS):
+        with suppress(DoraSystemdError):
+            manager.reload()
+            return
+    manager.reload()

@@ -5,6 +5,7 @@ from dataclasses import replace
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.host.unit_files import remove_changes, remove_unit_file
 from dora_systemd.decisions.properties.assignments import Properties
+from dora_systemd.decisions.releases.ids import release_of
 from dora_systemd.decisions.unit.file import persistent_unit, says_the_same
 from dora_systemd.decisions.unit.properties import format_unit
 from dora_systemd.decisions.views.dataflows import local_time
@@ -86,8 +87,19 @@ def place_unit_file(
         if not says_the_same(text, boot.text):
             raise _differs(plan.options.name, boot)
         return True
+    _refuse_deployed(plan.options.name, boot)
     drop_unit_files(manager, boot)
     return False
+
+
+def _refuse_deployed(name: str, boot: BootUnit) -> None:
+    """Raise DoraSystemdError (NAME_IN_USE) for the unit file of a release."""
+    if boot.options is not None and (release := release_of(boot.options.dataflow)):
+        raise DoraSystemdError(
+            f"cannot start {name}: release {release} is deployed under that name",
+            f"doractl restart {name} starts that one; or choose another --name",
+            ExitCode.NAME_IN_USE,
+        )
 
 
 def _forget(manager: Manager, boot: BootUnit) -> None:

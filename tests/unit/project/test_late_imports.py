@@ -32,7 +32,8 @@ LATE = {
         "cli.group": {"difflib"},
     },
     "a Tab after a verb or an option does not ask for a dataflow": {
-        "cli.completion": {"verbs.facts.cells", "verbs.facts.list", "verbs.facts.selector"},
+        "cli.completion": {"verbs.facts.cells", "verbs.facts.list", "verbs.facts.selector"}
+        | {"verbs.releases.listing"},
     },
     "seldom: what is not in systemd, has restarted, was killed, or enabled while it ran": {
         "verbs.facts.budget": {"adapters.journal.reader"},
