@@ -1,4 +1,4 @@
-"""Names of dataflows, their units, UUIDs and nodes; no name can mean another unit.
+"""Names of dataflows, their units, UUIDs, nodes and releases; no name can mean another unit.
 
 For a name that is not known there is a hint with similar ones.
 """
@@ -32,6 +32,12 @@ _UNIT_SUFFIXES = (
     *(".service", ".socket", ".device", ".mount", ".automount", ".swap"),
     *(".target", ".path", ".timer", ".slice", ".scope"),
 )
+STORE = "dora-systemd/releases"
+"""The directory of all releases, below that of states."""
+TREE = "tree"
+"""The directory of a project's files in a release."""
+_RELEASE = r"[0-9]{8}T[0-9]{6}(?:-[0-9a-f]{4,64}\+?)?(?:\.[0-9]{1,4})?"
+_RELEASE_PLACE = re.compile(rf"/{STORE}/[^/]+/({_RELEASE})/{TREE}/")
 _UUID = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}")
 _ZERO_UUID = "00000000-0000-0000-0000-000000000000"
 MIN_PREFIX = 4
@@ -110,6 +116,20 @@ def name_from_unit(unit: str) -> str | None:
     """The dataflow of `unit`, or None if it is not a unit of ours."""
     name = unit.removeprefix(UNIT_PREFIX).removesuffix(UNIT_SUFFIX)
     return name if unit == unit_name(name) and is_name(name) else None
+
+
+def is_release_id(text: str) -> bool:
+    """Whether it is the id of a release, such as 20261121T220012-9f3c1a2."""
+    return re.fullmatch(_RELEASE, text) is not None
+
+
+def release_of(path: str) -> str:
+    """The release that a file is in, "" if it is in none.
+
+    There is no registry: the unit names its dataflow file, and that path has the release in it.
+    """
+    found = _RELEASE_PLACE.search(path)
+    return found[1] if found else ""
 
 
 def is_node_id(text: str) -> bool:

@@ -13,9 +13,9 @@ from dora_systemd.adapters.host.unit_files import (
 from dora_systemd.adapters.runner_socket.client import done_of, order
 from dora_systemd.decisions.cell.hot_reload import CHANGE_VARIABLE
 from dora_systemd.decisions.properties.assignments import typed
-from dora_systemd.decisions.releases.ids import release_of
 from dora_systemd.decisions.unit.properties import format_unit
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import release_of
 from dora_systemd.scope import Scope
 from dora_systemd.values import format_bool
 from dora_systemd.verbs.facts.cells import Cell

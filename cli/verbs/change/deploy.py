@@ -91,9 +91,8 @@ def command(
 
 def deployed_outcome(done: Deployed, how: str) -> Outcome:
     """What is printed for a release that runs. how: "deployed" or "rolled back"."""
-    facts = done._asdict()
-    details = {key: facts[key] for key in ("release", "files", "size", "copied")}
-    details |= {"former": done.former or None}
+    details = {"release": done.release, "former": done.former or None, "files": done.files}
+    details |= {"size_bytes": done.size, "copied_bytes": done.copied}
     lines = [f"Dataflow {how}: {done.uuid} ({done.name})", f"Release: {done.release}"]
     lines += [f"Before: {done.former}"] if done.former else []
     return Outcome(done, "\n".join([*lines, f"Unit: {done.unit}"]), details=details)

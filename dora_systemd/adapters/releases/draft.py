@@ -12,8 +12,8 @@ from pathlib import Path
 
 from dora_systemd.adapters.releases.store import MANIFEST, Store, remove_tree, sync, write_part
 from dora_systemd.decisions.releases.entries import Stored
-from dora_systemd.decisions.releases.ids import TREE
 from dora_systemd.decisions.releases.manifest import Manifest, format_manifest
+from dora_systemd.names import TREE
 
 _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 _LIBC = ctypes.CDLL(None, use_errno=True)

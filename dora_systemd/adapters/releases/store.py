@@ -13,9 +13,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from dora_systemd.decisions.releases.choice import Known
-from dora_systemd.decisions.releases.ids import STORE, TREE, is_release_id
 from dora_systemd.decisions.releases.manifest import Manifest, parse_manifest
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import STORE, TREE, is_release_id
 from dora_systemd.trust.files import read_file
 from dora_systemd.values import shown
 

@@ -4,7 +4,7 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from dora_systemd.decisions.releases.ids import release_of
+from dora_systemd.names import release_of
 from dora_systemd.terminal_text import cut, one_line
 from dora_systemd.values import SECOND, format_rounded_size
 

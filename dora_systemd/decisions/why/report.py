@@ -10,7 +10,6 @@ from dora_systemd.decisions.cell.exits import ExitKind, parse_exit
 from dora_systemd.decisions.cell.restarts import budget_words
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.logs.events import ROLLED_BACK
-from dora_systemd.decisions.releases.ids import release_of
 from dora_systemd.decisions.views.dataflows import (
     RESTARTING,
     UNKNOWN,
@@ -21,6 +20,7 @@ from dora_systemd.decisions.views.dataflows import (
 from dora_systemd.decisions.why.last_lines import Word, shown_last
 from dora_systemd.decisions.why.signs import known_remedy
 from dora_systemd.decisions.why.verdict import Restart, Verdict
+from dora_systemd.names import release_of
 from dora_systemd.terminal_text import cut, one_line
 from dora_systemd.values import SECOND, format_duration, format_rounded_size
 

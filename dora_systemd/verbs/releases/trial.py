@@ -16,9 +16,9 @@ from dora_systemd.adapters.host.unit_files import (
     write_unit_file,
 )
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.releases.ids import release_of
 from dora_systemd.decisions.unit.file import runner_of
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import release_of
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell, read_cell
 from dora_systemd.verbs.start.claim import require_free_name

@@ -5,11 +5,11 @@ from dataclasses import replace
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.host.unit_files import remove_changes, remove_unit_file
 from dora_systemd.decisions.properties.assignments import Properties
-from dora_systemd.decisions.releases.ids import release_of
 from dora_systemd.decisions.unit.file import persistent_unit, says_the_same
 from dora_systemd.decisions.unit.properties import format_unit
 from dora_systemd.decisions.views.dataflows import local_time
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import release_of
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell, read_cell
 from dora_systemd.verbs.start.enable import (

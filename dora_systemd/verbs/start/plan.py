@@ -19,12 +19,11 @@ from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
 from dora_systemd.decisions.descriptor.expansion import called_variables
 from dora_systemd.decisions.descriptor.nodes import UNEXPANDED
 from dora_systemd.decisions.properties.sandbox import Sandbox
-from dora_systemd.decisions.releases.ids import release_of
 from dora_systemd.decisions.settings.resolve import Settings
 from dora_systemd.decisions.settings.runner_options import with_settings
 from dora_systemd.decisions.settings.table import ENV, ENV_FILE, USER, WORKING_DIRECTORY
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.names import name_from_path, parse_name, unit_name
+from dora_systemd.names import name_from_path, parse_name, release_of, unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.trust.files import read_file
 from dora_systemd.trust.paths import Place

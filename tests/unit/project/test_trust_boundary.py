@@ -43,7 +43,7 @@ OTHERWISE = (
 
 _TABLE = {
     DOOR: """
-        trust.eyes trust.paths trust.programs trust.sight trust.sockets trust.terminals
+        trust.courier trust.eyes trust.paths trust.project trust.programs trust.sight trust.sockets trust.terminals
     """,
     OWN: """
         adapters.dora.preparation adapters.host.files cli.main cli.verbs.look.logs
@@ -55,6 +55,7 @@ _TABLE = {
     """,
     ROOTS: """
         adapters.bus.connection adapters.bus.errors adapters.host.unit_files
+        adapters.releases.draft adapters.releases.store verbs.releases.trial
         adapters.journal.journalctl adapters.journal.reader adapters.journal.socket verbs.doctor
         verbs.facts.enabled verbs.follow verbs.gateway verbs.setup verbs.show
         verbs.start.enable verbs.up

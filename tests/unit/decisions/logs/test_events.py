@@ -36,6 +36,9 @@ def test_catalog_entry_says_what_and_what_to_do(name: str) -> None:
             "DORA_COUNT",
             "DORA_LIMIT",
             "DORA_MOST",
+            "DORA_RELEASE",
+            "DORA_FORMER",
+            "DORA_REASON",
             "UNIT",
         }
 
