@@ -43,7 +43,8 @@ OTHERWISE = (
 
 _TABLE = {
     DOOR: """
-        trust.courier trust.eyes trust.paths trust.project trust.programs trust.sight trust.sockets trust.terminals
+        trust.courier trust.eyes trust.paths trust.project trust.programs
+        trust.sight trust.sockets trust.terminals
     """,
     OWN: """
         adapters.dora.preparation adapters.host.files cli.main cli.verbs.look.logs
