@@ -4,6 +4,7 @@ import os
 import time
 import uuid
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -133,11 +134,15 @@ def newest(store: Store) -> Manifest | None:
 
 
 def prune(manager: Manager, scope: Scope, store: Store, keep: int, latest: str) -> None:
-    """Remove the oldest releases beyond `keep`. latest: the one that was tried."""
-    standing = read_standing(manager, scope, unit_name(store.name))
-    used = {latest, standing.trial}
-    for release in surplus(store.known(), keep, standing.current, used):
-        store.remove(release)
+    """Remove the oldest releases beyond `keep`. latest: the one that was tried.
+
+    What cannot be removed now can be after the next deploy.
+    """
+    with suppress(DoraSystemdError, OSError):
+        standing = read_standing(manager, scope, unit_name(store.name))
+        used = {latest, standing.trial}
+        for release in surplus(store.known(), keep, standing.current, used):
+            store.remove(release)
 
 
 def _owners(source: Source) -> list[int]:

@@ -6,7 +6,7 @@ in a trial, the machine boots what has proved itself.
 """
 
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import UP, Manager
@@ -43,8 +43,11 @@ class Standing:
 
     @property
     def current(self) -> str:
-        """The release that the unit file on the disk starts, or ""."""
-        return release_of(self.boot.options.dataflow) if self.boot.options else ""
+        """The release that every start runs without that of the trial, or ""."""
+        known = self.boot.options
+        if known is None and self.cell is not None and not self.path.exists():
+            known = self.cell.options  # disabled while it ran
+        return release_of(known.dataflow) if known else ""
 
     @property
     def has_base(self) -> bool:
@@ -78,8 +81,10 @@ def read_standing(manager: Manager, scope: Scope, unit: str) -> Standing:
     """What there is of the dataflow. Raises DoraSystemdError (NAME_IN_USE) for foreign units."""
     options = trial_options(scope, unit)
     boot = read_boot_unit(manager, scope, unit)
+    standing = Standing(boot, trial_path(scope, unit), "", read_cell(manager, unit))
     trial = release_of(options.dataflow) if options else ""
-    return Standing(boot, trial_path(scope, unit), trial, read_cell(manager, unit))
+    # A deploy that was killed right after its commit has left the same text in both places.
+    return standing if trial == standing.current else replace(standing, trial=trial)
 
 
 def require_deployable(manager: Manager, scope: Scope, standing: Standing) -> None:
