@@ -19,8 +19,8 @@ from typing import Any
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust import courier
-from dora_systemd.trust.programs import Account, account_of_uid, spawn
-from dora_systemd.trust.sight import cannot_reach
+from dora_systemd.trust.programs import Account, account_of_uid
+from dora_systemd.trust.sight import start_reader
 from dora_systemd.values import shown
 
 _SECONDS = 90.0
@@ -155,12 +155,7 @@ def opened_project(root: str, account: Account | None) -> Iterator[Project]:
     account = account or account_of_uid(os.geteuid())
     text = Path(courier.__file__).read_text(encoding="utf-8")
     command = (sys.executable, "-I", "-S", "-c", text, root)
-    try:
-        child = spawn(
-            command, account, directory="/", stdin=subprocess.PIPE, stderr=subprocess.DEVNULL
-        )
-    except OSError as error:
-        raise cannot_reach(account.name, sys.executable) from error
+    child = start_reader(command, account)
     try:
         yield Project(root, child, account)
     finally:

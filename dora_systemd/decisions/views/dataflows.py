@@ -147,8 +147,8 @@ def _prefix(uuid: str, others: Sequence[str]) -> str:
 
 
 _OPTIONAL = (
-    *("RELEASE", "BOOT", "PEAK", "PID", "THROTTLED%", "RESTARTS", "UPTIME", "WAITS FOR"),
-    *("MEM", "CPU%", "NODES", "UUID"),
+    *("FILES", "CREATED", "SIZE", "RELEASE", "BOOT", "PEAK", "PID", "THROTTLED%", "RESTARTS"),
+    *("UPTIME", "WAITS FOR", "MEM", "CPU%", "NODES", "UUID"),
 )
 """Columns that a narrow terminal does without, in this order."""
 _LEAST = 12

@@ -8,7 +8,7 @@ from dora_systemd.decisions.views.dataflows import UNKNOWN, format_table, local_
 from dora_systemd.decisions.views.objects import moment
 from dora_systemd.values import format_rounded_size
 
-_HEADER = ("NAME", "RELEASE", "STATE", "CREATED", "SIZE", "FILES")
+_HEADER = ("NAME", "ID", "STATE", "CREATED", "SIZE", "FILES")
 
 
 class ReleaseRow(NamedTuple):
