@@ -125,7 +125,7 @@ def test_what_cannot_run_is_refused_while_the_old_one_runs(
         assert reason in said
         assert str(STORE) not in said
     project.write("dataflow.yml", FLOW)
-    assert "hot_reload" in releases.deploy(project.root, "--hot-reload", status=5)
+    assert "hot reload is on" in releases.deploy(project.root, "--hot-reload", status=5)
     (project.root / "link").symlink_to("/etc/shadow")
     assert "cannot copy link" in releases.deploy(project.root, status=5)
     # Somebody else is at it.

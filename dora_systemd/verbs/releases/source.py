@@ -105,7 +105,7 @@ def _check(plan: Plan, dataflow: Dataflow, root: str) -> None:
     """Raise DoraSystemdError (BAD_INPUT) for what a release cannot do yet."""
     if plan.options.hot_reload:
         reason = "hot reload is on, and the files of a release do not change"
-        raise _refusal(reason, "deploy without hot_reload, or use doractl start")
+        raise _refusal(reason, "deploy with --no-hot-reload, or use doractl start")
     if plan.options.uv:
         reason = "uv is on, and would write to the release"
         raise _refusal(reason, "run uv sync in the project, and deploy with --venv .venv --no-uv")
