@@ -54,12 +54,12 @@ class Draft:
     def publish(self, manifest: Manifest, group: int | None) -> None:
         """Give the release its name, once all of it is on the disk.
 
-        group: who may enter it besides its owner; None: all that the directories above permit.
+        group: who may enter it besides its owner; None: nobody.
         """
         write_part(self._path, MANIFEST, format_manifest(manifest))
         for directory in self._made:
             directory.chmod(0o555)
-        self._path.chmod(0o755)
+        self._path.chmod(0o700)
         if group is not None:
             os.chown(self._path, -1, group)
             self._path.chmod(0o750)

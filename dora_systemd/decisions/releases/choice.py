@@ -4,6 +4,7 @@ from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 CURRENT, TRIAL, PROVED, UNPROVED = "current", "trial", "proved", "unproved"
+UNKNOWN = "unknown"
 
 
 class Known(NamedTuple):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.releases.store import Store, store_root
-from dora_systemd.decisions.releases.choice import Known, state_of
+from dora_systemd.decisions.releases.choice import UNKNOWN, UNPROVED, Known, state_of
 from dora_systemd.decisions.releases.manifest import Manifest
 from dora_systemd.decisions.views.findings import Finding, State
 from dora_systemd.decisions.views.releases import ReleaseRow
@@ -52,6 +52,8 @@ def _row(store: Store, standing: Standing, one: Known) -> ReleaseRow:
     with suppress(DoraSystemdError):  # others than root may not look into it
         manifest = store.manifest(one.id)
     state = state_of(one, standing.current, standing.trial)
+    if manifest is None and state == UNPROVED:
+        state = UNKNOWN
     return ReleaseRow(store.name, one.id, state, str(store.tree(one.id)), manifest)
 
 
