@@ -121,13 +121,26 @@ def locked(store: Store, make: bool = True) -> Iterator[None]:
     except OSError as error:
         raise unusable(store.path, error) from error
     try:
-        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        yield
-    except BlockingIOError as error:
-        message = f"cannot change the release of {store.name}: another deploy or rollback is at it"
-        raise DoraSystemdError(message, "wait until that one has ended") from error
+        _take(fd, store)
+        try:
+            yield
+        finally:
+            with contextlib.suppress(OSError):
+                store.path.rmdir()  # only an empty one: the first deploy was refused
     finally:
         os.close(fd)
+
+
+def _take(fd: int, store: Store) -> None:
+    """Lock the directory `fd`, unless another process has it, or has just removed it."""
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if os.fstat(fd).st_nlink:
+            return
+    except BlockingIOError:
+        pass
+    message = f"cannot change the release of {store.name}: another deploy or rollback is at it"
+    raise DoraSystemdError(message, "wait until that one has ended")
 
 
 def make_directories(path: Path) -> None:

@@ -96,6 +96,7 @@ def deploy(
     store, standing = store_of(scope, name), read_standing(manager, scope, unit_name(name))
     require_deployable(manager, scope, standing)
     with locked(store):
+        standing = read_standing(manager, scope, standing.boot.unit)  # nobody changes it now
         store.clean()
         copy = _copy_project(source, store, standing, tell)
         release = copy.manifest.id

@@ -22,7 +22,8 @@ def manifest(release: str, files: dict[str, Stored]) -> Manifest:
 def store(tmp_path: Path) -> Store:
     found = Store(tmp_path / "state" / "releases", "robot")
     with locked(found):
-        pass
+        found.path.joinpath(".lost").mkdir()
+    found.clean()
     return found
 
 
@@ -86,6 +87,13 @@ def test_one_at_a_time(store: Store) -> None:
         pass
     with locked(store):
         pass
+
+
+def test_a_store_without_a_release_goes(tmp_path: Path) -> None:
+    store = Store(tmp_path, "robot")
+    with locked(store):
+        assert store.path.exists()
+    assert not store.path.exists()
 
 
 def test_a_store_that_is_not_there(tmp_path: Path) -> None:
