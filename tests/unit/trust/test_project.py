@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.errors import DoraSystemdError
+from dora_systemd.trust import courier
 from dora_systemd.trust import project as module
 from dora_systemd.trust.project import Project, opened_project
 
@@ -87,7 +88,7 @@ LIARS = {
 def test_a_child_that_lies(lie: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     liar = tmp_path / "liar.py"
     liar.write_text(f"import sys\nsys.stdin.readline()\n{LIARS[lie]}\nsys.stdout.flush()\n")
-    monkeypatch.setattr(module.courier, "__file__", str(liar))
+    monkeypatch.setattr(courier, "__file__", str(liar))
     monkeypatch.setattr(module, "MOST_ANSWER", 100_000)
     with (
         opened_project(str(tmp_path), None) as project,
