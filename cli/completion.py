@@ -23,7 +23,7 @@ from dora_systemd.decisions.cell.hot_reload import REPLACE_WORDS
 from dora_systemd.decisions.cell.restarts import POLICIES
 from dora_systemd.decisions.properties.sandbox import LEVELS, NETWORKS
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.names import is_uuid_prefix
+from dora_systemd.names import is_name, is_uuid_prefix
 
 VARIABLE = "_DORACTL_COMPLETE"
 
@@ -113,6 +113,14 @@ def node_names(ctx: click.Context, incomplete: str) -> list[str]:
     return [one.node for one in row.nodes]
 
 
+def release_ids(ctx: click.Context, _incomplete: str) -> list[str]:
+    """The releases of the dataflow that is on the command line."""
+    from dora_systemd.verbs.releases.listing import store_of
+
+    name = ctx.params.get("selector") or next(iter(ctx.args), "")
+    return [one.id for one in store_of(current_scope(), name).known()] if is_name(name) else []
+
+
 # By name of the parameter, for all verbs.
 TYPES: dict[str, Any] = {
     "selector": Live(dataflow_names),
@@ -121,6 +129,7 @@ TYPES: dict[str, Any] = {
     "nodes": Live(node_names),
     "pattern": Live(dataflow_names),
     "level": Live(lambda *_: ["error", "warn", "info", "debug", "trace", "stdout"]),
+    "release": Live(release_ids),
     "run": click.Choice(["CURRENT", "PREVIOUS", "ALL"]),
     "dataflow": FileOrName(
         lambda ctx, word: dataflow_names(ctx, word) if ctx.command.name == "start" else []

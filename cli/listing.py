@@ -2,6 +2,7 @@
 
 import os
 import sys
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, NamedTuple
 
@@ -179,6 +180,11 @@ def _print_json(found: DataflowRow | list[DataflowRow]) -> None:
         print(format_json(dataflow_object(found), indent=2))
     else:
         print(format_json([dataflow_object(row) for row in found], indent=2))
+
+
+def print_table(form: Callable[[int | None, bool], str]) -> None:
+    """Print a table. form: makes it for a width, with or without colours."""
+    _print_view(form(_width(), _wants_colors()))
 
 
 def _print_view(text: str) -> None:

@@ -116,10 +116,10 @@ def parsed_by(parse: Callable[[str], T]) -> Callable[[click.Context, click.Param
     return parsed
 
 
-def duration_option(flag: str, text: str) -> Callable[[C], C]:
-    """An option with a time span in µs, INFINITY without it. text: for --help."""
+def duration_option(flag: str, text: str, default: str = "infinity") -> Callable[[C], C]:
+    """An option with a time span in µs. text: for --help. default: without the option."""
     callback = parsed_by(parse_duration)
-    return click.option(flag, metavar="TIME", default="infinity", callback=callback, help=text)
+    return click.option(flag, metavar="TIME", default=default, callback=callback, help=text)
 
 
 def current_scope() -> Scope:

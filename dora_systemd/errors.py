@@ -17,6 +17,7 @@ class ExitCode(IntEnum):
     NO_PERMISSION = 8
     NO_DORA = 9
     INHIBITED = 10
+    ROLLED_BACK = 11
     NO_HOST = 12
     INTERRUPTED = 130
 

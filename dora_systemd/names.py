@@ -1,4 +1,4 @@
-"""Names of dataflows, their units, UUIDs and nodes; no name can mean another unit.
+"""Names of dataflows, their units, UUIDs, nodes and releases; no name can mean another unit.
 
 For a name that is not known there is a hint with similar ones.
 """
@@ -32,9 +32,15 @@ _UNIT_SUFFIXES = (
     *(".service", ".socket", ".device", ".mount", ".automount", ".swap"),
     *(".target", ".path", ".timer", ".slice", ".scope"),
 )
-_UUID = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}")
+STORE = "dora-systemd/releases"
+"""The directory of all releases, below that of states."""
+TREE = "tree"
+"""The directory of a project's files in a release."""
+_RELEASE = r"[0-9]{8}T[0-9]{6}(?:-[0-9a-f]{4,64}\+?)?(?:\.[0-9]{1,4})?"
+_RELEASE_PLACE = re.compile(rf"/{STORE}/[^/]+/({_RELEASE})/{TREE}/")
+_UUID = re.compile(r"[0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12}")
 _ZERO_UUID = "00000000-0000-0000-0000-000000000000"
-_UUID_LENGTH = len(_ZERO_UUID)
+_DESCRIPTION = re.compile(rf"dora dataflow (\S+) \(({_UUID.pattern})\)(?:, release ({_RELEASE}))?")
 MIN_PREFIX = 4
 """Minimum characters of the beginning of a UUID."""
 _HINT = (
@@ -113,17 +119,30 @@ def name_from_unit(unit: str) -> str | None:
     return name if unit == unit_name(name) and is_name(name) else None
 
 
-def unit_description(name: str, uuid: str) -> str:
+def unit_description(name: str, uuid: str, release: str = "") -> str:
     """Description= of the unit: systemd lists it with the units, so `list` need not ask for it."""
-    return f"dora dataflow {name} ({uuid})"
+    return f"dora dataflow {name} ({uuid})" + (f", release {release}" if release else "")
 
 
-def uuid_from_description(unit: str, description: str) -> str | None:
-    """The UUID in the Description= of a unit of ours; None for any other text."""
+def facts_from_description(unit: str, description: str) -> tuple[str, str] | None:
+    """The UUID and the release, or "", in the Description= of a unit of ours; None if neither."""
     name = name_from_unit(unit)
-    uuid = description[-_UUID_LENGTH - 1 : -1]
-    is_ours = name is not None and is_uuid(uuid) and description == unit_description(name, uuid)
-    return uuid if is_ours else None
+    found = _DESCRIPTION.fullmatch(description)
+    return (found[2], found[3] or "") if found and name and found[1] == name else None
+
+
+def is_release_id(text: str) -> bool:
+    """Whether it is the id of a release, such as 20261121T220012-9f3c1a2."""
+    return re.fullmatch(_RELEASE, text) is not None
+
+
+def release_of(path: str) -> str:
+    """The release that a file is in, "" if it is in none.
+
+    There is no registry: the unit names its dataflow file, and that path has the release in it.
+    """
+    found = _RELEASE_PLACE.search(path)
+    return found[1] if found else ""
 
 
 def is_node_id(text: str) -> bool:

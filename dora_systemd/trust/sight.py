@@ -11,7 +11,7 @@ import select
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -131,12 +131,7 @@ def sight_of(account: Account | None) -> Iterator[Sight]:
         return
     text = Path(eyes.__file__).read_text(encoding="utf-8")
     command = (sys.executable, "-I", "-S", "-c", text, str(MAX_BYTES + 1))
-    try:
-        child = spawn(
-            command, account, directory="/", stdin=subprocess.PIPE, stderr=subprocess.DEVNULL
-        )
-    except OSError as error:
-        raise cannot_reach(account.name, sys.executable) from error
+    child = start_reader(command, account)
     try:
         yield LentSight(child, account)
     finally:
@@ -144,6 +139,19 @@ def sight_of(account: Account | None) -> Iterator[Sight]:
         # Closes its streams, of which the first may still have bytes for it, and waits for it.
         with contextlib.suppress(OSError), child:
             pass
+
+
+def start_reader(command: Sequence[str], account: Account) -> "subprocess.Popen[bytes]":
+    """Start our interpreter as the account, to read for us by its standard input and output.
+
+    Raises DoraSystemdError (NO_PERMISSION) if the account cannot execute it.
+    """
+    try:
+        return spawn(
+            command, account, directory="/", stdin=subprocess.PIPE, stderr=subprocess.DEVNULL
+        )
+    except OSError as error:
+        raise cannot_reach(account.name, sys.executable) from error
 
 
 def cannot_reach(user: str, path: str) -> DoraSystemdError:

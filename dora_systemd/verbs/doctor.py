@@ -42,6 +42,7 @@ from dora_systemd.trust.socket_table import listening_sockets
 from dora_systemd.verbs.facts.enabled import enabled_units, lost_units, own_directories
 from dora_systemd.verbs.facts.reading import slice_group
 from dora_systemd.verbs.gateway import read_gateway
+from dora_systemd.verbs.releases.listing import judge_releases
 from dora_systemd.verbs.start.account import DEFAULT_USER
 from dora_systemd.verbs.start.enable import boot_target
 from dora_systemd.verbs.start.linger import is_lingering, linger_command
@@ -243,5 +244,5 @@ def _real_time(_scope: Scope) -> Iterator[Finding]:
     yield from judge_real_time(read_real_time())
 
 
-_WITH_SYSTEMD = (_controllers, _linger, _boot, _units, _leftovers, _ports)
+_WITH_SYSTEMD = (_controllers, _linger, _boot, _units, _leftovers, _ports, judge_releases)
 _WITHOUT = (_journal, _dora, _user, judge_logins, _settings, _processes, _real_time)

@@ -14,6 +14,8 @@ from dora_systemd.adapters.runner_socket.client import done_of, order
 from dora_systemd.decisions.cell.hot_reload import CHANGE_VARIABLE
 from dora_systemd.decisions.properties.assignments import typed
 from dora_systemd.decisions.unit.properties import format_unit
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import release_of
 from dora_systemd.scope import Scope
 from dora_systemd.values import format_bool
 from dora_systemd.verbs.facts.cells import Cell
@@ -28,6 +30,7 @@ def reload_cell(scope: Scope, cell: Cell, node: str | None, ask: Ask = order) ->
     Raises DoraSystemdError; then the old version keeps running.
     """
     require_running(cell)
+    _refuse_release(cell)
     if node is not None:
         require_node(scope, cell, node)
     path = socket_of(scope, cell)
@@ -42,9 +45,18 @@ def switch_hot_reload(
     Raises DoraSystemdError.
     """
     require_running(cell)
+    _refuse_release(cell)
     unit = manager.read(cell.unit, ("FragmentPath", "Transient"))
     ask(socket_of(scope, cell), {"verb": "hot-reload", "on": is_on})
     text = format_unit(typed(Environment=(f"{CHANGE_VARIABLE}={format_bool(is_on)}",)))
     directory = drop_in_directory(Path(unit["FragmentPath"]), bool(unit["Transient"]))
     write_unit_file(directory / HOT_RELOAD_FILE, f"# Written by doractl set.\n{text}")
     manager.reload()
+
+
+def _refuse_release(cell: Cell) -> None:
+    """Raise DoraSystemdError (USAGE) for a deployed dataflow, whose files do not change."""
+    if release := release_of(cell.options.dataflow):
+        message = f"cannot reload {cell.name}: the files of its release {release} do not change"
+        hint = f"doractl deploy --name {cell.name} brings a new version"
+        raise DoraSystemdError(message, hint, ExitCode.USAGE)

@@ -85,7 +85,7 @@ _CHANGES = ("50-*.conf", NODE_LIMITS_FILE, HOT_RELOAD_FILE)
 def drop_in_directory(fragment: Path, is_transient: bool) -> Path:
     """The directory of drop-ins for changes: those of a transient unit disappear with it."""
     place = fragment.parent
-    if not is_transient:
+    if not is_transient and place.suffix != ".control":  # as of a release on trial
         place = place.with_name(f"{place.name}.control")
     return place / f"{fragment.name}.d"
 

@@ -99,10 +99,24 @@ EVENTS = {
         WARNING,
         "{count} log lines of node {node} exceed its limit of {limit}",
     ),
+    "release-committed": EventKind(
+        "a59dc340b5c54c1eb7422b0a5484d078",
+        NOTICE,
+        "Release {release} of dataflow {dataflow} has passed its trial",
+    ),
+    "release-rolled-back": EventKind(
+        "f058b93d20854c7a9b807cb93ae78efb",
+        WARNING,
+        "Release {release} of dataflow {dataflow} was rolled back",
+    ),
 }
 
 # Each life of a dataflow ends with one of these, unless the runner was killed.
 END_EVENTS = ("dataflow-finished", "dataflow-stopped", "dataflow-failed")
+
+ROLLED_BACK = "release-rolled-back"
+REQUESTS = ("stop-asked", "release-committed", ROLLED_BACK)
+"""What doractl writes about a dataflow, outside of its unit."""
 
 # Details for the text only: the origin of the record has the fields for them.
 _TEXT_ONLY = ("dataflow", "node")

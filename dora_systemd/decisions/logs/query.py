@@ -8,7 +8,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from dora_systemd.decisions.logs.events import EVENTS
+from dora_systemd.decisions.logs.events import EVENTS, REQUESTS
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import SLICE, unit_name
 from dora_systemd.scope import Scope
@@ -154,7 +154,7 @@ def story_matches(scope: Scope, name: str, uuid: str) -> list[str]:
     """Matches for life events, systemd's records of the unit, and stop requests."""
     dataflow = f"DORA_DATAFLOW={uuid}"
     own = [*scope_matches(scope, name), dataflow, *_event_matches()]
-    asked = [dataflow, *_asked_matches(scope, "stop-asked")]
+    asked = [dataflow, *_asked_matches(scope, *REQUESTS)]
     return [*own, "+", *_systemd_matches(scope, name), "+", *asked]
 
 
@@ -163,9 +163,10 @@ def request_matches(scope: Scope, event: str) -> list[str]:
     return [*_asked_matches(scope, event), f"DORA_SCOPE={scope.word}"]
 
 
-def _asked_matches(scope: Scope, event: str) -> list[str]:
+def _asked_matches(scope: Scope, *events: str) -> list[str]:
     # journald itself sets _UID.
-    return [f"DORA_EVENT={event}", f"_UID={scope.uid if scope.is_user else 0}"]
+    found = [f"DORA_EVENT={event}" for event in events]
+    return [*found, f"_UID={scope.uid if scope.is_user else 0}"]
 
 
 def _event_matches() -> list[str]:

@@ -22,15 +22,18 @@ DEFAULT_WATCH = (
 )
 """Programs, dataflows and configuration, as in dora's reference page."""
 
-ALWAYS_IGNORED = (
-    # Version control, environments, caches and build results.
+NOT_OF_PROJECT = (
+    # Version control, environments and caches.
     *(".git/", ".hg/", ".svn/", "__pycache__/", "venv/", ".venv/", ".dora/", "node_modules/"),
     *("site-packages/", ".tox/", ".nox/", ".*_cache/", ".hypothesis/", "*.egg-info/"),
-    *("build/", "dist/", "target/", "out/"),
     # Logs, temporary files, and files that editors create beside the edited file.
     *("*.log", "*.jsonl", "log/", "logs/", "tmp/", "*.tmp", "*.temp", "*.part", "*.bak", "*~"),
     *(".#*", "#*#", "*.sw?", "4913", "*.pyc"),
-    # Data.
+)
+ALWAYS_IGNORED = (
+    *NOT_OF_PROJECT,
+    # What is built, and data.
+    *("build/", "dist/", "target/", "out/"),
     *("data/", "*.csv", "*.parquet", "*.arrow", "*.npy", "*.npz", "*.pt", "*.onnx"),
 )
 
@@ -41,7 +44,8 @@ class WatchRules:
 
     root: absolute directory that patterns are relative to. watched: patterns of files. ignored:
     patterns that take precedence. gitignores: by directory relative to root, lines of .gitignore.
-    files: absolute paths that are always watched.
+    files: absolute paths that are always watched. always: patterns that any
+    project ignores.
     """
 
     root: str
@@ -49,6 +53,7 @@ class WatchRules:
     ignored: tuple[str, ...] = ()
     gitignores: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     files: frozenset[str] = frozenset()
+    always: tuple[str, ...] = ALWAYS_IGNORED
 
     def has(self, path: str) -> bool:
         """Whether a change of the file `path` (absolute) causes a reload."""
@@ -61,7 +66,7 @@ class WatchRules:
 
     def is_ignored(self, path: str) -> bool:
         """Whether `path` (absolute) is ignored; a path that ends with / is a directory."""
-        relative, ignored = self._relative(path), _spec((*ALWAYS_IGNORED, *self.ignored))
+        relative, ignored = self._relative(path), _spec((*self.always, *self.ignored))
         return not relative or ignored.match_file(relative) or self._gitignores(relative)
 
     def _relative(self, path: str) -> str:

@@ -19,7 +19,7 @@ from dora_systemd.decisions.properties.assignments import (
 from dora_systemd.decisions.properties.kinds import Property
 from dora_systemd.decisions.properties.structs import MS_REC
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.names import unit_description
+from dora_systemd.names import release_of, unit_description
 
 BOOT_TARGET = "dora.target"
 """Starts the enabled dataflows at boot, if it is installed; no other unit waits for it."""
@@ -84,6 +84,15 @@ def without_install(text: str) -> str:
     return HEADER + format_sections(sections)
 
 
+def with_boot_check(text: str) -> str:
+    """The unit file with what a boot check adds."""
+    sections = _sections([text])
+    for name, line in (("Unit", _BOOT_CHECK_ORDER), ("Install", f"RequiredBy={BOOT_CHECK}")):
+        lines = sections.setdefault(name, [])
+        lines += [] if line in lines else [line]
+    return HEADER + format_sections(sections)
+
+
 def is_boot_checked(text: str) -> bool:
     """Whether a boot is good only if the dataflow of this unit file comes up."""
     return f"RequiredBy={BOOT_CHECK}" in _logical_lines(text)
@@ -138,7 +147,7 @@ def _as_written_today(
         "RestartSec": (runner.restart.delay, runner.restart.unit_delay),  # before HEAD_START
         "Description": (
             f"dora dataflow {runner.name}",
-            unit_description(runner.name, runner.uuid),
+            unit_description(runner.name, runner.uuid, release_of(runner.dataflow)),
         ),
     }
     return {

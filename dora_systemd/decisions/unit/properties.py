@@ -37,7 +37,7 @@ from dora_systemd.decisions.settings.table import PROPERTY
 from dora_systemd.decisions.unit.file import format_sections
 from dora_systemd.decisions.unit.rights import rights_properties
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.names import SLICE, unit_description
+from dora_systemd.names import SLICE, release_of, unit_description
 from dora_systemd.scope import RUNTIME_NAME
 from dora_systemd.values import INFINITY, SECOND, quoted
 
@@ -118,7 +118,7 @@ def service_properties(options: RunnerOptions, context: UnitContext) -> dict[str
     # The runner reports late nodes itself; systemd's timeout is for a runner that hangs.
     most = min(pause + options.start_timeout + START_MARGIN, INFINITY)
     return typed(
-        Description=unit_description(options.name, options.uuid),
+        Description=unit_description(options.name, options.uuid, release_of(options.dataflow)),
         Slice=SLICE,
         Type="notify",
         NotifyAccess="main",

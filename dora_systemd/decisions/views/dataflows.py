@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from dora_systemd.decisions.cell.status import UNMET
+from dora_systemd.names import release_of
 from dora_systemd.terminal_text import cut, one_line
 from dora_systemd.values import SECOND, format_rounded_size
 
@@ -104,6 +105,7 @@ class DataflowRow(NamedTuple):
 
     Other fields are as in NodeRow, for the whole dataflow. enabled: whether it is started at boot.
     problem: why its node table is not valid, or "". inhibitors: who inhibits its restart.
+    listed_release: that in the Description= of its unit, for a row without `dataflow`.
     """
 
     uuid: str
@@ -129,6 +131,12 @@ class DataflowRow(NamedTuple):
     enabled: bool = False
     problem: str = ""
     inhibitors: tuple[Holder, ...] = ()
+    listed_release: str = ""
+
+    @property
+    def release(self) -> str:
+        """The release that it runs, "" if it was not deployed."""
+        return release_of(self.dataflow) or self.listed_release
 
 
 def status_word(active: str, sub: str, stage: str = "") -> str:
@@ -188,8 +196,8 @@ def _prefix(uuid: str, others: Sequence[str]) -> str:
 
 
 _OPTIONAL = (
-    *("BOOT", "PEAK", "PID", "THROTTLED%", "RESTARTS", "UPTIME", "WAITS FOR", "MEM", "CPU%"),
-    *("WATCHDOG", "NODES", "UUID"),
+    *("FILES", "CREATED", "SIZE", "RELEASE", "BOOT", "PEAK", "PID", "THROTTLED%", "RESTARTS"),
+    *("UPTIME", "WAITS FOR", "MEM", "CPU%", "WATCHDOG", "NODES", "UUID"),
 )
 """Columns that a narrow terminal does without, in this order."""
 _LEAST = 12
@@ -276,7 +284,7 @@ def format_dataflows(
 ) -> str:
     """The table of `doractl list`, for a terminal of that width.
 
-    With ENDED and WHY if any of them has ended.
+    With RELEASE if any of them is deployed, with ENDED and WHY if any of them has ended.
     """
     return format_table(*dataflow_table(rows), width, want_colors)
 
@@ -284,11 +292,14 @@ def format_dataflows(
 def dataflow_table(rows: Sequence[DataflowRow]) -> tuple[Sequence[str], list[Sequence[str]]]:
     """The header of that table, and the cells of each row."""
     prefixes = shortest_prefixes([row.uuid for row in rows])
-    header = _HEADER if all(map(is_up_word, rows)) else (*_HEADER, "ENDED", "WHY")
-    return header, [_dataflow_cells(row, prefixes[row.uuid])[: len(header)] for row in rows]
+    more = () if all(map(is_up_word, rows)) else ("ENDED", "WHY")
+    is_deployed = any(row.release for row in rows)
+    header = (*_HEADER, *(("RELEASE",) if is_deployed else ()), *more)
+    cells = [_dataflow_cells(row, prefixes[row.uuid], is_deployed)[: len(header)] for row in rows]
+    return header, list[Sequence[str]](cells)
 
 
-def _dataflow_cells(row: DataflowRow, prefix: str) -> tuple[str, ...]:
+def _dataflow_cells(row: DataflowRow, prefix: str, with_release: bool) -> tuple[str, ...]:
     return (
         prefix,
         row.name,
@@ -299,6 +310,7 @@ def _dataflow_cells(row: DataflowRow, prefix: str) -> tuple[str, ...]:
         format_memory(row.memory, row.memory_limit),
         format_count(row.restarts),
         "yes" if row.enabled else UNKNOWN,
+        *((row.release or UNKNOWN,) if with_release else ()),
         local_time(row.ended),
         UNKNOWN if is_up_word(row) else row.text or UNKNOWN,
     )

@@ -73,6 +73,7 @@ def format_dataflow(row: DataflowRow, width: int | None = None, want_colors: boo
         ("Name", row.name),
         ("Unit", row.unit),
         ("File", row.dataflow or UNKNOWN),
+        ("Release", row.release),
         ("Status", _status_words(row)),
         ("Uptime", format_uptime(row.uptime)),
         ("Started", zoned_time(row.started)),

@@ -50,6 +50,7 @@ def dataflow_object(row: DataflowRow, waits: Mapping[str, Shares] | None = None)
         "uuid": row.uuid,
         "unit": row.unit,
         "file": row.dataflow or None,
+        "release": row.release or None,
         "status": row.status,
         "text": row.text or None,
         "problem": row.problem or None,

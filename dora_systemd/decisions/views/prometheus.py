@@ -8,7 +8,13 @@ from dataclasses import dataclass
 
 from dora_systemd.decisions.cell.status import ALIVE_NODE_STATES, NODE_STATES, WHOLE_CELL
 from dora_systemd.decisions.resources.usage import Strain, Usage
-from dora_systemd.decisions.views.dataflows import FAILED, STOPPED, UP_WORDS, NodeRow
+from dora_systemd.decisions.views.dataflows import (
+    FAILED,
+    STOPPED,
+    UP_WORDS,
+    DataflowRow,
+    NodeRow,
+)
 from dora_systemd.decisions.views.snapshot import Observed
 from dora_systemd.values import INFINITY, SECOND
 
@@ -76,7 +82,7 @@ WATCHDOG = Family("watchdog_seconds", "Time in which it must send WATCHDOG=1.")
 SIGN_AGE = Family("watchdog_age_seconds", "Time since its last WATCHDOG=1.")
 SILENT = Family("silent", "1 while an output that it owes is missing.")
 LAST_OUTPUT = Family("last_output_age_seconds", "Time since the last message of an owed output.")
-INFO = Family("info", "UUID and unit of a dataflow; the value is always 1.")
+INFO = Family("info", "UUID, unit and release of a dataflow; the value is always 1.")
 NODES = Family("nodes", "Nodes that the dataflow has.")
 ALIVE = Family("nodes_alive", "Nodes that are running.")
 LINES = Family("log_lines_total", "Lines sent to journald.")
@@ -101,7 +107,7 @@ def format_metrics(observed: Sequence[Observed], version: str) -> str:
 
 def _dataflow_samples(observed: Sequence[Observed]) -> Iterator[tuple[Family, list[Sample]]]:
     labelled = [({"dataflow": one.row.name}, one) for one in observed]
-    yield INFO, [({**own, "uuid": o.row.uuid, "unit": o.row.unit}, 1) for own, o in labelled]
+    yield INFO, [({**own, **_identity(one.row)}, 1) for own, one in labelled]
     yield STATE, [s for own, o in labelled for s in _states(own, o.row.status.lower(), STATES)]
     yield RESTARTS, [(own, one.unit_restarts) for own, one in labelled]
     yield START, [(own, o.row.started / SECOND) for own, o in labelled if o.row.started]
@@ -109,6 +115,11 @@ def _dataflow_samples(observed: Sequence[Observed]) -> Iterator[tuple[Family, li
     yield ALIVE, [(own, one.row.nodes_alive) for own, one in labelled if one.usage]
     yield LOST, [(own, o.lines[WHOLE_CELL].lost) for own, o in labelled if WHOLE_CELL in o.lines]
     yield from _group_samples([(own, one, WHOLE_CELL) for own, one in labelled])
+
+
+def _identity(row: DataflowRow) -> Labels:
+    release = {"release": row.release} if row.release else {}
+    return {"uuid": row.uuid, "unit": row.unit, **release}
 
 
 def _node_samples(observed: Sequence[Observed]) -> Iterator[tuple[Family, list[Sample]]]:

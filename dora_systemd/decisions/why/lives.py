@@ -8,6 +8,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from dora_systemd.decisions.logs.events import REQUESTS
+
 # https://github.com/systemd/systemd/blob/main/src/systemd/sd-messages.h
 UNIT_MESSAGES = {
     "7d4958e842da4a758f6c1cdc7b36dcc5": "unit-starting",
@@ -130,7 +132,7 @@ def find_lives(happenings: Iterable[Happening]) -> list[Life]:
     found: dict[str, list[Happening]] = {}
     current = ""
     for one in happenings:
-        if one.invocation and one.name != "stop-asked":
+        if one.invocation and one.name not in REQUESTS:
             current = one.invocation
         found.setdefault(current, []).append(one)
     return [Life(tuple(life)) for life in found.values()]

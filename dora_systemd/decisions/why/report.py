@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from dora_systemd.decisions.cell.exits import ExitKind, parse_exit
 from dora_systemd.decisions.cell.restarts import budget_words
 from dora_systemd.decisions.life.causes import Cause
+from dora_systemd.decisions.logs.events import ROLLED_BACK
 from dora_systemd.decisions.views.dataflows import (
     RESTARTING,
     UNKNOWN,
@@ -21,6 +22,7 @@ from dora_systemd.decisions.views.inhibitors import format_holders
 from dora_systemd.decisions.why.last_lines import Word, shown_last
 from dora_systemd.decisions.why.signs import known_remedy
 from dora_systemd.decisions.why.verdict import Restart, Verdict
+from dora_systemd.names import release_of
 from dora_systemd.terminal_text import cut, one_line
 from dora_systemd.values import SECOND, format_duration, format_rounded_size
 
@@ -123,6 +125,12 @@ def remedies(report: Report) -> list[str]:
         "pid": verdict.details.get("node_pid", "PID"),
     }
     filled = [text.format(**values) for text in texts if text]
+    if release_of(subject.file) or any(one.name == ROLLED_BACK for one in verdict.timeline):
+        fixed = f"doractl deploy --name {subject.name}"
+        return [
+            text.replace(f", then run: doractl restart {subject.name}", f", then run: {fixed}")
+            for text in filled
+        ]
     if subject.is_loaded:
         return filled
     again = f"doractl start {values['file']} --name {subject.name}"
@@ -194,8 +202,19 @@ def _facts(report: Report) -> list[str]:
         "Before": f"{verdict.before} ({zoned_time(verdict.before_us)})" if verdict.before else "",
         "Unit": f"{subject.unit} ({subject.uuid})",
         "File": subject.file,
+        "Release": release_of(subject.file),
+        "Undone": _undone(verdict),
     }
     return [f"{key + ':':<{_TITLE_WIDTH}}{text}" for key, text in facts.items() if text]
+
+
+def _undone(verdict: Verdict) -> str:
+    """The last release that failed its trial before this life, if it is recorded."""
+    found = [one for one in verdict.timeline if one.name == ROLLED_BACK]
+    if not found:
+        return ""
+    one = found[-1]
+    return f"{one.detail('release')} at {zoned_time(one.at_us)}: {one.detail('reason')}"
 
 
 def _budget_words(report: Report) -> str:

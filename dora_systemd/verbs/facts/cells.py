@@ -8,8 +8,9 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import (
     UNIT_PREFIX,
     UNIT_SUFFIX,
+    facts_from_description,
     name_from_unit,
-    uuid_from_description,
+    release_of,
 )
 
 if TYPE_CHECKING:
@@ -69,6 +70,12 @@ class Cell:
         return self._options
 
     @property
+    def release(self) -> str:
+        """The release that it runs, "" if it was not deployed."""
+        found = facts_from_description(self.unit, self.state.description)
+        return found[1] if found else release_of(self.options.dataflow)
+
+    @property
     def known_options(self) -> "RunnerOptions | None":
         """The options, if something has asked for them already."""
         return self._options
@@ -117,8 +124,8 @@ def read_cell(manager: Manager, unit: str) -> Cell | None:
 
 
 def _listed(manager: Manager, state: UnitState) -> Cell | None:
-    uuid = uuid_from_description(state.unit, state.description)
-    return Cell(state, uuid, manager) if uuid else _asked(manager, state)
+    found = facts_from_description(state.unit, state.description)
+    return Cell(state, found[0], manager) if found else _asked(manager, state)
 
 
 def _asked(manager: Manager, state: UnitState) -> Cell | None:

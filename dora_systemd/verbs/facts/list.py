@@ -48,6 +48,7 @@ def row_of(reading: Reading, before: Reading | None = None) -> DataflowRow:
         "unit": cell.unit,
         "status": status_word(cell.state.active, cell.state.sub, status.stage),
         "dataflow": cell.dataflow,
+        "listed_release": cell.release,
         # The status says "failed" already.
         "text": unit.get("StatusText", "").removeprefix(FAILED_BECAUSE),
         "restarts": unit["NRestarts"],

@@ -9,6 +9,7 @@ from dora_systemd.decisions.unit.file import persistent_unit, says_the_same
 from dora_systemd.decisions.unit.properties import format_unit
 from dora_systemd.decisions.views.dataflows import local_time
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import release_of
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell, read_cell
 from dora_systemd.verbs.start.enable import (
@@ -88,8 +89,19 @@ def place_unit_file(
         if not says_the_same(text, boot.text):
             raise _differs(plan.options.name, boot)
         return True
+    _refuse_deployed(plan.options.name, boot)
     drop_unit_files(manager, boot)
     return False
+
+
+def _refuse_deployed(name: str, boot: BootUnit) -> None:
+    """Raise DoraSystemdError (NAME_IN_USE) for the unit file of a release."""
+    if boot.options is not None and (release := release_of(boot.options.dataflow)):
+        raise DoraSystemdError(
+            f"cannot start {name}: release {release} is deployed under that name",
+            f"doractl restart {name} starts that one; or choose another --name",
+            ExitCode.NAME_IN_USE,
+        )
 
 
 def _forget(manager: Manager, boot: BootUnit) -> None:

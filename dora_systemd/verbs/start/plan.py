@@ -22,9 +22,11 @@ from dora_systemd.decisions.properties.sandbox import Sandbox
 from dora_systemd.decisions.settings.resolve import Settings
 from dora_systemd.decisions.settings.runner_options import with_settings
 from dora_systemd.decisions.settings.table import ENV, ENV_FILE, USER, WORKING_DIRECTORY
-from dora_systemd.names import name_from_path, parse_name, unit_name
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import name_from_path, parse_name, release_of, unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.trust.files import read_file
+from dora_systemd.trust.paths import Place
 from dora_systemd.trust.sight import sight_of
 from dora_systemd.verbs.start.account import account_of, choose_user
 from dora_systemd.verbs.start.credentials import check_credentials, credential_files
@@ -41,7 +43,9 @@ class StartRequest:
     """A request to start a dataflow. flags: raw values by setting name, see resolve_settings.
 
     environment: the caller's variables. attached: the dataflow ends with the caller. caller: the
-    variables that the dataflow may read. uuid: of a dataflow that is started again.
+    variables that the dataflow may read. uuid: of a dataflow that is started again. origin: of a
+    release, the file that its dataflow file was copied from: who owns that decides, not root, who
+    owns the copy.
     """
 
     dataflow: str
@@ -51,6 +55,7 @@ class StartRequest:
     attached: bool = False
     caller: Mapping[str, str] = field(default_factory=dict)
     uuid: str = ""
+    origin: Place | None = None
 
 
 @dataclass(frozen=True)
@@ -90,18 +95,32 @@ def make_plan(scope: Scope, request: StartRequest) -> Plan:
     path = Path(request.dataflow).absolute()
     request_name(request)
     written = read_file(path)
-    settings = read_settings(scope, path, request.flags, request.environment)
+    if request.origin is None:
+        _refuse_release(path)
+    place = request.origin or written.place
+    settings = read_settings(scope, path, request.flags, request.environment, request.origin)
     given = settings[WORKING_DIRECTORY]
     directory = path.parent if given is None else Path(given).absolute()
-    user = choose_user(scope, settings[USER], written.place, str(directory))
+    user = choose_user(scope, settings[USER], place, str(directory))
     with sight_of(account_of(user)) as sight:
         # The process that looks for another user boots meanwhile.
         dataflow = parse_dataflow(parse_yaml(decoded(written.data, path), path), str(path))
         look = Look(sight, settings, user)
         # Root's variables are not for the file of another user, which could read them out.
-        is_own = scope.is_user or written.place.uid == os.geteuid()
+        is_own = scope.is_user or place.uid == os.geteuid()
         caller = request.environment if is_own else {}
         return _make_plan(scope, replace(request, caller=caller), dataflow, str(directory), look)
+
+
+def _refuse_release(path: Path) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) for a file of a release.
+
+    It is root's, and what it says is not: root must not take settings from it as from its own.
+    """
+    if release := release_of(str(path)):
+        hint = f"doractl rollback NAME {release} runs that release"
+        message = f"cannot start {path}: it belongs to a release"
+        raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
 
 
 def _make_plan(

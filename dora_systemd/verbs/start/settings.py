@@ -49,14 +49,22 @@ def settings_files(dataflow: Path, environment: Mapping[str, str]) -> list[Path]
 
 
 def read_settings(
-    scope: Scope, dataflow: Path, flags: Mapping[str, object], environment: Mapping[str, str]
+    scope: Scope,
+    dataflow: Path,
+    flags: Mapping[str, object],
+    environment: Mapping[str, str],
+    origin: Place | None = None,
 ) -> Settings:
     """The settings from flags, variables and files. Raises DoraSystemdError.
 
     dataflow: its absolute path. In system scope, another user's file may only contain what that
     user may decide, and the environment files that it names are `lent`: read as that user.
+    origin: of a release, the place of the original dataflow file, which counts for the settings
+    file that was copied with it.
     """
-    found = [_read(path) for path in settings_files(dataflow, environment) if exists(path)]
+    beside, *elsewhere = settings_files(dataflow, environment)
+    found = [_read(beside, origin)] if exists(beside) else []
+    found += [_read(path) for path in elsewhere if exists(path)]
     documents = [(str(one.path), one.document) for one in found]
     others = [] if scope.is_user else [one for one in found if not one.is_roots]
     for one in others:
@@ -71,10 +79,10 @@ def read_settings(
     return replace(settings, lent=frozenset(one for one in named if one not in by_root))
 
 
-def _read(path: Path) -> _Read:
+def _read(path: Path, origin: Place | None = None) -> _Read:
     text = read_file(path)
     document = parse_yaml(decoded(text.data, path), path, allow_empty=True)
-    return _Read(path, text.place, document)
+    return _Read(path, origin or text.place, document)
 
 
 def _check_rights(read: _Read) -> None:

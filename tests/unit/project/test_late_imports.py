@@ -40,7 +40,7 @@ LATE = {
     "a Tab after a verb or an option does not ask for a dataflow": {
         "cli.completion": {
             *("verbs.facts.cells", "verbs.facts.list", "verbs.facts.selector"),
-            "verbs.remote.hosts",
+            *("verbs.releases.listing", "verbs.remote.hosts"),
         },
     },
     "seldom: what is not in systemd, has restarted, was killed, or enabled while it ran": {

@@ -81,7 +81,8 @@ def test_values_and_defaults_are_those_of_help(verb: str) -> None:
         flag = param.opts[-1][1:]
         (entry,) = (one for one in items if re.search(rf"Fl {flag}(?: |$)", one, flags=re.M))
         assert re.search(
-            rf"\b{re.escape(f'{default:g}' if isinstance(default, float) else default)}\b", entry
+            rf"\b{re.escape(f'{default:g}' if isinstance(default, int | float) else default)}\b",
+            entry,
         )
         if isinstance(param.type, click.Choice):
             listed = entry.partition("\n")[0].partition("Cm ")[2].split(" | ")

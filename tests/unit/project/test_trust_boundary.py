@@ -43,7 +43,8 @@ OTHERWISE = (
 
 _TABLE = {
     DOOR: """
-        trust.eyes trust.locks trust.paths trust.programs trust.sight trust.sockets trust.terminals
+        trust.courier trust.eyes trust.locks trust.paths trust.project trust.programs
+        trust.sight trust.sockets trust.terminals
     """,
     OWN: """
         adapters.dora.preparation adapters.host.files adapters.ssh.program cli.main
@@ -58,6 +59,7 @@ _TABLE = {
     """,
     ROOTS: """
         adapters.bus.connection adapters.bus.errors adapters.host.unit_files
+        adapters.releases.draft adapters.releases.store verbs.releases.trial
         adapters.journal.journalctl adapters.journal.reader adapters.journal.socket verbs.doctor
         verbs.facts.enabled verbs.facts.locks verbs.follow verbs.gateway verbs.needs.notes
         verbs.setup verbs.show verbs.start.enable verbs.up

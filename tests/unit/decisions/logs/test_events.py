@@ -38,6 +38,9 @@ def test_catalog_entry_says_what_and_what_to_do(name: str) -> None:
             "DORA_MOST",
             "DORA_OUTPUT",
             "DORA_THEN",
+            "DORA_RELEASE",
+            "DORA_FORMER",
+            "DORA_REASON",
             "UNIT",
         }
 

@@ -1,0 +1,115 @@
+"""Copy a project into a release and run that, or what ran before."""
+
+import os
+import sys
+from typing import Any
+
+import click
+
+from dora_systemd.adapters.bus.systemd import Bus
+from dora_systemd.cli.inhibit_options import if_inhibited, inhibit_options
+from dora_systemd.cli.parameters import (
+    acting_options,
+    current_scope,
+    duration_option,
+    name_option,
+    print_json,
+    print_outcomes,
+    print_warnings,
+    tell,
+    wants_json,
+)
+from dora_systemd.cli.settingoptions import SettingsCommand, setting_options
+from dora_systemd.cli.stageline import StageLine
+from dora_systemd.decisions.views.outcome import Outcome
+from dora_systemd.errors import ExitCode
+from dora_systemd.verbs.releases.deploy import (
+    Deployed,
+    DeployRequest,
+    compare,
+    deploy,
+)
+from dora_systemd.verbs.start.linger import ensure_linger
+from dora_systemd.verbs.start.plan import DEFAULT_FILE, StartRequest
+
+_SIGNS = {"added": "+", "changed": "~", "removed": "-"}
+
+
+@click.command("deploy", cls=SettingsCommand)
+@click.argument("dataflow", default=DEFAULT_FILE, metavar="[FILE|DIR]")
+@name_option
+@setting_options
+@duration_option(
+    "--soak", "Time without a fault that the release has to pass; default: 30s.", "30s"
+)
+@click.option(
+    "--keep",
+    type=click.IntRange(min=1),
+    metavar="N",
+    default=5,
+    help="Releases to keep; the present one and the one before stay in any case; default: 5.",
+)
+@click.option("--no-enable", is_flag=True, help="Do not start it at every boot.")
+@click.option("--dry-run", is_flag=True, help="Print what would change, and change nothing.")
+@inhibit_options
+@acting_options
+def command(
+    dataflow: str,
+    name: str | None,
+    soak: int,
+    keep: int,
+    no_enable: bool,
+    dry_run: bool,
+    force: bool,
+    wait: bool,
+    **flags: Any,
+) -> int:
+    """Copy the project of FILE, or of DIR, into a release that does not change, and run it.
+
+    The release is on trial until all nodes are ready and no node has failed for a while. Then it is
+    what every start and boot runs. If it fails, what ran before runs again, and the exit status is
+    11. A reboot during the trial boots what ran before. Refused while a lock inhibits it.
+
+    Examples:
+      doractl deploy --name robot                 the project in this directory
+      doractl deploy /srv/robot --soak 5min
+      doractl deploy flows/robot.yml --memory-limit 4G --restart-policy on-failure
+      doractl deploy --dry-run                    files that differ from the last release
+    """
+    scope = current_scope()
+    start = StartRequest(dataflow, name, flags, os.environ)
+    if dry_run:
+        return _print_changes(*compare(scope, start))
+    bus = Bus(scope)
+    how = if_inhibited(force, wait)
+    request = DeployRequest(start, soak, keep, not no_enable, how)
+    with StageLine(sys.stderr) as stage:
+
+        def warn(text: str) -> None:
+            stage.wipe()
+            print_warnings([text])
+
+        done = deploy(bus, scope, request, stage, warn)
+    print_warnings([ensure_linger(scope) if request.want_boot else ""])
+    return print_outcomes([deployed_outcome(done, "deployed")])
+
+
+def deployed_outcome(done: Deployed, how: str) -> Outcome:
+    """What is printed for a release that runs. how: "deployed" or "rolled back"."""
+    details = {"release": done.release, "former": done.former or None, "files": done.files}
+    details |= {"size_bytes": done.size, "copied_bytes": done.copied}
+    lines = [f"Dataflow {how}: {done.uuid} ({done.name})", f"Release: {done.release}"]
+    lines += [f"Before: {done.former}"] if done.former else []
+    return Outcome(done, "\n".join([*lines, f"Unit: {done.unit}"]), details=details)
+
+
+def _print_changes(last: str, changes: dict[str, list[str]]) -> int:
+    if wants_json():
+        print_json({"release": last or None, **changes})
+        return ExitCode.OK
+    for what, paths in changes.items():
+        for path in paths:
+            tell(f"{_SIGNS[what]} {path}")
+    if not any(changes.values()):
+        tell(f"Nothing differs from release {last}")
+    return ExitCode.OK

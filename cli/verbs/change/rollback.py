@@ -1,0 +1,40 @@
+"""Run an older release again."""
+
+import sys
+
+import click
+
+from dora_systemd.adapters.bus.systemd import Bus
+from dora_systemd.cli.inhibit_options import if_inhibited, inhibit_options
+from dora_systemd.cli.parameters import (
+    acting_options,
+    current_scope,
+    duration_option,
+    print_outcomes,
+)
+from dora_systemd.cli.stageline import StageLine
+from dora_systemd.cli.verbs.change.deploy import deployed_outcome
+from dora_systemd.verbs.releases.rollback import roll_back
+
+
+@click.command("rollback")
+@click.argument("selector")
+@click.argument("release", required=False, metavar="[RELEASE]")
+@duration_option("--soak", "Time without a fault that the release has to pass; default: 0s.", "0s")
+@inhibit_options
+@acting_options
+def command(selector: str, release: str | None, soak: int, force: bool, wait: bool) -> int:
+    """Run an older release of a dataflow: the one before the present one, or RELEASE.
+
+    It is on trial until all its nodes are ready. If it fails, what ran before runs again, and the
+    exit status is 11. Refused while a lock inhibits it.
+
+    Examples:
+      doractl rollback robot
+      doractl rollback robot 20261121T220012-9f3c1a2
+    """
+    how = if_inhibited(force, wait)
+    scope = current_scope()
+    with StageLine(sys.stderr) as stage:
+        done = roll_back(Bus(scope), scope, selector, release, soak, stage, how)
+    return print_outcomes([deployed_outcome(done, "rolled back")])

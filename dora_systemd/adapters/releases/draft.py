@@ -1,0 +1,100 @@
+"""A release that is being written; it gets its name by a rename, when all of it is on the disk.
+
+Everything is created below a directory that only its writer can change, so no path in it can lead
+elsewhere. Files that are like those of the last release become hard links to them.
+"""
+
+import ctypes
+import hashlib
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+from dora_systemd.adapters.releases.store import MANIFEST, Store, remove_tree, sync, write_part
+from dora_systemd.decisions.releases.entries import Stored
+from dora_systemd.decisions.releases.manifest import Manifest, format_manifest
+from dora_systemd.names import TREE
+
+_NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+_LIBC = ctypes.CDLL(None, use_errno=True)
+
+
+class Draft:
+    """A release of `store` without a name yet. All methods raise OSError."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._path = store.path / f".new-{os.urandom(6).hex()}"
+        self._tree = self._path / TREE
+        self._made = {self._tree}
+        self._tree.mkdir(parents=True)
+
+    def write(self, path: str, chunks: Iterable[bytes], is_executable: bool) -> Stored:
+        """Write a file of the tree."""
+        mode = 0o555 if is_executable else 0o444
+        digest, size = hashlib.sha256(), 0
+        with os.fdopen(os.open(self._place(path), _NEW, 0o600), "wb", buffering=0) as file:
+            for chunk in chunks:
+                digest.update(chunk)
+                size += len(chunk)
+                file.write(chunk)
+            os.fchmod(file.fileno(), mode)
+        return Stored(size, is_executable, digest.hexdigest())
+
+    def share(self, path: str, release_id: str) -> None:
+        """Share a file with the same path in another release."""
+        place = self._place(path)
+        place.hardlink_to(self._store.tree(release_id) / path)
+
+    def link(self, path: str, target: str) -> Stored:
+        """Create a symbolic link in the tree."""
+        self._place(path).symlink_to(target)
+        return Stored(target=target)
+
+    def publish(self, manifest: Manifest, group: int | None) -> None:
+        """Give the release its name, once all of it is on the disk.
+
+        group: who may enter it besides its owner; None: nobody.
+        """
+        write_part(self._path, MANIFEST, format_manifest(manifest))
+        for directory in self._made:
+            directory.chmod(0o555)
+        self._path.chmod(0o700)
+        if group is not None:
+            os.chown(self._path, -1, group)
+            self._path.chmod(0o750)
+        _sync_file_system(self._path)
+        self._path.rename(self._store.release(manifest.id))
+        sync(self._store.path)
+
+    def discard(self) -> None:
+        """Remove it, unless it has its name."""
+        remove_tree(self._path)
+
+    def free_bytes(self) -> int:
+        """The space on its file system."""
+        found = os.statvfs(self._path)
+        return found.f_bavail * found.f_frsize
+
+    def _place(self, path: str) -> Path:
+        place = self._tree / path
+        missing = []
+        for directory in place.parents:
+            if directory in self._made:
+                break
+            missing.append(directory)
+        for directory in reversed(missing):
+            directory.mkdir(0o755)
+            self._made.add(directory)
+        return place
+
+
+def _sync_file_system(path: Path) -> None:
+    """See syncfs(2): thousands of fsync(2) would take minutes on an SD card."""
+    fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        if _LIBC.syncfs(fd):
+            number = ctypes.get_errno()
+            raise OSError(number, os.strerror(number), str(path))
+    finally:
+        os.close(fd)

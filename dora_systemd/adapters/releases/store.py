@@ -1,0 +1,191 @@
+"""The store of the releases of one dataflow: a directory for each, which no node can change.
+
+In system scope all of it is root's; the group of the nodes' user may enter a release, other users
+may not. In user scope it has no write permissions, against accidents. What is not finished has a
+name with a dot in front, and the next deploy removes it.
+"""
+
+import contextlib
+import fcntl
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+from dora_systemd.decisions.releases.choice import Known
+from dora_systemd.decisions.releases.manifest import Manifest, parse_manifest
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import STORE, TREE, is_release_id
+from dora_systemd.trust.files import read_file
+from dora_systemd.values import shown
+
+MANIFEST = "release.json"
+UNIT = "unit"
+_PROVED = "proved"
+MOST_MANIFEST = 64 * 1024 * 1024
+"""Maximum bytes of release.json: 100,000 files have about 20 MB."""
+SYSTEM_STATE = Path("/var/lib")
+
+
+def store_root(is_user: bool, environment_home: str, state_home: str) -> Path:
+    """The directory of the releases of all dataflows.
+
+    environment_home, state_home: the variables HOME and XDG_STATE_HOME, for user scope.
+    """
+    if not is_user:
+        return SYSTEM_STATE / STORE
+    home = state_home if state_home.startswith("/") else f"{environment_home}/.local/state"
+    return Path(home) / STORE
+
+
+class Store:
+    """The releases of the dataflow `name`, in the directory `root` / `name`."""
+
+    def __init__(self, root: Path, name: str) -> None:
+        self.name = name
+        self.path = root / name
+
+    def release(self, release_id: str) -> Path:
+        """The directory of a release."""
+        return self.path / release_id
+
+    def tree(self, release_id: str) -> Path:
+        """The directory of the files of a release."""
+        return self.release(release_id) / TREE
+
+    def known(self) -> list[Known]:
+        """All releases, oldest first; those that this user may not enter count as not proved."""
+        found = sorted(filter(is_release_id, self._names()))
+        return [Known(one, self._is_proved(one)) for one in found]
+
+    def unfinished(self) -> list[Path]:
+        """What a deploy that was killed has left."""
+        return sorted(self.path / name for name in self._names() if name.startswith("."))
+
+    def manifest(self, release_id: str) -> Manifest:
+        """The manifest of a release. Raises DoraSystemdError (BAD_INPUT)."""
+        path = self.release(release_id) / MANIFEST
+        text = read_file(path, MOST_MANIFEST).data.decode("utf-8", "replace")
+        return parse_manifest(text, str(path))
+
+    def unit(self, release_id: str) -> str:
+        """The unit file of a release. Raises DoraSystemdError (BAD_INPUT)."""
+        path = self.release(release_id) / UNIT
+        return read_file(path).data.decode("utf-8", "replace")
+
+    def write_unit(self, release_id: str, text: str) -> None:
+        """Write the unit file of a release. Raises OSError."""
+        write_part(self.release(release_id), UNIT, text)
+
+    def prove(self, release_id: str) -> None:
+        """Note that a release has passed its trial. Raises OSError."""
+        write_part(self.release(release_id), _PROVED, "")
+
+    def remove(self, release_id: str) -> None:
+        """Remove a release: its name goes first, so that no half release is ever listed."""
+        gone = self.path / f".old-{release_id}"
+        with contextlib.suppress(FileNotFoundError):
+            self.release(release_id).rename(gone)
+            remove_tree(gone)
+
+    def clean(self) -> None:
+        """Remove what is unfinished."""
+        for path in self.unfinished():
+            remove_tree(path)
+
+    def _names(self) -> list[str]:
+        try:
+            return [path.name for path in self.path.iterdir()]
+        except (FileNotFoundError, NotADirectoryError):
+            return []
+        except OSError as error:
+            raise unusable(self.path, error) from error
+
+    def _is_proved(self, release_id: str) -> bool:
+        try:
+            return (self.release(release_id) / _PROVED).exists()
+        except OSError:
+            return False
+
+
+@contextlib.contextmanager
+def locked(store: Store, make: bool = True) -> Iterator[None]:
+    """Let one process at a time change the store; the kernel ends the lock with the process.
+
+    make: create the directory. Raises DoraSystemdError if another process holds the lock.
+    """
+    try:
+        if make:
+            make_directories(store.path)
+        fd = os.open(store.path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    except OSError as error:
+        raise unusable(store.path, error) from error
+    try:
+        _take(fd, store)
+        try:
+            yield
+        finally:
+            with contextlib.suppress(OSError):
+                store.path.rmdir()  # only an empty one: the first deploy was refused
+    finally:
+        os.close(fd)
+
+
+def _take(fd: int, store: Store) -> None:
+    """Lock the directory `fd`, unless another process has it, or has just removed it."""
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if os.fstat(fd).st_nlink:
+            return
+    except BlockingIOError:
+        pass
+    message = f"cannot change the release of {store.name}: another deploy or rollback is at it"
+    raise DoraSystemdError(message, "wait until that one has ended")
+
+
+def make_directories(path: Path) -> None:
+    """Create a directory and those above it, which all users may enter. Raises OSError."""
+    for one in (*reversed(path.parents), path):
+        if not one.exists():
+            with contextlib.suppress(FileExistsError):
+                one.mkdir()
+                one.chmod(0o755)
+
+
+def remove_tree(path: Path) -> None:
+    """Remove a directory with all in it, although it may have no write permissions."""
+    for directory, _, _ in os.walk(path):
+        with contextlib.suppress(OSError):
+            Path(directory).chmod(0o700)
+    shutil.rmtree(path, ignore_errors=True)
+
+
+def unusable(path: Path, error: OSError) -> DoraSystemdError:
+    """The error for a store that cannot be used."""
+    is_refused = isinstance(error, PermissionError)
+    hint = "use sudo, or --user for a dataflow of your own" if is_refused else "see df"
+    code = ExitCode.NO_PERMISSION if is_refused else ExitCode.FAILURE
+    return DoraSystemdError(f"cannot use {shown(str(path))}: {error.strerror}", hint, code)
+
+
+def write_part(directory: Path, name: str, text: str) -> None:
+    """Write a file of a release in one step, for its owner only."""
+    new = directory / f".{name}"
+    with contextlib.suppress(FileNotFoundError):
+        new.unlink()
+    fd = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+    with os.fdopen(fd, "w") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    new.rename(directory / name)
+    sync(directory)
+
+
+def sync(directory: Path) -> None:
+    """Make the names in a directory durable. Raises OSError."""
+    fd = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)

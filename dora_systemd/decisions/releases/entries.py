@@ -1,0 +1,115 @@
+"""The files of a project, and which of them a release can have. Pure.
+
+Who owns the project names its files and links, so each is checked before root creates it.
+"""
+
+import posixpath
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.values import format_rounded_size, shown
+
+MOST_FILES = 100_000
+MOST_BYTES = 4 * 1024**3
+"""Maximum number of files and bytes of a release."""
+_MOST_PATH = 1024
+_MOST_TARGET = 1024
+
+FILE, LINK, DIRECTORY = "file", "link", "directory"
+
+
+@dataclass(frozen=True)
+class Found:
+    """A file of a project before it is copied.
+
+    path: relative to the project. kind: FILE, LINK, DIRECTORY, or a word for what no release has.
+    target: of a link. signature: changes with the content.
+    """
+
+    path: str
+    kind: str
+    size: int = 0
+    is_executable: bool = False
+    target: str = ""
+    signature: str = ""
+
+
+@dataclass(frozen=True)
+class Stored:
+    """A file of a release. digest: SHA-256 of its content. target: only of a link."""
+
+    size: int = 0
+    is_executable: bool = False
+    digest: str = ""
+    target: str = ""
+
+
+def check_found(one: Found) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) for what a release cannot have."""
+    reason, hint = "", "remove it, or name it in .gitignore"
+    if not is_plain_path(one.path):
+        reason, hint = "its name is not printable text", "rename it"
+    elif one.kind == LINK:
+        reason = _trouble_of_link(one.path, one.target)
+        hint = "link to a file of the project, or copy what it leads to"
+    elif one.kind != FILE:
+        reason = f"it is a {one.kind}"
+    if reason:
+        raise refusal(one.path, reason, hint)
+
+
+def check_amount(found: Iterable[Found]) -> int:
+    """The bytes of all files. Raises DoraSystemdError (BAD_INPUT) if they are too many."""
+    files = [one for one in found if one.kind == FILE]
+    total = sum(one.size for one in files)
+    if total > MOST_BYTES:
+        largest = max(files, key=lambda one: one.size)
+        amounts = f"{format_rounded_size(total)}, {format_rounded_size(largest.size)} of it here"
+        most = format_rounded_size(MOST_BYTES)
+        hint = f"a release has at most {most}: keep data elsewhere, or name it in .gitignore"
+        raise refusal(largest.path, f"the project has {amounts}", hint)
+    return total
+
+
+def too_many(path: str) -> DoraSystemdError:
+    """The error for a project with more than MOST_FILES files."""
+    reason = f"the project has more than {MOST_FILES} files"
+    return refusal(path or ".", reason, "name directories of data in .gitignore")
+
+
+def is_plain_path(path: str) -> bool:
+    """Whether it is a relative path, of printable text, that stays below where it begins."""
+    parts = path.split("/")
+    is_short = len(path.encode("utf-8", "surrogateescape")) <= _MOST_PATH
+    return path.isprintable() and is_short and not {"", ".", ".."} & {*parts}
+
+
+def touched(old: Mapping[str, Stored], new: Mapping[str, Stored]) -> dict[str, list[str]]:
+    """The paths that are added, changed and removed, sorted."""
+    return {
+        "added": sorted(new.keys() - old.keys()),
+        "changed": sorted(one for one in new.keys() & old.keys() if new[one] != old[one]),
+        "removed": sorted(old.keys() - new.keys()),
+    }
+
+
+def refusal(path: str, reason: str, hint: str) -> DoraSystemdError:
+    """The error for a file of a project that is not copied."""
+    return DoraSystemdError(f"cannot copy {shown(path)}: {reason}", hint, ExitCode.BAD_INPUT)
+
+
+def _trouble_of_link(path: str, target: str) -> str:
+    """Why a link could lead out of the project, or "".
+
+    ".." behind a name is refused as well: the name may be a link itself, and then it is unknown
+    where ".." leads.
+    """
+    if not target.isprintable() or not target or len(target) > _MOST_TARGET:
+        return "its target is not printable text"
+    parts = [part for part in target.split("/") if part not in ("", ".")]
+    ups = next((place for place, part in enumerate(parts) if part != ".."), len(parts))
+    depth = len([part for part in posixpath.dirname(path).split("/") if part])
+    if target.startswith("/") or ups > depth:
+        return f"it links to {shown(target)}, which is not in the project"
+    return f"it links to {shown(target)}, with .. behind a name" if ".." in parts[ups:] else ""

@@ -1,0 +1,71 @@
+"""release.json: what a release is, for people, for a rollback, and to check its files. Pure."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from dora_systemd.decisions.releases.entries import Stored
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.values import shown
+
+SCHEMA = 1
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """A release.
+
+    dataflow: the path of its file in the tree. source: the project that it was copied from. user:
+    User= of its nodes, "" in user scope. created_us: CLOCK_REALTIME µs. versions: by
+    name of the program.
+    """
+
+    id: str
+    name: str
+    uuid: str
+    dataflow: str
+    source: str
+    user: str
+    revision: str
+    created_us: int
+    versions: Mapping[str, str] = field(default_factory=dict)
+    files: Mapping[str, Stored] = field(default_factory=dict)
+
+    @property
+    def size(self) -> int:
+        """Bytes of all files, also of those that other releases share."""
+        return sum(one.size for one in self.files.values())
+
+
+def format_manifest(one: Manifest) -> str:
+    """The text of release.json; only ASCII, whatever the names of files are."""
+    value = {**vars(one), "schema": SCHEMA}
+    value["files"] = {path: _format_stored(stored) for path, stored in sorted(one.files.items())}
+    return json.dumps(value, indent=1) + "\n"
+
+
+def parse_manifest(text: str, path: str) -> Manifest:
+    """The manifest in the file `path`. Raises DoraSystemdError (BAD_INPUT)."""
+    try:
+        value = json.loads(text)
+        if value.pop("schema") != SCHEMA:
+            raise ValueError("schema")
+        files = {one: _parse_stored(stored) for one, stored in value.pop("files").items()}
+        return Manifest(**value, files=files)
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        message = f"cannot use {shown(path)}: it does not describe a release"
+        hint = "remove that release, or deploy again"
+        raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT) from error
+
+
+def _format_stored(one: Stored) -> dict[str, Any]:
+    if one.target:
+        return {"link": one.target}
+    return {"size": one.size, "executable": one.is_executable, "sha256": one.digest}
+
+
+def _parse_stored(value: Mapping[str, Any]) -> Stored:
+    if "link" in value:
+        return Stored(target=str(value["link"]))
+    return Stored(int(value["size"]), bool(value["executable"]), str(value["sha256"]))

@@ -1,0 +1,53 @@
+"""The table and the objects of `doractl releases`. Pure."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from dora_systemd.decisions.releases.manifest import Manifest
+from dora_systemd.decisions.views.dataflows import UNKNOWN, format_table, local_time
+from dora_systemd.decisions.views.objects import moment
+from dora_systemd.values import format_rounded_size
+
+_HEADER = ("NAME", "ID", "STATE", "CREATED", "SIZE", "FILES")
+
+
+class ReleaseRow(NamedTuple):
+    """A release. tree: the directory of its files. manifest: None if it is not readable."""
+
+    name: str
+    id: str
+    state: str
+    tree: str
+    manifest: Manifest | None
+
+
+def format_releases(
+    rows: Sequence[ReleaseRow], width: int | None = None, want_colors: bool = False
+) -> str:
+    """The table, for a terminal of that width."""
+    return format_table(_HEADER, list(map(_cells, rows)), width, want_colors)
+
+
+def _cells(row: ReleaseRow) -> tuple[str, ...]:
+    one = row.manifest
+    size = format_rounded_size(one.size) if one else UNKNOWN
+    count = str(len(one.files)) if one else UNKNOWN
+    return (row.name, row.id, row.state, local_time(one.created_us if one else 0), size, count)
+
+
+def release_object(row: ReleaseRow) -> dict[str, Any]:
+    """A release for `-o json`."""
+    one = row.manifest
+    return {
+        "name": row.name,
+        "release": row.id,
+        "state": row.state,
+        "tree": row.tree,
+        "uuid": one.uuid if one else None,
+        "revision": (one.revision or None) if one else None,
+        "source": one.source if one else None,
+        "user": (one.user or None) if one else None,
+        **moment("created", one.created_us if one else 0),
+        "size_bytes": one.size if one else None,
+        "files": len(one.files) if one else None,
+    }

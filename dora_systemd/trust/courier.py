@@ -1,0 +1,153 @@
+"""Reads a project for a release, as the account that runs this; imports the standard library only.
+
+project.py has a child process of that account run the text of this file. Requests are lines of
+JSON. An answer is frames: a letter, a length as 7 digits, and that many bytes; "+" has data, "."
+ends an answer, "-" ends it with the reason of a failure. All paths are relative to the project.
+"""
+
+import hashlib
+import json
+import os
+import stat
+import subprocess
+import sys
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+CHUNK = 256 * 1024
+_GIT_SECONDS = 60
+_KINDS = {
+    **{stat.S_IFREG: "file", stat.S_IFLNK: "link", stat.S_IFDIR: "directory"},
+    **{stat.S_IFIFO: "FIFO", stat.S_IFSOCK: "socket"},
+    **dict.fromkeys((stat.S_IFBLK, stat.S_IFCHR), "device"),
+}
+# No program that a repository's configuration names has to run for these questions.
+_GIT = (
+    *("git", "-c", "core.fsmonitor=false", "-c", "core.hooksPath=/dev/null"),
+    *("-c", "core.untrackedCache=false"),
+)
+_OPEN = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
+
+
+def facts(path: str) -> list[Any] | None:
+    """Path, kind, size, whether it is executable, target and signature; None for nothing."""
+    try:
+        found = Path(path).lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    kind = _KINDS.get(stat.S_IFMT(found.st_mode), "special file")
+    target = str(Path(path).readlink()) if kind == "link" else ""
+    signature = f"{found.st_ino} {found.st_size} {found.st_mtime_ns} {found.st_mode}"
+    is_executable = bool(found.st_mode & stat.S_IXUSR)
+    return [path, kind, found.st_size, is_executable, target, signature]
+
+
+def listed(path: str, most: int) -> list[Any]:
+    """The facts of at most `most` entries of a directory."""
+    with os.scandir(path or ".") as entries:
+        names = sorted(entry.name for entry in islice(entries, most))
+    places = (f"{path}/{name}" if path else name for name in names)
+    return [one for one in map(facts, places) if one]
+
+
+def content(path: str) -> Iterator[bytes]:
+    """The content of a regular file."""
+    fd = os.open(path, _OPEN)
+    with os.fdopen(fd, "rb", buffering=0) as file:
+        if not stat.S_ISREG(os.fstat(fd).st_mode):
+            raise OSError(0, "not a regular file")
+        while chunk := file.read(CHUNK):
+            yield chunk
+
+
+def digest(path: str) -> str:
+    """The SHA-256 of a file's content."""
+    found = hashlib.sha256()
+    for chunk in content(path):
+        found.update(chunk)
+    return found.hexdigest()
+
+
+def git(command: tuple[str, ...], safe: str) -> bytes | None:
+    """What a git command prints, None if it fails."""
+    trusted = ("-c", f"safe.directory={safe}") if safe else ()
+    try:
+        done = subprocess.run(
+            [*_GIT, *trusted, *command],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            timeout=_GIT_SECONDS,
+            check=False,
+            env={**os.environ, "GIT_OPTIONAL_LOCKS": "0", "LC_ALL": "C"},
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return None if done.returncode else done.stdout
+
+
+def repository(owners: list[int]) -> str:
+    """The directory above, or at the project, with a .git, if one of `owners` owns both, or ""."""
+    here = Path.cwd()
+    for place in (here, *here.parents):
+        try:
+            found = {place.lstat().st_uid, (place / ".git").lstat().st_uid}
+        except OSError:
+            continue
+        return str(place) if found <= {*owners} else ""
+    return ""
+
+
+def tracked(owners: list[int], most: int) -> dict[str, Any]:
+    """The files that git would track, None without git, and the revision."""
+    safe = repository(owners)
+    names = git(("ls-files", "-z", "--cached", "--others", "--exclude-standard"), safe)
+    if names is None:
+        return {"files": None, "revision": ""}
+    about = git(("describe", "--always", "--abbrev=7", "--dirty=+", "--exclude=*"), safe)
+    files = [os.fsdecode(one) for one in names.split(b"\0") if one]
+    return {"files": sorted({*files})[:most], "revision": os.fsdecode(about or b"").strip()}
+
+
+def answer(request: dict[str, Any]) -> Iterator[bytes]:
+    """The data of an answer. Raises OSError."""
+    what = request["ask"]
+    if what == "read":
+        yield from content(request["path"])
+    elif what == "list":
+        yield json.dumps(listed(request["path"], request["most"])).encode()
+    elif what == "facts":
+        yield json.dumps([facts(one) for one in request["paths"]]).encode()
+    elif what == "digest":
+        yield digest(request["path"]).encode()
+    elif what == "git":
+        yield json.dumps(tracked(request["owners"], request["most"])).encode()
+
+
+def frame(letter: bytes, data: bytes = b"") -> None:
+    """Write frames with this data."""
+    for start in range(0, len(data) or 1, CHUNK):
+        part = data[start : start + CHUNK]
+        sys.stdout.buffer.write(b"%s%07d%s" % (letter, len(part), part))
+
+
+def main(root: str) -> None:
+    """Answer requests about the project `root` until the end of standard input."""
+    is_there = False
+    for line in sys.stdin.buffer:
+        try:
+            if not is_there:
+                os.chdir(root)
+                is_there = True
+            for data in answer(json.loads(line)):
+                frame(b"+", data)
+            frame(b".")
+        except (OSError, ValueError) as error:
+            frame(b"-", str(getattr(error, "strerror", None) or error).encode()[:200])
+        sys.stdout.buffer.flush()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

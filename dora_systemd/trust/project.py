@@ -1,0 +1,166 @@
+"""Reads a project with the permissions of the user that its nodes will run as.
+
+Root copies what another user owns. A child process that is that user reads it, see courier.py: so a
+release contains nothing that its nodes could not read before, and git and whatever the repository
+configures never run as root. That user can trace the child and make it lie, so every answer is
+bounded and checked on arrival.
+"""
+
+import contextlib
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.trust import courier
+from dora_systemd.trust.programs import Account, account_of_uid
+from dora_systemd.trust.sight import start_reader
+from dora_systemd.values import shown
+
+_SECONDS = 90.0
+"""Timeout for each frame: git has 60 s, and a mount of the user may hang."""
+_HEAD = 8
+MOST_ANSWER = 64 * 1024 * 1024
+"""Maximum bytes of an answer that is not the content of a file."""
+_BATCH = 500
+
+
+class Project:
+    """The files of a project, as an account sees them. root: its absolute path."""
+
+    def __init__(self, root: str, child: "subprocess.Popen[bytes]", account: Account) -> None:
+        self.root = root
+        self._child = child
+        self._account = account
+
+    def listed(self, directory: str, most: int) -> list[list[Any]]:
+        """The facts of at most `most` entries of a directory, see courier.facts()."""
+        return self._rows(self._value({"ask": "list", "path": directory, "most": most}, directory))
+
+    def facts(self, paths: Sequence[str]) -> list[list[Any] | None]:
+        """The facts of these files, None for one that is not there."""
+        found: list[list[Any] | None] = []
+        for start in range(0, len(paths), _BATCH):
+            part = paths[start : start + _BATCH]
+            rows = self._value({"ask": "facts", "paths": list(part)}, part[0])
+            if not isinstance(rows, list) or len(rows) != len(part):
+                raise self._broken(part[0])
+            self._rows([one for one in rows if one is not None])
+            found += rows
+        return found
+
+    def digest(self, path: str) -> str:
+        """The SHA-256 of a file, as the child says."""
+        return self._whole({"ask": "digest", "path": path}, path).decode("ascii", "replace")
+
+    def read(self, path: str) -> Iterator[bytes]:
+        """The content of a file. Raises DoraSystemdError; the caller bounds its length."""
+        yield from self._ask({"ask": "read", "path": path}, path)
+
+    def tracked(self, owners: Sequence[int], most: int) -> tuple[list[str] | None, str]:
+        """The files that git would track, None without git, and the revision, "" without one.
+
+        owners: of a repository that git may read although the account does not own it.
+        """
+        value = self._value({"ask": "git", "owners": list(owners), "most": most}, ".git")
+        files = value.get("files") if isinstance(value, dict) else None
+        if files is None:
+            return None, ""
+        if not isinstance(files, list) or not all(isinstance(one, str) for one in files):
+            raise self._broken(".git")
+        return files, str(value.get("revision", ""))
+
+    def _rows(self, rows: Any) -> list[list[Any]]:
+        types = (str, str, int, bool, str, str)
+        is_sound = isinstance(rows, list) and all(
+            isinstance(row, list)
+            and len(row) == len(types)
+            and all(isinstance(one, kind) for one, kind in zip(row, types, strict=True))
+            and row[2] >= 0
+            for row in rows
+        )
+        if not is_sound:
+            raise self._broken(".")
+        return list(rows)
+
+    def _value(self, request: dict[str, Any], path: str) -> Any:
+        try:
+            return json.loads(self._whole(request, path))
+        except (ValueError, RecursionError) as error:
+            raise self._broken(path) from error
+
+    def _whole(self, request: dict[str, Any], path: str) -> bytes:
+        parts, size = [], 0
+        for part in self._ask(request, path):
+            size += len(part)
+            if size > MOST_ANSWER:
+                raise self._broken(path)
+            parts.append(part)
+        return b"".join(parts)
+
+    def _ask(self, request: dict[str, Any], path: str) -> Iterator[bytes]:
+        assert self._child.stdin
+        try:
+            self._child.stdin.write(json.dumps(request).encode() + b"\n")
+            self._child.stdin.flush()
+            while (frame := self._frame())[0] == b"+":
+                yield frame[1]
+        except (BrokenPipeError, ValueError) as error:
+            raise self._broken(path) from error
+        if frame[0] != b".":
+            reason = frame[1].decode("utf-8", "replace")
+            hint = "let that user read it, or name it in .gitignore"
+            raise self._refusal(path, reason, hint, ExitCode.BAD_INPUT)
+
+    def _frame(self) -> tuple[bytes, bytes]:
+        head = self._receive(_HEAD)
+        if not head[1:].isdigit() or int(head[1:]) > courier.CHUNK:
+            raise ValueError(head)
+        return head[:1], self._receive(int(head[1:]))
+
+    def _receive(self, count: int) -> bytes:
+        assert self._child.stdout
+        fd, received = self._child.stdout.fileno(), bytearray()
+        while len(received) < count:
+            ready = select.select([fd], [], [], _SECONDS)[0]
+            chunk = os.read(fd, count - len(received)) if ready else b""
+            if not chunk:
+                raise BrokenPipeError
+            received += chunk
+        return bytes(received)
+
+    def _broken(self, path: str) -> DoraSystemdError:
+        hint = "see whether a mount of that user hangs"
+        return self._refusal(path, "no answer", hint, ExitCode.FAILURE)
+
+    def _refusal(self, path: str, reason: str, hint: str, code: ExitCode) -> DoraSystemdError:
+        place = shown(str(Path(self.root, path)))
+        return DoraSystemdError(
+            f"cannot read {place} as user {self._account.name}: {reason}", hint, code
+        )
+
+
+@contextlib.contextmanager
+def opened_project(root: str, account: Account | None) -> Iterator[Project]:
+    """The project in the directory `root` as the account sees it; None: as the caller does.
+
+    Raises DoraSystemdError (NO_PERMISSION) if the account cannot execute our Python interpreter.
+    """
+    account = account or account_of_uid(os.geteuid())
+    text = Path(courier.__file__).read_text(encoding="utf-8")
+    command = (sys.executable, "-I", "-S", "-c", text, root)
+    child = start_reader(command, account)
+    try:
+        yield Project(root, child, account)
+    finally:
+        # With its git, if that hangs: the child is the leader of its process group.
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(child.pid, signal.SIGKILL)
+        with contextlib.suppress(OSError), child:
+            pass

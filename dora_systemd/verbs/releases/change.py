@@ -1,0 +1,160 @@
+"""Changes the release of a dataflow: trial, soak, then commit or the way back.
+
+deploy and rollback both end here, so this is the one place for what may forbid such a change.
+"""
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+from dora_systemd.adapters.bus.manager import SETTLED, Manager
+from dora_systemd.adapters.host.unit_files import remove_unit_file
+from dora_systemd.adapters.releases.store import Store, unusable
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.logs.events import ROLLED_BACK
+from dora_systemd.decisions.unit.file import is_boot_checked, with_boot_check
+from dora_systemd.decisions.why.faults import Fault
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.scope import Scope
+from dora_systemd.values import INFINITY
+from dora_systemd.verbs.inhibit.guard import IfInhibited, uninhibited
+from dora_systemd.verbs.releases.soak import START_LIMIT, Gate, Tell, settle
+from dora_systemd.verbs.releases.trial import (
+    Standing,
+    begin_trial,
+    commit,
+    end_trial,
+    go_back,
+)
+from dora_systemd.verbs.start.asked import note_request
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+@dataclass(frozen=True)
+class Change:
+    """A release that is to run. text: its unit file. soak: µs. command: by which it is asked.
+
+    how: what to do while a lock inhibits it.
+    """
+
+    release: str
+    text: str
+    options: RunnerOptions
+    soak: int
+    want_boot: bool
+    command: str
+    how: IfInhibited
+
+
+def change_release(
+    manager: Manager, scope: Scope, store: Store, standing: Standing, change: Change, tell: Tell
+) -> None:
+    """Run the release, and commit it or roll back.
+
+    Raises DoraSystemdError: ROLLED_BACK if it has failed its trial, INHIBITED before that. SIGINT,
+    SIGTERM and SIGHUP roll back, too.
+    """
+    if is_boot_checked(standing.boot.text or ""):
+        change = replace(change, text=with_boot_check(change.text))
+    verb = change.command.removeprefix("doractl ")
+    with uninhibited(scope, standing.running, verb, change.how, tell):
+        for cell in standing.running:
+            note_request("stop-asked", cell.name, cell.uuid, change.command)
+        _try(manager, scope, store, standing, change, tell)
+    details = {"scope": scope.word, "release": change.release, "former": standing.current}
+    options = change.options
+    note_request("release-committed", options.name, options.uuid, change.command, **details)
+
+
+def _try(
+    manager: Manager, scope: Scope, store: Store, standing: Standing, change: Change, tell: Tell
+) -> None:
+    name = change.options.name
+    # After this nothing is certain but what the journal and systemd say: undo it in any case.
+    with _interruptible():
+        try:
+            begin_trial(manager, standing, change.text)
+            fault = Gate(manager, scope, name, tell).run(_limit(change.options), change.soak)
+            if fault is None:
+                _ignore_signals()
+                _prove(store, change.release)
+                commit(manager, standing, change.text, change.want_boot)
+        except KeyboardInterrupt:
+            fault = Fault("the command was interrupted")
+        except DoraSystemdError as error:
+            fault = Fault(error.message)
+        if fault is not None:
+            _ignore_signals()
+            raise _roll_back(manager, standing, change, fault)
+        remove_unit_file(standing.boot.runtime)
+        end_trial(manager, standing)
+
+
+def _limit(options: RunnerOptions) -> int:
+    own = options.start_timeout
+    return max(START_LIMIT, own) if own != INFINITY else START_LIMIT
+
+
+def _prove(store: Store, release: str) -> None:
+    try:
+        store.prove(release)
+    except OSError as error:
+        raise unusable(store.release(release), error) from error
+
+
+def _roll_back(
+    manager: Manager, standing: Standing, change: Change, fault: Fault
+) -> DoraSystemdError:
+    """Go back to what was there before; the error that tells it."""
+    name, former = change.options.name, standing.current
+    want_start = standing.was_up and not fault.is_stop
+    now = "nothing of it runs"
+    try:
+        go_back(manager, standing, want_start)
+        if want_start:
+            now = f"{former or 'what was there before'} {_back(manager, standing.boot.unit)}"
+    except DoraSystemdError as error:
+        now = f"the way back has failed, too: {error.message}"
+    details = {"release": change.release, "former": former, "nodes": fault.node}
+    note_request(
+        ROLLED_BACK,
+        name,
+        change.options.uuid,
+        change.command,
+        **details,
+        reason=fault.reason,
+    )
+    return DoraSystemdError(
+        f"release {change.release} of {name} was rolled back: {fault.reason}",
+        f"{now}; doractl why {name} tells more",
+        ExitCode.ROLLED_BACK,
+    )
+
+
+def _back(manager: Manager, unit: str) -> str:
+    """Whether the unit is up again, in words."""
+    state = settle(manager, unit, START_LIMIT, lambda _: None)
+    return "runs again" if state in SETTLED else f"has not started again: {state}"
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """Let the signals that would end this process raise KeyboardInterrupt instead."""
+    before = {one: signal.signal(one, _interrupt) for one in _SIGNALS}
+    try:
+        yield
+    finally:
+        for one, handler in before.items():
+            signal.signal(one, handler)
+
+
+def _interrupt(*_arguments: object) -> None:
+    raise KeyboardInterrupt
+
+
+def _ignore_signals() -> None:
+    """Let nothing interrupt the way back."""
+    for one in _SIGNALS:
+        signal.signal(one, signal.SIG_IGN)

@@ -1,0 +1,159 @@
+"""Finds the files of a project that belong to a release, and copies them.
+
+They are those that git would track; without git, all but what .gitignore and the first rules of hot
+reload leave out. Whatever the dataflow itself names belongs to them in any case.
+"""
+
+import errno
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+
+from dora_systemd.adapters.releases.draft import Draft
+from dora_systemd.decisions.releases.entries import (
+    DIRECTORY,
+    FILE,
+    LINK,
+    MOST_FILES,
+    Found,
+    Stored,
+    check_amount,
+    check_found,
+    refusal,
+    too_many,
+)
+from dora_systemd.decisions.releases.ids import is_revision
+from dora_systemd.decisions.releases.manifest import Manifest
+from dora_systemd.decisions.reload.watch_rules import NOT_OF_PROJECT, WatchRules
+from dora_systemd.trust.files import MAX_BYTES
+from dora_systemd.trust.project import Project
+
+Progress = Callable[[int, int], None]
+"""Called with the bytes that are done, and those of all files."""
+_IGNORE_FILE = ".gitignore"
+_AGAIN = "wait until nothing writes to the project, then deploy again"
+
+
+def find_files(
+    project: Project, named: Sequence[str], owners: Sequence[int]
+) -> tuple[dict[str, Found], str]:
+    """The files of a release by path, and the revision of git, or "".
+
+    named: paths that belong to it in any case, as far as they exist. owners: of a repository that
+    git may read. Raises DoraSystemdError (BAD_INPUT) for what a release cannot have.
+    """
+    names, revision = project.tracked(owners, MOST_FILES + 1)
+    found: dict[str, Found] = {}
+    if names is None:
+        found = _walk(project, "")
+    paths = [*(name.rstrip("/") for name in names or ()), *named]
+    for one in _existing(project, list(dict.fromkeys(paths))):
+        # git names the directory of a repository in the repository, and nothing in it.
+        found |= _walk(project, one.path) if one.kind == DIRECTORY else {one.path: one}
+    if len(found) > MOST_FILES:
+        raise too_many("")
+    for one in found.values():
+        check_found(one)
+    check_amount(found.values())
+    return dict(sorted(found.items())), revision if is_revision(revision) else ""
+
+
+def _existing(project: Project, paths: Sequence[str]) -> Iterator[Found]:
+    for row in project.facts(paths) if paths else ():
+        if row is not None:
+            yield Found(*row)
+
+
+def _walk(project: Project, top: str) -> dict[str, Found]:
+    """All files below a directory that no rule leaves out."""
+    found: dict[str, Found] = {}
+    ignores: dict[str, tuple[str, ...]] = {}
+    queue = [top]
+    for directory in queue:
+        entries = [Found(*row) for row in project.listed(directory, MOST_FILES + 1)]
+        if any(one.path.rpartition("/")[2] == _IGNORE_FILE and one.kind == FILE for one in entries):
+            ignores[directory] = _ignore_lines(project, directory)
+        rules = WatchRules(project.root, gitignores=ignores, always=NOT_OF_PROJECT)
+        for one in entries:
+            place = f"{project.root.rstrip('/')}/{one.path}"
+            if one.kind == DIRECTORY:
+                queue += [] if rules.is_ignored(f"{place}/") else [one.path]
+            elif not rules.is_ignored(place):
+                found[one.path] = one
+        if len(found) + len(queue) > MOST_FILES:
+            raise too_many(directory)
+    return found
+
+
+def _ignore_lines(project: Project, directory: str) -> tuple[str, ...]:
+    path = f"{directory}/{_IGNORE_FILE}" if directory else _IGNORE_FILE
+    data = b"".join(_bounded(project.read(path), path, MAX_BYTES))
+    return tuple(data.decode(errors="replace").splitlines())
+
+
+def digests(project: Project, found: Mapping[str, Found]) -> dict[str, Stored]:
+    """What a release of these files would contain, without copying them."""
+    return {
+        path: Stored(target=one.target)
+        if one.kind == LINK
+        else Stored(one.size, one.is_executable, project.digest(path))
+        for path, one in found.items()
+    }
+
+
+def copy_files(
+    project: Project,
+    found: Mapping[str, Found],
+    draft: Draft,
+    last: Manifest | None,
+    progress: Progress,
+) -> dict[str, Stored]:
+    """Copy the files; those that are as in the release `last` are shared with it.
+
+    Raises OSError, and DoraSystemdError (BAD_INPUT) for a file that changes meanwhile.
+    """
+    stored: dict[str, Stored] = {}
+    total, done = sum(one.size for one in found.values()), 0
+    for path, one in found.items():
+        progress(done, total)
+        stored[path] = _copy(project, one, draft, last)
+        done += one.size
+    now = project.facts(list(found)) if found else []
+    for one, row in zip(found.values(), now, strict=True):
+        if row is None or Found(*row) != one:
+            raise _changed(one.path)
+    return stored
+
+
+def _copy(project: Project, one: Found, draft: Draft, last: Manifest | None) -> Stored:
+    if one.kind == LINK:
+        return draft.link(one.path, one.target)
+    old = last.files.get(one.path) if last else None
+    if last and old and not old.target and _is_same(project, one, old):
+        try:
+            draft.share(one.path, last.id)
+            return old
+        except OSError as error:
+            if error.errno not in (errno.EMLINK, errno.EPERM, errno.ENOENT):
+                raise
+    chunks = _bounded(project.read(one.path), one.path, one.size)
+    stored = draft.write(one.path, chunks, one.is_executable)
+    if stored.size != one.size:
+        raise _changed(one.path)
+    return stored
+
+
+def _is_same(project: Project, one: Found, old: Stored) -> bool:
+    is_alike = (one.size, one.is_executable) == (old.size, old.is_executable)
+    return is_alike and project.digest(one.path) == old.digest
+
+
+def _bounded(chunks: Iterable[bytes], path: str, most: int) -> Iterator[bytes]:
+    size = 0
+    for chunk in chunks:
+        size += len(chunk)
+        if size > most:
+            raise _changed(path)
+        yield chunk
+
+
+def _changed(path: str) -> Exception:
+    return refusal(path, "it changed while it was copied", _AGAIN)

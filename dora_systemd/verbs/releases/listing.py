@@ -1,0 +1,70 @@
+"""`doractl releases`: the releases in the store, and which of them runs."""
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.releases.store import Store, store_root
+from dora_systemd.decisions.releases.choice import UNKNOWN, UNPROVED, Known, state_of
+from dora_systemd.decisions.releases.manifest import Manifest
+from dora_systemd.decisions.views.findings import Finding, State
+from dora_systemd.decisions.views.releases import ReleaseRow
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.names import is_name, unit_name
+from dora_systemd.scope import Scope
+from dora_systemd.trust.paths import list_directory
+from dora_systemd.verbs.releases.trial import Standing, read_standing
+
+_MOST_NAMES = 10_000
+
+
+def root_of(scope: Scope) -> Path:
+    """The directory of the releases of all dataflows."""
+    home, state = os.environ.get("HOME", ""), os.environ.get("XDG_STATE_HOME", "")
+    return store_root(scope.is_user, home, state)
+
+
+def store_of(scope: Scope, name: str) -> Store:
+    """The releases of a dataflow."""
+    return Store(root_of(scope), name)
+
+
+def deployed_names(scope: Scope) -> list[str]:
+    """The dataflows that have releases, sorted."""
+    with suppress(OSError):
+        return [name for name in list_directory(root_of(scope), _MOST_NAMES) if is_name(name)]
+    return []
+
+
+def read_releases(manager: Manager, scope: Scope, names: Sequence[str]) -> list[ReleaseRow]:
+    """All releases of these dataflows, the newest of each one first."""
+    rows = []
+    for name in names:
+        store, standing = store_of(scope, name), read_standing(manager, scope, unit_name(name))
+        rows += [_row(store, standing, one) for one in reversed(store.known())]
+    return rows
+
+
+def _row(store: Store, standing: Standing, one: Known) -> ReleaseRow:
+    manifest: Manifest | None = None
+    with suppress(DoraSystemdError):  # others than root may not look into it
+        manifest = store.manifest(one.id)
+    state = state_of(one, standing.current, standing.trial)
+    if manifest is None and state == UNPROVED:
+        state = UNKNOWN
+    return ReleaseRow(store.name, one.id, state, str(store.tree(one.id)), manifest)
+
+
+def judge_releases(manager: Manager, scope: Scope) -> Iterator[Finding]:
+    """The findings of `doractl doctor` about what a killed deploy has left."""
+    for name in deployed_names(scope):
+        store, standing = store_of(scope, name), read_standing(manager, scope, unit_name(name))
+        if standing.trial:
+            text = f"{name} runs release {standing.trial} on trial, and the next boot does not"
+            remedy = f"doractl deploy --name {name}, or doractl rollback {name}"
+            yield Finding("releases", State.WARNING, text, remedy)
+        for path in store.unfinished():
+            text = f"{path} is the rest of a deploy that was killed"
+            yield Finding("releases", State.NOTE, text, "the next deploy removes it")

@@ -1,0 +1,83 @@
+"""`doractl rollback`: an older release proves itself once more, and takes the place of this one."""
+
+from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.releases.store import Store, locked
+from dora_systemd.decisions.releases.choice import before
+from dora_systemd.decisions.unit.file import runner_of
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import did_you_mean, unit_name
+from dora_systemd.scope import Scope
+from dora_systemd.trust.paths import is_directory
+from dora_systemd.values import quoted
+from dora_systemd.verbs.facts.selector import Selector
+from dora_systemd.verbs.inhibit.guard import IfInhibited
+from dora_systemd.verbs.releases.change import Change, change_release
+from dora_systemd.verbs.releases.deploy import Deployed
+from dora_systemd.verbs.releases.listing import deployed_names, store_of
+from dora_systemd.verbs.releases.soak import Tell
+from dora_systemd.verbs.releases.trial import Standing, read_standing, require_deployable
+
+_COMMAND = "doractl rollback"
+
+
+def roll_back(
+    manager: Manager,
+    scope: Scope,
+    selector: str,
+    release: str | None,
+    soak: int,
+    tell: Tell,
+    how: IfInhibited = IfInhibited.REFUSE,
+) -> Deployed:
+    """Run an older release. release: its id; None for the one before the present one.
+
+    soak: µs. how: what to do while a lock inhibits it. Raises DoraSystemdError: ROLLED_BACK if that
+    release fails its trial, INHIBITED.
+    """
+    store = store_of(scope, deployed_name(manager, scope, selector))
+    with locked(store, make=False):
+        standing = read_standing(manager, scope, unit_name(store.name))
+        require_deployable(manager, scope, standing)
+        chosen = _choose(store, standing, release)
+        text = store.unit(chosen)
+        options, manifest = runner_of(text), store.manifest(chosen)
+        if options is None or options.name != store.name:
+            hint = f"doractl releases {store.name} lists the others"
+            message = f"cannot run release {chosen} of {store.name}: it has no unit file of ours"
+            raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+        want_boot = standing.boot.text is None
+        change = Change(chosen, text, options, soak, want_boot, _COMMAND, how)
+        change_release(manager, scope, store, standing, change, tell)
+    facts = (options.uuid, store.name, standing.boot.unit, chosen, standing.current)
+    return Deployed(*facts, len(manifest.files), manifest.size, 0)
+
+
+def deployed_name(manager: Manager, scope: Scope, selector: str) -> str:
+    """The name of the dataflow with releases that is meant. Raises DoraSystemdError (NOT_FOUND)."""
+    wanted, known = Selector(selector), deployed_names(scope)
+    for name in wanted.names:
+        if name in known:
+            return name
+    name = wanted.find(manager).name
+    if name not in known:
+        hint = f"doractl deploy --name {name} makes the first one"
+        raise DoraSystemdError(f"{name} has no release", hint, ExitCode.NOT_FOUND)
+    return name
+
+
+def _choose(store: Store, standing: Standing, release: str | None) -> str:
+    known = store.known()
+    ids = [one.id for one in known]
+    if release is None:
+        # A trial whose doractl was killed: what is on the disk has proved itself.
+        chosen = standing.current if standing.trial else before(known, standing.current)
+        if not chosen:
+            hint = f"doractl releases {store.name} lists all"
+            message = f"{store.name} has no release before the present one"
+            raise DoraSystemdError(message, hint, ExitCode.NOT_FOUND)
+        return chosen
+    if release not in ids or not is_directory(store.tree(release)):
+        hint = did_you_mean(release, ids) or f"doractl releases {store.name} lists all"
+        message = f"{store.name} has no release {quoted(release)}"
+        raise DoraSystemdError(message, hint, ExitCode.NOT_FOUND)
+    return release

@@ -1,0 +1,131 @@
+"""The gate of a release: it starts, and then runs for a while without a fault.
+
+With Restart=always a bad version never reads "failed", and dora restarts nodes by itself. So the
+journal tells as well: every crash and restart of a node is an event there.
+"""
+
+import time
+from collections.abc import Callable
+from contextlib import suppress
+
+from dora_systemd.adapters.bus.manager import ON_THE_WAY, SETTLED, Manager
+from dora_systemd.adapters.journal.reader import JournalReader
+from dora_systemd.decisions.logs.query import scope_matches
+from dora_systemd.decisions.why.faults import FAULT_IDS, Fault, find_fault, is_finished
+from dora_systemd.decisions.why.lives import Happening, parse_happening
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.names import unit_name
+from dora_systemd.scope import Scope
+from dora_systemd.values import SECOND, format_duration
+from dora_systemd.verbs.facts.reason import failure_reason, runners_refusal
+
+Tell = Callable[[str], None]
+START_LIMIT = 120 * SECOND
+"""µs for all nodes to become ready, unless the dataflow's own start_timeout is longer."""
+LATE = "late"
+_STEP_SECONDS = 0.2
+_LOOK_SECONDS = 1.0
+_MOST_RECORDS = 200
+_MICROSECOND_NS = 1000
+
+
+def settle(manager: Manager, unit: str, limit: int, tell: Tell) -> str:
+    """Wait until a unit that has a job to start is up or down: its ActiveState, or LATE.
+
+    A unit that systemd is about to start again has failed. limit: µs. Raises DoraSystemdError.
+    """
+    deadline = time.monotonic() + limit / SECOND
+    while True:
+        facts = manager.read(unit, ["ActiveState", "SubState", "Job", "StatusText"])
+        active, is_queued = str(facts["ActiveState"]), bool((facts["Job"] or (0,))[0])
+        if not is_queued and str(facts["SubState"]).startswith("auto-restart"):
+            return "failed"
+        if not is_queued and active not in ON_THE_WAY:
+            return active
+        if time.monotonic() > deadline:
+            return LATE
+        tell(f"trial: {facts['StatusText'] or 'starting'}")
+        time.sleep(_STEP_SECONDS)
+
+
+class Gate:
+    """The trial of the dataflow `name`. tell: gets a line for each stage."""
+
+    def __init__(self, manager: Manager, scope: Scope, name: str, tell: Tell) -> None:
+        self._manager = manager
+        self._scope = scope
+        self._name = name
+        self._unit = unit_name(name)
+        self._tell = tell
+        self._since_us = time.time_ns() // _MICROSECOND_NS
+        self._before = self._invocation()
+
+    def run(self, start_limit: int, soak: int) -> Fault | None:
+        """Restart the unit, and watch it for `soak` µs after its nodes are ready.
+
+        start_limit: µs until then. None if all is well. Raises DoraSystemdError.
+        """
+        with suppress(DoraSystemdError):  # systemd does not know a new unit
+            self._manager.reset_failed(self._unit)
+        self._manager.queue_job("RestartUnit", self._unit)
+        fault = self._wait_ready(start_limit)
+        return fault or self._soak(soak)
+
+    def _wait_ready(self, limit: int) -> Fault | None:
+        state = settle(self._manager, self._unit, limit, self._tell)
+        if state in SETTLED:
+            return None
+        if state == LATE:
+            return self._fault() or Fault(f"not all nodes are ready after {format_duration(limit)}")
+        return self._end(state)
+
+    def _soak(self, soak: int) -> Fault | None:
+        invocation, begun = self._invocation(), time.monotonic()
+        while True:
+            passed = time.monotonic() - begun
+            is_over = passed >= soak / SECOND
+            state = str(self._manager.read(self._unit, ["ActiveState"])["ActiveState"])
+            if fault := self._fault():
+                return fault
+            if state not in SETTLED:
+                return self._end(state)
+            if self._invocation() != invocation:
+                return Fault("systemd has restarted it")
+            if is_over:
+                return None
+            self._tell(f"trial: soak {int(passed)} of {format_duration(soak)}")
+            time.sleep(min(_LOOK_SECONDS, max(soak / SECOND - passed, 0)))
+
+    def _end(self, state: str) -> Fault | None:
+        """What its end means: a dataflow may finish, everything else is a fault."""
+        found = self._happenings()
+        if fault := find_fault(found, self._since_us, self._before):
+            # The runner's own words have the number of restarts, and may name other nodes, too.
+            words = failure_reason(self._manager, self._unit)
+            is_same = words.startswith(f"node {fault.node}: ") and ", node " not in words
+            return fault._replace(reason=words) if is_same else fault
+        if refusal := runners_refusal(self._manager, self._unit):
+            return Fault(refusal.message)
+        if state == "inactive":
+            is_done = is_finished(found, self._since_us)
+            return None if is_done else Fault("it was stopped", is_stop=True)
+        return Fault(failure_reason(self._manager, self._unit))
+
+    def _fault(self) -> Fault | None:
+        return find_fault(self._happenings(), self._since_us, self._before)
+
+    def _happenings(self) -> list[Happening]:
+        matches = [*scope_matches(self._scope, self._name)]
+        matches += [f"MESSAGE_ID={one}" for one in FAULT_IDS]
+        found: list[Happening] = []
+        with suppress(DoraSystemdError):  # who may not read the journal has systemd's word only
+            for record in JournalReader().newest(matches, _MOST_RECORDS):
+                happening = parse_happening(record)
+                if happening and happening.at_us < self._since_us:
+                    break
+                found += [happening] if happening else []
+        return found
+
+    def _invocation(self) -> str:
+        raw = self._manager.read(self._unit, ["InvocationID"])["InvocationID"]
+        return bytes(raw).hex() if raw else ""

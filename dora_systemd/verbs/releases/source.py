@@ -1,0 +1,152 @@
+"""The project of a deploy: where it is, and what cannot be deployed."""
+
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from dora_systemd.adapters.host.files import decoded, parse_yaml
+from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
+from dora_systemd.decisions.settings.table import ENV_FILE, USER, VENV, WORKING_DIRECTORY
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import settings_path
+from dora_systemd.scope import Scope
+from dora_systemd.trust.files import read_file
+from dora_systemd.trust.paths import Place, exists, is_directory
+from dora_systemd.values import shown
+from dora_systemd.verbs.start.plan import DEFAULT_FILE, Plan, StartRequest, make_plan
+
+
+@dataclass(frozen=True)
+class Source:
+    """A project. root: its directory. origin: of its files, whose owner decides what they may say.
+
+    plan: of a start from there. named: files that the dataflow names, relative to root.
+    """
+
+    root: str
+    origin: Place
+    plan: Plan
+    named: tuple[str, ...]
+
+    @property
+    def dataflow(self) -> str:
+        """The dataflow file, relative to root."""
+        return os.path.relpath(self.plan.options.dataflow, self.root)
+
+
+def find_source(scope: Scope, request: StartRequest) -> Source:
+    """The project of the file or directory that `request` names. Raises DoraSystemdError."""
+    path = Path(request.dataflow).absolute()
+    path = path / DEFAULT_FILE if is_directory(path) else path
+    path = Path(os.path.normpath(path))
+    plan = make_plan(scope, replace(request, dataflow=str(path)))
+    written = read_file(path)
+    dataflow = parse_dataflow(parse_yaml(decoded(written.data, path), path), str(path))
+    root = _root(path, plan)
+    _check(plan, dataflow, root)
+    named = (str(path), settings_path(str(path)), *_programs(dataflow, plan))
+    inside = [os.path.normpath(one) for one in (*named, *plan.settings[ENV_FILE])]
+    relative = (os.path.relpath(one, root) for one in inside if _is_below(one, root))
+    return Source(root, _origin(path, written.place), plan, tuple(dict.fromkeys(relative)))
+
+
+def released(source: Source, request: StartRequest, tree: Path, uuid: str) -> StartRequest:
+    """The request to start the copy in `tree`, with what was found at the source."""
+    options, user = source.plan.options, source.plan.user
+    given: dict[str, object] = {}
+    if source.plan.settings.is_given(WORKING_DIRECTORY):
+        place = os.path.relpath(options.working_directory, source.root)
+        given[WORKING_DIRECTORY.name] = os.path.normpath(tree / place)
+    if options.venv is not None:
+        given[VENV.name] = options.venv
+    if user is not None:
+        given[USER.name] = user.pw_name
+    return replace(
+        request,
+        dataflow=str(tree / source.dataflow),
+        name=options.name,
+        flags={**request.flags, **given},
+        uuid=uuid,
+        origin=source.origin,
+    )
+
+
+def source_notes(source: Source) -> Iterator[str]:
+    """What people have to know about a release of this project."""
+    if venv := source.plan.options.venv:
+        yield f"all releases share the virtual environment {shown(venv)}: pip changes all of them"
+
+
+def _origin(path: Path, place: Place) -> Place:
+    """The place of the dataflow file; that of the settings file beside it if that is not root's."""
+    beside = settings_path(str(path))
+    if not exists(beside):
+        return place
+    settings = read_file(beside).place
+    return place if settings.uid == 0 and not settings.borrowed else settings
+
+
+def _root(path: Path, plan: Plan) -> str:
+    """The directory of the file, or the working directory if that is above it."""
+    directory = os.path.normpath(plan.options.working_directory)
+    above = str(path.parent)
+    if _is_below(directory, above) or directory == above:
+        return above
+    if _is_below(above, directory) and directory != "/":
+        return directory
+    raise _refusal(
+        f"its working directory {shown(directory)} is not in the project",
+        "give a directory below the file, or above it, with --working-directory",
+    )
+
+
+def _check(plan: Plan, dataflow: Dataflow, root: str) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) for what a release cannot do yet."""
+    if plan.options.hot_reload:
+        reason = "hot reload is on, and the files of a release do not change"
+        raise _refusal(reason, "deploy with --no-hot-reload, or use doractl start")
+    if plan.options.uv:
+        reason = "uv is on, and would write to the release"
+        raise _refusal(reason, "run uv sync in the project, and deploy with --venv .venv --no-uv")
+    for node in dataflow.nodes:
+        reason = hint = ""
+        if node.git:
+            reason, hint = "its program comes from git", "commit a copy, and name it in path"
+        elif node.build:
+            reason = "deploy does not run its build command"
+            hint = "run dora build before, commit what it makes, and remove build from the node"
+        elif node.path.startswith(f"{root}/"):
+            reason = f"its path {shown(node.path)} would be outside of the release"
+            hint = f"write it relative to {shown(root)}"
+        if reason:
+            raise _refusal(f"node {node.id}: {reason}", hint)
+
+
+def _programs(dataflow: Dataflow, plan: Plan) -> Iterator[str]:
+    """The files that nodes and operators are started from, absolute, as far as they have a path."""
+    for node in dataflow.nodes:
+        raw = node.raw
+        operators = [raw.get("operator"), *_list(raw.get("operators"))]
+        values = [node.path, raw.get("module"), *(_operator_file(one) for one in operators)]
+        for one in values:
+            if isinstance(one, str) and one and "://" not in one:
+                directory = Path(plan.options.working_directory, node.working_directory)
+                yield str(directory / one)
+
+
+def _operator_file(raw: object) -> object:
+    python = raw.get("python") if isinstance(raw, Mapping) else None
+    return python.get("source") if isinstance(python, Mapping) else python
+
+
+def _list(value: object) -> list[object]:
+    return value if isinstance(value, list) else []
+
+
+def _is_below(path: str, directory: str) -> bool:
+    return path.startswith(f"{directory.rstrip('/')}/")
+
+
+def _refusal(reason: str, hint: str) -> DoraSystemdError:
+    return DoraSystemdError(f"cannot deploy: {reason}", hint, ExitCode.BAD_INPUT)

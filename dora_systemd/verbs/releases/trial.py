@@ -1,0 +1,153 @@
+"""The unit files of a release on trial, of its commit, and of the way back.
+
+The trial's unit file is in /run/systemd/system.control, see UnitPath in systemd.unit(5): it has
+precedence over the one in /etc, which stays as it is, and a reboot removes it. So whatever happens
+in a trial, the machine boots what has proved itself.
+"""
+
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from dora_systemd.adapters.bus.manager import UP, Manager
+from dora_systemd.adapters.host.unit_files import (
+    read_unit_file,
+    remove_unit_file,
+    write_unit_file,
+)
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.unit.file import runner_of
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import release_of
+from dora_systemd.scope import Scope
+from dora_systemd.verbs.facts.cells import Cell, read_cell
+from dora_systemd.verbs.start.claim import require_free_name
+from dora_systemd.verbs.start.enable import BootUnit, install_unit_file, read_boot_unit
+
+_RELOADS = 2
+"""Tries to reload systemd before the one whose failure counts."""
+
+
+@dataclass(frozen=True)
+class Standing:
+    """What there is of a dataflow before its release changes.
+
+    boot: its unit file. path: where that of a trial is. trial: the release on trial, or "". cell:
+    what systemd has loaded.
+    """
+
+    boot: BootUnit
+    path: Path
+    trial: str
+    cell: Cell | None
+
+    @property
+    def current(self) -> str:
+        """The release that every start runs without that of the trial, or ""."""
+        known = self.boot.options
+        if known is None and self.cell is not None and not self.path.exists():
+            known = self.cell.options  # disabled while it ran
+        return release_of(known.dataflow) if known else ""
+
+    @property
+    def has_base(self) -> bool:
+        """Whether there is a unit file without that of the trial."""
+        return self.boot.text is not None or self.boot.runtime.exists()
+
+    @property
+    def was_up(self) -> bool:
+        """Whether something runs that a failed trial has to start again."""
+        return self.has_base and self.cell is not None and self.cell.is_up
+
+    @property
+    def running(self) -> list[Cell]:
+        """The dataflow, if it is up."""
+        return [self.cell] if self.cell is not None and self.cell.is_up else []
+
+    @property
+    def uuid(self) -> str:
+        """The UUID of the dataflow, "" if it is new."""
+        known = self.boot.options or (self.cell.options if self.cell else None)
+        return known.uuid if known else ""
+
+
+def trial_path(scope: Scope, unit: str) -> Path:
+    """The unit file of a trial."""
+    return scope.runtime_root / "systemd" / f"{scope.word}.control" / unit
+
+
+def trial_options(scope: Scope, unit: str) -> RunnerOptions | None:
+    """The runner's options of the release on trial. Raises DoraSystemdError for a foreign file."""
+    text = read_unit_file(trial_path(scope, unit))
+    return None if text is None else runner_of(text)
+
+
+def read_standing(manager: Manager, scope: Scope, unit: str) -> Standing:
+    """What there is of the dataflow. Raises DoraSystemdError (NAME_IN_USE) for foreign units."""
+    options = trial_options(scope, unit)
+    boot = read_boot_unit(manager, scope, unit)
+    standing = Standing(boot, trial_path(scope, unit), "", read_cell(manager, unit))
+    trial = release_of(options.dataflow) if options else ""
+    # A deploy that was killed right after its commit has left the same text in both places.
+    return standing if trial == standing.current else replace(standing, trial=trial)
+
+
+def require_deployable(manager: Manager, scope: Scope, standing: Standing) -> None:
+    """Raise DoraSystemdError (NAME_IN_USE) for what a deploy must not replace."""
+    cell, unit = standing.cell, standing.boot.unit
+    if cell is None or cell.state.active not in UP:
+        require_free_name(manager, scope, unit)
+    elif manager.read(unit, ["Transient"])["Transient"]:
+        raise DoraSystemdError(
+            f"cannot deploy {cell.name}: it runs from {cell.options.dataflow}, started by "
+            "doractl start",
+            f"doractl stop {cell.name}, then deploy again; or choose another --name",
+            ExitCode.NAME_IN_USE,
+        )
+
+
+def begin_trial(manager: Manager, standing: Standing, text: str) -> None:
+    """Let the next start of the unit be that of the release. Raises DoraSystemdError."""
+    write_unit_file(standing.path, text)
+    _reload(manager)
+
+
+def commit(manager: Manager, standing: Standing, text: str, want_boot: bool) -> None:
+    """Let the release be what every start runs: a rename on the disk decides.
+
+    want_boot: enable it as well, unless it is. Raises DoraSystemdError; then nothing has changed.
+    """
+    if want_boot and not standing.boot.is_enabled:
+        install_unit_file(manager, standing.boot, text)
+    else:
+        write_unit_file(standing.boot.path, text)
+
+
+def end_trial(manager: Manager, standing: Standing) -> None:
+    """Let the unit file on the disk take effect again. Raises DoraSystemdError."""
+    remove_unit_file(standing.path)
+    _reload(manager)
+
+
+def go_back(manager: Manager, standing: Standing, want_start: bool) -> None:
+    """End the trial, and start what ran before; without that, stop the unit.
+
+    Does not wait for the start. Raises DoraSystemdError.
+    """
+    unit = standing.boot.unit
+    if not want_start:
+        manager.run_jobs("StopUnit", [unit])
+    end_trial(manager, standing)
+    with suppress(DoraSystemdError):  # a unit that is gone has nothing to reset
+        manager.reset_failed(unit)
+    if want_start:
+        manager.queue_job("RestartUnit", unit)
+
+
+def _reload(manager: Manager) -> None:
+    """Have systemd load its unit files; on a loaded machine that can take longer than a call."""
+    for _ in range(_RELOADS):
+        with suppress(DoraSystemdError):
+            manager.reload()
+            return
+    manager.reload()

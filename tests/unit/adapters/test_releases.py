@@ -1,0 +1,112 @@
+"""The store of releases: a release is there as a whole or not at all."""
+
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.adapters.releases.draft import Draft
+from dora_systemd.adapters.releases.store import Store, locked, store_root
+from dora_systemd.decisions.releases.choice import Known
+from dora_systemd.decisions.releases.entries import Stored
+from dora_systemd.decisions.releases.manifest import Manifest
+from dora_systemd.errors import DoraSystemdError
+
+ONE, TWO = "20261121T220012", "20261122T220012"
+
+
+def manifest(release: str, files: dict[str, Stored]) -> Manifest:
+    return Manifest(release, "robot", "u", "d.yml", "/srv", "", "", 1, files=files)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    found = Store(tmp_path / "state" / "releases", "robot")
+    with locked(found):
+        found.path.joinpath(".lost").mkdir()
+    found.clean()
+    return found
+
+
+def written(store: Store, release: str) -> Manifest:
+    """A release with a file in a directory, and a link."""
+    draft = Draft(store)
+    files = {"d/a.py": draft.write("d/a.py", [b"ab", b"c"], True), "l": draft.link("l", "d/a.py")}
+    draft.publish(manifest(release, files), None)
+    draft.discard()
+    return store.manifest(release)
+
+
+def test_a_release(store: Store) -> None:
+    assert store.known() == []
+    one = written(store, ONE)
+    assert one.files["d/a.py"].size == 3
+    path = store.tree(ONE) / "d/a.py"
+    assert (path.read_text(), path.stat().st_mode & 0o777) == ("abc", 0o555)
+    assert (store.tree(ONE) / "l").read_text() == "abc"
+    assert store.tree(ONE).stat().st_mode & 0o222 == 0
+    assert store.known() == [Known(ONE, False)]
+    store.write_unit(ONE, "text")
+    store.prove(ONE)
+    assert store.unit(ONE) == "text"
+    assert store.known() == [Known(ONE, True)]
+    assert store.unfinished() == []
+
+
+def test_what_is_shared_survives_the_first_owner(store: Store) -> None:
+    written(store, ONE)
+    draft = Draft(store)
+    draft.share("d/a.py", ONE)
+    draft.publish(manifest(TWO, {}), None)
+    shared = store.tree(TWO) / "d/a.py"
+    assert shared.stat().st_nlink == 2
+    store.remove(ONE)
+    assert shared.read_text() == "abc"
+    assert [one.id for one in store.known()] == [TWO]
+    store.remove(ONE)  # as by two at once
+
+
+def test_an_unfinished_one_is_no_release(store: Store) -> None:
+    draft = Draft(store)
+    draft.write("a", [b"x"], False)
+    assert store.known() == []
+    (left,) = store.unfinished()
+    store.clean()
+    assert not left.exists()
+
+
+def test_a_draft_stays_in_its_directory(store: Store) -> None:
+    draft = Draft(store)
+    draft.link("d", "/tmp")
+    with pytest.raises(FileExistsError):
+        draft.write("d", [b""], False)
+    draft.discard()
+
+
+def test_one_at_a_time(store: Store) -> None:
+    with locked(store), pytest.raises(DoraSystemdError, match="another deploy"), locked(store):
+        pass
+    with locked(store):
+        pass
+
+
+def test_a_store_without_a_release_goes(tmp_path: Path) -> None:
+    store = Store(tmp_path, "robot")
+    with locked(store):
+        assert store.path.exists()
+    assert not store.path.exists()
+
+
+def test_a_store_that_is_not_there(tmp_path: Path) -> None:
+    store = Store(tmp_path, "robot")
+    assert store.known() == []
+    with pytest.raises(DoraSystemdError, match="cannot use"), locked(store, make=False):
+        pass
+    with pytest.raises(DoraSystemdError, match="cannot read"):
+        store.manifest(ONE)
+
+
+def test_where_it_is() -> None:
+    assert store_root(False, "/x", "/y") == Path("/var/lib/dora-systemd/releases")
+    assert store_root(True, "/x", "") == Path("/x/.local/state/dora-systemd/releases")
+    assert store_root(True, "/x", "/y") == Path("/y/dora-systemd/releases")
+    assert store_root(True, "/x", "relative") == Path("/x/.local/state/dora-systemd/releases")

@@ -1,0 +1,79 @@
+"""Ids, manifests, which releases stay, and which one a rollback takes."""
+
+import pytest
+
+from dora_systemd.decisions.releases.choice import Known, before, state_of, surplus
+from dora_systemd.decisions.releases.entries import Stored
+from dora_systemd.decisions.releases.ids import is_revision, new_id
+from dora_systemd.decisions.releases.manifest import Manifest, format_manifest, parse_manifest
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.names import is_release_id, release_of
+
+MOMENT = 1_795_298_412_000_000
+DAYS = [f"2026112{day}T220012" for day in range(7)]
+KNOWN = [Known(one, place not in (3, 5)) for place, one in enumerate(DAYS)]
+
+
+def test_ids() -> None:
+    plain = new_id(MOMENT, "", frozenset())
+    assert is_release_id(plain)
+    assert new_id(MOMENT, "9f3c1a2+", frozenset()) == f"{plain}-9f3c1a2+"
+    second = new_id(MOMENT, "", frozenset({plain}))
+    assert is_release_id(second)
+    assert second > plain
+    assert is_revision("9f3c1a2+")
+    assert not is_revision("$(id)")
+    for text in ("", "..", f"{plain}/x", f".new-{plain}", f"{plain}-xyz", f"{plain}\n"):
+        assert not is_release_id(text)
+
+
+def test_the_path_has_the_release() -> None:
+    place = f"dora-systemd/releases/robot/{DAYS[0]}-9f3c1a2+/tree/flows/a.yml"
+    assert release_of(f"/var/lib/{place}") == f"{DAYS[0]}-9f3c1a2+"
+    assert release_of(f"/home/a/.local/state/{place}") == f"{DAYS[0]}-9f3c1a2+"
+    assert release_of("/srv/robot/dataflow.yml") == ""
+    assert release_of(f"/var/lib/dora-systemd/releases/robot/{DAYS[0]}/other/a.yml") == ""
+
+
+def test_what_a_rollback_takes() -> None:
+    assert before(KNOWN, DAYS[6]) == DAYS[4]
+    assert before(KNOWN, DAYS[4]) == DAYS[2]
+    assert before(KNOWN, DAYS[0]) == ""
+    assert before(KNOWN, "") == DAYS[6]
+    assert before([], "") == ""
+
+
+@pytest.mark.parametrize("keep", [1, 2, 5, 9])
+@pytest.mark.parametrize("current", DAYS)
+def test_what_stays(keep: int, current: str) -> None:
+    gone = surplus(KNOWN, keep, current, {DAYS[1], ""})
+    left = [one for one in DAYS if one not in gone]
+    assert {current, DAYS[1], before(KNOWN, current)} - {""} <= {*left}
+    assert left[-keep:] == DAYS[-keep:]
+    assert len(left) <= keep + 3
+
+
+def test_states() -> None:
+    states = [state_of(one, DAYS[4], DAYS[6]) for one in KNOWN[3:]]
+    assert states == ["unproved", "current", "unproved", "trial"]
+    assert state_of(KNOWN[0], DAYS[4], "") == "proved"
+
+
+MANIFEST = Manifest(
+    *(DAYS[0], "robot", "u-u", "dataflow.yml", "/srv/robot", "eve", "9f3c1a2", MOMENT),
+    versions={"dora-systemd": "1"},
+    files={"a\udcff": Stored(3, True, "ab"), "l": Stored(target="a"), "e": Stored(0, False, "x")},
+)
+
+
+def test_manifests() -> None:
+    text = format_manifest(MANIFEST)
+    assert text.isascii()
+    assert parse_manifest(text, "x") == MANIFEST
+    assert MANIFEST.size == 3
+
+
+@pytest.mark.parametrize("text", ["", "{}", "[]", "null", '{"schema": 1}', "[" * 100_000])
+def test_bad_manifests(text: str) -> None:
+    with pytest.raises(DoraSystemdError, match="does not describe a release"):
+        parse_manifest(text, "/x/release.json")

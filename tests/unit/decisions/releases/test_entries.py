@@ -1,0 +1,104 @@
+"""Which files a release can have: who owns the project chooses names, links and sizes."""
+
+import posixpath
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dora_systemd.decisions.releases.entries import (
+    FILE,
+    LINK,
+    MOST_BYTES,
+    Found,
+    Stored,
+    check_amount,
+    check_found,
+    touched,
+)
+from dora_systemd.errors import DoraSystemdError, ExitCode
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["a.py", "dir/a.py", "é/日本.py", "-rf", "a b.py", "..a", ".env"],
+)
+def test_good_names(path: str) -> None:
+    check_found(Found(path, FILE))
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "",
+        "/etc/x",
+        "a//b",
+        "../a",
+        "a/../b",
+        "./a",
+        "a/",
+        "new\nline",
+        "\x1b[2J",
+        "\udcff",
+        "a" * 2000,
+    ],
+)
+def test_bad_names(path: str) -> None:
+    with pytest.raises(DoraSystemdError) as caught:
+        check_found(Found(path, FILE))
+    assert caught.value.code is ExitCode.BAD_INPUT
+    assert caught.value.message.isprintable()
+
+
+@pytest.mark.parametrize(
+    ("path", "target"),
+    [("l", "a"), ("d/l", "../a"), ("d/e/l", "../../a/b"), ("l", "./d/a"), ("d/l", ".")],
+)
+def test_good_links(path: str, target: str) -> None:
+    check_found(Found(path, LINK, target=target))
+
+
+@pytest.mark.parametrize(
+    ("path", "target"),
+    [
+        *(("l", "/etc/shadow"), ("l", ".."), ("l", "../a"), ("d/l", "../../a"), ("l", "")),
+        # d may be a link to elsewhere in the project, and then this leads out of it.
+        *(("l", "d/../../a"), ("l", "d/.."), ("l", "a\nb"), ("l", "a" * 2000)),
+    ],
+)
+def test_bad_links(path: str, target: str) -> None:
+    with pytest.raises(DoraSystemdError, match="cannot copy"):
+        check_found(Found(path, LINK, target=target))
+
+
+PARTS = st.lists(st.sampled_from(["..", "a", "b", ".", ""]), min_size=1, max_size=6)
+
+
+@given(PARTS, st.integers(0, 3))
+def test_no_link_leads_out(parts: list[str], depth: int) -> None:
+    path, target = "/".join(["d"] * depth + ["l"]), "/".join(parts)
+    try:
+        check_found(Found(path, LINK, target=target))
+    except DoraSystemdError:
+        return
+    end = posixpath.normpath(posixpath.join("/top/tree", posixpath.dirname(path), target))
+    assert end == "/top/tree" or end.startswith("/top/tree/")
+
+
+@pytest.mark.parametrize("kind", ["socket", "device", "FIFO", "directory", "special file"])
+def test_other_kinds(kind: str) -> None:
+    with pytest.raises(DoraSystemdError, match=f"it is a {kind}"):
+        check_found(Found("x", kind))
+
+
+def test_amounts() -> None:
+    found = [Found("small", FILE, 1), Found("large", FILE, MOST_BYTES - 1)]
+    assert check_amount(found) == MOST_BYTES
+    with pytest.raises(DoraSystemdError, match="cannot copy large"):
+        check_amount([*found, Found("one", FILE, 1)])
+
+
+def test_what_has_changed() -> None:
+    old = {"a": Stored(1, False, "x"), "b": Stored(1, False, "y"), "c": Stored(target="a")}
+    new = {"a": Stored(1, True, "x"), "b": Stored(1, False, "y"), "d": Stored(target="a")}
+    assert touched(old, new) == {"added": ["d"], "changed": ["a"], "removed": ["c"]}

@@ -1,0 +1,97 @@
+"""The child that reads a project, and what is believed of it."""
+
+import os
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.trust import courier
+from dora_systemd.trust import project as module
+from dora_systemd.trust.project import Project, opened_project
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    (tmp_path / "dir").mkdir()
+    (tmp_path / "dir/a.py").write_text("print()\n")
+    (tmp_path / "link").symlink_to("dir/a.py")
+    os.mkfifo(tmp_path / "fifo")
+    return tmp_path
+
+
+@pytest.fixture
+def project(root: Path) -> Iterator[Project]:
+    with opened_project(str(root), None) as found:
+        yield found
+
+
+def test_a_look(project: Project) -> None:
+    kinds = {row[0]: row[1] for row in project.listed("", 10)}
+    assert kinds == {"dir": "directory", "fifo": "FIFO", "link": "link"}
+    (file, missing) = project.facts(["dir/a.py", "gone"])
+    assert file is not None
+    assert file[:5] == ["dir/a.py", "file", 8, False, ""]
+    assert missing is None
+    assert b"".join(project.read("dir/a.py")) == b"print()\n"
+    assert len(project.digest("dir/a.py")) == 64
+    assert len(project.listed("", 2)) == 2
+
+
+@pytest.mark.parametrize("path", ["gone", "fifo", "link", "dir"])
+def test_only_regular_files_are_read(project: Project, path: str) -> None:
+    with pytest.raises(DoraSystemdError, match=f"cannot read .*{path} as user"):
+        list(project.read(path))
+    # The next answer is not disturbed.
+    assert b"".join(project.read("dir/a.py")) == b"print()\n"
+
+
+def test_a_large_file_comes_whole(root: Path, project: Project) -> None:
+    data = os.urandom(1_000_000)
+    (root / "large").write_bytes(data)
+    assert b"".join(project.read("large")) == data
+
+
+def test_without_git(project: Project) -> None:
+    assert project.tracked([os.getuid()], 10) == (None, "")
+
+
+def test_with_git(root: Path, project: Project) -> None:
+    (root / ".gitignore").write_text("ignored\n")
+    for name in ("ignored", "new\nline"):
+        (root / name).write_text("")
+    identity = ("-c", "user.name=a", "-c", "user.email=a@b")
+    for words in (("init", "-q"), ("add", "dir"), (*identity, "commit", "-q", "-m", "x")):
+        subprocess.run(["git", *words], cwd=root, check=True)
+    files, revision = project.tracked([os.getuid()], 10)
+    assert files == [".gitignore", "dir/a.py", "link", "new\nline"]
+    assert len(revision) == 7
+    (root / "dir/a.py").write_text("changed\n")
+    assert project.tracked([os.getuid()], 10)[1] == f"{revision}+"
+
+
+LIARS = {
+    "silent": "",
+    "no frame": "sys.stdout.write('hello, world')",
+    "too long": "sys.stdout.write('+9999999')",
+    "no JSON": "sys.stdout.write('+0000001x.0000000')",
+    "other JSON": "sys.stdout.write('+0000004null.0000000')",
+    "other rows": "sys.stdout.write('+0000013[[1,2,3,4,5]].0000000')",
+    "negative": """sys.stdout.write('+0000033[["a","file",-1,false,"","s"]]   .0000000')""",
+    "endless": "[sys.stdout.write('+0001000' + ' ' * 1000) for _ in range(5000)]",
+}
+
+
+@pytest.mark.parametrize("lie", LIARS)
+def test_a_child_that_lies(lie: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    liar = tmp_path / "liar.py"
+    liar.write_text(f"import sys\nsys.stdin.readline()\n{LIARS[lie]}\nsys.stdout.flush()\n")
+    monkeypatch.setattr(courier, "__file__", str(liar))
+    monkeypatch.setattr(module, "MOST_ANSWER", 100_000)
+    with (
+        opened_project(str(tmp_path), None) as project,
+        pytest.raises(DoraSystemdError, match="no answer"),
+    ):
+        project.listed("", 10)

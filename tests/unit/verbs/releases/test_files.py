@@ -1,0 +1,99 @@
+"""Which files of a project are copied, and that none is copied in half."""
+
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.adapters.releases.draft import Draft
+from dora_systemd.adapters.releases.store import Store, locked
+from dora_systemd.decisions.releases.entries import Found, Stored
+from dora_systemd.decisions.releases.manifest import Manifest
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.trust.project import Project, opened_project
+from dora_systemd.verbs.releases import files as module
+from dora_systemd.verbs.releases.files import copy_files, digests, find_files
+
+FIRST = "20261121T220012"
+PLACES = ("a.py", "models/m.onnx", "target/release/node", ".venv/x", "__pycache__/a.pyc", "x.log")
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    root = tmp_path / "project"
+    for place in PLACES:
+        (root / place).parent.mkdir(parents=True, exist_ok=True)
+        (root / place).write_text(place)
+    return root
+
+
+@pytest.fixture
+def project(root: Path) -> Iterator[Project]:
+    with opened_project(str(root), None) as found:
+        yield found
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    found = Store(tmp_path / "store", "robot")
+    with locked(found):
+        return found
+
+
+def test_without_git_all_but_rubbish(root: Path, project: Project) -> None:
+    assert set(find_files(project, [], [])[0]) == {*PLACES[:3]}
+    (root / ".gitignore").write_text("models/\n")
+    assert set(find_files(project, [], [])[0]) == {".gitignore", "a.py", "target/release/node"}
+
+
+def test_what_the_dataflow_names_belongs_to_it(root: Path, project: Project) -> None:
+    subprocess.run(["git", "init", "-q"], cwd=root, check=True)
+    (root / ".gitignore").write_text("target/\n*.log\n.venv\n__pycache__\n")
+    found, revision = find_files(project, ["target/release/node", "not/there"], [])
+    assert set(found) == {".gitignore", "a.py", "models/m.onnx", "target/release/node"}
+    assert revision == ""
+
+
+def test_a_repository_in_the_repository(root: Path, project: Project) -> None:
+    for directory in (root, root / "models"):
+        subprocess.run(["git", "init", "-q"], cwd=directory, check=True)
+    assert "models/m.onnx" in find_files(project, [], [])[0]
+
+
+def test_too_many(project: Project, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "MOST_FILES", 2)
+    with pytest.raises(DoraSystemdError, match="more than"):
+        find_files(project, [], [])
+
+
+def copied(project: Project, store: Store, found: dict[str, Found]) -> dict[str, Stored]:
+    """A release of these files, and what is in it."""
+    last = store.manifest(FIRST) if store.known() else None
+    draft = Draft(store)
+    stored = copy_files(project, found, draft, last, lambda _done, _total: None)
+    name = FIRST if last is None else "20261122T220012"
+    draft.publish(Manifest(name, "robot", "", "", "", "", "", 1, files=stored), None)
+    return stored
+
+
+def test_copies_share_what_is_the_same(root: Path, project: Project, store: Store) -> None:
+    found, _ = find_files(project, [], [])
+    first = copied(project, store, found)
+    assert first == digests(project, found)
+    (root / "a.py").write_text("else")
+    second = copied(project, store, find_files(project, [], [])[0])
+    assert {one for one in first if first[one] != second[one]} == {"a.py"}
+    links = {path: (store.tree(FIRST) / path).stat().st_nlink for path in first}
+    assert links == {"a.py": 1, "models/m.onnx": 2, "target/release/node": 2}
+
+
+@pytest.mark.parametrize("text", ["longer than before", "", "b.py"])
+def test_a_file_that_changes_meanwhile(
+    root: Path, project: Project, store: Store, text: str
+) -> None:
+    found, _ = find_files(project, [], [])
+    (root / "a.py").write_text(text)
+    with pytest.raises(DoraSystemdError, match=r"cannot copy a\.py: it changed"):
+        copied(project, store, found)
+    assert store.known() == []

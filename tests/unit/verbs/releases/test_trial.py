@@ -1,0 +1,164 @@
+"""The files of a trial, and what a reboot at any moment would find."""
+
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.adapters.releases.store import Store, locked
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.settings.resolve import resolve_settings
+from dora_systemd.decisions.unit.properties import UnitContext, format_unit, unit_properties
+from dora_systemd.decisions.why.faults import Fault
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.scope import Scope
+from dora_systemd.verbs.inhibit.guard import IfInhibited
+from dora_systemd.verbs.releases import change as module
+from dora_systemd.verbs.releases.change import Change, change_release
+from dora_systemd.verbs.releases.trial import read_standing, require_deployable
+from tests.unit.fakes.manager import FakeManager, options
+
+UNIT = "dora-robot.service"
+OLD, NEW = "20261121T220012", "20261122T220012"
+
+
+def release_options(release: str) -> RunnerOptions:
+    place = f"/var/lib/dora-systemd/releases/robot/{release}/tree"
+    return options(dataflow=f"{place}/dataflow.yml", working_directory=place)
+
+
+def text_of(release: str) -> str:
+    context = UnitContext("/usr/bin/python3", False, "dora", {})
+    properties = unit_properties(release_options(release), context, resolve_settings({}, {}, []))
+    return f"{format_unit(properties)}\n[Install]\nWantedBy=multi-user.target\n"
+
+
+def etc(manager: FakeManager) -> Path:
+    return manager.etc / "systemd/system" / UNIT
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    found = Store(tmp_path / "store", "robot")
+    with locked(found):
+        found.release(NEW).mkdir()
+    return found
+
+
+def deployed(manager: FakeManager, active: str = "active") -> None:
+    """The old release is enabled and runs."""
+    etc(manager).parent.mkdir(parents=True)
+    etc(manager).write_text(text_of(OLD))
+    manager.enable_unit_files([str(etc(manager))])
+    manager.add(release_options(OLD), active, Transient=False, FragmentPath=str(etc(manager)))
+
+
+def try_new(
+    manager: FakeManager,
+    scope: Scope,
+    store: Store,
+    monkeypatch: pytest.MonkeyPatch,
+    fault: Fault | None,
+) -> None:
+    """Change to the new release, whose gate finds `fault`."""
+
+    class FakeGate:
+        def __init__(self, *_: object) -> None:
+            pass
+
+        def run(self, *_: object) -> Fault | None:
+            standing = read_standing(manager, scope, UNIT)
+            assert standing.path.read_text() == text_of(NEW)
+            assert standing.trial == NEW
+            return fault
+
+    monkeypatch.setattr(module, "Gate", FakeGate)
+    change = Change(
+        NEW, text_of(NEW), release_options(NEW), 0, True, "doractl deploy", IfInhibited.REFUSE
+    )
+    change_release(manager, scope, store, read_standing(manager, scope, UNIT), change, print)
+
+
+def test_a_good_release_is_committed(
+    manager: FakeManager, scope: Scope, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    deployed(manager)
+    try_new(manager, scope, store, monkeypatch, None)
+    standing = read_standing(manager, scope, UNIT)
+    assert (standing.current, standing.trial) == (NEW, "")
+    assert not standing.path.exists()
+    assert [one.is_proved for one in store.known()] == [True]
+
+
+def test_a_bad_release_leaves_the_disk_as_it_was(
+    manager: FakeManager, scope: Scope, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    deployed(manager)
+    with pytest.raises(DoraSystemdError, match="node a: exit code 1") as caught:
+        try_new(manager, scope, store, monkeypatch, Fault("node a: exit code 1", "a"))
+    assert caught.value.code is ExitCode.ROLLED_BACK
+    assert f"{OLD} runs again" in caught.value.hint
+    assert etc(manager).read_text() == text_of(OLD)
+    assert not read_standing(manager, scope, UNIT).path.exists()
+    assert manager.calls[-1] == ("RestartUnit", UNIT)
+    assert [one.is_proved for one in store.known()] == [False]
+
+
+@pytest.mark.parametrize("active", ["inactive", "failed"])
+def test_what_did_not_run_is_not_started(
+    manager: FakeManager,
+    scope: Scope,
+    store: Store,
+    monkeypatch: pytest.MonkeyPatch,
+    active: str,
+) -> None:
+    deployed(manager, active)
+    with pytest.raises(DoraSystemdError):
+        try_new(manager, scope, store, monkeypatch, Fault("x"))
+    assert "RestartUnit" not in [call[0] for call in manager.calls]
+    assert ("StopUnit", UNIT) in manager.calls
+
+
+def test_who_stops_a_trial_wants_nothing_to_run(
+    manager: FakeManager, scope: Scope, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    deployed(manager)
+    with pytest.raises(DoraSystemdError):
+        try_new(manager, scope, store, monkeypatch, Fault("it was stopped", is_stop=True))
+    assert "RestartUnit" not in [call[0] for call in manager.calls]
+
+
+def test_a_commit_that_fails_is_undone(
+    manager: FakeManager, scope: Scope, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    deployed(manager)
+
+    def fail(*_: object) -> None:
+        raise DoraSystemdError("cannot write it: no space")
+
+    monkeypatch.setattr(module, "commit", fail)
+    with pytest.raises(DoraSystemdError, match="no space") as caught:
+        try_new(manager, scope, store, monkeypatch, None)
+    assert caught.value.code is ExitCode.ROLLED_BACK
+    assert read_standing(manager, scope, UNIT).current == OLD
+
+
+def test_a_first_release_is_enabled(
+    manager: FakeManager, scope: Scope, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    try_new(manager, scope, store, monkeypatch, None)
+    assert read_standing(manager, scope, UNIT).boot.is_enabled
+
+
+def test_killed_right_after_its_commit(manager: FakeManager, scope: Scope) -> None:
+    deployed(manager)
+    path = read_standing(manager, scope, UNIT).path
+    path.parent.mkdir(parents=True)
+    path.write_text(text_of(OLD))
+    assert read_standing(manager, scope, UNIT).trial == ""
+
+
+def test_what_start_has_started_is_not_replaced(manager: FakeManager, scope: Scope) -> None:
+    manager.add(options())
+    with pytest.raises(DoraSystemdError, match="started by doractl start") as caught:
+        require_deployable(manager, scope, read_standing(manager, scope, UNIT))
+    assert caught.value.code is ExitCode.NAME_IN_USE
