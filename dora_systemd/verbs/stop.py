@@ -220,13 +220,14 @@ def _begin(manager: Manager, cell: Cell, most: int | None, now: float) -> _Stop:
     """Stop a dataflow in any state: the job replaces a start or restart that is queued."""
     given = manager.read(cell.unit, ["TimeoutStopUSec"])["TimeoutStopUSec"]
     manager.queue_job("StopUnit", cell.unit)
+    seconds = given / SECOND if given and given != INFINITY else UNBOUNDED_SECONDS
+    seconds += _MARGIN_SECONDS
     if most is not None and most <= 0:
         # There may be no process, as between two restarts.
         with suppress(DoraSystemdError):
             manager.kill(cell.unit, signal.SIGKILL)
-        return _Stop(cell, now + KILLED_SECONDS, True)
-    seconds = given / SECOND if given and given != INFINITY else UNBOUNDED_SECONDS
-    seconds += _MARGIN_SECONDS
+        # ExecStopPost= runs now, and systemd allows it the same time again.
+        return _Stop(cell, now + max(KILLED_SECONDS, seconds), True)
     return _Stop(cell, now + (seconds if most is None else min(seconds, most / SECOND)), False)
 
 

@@ -57,7 +57,7 @@ def test_a_start_that_waits_for_needs_alone_counts_as_started() -> None:
     assert stage(busy) == "waiting"
     cell, _ = after(busy, life.NodeReady(2, "sink"))
     assert stage(cell) == UNMET
-    table = cell_status(cell, "", (), {})
+    table = cell_status(cell, "", (), {}, {})
     assert CellStatus.from_json(table.to_json()).nodes["camera"].needs == GONE
 
 

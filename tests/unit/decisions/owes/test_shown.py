@@ -35,13 +35,13 @@ def test_a_warning_and_its_end() -> None:
     details = {"output": "image", "reason": MISSING, "then": "warn"}
     assert actions == (Record("node-silent", "camera", details),)
     assert format_status(cell) == f"2/2 nodes running; silent: camera ({MISSING})"
-    shown = cell_status(cell, "uuid", (), {})
+    shown = cell_status(cell, "uuid", (), {}, {})
     assert shown.stage == "degraded"
     assert CellStatus.from_json(shown.to_json()).nodes["camera"].silent == MISSING
     cell, (record,) = step(cell, SPEAKS)
     assert isinstance(record, Record)
     assert record.event == "node-speaks-again"
-    assert (format_status(cell), cell_status(cell, "", (), {}).stage) == (
+    assert (format_status(cell), cell_status(cell, "", (), {}, {}).stage) == (
         "2/2 nodes running",
         "running",
     )
