@@ -61,7 +61,6 @@ LATE = {
     },
     "limits, CPUs or rights of single nodes only": {
         "decisions.cell.limits": {"node_words"},
-        "decisions.cell.options": {"decisions.rights.node_rights"},
         "runner.cell.begin": {"runner.nodes.rights"},
     },
     "uv only": {"decisions.cell.uv": {"tomllib"}},
@@ -71,7 +70,6 @@ LATE = {
     },
     "most dataflows owe nothing": {
         "adapters.dora.preparation": {"adapters.dora.probe"},
-        "decisions.cell.options": {"decisions.cell.owed"},
         "runner.owes.begin": {"runner.owes.watch"},
         "verbs.facts.reading": {"decisions.owes.probe"},
     },
