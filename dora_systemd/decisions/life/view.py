@@ -3,15 +3,9 @@
 from collections.abc import Mapping
 from typing import Any
 
+from dora_systemd.decisions.cell.counters import CpuSample, LineCount
 from dora_systemd.decisions.cell.restarts import HELD_SECONDS
-from dora_systemd.decisions.cell.status import (
-    FAILED_BECAUSE,
-    HELD,
-    CellStatus,
-    CpuSample,
-    LineCount,
-    NodeStatus,
-)
+from dora_systemd.decisions.cell.status import FAILED_BECAUSE, HELD, CellStatus, NodeStatus
 from dora_systemd.decisions.life.nodes import WITH_PROCESS
 from dora_systemd.decisions.life.states import Cell, State
 from dora_systemd.decisions.life.stop_budget import kill_delay

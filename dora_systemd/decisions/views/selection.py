@@ -12,8 +12,8 @@ from dora_systemd.decisions.views.dataflows import (
     STOPPED,
     STOPPING,
     UP_WORDS,
-    DataflowRow,
 )
+from dora_systemd.decisions.views.rows import DataflowRow
 
 STATUSES: Mapping[str, frozenset[str]] = {
     "running": UP_WORDS,

@@ -7,10 +7,10 @@ from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.life.states import Cell, Do, Record, RunnerExit, State
 from dora_systemd.decisions.life.table import step
 from dora_systemd.decisions.life.view import cell_status, format_status
-from dora_systemd.decisions.views.dataflows import DataflowRow, NodeRow, OutputRow
 from dora_systemd.decisions.views.details import format_dataflow
 from dora_systemd.decisions.views.objects import dataflow_object
 from dora_systemd.decisions.views.prometheus import format_metrics
+from dora_systemd.decisions.views.rows import DataflowRow, NodeRow, OutputRow
 from dora_systemd.decisions.views.snapshot import Observed
 from dora_systemd.decisions.why.lives import Happening, Life
 from dora_systemd.decisions.why.postmortem import examine
@@ -35,13 +35,13 @@ def test_a_warning_and_its_end() -> None:
     details = {"output": "image", "reason": MISSING, "then": "warn"}
     assert actions == (Record("node-silent", "camera", details),)
     assert format_status(cell) == f"2/2 nodes running; silent: camera ({MISSING})"
-    shown = cell_status(cell, "uuid", (), {})
+    shown = cell_status(cell, "uuid", (), {}, {})
     assert shown.stage == "degraded"
     assert CellStatus.from_json(shown.to_json()).nodes["camera"].silent == MISSING
     cell, (record,) = step(cell, SPEAKS)
     assert isinstance(record, Record)
     assert record.event == "node-speaks-again"
-    assert (format_status(cell), cell_status(cell, "", (), {}).stage) == (
+    assert (format_status(cell), cell_status(cell, "", (), {}, {}).stage) == (
         "2/2 nodes running",
         "running",
     )
