@@ -8,11 +8,8 @@ from typing import Any, NamedTuple
 
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.edge import write_own
-from dora_systemd.decisions.views.dataflows import (
-    DataflowRow,
-    format_dataflows,
-    is_up_word,
-)
+from dora_systemd.decisions.views.dataflows import format_dataflows, is_up_word
+from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope, scope_of
 from dora_systemd.verbs.facts.cells import read_cells

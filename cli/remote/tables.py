@@ -13,7 +13,7 @@ from dora_systemd.decisions.remote.failures import invalid
 from dora_systemd.decisions.remote.hosts import Host
 from dora_systemd.decisions.remote.stream import objects_of
 from dora_systemd.decisions.remote.table import format_hosts, row_of
-from dora_systemd.decisions.views.dataflows import DataflowRow
+from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.errors import DoraSystemdError
 
 

@@ -3,7 +3,8 @@
 from collections.abc import Iterable
 
 from dora_systemd.adapters.bus.manager import Manager
-from dora_systemd.decisions.views.dataflows import DataflowRow, is_up_word
+from dora_systemd.decisions.views.dataflows import is_up_word
+from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell, proven, read_cells
 from dora_systemd.verbs.facts.list import mark_enabled

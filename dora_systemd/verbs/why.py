@@ -9,7 +9,8 @@ from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.decisions.life import nodes as node_table
 from dora_systemd.decisions.logs.query import scope_matches, story_matches
-from dora_systemd.decisions.views.dataflows import DataflowRow, status_word
+from dora_systemd.decisions.views.dataflows import status_word
+from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.why.last_lines import Word, choose_last, shown_last
 from dora_systemd.decisions.why.lives import SHUTDOWN_MESSAGE, Life, find_lives, parse_happening
 from dora_systemd.decisions.why.postmortem import examine

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from dora_systemd.adapters.bus.systemd import Bus
-from dora_systemd.decisions.views.dataflows import DataflowRow
+from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.facts.list import table_rows
 from tests.system.cells import Cell, Project, is_alive, run, wait_for

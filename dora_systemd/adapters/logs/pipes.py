@@ -21,8 +21,8 @@ from pathlib import Path
 from dora_systemd.adapters.logs.held import HeldLines, held_path, read_held
 from dora_systemd.adapters.logs.queue import Journal, LogQueue
 from dora_systemd.adapters.logs.source import CHUNK, PIPE_SIZE, OnLine, Pipe, Source, fifos
+from dora_systemd.decisions.cell.counters import WHOLE_CELL, LineCount
 from dora_systemd.decisions.cell.line_rates import RateLimit, format_rate
-from dora_systemd.decisions.cell.status import WHOLE_CELL, LineCount
 from dora_systemd.decisions.logs.events import event_fields
 from dora_systemd.decisions.logs.fields import Value, encode_entry
 from dora_systemd.decisions.logs.limiter import LineLimiter

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
+from dora_systemd.decisions.cell.counters import CpuSample, LineCount
 from dora_systemd.decisions.cell.restarts import HELD_SECONDS, LATCH_SECONDS
 from dora_systemd.decisions.cell.status import (
     FAILED_BECAUSE,
@@ -11,8 +12,6 @@ from dora_systemd.decisions.cell.status import (
     UNMET,
     WAITS,
     CellStatus,
-    CpuSample,
-    LineCount,
     NodeStatus,
 )
 from dora_systemd.decisions.life.nodes import WITH_PROCESS, is_held_up, lacking

@@ -6,10 +6,10 @@ from typing import Any
 from dora_systemd.decisions.views.dataflows import (
     UNKNOWN,
     UNREACHABLE,
-    DataflowRow,
     dataflow_table,
     format_table,
 )
+from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.views.selection import sorted_rows
 
 _TEXTS = ("uuid", "name", "unit", "status", "text", "problem")

@@ -9,8 +9,6 @@ from dora_systemd.decisions.views.dataflows import (
     FAILED,
     RESTARTING,
     UNKNOWN,
-    DataflowRow,
-    NodeRow,
     colored_state,
     format_count,
     format_cpu,
@@ -21,6 +19,7 @@ from dora_systemd.decisions.views.dataflows import (
     zoned_time,
 )
 from dora_systemd.decisions.views.inhibitors import format_holders
+from dora_systemd.decisions.views.rows import DataflowRow, NodeRow
 from dora_systemd.terminal_text import cut, one_line
 
 

@@ -3,7 +3,8 @@
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from dora_systemd.decisions.views.dataflows import UNKNOWN, Holder, format_table
+from dora_systemd.decisions.views.dataflows import UNKNOWN, format_table
+from dora_systemd.decisions.views.rows import Holder
 from dora_systemd.terminal_text import cut, short_line
 
 _HEADER = ("NAME", "NODE", "PID", "USER", "COMMAND", "WHY")

@@ -8,9 +8,9 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from dora_systemd.decisions.cell.status import WHOLE_CELL
-from dora_systemd.decisions.views.dataflows import DataflowRow, NodeRow
+from dora_systemd.decisions.cell.counters import WHOLE_CELL
 from dora_systemd.decisions.views.inhibitors import holder_object
+from dora_systemd.decisions.views.rows import DataflowRow, NodeRow
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.values import format_moment
 

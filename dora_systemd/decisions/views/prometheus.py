@@ -6,15 +6,11 @@ https://prometheus.io/docs/instrumenting/exposition_formats and .../docs/practic
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from dora_systemd.decisions.cell.status import ALIVE_NODE_STATES, NODE_STATES, WHOLE_CELL
+from dora_systemd.decisions.cell.counters import WHOLE_CELL
+from dora_systemd.decisions.cell.status import ALIVE_NODE_STATES, NODE_STATES
 from dora_systemd.decisions.resources.usage import Strain, Usage
-from dora_systemd.decisions.views.dataflows import (
-    FAILED,
-    STOPPED,
-    UP_WORDS,
-    DataflowRow,
-    NodeRow,
-)
+from dora_systemd.decisions.views.dataflows import FAILED, STOPPED, UP_WORDS
+from dora_systemd.decisions.views.rows import DataflowRow, NodeRow
 from dora_systemd.decisions.views.snapshot import Observed
 from dora_systemd.values import INFINITY, SECOND
 

@@ -13,8 +13,8 @@ from dora_systemd.decisions.views.dataflows import (
     STOPPING,
     UP_WORDS,
     WAITING,
-    DataflowRow,
 )
+from dora_systemd.decisions.views.rows import DataflowRow
 
 STATUSES: Mapping[str, frozenset[str]] = {
     "running": UP_WORDS,

@@ -4,12 +4,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-from dora_systemd.decisions.cell.status import ALIVE_NODE_STATES, WHOLE_CELL
+from dora_systemd.decisions.cell.counters import WHOLE_CELL
+from dora_systemd.decisions.cell.status import ALIVE_NODE_STATES
 from dora_systemd.decisions.resources.usage import format_waits
 from dora_systemd.decisions.views.dataflows import (
     UNKNOWN,
-    DataflowRow,
-    NodeRow,
     format_count,
     format_cpu,
     format_memory,
@@ -18,6 +17,7 @@ from dora_systemd.decisions.views.dataflows import (
     node_count,
 )
 from dora_systemd.decisions.views.objects import Shares, dataflow_object, moment
+from dora_systemd.decisions.views.rows import DataflowRow, NodeRow
 from dora_systemd.terminal_text import cut
 
 SORTS = ("cpu", "memory", "name")

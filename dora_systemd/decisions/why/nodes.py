@@ -1,6 +1,6 @@
 """The nodes of an ended dataflow, from its life events: the runner's table is gone. Pure."""
 
-from dora_systemd.decisions.views.dataflows import NodeRow
+from dora_systemd.decisions.views.rows import NodeRow
 from dora_systemd.decisions.why.lives import Happening, Life
 
 _STATES = {

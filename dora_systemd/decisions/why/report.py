@@ -13,12 +13,12 @@ from dora_systemd.decisions.logs.events import ROLLED_BACK
 from dora_systemd.decisions.views.dataflows import (
     RESTARTING,
     UNKNOWN,
-    Holder,
     colored_state,
     local_time,
     zoned_time,
 )
 from dora_systemd.decisions.views.inhibitors import format_holders
+from dora_systemd.decisions.views.rows import Holder
 from dora_systemd.decisions.why.last_lines import Word, shown_last
 from dora_systemd.decisions.why.signs import known_remedy
 from dora_systemd.decisions.why.verdict import Restart, Verdict

@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
-from dora_systemd.decisions.views.dataflows import DataflowRow
 from dora_systemd.decisions.views.objects import dataflow_object, moment
+from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.why.report import Report, remedies
 
 _TOLD = ("event", "node", "nodes", "dataflow", "dataflow_name", "downstream", "cause", "reason")

@@ -15,7 +15,8 @@ from dora_systemd.decisions.gateway.answers import (
     node_list,
     stopped,
 )
-from dora_systemd.decisions.views.dataflows import FAILED, FINISHED, DataflowRow, status_word
+from dora_systemd.decisions.views.dataflows import FAILED, FINISHED, status_word
+from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.why.report import Report
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.gateway.control.talk import find_by_uuid, find_if_loaded

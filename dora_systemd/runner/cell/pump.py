@@ -22,7 +22,7 @@ from pathlib import Path
 
 from dora_systemd.adapters.host import fd_store, files, notify
 from dora_systemd.adapters.logs.pipes import LogPipes
-from dora_systemd.decisions.cell.status import CpuSample, add_sample
+from dora_systemd.decisions.cell.counters import CpuSample, add_sample
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.life.failures import ENGINE_TIMEOUT

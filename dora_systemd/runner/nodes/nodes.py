@@ -12,11 +12,11 @@ from dora_systemd.adapters.host.process import beside
 from dora_systemd.adapters.host.rights import lower_rights
 from dora_systemd.adapters.logs.jsonl import JsonlTail
 from dora_systemd.adapters.logs.pipes import LogPipes
+from dora_systemd.decisions.cell.counters import WHOLE_CELL, CpuSample
 from dora_systemd.decisions.cell.launch import has_launcher, has_pipes, is_launched
 from dora_systemd.decisions.cell.limits import NodeLimits, without_cpus
 from dora_systemd.decisions.cell.line_rates import RateLimits, rate_of
 from dora_systemd.decisions.cell.log_backlog import marks_of
-from dora_systemd.decisions.cell.status import WHOLE_CELL, CpuSample
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.descriptor.nodes import Node, NodeKind
 from dora_systemd.decisions.resources.oom import Oom

@@ -6,13 +6,8 @@ from typing import Any
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.journal.reader import JournalReader, LastEvent, is_volatile
-from dora_systemd.decisions.views.dataflows import (
-    FAILED,
-    FINISHED,
-    STOPPED,
-    DataflowRow,
-    is_up_word,
-)
+from dora_systemd.decisions.views.dataflows import FAILED, FINISHED, STOPPED, is_up_word
+from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope

@@ -5,22 +5,16 @@ from typing import Any
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
-from dora_systemd.decisions.cell.status import (
-    FAILED_BECAUSE,
+from dora_systemd.decisions.cell.counters import (
     WHOLE_CELL,
-    CellStatus,
     CpuSample,
-    NodeStatus,
     cpu_percent,
     throttled_percent,
 )
+from dora_systemd.decisions.cell.status import FAILED_BECAUSE, CellStatus, NodeStatus
 from dora_systemd.decisions.resources.usage import Usage
-from dora_systemd.decisions.views.dataflows import (
-    DataflowRow,
-    NodeRow,
-    OutputRow,
-    status_word,
-)
+from dora_systemd.decisions.views.dataflows import status_word
+from dora_systemd.decisions.views.rows import DataflowRow, NodeRow, OutputRow
 from dora_systemd.scope import Scope
 from dora_systemd.values import INFINITY, SECOND
 from dora_systemd.verbs.facts.cells import Cell, proven, read_cells

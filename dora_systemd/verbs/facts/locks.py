@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from dora_systemd.adapters.host.lock_table import LockProcess, read_flocks, read_lock_process
 from dora_systemd.decisions.cell.inhibit import parse_reasons
-from dora_systemd.decisions.views.dataflows import DataflowRow, Holder
+from dora_systemd.decisions.views.rows import DataflowRow, Holder
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import unit_name
 from dora_systemd.scope import RUNTIME_NAME, Scope

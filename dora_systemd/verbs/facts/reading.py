@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 
 from dora_systemd.adapters.bus.manager import SETTLED, Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
-from dora_systemd.decisions.cell.status import WHOLE_CELL, CellStatus, CpuSample
+from dora_systemd.decisions.cell.counters import WHOLE_CELL, CpuSample
+from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.decisions.resources.usage import Usage
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import SLICE

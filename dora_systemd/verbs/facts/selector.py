@@ -29,7 +29,7 @@ from dora_systemd.verbs.facts.cells import Cell, read_cell, read_cells
 from dora_systemd.verbs.facts.enabled import lost_units
 
 if TYPE_CHECKING:
-    from dora_systemd.decisions.views.dataflows import DataflowRow
+    from dora_systemd.decisions.views.rows import DataflowRow
 
 _SHOWN = 10
 _PATTERN = re.compile(r"[*?\[]")

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.cgroup.strain import read_strain
 from dora_systemd.decisions.resources.usage import Strain
-from dora_systemd.decisions.views.dataflows import DataflowRow
+from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.views.snapshot import Observed
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import proven, read_cells

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Sequence
 
 from dora_systemd.adapters.bus.manager import Manager
-from dora_systemd.decisions.views.dataflows import DataflowRow
+from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.budget import restart_budget
 from dora_systemd.verbs.facts.cells import Cell

@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from enum import Enum
 
-from dora_systemd.decisions.views.dataflows import Holder
 from dora_systemd.decisions.views.inhibitors import format_holders
+from dora_systemd.decisions.views.rows import Holder
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import Named
 from dora_systemd.scope import Scope

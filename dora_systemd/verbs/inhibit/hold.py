@@ -9,8 +9,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from dora_systemd.decisions.cell.inhibit import format_reason
-from dora_systemd.decisions.views.dataflows import Holder
 from dora_systemd.decisions.views.inhibitors import format_holders
+from dora_systemd.decisions.views.rows import Holder
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.trust.locks import find_lock, open_lock, place_of, take_lock, write_reason

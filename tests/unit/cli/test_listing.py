@@ -8,7 +8,7 @@ import pytest
 from dora_systemd.adapters.journal.reader import JournalReader, LastEvent
 from dora_systemd.cli import listing
 from dora_systemd.cli.listing import ListRequest
-from dora_systemd.decisions.views.dataflows import DataflowRow
+from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.errors import DoraSystemdError
 from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
 

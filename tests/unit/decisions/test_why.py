@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dora_systemd.decisions.life.causes import Cause
-from dora_systemd.decisions.views.dataflows import DataflowRow
+from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.why.last_lines import Word
 from dora_systemd.decisions.why.lives import (
     SHUTDOWN_MESSAGE,

@@ -10,9 +10,9 @@ from typing import Any
 from dora_systemd.adapters.dora.engine import Child
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.adapters.logs.source import OnLine
+from dora_systemd.decisions.cell.counters import CpuSample, LineCount
 from dora_systemd.decisions.cell.limits import NodeLimits
 from dora_systemd.decisions.cell.line_rates import RateLimits
-from dora_systemd.decisions.cell.status import CpuSample, LineCount
 from dora_systemd.decisions.descriptor.nodes import Node
 from dora_systemd.decisions.dora.protocol import LogRecord, Params, Reply
 from dora_systemd.decisions.life.states import Record

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from dora_systemd.adapters.journal.socket import JournalSocket
 from dora_systemd.adapters.logs.pipes import LogPipes
+from dora_systemd.decisions.cell.counters import LineCount
 from dora_systemd.decisions.cell.line_rates import RateLimit
-from dora_systemd.decisions.cell.status import LineCount
 from dora_systemd.decisions.logs.lines import Origin
 from dora_systemd.paths import CellPaths
 from dora_systemd.values import SECOND

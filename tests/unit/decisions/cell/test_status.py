@@ -7,18 +7,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dora_systemd.decisions.cell.exits import parse_exit
-from dora_systemd.decisions.cell.status import (
-    NODE_STATES,
-    STAGES,
-    CellStatus,
+from dora_systemd.decisions.cell.counters import (
     CpuSample,
     LineCount,
-    NodeStatus,
     add_sample,
     cpu_percent,
     throttled_percent,
 )
+from dora_systemd.decisions.cell.exits import parse_exit
+from dora_systemd.decisions.cell.status import NODE_STATES, STAGES, CellStatus, NodeStatus
 from dora_systemd.decisions.signs.messages import MAX_STATUS
 from dora_systemd.decisions.signs.table import Sign
 from dora_systemd.errors import DoraSystemdError

@@ -2,8 +2,9 @@
 
 from dataclasses import replace
 
+from dora_systemd.decisions.cell.counters import LineCount
 from dora_systemd.decisions.cell.exits import exit_of
-from dora_systemd.decisions.cell.status import CellStatus, LineCount, NodeStatus
+from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
 from dora_systemd.decisions.life.states import Cell, State
 from dora_systemd.decisions.life.view import cell_status, format_status, initial_nodes, stage
 from dora_systemd.decisions.signs.table import Sign

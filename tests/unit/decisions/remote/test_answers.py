@@ -11,8 +11,8 @@ from dora_systemd.decisions.remote.hosts import Host
 from dora_systemd.decisions.remote.merge import MOST_HELD, WINDOW_SECONDS, Merge
 from dora_systemd.decisions.remote.stream import MAX_LINE, AfterMark, Lines, objects_of, with_host
 from dora_systemd.decisions.remote.table import format_hosts, row_of
-from dora_systemd.decisions.views.dataflows import DataflowRow
 from dora_systemd.decisions.views.objects import dataflow_object, format_json
+from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.errors import ExitCode
 
 A = Host("alice@a", "alice@a")

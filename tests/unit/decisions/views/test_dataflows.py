@@ -3,8 +3,6 @@
 import pytest
 
 from dora_systemd.decisions.views.dataflows import (
-    DataflowRow,
-    NodeRow,
     format_dataflows,
     format_uptime,
     local_time,
@@ -13,6 +11,7 @@ from dora_systemd.decisions.views.dataflows import (
 )
 from dora_systemd.decisions.views.details import format_dataflow
 from dora_systemd.decisions.views.objects import dataflow_object
+from dora_systemd.decisions.views.rows import DataflowRow, NodeRow
 from dora_systemd.values import SECOND
 
 A = "550e8400-e29b-41d4-a716-446655440000"

@@ -3,7 +3,6 @@
 import pytest
 
 from dora_systemd.decisions.cell.inhibit import format_reason, parse_reason, parse_reasons
-from dora_systemd.decisions.views.dataflows import DataflowRow, Holder
 from dora_systemd.decisions.views.details import format_dataflow
 from dora_systemd.decisions.views.inhibitors import (
     Inhibited,
@@ -12,6 +11,7 @@ from dora_systemd.decisions.views.inhibitors import (
     format_inhibited,
     inhibited_objects,
 )
+from dora_systemd.decisions.views.rows import DataflowRow, Holder
 from dora_systemd.errors import DoraSystemdError, ExitCode
 
 NODE = Holder(231, "dora", "/srv/robot/.venv/bin/python -u /srv/robot/arm.py", "arm", "it moves")

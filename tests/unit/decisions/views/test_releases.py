@@ -2,11 +2,12 @@
 
 from dora_systemd.decisions.releases.entries import Stored
 from dora_systemd.decisions.releases.manifest import Manifest
-from dora_systemd.decisions.views.dataflows import DataflowRow, format_dataflows
+from dora_systemd.decisions.views.dataflows import format_dataflows
 from dora_systemd.decisions.views.details import format_dataflow
 from dora_systemd.decisions.views.objects import dataflow_object
 from dora_systemd.decisions.views.prometheus import format_metrics
 from dora_systemd.decisions.views.releases import ReleaseRow, format_releases, release_object
+from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.views.snapshot import Observed
 
 ONE = "20261121T220012-9f3c1a2"

@@ -2,7 +2,8 @@
 
 import pytest
 
-from dora_systemd.decisions.views.dataflows import FAILED, FINISHED, STOPPED, UP_WORDS, DataflowRow
+from dora_systemd.decisions.views.dataflows import FAILED, FINISHED, STOPPED, UP_WORDS
+from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.views.selection import (
     SORTS,
     STATUSES,

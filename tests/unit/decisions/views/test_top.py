@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from dora_systemd.decisions.views.dataflows import DataflowRow, NodeRow
+from dora_systemd.decisions.views.rows import DataflowRow, NodeRow
 from dora_systemd.decisions.views.top import (
     NOTHING,
     Look,

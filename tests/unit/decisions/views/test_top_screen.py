@@ -2,7 +2,7 @@
 
 import pytest
 
-from dora_systemd.decisions.views.dataflows import DataflowRow, NodeRow
+from dora_systemd.decisions.views.rows import DataflowRow, NodeRow
 from dora_systemd.decisions.views.top import NOTHING, Look, TopEntry
 from dora_systemd.decisions.views.top_screen import HELP, TopScreen
 

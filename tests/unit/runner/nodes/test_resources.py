@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.adapters.cgroup.strain import read_load, read_oom
-from dora_systemd.decisions.cell.status import CpuSample
+from dora_systemd.decisions.cell.counters import CpuSample
 from dora_systemd.decisions.resources.oom import Owner
 from dora_systemd.decisions.resources.pressure import CPU, MEMORY
 from dora_systemd.runner.nodes.resources import Resources

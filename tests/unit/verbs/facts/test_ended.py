@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from dora_systemd.adapters.journal.reader import JournalReader, LastEvent
-from dora_systemd.decisions.views.dataflows import DataflowRow
+from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.ended import ended_row, newest_ended, not_recorded

@@ -10,11 +10,13 @@ import pytest
 
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.journal.reader import JournalReader, LastEvent
+from dora_systemd.decisions.cell.counters import CpuSample
 from dora_systemd.decisions.cell.exits import exit_of
-from dora_systemd.decisions.cell.status import CellStatus, CpuSample, NodeStatus
-from dora_systemd.decisions.views.dataflows import DataflowRow, format_dataflows
+from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
+from dora_systemd.decisions.views.dataflows import format_dataflows
 from dora_systemd.decisions.views.details import format_dataflow
 from dora_systemd.decisions.views.prometheus import format_metrics
+from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.views.top import Look, TopEntry, format_top
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope

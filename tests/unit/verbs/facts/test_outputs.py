@@ -9,7 +9,7 @@ import pytest
 
 from dora_systemd.decisions.cell.owed import Owed
 from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
-from dora_systemd.decisions.views.dataflows import OutputRow
+from dora_systemd.decisions.views.rows import OutputRow
 from dora_systemd.scope import Scope
 from dora_systemd.trust.cells import read_times
 from dora_systemd.values import SECOND

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from dora_systemd.adapters.journal.reader import JournalReader
-from dora_systemd.decisions.views.dataflows import DataflowRow
+from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.why.report import Subject
 from dora_systemd.scope import Scope
 from dora_systemd.values import SECOND
