@@ -3,7 +3,6 @@
 import time
 from collections.abc import Sequence
 
-from dora_systemd.decisions.cell.status import UNMET
 from dora_systemd.decisions.views.rows import SILENT, DataflowRow, NodeRow
 from dora_systemd.terminal_text import cut, one_line
 from dora_systemd.values import SECOND, format_rounded_size
@@ -25,7 +24,7 @@ _BY_ACTIVE = {
     "failed": FAILED,
     "inactive": STOPPED,
 }
-_BY_STAGE = {"degraded": DEGRADED, UNMET: WAITING, "stopping": STOPPING}
+_BY_STAGE = {"degraded": DEGRADED, "unmet": WAITING, "stopping": STOPPING}
 
 UNKNOWN = "-"
 UNREADABLE = "?"
