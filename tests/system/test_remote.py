@@ -128,7 +128,9 @@ def test_logs_of_several_hosts(cell: Cell, hers: Cell, project: Project) -> None
         while {line.split()[0] for line in lines} != {"base", "arm"} or len(lines) < 100:
             lines.append(child.stdout.readline())
             assert lines[-1], "it has ended"
-        assert all("sink" in line and " got " in line for line in lines)
+        # Others are of dora, such as "Discarding event" on a busy machine.
+        assert all("sink" in line for line in lines)
+        assert any(" got " in line for line in lines)
         child.send_signal(signal.SIGINT)
         child.stdout.read()
         assert child.wait(bound(20)) == ExitCode.INTERRUPTED
