@@ -19,7 +19,8 @@ FLAT_AFTER = 2
 """Looks before a process has all that it needs."""
 MOST_DESCRIPTORS = 12
 MOST_KIB = 24 * 1024
-_STATUSES = frozenset({*range(10), 130})
+_STATUSES = frozenset({0, 1, *range(3, 10), 130})
+"""Those of doractl(1), but for a wrong command line: the table has none."""
 
 
 class Complaint(NamedTuple):
@@ -89,7 +90,13 @@ INVARIANTS: dict[str, Invariant] = {
     for one in (
         *(lives.one_life_at_a_time, lives.inside_the_unit, lives.restarts_are_counted_once),
         *(views.last_wish_or_reason, views.views_agree, views.nodes_are_real, views.uuid_is_stable),
-        *(lines.every_line_once, quiet_comes, answers_are_orderly, an_error_says_something),
+        *(
+            views.why_lists_each_restart,
+            lines.every_line_once,
+            quiet_comes,
+            answers_are_orderly,
+            an_error_says_something,
+        ),
         *(nothing_is_left, everything_is_flat),
     )
 }

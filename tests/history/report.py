@@ -4,7 +4,7 @@ from collections import Counter, defaultdict
 from collections.abc import Sequence
 
 from tests.history.checker import Complaint
-from tests.history.history import History
+from tests.history.history import History, Vital
 from tests.history.lives import vital_series
 from tests.history.steps import FAULTS
 
@@ -19,6 +19,7 @@ class Report:
         self.lines = 0
         self.looks = 0
         self.seeds: list[int] = []
+        self.ends: dict[str, tuple[Vital, Vital]] = {}
         self.growth: defaultdict[str, list[tuple[int, int]]] = defaultdict(list)
 
     def add(self, seed: int, history: History, complaints: Sequence[Complaint]) -> None:
@@ -34,6 +35,7 @@ class Report:
             first, last = series[min(1, len(series) - 1)], series[-1]
             grown = last.anonymous - first.anonymous, last.descriptors - first.descriptors
             self.growth[name.partition(" (")[0]].append(grown)
+            self.ends[name] = self.ends.get(name, (first, last))[0], last
 
     def line_of(self, seed: int, history: History, complaints: Sequence[Complaint]) -> str:
         """What came of one seed."""
@@ -55,8 +57,18 @@ class Report:
             *rows,
             *missed,
             *(f"{name}: most growth {self._most(name)}" for name in sorted(self.growth)),
+            *(f"{name} over all: {self._drift(name)}" for name in self._lasting()),
             f"complaints {dict(self.complaints)}",
         ])  # fmt: skip
+
+    def _lasting(self) -> list[str]:
+        return [name for name in self.ends if not name.startswith("runner")]
+
+    def _drift(self, name: str) -> str:
+        """What a process that outlives histories held at the first and at the last look."""
+        first, last = self.ends[name]
+        memory = f"{first.anonymous} to {last.anonymous} KiB"
+        return f"{memory}, {first.descriptors} to {last.descriptors} descriptors"
 
     def _most(self, name: str) -> str:
         memory, descriptors = (max(column) for column in zip(*self.growth[name], strict=True))

@@ -35,7 +35,7 @@ class Command:
 @dataclass(frozen=True)
 class Fault:
     """A fault. undo: takes it back before the next look. kills_runner: the runner may be killed
-    between a line and the note that it is written. may_end: nodes may end by it, for good."""
+    between a line and the note that it is written."""
 
     shell: str
     undo: str = ""
@@ -103,9 +103,13 @@ FAULTS = {
     "project-deleted": Fault(
         'mv "$place/project" "$place/deleted"', 'mv "$place/deleted" "$place/project"'
     ),
+    "project-read-only": Fault(
+        'mount --bind "$place/project" "$place/project"'
+        ' && mount -o remount,bind,ro "$place/project"',
+        'mountpoint -q "$place/project" && umount -l "$place/project"',
+    ),
     "directory-deleted": Fault('rm -r "/run/dora-systemd/$name"', weight=1),
 }
-"""RuntimeDirectory= of a dataflow is below /run/dora-systemd."""
 
 
 @dataclass(frozen=True)

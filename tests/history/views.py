@@ -1,5 +1,6 @@
 """Invariants of what the views say of the same dataflow at the same time. Pure."""
 
+from collections import Counter
 from collections.abc import Iterator
 
 from dora_systemd.decisions.views.dataflows import UP_WORDS
@@ -110,6 +111,19 @@ def _of_metrics(view: CellView) -> Iterator[str]:
     series = f'dora_dataflow_state{{state="{view.listed["status"].lower()}"}}'
     if view.metrics.get(series) != 1:
         yield f"list says {view.listed['status']}, /metrics does not"
+
+
+def why_lists_each_restart(history: History) -> Iterator[str]:
+    """`why` lists as many restarts of a dataflow that runs, and of its nodes, as are counted."""
+    for look, cell, view in quiet_looks(history):
+        if view.why is None or view.listed is None or view.unit["ActiveState"] != "active":
+            continue
+        told = Counter((one["owner"], one["node"]) for one in view.why["restart_history"])
+        counts = {("dora", node["node"]): node["restarts"] for node in view.listed["nodes"]}
+        counts["systemd", None] = view.listed["restarts"]
+        for key, count in counts.items():
+            if told[key] != count:
+                yield f"step {look.at}: {cell}: {key}: {count} are counted, why lists {told[key]}"
 
 
 def nodes_are_real(history: History) -> Iterator[str]:

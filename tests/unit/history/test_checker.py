@@ -17,7 +17,8 @@ UNIT = f"dora-{A}.service"
 GROUP = f"/dora.slice/{UNIT}/node-sink"
 ROW: dict[str, Any] = {
     **{"name": A, "uuid": "1", "status": "Running", "restarts": 0, "summary": "it runs"},
-    "nodes": [{"node": "sink", "state": "running", "pid": 9}],
+    "nodes": [{"node": "sink", "state": "running", "pid": 9, "restarts": 0}],
+    "restart_history": [],
 }
 
 
@@ -66,6 +67,7 @@ GOOD = History(
     lines=(Line(A, "sink.1", 1), Line(A, "sink.1", 2), Line(A, "sink.1", 3)),
     end=tuple(answer(-1, what) for what in ("disable", "destroy", "reset")),
 )
+BY_DORA = {"owner": "dora", "node": "sink"}
 FAILED = {**ROW, "status": "Failed", "nodes": []}
 SILENT = {**FAILED, "summary": ""}
 GROWN = tuple(look(at, vital=Vital(1, 1, 9000 * at, 90)) for at in range(1, 9))
@@ -93,6 +95,7 @@ BROKEN: list[tuple[str, dict[str, Any]]] = [
     ("views_agree", last(view(NRestarts="1"))),
     ("views_agree", last(view(None, ROW, ActiveState="inactive"))),
     ("views_agree", last(replace(view(), metrics={"dora_dataflow_restarts_total{}": 7}))),
+    ("why_lists_each_restart", last(view(why={**ROW, "restart_history": [BY_DORA]}))),
     ("nodes_are_real", last(replace(view(), pids={"node-sink": (10,)}))),
     ("uuid_is_stable", last(view({**ROW, "uuid": "2"}, {**ROW, "uuid": "2"}))),
     ("every_line_once", {"printed": {(A, "sink.1"): 4}}),
