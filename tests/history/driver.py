@@ -132,7 +132,6 @@ class Driver:
             status, out, err = self._shell(text)
             answers.append(Answer(-1, Step(text), status, out, err))
         wait_for("no process is left", lambda: not dora_processes())
-        self.scene.front.up()
         return answers
 
     def clean(self) -> None:

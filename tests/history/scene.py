@@ -93,7 +93,10 @@ def ask(*words: str) -> Any:
 def inventory() -> set[str]:
     """Everything of ours that a machine can have: files, units, groups."""
     listed = run("systemctl", "list-units", "--all", "--plain", "--no-legend", "dora*").stdout
-    units = {f"unit {line.split()[0]}" for line in listed.splitlines() if line.split()}
+    # The fields are unit, LoadState and ActiveState, see systemctl(1).
+    rows = [line.split() for line in listed.splitlines()]
+    units = {f"unit {row[0]}" for row in rows}
+    units |= {f"failed unit {row[0]}" for row in rows if row[2] == "failed"}
     groups = Path("/sys/fs/cgroup").rglob("*history-*")
     return units | {f"group {path}" for path in groups} | {f"file {one}" for one in _files()}
 
