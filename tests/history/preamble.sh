@@ -56,10 +56,14 @@ order() {
     touch "$WORK/draft" && chmod 666 "$WORK/draft" && mv "$WORK/draft" "$place/notes/order.$1.$2"
 }
 
-RUN_SIZE=$(findmnt -no SIZE -b /run 2>/dev/null)
-
-# fill_run: /run gets no larger than it is
+# fill_run: /run gets no larger than it is, until empty_run
 fill_run() {
     [ "$(findmnt -no FSTYPE /run)" = tmpfs ] || return 3
+    [ -e "$WORK/run_size" ] || findmnt -no SIZE -b /run >"$WORK/run_size"
     mount -o "remount,size=$(($(findmnt -no USED -b /run) + 8192))" /run
+}
+
+empty_run() {
+    [ -e "$WORK/run_size" ] || return 0
+    mount -o "remount,size=$(cat "$WORK/run_size")" /run && rm "$WORK/run_size"
 }

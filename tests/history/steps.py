@@ -59,8 +59,8 @@ COMMANDS = {
     "disable": Command("doractl disable $name"),
     "reload": Command("doractl reload $name", weight=2),
     "edit-reload": Command('echo "# edited" >>"$place/project/node.py"; doractl reload $name'),
-    "set": Command("doractl set $name --memory-limit 3G", weight=2),
-    "set-policy": Command("doractl set $name --log-level info"),
+    "set": Command("doractl set $name --hot-reload on", weight=2),
+    "set-memory": Command("doractl set $name --memory-limit 3G"),
     "node-restart": Command("doractl node restart $name source", weight=2),
     "reset": Command("doractl reset $name"),
     "list": Command("doractl list", is_for_all=True),
@@ -99,7 +99,7 @@ FAULTS = {
     "logind-restarts": Fault("systemctl restart systemd-logind.service", weight=1),
     "daemon-reload": Fault("systemctl daemon-reload"),
     "daemon-reexec": Fault("systemctl daemon-reexec"),
-    "run-full": Fault("fill_run", "mount -o remount,size=$RUN_SIZE /run", 1),
+    "run-full": Fault("fill_run", "empty_run", 1),
     "project-deleted": Fault(
         'mv "$place/project" "$place/deleted"', 'mv "$place/deleted" "$place/project"'
     ),
