@@ -6,6 +6,7 @@ script.
 
 import argparse
 import shutil
+import subprocess
 import sys
 import tempfile
 import time
@@ -88,7 +89,12 @@ def main(arguments: Sequence[str]) -> int:
     report, seed, is_good = Report(), chosen.seed, True
     until = time.monotonic() + chosen.hours * HOUR
     while True:
-        is_good &= run_seed(seed, chosen.steps, report, chosen.shrink, chosen.out)
+        try:
+            is_good &= run_seed(seed, chosen.steps, report, chosen.shrink, chosen.out)
+        except (AssertionError, OSError, subprocess.SubprocessError) as error:
+            is_good = False  # the report of hours is worth more than one history
+            report.complaints["the driver failed"] += 1
+            print(f"seed {seed}: the driver failed: {error!r}", flush=True)
         seed += 1
         if time.monotonic() >= until:
             break
