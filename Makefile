@@ -4,7 +4,7 @@
 #   LAB=host       system tests right here, on a machine booted with systemd
 
 LAB ?= container
-export LAB SEED STEPS HOURS SECONDS
+export LAB
 
 PREPARE := tests/lab/prepare
 CHECK := /usr/bin/python3 tests/lab/check
@@ -38,11 +38,11 @@ faults:  ## every fault of tests/system/faults, ROUNDS=n times
 
 history:  ## commands and faults in combination; SEED=n STEPS=n HOURS=n, LAB_OUT=DIR keeps records
 	@$(PREPARE) container
-	@$(CHECK) history
+	@SEED=$(SEED) STEPS=$(STEPS) HOURS=$(HOURS) $(CHECK) history
 
 fuzz:  ## feed what reads other people's bytes, for SECONDS=n
 	@$(PREPARE)
-	@$(CHECK) fuzz
+	@FUZZ_SECONDS=$(SECONDS) $(CHECK) fuzz
 
 browser:  ## the status page in headless Chromium; LAB_OUT=DIR keeps pictures of it
 	@$(PREPARE) container

@@ -12,6 +12,9 @@ START_SHARE = 0.7
 ANSWERED_SHARE = 0.4
 """Of the steps after a fault: those that meet the dataflow while it is not what it was."""
 AFTER_FAULTS = ("stop", "stop", "restart", "start", "systemctl-stop", "reload", "enable", "destroy")
+HIT_SHARE = 0.1
+"""Of the steps after a command: those that hit doractl while it runs."""
+IN_COMMANDS = ("kill-doractl", "kill-doractl", "stop-doractl", "daemon-reexec")
 SOON_MS = (0, 30, 100, 300, 700)
 PAUSES_MS = (0, 0, 0, 50, 200, 600, 1500)
 
@@ -33,6 +36,8 @@ def _step(random: Random, up: set[str], before: Step) -> Step:
         what = random.choice(AFTER_FAULTS)
         _note_wish(what, before.cell, up)
         return Step(what, before.cell, random.choice(SOON_MS), random.random() < JOINED_SHARE)
+    if before.what in COMMANDS and random.random() < HIT_SHARE:
+        return Step(random.choice(IN_COMMANDS), before.cell, random.choice(SOON_MS), is_joined=True)
     cell = random.choices(CELLS, (3, 1))[0]
     what = _command(random) if random.random() < COMMAND_SHARE else _fault(random)
     if cell not in up and random.random() < START_SHARE:
@@ -55,4 +60,5 @@ def _command(random: Random) -> str:
 
 
 def _fault(random: Random) -> str:
-    return random.choices(list(FAULTS), [one.weight for one in FAULTS.values()])[0]
+    weights = [one.weight for one in FAULTS.values()]
+    return random.choices(list(FAULTS), weights)[0]

@@ -34,8 +34,9 @@ class Command:
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault. undo: takes it back before the next look. kills_runner: the runner may be killed
-    between a line and the note that it is written."""
+    """A fault. undo: takes it back before the next look. weight: how often it is drawn, 0 only as
+    an answer to a command. kills_runner: the runner may be killed between a line and the note that
+    it is written."""
 
     shell: str
     undo: str = ""
@@ -80,13 +81,13 @@ FAULTS = {
     "kill-sink": Fault("hit KILL $(node sink)"),
     "kill-launcher": Fault("hit KILL $(node source) && hit KILL $(launcher)"),
     "kill-unit": Fault("systemctl kill --signal=KILL $unit", kills_runner=True),
-    "kill-doractl": Fault("hit KILL $(pgrep -x doractl)", weight=4),
+    "kill-doractl": Fault("hit KILL $(pgrep -x doractl)", weight=0),
     "kill-gateway": Fault("hit KILL $(main_pid dora-gateway.service)"),
     "stop-runner": Fault("hit STOP $(part runner)", "thaw", kills_runner=True),
     "stop-coordinator": Fault("hit STOP $(part coordinator)", "thaw"),
     "stop-daemon": Fault("hit STOP $(part daemon)", "thaw"),
     "stop-source": Fault("hit STOP $(node source)", "thaw"),
-    "stop-doractl": Fault("hit STOP $(pgrep -x doractl)", "thaw"),
+    "stop-doractl": Fault("hit STOP $(pgrep -x doractl)", "thaw", weight=0),
     "stop-gateway": Fault("hit STOP $(main_pid dora-gateway.service)", "thaw", 1),
     "node-exit-1": Fault("order sink exit1"),
     "node-exit-0": Fault("order source exit0", weight=1),

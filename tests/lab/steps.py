@@ -280,7 +280,7 @@ def plan_history(_form: str) -> list[Step]:
 
 
 def plan_fuzz(_form: str) -> list[Step]:
-    seconds = os.environ.get("SECONDS") or "120"
+    seconds = os.environ.get("FUZZ_SECONDS") or "120"
     return [Step("fuzzing", ["python", "-m", "tests.fuzz", seconds], in_venv)]
 
 
