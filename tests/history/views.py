@@ -81,7 +81,7 @@ def _of_list(view: CellView) -> Iterator[str]:
         return
     if listed["status"] not in BY_STATE.get(state, ()):
         yield f"it is {state}, and list says {listed['status']}"
-    if view.unit["LoadState"] == "loaded" and listed["restarts"] != int(view.unit["NRestarts"]):
+    if listed["restarts"] not in (None, int(view.unit["NRestarts"])):
         yield f"systemd counts {view.unit['NRestarts']} restarts, list {listed['restarts']}"
 
 
@@ -96,7 +96,8 @@ def _of_why(view: CellView) -> Iterator[str]:
             yield f"list does not know it, and why says {why['status']}"
         return
     for key in ("uuid", "restarts"):
-        if why[key] != listed[key]:
+        # What is null is unknown: systemd forgets a dataflow, and `why` has it loaded again.
+        if None not in (why[key], listed[key]) and why[key] != listed[key]:
             yield f"{key}: list says {listed[key]}, why {why[key]}"
     if why["status"] != listed["status"] and not {why["status"], listed["status"]} <= ENDED:
         yield f"list says {listed['status']}, why {why['status']}: {why['summary']}"
@@ -106,7 +107,7 @@ def _of_metrics(view: CellView) -> Iterator[str]:
     if view.listed is None or not view.metrics:
         return
     restarts = view.metrics.get("dora_dataflow_restarts_total{}")
-    if restarts != view.listed["restarts"]:
+    if view.listed["restarts"] not in (None, restarts):
         yield f"list counts {view.listed['restarts']} restarts, /metrics {restarts}"
     series = f'dora_dataflow_state{{state="{view.listed["status"].lower()}"}}'
     if view.metrics.get(series) != 1:
