@@ -99,8 +99,10 @@ class Driver:
                 one.was_hit = True
         if step.what in FAULTS and FAULTS[step.what].undo:
             self._undo.append((FAULTS[step.what].undo, step.cell))
+        # One that hits may still look for its target when the next command begins.
+        may_be_hit = any(one.step.what.endswith("-doractl") for one in self._running)
         process = self.scene.begin(shell_of(step.what), step.cell)
-        self._running.append(Running(at, step, process, time.monotonic()))
+        self._running.append(Running(at, step, process, time.monotonic(), may_be_hit))
 
     def _finish(self) -> None:
         """Wait for all steps that run; one that is stopped goes on first."""

@@ -78,7 +78,12 @@ def test_a_script_undoes_a_fault_when_it_looks() -> None:
     lines = format_script(steps, "").splitlines()
     assert "wait; of history-a; { hit STOP $(node source); } &" in lines
     assert "of history-a; { doractl list; }" in lines
-    assert "wait; of history-a; thaw; :" in lines
+    assert "thaw; wait; of history-a; thaw; :" in lines
+
+
+def test_a_script_does_not_wait_for_a_doractl_that_is_stopped() -> None:
+    steps = [Step("stop"), Step("stop-doractl", is_joined=True), Step("list"), Step(LOOK)]
+    assert "thaw; wait; of history-a; { doractl list; }" in format_script(steps, "").splitlines()
 
 
 def test_the_preamble_knows_the_status_without_a_target() -> None:
