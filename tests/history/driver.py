@@ -105,14 +105,22 @@ class Driver:
         self._running.append(Running(at, step, process, time.monotonic(), may_be_hit))
 
     def _finish(self) -> None:
-        """Wait for all steps that run; one that is stopped goes on first."""
-        if any(one.step.what == "stop-doractl" for one in self._running):
+        """Wait for all steps that run; a doractl that is stopped goes on first."""
+        if any(one.what == "stop-doractl" for one in self._finish_faults()):
             self._shell("thaw")
         self._answers += [one.finish() for one in self._running]
         self._running.clear()
 
+    def _finish_faults(self) -> list[Step]:
+        """Wait for the faults that run; what they stop after a `thaw` would stay stopped."""
+        faults = [one for one in self._running if one.step.what in FAULTS]
+        self._answers += [one.finish() for one in faults]
+        self._running = [one for one in self._running if one not in faults]
+        return [one.step for one in faults]
+
     def settle(self) -> None:
         """Take the faults back, and wait for what runs."""
+        self._finish_faults()
         if any(undo == "thaw" for undo, _ in self._undo):
             self._shell("thaw")
         self._finish()
