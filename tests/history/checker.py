@@ -19,6 +19,7 @@ FLAT_AFTER = 2
 """Looks before a process has all that it needs."""
 MOST_DESCRIPTORS = 12
 MOST_KIB = 24 * 1024
+_OF_PYTHON = ("Traceback (most recent call last)", "[Errno ")
 _STATUSES = frozenset({0, 1, *range(3, 10), 130})
 """Those of doractl(1), but for a wrong command line: the table has none."""
 
@@ -40,10 +41,10 @@ def quiet_comes(history: History) -> Iterator[str]:
 
 
 def answers_are_orderly(history: History) -> Iterator[str]:
-    """A doractl ends by itself, with a status of the manual and never with a traceback."""
+    """A doractl ends by itself, with a status of the manual and no words of Python's."""
     for answer in (*history.answers, *history.end):
         text = answer.stderr + answer.stdout
-        if "Traceback (most recent call last)" in text:
+        if any(word in text for word in _OF_PYTHON):
             yield f"step {answer.at}: {answer.step.what}: {text[-800:]}"
         elif _is_doractl(answer) and answer.status not in _STATUSES and not answer.was_hit:
             yield f"step {answer.at}: {answer.step.what} ended with {answer.status}: {text[-400:]}"

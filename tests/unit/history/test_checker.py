@@ -104,6 +104,7 @@ BROKEN: list[tuple[str, dict[str, Any]]] = [
     ("quiet_comes", {"looks": (replace(look(1), is_quiet=False),)}),
     ("answers_are_orderly", {"answers": (answer(0, "start", -9),)}),
     ("answers_are_orderly", {"answers": (answer(0, "set", 2),)}),
+    ("answers_are_orderly", {"answers": (answer(0, "set", 3, stderr="doractl: [Errno 2]"),)}),
     (
         "answers_are_orderly",
         {"end": (answer(-1, "x", stderr="Traceback (most recent call last)"),)},
