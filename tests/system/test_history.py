@@ -1,4 +1,4 @@
-"""Histories of fixed seeds, with every invariant; `make history` runs others, and more of them."""
+"""A history of a fixed seed, with every invariant; `make history` runs others, and more of them."""
 
 import pytest
 
@@ -10,7 +10,7 @@ STEPS = 14
 
 
 @pytest.mark.lab
-@pytest.mark.parametrize("seed", [3, 4])
+@pytest.mark.parametrize("seed", [3])
 def test_history(seed: int, reserved_ports: None) -> None:
     del reserved_ports
     complaints = check(run_history(generate(seed, STEPS)))
