@@ -36,6 +36,14 @@ faults:  ## every fault of tests/system/faults, ROUNDS=n times
 	@$(PREPARE) $(if $(filter vm,$(LAB)),container vm,container)
 	@ROUNDS=$(ROUNDS) $(CHECK) faults
 
+history:  ## commands and faults in combination; SEED=n STEPS=n HOURS=n, LAB_OUT=DIR keeps records
+	@$(PREPARE) container
+	@SEED=$(SEED) STEPS=$(STEPS) HOURS=$(HOURS) $(CHECK) history
+
+fuzz:  ## feed what reads other people's bytes, for SECONDS=n
+	@$(PREPARE)
+	@FUZZ_SECONDS=$(SECONDS) $(CHECK) fuzz
+
 browser:  ## the status page in headless Chromium; LAB_OUT=DIR keeps pictures of it
 	@$(PREPARE) container
 	@$(CHECK) browser
@@ -75,4 +83,4 @@ autopkgtest:  ## debian/tests, by Debian's own autopkgtest, on what make deb has
 	@$(PREPARE) $(if $(filter vm,$(LAB)),container vm,container)
 	@packaging/autopkgtest
 
-.PHONY: help test unit system quick vm faults browser bench bench-quick bookworm lint demo clean deb autopkgtest
+.PHONY: help test unit system quick vm faults history fuzz browser bench bench-quick bookworm lint demo clean deb autopkgtest

@@ -270,6 +270,20 @@ def plan_faults(form: str) -> list[Step]:
     return [Step(f"faults, {form}", command, in_lab(form), minutes=3 * int(rounds))]
 
 
+def plan_history(_form: str) -> list[Step]:
+    """Histories from SEED on, for HOURS or one; what breaks one is made shorter and printed."""
+    asked = ("--seed", "SEED", "1"), ("--steps", "STEPS", "40"), ("--hours", "HOURS", "0")
+    chosen = [word for flag, name, usual in asked for word in (flag, os.environ.get(name) or usual)]
+    kept = ["--out", "/out"] if os.environ.get("LAB_OUT") else []
+    command = ["tests/lab/lab", "run", "--", "python", "-m", "tests.history", "--shrink"]
+    return [Step("histories", [*command, *chosen, *kept], in_lab("container"))]
+
+
+def plan_fuzz(_form: str) -> list[Step]:
+    seconds = os.environ.get("FUZZ_SECONDS") or "120"
+    return [Step("fuzzing", ["python", "-m", "tests.fuzz", seconds], in_venv)]
+
+
 def plan_quick(_form: str) -> list[Step]:
     """The heart of the system tests, two containers at the same time."""
     first, second = (
@@ -310,6 +324,8 @@ PLANS: dict[str, Callable[[str], list[Step]]] = {
     "system": plan_system,
     "quick": plan_quick,
     "faults": plan_faults,
+    "history": plan_history,
+    "fuzz": plan_fuzz,
     "lab": plan_lab,
     "vm": plan_vm,
     "packages": plan_packages,

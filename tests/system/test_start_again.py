@@ -10,6 +10,7 @@ import pytest
 
 from dora_systemd.errors import ExitCode
 from tests.system.cells import Cell, Project, run, sync_journal, wait_for
+from tests.system.faults.table import LOST
 
 SAYS = """
 import os
@@ -143,3 +144,14 @@ def test_another_users_words_start_nothing(cell: Cell, project: Project) -> None
     wait_for("the record", lambda: run(*mine).stdout)
     done = cell.doractl("start", cell.name, check=False)
     assert done.returncode == ExitCode.NOT_FOUND, done.stdout
+
+
+@pytest.mark.warns(*LOST)
+def test_a_start_that_is_refused_leaves_what_has_failed(cell: Cell, project: Project) -> None:
+    cell.start(project.three_nodes(), "--restart-policy", "no")
+    cell.systemctl("kill", "--signal=KILL")
+    wait_for("it has failed", lambda: cell.show("ActiveState") == "failed")
+    done = cell.start(project.root / "missing.yml", check=False)
+    assert done.returncode == ExitCode.BAD_INPUT
+    assert cell.show("ActiveState") == "failed"
+    assert known(cell)["status"] == "Failed"

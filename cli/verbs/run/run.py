@@ -20,7 +20,7 @@ from dora_systemd.decisions.logs.filter import RAW, LogFilter, parse_filter
 from dora_systemd.decisions.logs.records import DORA_LEVELS
 from dora_systemd.names import unit_name
 from dora_systemd.verbs.start.again import note_start
-from dora_systemd.verbs.start.claim import refuse_unit_file, require_free_name
+from dora_systemd.verbs.start.claim import make_room, refuse_unit_file, require_free_name
 from dora_systemd.verbs.start.enable import drop_unit_files
 from dora_systemd.verbs.start.plan import DEFAULT_FILE, StartRequest, make_plan, request_name
 from dora_systemd.verbs.start.run import attached_properties, life_line
@@ -84,6 +84,7 @@ def command(
     refuse_unit_file(boot)
     plan = make_plan(scope, request)
     properties, warnings = plan_properties(plan, bus)
+    make_room(bus, boot)
     drop_unit_files(bus, boot)
     note_start(plan, request, "doractl run")
     print_warnings(warnings)

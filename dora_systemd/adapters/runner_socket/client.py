@@ -135,7 +135,8 @@ def _reaching(path: Path) -> Iterator[None]:
         raise _unreachable(path, "permission denied", hint, ExitCode.NO_PERMISSION) from error
     except (OSError, ValueError) as error:
         hint = "it may be starting or stopping; see doractl list"
-        raise _unreachable(path, str(error), hint, ExitCode.NOT_RUNNING) from error
+        reason = (isinstance(error, OSError) and error.strerror) or str(error)
+        raise _unreachable(path, reason, hint, ExitCode.NOT_RUNNING) from error
 
 
 def _unreadable(path: Path) -> DoraSystemdError:

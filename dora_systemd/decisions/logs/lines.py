@@ -143,7 +143,7 @@ def jsonl_fields(line: bytes) -> dict[str, Value]:
     """The fields of a line of dora's own log file, log_<node>.jsonl."""
     try:
         record = json.loads(line)
-        stream, level = str(record["stream"] or "stdout"), str(record["level"])
+        stream, level = _text(str(record["stream"] or "stdout")), str(record["level"])
         text = _text(record["msg"])
     except (ValueError, RecursionError, TypeError, KeyError):
         return {"PRIORITY": INFO, "MESSAGE": line}

@@ -25,7 +25,7 @@ from dora_systemd.verbs.start.plan import Plan
 
 
 def require_free_name(manager: Manager, scope: Scope, unit: str) -> BootUnit:
-    """Make sure that `unit` is not running; systemd unloads an ended transient unit.
+    """Make sure that `unit` is not running, and change nothing; make_room() comes later.
 
     Returns the unit file, if there is one. Raises DoraSystemdError (NAME_IN_USE), which says what
     is running.
@@ -33,19 +33,25 @@ def require_free_name(manager: Manager, scope: Scope, unit: str) -> BootUnit:
     cell = read_cell(manager, unit)
     if cell is not None and cell.is_up:
         raise _in_use(manager, cell)
-    state = manager.read(unit, ["LoadState", "Transient"])
-    if cell is None and state["LoadState"] != "not-found":
+    if cell is None and manager.read(unit, ["LoadState"])["LoadState"] != "not-found":
         raise DoraSystemdError(
             f"cannot start {unit}: a unit of that name already exists",
             f"see systemctl {scope.flag} cat {unit}; choose another --name",
             ExitCode.NAME_IN_USE,
         )
-    boot = read_boot_unit(manager, scope, unit)
+    return read_boot_unit(manager, scope, unit)
+
+
+def make_room(manager: Manager, boot: BootUnit) -> None:
+    """Have systemd unload an ended transient unit, and with it how that has ended.
+
+    So only after everything that can refuse a start. Raises DoraSystemdError (NAME_IN_USE).
+    """
+    state = manager.read(boot.unit, ["LoadState", "Transient"])
     if state["Transient"]:
         _forget(manager, boot)
     elif boot.text is not None and state["LoadState"] == "not-found":
         manager.reload()  # see lost_units()
-    return boot
 
 
 def refuse_unit_file(boot: BootUnit) -> None:
@@ -79,19 +85,20 @@ def place_unit_file(
     text = persistent_unit(
         [format_unit(properties)], plan.options, scope.is_user, target, boot.is_checked
     )
+    is_kept = boot.text is not None and boot.is_enabled and not want_boot
+    if is_kept and not says_the_same(text, boot.text or ""):
+        raise _differs(plan.options.name, boot)
+    if not is_kept and not want_boot:
+        _refuse_deployed(plan.options.name, boot)
+    make_room(manager, boot)
     if want_boot:
         install_unit_file(manager, boot, text)
         remove_changes(boot.path)
         remove_unit_file(boot.runtime)
         manager.reload()
-        return True
-    if boot.text is not None and boot.is_enabled:
-        if not says_the_same(text, boot.text):
-            raise _differs(plan.options.name, boot)
-        return True
-    _refuse_deployed(plan.options.name, boot)
-    drop_unit_files(manager, boot)
-    return False
+    elif not is_kept:
+        drop_unit_files(manager, boot)
+    return want_boot or is_kept
 
 
 def _refuse_deployed(name: str, boot: BootUnit) -> None:

@@ -117,6 +117,7 @@ def test_nobody_there(tmp_path: Path) -> None:
     with pytest.raises(DoraSystemdError, match="cannot reach the runner of robot: ") as caught:
         ask(tmp_path / "robot/runner.sock", {"verb": "yes"})
     assert caught.value.code == ExitCode.NOT_RUNNING
+    assert caught.value.message.endswith(": No such file or directory")
 
 
 @contextmanager

@@ -13,6 +13,7 @@ from dora_systemd.decisions.logs.lines import (
     Piece,
     dora_log_fields,
     json_fields,
+    jsonl_fields,
 )
 
 ORIGIN = Origin("robot", "550e8400-e29b-41d4-a716-446655440000", "camera", "run1", 42)
@@ -154,6 +155,11 @@ def test_not_in_dora_form_is_plain(line: bytes) -> None:
 def test_half_a_surrogate_pair_is_no_error() -> None:
     line = b'{"level":"info","timestamp":"t","message":"\\ud800"}'
     assert b"MESSAGE=\\ud800\n" in LineEncoder(ORIGIN, "stdout").entry(line)
+
+
+def test_half_a_surrogate_pair_in_the_name_of_a_stream_is_no_error() -> None:
+    fields = jsonl_fields(b'{"ts":"t","level":"INFO","stream":"\\ud800","msg":"m"}')
+    assert fields["DORA_STREAM"] == "\\ud800"
 
 
 def test_many_fields_stay_below_the_limit_of_journald() -> None:

@@ -64,8 +64,23 @@ def test_a_name_in_use(state: str, manager: FakeManager, scope: Scope) -> None:
 
 def test_a_failed_one_is_forgotten(manager: FakeManager, scope: Scope) -> None:
     manager.add(options(), active="failed")
-    require_free_name(manager, scope, UNIT)
+    place(manager, make_plan(scope))
     assert manager.calls == [("reset", UNIT)]
+
+
+def test_a_failed_one_is_kept_until_nothing_can_refuse_the_start(
+    manager: FakeManager, scope: Scope
+) -> None:
+    manager.add(options(), active="failed")
+    require_free_name(manager, scope, UNIT)
+    assert manager.calls == []
+    manager.units.pop(UNIT)
+    place(manager, make_plan(scope), want_boot=True)
+    manager.add(options(), active="failed")
+    manager.calls.clear()
+    with pytest.raises(DoraSystemdError):
+        place(manager, make_plan(scope, memory_limit="1G"))
+    assert manager.calls == []
 
 
 @pytest.mark.parametrize("facts", [{"ExecStart": []}, {"LoadState": "bad-setting"}])

@@ -1,0 +1,190 @@
+"""Everything that reads other people's bytes, as functions of bytes.
+
+A target returns for every input, or raises what its reader documents. Anything else is a defect.
+A new reader is one new line in TARGETS, and a file with a good example in corpus/NAME/.
+"""
+
+import json
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dora_systemd.adapters.dora.command import parse_dora_version, version_numbers
+from dora_systemd.adapters.host.files import decoded, parse_yaml
+from dora_systemd.adapters.runner_socket.client import parse_line
+from dora_systemd.decisions.cell.environment import parse_environment_file
+from dora_systemd.decisions.cell.exits import parse_exit
+from dora_systemd.decisions.cell.limits import parse_changes
+from dora_systemd.decisions.cell.line_rates import parse_rates
+from dora_systemd.decisions.cell.status import CellStatus
+from dora_systemd.decisions.descriptor.build_session import parse_session
+from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
+from dora_systemd.decisions.dora.coordinator import parse_coordinator
+from dora_systemd.decisions.dora.errors import parse_dora_error
+from dora_systemd.decisions.dora.life_events import parse_daemon_line, parse_life_event
+from dora_systemd.decisions.dora.protocol import (
+    LogRecord,
+    Reply,
+    parse_frame,
+    parse_heartbeat,
+    parse_results,
+    parse_spawn_failure,
+)
+from dora_systemd.decisions.gateway.access import has_token, refuse_address
+from dora_systemd.decisions.gateway.frames import Malformed, format_malformed, parse_request
+from dora_systemd.decisions.gateway.page_messages import parse_message
+from dora_systemd.decisions.life.refusal import parse_refusal
+from dora_systemd.decisions.logs.filter import parse_filter
+from dora_systemd.decisions.logs.lines import (
+    LineEncoder,
+    LineSplitter,
+    Origin,
+    dora_log_fields,
+    json_fields,
+    jsonl_fields,
+)
+from dora_systemd.decisions.properties.assignments import parse_property
+from dora_systemd.decisions.settings.resolve import resolve_settings
+from dora_systemd.decisions.settings.table import SETTINGS
+from dora_systemd.decisions.why.lives import find_lives, parse_happening
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.names import name_from_path, parse_name, parse_uuid
+from dora_systemd.terminal_text import one_line, shown_log, without_sequences
+from dora_systemd.values import parse_bool, parse_cpu, parse_duration, parse_size
+
+FILE = Path("/fuzz/dataflow.yml")
+SMALL_LIMIT = 8
+"""Bytes of a line, small so that short inputs have long lines."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """One reader. raises: what it documents for input that is not valid."""
+
+    read: Callable[[bytes], object]
+    raises: tuple[type[Exception], ...] = ()
+
+    def feed(self, data: bytes) -> None:
+        """Read `data`; raises for a defect only."""
+        with suppress(*self.raises):
+            self.read(data)
+
+
+def text_of(data: bytes) -> str:
+    """What arrives as text: valid Unicode, any of it."""
+    return data.decode("utf-8", "replace")
+
+
+def loaded(data: bytes) -> Any:
+    """The JSON value in `data`, or the text of it."""
+    try:
+        return json.loads(data)
+    except (ValueError, RecursionError):
+        return text_of(data)
+
+
+def _yaml(data: bytes) -> object:
+    return parse_yaml(decoded(data, FILE), FILE, allow_empty=True)
+
+
+def _settings(data: bytes) -> object:
+    return resolve_settings({}, {}, [(str(FILE), _yaml(data))], SETTINGS)
+
+
+def _request(data: bytes) -> object:
+    request = parse_request(text_of(data))
+    if isinstance(request, Malformed):
+        format_malformed(request).encode()
+    return request
+
+
+def _reply(data: bytes) -> object:
+    reply = parse_frame(text_of(data))
+    if isinstance(reply, Reply):
+        return parse_heartbeat(reply), parse_results(reply), parse_spawn_failure(reply)
+    return parse_life_event(reply, 1) if isinstance(reply, LogRecord) else None
+
+
+def _encoded(fields: Any) -> None:
+    """What goes into the journal is text that can be encoded."""
+    for value in (fields or {}).values():
+        str(value).encode()
+
+
+def _splitter(data: bytes) -> None:
+    whole, parts = LineSplitter(SMALL_LIMIT), LineSplitter(SMALL_LIMIT)
+    once = [*whole.feed(data), *whole.flush()]
+    pieces = [line for byte in data for line in parts.feed(bytes([byte]))] + parts.flush()
+    if b"\r" not in data:
+        assert b"".join(once) == b"".join(pieces) == data.replace(b"\n", b"")
+
+
+def _encoder(data: bytes) -> bytes:
+    encoder = LineEncoder(Origin("name", "uuid", "node"), "stdout")
+    return encoder.entry(data.replace(b"\n", b""))
+
+
+def _happenings(data: bytes) -> object:
+    records = [loaded(line) for line in data.splitlines()]
+    found = [parse_happening(record) for record in records if isinstance(record, dict)]
+    return find_lives([one for one in found if one is not None])
+
+
+def _table(data: bytes) -> None:
+    status = CellStatus.from_json(data)
+    assert CellStatus.from_json(status.to_json()) == status
+
+
+def _terminal(data: bytes) -> None:
+    shown = shown_log(data)
+    assert b"\x1b]" not in shown
+    assert "\n" not in one_line(text_of(data))
+    without_sequences(text_of(data))
+
+
+def _of_text(*readers: Callable[[str], object]) -> Callable[[bytes], None]:
+    """Each of these reads the same text, whatever the others say of it."""
+
+    def read(data: bytes) -> None:
+        for reader in readers:
+            with suppress(DoraSystemdError):
+                reader(text_of(data))
+
+    return read
+
+
+REFUSED = (DoraSystemdError,)
+
+TARGETS = {
+    "status": Target(_table, REFUSED),
+    "descriptor": Target(lambda data: parse_dataflow(_yaml(data), "dataflow.yml"), REFUSED),
+    "settings": Target(_settings, REFUSED),
+    "session": Target(lambda data: parse_session(_yaml(data)), REFUSED),
+    "environment": Target(lambda data: parse_environment_file(text_of(data), "env"), REFUSED),
+    "control-request": Target(_request),
+    "dora-reply": Target(_reply),
+    "page-message": Target(lambda data: parse_message(text_of(data)), REFUSED),
+    "runner-socket": Target(parse_line),
+    "coordinator": Target(lambda data: parse_coordinator(loaded(data)), (ValueError,)),
+    "address": Target(lambda data: refuse_address([text_of(data)], [text_of(data)])),
+    "token": Target(lambda data: has_token([text_of(data)], "0" * 64)),
+    "jsonl": Target(lambda data: _encoded(jsonl_fields(data))),
+    "json-line": Target(lambda data: _encoded(json_fields(data))),
+    "dora-line": Target(lambda data: _encoded(dora_log_fields(data))),
+    "line-splitter": Target(_splitter),
+    "line-encoder": Target(_encoder),
+    "journal": Target(_happenings),
+    "daemon-line": Target(lambda data: parse_daemon_line(text_of(data), 1)),
+    "terminal": Target(_terminal),
+    "refusal": Target(lambda data: [parse_refusal(text_of(data), n) for n in range(80)]),
+    "property": Target(lambda data: parse_property(text_of(data)), REFUSED),
+    "values": Target(_of_text(parse_size, parse_duration, parse_cpu, parse_bool)),
+    "names": Target(_of_text(parse_name, parse_uuid, name_from_path)),
+    "limits": Target(_of_text(parse_changes, lambda text: parse_rates(text.split(";")))),
+    "exit": Target(_of_text(parse_exit, parse_dora_error, parse_filter)),
+    "dora-version": Target(
+        lambda data: version_numbers(parse_dora_version(text_of(data)) or text_of(data))
+    ),
+}

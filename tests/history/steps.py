@@ -1,0 +1,133 @@
+"""What can be done in a history: an operator's commands and faults, each one a line of shell.
+
+A new verb or fault is one new line here. $name is the dataflow, $unit its unit, $place the
+directory of its project and notes; the functions are those of preamble.sh. The driver runs the same
+text that script.py prints, so that a person can do by hand what the driver did.
+"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+NO_TARGET = 3
+"""Exit status of a fault that found nothing to hit; preamble.sh has it as well."""
+
+CELLS = ("history-a", "history-b")
+
+
+class Wish(StrEnum):
+    """What a command that succeeds asks for."""
+
+    NOTHING = ""
+    RUN = "run"
+    STOP = "stop"
+
+
+@dataclass(frozen=True)
+class Command:
+    """An operator's command. wish: what it asks for. weight: how often it is drawn."""
+
+    shell: str
+    wish: Wish = Wish.NOTHING
+    weight: int = 1
+    is_for_all: bool = False
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault. undo: takes it back before the next look. weight: how often it is drawn, 0 only as
+    an answer to a command. kills_runner: the runner may be killed between a line and the note that
+    it is written."""
+
+    shell: str
+    undo: str = ""
+    weight: int = 2
+    kills_runner: bool = False
+
+
+_START = (
+    'doractl start "$place/project/dataflow.yml" --name $name --env "NOTES=$place/notes" '
+    '--writable "$place/notes" --restart-policy on-failure'
+)
+
+COMMANDS = {
+    "start": Command(_START, Wish.RUN, 8),
+    "start-quick-grace": Command(f"{_START} --grace-duration 1s", Wish.RUN, 2),
+    "stop": Command("doractl stop $name", Wish.STOP, 3),
+    "restart": Command("doractl restart $name", Wish.RUN, 3),
+    "systemctl-restart": Command("systemctl restart $unit", Wish.RUN),
+    "systemctl-stop": Command("systemctl stop $unit", Wish.STOP),
+    "enable": Command("doractl enable $name"),
+    "disable": Command("doractl disable $name"),
+    "reload": Command("doractl reload $name", weight=2),
+    "edit-reload": Command('echo "# edited" >>"$place/project/node.py"; doractl reload $name'),
+    "set": Command("doractl set $name --hot-reload on", weight=2),
+    "set-memory": Command("doractl set $name --memory-limit 3G"),
+    "node-restart": Command("doractl node restart $name source", weight=2),
+    "reset": Command("doractl reset $name"),
+    "list": Command("doractl list", is_for_all=True),
+    "why": Command("doractl why $name", weight=2),
+    "logs": Command("doractl logs $name -n 5 --no-pager"),
+    "show": Command("doractl show $name"),
+    "export": Command("doractl export $name >/dev/null"),
+    "up": Command("doractl up", is_for_all=True),
+    "destroy": Command("doractl destroy", Wish.STOP, is_for_all=True),
+}
+
+FAULTS = {
+    "kill-runner": Fault("hit KILL $(part runner)", kills_runner=True),
+    "kill-coordinator": Fault("hit KILL $(part coordinator)"),
+    "kill-daemon": Fault("hit KILL $(part daemon)"),
+    "kill-source": Fault("hit KILL $(node source)"),
+    "kill-sink": Fault("hit KILL $(node sink)"),
+    "kill-launcher": Fault("hit KILL $(node source) && hit KILL $(launcher)"),
+    "kill-unit": Fault("systemctl kill --signal=KILL $unit", kills_runner=True),
+    "kill-doractl": Fault("hit KILL $(pgrep -x doractl)", weight=0),
+    "kill-gateway": Fault("hit KILL $(main_pid dora-gateway.service)"),
+    "stop-runner": Fault("hit STOP $(part runner)", "thaw", kills_runner=True),
+    "stop-coordinator": Fault("hit STOP $(part coordinator)", "thaw"),
+    "stop-daemon": Fault("hit STOP $(part daemon)", "thaw"),
+    "stop-source": Fault("hit STOP $(node source)", "thaw"),
+    "stop-doractl": Fault("hit STOP $(pgrep -x doractl)", "thaw", weight=0),
+    "stop-gateway": Fault("hit STOP $(main_pid dora-gateway.service)", "thaw", 1),
+    "node-exit-1": Fault("order sink exit1"),
+    "node-exit-0": Fault("order source exit0", weight=1),
+    "node-leaves-child": Fault("order sink leave-child"),
+    "node-daemonises": Fault("order sink daemonise"),
+    "node-floods": Fault("order sink flood", weight=1),
+    "node-ignores": Fault("order sink ignore", weight=1),
+    "journald-restarts": Fault("systemctl restart systemd-journald.service"),
+    "bus-hangs": Fault("hit STOP $(main_pid dbus.service) && sleep 2; thaw", weight=1),
+    "logind-restarts": Fault("systemctl restart systemd-logind.service", weight=1),
+    "daemon-reload": Fault("systemctl daemon-reload"),
+    "daemon-reexec": Fault("systemctl daemon-reexec"),
+    "run-full": Fault("fill_run", "empty_run", 1),
+    "project-deleted": Fault(
+        'mv "$place/project" "$place/deleted"', 'mv "$place/deleted" "$place/project"'
+    ),
+    "project-read-only": Fault(
+        'mount --bind "$place/project" "$place/project"'
+        ' && mount -o remount,bind,ro "$place/project"',
+        'mountpoint -q "$place/project" && umount -l "$place/project"',
+    ),
+    "directory-deleted": Fault('rm -r "/run/dora-systemd/$name"', weight=1),
+}
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step: a key of COMMANDS or FAULTS, or LOOK. pause_ms: how long the driver does nothing
+    before it. is_joined: it begins while the one before still runs."""
+
+    what: str
+    cell: str = CELLS[0]
+    pause_ms: int = 0
+    is_joined: bool = False
+
+
+LOOK = "look"
+"""Undo the faults, wait until nothing changes any more, and ask everyone what there is."""
+
+
+def shell_of(what: str) -> str:
+    """The text that carries out a step."""
+    return COMMANDS[what].shell if what in COMMANDS else FAULTS[what].shell
