@@ -21,8 +21,10 @@ from dora_systemd.terminal_text import shown_log
 
 FORMS = {"short": "export", "cat": "export", "json": "json"}
 """By the output that was asked for, the output that the hosts are asked for."""
-_MOST_BYTES = 64 << 20
+_MOST_BYTES = 4 << 20
 """Of one record that is not complete."""
+_MOST_TIME = 253_370_764_800_000_000
+"""The year 9999, in µs."""
 _TIME = "__REALTIME_TIMESTAMP"
 
 
@@ -78,7 +80,9 @@ class LogPrinter:
                 self.merge.add(host.text, _time(value.get(_TIME)), line, now)
             return None
         for record in records.exported(data):
-            self.merge.add(host.text, _time(record.get(_TIME)), self._line(host, record), now)
+            at_us = _time(record.get(_TIME))
+            record[_TIME] = b"%d" % at_us
+            self.merge.add(host.text, at_us, self._line(host, record), now)
         return too_much(host) if records.pending > _MOST_BYTES else None
 
     def ended(self, host: Host, error: DoraSystemdError | None) -> DoraSystemdError | None:
@@ -111,6 +115,7 @@ class LogPrinter:
 def _time(value: object) -> int:
     """A time of the journal as µs; 0 for what is none."""
     try:
-        return int(value) if isinstance(value, str | bytes) else 0
+        number = int(value) if isinstance(value, str | bytes) else 0
     except ValueError:
         return 0
+    return number if 0 <= number <= _MOST_TIME else 0

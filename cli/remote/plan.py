@@ -68,7 +68,11 @@ def plan_of(context: click.Context, words: list[str]) -> Plan:
     wants_json = _value(context, "output") == "json"
     endless = any(options.get(name) for name in _FOLLOWING) or verb in ("run", "dora")
     endless |= verb == "top" and wants_json and not options.get("is_once")
-    return Plan(verb, words, options, _acts(context), wants_json, endless)
+    holds = verb == "inhibit" and options.get("selector") is not None
+    # What waits or holds a lock over there must not go on when this command has ended.
+    endless |= holds or (verb in ("restart", "reload") and bool(options.get("wait")))
+    acts = _acts(context) and (holds or verb != "inhibit")  # the list of locks is one text
+    return Plan(verb, words, options, acts, wants_json, endless)
 
 
 def _verb(context: click.Context) -> str:

@@ -11,6 +11,7 @@ from dora_systemd.decisions.remote.hosts import Host
 from dora_systemd.decisions.remote.stream import Lines, objects_of, read_json, with_host
 from dora_systemd.decisions.views.objects import error_object, format_json
 from dora_systemd.errors import DoraSystemdError
+from dora_systemd.terminal_text import one_line
 
 MOST_BYTES = 64 << 20
 """Of the answer of one host that is printed as a whole."""
@@ -159,9 +160,11 @@ class Complaints:
     def _print_words(self, host: Host, value: dict[str, object]) -> None:
         for found in (value.get("error"), value.get("warning")):
             if isinstance(found, dict):
-                print(f"doractl: {host.text}: {found.get('message')}", file=sys.stderr)
+                print(
+                    f"doractl: {host.text}: {one_line(str(found.get('message')))}", file=sys.stderr
+                )
                 if hint := found.get("hint"):
-                    print(f"{host.text}: hint: {hint}", file=sys.stderr)
+                    print(f"{host.text}: hint: {one_line(str(hint))}", file=sys.stderr)
 
     def _print_object(self, host: Host, value: dict[str, object]) -> None:
         print(format_json(with_host(value, host.text)), file=sys.stderr)

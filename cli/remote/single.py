@@ -14,7 +14,13 @@ from dora_systemd.decisions.remote.command import (
     remote_command,
     ssh_arguments,
 )
-from dora_systemd.decisions.remote.failures import SSH_FAILED, unreached, without_doractl
+from dora_systemd.decisions.remote.failures import (
+    SSH_FAILED,
+    is_of_ssh,
+    lost,
+    unreached,
+    without_doractl,
+)
 from dora_systemd.decisions.remote.hosts import Host
 from dora_systemd.errors import ExitCode
 from dora_systemd.terminal_text import shown_log
@@ -34,8 +40,8 @@ def run_there(host: Host, plan: Plan) -> int:
     command = remote_command(Way.TERMINAL, plan.words)
     status, said = run_on_terminal(ssh_arguments(host, Way.TERMINAL, command))
     if status == SSH_FAILED and said:
-        raise unreached(host, said)
-    if status == NO_PROGRAM and plan.verb != "dora":
+        raise lost(host, said) if is_of_ssh(said.encode()) else unreached(host, said)
+    if status == NO_PROGRAM and plan.verb not in ("dora", "inhibit"):
         raise without_doractl(host)
     print(said, end="", file=sys.stderr)
     return status if status >= 0 else 128 - status

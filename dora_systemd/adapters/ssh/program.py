@@ -1,12 +1,16 @@
 """Starts ssh(1), as the caller and with the caller's keys and configuration."""
 
 import os
+import select
 import subprocess
 from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
+
+_MOST_BYTES = 1 << 16
+"""Of what ssh has said, the last."""
 
 
 def start_ssh(arguments: Sequence[str], **streams: Any) -> "subprocess.Popen[bytes]":
@@ -37,10 +41,22 @@ def run_on_terminal(arguments: Sequence[str]) -> tuple[int, str]:
     os.set_blocking(read, False)
     try:
         with start_ssh(arguments, stderr=write) as child:
+            said = _hear(child.pid, read)
             status = child.wait()
         # Not to the end of the file: a connection that is shared, ControlPersist in ssh_config(5),
         # goes on and keeps it open.
-        return status, (read_now(read) or b"").decode("utf-8", "replace")
+        return status, (said + (read_now(read) or b"")).decode("utf-8", "replace")
     finally:
         os.close(read)
         os.close(write)
+
+
+def _hear(pid: int, read: int) -> bytes:
+    """The last that is written to a pipe until a process ends: a full pipe would hold it up."""
+    said, ended = b"", os.pidfd_open(pid)
+    try:
+        while ended not in select.select([ended, read], [], [])[0]:
+            said = (said + (read_now(read) or b""))[-_MOST_BYTES:]
+    finally:
+        os.close(ended)
+    return said

@@ -59,15 +59,21 @@ class Way(Enum):
 
 
 def quote(word: str) -> str:
-    r"""A word for any login shell: sh, csh and fish differ about \ within quotes, not outside."""
-    inner = re.sub(r"[\\']", lambda match: f"'\\{match[0]}'", word)
+    r"""A word for any login shell: sh, csh and fish differ about \ and ! in quotes, not outside."""
+    inner = re.sub(r"[\\'!]", lambda match: f"'\\{match[0]}'", word)
     return f"'{inner}'"
 
 
 def remote_command(way: Way, words: Sequence[str], mark: str = "") -> str:
     """What the login shell of the host runs. mark: printed first, if not TERMINAL."""
     first = [] if way is Way.TERMINAL else [mark]
-    return " ".join(["exec", "sh", "-c", *map(quote, (way.value, "doractl", *first, *words))])
+    script = _one_line(way.value)
+    return " ".join(["exec", "sh", "-c", *map(quote, (script, "doractl", *first, *words))])
+
+
+def _one_line(script: str) -> str:
+    """csh takes no newline within quotes."""
+    return re.sub(r"(?<! &)\n", "; ", script.strip("\n")).replace(" &\n", " & ")
 
 
 def ssh_arguments(host: Host, way: Way, command: str) -> list[str]:

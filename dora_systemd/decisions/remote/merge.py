@@ -11,6 +11,8 @@ WINDOW_SECONDS = 0.6
 a second."""
 MOST_HELD = 2000
 """Records of one host that are held: more of them stay in its pipe."""
+MOST_BYTES = 16 << 20
+"""The same, in bytes."""
 
 
 class Held(NamedTuple):
@@ -35,6 +37,7 @@ class Merge:
         self._sign = -1 if is_reverse else 1
         self._heap: list[Held] = []
         self._counts: Counter[str] = Counter()
+        self._bytes: Counter[str] = Counter()
         self._numbers = itertools.count()
 
     def add(self, host: str, at_us: int, data: bytes, now: float) -> None:
@@ -42,6 +45,7 @@ class Merge:
         held = Held(self._sign * at_us, next(self._numbers), host, now, data)
         heapq.heappush(self._heap, held)
         self._counts[host] += 1
+        self._bytes[host] += len(data)
 
     def end(self, host: str) -> None:
         """No more will come from that host."""
@@ -49,7 +53,7 @@ class Merge:
 
     def is_full(self, host: str) -> bool:
         """Whether enough of that host is held."""
-        return self._counts[host] >= MOST_HELD
+        return self._counts[host] >= MOST_HELD or self._bytes[host] >= MOST_BYTES
 
     @property
     def is_empty(self) -> bool:
@@ -64,6 +68,7 @@ class Merge:
         while self._heap and is_complete and self._is_due(now):
             held = heapq.heappop(self._heap)
             self._counts[held.host] -= 1
+            self._bytes[held.host] -= len(held.data)
             yield held
 
     def _is_due(self, now: float) -> bool:

@@ -64,7 +64,18 @@ def with_host(value: dict[str, Any], host: str) -> dict[str, Any]:
 def objects_of(text: str, host: str) -> list[dict[str, Any]] | None:
     """The object in a text, or those of a list, with their host; None if there are none."""
     value = read_json(text)
+    if not _is_printable(value):
+        return None
     found = value if isinstance(value, list) else [value]
     if not all(isinstance(one, dict) for one in found):
         return None
     return [with_host(one, host) for one in found]
+
+
+def _is_printable(value: object) -> bool:
+    """Whether json can write what it has read: it reads deeper lists than it writes."""
+    try:
+        json.dumps(value, indent=0)
+    except RecursionError:
+        return False
+    return True
