@@ -274,8 +274,14 @@ def choose(browser: Browser, action: str) -> None:
     """Choose an action of the menu, as soon as nothing else is being done."""
     button = f"#detail [data-action={action}]"
     browser.wait_js(f"!document.querySelector({json.dumps(button)}).disabled")
-    browser.click("#detail .menu summary")
-    browser.wait_js(f"document.querySelector({json.dumps(button)}).checkVisibility()")
+
+    def is_shown() -> bool:
+        # Once more, as a person does, if what is above has moved the menu away from the pointer.
+        if not browser.js("document.querySelector('#detail .menu').open"):
+            browser.click("#detail .menu summary")
+        return bool(browser.js(f"document.querySelector({json.dumps(button)}).checkVisibility()"))
+
+    wait_for("the menu is open", is_shown)
     browser.click(button)
     browser.wait_js("document.querySelector('#confirm').open")
 
