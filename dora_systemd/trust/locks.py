@@ -50,11 +50,11 @@ def place_of(lock: int) -> LockPlace:
 
 
 def take_lock(lock: int, is_shared: bool) -> bool:
-    """Lock an open file, see flock(2); False if another one prevents it."""
+    """Lock an open file, see flock(2); False if another one prevents it, or the kernel (ENOLCK)."""
     operation = fcntl.LOCK_SH if is_shared else fcntl.LOCK_EX
     try:
         fcntl.flock(lock, operation | fcntl.LOCK_NB)
-    except BlockingIOError:
+    except OSError:
         return False
     return True
 

@@ -1,5 +1,6 @@
 """The stock dora command, pointed at the gateway, with dataflows of two users."""
 
+import fcntl
 import json
 import os
 import shutil
@@ -219,6 +220,18 @@ def test_single_nodes(dora: Dora, three: list[Cell]) -> None:
     dora("node", "stop", "sink", "-d", "two", "--grace", "2s")
     wait_for("it is gone", lambda: not three[1].status.nodes["sink"].is_alive)
     assert [three[n].status.nodes for n in (0, 2)] == [before[0], before[2]]
+
+
+@pytest.mark.warns("on shutdown")
+def test_a_restart_that_is_inhibited(dora: Dora, three: list[Cell]) -> None:
+    two = three[1]
+    before = two.show("InvocationID")
+    with (two.scope.cell_directory("two") / "inhibit.lock").open("a") as lock:
+        fcntl.flock(lock, fcntl.LOCK_SH)
+        assert "cannot restart two: inhibited by" in dora.refusal("restart", "two")
+    assert two.show("InvocationID") == before
+    dora("restart", "two")
+    assert two.show("InvocationID") != before
 
 
 @pytest.mark.warns("on shutdown")

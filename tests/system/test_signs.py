@@ -56,6 +56,18 @@ print("runs", flush=True)
 while True:
     time.sleep(3600)
 """
+PARENT = """
+import subprocess, time
+from dora import Node
+node = Node()
+subprocess.Popen(["sleep", "3600"], start_new_session=True)
+time.sleep(3600)
+"""
+IDLE = """
+from dora import Node
+for event in Node():
+    pass
+"""
 LIAR = f"""
 import pathlib
 from dora import Node
@@ -162,6 +174,16 @@ def test_no_node_speaks_for_another(cell: Cell, project: Project) -> None:
     (record, *_) = cell.journal("DORA_EVENT=notify-refused")
     assert record["DORA_SENDER"] == str(cell.pids("node-liar")[0])
     assert cell.pids("node-feeder") == [feeder]
+
+
+@pytest.mark.warns(*ENDED)
+def test_nothing_is_left_of_a_node_that_is_not_restarted(cell: Cell, project: Project) -> None:
+    project.write("flow.systemd.yml", f"nodes: {{parent: {{watchdog: {limit()}s}}}}")
+    cell.start(project.root / write_flow(project, parent=PARENT, idle=IDLE))
+    wait_for("it has failed", lambda: ("node-crashed", "parent") in cell.events())
+    wait_for("nothing is left of it", lambda: not cell.pids("node-parent"))
+    assert cell.status.nodes["parent"].state == "failed"
+    assert cell.status.nodes["idle"].state == "running"
 
 
 BAD = {

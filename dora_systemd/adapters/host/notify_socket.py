@@ -96,11 +96,13 @@ class Pending:
             return self.pid > 0
         if self._pidfd < 0:
             return False
-        with contextlib.suppress(ProcessLookupError):
-            with contextlib.suppress(PermissionError):
-                pidfd_send_signal(self._pidfd, 0)
-            return self.pid > 0
-        return False
+        try:
+            pidfd_send_signal(self._pidfd, 0)
+        except OSError as error:
+            # EPERM: of another user. EINVAL: of a PID namespace that is not below ours.
+            if isinstance(error, ProcessLookupError):
+                return False
+        return self.pid > 0
 
     def __enter__(self) -> "Pending":
         return self

@@ -62,8 +62,13 @@ def _existing(path: str) -> set[str]:
 
     The latter tells when the former is moved away.
     """
-    parent = next(one for one in Path(path).parents if one.is_dir() or one == one.parent)
+    parent = next(one for one in Path(path).parents if _is_directory(one) or one == one.parent)
     return {str(parent), str(parent.parent)}
+
+
+def _is_directory(path: Path) -> bool:
+    """Whether a directory is there; not if nobody can tell, such as without permission."""
+    return os.path.isdir(path)  # noqa: PTH112 - up to Python 3.13, is_dir() raises for EACCES
 
 
 def _first_link(path: str) -> str | None:

@@ -109,7 +109,9 @@ def _needs(nodes: NodeTable, event: life.NodeLacks | life.NodeMet) -> Update:
 
 def _lacks(nodes: NodeTable, event: life.NodeLacks) -> Update:
     old = nodes.get(event.node, NodeStatus())
-    nodes = _set(nodes, event.node, event.at_us, state="waiting", needs=event.needs, hung="")
+    # Its end is told as a wait: what was wrong with it before is over.
+    ended: dict[str, str | int] = {"hung": "", "silent": "", "is_ended": False}
+    nodes = _set(nodes, event.node, event.at_us, state="waiting", needs=event.needs, **ended)
     if old.state == "waiting":
         return nodes, None
     return nodes, Record("node-waiting", event.node, {"reason": event.needs})

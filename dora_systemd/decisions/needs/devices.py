@@ -34,12 +34,19 @@ _GROUPS: tuple[tuple[str, tuple[str, ...]], ...] = (
     (r"sd[a-z]+\d*", ("block-sd",)),
     (r"mmcblk\d+.*", ("block-mmc",)),
 )
+_ALWAYS = frozenset(f"/dev/{one}" for one in ("null", "zero", "full", "random", "urandom", "tty"))
+"""Devices that no sandbox closes, see DevicePolicy= in systemd.resource-control(5)."""
 
 
 def device_entries(needs: Iterable[NodeNeed]) -> tuple[str, ...]:
     """The values of DeviceAllow= for what nodes need below /dev."""
     entries = (entry for one in needs for entry in _entries(one.path))
     return tuple(dict.fromkeys(f"{entry} rw" for entry in entries))
+
+
+def lone_devices(needs: Iterable[NodeNeed]) -> tuple[NodeNeed, ...]:
+    """The needed devices that have no group here: they stay closed unless the start finds them."""
+    return tuple(one for one in needs if one.path not in _ALWAYS and one.path in _entries(one.path))
 
 
 def _entries(path: str) -> tuple[str, ...]:

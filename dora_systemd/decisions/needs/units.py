@@ -35,7 +35,8 @@ def needs_properties(needs: tuple[str, ...], clock: str) -> dict[str, Property]:
     """
     wanted = [NETWORK_UNIT] if NETWORK in needs else []
     wanted += [CLOCK_UNIT, *([clock] if clock else [])] if CLOCK in needs else []
-    required = list(required_units(needs).values())
+    # As in a unit file, in which the escapes of a unit's name have to be escaped.
+    required = [one.replace("\\", "\\\\") for one in required_units(needs).values()]
     lines = [f"Wants={one}" for one in wanted]
     lines += [f"Requires={one}" for one in required]
     lines += [f"After={one}" for one in (*wanted, *required)]

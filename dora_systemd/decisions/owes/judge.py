@@ -28,13 +28,15 @@ class Look:
     """What is known at one moment. at_us, beat_us, heard: CLOCK_MONOTONIC, 0 is never.
 
     beat_us: the last beat of the probe. heard: the last message of each owed output. lives: by
-    node that runs, when its process became ready.
+    node that runs, when its process became ready. probe: the number of the one that has noted the
+    beat.
     """
 
     at_us: int
     beat_us: int
     heard: Sequence[int]
     lives: Mapping[str, int]
+    probe: int = 0
 
 
 @dataclass(frozen=True)
@@ -67,11 +69,15 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Judge:
-    """The state of the watch over `owes`. at_us: the last look, 0 before the first."""
+    """The state of the watch over `owes`. at_us: the last look, 0 before the first.
+
+    probe: the one that was heard at the last look.
+    """
 
     owes: tuple[Owed, ...]
     ears: tuple[Ear, ...] = ()
     at_us: int = 0
+    probe: int = 0
 
     @property
     def tick(self) -> int:
@@ -100,13 +106,15 @@ def look(judge: Judge, now: Look) -> tuple[Judge, tuple[Verdict, ...]]:
     if now.at_us - now.beat_us > BEATS * judge.tick:
         step = 0
     before = judge.ears or (Ear(),) * len(judge.owes)
+    if now.probe != judge.probe:  # nobody heard what came between two probes
+        step, before = 0, tuple(replace(ear, quiet=0) for ear in before)
     ears: list[Ear] = []
     verdicts: list[Verdict] = []
     for owed, ear, heard in zip(judge.owes, before, now.heard, strict=True):
         after = _judged(owed, _listen(ear, now.lives.get(owed.node, 0), heard, step), now.at_us)
         verdicts += _verdicts(owed, ear, after, now.at_us)
         ears.append(after)
-    return replace(judge, ears=tuple(ears), at_us=now.at_us), tuple(verdicts)
+    return replace(judge, ears=tuple(ears), at_us=now.at_us, probe=now.probe), tuple(verdicts)
 
 
 def _listen(ear: Ear, life: int, heard: int, step: int) -> Ear:

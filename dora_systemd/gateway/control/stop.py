@@ -3,6 +3,7 @@
 import asyncio
 import signal
 from collections.abc import Callable
+from contextlib import ExitStack
 from typing import Any
 
 from dora_systemd.adapters.bus.systemd import Bus
@@ -17,6 +18,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.values import SECOND
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.selector import Selector
+from dora_systemd.verbs.inhibit.guard import uninhibited
 from dora_systemd.verbs.stop import note_stop, restart_cells, stop_cells
 
 _FORCE_SECONDS = 0.2
@@ -44,11 +46,25 @@ async def stop(talk: Talk, request: Request) -> dict[str, Any]:
 async def restart(talk: Talk, request: Request) -> dict[str, Any]:
     """Restart and RestartByName. Raises DoraSystemdError."""
     scope, cell = talk.scope, await _find(talk, request)
-    await asyncio.to_thread(note_stop, [cell], "dora restart")
-    outcome = await _within(scope, cell, request, lambda: restart_cells(Bus(scope), [cell])[0])
+    with ExitStack() as held:
+        # Before the time of `_within` begins, which ends in a kill.
+        await asyncio.to_thread(_hold, held, scope, cell)
+        await asyncio.to_thread(note_stop, [cell], "dora restart")
+        outcome = await _within(scope, cell, request, lambda: restart_cells(Bus(scope), [cell])[0])
     if outcome.problem:
         raise DoraSystemdError(outcome.problem, f"doractl {scope.flag} why {cell.name} tells more")
     return {"DataflowRestarted": {"old_uuid": cell.uuid, "new_uuid": cell.uuid}}
+
+
+def _hold(held: ExitStack, scope: Scope, cell: Cell) -> None:
+    """Take the lock of the dataflow into `held`. Raises DoraSystemdError as uninhibited()."""
+    try:
+        held.enter_context(uninhibited(scope, [cell], "restart"))
+    except DoraSystemdError as error:
+        if error.code is not ExitCode.INHIBITED:
+            raise
+        hint = f"doractl {scope.flag} restart --wait {cell.name} waits until it is free"
+        raise DoraSystemdError(error.message, hint, error.code) from error
 
 
 async def _find(talk: Talk, request: Request) -> Cell:

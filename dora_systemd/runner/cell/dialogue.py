@@ -14,6 +14,7 @@ from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.decisions.cell.exits import Exit
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.owed import is_probe
+from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.dora import life_events, protocol
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.nodes import lacking, with_process
@@ -163,12 +164,17 @@ class Dialogue(Tasks):
             essential = is_essential(self._options.node_rights, event.node)
             oom = self._nodes.find_oom(event.node)
             event = life_events.with_facts(event, is_stale, oom, essential)
-            if node is not None and event.exit.is_failure and event.will_restart and not is_stale:
-                self._nodes.clear(event.node, node.pid)
+            if node is not None and not is_stale:
+                self._clear(event, node)
         if event is not None:
             self._pump.push(event)
         if isinstance(event, life.NodeExited) and not event.is_stale:
             self._nodes.forget(event.node)
+
+    def _clear(self, event: life.NodeExited, node: NodeStatus) -> None:
+        """Kill the leftovers that a next process would meet, or that a watchdog was to end."""
+        if event.exit.is_failure and (event.will_restart or node.hung):
+            self._nodes.clear(event.node, node.pid)
 
     async def _ask_spawn(self) -> None:
         params = protocol.wait_spawn_params(self._pump.cell.run)

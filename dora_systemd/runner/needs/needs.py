@@ -24,6 +24,8 @@ from dora_systemd.runner.reload.apply import Run
 from dora_systemd.values import INFINITY, SECOND
 
 _LOOK_SECONDS = 2.0
+_PAUSE_SECONDS = 0.05
+"""A directory may change without end, such as /tmp: more looks than this would only cost time."""
 _AGAIN = "plugged in again"
 _STATES = (State.WAITING, State.RUNNING)
 
@@ -81,6 +83,7 @@ class Needs:
                 self._watch.clear()
                 self._act(await asyncio.to_thread(self._look))
                 await self._watch.wait(_LOOK_SECONDS)
+                await asyncio.sleep(_PAUSE_SECONDS)
 
     def _look(self) -> dict[str, list[Presence]]:
         # Watch first: what changes after the look is not missed then.

@@ -47,6 +47,8 @@ class Probe:
         self._path = paths.times
         self._group = unit / f"{cgroup.NODE_PREFIX}{PROBE}"
         self._count = 0
+        self._added_us = 0
+        self._number = 0
         self._beat = 0
         self._quiet = 0
         self._next_us = 0
@@ -63,7 +65,18 @@ class Probe:
                 self._tell("the probe ended again and again")
             self._next_us, self._pause = now + self._pause, min(2 * self._pause, _LATE)
             self._quiet = 0
+            self._added_us = now
             await self._add(inputs)
+
+    def heard(self, beat: int) -> tuple[int, int]:
+        """The number of the probe that has noted `beat`, and the beat; 0 if that probe has gone.
+
+        Messages that come before the next one listens are noted by nobody.
+        """
+        is_own = beat > self._added_us
+        if is_own:
+            self._number = self._count
+        return self._number, beat if is_own and cgroup.is_populated(self._group) else 0
 
     def _inputs(self) -> list[tuple[int, Owed]]:
         """The owed outputs of nodes that have not ended for good, each with its place."""

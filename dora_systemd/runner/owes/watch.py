@@ -65,7 +65,8 @@ class Watch:
             # CLOCK_MONOTONIC: it stands while the machine is suspended, and nobody sets it.
             now = int(loop.time() * SECOND)
             beat, heard = parse_times(self._times.read(), self._judge.owes, now)
-            self._look(Look(now, beat, heard, self._lives(now)))
+            number, fresh = self._probe.heard(beat)
+            self._look(Look(now, fresh, heard, self._lives(now), number))
             await self._probe.tend(beat, now)
             await asyncio.sleep(self._judge.tick / SECOND)
 

@@ -7,11 +7,13 @@ from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.decisions.cell.needs import CLOCK, NodeNeed
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import WAITS
+from dora_systemd.decisions.needs.devices import lone_devices
 from dora_systemd.decisions.needs.units import CLOCK_WAITERS
 from dora_systemd.names import unit_name
 from dora_systemd.values import shown
 
 _UNIT_PATHS = ("/etc/systemd/system", "/usr/lib/systemd/system", "/lib/systemd/system")
+_GROUPS = ("char-", "block-")
 _HIDDEN = ("/tmp/", "/var/tmp/")
 
 
@@ -24,14 +26,29 @@ def clock_service() -> str:
 
 
 def needs_warnings(
-    needs: tuple[str, ...], nodes: tuple[NodeNeed, ...], has_own_tmp: bool
+    needs: tuple[str, ...], nodes: tuple[NodeNeed, ...], has_mounts: bool, allowed: tuple[str, ...]
 ) -> Iterator[str]:
-    """Warnings about needs that nothing here meets. has_own_tmp: the nodes do not see /tmp."""
+    """Warnings about needs that nothing here meets.
+
+    has_mounts: the sandbox has a /tmp of its own, and closes devices. allowed: DeviceAllow= of the
+    settings.
+    """
     if CLOCK in needs and not clock_service():
         yield "nothing waits for the clock: neither systemd-timesyncd nor chrony is installed"
+    if has_mounts:
+        yield from _sandbox_warnings(nodes, allowed)
+
+
+def _sandbox_warnings(nodes: tuple[NodeNeed, ...], allowed: tuple[str, ...]) -> Iterator[str]:
     for node, path in nodes:
-        if has_own_tmp and path.startswith(_HIDDEN):
+        if path.startswith(_HIDDEN):
             yield f"node {node} waits for {shown(path)}, but the sandbox has its own /tmp"
+    if any(one.startswith(_GROUPS) for one in allowed):
+        return  # probably that of the device: which one it has is only known when it is there
+    for node, path in lone_devices(nodes):
+        reason = "the sandbox opens it only if it is there at the start"
+        hint = "name its group of /proc/devices, such as --device char-GROUP"
+        yield f"node {node} waits for {shown(path)}, but {reason}; {hint}"
 
 
 def waiting_notes(manager: Manager, options: RunnerOptions) -> Iterator[str]:

@@ -5,6 +5,7 @@ import sys
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.dora.command import version_numbers
 from dora_systemd.decisions.properties.kinds import Property
+from dora_systemd.decisions.settings.limits import DEVICE
 from dora_systemd.decisions.settings.needs import NEEDS
 from dora_systemd.decisions.settings.runner_options import idle_warnings
 from dora_systemd.decisions.unit.file import persistent_unit
@@ -25,14 +26,14 @@ def plan_properties(plan: Plan, manager: Manager) -> tuple[dict[str, Property], 
     The warnings are about unsupported properties, and limits above the machine's size. Raises
     DoraSystemdError.
     """
-    needs, has_own_tmp = plan.settings[NEEDS], plan.sandbox.has_mounts
+    needs, allowed = plan.settings[NEEDS], plan.settings[DEVICE]
     check_needs(manager, Needy(plan.options.name, plan.scope.is_user, needs))
     properties, warnings = drop_unsupported(_properties(plan), systemd_number(manager))
     warnings = (
         *warnings,
         *idle_warnings(plan.settings),
         *watch_warnings(plan),
-        *needs_warnings(needs, plan.options.needs, has_own_tmp),
+        *needs_warnings(needs, plan.options.needs, plan.sandbox.has_mounts, allowed),
     )
     warnings = (*warnings, *sandbox_warnings(plan.sandbox))
     return properties, (*warnings, *check_limits(manager, plan, properties))

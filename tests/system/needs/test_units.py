@@ -51,6 +51,17 @@ def test_a_dataflow_stops_with_the_one_that_it_needs(
     assert cell.show("Result") == "success"
 
 
+def test_a_dataflow_stops_with_a_unit_whose_name_is_escaped(cell: Cell, project: Project) -> None:
+    flag, unit = cell.scope.flag, f"{cell.name[:50]}-a\\x2db.service"
+    run("systemd-run", flag, "--collect", f"--unit={unit}", "sleep", "infinity")
+    try:
+        cell.start(one_node(project), "--needs", f"unit:{unit}")
+    finally:
+        run("systemctl", flag, "stop", unit)
+    wait_for("it stops too", lambda: cell.is_gone)
+    assert cell.show("Result") == "success"
+
+
 def test_bad_needs_are_refused_before_anything_starts(cell: Cell, project: Project) -> None:
     assert "cannot wait for 'netwrok'" in refusal(cell, project, "netwrok")
     assert "wait for each other" in refusal(cell, project, f"dataflow:{cell.name}")

@@ -4,7 +4,7 @@ import pytest
 
 from dora_systemd.decisions.cell.needs import NodeNeed
 from dora_systemd.decisions.cell.status import HELD, LATCHED, NODE_STATES, NodeStatus
-from dora_systemd.decisions.needs.devices import device_entries
+from dora_systemd.decisions.needs.devices import device_entries, lone_devices
 from dora_systemd.decisions.needs.steps import Do, NeedStep, need_steps
 
 GONE = "/dev/video0 (not there)"
@@ -70,3 +70,8 @@ def test_the_sandbox_opens_the_group_of_a_device() -> None:
     assert device_entries(NodeNeed("camera", path) for path in paths) == (
         *("char-video4linux rw", "char-ttyUSB rw", "char-ttyACM rw", "/dev/odd rw"),
     )
+
+
+def test_a_device_without_a_group_is_told() -> None:
+    sandboxed = [NodeNeed("arm", f"/dev/{one}") for one in ("odd", "video0", "null", "shm/map")]
+    assert lone_devices(sandboxed) == (NodeNeed("arm", "/dev/odd"),)

@@ -1,6 +1,7 @@
 """What the gateway does for others: the buttons of the page, and stop and restart of dora."""
 
 import asyncio
+import fcntl
 import json
 import os
 import signal
@@ -22,6 +23,7 @@ from dora_systemd.gateway.control.serve import HANDLERS
 from dora_systemd.gateway.control.talk import Talk
 from dora_systemd.gateway.live import act as acting
 from dora_systemd.gateway.live.act import act, read_graph
+from dora_systemd.runner.cell.begin import make_lock
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.start.again import Asked
 from dora_systemd.verbs.start.plan import StartRequest
@@ -251,6 +253,22 @@ def test_the_next_life_of_a_unit_is_not_killed(bench: Bench) -> None:
 def test_a_dora_restart(bench: Bench) -> None:
     answer = bench.ask("Restart", dataflow_uuid=UUID)
     assert answer == {"DataflowRestarted": {"old_uuid": UUID, "new_uuid": UUID}}
+
+
+def test_a_dora_restart_asks_for_locks(bench: Bench) -> None:
+    lock = bench.scope.cell_directory("robot") / "inhibit.lock"
+    lock.parent.mkdir(parents=True)
+    make_lock(lock)
+    with lock.open("a") as file:
+        fcntl.flock(file, fcntl.LOCK_SH)
+        with pytest.raises(DoraSystemdError, match="cannot restart robot: inhibited by") as caught:
+            bench.ask("RestartByName", name="robot", force=True)
+    assert caught.value.code is ExitCode.INHIBITED
+    assert "restart --wait robot" in caught.value.hint
+    assert not bench.manager.calls
+    assert not bench.notes
+    bench.ask("Restart", dataflow_uuid=UUID)
+    assert bench.jobs == ["RestartUnit"]
 
 
 def test_a_dora_restart_that_fails(bench: Bench) -> None:

@@ -88,3 +88,10 @@ def test_use_of_a_file_wakes_nobody(tmp_path: Path) -> None:
         watch.close()
 
     asyncio.run(scene())
+
+
+def test_a_path_at_which_nobody_may_look(tmp_path: Path) -> None:
+    """Python 3.11 raises for a name that is too long, as it does without permission."""
+    path = f"{tmp_path}/{'x' * 300}/camera"
+    assert look_at(path).reason == "not there"
+    assert str(tmp_path) in watched_places([path])

@@ -1,5 +1,6 @@
 """Locks that inhibit restarts: who holds them, who is refused, and what a hostile owner can do."""
 
+import errno
 import fcntl
 import os
 import signal
@@ -16,6 +17,7 @@ import pytest
 from dora_systemd.decisions.cell.environment import LOCK_VARIABLE, node_environment
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.runner.cell.begin import make_lock
+from dora_systemd.trust.locks import take_lock
 from dora_systemd.verbs.facts.cells import Cell, read_cells
 from dora_systemd.verbs.facts.locks import read_holders
 from dora_systemd.verbs.inhibit.guard import IfInhibited, require_uninhibited, uninhibited
@@ -101,6 +103,15 @@ def test_the_reasons_of_others_do_not_count(scope: ScopeIn, lock: Path) -> None:
         os.write(file, b"\xff\n1 not mine\n99999999999999999999 x\n-1 x\n\n" + b"x" * 100_000)
         (holder,) = read_holders(scope, ["robot"])["robot"]
     assert holder.why == ""
+
+
+def test_a_file_system_without_locks(monkeypatch: pytest.MonkeyPatch, lock: Path) -> None:
+    def refuse(*_: int) -> None:
+        raise OSError(errno.ENOLCK, "no locks")
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    with lock.open("a") as file:
+        assert not take_lock(file.fileno(), is_shared=True)
 
 
 def test_force(scope: ScopeIn, cell: Cell, lock: Path) -> None:

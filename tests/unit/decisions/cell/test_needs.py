@@ -107,3 +107,9 @@ def test_needs_become_dependencies_of_the_unit() -> None:
     assert set(found["After"]) == {*wanted, *found["Requires"]}
     assert found["RequiresMountsFor"] == ("/mnt/a b",)
     assert needs_properties((), "chrony-wait.service") == {}
+
+
+def test_the_escapes_of_a_unit_stay() -> None:
+    unit = r"dev-disk-by\x2duuid-1.device"
+    found = needs_properties((f"unit:{unit}",), "")
+    assert (found["Requires"].value, found["After"].value) == ((unit,), (unit,))

@@ -119,3 +119,17 @@ def test_the_policy_of_such_a_node_is_known_by_its_delay() -> None:
     raw = {"id": "camera", **LATCH_KEYS}
     node = initial_nodes({"camera": "python"}, {"nodes": [raw]}, 1)["camera"]
     assert (node.policy, node.max_restarts) == (LATCHED, 0)
+
+
+def test_a_silent_node_that_loses_its_device_is_watched_again() -> None:
+    cell = cell_of(State.RUNNING, camera=CAMERA)
+    silent = life.NodeSilent(1, "camera", "image", "no image for 2s", "restart", "no image for 2s")
+    cell, _ = after(
+        cell,
+        silent,
+        life.NodeLacks(2, "camera", GONE),
+        life.NodeExited(3, "camera", exit_of(0), True),
+        life.NodeMet(4, "camera"),
+    )
+    node = cell.nodes["camera"]
+    assert (node.state, node.silent, node.is_ended, node.hung) == ("starting", "", False, "")

@@ -39,6 +39,7 @@ class World:
         self.verdicts: list[Verdict] = []
         self.speaks: Callable[[int], bool] = always
         self.has_probe = True
+        self.probe = 1
         self.restarted: list[int] = []
 
     def run(self, duration: int, late: int = 0) -> "World":
@@ -64,7 +65,9 @@ class World:
 
     def look(self) -> None:
         lives = {"camera": self.life} if self.now >= self.life else {}
-        self.judge, found = look(self.judge, Look(self.now, self.beat, (self.heard,), lives))
+        beat = self.beat if self.has_probe else 0
+        now = Look(self.now, beat, (self.heard,), lives, self.probe)
+        self.judge, found = look(self.judge, now)
         self.verdicts += found
         if any(one.is_silent and one.owed.then == "restart" for one in found):
             self.restarted.append(self.now)
@@ -213,3 +216,16 @@ def test_the_tick_depends_on_the_shortest_time() -> None:
     assert World().judge.tick == SECOND // 4
     assert World(CAMERA._replace(within=HOUR, first=HOUR)).judge.tick == SECOND
     assert World(CAMERA._replace(first=SECOND // 5)).judge.tick == SECOND // 40
+
+
+@pytest.mark.parametrize("gap", [SECOND // 2, SECOND, 2 * SECOND, 10 * SECOND])
+def test_nobody_is_silent_for_what_came_between_two_probes(gap: int) -> None:
+    world = World(period=1_900_000)
+    for _ in range(40):
+        world.run(7 * SECOND + SECOND // 4)
+        world.has_probe = False
+        world.run(gap)
+        world.has_probe, world.probe = True, world.probe + 1
+    assert not world.verdicts
+    world.speaks = never
+    assert world.run(3 * SECOND).words() == ["no image for 2s"]

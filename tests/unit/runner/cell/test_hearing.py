@@ -1,6 +1,7 @@
 """What dora tells of the nodes, and what is done about it before it becomes an event."""
 
 import asyncio
+from dataclasses import replace
 from pathlib import Path
 
 from dora_systemd.decisions.cell.exits import Exit, exit_of
@@ -53,6 +54,17 @@ def test_what_a_crashed_node_has_left_goes_before_the_next_one(tmp_path: Path) -
         done = await hear(bench, EXITED.format("true"))
         assert done == [("clear", "a", 7), ("push", "NodeExited"), ("forget", "a")]
         assert bench.heard == [life.NodeExited(0, "a", exit_of(1), True)]
+
+    live(work)
+
+
+def test_what_a_hung_node_has_left_is_killed_even_for_good(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        node = bench.pump.cell.nodes["a"]._replace(hung="no WATCHDOG=1 for 5s")
+        bench.pump.cell = replace(bench.pump.cell, nodes={"a": node})
+        done = await hear(bench, EXITED.format("false"))
+        assert done == [("clear", "a", 7), ("push", "NodeExited"), ("forget", "a")]
 
     live(work)
 

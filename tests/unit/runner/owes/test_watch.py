@@ -250,3 +250,24 @@ def test_nodes_that_have_ended_owe_nothing(tmp_path: Path) -> None:
     bench = lived(tmp_path, work)
     assert bench.added() == []
     assert not bench.named("node-silent", "outputs-unwatched")
+
+
+def test_a_node_that_speaks_while_the_probe_is_replaced(tmp_path: Path) -> None:
+    """One message in 1.9 s, and none of them is noted while there is no probe."""
+
+    async def work(bench: Bench) -> None:
+        for _ in range(10):
+            await bench.work(0.2)
+            bench.speaks = False
+            await bench.work(1.8)
+            bench.populate(False)
+            bench.listens = False
+            await bench.work(1.5)
+            bench.listens = True
+            await bench.work(1)
+            bench.speaks = True
+            await bench.work(40)
+
+    bench = lived(tmp_path, work)
+    assert len(bench.added()) == 11
+    assert not bench.named("node-silent")

@@ -3,16 +3,19 @@
 import asyncio
 import os
 import socket
+import struct
 import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager, closing
+from errno import EINVAL, EPERM, ESRCH
 from pathlib import Path
 from signal import SIGABRT
 
 import pytest
 
 from dora_systemd.adapters.cgroup import members
+from dora_systemd.adapters.host import notify_socket
 from dora_systemd.adapters.host.notify_socket import NotifySocket
 from dora_systemd.decisions.signs.table import Sign
 from dora_systemd.decisions.signs.watchdogs import Watchdogs
@@ -182,3 +185,21 @@ def test_members(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     assert [members.is_member(group, pid) for pid in (3, 5, 7, 9)] == [True, True, False, False]
     members.signal_group(group, SIGABRT, 5)
     assert sent == [6, 6]
+
+
+@pytest.mark.parametrize(
+    ("number", "is_there"), [(0, True), (EPERM, True), (EINVAL, True), (ESRCH, False)]
+)
+def test_a_sender_that_gets_no_signal_of_ours(
+    number: int, is_there: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: int) -> None:
+        if number:
+            raise OSError(number, "no")
+
+    monkeypatch.setattr(notify_socket, "pidfd_send_signal", refuse)
+    credentials = socket.SOL_SOCKET, socket.SCM_CREDENTIALS, struct.pack("iII", 7, 0, 0)
+    read, write = os.pipe()
+    os.close(write)
+    with notify_socket.Pending(b"", [credentials, (1, 4, struct.pack("i", read))]) as pending:
+        assert pending.is_there() is is_there
