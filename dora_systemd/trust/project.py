@@ -13,6 +13,7 @@ import select
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -107,8 +108,7 @@ class Project:
     def _ask(self, request: dict[str, Any], path: str) -> Iterator[bytes]:
         assert self._child.stdin
         try:
-            self._child.stdin.write(json.dumps(request).encode() + b"\n")
-            self._child.stdin.flush()
+            self._send(json.dumps(request).encode() + b"\n")
             while (frame := self._frame())[0] == b"+":
                 yield frame[1]
         except (BrokenPipeError, ValueError) as error:
@@ -118,17 +118,29 @@ class Project:
             hint = "let that user read it, or name it in .gitignore"
             raise self._refusal(path, reason, hint, ExitCode.BAD_INPUT)
 
+    def _send(self, data: bytes) -> None:
+        assert self._child.stdin
+        fd = self._child.stdin.fileno()
+        os.set_blocking(fd, False)  # the child may be stopped, and a pipe has 64 KiB
+        while data:
+            if not select.select([], [fd], [], _SECONDS)[1]:
+                raise BrokenPipeError
+            data = data[os.write(fd, data) :]
+
     def _frame(self) -> tuple[bytes, bytes]:
-        head = self._receive(_HEAD)
+        deadline = time.monotonic() + _SECONDS
+        head = self._receive(_HEAD, deadline)
         if not head[1:].isdigit() or int(head[1:]) > courier.CHUNK:
             raise ValueError(head)
-        return head[:1], self._receive(int(head[1:]))
+        if head[:1] == b"+" and not int(head[1:]):
+            raise ValueError(head)  # else an answer could have no end
+        return head[:1], self._receive(int(head[1:]), deadline)
 
-    def _receive(self, count: int) -> bytes:
+    def _receive(self, count: int, deadline: float) -> bytes:
         assert self._child.stdout
         fd, received = self._child.stdout.fileno(), bytearray()
         while len(received) < count:
-            ready = select.select([fd], [], [], _SECONDS)[0]
+            ready = select.select([fd], [], [], max(deadline - time.monotonic(), 0))[0]
             chunk = os.read(fd, count - len(received)) if ready else b""
             if not chunk:
                 raise BrokenPipeError

@@ -85,6 +85,8 @@ def _try(
             fault = Fault("the command was interrupted")
         except DoraSystemdError as error:
             fault = Fault(error.message)
+        except Exception as error:  # a terminal that is gone, too
+            fault = Fault(f"the command failed: {error}")
         if fault is not None:
             _ignore_signals()
             raise _roll_back(manager, standing, change, fault)

@@ -70,6 +70,7 @@ def test_an_unfinished_one_is_no_release(store: Store) -> None:
     draft.write("a", [b"x"], False)
     assert store.known() == []
     (left,) = store.unfinished()
+    assert left.stat().st_mode & 0o777 == 0o700  # others may not read what it copies
     store.clean()
     assert not left.exists()
 

@@ -1,6 +1,7 @@
 """The child that reads a project, and what is believed of it."""
 
 import os
+import signal
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -80,6 +81,7 @@ LIARS = {
     "other JSON": "sys.stdout.write('+0000004null.0000000')",
     "other rows": "sys.stdout.write('+0000013[[1,2,3,4,5]].0000000')",
     "negative": """sys.stdout.write('+0000033[["a","file",-1,false,"","s"]]   .0000000')""",
+    "empty frames": "[sys.stdout.write('+0000000') for _ in range(5000)]",
     "endless": "[sys.stdout.write('+0001000' + ' ' * 1000) for _ in range(5000)]",
 }
 
@@ -95,3 +97,10 @@ def test_a_child_that_lies(lie: str, tmp_path: Path, monkeypatch: pytest.MonkeyP
         pytest.raises(DoraSystemdError, match="no answer"),
     ):
         project.listed("", 10)
+
+
+def test_a_child_that_stops(project: Project, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_SECONDS", 0.1)
+    os.kill(project._child.pid, signal.SIGSTOP)
+    with pytest.raises(DoraSystemdError, match="no answer"):
+        project.facts(["x" * 4000] * 100)  # more than a pipe holds
