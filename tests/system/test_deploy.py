@@ -130,7 +130,7 @@ def test_what_cannot_run_is_refused_while_the_old_one_runs(
     assert "cannot copy link" in releases.deploy(project.root, status=5)
     # Somebody else is at it.
     (project.root / "link").unlink()
-    with locked(releases.path):
+    with locked(STORE / f".{cell.name}.lock"):
         assert "another deploy" in releases.deploy(project.root, status=1)
     assert (cell.show("InvocationID"), releases.states()) == (life, known)
     assert not Path("/proof").exists()
