@@ -183,6 +183,21 @@ def test_an_interrupted_trial_is_undone(releases: Releases, project: Project) ->
     assert not releases.trial.exists()
 
 
+def test_a_first_trial_that_was_killed_can_be_ended(releases: Releases, project: Project) -> None:
+    cell = releases.cell
+    write_version(project, "first")
+    with begin(releases, project, "1h") as child:
+        wait_for("it runs", lambda: "version first" in cell.messages("a"))
+        child.kill()
+    assert "trial" in releases.states().values()
+    assert "its trial has ended" in cell.doractl("rollback", cell.name).stdout
+    assert (releases.running(), list(releases.states().values())) == ("", ["unproved"])
+    assert not releases.trial.exists()
+    assert not (ETC / cell.unit).exists()
+    again = cell.doractl("rollback", cell.name, check=False)
+    assert (again.returncode, "no release before" in again.stderr) == (3, True)
+
+
 ROUNDS = int(os.environ.get("ROUNDS", "6"))
 
 
