@@ -195,7 +195,7 @@ def test_a_first_trial_that_was_killed_can_be_ended(releases: Releases, project:
     assert not releases.trial.exists()
     assert not (ETC / cell.unit).exists()
     again = cell.doractl("rollback", cell.name, check=False)
-    assert (again.returncode, "no release before" in again.stderr) == (3, True)
+    assert (again.returncode, "no release before" in again.stderr) == (4, True)
 
 
 ROUNDS = int(os.environ.get("ROUNDS", "6"))
