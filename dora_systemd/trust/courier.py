@@ -5,7 +5,6 @@ JSON. An answer is frames: a letter, a length as 7 digits, and that many bytes; 
 ends an answer, "-" ends it with the reason of a failure. All paths are relative to the project.
 """
 
-import hashlib
 import json
 import os
 import stat
@@ -62,14 +61,6 @@ def content(path: str) -> Iterator[bytes]:
             yield chunk
 
 
-def digest(path: str) -> str:
-    """The SHA-256 of a file's content."""
-    found = hashlib.sha256()
-    for chunk in content(path):
-        found.update(chunk)
-    return found.hexdigest()
-
-
 def git(command: tuple[str, ...], safe: str) -> bytes | None:
     """What a git command prints, None if it fails."""
     trusted = ("-c", f"safe.directory={safe}") if safe else ()
@@ -104,7 +95,7 @@ def tracked(owners: list[int], most: int) -> dict[str, Any]:
     """The files that git would track, None without git, and the revision."""
     safe = repository(owners)
     names = git(("ls-files", "-z", "--cached", "--others", "--exclude-standard"), safe)
-    if names is None:
+    if not names:  # nor if a git above ignores all of it
         return {"files": None, "revision": ""}
     about = git(("describe", "--always", "--abbrev=7", "--dirty=+", "--exclude=*"), safe)
     files = [os.fsdecode(one) for one in names.split(b"\0") if one]
@@ -120,8 +111,6 @@ def answer(request: dict[str, Any]) -> Iterator[bytes]:
         yield json.dumps(listed(request["path"], request["most"])).encode()
     elif what == "facts":
         yield json.dumps([facts(one) for one in request["paths"]]).encode()
-    elif what == "digest":
-        yield digest(request["path"]).encode()
     elif what == "git":
         yield json.dumps(tracked(request["owners"], request["most"])).encode()
 
@@ -131,6 +120,13 @@ def frame(letter: bytes, data: bytes = b"") -> None:
     for start in range(0, len(data) or 1, CHUNK):
         part = data[start : start + CHUNK]
         sys.stdout.buffer.write(b"%s%07d%s" % (letter, len(part), part))
+
+
+def reason(error: OSError | ValueError) -> bytes:
+    """Why a request failed, and in a second line the path that did."""
+    text = str(getattr(error, "strerror", None) or error)[:200]
+    path = getattr(error, "filename", None)
+    return f"{text}\n{path if isinstance(path, str) else ''}".encode("utf-8", "surrogateescape")
 
 
 def main(root: str) -> None:
@@ -145,7 +141,7 @@ def main(root: str) -> None:
                 frame(b"+", data)
             frame(b".")
         except (OSError, ValueError) as error:
-            frame(b"-", str(getattr(error, "strerror", None) or error).encode()[:200])
+            frame(b"-", reason(error))
         sys.stdout.buffer.flush()
 
 

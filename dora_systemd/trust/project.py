@@ -9,10 +9,12 @@ bounded and checked on arrival.
 import contextlib
 import json
 import os
+import posixpath
 import select
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -29,6 +31,9 @@ _HEAD = 8
 MOST_ANSWER = 64 * 1024 * 1024
 """Maximum bytes of an answer that is not the content of a file."""
 _BATCH = 500
+_MOST_SIZE = 2**63
+_LONGEST = 4096
+"""Maximum length of a text about a file, see PATH_MAX in limits.h(0p)."""
 
 
 class Project:
@@ -41,7 +46,11 @@ class Project:
 
     def listed(self, directory: str, most: int) -> list[list[Any]]:
         """The facts of at most `most` entries of a directory, see courier.facts()."""
-        return self._rows(self._value({"ask": "list", "path": directory, "most": most}, directory))
+        value = self._value({"ask": "list", "path": directory, "most": most}, directory)
+        rows = self._rows(value, directory)
+        if len(rows) > most or any(posixpath.dirname(row[0]) != directory for row in rows):
+            raise self._broken(directory)
+        return rows
 
     def facts(self, paths: Sequence[str]) -> list[list[Any] | None]:
         """The facts of these files, None for one that is not there."""
@@ -51,13 +60,12 @@ class Project:
             rows = self._value({"ask": "facts", "paths": list(part)}, part[0])
             if not isinstance(rows, list) or len(rows) != len(part):
                 raise self._broken(part[0])
-            self._rows([one for one in rows if one is not None])
+            asked = [(one, row) for one, row in zip(part, rows, strict=True) if row is not None]
+            there = self._rows([row for _, row in asked], part[0])
+            if any(one != row[0] for (one, _), row in zip(asked, there, strict=True)):
+                raise self._broken(part[0])
             found += rows
         return found
-
-    def digest(self, path: str) -> str:
-        """The SHA-256 of a file, as the child says."""
-        return self._whole({"ask": "digest", "path": path}, path).decode("ascii", "replace")
 
     def read(self, path: str) -> Iterator[bytes]:
         """The content of a file. Raises DoraSystemdError; the caller bounds its length."""
@@ -72,21 +80,22 @@ class Project:
         files = value.get("files") if isinstance(value, dict) else None
         if files is None:
             return None, ""
-        if not isinstance(files, list) or not all(isinstance(one, str) for one in files):
+        if not isinstance(files, list) or len(files) > most or not all(map(_is_text, files)):
             raise self._broken(".git")
         return files, str(value.get("revision", ""))
 
-    def _rows(self, rows: Any) -> list[list[Any]]:
+    def _rows(self, rows: Any, path: str) -> list[list[Any]]:
         types = (str, str, int, bool, str, str)
         is_sound = isinstance(rows, list) and all(
             isinstance(row, list)
             and len(row) == len(types)
-            and all(isinstance(one, kind) for one, kind in zip(row, types, strict=True))
-            and row[2] >= 0
+            and all(type(one) is kind for one, kind in zip(row, types, strict=True))
+            and 0 <= row[2] < _MOST_SIZE
+            and all(_is_text(one) for one in row if isinstance(one, str))
             for row in rows
         )
         if not is_sound:
-            raise self._broken(".")
+            raise self._broken(path)
         return list(rows)
 
     def _value(self, request: dict[str, Any], path: str) -> Any:
@@ -107,28 +116,40 @@ class Project:
     def _ask(self, request: dict[str, Any], path: str) -> Iterator[bytes]:
         assert self._child.stdin
         try:
-            self._child.stdin.write(json.dumps(request).encode() + b"\n")
-            self._child.stdin.flush()
+            self._send(json.dumps(request).encode() + b"\n")
             while (frame := self._frame())[0] == b"+":
                 yield frame[1]
         except (BrokenPipeError, ValueError) as error:
             raise self._broken(path) from error
         if frame[0] != b".":
-            reason = frame[1].decode("utf-8", "replace")
+            reason, _, place = frame[1].decode("utf-8", "surrogateescape").partition("\n")
+            path = place if place in request.get("paths", ()) else path
             hint = "let that user read it, or name it in .gitignore"
-            raise self._refusal(path, reason, hint, ExitCode.BAD_INPUT)
+            raise self._refusal(path, shown(reason[:200]), hint, ExitCode.BAD_INPUT)
+
+    def _send(self, data: bytes) -> None:
+        assert self._child.stdin
+        fd = self._child.stdin.fileno()
+        os.set_blocking(fd, False)  # the child may be stopped, and a pipe has 64 KiB
+        while data:
+            if not select.select([], [fd], [], _SECONDS)[1]:
+                raise BrokenPipeError
+            data = data[os.write(fd, data) :]
 
     def _frame(self) -> tuple[bytes, bytes]:
-        head = self._receive(_HEAD)
+        deadline = time.monotonic() + _SECONDS
+        head = self._receive(_HEAD, deadline)
         if not head[1:].isdigit() or int(head[1:]) > courier.CHUNK:
             raise ValueError(head)
-        return head[:1], self._receive(int(head[1:]))
+        if head[:1] == b"+" and not int(head[1:]):
+            raise ValueError(head)  # else an answer could have no end
+        return head[:1], self._receive(int(head[1:]), deadline)
 
-    def _receive(self, count: int) -> bytes:
+    def _receive(self, count: int, deadline: float) -> bytes:
         assert self._child.stdout
         fd, received = self._child.stdout.fileno(), bytearray()
         while len(received) < count:
-            ready = select.select([fd], [], [], _SECONDS)[0]
+            ready = select.select([fd], [], [], max(deadline - time.monotonic(), 0))[0]
             chunk = os.read(fd, count - len(received)) if ready else b""
             if not chunk:
                 raise BrokenPipeError
@@ -144,6 +165,10 @@ class Project:
         return DoraSystemdError(
             f"cannot read {place} as user {self._account.name}: {reason}", hint, code
         )
+
+
+def _is_text(value: object) -> bool:
+    return isinstance(value, str) and len(value) <= _LONGEST
 
 
 @contextlib.contextmanager

@@ -77,4 +77,5 @@ class Releases:
         for path in (self.trial, Path("/etc/systemd/system") / self.cell.unit):
             path.unlink(missing_ok=True)
         shutil.rmtree(self.path, ignore_errors=True)
+        (STORE / f".{self.cell.name}.lock").unlink(missing_ok=True)
         run("systemctl", "daemon-reload")

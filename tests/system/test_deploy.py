@@ -130,7 +130,7 @@ def test_what_cannot_run_is_refused_while_the_old_one_runs(
     assert "cannot copy link" in releases.deploy(project.root, status=5)
     # Somebody else is at it.
     (project.root / "link").unlink()
-    with locked(releases.path):
+    with locked(STORE / f".{cell.name}.lock"):
         assert "another deploy" in releases.deploy(project.root, status=1)
     assert (cell.show("InvocationID"), releases.states()) == (life, known)
     assert not Path("/proof").exists()
@@ -181,6 +181,21 @@ def test_an_interrupted_trial_is_undone(releases: Releases, project: Project) ->
         assert child.wait() == 11
     assert (releases.current(), releases.running()) == (good, good)
     assert not releases.trial.exists()
+
+
+def test_a_first_trial_that_was_killed_can_be_ended(releases: Releases, project: Project) -> None:
+    cell = releases.cell
+    write_version(project, "first")
+    with begin(releases, project, "1h") as child:
+        wait_for("it runs", lambda: "version first" in cell.messages("a"))
+        child.kill()
+    assert "trial" in releases.states().values()
+    assert "its trial has ended" in cell.doractl("rollback", cell.name).stdout
+    assert (releases.running(), list(releases.states().values())) == ("", ["unproved"])
+    assert not releases.trial.exists()
+    assert not (ETC / cell.unit).exists()
+    again = cell.doractl("rollback", cell.name, check=False)
+    assert (again.returncode, "no release before" in again.stderr) == (4, True)
 
 
 ROUNDS = int(os.environ.get("ROUNDS", "6"))

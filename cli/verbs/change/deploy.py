@@ -96,9 +96,12 @@ def command(
 
 def deployed_outcome(done: Deployed, how: str) -> Outcome:
     """What is printed for a release that runs. how: "deployed" or "rolled back"."""
-    details = {"release": done.release, "former": done.former or None, "files": done.files}
+    details = {"release": done.release or None, "former": done.former or None, "files": done.files}
     details |= {"size_bytes": done.size, "copied_bytes": done.copied}
-    lines = [f"Dataflow {how}: {done.uuid} ({done.name})", f"Release: {done.release}"]
+    lines = [
+        f"Dataflow {how}: {done.uuid} ({done.name})",
+        f"Release: {done.release or 'none, its trial has ended'}",
+    ]
     lines += [f"Before: {done.former}"] if done.former else []
     return Outcome(done, "\n".join([*lines, f"Unit: {done.unit}"]), details=details)
 

@@ -27,7 +27,8 @@ class Draft:
         self._path = store.path / f".new-{os.urandom(6).hex()}"
         self._tree = self._path / TREE
         self._made = {self._tree}
-        self._tree.mkdir(parents=True)
+        self._path.mkdir(0o700, parents=True)  # others may not read what it gets
+        self._tree.mkdir()
 
     def write(self, path: str, chunks: Iterable[bytes], is_executable: bool) -> Stored:
         """Write a file of the tree."""

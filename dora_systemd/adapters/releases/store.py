@@ -22,6 +22,7 @@ from dora_systemd.values import shown
 MANIFEST = "release.json"
 UNIT = "unit"
 _PROVED = "proved"
+_LOCK = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
 MOST_MANIFEST = 64 * 1024 * 1024
 """Maximum bytes of release.json: 100,000 files have about 20 MB."""
 SYSTEM_STATE = Path("/var/lib")
@@ -39,11 +40,15 @@ def store_root(is_user: bool, environment_home: str, state_home: str) -> Path:
 
 
 class Store:
-    """The releases of the dataflow `name`, in the directory `root` / `name`."""
+    """The releases of the dataflow `name`, in the directory `root` / `name`.
+
+    lock: a file that nobody else can open, unlike the directory, which everybody could lock.
+    """
 
     def __init__(self, root: Path, name: str) -> None:
         self.name = name
         self.path = root / name
+        self.lock = root / f".{name}.lock"
 
     def release(self, release_id: str) -> Path:
         """The directory of a release."""
@@ -116,23 +121,41 @@ def locked(store: Store, make: bool = True) -> Iterator[None]:
     """
     try:
         if make:
-            make_directories(store.path)
-        fd = os.open(store.path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+            make_directories(store.path.parent)
+        fd = os.open(store.lock, _LOCK, 0o600)
     except OSError as error:
         raise unusable(store.path, error) from error
     try:
         _take(fd, store)
         try:
+            _require(store, make)
             yield
         finally:
-            with contextlib.suppress(OSError):
-                store.path.rmdir()  # only an empty one: the first deploy was refused
+            _leave(store)
     finally:
         os.close(fd)
 
 
+def _require(store: Store, make: bool) -> None:
+    try:
+        if make:
+            make_directories(store.path)
+        store.path.stat()
+    except OSError as error:
+        raise unusable(store.path, error) from error
+
+
+def _leave(store: Store) -> None:
+    """Remove an empty store, as of a first deploy that was refused, and its lock with it."""
+    with contextlib.suppress(OSError):
+        store.path.rmdir()
+    with contextlib.suppress(OSError):
+        if not store.path.exists():
+            store.lock.unlink()
+
+
 def _take(fd: int, store: Store) -> None:
-    """Lock the directory `fd`, unless another process has it, or has just removed it."""
+    """Lock the file `fd`, unless another process has it, or has just removed it."""
     try:
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         if os.fstat(fd).st_nlink:

@@ -81,7 +81,7 @@ def too_many(path: str) -> DoraSystemdError:
 def is_plain_path(path: str) -> bool:
     """Whether it is a relative path, of printable text, that stays below where it begins."""
     parts = path.split("/")
-    is_short = len(path.encode("utf-8", "surrogateescape")) <= _MOST_PATH
+    is_short = len(path.encode("utf-8", "surrogatepass")) <= _MOST_PATH
     return path.isprintable() and is_short and not {"", ".", ".."} & {*parts}
 
 

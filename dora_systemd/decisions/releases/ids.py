@@ -1,12 +1,14 @@
 """Makes the ids of releases; names.py reads them."""
 
+import calendar
 import re
 import time
 
 from dora_systemd.values import SECOND
 
 _REVISION = re.compile(r"[0-9a-f]{4,64}\+?")
-_MOST_AT_ONCE = 10_000
+_MOMENT = "%Y%m%dT%H%M%S"
+_MOMENT_LENGTH = 15
 
 
 def is_revision(text: str) -> bool:
@@ -15,11 +17,20 @@ def is_revision(text: str) -> bool:
 
 
 def new_id(at_us: int, revision: str, known: frozenset[str]) -> str:
-    """The id of a release of that time, which none of `known` has, and that sorts behind them.
+    """The id of a release of that time, that sorts behind all of `known`.
 
     at_us: CLOCK_REALTIME µs. revision: of git, or "".
     """
-    moment = time.strftime("%Y%m%dT%H%M%S", time.gmtime(at_us // SECOND))
-    plain = f"{moment}-{revision}" if revision else moment
-    numbered = (f"{plain}.{count}" for count in range(1, _MOST_AT_ONCE))
-    return plain if plain not in known else next(one for one in numbered if one not in known)
+    newest = max(known, default="")
+    now = _id(at_us // SECOND, revision)
+    # The clock may have been ahead, or be behind, as without a battery.
+    return now if now > newest else _id(_second_of(newest) + 1, revision)
+
+
+def _id(second: int, revision: str) -> str:
+    moment = time.strftime(_MOMENT, time.gmtime(second))
+    return f"{moment}-{revision}" if revision else moment
+
+
+def _second_of(release_id: str) -> int:
+    return calendar.timegm(time.strptime(release_id[:_MOMENT_LENGTH], _MOMENT))

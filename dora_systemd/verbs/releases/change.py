@@ -63,9 +63,6 @@ def change_release(
         for cell in standing.running:
             note_request("stop-asked", cell.name, cell.uuid, change.command)
         _try(manager, scope, store, standing, change, tell)
-    details = {"scope": scope.word, "release": change.release, "former": standing.current}
-    options = change.options
-    note_request("release-committed", options.name, options.uuid, change.command, **details)
 
 
 def _try(
@@ -85,11 +82,20 @@ def _try(
             fault = Fault("the command was interrupted")
         except DoraSystemdError as error:
             fault = Fault(error.message)
+        except Exception as error:  # a terminal that is gone, too
+            fault = Fault(f"the command failed: {error}")
         if fault is not None:
             _ignore_signals()
             raise _roll_back(manager, standing, change, fault)
+        _note_commit(scope, standing, change)
         remove_unit_file(standing.boot.runtime)
         end_trial(manager, standing)
+
+
+def _note_commit(scope: Scope, standing: Standing, change: Change) -> None:
+    details = {"scope": scope.word, "release": change.release, "former": standing.current}
+    options = change.options
+    note_request("release-committed", options.name, options.uuid, change.command, **details)
 
 
 def _limit(options: RunnerOptions) -> int:
@@ -142,7 +148,10 @@ def _back(manager: Manager, unit: str) -> str:
 @contextmanager
 def _interruptible() -> Iterator[None]:
     """Let the signals that would end this process raise KeyboardInterrupt instead."""
-    before = {one: signal.signal(one, _interrupt) for one in _SIGNALS}
+    before = {one: signal.getsignal(one) for one in _SIGNALS}
+    for one, handler in before.items():
+        if handler is not signal.SIG_IGN:  # as by nohup(1)
+            signal.signal(one, _interrupt)
     try:
         yield
     finally:

@@ -28,7 +28,13 @@ from dora_systemd.verbs.releases.change import Change, change_release
 from dora_systemd.verbs.releases.files import copy_files, digests, find_files
 from dora_systemd.verbs.releases.listing import store_of
 from dora_systemd.verbs.releases.soak import Tell
-from dora_systemd.verbs.releases.source import Source, find_source, released, source_notes
+from dora_systemd.verbs.releases.source import (
+    Source,
+    find_source,
+    released,
+    require_same,
+    source_notes,
+)
 from dora_systemd.verbs.releases.trial import Standing, read_standing, require_deployable
 from dora_systemd.verbs.start.account import account_of
 from dora_systemd.verbs.start.check import check_plan
@@ -120,6 +126,8 @@ def deploy(
         assert options is not None
         for note in source_notes(source):
             warn(note)
+        standing = read_standing(manager, scope, standing.boot.unit)  # the copy took its time
+        require_deployable(manager, scope, standing)
         how, want_boot = request.how, request.want_boot
         change = Change(release, text, options, request.soak, want_boot, _COMMAND, how)
         try:
@@ -226,6 +234,7 @@ def _unit_text(
     """The unit file of the copy, which has been checked as for a start."""
     tell("checking")
     tree = store.tree(manifest.id)
+    require_same(source, tree)
     wanted = released(source, request.start, tree, manifest.uuid)
     plan = make_plan(scope, wanted)
     check_plan(lambda: manager, plan)

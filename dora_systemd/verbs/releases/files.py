@@ -5,6 +5,7 @@ reload leave out. Whatever the dataflow itself names belongs to them in any case
 """
 
 import errno
+import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 from dora_systemd.adapters.releases.draft import Draft
@@ -94,7 +95,7 @@ def digests(project: Project, found: Mapping[str, Found]) -> dict[str, Stored]:
     return {
         path: Stored(target=one.target)
         if one.kind == LINK
-        else Stored(one.size, one.is_executable, project.digest(path))
+        else Stored(one.size, one.is_executable, _digest(project, one))
         for path, one in found.items()
     }
 
@@ -143,7 +144,14 @@ def _copy(project: Project, one: Found, draft: Draft, last: Manifest | None) -> 
 
 def _is_same(project: Project, one: Found, old: Stored) -> bool:
     is_alike = (one.size, one.is_executable) == (old.size, old.is_executable)
-    return is_alike and project.digest(one.path) == old.digest
+    return is_alike and _digest(project, one) == old.digest
+
+
+def _digest(project: Project, one: Found) -> str:
+    found = hashlib.sha256()
+    for chunk in _bounded(project.read(one.path), one.path, one.size):
+        found.update(chunk)
+    return found.hexdigest()
 
 
 def _bounded(chunks: Iterable[bytes], path: str, most: int) -> Iterator[bytes]:

@@ -2,6 +2,7 @@
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.releases.store import Store, locked
+from dora_systemd.decisions.logs.events import ROLLED_BACK
 from dora_systemd.decisions.releases.choice import before
 from dora_systemd.decisions.unit.file import runner_of
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -10,14 +11,16 @@ from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import is_directory
 from dora_systemd.values import quoted
 from dora_systemd.verbs.facts.selector import Selector
-from dora_systemd.verbs.inhibit.guard import IfInhibited
+from dora_systemd.verbs.inhibit.guard import IfInhibited, require_uninhibited
 from dora_systemd.verbs.releases.change import Change, change_release
 from dora_systemd.verbs.releases.deploy import Deployed
 from dora_systemd.verbs.releases.listing import deployed_names, store_of
 from dora_systemd.verbs.releases.soak import Tell
-from dora_systemd.verbs.releases.trial import Standing, read_standing, require_deployable
+from dora_systemd.verbs.releases.trial import Standing, go_back, read_standing, require_deployable
+from dora_systemd.verbs.start.asked import note_request
 
 _COMMAND = "doractl rollback"
+_KILLED = "the command that tried it was killed"
 
 
 def roll_back(
@@ -31,6 +34,7 @@ def roll_back(
 ) -> Deployed:
     """Run an older release. release: its id; None for the one before the present one.
 
+    Without one before, ends a trial whose doractl was killed; the id of what runs then is "".
     soak: µs. how: what to do while a lock inhibits it. Raises DoraSystemdError: ROLLED_BACK if that
     release fails its trial, INHIBITED.
     """
@@ -38,6 +42,9 @@ def roll_back(
     with locked(store, make=False):
         standing = read_standing(manager, scope, unit_name(store.name))
         require_deployable(manager, scope, standing)
+        if release is None and standing.trial and not standing.current:
+            require_uninhibited(scope, standing.running, "rollback", how, tell)
+            return _end_first(manager, store, standing)
         chosen = _choose(store, standing, release)
         text = store.unit(chosen)
         options, manifest = runner_of(text), store.manifest(chosen)
@@ -45,8 +52,8 @@ def roll_back(
             hint = f"doractl releases {store.name} lists the others"
             message = f"cannot run release {chosen} of {store.name}: it has no unit file of ours"
             raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
-        want_boot = standing.boot.text is None
-        change = Change(chosen, text, options, soak, want_boot, _COMMAND, how)
+        # One that was disabled stays so.
+        change = Change(chosen, text, options, soak, False, _COMMAND, how)
         change_release(manager, scope, store, standing, change, tell)
     facts = (options.uuid, store.name, standing.boot.unit, chosen, standing.current)
     return Deployed(*facts, len(manifest.files), manifest.size, 0)
@@ -63,6 +70,17 @@ def deployed_name(manager: Manager, scope: Scope, selector: str) -> str:
         hint = f"doractl deploy --name {name} makes the first one"
         raise DoraSystemdError(f"{name} has no release", hint, ExitCode.NOT_FOUND)
     return name
+
+
+def _end_first(manager: Manager, store: Store, standing: Standing) -> Deployed:
+    """End the trial of a release that has none before it: what was there before runs again."""
+    for cell in standing.running:
+        note_request("stop-asked", cell.name, cell.uuid, _COMMAND)
+    go_back(manager, standing, standing.was_up)
+    uuid = standing.uuid or store.manifest(standing.trial).uuid
+    details = {"release": standing.trial, "former": "", "nodes": "", "reason": _KILLED}
+    note_request(ROLLED_BACK, store.name, uuid, _COMMAND, **details)
+    return Deployed(uuid, store.name, standing.boot.unit, "", standing.trial, 0, 0, 0)
 
 
 def _choose(store: Store, standing: Standing, release: str | None) -> str:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from dora_systemd.adapters.host.files import decoded, parse_yaml
 from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
+from dora_systemd.decisions.releases.entries import refusal
 from dora_systemd.decisions.settings.table import ENV_FILE, USER, VENV, WORKING_DIRECTORY
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import settings_path
@@ -21,13 +22,15 @@ from dora_systemd.verbs.start.plan import DEFAULT_FILE, Plan, StartRequest, make
 class Source:
     """A project. root: its directory. origin: of its files, whose owner decides what they may say.
 
-    plan: of a start from there. named: files that the dataflow names, relative to root.
+    plan: of a start from there. named: files that the dataflow names, relative to root. read: what
+    the files say that decide what root does, None for one that is not there.
     """
 
     root: str
     origin: Place
     plan: Plan
     named: tuple[str, ...]
+    read: Mapping[str, bytes | None]
 
     @property
     def dataflow(self) -> str:
@@ -48,7 +51,28 @@ def find_source(scope: Scope, request: StartRequest) -> Source:
     named = (str(path), settings_path(str(path)), *_programs(dataflow, plan))
     inside = [os.path.normpath(one) for one in (*named, *plan.settings[ENV_FILE])]
     relative = (os.path.relpath(one, root) for one in inside if _is_below(one, root))
-    return Source(root, _origin(path, written.place), plan, tuple(dict.fromkeys(relative)))
+    beside = settings_path(str(path))
+    settings = read_file(beside) if exists(beside) else None
+    origin = _origin(written.place, settings and settings.place)
+    read: dict[str, bytes | None] = {
+        os.path.relpath(one, root): read_file(one).data
+        for one in plan.settings[ENV_FILE]
+        if _is_below(os.path.normpath(one), root) and one not in plan.settings.lent
+    }
+    read[os.path.relpath(path, root)] = written.data
+    read[os.path.relpath(beside, root)] = settings and settings.data
+    return Source(root, origin, plan, tuple(dict.fromkeys(relative)), read)
+
+
+def require_same(source: Source, tree: Path) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) if the copy says other things than its owner does.
+
+    The user of the nodes has read it for root, and can lie about files that are not that user's.
+    """
+    for path, data in source.read.items():
+        copy = tree / path
+        if (read_file(copy).data if exists(copy) else None) != data:
+            raise refusal(path, "it changed while it was copied", "deploy again")
 
 
 def released(source: Source, request: StartRequest, tree: Path, uuid: str) -> StartRequest:
@@ -78,12 +102,10 @@ def source_notes(source: Source) -> Iterator[str]:
         yield f"all releases share the virtual environment {shown(venv)}: pip changes all of them"
 
 
-def _origin(path: Path, place: Place) -> Place:
+def _origin(place: Place, settings: Place | None) -> Place:
     """The place of the dataflow file; that of the settings file beside it if that is not root's."""
-    beside = settings_path(str(path))
-    if not exists(beside):
+    if settings is None:
         return place
-    settings = read_file(beside).place
     return place if settings.uid == 0 and not settings.borrowed else settings
 
 

@@ -1,5 +1,7 @@
 """The store of releases: a release is there as a whole or not at all."""
 
+import fcntl
+import os
 from pathlib import Path
 
 import pytest
@@ -70,6 +72,7 @@ def test_an_unfinished_one_is_no_release(store: Store) -> None:
     draft.write("a", [b"x"], False)
     assert store.known() == []
     (left,) = store.unfinished()
+    assert left.stat().st_mode & 0o777 == 0o700  # others may not read what it copies
     store.clean()
     assert not left.exists()
 
@@ -89,11 +92,25 @@ def test_one_at_a_time(store: Store) -> None:
         pass
 
 
+def test_nobody_else_can_take_the_lock(store: Store) -> None:
+    (store.path / "release").touch()
+    held = os.open(store.path, os.O_RDONLY)
+    fcntl.flock(held, fcntl.LOCK_EX)  # the directory, which all users may open
+    with locked(store):
+        assert store.lock.stat().st_mode & 0o777 == 0o600
+    os.close(held)
+    store.lock.unlink()
+    store.lock.symlink_to(store.path / "elsewhere")
+    with pytest.raises(DoraSystemdError, match="cannot use"), locked(store):
+        pass
+    assert not (store.path / "elsewhere").exists()
+
+
 def test_a_store_without_a_release_goes(tmp_path: Path) -> None:
     store = Store(tmp_path, "robot")
     with locked(store):
         assert store.path.exists()
-    assert not store.path.exists()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_store_that_is_not_there(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """The child that reads a project, and what is believed of it."""
 
 import os
+import signal
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -36,7 +37,6 @@ def test_a_look(project: Project) -> None:
     assert file[:5] == ["dir/a.py", "file", 8, False, ""]
     assert missing is None
     assert b"".join(project.read("dir/a.py")) == b"print()\n"
-    assert len(project.digest("dir/a.py")) == 64
     assert len(project.listed("", 2)) == 2
 
 
@@ -72,7 +72,24 @@ def test_with_git(root: Path, project: Project) -> None:
     assert project.tracked([os.getuid()], 10)[1] == f"{revision}+"
 
 
+def test_a_git_above_that_ignores_all_of_it(root: Path) -> None:
+    (root / ".gitignore").write_text("dir/\n")
+    subprocess.run(["git", "init", "-q"], cwd=root, check=True)
+    with opened_project(str(root / "dir"), None) as project:
+        assert project.tracked([os.getuid()], 10) == (None, "")
+
+
+def row(path: str = "a", size: int | str = 1) -> str:
+    """Code that answers with a row."""
+    return f"answer([[{path!r}, 'file', {size}, False, '', 's']])"
+
+
 LIARS = {
+    "huge": row(size="2**63"),
+    "no number": row(size="True"),
+    "long": row(path="a" * 5000),
+    "elsewhere": row(path="b/a"),
+    "too many": "answer([[str(n), 'file', 1, False, '', 's'] for n in range(11)])",
     "silent": "",
     "no frame": "sys.stdout.write('hello, world')",
     "too long": "sys.stdout.write('+9999999')",
@@ -80,14 +97,24 @@ LIARS = {
     "other JSON": "sys.stdout.write('+0000004null.0000000')",
     "other rows": "sys.stdout.write('+0000013[[1,2,3,4,5]].0000000')",
     "negative": """sys.stdout.write('+0000033[["a","file",-1,false,"","s"]]   .0000000')""",
+    "empty frames": "[sys.stdout.write('+0000000') for _ in range(5000)]",
     "endless": "[sys.stdout.write('+0001000' + ' ' * 1000) for _ in range(5000)]",
 }
+
+
+_ANSWER = """
+import json, sys
+def answer(value):
+    text = json.dumps(value)
+    sys.stdout.write(f"+{len(text):07d}{text}.0000000")
+sys.stdin.readline()
+"""
 
 
 @pytest.mark.parametrize("lie", LIARS)
 def test_a_child_that_lies(lie: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     liar = tmp_path / "liar.py"
-    liar.write_text(f"import sys\nsys.stdin.readline()\n{LIARS[lie]}\nsys.stdout.flush()\n")
+    liar.write_text(f"{_ANSWER}{LIARS[lie]}\nsys.stdout.flush()\n")
     monkeypatch.setattr(courier, "__file__", str(liar))
     monkeypatch.setattr(module, "MOST_ANSWER", 100_000)
     with (
@@ -95,3 +122,27 @@ def test_a_child_that_lies(lie: str, tmp_path: Path, monkeypatch: pytest.MonkeyP
         pytest.raises(DoraSystemdError, match="no answer"),
     ):
         project.listed("", 10)
+
+
+def test_a_child_that_stops(project: Project, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_SECONDS", 0.1)
+    os.kill(project._child.pid, signal.SIGSTOP)
+    with pytest.raises(DoraSystemdError, match="no answer"):
+        project.facts(["x" * 4000] * 100)  # more than a pipe holds
+
+
+def test_an_answer_about_another_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    liar = tmp_path / "liar.py"
+    liar.write_text(f"{_ANSWER}{row('b')}\nsys.stdout.flush()\n")
+    monkeypatch.setattr(courier, "__file__", str(liar))
+    with (
+        opened_project(str(tmp_path), None) as project,
+        pytest.raises(DoraSystemdError, match="no answer"),
+    ):
+        project.facts(["a"])
+
+
+def test_the_file_that_failed_is_named(project: Project) -> None:
+    long = "x" * 300
+    with pytest.raises(DoraSystemdError, match=f"cannot read .*/{long} as user .*: File name too"):
+        project.facts(["dir/a.py", long])

@@ -21,6 +21,11 @@ def test_ids() -> None:
     second = new_id(MOMENT, "", frozenset({plain}))
     assert is_release_id(second)
     assert second > plain
+    ahead = f"{plain}-ffff.10"
+    for revision in ("", "0000", "9f3c1a2+"):  # the clock was ahead, or goes back
+        third = new_id(MOMENT - 10**12, revision, frozenset({plain, second, ahead}))
+        assert is_release_id(third)
+        assert third > max(second, ahead)
     assert is_revision("9f3c1a2+")
     assert not is_revision("$(id)")
     for text in ("", "..", f"{plain}/x", f".new-{plain}", f"{plain}-xyz", f"{plain}\n"):

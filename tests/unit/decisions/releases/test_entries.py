@@ -38,6 +38,7 @@ def test_good_names(path: str) -> None:
         "./a",
         "a/",
         "new\nline",
+        "\ud800",
         "\x1b[2J",
         "\udcff",
         "a" * 2000,

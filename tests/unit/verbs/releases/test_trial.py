@@ -142,6 +142,21 @@ def test_a_commit_that_fails_is_undone(
     assert read_standing(manager, scope, UNIT).current == OLD
 
 
+def test_a_terminal_that_is_gone(
+    manager: FakeManager, scope: Scope, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    deployed(manager)
+
+    def fail(*_: object) -> None:
+        raise OSError(5, "Input/output error")
+
+    monkeypatch.setattr(module, "commit", fail)
+    with pytest.raises(DoraSystemdError, match="Input/output error") as caught:
+        try_new(manager, scope, store, monkeypatch, None)
+    assert caught.value.code is ExitCode.ROLLED_BACK
+    assert not read_standing(manager, scope, UNIT).path.exists()
+
+
 def test_a_first_release_is_enabled(
     manager: FakeManager, scope: Scope, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,0 +1,52 @@
+"""What a rollback does to a dataflow without a release before the present one, or disabled."""
+
+import pytest
+
+from dora_systemd.adapters.releases.draft import Draft
+from dora_systemd.adapters.releases.store import Store
+from dora_systemd.decisions.releases.manifest import Manifest
+from dora_systemd.scope import Scope
+from dora_systemd.verbs.releases import rollback as module
+from dora_systemd.verbs.releases.change import Change
+from dora_systemd.verbs.releases.rollback import roll_back
+from dora_systemd.verbs.releases.trial import read_standing
+from tests.unit.fakes.manager import FakeManager
+from tests.unit.verbs.releases.test_trial import NEW, OLD, UNIT, release_options, store, text_of
+
+__all__ = ["store"]
+
+
+@pytest.fixture(autouse=True)
+def _known(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    store.release(NEW).rmdir()
+    for release in (OLD, NEW):
+        draft = Draft(store)
+        draft.publish(Manifest(release, "robot", "u", "dataflow.yml", "/srv", "", "", 1), None)
+        store.write_unit(release, text_of(release))
+    monkeypatch.setattr(module, "store_of", lambda *_: store)
+    monkeypatch.setattr(module, "deployed_names", lambda *_: ["robot"])
+
+
+@pytest.mark.parametrize("active", ["active", "failed"])
+def test_a_first_trial_that_was_killed_ends(
+    manager: FakeManager, scope: Scope, active: str
+) -> None:
+    path = read_standing(manager, scope, UNIT).path
+    path.parent.mkdir(parents=True)
+    path.write_text(text_of(NEW))
+    manager.add(release_options(NEW), active, Transient=False, FragmentPath=str(path))
+    done = roll_back(manager, scope, "robot", None, 0, print)
+    assert (done.release, done.former) == ("", NEW)
+    assert not path.exists()
+    assert ("StopUnit", UNIT) in manager.calls
+    assert "RestartUnit" not in [call[0] for call in manager.calls]
+
+
+def test_what_is_disabled_stays_so(
+    manager: FakeManager, scope: Scope, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    changes: list[Change] = []
+    monkeypatch.setattr(module, "change_release", lambda *given: changes.append(given[4]))
+    manager.add(release_options(NEW), "active", Transient=False)
+    roll_back(manager, scope, "robot", OLD, 0, print)
+    assert [one.want_boot for one in changes] == [False]

@@ -1,0 +1,52 @@
+"""What root believes of a copy that another user has read for it."""
+
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.scope import Scope
+from dora_systemd.verbs.releases.source import Source, find_source, require_same
+from dora_systemd.verbs.start.plan import StartRequest
+from tests.unit.fakes.programs import make_program
+
+USER = Scope(is_user=True, uid=1000)
+FLOW, SETTINGS, VARIABLES = "dataflow.yml", "dataflow.systemd.yml", "robot.env"
+TEXT = "nodes: [{id: a, path: a.py}]\n"
+
+
+def source_of(root: Path) -> Source:
+    (root / "a.py").write_text("")
+    dora = make_program(root.parent / "bin/dora")
+    return find_source(USER, StartRequest(str(root), flags={"dora": dora}))
+
+
+@pytest.mark.parametrize("name", [FLOW, SETTINGS, VARIABLES])
+@pytest.mark.parametrize("lie", ["A=2\n", None])
+def test_a_copy_says_the_same(tmp_path: Path, name: str, lie: str | None) -> None:
+    here, tree = tmp_path / "here", tmp_path / "tree"
+    for place in (here, tree):
+        place.mkdir()
+        (place / FLOW).write_text(TEXT)
+        (place / SETTINGS).write_text(f"env_file: {VARIABLES}\n")
+        (place / VARIABLES).write_text("A=1\n")
+    source = source_of(here)
+    require_same(source, tree)
+    if lie is None:
+        (tree / name).unlink()
+    else:
+        (tree / name).write_text(lie)
+    with pytest.raises(DoraSystemdError, match=f"cannot copy {name}: it changed"):
+        require_same(source, tree)
+
+
+def test_settings_that_only_the_copy_has(tmp_path: Path) -> None:
+    (tmp_path / FLOW).write_text(TEXT)
+    source = source_of(tmp_path)
+    tree = tmp_path / "tree"
+    tree.mkdir()
+    (tree / FLOW).write_text(TEXT)
+    require_same(source, tree)
+    (tree / SETTINGS).write_text("user: root\n")
+    with pytest.raises(DoraSystemdError, match="it changed"):
+        require_same(source, tree)
