@@ -184,6 +184,9 @@ def limit_group(path: Path, limits: NodeLimits) -> None:
     """Set the limits of a node's group. Raises DoraSystemdError if one does not take effect."""
     for file, text in limits.files().items():
         try:
+            if file == CPUS_FILE and not text.strip():
+                # The kernel refuses an empty list for a group with processes (EIO).
+                text = read_text(path.parent / f"{file}.effective").strip()
             is_limited = _write(path / file, text)
             reason = f"its group has no {file}"
         except OSError as error:

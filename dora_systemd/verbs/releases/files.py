@@ -70,6 +70,8 @@ def _walk(project: Project, top: str) -> dict[str, Found]:
     queue = [top]
     for directory in queue:
         entries = [Found(*row) for row in project.listed(directory, MOST_FILES + 1)]
+        if len(entries) > MOST_FILES:  # the rest of them is not known
+            raise too_many(directory)
         if any(one.path.rpartition("/")[2] == _IGNORE_FILE and one.kind == FILE for one in entries):
             ignores[directory] = _ignore_lines(project, directory)
         rules = WatchRules(project.root, gitignores=ignores, always=NOT_OF_PROJECT)
