@@ -33,8 +33,8 @@ def command(selector: str, hot_reload: str | None, force: bool, **flags: Any) ->
     """Change limits or hot reload of a running dataflow.
 
     Changes take effect at once and survive restarts, until the dataflow is stopped; those of an
-    enabled dataflow, until it is disabled. If it does not run, its next start has them. infinity
-    removes a limit. If one change is invalid, nothing is changed.
+    enabled dataflow, until it is disabled: if it does not run, its next start has new limits.
+    infinity removes a limit. If one change is invalid, nothing is changed.
 
     Examples:
       doractl set robot --memory-limit 6G
