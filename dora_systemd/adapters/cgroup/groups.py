@@ -63,10 +63,7 @@ def own_group() -> str:
 
 
 def group_of(process: int | str) -> str:
-    """The group of a process: the "0::" line of /proc/PID/cgroup, see cgroups(7).
-
-    "/" if the process has exited.
-    """
+    """The group of a process, or "/" if it has exited: "0::" in /proc/PID/cgroup, cgroups(7)."""
     for line in read_text(Path(f"/proc/{process}/cgroup")).splitlines():
         if line.startswith("0::"):
             return line[3:]
@@ -184,10 +181,7 @@ def limit_group(path: Path, limits: NodeLimits) -> None:
     """Set the limits of a node's group. Raises DoraSystemdError if one does not take effect."""
     for file, text in limits.files().items():
         try:
-            if file == CPUS_FILE and not text.strip():
-                # The kernel refuses an empty list for a group with processes (EIO).
-                text = read_text(path.parent / f"{file}.effective").strip()
-            is_limited = _write(path / file, text)
+            is_limited = _write(path / file, text := _written(path, file, text))
             reason = f"its group has no {file}"
         except OSError as error:
             is_limited, reason = False, f"{error.strerror} ({file}: {text})"
@@ -211,8 +205,13 @@ def restore_group(path: Path, texts: Mapping[str, str]) -> None:
     """Write back what read_files() has read, as far as the kernel accepts it."""
     for name, text in texts.items():
         with contextlib.suppress(OSError):
-            # An empty line removes the CPUs of cpuset.cpus; nothing written changes nothing.
-            _write(path / name, text.strip() or "\n")
+            _write(path / name, _written(path, name, text.strip()))
+
+
+def _written(path: Path, file: str, text: str) -> str:
+    """What to write: for no CPUs those of the group above, or the kernel refuses it (EIO)."""
+    is_empty = file == CPUS_FILE and not text.strip()
+    return read_text(f"{path.parent}/{file}.effective").strip() if is_empty else text
 
 
 def move_process(path: Path, pid: int) -> None:

@@ -60,7 +60,6 @@ class Draft:
         write_part(self._path, MANIFEST, format_manifest(manifest))
         for directory in self._made:
             directory.chmod(0o555)
-        self._path.chmod(0o700)
         if group is not None:
             os.chown(self._path, -1, group)
             self._path.chmod(0o750)

@@ -82,6 +82,16 @@ def test_cpus_of_a_node_are_those_that_the_kernel_uses(unit: Path, used: str) ->
     assert caught.value.message == ("cannot limit the node camera: of the cpus 2-3 it may use 0")
 
 
+def test_a_node_without_cpus_of_its_own_gets_those_of_the_unit(unit: Path) -> None:
+    group = unit / "node-camera"
+    (unit / "cpuset.cpus.effective").write_text("0-3\n")
+    (group / "cpuset.cpus").write_text("\n")
+    before = cgroup.read_files(group, ["cpuset.cpus"])
+    (group / "cpuset.cpus").write_text("2")
+    cgroup.restore_group(group, before)
+    assert (group / "cpuset.cpus").read_text() == "0-3"
+
+
 def test_usage_of_a_group_that_has_gone(tmp_path: Path) -> None:
     assert cgroup.read_usage(tmp_path / "gone") == Usage(0, 0)
 
