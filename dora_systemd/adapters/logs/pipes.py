@@ -133,18 +133,16 @@ class LogPipes:
         for source in self._sources.values():
             source.renew(run=run_id)
 
-    def drain(self, node_id: str) -> None:
-        """Queue what is in the pipes of a node that has ended, and its unterminated last line.
-
-        Call it before write_event("node-exited", ...), so that the journal has this order too.
-        """
+    def drain(self, node_id: str, is_live: bool = False) -> None:
+        """Queue what is in a node's pipes, before an event. is_live: its last line may go on."""
         source = self._source(node_id)
         for pipe in source.pipes:
             # Above the limit while journald takes nothing: the lines are safe in the pipe.
             while source.drained < DRAIN_LIMIT and (data := pipe.read()):
                 source.drained += len(data)
                 self._put(node_id, pipe, data, is_flood=True)
-            self._put(node_id, pipe, b"", is_flood=False)
+            if not is_live:
+                self._put(node_id, pipe, b"", is_flood=False)
         self._tell_suppressed(node_id)
         if not self._queue.waiting(node_id):
             source.drained = 0

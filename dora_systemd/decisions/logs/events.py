@@ -113,6 +113,8 @@ EVENTS = {
 
 # Each life of a dataflow ends with one of these, unless the runner was killed.
 END_EVENTS = ("dataflow-finished", "dataflow-stopped", "dataflow-failed")
+# Each life of a node's process ends with one of these.
+NODE_END_EVENTS = ("node-exited", "node-crashed", "node-oom")
 
 ROLLED_BACK = "release-rolled-back"
 REQUESTS = ("stop-asked", "release-committed", ROLLED_BACK)

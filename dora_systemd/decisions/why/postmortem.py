@@ -9,6 +9,7 @@ from dataclasses import replace
 
 from dora_systemd.decisions.cell.exits import KILLED, ExitKind, exit_of, parse_exit
 from dora_systemd.decisions.life.causes import ESSENTIAL, UNIT_RESULTS, Cause
+from dora_systemd.decisions.logs.events import NODE_END_EVENTS
 from dora_systemd.decisions.reload.steps import How
 from dora_systemd.decisions.signs.words import by_watchdog
 from dora_systemd.decisions.views.dataflows import FAILED, FINISHED, RESTARTING, STOPPED, UP_WORDS
@@ -242,7 +243,7 @@ def restarts_of(chain: Sequence[Life]) -> list[Restart]:
     for life in chain:
         exits: dict[str, str] = {}
         for one in life.happenings:
-            if one.name in (*_CRASHES, "node-exited"):
+            if one.name in NODE_END_EVENTS:
                 exits[one.node] = one.detail("exit") or "ended"
             elif one.name == "node-restarted":
                 found.append(Restart(one.at_us, "dora", one.node, exits.get(one.node, "unknown")))

@@ -29,7 +29,7 @@ from dora_systemd.decisions.life.failures import ENGINE_TIMEOUT
 from dora_systemd.decisions.life.states import Action, Cell, Deadline, Do, Record, RunnerExit, State
 from dora_systemd.decisions.life.table import step
 from dora_systemd.decisions.life.view import cell_status, format_status, has_started
-from dora_systemd.decisions.logs.events import END_EVENTS
+from dora_systemd.decisions.logs.events import END_EVENTS, NODE_END_EVENTS
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.failure import failed
@@ -150,7 +150,7 @@ class Pump:
         if record.event in END_EVENTS:
             self._nodes.kill()  # so that no line of a node follows the last event
         elif record.node:
-            self._nodes.drain([record.node])
+            self._nodes.drain([record.node], is_live=record.event not in NODE_END_EVENTS)
         elif record.event == "dataflow-stopping":
             notify.send_stopping()
             fd_store.forget_lives()  # a restart that a person asks for has no delay

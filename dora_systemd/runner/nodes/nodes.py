@@ -248,12 +248,15 @@ class Nodes:
         self._holds.clear()
         self._tails.clear()
 
-    def drain(self, nodes: Iterable[str]) -> None:
-        """Queue what `nodes` have written so far, before whatever is written next."""
+    def drain(self, nodes: Iterable[str], is_live: bool = False) -> None:
+        """Queue what `nodes` have written so far, before whatever is written next.
+
+        is_live: they go on, and may be in the middle of a line.
+        """
         for node in nodes:
             if (tail := self._tails.get(node)) is not None:
                 tail.drain()
-            self._pipes.drain(node)
+            self._pipes.drain(node, is_live)
 
     async def wait_quiet(self, seconds: float) -> None:
         """Return once dora has written nothing to the nodes' log files for `seconds`."""

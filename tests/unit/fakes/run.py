@@ -85,8 +85,8 @@ class FakeNodes(Nodes):
         del seconds
         self.calls.append(("wait quiet",))
 
-    def drain(self, nodes: Iterable[str]) -> None:
-        self.calls.append(("drain", *nodes))
+    def drain(self, nodes: Iterable[str], is_live: bool = False) -> None:
+        self.calls.append(("drain live" if is_live else "drain", *nodes))
 
     def kill(self) -> None:
         self.calls.append(("kill",))

@@ -133,6 +133,18 @@ def test_last_words_come_before_the_event(tmp_path: Path) -> None:
     run(tmp_path, scenario)
 
 
+def test_a_line_is_whole_though_an_event_comes_in_the_middle_of_it(tmp_path: Path) -> None:
+    async def scenario(cell: Cell) -> None:
+        cell.node("a")
+        cell.write(cell.paths.node_stdout("a"), b"before\none l")
+        cell.pipes.drain("a", is_live=True)
+        cell.pipes.write_event("node-ready", "a")
+        cell.write(cell.paths.node_stdout("a"), b"ine\n")
+        assert await cell.messages(3) == ["before", "Node a is ready", "one line"]
+
+    run(tmp_path, scenario)
+
+
 def test_what_a_limit_takes_is_counted(tmp_path: Path) -> None:
     async def scenario(cell: Cell) -> None:
         cell.node("a")

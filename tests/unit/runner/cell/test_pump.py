@@ -89,6 +89,12 @@ def test_these_are_all_actions() -> None:
             life.NodeExited(1, "a", exit_of(1), False),
             [("drain", "a"), ("event", "node-crashed")],
         ),
+        # It may be in the middle of a line.
+        (
+            State.RUNNING,
+            life.NodeReady(1, "a"),
+            [("drain live", "a"), ("event", "node-ready")],
+        ),
     ],
 )
 def test_the_last_words_come_before_the_event(
