@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.lab.pace import bound
 from tests.system.cells import Cell, Project, dora_processes, run, wait_for
 from tests.system.chromium import Browser
 from tests.system.gateways import Front
@@ -22,6 +23,10 @@ FIRST_HALF = (
 """Files of about half the time, which `make test` runs beside the others in a lab of their own."""
 
 
+LONGEST_SECONDS = 600
+"""No test takes a tenth of it: one that hangs fails, shows where it stood, and the others run."""
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--half", choices=["1", "2"], help="only this half of the system tests")
 
@@ -31,6 +36,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for item in items:
         if here in item.path.parents:
             item.add_marker(pytest.mark.system)
+            item.add_marker(pytest.mark.timeout(bound(LONGEST_SECONDS)))
     if half:
         items[:] = [item for item in items if (item.path.stem in FIRST_HALF) == (half == "1")]
 

@@ -16,8 +16,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from lab import cache, definition, initrd, pace, wire
 from lab.errors import LabError
 from lab.options import parse_options
+from lab.plans import PLANS
 from lab.slow import read_speed
-from lab.steps import Result, Step, read_summary, run_steps, total
+from lab.steps import Result, Step, predecessors, read_summary, run_steps, total, whole_minutes
 
 from tests.system.tolerated import TOLERATED
 
@@ -157,11 +158,12 @@ def test_all_steps_run_and_the_worst_status_counts(capfd: pytest.CaptureFixture[
     steps = [
         Step(f"step {n}", ["sh", "-c", text], os.environ.copy) for n, text in enumerate(scripts)
     ]
-    steps[0] = replace(steps[0], with_next=True, minutes=3)
+    steps[0] = replace(steps[0], minutes=3)
+    steps[1] = replace(steps[1], after=(), minutes=2)
     assert run_steps(steps) == 143
     out, said = capfd.readouterr()
     assert "3 steps, about 3 minutes on two cores" in said
-    assert "step 2 of 3: step 1" in said
+    assert "step 2 of 3, 0 min: step 1" in said
     assert "step 0: ok; done" in said
     assert "step 1: FAILED with exit status 1; 2 failed, 1 passed in 1.00s" in said
     assert "step 2: FAILED with exit status 143; done" in said
@@ -175,15 +177,44 @@ run_steps([Step("endless", ["sh", "-c", "echo begun; exec sleep 1000"], os.envir
 """
 
 
+def test_steps_that_run_at_the_same_time(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    """Each of two waits for the other; the third waits for both, and is shown where it stands."""
+    meet = "touch {0}; until [ -e {1} ]; do sleep 0.01; done; echo {0}; printf rest"
+    steps = [
+        Step(name, ["sh", "-c", text], os.environ.copy, tmp_path, after=after)
+        for name, text, after in (
+            ("one", meet.format("a", "b"), ()),
+            ("last", "cat a b && echo last", ("one", "other")),
+            ("other", meet.format("b", "a"), ()),
+        )
+    ]
+    steps = [steps[0], steps[2], steps[1]]
+    assert run_steps(steps) == 0
+    assert capfd.readouterr().out.splitlines()[:3] == ["a", "restb", "restlast"]
+
+
+@pytest.mark.parametrize("what", PLANS)
+def test_a_step_waits_for_steps_before_it(what: str) -> None:
+    steps = PLANS[what]("container")
+    known: set[str] = set()
+    for step, names in predecessors(steps):
+        assert known.issuperset(names)
+        assert step.name not in known
+        known.add(step.name)
+    assert whole_minutes(steps) <= 60
+
+
 def test_a_step_ends_with_the_command_that_has_begun_it() -> None:
     environment = {**os.environ, "PYTHONPATH": str(definition.CHECKOUT / "tests")}
     command = [sys.executable, "-c", STEPS]
-    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE) as child:
+    both = subprocess.PIPE
+    with subprocess.Popen(command, env=environment, stdout=both, stderr=both) as child:
         assert child.stdout
+        assert child.stderr
         assert child.stdout.readline() == b"begun\n"
         child.kill()
         # The step holds the other end as well: this returns when that has ended, too.
-        assert child.stdout.read() == b""
+        assert child.stderr.read().startswith(b"lab: --- step 1 of 1")
 
 
 def test_bounds_are_in_seconds_of_an_idle_machine(monkeypatch: pytest.MonkeyPatch) -> None:

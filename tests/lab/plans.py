@@ -1,0 +1,221 @@
+"""What the steps of `make test` and its parts are."""
+
+import os
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+from lab.cache import find_cache
+from lab.definition import CHECKOUT
+from lab.errors import LabError
+from lab.steps import Step, run_steps
+from lab.venv import ensure_venv, venv_environment, write_package
+
+LAB_PYTHON = (3, 13)
+FAULTS = "tests/system/faults"
+# A dataflow as a service, from start to stop: what to run after every change.
+QUICK = (
+    ("cell", "start", "bus", "lab"),
+    ("stop", "list", "kinds", "start_refused", "start_run", "cli"),
+)
+
+
+def main(arguments: Sequence[str]) -> int:
+    form = os.environ.get("LAB") or "container"
+    try:
+        plan = PLANS[arguments[0]]
+        os.environ["LAB"] = form
+        return run_steps(plan(form))
+    except LabError as error:
+        print(error, file=sys.stderr)
+        return 125
+    except KeyboardInterrupt:
+        return 130
+
+
+def plan_test(form: str) -> list[Step]:
+    if form == "host":
+        return [*plan_unit(form), *plan_system(form)]
+    own = [*plan_unit(form), *unit_in_lab(), *plan_lab(form)]
+    return [*own, *beside_the_machine(own[-1].name)]
+
+
+def beside_the_machine(before: str) -> list[Step]:
+    """The virtual machine is emulated by one processor; the other has the containers meanwhile."""
+    packages = replace(build_step(), after=(before,))
+    inside, restarted = limits_step(), reboot_step()
+    inside = replace(inside, after=(before,))
+    restarted = replace(restarted, after=(packages.name, inside.name))
+    installed = replace(packages_step(), after=(packages.name,))
+    faults, first, second, browser = plan_system("container")
+    second = replace(second, after=(first.name,))
+    browser = replace(browser, after=(restarted.name,))
+    return [packages, installed, faults, first, inside, restarted, second, browser]
+
+
+def in_venv(for_system_tests: bool = False) -> dict[str, str]:
+    return venv_environment(ensure_venv(find_cache(), for_system_tests))
+
+
+def in_lab(form: str) -> Callable[[], dict[str, str]]:
+    return lambda: {**os.environ, "LAB": form}
+
+
+def plan_unit(_form: str) -> list[Step]:
+    command = ["python", "-m", "pytest", "tests/unit"]
+    version = ".".join(map(str, sys.version_info[:2]))
+    return [Step(f"unit tests, Python {version}", command, in_venv, minutes=1)]
+
+
+def unit_in_lab() -> list[Step]:
+    if sys.version_info[:2] == LAB_PYTHON:
+        return []
+    version = ".".join(map(str, LAB_PYTHON))
+    # The linters, and Prometheus' parser, say the same of every Python; the image does without.
+    without = ("project/test_linters", "decisions/views/test_prometheus")
+    arguments = ["tests/unit", *(f"--ignore=tests/unit/{name}.py" for name in without)]
+    step = lab_step(f"unit tests, Python {version}", "container", arguments, minutes=1)
+    return [replace(step, after=())]
+
+
+def plan_lab(_form: str) -> list[Step]:
+    command = ["python", "-m", "pytest", "tests/lab"]
+    return [Step("tests of the lab", command, in_venv, minutes=2)]
+
+
+def plan_vm(_form: str) -> list[Step]:
+    inside, build, restarted = limits_step(), build_step(), reboot_step()
+    return [inside, replace(build, after=()), replace(restarted, after=(inside.name, build.name))]
+
+
+def limits_step() -> Step:
+    arguments = ["tests/system", "-m", "vm"]
+    return lab_step("system tests that need limits, vm", "vm", arguments, minutes=15)
+
+
+def build_step() -> Step:
+    return Step("Debian packages", ["packaging/build"], os.environ.copy, minutes=4)
+
+
+def reboot_step() -> Step:
+    """One machine for all: the packages, a reboot and a power cut with them, and their end."""
+    stages = (("before",), ("after", "cut"), ("was_cut", "purge"))
+    command = ["tests/lab/lab", "run", "--"]
+    for place, stage in enumerate(stages):
+        command += ["--reboot--"] if place else []
+        command += ["pytest", *(f"tests/boot/test_{name}.py" for name in stage)]
+    return Step("the packages, a reboot and a power cut, vm", command, in_lab("vm"), minutes=8)
+
+
+def plan_packages(_form: str) -> list[Step]:
+    """The real .deb files, as a user installs them."""
+    return [build_step(), packages_step(), reboot_step()]
+
+
+def packages_step() -> Step:
+    return lab_step("tests of the Debian packages", "container", ["tests/deb"], minutes=4)
+
+
+def plan_bookworm(_form: str) -> list[Step]:
+    """The oldest systemd that the product takes, and the checkout installed there by pip."""
+    return [lab_step("tests on Debian 12", "bookworm", ["tests/bookworm"], minutes=2)]
+
+
+def plan_system(form: str) -> list[Step]:
+    here = " and not lab" if form == "host" else ""
+    arguments = ["tests/system", "-m", f"not vm and not browser{here}"]
+    if form == "container":
+        halves = two_halves([*arguments, f"--ignore={FAULTS}"])
+        return [*plan_faults(form), *halves, *plan_browser(form)]
+    if form != "host":
+        return [lab_step(f"system tests, {form}", form, arguments)]
+    if not Path("/run/systemd/system").is_dir():
+        raise LabError("use LAB=host", "systemd is not running here; LAB=container brings its own")
+    if os.geteuid() == 0:
+        raise LabError("use LAB=host as root", "its tests run in user scope: be a user, not root")
+    command = ["python", "-m", "pytest", *arguments]
+    return [Step("system tests, this machine", command, partial(in_venv, for_system_tests=True))]
+
+
+def plan_browser(_form: str) -> list[Step]:
+    arguments = ["tests/system", "-m", "browser"]
+    return [lab_step("status page in a browser", "browser", arguments, minutes=1)]
+
+
+def plan_faults(form: str) -> list[Step]:
+    """Every fault as often as ROUNDS says; a machine of its own, and nothing beside it."""
+    rounds = os.environ.get("ROUNDS") or "1"
+    marks = "vm" if form == "vm" else "not vm"
+    command = ["tests/lab/lab", "run", "--env", f"FAULT_ROUNDS={rounds}", "--", "pytest"]
+    command += [FAULTS, "-m", marks]
+    return [Step(f"faults, {form}", command, in_lab(form), minutes=3 * int(rounds))]
+
+
+def plan_history(_form: str) -> list[Step]:
+    """Histories from SEED on, for HOURS or one; what breaks one is made shorter and printed."""
+    asked = ("--seed", "SEED", "1"), ("--steps", "STEPS", "40"), ("--hours", "HOURS", "0")
+    chosen = [word for flag, name, usual in asked for word in (flag, os.environ.get(name) or usual)]
+    kept = ["--out", "/out"] if os.environ.get("LAB_OUT") else []
+    command = ["tests/lab/lab", "run", "--", "python", "-m", "tests.history", "--shrink"]
+    return [Step("histories", [*command, *chosen, *kept], in_lab("container"))]
+
+
+def plan_fuzz(_form: str) -> list[Step]:
+    seconds = os.environ.get("FUZZ_SECONDS") or "120"
+    return [Step("fuzzing", ["python", "-m", "tests.fuzz", seconds], in_venv)]
+
+
+def plan_quick(_form: str) -> list[Step]:
+    """The heart of the system tests, two containers at the same time."""
+    first, second = (
+        quick_step(word, [f"tests/system/test_{name}.py" for name in half])
+        for word, half in zip(("first", "second"), QUICK, strict=True)
+    )
+    return [first, replace(second, after=())]
+
+
+def quick_step(half: str, files: Sequence[str]) -> Step:
+    return lab_step(f"quick system tests, {half} half", "container", [*files, "-m", "not vm"])
+
+
+def two_halves(arguments: Sequence[str]) -> list[Step]:
+    """Two containers at the same time; a test that measures or floods has its half for itself."""
+    first = lab_step("system tests, first half", "container", [*arguments, "--half=1"], minutes=7)
+    second = lab_step(
+        "system tests, second half", "container", [*arguments, "--half=2"], minutes=18
+    )
+    return [first, replace(second, after=("faults, container",))]
+
+
+def lab_step(name: str, form: str, arguments: Sequence[str], minutes: int = 0) -> Step:
+    command = ["tests/lab/lab", "run", "--", "pytest", *arguments]
+    return Step(name, command, in_lab(form), minutes=minutes)
+
+
+def plan_lint(_form: str) -> list[Step]:
+    venv = ensure_venv(find_cache())
+    config = f"--config-file={CHECKOUT / 'pyproject.toml'}"
+    sources = ["dora_systemd", "lab"]
+    return [
+        Step("ruff", ["ruff", "check", "."], in_venv),
+        Step("mypy", ["mypy", config, *sources], in_venv, write_package(venv)),
+    ]
+
+
+PLANS: dict[str, Callable[[str], list[Step]]] = {
+    "test": plan_test,
+    "unit": plan_unit,
+    "system": plan_system,
+    "quick": plan_quick,
+    "faults": plan_faults,
+    "history": plan_history,
+    "fuzz": plan_fuzz,
+    "lab": plan_lab,
+    "vm": plan_vm,
+    "packages": plan_packages,
+    "bookworm": plan_bookworm,
+    "browser": plan_browser,
+    "lint": plan_lint,
+}
