@@ -23,7 +23,7 @@ FIRST_HALF = (
 """Files of about half the time, which `make test` runs beside the others in a lab of their own."""
 
 
-LONGEST_SECONDS = 600
+LONGEST_SECONDS = 300
 """No test takes a tenth of it: one that hangs fails, shows where it stood, and the others run."""
 
 
