@@ -13,7 +13,7 @@ help:  ## this list
 	@sed -n 's/^\([a-z-]*\):.*##/make \1:/p' $(MAKEFILE_LIST)
 
 test:  ## everything: unit tests, system tests in the vm, system tests
-	@$(PREPARE) $(if $(filter host,$(LAB)),host,container vm)
+	@$(PREPARE) $(if $(filter host,$(LAB)),host,container machines vm)
 	@$(CHECK) test
 
 unit:  ## unit tests, on this machine's Python
@@ -47,6 +47,10 @@ fuzz:  ## feed what reads other people's bytes, for SECONDS=n
 browser:  ## the status page in headless Chromium; LAB_OUT=DIR keeps pictures of it
 	@$(PREPARE) container
 	@$(CHECK) browser
+
+machines:  ## three machines on a network: doractl -H, pulled cables, power cuts
+	@$(PREPARE) machines
+	@$(CHECK) machines
 
 BENCHMARKS := start stop recovery startup many cost logs messages reload owes
 
@@ -83,4 +87,4 @@ autopkgtest:  ## debian/tests, by Debian's own autopkgtest, on what make deb has
 	@$(PREPARE) $(if $(filter vm,$(LAB)),container vm,container)
 	@packaging/autopkgtest
 
-.PHONY: help test unit system quick vm faults history fuzz browser bench bench-quick bookworm lint demo clean deb autopkgtest
+.PHONY: help test unit system quick vm faults history fuzz browser machines bench bench-quick bookworm lint demo clean deb autopkgtest

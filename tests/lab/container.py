@@ -87,12 +87,18 @@ def start_nspawn(run: Run, command: list[str]) -> subprocess.Popen[bytes]:
 
 def nspawn_command(run: Run, tree: Path, out: Path | None) -> list[str]:
     return die_with_parent([
-        "systemd-nspawn", "--register=no", "--keep-unit", "--quiet", "--boot",
-        f"--directory={tree}", "--volatile=overlay", f"--machine={run.name}", "--hostname=lab",
-        "--private-network", "--resolv-conf=off", "--timezone=off", "--link-journal=no",
-        f"--capability={CAPABILITIES}", "--console=pipe", "--notify-ready=yes",
+        *nspawn_words(run, tree, "lab"), "--volatile=overlay",
         f"--bind={run.directory / 'src'}:/src", *([f"--bind={out}:/out"] if out else []),
     ])  # fmt: skip
+
+
+def nspawn_words(run: Run, root: Path, hostname: str) -> list[str]:
+    return [
+        "systemd-nspawn", "--register=no", "--keep-unit", "--quiet", "--boot",
+        f"--directory={root}", f"--machine={run.name}", f"--hostname={hostname}",
+        "--private-network", "--resolv-conf=off", "--timezone=off", "--link-journal=no",
+        f"--capability={CAPABILITIES}", "--console=pipe", "--notify-ready=yes",
+    ]  # fmt: skip
 
 
 def wait_ready(ready: socket.socket, nspawn: subprocess.Popen[bytes], run: Run) -> int:

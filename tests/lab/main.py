@@ -12,6 +12,7 @@ from lab.container import run_in_container
 from lab.errors import LabError
 from lab.image import ensure_tree
 from lab.machine import ensure_machine, run_in_machine
+from lab.machines import run_in_machines
 from lab.options import Options, parse_options
 from lab.process import need_root
 from lab.rivals import ensure_rivals
@@ -81,6 +82,7 @@ ENSURE = {
     "bookworm": ensure_bookworm,
     "rivals": ensure_rivals,
     "browser": ensure_browser,
+    "machines": ensure_tree,
 }
 RUN = {
     "container": run_in_container,
@@ -88,6 +90,7 @@ RUN = {
     "bookworm": run_in_container,
     "rivals": run_in_container,
     "browser": run_in_container,
+    "machines": run_in_machines,
 }
 VERBS = {
     "run": run_command,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from lab.errors import LabError
 
-FORMS = ("container", "vm", "bookworm", "rivals", "browser")
+FORMS = ("container", "vm", "bookworm", "rivals", "browser", "machines")
 
 REBOOT = "--reboot--"
 
@@ -21,6 +21,7 @@ environment:
                     not installed, but all that pip needs to do so
   LAB=rivals        the container with supervisord, circus and pm2, for benchmarks
   LAB=browser       the container with Chromium, for the status page
+  LAB=machines      three containers, a b c, on a network with sshd; the command runs in a
   LAB_OUT=DIR       this directory is /out inside
   DORA_LAB_CACHE    where images are kept (default: ~/.cache/dora-systemd-lab)
   LAB_MIRROR        another Debian mirror for building the image

@@ -50,9 +50,10 @@ def beside_the_machine(before: str) -> list[Step]:
     restarted = replace(restarted, after=(packages.name, inside.name))
     installed = replace(packages_step(), after=(packages.name,))
     faults, first, second, browser = plan_system("container")
+    several = replace(machines_step(), after=(second.name,))
     second = replace(second, after=(first.name,))
     browser = replace(browser, after=(restarted.name,))
-    return [packages, installed, faults, first, inside, restarted, second, browser]
+    return [packages, installed, faults, first, inside, restarted, second, several, browser]
 
 
 def in_venv(for_system_tests: bool = False) -> dict[str, str]:
@@ -144,6 +145,14 @@ def plan_browser(_form: str) -> list[Step]:
     return [lab_step("status page in a browser", "browser", arguments, minutes=1)]
 
 
+def plan_machines(_form: str) -> list[Step]:
+    return [machines_step()]
+
+
+def machines_step() -> Step:
+    return lab_step("several machines", "machines", ["tests/machines"], minutes=2)
+
+
 def plan_faults(form: str) -> list[Step]:
     """Every fault as often as ROUNDS says; a machine of its own, and nothing beside it."""
     rounds = os.environ.get("ROUNDS") or "1"
@@ -217,5 +226,6 @@ PLANS: dict[str, Callable[[str], list[Step]]] = {
     "packages": plan_packages,
     "bookworm": plan_bookworm,
     "browser": plan_browser,
+    "machines": plan_machines,
     "lint": plan_lint,
 }

@@ -14,6 +14,7 @@ TOOLS = {
     "mmdebstrap": "mmdebstrap",
     "systemd-nspawn": "systemd-container",
     "mke2fs": "e2fsprogs",
+    "ip": "iproute2",
 }
 
 

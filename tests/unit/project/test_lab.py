@@ -15,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from lab import cache, definition, initrd, pace, wire
 from lab.errors import LabError
-from lab.options import parse_options
+from lab.options import FORMS, parse_options
 from lab.plans import PLANS
 from lab.slow import read_speed
 from lab.steps import Result, Step, predecessors, read_summary, run_steps, total, whole_minutes
@@ -59,7 +59,7 @@ def test_commands_around_a_reboot() -> None:
         (
             ["run", "x"],
             {"LAB": "moon"},
-            "lab: cannot use LAB=moon (hint: one of container, vm, bookworm, rivals, browser)",
+            f"lab: cannot use LAB=moon (hint: one of {', '.join(FORMS)})",
         ),
         (
             ["run", "x"],

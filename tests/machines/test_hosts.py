@@ -1,0 +1,93 @@
+"""doractl -H from one machine to others, with cables that are pulled and power that is cut."""
+
+import json
+import re
+import subprocess
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from dora_systemd.errors import ExitCode
+from tests.lab.pace import bound
+from tests.machines.wires import OTHERS, cable, clear, power_cut, there
+from tests.system.cells import run, wait_for
+
+ROBOT = "/src/examples/robot/dataflow.yml"
+
+
+@pytest.fixture(autouse=True)
+def dataflows() -> Iterator[None]:
+    """The same dataflow on both of the others, enabled on b."""
+    started = doractl("start", ROBOT, "--name", "robot", "-H", "b,c")
+    assert started.returncode == 0, started.stderr
+    assert doractl("enable", "robot", "-H", "b").returncode == 0
+    yield
+    doractl("disable", "robot", "-H", "b")
+    for name in OTHERS:
+        clear(name)
+
+
+def doractl(*words: str) -> subprocess.CompletedProcess[str]:
+    return run("doractl", *words, check=False)
+
+
+def running() -> dict[str, str]:
+    """The status of the dataflow by host."""
+    done = doractl("list", "-H", "b,c", "-o", "json")
+    return {one["host"]: one["status"] for one in json.loads(done.stdout)}
+
+
+def test_all_see_all() -> None:
+    assert running() == {"b": "Running", "c": "Running"}
+    assert doractl("list").stdout.count("robot") == 0
+    assert doractl("restart", "robot", "-H", "b,c").returncode == 0
+    why = doractl("why", "robot", "-H", "b,c").stdout
+    assert re.findall("==> (.*) <==", why) == ["b", "c"]
+
+
+@pytest.mark.parametrize("how", ["off", "mute"])
+def test_a_dead_host_takes_bounded_time(how: str) -> None:
+    with cable("b", how):
+        begun = time.monotonic()
+        done = doractl("list", "-H", "b,c")
+        assert time.monotonic() - begun < bound(15)
+        rows = [line.split()[:4] for line in done.stdout.splitlines()[1:]]
+        assert [(row[0], row[3]) for row in rows] == [("c", "Running"), ("b", "Unreachable")]
+        assert done.stderr.startswith("doractl: cannot reach b: ")
+        assert done.returncode == ExitCode.NO_HOST
+        assert doractl("stop", "robot", "-H", "b,c").returncode == ExitCode.NO_HOST
+    assert running() == {"b": "Running", "c": "Stopped"} or running() == {"b": "Running"}
+
+
+@pytest.mark.parametrize("how", ["off", "mute"])
+def test_a_cable_pulled_in_the_middle_of_the_logs(how: str) -> None:
+    """What the other host says goes on, and what is lost is named."""
+    command = ["doractl", "logs", "robot", "-f", "-H", "b,c"]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as child:
+        assert child.stdout
+        assert child.stderr
+        seen = set[str]()
+        while seen != set(OTHERS):
+            seen.add(child.stdout.readline().split()[0])
+        with cable("b", how):
+            assert child.stderr.readline().startswith("doractl: ")
+            line = child.stdout.readline()
+            while not line.startswith("c"):
+                line = child.stdout.readline()
+        child.terminate()
+        child.communicate()
+    wait_for("nobody follows on c", lambda: there("c", "pgrep", "-f", "doractl logs").returncode)
+
+
+def test_power_comes_back() -> None:
+    """What is enabled runs again, what is not does not."""
+    with power_cut("b"):
+        assert doractl("list", "-H", "b").returncode == ExitCode.NO_HOST
+    wait_for("it runs again", lambda: running().get("b") == "Running")
+    life = json.loads(doractl("show", "robot", "-H", "b", "-o", "json").stdout)
+    assert life["name"] == "robot"
+    with power_cut("c"):
+        pass
+    assert "c" not in running()
