@@ -89,6 +89,8 @@ def test_stages_are_shown_on_a_terminal_only(cell: Cell, project: Project) -> No
     assert "Dataflow started" in shown.stdout.rpartition("\x1b[K")[2]
 
 
+# Its end comes before or after dora has started the node.
+@pytest.mark.warns("Signal(15)")
 def test_no_wait(cell: Cell, project: Project) -> None:
     flow = project.write("dataflow.yml", "nodes: [{id: never, path: sleep, args: '100'}]")
     done = cell.start(flow, "--no-wait")
@@ -208,6 +210,8 @@ def test_a_failed_start_says_why(cell: Cell, project: Project) -> None:
     assert hint == f"hint: doractl {cell.scope.flag} why {cell.name} tells more"
 
 
+# As above.
+@pytest.mark.warns("Signal(15)")
 def test_ctrl_c_while_it_starts_ends_the_waiting_only(cell: Cell, project: Project) -> None:
     flow = project.write("dataflow.yml", "nodes: [{id: never, path: sleep, args: '100'}]")
     command = ("doractl", "start", str(flow), "--name", cell.name)
