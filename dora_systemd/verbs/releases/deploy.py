@@ -4,16 +4,17 @@ import os
 import time
 import uuid
 from collections.abc import Callable
-from contextlib import suppress
-from dataclasses import dataclass
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from dora_systemd import __version__
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.releases.draft import Draft
 from dora_systemd.adapters.releases.store import Store, locked, unusable
+from dora_systemd.decisions.releases.build import build_commands
 from dora_systemd.decisions.releases.choice import surplus
-from dora_systemd.decisions.releases.entries import Found, touched
+from dora_systemd.decisions.releases.entries import Found, Stored, touched
 from dora_systemd.decisions.releases.ids import new_id
 from dora_systemd.decisions.releases.manifest import Manifest
 from dora_systemd.decisions.unit.file import persistent_unit, runner_of
@@ -24,6 +25,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.trust.project import Project, opened_project
 from dora_systemd.values import format_rounded_size
 from dora_systemd.verbs.inhibit.guard import IfInhibited, require_uninhibited
+from dora_systemd.verbs.releases.build import Build, built_project
 from dora_systemd.verbs.releases.change import Change, change_release
 from dora_systemd.verbs.releases.files import copy_files, digests, find_files
 from dora_systemd.verbs.releases.listing import store_of
@@ -50,7 +52,7 @@ _MICROSECOND_NS = 1000
 class DeployRequest:
     """A deploy. start: as of `doractl start`; its dataflow may be a directory. soak: µs.
 
-    how: what to do while a lock inhibits it.
+    how: what to do while a lock inhibits it. build_timeout: µs; 0: without a build.
     """
 
     start: StartRequest
@@ -58,6 +60,7 @@ class DeployRequest:
     keep: int
     want_boot: bool
     how: IfInhibited = IfInhibited.REFUSE
+    build_timeout: int = 0
 
 
 class Deployed(NamedTuple):
@@ -80,14 +83,20 @@ class _Copy(NamedTuple):
     copied: int
 
 
-def compare(scope: Scope, request: StartRequest) -> tuple[str, dict[str, list[str]]]:
-    """What a deploy would change: the newest release, and paths. Raises DoraSystemdError."""
-    source = find_source(scope, request)
+def compare(
+    scope: Scope, request: StartRequest, want_build: bool = True
+) -> tuple[str, dict[str, list[str]]]:
+    """What a deploy would change: the newest release, and paths, but none that a build makes.
+
+    Raises DoraSystemdError.
+    """
+    source = find_source(scope, request, want_build)
     store = store_of(scope, source.plan.options.name)
     last = newest(store)
+    old = {path: one for path, one in last.files.items() if not one.is_built} if last else {}
     with opened_project(source.root, account_of(source.plan.user)) as project:
         found, _ = find_files(project, source.named, _owners(source))
-        return last.id if last else "", touched(last.files if last else {}, digests(project, found))
+        return last.id if last else "", touched(old, digests(project, found))
 
 
 def deploy(
@@ -102,7 +111,7 @@ def deploy(
     Raises DoraSystemdError: ROLLED_BACK if the release has failed its trial. After any other error
     everything is as before.
     """
-    source = find_source(scope, request.start)
+    source = find_source(scope, request.start, bool(request.build_timeout))
     name = source.plan.options.name
     store, standing = store_of(scope, name), read_standing(manager, scope, unit_name(name))
     require_deployable(manager, scope, standing)
@@ -110,7 +119,7 @@ def deploy(
         standing = read_standing(manager, scope, standing.boot.unit)  # nobody changes it now
         require_uninhibited(scope, standing.running, "deploy", request.how, tell)
         store.clean()
-        copy = _copy_project(source, store, standing, tell)
+        copy = _copy_project(manager, scope, source, store, standing, request, tell)
         release = copy.manifest.id
         try:
             text = _unit_text(manager, scope, source, store, request, copy.manifest, tell, warn)
@@ -124,7 +133,7 @@ def deploy(
             raise
         options = runner_of(text)
         assert options is not None
-        for note in source_notes(source):
+        for note in source_notes(source, store.tree(release)):
             warn(note)
         standing = read_standing(manager, scope, standing.boot.unit)  # the copy took its time
         require_deployable(manager, scope, standing)
@@ -167,23 +176,38 @@ def _owners(source: Source) -> list[int]:
     return [0, os.geteuid() if user is None else user.pw_uid]
 
 
-def _copy_project(source: Source, store: Store, standing: Standing, tell: Tell) -> _Copy:
+def _copy_project(
+    manager: Manager,
+    scope: Scope,
+    source: Source,
+    store: Store,
+    standing: Standing,
+    request: DeployRequest,
+    tell: Tell,
+) -> _Copy:
     user = source.plan.user
     last = newest(store)
     draft = None
     try:
-        with opened_project(source.root, account_of(user)) as project:
+        with ExitStack() as held:
+            project = held.enter_context(opened_project(source.root, account_of(user)))
             found, revision = find_files(project, source.named, _owners(source))
+            manifest = _manifest(source, store, standing, last, revision)
+            originals = found.keys()
+            if commands := _commands(source, store, manifest, found):
+                build = Build(
+                    *(scope, source, store, manifest.id, manifest.uuid, commands),
+                    request.build_timeout,
+                    on_line=lambda line: tell(f"building: {line}"),
+                )
+                at_work = built_project(manager, build, project, found, tell)
+                project, found = held.enter_context(at_work)
             draft = Draft(store)
-            manifest = _fill(project, found, draft, last, source, revision, tell)
+            files = _fill(project, found, draft, last, tell)
+            files = {p: replace(one, is_built=p not in originals) for p, one in files.items()}
+            manifest = replace(manifest, files=files)
             shared = last.files if last else {}
-            copied = sum(
-                one.size for path, one in manifest.files.items() if shared.get(path) != one
-            )
-            uuid_ = standing.uuid or (last.uuid if last else "") or str(uuid.uuid4())
-            known = frozenset(one.id for one in store.known())
-            release = new_id(manifest.created_us, revision, known)
-            manifest = Manifest(**{**vars(manifest), "id": release, "uuid": uuid_})
+            copied = sum(one.size for path, one in files.items() if shared.get(path) != one)
             draft.publish(manifest, None if user is None else user.pw_gid)
             return _Copy(manifest, copied)
     except OSError as error:
@@ -193,32 +217,41 @@ def _copy_project(source: Source, store: Store, standing: Standing, tell: Tell) 
             draft.discard()
 
 
-def _fill(
-    project: Project,
-    found: dict[str, Found],
-    draft: Draft,
-    last: Manifest | None,
-    source: Source,
-    revision: str,
-    tell: Tell,
+def _manifest(
+    source: Source, store: Store, standing: Standing, last: Manifest | None, revision: str
 ) -> Manifest:
-    def progress(done: int, total: int) -> None:
-        tell(f"copying: {format_rounded_size(done)} of {format_rounded_size(total)}")
-
-    files = copy_files(project, found, draft, last, progress)
+    """The manifest of a new release, without its files."""
     user = source.plan.user
+    created_us = time.time_ns() // _MICROSECOND_NS
     return Manifest(
-        id="",
+        id=new_id(created_us, revision, frozenset(one.id for one in store.known())),
         name=source.plan.options.name,
-        uuid="",
+        uuid=standing.uuid or (last.uuid if last else "") or str(uuid.uuid4()),
         dataflow=source.dataflow,
         source=source.root,
         user="" if user is None else user.pw_name,
         revision=revision,
-        created_us=time.time_ns() // _MICROSECOND_NS,
+        created_us=created_us,
         versions={"dora-systemd": __version__},
-        files=files,
     )
+
+
+def _commands(
+    source: Source, store: Store, manifest: Manifest, found: dict[str, Found]
+) -> tuple[tuple[str, ...], ...]:
+    if not (source.dora or source.uv):
+        return ()
+    place = str(store.tree(manifest.id))
+    return build_commands(found, place, source.dataflow, source.uv, source.dora)
+
+
+def _fill(
+    project: Project, found: dict[str, Found], draft: Draft, last: Manifest | None, tell: Tell
+) -> dict[str, Stored]:
+    def progress(done: int, total: int) -> None:
+        tell(f"copying: {format_rounded_size(done)} of {format_rounded_size(total)}")
+
+    return copy_files(project, found, draft, last, progress)
 
 
 def _unit_text(
