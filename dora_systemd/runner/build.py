@@ -33,6 +33,7 @@ _LONGEST = 8192
 """Bytes of a line; the rest is another line."""
 _TAIL = 16384
 """Bytes of the output of a command in which its error is looked for."""
+_LAST_CHUNKS = 64
 _STATUS_SECONDS = 0.1
 _JOURNAL_SECONDS = 5.0
 
@@ -44,8 +45,8 @@ class Gone(Exception):
 class Output:
     """What the build prints: to the journal, and its last line to STATUS=."""
 
-    def __init__(self, task: BuildTask) -> None:
-        self._journal = JournalSocket()
+    def __init__(self, task: BuildTask, journal: JournalSocket) -> None:
+        self._journal = journal
         self._fields = {
             "PRIORITY": "6",
             "SYSLOG_IDENTIFIER": task.name,
@@ -101,24 +102,37 @@ def run_command(command: Sequence[str], directory: str, output: Output) -> int:
     environment = {**node_environment(os.environ), "RUST_BACKTRACE": "0", "NO_COLOR": "1"}
     child = spawn(command, own_account(), environment, directory, stderr=subprocess.STDOUT)
     assert child.stdout
-    pipe, end = child.stdout.fileno(), os.pidfd_open(child.pid)
-    is_over = False
-    while not is_over:
-        # A process that it leaves may hold the pipe for ever: what counts is the command's end.
-        ready, _, _ = select.select([pipe, end, sys.stdin.fileno()], [], [])
-        if sys.stdin.fileno() in ready:
-            raise Gone
-        is_over = _read(pipe, output) if pipe in ready else end in ready
+    end = os.pidfd_open(child.pid)
+    with child.stdout:
+        try:
+            _follow(child.stdout.fileno(), end, output)
+        finally:
+            os.close(end)
     output.feed(b"")
     return child.wait()
 
 
+def _follow(pipe: int, end: int, output: Output) -> None:
+    """Take what a child prints until it ends. end: its pidfd. Raises Gone."""
+    stdin = sys.stdin.fileno()
+    watched = [stdin, end, pipe]
+    # A process that it leaves may hold the pipe for ever: what counts is the end of the command.
+    while end not in (ready := select.select(watched, [], [])[0]):
+        if stdin in ready:
+            raise Gone
+        if not _read(pipe, output):
+            watched.remove(pipe)
+    for _ in range(_LAST_CHUNKS):
+        if not select.select([pipe], [], [], 0)[0] or not _read(pipe, output):
+            break
+
+
 def _read(pipe: int, output: Output) -> bool:
-    """Whether that was the end of the pipe."""
+    """Take what is in the pipe; whether there can be more."""
     data = os.read(pipe, _CHUNK)
     if data:
         output.feed(data)
-    return not data
+    return bool(data)
 
 
 def failure(task: BuildTask, command: Sequence[str], status: int, output: Output) -> str:
@@ -143,7 +157,7 @@ def build(task: BuildTask, output: Output) -> None:
 def main(argv: list[str]) -> int:
     """Carry out the task in `argv`; the exit status of a runner."""
     task = parse_task(argv[0])
-    output = Output(task)
+    output = Output(task, JournalSocket())
     try:
         build(task, output)
     except DoraSystemdError as error:

@@ -1,14 +1,17 @@
 """doractl deploy of what has to be built first."""
 
 import json
+import shutil
 import subprocess
 import sys
 import sysconfig
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
 from tests.system.cells import Cell, Project, run, wait_for
+from tests.system.homes import Home
 from tests.system.releases import Releases, write_version
 
 pytestmark = pytest.mark.lab
@@ -45,10 +48,10 @@ def built_unit(cell: Cell) -> str:
     return f"doractl-build-{cell.name}.service"
 
 
-def printed(cell: Cell) -> list[dict[str, str]]:
+def printed(cell: Cell, field: str = "_SYSTEMD_UNIT") -> list[dict[str, str]]:
     """What builds have printed, from the journal."""
     run("journalctl", "--sync")
-    found = run("journalctl", f"_SYSTEMD_UNIT={built_unit(cell)}", "-o", "json").stdout
+    found = run("journalctl", f"{field}={built_unit(cell)}", "-o", "json").stdout
     return [json.loads(line) for line in found.splitlines()]
 
 
@@ -222,3 +225,27 @@ def test_a_node_from_git_is_built(releases: Releases, project: Project) -> None:
     assert list(tree.glob("git/**/built"))
     assert not list(tree.glob("git/**/.git"))
     releases.check_whole()
+
+
+def test_users_build_their_own(cell: Cell) -> None:
+    home, name = Home("alice"), cell.name
+
+    def doractl(*words: str) -> str:
+        own = ("runuser", "-u", "alice", "--", "env", "XDG_RUNTIME_DIR=/run/user/1000")
+        done = run(*own, "doractl", "--user", *words, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    try:
+        home.write("build.sh", BUILD + "touch /home/alice/project/proof || true\n")
+        home.write("dataflow.yml", FLOW)
+        doractl("deploy", str(home.root), "--name", name, "--no-enable", *FAST)
+        (row,) = json.loads(doractl("releases", name, "-o", "json"))
+        tree = Path("/home/alice/.local/state/dora-systemd/releases", name, row["release"], "tree")
+        assert row["state"] == "current"
+        assert (tree / "made/a.py").exists()
+        assert f"builds in {tree}" in str(printed(cell, "_SYSTEMD_USER_UNIT"))
+    finally:
+        doractl("stop", name)
+        shutil.rmtree("/home/alice/.local/state/dora-systemd")
+        shutil.rmtree(home.root)

@@ -70,6 +70,8 @@ def command(
 ) -> int:
     """Copy the project of FILE, or of DIR, into a release that does not change, and run it.
 
+    Nodes with build or git are built first, as the user of the nodes.
+
     The release is on trial until all nodes are ready and no node has failed for a while. Then it is
     what every start and boot runs. If it fails, what ran before runs again, and the exit status is
     11. A reboot during the trial boots what ran before. Refused while a lock inhibits it.

@@ -15,11 +15,6 @@ from dora_systemd.decisions.properties.table import TABLE
 from dora_systemd.decisions.releases.entries import MOST_BYTES
 from dora_systemd.values import SECOND
 
-OF_RUNNERS = (
-    *("Exec", "Restart", "StartLimit", "RuntimeDirectory", "Watchdog", "FileDescriptorStore"),
-    *("Delegate", "LogExtraFields", "Type", "Timeout", "OOMPolicy", "Notify"),
-)
-"""Prefixes of the properties that only apply to a runner."""
 _OF_NODES = (
     *(
         "LoadCredential",
@@ -51,11 +46,10 @@ def build_properties(
 ) -> dict[str, Property]:
     """All properties but ExecStart= and standard input.
 
-    own: of the unit of the dataflow. tree: the directory that is built, which the unit sees as
-    `place`, below `releases`. timeout: µs.
+    own: of the unit of the dataflow, without those of its runner. tree: the directory that is
+    built, which the unit sees as `place`, below `releases`. timeout: µs.
     """
-    dropped = (*OF_RUNNERS, *_OF_NODES)
-    kept = {slot: one for slot, one in own.items() if not _is_one_of(slot, dropped)}
+    kept = {slot: one for slot, one in own.items() if not _is_of_nodes(slot)}
     if not any(slot.startswith("MemoryMax") for slot in kept):
         kept = with_assignments(kept, [f"MemoryMax={_MEMORY}"])
     binds, hidden = (_values(kept, key) for key in ("BindPaths", "TemporaryFileSystem"))
@@ -79,10 +73,10 @@ def build_properties(
     return with_assignments(kept, ["PrivateUsers=yes"]) if is_user else kept
 
 
-def _is_one_of(slot: str, prefixes: tuple[str, ...]) -> bool:
-    """Whether a slot has such a prefix, or is of [Unit]: a build starts no other units."""
+def _is_of_nodes(slot: str) -> bool:
+    """Whether it has such a prefix, or is of [Unit]: a build starts no other units."""
     row = TABLE.get(slot.removesuffix("~").removesuffix("Soft"))
-    return slot.startswith(prefixes) or (row is not None and row.section == "Unit")
+    return slot.startswith(_OF_NODES) or (row is not None and row.section == "Unit")
 
 
 def _values(properties: Mapping[str, Property], key: str) -> tuple[object, ...]:

@@ -35,8 +35,7 @@ from dora_systemd.verbs.releases.files import copy_files
 from dora_systemd.verbs.releases.soak import Tell
 from dora_systemd.verbs.releases.source import Source
 from dora_systemd.verbs.start.account import account_of
-from dora_systemd.verbs.start.check import exec_start, without_cell
-from dora_systemd.verbs.start.unit import plan_properties
+from dora_systemd.verbs.start.check import beside_properties, exec_start
 
 _LOOK_SECONDS = 0.2
 _GONE_SECONDS = 20.0
@@ -100,7 +99,6 @@ def built_project(
 
 def _run(manager: Manager, build: Build, tree: BuildTree) -> None:
     """Run the unit of the build to its end, which is also that of all its processes."""
-    _end_former(manager, build.unit)
     reading, writing = os.pipe2(os.O_CLOEXEC)
     try:
         try:
@@ -117,7 +115,7 @@ def _run(manager: Manager, build: Build, tree: BuildTree) -> None:
         os.close(writing)  # our end is its end
 
 
-def _end_former(manager: Manager, unit: str) -> None:
+def end_former(manager: Manager, unit: str) -> None:
     """Stop the build of a deploy that was killed: it notices that itself, unless it is hostile."""
     deadline = time.monotonic() + _GONE_SECONDS
     while manager.list_units(unit) and time.monotonic() < deadline:
@@ -179,7 +177,7 @@ def _sent(manager: Manager, build: Build, tree: BuildTree, reading: int) -> list
     own = build.source.own_venv
     venv = None if own is None else str(place / own)
     properties = build_properties(
-        without_cell(plan, plan_properties(plan, manager)[0]),
+        beside_properties(manager, plan),
         str(tree.place),
         str(place),
         str(build.store.path.parent),

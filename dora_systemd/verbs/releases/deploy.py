@@ -1,33 +1,28 @@
 """`doractl deploy`: copies a project into a release, and lets it prove itself."""
 
-import os
-import time
-import uuid
 from collections.abc import Callable
-from contextlib import ExitStack, suppress
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass
 from typing import NamedTuple
 
-from dora_systemd import __version__
 from dora_systemd.adapters.bus.manager import Manager
-from dora_systemd.adapters.releases.draft import Draft
 from dora_systemd.adapters.releases.store import Store, locked, unusable
-from dora_systemd.decisions.releases.build import build_commands
+from dora_systemd.decisions.releases.build import build_unit
 from dora_systemd.decisions.releases.choice import surplus
-from dora_systemd.decisions.releases.entries import Found, Stored, touched
-from dora_systemd.decisions.releases.ids import new_id
+from dora_systemd.decisions.releases.entries import touched
 from dora_systemd.decisions.releases.manifest import Manifest
 from dora_systemd.decisions.unit.file import persistent_unit, runner_of
 from dora_systemd.decisions.unit.properties import format_unit
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
-from dora_systemd.trust.project import Project, opened_project
-from dora_systemd.values import format_rounded_size
+from dora_systemd.trust.project import opened_project
+from dora_systemd.values import SECOND
 from dora_systemd.verbs.inhibit.guard import IfInhibited, require_uninhibited
-from dora_systemd.verbs.releases.build import Build, built_project
+from dora_systemd.verbs.releases.build import end_former
 from dora_systemd.verbs.releases.change import Change, change_release
-from dora_systemd.verbs.releases.files import copy_files, digests, find_files
+from dora_systemd.verbs.releases.copy import copy_project, newest, repository_owners
+from dora_systemd.verbs.releases.files import digests, find_files
 from dora_systemd.verbs.releases.listing import store_of
 from dora_systemd.verbs.releases.soak import Tell
 from dora_systemd.verbs.releases.source import (
@@ -37,7 +32,7 @@ from dora_systemd.verbs.releases.source import (
     require_same,
     source_notes,
 )
-from dora_systemd.verbs.releases.trial import Standing, read_standing, require_deployable
+from dora_systemd.verbs.releases.trial import read_standing, require_deployable
 from dora_systemd.verbs.start.account import account_of
 from dora_systemd.verbs.start.check import check_plan
 from dora_systemd.verbs.start.enable import boot_target
@@ -45,6 +40,7 @@ from dora_systemd.verbs.start.plan import Plan, StartRequest, make_plan
 from dora_systemd.verbs.start.unit import plan_properties
 
 _COMMAND = "doractl deploy"
+BUILD_TIMEOUT = 30 * 60 * SECOND
 _MICROSECOND_NS = 1000
 
 
@@ -60,7 +56,7 @@ class DeployRequest:
     keep: int
     want_boot: bool
     how: IfInhibited = IfInhibited.REFUSE
-    build_timeout: int = 0
+    build_timeout: int = BUILD_TIMEOUT
 
 
 class Deployed(NamedTuple):
@@ -76,13 +72,6 @@ class Deployed(NamedTuple):
     copied: int
 
 
-class _Copy(NamedTuple):
-    """A copied project."""
-
-    manifest: Manifest
-    copied: int
-
-
 def compare(
     scope: Scope, request: StartRequest, want_build: bool = True
 ) -> tuple[str, dict[str, list[str]]]:
@@ -95,7 +84,7 @@ def compare(
     last = newest(store)
     old = {path: one for path, one in last.files.items() if not one.is_built} if last else {}
     with opened_project(source.root, account_of(source.plan.user)) as project:
-        found, _ = find_files(project, source.named, _owners(source))
+        found, _ = find_files(project, source.named, repository_owners(source))
         return last.id if last else "", touched(old, digests(project, found))
 
 
@@ -118,8 +107,10 @@ def deploy(
     with locked(store):
         standing = read_standing(manager, scope, standing.boot.unit)  # nobody changes it now
         require_uninhibited(scope, standing.running, "deploy", request.how, tell)
-        store.clean()
-        copy = _copy_project(manager, scope, source, store, standing, request, tell)
+        if store.unfinished():
+            end_former(manager, build_unit(name))
+            store.clean()
+        copy = copy_project(manager, scope, source, store, standing, request.build_timeout, tell)
         release = copy.manifest.id
         try:
             text = _unit_text(manager, scope, source, store, request, copy.manifest, tell, warn)
@@ -148,16 +139,6 @@ def deploy(
     return Deployed(*facts, len(manifest.files), manifest.size, copy.copied)
 
 
-def newest(store: Store) -> Manifest | None:
-    """The manifest of the newest release that has one."""
-    for one in reversed(store.known()):
-        try:
-            return store.manifest(one.id)
-        except DoraSystemdError:
-            continue
-    return None
-
-
 def prune(manager: Manager, scope: Scope, store: Store, keep: int, latest: str) -> None:
     """Remove the oldest releases beyond `keep`. latest: the one that was tried.
 
@@ -168,90 +149,6 @@ def prune(manager: Manager, scope: Scope, store: Store, keep: int, latest: str) 
         used = {latest, standing.trial}
         for release in surplus(store.known(), keep, standing.current, used):
             store.remove(release)
-
-
-def _owners(source: Source) -> list[int]:
-    """Whose repositories git may read: root's, and those of the user that reads."""
-    user = source.plan.user
-    return [0, os.geteuid() if user is None else user.pw_uid]
-
-
-def _copy_project(
-    manager: Manager,
-    scope: Scope,
-    source: Source,
-    store: Store,
-    standing: Standing,
-    request: DeployRequest,
-    tell: Tell,
-) -> _Copy:
-    user = source.plan.user
-    last = newest(store)
-    draft = None
-    try:
-        with ExitStack() as held:
-            project = held.enter_context(opened_project(source.root, account_of(user)))
-            found, revision = find_files(project, source.named, _owners(source))
-            manifest = _manifest(source, store, standing, last, revision)
-            originals = found.keys()
-            if commands := _commands(source, store, manifest, found):
-                build = Build(
-                    *(scope, source, store, manifest.id, manifest.uuid, commands),
-                    request.build_timeout,
-                    on_line=lambda line: tell(f"building: {line}"),
-                )
-                at_work = built_project(manager, build, project, found, tell)
-                project, found = held.enter_context(at_work)
-            draft = Draft(store)
-            files = _fill(project, found, draft, last, tell)
-            files = {p: replace(one, is_built=p not in originals) for p, one in files.items()}
-            manifest = replace(manifest, files=files)
-            shared = last.files if last else {}
-            copied = sum(one.size for path, one in files.items() if shared.get(path) != one)
-            draft.publish(manifest, None if user is None else user.pw_gid)
-            return _Copy(manifest, copied)
-    except OSError as error:
-        raise unusable(store.path, error) from error
-    finally:
-        if draft is not None:
-            draft.discard()
-
-
-def _manifest(
-    source: Source, store: Store, standing: Standing, last: Manifest | None, revision: str
-) -> Manifest:
-    """The manifest of a new release, without its files."""
-    user = source.plan.user
-    created_us = time.time_ns() // _MICROSECOND_NS
-    return Manifest(
-        id=new_id(created_us, revision, frozenset(one.id for one in store.known())),
-        name=source.plan.options.name,
-        uuid=standing.uuid or (last.uuid if last else "") or str(uuid.uuid4()),
-        dataflow=source.dataflow,
-        source=source.root,
-        user="" if user is None else user.pw_name,
-        revision=revision,
-        created_us=created_us,
-        versions={"dora-systemd": __version__},
-    )
-
-
-def _commands(
-    source: Source, store: Store, manifest: Manifest, found: dict[str, Found]
-) -> tuple[tuple[str, ...], ...]:
-    if not (source.dora or source.uv):
-        return ()
-    place = str(store.tree(manifest.id))
-    return build_commands(found, place, source.dataflow, source.uv, source.dora)
-
-
-def _fill(
-    project: Project, found: dict[str, Found], draft: Draft, last: Manifest | None, tell: Tell
-) -> dict[str, Stored]:
-    def progress(done: int, total: int) -> None:
-        tell(f"copying: {format_rounded_size(done)} of {format_rounded_size(total)}")
-
-    return copy_files(project, found, draft, last, progress)
 
 
 def _unit_text(
@@ -283,6 +180,8 @@ def _at_source(
     """The error with the paths of the project: those of the copy are gone."""
     tree = str(store.tree(release))
     message, hint = (text.replace(tree, source.root) for text in (error.message, error.hint))
+    if source.dora and "dora build" in hint:
+        hint = "the build has to make it there"
     return DoraSystemdError(message, hint, error.code)
 
 

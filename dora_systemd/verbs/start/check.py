@@ -7,7 +7,7 @@ directly.
 
 import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import Manager
@@ -19,7 +19,6 @@ from dora_systemd.decisions.cell.options import check_command
 from dora_systemd.decisions.life.refusal import parse_refusal
 from dora_systemd.decisions.properties.assignments import typed
 from dora_systemd.decisions.properties.kinds import Property
-from dora_systemd.decisions.unit.build import OF_RUNNERS
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.trust.programs import own_account
 from dora_systemd.values import SECOND, shown
@@ -29,6 +28,11 @@ from dora_systemd.verbs.start.unit import plan_properties
 
 _FORBIDDEN = 200
 """Exit statuses from this one on are systemd's own, see systemd.exec(5)."""
+_OF_RUNNERS = (
+    *("Exec", "Restart", "StartLimit", "RuntimeDirectory", "Watchdog", "FileDescriptorStore"),
+    *("Delegate", "LogExtraFields", "Type", "Timeout", "OOMPolicy", "Notify"),
+)
+"""Prefixes of the properties that only apply to a runner."""
 
 
 def check_plan(connect: Callable[[], Manager], plan: Plan) -> None:
@@ -70,14 +74,13 @@ def _properties(
     manager: Manager, plan: Plan, command: Sequence[str], streams: Sequence[int]
 ) -> list[Sent]:
     """The dataflow's unit properties, for a command; the unit disappears with this client."""
-    properties, _ = plan_properties(plan, manager)
-    kept = {key: one for key, one in properties.items() if not key.startswith(OF_RUNNERS)}
+    kept = beside_properties(manager, plan)
     kept |= typed(Type="oneshot", TimeoutStartSec=int(DORA_SECONDS) * SECOND)
     for key in ("StandardOutput", "StandardError"):
         del kept[key]
     stdout, stderr = streams
     return [
-        *without_cell(plan, kept).values(),
+        *kept.values(),
         exec_start(command),
         ("StandardOutputFileDescriptor", "h", stdout),
         ("StandardErrorFileDescriptor", "h", stderr),
@@ -86,12 +89,14 @@ def _properties(
     ]
 
 
-def without_cell(plan: Plan, properties: Mapping[str, Property]) -> dict[str, Property]:
-    """The properties without the mount of the cell's directory.
+def beside_properties(manager: Manager, plan: Plan) -> dict[str, Property]:
+    """The dataflow's unit properties, by slot, for a unit that has no runner.
 
-    It exists only while the cell runs, and may then be that of another dataflow with this name.
+    The directory of the cell exists only while the cell runs, and may then be that of another
+    dataflow with this name.
     """
-    kept = dict(properties)
+    properties, _ = plan_properties(plan, manager)
+    kept = {key: one for key, one in properties.items() if not key.startswith(_OF_RUNNERS)}
     if binds := kept.pop("BindPaths", None):
         cell = str(plan.scope.cell_directory(plan.options.name))
         others = tuple(one for one in binds.value if one[0] != cell)
