@@ -17,6 +17,7 @@ from dora_systemd.adapters.bus.manager import DOWN, Manager, Property
 from dora_systemd.adapters.releases.build_tree import BuildTree
 from dora_systemd.adapters.releases.store import Store
 from dora_systemd.decisions.cell.options import build_command
+from dora_systemd.decisions.logs.events import BUILD_FAILED
 from dora_systemd.decisions.releases.build import (
     BuildTask,
     build_environment,
@@ -35,6 +36,7 @@ from dora_systemd.verbs.releases.files import copy_files
 from dora_systemd.verbs.releases.soak import Tell
 from dora_systemd.verbs.releases.source import Source
 from dora_systemd.verbs.start.account import account_of
+from dora_systemd.verbs.start.asked import note_request
 from dora_systemd.verbs.start.check import beside_properties, exec_start
 
 _LOOK_SECONDS = 0.2
@@ -88,13 +90,23 @@ def built_project(
     try:
         files = copy_files(project, found, tree, None, progress)
         tree.hand_over(files, None if user is None else (user.pw_uid, user.pw_gid))
-        _run(manager, build, tree)
+        _run_noted(manager, build, tree)
         root, place = build.source.root, str(tree.place)
         with opened_project(root, account_of(user), place) as built:
             named, is_user = build.source.named, build.scope.is_user
             yield built, find_built(built, named, build.place, is_user)
     finally:
         tree.discard()
+
+
+def _run_noted(manager: Manager, build: Build, tree: BuildTree) -> None:
+    try:
+        _run(manager, build, tree)
+    except DoraSystemdError as error:
+        reason = error.message.removeprefix(f"cannot build {build.store.name}: ")
+        details = {"scope": build.scope.word, "release": build.release, "reason": reason}
+        note_request(BUILD_FAILED, build.store.name, build.uuid, "doractl deploy", **details)
+        raise
 
 
 def _run(manager: Manager, build: Build, tree: BuildTree) -> None:
