@@ -136,6 +136,21 @@ def locked(store: Store, make: bool = True) -> Iterator[None]:
         os.close(fd)
 
 
+def is_locked(store: Store) -> bool:
+    """Whether a process changes the store now, as far as this user may know."""
+    try:
+        fd = os.open(store.lock, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(fd)
+    return False
+
+
 def _require(store: Store, make: bool) -> None:
     try:
         if make:

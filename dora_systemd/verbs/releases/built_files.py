@@ -27,6 +27,7 @@ from dora_systemd.trust.project import Project
 
 _VENV, _CACHE = "pyvenv.cfg", "CACHEDIR.TAG"
 """Files whose directory is a virtual environment, or a cache such as Cargo's `target`."""
+_HINT = "the build has left it: have the build remove it, or make something else of it"
 _LEFT_OUT = (".git", "__pycache__")
 _LEFT_OUT_OF_CACHE = (*_LEFT_OUT, "build", "deps", "examples", "incremental", ".fingerprint")
 
@@ -45,10 +46,14 @@ def find_built(
             found[row[0]] = Found(*row)
     if len(found) > MOST_FILES:
         raise too_many("")
-    for one in found.values():
-        if not _is_interpreter(one, venvs, is_user):
+    others = [one for one in found.values() if not _is_interpreter(one, venvs, is_user)]
+    try:
+        for one in others:
             check_found(_relative(one, tree))
-    check_amount(found.values())
+        check_amount(found.values())
+    except DoraSystemdError as error:
+        # Not the hint for a file of the project.
+        raise DoraSystemdError(error.message, _HINT, error.code) from error
     return dict(sorted(found.items()))
 
 
