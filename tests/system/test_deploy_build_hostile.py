@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.system.cells import Cell, run
+from tests.system.cells import run
 from tests.system.homes import Home
 from tests.system.releases import STORE, Releases
 
@@ -38,13 +38,6 @@ ln SECRET hard
 } >said 2>errors
 true
 """
-
-
-@pytest.fixture
-def releases(cell: Cell) -> Iterator[Releases]:
-    found = Releases(cell)
-    yield found
-    found.end()
 
 
 @pytest.fixture
