@@ -172,15 +172,18 @@ def _is_text(value: object) -> bool:
 
 
 @contextlib.contextmanager
-def opened_project(root: str, account: Account | None) -> Iterator[Project]:
+def opened_project(
+    root: str, account: Account | None, place: str | None = None
+) -> Iterator[Project]:
     """The project in the directory `root` as the account sees it; None: as the caller does.
 
-    Raises DoraSystemdError (NO_PERMISSION) if the account cannot execute our Python interpreter.
+    place: where its files are instead, in a directory that the account could not reach. Raises
+    DoraSystemdError (NO_PERMISSION) if the account cannot execute our Python interpreter.
     """
     account = account or account_of_uid(os.geteuid())
     text = Path(courier.__file__).read_text(encoding="utf-8")
-    command = (sys.executable, "-I", "-S", "-c", text, root)
-    child = start_reader(command, account)
+    command = (sys.executable, "-I", "-S", "-c", text, "." if place else root)
+    child = start_reader(command, account, place or "/")
     try:
         yield Project(root, child, account)
     finally:

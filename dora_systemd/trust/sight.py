@@ -141,14 +141,17 @@ def sight_of(account: Account | None) -> Iterator[Sight]:
             pass
 
 
-def start_reader(command: Sequence[str], account: Account) -> "subprocess.Popen[bytes]":
+def start_reader(
+    command: Sequence[str], account: Account, directory: str = "/"
+) -> "subprocess.Popen[bytes]":
     """Start our interpreter as the account, to read for us by its standard input and output.
 
-    Raises DoraSystemdError (NO_PERMISSION) if the account cannot execute it.
+    directory: where it starts; the caller has to reach it, not the account. Raises
+    DoraSystemdError (NO_PERMISSION) if the account cannot execute it.
     """
     try:
         return spawn(
-            command, account, directory="/", stdin=subprocess.PIPE, stderr=subprocess.DEVNULL
+            command, account, directory=directory, stdin=subprocess.PIPE, stderr=subprocess.DEVNULL
         )
     except OSError as error:
         raise cannot_reach(account.name, sys.executable) from error

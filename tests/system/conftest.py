@@ -13,6 +13,7 @@ from tests.system.cells import Cell, Project, dora_processes, run, wait_for
 from tests.system.chromium import Browser
 from tests.system.gateways import Front
 from tests.system.ports import reserve_ports
+from tests.system.releases import Releases
 from tests.system.tolerated import is_tolerated
 
 FIRST_HALF = (
@@ -92,6 +93,13 @@ def front(reserved_ports: None) -> Iterator[Front]:
     front = Front()
     yield front
     front.end()
+
+
+@pytest.fixture
+def releases(cell: Cell) -> Iterator[Releases]:
+    found = Releases(cell)
+    yield found
+    found.end()
 
 
 @pytest.fixture

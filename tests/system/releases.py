@@ -62,9 +62,16 @@ class Releases:
             directory = self.path / release
             files = json.loads((directory / "release.json").read_text())["files"]
             tree = directory / "tree"
-            there = {str(p.relative_to(tree)) for p in tree.rglob("*") if not p.is_dir()}
+            there = {
+                str(p.relative_to(tree))
+                for p in tree.rglob("*")
+                if p.is_symlink() or not p.is_dir()
+            }
             assert there == files.keys()
             for path, facts in files.items():
+                if "link" in facts:
+                    assert str((tree / path).readlink()) == facts["link"]
+                    continue
                 data = (tree / path).read_bytes()
                 assert hashlib.sha256(data).hexdigest() == facts["sha256"], path
                 assert (tree / path).stat().st_mode & 0o222 == 0

@@ -22,7 +22,7 @@ from dora_systemd.cli.parameters import (
 from dora_systemd.cli.settingoptions import SettingsCommand, setting_options
 from dora_systemd.cli.stageline import StageLine
 from dora_systemd.decisions.views.outcome import Outcome
-from dora_systemd.errors import ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.verbs.releases.deploy import (
     Deployed,
     DeployRequest,
@@ -49,6 +49,8 @@ _SIGNS = {"added": "+", "changed": "~", "removed": "-"}
     default=5,
     help="Releases to keep; the present one and the one before stay in any case; default: 5.",
 )
+@duration_option("--build-timeout", "Time that its build may take; default: 30min.", "30min")
+@click.option("--no-build", is_flag=True, help="Do not build; deploy what the project has.")
 @click.option("--no-enable", is_flag=True, help="Do not start it at every boot.")
 @click.option("--dry-run", is_flag=True, help="Print what would change, and change nothing.")
 @inhibit_options
@@ -58,6 +60,8 @@ def command(
     name: str | None,
     soak: int,
     keep: int,
+    build_timeout: int,
+    no_build: bool,
     no_enable: bool,
     dry_run: bool,
     force: bool,
@@ -65,6 +69,8 @@ def command(
     **flags: Any,
 ) -> int:
     """Copy the project of FILE, or of DIR, into a release that does not change, and run it.
+
+    Nodes with build or git are built first, as the user of the nodes.
 
     The release is on trial until all nodes are ready and no node has failed for a while. Then it is
     what every start and boot runs. If it fails, what ran before runs again, and the exit status is
@@ -79,10 +85,13 @@ def command(
     scope = current_scope()
     start = StartRequest(dataflow, name, flags, os.environ)
     if dry_run:
-        return _print_changes(*compare(scope, start))
+        return _print_changes(*compare(scope, start, not no_build))
     bus = Bus(scope)
     how = if_inhibited(force, wait)
-    request = DeployRequest(start, soak, keep, not no_enable, how)
+    if not build_timeout:
+        raise DoraSystemdError("cannot build in no time", "give a --build-timeout", ExitCode.USAGE)
+    build_timeout = 0 if no_build else build_timeout
+    request = DeployRequest(start, soak, keep, not no_enable, how, build_timeout)
     with StageLine(sys.stderr) as stage:
 
         def warn(text: str) -> None:

@@ -20,11 +20,14 @@ _LIBC = ctypes.CDLL(None, use_errno=True)
 
 
 class Draft:
-    """A release of `store` without a name yet. All methods raise OSError."""
+    """A release of `store` without a name yet. All methods raise OSError.
 
-    def __init__(self, store: Store) -> None:
+    kind: in the name of its directory.
+    """
+
+    def __init__(self, store: Store, kind: str = "new") -> None:
         self._store = store
-        self._path = store.path / f".new-{os.urandom(6).hex()}"
+        self._path = store.path / f".{kind}-{os.urandom(6).hex()}"
         self._tree = self._path / TREE
         self._made = {self._tree}
         self._path.mkdir(0o700, parents=True)  # others may not read what it gets

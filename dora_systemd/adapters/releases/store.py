@@ -8,7 +8,6 @@ name with a dot in front, and the next deploy removes it.
 import contextlib
 import fcntl
 import os
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from dora_systemd.decisions.releases.manifest import Manifest, parse_manifest
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import STORE, TREE, is_release_id
 from dora_systemd.trust.files import read_file
+from dora_systemd.trust.programs import spawn
 from dora_systemd.values import shown
 
 MANIFEST = "release.json"
@@ -136,6 +136,21 @@ def locked(store: Store, make: bool = True) -> Iterator[None]:
         os.close(fd)
 
 
+def is_locked(store: Store) -> bool:
+    """Whether a process changes the store now, as far as this user may know."""
+    try:
+        fd = os.open(store.lock, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(fd)
+    return False
+
+
 def _require(store: Store, make: bool) -> None:
     try:
         if make:
@@ -176,11 +191,16 @@ def make_directories(path: Path) -> None:
 
 
 def remove_tree(path: Path) -> None:
-    """Remove a directory with all in it, although it may have no write permissions."""
-    for directory, _, _ in os.walk(path):
-        with contextlib.suppress(OSError):
-            Path(directory).chmod(0o700)
-    shutil.rmtree(path, ignore_errors=True)
+    """Remove a directory with all in it, although it may have no write permissions.
+
+    A build may have filled it: rm(1) follows no link, and removes what is as deep as a path can be.
+    """
+    steps = [("rm", "-rf", "--one-file-system", "--", str(path))]
+    if os.geteuid() != 0 and path.exists():
+        steps.insert(0, ("chmod", "-R", "u+rwX", "--", str(path)))
+    for command in steps:
+        with contextlib.suppress(OSError), spawn(command, None) as child:
+            child.communicate()
 
 
 def unusable(path: Path, error: OSError) -> DoraSystemdError:

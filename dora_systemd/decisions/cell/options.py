@@ -268,6 +268,11 @@ def check_command(python: str, options: RunnerOptions) -> list[str]:
     return [*_python(python, ".check"), *format_runner_argv(options)]
 
 
+def build_command(python: str, task: str) -> list[str]:
+    """The command that builds a release. task: from decisions/releases/build.py."""
+    return [*_python(python, ".build"), task]
+
+
 def options_from_command(command: Sequence[str]) -> RunnerOptions:
     """The options in an ExecStart= of runner_command; raises DoraSystemdError for any other."""
     if RUNNER_MODULE not in command:

@@ -109,6 +109,11 @@ EVENTS = {
         WARNING,
         "Release {release} of dataflow {dataflow} was rolled back",
     ),
+    "build-failed": EventKind(
+        "c598b7b44f614a64a048fc856c696082",
+        WARNING,
+        "Release {release} of dataflow {dataflow} could not be built",
+    ),
 }
 
 # Each life of a dataflow ends with one of these, unless the runner was killed.
@@ -117,7 +122,8 @@ END_EVENTS = ("dataflow-finished", "dataflow-stopped", "dataflow-failed")
 NODE_END_EVENTS = ("node-exited", "node-crashed", "node-oom")
 
 ROLLED_BACK = "release-rolled-back"
-REQUESTS = ("stop-asked", "release-committed", ROLLED_BACK)
+BUILD_FAILED = "build-failed"
+REQUESTS = ("stop-asked", "release-committed", ROLLED_BACK, BUILD_FAILED)
 """What doractl writes about a dataflow, outside of its unit."""
 
 # Details for the text only: the origin of the record has the fields for them.

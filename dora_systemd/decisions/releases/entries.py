@@ -5,7 +5,7 @@ Who owns the project names its files and links, so each is checked before root c
 
 import posixpath
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import format_rounded_size, shown
@@ -37,12 +37,16 @@ class Found:
 
 @dataclass(frozen=True)
 class Stored:
-    """A file of a release. digest: SHA-256 of its content. target: only of a link."""
+    """A file of a release. digest: SHA-256 of its content. target: only of a link.
+
+    is_built: the build has made it; the project has no such file.
+    """
 
     size: int = 0
     is_executable: bool = False
     digest: str = ""
     target: str = ""
+    is_built: bool = field(default=False, compare=False)
 
 
 def check_found(one: Found) -> None:

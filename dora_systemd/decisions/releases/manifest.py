@@ -60,12 +60,15 @@ def parse_manifest(text: str, path: str) -> Manifest:
 
 
 def _format_stored(one: Stored) -> dict[str, Any]:
+    built = {"built": True} if one.is_built else {}
     if one.target:
-        return {"link": one.target}
-    return {"size": one.size, "executable": one.is_executable, "sha256": one.digest}
+        return {"link": one.target, **built}
+    return {"size": one.size, "executable": one.is_executable, "sha256": one.digest, **built}
 
 
 def _parse_stored(value: Mapping[str, Any]) -> Stored:
+    is_built = bool(value.get("built", False))
     if "link" in value:
-        return Stored(target=str(value["link"]))
-    return Stored(int(value["size"]), bool(value["executable"]), str(value["sha256"]))
+        return Stored(target=str(value["link"]), is_built=is_built)
+    size, is_executable, digest = int(value["size"]), bool(value["executable"]), value["sha256"]
+    return Stored(size, is_executable, str(digest), is_built=is_built)

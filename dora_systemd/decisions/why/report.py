@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from dora_systemd.decisions.cell.exits import ExitKind, parse_exit
 from dora_systemd.decisions.cell.restarts import budget_words
 from dora_systemd.decisions.life.causes import Cause
-from dora_systemd.decisions.logs.events import ROLLED_BACK
+from dora_systemd.decisions.logs.events import BUILD_FAILED, ROLLED_BACK
 from dora_systemd.decisions.views.dataflows import (
     RESTARTING,
     UNKNOWN,
@@ -209,8 +209,8 @@ def _facts(report: Report) -> list[str]:
 
 
 def _undone(verdict: Verdict) -> str:
-    """The last release that failed its trial before this life, if it is recorded."""
-    found = [one for one in verdict.timeline if one.name == ROLLED_BACK]
+    """The last release that failed its build or trial before this life, if it is recorded."""
+    found = [one for one in verdict.timeline if one.name in (BUILD_FAILED, ROLLED_BACK)]
     if not found:
         return ""
     one = found[-1]

@@ -1,31 +1,28 @@
 """`doractl deploy`: copies a project into a release, and lets it prove itself."""
 
-import os
-import time
-import uuid
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from dora_systemd import __version__
 from dora_systemd.adapters.bus.manager import Manager
-from dora_systemd.adapters.releases.draft import Draft
 from dora_systemd.adapters.releases.store import Store, locked, unusable
+from dora_systemd.decisions.releases.build import build_unit
 from dora_systemd.decisions.releases.choice import surplus
-from dora_systemd.decisions.releases.entries import Found, touched
-from dora_systemd.decisions.releases.ids import new_id
+from dora_systemd.decisions.releases.entries import touched
 from dora_systemd.decisions.releases.manifest import Manifest
 from dora_systemd.decisions.unit.file import persistent_unit, runner_of
 from dora_systemd.decisions.unit.properties import format_unit
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
-from dora_systemd.trust.project import Project, opened_project
-from dora_systemd.values import format_rounded_size
+from dora_systemd.trust.project import opened_project
+from dora_systemd.values import SECOND
 from dora_systemd.verbs.inhibit.guard import IfInhibited, require_uninhibited
+from dora_systemd.verbs.releases.build import end_former
 from dora_systemd.verbs.releases.change import Change, change_release
-from dora_systemd.verbs.releases.files import copy_files, digests, find_files
+from dora_systemd.verbs.releases.copy import copy_project, newest, repository_owners
+from dora_systemd.verbs.releases.files import digests, find_files
 from dora_systemd.verbs.releases.listing import store_of
 from dora_systemd.verbs.releases.soak import Tell
 from dora_systemd.verbs.releases.source import (
@@ -35,7 +32,7 @@ from dora_systemd.verbs.releases.source import (
     require_same,
     source_notes,
 )
-from dora_systemd.verbs.releases.trial import Standing, read_standing, require_deployable
+from dora_systemd.verbs.releases.trial import read_standing, require_deployable
 from dora_systemd.verbs.start.account import account_of
 from dora_systemd.verbs.start.check import check_plan
 from dora_systemd.verbs.start.enable import boot_target
@@ -43,6 +40,7 @@ from dora_systemd.verbs.start.plan import Plan, StartRequest, make_plan
 from dora_systemd.verbs.start.unit import plan_properties
 
 _COMMAND = "doractl deploy"
+BUILD_TIMEOUT = 30 * 60 * SECOND
 _MICROSECOND_NS = 1000
 
 
@@ -50,7 +48,7 @@ _MICROSECOND_NS = 1000
 class DeployRequest:
     """A deploy. start: as of `doractl start`; its dataflow may be a directory. soak: µs.
 
-    how: what to do while a lock inhibits it.
+    how: what to do while a lock inhibits it. build_timeout: µs; 0: without a build.
     """
 
     start: StartRequest
@@ -58,6 +56,7 @@ class DeployRequest:
     keep: int
     want_boot: bool
     how: IfInhibited = IfInhibited.REFUSE
+    build_timeout: int = BUILD_TIMEOUT
 
 
 class Deployed(NamedTuple):
@@ -73,21 +72,20 @@ class Deployed(NamedTuple):
     copied: int
 
 
-class _Copy(NamedTuple):
-    """A copied project."""
+def compare(
+    scope: Scope, request: StartRequest, want_build: bool = True
+) -> tuple[str, dict[str, list[str]]]:
+    """What a deploy would change: the newest release, and paths, but none that a build makes.
 
-    manifest: Manifest
-    copied: int
-
-
-def compare(scope: Scope, request: StartRequest) -> tuple[str, dict[str, list[str]]]:
-    """What a deploy would change: the newest release, and paths. Raises DoraSystemdError."""
-    source = find_source(scope, request)
+    Raises DoraSystemdError.
+    """
+    source = find_source(scope, request, want_build)
     store = store_of(scope, source.plan.options.name)
     last = newest(store)
+    old = {path: one for path, one in last.files.items() if not one.is_built} if last else {}
     with opened_project(source.root, account_of(source.plan.user)) as project:
-        found, _ = find_files(project, source.named, _owners(source))
-        return last.id if last else "", touched(last.files if last else {}, digests(project, found))
+        found, _ = find_files(project, source.named, repository_owners(source))
+        return last.id if last else "", touched(old, digests(project, found))
 
 
 def deploy(
@@ -102,15 +100,17 @@ def deploy(
     Raises DoraSystemdError: ROLLED_BACK if the release has failed its trial. After any other error
     everything is as before.
     """
-    source = find_source(scope, request.start)
+    source = find_source(scope, request.start, bool(request.build_timeout))
     name = source.plan.options.name
     store, standing = store_of(scope, name), read_standing(manager, scope, unit_name(name))
     require_deployable(manager, scope, standing)
     with locked(store):
         standing = read_standing(manager, scope, standing.boot.unit)  # nobody changes it now
         require_uninhibited(scope, standing.running, "deploy", request.how, tell)
-        store.clean()
-        copy = _copy_project(source, store, standing, tell)
+        if store.unfinished():
+            end_former(manager, build_unit(name))
+            store.clean()
+        copy = copy_project(manager, scope, source, store, standing, request.build_timeout, tell)
         release = copy.manifest.id
         try:
             text = _unit_text(manager, scope, source, store, request, copy.manifest, tell, warn)
@@ -124,7 +124,7 @@ def deploy(
             raise
         options = runner_of(text)
         assert options is not None
-        for note in source_notes(source):
+        for note in source_notes(source, store.tree(release)):
             warn(note)
         standing = read_standing(manager, scope, standing.boot.unit)  # the copy took its time
         require_deployable(manager, scope, standing)
@@ -139,16 +139,6 @@ def deploy(
     return Deployed(*facts, len(manifest.files), manifest.size, copy.copied)
 
 
-def newest(store: Store) -> Manifest | None:
-    """The manifest of the newest release that has one."""
-    for one in reversed(store.known()):
-        try:
-            return store.manifest(one.id)
-        except DoraSystemdError:
-            continue
-    return None
-
-
 def prune(manager: Manager, scope: Scope, store: Store, keep: int, latest: str) -> None:
     """Remove the oldest releases beyond `keep`. latest: the one that was tried.
 
@@ -159,66 +149,6 @@ def prune(manager: Manager, scope: Scope, store: Store, keep: int, latest: str) 
         used = {latest, standing.trial}
         for release in surplus(store.known(), keep, standing.current, used):
             store.remove(release)
-
-
-def _owners(source: Source) -> list[int]:
-    """Whose repositories git may read: root's, and those of the user that reads."""
-    user = source.plan.user
-    return [0, os.geteuid() if user is None else user.pw_uid]
-
-
-def _copy_project(source: Source, store: Store, standing: Standing, tell: Tell) -> _Copy:
-    user = source.plan.user
-    last = newest(store)
-    draft = None
-    try:
-        with opened_project(source.root, account_of(user)) as project:
-            found, revision = find_files(project, source.named, _owners(source))
-            draft = Draft(store)
-            manifest = _fill(project, found, draft, last, source, revision, tell)
-            shared = last.files if last else {}
-            copied = sum(
-                one.size for path, one in manifest.files.items() if shared.get(path) != one
-            )
-            uuid_ = standing.uuid or (last.uuid if last else "") or str(uuid.uuid4())
-            known = frozenset(one.id for one in store.known())
-            release = new_id(manifest.created_us, revision, known)
-            manifest = Manifest(**{**vars(manifest), "id": release, "uuid": uuid_})
-            draft.publish(manifest, None if user is None else user.pw_gid)
-            return _Copy(manifest, copied)
-    except OSError as error:
-        raise unusable(store.path, error) from error
-    finally:
-        if draft is not None:
-            draft.discard()
-
-
-def _fill(
-    project: Project,
-    found: dict[str, Found],
-    draft: Draft,
-    last: Manifest | None,
-    source: Source,
-    revision: str,
-    tell: Tell,
-) -> Manifest:
-    def progress(done: int, total: int) -> None:
-        tell(f"copying: {format_rounded_size(done)} of {format_rounded_size(total)}")
-
-    files = copy_files(project, found, draft, last, progress)
-    user = source.plan.user
-    return Manifest(
-        id="",
-        name=source.plan.options.name,
-        uuid="",
-        dataflow=source.dataflow,
-        source=source.root,
-        user="" if user is None else user.pw_name,
-        revision=revision,
-        created_us=time.time_ns() // _MICROSECOND_NS,
-        versions={"dora-systemd": __version__},
-        files=files,
-    )
 
 
 def _unit_text(
@@ -250,6 +180,8 @@ def _at_source(
     """The error with the paths of the project: those of the copy are gone."""
     tree = str(store.tree(release))
     message, hint = (text.replace(tree, source.root) for text in (error.message, error.hint))
+    if source.dora and "dora build" in hint:
+        hint = "the build has to make it there"
     return DoraSystemdError(message, hint, error.code)
 
 

@@ -6,7 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import Manager
-from dora_systemd.adapters.releases.store import Store, store_root
+from dora_systemd.adapters.releases.store import Store, is_locked, store_root
 from dora_systemd.decisions.releases.choice import UNKNOWN, UNPROVED, Known, state_of
 from dora_systemd.decisions.releases.manifest import Manifest
 from dora_systemd.decisions.views.findings import Finding, State
@@ -65,6 +65,6 @@ def judge_releases(manager: Manager, scope: Scope) -> Iterator[Finding]:
             text = f"{name} runs release {standing.trial} on trial, and the next boot does not"
             remedy = f"doractl deploy --name {name}, or doractl rollback {name}"
             yield Finding("releases", State.WARNING, text, remedy)
-        for path in store.unfinished():
+        for path in () if is_locked(store) else store.unfinished():
             text = f"{path} is the rest of a deploy that was killed"
             yield Finding("releases", State.NOTE, text, "the next deploy removes it")

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from dora_systemd.adapters.host.files import decoded, parse_yaml
 from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
+from dora_systemd.decisions.releases.build import built_nodes
 from dora_systemd.decisions.releases.entries import refusal
 from dora_systemd.decisions.settings.table import ENV_FILE, USER, VENV, WORKING_DIRECTORY
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -15,6 +16,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.trust.files import read_file
 from dora_systemd.trust.paths import Place, exists, is_directory
 from dora_systemd.values import shown
+from dora_systemd.verbs.releases.builders import find_builders
 from dora_systemd.verbs.start.plan import DEFAULT_FILE, Plan, StartRequest, make_plan
 
 
@@ -23,7 +25,8 @@ class Source:
     """A project. root: its directory. origin: of its files, whose owner decides what they may say.
 
     plan: of a start from there. named: files that the dataflow names, relative to root. read: what
-    the files say that decide what root does, None for one that is not there.
+    the files say that decide what root does, None for one that is not there. dora, uv: the commands
+    that have something to build, "" otherwise.
     """
 
     root: str
@@ -31,6 +34,16 @@ class Source:
     plan: Plan
     named: tuple[str, ...]
     read: Mapping[str, bytes | None]
+    dora: str = ""
+    uv: str = ""
+
+    @property
+    def own_venv(self) -> str | None:
+        """The virtual environment of the nodes, relative to root; None for one that is given."""
+        if self.plan.settings.is_given(VENV):
+            return None
+        venv = self.plan.options.venv or str(Path(self.plan.options.dataflow).parent / ".venv")
+        return os.path.relpath(venv, self.root) if _is_below(venv, self.root) else None
 
     @property
     def dataflow(self) -> str:
@@ -38,16 +51,20 @@ class Source:
         return os.path.relpath(self.plan.options.dataflow, self.root)
 
 
-def find_source(scope: Scope, request: StartRequest) -> Source:
-    """The project of the file or directory that `request` names. Raises DoraSystemdError."""
+def find_source(scope: Scope, request: StartRequest, want_build: bool = True) -> Source:
+    """The project of the file or directory that `request` names.
+
+    want_build: what it needs is built in the release. Raises DoraSystemdError.
+    """
     path = Path(request.dataflow).absolute()
     path = path / DEFAULT_FILE if is_directory(path) else path
     path = Path(os.path.normpath(path))
-    plan = make_plan(scope, replace(request, dataflow=str(path)))
     written = read_file(path)
     dataflow = parse_dataflow(parse_yaml(decoded(written.data, path), path), str(path))
+    is_unbuilt = want_build and bool(built_nodes(dataflow))
+    plan = make_plan(scope, replace(request, dataflow=str(path), is_unbuilt=is_unbuilt))
     root = _root(path, plan)
-    _check(plan, dataflow, root)
+    _check(plan, dataflow, root, want_build)
     named = (str(path), settings_path(str(path)), *_programs(dataflow, plan))
     inside = [os.path.normpath(one) for one in (*named, *plan.settings[ENV_FILE])]
     relative = (os.path.relpath(one, root) for one in inside if _is_below(one, root))
@@ -61,7 +78,8 @@ def find_source(scope: Scope, request: StartRequest) -> Source:
     }
     read[os.path.relpath(path, root)] = written.data
     read[os.path.relpath(beside, root)] = settings and settings.data
-    return Source(root, origin, plan, tuple(dict.fromkeys(relative)), read)
+    builders = find_builders(plan, dataflow, root) if want_build else ()
+    return Source(root, origin, plan, tuple(dict.fromkeys(relative)), read, *builders)
 
 
 def require_same(source: Source, tree: Path) -> None:
@@ -72,7 +90,8 @@ def require_same(source: Source, tree: Path) -> None:
     for path, data in source.read.items():
         copy = tree / path
         if (read_file(copy).data if exists(copy) else None) != data:
-            raise refusal(path, "it changed while it was copied", "deploy again")
+            hint = "deploy again; a build must not change it"
+            raise refusal(path, "it changed while it was copied or built", hint)
 
 
 def released(source: Source, request: StartRequest, tree: Path, uuid: str) -> StartRequest:
@@ -82,8 +101,8 @@ def released(source: Source, request: StartRequest, tree: Path, uuid: str) -> St
     if source.plan.settings.is_given(WORKING_DIRECTORY):
         place = os.path.relpath(options.working_directory, source.root)
         given[WORKING_DIRECTORY.name] = os.path.normpath(tree / place)
-    if options.venv is not None:
-        given[VENV.name] = options.venv
+    if venv := own_venv(source, tree) or options.venv:
+        given[VENV.name] = venv
     if user is not None:
         given[USER.name] = user.pw_name
     return replace(
@@ -96,9 +115,15 @@ def released(source: Source, request: StartRequest, tree: Path, uuid: str) -> St
     )
 
 
-def source_notes(source: Source) -> Iterator[str]:
-    """What people have to know about a release of this project."""
-    if venv := source.plan.options.venv:
+def own_venv(source: Source, tree: Path) -> str | None:
+    """The virtual environment that the build has made in the release in `tree`, or None."""
+    venv = source.own_venv
+    return str(tree / venv) if venv and exists(tree / venv / "bin/python") else None
+
+
+def source_notes(source: Source, tree: Path) -> Iterator[str]:
+    """What people have to know about a release of this project in `tree`."""
+    if (venv := source.plan.options.venv) and not own_venv(source, tree):
         yield f"all releases share the virtual environment {shown(venv)}: pip changes all of them"
 
 
@@ -123,7 +148,7 @@ def _root(path: Path, plan: Plan) -> str:
     )
 
 
-def _check(plan: Plan, dataflow: Dataflow, root: str) -> None:
+def _check(plan: Plan, dataflow: Dataflow, root: str, want_build: bool) -> None:
     """Raise DoraSystemdError (BAD_INPUT) for what a release cannot do yet."""
     if plan.options.hot_reload:
         reason = "hot reload is on, and the files of a release do not change"
@@ -133,11 +158,8 @@ def _check(plan: Plan, dataflow: Dataflow, root: str) -> None:
         raise _refusal(reason, "run uv sync in the project, and deploy with --venv .venv --no-uv")
     for node in dataflow.nodes:
         reason = hint = ""
-        if node.git:
-            reason, hint = "its program comes from git", "commit a copy, and name it in path"
-        elif node.build:
-            reason = "deploy does not run its build command"
-            hint = "run dora build before, commit what it makes, and remove build from the node"
+        if node.git and not want_build:
+            reason, hint = "its program comes from git", "deploy without --no-build"
         elif node.path.startswith(f"{root}/"):
             reason = f"its path {shown(node.path)} would be outside of the release"
             hint = f"write it relative to {shown(root)}"

@@ -10,13 +10,15 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from dora_systemd.adapters.bus.manager import Manager, Property
+from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.bus.manager import Property as Sent
 from dora_systemd.adapters.dora.command import DORA_SECONDS
 from dora_systemd.adapters.host.process import Completed, beside, read_streams, run_command
 from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.cell.options import check_command
 from dora_systemd.decisions.life.refusal import parse_refusal
 from dora_systemd.decisions.properties.assignments import typed
+from dora_systemd.decisions.properties.kinds import Property
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.trust.programs import own_account
 from dora_systemd.values import SECOND, shown
@@ -70,30 +72,45 @@ def _run_unit(manager: Manager, plan: Plan, command: Sequence[str]) -> Completed
 
 def _properties(
     manager: Manager, plan: Plan, command: Sequence[str], streams: Sequence[int]
-) -> list[Property]:
+) -> list[Sent]:
     """The dataflow's unit properties, for a command; the unit disappears with this client."""
-    properties, _ = plan_properties(plan, manager)
-    kept = {key: one for key, one in properties.items() if not key.startswith(_OF_RUNNERS)}
+    kept = beside_properties(manager, plan)
     kept |= typed(Type="oneshot", TimeoutStartSec=int(DORA_SECONDS) * SECOND)
     for key in ("StandardOutput", "StandardError"):
         del kept[key]
-    if binds := kept.pop("BindPaths", None):
-        # The directory of the cell exists only while the cell runs, and may then be that of another
-        # dataflow with this name.
-        cell = str(plan.scope.cell_directory(plan.options.name))
-        others = tuple(one for one in binds.value if one[0] != cell)
-        kept |= {"BindPaths": binds._replace(value=others)} if others else {}
     stdout, stderr = streams
-    # systemd 252 cannot read ExecStartEx back at a reload, so use ExecStart, with "$" as "$$".
-    words = tuple(word.replace("$", "$$") for word in command)
     return [
         *kept.values(),
-        ("ExecStart", "a(sasb)", ((command[0], words, False),)),
+        exec_start(command),
         ("StandardOutputFileDescriptor", "h", stdout),
         ("StandardErrorFileDescriptor", "h", stderr),
         ("CollectMode", "s", "inactive-or-failed"),
         ("AddRef", "b", True),
     ]
+
+
+def beside_properties(manager: Manager, plan: Plan) -> dict[str, Property]:
+    """The dataflow's unit properties, by slot, for a unit that has no runner.
+
+    The directory of the cell exists only while the cell runs, and may then be that of another
+    dataflow with this name.
+    """
+    properties, _ = plan_properties(plan, manager)
+    kept = {key: one for key, one in properties.items() if not key.startswith(_OF_RUNNERS)}
+    if binds := kept.pop("BindPaths", None):
+        cell = str(plan.scope.cell_directory(plan.options.name))
+        others = tuple(one for one in binds.value if one[0] != cell)
+        kept |= {"BindPaths": binds._replace(value=others)} if others else {}
+    return kept
+
+
+def exec_start(command: Sequence[str]) -> Sent:
+    """ExecStart= as it is sent.
+
+    systemd 252 cannot read ExecStartEx back at a reload, so this is ExecStart, with "$" as "$$".
+    """
+    words = tuple(word.replace("$", "$$") for word in command)
+    return "ExecStart", "a(sasb)", ((command[0], words, False),)
 
 
 def _no_check(plan: Plan, reason: str) -> DoraSystemdError:

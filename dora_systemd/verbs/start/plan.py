@@ -45,7 +45,7 @@ class StartRequest:
     environment: the caller's variables. attached: the dataflow ends with the caller. caller: the
     variables that the dataflow may read. uuid: of a dataflow that is started again. origin: of a
     release, the file that its dataflow file was copied from: who owns that decides, not root, who
-    owns the copy.
+    owns the copy. is_unbuilt: the programs of its nodes need not exist yet.
     """
 
     dataflow: str
@@ -56,6 +56,7 @@ class StartRequest:
     caller: Mapping[str, str] = field(default_factory=dict)
     uuid: str = ""
     origin: Place | None = None
+    is_unbuilt: bool = False
 
 
 @dataclass(frozen=True)
@@ -150,7 +151,8 @@ def _make_plan(
     if not any(node.kind in UNEXPANDED for node in dataflow.nodes):
         # The runner repeats this, but an error here needs no unit.
         check_named_nodes(options, dataflow)
-        launch_descriptor(dataflow, launch)
+        if not request.is_unbuilt:
+            launch_descriptor(dataflow, launch)
     prepared = Prepared(dataflow, launch, {})
     sandbox = make_sandbox(scope, settings, look.user, prepared, look.sight)
     notes = tuple(plan_notes(scope, dataflow, launch, look))

@@ -1,5 +1,6 @@
 """The store of releases: a release is there as a whole or not at all."""
 
+import contextlib
 import fcntl
 import os
 from pathlib import Path
@@ -7,7 +8,13 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.adapters.releases.draft import Draft
-from dora_systemd.adapters.releases.store import Store, locked, store_root
+from dora_systemd.adapters.releases.store import (
+    Store,
+    is_locked,
+    locked,
+    remove_tree,
+    store_root,
+)
 from dora_systemd.decisions.releases.choice import Known
 from dora_systemd.decisions.releases.entries import Stored
 from dora_systemd.decisions.releases.manifest import Manifest
@@ -127,3 +134,28 @@ def test_where_it_is() -> None:
     assert store_root(True, "/x", "") == Path("/x/.local/state/dora-systemd/releases")
     assert store_root(True, "/x", "/y") == Path("/y/dora-systemd/releases")
     assert store_root(True, "/x", "relative") == Path("/x/.local/state/dora-systemd/releases")
+
+
+def test_whether_somebody_changes_a_store(tmp_path: Path) -> None:
+    store = Store(tmp_path, "robot")
+    assert not is_locked(store)
+    with locked(store):
+        assert is_locked(store)
+        (store.path / ".build-1").mkdir()
+    assert not is_locked(store)
+
+
+def test_what_is_removed_follows_no_link_and_may_be_deep(tmp_path: Path) -> None:
+    kept = tmp_path / "kept"
+    kept.mkdir(mode=0o750)
+    place = tmp_path / "tree"
+    place.mkdir()
+    (place / "link").symlink_to(kept)
+    with contextlib.chdir(place):
+        for _ in range(3000):
+            Path("ddd").mkdir()
+            os.chdir("ddd")
+    (place / "closed").mkdir(mode=0)
+    remove_tree(place)
+    assert not place.exists()
+    assert kept.stat().st_mode & 0o777 == 0o750

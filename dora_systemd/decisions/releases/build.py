@@ -1,0 +1,130 @@
+"""The build of a release: whether there is one, its commands, and what it prints. Pure."""
+
+import json
+import re
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import PurePath
+
+from dora_systemd.decisions.descriptor.dataflow import Dataflow
+from dora_systemd.decisions.descriptor.nodes import Node
+from dora_systemd.terminal_text import short_line, without_sequences
+
+LOCK = "uv.lock"
+_LONGEST = 300
+"""Maximum characters of a line of the build in an error or on a terminal."""
+_OF_NODE = re.compile(r"(?P<node>[\w.-]+): +(?P<level>stdout|stderr|[A-Z]+) +(?P<text>\S.*)")
+"""A line that dora prints: "a: stdout   text", or "a: INFO     running build command"."""
+_ALWAYS = {
+    # Bytecode is valid by its source's content, for the files get new times; and equal builds have
+    # equal files, which releases share.
+    "SOURCE_DATE_EPOCH": "315532800",
+    "PYC_INVALIDATION_MODE": "checked-hash",
+    "UV_COMPILE_BYTECODE": "1",
+    # The sandbox makes homes read-only, and a Python in one of them is no part of the release.
+    "UV_NO_CACHE": "1",
+    "UV_LINK_MODE": "copy",
+    "UV_PYTHON_DOWNLOADS": "never",
+    "UV_PYTHON_PREFERENCE": "only-system",
+    # Nobody is there to answer.
+    "PIP_NO_INPUT": "1",
+    "GIT_TERMINAL_PROMPT": "0",
+}
+
+
+@dataclass(frozen=True)
+class BuildTask:
+    """What the program of the build's unit is told.
+
+    name, uuid: of the dataflow. release: its id. directory: where the commands run, in their order.
+    """
+
+    name: str
+    uuid: str
+    release: str
+    directory: str
+    commands: tuple[tuple[str, ...], ...]
+
+
+def format_task(task: BuildTask) -> str:
+    """The task as one argument of a command line."""
+    return json.dumps(asdict(task))
+
+
+def parse_task(text: str) -> BuildTask:
+    """The inverse of format_task(). Raises ValueError, TypeError or KeyError for another text."""
+    value = json.loads(text)
+    return BuildTask(**{**value, "commands": tuple(map(tuple, value["commands"]))})
+
+
+def build_unit(name: str) -> str:
+    """The unit that builds releases of the dataflow `name`."""
+    return f"doractl-build-{name}.service"
+
+
+def built_nodes(dataflow: Dataflow) -> list[str]:
+    """The ids of the nodes that `dora build` has something to do for."""
+    return [node.id for node in dataflow.nodes if node.git or any(_builds(node))]
+
+
+def _builds(node: Node) -> Iterator[object]:
+    yield node.build
+    operators = node.raw.get("operators")
+    every = operators if isinstance(operators, list) else []
+    for operator in (node.raw.get("operator"), *every):
+        yield operator.get("build") if isinstance(operator, Mapping) else None
+
+
+def has_builds(value: object) -> bool:
+    """Whether a module's document has a key that `dora build` reads; those of its modules count."""
+    if isinstance(value, Mapping):
+        keys = ("build", "git", "module")
+        return any(value.get(key) for key in keys) or any(map(has_builds, value.values()))
+    return isinstance(value, list) and any(map(has_builds, value))
+
+
+def lock_places(dataflow: str) -> tuple[str, ...]:
+    """Where a uv.lock may be: beside the dataflow file, or at the top of the project."""
+    return tuple(str(PurePath(one, LOCK)) for one in (PurePath(dataflow).parent, "."))
+
+
+def build_commands(
+    files: Collection[str], place: str, dataflow: str, uv: str, dora: str
+) -> tuple[tuple[str, ...], ...]:
+    """The commands of a build.
+
+    files: of the project, which is at `place` while it is built. dataflow: its path there. uv,
+    dora: paths of these commands, "" if there is nothing to do for them.
+    """
+    lock = next((one for one in lock_places(dataflow) if one in files), None)
+    sync = ("sync", "--frozen", "--directory", str(PurePath(place, lock or "").parent))
+    found = ((uv, *sync),) if uv and lock else ()
+    return (*found, (dora, "build", "--local", str(PurePath(place, dataflow)))) if dora else found
+
+
+def build_environment(
+    given: Mapping[str, str], venv: str | None, former_venv: str | None
+) -> dict[str, str]:
+    """The variables of a build, from those of the nodes, which have precedence.
+
+    venv: which the build may create, None for one that is given. former_venv: whose programs come
+    first on PATH otherwise.
+    """
+    if venv is None:
+        return {**_ALWAYS, **given}
+    path = given.get("PATH", "").removeprefix(f"{former_venv}/bin:")
+    own = {"PATH": f"{venv}/bin:{path}", "VIRTUAL_ENV": venv, "UV_PROJECT_ENVIRONMENT": venv}
+    return {**_ALWAYS, **given, **own}
+
+
+def shown_line(line: str) -> str:
+    """A line of the build as people read it: "NODE: TEXT" of what dora prints for a node."""
+    text = without_sequences(line).strip()
+    found = _OF_NODE.fullmatch(text)
+    return short_line(f"{found['node']}: {found['text']}" if found else text, _LONGEST)
+
+
+def is_output(line: str) -> bool:
+    """Whether a build command has printed the line, and not dora itself."""
+    found = _OF_NODE.fullmatch(without_sequences(line).strip())
+    return found is not None and not found["level"].isupper()

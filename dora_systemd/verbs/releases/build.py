@@ -1,0 +1,207 @@
+"""Builds a release: `uv sync` and `dora build`, as the user of the nodes and in their sandbox.
+
+The project is copied into a tree that this user may change, and built there. Then the tree is read
+as the project was, by a process of that user, and what arrives is checked again: root believes
+nothing of a build. No hard link leads from the tree to another release.
+"""
+
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path, PurePath
+
+from dora_systemd.adapters.bus.manager import DOWN, Manager, Property
+from dora_systemd.adapters.releases.build_tree import BuildTree
+from dora_systemd.adapters.releases.store import Store
+from dora_systemd.decisions.cell.options import build_command
+from dora_systemd.decisions.logs.events import BUILD_FAILED
+from dora_systemd.decisions.releases.build import (
+    BuildTask,
+    build_environment,
+    build_unit,
+    format_task,
+)
+from dora_systemd.decisions.releases.entries import Found
+from dora_systemd.decisions.unit.build import build_properties
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.scope import Scope
+from dora_systemd.trust.project import Project, opened_project
+from dora_systemd.values import format_duration, format_rounded_size
+from dora_systemd.verbs.facts.reason import failure_reason, runners_refusal
+from dora_systemd.verbs.releases.built_files import find_built
+from dora_systemd.verbs.releases.files import copy_files
+from dora_systemd.verbs.releases.soak import Tell
+from dora_systemd.verbs.releases.source import Source
+from dora_systemd.verbs.start.account import account_of
+from dora_systemd.verbs.start.asked import note_request
+from dora_systemd.verbs.start.check import beside_properties, exec_start
+
+_LOOK_SECONDS = 0.2
+_GONE_SECONDS = 20.0
+
+
+@dataclass(frozen=True)
+class Build:
+    """A build of a release of `source`.
+
+    release, uuid: ids of the release and the dataflow. timeout: µs. on_line: gets the lines that
+    the build prints, but not more than one each time that somebody looks.
+    """
+
+    scope: Scope
+    source: Source
+    store: Store
+    release: str
+    uuid: str
+    commands: Sequence[Sequence[str]]
+    timeout: int
+    on_line: Callable[[str], None]
+
+    @property
+    def unit(self) -> str:
+        """The unit that it runs in."""
+        return build_unit(self.store.name)
+
+    @property
+    def place(self) -> Path:
+        """Where its files will be, and where the build sees them already."""
+        return self.store.tree(self.release)
+
+
+@contextmanager
+def built_project(
+    manager: Manager, build: Build, project: Project, found: Mapping[str, Found], tell: Tell
+) -> Iterator[tuple[Project, dict[str, Found]]]:
+    """The project after its build, and the files that belong to its release.
+
+    found: those of the project. Raises DoraSystemdError (BAD_INPUT) for a build that fails or does
+    not end, or leaves what no release can have, and OSError.
+    """
+    user = build.source.plan.user
+
+    def progress(done: int, total: int) -> None:
+        amounts = f"{format_rounded_size(done)} of {format_rounded_size(total)}"
+        tell(f"copying for the build: {amounts}")
+
+    tree = BuildTree(build.store)
+    try:
+        files = copy_files(project, found, tree, None, progress)
+        tree.hand_over(files, None if user is None else (user.pw_uid, user.pw_gid))
+        _run_noted(manager, build, tree)
+        root, place = build.source.root, str(tree.place)
+        with opened_project(root, account_of(user), place) as built:
+            named, is_user = build.source.named, build.scope.is_user
+            yield built, find_built(built, named, build.place, is_user)
+    finally:
+        tree.discard()
+
+
+def _run_noted(manager: Manager, build: Build, tree: BuildTree) -> None:
+    try:
+        _run(manager, build, tree)
+    except DoraSystemdError as error:
+        reason = error.message.removeprefix(f"cannot build {build.store.name}: ")
+        details = {"scope": build.scope.word, "release": build.release, "reason": reason}
+        note_request(BUILD_FAILED, build.store.name, build.uuid, "doractl deploy", **details)
+        raise
+
+
+def _run(manager: Manager, build: Build, tree: BuildTree) -> None:
+    """Run the unit of the build to its end, which is also that of all its processes."""
+    reading, writing = os.pipe2(os.O_CLOEXEC)
+    try:
+        try:
+            sent = _sent(manager, build, tree, reading)
+            manager.start_transient(build.unit, sent, None, wait=False)
+        finally:
+            os.close(reading)
+        try:
+            _wait(manager, build, tree)
+        finally:
+            _stop(manager, build.unit)
+        _check_end(manager, build)
+    finally:
+        os.close(writing)  # our end is its end
+
+
+def end_former(manager: Manager, unit: str) -> None:
+    """Stop the build of a deploy that was killed: it notices that itself, unless it is hostile."""
+    deadline = time.monotonic() + _GONE_SECONDS
+    while manager.list_units(unit) and time.monotonic() < deadline:
+        _stop(manager, unit)
+        with suppress(DoraSystemdError):  # systemd has unloaded it meanwhile
+            manager.reset_failed(unit)
+        time.sleep(_LOOK_SECONDS)
+
+
+def _stop(manager: Manager, unit: str) -> None:
+    if manager.read(unit, ["ActiveState"])["ActiveState"] not in DOWN:
+        manager.run_jobs("StopUnit", [unit])
+
+
+def _wait(manager: Manager, build: Build, tree: BuildTree) -> None:
+    """Wait for the end of the unit. Raises DoraSystemdError if it fills the disk."""
+    told = ""
+    while True:
+        facts = manager.read(build.unit, ["ActiveState", "Job", "StatusText"])
+        is_queued = bool((facts["Job"] or (0,))[0])
+        if not is_queued and str(facts["ActiveState"]) in DOWN:
+            return
+        line = str(facts["StatusText"])
+        if line not in ("", told):
+            build.on_line(told := line)
+        if tree.is_disk_full():
+            reason = "it has left too little space on the disk"
+            raise _refusal(build, reason, f"see df {build.store.path}", ExitCode.FAILURE)
+        time.sleep(_LOOK_SECONDS)
+
+
+def _check_end(manager: Manager, build: Build) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) unless the build has succeeded."""
+    own = "--user " if build.scope.is_user else ""
+    hint = f"journalctl {own}--unit {build.unit} has all that it printed"
+    result = str(manager.read(build.unit, ["Result"])["Result"])
+    if refusal := runners_refusal(manager, build.unit):
+        raise DoraSystemdError(refusal.message, hint, ExitCode.BAD_INPUT)
+    if result == "timeout":
+        most = format_duration(build.timeout)
+        hint = f"{hint}; --build-timeout allows more time"
+        raise _refusal(build, f"it did not end within {most}", hint)
+    if result != "success":
+        raise _refusal(build, failure_reason(manager, build.unit), hint)
+
+
+def _refusal(
+    build: Build, reason: str, hint: str, code: ExitCode = ExitCode.BAD_INPUT
+) -> DoraSystemdError:
+    return DoraSystemdError(f"cannot build {build.store.name}: {reason}", hint, code)
+
+
+def _sent(manager: Manager, build: Build, tree: BuildTree, reading: int) -> list[Property]:
+    """The properties of the unit. reading: its standard input."""
+    plan, place = build.source.plan, build.place
+    directory = str(PurePath(place, build.source.dataflow).parent)
+    commands = tuple(tuple(one) for one in build.commands)
+    task = BuildTask(plan.options.name, build.uuid, build.release, directory, commands)
+    own = build.source.own_venv
+    venv = None if own is None else str(place / own)
+    properties = build_properties(
+        beside_properties(manager, plan),
+        str(tree.place),
+        str(place),
+        str(build.store.path.parent),
+        build_environment(plan.environment, venv, plan.options.venv),
+        build.timeout,
+        build.scope.is_user,
+    )
+    return [
+        *properties.values(),
+        ("Description", "s", f"build of release {build.release} of dora dataflow {task.name}"),
+        exec_start(build_command(sys.executable, format_task(task))),
+        ("StandardInputFileDescriptor", "h", reading),
+        ("CollectMode", "s", "inactive-or-failed"),
+        ("AddRef", "b", True),
+    ]

@@ -1,0 +1,84 @@
+"""What a build is, and what is made of its lines."""
+
+from typing import Any
+
+import pytest
+
+from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
+from dora_systemd.decisions.releases.build import (
+    BuildTask,
+    build_commands,
+    build_environment,
+    built_nodes,
+    format_task,
+    has_builds,
+    is_output,
+    parse_task,
+    shown_line,
+)
+
+PLAIN = {"id": "plain", "path": "a.py"}
+NODES: tuple[tuple[dict[str, Any], bool], ...] = (
+    (PLAIN, False),
+    ({**PLAIN, "build": "make"}, True),
+    ({**PLAIN, "git": "https://host/a"}, True),
+    ({"id": "a", "operator": {"python": "a.py", "build": "make"}}, True),
+    ({"id": "a", "operators": [{"id": "x", "python": "a.py"}]}, False),
+    ({"id": "a", "operators": [{"id": "x", "python": "a.py", "build": "make"}]}, True),
+)
+
+
+@pytest.mark.parametrize(("node", "is_built"), NODES)
+def test_which_nodes_are_built(node: dict[str, Any], is_built: bool) -> None:
+    dataflow = parse_dataflow({"nodes": [{**node, "id": "a"}, {**PLAIN, "id": "b"}]}, "/x.yml")
+    assert built_nodes(dataflow) == ["a"] * is_built
+
+
+def test_modules_that_ask_for_a_build() -> None:
+    assert not has_builds({"nodes": [PLAIN], "module": {"name": "m"}} | {"module": None})
+    assert has_builds({"nodes": [PLAIN, {**PLAIN, "build": "make"}]})
+    assert has_builds({"nodes": [{"id": "n", "module": "other.yml"}]})
+    assert not has_builds("build")
+
+
+def test_the_commands_and_their_order() -> None:
+    dora = ("/bin/dora", "build", "--local", "/r/tree/flows/x.yml")
+    sync = ("/bin/uv", "sync", "--frozen", "--directory")
+    flow = "flows/x.yml"
+    assert build_commands(["a.py"], "/r/tree", flow, "/bin/uv", "/bin/dora") == (dora,)
+    assert build_commands(["uv.lock"], "/r/tree", flow, "", "") == ()
+    found = build_commands(["uv.lock"], "/r/tree", flow, "/bin/uv", "/bin/dora")
+    assert found == ((*sync, "/r/tree"), dora)
+    found = build_commands(["uv.lock", "flows/uv.lock"], "/r/tree", flow, "/bin/uv", "")
+    assert found == ((*sync, "/r/tree/flows"),)
+
+
+def test_the_environment() -> None:
+    given = {"PATH": "/p/.venv/bin:/usr/bin", "VIRTUAL_ENV": "/p/.venv", "UV_NO_CACHE": "0"}
+    found = build_environment(given, "/r/tree/.venv", "/p/.venv")
+    assert found["PATH"] == "/r/tree/.venv/bin:/usr/bin"
+    assert found["VIRTUAL_ENV"] == found["UV_PROJECT_ENVIRONMENT"] == "/r/tree/.venv"
+    assert found["UV_NO_CACHE"] == "0"
+    assert build_environment(given, None, "/p/.venv")["PATH"] == given["PATH"]
+
+
+LINES = {
+    "a: stdout   hello": ("a: hello", True),
+    "a: INFO     running build command: `make`": ("a: running build command: `make`", False),
+    "Resolved 3 packages": ("Resolved 3 packages", False),
+    "\x1b[31ma: stderr   oh\x1b[0m": ("a: oh", True),
+    "a: stdout   " + "x" * 999: (None, True),
+}
+
+
+@pytest.mark.parametrize(("line", "expected"), LINES.items())
+def test_lines(line: str, expected: tuple[str | None, bool]) -> None:
+    words, is_of_command = expected
+    assert words is None or shown_line(line) == words
+    assert len(shown_line(line)) <= 300
+    assert is_output(line) == is_of_command
+
+
+def test_a_task_as_text() -> None:
+    task = BuildTask("robot", "u", "20260101T000000", "/r/tree", (("uv", "sync"), ("dora", "b $x")))
+    assert parse_task(format_task(task)) == task

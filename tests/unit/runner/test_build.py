@@ -1,0 +1,94 @@
+"""The program in the unit of a build."""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.adapters.journal.socket import JournalSocket
+from dora_systemd.decisions.releases.build import BuildTask
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.runner.build import Output, build
+
+PROGRAM = (sys.executable, "-m", "dora_systemd.runner.build")
+
+
+class Journal(JournalSocket):
+    """Keeps what it is sent."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.entries: list[bytes] = []
+
+    def send(self, entry: bytes) -> bool:
+        self.entries.append(entry)
+        return True
+
+
+@pytest.fixture
+def stdin(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The pipe that doractl holds."""
+    reading, writing = os.pipe()
+    with os.fdopen(reading) as ours, os.fdopen(writing, "w"):
+        monkeypatch.setattr("sys.stdin", ours)
+        yield
+
+
+def output_of(*script: str, directory: Path) -> tuple[list[bytes], str]:
+    """The journal, and the error of a build with these commands, "" for none."""
+    commands = tuple(("sh", "-c", one) for one in script)
+    task = BuildTask("robot", "uuid", "20260101T000000", str(directory), commands)
+    journal, error = Journal(), ""
+    try:
+        build(task, Output(task, journal))
+    except DoraSystemdError as refusal:
+        error = refusal.message
+    return journal.entries, error
+
+
+@pytest.mark.usefixtures("stdin")
+def test_what_it_prints_is_in_the_journal(tmp_path: Path) -> None:
+    entries, error = output_of("echo one; echo two >&2", "pwd", directory=tmp_path)
+    assert error == ""
+    texts = [entry.splitlines()[0] for entry in entries]
+    assert texts == [b"MESSAGE=one", b"MESSAGE=two", b"MESSAGE=" + os.fsencode(tmp_path)]
+    assert b"DORA_RELEASE=20260101T000000\n" in entries[0]
+
+
+@pytest.mark.usefixtures("stdin")
+def test_the_first_command_that_fails_is_the_last(tmp_path: Path) -> None:
+    script = "echo 'a: stdout   all is lost'; echo 'a: INFO   x'; exit 3"
+    _, error = output_of(script, "touch proof", directory=tmp_path)
+    assert error.startswith("cannot build robot: ")
+    assert error.endswith("; its last line: a: all is lost")
+    assert not (tmp_path / "proof").exists()
+
+
+@pytest.mark.usefixtures("stdin")
+def test_a_process_in_the_background_is_not_waited_for(tmp_path: Path) -> None:
+    entries, error = output_of("while sleep 0.1; do echo x; done & echo $!", directory=tmp_path)
+    os.kill(int(entries[0].split(b"\n")[0].removeprefix(b"MESSAGE=")), 9)
+    assert error == ""
+
+
+@pytest.mark.usefixtures("stdin")
+def test_lines_are_bounded(tmp_path: Path) -> None:
+    entries, _ = output_of("head -c 300000 /dev/zero | tr '\\0' x", directory=tmp_path)
+    assert len(entries) > 1
+    assert max(map(len, entries)) < 100_000
+
+
+def test_it_ends_with_doractl(tmp_path: Path) -> None:
+    commands = [["sh", "-c", "touch begun; sleep 1000"]]
+    names = {"name": "robot", "uuid": "u", "release": "r", "directory": str(tmp_path)}
+    task = json.dumps({**names, "commands": commands})
+    with subprocess.Popen((*PROGRAM, task), stdin=subprocess.PIPE) as child:
+        while not (tmp_path / "begun").exists():
+            assert child.poll() is None
+        assert child.stdin
+        child.stdin.close()
+        assert child.wait(60) == 1
