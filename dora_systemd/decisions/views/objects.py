@@ -52,6 +52,8 @@ def dataflow_object(row: DataflowRow, waits: Mapping[str, Shares] | None = None)
         "file": row.dataflow or None,
         "release": row.release or None,
         "status": row.status,
+        "waits_for": row.needs or None,
+        **moment("waits_since", row.waits_since),
         "text": row.text or None,
         "problem": row.problem or None,
         "enabled": row.enabled,

@@ -78,7 +78,8 @@ class DataflowRow(NamedTuple):
 
     Other fields are as in NodeRow, for the whole dataflow. enabled: whether it is started at boot.
     problem: why its node table is not valid, or "". inhibitors: who inhibits its restart.
-    listed_release: that in the Description= of its unit, for a row without `dataflow`.
+    listed_release: that in the Description= of its unit, for a row without `dataflow`. needs: what
+    systemd waits for before it starts it, or ""; waits_since: since when, CLOCK_REALTIME µs.
     """
 
     uuid: str
@@ -105,6 +106,8 @@ class DataflowRow(NamedTuple):
     problem: str = ""
     inhibitors: tuple[Holder, ...] = ()
     listed_release: str = ""
+    needs: str = ""
+    waits_since: int = 0
 
     @property
     def release(self) -> str:

@@ -13,7 +13,6 @@ from dora_systemd.decisions.cell.counters import (
 )
 from dora_systemd.decisions.cell.status import FAILED_BECAUSE, CellStatus, NodeStatus
 from dora_systemd.decisions.resources.usage import Usage
-from dora_systemd.decisions.views.dataflows import status_word
 from dora_systemd.decisions.views.rows import DataflowRow, NodeRow, OutputRow
 from dora_systemd.scope import Scope
 from dora_systemd.values import INFINITY, SECOND
@@ -40,7 +39,7 @@ def row_of(reading: Reading, before: Reading | None = None) -> DataflowRow:
         "uuid": cell.uuid,
         "name": cell.name,
         "unit": cell.unit,
-        "status": status_word(cell.state.active, cell.state.sub, status.stage),
+        "status": cell.word(status.stage),
         "dataflow": cell.dataflow,
         "listed_release": cell.release,
         # The status says "failed" already.
@@ -48,6 +47,9 @@ def row_of(reading: Reading, before: Reading | None = None) -> DataflowRow:
         "restarts": unit["NRestarts"],
         "problem": reading.problem,
     }
+    if held := reading.held:
+        facts |= {"status": held.word, "text": held.text}
+        return DataflowRow(**facts, needs=held.needs, waits_since=held.since_us)
     if not cell.is_up:
         return DataflowRow(**facts, ended=unit.get(ENDED) or 0)
     if not reading.usage:
