@@ -195,6 +195,10 @@ RAISING = {
     "node_rights: ['a:nice=1', 'b:scheduling=rr:1']": "node_rights",
     "nodes: {a: {nice: 5, scheduling: idle, essential: true, cpus: 0, lock_memory: no}}": "",
     "node_rights: a:oom-score-adjust=9": "",
+    "nice: -5": "nice",
+    "needs: [network, ' unit:reboot.target']": "needs",
+    "needs: mount:/srv": "needs",
+    "needs: [network, clock]\nnodes: {a: {needs: /dev/video0}}": "",
 }
 
 
