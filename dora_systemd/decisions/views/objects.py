@@ -85,6 +85,7 @@ def _node_object(row: NodeRow, shares: Shares | None) -> dict[str, Any]:
         "restarts": row.restarts,
         "max_restarts": row.max_restarts,
         "essential": row.essential,
+        "scheduling": row.scheduling or None,
         "silent": row.silent or None,
         "outputs": [
             {"output": one.output, "age_us": one.age, "within_us": one.within, "then": one.then}

@@ -28,8 +28,8 @@ class NodeRow(NamedTuple):
     which its CPU limit throttled it, None without one. since: time of its last change of state,
     CLOCK_REALTIME µs, 0: unknown. text: its own STATUS=. watchdog, sign_age: the time in which it
     must send WATCHDOG=1, and how long ago it did, in µs. essential: whether its final failure ends
-    the dataflow. silent: what is missing of the outputs that it owes, or "". needs: what it waits
-    for, or "".
+    the dataflow. scheduling: as in the settings, or "". silent: what is missing of the outputs that
+    it owes, or "". needs: what it waits for, or "".
     """
 
     node: str
@@ -49,6 +49,7 @@ class NodeRow(NamedTuple):
     watchdog: int | None = None
     sign_age: int | None = None
     essential: bool | None = None
+    scheduling: str = ""
     silent: str = ""
     needs: str = ""
     outputs: tuple[OutputRow, ...] = ()
