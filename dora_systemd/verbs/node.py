@@ -65,6 +65,12 @@ def reached_coordinator(scope: Scope, manager: Manager, cell: Cell) -> Coordinat
 
 def require_running(cell: Cell) -> None:
     """Raise DoraSystemdError (NOT_RUNNING) unless the dataflow is up."""
+    if cell.state.is_held:
+        raise DoraSystemdError(
+            f"cannot use the dataflow {cell.name}: systemd has not started it yet",
+            f"doractl list {cell.name} says what it waits for",
+            ExitCode.NOT_RUNNING,
+        )
     if not cell.is_up:
         raise DoraSystemdError(
             f"cannot use the dataflow {cell.name}: it is not running",

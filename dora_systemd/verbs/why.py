@@ -9,7 +9,6 @@ from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.decisions.life import nodes as node_table
 from dora_systemd.decisions.logs.query import scope_matches, story_matches
-from dora_systemd.decisions.views.dataflows import status_word
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.why.last_lines import Word, choose_last, shown_last
 from dora_systemd.decisions.why.lives import SHUTDOWN_MESSAGE, Life, find_lives, parse_happening
@@ -22,6 +21,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.budget import restart_budget
 from dora_systemd.verbs.facts.cells import Cell, read_cell, read_cells
 from dora_systemd.verbs.facts.ended import not_recorded
+from dora_systemd.verbs.facts.held import read_held
 from dora_systemd.verbs.facts.list import mark_enabled
 from dora_systemd.verbs.facts.locks import read_holders
 from dora_systemd.verbs.facts.reading import look_at_table, read_status
@@ -77,11 +77,13 @@ def _subject(scope: Scope, cell: Cell) -> Subject:
 
 
 def _facts(manager: Manager, scope: Scope, cell: Cell) -> Facts:
+    if cell.state.is_held:
+        return _held_facts(manager, cell)
     status, problem = look_at_table(scope, cell) if cell.is_up else (CellStatus(), "")
     nodes, spent = status.nodes.items(), node_table.spent(status.nodes)
     unit = manager.read(cell.unit, ["StatusText", "NRestarts"])
     return Facts(
-        status_word(cell.state.active, cell.state.sub, status.stage),
+        cell.word(status.stage),
         problem or str(unit["StatusText"]),
         {key: spent.get(key, str(node.exit)) for key, node in nodes if node.state == "failed"},
         tuple(key for key, node in nodes if node.state == "restarting"),
@@ -89,6 +91,12 @@ def _facts(manager: Manager, scope: Scope, cell: Cell) -> Facts:
         unit["NRestarts"],
         {key: node.silent for key, node in nodes if node.silent},
     )
+
+
+def _held_facts(manager: Manager, cell: Cell) -> Facts:
+    held = read_held(manager, cell)
+    restarts = manager.read(cell.unit, ["NRestarts"])["NRestarts"]
+    return Facts(held.word, held.text, {}, (), _now_boot(), restarts, is_held=True)
 
 
 def _now_boot() -> str:

@@ -198,6 +198,42 @@ def test_an_essential_node_ends_the_dataflow(cell: Cell, project: Project, resta
 
 
 @pytest.mark.warns(*CRASHES, *FAILED)
+def test_a_reload_that_fails_and_leaves_it_down_ends_the_dataflow(
+    cell: Cell, project: Project
+) -> None:
+    """Its old version has ended, and the old file is gone: nothing can be started again."""
+    bad = project.write("bad.py", WAITING)
+    project.write("other.py", WAITING)
+    cell.start(project.write("dataflow.yml", ESSENTIAL), "--node-rights=bad:essential")
+    bad.write_text("raise SystemExit(3)\n")
+    refused = cell.doractl("reload", cell.name, check=False)
+    assert "cannot use what was saved: node bad: exit code 3" in refused.stderr
+    assert refused.returncode == 1
+    wait_for("it has failed", lambda: cell.show("ActiveState") == "failed")
+    why = json.loads(cell.doractl("why", cell.name, "-o", "json", check=False).stdout)
+    found = (why["cause"], why["summary"], why["node"])
+    assert found == ("node-failed", "essential node bad: exit code 3", "bad")
+    assert cell.show("ExecMainStatus") == "1"
+    names = [name for name, _ in cell.events()]
+    assert names.index("reload-failed") < names.index("dataflow-failed")
+    assert ("node-crashed", "other") not in cell.events()
+
+
+@pytest.mark.warns(*CRASHES, *FAILED)
+def test_a_reload_that_goes_back_keeps_it(cell: Cell, project: Project) -> None:
+    for name in ("bad.py", "other.py"):
+        project.write(name, WAITING)
+    project.write("new.py", "raise SystemExit(3)\n")
+    flow = project.write("dataflow.yml", ESSENTIAL)
+    cell.start(flow, "--node-rights=bad:essential")
+    flow.write_text(ESSENTIAL.replace("bad.py", "new.py"))
+    refused = cell.doractl("reload", cell.name, check=False)
+    assert "the previous version is running again" in refused.stderr
+    cell.wait_exchanging("bad")
+    assert (cell.show("ActiveState"), cell.show("NRestarts")) == ("active", "0")
+
+
+@pytest.mark.warns(*CRASHES, *FAILED)
 def test_without_it_the_others_stay(cell: Cell, project: Project) -> None:
     project.write("bad.py", CRASHING)
     project.write("other.py", WAITING)

@@ -57,7 +57,7 @@ def _changes(
     """Make each change, then yield it."""
     if hot_reload is None or any(map(is_given, flags.values())):
         print_warnings(set_limits(bus, scope, cell, flags, force))
-        yield "Limits changed" if cell.is_up else "Limits changed for the next start"
+        yield "Limits changed" if cell.has_begun else "Limits changed for the next start"
     if hot_reload is not None:
         switch_hot_reload(bus, scope, cell, hot_reload == "on")
         yield f"Hot reload {hot_reload}"

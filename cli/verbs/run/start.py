@@ -28,7 +28,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.selector import Selector
-from dora_systemd.verbs.needs.notes import waiting_notes
+from dora_systemd.verbs.needs.notes import held_notes, waiting_notes
 from dora_systemd.verbs.start.again import find_start, means_name
 from dora_systemd.verbs.start.check import check_plan
 from dora_systemd.verbs.start.enable import boot_target
@@ -118,6 +118,7 @@ def command(
         started = start_unit(bus, scope, options, claimed.properties, stage, not no_wait)
     # Only after the start: a refusal must be one line and a hint.
     print_warnings([*notes, *waiting_notes(bus, options)])
+    print_warnings(held_notes(bus, options.name) if no_wait else ())
     return _print_started(started, options.dataflow, watched_patterns(claimed.plan))
 
 
@@ -135,7 +136,7 @@ def _attach(bus: Bus, claimed: Claim, notes: Sequence[str]) -> int:
 def _start_known(bus: Bus, scope: Scope, cell: Cell, wait: bool) -> ExitCode:
     """As systemctl start: what runs goes on running."""
     file = cell.options.dataflow
-    if cell.is_up:
+    if cell.has_begun:
         text = f"Dataflow already running: {cell.uuid} ({cell.name})"
         details = {"file": file, "is_ready": cell.state.active == "active"}
         return print_outcomes([Outcome(cell, text, is_news=False, details=details)])
@@ -144,6 +145,7 @@ def _start_known(bus: Bus, scope: Scope, cell: Cell, wait: bool) -> ExitCode:
     with _last_words(bus, scope, cell.uuid), StageLine(sys.stderr) as stage:
         started = start_unit(bus, scope, cell.options, None, stage, wait)
     print_warnings([*waiting_notes(bus, cell.options)])
+    print_warnings(() if wait else held_notes(bus, cell.name))
     return _print_started(started, file, ())
 
 

@@ -16,6 +16,7 @@ _REASONS = {
     **dict.fromkeys(("AccessDenied", "InteractiveAuthorizationRequired", "AuthFailed"), _DENIED),
     "UnitExists": ("a unit of that name already exists", ExitCode.NAME_IN_USE),
     "NoSuchUnit": ("there is no such unit", ExitCode.NOT_FOUND),
+    "NoSuchJob": ("there is no such job", ExitCode.NOT_FOUND),
     "Disconnected": ("systemd hung up", ExitCode.NO_SYSTEMD),
     **dict.fromkeys(("ConnectionRefused", "NoReply", "Timeout", "TimedOut"), _SILENT),
     **dict.fromkeys(("ServiceUnknown", "NameHasNoOwner"), _AWAY),

@@ -11,23 +11,35 @@ UP = (*SETTLED, *ON_THE_WAY)
 DOWN = ("inactive", "failed")
 """Words of ActiveState=, see systemctl(1)."""
 
+START_JOBS = ("start", "restart")
+"""Types of jobs that start a unit that is down, see systemctl(1) list-jobs."""
+
 Property = tuple[str, str, Any]
 """Name, D-Bus signature and value of one unit property."""
 Observer = Callable[[Mapping[str, Any]], None]
-"""Called with the changed properties of a unit during a wait."""
+"""Called with the changed properties of a unit during a wait; {}: nothing changes for a while."""
 
 StageObserver = Callable[[str], None]
 """Called with a new STATUS= of a unit."""
 
 
 class UnitState(NamedTuple):
-    """One unit as ListUnits reports it, in the terms of `systemctl list-units`."""
+    """One unit as ListUnits reports it, in the terms of `systemctl list-units`.
+
+    job: the type of the job that is queued for it, "" if there is none.
+    """
 
     unit: str
     load: str
     active: str
     sub: str
     description: str = ""
+    job: str = ""
+
+    @property
+    def is_held(self) -> bool:
+        """Whether systemd has its start in the queue, and waits for other units first."""
+        return self.active in DOWN and self.job in START_JOBS
 
 
 class Manager(Protocol):
@@ -76,6 +88,12 @@ class Manager(Protocol):
 
     def hold(self, unit: str) -> None:
         """Keep systemd from unloading the unit until this client disconnects."""
+
+    def awaited(self, unit: str) -> list[str]:
+        """The units whose jobs the job of this unit waits for; [] if it has none (any more)."""
+
+    def began_us(self) -> int:
+        """When this manager began, CLOCK_MONOTONIC µs: at boot, or at the user's first login."""
 
     def control_group(self) -> str:
         """The manager's own cgroup, which contains its units; "" is the root."""

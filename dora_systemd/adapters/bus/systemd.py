@@ -65,7 +65,7 @@ class Bus:
 
     def list_units(self, pattern: str) -> list[UnitState]:
         rows = self._call("list units", "ListUnitsByPatterns", ("as", []), ("as", [pattern]))
-        return [UnitState(row[0], row[2], row[3], row[4], row[1]) for row in rows or ()]
+        return [UnitState(row[0], row[2], row[3], row[4], row[1], row[8]) for row in rows or ()]
 
     def read(self, unit: str, names: Sequence[str]) -> dict[str, Any]:
         return {name: self._read_one(unit, name) for name in names}
@@ -113,6 +113,19 @@ class Bus:
     def changes(self, unit: str) -> list[Mapping[str, Any]]:
         self._listen(unit)
         return [body[1] for member, body in self._signals() if member == "PropertiesChanged"]
+
+    def awaited(self, unit: str) -> list[str]:
+        job = self._read_one(unit, "Job")[0]
+        try:
+            jobs = self._call(f"read the job of {unit}", "GetJobBefore", ("u", job)) if job else ()
+        except DoraSystemdError as error:
+            if error.code is not ExitCode.NOT_FOUND:
+                raise
+            return []
+        return [one[1] for one in jobs or ()]
+
+    def began_us(self) -> int:
+        return int(self._get("read when systemd began", "UserspaceTimestampMonotonic"))
 
     def control_group(self) -> str:
         return str(self._get("read systemd's cgroup", "ControlGroup"))
@@ -209,6 +222,8 @@ class Bus:
             if not heard and not self._sleep(_IDLE_SECONDS):
                 left = [unit for unit in jobs.values() if unit not in results]
                 results |= {unit: word for unit in left if (word := self._job_result(unit))}
+                if observer:
+                    observer({})
         return results
 
     def _job_result(self, unit: str) -> str:

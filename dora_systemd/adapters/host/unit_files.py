@@ -26,6 +26,14 @@ def read_unit_file(path: Path) -> str | None:
     return read_text(path)
 
 
+def written_us(path: Path) -> int:
+    """When a unit file was written, CLOCK_REALTIME µs; 0 if there is none."""
+    try:
+        return path.lstat().st_mtime_ns // 1000
+    except OSError:
+        return 0
+
+
 def write_link(path: Path, target: str) -> None:
     """Create the symbolic link `path` unless it exists. Raises DoraSystemdError."""
     with _told("write", path):

@@ -28,8 +28,6 @@ NODE_STATES = (
 )
 FAILED_BECAUSE = "failed: "
 """Prefix of STATUS= for the reason why a dataflow failed."""
-WAITS = " waits for "
-"""In STATUS=, between a node and what it needs."""
 HELD = "held"
 """Policy of a node that waits for a reload after it has failed."""
 LATCHED = "latched"

@@ -237,11 +237,13 @@ class NodeRemoved(Event):
 class ReloadNoted(Event):
     """The result of the last reload. notice: what to show as long as it is true, or "".
 
-    downstream: the nodes that depend on each node, if that has changed.
+    downstream: the nodes that depend on each node, if that has changed. essential: the nodes that
+    the dataflow needs, if the reload has failed.
     """
 
     notice: str
     downstream: Downstream | None = None
+    essential: tuple[str, ...] = ()
 
 
 class ReloadAsked(Event):

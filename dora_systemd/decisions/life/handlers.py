@@ -13,11 +13,10 @@ events came before: dora's events and the ends of its processes arrive in any or
 
 from dataclasses import replace
 
-from dora_systemd.decisions.cell.owed import FAIL
-from dora_systemd.decisions.cell.status import HELD, LATCHED, NodeStatus
+from dora_systemd.decisions.cell.status import HELD, LATCHED
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life import nodes as table
-from dora_systemd.decisions.life.causes import ESSENTIAL, Cause
+from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.life.failures import ENGINE_TIMEOUT, Next, because, fail, oom_of_all, to
 from dora_systemd.decisions.life.states import Action, Cell, Deadline, Do, Record, RunnerExit, State
 from dora_systemd.decisions.life.stop_budget import LEAVE_TIMEOUT, stop_timeout
@@ -104,44 +103,6 @@ def node_event(cell: Cell, event: life.Event) -> Next:
     return replace(cell, nodes=nodes), (*oom_of_all(event), *actions)
 
 
-def node_event_running(cell: Cell, event: life.NodeExited) -> Next:
-    """A node exited: end the dataflow if it is essential and has failed for good.
-
-    A node with the policy HELD waits for a reload. Without restarts left the unit is not restarted
-    either: that would be more than the policy says.
-    """
-    after, actions = node_event(cell, event)
-    before, node = cell.nodes.get(event.node), after.nodes.get(event.node)
-    if before is None or node is None or not event.is_essential or _is_replaced(before):
-        return after, actions
-    if node.state != "failed" or node.policy == HELD:
-        return after, actions
-    spent = table.spent(after.nodes)
-    reason = f"{ESSENTIAL}node {event.node}: {spent.get(event.node) or node.exit}"
-    code = RunnerExit.NODES_FAILED if event.node in spent else RunnerExit.FAILED
-    after = because(after, Cause.NODE_FAILED, [event.node])
-    return _wind_down(replace(after, failure=reason, exit=code), *actions)
-
-
-def _is_replaced(node: NodeStatus) -> bool:
-    """Whether this is the first process after a reload: the reloader goes back if it fails.
-
-    While the dataflow runs, only such a process has never been ready and is no restart of dora's.
-    """
-    return node.state == "starting" and not node.restarts
-
-
-def silent(cell: Cell, event: life.NodeSilent) -> Next:
-    """A node owes an output: record it, and end the dataflow if that is asked."""
-    cell, actions = node_event(cell, event)
-    if event.then != FAIL:
-        return cell, actions
-    reason = f"node {event.node}: {event.reason}"
-    cell = replace(because(cell, Cause.NODE_SILENT, [event.node]), failure=reason)
-    cell = replace(cell, exit=RunnerExit.FAILED)
-    return _wind_down(cell, *actions)
-
-
 def node_met(cell: Cell, event: life.NodeMet) -> Next:
     """The node goes on, and has the whole start timeout again."""
     return node_event(replace(cell, met_us=event.at_us), event)
@@ -159,7 +120,7 @@ def stop_early(cell: Cell, event: life.StopAsked) -> Next:
 
 def stop(cell: Cell, event: life.StopAsked) -> Next:
     """Have dora stop the nodes, if any of them runs."""
-    return _wind_down(replace(cell, stop_by=event.by), _stopping(event))
+    return wind_down(replace(cell, stop_by=event.by), _stopping(event))
 
 
 def _stopping(event: life.StopAsked) -> Record:
@@ -186,10 +147,10 @@ def leave_now(cell: Cell, event: life.Event) -> Next:
 
 def reload(cell: Cell, event: life.Event) -> Next:
     """Wind down as for a stop, but record no event: the reloader starts the next run."""
-    return _wind_down(replace(cell, reload=True))
+    return wind_down(replace(cell, reload=True))
 
 
-def _wind_down(cell: Cell, *actions: Action) -> Next:
+def wind_down(cell: Cell, *actions: Action) -> Next:
     if not table.has_process(cell.nodes):
         return _leave(cell, *actions)
     return to(cell, State.STOPPING, *actions, Do.ASK_STOP, after=stop_timeout(cell.grace))

@@ -9,7 +9,7 @@ Every pair of state and event has an entry in TABLE; its unit test takes them al
 from collections.abc import Mapping
 
 from dora_systemd.decisions.life import events as life
-from dora_systemd.decisions.life import failures
+from dora_systemd.decisions.life import failures, running
 from dora_systemd.decisions.life import handlers as handle
 from dora_systemd.decisions.life.failures import Handler, Next
 from dora_systemd.decisions.life.states import Cell, State
@@ -55,6 +55,12 @@ _ALIVE: dict[str, Handler] = {
     "ResultKnown": handle.result,
     "StopAsked": handle.stop,
 }
+_RUNNING: dict[str, Handler] = {
+    **_ALIVE,
+    **_RELOADS,
+    "NodeExited": running.node_exited,
+    "ReloadNoted": running.reload_noted,
+}
 _STOPPING: dict[str, Handler] = {
     **dict.fromkeys(_NODES, handle.node_event_stopping),
     **dict.fromkeys(("StopAnswered", "RunFinished", "DeadlinePassed"), handle.leave_now),
@@ -74,8 +80,8 @@ TABLE: Mapping[State, Mapping[type[life.Event], Handler]] = {
         StartTimedOut=handle.start_timed_out,
     ),
     State.RUNNING: _row(
-        **{**_ALIVE, **_RELOADS, "NodeExited": handle.node_event_running},
-        NodeSilent=handle.silent,
+        **_RUNNING,
+        NodeSilent=running.silent,
         NodeSpeaks=handle.node_event,
     ),
     State.STOPPING: _row(**_STOPPING),

@@ -10,15 +10,15 @@ from dora_systemd.decisions.cell.status import (
     HELD,
     LATCHED,
     UNMET,
-    WAITS,
     CellStatus,
     NodeStatus,
 )
 from dora_systemd.decisions.life.nodes import WITH_PROCESS, is_held_up, lacking
 from dora_systemd.decisions.life.states import Cell, State
 from dora_systemd.decisions.life.stop_budget import kill_delay
+from dora_systemd.decisions.needs.words import format_wait
 from dora_systemd.decisions.signs.table import Sign
-from dora_systemd.values import INFINITY, format_duration, format_moment
+from dora_systemd.values import INFINITY, format_duration
 
 _SHOWN = {
     State.BOOTING: ("starting", "starting the dora coordinator"),
@@ -87,15 +87,8 @@ def _format_running(cell: Cell) -> str:
 
 def _format_lacking(cell: Cell) -> str:
     """As "camera waits for /dev/video0 since 14:02:11 UTC"."""
-    texts = [
-        f"{ident}{WAITS}{node.needs} since {_clock(node.since_us)}"
-        for ident, node in lacking(cell.nodes).items()
-    ]
-    return _names(texts)
-
-
-def _clock(at_us: int) -> str:
-    return f"{format_moment(at_us)[:19].replace('T', ' ')} UTC"
+    nodes = lacking(cell.nodes).items()
+    return _names([format_wait(ident, node.needs, node.since_us) for ident, node in nodes])
 
 
 def _with_exit(ident: str, node: NodeStatus) -> str:

@@ -157,7 +157,12 @@ def merge_node_rights(*sources: Iterable[NodeRights]) -> tuple[NodeRights, ...]:
 
 def is_essential(rights: Iterable[NodeRights], node: str) -> bool:
     """Whether the final failure of `node` ends the dataflow."""
-    return any(bool(one.essential) for one in rights if one.node == node)
+    return node in essential_nodes(rights)
+
+
+def essential_nodes(rights: Iterable[NodeRights]) -> tuple[str, ...]:
+    """The nodes whose final failure ends the dataflow."""
+    return tuple(one.node for one in rights if one.essential)
 
 
 def has_process_rights(rights: Iterable[NodeRights]) -> bool:

@@ -69,7 +69,6 @@ class Setting(Generic[T]):
     only_nodes: only valid below `nodes: NODE:`, so there is no flag and no variable.
     raises: whether a value, of a node or of the dataflow, gives more than the user of the dataflow
     has. In system scope such a value is only valid where root_only settings are.
-    roots_words: the same for single values: beginnings of those that only root may give.
     """
 
     name: str
@@ -84,7 +83,6 @@ class Setting(Generic[T]):
     root_only: bool = False
     only_nodes: bool = False
     raises: Callable[[Any], bool] | None = None
-    roots_words: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         word = self.name.replace("_", "-")

@@ -17,6 +17,6 @@ NEEDS = Setting[tuple[str, ...]](
     (),
     "What to wait for: network, clock, dataflow:NAME, unit:NAME, mount:PATH, or NODE=PATH.",
     per_node=True,
-    roots_words=FOREIGN,
+    raises=lambda needs: any(one.startswith(FOREIGN) for one in needs),
 )
 NEED_SETTINGS = (NEEDS,)

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Sequence
 
+from dora_systemd.decisions.needs.words import format_wait
 from dora_systemd.decisions.views.rows import SILENT, DataflowRow, NodeRow
 from dora_systemd.terminal_text import cut, one_line
 from dora_systemd.values import SECOND, format_rounded_size
@@ -32,12 +33,15 @@ UNREADABLE = "?"
 SHORTEST_PREFIX = 8
 
 
-def status_word(active: str, sub: str, stage: str = "") -> str:
+def status_word(active: str, sub: str, stage: str = "", is_held: bool = False) -> str:
     """The status of a dataflow in one word.
 
     active, sub: ActiveState and SubState of its unit, see org.freedesktop.systemd1(5). stage: the
-    runner's own, or "" if that is not readable.
+    runner's own, or "" if that is not readable. is_held: whether systemd has its start in the
+    queue.
     """
+    if is_held:
+        return WAITING
     if sub.startswith("auto-restart") or (active == "activating" and stage == "restarting"):
         return RESTARTING
     word = _BY_ACTIVE.get(active, STOPPED)
@@ -177,7 +181,8 @@ def format_dataflows(
 ) -> str:
     """The table of `doractl list`, for a terminal of that width.
 
-    With RELEASE if any of them is deployed, with ENDED and WHY if any of them has ended.
+    With RELEASE if any of them is deployed, with ENDED if any has ended, and with WHY if any has
+    ended or waits.
     """
     return format_table(*dataflow_table(rows), width, want_colors)
 
@@ -185,28 +190,39 @@ def format_dataflows(
 def dataflow_table(rows: Sequence[DataflowRow]) -> tuple[Sequence[str], list[Sequence[str]]]:
     """The header of that table, and the cells of each row."""
     prefixes = shortest_prefixes([row.uuid for row in rows])
-    more = () if all(map(is_up_word, rows)) else ("ENDED", "WHY")
-    is_deployed = any(row.release for row in rows)
-    header = (*_HEADER, *(("RELEASE",) if is_deployed else ()), *more)
-    cells = [_dataflow_cells(row, prefixes[row.uuid], is_deployed)[: len(header)] for row in rows]
-    return header, list[Sequence[str]](cells)
+    optional = {
+        "RELEASE": any(row.release for row in rows),
+        "ENDED": not all(map(is_up_word, rows)),
+        "WHY": any(row.status == WAITING or not is_up_word(row) for row in rows),
+    }
+    header = [*_HEADER, *(title for title, is_shown in optional.items() if is_shown)]
+    cells = [_dataflow_cells(row, prefixes[row.uuid]) for row in rows]
+    return header, [[row[title] for title in header] for row in cells]
 
 
-def _dataflow_cells(row: DataflowRow, prefix: str, with_release: bool) -> tuple[str, ...]:
-    return (
-        prefix,
-        row.name,
-        row.status,
-        format_uptime(row.uptime),
-        node_count(row) or UNKNOWN,
-        format_cpu(row),
-        format_memory(row.memory, row.memory_limit),
-        format_count(row.restarts),
-        "yes" if row.enabled else UNKNOWN,
-        *((row.release or UNKNOWN,) if with_release else ()),
-        local_time(row.ended),
-        UNKNOWN if is_up_word(row) else row.text or UNKNOWN,
-    )
+def _dataflow_cells(row: DataflowRow, prefix: str) -> dict[str, str]:
+    return {
+        "UUID": prefix,
+        "NAME": row.name,
+        "STATUS": row.status,
+        "UPTIME": format_uptime(row.uptime),
+        "NODES": node_count(row) or UNKNOWN,
+        "CPU%": format_cpu(row),
+        "MEM": format_memory(row.memory, row.memory_limit),
+        "RESTARTS": format_count(row.restarts),
+        "BOOT": "yes" if row.enabled else UNKNOWN,
+        "RELEASE": row.release or UNKNOWN,
+        "ENDED": local_time(row.ended),
+        "WHY": _why(row) or UNKNOWN,
+    }
+
+
+def _why(row: DataflowRow) -> str:
+    """How it ended, or what it waits for."""
+    if row.status != WAITING:
+        return "" if is_up_word(row) else row.text
+    nodes = (format_wait(one.node, one.needs, one.since) for one in row.nodes if one.needs)
+    return ", ".join(nodes) or row.text
 
 
 def node_count(row: DataflowRow) -> str:

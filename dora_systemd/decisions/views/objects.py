@@ -52,6 +52,8 @@ def dataflow_object(row: DataflowRow, waits: Mapping[str, Shares] | None = None)
         "file": row.dataflow or None,
         "release": row.release or None,
         "status": row.status,
+        "waits_for": row.needs or None,
+        **moment("waits_since", row.waits_since),
         "text": row.text or None,
         "problem": row.problem or None,
         "enabled": row.enabled,
@@ -83,6 +85,7 @@ def _node_object(row: NodeRow, shares: Shares | None) -> dict[str, Any]:
         "restarts": row.restarts,
         "max_restarts": row.max_restarts,
         "essential": row.essential,
+        "scheduling": row.scheduling or None,
         "silent": row.silent or None,
         "outputs": [
             {"output": one.output, "age_us": one.age, "within_us": one.within, "then": one.then}

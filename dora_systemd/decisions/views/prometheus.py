@@ -79,6 +79,7 @@ SIGN_AGE = Family("watchdog_age_seconds", "Time since its last WATCHDOG=1.")
 SILENT = Family("silent", "1 while an output that it owes is missing.")
 LAST_OUTPUT = Family("last_output_age_seconds", "Time since the last message of an owed output.")
 INFO = Family("info", "UUID, unit and release of a dataflow; the value is always 1.")
+RIGHTS = Family("info", "What it is, and its scheduling; the value is always 1.")
 NODES = Family("nodes", "Nodes that the dataflow has.")
 ALIVE = Family("nodes_alive", "Nodes that are running.")
 LINES = Family("log_lines_total", "Lines sent to journald.")
@@ -124,6 +125,7 @@ def _node_samples(observed: Sequence[Observed]) -> Iterator[tuple[Family, list[S
         for one in observed
         for node in one.row.nodes
     ]
+    yield RIGHTS, [({**own, **_rights(n)}, 1) for own, _, n in places if _rights(n)]
     states = (*NODE_STATES, UNKNOWN_STATE)
     yield STATE, [sample for own, _, node in places for sample in _states(own, node.state, states)]
     restarts = [(own, node.restarts) for own, _, node in places]
@@ -145,6 +147,12 @@ def _ages(own: Labels, node: NodeRow) -> Iterator[Sample]:
     for one in node.outputs:
         if one.age is not None:
             yield {**own, "output": one.output}, one.age / SECOND
+
+
+def _rights(node: NodeRow) -> Labels:
+    """What is special about a node; most have nothing."""
+    essential = {"essential": "yes"} if node.essential else {}
+    return essential | ({"scheduling": node.scheduling} if node.scheduling else {})
 
 
 def _is_there(node: NodeRow) -> bool:

@@ -28,8 +28,8 @@ class NodeRow(NamedTuple):
     which its CPU limit throttled it, None without one. since: time of its last change of state,
     CLOCK_REALTIME µs, 0: unknown. text: its own STATUS=. watchdog, sign_age: the time in which it
     must send WATCHDOG=1, and how long ago it did, in µs. essential: whether its final failure ends
-    the dataflow. silent: what is missing of the outputs that it owes, or "". needs: what it waits
-    for, or "".
+    the dataflow. scheduling: as in the settings, or "". silent: what is missing of the outputs that
+    it owes, or "". needs: what it waits for, or "".
     """
 
     node: str
@@ -49,6 +49,7 @@ class NodeRow(NamedTuple):
     watchdog: int | None = None
     sign_age: int | None = None
     essential: bool | None = None
+    scheduling: str = ""
     silent: str = ""
     needs: str = ""
     outputs: tuple[OutputRow, ...] = ()
@@ -78,7 +79,8 @@ class DataflowRow(NamedTuple):
 
     Other fields are as in NodeRow, for the whole dataflow. enabled: whether it is started at boot.
     problem: why its node table is not valid, or "". inhibitors: who inhibits its restart.
-    listed_release: that in the Description= of its unit, for a row without `dataflow`.
+    listed_release: that in the Description= of its unit, for a row without `dataflow`. needs: what
+    systemd waits for before it starts it, or ""; waits_since: since when, CLOCK_REALTIME µs.
     """
 
     uuid: str
@@ -105,6 +107,8 @@ class DataflowRow(NamedTuple):
     problem: str = ""
     inhibitors: tuple[Holder, ...] = ()
     listed_release: str = ""
+    needs: str = ""
+    waits_since: int = 0
 
     @property
     def release(self) -> str:

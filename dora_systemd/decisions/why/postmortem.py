@@ -44,7 +44,8 @@ def examine(lives: Sequence[Life], facts: Facts, shutdowns: Sequence[int] = ()) 
 
     shutdowns: CLOCK_REALTIME µs of shutdown requests for the machine.
     """
-    chain = with_restarts(lives)
+    # What is recorded is of earlier lives, as long as systemd has not begun this one.
+    chain = [] if facts.is_held else with_restarts(lives)
     life = chain[-1] if chain else Life()
     only_begins = all(one.name == "unit-starting" for one in life.happenings)
     if facts.status == RESTARTING and len(chain) > 1 and only_begins:

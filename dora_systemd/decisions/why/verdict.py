@@ -16,6 +16,7 @@ class Facts:
     status: a word of `list`. text: STATUS=. failed: nodes that have failed for good. restarting:
     nodes that wait for a restart. now_boot: id of this boot. restarts: NRestarts= of the unit, None
     if systemd has unloaded it. silent: nodes of which an owed output is missing, and which.
+    is_held: whether systemd has not begun the start that it has in its queue.
     """
 
     status: str = ""
@@ -25,6 +26,7 @@ class Facts:
     now_boot: str = ""
     restarts: int | None = None
     silent: Mapping[str, str] = field(default_factory=dict)
+    is_held: bool = False
 
 
 @dataclass(frozen=True)

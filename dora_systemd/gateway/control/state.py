@@ -15,7 +15,7 @@ from dora_systemd.decisions.gateway.answers import (
     node_list,
     stopped,
 )
-from dora_systemd.decisions.views.dataflows import FAILED, FINISHED, status_word
+from dora_systemd.decisions.views.dataflows import FAILED, FINISHED
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.why.report import Report
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -48,8 +48,7 @@ def _ended(scope: Scope, rows: tuple[DataflowRow, ...], _period: int) -> tuple[D
 
 
 def _row(cell: Cell) -> DataflowRow:
-    word = status_word(cell.state.active, cell.state.sub)
-    return DataflowRow(cell.uuid, cell.name, cell.unit, word)
+    return DataflowRow(cell.uuid, cell.name, cell.unit, cell.word())
 
 
 def list_nodes(scope: Scope) -> dict[str, Any]:

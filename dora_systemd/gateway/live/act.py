@@ -104,7 +104,7 @@ def read_graph(scope: Scope, uuid: str) -> dict[str, Any]:
 
 def _running_descriptor(scope: Scope, cell: Cell) -> object:
     """dora's copy, or None if no run has one."""
-    run = read_status(scope, cell).run if cell.is_up else ""
+    run = read_status(scope, cell).run if cell.has_begun else ""
     # The dataflow may be ending at this moment.
     with suppress(DoraSystemdError, KeyError, TypeError):
         if run:

@@ -19,6 +19,7 @@ from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.wiring import downstream_of
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.reload.steps import How, Step
+from dora_systemd.decisions.rights.node_rights import essential_nodes
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.runner.cell.begin import let_openssl_in
 from dora_systemd.runner.cell.failure import words
@@ -147,7 +148,8 @@ class Reloader:
         self._untold = error if self._run is None else None
         self.notice = f"not reloaded: {error.message.removeprefix('cannot use ')}"
         if self._run is not None:
-            self._run.pump.push(life.ReloadNoted(now_us(), self.notice))
+            needed = essential_nodes(self.options.node_rights)
+            self._run.pump.push(life.ReloadNoted(now_us(), self.notice, essential=needed))
             hint = f" ({error.hint})" if error.hint else ""
             self._run.pipes.write_event("reload-failed", reason=error.message + hint)
 

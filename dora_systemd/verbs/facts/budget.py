@@ -8,7 +8,7 @@ from typing import Any
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.decisions.cell.restarts import unit_budget
 from dora_systemd.decisions.cell.status import CellStatus
-from dora_systemd.decisions.views.dataflows import RESTARTING, status_word
+from dora_systemd.decisions.views.dataflows import RESTARTING
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
 from dora_systemd.values import INFINITY
@@ -70,7 +70,7 @@ def _starts(scope: Scope, uuid: str, restarts: int, _life: object) -> list[int]:
 
 def _next(manager: Manager, cell: Cell, status: CellStatus) -> int | None:
     """The delay in µs: systemd waits for the shortest one, the runner for the rest."""
-    if status_word(cell.state.active, cell.state.sub, status.stage) != RESTARTING:
+    if cell.word(status.stage) != RESTARTING:
         return None
     if not cell.state.sub.startswith("auto-restart"):
         return max(status.started_us - time.time_ns() // 1000, 0)

@@ -3,7 +3,8 @@
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from dora_systemd.adapters.bus.manager import UP, Manager, UnitState
+from dora_systemd.adapters.bus.manager import DOWN, UP, Manager, UnitState
+from dora_systemd.decisions.views.dataflows import status_word
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import (
     UNIT_PREFIX,
@@ -52,8 +53,17 @@ class Cell:
 
     @property
     def is_up(self) -> bool:
-        """Whether it runs, or is on its way up or down."""
+        """Whether it runs, is on its way up or down, or waits for its start."""
+        return self.has_begun or self.state.is_held
+
+    @property
+    def has_begun(self) -> bool:
+        """Whether systemd has begun its start, so that there may be processes of it."""
         return self.state.active in UP
+
+    def word(self, stage: str = "") -> str:
+        """Its status in one word, as status_word(). stage: the runner's own."""
+        return status_word(self.state.active, self.state.sub, stage, self.state.is_held)
 
     @property
     def options(self) -> "RunnerOptions":
@@ -120,6 +130,9 @@ def read_cell(manager: Manager, unit: str) -> Cell | None:
     if state["LoadState"] != "loaded":
         return None
     found = UnitState(unit, state["LoadState"], state["ActiveState"], state["SubState"])
+    if found.active in DOWN:
+        # Only the list has the types of jobs. It may have lost the unit, which it does not load.
+        found = next(iter(manager.list_units(unit)), found)
     return _asked(manager, found)
 
 

@@ -1,7 +1,7 @@
 """`doractl list`: dataflows and their resource usage, a row for each."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
@@ -13,7 +13,6 @@ from dora_systemd.decisions.cell.counters import (
 )
 from dora_systemd.decisions.cell.status import FAILED_BECAUSE, CellStatus, NodeStatus
 from dora_systemd.decisions.resources.usage import Usage
-from dora_systemd.decisions.views.dataflows import status_word
 from dora_systemd.decisions.views.rows import DataflowRow, NodeRow, OutputRow
 from dora_systemd.scope import Scope
 from dora_systemd.values import INFINITY, SECOND
@@ -28,6 +27,9 @@ from dora_systemd.verbs.facts.reading import (
     slice_group,
 )
 
+if TYPE_CHECKING:
+    from dora_systemd.decisions.rights.node_rights import NodeRights
+
 
 def row_of(reading: Reading, before: Reading | None = None) -> DataflowRow:
     """All that `list` knows of one dataflow.
@@ -40,7 +42,7 @@ def row_of(reading: Reading, before: Reading | None = None) -> DataflowRow:
         "uuid": cell.uuid,
         "name": cell.name,
         "unit": cell.unit,
-        "status": status_word(cell.state.active, cell.state.sub, status.stage),
+        "status": cell.word(status.stage),
         "dataflow": cell.dataflow,
         "listed_release": cell.release,
         # The status says "failed" already.
@@ -48,6 +50,9 @@ def row_of(reading: Reading, before: Reading | None = None) -> DataflowRow:
         "restarts": unit["NRestarts"],
         "problem": reading.problem,
     }
+    if held := reading.held:
+        facts |= {"status": held.word, "text": held.text}
+        return DataflowRow(**facts, needs=held.needs, waits_since=held.since_us)
     if not cell.is_up:
         return DataflowRow(**facts, ended=unit.get(ENDED) or 0)
     if not reading.usage:
@@ -103,7 +108,7 @@ def _life(reading: Reading) -> dict[str, Any]:
 
 def _usage(reading: Reading, known: tuple[CpuSample, ...]) -> dict[str, Any]:
     status, use, now = reading.status, reading.usage, reading.sample
-    essential = _essential(reading.cell)
+    rights = _rights(reading.cell)
     samples = known or (CpuSample(reading.unit[STARTED]),)
     groups = {key: path for key, path in reading.groups.items() if key != WHOLE_CELL}
     names = status.nodes or dict.fromkeys(groups)
@@ -121,7 +126,7 @@ def _usage(reading: Reading, known: tuple[CpuSample, ...]) -> dict[str, Any]:
                     **_signs(status, node, now.at_us),
                 },
             )._replace(
-                essential=None if essential is None else node in essential,
+                **_right_facts(rights, node),
                 outputs=_outputs(reading, node),
             )
             for node in names
@@ -129,10 +134,18 @@ def _usage(reading: Reading, known: tuple[CpuSample, ...]) -> dict[str, Any]:
     }
 
 
-def _essential(cell: Cell) -> set[str] | None:
-    """The essential nodes; None in the table, for which nobody has asked for the options."""
+def _rights(cell: Cell) -> "dict[str, NodeRights] | None":
+    """The rights of nodes; None in the table, for which nobody has asked for the options."""
     options = cell.known_options
-    return options and {one.node for one in options.node_rights if one.essential}
+    return options and {one.node: one for one in options.node_rights}
+
+
+def _right_facts(rights: "dict[str, NodeRights] | None", node: str) -> dict[str, Any]:
+    """What of its rights a row has."""
+    if rights is None or node not in rights:
+        return {"essential": None if rights is None else False}
+    own = rights[node]
+    return {"essential": bool(own.essential), "scheduling": own.scheduling or ""}
 
 
 def _outputs(reading: Reading, node: str) -> tuple[OutputRow, ...]:

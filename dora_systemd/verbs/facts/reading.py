@@ -6,7 +6,7 @@ It needs no running process of ours.
 import time
 from collections.abc import Container, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from dora_systemd.adapters.bus.manager import SETTLED, Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
@@ -18,6 +18,9 @@ from dora_systemd.names import SLICE
 from dora_systemd.scope import Scope
 from dora_systemd.trust.cells import read_table, read_times
 from dora_systemd.verbs.facts.cells import Cell
+
+if TYPE_CHECKING:
+    from dora_systemd.verbs.facts.held import Held
 
 UP_SINCE = "ActiveEnterTimestampMonotonic"
 STARTED = "InactiveExitTimestampMonotonic"
@@ -31,7 +34,7 @@ class Reading(NamedTuple):
     unit: properties of its unit. problem: why its node table is not usable, or "". groups, usage:
     by node, with the unit's own as WHOLE_CELL; empty for a dataflow that is not running. at_us:
     time of the reading, CLOCK_MONOTONIC. heard: the last message of each owed output, on the same
-    clock, 0 is never.
+    clock, 0 is never. held: what systemd waits for before it starts it.
     """
 
     cell: Cell
@@ -42,6 +45,7 @@ class Reading(NamedTuple):
     usage: Mapping[str, Usage] = {}
     at_us: int = 0
     heard: tuple[int, ...] = ()
+    held: "Held | None" = None
 
     @property
     def sample(self) -> CpuSample:
@@ -61,6 +65,8 @@ def read_dataflow(
     slice_path: where the groups of dataflows usually are; given if only the table of `list` is
     wanted.
     """
+    if cell.state.is_held:
+        return _read_held(manager, cell)
     status, problem = look_at_table(scope, cell) if cell.is_up else (CellStatus(), "")
     path = slice_path / cell.unit if slice_path else None
     path = path if path and path.is_dir() else None
@@ -79,6 +85,14 @@ def read_dataflow(
     usage = {key: cgroup.read_usage(group) for key, group in groups.items()}
     heard = () if slice_path else _heard(scope, cell)
     return Reading(cell, unit, status, problem, groups, usage, _monotonic_us(), heard)
+
+
+def _read_held(manager: Manager, cell: Cell) -> Reading:
+    # Imported late: few dataflows need anything, and those that run have it.
+    from dora_systemd.verbs.facts.held import read_held
+
+    unit = manager.read(cell.unit, ["NRestarts"])
+    return Reading(cell, unit, at_us=_monotonic_us(), held=read_held(manager, cell))
 
 
 def _heard(scope: Scope, cell: Cell) -> tuple[int, ...]:

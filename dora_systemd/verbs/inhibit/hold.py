@@ -63,7 +63,7 @@ class Lock:
 
 def take_inhibiting(scope: Scope, cell: Cell, reason: str) -> Lock:
     """A lock of a running dataflow, and the event that says so. Raises DoraSystemdError."""
-    if not cell.is_up:
+    if not cell.has_begun:
         message = f"cannot inhibit {cell.name}: it is not running"
         raise DoraSystemdError(message, f"doractl start {cell.name}", ExitCode.NOT_RUNNING)
     directory = scope.cell_directory(cell.name)

@@ -6,9 +6,10 @@ from pathlib import Path
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.decisions.cell.needs import CLOCK, NodeNeed
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.cell.status import WAITS
+from dora_systemd.decisions.needs.awaited import format_awaited
 from dora_systemd.decisions.needs.devices import lone_devices
 from dora_systemd.decisions.needs.units import CLOCK_WAITERS
+from dora_systemd.decisions.needs.words import START, WAITS, format_wait
 from dora_systemd.names import unit_name
 from dora_systemd.values import shown
 
@@ -49,6 +50,12 @@ def _sandbox_warnings(nodes: tuple[NodeNeed, ...], allowed: tuple[str, ...]) -> 
         reason = "the sandbox opens it only if it is there at the start"
         hint = "name its group of /proc/devices, such as --device char-GROUP"
         yield f"node {node} waits for {shown(path)}, but {reason}; {hint}"
+
+
+def held_notes(manager: Manager, name: str) -> Iterator[str]:
+    """What a start that nobody has waited for waits for, while systemd holds it."""
+    if needs := format_awaited(manager.awaited(unit_name(name))):
+        yield format_wait(START, needs, 0)
 
 
 def waiting_notes(manager: Manager, options: RunnerOptions) -> Iterator[str]:

@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from dora_systemd.adapters.bus.manager import UP, Manager
+from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.host.unit_files import (
     read_unit_file,
     remove_unit_file,
@@ -95,7 +95,7 @@ def read_standing(manager: Manager, scope: Scope, unit: str) -> Standing:
 def require_deployable(manager: Manager, scope: Scope, standing: Standing) -> None:
     """Raise DoraSystemdError (NAME_IN_USE) for what a deploy must not replace."""
     cell, unit = standing.cell, standing.boot.unit
-    if cell is None or cell.state.active not in UP:
+    if cell is None or not cell.is_up:
         require_free_name(manager, scope, unit)
     elif manager.read(unit, ["Transient"])["Transient"]:
         raise DoraSystemdError(

@@ -121,9 +121,10 @@ def _forget(manager: Manager, boot: BootUnit) -> None:
 
 def _in_use(manager: Manager, cell: Cell) -> DoraSystemdError:
     since = manager.read(cell.unit, ["InactiveExitTimestamp"])["InactiveExitTimestamp"]
+    does = "waits for its start" if cell.state.is_held else f"runs since {local_time(since)}"
     return DoraSystemdError(
-        f"cannot start {cell.name}: dataflow {cell.uuid} of that name runs since "
-        f"{local_time(since)} from {cell.options.dataflow}",
+        f"cannot start {cell.name}: dataflow {cell.uuid} of that name {does} "
+        f"from {cell.options.dataflow}",
         f"doractl stop {cell.name}, or choose another --name",
         ExitCode.NAME_IN_USE,
     )

@@ -168,7 +168,8 @@ def disable_cell(manager: Manager, scope: Scope, cell: Cell) -> bool:
     if not boot.is_wanted and boot.text is None:
         return False
     facts = manager.read(cell.unit, ["FragmentPath", "ActiveState"])
-    is_in_use = facts["FragmentPath"] == str(boot.path) and facts["ActiveState"] != "inactive"
+    is_there = facts["ActiveState"] != "inactive" or cell.state.is_held
+    is_in_use = facts["FragmentPath"] == str(boot.path) and is_there
     if boot.text is not None and is_in_use:
         changes = [read_unit_file(path) or "" for path in changed_files(boot.path)]
         write_unit_file(boot.runtime, without_install("\n".join([boot.text, *changes])))

@@ -1,12 +1,14 @@
 """`doractl start`: starts the unit of a dataflow, and waits for it."""
 
 import select
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 from dora_systemd.adapters.bus.manager import (
+    DOWN,
     JOB_DONE,
     ON_THE_WAY,
     Manager,
@@ -17,6 +19,8 @@ from dora_systemd.adapters.bus.manager import (
 )
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import FAILED_BECAUSE
+from dora_systemd.decisions.needs.awaited import format_awaited
+from dora_systemd.decisions.needs.words import START, format_wait
 from dora_systemd.decisions.unit.versions import transient_commands
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import unit_name
@@ -53,7 +57,8 @@ def start_unit(
     """
     unit = unit_name(options.name)
     try:
-        result = _begin(manager, unit, properties, partial(tell_stage, on_stage), wait)
+        observe = partial(_tell, manager, unit, on_stage)
+        result = _begin(manager, unit, properties, observe, wait)
         if not wait:
             _wait_until_checked(manager, unit)
     except KeyboardInterrupt as error:
@@ -70,6 +75,15 @@ def start_unit(
         result = "failed" if result == JOB_DONE else result
         raise _start_failure(manager, scope, unit, options.name, result)
     return Started(options.uuid, options.name, unit, is_ready=wait)
+
+
+def _tell(
+    manager: Manager, unit: str, on_stage: StageObserver | None, changes: Mapping[str, Any]
+) -> None:
+    """Tell the stage of a start; while systemd holds it, what it waits for."""
+    tell_stage(on_stage, changes)
+    if on_stage and not changes and (needs := format_awaited(manager.awaited(unit))):
+        on_stage(format_wait(START, needs, 0))
 
 
 def _begin(
@@ -118,12 +132,13 @@ def _interruption(name: str) -> DoraSystemdError:
 
 
 def _wait_until_checked(manager: Manager, unit: str) -> None:
-    """Return once the runner has accepted the dataflow, or has ended."""
+    """Return once the runner has accepted the dataflow, or has ended, or systemd holds it."""
     while True:
         state = manager.read(unit, ["ActiveState", "Job", "StatusText"])
         is_on_the_way = state["ActiveState"] in ON_THE_WAY or (state["Job"] or (0,))[0]
         goes_on = state["StatusText"] and not state["StatusText"].startswith(FAILED_BECAUSE)
-        if goes_on or not is_on_the_way:
+        is_held = state["ActiveState"] in DOWN and manager.awaited(unit)
+        if goes_on or is_held or not is_on_the_way:
             return
         select.select([manager.fileno()], [], [], _POLL_SECONDS)
         manager.changes(unit)

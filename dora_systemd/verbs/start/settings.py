@@ -3,10 +3,9 @@
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from dora_systemd.adapters.host.files import decoded, parse_yaml
-from dora_systemd.decisions.settings.kinds import Setting, listed
+from dora_systemd.decisions.rights.node_rights import BY_KEY
 from dora_systemd.decisions.settings.resolve import Settings, resolve_settings
 from dora_systemd.decisions.settings.rights import NODE_RIGHTS
 from dora_systemd.decisions.settings.table import ENV_FILE, SETTINGS
@@ -69,7 +68,7 @@ def read_settings(
     others = [] if scope.is_user else [one for one in found if not one.is_roots]
     for one in others:
         _check_trust(one)
-        _check_rights(one)
+        _check_values(one)
     settings = resolve_settings(flags, environment, documents, SETTINGS)
     if not any(ENV_FILE.name in one.words() for one in others):
         return settings
@@ -85,46 +84,37 @@ def _read(path: Path, origin: Place | None = None) -> _Read:
     return _Read(path, origin or text.place, document)
 
 
-def _check_rights(read: _Read) -> None:
-    """Refuse values by which another user's file would give a node more than that user has."""
+def _check_values(read: _Read) -> None:
+    """Refuse values by which another user's file would get more than that user has."""
     own = resolve_settings({}, {}, [(str(read.path), read.document)], SETTINGS)
-    for key in _raising(own):
-        raise _untrusted(read, key, f"give {NODE_RIGHTS.flags[0]} on the command line")
+    for key, flag in _raising(own):
+        raise _untrusted(read, key, flag)
 
 
-def _raising(settings: Settings) -> Iterator[str]:
-    """The keys of values that only root may give."""
+def _raising(settings: Settings) -> Iterator[tuple[str, str]]:
+    """The keys of values that only root may give, and the flags with which it gives them."""
     for setting in SETTINGS:
         if (raises := setting.raises) is not None:
             if settings.is_given(setting) and raises(settings[setting]):
-                yield setting.name
+                yield setting.name, setting.flags[0]
+            flag = (NODE_RIGHTS if setting.name in BY_KEY else setting).flags[0]
             for node, value in settings.by_node(setting).items():
                 if raises(value):
-                    yield f"nodes.{node}.{setting.name}"
-
-
-def _of_root(words: Mapping[object, object]) -> Iterator[Setting[Any]]:
-    """The settings with a value that only root may give."""
-    for setting in SETTINGS:
-        values = (str(one).strip() for one in listed(words.get(setting.name)))
-        if any(one.startswith(setting.roots_words) for one in values):
-            yield setting
+                    yield f"nodes.{node}.{setting.name}", flag
 
 
 def _check_trust(read: _Read) -> None:
     """Refuse keys by which another user's file could make root read, run or grant something."""
     only = {setting.name: setting for setting in SETTINGS if setting.root_only}
     dangerous = [only[key] for key in read.words() if key in only]
-    dangerous += _of_root(read.words())
     if dangerous:
-        setting = dangerous[0]
-        raise _untrusted(read, setting.name, f"give {setting.flags[0]} on the command line")
+        raise _untrusted(read, dangerous[0].name, dangerous[0].flags[0])
 
 
-def _untrusted(read: _Read, key: str, hint: str) -> DoraSystemdError:
+def _untrusted(read: _Read, key: str, flag: str) -> DoraSystemdError:
     reason = "the file is not root's" if read.place.uid != 0 else read.place.borrowed
     return DoraSystemdError(
         f"cannot use {shown(str(read.path))}: {key} is set there, and {reason}",
-        f"{hint}, or set it in {SYSTEM_FILE}",
+        f"give {flag} on the command line, or set it in {SYSTEM_FILE}",
         ExitCode.NO_PERMISSION,
     )

@@ -28,9 +28,9 @@ def with_needs(project: Project, needs: Sequence[Path | str], node: str = "sourc
 
 
 def fragile(project: Project, path: Path) -> Path:
-    """A driver that ends when `path` is gone, and a node beside it."""
+    """A driver that ends when `path` is gone, which is essential, and a node beside it."""
     project.write("driver.py", FRAGILE)
-    project.write("dataflow.systemd.yml", f"nodes: {{driver: {{needs: {path}}}}}\n")
+    project.write("dataflow.systemd.yml", f"nodes: {{driver: {{needs: {path}, essential: yes}}}}\n")
     project.three_nodes()
     return project.write(
         "dataflow.yml",

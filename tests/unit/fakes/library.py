@@ -65,7 +65,7 @@ class FakeSystemd:
     def _answer(self, path: bytes, method: str, words: list[str]) -> Any:
         if method == "ListUnitsByPatterns":
             found = self.manager.list_units(words[0])
-            return [[one.unit, one.description, *one[1:4]] for one in found]
+            return [[one.unit, one.description, *one[1:4], "", "/", 0, one.job] for one in found]
         if method == "Get":
             return self._get(path.rpartition(b"/")[2].decode(), words[1])
         if method == "ResetFailedUnit":

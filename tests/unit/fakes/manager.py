@@ -92,6 +92,7 @@ class FakeManager:
             UnitState(
                 *(unit, facts["LoadState"], facts["ActiveState"], facts["SubState"]),
                 facts["Description"],
+                facts.get("JobType", ""),
             )
             for unit, facts in self.units.items()
             if fnmatch(unit, pattern)
@@ -146,6 +147,15 @@ class FakeManager:
     def changes(self, unit: str) -> list[Mapping[str, Any]]:
         del unit
         return []
+
+    def awaited(self, unit: str) -> list[str]:
+        self.questions += 2
+        found: list[str] = self.units[unit].get("Awaited", [])
+        return found
+
+    def began_us(self) -> int:
+        self.questions += 1
+        return 1
 
     def control_group(self) -> str:
         self.questions += 1

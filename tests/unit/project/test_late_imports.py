@@ -71,10 +71,10 @@ LATE = {
         "cli.parameters": {"decisions.views.objects"},
         "decisions.views.outcome": {"decisions.views.objects"},
     },
-    "most dataflows owe nothing": {
+    "most dataflows owe nothing, and wait for nothing": {
         "adapters.dora.preparation": {"adapters.dora.probe"},
         "runner.owes.begin": {"runner.owes.watch"},
-        "verbs.facts.reading": {"decisions.owes.probe"},
+        "verbs.facts.reading": {"decisions.owes.probe", "verbs.facts.held"},
     },
     "a program of its own: it makes room first, and it runs with the Python of the nodes": {
         "runner.owes.listen": {"dora"},

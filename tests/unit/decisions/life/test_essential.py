@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from dora_systemd.decisions.cell.exits import Exit, exit_of
-from dora_systemd.decisions.cell.status import HELD, NodeStatus
+from dora_systemd.decisions.cell.status import HELD, LATCHED, NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Cell, Do, Record, RunnerExit, State
 from dora_systemd.decisions.life.table import step
@@ -67,12 +67,13 @@ def test_the_others_are_stopped_and_the_dataflow_has_failed(
     [
         ({"policy": "on-failure"}, exited("a", again=True)),
         ({"policy": HELD}, exited("a", again=True)),
+        ({"policy": LATCHED}, exited("a", again=True)),
         ({}, exited("a", number=0)),
         ({}, exited("a", is_stale=True)),
         ({}, exited("unknown", is_stale=True)),
         ({}, life.NodeExited(1, "a", exit_of(1), False)),
     ],
-    ids=["restarted", "held", "finished", "stale", "unknown", "not essential"],
+    ids=["restarted", "held", "latched", "finished", "stale", "unknown", "not essential"],
 )
 def test_what_ends_nothing(of_a: dict[str, Any], event: life.NodeExited) -> None:
     cell, _ = live(running(**of_a), event)
@@ -88,6 +89,35 @@ def test_a_new_version_that_fails_is_taken_back_by_the_reloader(
     cell, _ = live(replace(running(), nodes={**running().nodes, "a": reloaded}), exited("a"))
     assert cell.nodes["a"].state == "failed"
     assert bool(cell.failure) is is_ended
+
+
+def test_a_node_that_lacked_nothing_is_given_up() -> None:
+    """Its launcher exits in its place, as the needs of the node decide."""
+    latched = running(policy=LATCHED)
+    cell, _ = live(latched, exited("a", again=True), life.NodeSpawned(2, "a", 9))
+    assert (cell.state, cell.failure) == (State.RUNNING, "")
+    cell, _ = live(cell, exited("a"))
+    assert (cell.state, cell.failure) == (State.STOPPING, "essential node a: exit code 1")
+
+
+@pytest.mark.parametrize(
+    ("of_a", "essential", "is_ended"),
+    [
+        ({"state": "failed", "exit": exit_of(1)}, ("b", "a"), True),
+        ({"state": "failed", "exit": exit_of(1)}, ("b",), False),
+        ({"state": "failed", "exit": exit_of(1), "policy": HELD}, ("a",), False),
+        ({"state": "running"}, ("a", "unknown"), False),
+    ],
+    ids=["failed", "not essential", "held", "old version"],
+)
+def test_a_failed_reload_ends_it_only_if_the_node_is_down(
+    of_a: dict[str, Any], essential: tuple[str, ...], is_ended: bool
+) -> None:
+    nodes = {**running().nodes, "a": NodeStatus(**of_a)}
+    noted = life.ReloadNoted(2, "not reloaded: node a: exit code 1", essential=essential)
+    cell, _ = live(replace(running(), nodes=nodes), noted)
+    assert (cell.state is State.STOPPING) is is_ended
+    assert cell.failure == ("essential node a: exit code 1" if is_ended else "")
 
 
 def test_a_stop_meanwhile_is_a_stop() -> None:

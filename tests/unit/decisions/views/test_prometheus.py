@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -117,6 +118,19 @@ def test_signs_of_life() -> None:
     assert value(found, "dora_node_watchdog_seconds", **camera) == 5
     assert value(found, "dora_node_watchdog_age_seconds", **camera) == 1.5
     assert len(found["dora_node_watchdog_age_seconds"].samples) == 1, "plot has no watchdog"
+
+
+def test_what_is_special_about_a_node() -> None:
+    nodes = (
+        NodeRow("camera", "running", essential=True, scheduling="fifo:50"),
+        NodeRow("plot", "running", essential=False),
+    )
+    (found,) = families(replace(ROBOT, row=ROBOT.row._replace(nodes=nodes)))[
+        "dora_node_info"
+    ].samples
+    expected = {"dataflow": "robot", "node": "camera", "essential": "yes", "scheduling": "fifo:50"}
+    assert (found.labels, found.value) == (expected, 1)
+    assert "dora_node_info" not in families(ROBOT)
 
 
 def test_pressure() -> None:

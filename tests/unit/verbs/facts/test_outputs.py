@@ -9,6 +9,7 @@ import pytest
 
 from dora_systemd.decisions.cell.owed import Owed
 from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
+from dora_systemd.decisions.rights.node_rights import parse_node_rights
 from dora_systemd.decisions.views.rows import OutputRow
 from dora_systemd.scope import Scope
 from dora_systemd.trust.cells import read_times
@@ -62,3 +63,15 @@ def test_other_files_in_its_place(tmp_path: Path) -> None:
         os.chown(tmp_path, 1000, 1000)
         os.lchown(times, 1000, 1000)
         assert read_times(tmp_path, 24) == b""
+
+
+@pytest.mark.usefixtures("unit_group")
+def test_what_is_special_about_nodes(scope: Scope) -> None:
+    manager = FakeManager()
+    rights = (parse_node_rights("camera:essential,scheduling=batch"),)
+    manager.add(options()._replace(node_rights=rights), ControlGroup=GROUP)
+    nodes = {one: NodeStatus("running") for one in ("camera", "plot")}
+    write_status(scope, CellStatus(nodes=nodes))
+    camera, plot = dataflow_row(manager, scope, read_cells(manager)[0]).nodes
+    assert (camera.essential, camera.scheduling) == (True, "batch")
+    assert (plot.essential, plot.scheduling) == (False, "")

@@ -195,6 +195,10 @@ RAISING = {
     "node_rights: ['a:nice=1', 'b:scheduling=rr:1']": "node_rights",
     "nodes: {a: {nice: 5, scheduling: idle, essential: true, cpus: 0, lock_memory: no}}": "",
     "node_rights: a:oom-score-adjust=9": "",
+    "nice: -5": "nice",
+    "needs: [network, ' unit:reboot.target']": "needs",
+    "needs: mount:/srv": "needs",
+    "needs: [network, clock]\nnodes: {a: {needs: /dev/video0}}": "",
 }
 
 
@@ -214,7 +218,8 @@ def test_rights_that_only_root_gives(project: Path, text: str) -> None:
     assert caught.value.message == (
         f"cannot use {beside}: {RAISING[text]} is set there, and the file is not root's"
     )
-    assert caught.value.hint.startswith("give --node-rights on the command line, or set it in ")
+    flag = f"--{RAISING[text]}" if RAISING[text] in ("nice", "needs") else "--node-rights"
+    assert caught.value.hint.startswith(f"give {flag} on the command line, or set it in ")
     assert caught.value.code is ExitCode.NO_PERMISSION
 
 
