@@ -5,10 +5,10 @@ deploy and rollback both end here, so this is the one place for what may forbid 
 
 import signal
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 
-from dora_systemd.adapters.bus.manager import SETTLED, Manager
+from dora_systemd.adapters.bus.manager import SETTLED, UP, Manager
 from dora_systemd.adapters.host.unit_files import remove_unit_file
 from dora_systemd.adapters.releases.store import Store, unusable
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -16,6 +16,7 @@ from dora_systemd.decisions.logs.events import ROLLED_BACK
 from dora_systemd.decisions.unit.file import is_boot_checked, with_boot_check
 from dora_systemd.decisions.why.faults import Fault
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.values import INFINITY
 from dora_systemd.verbs.inhibit.guard import IfInhibited, uninhibited
@@ -68,12 +69,13 @@ def change_release(
 def _try(
     manager: Manager, scope: Scope, store: Store, standing: Standing, change: Change, tell: Tell
 ) -> None:
-    name = change.options.name
     # After this nothing is certain but what the journal and systemd say: undo it in any case.
     with _interruptible():
         try:
             begin_trial(manager, standing, change.text)
-            fault = Gate(manager, scope, name, tell).run(_limit(change.options), change.soak)
+            fault = Gate(manager, scope, change.options, tell).run(
+                _limit(change.options), change.soak
+            )
             if fault is None:
                 _ignore_signals()
                 _prove(store, change.release)
@@ -116,6 +118,8 @@ def _roll_back(
     """Go back to what was there before; the error that tells it."""
     name, former = change.options.name, standing.current
     want_start = standing.was_up and not fault.is_stop
+    if not fault.is_stop:
+        _note_stop(manager, change)
     now = "nothing of it runs"
     try:
         go_back(manager, standing, want_start)
@@ -137,6 +141,15 @@ def _roll_back(
         f"{now}; doractl why {name} tells more",
         ExitCode.ROLLED_BACK,
     )
+
+
+def _note_stop(manager: Manager, change: Change) -> None:
+    """Note who stops the release on trial, if that still runs."""
+    with suppress(DoraSystemdError):
+        state = manager.read(unit_name(change.options.name), ["ActiveState"])["ActiveState"]
+        if state in UP:
+            options = change.options
+            note_request("stop-asked", options.name, options.uuid, change.command)
 
 
 def _back(manager: Manager, unit: str) -> str:
