@@ -62,35 +62,6 @@ def test_a_release_runs_and_is_not_what_it_was_copied_from(
     assert f"Release:  {first}" in cell.doractl("list", cell.name).stdout
 
 
-BAD = {
-    "it does not compile": ("def (:\n", "node a: exit code 1"),
-    "a module is missing": ("import nothing_of_that_name\n", "node a: exit code 1"),
-    "it crashes while it soaks": (
-        "import os, threading\nthreading.Timer(1, os._exit, (7,)).start()\n",
-        "node a: exit code 7",
-    ),
-}
-
-
-@pytest.mark.warns("crashed", "failed", "Failed", "exited", "exit code", "error", "Error")
-def test_bad_versions_are_undone(releases: Releases, project: Project) -> None:
-    cell = releases.cell
-    write_version(project, "good")
-    releases.deploy(project.root, *FAST)
-    good = releases.current()
-    for how, (before, reason) in BAD.items():
-        write_version(project, how, before)
-        said = releases.deploy(project.root, "--soak", "20s", status=11)
-        assert f"was rolled back: {reason}" in said, how
-        assert f"hint: {good} runs again" in said
-        assert (releases.current(), releases.running()) == (good, good)
-        assert not releases.trial.exists()
-    assert list(releases.states().values()) == ["unproved"] * 3 + ["current"]
-    why = cell.doractl("why", cell.name).stdout
-    assert "node a: exit code 7" in why.partition("Undone:")[2].splitlines()[0]
-    releases.check_whole()
-
-
 @pytest.mark.warns("crashed", "failed", "Failed", "exited", "exit code", "error", "Error")
 def test_a_first_version_that_is_bad_leaves_nothing_running(
     releases: Releases, project: Project

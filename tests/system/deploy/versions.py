@@ -52,7 +52,6 @@ def python(text: str, says: str, *flags: str) -> Version:
 
 BAD = {
     "syntax-error": python("def (:\n", "node a: exit code 1"),
-    "missing-module": python("import nothing_of_that_name\n", "node a: exit code 1"),
     "missing-model": python('open("model.onnx")\n' + READY, "node a: exit code 1"),
     "crash-after-5-s": python(
         f"import os, threading\nthreading.Timer(5, os._exit, (7,)).start()\n{NODE}",
