@@ -71,8 +71,8 @@ def _try(
 ) -> None:
     # After this nothing is certain but what the journal and systemd say: undo it in any case.
     with _interruptible():
+        _begin(manager, standing, change.text)
         try:
-            begin_trial(manager, standing, change.text)
             fault = Gate(manager, scope, change.options, tell).run(
                 _limit(change.options), change.soak
             )
@@ -92,6 +92,15 @@ def _try(
         _note_commit(scope, standing, change)
         remove_unit_file(standing.boot.runtime)
         end_trial(manager, standing)
+
+
+def _begin(manager: Manager, standing: Standing, text: str) -> None:
+    """Put the release on trial. Raises DoraSystemdError; what runs has not been touched then."""
+    try:
+        begin_trial(manager, standing, text)
+    except DoraSystemdError:
+        end_trial(manager, standing)
+        raise
 
 
 def _note_commit(scope: Scope, standing: Standing, change: Change) -> None:

@@ -18,7 +18,7 @@ from dora_systemd.decisions.releases.ids import new_id
 from dora_systemd.decisions.releases.manifest import Manifest
 from dora_systemd.decisions.unit.file import persistent_unit, runner_of
 from dora_systemd.decisions.unit.properties import format_unit
-from dora_systemd.errors import DoraSystemdError
+from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.trust.project import Project, opened_project
@@ -27,6 +27,7 @@ from dora_systemd.verbs.inhibit.guard import IfInhibited, require_uninhibited
 from dora_systemd.verbs.releases.change import Change, change_release
 from dora_systemd.verbs.releases.files import copy_files, digests, find_files
 from dora_systemd.verbs.releases.listing import store_of
+from dora_systemd.verbs.releases.remains import clean
 from dora_systemd.verbs.releases.soak import Tell
 from dora_systemd.verbs.releases.source import (
     Source,
@@ -109,7 +110,7 @@ def deploy(
     with locked(store):
         standing = read_standing(manager, scope, standing.boot.unit)  # nobody changes it now
         require_uninhibited(scope, standing.running, "deploy", request.how, tell)
-        store.clean()
+        clean(store, standing)
         copy = _copy_project(source, store, standing, tell)
         release = copy.manifest.id
         try:
@@ -132,6 +133,10 @@ def deploy(
         change = Change(release, text, options, request.soak, want_boot, _COMMAND, how)
         try:
             change_release(manager, scope, store, standing, change, tell)
+        except BaseException as error:
+            if getattr(error, "code", None) is not ExitCode.ROLLED_BACK:
+                _remove_unused(manager, scope, store, release)
+            raise
         finally:
             prune(manager, scope, store, request.keep, release)
     manifest = copy.manifest
@@ -158,6 +163,14 @@ def prune(manager: Manager, scope: Scope, store: Store, keep: int, latest: str) 
         standing = read_standing(manager, scope, unit_name(store.name))
         used = {latest, standing.trial}
         for release in surplus(store.known(), keep, standing.current, used):
+            store.remove(release)
+
+
+def _remove_unused(manager: Manager, scope: Scope, store: Store, release: str) -> None:
+    """Remove a release that has never been tried, unless it can still be what runs."""
+    with suppress(DoraSystemdError):
+        standing = read_standing(manager, scope, unit_name(store.name))
+        if release not in (standing.current, standing.trial):
             store.remove(release)
 
 
