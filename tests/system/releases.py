@@ -8,6 +8,7 @@ from pathlib import Path
 from tests.system.cells import Cell, Project, run
 
 STORE = Path("/var/lib/dora-systemd/releases")
+ETC = Path("/etc/systemd/system")
 CONTROL = Path("/run/systemd/system.control")
 NODE = """
 from dora import Node
@@ -96,7 +97,7 @@ class Releases:
         """Leave nothing of all this."""
         self.cell.doractl("disable", self.cell.name, check=False)
         self.cell.end()
-        for path in (self.trial, Path("/etc/systemd/system") / self.cell.unit):
+        for path in (self.trial, ETC / self.cell.unit):
             path.unlink(missing_ok=True)
         shutil.rmtree(self.path, ignore_errors=True)
         (STORE / f".{self.cell.name}.lock").unlink(missing_ok=True)

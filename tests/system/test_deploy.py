@@ -14,13 +14,12 @@ import pytest
 
 from tests.lab.pace import pace
 from tests.system.cells import Cell, Project, run, wait_for
-from tests.system.releases import FLOW, STORE, Releases, write_version
+from tests.system.releases import ETC, FLOW, STORE, Releases, write_version
 
 # They write to /etc and /var/lib.
 pytestmark = pytest.mark.lab
 
 FAST = ("--soak", "0s")
-ETC = Path("/etc/systemd/system")
 
 
 @pytest.fixture
