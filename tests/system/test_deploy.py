@@ -2,18 +2,15 @@
 
 import fcntl
 import os
-import random
 import signal
 import subprocess
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-from tests.lab.pace import pace
-from tests.system.cells import Cell, Project, run, wait_for
+from tests.system.cells import Cell, Project, wait_for
 from tests.system.releases import ETC, FLOW, STORE, Releases, write_version
 
 # They write to /etc and /var/lib.
@@ -115,23 +112,6 @@ def locked(path: Path) -> Iterator[None]:
     os.close(fd)
 
 
-def test_a_full_disk_changes_nothing(releases: Releases, project: Project) -> None:
-    write_version(project, "good")
-    releases.path.mkdir(parents=True)
-    run("mount", "-t", "tmpfs", "-o", "size=200k", "none", str(releases.path))
-    try:
-        releases.deploy(project.root, *FAST)
-        life, known = releases.cell.show("InvocationID"), releases.states()
-        project.write("model.bin", "x" * 1_000_000)
-        assert "No space left on device" in releases.deploy(project.root, status=1)
-        assert (releases.cell.show("InvocationID"), releases.states()) == (life, known)
-        assert not list(releases.path.glob(".*"))
-        releases.check_whole()
-    finally:
-        releases.cell.end()
-        run("umount", "--lazy", str(releases.path))
-
-
 def begin(releases: Releases, project: Project, soak: str) -> "subprocess.Popen[bytes]":
     """A deploy that goes on."""
     cell = releases.cell
@@ -166,26 +146,3 @@ def test_a_first_trial_that_was_killed_can_be_ended(releases: Releases, project:
     assert not (ETC / cell.unit).exists()
     again = cell.doractl("rollback", cell.name, check=False)
     assert (again.returncode, "no release before" in again.stderr) == (4, True)
-
-
-ROUNDS = int(os.environ.get("ROUNDS", "6"))
-
-
-def test_it_can_be_killed_at_any_moment(releases: Releases, project: Project) -> None:
-    cell, chance = releases.cell, random.Random(ROUNDS)
-    write_version(project, "0")
-    releases.deploy(project.root, *FAST)
-    for count in range(ROUNDS):
-        write_version(project, str(count + 1))
-        with begin(releases, project, "0s") as child:
-            time.sleep(chance.uniform(0, 4 * pace()))  # the moment is what is tried
-            child.kill()
-        states, running = releases.states(), releases.running()
-        assert list(states.values()).count("current") == 1
-        assert not running or states[running] in ("current", "trial"), (count, states)
-        wait_for("it runs", lambda: cell.show("ActiveState") == "active")
-        releases.check_whole()
-    releases.deploy(project.root, *FAST)
-    assert not releases.trial.exists()
-    assert not list(releases.path.glob(".*"))
-    assert releases.running() == releases.current()

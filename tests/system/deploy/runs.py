@@ -6,7 +6,7 @@ from pathlib import Path
 
 from tests.system.releases import Releases
 
-# The hook is called before each thing that Python does to the disk, to processes and to sockets.
+# The hook is called before each thing that Python does to the disk and to processes.
 _HOOK = """
 import os, signal, sys
 left = int(sys.argv.pop(1))
@@ -19,7 +19,7 @@ def hook(event, arguments):
     if (event in NAMES or is_write) and os.getpid() == own:
         left -= 1
         if not left:
-            os.kill(own, signal.SIGKILL)
+            {END}
 sys.addaudithook(hook)
 def leave(status, really=os._exit):
     sys.stderr.write(f"{COUNTED} {-left}\\n")
@@ -30,6 +30,7 @@ from dora_systemd.cli.main import main
 main()
 """
 COUNTED = "changes:"
+KILL = "os.kill(own, signal.SIGKILL)"
 
 
 def deploy_words(releases: Releases, place: Path, soak: str = "0s") -> tuple[str, ...]:
@@ -43,8 +44,13 @@ def begin(releases: Releases, *words: str) -> "subprocess.Popen[str]":
     return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
 
 
-def begin_counted(releases: Releases, change: int, *words: str) -> "subprocess.Popen[str]":
-    """A doractl that kills itself before this change of the disk; 0: it counts them."""
-    hook = _HOOK.replace("{COUNTED}", COUNTED)
+def begin_counted(
+    releases: Releases, change: int, *words: str, end: str = KILL
+) -> "subprocess.Popen[str]":
+    """A doractl that ends itself before this change of the disk; 0: it counts them.
+
+    end: the line of Python that does it.
+    """
+    hook = _HOOK.replace("{COUNTED}", COUNTED).replace("{END}", end)
     command = (sys.executable, "-c", hook, str(change), releases.cell.scope.flag, *words)
     return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)

@@ -6,16 +6,17 @@ import random
 import pytest
 
 from tests.system.cells import Project
-from tests.system.deploy.kills import Kills, table
+from tests.system.deploy.kills import Scene, kill, table
 from tests.system.releases import Releases
 
 pytestmark = pytest.mark.lab
 
-ROUNDS = int(os.environ.get("ROUNDS", "6"))
+ROUNDS = int(os.environ.get("ROUNDS", "8"))
 
 
 def test_it_can_be_killed_at_any_moment(releases: Releases, project: Project) -> None:
-    kills = Kills(releases, project)
-    rounds = [kills.run(one) for one in kills.moments(ROUNDS, random.Random())]
+    scene, chance = Scene(releases, project), random.Random()
+    course = scene.begin()
+    rounds = [kill(scene, course.moment(number, chance)) for number in range(ROUNDS)]
     print(table(rounds))
     assert not [one.wrong for one in rounds if one.wrong]
