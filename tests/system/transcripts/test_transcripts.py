@@ -13,6 +13,7 @@ import pytest
 
 from tests.deb.packages import ROBOT
 from tests.system.cells import dora_processes, run, wait_for
+from tests.system.releases import STORE
 from tests.system.typed import Shell, replay
 
 # They have the name of the README's robot, and a journal that knows of no other.
@@ -37,6 +38,8 @@ def shell() -> Iterator[Shell]:
     run("doractl", "destroy", "--force")
     run("systemctl", "reset-failed", "dora-robot", check=False)
     run("umount", f"{PLACE}/records", check=False)
+    shutil.rmtree(STORE / "robot", ignore_errors=True)
+    (STORE / ".robot.lock").unlink(missing_ok=True)
     shutil.rmtree(PLACE)
     wait_for("no process is left", lambda: not dora_processes())
 
