@@ -39,8 +39,6 @@ def prepare(scene: Scene) -> Notes:
 def look_back(notes: Notes, scene: Scene) -> None:
     """Note what there is after the power cut."""
     found = judge(scene, notes.moment, notes.old)
-    trial = ("a trial survives",) if scene.releases.trial.exists() else ()
-    found = found._replace(wrong=(*found.wrong, *trial))
     notes.rows.append(found.row(len(notes.rows) + 1))
     notes.failed += bool(found.wrong)
     say("  ".join(notes.rows[-1]))

@@ -7,8 +7,11 @@ import signal
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 
 from dora_systemd.adapters.bus.manager import SETTLED, UP, Manager
+from dora_systemd.adapters.bus.systemd import Bus
+from dora_systemd.adapters.host.guard import SIGNALS, guarded
 from dora_systemd.adapters.host.unit_files import remove_unit_file
 from dora_systemd.adapters.releases.store import Store, unusable
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -27,10 +30,11 @@ from dora_systemd.verbs.releases.trial import (
     commit,
     end_trial,
     go_back,
+    read_standing,
 )
 from dora_systemd.verbs.start.asked import note_request
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_KILLED = "the command that tried it was killed"
 
 
 @dataclass(frozen=True)
@@ -70,7 +74,7 @@ def _try(
     manager: Manager, scope: Scope, store: Store, standing: Standing, change: Change, tell: Tell
 ) -> None:
     # After this nothing is certain but what the journal and systemd say: undo it in any case.
-    with _interruptible():
+    with guarded(partial(_end_killed, scope, standing, change)), _interruptible():
         _begin(manager, standing, change.text)
         try:
             fault = Gate(manager, scope, change.options, tell).run(
@@ -152,6 +156,16 @@ def _roll_back(
     )
 
 
+def _end_killed(scope: Scope, standing: Standing, change: Change) -> None:
+    """Go back after this process was killed, unless the release was committed before that."""
+    manager = Bus(scope)  # that of the process that was killed is of no use, see sd_bus_new(3)
+    now = read_standing(manager, scope, standing.boot.unit)
+    if now.current != change.release or standing.current == change.release:
+        _roll_back(manager, standing, change, Fault(_KILLED))
+    elif now.path.exists():
+        end_trial(manager, now)
+
+
 def _note_stop(manager: Manager, change: Change) -> None:
     """Note who stops the release on trial, if that still runs."""
     with suppress(DoraSystemdError):
@@ -170,7 +184,7 @@ def _back(manager: Manager, unit: str) -> str:
 @contextmanager
 def _interruptible() -> Iterator[None]:
     """Let the signals that would end this process raise KeyboardInterrupt instead."""
-    before = {one: signal.getsignal(one) for one in _SIGNALS}
+    before = {one: signal.getsignal(one) for one in SIGNALS}
     for one, handler in before.items():
         if handler is not signal.SIG_IGN:  # as by nohup(1)
             signal.signal(one, _interrupt)
@@ -187,5 +201,5 @@ def _interrupt(*_arguments: object) -> None:
 
 def _ignore_signals() -> None:
     """Let nothing interrupt the way back."""
-    for one in _SIGNALS:
+    for one in SIGNALS:
         signal.signal(one, signal.SIG_IGN)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from dora_systemd.decisions.views.dataflows import format_table
 from tests.lab.pace import pace
 from tests.system.cells import Cell, Project
-from tests.system.deploy.look import kind, look, release_in, unnamed
+from tests.system.deploy.look import age, kind, look, release_in, unnamed
 from tests.system.deploy.runs import COUNTED, begin, begin_counted, deploy_words
 from tests.system.releases import ETC, Releases, write_version
 
@@ -113,6 +113,7 @@ def judge(scene: Scene, moment: Moment, before: str) -> Round:
     """What is there after that. before: the release that ran."""
     after = look(scene.releases)
     wrong = (*after.wrong, *unnamed(scene.releases, after.left))
+    age(after.left)
     return Round(
         moment, "old" if after.ran == before else "new", tuple(map(kind, after.left)), wrong
     )

@@ -1,5 +1,7 @@
 """What runs and what is left of a killed deploy, seen without the help of doractl."""
 
+import fcntl
+import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -7,7 +9,7 @@ from typing import NamedTuple
 
 from dora_systemd.names import is_release_id
 from tests.system.cells import Cell, command_line, wait_for
-from tests.system.releases import ETC, Releases, differences
+from tests.system.releases import ETC, STORE, Releases, differences
 
 
 class Look(NamedTuple):
@@ -24,12 +26,15 @@ class Look(NamedTuple):
 
 def look(releases: Releases) -> Look:
     """What there is when the dataflow is up or down."""
+    wait_for("nobody changes it", lambda: _is_free(releases), 120)
     wait_for("it is up or down", lambda: _is_settled(releases.cell), 120)
     current, ran = release_in(ETC / releases.cell.unit), running(releases)
     trial, left = release_in(releases.trial), tuple(sorted({*_left(releases)}))
     wrong = []
     if ran not in (current, trial) or not ran:
         wrong.append(f"{ran or 'nothing'} runs, not {current} nor {trial or 'a trial'}")
+    if releases.trial.exists():
+        wrong.append("a trial survives")
     for directory in releases.path.iterdir():
         if is_release_id(directory.name) and directory not in left:
             wrong += [f"{directory.name}: {path}" for path in differences(directory)]
@@ -65,6 +70,23 @@ def kind(path: Path) -> str:
         return "copy without a unit file"
     words = {".new": "draft", ".old": "removed one"}
     return words.get(path.name[:4], "temporary file")
+
+
+def age(left: tuple[Path, ...]) -> None:
+    """Let files that may be about to get their names be older than they are."""
+    for path in left:
+        if path.is_file():
+            os.utime(path, (0, 0))
+
+
+def _is_free(releases: Releases) -> bool:
+    """Whether no doractl and no child of one holds the lock of the store."""
+    with (STORE / f".{releases.cell.name}.lock").open() as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        return True
 
 
 def _is_settled(cell: Cell) -> bool:
