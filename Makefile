@@ -40,6 +40,10 @@ history:  ## commands and faults in combination; SEED=n STEPS=n HOURS=n, LAB_OUT
 	@$(PREPARE) container
 	@SEED=$(SEED) STEPS=$(STEPS) HOURS=$(HOURS) $(CHECK) history
 
+power:  ## the power fails ROUNDS=n times in the middle of a deploy or rollback; SEED=n
+	@$(PREPARE) container vm
+	@ROUNDS=$(ROUNDS) SEED=$(SEED) $(CHECK) power
+
 fuzz:  ## feed what reads other people's bytes, for SECONDS=n
 	@$(PREPARE)
 	@FUZZ_SECONDS=$(SECONDS) $(CHECK) fuzz
@@ -87,4 +91,4 @@ autopkgtest:  ## debian/tests, by Debian's own autopkgtest, on what make deb has
 	@$(PREPARE) $(if $(filter vm,$(LAB)),container vm,container)
 	@packaging/autopkgtest
 
-.PHONY: help test unit system quick vm faults history fuzz browser machines bench bench-quick bookworm lint demo clean deb autopkgtest
+.PHONY: help test unit system quick vm faults history power fuzz browser machines bench bench-quick bookworm lint demo clean deb autopkgtest

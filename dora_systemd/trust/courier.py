@@ -10,6 +10,7 @@ import os
 import stat
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
@@ -17,6 +18,8 @@ from typing import Any
 
 CHUNK = 256 * 1024
 _GIT_SECONDS = 60
+MOST_PRINTED = 64 * 1024 * 1024
+"""Maximum bytes that git may print."""
 _KINDS = {
     **{stat.S_IFREG: "file", stat.S_IFLNK: "link", stat.S_IFDIR: "directory"},
     **{stat.S_IFIFO: "FIFO", stat.S_IFSOCK: "socket"},
@@ -65,18 +68,33 @@ def git(command: tuple[str, ...], safe: str) -> bytes | None:
     """What a git command prints, None if it fails."""
     trusted = ("-c", f"safe.directory={safe}") if safe else ()
     try:
-        done = subprocess.run(
+        child = subprocess.Popen(
             [*_GIT, *trusted, *command],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
-            timeout=_GIT_SECONDS,
-            check=False,
             env={**os.environ, "GIT_OPTIONAL_LOCKS": "0", "LC_ALL": "C"},
         )
-    except (OSError, subprocess.TimeoutExpired):
+    except OSError:
         return None
-    return None if done.returncode else done.stdout
+    return printed(child)
+
+
+def printed(child: "subprocess.Popen[bytes]") -> bytes | None:
+    """What a child prints, None if it fails or is late. Raises OSError if that is too much."""
+    assert child.stdout
+    late = threading.Timer(_GIT_SECONDS, child.kill)
+    late.start()
+    try:
+        with child:
+            data = child.stdout.read(MOST_PRINTED + 1)
+            if len(data) > MOST_PRINTED:
+                child.kill()
+    finally:
+        late.cancel()
+    if len(data) > MOST_PRINTED:
+        raise OSError(0, "git lists too many files")
+    return None if child.returncode else data
 
 
 def repository(owners: list[int]) -> str:

@@ -51,17 +51,36 @@ class Guest:
         self.send(b"I")
 
     def wait_exit(self, out: Sink, err: Sink) -> int:
+        status = self.follow(out, err)
+        if status is None:
+            raise LabError("go on: the machine has restarted")
+        return status
+
+    def follow(self, out: Sink, err: Sink) -> int | None:
+        """The exit status of the command, None if the machine has restarted before its end."""
         sinks = {b"O": out, b"E": err}
         try:
-            while True:
-                kind, body = read_frame(self.port.recv)
-                if kind == b"X":
-                    return int(body)
-                if kind == b"H":
-                    raise EOFError
-                sinks[kind](body)
+            while (frame := read_frame(self.port.recv))[0] not in (b"X", b"H"):
+                sinks[frame[0]](frame[1])
         except (EOFError, ConnectionError):
-            raise LabError("go on: the machine has ended or restarted") from None
+            raise LabError("go on: the machine has ended") from None
+        return int(frame[1]) if frame[0] == b"X" else None
+
+    def run_through_cuts(self, command: Sequence[str], seconds: float) -> int:
+        """Run a command that restarts the machine, and again after each boot, until it exits.
+
+        seconds: in which something must come from the machine, or it is not up again.
+        """
+        self.port.settimeout(seconds)
+        while True:
+            self.request(command)
+            self.send(b"I")
+            try:
+                status = self.follow(write_out, write_err)
+            except TimeoutError:
+                raise LabError("boot the machine") from None
+            if status is not None:
+                return status
 
     def run_quietly(self, command: Sequence[str]) -> int:
         self.request(command)

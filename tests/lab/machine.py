@@ -3,7 +3,7 @@
 import os
 import shutil
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -111,7 +111,7 @@ def write_disk(path: Path, base: Path, log: Path) -> None:
     (path / "merged").mkdir()
     script = (
         'mount -t overlay -o "lowerdir=$1/extras:$2" overlay "$1/merged" && '
-        'mke2fs -q -t ext4 -d "$1/merged" -O ^has_journal -E lazy_itable_init=1 "$1/root.ext4" "$3"'
+        'mke2fs -q -t ext4 -d "$1/merged" -E lazy_itable_init=1 "$1/root.ext4" "$3"'
     )
     # In a mount namespace of its own: nothing to unmount, whatever happens.
     mount = ["unshare", "--mount", "sh", "-c", script, "sh", str(path), str(base), DISK]
@@ -184,12 +184,18 @@ def run_commands(guest: Guest, options: Options) -> int:
             reboot(guest)
         terminal = is_terminal()
         with kept_terminal():
-            status = guest.run(service_command(command, options, terminal), terminal)
+            status = run_command(guest, service_command(command, options, terminal), options)
         if status:
             break
     if options.out:
         pull_out(guest, options.out)
     return status
+
+
+def run_command(guest: Guest, command: Sequence[str], options: Options) -> int:
+    if options.cuts:
+        return guest.run_through_cuts(command, bound(3 * BOOT_SECONDS))
+    return guest.run(command, is_terminal())
 
 
 def push_checkout(guest: Guest) -> None:

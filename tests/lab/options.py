@@ -42,16 +42,22 @@ class Options:
     commands: tuple[tuple[str, ...], ...] = ()
     env: tuple[tuple[str, str], ...] = ()
     out: Path | None = None
+    # The command restarts the machine by itself, and runs again after each boot until it exits.
+    cuts: bool = False
 
 
 def parse_options(arguments: Sequence[str], environ: Mapping[str, str] = os.environ) -> Options:
     given = build_parser().parse_args(arguments)
+    form = parse_form(environ.get("LAB") or FORMS[0])
+    if getattr(given, "cuts", False) and form != "vm":
+        raise LabError("cut the power of a container", "LAB=vm")
     return Options(
         verb=given.verb,
-        form=parse_form(environ.get("LAB") or FORMS[0]),
+        form=form,
         commands=parse_commands(given.verb, getattr(given, "command", [])),
         env=tuple(parse_variable(text, environ) for text in getattr(given, "env", [])),
         out=parse_out(environ.get("LAB_OUT", "")),
+        cuts=getattr(given, "cuts", False),
     )
 
 
@@ -76,6 +82,9 @@ def build_parser() -> argparse.ArgumentParser:
             metavar="NAME[=VALUE]",
             help="set a variable for the command; without a value, the caller's",
         )
+    run.add_argument(
+        "--cuts", action="store_true", help="CMD cuts the power: run it again after each boot"
+    )
     run.add_argument("command", nargs=argparse.REMAINDER, metavar="CMD")
     return parser
 

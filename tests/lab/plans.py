@@ -171,6 +171,13 @@ def plan_history(_form: str) -> list[Step]:
     return [Step("histories", [*command, *chosen, *kept], in_lab("container"))]
 
 
+def plan_power(_form: str) -> list[Step]:
+    """The power fails in the middle of deploys and rollbacks, as often as ROUNDS says."""
+    words = [os.environ.get("ROUNDS") or "10", os.environ.get("SEED") or "1"]
+    command = ["tests/lab/lab", "run", "--cuts", "--", "python", "-m", "tests.power", *words]
+    return [Step("power cuts, vm", command, in_lab("vm"), minutes=2 * int(words[0]))]
+
+
 def plan_fuzz(_form: str) -> list[Step]:
     seconds = os.environ.get("FUZZ_SECONDS") or "120"
     return [Step("fuzzing", ["python", "-m", "tests.fuzz", seconds], in_venv)]
@@ -220,6 +227,7 @@ PLANS: dict[str, Callable[[str], list[Step]]] = {
     "quick": plan_quick,
     "faults": plan_faults,
     "history": plan_history,
+    "power": plan_power,
     "fuzz": plan_fuzz,
     "lab": plan_lab,
     "vm": plan_vm,

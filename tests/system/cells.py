@@ -102,9 +102,9 @@ def sync_journal() -> None:
 class Project:
     """A directory with a dataflow, readable for everyone."""
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, is_new: bool = True) -> None:
         self.root = root
-        root.mkdir()
+        root.mkdir(exist_ok=not is_new)
         root.chmod(0o755)
 
     def write(self, name: str, text: str) -> Path:

@@ -8,6 +8,7 @@ from pathlib import Path
 from tests.system.cells import Cell, Project, run
 
 STORE = Path("/var/lib/dora-systemd/releases")
+ETC = Path("/etc/systemd/system")
 CONTROL = Path("/run/systemd/system.control")
 NODE = """
 from dora import Node
@@ -22,6 +23,30 @@ def write_version(project: Project, version: str, before: str = "") -> Path:
     """Write a version of the project, whose node runs `before` first; its dataflow file."""
     project.write("a.py", before + NODE.format(version=version))
     return project.write("dataflow.yml", FLOW)
+
+
+def differences(release: Path) -> list[str]:
+    """What is not as the manifest of the release in that directory says, or can be changed."""
+    said = json.loads((release / "release.json").read_text())["files"]
+    for facts in said.values():
+        facts.pop("built", None)
+    tree = release / "tree"
+    places = [place for place in tree.rglob("*") if place.is_symlink() or not place.is_dir()]
+    there = {str(place.relative_to(tree)): _facts(place) for place in places}
+    wrong = [path for path in said.keys() | there.keys() if said.get(path) != there.get(path)]
+    inside = [place.lstat() for place in (tree, *tree.rglob("*")) if not place.is_symlink()]
+    wrong += ["can be changed"] if any(one.st_mode & 0o222 or one.st_uid for one in inside) else []
+    return sorted(wrong)
+
+
+def _facts(place: Path) -> dict[str, object]:
+    """A file as a manifest describes it."""
+    if place.is_symlink():
+        return {"link": str(place.readlink())}
+    data = place.read_bytes()
+    is_executable = bool(place.stat().st_mode & 0o111)
+    digest = hashlib.sha256(data).hexdigest()
+    return {"size": len(data), "executable": is_executable, "sha256": digest}
 
 
 class Releases:
@@ -59,29 +84,22 @@ class Releases:
     def check_whole(self) -> None:
         """Each tree is byte for byte what its manifest says, and nobody but root can change it."""
         for release in self.states():
-            directory = self.path / release
-            files = json.loads((directory / "release.json").read_text())["files"]
-            tree = directory / "tree"
-            there = {
-                str(p.relative_to(tree))
-                for p in tree.rglob("*")
-                if p.is_symlink() or not p.is_dir()
-            }
-            assert there == files.keys()
-            for path, facts in files.items():
-                if "link" in facts:
-                    assert str((tree / path).readlink()) == facts["link"]
-                    continue
-                data = (tree / path).read_bytes()
-                assert hashlib.sha256(data).hexdigest() == facts["sha256"], path
-                assert (tree / path).stat().st_mode & 0o222 == 0
-                assert (tree / path).stat().st_uid == 0
+            assert differences(self.path / release) == [], release
+
+    def check_only(self, release: str) -> None:
+        """That release runs, every start runs it, and nothing is half done."""
+        states = self.states()
+        assert [one for one, state in states.items() if state in ("current", "trial")] == [release]
+        assert (self.running(), self.cell.show("ActiveState")) == (release, "active")
+        assert not self.trial.exists()
+        assert not list(self.path.glob(".*"))
+        self.check_whole()
 
     def end(self) -> None:
         """Leave nothing of all this."""
         self.cell.doractl("disable", self.cell.name, check=False)
         self.cell.end()
-        for path in (self.trial, Path("/etc/systemd/system") / self.cell.unit):
+        for path in (self.trial, ETC / self.cell.unit):
             path.unlink(missing_ok=True)
         shutil.rmtree(self.path, ignore_errors=True)
         (STORE / f".{self.cell.name}.lock").unlink(missing_ok=True)

@@ -4,11 +4,13 @@ import os
 import pwd
 import shutil
 import subprocess
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from tests.lab.pace import bound
 from tests.system.cells import Cell, run
 from tests.system.homes import FLOW, Home
 from tests.system.releases import Releases
@@ -73,6 +75,49 @@ def test_root_reads_and_runs_nothing_of_hers(releases: Releases, eve: Home) -> N
     releases.check_whole()
 
 
+def test_what_she_leaves_around_is_not_roots(releases: Releases, eve: Home) -> None:
+    """Modules with the names of ours beside the dataflow, a virtual environment, uv and its index.
+
+    doractl is called in the project, as people do.
+    """
+    proof = eve.write("proof", "", 0o666)
+    spy = f"import os\nopen('{proof}', 'a').write(f'{{os.getuid()}}\\n')\n"
+    for name in ("sitecustomize", "usercustomize", "json", "yaml", "click", "dora_systemd"):
+        eve.write(f"{name}.py", spy)
+    (eve.root / ".venv/bin").mkdir(parents=True)
+    eve.write(".venv/pyvenv.cfg", "home = /usr/bin\n")
+    for name in ("dora", "python", "python3", "uv", "git"):
+        program = SPY.format(proof=proof).replace("cat", f'exec {shutil.which(name)} "$@"')
+        eve.write(f".venv/bin/{name}", program, 0o755)
+    index = 'index-url = "http://127.0.0.1:9/"\n'
+    eve.write("uv.toml", index)
+    eve.write("pyproject.toml", f"[project]\nname='x'\nversion='1'\n[tool.uv]\n{index}")
+    eve.write("uv.lock", "version = 1\n")
+    cell = releases.cell
+    words = (*("deploy", ".", "--name", cell.name, "--soak", "0s"), "--no-hot-reload")
+    environment = {**os.environ, "VIRTUAL_ENV": str(eve.root / ".venv")}
+    done = run("doractl", "--system", *words, cwd=eve.root, env=environment, check=False)
+    assert "0" not in proof.read_text().split(), done.stderr
+    proof.write_text("")
+    # By its user nothing but her nodes and her dora have run.
+    run("doractl", "--system", *words, "--dry-run", cwd=eve.root, env=environment, check=False)
+    assert "0" not in proof.read_text().split()
+
+
+def test_a_million_files_in_an_index(releases: Releases, eve: Home) -> None:
+    """They are refused by their number, and nobody looks for each of them."""
+    as_owner(eve, "git", "init", "-q")
+    blob = "e69de29bb2d1d6434b8b29ae775ad8c2e48c5391"
+    lines = (f"100644 {blob}\tmany/{number:06x}" for number in range(1_000_000))
+    index = eve.write("index", "\n".join(lines))
+    as_owner(eve, "sh", "-c", "git update-index --index-info <index")
+    index.unlink()
+    begun = time.monotonic()
+    assert "more than 100000 files" in releases.deploy(eve.root, status=5)
+    assert time.monotonic() - begun < bound(20)
+    assert not releases.path.exists()
+
+
 def test_what_a_release_must_not_have(releases: Releases, eve: Home) -> None:
     def refused(words: str, status: int = 5) -> None:
         assert words in releases.deploy(eve.root, status=status)
@@ -87,7 +132,7 @@ def test_what_a_release_must_not_have(releases: Releases, eve: Home) -> None:
     finally:
         secret.unlink()
         (eve.root / "hard").unlink()
-    for target in ("/etc/shadow", "../../other", "a/../../../etc"):
+    for target in (str(secret), "../../other", "a/../../../etc"):
         (eve.root / "link").symlink_to(target)
         refused("cannot copy link: it links to")
         (eve.root / "link").unlink()

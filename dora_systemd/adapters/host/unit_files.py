@@ -3,11 +3,15 @@
 import contextlib
 import os
 import stat
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 from dora_systemd.adapters.host.files import REFUSED, read_text, write_atomic
 from dora_systemd.errors import DoraSystemdError, ExitCode
+
+_WRITTEN_SECONDS = 60.0
+"""A younger one may still be written."""
 
 
 def read_unit_file(path: Path) -> str | None:
@@ -68,6 +72,27 @@ def _sync_directory(directory: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def remains_of(path: Path) -> list[Path]:
+    """What a process that was killed while it wrote this unit file has left, see write_atomic()."""
+    found = []
+    for one in path.parent.glob(f".{path.name}.*"):
+        with contextlib.suppress(FileNotFoundError):  # it has just got its name
+            age = time.time() - one.lstat().st_mtime
+            found += [one] if not 0 <= age < _WRITTEN_SECONDS else []
+    return sorted(found)
+
+
+def sync_links(path: Path) -> None:
+    """Make the links by which targets start a unit file durable, which systemd does not.
+
+    Raises DoraSystemdError.
+    """
+    with _told("write", path):
+        for link in path.parent.glob(f"*/{path.name}"):
+            _sync_directory(link.parent)
+        _sync_directory(path.parent)
 
 
 def remove_unit_file(path: Path) -> None:

@@ -31,7 +31,11 @@ class Draft:
         self._tree = self._path / TREE
         self._made = {self._tree}
         self._path.mkdir(0o700, parents=True)  # others may not read what it gets
-        self._tree.mkdir()
+        try:
+            self._tree.mkdir()
+        except OSError:  # no room
+            self.discard()
+            raise
 
     def write(self, path: str, chunks: Iterable[bytes], is_executable: bool) -> Stored:
         """Write a file of the tree."""

@@ -64,8 +64,8 @@ class Store:
         return [Known(one, self._is_proved(one)) for one in found]
 
     def unfinished(self) -> list[Path]:
-        """What a deploy that was killed has left."""
-        return sorted(self.path / name for name in self._names() if name.startswith("."))
+        """What a deploy that was killed has left: a release gets its unit file last."""
+        return sorted(self.path / name for name in self._names() if self._is_unfinished(name))
 
     def manifest(self, release_id: str) -> Manifest:
         """The manifest of a release. Raises DoraSystemdError (BAD_INPUT)."""
@@ -89,14 +89,10 @@ class Store:
     def remove(self, release_id: str) -> None:
         """Remove a release: its name goes first, so that no half release is ever listed."""
         gone = self.path / f".old-{release_id}"
+        remove_tree(gone)  # of one that was killed
         with contextlib.suppress(FileNotFoundError):
             self.release(release_id).rename(gone)
             remove_tree(gone)
-
-    def clean(self) -> None:
-        """Remove what is unfinished."""
-        for path in self.unfinished():
-            remove_tree(path)
 
     def _names(self) -> list[str]:
         try:
@@ -105,6 +101,13 @@ class Store:
             return []
         except OSError as error:
             raise unusable(self.path, error) from error
+
+    def _is_unfinished(self, name: str) -> bool:
+        try:
+            is_release = is_release_id(name)
+            return name.startswith(".") or (is_release and not (self.path / name / UNIT).exists())
+        except OSError:  # others than root may not look into it
+            return False
 
     def _is_proved(self, release_id: str) -> bool:
         try:

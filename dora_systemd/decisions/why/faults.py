@@ -14,6 +14,8 @@ FAULTS = (
 ENDS = ("dataflow-finished", "dataflow-stopped")
 FAULT_IDS = tuple(EVENTS[name].message_id for name in (*FAULTS, *ENDS))
 """The MESSAGE_IDs that a trial looks for."""
+_HOW = {"node-watchdog": "hung, ", "node-waiting": "waits for "}
+"""What `why` and `list` say before the reason, where that is not the name of the event."""
 
 
 class Fault(NamedTuple):
@@ -45,8 +47,10 @@ def is_finished(happenings: Iterable[Happening], since_us: int) -> bool:
 
 
 def _how(one: Happening) -> str:
-    word, reason = one.name.replace("-", " ").removeprefix("node "), one.detail("reason")
-    return f"{word}, {reason}" if reason else word
+    reason, word = one.detail("reason"), one.name.replace("-", " ").removeprefix("node ")
+    if not reason:
+        return word
+    return _HOW.get(one.name, f"{word}, ") + reason
 
 
 def _fault(one: Happening) -> Fault:

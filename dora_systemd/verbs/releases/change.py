@@ -5,10 +5,13 @@ deploy and rollback both end here, so this is the one place for what may forbid 
 
 import signal
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 
-from dora_systemd.adapters.bus.manager import SETTLED, Manager
+from dora_systemd.adapters.bus.manager import SETTLED, UP, Manager
+from dora_systemd.adapters.bus.systemd import Bus
+from dora_systemd.adapters.host.guard import SIGNALS, guarded
 from dora_systemd.adapters.host.unit_files import remove_unit_file
 from dora_systemd.adapters.releases.store import Store, unusable
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -16,6 +19,7 @@ from dora_systemd.decisions.logs.events import ROLLED_BACK
 from dora_systemd.decisions.unit.file import is_boot_checked, with_boot_check
 from dora_systemd.decisions.why.faults import Fault
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.values import INFINITY
 from dora_systemd.verbs.inhibit.guard import IfInhibited, uninhibited
@@ -26,10 +30,11 @@ from dora_systemd.verbs.releases.trial import (
     commit,
     end_trial,
     go_back,
+    read_standing,
 )
 from dora_systemd.verbs.start.asked import note_request
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_KILLED = "the command that tried it was killed"
 
 
 @dataclass(frozen=True)
@@ -68,12 +73,13 @@ def change_release(
 def _try(
     manager: Manager, scope: Scope, store: Store, standing: Standing, change: Change, tell: Tell
 ) -> None:
-    name = change.options.name
     # After this nothing is certain but what the journal and systemd say: undo it in any case.
-    with _interruptible():
+    with guarded(partial(_end_killed, scope, standing, change)), _interruptible():
+        _begin(manager, standing, change.text)
         try:
-            begin_trial(manager, standing, change.text)
-            fault = Gate(manager, scope, name, tell).run(_limit(change.options), change.soak)
+            fault = Gate(manager, scope, change.options, tell).run(
+                _limit(change.options), change.soak
+            )
             if fault is None:
                 _ignore_signals()
                 _prove(store, change.release)
@@ -90,6 +96,15 @@ def _try(
         _note_commit(scope, standing, change)
         remove_unit_file(standing.boot.runtime)
         end_trial(manager, standing)
+
+
+def _begin(manager: Manager, standing: Standing, text: str) -> None:
+    """Put the release on trial. Raises DoraSystemdError; what runs has not been touched then."""
+    try:
+        begin_trial(manager, standing, text)
+    except DoraSystemdError:
+        end_trial(manager, standing)
+        raise
 
 
 def _note_commit(scope: Scope, standing: Standing, change: Change) -> None:
@@ -116,6 +131,8 @@ def _roll_back(
     """Go back to what was there before; the error that tells it."""
     name, former = change.options.name, standing.current
     want_start = standing.was_up and not fault.is_stop
+    if not fault.is_stop:
+        _note_stop(manager, change)
     now = "nothing of it runs"
     try:
         go_back(manager, standing, want_start)
@@ -139,6 +156,25 @@ def _roll_back(
     )
 
 
+def _end_killed(scope: Scope, standing: Standing, change: Change) -> None:
+    """Go back after this process was killed, unless the release was committed before that."""
+    manager = Bus(scope)  # that of the process that was killed is of no use, see sd_bus_new(3)
+    now = read_standing(manager, scope, standing.boot.unit)
+    if now.current != change.release or standing.current == change.release:
+        _roll_back(manager, standing, change, Fault(_KILLED))
+    elif now.path.exists():
+        end_trial(manager, now)
+
+
+def _note_stop(manager: Manager, change: Change) -> None:
+    """Note who stops the release on trial, if that still runs."""
+    with suppress(DoraSystemdError):
+        state = manager.read(unit_name(change.options.name), ["ActiveState"])["ActiveState"]
+        if state in UP:
+            options = change.options
+            note_request("stop-asked", options.name, options.uuid, change.command)
+
+
 def _back(manager: Manager, unit: str) -> str:
     """Whether the unit is up again, in words."""
     state = settle(manager, unit, START_LIMIT, lambda _: None)
@@ -148,7 +184,7 @@ def _back(manager: Manager, unit: str) -> str:
 @contextmanager
 def _interruptible() -> Iterator[None]:
     """Let the signals that would end this process raise KeyboardInterrupt instead."""
-    before = {one: signal.getsignal(one) for one in _SIGNALS}
+    before = {one: signal.getsignal(one) for one in SIGNALS}
     for one, handler in before.items():
         if handler is not signal.SIG_IGN:  # as by nohup(1)
             signal.signal(one, _interrupt)
@@ -165,5 +201,5 @@ def _interrupt(*_arguments: object) -> None:
 
 def _ignore_signals() -> None:
     """Let nothing interrupt the way back."""
-    for one in _SIGNALS:
+    for one in SIGNALS:
         signal.signal(one, signal.SIG_IGN)

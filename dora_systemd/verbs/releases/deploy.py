@@ -13,7 +13,7 @@ from dora_systemd.decisions.releases.entries import touched
 from dora_systemd.decisions.releases.manifest import Manifest
 from dora_systemd.decisions.unit.file import persistent_unit, runner_of
 from dora_systemd.decisions.unit.properties import format_unit
-from dora_systemd.errors import DoraSystemdError
+from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.trust.project import opened_project
@@ -24,6 +24,7 @@ from dora_systemd.verbs.releases.change import Change, change_release
 from dora_systemd.verbs.releases.copy import copy_project, newest, repository_owners
 from dora_systemd.verbs.releases.files import digests, find_files
 from dora_systemd.verbs.releases.listing import store_of
+from dora_systemd.verbs.releases.remains import clean
 from dora_systemd.verbs.releases.soak import Tell
 from dora_systemd.verbs.releases.source import (
     Source,
@@ -109,7 +110,7 @@ def deploy(
         require_uninhibited(scope, standing.running, "deploy", request.how, tell)
         if store.unfinished():
             end_former(manager, build_unit(name))
-            store.clean()
+        clean(store, standing)
         copy = copy_project(manager, scope, source, store, standing, request.build_timeout, tell)
         release = copy.manifest.id
         try:
@@ -132,6 +133,10 @@ def deploy(
         change = Change(release, text, options, request.soak, want_boot, _COMMAND, how)
         try:
             change_release(manager, scope, store, standing, change, tell)
+        except BaseException as error:
+            if getattr(error, "code", None) is not ExitCode.ROLLED_BACK:
+                _remove_unused(manager, scope, store, release)
+            raise
         finally:
             prune(manager, scope, store, request.keep, release)
     manifest = copy.manifest
@@ -148,6 +153,14 @@ def prune(manager: Manager, scope: Scope, store: Store, keep: int, latest: str) 
         standing = read_standing(manager, scope, unit_name(store.name))
         used = {latest, standing.trial}
         for release in surplus(store.known(), keep, standing.current, used):
+            store.remove(release)
+
+
+def _remove_unused(manager: Manager, scope: Scope, store: Store, release: str) -> None:
+    """Remove a release that has never been tried, unless it can still be what runs."""
+    with suppress(DoraSystemdError):
+        standing = read_standing(manager, scope, unit_name(store.name))
+        if release not in (standing.current, standing.trial):
             store.remove(release)
 
 

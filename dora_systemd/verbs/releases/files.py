@@ -43,6 +43,8 @@ def find_files(
     """
     names, revision = project.tracked(owners, MOST_FILES + 1)
     found: dict[str, Found] = {}
+    if names is not None and len(names) > MOST_FILES:  # the rest of them is not known
+        raise too_many("")
     if names is None:
         found = _walk(project, "")
     paths = [*(name.rstrip("/") for name in names or ()), *named]

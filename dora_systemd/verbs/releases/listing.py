@@ -15,6 +15,7 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import is_name, unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import list_directory
+from dora_systemd.verbs.releases.remains import remains
 from dora_systemd.verbs.releases.trial import Standing, read_standing
 
 _MOST_NAMES = 10_000
@@ -65,6 +66,6 @@ def judge_releases(manager: Manager, scope: Scope) -> Iterator[Finding]:
             text = f"{name} runs release {standing.trial} on trial, and the next boot does not"
             remedy = f"doractl deploy --name {name}, or doractl rollback {name}"
             yield Finding("releases", State.WARNING, text, remedy)
-        for path in () if is_locked(store) else store.unfinished():
+        for path in () if is_locked(store) else remains(store, standing):
             text = f"{path} is the rest of a deploy that was killed"
             yield Finding("releases", State.NOTE, text, "the next deploy removes it")

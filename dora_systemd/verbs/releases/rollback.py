@@ -15,6 +15,7 @@ from dora_systemd.verbs.inhibit.guard import IfInhibited, require_uninhibited
 from dora_systemd.verbs.releases.change import Change, change_release
 from dora_systemd.verbs.releases.deploy import Deployed
 from dora_systemd.verbs.releases.listing import deployed_names, store_of
+from dora_systemd.verbs.releases.remains import clean
 from dora_systemd.verbs.releases.soak import Tell
 from dora_systemd.verbs.releases.trial import Standing, go_back, read_standing, require_deployable
 from dora_systemd.verbs.start.asked import note_request
@@ -42,6 +43,7 @@ def roll_back(
     with locked(store, make=False):
         standing = read_standing(manager, scope, unit_name(store.name))
         require_deployable(manager, scope, standing)
+        clean(store, standing)
         if release is None and standing.trial and not standing.current:
             require_uninhibited(scope, standing.running, "rollback", how, tell)
             return _end_first(manager, store, standing)

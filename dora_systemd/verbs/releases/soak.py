@@ -10,6 +10,8 @@ from contextlib import suppress
 
 from dora_systemd.adapters.bus.manager import ON_THE_WAY, SETTLED, Manager
 from dora_systemd.adapters.journal.reader import JournalReader
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.owed import Owed
 from dora_systemd.decisions.logs.query import scope_matches
 from dora_systemd.decisions.why.faults import FAULT_IDS, Fault, find_fault, is_finished
 from dora_systemd.decisions.why.lives import Happening, parse_happening
@@ -17,6 +19,7 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.values import SECOND, format_duration
+from dora_systemd.verbs.facts.reading import read_heard
 from dora_systemd.verbs.facts.reason import failure_reason, runners_refusal
 
 Tell = Callable[[str], None]
@@ -49,21 +52,23 @@ def settle(manager: Manager, unit: str, limit: int, tell: Tell) -> str:
 
 
 class Gate:
-    """The trial of the dataflow `name`. tell: gets a line for each stage."""
+    """The trial of a dataflow. options: of the release. tell: gets a line for each stage."""
 
-    def __init__(self, manager: Manager, scope: Scope, name: str, tell: Tell) -> None:
+    def __init__(self, manager: Manager, scope: Scope, options: RunnerOptions, tell: Tell) -> None:
         self._manager = manager
         self._scope = scope
-        self._name = name
-        self._unit = unit_name(name)
+        self._options = options
+        self._unit = unit_name(options.name)
         self._tell = tell
         self._since_us = time.time_ns() // _MICROSECOND_NS
+        self._since_monotonic_us = time.monotonic_ns() // _MICROSECOND_NS
         self._before = self._invocation()
 
     def run(self, start_limit: int, soak: int) -> Fault | None:
         """Restart the unit, and watch it for `soak` µs after its nodes are ready.
 
-        start_limit: µs until then. None if all is well. Raises DoraSystemdError.
+        Longer, until each output that a node owes has come: one that never comes would pass.
+        start_limit: µs until the nodes are ready. None if all is well. Raises DoraSystemdError.
         """
         with suppress(DoraSystemdError):  # systemd does not know a new unit
             self._manager.reset_failed(self._unit)
@@ -91,10 +96,22 @@ class Gate:
                 return self._end(state)
             if self._invocation() != invocation:
                 return Fault("systemd has restarted it")
-            if is_over:
+            late = self._unheard() if is_over else None
+            if is_over and late is None:
                 return None
-            self._tell(f"trial: soak {int(passed)} of {format_duration(soak)}")
-            time.sleep(min(_LOOK_SECONDS, max(soak / SECOND - passed, 0)))
+            if late and passed > late.first / SECOND + _LOOK_SECONDS:
+                how = f"no {late.output} within {format_duration(late.first)} of its start"
+                return Fault(f"node {late.node}: silent, {how}", late.node)
+            left = f", waits for {late.place}" if late else ""
+            self._tell(f"trial: soak {int(passed)} of {format_duration(soak)}{left}")
+            time.sleep(min(_LOOK_SECONDS, max(soak / SECOND - passed, _STEP_SECONDS)))
+
+    def _unheard(self) -> Owed | None:
+        """The owed output that the trial has to wait for the longest, if any has not come yet."""
+        heard = read_heard(self._scope, self._options)
+        pairs = zip(self._options.owes, heard, strict=True)
+        late = (one for one, at in pairs if at < self._since_monotonic_us)
+        return max(late, key=lambda one: one.first, default=None)
 
     def _end(self, state: str) -> Fault | None:
         """What its end means: a dataflow may finish, everything else is a fault."""
@@ -115,7 +132,7 @@ class Gate:
         return find_fault(self._happenings(), self._since_us, self._before)
 
     def _happenings(self) -> list[Happening]:
-        matches = [*scope_matches(self._scope, self._name)]
+        matches = [*scope_matches(self._scope, self._options.name)]
         matches += [f"MESSAGE_ID={one}" for one in FAULT_IDS]
         found: list[Happening] = []
         with suppress(DoraSystemdError):  # who may not read the journal has systemd's word only

@@ -19,6 +19,7 @@ from dora_systemd.adapters.host.unit_files import (
     read_unit_file,
     remove_changes,
     remove_unit_file,
+    sync_links,
     write_unit_file,
 )
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -107,6 +108,7 @@ def enable_cell(
         install_unit_file(manager, boot, text)
     else:
         _link(manager, cell.unit, cell.unit)
+        sync_links(boot.path)
     if not (facts["Transient"] and cell.is_up):
         remove_unit_file(boot.runtime)
         manager.reload()
@@ -147,6 +149,7 @@ def install_unit_file(manager: Manager, boot: BootUnit, text: str) -> None:
     write_unit_file(boot.path, text)
     try:
         _link(manager, str(boot.path), boot.unit)
+        sync_links(boot.path)
     except DoraSystemdError as error:
         put_unit_file(boot.path, boot.text)
         raise _no_link(boot.unit) if error.code is ExitCode.NOT_FOUND else error from error

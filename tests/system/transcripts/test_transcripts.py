@@ -1,4 +1,4 @@
-"""Thirteen tasks as a person types them, from the first start to the end.
+"""Fifteen tasks as a person types them, from the first start to the end.
 
 Each is a text: tests/system/typed.py says how it is read. Where one differs, the whole of it is
 printed as it was really shown. Two of them need another lab: reboot.txt is replayed by tests/boot,
@@ -13,6 +13,7 @@ import pytest
 
 from tests.deb.packages import ROBOT
 from tests.system.cells import dora_processes, run, wait_for
+from tests.system.releases import STORE
 from tests.system.typed import Shell, replay
 
 # They have the name of the README's robot, and a journal that knows of no other.
@@ -37,6 +38,8 @@ def shell() -> Iterator[Shell]:
     run("doractl", "destroy", "--force")
     run("systemctl", "reset-failed", "dora-robot", check=False)
     run("umount", f"{PLACE}/records", check=False)
+    shutil.rmtree(STORE / "robot", ignore_errors=True)
+    (STORE / ".robot.lock").unlink(missing_ok=True)
     shutil.rmtree(PLACE)
     wait_for("no process is left", lambda: not dora_processes())
 

@@ -22,6 +22,13 @@ def test_the_end_of_the_one_before_is_none() -> None:
 def test_a_hang_has_words() -> None:
     hung = Happening("node-hung", 20, "a", "Node a hangs", "new")
     assert find_fault([hung], 5, "") == Fault("node a: hung", "a")
+    for event, reason, words in (
+        ("node-watchdog", "no WATCHDOG=1 for 2s", "hung, no WATCHDOG=1 for 2s"),
+        ("node-waiting", "/dev/video0 (not there)", "waits for /dev/video0 (not there)"),
+        ("node-silent", "no image for 2s", "silent, no image for 2s"),
+    ):
+        one = Happening(event, 20, "a", "", "new", details={"reason": reason})
+        assert find_fault([one], 5, "") == Fault(f"node a: {words}", "a")
 
 
 def test_a_dataflow_may_finish() -> None:

@@ -51,9 +51,19 @@ def test_commands_around_a_reboot() -> None:
     assert options.commands == (("a", "b"), ("c",))
 
 
+def test_a_command_that_cuts_the_power() -> None:
+    assert parse_options(["run", "--cuts", "--", "a"], {"LAB": "vm"}).cuts
+    assert not parse_options(["run", "--", "a", "--cuts"], {"LAB": "vm"}).cuts
+
+
 @pytest.mark.parametrize(
     ("arguments", "environ", "message"),
     [
+        (
+            ["run", "--cuts", "x"],
+            {},
+            "lab: cannot cut the power of a container (hint: LAB=vm)",
+        ),
         (["run"], {}, "lab: cannot run nothing (hint: lab run -- CMD)"),
         (["run", "a", "--reboot--"], {}, "lab: cannot run nothing (hint: lab run -- CMD)"),
         (

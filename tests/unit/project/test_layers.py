@@ -261,10 +261,12 @@ STARTS_PROGRAMS = {
     "adapters.dora.engine": "dora's, in a cell",
     "adapters.journal.journalctl": "journalctl",
     "adapters.ssh.program": "ssh, as the caller",
+    "adapters.host.guard": "itself, without another program",
     "verbs.node": "dora, as the caller",
     "verbs.inhibit.hold": "what the caller has typed, as the caller",
     "cli.verbs.look.logs": "the caller's own pager",
     "adapters.runner_socket.relay": "itself, as the user of the dataflow",
+    "trust.courier": "git, as the user of the nodes",
     "trust.terminals": "another user's program, on a terminal of its own",
 }
 """The modules that start programs, and which."""

@@ -72,6 +72,18 @@ def test_with_git(root: Path, project: Project) -> None:
     assert project.tracked([os.getuid()], 10)[1] == f"{revision}+"
 
 
+def test_git_prints_too_much(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(courier, "MOST_PRINTED", 1000)
+    endless = subprocess.Popen(["yes"], stdout=subprocess.PIPE)
+    with pytest.raises(OSError, match="too many"):
+        courier.printed(endless)
+    assert endless.returncode == -signal.SIGKILL
+    monkeypatch.setattr(courier, "_GIT_SECONDS", 0.05)
+    assert courier.printed(subprocess.Popen(["sleep", "100"], stdout=subprocess.PIPE)) is None
+
+
 def test_a_git_above_that_ignores_all_of_it(root: Path) -> None:
     (root / ".gitignore").write_text("dir/\n")
     subprocess.run(["git", "init", "-q"], cwd=root, check=True)

@@ -67,6 +67,34 @@ def test_too_many(project: Project, monkeypatch: pytest.MonkeyPatch) -> None:
         find_files(project, [], [])
 
 
+class Many:
+    """A project whose git, or without it whose only directory, has a million files."""
+
+    root = "/srv/many"
+
+    def __init__(self, has_git: bool) -> None:
+        self._has_git = has_git
+        self.asked = 0
+
+    def tracked(self, _owners: object, most: int) -> tuple[list[str] | None, str]:
+        return [str(number) for number in range(1_000_000)[:most]] if self._has_git else None, ""
+
+    def listed(self, _directory: str, most: int) -> list[list[object]]:
+        self.asked += 1
+        return [[str(one), "file", 1, False, "", ""] for one in range(1_000_000)[:most]]
+
+    def facts(self, _paths: object) -> list[None]:
+        raise AssertionError("nobody looks for each of them")
+
+
+@pytest.mark.parametrize("has_git", [True, False])
+def test_a_million_files_are_refused_early(has_git: bool) -> None:
+    many = Many(has_git)
+    with pytest.raises(DoraSystemdError, match="more than 100000 files"):
+        find_files(many, [], [])  # type: ignore[arg-type]
+    assert many.asked == (0 if has_git else 1)
+
+
 def copied(project: Project, store: Store, found: dict[str, Found]) -> dict[str, Stored]:
     """A release of these files, and what is in it."""
     last = store.manifest(FIRST) if store.known() else None

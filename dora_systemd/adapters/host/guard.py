@@ -1,0 +1,54 @@
+"""A child process that does what this one leaves undone when it is killed, as by SIGKILL.
+
+The out-of-memory killer, too, takes one process without a word. Only the kernel tells of it, by the
+end of a connection. The child has the locks of its parent, see flock(2), so nobody else takes them
+until it has done its work.
+"""
+
+import os
+import signal
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import NoReturn
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Those that ask a process to end; the child ignores them."""
+
+_WORD = b"."
+
+
+@contextmanager
+def guarded(end: Callable[[], None]) -> Iterator[None]:
+    """Call `end` in another process if this one is killed in the block."""
+    ours, theirs = socket.socketpair()
+    child = os.fork()
+    if not child:
+        ours.close()
+        _guard(theirs, end)
+    theirs.close()
+    ours.recv(1)  # it is out of reach of what ends this process group
+    try:
+        yield
+    finally:
+        with suppress(BrokenPipeError):
+            ours.send(_WORD)
+        ours.close()
+        os.waitpid(child, 0)
+
+
+def _guard(parent: socket.socket, end: Callable[[], None]) -> NoReturn:
+    status = 1
+    try:
+        os.setsid()
+        for one in SIGNALS:
+            signal.signal(one, signal.SIG_IGN)
+        nowhere = os.open(os.devnull, os.O_RDWR)
+        for stream in range(3):  # who waits for the end of our output does not wait for this
+            os.dup2(nowhere, stream)
+        parent.send(_WORD)
+        if not parent.recv(1):
+            end()
+        status = 0
+    finally:
+        os._exit(status)

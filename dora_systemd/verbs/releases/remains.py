@@ -1,0 +1,27 @@
+"""What a deploy or rollback that was killed has left: doctor names it, the next one removes it."""
+
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+from dora_systemd.adapters.host.unit_files import remains_of
+from dora_systemd.adapters.releases.store import Store, remove_tree
+from dora_systemd.verbs.releases.trial import Standing
+
+
+def remains(store: Store, standing: Standing) -> Iterator[Path]:
+    """Files and directories that nothing uses."""
+    used = {store.release(one) for one in (standing.current, standing.trial) if one}
+    yield from (path for path in store.unfinished() if path not in used)
+    for place in (standing.boot.path, standing.path):
+        yield from remains_of(place)
+
+
+def clean(store: Store, standing: Standing) -> None:
+    """Remove them. The caller holds the lock of the store."""
+    for path in remains(store, standing):
+        if path.is_dir() and not path.is_symlink():
+            remove_tree(path)
+        else:
+            with suppress(OSError):
+                path.unlink()

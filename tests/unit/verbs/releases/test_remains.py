@@ -1,0 +1,58 @@
+"""What a killed deploy has left is named and removed, and nothing else."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.adapters.releases.store import Store
+from dora_systemd.scope import Scope
+from dora_systemd.verbs.releases import listing as module
+from dora_systemd.verbs.releases.remains import clean, remains
+from dora_systemd.verbs.releases.trial import read_standing
+from tests.unit.fakes.manager import FakeManager
+from tests.unit.verbs.releases.test_trial import NEW, OLD, UNIT, deployed, etc, store
+
+__all__ = ["store"]
+
+
+def leave(path: Path, age: float) -> Path:
+    """A file as of write_atomic(), so many seconds old."""
+    left = path.with_name(f".{path.name}.0a1b2c3d")
+    left.parent.mkdir(parents=True, exist_ok=True)
+    left.touch()
+    at = left.stat().st_mtime - age
+    os.utime(left, (at, at))
+    return left
+
+
+def test_what_is_left(
+    manager: FakeManager, scope: Scope, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    deployed(manager)
+    monkeypatch.setattr(module, "root_of", lambda _: store.path.parent)
+    store.release(OLD).mkdir()  # without a unit file, but it is what runs
+    (store.path / "notes").touch()
+    draft = store.path / ".new-0a1b2c3d4e5f"
+    draft.mkdir()
+    standing = read_standing(manager, scope, UNIT)
+    own, trial = leave(etc(manager), 100), leave(standing.path, 100)
+    young, other = leave(etc(manager).with_name("x.service"), 100), etc(manager).with_suffix(".d")
+    other.mkdir()
+    assert set(remains(store, standing)) == {draft, store.release(NEW), own, trial}
+    told = [one.text for one in module.judge_releases(manager, scope)]
+    assert [f"{one} is the rest of a deploy that was killed" for one in (draft, own)] == [
+        one for one in told if str(draft) in one or str(own) in one
+    ]
+    clean(store, standing)
+    assert list(remains(store, standing)) == []
+    assert young.exists()
+    assert sorted(path.name for path in store.path.iterdir()) == [OLD, "notes"]
+
+
+def test_what_is_being_written_stays(manager: FakeManager, scope: Scope, store: Store) -> None:
+    deployed(manager)
+    store.write_unit(NEW, "")
+    left = leave(etc(manager), 1)
+    clean(store, read_standing(manager, scope, UNIT))
+    assert left.exists()

@@ -1,0 +1,73 @@
+"""How long a trial lasts: until all that nodes owe has come, however short the soak is."""
+
+import time
+
+import pytest
+
+from dora_systemd.decisions.cell.owed import Owed
+from dora_systemd.decisions.why.faults import Fault
+from dora_systemd.scope import Scope
+from dora_systemd.values import SECOND
+from dora_systemd.verbs.releases import soak as module
+from dora_systemd.verbs.releases.soak import Gate
+from tests.unit.fakes.manager import FakeManager, options
+
+IMAGE, DEPTH = Owed("camera", "image", SECOND, 3 * SECOND), Owed("camera", "depth", SECOND, SECOND)
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The time, which only a sleep changes."""
+    now = [1000.0]
+    monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(module.time, "monotonic_ns", lambda: int(now[0] * 1e9))
+    monkeypatch.setattr(time, "sleep", lambda seconds: now.append(now.pop() + seconds))
+    return now
+
+
+def soaked(
+    manager: FakeManager,
+    scope: Scope,
+    monkeypatch: pytest.MonkeyPatch,
+    clock: list[float],
+    comes: tuple[float, ...],
+) -> tuple[Fault | None, list[str]]:
+    """What a trial of 2 s finds and tells, whose outputs come so many seconds after its begin."""
+    runner = options(owes=(IMAGE, DEPTH)[: len(comes)])
+    manager.add(runner, InvocationID=b"")
+    told: list[str] = []
+    gate, begun = Gate(manager, scope, runner, told.append), clock[0]
+
+    def heard(*_: object) -> tuple[int, ...]:
+        last = 5 if clock[0] < begun else 0  # of what ran before
+        return tuple(
+            int((begun + one) * SECOND) if clock[0] >= begun + one else last for one in comes
+        )
+
+    monkeypatch.setattr(module, "read_heard", heard)
+    monkeypatch.setattr(Gate, "_fault", lambda _: None)
+    return gate._soak(2 * SECOND), told
+
+
+@pytest.mark.parametrize(
+    ("comes", "seconds"), [((), 2), ((0.5,), 2), ((2.5,), 2.6), ((2.5, 0.1), 2.6)]
+)
+def test_it_lasts_until_all_has_come(
+    manager: FakeManager,
+    scope: Scope,
+    monkeypatch: pytest.MonkeyPatch,
+    clock: list[float],
+    comes: tuple[float, ...],
+    seconds: float,
+) -> None:
+    found, told = soaked(manager, scope, monkeypatch, clock, comes)
+    assert (found, clock[0] - 1000) == (None, pytest.approx(seconds, abs=0.21))
+    assert any("waits for camera/image" in one for one in told) == (seconds > 2)
+
+
+def test_what_never_comes_fails_it(
+    manager: FakeManager, scope: Scope, monkeypatch: pytest.MonkeyPatch, clock: list[float]
+) -> None:
+    found, _ = soaked(manager, scope, monkeypatch, clock, (1e6, 0.1))
+    words = "node camera: silent, no image within 3s of its start"
+    assert (found, clock[0] < 1006) == (Fault(words, "camera"), True)
