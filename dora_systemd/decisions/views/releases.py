@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from dora_systemd.decisions.releases.manifest import Manifest
+from dora_systemd.decisions.releases.progress import COPY, SOAK, Step
 from dora_systemd.decisions.views.dataflows import UNKNOWN, format_table, local_time
 from dora_systemd.decisions.views.objects import moment
 from dora_systemd.values import format_rounded_size
@@ -50,4 +51,22 @@ def release_object(row: ReleaseRow) -> dict[str, Any]:
         **moment("created", one.created_us if one else 0),
         "size_bytes": one.size if one else None,
         "files": len(one.files) if one else None,
+    }
+
+
+def step_object(one: Step) -> dict[str, Any]:
+    """A step of a deploy or a rollback for `-o json`."""
+    done, total = one.amount or (None, None)
+    ready, nodes = one.nodes or (None, None)
+    is_copy, is_soak = one.stage == COPY, one.stage == SOAK
+    return {
+        "stage": one.stage,
+        "text": one.text,
+        "done_bytes": done if is_copy else None,
+        "total_bytes": total if is_copy else None,
+        "nodes_ready": ready,
+        "nodes_total": nodes,
+        "soaked_us": done if is_soak else None,
+        "soak_us": total if is_soak else None,
+        "passed": one.passed,
     }

@@ -13,6 +13,7 @@ from dora_systemd.adapters.host.unit_files import remove_unit_file
 from dora_systemd.adapters.releases.store import Store, unusable
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.logs.events import ROLLED_BACK
+from dora_systemd.decisions.releases.progress import going_back, judged, waiting
 from dora_systemd.decisions.unit.file import is_boot_checked, with_boot_check
 from dora_systemd.decisions.why.faults import Fault
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -59,7 +60,7 @@ def change_release(
     if is_boot_checked(standing.boot.text or ""):
         change = replace(change, text=with_boot_check(change.text))
     verb = change.command.removeprefix("doractl ")
-    with uninhibited(scope, standing.running, verb, change.how, tell):
+    with uninhibited(scope, standing.running, verb, change.how, lambda text: tell(waiting(text))):
         for cell in standing.running:
             note_request("stop-asked", cell.name, cell.uuid, change.command)
         _try(manager, scope, store, standing, change, tell)
@@ -86,10 +87,11 @@ def _try(
             fault = Fault(f"the command failed: {error}")
         if fault is not None:
             _ignore_signals()
-            raise _roll_back(manager, standing, change, fault)
+            raise _roll_back(manager, standing, change, fault, tell)
         _note_commit(scope, standing, change)
         remove_unit_file(standing.boot.runtime)
         end_trial(manager, standing)
+    tell(judged(change.release, ""))
 
 
 def _note_commit(scope: Scope, standing: Standing, change: Change) -> None:
@@ -111,16 +113,17 @@ def _prove(store: Store, release: str) -> None:
 
 
 def _roll_back(
-    manager: Manager, standing: Standing, change: Change, fault: Fault
+    manager: Manager, standing: Standing, change: Change, fault: Fault, tell: Tell
 ) -> DoraSystemdError:
     """Go back to what was there before; the error that tells it."""
     name, former = change.options.name, standing.current
+    tell(judged(change.release, fault.reason))
     want_start = standing.was_up and not fault.is_stop
     now = "nothing of it runs"
     try:
         go_back(manager, standing, want_start)
         if want_start:
-            now = f"{former or 'what was there before'} {_back(manager, standing.boot.unit)}"
+            now = f"{former or 'what was there before'} {_back(manager, standing, tell)}"
     except DoraSystemdError as error:
         now = f"the way back has failed, too: {error.message}"
     details = {"release": change.release, "former": former, "nodes": fault.node}
@@ -139,9 +142,13 @@ def _roll_back(
     )
 
 
-def _back(manager: Manager, unit: str) -> str:
+def _back(manager: Manager, standing: Standing, tell: Tell) -> str:
     """Whether the unit is up again, in words."""
-    state = settle(manager, unit, START_LIMIT, lambda _: None)
+
+    def observe(active: str, status: str) -> None:
+        tell(going_back(standing.current, status if active == "activating" else ""))
+
+    state = settle(manager, standing.boot.unit, START_LIMIT, observe)
     return "runs again" if state in SETTLED else f"has not started again: {state}"
 
 

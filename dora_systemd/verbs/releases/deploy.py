@@ -16,13 +16,13 @@ from dora_systemd.decisions.releases.choice import surplus
 from dora_systemd.decisions.releases.entries import Found, touched
 from dora_systemd.decisions.releases.ids import new_id
 from dora_systemd.decisions.releases.manifest import Manifest
+from dora_systemd.decisions.releases.progress import checking, copied, copying, waiting
 from dora_systemd.decisions.unit.file import persistent_unit, runner_of
 from dora_systemd.decisions.unit.properties import format_unit
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.trust.project import Project, opened_project
-from dora_systemd.values import format_rounded_size
 from dora_systemd.verbs.inhibit.guard import IfInhibited, require_uninhibited
 from dora_systemd.verbs.releases.change import Change, change_release
 from dora_systemd.verbs.releases.files import copy_files, digests, find_files
@@ -97,7 +97,7 @@ def deploy(
     tell: Tell,
     warn: Callable[[str], None],
 ) -> Deployed:
-    """Deploy a project. tell: gets each stage; warn: each warning.
+    """Deploy a project. tell: gets each step; warn: each warning.
 
     Raises DoraSystemdError: ROLLED_BACK if the release has failed its trial. After any other error
     everything is as before.
@@ -108,7 +108,9 @@ def deploy(
     require_deployable(manager, scope, standing)
     with locked(store):
         standing = read_standing(manager, scope, standing.boot.unit)  # nobody changes it now
-        require_uninhibited(scope, standing.running, "deploy", request.how, tell)
+        require_uninhibited(
+            scope, standing.running, "deploy", request.how, lambda text: tell(waiting(text))
+        )
         store.clean()
         copy = _copy_project(source, store, standing, tell)
         release = copy.manifest.id
@@ -177,15 +179,14 @@ def _copy_project(source: Source, store: Store, standing: Standing, tell: Tell) 
             draft = Draft(store)
             manifest = _fill(project, found, draft, last, source, revision, tell)
             shared = last.files if last else {}
-            copied = sum(
-                one.size for path, one in manifest.files.items() if shared.get(path) != one
-            )
+            new = sum(one.size for path, one in manifest.files.items() if shared.get(path) != one)
             uuid_ = standing.uuid or (last.uuid if last else "") or str(uuid.uuid4())
             known = frozenset(one.id for one in store.known())
             release = new_id(manifest.created_us, revision, known)
             manifest = Manifest(**{**vars(manifest), "id": release, "uuid": uuid_})
             draft.publish(manifest, None if user is None else user.pw_gid)
-            return _Copy(manifest, copied)
+            tell(copied(len(manifest.files), manifest.size, new))
+            return _Copy(manifest, new)
     except OSError as error:
         raise unusable(store.path, error) from error
     finally:
@@ -202,10 +203,7 @@ def _fill(
     revision: str,
     tell: Tell,
 ) -> Manifest:
-    def progress(done: int, total: int) -> None:
-        tell(f"copying: {format_rounded_size(done)} of {format_rounded_size(total)}")
-
-    files = copy_files(project, found, draft, last, progress)
+    files = copy_files(project, found, draft, last, lambda *amount: tell(copying(*amount)))
     user = source.plan.user
     return Manifest(
         id="",
@@ -232,7 +230,7 @@ def _unit_text(
     warn: Callable[[str], None],
 ) -> str:
     """The unit file of the copy, which has been checked as for a start."""
-    tell("checking")
+    tell(checking())
     tree = store.tree(manifest.id)
     require_same(source, tree)
     wanted = released(source, request.start, tree, manifest.uuid)

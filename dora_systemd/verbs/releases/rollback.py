@@ -4,6 +4,7 @@ from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.releases.store import Store, locked
 from dora_systemd.decisions.logs.events import ROLLED_BACK
 from dora_systemd.decisions.releases.choice import before
+from dora_systemd.decisions.releases.progress import waiting
 from dora_systemd.decisions.unit.file import runner_of
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import did_you_mean, unit_name
@@ -43,7 +44,9 @@ def roll_back(
         standing = read_standing(manager, scope, unit_name(store.name))
         require_deployable(manager, scope, standing)
         if release is None and standing.trial and not standing.current:
-            require_uninhibited(scope, standing.running, "rollback", how, tell)
+            require_uninhibited(
+                scope, standing.running, "rollback", how, lambda text: tell(waiting(text))
+            )
             return _end_first(manager, store, standing)
         chosen = _choose(store, standing, release)
         text = store.unit(chosen)
