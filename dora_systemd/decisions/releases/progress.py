@@ -21,7 +21,7 @@ class Step(NamedTuple):
     """A moment of a change of the release.
 
     stage: one of STAGES. text: for people. amount: bytes in COPY, µs in SOAK. nodes: those that are
-    ready, of all. passed: the verdict.
+    ready, of all. passed: the verdict. is_last: of its stage.
     """
 
     stage: str
@@ -29,12 +29,12 @@ class Step(NamedTuple):
     amount: Amount | None = None
     nodes: Amount | None = None
     passed: bool | None = None
+    is_last: bool = False
 
     @property
     def news(self) -> tuple[object, ...]:
         """What differs in two steps that are both worth a line at once."""
-        is_whole = self.amount is not None and self.amount[0] >= self.amount[1]
-        return self.stage, self.nodes, is_whole, self.passed
+        return self.stage, self.nodes, self.is_last
 
 
 class Pace:
@@ -73,7 +73,7 @@ def copied(files: int, total: int, new: int) -> Step:
     """The copy is complete. new: bytes that no other release has."""
     count = f"{files} file{'' if files == 1 else 's'}"
     text = f"copied: {count}, {format_rounded_size(total)}, {format_rounded_size(new)} of it new"
-    return Step(COPY, text, amount=(total, total))
+    return Step(COPY, text, amount=(total, total), is_last=True)
 
 
 def checking() -> Step:
@@ -102,7 +102,8 @@ def soaking(status: str, passed: int, soak: int) -> Step:
     passed = min(passed, soak)
     state = status.replace("nodes running", "nodes ready", 1) or "up"
     soaked = f", soak {_soaked(passed, soak)}" if soak else ""
-    return Step(SOAK, f"trial: {state}{soaked}", (passed, soak), _count(status))
+    text = f"trial: {state}{soaked}"
+    return Step(SOAK, text, (passed, soak), _count(status), is_last=passed == soak)
 
 
 def judged(release: str, reason: str) -> Step:

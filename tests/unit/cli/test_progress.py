@@ -7,10 +7,10 @@ import os
 import pytest
 
 from dora_systemd.cli.progress import Progress
-from dora_systemd.decisions.releases.progress import Step, checking, copying, judged
+from dora_systemd.decisions.releases.progress import Step, checking, copied, copying, judged
 from tests.unit.cli.test_stageline import Terminal
 
-STEPS = (copying(1, 3), copying(2, 3), copying(3, 3), checking(), checking(), judged("X", ""))
+STEPS = (copying(1, 3), copying(2, 3), copied(1, 3, 0), checking(), checking(), judged("X", ""))
 
 
 class Clock:
@@ -34,7 +34,7 @@ def test_a_pipe_gets_lines_that_are_news() -> None:
     stream = io.StringIO()
     show(stream, *STEPS)
     assert stream.getvalue() == (
-        "copying: 1B of 3B\ncopying: 3B of 3B\nchecking\ntrial of X: passed\n"
+        "copying: 1B of 3B\ncopied: 1 file, 3B, 0B of it new\nchecking\ntrial of X: passed\n"
     )
 
 

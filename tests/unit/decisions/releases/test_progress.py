@@ -70,7 +70,7 @@ def test_what_grows_is_shown_now_and_then() -> None:
     copy = [(at / 10, copying(at, 100)) for at in range(101)]
     assert shown(Pace(60), *copy, (10.1, copied(2, 100, 5))) == [
         "copying: 0B of 100B",
-        "copying: 100B of 100B",
+        "copied: 2 files, 100B, 5B of it new",
     ]
 
 
