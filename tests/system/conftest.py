@@ -13,6 +13,7 @@ from tests.system.cells import Cell, Project, dora_processes, run, wait_for
 from tests.system.chromium import Browser
 from tests.system.gateways import Front
 from tests.system.ports import reserve_ports
+from tests.system.releases import Releases
 from tests.system.tolerated import is_tolerated
 
 FIRST_HALF = (
@@ -77,6 +78,14 @@ def cell(request: pytest.FixtureRequest, project: Project) -> Iterator[Cell]:
     expected = [m for mark in request.node.iter_markers("warns") for m in mark.args]
     unexpected = [w for w in _warnings(cursor) if not any(e in w for e in expected)]
     assert not unexpected, "unexpected warnings:\n" + "\n".join(unexpected)
+
+
+@pytest.fixture
+def releases(cell: Cell) -> Iterator[Releases]:
+    """Those of the cell; they go to /etc and /var/lib."""
+    releases = Releases(cell)
+    yield releases
+    releases.end()
 
 
 @pytest.fixture(scope="session")

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.lab.pace import pace
-from tests.system.cells import Cell, Project, run, wait_for
+from tests.system.cells import Project, run, wait_for
 from tests.system.releases import FLOW, STORE, Releases, write_version
 
 # They write to /etc and /var/lib.
@@ -21,13 +21,6 @@ pytestmark = pytest.mark.lab
 
 FAST = ("--soak", "0s")
 ETC = Path("/etc/systemd/system")
-
-
-@pytest.fixture
-def releases(cell: Cell) -> Iterator[Releases]:
-    found = Releases(cell)
-    yield found
-    found.end()
 
 
 def test_a_release_runs_and_is_not_what_it_was_copied_from(

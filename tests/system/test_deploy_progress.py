@@ -3,24 +3,16 @@
 import json
 import re
 import shlex
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.system.cells import Cell, Project, run
+from tests.system.cells import Project, run
 from tests.system.releases import Releases, write_version
 from tests.system.terminal import shown
 
 # They write to /etc and /var/lib.
 pytestmark = pytest.mark.lab
-
-
-@pytest.fixture
-def releases(cell: Cell) -> Iterator[Releases]:
-    found = Releases(cell)
-    yield found
-    found.end()
 
 
 def words(releases: Releases, place: Path, *more: str) -> list[str]:

@@ -4,6 +4,7 @@ deploy and rollback both end here, so this is the one place for what may forbid 
 """
 
 import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -35,9 +36,9 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 @dataclass(frozen=True)
 class Change:
-    """A release that is to run. text: its unit file. soak: µs. command: by which it is asked.
+    """A release that is to run. text: its unit file. soak: µs. verb: "deploy" or "rollback".
 
-    how: what to do while a lock inhibits it.
+    how: what to do while a lock inhibits it. by: what asks for it, as in note_request().
     """
 
     release: str
@@ -45,8 +46,9 @@ class Change:
     options: RunnerOptions
     soak: int
     want_boot: bool
-    command: str
+    verb: str
     how: IfInhibited
+    by: str
 
 
 def change_release(
@@ -59,10 +61,10 @@ def change_release(
     """
     if is_boot_checked(standing.boot.text or ""):
         change = replace(change, text=with_boot_check(change.text))
-    verb = change.command.removeprefix("doractl ")
-    with uninhibited(scope, standing.running, verb, change.how, lambda text: tell(waiting(text))):
-        for cell in standing.running:
-            note_request("stop-asked", cell.name, cell.uuid, change.command)
+    running, verb = standing.running, change.verb
+    with uninhibited(scope, running, verb, change.how, lambda text: tell(waiting(text))):
+        for cell in running:
+            note_request("stop-asked", cell.name, cell.uuid, change.by)
         _try(manager, scope, store, standing, change, tell)
 
 
@@ -97,7 +99,7 @@ def _try(
 def _note_commit(scope: Scope, standing: Standing, change: Change) -> None:
     details = {"scope": scope.word, "release": change.release, "former": standing.current}
     options = change.options
-    note_request("release-committed", options.name, options.uuid, change.command, **details)
+    note_request("release-committed", options.name, options.uuid, change.by, **details)
 
 
 def _limit(options: RunnerOptions) -> int:
@@ -131,7 +133,7 @@ def _roll_back(
         ROLLED_BACK,
         name,
         change.options.uuid,
-        change.command,
+        change.by,
         **details,
         reason=fault.reason,
     )
@@ -155,7 +157,7 @@ def _back(manager: Manager, standing: Standing, tell: Tell) -> str:
 @contextmanager
 def _interruptible() -> Iterator[None]:
     """Let the signals that would end this process raise KeyboardInterrupt instead."""
-    before = {one: signal.getsignal(one) for one in _SIGNALS}
+    before = {one: signal.getsignal(one) for one in _SIGNALS if _takes_signals()}
     for one, handler in before.items():
         if handler is not signal.SIG_IGN:  # as by nohup(1)
             signal.signal(one, _interrupt)
@@ -173,4 +175,10 @@ def _interrupt(*_arguments: object) -> None:
 def _ignore_signals() -> None:
     """Let nothing interrupt the way back."""
     for one in _SIGNALS:
-        signal.signal(one, signal.SIG_IGN)
+        if _takes_signals():
+            signal.signal(one, signal.SIG_IGN)
+
+
+def _takes_signals() -> bool:
+    """Only the main thread can; those of the gateway are told by `tell`, which raises."""
+    return threading.current_thread() is threading.main_thread()

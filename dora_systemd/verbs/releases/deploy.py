@@ -131,7 +131,7 @@ def deploy(
         standing = read_standing(manager, scope, standing.boot.unit)  # the copy took its time
         require_deployable(manager, scope, standing)
         how, want_boot = request.how, request.want_boot
-        change = Change(release, text, options, request.soak, want_boot, _COMMAND, how)
+        change = Change(release, text, options, request.soak, want_boot, "deploy", how, _COMMAND)
         try:
             change_release(manager, scope, store, standing, change, tell)
         finally:

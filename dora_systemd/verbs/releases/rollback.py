@@ -32,12 +32,14 @@ def roll_back(
     soak: int,
     tell: Tell,
     how: IfInhibited = IfInhibited.REFUSE,
+    by: str = _COMMAND,
 ) -> Deployed:
     """Run an older release. release: its id; None for the one before the present one.
 
     Without one before, ends a trial whose doractl was killed; the id of what runs then is "".
-    soak: µs. how: what to do while a lock inhibits it. Raises DoraSystemdError: ROLLED_BACK if that
-    release fails its trial, INHIBITED.
+    soak: µs. how: what to do while a lock inhibits it. by: as in note_request().
+
+    Raises DoraSystemdError: ROLLED_BACK if that release fails its trial, INHIBITED.
     """
     store = store_of(scope, deployed_name(manager, scope, selector))
     with locked(store, make=False):
@@ -47,7 +49,7 @@ def roll_back(
             require_uninhibited(
                 scope, standing.running, "rollback", how, lambda text: tell(waiting(text))
             )
-            return _end_first(manager, store, standing)
+            return _end_first(manager, store, standing, by)
         chosen = _choose(store, standing, release)
         text = store.unit(chosen)
         options, manifest = runner_of(text), store.manifest(chosen)
@@ -56,7 +58,7 @@ def roll_back(
             message = f"cannot run release {chosen} of {store.name}: it has no unit file of ours"
             raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
         # One that was disabled stays so.
-        change = Change(chosen, text, options, soak, False, _COMMAND, how)
+        change = Change(chosen, text, options, soak, False, "rollback", how, by)
         change_release(manager, scope, store, standing, change, tell)
     facts = (options.uuid, store.name, standing.boot.unit, chosen, standing.current)
     return Deployed(*facts, len(manifest.files), manifest.size, 0)
@@ -75,14 +77,14 @@ def deployed_name(manager: Manager, scope: Scope, selector: str) -> str:
     return name
 
 
-def _end_first(manager: Manager, store: Store, standing: Standing) -> Deployed:
+def _end_first(manager: Manager, store: Store, standing: Standing, by: str) -> Deployed:
     """End the trial of a release that has none before it: what was there before runs again."""
     for cell in standing.running:
-        note_request("stop-asked", cell.name, cell.uuid, _COMMAND)
+        note_request("stop-asked", cell.name, cell.uuid, by)
     go_back(manager, standing, standing.was_up)
     uuid = standing.uuid or store.manifest(standing.trial).uuid
     details = {"release": standing.trial, "former": "", "nodes": "", "reason": _KILLED}
-    note_request(ROLLED_BACK, store.name, uuid, _COMMAND, **details)
+    note_request(ROLLED_BACK, store.name, uuid, by, **details)
     return Deployed(uuid, store.name, standing.boot.unit, "", standing.trial, 0, 0, 0)
 
 

@@ -73,7 +73,8 @@ def try_new(
 
     monkeypatch.setattr(module, "Gate", FakeGate)
     change = Change(
-        NEW, text_of(NEW), release_options(NEW), 0, True, "doractl deploy", IfInhibited.REFUSE
+        *(NEW, text_of(NEW), release_options(NEW), 0, True, "deploy", IfInhibited.REFUSE),
+        by="doractl deploy",
     )
     change_release(manager, scope, store, read_standing(manager, scope, UNIT), change, print)
 
