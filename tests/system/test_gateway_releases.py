@@ -55,7 +55,7 @@ def test_roll_back(browser: Browser, releases: Releases, project: Project, flag:
     browser.wait_text(f"{row(second)} .badge", "Current")
     browser.wait_text(f"{row(first)} .badge", "Proved")
     assert second in browser.text("#detail dl")
-    shown = "document.querySelector(\"{} button\").checkVisibility()"
+    shown = 'document.querySelector("{} button").checkVisibility()'
     assert [browser.js(shown.format(row(one))) for one in (first, second)] == [True, False]
     browser.resize(1200, 900)
     browser.picture("releases", is_whole=True)
@@ -112,7 +112,7 @@ def test_a_gateway_that_is_stopped_ends_the_trial(
     cell = releases.cell
     slow = f"import pathlib, time\nwhile pathlib.Path('{FLAG}').exists(): time.sleep(0.1)\n"
     write_version(project, "1", slow)
-    releases.deploy(project.root, "--soak", "0s")
+    releases.deploy(project.root, "--soak", "0s", "--grace-duration", "1s")
     first = releases.current()
     write_version(project, "2")
     releases.deploy(project.root, "--soak", "0s")

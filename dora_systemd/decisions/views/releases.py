@@ -5,11 +5,12 @@ from typing import Any, NamedTuple
 
 from dora_systemd.decisions.releases.manifest import Manifest
 from dora_systemd.decisions.releases.progress import COPY, SOAK, Step
+from dora_systemd.decisions.releases.versions import PROGRAMS
 from dora_systemd.decisions.views.dataflows import UNKNOWN, format_table, local_time
 from dora_systemd.decisions.views.objects import moment
 from dora_systemd.values import format_rounded_size
 
-_HEADER = ("NAME", "ID", "STATE", "CREATED", "SIZE", "FILES")
+_HEADER = ("NAME", "ID", "STATE", "CREATED", "SIZE", "FILES", "DORA", "PYTHON")
 
 
 class ReleaseRow(NamedTuple):
@@ -33,7 +34,9 @@ def _cells(row: ReleaseRow) -> tuple[str, ...]:
     one = row.manifest
     size = format_rounded_size(one.size) if one else UNKNOWN
     count = str(len(one.files)) if one else UNKNOWN
-    return (row.name, row.id, row.state, local_time(one.created_us if one else 0), size, count)
+    versions = [one.versions.get(name, UNKNOWN) if one else UNKNOWN for name in PROGRAMS]
+    created = local_time(one.created_us if one else 0)
+    return (row.name, row.id, row.state, created, size, count, *versions)
 
 
 def release_object(row: ReleaseRow) -> dict[str, Any]:
@@ -51,6 +54,7 @@ def release_object(row: ReleaseRow) -> dict[str, Any]:
         **moment("created", one.created_us if one else 0),
         "size_bytes": one.size if one else None,
         "files": len(one.files) if one else None,
+        "versions": dict(one.versions) if one else None,
     }
 
 

@@ -5,7 +5,7 @@ import time
 import uuid
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from dora_systemd import __version__
@@ -214,7 +214,7 @@ def _fill(
         user="" if user is None else user.pw_name,
         revision=revision,
         created_us=time.time_ns() // _MICROSECOND_NS,
-        versions={"dora-systemd": __version__},
+        versions={"doractl": __version__},
         files=files,
     )
 
@@ -235,7 +235,8 @@ def _unit_text(
     require_same(source, tree)
     wanted = released(source, request.start, tree, manifest.uuid)
     plan = make_plan(scope, wanted)
-    check_plan(lambda: manager, plan)
+    versions = {**manifest.versions, **check_plan(lambda: manager, plan)}
+    store.write_manifest(replace(manifest, versions={**versions, "systemd": manager.version()}))
     properties, warnings = plan_properties(plan, manager)
     for warning in warnings:
         warn(warning)

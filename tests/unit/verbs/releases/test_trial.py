@@ -1,5 +1,7 @@
 """The files of a trial, and what a reboot at any moment would find."""
 
+import signal
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -88,6 +90,20 @@ def test_a_good_release_is_committed(
     assert (standing.current, standing.trial) == (NEW, "")
     assert not standing.path.exists()
     assert [one.is_proved for one in store.known()] == [True]
+
+
+def test_a_thread_of_the_gateway_leaves_the_signals_alone(
+    manager: FakeManager, scope: Scope, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    deployed(manager)
+    before = signal.getsignal(signal.SIGTERM)
+    thread = ThreadPoolExecutor(1)
+    for fault, told in ((Fault("x"), "x"), (None, "")):
+        done = thread.submit(try_new, manager, scope, store, monkeypatch, fault)
+        assert told in str(done.exception())
+    assert signal.getsignal(signal.SIGTERM) == before
+    assert read_standing(manager, scope, UNIT).current == NEW
+    thread.shutdown()
 
 
 def test_a_bad_release_leaves_the_disk_as_it_was(
