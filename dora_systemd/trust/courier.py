@@ -64,6 +64,8 @@ def content(path: str) -> Iterator[bytes]:
 def git(command: tuple[str, ...], safe: str) -> bytes | None:
     """What a git command prints, None if it fails."""
     trusted = ("-c", f"safe.directory={safe}") if safe else ()
+    # A hook of git has variables that lead to another repository.
+    own = {key: value for key, value in os.environ.items() if not key.startswith("GIT_")}
     try:
         done = subprocess.run(
             [*_GIT, *trusted, *command],
@@ -72,7 +74,7 @@ def git(command: tuple[str, ...], safe: str) -> bytes | None:
             stderr=subprocess.DEVNULL,
             timeout=_GIT_SECONDS,
             check=False,
-            env={**os.environ, "GIT_OPTIONAL_LOCKS": "0", "LC_ALL": "C"},
+            env={**own, "GIT_OPTIONAL_LOCKS": "0", "LC_ALL": "C"},
         )
     except (OSError, subprocess.TimeoutExpired):
         return None
