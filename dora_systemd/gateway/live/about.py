@@ -9,7 +9,6 @@ from dora_systemd.decisions.gateway.page_facts import PROPERTIES, fact_values
 from dora_systemd.decisions.gateway.page_messages import MAX_ITEMS, shown_values
 from dora_systemd.decisions.views.dataflows import is_up_word
 from dora_systemd.decisions.views.objects import dataflow_object
-from dora_systemd.decisions.views.releases import release_object
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.why.report import Report
 from dora_systemd.decisions.why.report_object import report_object
@@ -18,7 +17,6 @@ from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import read_cell, read_cells
 from dora_systemd.verbs.facts.ended import ended_rows
 from dora_systemd.verbs.list import find_row
-from dora_systemd.verbs.releases.listing import read_releases
 from dora_systemd.verbs.why import explain
 
 
@@ -54,6 +52,10 @@ def read_ended(scope: Scope, _uuid: str = "") -> dict[str, Any]:
 
 def read_own_releases(scope: Scope, uuid: str) -> dict[str, Any]:
     """The releases of a dataflow, newest first. Raises DoraSystemdError."""
+    # Imported late: only deployed dataflows need it.
+    from dora_systemd.decisions.views.releases import release_object
+    from dora_systemd.verbs.releases.listing import read_releases
+
     bus = Bus(scope, for_reading=True)
     rows = read_releases(bus, scope, [find_row(bus, scope, uuid).name])
     return {"releases": shown_values(list(map(release_object, rows[:MAX_ITEMS])))}

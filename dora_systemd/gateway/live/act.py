@@ -19,7 +19,6 @@ from dora_systemd.verbs.facts.reading import read_status
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.inhibit.guard import require_uninhibited
 from dora_systemd.verbs.node import ask_coordinator
-from dora_systemd.verbs.releases.rollback import roll_back
 from dora_systemd.verbs.reload import reload_cell, switch_hot_reload
 from dora_systemd.verbs.restart import restart_asked
 from dora_systemd.verbs.set import set_limits
@@ -85,6 +84,9 @@ def _set(manager: Manager, scope: Scope, cell: Cell, message: PageMessage) -> st
 
 
 def _roll_back(manager: Manager, scope: Scope, name: str, release: str) -> str:
+    # Imported late: few roll back, and its imports are memory.
+    from dora_systemd.verbs.releases.rollback import roll_back
+
     with acting() as action:
         done = roll_back(manager, scope, name, release or None, 0, action.go_on, by=_BY)
     how = f"runs release {done.release}" if done.release else "has ended its trial"

@@ -6,7 +6,7 @@ deploy and rollback both end here, so this is the one place for what may forbid 
 import signal
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 
 from dora_systemd.adapters.bus.manager import SETTLED, Manager
@@ -14,7 +14,7 @@ from dora_systemd.adapters.host.unit_files import remove_unit_file
 from dora_systemd.adapters.releases.store import Store, unusable
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.logs.events import ROLLED_BACK
-from dora_systemd.decisions.releases.progress import going_back, judged, waiting
+from dora_systemd.decisions.releases.progress import Step, going_back, judged, waiting
 from dora_systemd.decisions.unit.file import is_boot_checked, with_boot_check
 from dora_systemd.decisions.why.faults import Fault
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -93,7 +93,7 @@ def _try(
         _note_commit(scope, standing, change)
         remove_unit_file(standing.boot.runtime)
         end_trial(manager, standing)
-    tell(judged(change.release, ""))
+    _calm(tell)(judged(change.release, ""))
 
 
 def _note_commit(scope: Scope, standing: Standing, change: Change) -> None:
@@ -118,7 +118,7 @@ def _roll_back(
     manager: Manager, standing: Standing, change: Change, fault: Fault, tell: Tell
 ) -> DoraSystemdError:
     """Go back to what was there before; the error that tells it."""
-    name, former = change.options.name, standing.current
+    name, former, tell = change.options.name, standing.current, _calm(tell)
     tell(judged(change.release, fault.reason))
     want_start = standing.was_up and not fault.is_stop
     now = "nothing of it runs"
@@ -142,6 +142,16 @@ def _roll_back(
         f"{now}; doractl why {name} tells more",
         ExitCode.ROLLED_BACK,
     )
+
+
+def _calm(tell: Tell) -> Tell:
+    """Tell without an end of what is done: neither a commit nor the way back stops for that."""
+
+    def tell_on(step: Step) -> None:
+        with suppress(Exception):
+            tell(step)
+
+    return tell_on
 
 
 def _back(manager: Manager, standing: Standing, tell: Tell) -> str:

@@ -16,6 +16,7 @@ from dora_systemd.gateway.live import lines as lines_module
 from dora_systemd.gateway.live.about import read_about, read_ended, read_own_releases
 from dora_systemd.gateway.live.lines import find_lines
 from dora_systemd.scope import Scope
+from dora_systemd.verbs.releases import listing
 from tests.unit.fakes.library import fake_journalctl, fake_systemd
 from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
 from tests.unit.fakes.programs import make_program
@@ -184,7 +185,7 @@ def test_the_releases_of_a_dataflow(bench: Bench) -> None:
         ids = (f"2026{number:04}T220012" for number in range(200, 0, -1))
         return [ReleaseRow("robot", one, "proved", "/x\x1b[2J", None) for one in ids]
 
-    bench.patch.setattr(about, "read_releases", read)
+    bench.patch.setattr(listing, "read_releases", read)
     found = read_own_releases(bench.scope, UUID)["releases"]
     assert asked == [["robot"]]
     assert (len(found), found[0]["release"]) == (MAX_ITEMS, "20260200T220012")

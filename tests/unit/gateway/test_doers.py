@@ -27,6 +27,7 @@ from dora_systemd.gateway.live.acting import acting as begun_action
 from dora_systemd.gateway.live.acting import end_actions, is_acting
 from dora_systemd.runner.cell.begin import make_lock
 from dora_systemd.scope import Scope
+from dora_systemd.verbs.releases import rollback
 from dora_systemd.verbs.releases.deploy import Deployed
 from dora_systemd.verbs.start.again import Asked
 from dora_systemd.verbs.start.plan import StartRequest
@@ -191,7 +192,7 @@ def test_the_page_rolls_back(bench: Bench, monkeypatch: pytest.MonkeyPatch, rele
         asked.extend((*given[:3], by))
         return Deployed(UUID, "robot", UNIT, release, "20261122T220012", 1, 2, 0)
 
-    monkeypatch.setattr(acting, "roll_back", note)
+    monkeypatch.setattr(rollback, "roll_back", note)
     done = act(bench.scope, PageMessage("act", UNIT, action="rollback", release=release))
     assert asked == ["robot", release or None, 0, "status page"]
     how = f"runs release {release}" if release else "has ended its trial"
