@@ -71,7 +71,7 @@ def print_error(error: DoraSystemdError, is_json: bool) -> None:
         # Imported late: a command that works does without it.
         from dora_systemd.decisions.views.objects import error_object
 
-        _print_object("error", error_object(error))
+        print_object("error", error_object(error))
         return
     print(f"doractl: {error.message}", file=sys.stderr)
     if error.hint:
@@ -81,12 +81,13 @@ def print_error(error: DoraSystemdError, is_json: bool) -> None:
 def print_warning(text: str, is_json: bool) -> None:
     """The same for a warning."""
     if is_json:
-        _print_object("warning", {"message": text})
+        print_object("warning", {"message": text})
     else:
         print(f"doractl: {text}", file=sys.stderr)
 
 
-def _print_object(key: str, value: dict[str, Any]) -> None:
+def print_object(key: str, value: dict[str, Any]) -> None:
+    """An object for programs on standard error, in one line."""
     from dora_systemd.decisions.views.objects import format_json
 
     print(format_json({key: value}), file=sys.stderr)

@@ -1,17 +1,21 @@
 """Reports what a runner would refuse: `python3 -m dora_systemd.runner.check`.
 
 `doractl start --dry-run` runs it with the runner's arguments. It prints the refusal and exits with
-the runner's exit status. It starts nothing but dora's own checks.
+the runner's exit status; otherwise it prints the versions of dora and of the nodes' Python. It
+starts nothing but dora's own checks and that Python.
 """
 
 import os
 import sys
 
 from dora_systemd.adapters.dora.check import DoraCheck
+from dora_systemd.adapters.dora.command import python_version
 from dora_systemd.adapters.dora.preparation import prepare
 from dora_systemd.decisions.cell.environment import node_environment
+from dora_systemd.decisions.cell.launch import python_of
 from dora_systemd.decisions.cell.options import parse_runner_argv
 from dora_systemd.decisions.life.refusal import format_refusal, refusal_exit
+from dora_systemd.decisions.releases.versions import format_versions
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.runner.nodes.rights import check_first
 
@@ -24,6 +28,8 @@ def main(argv: list[str]) -> int:
         check = DoraCheck(options, environment)
         prepared = check.beside(lambda: prepare(options, environment))
         check_first(options, prepared.dataflow)
+        python = python_version(python_of(prepared.plan), environment)
+        print(format_versions({"dora": check.version(), "python": python}))
     except DoraSystemdError as error:
         print(format_refusal(error))
         return refusal_exit(error)

@@ -67,13 +67,15 @@ def content(path: str) -> Iterator[bytes]:
 def git(command: tuple[str, ...], safe: str) -> bytes | None:
     """What a git command prints, None if it fails."""
     trusted = ("-c", f"safe.directory={safe}") if safe else ()
+    # A hook of git has variables that lead to another repository.
+    own = {key: value for key, value in os.environ.items() if not key.startswith("GIT_")}
     try:
         child = subprocess.Popen(
             [*_GIT, *trusted, *command],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
-            env={**os.environ, "GIT_OPTIONAL_LOCKS": "0", "LC_ALL": "C"},
+            env={**own, "GIT_OPTIONAL_LOCKS": "0", "LC_ALL": "C"},
         )
     except OSError:
         return None

@@ -80,6 +80,14 @@ def cell(request: pytest.FixtureRequest, project: Project) -> Iterator[Cell]:
     assert not unexpected, "unexpected warnings:\n" + "\n".join(unexpected)
 
 
+@pytest.fixture
+def releases(cell: Cell) -> Iterator[Releases]:
+    """Those of the cell; they go to /etc and /var/lib."""
+    releases = Releases(cell)
+    yield releases
+    releases.end()
+
+
 @pytest.fixture(scope="session")
 def reserved_ports() -> None:
     """See reserve_ports()."""
@@ -93,13 +101,6 @@ def front(reserved_ports: None) -> Iterator[Front]:
     front = Front()
     yield front
     front.end()
-
-
-@pytest.fixture
-def releases(cell: Cell) -> Iterator[Releases]:
-    found = Releases(cell)
-    yield found
-    found.end()
 
 
 @pytest.fixture

@@ -1,6 +1,7 @@
 """doractl deploy, releases and rollback: what runs is whole, and has proved itself."""
 
 import fcntl
+import json
 import os
 import signal
 import subprocess
@@ -10,20 +11,13 @@ from pathlib import Path
 
 import pytest
 
-from tests.system.cells import Cell, Project, wait_for
+from tests.system.cells import Project, wait_for
 from tests.system.releases import ETC, FLOW, STORE, Releases, write_version
 
 # They write to /etc and /var/lib.
 pytestmark = pytest.mark.lab
 
 FAST = ("--soak", "0s")
-
-
-@pytest.fixture
-def releases(cell: Cell) -> Iterator[Releases]:
-    found = Releases(cell)
-    yield found
-    found.end()
 
 
 def test_a_release_runs_and_is_not_what_it_was_copied_from(
@@ -38,6 +32,9 @@ def test_a_release_runs_and_is_not_what_it_was_copied_from(
     assert cell.show("UnitFileState") == "enabled"
     assert not releases.trial.exists()
     write_version(project, "half a cop")
+    (row,) = json.loads(cell.doractl("releases", cell.name, "-o", "json").stdout)
+    assert {*row["versions"]} == {"doractl", "dora", "python", "systemd"}
+    assert row["versions"]["dora"].startswith("1.")
     cell.systemctl("restart")
     assert cell.messages("a") == ["version 1", "version 1"]
     refused = cell.doractl("reload", cell.name, check=False)

@@ -11,20 +11,13 @@ from pathlib import Path
 import pytest
 
 from tests.lab.pace import bound
-from tests.system.cells import Cell, run
+from tests.system.cells import run
 from tests.system.homes import FLOW, Home
 from tests.system.releases import Releases
 
 pytestmark = pytest.mark.lab
 
 SPY = "#!/bin/sh\nid -u >>{proof}\ncat\n"
-
-
-@pytest.fixture
-def releases(cell: Cell) -> Iterator[Releases]:
-    found = Releases(cell)
-    yield found
-    found.end()
 
 
 @pytest.fixture

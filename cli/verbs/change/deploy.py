@@ -1,7 +1,6 @@
 """Copy a project into a release and run that, or what ran before."""
 
 import os
-import sys
 from typing import Any
 
 import click
@@ -15,12 +14,11 @@ from dora_systemd.cli.parameters import (
     name_option,
     print_json,
     print_outcomes,
-    print_warnings,
     tell,
     wants_json,
 )
+from dora_systemd.cli.progress import open_progress, quiet_option
 from dora_systemd.cli.settingoptions import SettingsCommand, setting_options
-from dora_systemd.cli.stageline import StageLine
 from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.verbs.releases.deploy import (
@@ -53,6 +51,7 @@ _SIGNS = {"added": "+", "changed": "~", "removed": "-"}
 @click.option("--no-build", is_flag=True, help="Do not build; deploy what the project has.")
 @click.option("--no-enable", is_flag=True, help="Do not start it at every boot.")
 @click.option("--dry-run", is_flag=True, help="Print what would change, and change nothing.")
+@quiet_option
 @inhibit_options
 @acting_options
 def command(
@@ -64,6 +63,7 @@ def command(
     no_build: bool,
     no_enable: bool,
     dry_run: bool,
+    is_quiet: bool,
     force: bool,
     wait: bool,
     **flags: Any,
@@ -85,22 +85,17 @@ def command(
     scope = current_scope()
     start = StartRequest(dataflow, name, flags, os.environ)
     if dry_run:
-        return _print_changes(*compare(scope, start, not no_build))
-    bus = Bus(scope)
-    how = if_inhibited(force, wait)
+        found = compare(scope, start, not no_build)
+        return ExitCode.OK if is_quiet else _print_changes(*found)
     if not build_timeout:
         raise DoraSystemdError("cannot build in no time", "give a --build-timeout", ExitCode.USAGE)
-    build_timeout = 0 if no_build else build_timeout
+    bus = Bus(scope)
+    how, build_timeout = if_inhibited(force, wait), 0 if no_build else build_timeout
     request = DeployRequest(start, soak, keep, not no_enable, how, build_timeout)
-    with StageLine(sys.stderr) as stage:
-
-        def warn(text: str) -> None:
-            stage.wipe()
-            print_warnings([text])
-
-        done = deploy(bus, scope, request, stage, warn)
-    print_warnings([ensure_linger(scope) if request.want_boot else ""])
-    return print_outcomes([deployed_outcome(done, "deployed")])
+    with open_progress(is_quiet) as progress:
+        done = deploy(bus, scope, request, progress, progress.warn)
+    progress.warn(ensure_linger(scope) if request.want_boot else "")
+    return print_outcomes([] if is_quiet else [deployed_outcome(done, "deployed")])
 
 
 def deployed_outcome(done: Deployed, how: str) -> Outcome:

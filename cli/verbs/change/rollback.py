@@ -1,7 +1,5 @@
 """Run an older release again."""
 
-import sys
-
 import click
 
 from dora_systemd.adapters.bus.systemd import Bus
@@ -12,7 +10,7 @@ from dora_systemd.cli.parameters import (
     duration_option,
     print_outcomes,
 )
-from dora_systemd.cli.stageline import StageLine
+from dora_systemd.cli.progress import open_progress, quiet_option
 from dora_systemd.cli.verbs.change.deploy import deployed_outcome
 from dora_systemd.verbs.releases.rollback import roll_back
 
@@ -21,9 +19,12 @@ from dora_systemd.verbs.releases.rollback import roll_back
 @click.argument("selector")
 @click.argument("release", required=False, metavar="[RELEASE]")
 @duration_option("--soak", "Time without a fault that the release has to pass; default: 0s.", "0s")
+@quiet_option
 @inhibit_options
 @acting_options
-def command(selector: str, release: str | None, soak: int, force: bool, wait: bool) -> int:
+def command(
+    selector: str, release: str | None, soak: int, is_quiet: bool, force: bool, wait: bool
+) -> int:
     """Run an older release of a dataflow: the one before the present one, or RELEASE.
 
     It is on trial until all its nodes are ready. If it fails, what ran before runs again, and the
@@ -35,6 +36,6 @@ def command(selector: str, release: str | None, soak: int, force: bool, wait: bo
     """
     how = if_inhibited(force, wait)
     scope = current_scope()
-    with StageLine(sys.stderr) as stage:
-        done = roll_back(Bus(scope), scope, selector, release, soak, stage, how)
-    return print_outcomes([deployed_outcome(done, "rolled back")])
+    with open_progress(is_quiet) as progress:
+        done = roll_back(Bus(scope), scope, selector, release, soak, progress, how)
+    return print_outcomes([] if is_quiet else [deployed_outcome(done, "rolled back")])

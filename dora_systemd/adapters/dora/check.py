@@ -33,9 +33,8 @@ class DoraCheck:
         environment: Mapping[str, str],
         listens: Callable[[], bool] = lambda: False,
     ) -> None:
-        def check_version() -> None:
-            if not listens():
-                dora_version(options.dora, own_account(), environment)
+        def check_version() -> str:
+            return "" if listens() else dora_version(options.dora, own_account(), environment)
 
         self._options = options
         self._version = beside(check_version)
@@ -48,6 +47,10 @@ class DoraCheck:
         finally:
             self.result()
 
+    def version(self) -> str:
+        """Wait for the version of dora, "" for one that listens. Raises DoraSystemdError."""
+        return self._version.result()
+
     def result(self) -> None:
         """Wait for all checks. Raises DoraSystemdError for what is refused.
 
@@ -55,7 +58,7 @@ class DoraCheck:
         """
         options = self._options
         check_access(options)
-        self._version.result()
+        self.version()
         if reason := self._refusal.result():
             raise DoraSystemdError(
                 f"cannot use {options.dataflow}: {reason}",

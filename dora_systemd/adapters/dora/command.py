@@ -8,7 +8,7 @@ from pathlib import Path
 
 from dora_systemd.adapters.host.process import Completed, run_command
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.trust.programs import Account, fresh_environment
+from dora_systemd.trust.programs import Account, fresh_environment, own_account
 from dora_systemd.trust.sight import Sight
 
 OLDEST_DORA = (1, 0)
@@ -17,6 +17,7 @@ RECOMMENDED_DORA = (1, 1)
 
 DORA_SECONDS = 60.0
 
+_PRINT_VERSION = "import sys; print('%d.%d.%d' % sys.version_info[:3])"
 _INSTALL_HINT = "pip install dora-rs-cli, install the package dora-cli, or give --dora PATH"
 
 
@@ -83,6 +84,19 @@ def dora_version(
             ExitCode.NO_DORA,
         )
     return version
+
+
+def python_version(python: str, environment: Mapping[str, str]) -> str:
+    """The version of an interpreter, as in "3.13.5", "" if it is none. Blocks for some 10 ms.
+
+    This runs inside the cell, so as its user, and never as root for another user.
+    """
+    try:
+        command = (python, "-I", "-S", "-c", _PRINT_VERSION)
+        done = run_command(command, DORA_SECONDS, environment, None, own_account())
+    except DoraSystemdError:
+        return ""
+    return done.stdout.strip() if done.status == 0 else ""
 
 
 def parse_dora_version(text: str) -> str | None:

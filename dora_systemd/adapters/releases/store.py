@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from dora_systemd.decisions.releases.choice import Known
-from dora_systemd.decisions.releases.manifest import Manifest, parse_manifest
+from dora_systemd.decisions.releases.manifest import Manifest, format_manifest, parse_manifest
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import STORE, TREE, is_release_id
 from dora_systemd.trust.files import read_file
@@ -72,6 +72,10 @@ class Store:
         path = self.release(release_id) / MANIFEST
         text = read_file(path, MOST_MANIFEST).data.decode("utf-8", "replace")
         return parse_manifest(text, str(path))
+
+    def write_manifest(self, manifest: Manifest) -> None:
+        """Write the manifest of a release anew. Raises OSError."""
+        write_part(self.release(manifest.id), MANIFEST, format_manifest(manifest))
 
     def unit(self, release_id: str) -> str:
         """The unit file of a release. Raises DoraSystemdError (BAD_INPUT)."""

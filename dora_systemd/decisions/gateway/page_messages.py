@@ -10,9 +10,11 @@ The page sends, each with its `type`:
   graph     {dataflow}
   about     {dataflow}
   ended     {}
-  act       {action, dataflow, node, number, values}
+  releases  {dataflow}
+  act       {action, dataflow, node, number, values, release}
                                               action: one of ACTIONS; node "": the dataflow;
-                                              values: texts by the settings of "set"
+                                              values: texts by the settings of "set"; release: of
+                                              "rollback", "" for the one before the present one
 
 It receives:
   hello     {version, host, scope}            first
@@ -22,6 +24,7 @@ It receives:
                                               row: as `list` has it, with the nodes of an ended one;
                                               why: as in report_object; facts: see page_facts
   ended     {dataflows, problem}              those that systemd has unloaded, newest first
+  releases  {dataflow, releases, problem}     as `doractl releases -o json` has them, newest first
   lines     {number, lines, skipped}          lines: {at_us, node, text, priority, event};
                                               skipped: number of lines left out before these
   file      {number, text}                    a part of the file, in order
@@ -47,8 +50,8 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.terminal_text import escaped, one_line, without_sequences
 from dora_systemd.values import format_moment
 
-TYPES = ("follow", "find", "save", "unfollow", "graph", "about", "ended", "act")
-ACTIONS = ("stop", "start", "restart", "enable", "disable", "reload", "set")
+TYPES = ("follow", "find", "save", "unfollow", "graph", "about", "ended", "releases", "act")
+ACTIONS = ("stop", "start", "restart", "enable", "disable", "reload", "set", "rollback")
 RUNS = ("", "CURRENT", "PREVIOUS")
 HOT_RELOAD = "hot_reload"
 LOG_FIELDS = "MESSAGE,PRIORITY,DORA_NODE,DORA_EVENT,SYSLOG_IDENTIFIER"
@@ -59,7 +62,7 @@ MAX_ITEMS = 100
 
 _MAX_ASKED = 1000
 """Maximum characters of a text in a request."""
-_TEXTS = ("type", "dataflow", "node", "action", "search", "since", "until", "run")
+_TEXTS = ("type", "dataflow", "node", "action", "search", "since", "until", "run", "release")
 _SETTINGS = frozenset({*(one.name for one in LIVE_SETTINGS), HOT_RELOAD})
 _DEFAULT_PRIORITY = 6
 _PRIORITIES = frozenset(b"%d" % number for number in range(8))
@@ -78,6 +81,7 @@ class PageMessage:
     since: str = ""
     until: str = ""
     run: str = ""
+    release: str = ""
     values: Mapping[str, str] = field(default_factory=dict)
 
 

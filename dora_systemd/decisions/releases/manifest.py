@@ -52,7 +52,8 @@ def parse_manifest(text: str, path: str) -> Manifest:
         if value.pop("schema") != SCHEMA:
             raise ValueError("schema")
         files = {one: _parse_stored(stored) for one, stored in value.pop("files").items()}
-        return Manifest(**value, files=files)
+        versions = {str(name): str(one) for name, one in value.pop("versions", {}).items()}
+        return Manifest(**value, versions=versions, files=files)
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         message = f"cannot use {shown(path)}: it does not describe a release"
         hint = "remove that release, or deploy again"

@@ -93,7 +93,8 @@ def _prefix(uuid: str, others: Sequence[str]) -> str:
 
 
 _OPTIONAL = (
-    *("FILES", "CREATED", "SIZE", "RELEASE", "BOOT", "PEAK", "PID", "THROTTLED%", "RESTARTS"),
+    *("PYTHON", "DORA", "FILES", "CREATED", "SIZE", "RELEASE", "BOOT", "PEAK", "PID"),
+    *("THROTTLED%", "RESTARTS"),
     *("UPTIME", "WAITS FOR", "MEM", "CPU%", "WATCHDOG", "NODES", "UUID"),
 )
 """Columns that a narrow terminal does without, in this order."""

@@ -4,11 +4,13 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from dora_systemd.decisions.releases.manifest import Manifest
+from dora_systemd.decisions.releases.progress import COPY, SOAK, Step
+from dora_systemd.decisions.releases.versions import PROGRAMS
 from dora_systemd.decisions.views.dataflows import UNKNOWN, format_table, local_time
 from dora_systemd.decisions.views.objects import moment
 from dora_systemd.values import format_rounded_size
 
-_HEADER = ("NAME", "ID", "STATE", "CREATED", "SIZE", "FILES")
+_HEADER = ("NAME", "ID", "STATE", "CREATED", "SIZE", "FILES", "DORA", "PYTHON")
 
 
 class ReleaseRow(NamedTuple):
@@ -32,7 +34,9 @@ def _cells(row: ReleaseRow) -> tuple[str, ...]:
     one = row.manifest
     size = format_rounded_size(one.size) if one else UNKNOWN
     count = str(len(one.files)) if one else UNKNOWN
-    return (row.name, row.id, row.state, local_time(one.created_us if one else 0), size, count)
+    versions = [one.versions.get(name, UNKNOWN) if one else UNKNOWN for name in PROGRAMS]
+    created = local_time(one.created_us if one else 0)
+    return (row.name, row.id, row.state, created, size, count, *versions)
 
 
 def release_object(row: ReleaseRow) -> dict[str, Any]:
@@ -50,4 +54,23 @@ def release_object(row: ReleaseRow) -> dict[str, Any]:
         **moment("created", one.created_us if one else 0),
         "size_bytes": one.size if one else None,
         "files": len(one.files) if one else None,
+        "versions": dict(one.versions) if one else None,
+    }
+
+
+def step_object(one: Step) -> dict[str, Any]:
+    """A step of a deploy or a rollback for `-o json`."""
+    done, total = one.amount or (None, None)
+    ready, nodes = one.nodes or (None, None)
+    is_copy, is_soak = one.stage == COPY, one.stage == SOAK
+    return {
+        "stage": one.stage,
+        "text": one.text,
+        "done_bytes": done if is_copy else None,
+        "total_bytes": total if is_copy else None,
+        "nodes_ready": ready,
+        "nodes_total": nodes,
+        "soaked_us": done if is_soak else None,
+        "soak_us": total if is_soak else None,
+        "passed": one.passed,
     }

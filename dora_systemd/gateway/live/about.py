@@ -6,7 +6,7 @@ from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.adapters.journal.reader import JournalReader, check_readable
 from dora_systemd.decisions.gateway.page_facts import PROPERTIES, fact_values
-from dora_systemd.decisions.gateway.page_messages import shown_values
+from dora_systemd.decisions.gateway.page_messages import MAX_ITEMS, shown_values
 from dora_systemd.decisions.views.dataflows import is_up_word
 from dora_systemd.decisions.views.objects import dataflow_object
 from dora_systemd.decisions.views.rows import DataflowRow
@@ -48,6 +48,17 @@ def read_ended(scope: Scope, _uuid: str = "") -> dict[str, Any]:
         newest.setdefault(row.name, row)
     rows = [dataflow_object(row) for name, row in newest.items() if name not in loaded]
     return {"dataflows": shown_values(rows)}
+
+
+def read_own_releases(scope: Scope, uuid: str) -> dict[str, Any]:
+    """The releases of a dataflow, newest first. Raises DoraSystemdError."""
+    # Imported late: only deployed dataflows need it.
+    from dora_systemd.decisions.views.releases import release_object
+    from dora_systemd.verbs.releases.listing import read_releases
+
+    bus = Bus(scope, for_reading=True)
+    rows = read_releases(bus, scope, [find_row(bus, scope, uuid).name])
+    return {"releases": shown_values(list(map(release_object, rows[:MAX_ITEMS])))}
 
 
 def _with_end(row: DataflowRow, report: Report) -> DataflowRow:

@@ -10,6 +10,7 @@ from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
 from dora_systemd.decisions.gateway.page_messages import HOT_RELOAD, PageMessage, graph_values
 from dora_systemd.errors import DoraSystemdError
+from dora_systemd.gateway.live.acting import acting
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.act import act_on, told
 from dora_systemd.verbs.facts.cells import Cell
@@ -25,6 +26,8 @@ from dora_systemd.verbs.start.again import find_start
 from dora_systemd.verbs.start.enable import disable_cell, enable_cell
 from dora_systemd.verbs.start.linger import ensure_linger
 
+_BY = "status page"
+
 Action = Callable[[Manager, Scope, Cell, PageMessage], str]
 
 
@@ -35,6 +38,8 @@ def act(scope: Scope, message: PageMessage) -> str:
     """
     bus = Bus(scope)
     known = find_start(bus, scope, Selector(message.dataflow))
+    if message.action == "rollback":
+        return _roll_back(bus, scope, known.name, message.release)
     if isinstance(known, Cell):
         return _ACTIONS[message.action](bus, scope, known, message)
     if message.action in ("start", "restart"):
@@ -46,7 +51,7 @@ def act(scope: Scope, message: PageMessage) -> str:
 def _act(manager: Manager, scope: Scope, cell: Cell, message: PageMessage) -> str:
     # Only what has ended can be started, and a restart does that.
     action = "stop" if message.action == "stop" else "restart"
-    return act_on(manager, scope, cell, message.node, action, by="status page")
+    return act_on(manager, scope, cell, message.node, action, by=_BY)
 
 
 def _enable(manager: Manager, scope: Scope, cell: Cell, _message: PageMessage) -> str:
@@ -76,6 +81,16 @@ def _set(manager: Manager, scope: Scope, cell: Cell, message: PageMessage) -> st
         switch_hot_reload(manager, scope, cell, switch == "on")
         done.append(f"Hot reload {switch}: {cell.uuid} ({cell.name})")
     return _joined(*done)
+
+
+def _roll_back(manager: Manager, scope: Scope, name: str, release: str) -> str:
+    # Imported late: few roll back, and its imports are memory.
+    from dora_systemd.verbs.releases.rollback import roll_back
+
+    with acting() as action:
+        done = roll_back(manager, scope, name, release or None, 0, action.go_on, by=_BY)
+    how = f"runs release {done.release}" if done.release else "has ended its trial"
+    return f"Dataflow rolled back: {done.uuid} ({name}) {how}"
 
 
 def _joined(*texts: str) -> str:

@@ -13,7 +13,7 @@ from dora_systemd.decisions.gateway.page_messages import PageMessage, parse_mess
 from dora_systemd.decisions.gateway.request import Request, Socket
 from dora_systemd.decisions.views.snapshot import observed_values
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.gateway.live.about import read_about, read_ended
+from dora_systemd.gateway.live.about import read_about, read_ended, read_own_releases
 from dora_systemd.gateway.live.act import act, read_graph
 from dora_systemd.gateway.live.lines import (
     MAX_FOUND,
@@ -37,6 +37,7 @@ _QUESTIONS: dict[str, Callable[[Scope, str], dict[str, Any]]] = {
     "graph": read_graph,
     "about": read_about,
     "ended": read_ended,
+    "releases": read_own_releases,
 }
 _STREAMS = ("follow", "find", "unfollow")
 """Each ends the one before it."""

@@ -20,6 +20,8 @@ const ACTIONS = {
     "reloading"],
   enable: ["Start at boot", "It starts at every boot, as it runs now.", "enabling"],
   disable: ["Not at boot", "It no longer starts at boot; if it runs, it keeps running.", "disabling"],
+  rollback: ["Roll back", "That release starts in place of the present one. If not all of its nodes "
+    + "become ready, or one fails, the present one runs again.", "rolling back"],
   set: SET,
   "hot-reload": ["Hot reload", "While it is on, nodes restart when their files change.", "changing"],
   "set node": SET,
@@ -78,12 +80,13 @@ export class Buttons {
 
   /** flow: a row, with isEnded if systemd has unloaded it. about: the message of that type. */
   show(flow, about, isFree) {
-    const { start, stop, restart, reload, enable, disable, set } = this.all;
+    const { start, stop, restart, reload, enable, disable, set, rollback } = this.all;
     const up = isUp(flow);
     start.hidden = up;
     restart.hidden = stop.hidden = !up;
     disable.hidden = !about?.row?.enabled;
     enable.hidden = !disable.hidden;
+    rollback.hidden = !flow.release;
     this.menu.hidden = Boolean(flow.isEnded);
     for (const button of Object.values(this.all)) button.disabled = !isFree;
     for (const button of [reload, set, this.all["hot-reload"]]) button.disabled = !isFree || !up;
@@ -107,15 +110,16 @@ function limitsGiven(facts) {
     .map(([key, text]) => [key, text || "infinity"]));
 }
 
-/** Asks in a dialog; then calls `act` with the action, the node and the values of "set". */
-export function askFirst(action, node, flow, facts, act) {
+/** Asks in a dialog; then calls `act` with the action, the node, the values of "set" and the release.
+ * release: of "rollback", "" for the one before the present one. */
+export function askFirst(action, node, flow, facts, act, release = "") {
   const [word, consequence] = ACTIONS[node ? `${action} node` : action];
   const isSet = action === "set";
   const hotReload = { hot_reload: facts.hot_reload ? "off" : "on" };
   const title = action === "hot-reload" ? `${word} ${hotReload.hot_reload}` : word;
   const limits = limitsOf(node, facts);
   say(by("question"), isSet ? `Limits of ${node ? `node ${node} of ` : ""}${flow.name}`
-    : `${title} ${node ? `node ${node} of ${flow.name}` : flow.name}?`);
+    : `${title} ${node ? `node ${node} of ${flow.name}` : flow.name}${release && ` to ${release}`}?`);
   say(by("consequence"), consequence);
   say(by("confirmed"), isSet ? "Set" : title);
   by("confirmed").dataset.action = action;
@@ -126,7 +130,7 @@ export function askFirst(action, node, flow, facts, act) {
     if (dialog.returnValue !== "yes") return;
     const values = isSet ? asSettings(node, limitsGiven(limits)) : hotReload;
     if (action === "hot-reload") act("set", "", values);
-    else if (!isSet || Object.keys(values).length) act(action, node, isSet ? values : {});
+    else if (!isSet || Object.keys(values).length) act(action, node, isSet ? values : {}, release);
   };
   dialog.showModal();
   by("limits").querySelector("input")?.focus();

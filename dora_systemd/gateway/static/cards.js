@@ -22,7 +22,8 @@ export class Card {
     const ended = flow.ended_us ? since(flow.ended_us) : "";
     const parts = [flow.waits_for || !isUp(flow) ? flow.text : `up ${uptime(flow.uptime_us)}`,
       flow.nodes_total ? `${flow.nodes_alive}/${flow.nodes_total} nodes` : "",
-      flow.restarts ? plural(flow.restarts, "restart") : "", ended];
+      flow.restarts ? plural(flow.restarts, "restart") : "", ended,
+      flow.release ? `release ${flow.release}` : ""];
     say(this.facts, parts.filter(Boolean).join(" · "));
     showUse(this.charts, history.of(flow.uuid), flow);
     if (isChosen) this.node.setAttribute("aria-current", "true");

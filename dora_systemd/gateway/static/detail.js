@@ -7,6 +7,7 @@ import { waitWords } from "./history.js";
 import { Logs } from "./logs.js";
 import { NodeRow } from "./nodes.js";
 import { Facts, cpuChart, memoryChart, showState, showUse } from "./parts.js";
+import { Releases } from "./releases.js";
 import { Why } from "./why.js";
 import { bytes, isUp, since, uptime } from "./words.js";
 
@@ -22,6 +23,12 @@ const limitWords = (facts) => [
 
 const inhibitorWords = ({ node, pid, user, why }) =>
   `${node ? `node ${node}` : `PID ${pid ?? "unknown"}, user ${user ?? "unknown"}`}${why ? `: ${why}` : ""}`;
+
+/** The last release that has failed its trial, as far as the journal tells of this life. */
+function undoneWords(why) {
+  const last = why?.timeline.findLast(({ event }) => event === "release-rolled-back");
+  return last ? `${last.text}, ${since(last.at_us)}` : "";
+}
 
 const sandboxWords = ({ sandbox, network }) =>
   (network === "host" ? sandbox : `${sandbox}, network ${network}`);
@@ -45,6 +52,7 @@ export class Detail {
     this.why = new Why((node) => this.follow(node));
     this.graph = new Graph(choose);
     this.nodes = el("ul", { class: "nodes" });
+    this.releases = new Releases((release) => ask("rollback", "", release));
     this.logs = new Logs((node) => this.follow(node), this.send);
     const panel = (title, label, node) => el("section", { class: "panel", "aria-label": label },
       el("div", { class: "head" }, el("h2", {}, title)), node);
@@ -57,13 +65,14 @@ export class Detail {
         this.buttons.node),
       this.why.node, this.facts.node,
       el("div", { class: "charts" }, this.charts.cpu.node, this.charts.memory.node),
-      this.waits, ...this.panels, this.logs.node);
+      this.waits, ...this.panels, this.releases.node, this.logs.node);
   }
 
   /** Asks for what comes once: after each connection. */
   begin() {
     this.send({ type: "graph" });
     this.asks = 2;
+    this.releases.isDue = true;
     this.logs.begin(this.chosen);
   }
 
@@ -85,6 +94,12 @@ export class Detail {
     if (this.flow) this.show(this.flow, this.history, this.isFree);
   }
 
+  /** After an action. */
+  askAbout() {
+    this.send({ type: "about" });
+    this.releases.isDue = true;
+  }
+
   show(flow, history, isFree) {
     this.#askAgain(flow);
     Object.assign(this, { flow, history, isFree });
@@ -102,18 +117,21 @@ export class Detail {
     this.#showFacts(shown);
     this.#showNodes(shown, isFree && isUp(flow));
     this.buttons.show(flow, this.about, isFree);
+    this.releases.show(flow.release, isFree);
   }
 
   /** Another state has another reason, and another run may have other nodes and wires. */
   #askAgain(flow) {
     if (flow === this.flow) return;
-    const news = JSON.stringify([flow.status, flow.text, flow.restarts, flow.started_us]);
+    const news = JSON.stringify([flow.status, flow.text, flow.restarts, flow.started_us,
+      flow.release]);
     // Twice, because the journal may be behind.
     if (news !== this.news) this.asks = 2;
     if (this.asks > 0) {
       this.asks -= 1;
-      this.send({ type: "about" });
+      this.askAbout();
     }
+    if (flow.release && this.releases.isNext()) this.send({ type: "releases" });
     if (this.flow && this.flow.started_us !== flow.started_us) this.send({ type: "graph" });
     this.news = news;
   }
@@ -158,6 +176,8 @@ export class Detail {
     facts.show("Sandbox", isKnown ? sandboxWords(known) : "");
     facts.show("At boot", isKnown && row ? (row.enabled ? "started" : "not started") : "");
     facts.show("Inhibited", (row?.inhibitors ?? []).map(inhibitorWords).join("; "));
+    facts.show("Release", flow.release ?? "");
+    facts.show("Rolled back", undoneWords(this.about?.why));
     facts.show("Unit", flow.unit);
     facts.show("UUID", flow.uuid);
     facts.show("File", flow.file);

@@ -28,6 +28,7 @@ const TAKERS = {
   ended: showEnded,
   graph: (message) => detail?.graph.show(message),
   about: (message) => detail?.learn(message),
+  releases: (message) => detail?.releases.take(message),
   lines: (message) => detail?.logs.take(message),
   found: (message) => detail?.logs.take(message),
   file: (message) => detail?.logs.take(message),
@@ -36,7 +37,7 @@ const TAKERS = {
 };
 
 function take(message) {
-  const isForeign = ["graph", "about"].includes(message.type) && message.dataflow !== detail?.uuid;
+  const isForeign = ["graph", "about", "releases"].includes(message.type) && message.dataflow !== detail?.uuid;
   if (!isForeign) TAKERS[message.type]?.(message);
 }
 
@@ -144,16 +145,16 @@ function showProblem({ text, hint }) {
   node.hidden = false;
 }
 
-function ask(action, node) {
+function ask(action, node, release) {
   const flow = flowOf(detail.uuid);
   const facts = detail.about?.facts ?? {};
-  askFirst(action, node, flow, facts, (...done) => act(flow, ...done));
+  askFirst(action, node, flow, facts, (...done) => act(flow, ...done), release);
 }
 
-function act(flow, action, node, values) {
+function act(flow, action, node, values, release = "") {
   number += 1;
   actions.set(number, flow.uuid);
-  link.send({ type: "act", action, dataflow: flow.uuid, node, number, values });
+  link.send({ type: "act", action, dataflow: flow.uuid, node, number, values, release });
   if (detail?.uuid === flow.uuid) say(detail.buttons.pending, doing(action, node || flow.name));
   show();
 }
@@ -162,7 +163,7 @@ function acted(message) {
   actions.delete(message.number);
   if (detail) {
     say(detail.buttons.pending, "");
-    link.send({ type: "about", dataflow: detail.uuid });
+    detail.askAbout();
   }
   tell(message);
   show();

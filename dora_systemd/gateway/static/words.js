@@ -54,6 +54,7 @@ const TONES = {
   running: "good", ready: "good", dynamic: "good", finished: "calm", stopped: "calm",
   starting: "busy", stopping: "busy", restarting: "warn", reloading: "busy", degraded: "warn",
   waiting: "warn", failed: "bad", silent: "warn",
+  current: "good", trial: "busy", proved: "calm", unproved: "warn",
 };
 
 /** The state of a node; one that runs and sends nothing is silent. */

@@ -25,11 +25,12 @@ from dora_systemd.decisions.releases.build import (
     format_task,
 )
 from dora_systemd.decisions.releases.entries import Found
+from dora_systemd.decisions.releases.progress import copying
 from dora_systemd.decisions.unit.build import build_properties
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.trust.project import Project, opened_project
-from dora_systemd.values import format_duration, format_rounded_size
+from dora_systemd.values import format_duration
 from dora_systemd.verbs.facts.reason import failure_reason, runners_refusal
 from dora_systemd.verbs.releases.built_files import find_built
 from dora_systemd.verbs.releases.files import copy_files
@@ -81,14 +82,9 @@ def built_project(
     not end, or leaves what no release can have, and OSError.
     """
     user = build.source.plan.user
-
-    def progress(done: int, total: int) -> None:
-        amounts = f"{format_rounded_size(done)} of {format_rounded_size(total)}"
-        tell(f"copying for the build: {amounts}")
-
     tree = BuildTree(build.store)
     try:
-        files = copy_files(project, found, tree, None, progress)
+        files = copy_files(project, found, tree, None, lambda *amount: tell(copying(*amount)))
         tree.hand_over(files, None if user is None else (user.pw_uid, user.pw_gid))
         _run_noted(manager, build, tree)
         root, place = build.source.root, str(tree.place)

@@ -4,6 +4,7 @@ deploy and rollback both end here, so this is the one place for what may forbid 
 """
 
 import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -16,6 +17,7 @@ from dora_systemd.adapters.host.unit_files import remove_unit_file
 from dora_systemd.adapters.releases.store import Store, unusable
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.logs.events import ROLLED_BACK
+from dora_systemd.decisions.releases.progress import Step, going_back, judged, waiting
 from dora_systemd.decisions.unit.file import is_boot_checked, with_boot_check
 from dora_systemd.decisions.why.faults import Fault
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -39,9 +41,9 @@ _KILLED = "the command that tried it was killed"
 
 @dataclass(frozen=True)
 class Change:
-    """A release that is to run. text: its unit file. soak: µs. command: by which it is asked.
+    """A release that is to run. text: its unit file. soak: µs. verb: "deploy" or "rollback".
 
-    how: what to do while a lock inhibits it.
+    how: what to do while a lock inhibits it. by: what asks for it, as in note_request().
     """
 
     release: str
@@ -49,8 +51,9 @@ class Change:
     options: RunnerOptions
     soak: int
     want_boot: bool
-    command: str
+    verb: str
     how: IfInhibited
+    by: str
 
 
 def change_release(
@@ -63,10 +66,10 @@ def change_release(
     """
     if is_boot_checked(standing.boot.text or ""):
         change = replace(change, text=with_boot_check(change.text))
-    verb = change.command.removeprefix("doractl ")
-    with uninhibited(scope, standing.running, verb, change.how, tell):
-        for cell in standing.running:
-            note_request("stop-asked", cell.name, cell.uuid, change.command)
+    running, verb = standing.running, change.verb
+    with uninhibited(scope, running, verb, change.how, lambda text: tell(waiting(text))):
+        for cell in running:
+            note_request("stop-asked", cell.name, cell.uuid, change.by)
         _try(manager, scope, store, standing, change, tell)
 
 
@@ -92,10 +95,11 @@ def _try(
             fault = Fault(f"the command failed: {error}")
         if fault is not None:
             _ignore_signals()
-            raise _roll_back(manager, standing, change, fault)
+            raise _roll_back(manager, standing, change, fault, tell)
         _note_commit(scope, standing, change)
         remove_unit_file(standing.boot.runtime)
         end_trial(manager, standing)
+    _calm(tell)(judged(change.release, ""))
 
 
 def _begin(manager: Manager, standing: Standing, text: str) -> None:
@@ -110,7 +114,7 @@ def _begin(manager: Manager, standing: Standing, text: str) -> None:
 def _note_commit(scope: Scope, standing: Standing, change: Change) -> None:
     details = {"scope": scope.word, "release": change.release, "former": standing.current}
     options = change.options
-    note_request("release-committed", options.name, options.uuid, change.command, **details)
+    note_request("release-committed", options.name, options.uuid, change.by, **details)
 
 
 def _limit(options: RunnerOptions) -> int:
@@ -126,10 +130,11 @@ def _prove(store: Store, release: str) -> None:
 
 
 def _roll_back(
-    manager: Manager, standing: Standing, change: Change, fault: Fault
+    manager: Manager, standing: Standing, change: Change, fault: Fault, tell: Tell
 ) -> DoraSystemdError:
     """Go back to what was there before; the error that tells it."""
-    name, former = change.options.name, standing.current
+    name, former, tell = change.options.name, standing.current, _calm(tell)
+    tell(judged(change.release, fault.reason))
     want_start = standing.was_up and not fault.is_stop
     if not fault.is_stop:
         _note_stop(manager, change)
@@ -137,7 +142,7 @@ def _roll_back(
     try:
         go_back(manager, standing, want_start)
         if want_start:
-            now = f"{former or 'what was there before'} {_back(manager, standing.boot.unit)}"
+            now = f"{former or 'what was there before'} {_back(manager, standing, tell)}"
     except DoraSystemdError as error:
         now = f"the way back has failed, too: {error.message}"
     details = {"release": change.release, "former": former, "nodes": fault.node}
@@ -145,7 +150,7 @@ def _roll_back(
         ROLLED_BACK,
         name,
         change.options.uuid,
-        change.command,
+        change.by,
         **details,
         reason=fault.reason,
     )
@@ -161,7 +166,7 @@ def _end_killed(scope: Scope, standing: Standing, change: Change) -> None:
     manager = Bus(scope)  # that of the process that was killed is of no use, see sd_bus_new(3)
     now = read_standing(manager, scope, standing.boot.unit)
     if now.current != change.release or standing.current == change.release:
-        _roll_back(manager, standing, change, Fault(_KILLED))
+        _roll_back(manager, standing, change, Fault(_KILLED), lambda _: None)
     elif now.path.exists():
         end_trial(manager, now)
 
@@ -171,20 +176,33 @@ def _note_stop(manager: Manager, change: Change) -> None:
     with suppress(DoraSystemdError):
         state = manager.read(unit_name(change.options.name), ["ActiveState"])["ActiveState"]
         if state in UP:
-            options = change.options
-            note_request("stop-asked", options.name, options.uuid, change.command)
+            note_request("stop-asked", change.options.name, change.options.uuid, change.by)
 
 
-def _back(manager: Manager, unit: str) -> str:
+def _calm(tell: Tell) -> Tell:
+    """Tell without an end of what is done: neither a commit nor the way back stops for that."""
+
+    def tell_on(step: Step) -> None:
+        with suppress(Exception):
+            tell(step)
+
+    return tell_on
+
+
+def _back(manager: Manager, standing: Standing, tell: Tell) -> str:
     """Whether the unit is up again, in words."""
-    state = settle(manager, unit, START_LIMIT, lambda _: None)
+
+    def observe(active: str, status: str) -> None:
+        tell(going_back(standing.current, status if active == "activating" else ""))
+
+    state = settle(manager, standing.boot.unit, START_LIMIT, observe)
     return "runs again" if state in SETTLED else f"has not started again: {state}"
 
 
 @contextmanager
 def _interruptible() -> Iterator[None]:
     """Let the signals that would end this process raise KeyboardInterrupt instead."""
-    before = {one: signal.getsignal(one) for one in SIGNALS}
+    before = {one: signal.getsignal(one) for one in SIGNALS if _takes_signals()}
     for one, handler in before.items():
         if handler is not signal.SIG_IGN:  # as by nohup(1)
             signal.signal(one, _interrupt)
@@ -202,4 +220,10 @@ def _interrupt(*_arguments: object) -> None:
 def _ignore_signals() -> None:
     """Let nothing interrupt the way back."""
     for one in SIGNALS:
-        signal.signal(one, signal.SIG_IGN)
+        if _takes_signals():
+            signal.signal(one, signal.SIG_IGN)
+
+
+def _takes_signals() -> bool:
+    """Only the main thread can; those of the gateway are told by `tell`, which raises."""
+    return threading.current_thread() is threading.main_thread()

@@ -15,10 +15,10 @@ from dora_systemd.decisions.releases.build import build_commands
 from dora_systemd.decisions.releases.entries import Found, Stored
 from dora_systemd.decisions.releases.ids import new_id
 from dora_systemd.decisions.releases.manifest import Manifest
+from dora_systemd.decisions.releases.progress import building, copied, copying
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
 from dora_systemd.trust.project import Project, opened_project
-from dora_systemd.values import format_rounded_size
 from dora_systemd.verbs.releases.build import Build, built_project
 from dora_systemd.verbs.releases.files import copy_files, find_files
 from dora_systemd.verbs.releases.soak import Tell
@@ -79,7 +79,7 @@ def copy_project(
                 build = Build(
                     *(scope, source, store, manifest.id, manifest.uuid, commands),
                     build_timeout,
-                    on_line=lambda line: tell(f"building: {line}"),
+                    on_line=lambda line: tell(building(line)),
                 )
                 at_work = built_project(manager, build, project, found, tell)
                 project, found = held.enter_context(at_work)
@@ -88,9 +88,10 @@ def copy_project(
             files = {p: replace(one, is_built=p not in originals) for p, one in files.items()}
             manifest = replace(manifest, files=files)
             shared = last.files if last else {}
-            copied = sum(one.size for path, one in files.items() if shared.get(path) != one)
+            new = sum(one.size for path, one in files.items() if shared.get(path) != one)
             draft.publish(manifest, None if user is None else user.pw_gid)
-            return Copied(manifest, copied)
+            tell(copied(len(files), manifest.size, new))
+            return Copied(manifest, new)
     except OSError as error:
         raise unusable(store.path, error) from error
     finally:
@@ -113,7 +114,7 @@ def _manifest(
         user="" if user is None else user.pw_name,
         revision=revision,
         created_us=created_us,
-        versions={"dora-systemd": __version__},
+        versions={"doractl": __version__},
     )
 
 
@@ -129,7 +130,4 @@ def _commands(
 def _fill(
     project: Project, found: dict[str, Found], draft: Draft, last: Manifest | None, tell: Tell
 ) -> dict[str, Stored]:
-    def progress(done: int, total: int) -> None:
-        tell(f"copying: {format_rounded_size(done)} of {format_rounded_size(total)}")
-
-    return copy_files(project, found, draft, last, progress)
+    return copy_files(project, found, draft, last, lambda *amount: tell(copying(*amount)))

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from dora_systemd.adapters.bus.manager import Manager
@@ -11,6 +11,7 @@ from dora_systemd.decisions.releases.build import build_unit
 from dora_systemd.decisions.releases.choice import surplus
 from dora_systemd.decisions.releases.entries import touched
 from dora_systemd.decisions.releases.manifest import Manifest
+from dora_systemd.decisions.releases.progress import checking, waiting
 from dora_systemd.decisions.unit.file import persistent_unit, runner_of
 from dora_systemd.decisions.unit.properties import format_unit
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -42,7 +43,6 @@ from dora_systemd.verbs.start.unit import plan_properties
 
 _COMMAND = "doractl deploy"
 BUILD_TIMEOUT = 30 * 60 * SECOND
-_MICROSECOND_NS = 1000
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ def deploy(
     tell: Tell,
     warn: Callable[[str], None],
 ) -> Deployed:
-    """Deploy a project. tell: gets each stage; warn: each warning.
+    """Deploy a project. tell: gets each step; warn: each warning.
 
     Raises DoraSystemdError: ROLLED_BACK if the release has failed its trial. After any other error
     everything is as before.
@@ -107,7 +107,9 @@ def deploy(
     require_deployable(manager, scope, standing)
     with locked(store):
         standing = read_standing(manager, scope, standing.boot.unit)  # nobody changes it now
-        require_uninhibited(scope, standing.running, "deploy", request.how, tell)
+        require_uninhibited(
+            scope, standing.running, "deploy", request.how, lambda text: tell(waiting(text))
+        )
         if store.unfinished():
             end_former(manager, build_unit(name))
         clean(store, standing)
@@ -130,7 +132,7 @@ def deploy(
         standing = read_standing(manager, scope, standing.boot.unit)  # the copy took its time
         require_deployable(manager, scope, standing)
         how, want_boot = request.how, request.want_boot
-        change = Change(release, text, options, request.soak, want_boot, _COMMAND, how)
+        change = Change(release, text, options, request.soak, want_boot, "deploy", how, _COMMAND)
         try:
             change_release(manager, scope, store, standing, change, tell)
         except BaseException as error:
@@ -175,12 +177,13 @@ def _unit_text(
     warn: Callable[[str], None],
 ) -> str:
     """The unit file of the copy, which has been checked as for a start."""
-    tell("checking")
+    tell(checking())
     tree = store.tree(manifest.id)
     require_same(source, tree)
     wanted = released(source, request.start, tree, manifest.uuid)
     plan = make_plan(scope, wanted)
-    check_plan(lambda: manager, plan)
+    versions = {**manifest.versions, **check_plan(lambda: manager, plan)}
+    store.write_manifest(replace(manifest, versions={**versions, "systemd": manager.version()}))
     properties, warnings = plan_properties(plan, manager)
     for warning in warnings:
         warn(warning)

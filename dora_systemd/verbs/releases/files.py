@@ -29,6 +29,8 @@ from dora_systemd.trust.project import Project
 
 Progress = Callable[[int, int], None]
 """Called with the bytes that are done, and those of all files."""
+Count = Callable[[int], None]
+"""Called with the bytes of one file that are read."""
 _IGNORE_FILE = ".gitignore"
 _AGAIN = "wait until nothing writes to the project, then deploy again"
 
@@ -118,8 +120,12 @@ def copy_files(
     stored: dict[str, Stored] = {}
     total, done = sum(one.size for one in found.values()), 0
     for path, one in found.items():
-        progress(done, total)
-        stored[path] = _copy(project, one, draft, last)
+
+        def count(size: int, before: int = done) -> None:
+            progress(before + size, total)
+
+        count(0)
+        stored[path] = _copy(project, one, draft, last, count)
         done += one.size
     now = project.facts(list(found)) if found else []
     for one, row in zip(found.values(), now, strict=True):
@@ -128,42 +134,48 @@ def copy_files(
     return stored
 
 
-def _copy(project: Project, one: Found, draft: Draft, last: Manifest | None) -> Stored:
+def _copy(
+    project: Project, one: Found, draft: Draft, last: Manifest | None, count: Count
+) -> Stored:
     if one.kind == LINK:
         return draft.link(one.path, one.target)
     old = last.files.get(one.path) if last else None
-    if last and old and not old.target and _is_same(project, one, old):
+    if last and old and not old.target and _is_same(project, one, old, count):
         try:
             draft.share(one.path, last.id)
             return old
         except OSError as error:
             if error.errno not in (errno.EMLINK, errno.EPERM, errno.ENOENT):
                 raise
-    chunks = _bounded(project.read(one.path), one.path, one.size)
+    chunks = _bounded(project.read(one.path), one.path, one.size, count)
     stored = draft.write(one.path, chunks, one.is_executable)
     if stored.size != one.size:
         raise _changed(one.path)
     return stored
 
 
-def _is_same(project: Project, one: Found, old: Stored) -> bool:
+def _is_same(project: Project, one: Found, old: Stored, count: Count) -> bool:
     is_alike = (one.size, one.is_executable) == (old.size, old.is_executable)
-    return is_alike and _digest(project, one) == old.digest
+    return is_alike and _digest(project, one, count) == old.digest
 
 
-def _digest(project: Project, one: Found) -> str:
+def _digest(project: Project, one: Found, count: Count | None = None) -> str:
     found = hashlib.sha256()
-    for chunk in _bounded(project.read(one.path), one.path, one.size):
+    for chunk in _bounded(project.read(one.path), one.path, one.size, count):
         found.update(chunk)
     return found.hexdigest()
 
 
-def _bounded(chunks: Iterable[bytes], path: str, most: int) -> Iterator[bytes]:
+def _bounded(
+    chunks: Iterable[bytes], path: str, most: int, count: Count | None = None
+) -> Iterator[bytes]:
     size = 0
     for chunk in chunks:
         size += len(chunk)
         if size > most:
             raise _changed(path)
+        if count is not None:
+            count(size)
         yield chunk
 
 

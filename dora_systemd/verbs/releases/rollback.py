@@ -4,6 +4,7 @@ from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.releases.store import Store, locked
 from dora_systemd.decisions.logs.events import ROLLED_BACK
 from dora_systemd.decisions.releases.choice import before
+from dora_systemd.decisions.releases.progress import waiting
 from dora_systemd.decisions.unit.file import runner_of
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import did_you_mean, unit_name
@@ -32,12 +33,14 @@ def roll_back(
     soak: int,
     tell: Tell,
     how: IfInhibited = IfInhibited.REFUSE,
+    by: str = _COMMAND,
 ) -> Deployed:
     """Run an older release. release: its id; None for the one before the present one.
 
     Without one before, ends a trial whose doractl was killed; the id of what runs then is "".
-    soak: µs. how: what to do while a lock inhibits it. Raises DoraSystemdError: ROLLED_BACK if that
-    release fails its trial, INHIBITED.
+    soak: µs. how: what to do while a lock inhibits it. by: as in note_request().
+
+    Raises DoraSystemdError: ROLLED_BACK if that release fails its trial, INHIBITED.
     """
     store = store_of(scope, deployed_name(manager, scope, selector))
     with locked(store, make=False):
@@ -45,8 +48,10 @@ def roll_back(
         require_deployable(manager, scope, standing)
         clean(store, standing)
         if release is None and standing.trial and not standing.current:
-            require_uninhibited(scope, standing.running, "rollback", how, tell)
-            return _end_first(manager, store, standing)
+            require_uninhibited(
+                scope, standing.running, "rollback", how, lambda text: tell(waiting(text))
+            )
+            return _end_first(manager, store, standing, by)
         chosen = _choose(store, standing, release)
         text = store.unit(chosen)
         options, manifest = runner_of(text), store.manifest(chosen)
@@ -55,7 +60,7 @@ def roll_back(
             message = f"cannot run release {chosen} of {store.name}: it has no unit file of ours"
             raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
         # One that was disabled stays so.
-        change = Change(chosen, text, options, soak, False, _COMMAND, how)
+        change = Change(chosen, text, options, soak, False, "rollback", how, by)
         change_release(manager, scope, store, standing, change, tell)
     facts = (options.uuid, store.name, standing.boot.unit, chosen, standing.current)
     return Deployed(*facts, len(manifest.files), manifest.size, 0)
@@ -74,14 +79,14 @@ def deployed_name(manager: Manager, scope: Scope, selector: str) -> str:
     return name
 
 
-def _end_first(manager: Manager, store: Store, standing: Standing) -> Deployed:
+def _end_first(manager: Manager, store: Store, standing: Standing, by: str) -> Deployed:
     """End the trial of a release that has none before it: what was there before runs again."""
     for cell in standing.running:
-        note_request("stop-asked", cell.name, cell.uuid, _COMMAND)
+        note_request("stop-asked", cell.name, cell.uuid, by)
     go_back(manager, standing, standing.was_up)
     uuid = standing.uuid or store.manifest(standing.trial).uuid
     details = {"release": standing.trial, "former": "", "nodes": "", "reason": _KILLED}
-    note_request(ROLLED_BACK, store.name, uuid, _COMMAND, **details)
+    note_request(ROLLED_BACK, store.name, uuid, by, **details)
     return Deployed(uuid, store.name, standing.boot.unit, "", standing.trial, 0, 0, 0)
 
 

@@ -13,6 +13,7 @@ from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.owed import Owed
 from dora_systemd.decisions.logs.query import scope_matches
+from dora_systemd.decisions.releases.progress import Step, soaking, starting, stopping
 from dora_systemd.decisions.why.faults import FAULT_IDS, Fault, find_fault, is_finished
 from dora_systemd.decisions.why.lives import Happening, parse_happening
 from dora_systemd.errors import DoraSystemdError
@@ -22,7 +23,7 @@ from dora_systemd.values import SECOND, format_duration
 from dora_systemd.verbs.facts.reading import read_heard
 from dora_systemd.verbs.facts.reason import failure_reason, runners_refusal
 
-Tell = Callable[[str], None]
+Tell = Callable[[Step], None]
 START_LIMIT = 120 * SECOND
 """µs for all nodes to become ready, unless the dataflow's own start_timeout is longer."""
 LATE = "late"
@@ -32,10 +33,11 @@ _MOST_RECORDS = 200
 _MICROSECOND_NS = 1000
 
 
-def settle(manager: Manager, unit: str, limit: int, tell: Tell) -> str:
+def settle(manager: Manager, unit: str, limit: int, tell: Callable[[str, str], None]) -> str:
     """Wait until a unit that has a job to start is up or down: its ActiveState, or LATE.
 
-    A unit that systemd is about to start again has failed. limit: µs. Raises DoraSystemdError.
+    A unit that systemd is about to start again has failed. limit: µs. tell: gets its ActiveState
+    and its status text, again and again. Raises DoraSystemdError.
     """
     deadline = time.monotonic() + limit / SECOND
     while True:
@@ -47,12 +49,12 @@ def settle(manager: Manager, unit: str, limit: int, tell: Tell) -> str:
             return active
         if time.monotonic() > deadline:
             return LATE
-        tell(f"trial: {facts['StatusText'] or 'starting'}")
+        tell(active, str(facts["StatusText"]))
         time.sleep(_STEP_SECONDS)
 
 
 class Gate:
-    """The trial of a dataflow. options: of the release. tell: gets a line for each stage."""
+    """The trial of a dataflow. options: of the release. tell: gets each step."""
 
     def __init__(self, manager: Manager, scope: Scope, options: RunnerOptions, tell: Tell) -> None:
         self._manager = manager
@@ -77,19 +79,26 @@ class Gate:
         return fault or self._soak(soak)
 
     def _wait_ready(self, limit: int) -> Fault | None:
-        state = settle(self._manager, self._unit, limit, self._tell)
+        state = settle(self._manager, self._unit, limit, self._tell_start)
         if state in SETTLED:
             return None
         if state == LATE:
             return self._fault() or Fault(f"not all nodes are ready after {format_duration(limit)}")
         return self._end(state)
 
+    def _tell_start(self, active: str, status: str) -> None:
+        if active in (*SETTLED, "deactivating"):
+            self._tell(stopping(status))
+        else:  # the text of a unit that does not run is that of its last life
+            self._tell(starting(status if active == "activating" else ""))
+
     def _soak(self, soak: int) -> Fault | None:
         invocation, begun = self._invocation(), time.monotonic()
         while True:
             passed = time.monotonic() - begun
             is_over = passed >= soak / SECOND
-            state = str(self._manager.read(self._unit, ["ActiveState"])["ActiveState"])
+            facts = self._manager.read(self._unit, ["ActiveState", "StatusText"])
+            state = str(facts["ActiveState"])
             if fault := self._fault():
                 return fault
             if state not in SETTLED:
@@ -97,13 +106,19 @@ class Gate:
             if self._invocation() != invocation:
                 return Fault("systemd has restarted it")
             late = self._unheard() if is_over else None
+            self._tell(
+                soaking(
+                    str(facts["StatusText"]),
+                    int(passed * SECOND),
+                    soak,
+                    awaited=late.place if late else "",
+                )
+            )
             if is_over and late is None:
                 return None
             if late and passed > late.first / SECOND + _LOOK_SECONDS:
                 how = f"no {late.output} within {format_duration(late.first)} of its start"
                 return Fault(f"node {late.node}: silent, {how}", late.node)
-            left = f", waits for {late.place}" if late else ""
-            self._tell(f"trial: soak {int(passed)} of {format_duration(soak)}{left}")
             time.sleep(min(_LOOK_SECONDS, max(soak / SECOND - passed, _STEP_SECONDS)))
 
     def _unheard(self) -> Owed | None:

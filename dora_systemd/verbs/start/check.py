@@ -19,6 +19,7 @@ from dora_systemd.decisions.cell.options import check_command
 from dora_systemd.decisions.life.refusal import parse_refusal
 from dora_systemd.decisions.properties.assignments import typed
 from dora_systemd.decisions.properties.kinds import Property
+from dora_systemd.decisions.releases.versions import parse_versions
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.trust.programs import own_account
 from dora_systemd.values import SECOND, shown
@@ -35,14 +36,18 @@ _OF_RUNNERS = (
 """Prefixes of the properties that only apply to a runner."""
 
 
-def check_plan(connect: Callable[[], Manager], plan: Plan) -> None:
-    """Raise DoraSystemdError for what the runner would refuse at its start."""
+def check_plan(connect: Callable[[], Manager], plan: Plan) -> dict[str, str]:
+    """The versions of dora and Python, by name, as far as the check knows them.
+
+    Raises DoraSystemdError for what the runner would refuse at its start.
+    """
     command = check_command(sys.executable, plan.options)
     done = run_beside(connect, plan, command)
     if refusal := parse_refusal(done.stdout, done.status):
         raise refusal
     if done.status:
         raise _no_check(plan, done.stderr.strip() or str(exit_of(done.status)))
+    return parse_versions(done.stdout)
 
 
 def run_beside(connect: Callable[[], Manager], plan: Plan, command: Sequence[str]) -> Completed:

@@ -8,13 +8,15 @@ from typing import Any
 
 import pytest
 
-from dora_systemd.decisions.gateway.page_messages import MAX_TEXT, PageMessage
+from dora_systemd.decisions.gateway.page_messages import MAX_ITEMS, MAX_TEXT, PageMessage
+from dora_systemd.decisions.views.releases import ReleaseRow
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.gateway.live import about
 from dora_systemd.gateway.live import lines as lines_module
-from dora_systemd.gateway.live.about import read_about, read_ended
+from dora_systemd.gateway.live.about import read_about, read_ended, read_own_releases
 from dora_systemd.gateway.live.lines import find_lines
 from dora_systemd.scope import Scope
+from dora_systemd.verbs.releases import listing
 from tests.unit.fakes.library import fake_journalctl, fake_systemd
 from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
 from tests.unit.fakes.programs import make_program
@@ -172,3 +174,19 @@ def test_a_time_that_journalctl_does_not_take(bench: Bench, tmp_path: Path) -> N
     with pytest.raises(DoraSystemdError, match="cannot read the time") as caught:
         search(bench, since="x")
     assert caught.value.code is ExitCode.USAGE
+
+
+def test_the_releases_of_a_dataflow(bench: Bench) -> None:
+    bench.journal()
+    asked: list[list[str]] = []
+
+    def read(_manager: object, _scope: object, names: list[str]) -> list[ReleaseRow]:
+        asked.append(names)
+        ids = (f"2026{number:04}T220012" for number in range(200, 0, -1))
+        return [ReleaseRow("robot", one, "proved", "/x\x1b[2J", None) for one in ids]
+
+    bench.patch.setattr(listing, "read_releases", read)
+    found = read_own_releases(bench.scope, UUID)["releases"]
+    assert asked == [["robot"]]
+    assert (len(found), found[0]["release"]) == (MAX_ITEMS, "20260200T220012")
+    assert found[0]["tree"] == "/x"

@@ -23,8 +23,12 @@ from dora_systemd.gateway.control.serve import HANDLERS
 from dora_systemd.gateway.control.talk import Talk
 from dora_systemd.gateway.live import act as acting
 from dora_systemd.gateway.live.act import act, read_graph
+from dora_systemd.gateway.live.acting import acting as begun_action
+from dora_systemd.gateway.live.acting import end_actions, is_acting
 from dora_systemd.runner.cell.begin import make_lock
 from dora_systemd.scope import Scope
+from dora_systemd.verbs.releases import rollback
+from dora_systemd.verbs.releases.deploy import Deployed
 from dora_systemd.verbs.start.again import Asked
 from dora_systemd.verbs.start.plan import StartRequest
 from tests.unit.fakes.library import FakeSystemd, fake_journalctl, fake_systemd
@@ -177,6 +181,33 @@ def test_the_page_enables_and_disables(bench: Bench, monkeypatch: pytest.MonkeyP
     done = bench.act("enable")
     assert done == f"Dataflow enabled: {UUID} (robot); /etc/robot; lingering is now on"
     assert bench.act("disable") == f"Dataflow not enabled: {UUID} (robot)"
+
+
+@pytest.mark.parametrize("release", ["", "20261121T220012"])
+def test_the_page_rolls_back(bench: Bench, monkeypatch: pytest.MonkeyPatch, release: str) -> None:
+    asked: list[object] = []
+
+    def note(_manager: object, _scope: object, *given: Any, by: str) -> Deployed:
+        assert is_acting()
+        asked.extend((*given[:3], by))
+        return Deployed(UUID, "robot", UNIT, release, "20261122T220012", 1, 2, 0)
+
+    monkeypatch.setattr(rollback, "roll_back", note)
+    done = act(bench.scope, PageMessage("act", UNIT, action="rollback", release=release))
+    assert asked == ["robot", release or None, 0, "status page"]
+    how = f"runs release {release}" if release else "has ended its trial"
+    assert done == f"Dataflow rolled back: {UUID} (robot) {how}"
+    assert not is_acting()
+
+
+def test_an_action_of_a_gateway_that_ends() -> None:
+    with begun_action() as action:
+        action.go_on()
+        end_actions()
+        with pytest.raises(DoraSystemdError, match="the gateway was stopped"):
+            action.go_on()
+        action.go_on()  # the way back is not stopped
+    end_actions()
 
 
 def test_the_drawing_of_a_dataflow_that_has_no_coordinator(bench: Bench) -> None:

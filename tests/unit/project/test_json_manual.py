@@ -8,6 +8,7 @@ import pytest
 
 from dora_systemd.decisions.cell.status import NODE_STATES
 from dora_systemd.decisions.life.causes import Cause
+from dora_systemd.decisions.releases.progress import STAGES, checking
 from dora_systemd.decisions.views import outcome
 from dora_systemd.decisions.views.dataflows import FAILED, FINISHED, STOPPED, UP_WORDS
 from dora_systemd.decisions.views.findings import Finding, State, finding_values
@@ -19,6 +20,7 @@ from dora_systemd.decisions.views.objects import (
 )
 from dora_systemd.decisions.views.outcome import Outcome, outcome_object
 from dora_systemd.decisions.views.prometheus import UNKNOWN_STATE
+from dora_systemd.decisions.views.releases import step_object
 from dora_systemd.decisions.views.rows import DataflowRow, NodeRow
 from dora_systemd.decisions.views.top import Look, TopEntry, look_values
 from dora_systemd.decisions.why.last_lines import Word
@@ -115,6 +117,7 @@ OBJECTS = {
     },
     "Outcome": outcome_object(STOP, "stop"),
     "Error": error_object(NO_DATAFLOW),
+    "Progress": step_object(checking()),
 }
 """By section, an object whose keys are described there."""
 
@@ -163,6 +166,7 @@ def test_words() -> None:
         "Node": (*NODE_STATES, UNKNOWN_STATE),
         "Why": (cause for cause in Cause if cause),
         "Outcome": (outcome.DONE, outcome.UNCHANGED, outcome.FAILED),
+        "Progress": STAGES,
     }
     for section, those in words.items():
         named = re.findall(r"^\.Li (.+)$", sections(PAGE)[section], flags=re.M)

@@ -14,6 +14,10 @@ LATE = {
     "ctypes is memory: only dataflows with needs have it": {
         "runner.needs.needs": {"runner.needs.watch"},
     },
+    "the gateway does without it until somebody looks at releases, or rolls back": {
+        "gateway.live.about": {"decisions.views.releases", "verbs.releases.listing"},
+        "gateway.live.act": {"verbs.releases.rollback"},
+    },
     "the table of list does without it": {
         "cli.listing": {
             *("verbs.list", "verbs.facts.ended", "verbs.facts.list"),

@@ -31,6 +31,8 @@ def test_messages() -> None:
     assert parse_message(text) == PageMessage("act", action="set", values=values)
     text = '{"type": "act", "action": "set", "values": {"node_limit": "a:memory=2G"}}'
     assert parse_message(text).values == {"node_limit": "a:memory=2G"}
+    text = '{"type": "act", "action": "rollback", "dataflow": "u", "release": "2026"}'
+    assert parse_message(text) == PageMessage("act", "u", action="rollback", release="2026")
     text = '{"type": "find", "search": "b\u00f6se", "run": "PREVIOUS", "since": "@7"}'
     assert parse_message(text) == PageMessage("find", search="böse", run="PREVIOUS", since="@7")
 
@@ -49,6 +51,7 @@ def test_messages() -> None:
         *('{"type": "act", "action": "set", "values": {"nice": "-20"}}', '{"values": 3}'),
         *('{"type": "act", "action": "set", "values": {"memory_limit": 3}}', '{"values": "x"}'),
         '{"type": "act", "action": "set", "values": {"hot_reload": "perhaps"}}',
+        '{"type": "act", "action": "rollback", "release": 3}',
     ],
 )
 def test_what_is_no_message(text: str | bytes) -> None:

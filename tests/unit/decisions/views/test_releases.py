@@ -14,6 +14,7 @@ ONE = "20261121T220012-9f3c1a2"
 PLACE = f"/var/lib/dora-systemd/releases/robot/{ONE}/tree"
 MANIFEST = Manifest(
     *(ONE, "robot", "u-u-i-d", "dataflow.yml", "/srv/robot", "", "9f3c1a2", 1_000_000),
+    versions={"dora": "1.1.0"},
     files={"a": Stored(2048, False, "x"), "l": Stored(target="a")},
 )
 ROWS = [
@@ -24,10 +25,10 @@ ROWS = [
 
 def test_the_table() -> None:
     title, first, second = format_releases(ROWS).splitlines()
-    assert title.split() == ["NAME", "ID", "STATE", "CREATED", "SIZE", "FILES"]
+    assert title.split() == ["NAME", "ID", "STATE", "CREATED", "SIZE", "FILES", "DORA", "PYTHON"]
     assert first.split()[:3] == ["robot", ONE, "current"]
-    assert first.split()[-2:] == ["2K", "2"]
-    assert second.split() == ["robot", "20261120T220012", "proved", "-", "-", "-"]
+    assert first.split()[-4:] == ["2K", "2", "1.1.0", "-"]
+    assert second.split() == ["robot", "20261120T220012", "proved", *"-----"]
 
 
 def test_a_narrow_terminal() -> None:

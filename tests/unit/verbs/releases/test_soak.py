@@ -62,7 +62,7 @@ def test_it_lasts_until_all_has_come(
 ) -> None:
     found, told = soaked(manager, scope, monkeypatch, clock, comes)
     assert (found, clock[0] - 1000) == (None, pytest.approx(seconds, abs=0.21))
-    assert any("waits for camera/image" in one for one in told) == (seconds > 2)
+    assert any("waits for camera/image" in one.text for one in told) == (seconds > 2)
 
 
 def test_what_never_comes_fails_it(

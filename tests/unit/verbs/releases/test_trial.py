@@ -1,5 +1,7 @@
 """The files of a trial, and what a reboot at any moment would find."""
 
+import signal
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -14,6 +16,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.verbs.inhibit.guard import IfInhibited
 from dora_systemd.verbs.releases import change as module
 from dora_systemd.verbs.releases.change import Change, change_release
+from dora_systemd.verbs.releases.soak import Tell
 from dora_systemd.verbs.releases.trial import read_standing, require_deployable
 from tests.unit.fakes.manager import FakeManager, options
 
@@ -58,6 +61,7 @@ def try_new(
     store: Store,
     monkeypatch: pytest.MonkeyPatch,
     fault: Fault | None,
+    tell: Tell = print,
 ) -> None:
     """Change to the new release, whose gate finds `fault`."""
 
@@ -73,9 +77,10 @@ def try_new(
 
     monkeypatch.setattr(module, "Gate", FakeGate)
     change = Change(
-        NEW, text_of(NEW), release_options(NEW), 0, True, "doractl deploy", IfInhibited.REFUSE
+        *(NEW, text_of(NEW), release_options(NEW), 0, True, "deploy", IfInhibited.REFUSE),
+        by="doractl deploy",
     )
-    change_release(manager, scope, store, read_standing(manager, scope, UNIT), change, print)
+    change_release(manager, scope, store, read_standing(manager, scope, UNIT), change, tell)
 
 
 def test_a_good_release_is_committed(
@@ -87,6 +92,35 @@ def test_a_good_release_is_committed(
     assert (standing.current, standing.trial) == (NEW, "")
     assert not standing.path.exists()
     assert [one.is_proved for one in store.known()] == [True]
+
+
+def test_nothing_that_is_told_stops_the_way_back(
+    manager: FakeManager, scope: Scope, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(_step: object) -> None:
+        raise DoraSystemdError("the gateway was stopped")
+
+    deployed(manager)
+    with pytest.raises(DoraSystemdError, match="rolled back: node a") as caught:
+        try_new(manager, scope, store, monkeypatch, Fault("node a: exit code 1", "a"), refuse)
+    assert f"{OLD} runs again" in caught.value.hint
+    assert not read_standing(manager, scope, UNIT).path.exists()
+    try_new(manager, scope, store, monkeypatch, None, refuse)
+    assert read_standing(manager, scope, UNIT).current == NEW
+
+
+def test_a_thread_of_the_gateway_leaves_the_signals_alone(
+    manager: FakeManager, scope: Scope, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    deployed(manager)
+    before = signal.getsignal(signal.SIGTERM)
+    thread = ThreadPoolExecutor(1)
+    for fault, told in ((Fault("x"), "x"), (None, "")):
+        done = thread.submit(try_new, manager, scope, store, monkeypatch, fault)
+        assert told in str(done.exception())
+    assert signal.getsignal(signal.SIGTERM) == before
+    assert read_standing(manager, scope, UNIT).current == NEW
+    thread.shutdown()
 
 
 def test_a_bad_release_leaves_the_disk_as_it_was(

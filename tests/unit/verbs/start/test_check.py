@@ -61,3 +61,8 @@ def test_a_check_that_cannot_be_made(status: int) -> None:
     manager = CheckingManager(b"", status)
     with pytest.raises(DoraSystemdError, match=r"cannot check /srv/robot.yml: .*exit code"):
         check_plan(lambda: manager, make_plan())
+
+
+def test_the_versions_of_a_check() -> None:
+    manager = CheckingManager(b"versions: dora=1.1.0 python=3.13.5\n")
+    assert check_plan(lambda: manager, make_plan()) == {"dora": "1.1.0", "python": "3.13.5"}

@@ -1,0 +1,135 @@
+"""What deploy and rollback tell while they last, and which of it is worth a line. Pure."""
+
+import re
+from typing import NamedTuple
+
+from dora_systemd.values import SECOND, format_duration, format_rounded_size
+
+WAIT, COPY, CHECK, BUILD = "wait", "copy", "check", "build"
+STOP, START, SOAK, VERDICT, BACK = "stop", "start", "soak", "verdict", "back"
+STAGES = (WAIT, COPY, CHECK, BUILD, STOP, START, SOAK, VERDICT, BACK)
+
+_COUNT = re.compile(r"(\d{1,6})/(\d{1,6}) nodes (ready|running)")
+_IN_SECONDS = 600 * SECOND
+"""A soak up to this long is told as "12/30 s"."""
+
+Amount = tuple[int, int]
+"""How much of it is done, and all of it."""
+
+
+class Step(NamedTuple):
+    """A moment of a change of the release.
+
+    stage: one of STAGES. text: for people. amount: bytes in COPY, µs in SOAK. nodes: those that are
+    ready, of all. passed: the verdict. is_last: of its stage.
+    """
+
+    stage: str
+    text: str
+    amount: Amount | None = None
+    nodes: Amount | None = None
+    passed: bool | None = None
+    is_last: bool = False
+
+    @property
+    def news(self) -> tuple[object, ...]:
+        """What differs in two steps that are both worth a line at once."""
+        return self.stage, self.nodes, self.is_last
+
+
+class Pace:
+    """Chooses the steps that are shown: what is new at once, what only grows now and then.
+
+    interval: seconds between two steps of the latter kind.
+    """
+
+    def __init__(self, interval: float) -> None:
+        self._interval = interval
+        self._last: Step | None = None
+        self._next = 0.0
+
+    def takes(self, step: Step, now: float) -> bool:
+        """Whether the step is shown. now: seconds of any clock that only goes forward."""
+        last = self._last
+        is_same = last is not None and last.text == step.text
+        if is_same or (last is not None and last.news == step.news and now < self._next):
+            return False
+        self._last, self._next = step, now + self._interval
+        return True
+
+
+def waiting(text: str) -> Step:
+    """A lock inhibits it. text: which one."""
+    return Step(WAIT, text)
+
+
+def copying(done: int, total: int) -> Step:
+    """Bytes of the project that are in the release."""
+    text = f"copying: {format_rounded_size(done)} of {format_rounded_size(total)}"
+    return Step(COPY, text, amount=(done, total))
+
+
+def copied(files: int, total: int, new: int) -> Step:
+    """The copy is complete. new: bytes that no other release has."""
+    count = f"{files} file{'' if files == 1 else 's'}"
+    text = f"copied: {count}, {format_rounded_size(total)}, {format_rounded_size(new)} of it new"
+    return Step(COPY, text, amount=(total, total), is_last=True)
+
+
+def checking() -> Step:
+    """The copy is checked as for a start."""
+    return Step(CHECK, "checking")
+
+
+def building(line: str) -> Step:
+    """The build goes on. line: the last one that it has written, "" before the first."""
+    return Step(BUILD, f"building: {line}" if line else "building")
+
+
+def stopping(status: str) -> Step:
+    """What runs is stopped. status: STATUS= of its unit."""
+    _, comma, left = status.partition("stopping, ")
+    return Step(STOP, f"stopping what runs now: {left}" if comma else "stopping what runs now")
+
+
+def starting(status: str) -> Step:
+    """The release starts. status: STATUS= of its unit."""
+    return Step(START, f"trial: {status or 'starting'}", nodes=_count(status))
+
+
+def soaking(status: str, passed: int, soak: int, awaited: str = "") -> Step:
+    """The release runs. passed, soak: µs since its nodes were ready, and until the verdict.
+
+    awaited: an output that a node owes, which the verdict waits for.
+    """
+    passed = min(passed, soak)
+    state = status.replace("nodes running", "nodes ready", 1) or "up"
+    soaked = f", soak {_soaked(passed, soak)}" if soak else ""
+    left = f", waits for {awaited}" if awaited else ""
+    is_last = passed == soak and not awaited
+    text = f"trial: {state}{soaked}{left}"
+    return Step(SOAK, text, (passed, soak), _count(status), is_last=is_last)
+
+
+def judged(release: str, reason: str) -> Step:
+    """The verdict. reason: why it has failed, or ""."""
+    words = f"failed: {reason}" if reason else "passed"
+    return Step(VERDICT, f"trial of {release}: {words}", passed=not reason)
+
+
+def going_back(release: str, status: str) -> Step:
+    """What ran before starts again. release: "" if that is none."""
+    words = f": {status}" if status else ""
+    return Step(BACK, f"going back to {release or 'what ran before'}{words}", nodes=_count(status))
+
+
+def _count(status: str) -> Amount | None:
+    match = _COUNT.match(status)
+    return (int(match[1]), int(match[2])) if match else None
+
+
+def _soaked(passed: int, soak: int) -> str:
+    whole = passed // SECOND
+    if soak <= _IN_SECONDS:
+        return f"{whole}/{soak / SECOND:g} s"
+    return f"{format_duration(whole * SECOND)} of {format_duration(soak)}"
