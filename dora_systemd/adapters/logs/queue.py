@@ -20,10 +20,13 @@ from typing import Protocol
 
 # Lines cannot pile up because `pause` stops reading their pipes; records of the runner could.
 MAX_RECORDS = 20_000
+NOTE_EVERY = 16
+"""Entries between two notes: so many lines come twice if the runner is killed between them."""
 
 MakeEntries = Callable[[], list[bytes]]
 Note = Callable[[int], object]
-"""Called with the number of entries of an item still waiting, when a send pauses or completes."""
+"""Called with the number of entries of an item still waiting: now and then, when a send pauses, and
+with 0 when it completes."""
 
 
 class Journal(Protocol):
@@ -174,6 +177,8 @@ class LogQueue:
                     lane.note(len(entries))
                     return False
                 entries.pop()
+                if entries and not len(entries) % NOTE_EVERY:
+                    lane.note(len(entries))
             lane.note(0)
         lane.records = 0
         return True

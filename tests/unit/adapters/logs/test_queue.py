@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dora_systemd.adapters.logs import queue as log_queue
-from dora_systemd.adapters.logs.queue import LogQueue
+from dora_systemd.adapters.logs.queue import NOTE_EVERY, LogQueue
 
 
 class SlowJournal:
@@ -77,6 +77,17 @@ def test_node_is_paused_until_its_lines_are_taken(case: Case) -> None:
     case.journal.make_room(9)
     assert not case.paused
     assert case.queue.is_empty
+
+
+def test_what_is_taken_is_noted_soon(case: Case) -> None:
+    """Or a runner that is killed in a flood would have all of it written again."""
+    noted: list[int] = []
+    case.journal.make_room(NOTE_EVERY * 2 + 3)
+    entries = [b"%d" % number for number in range(NOTE_EVERY * 3)]
+    case.queue.put("a", lambda: entries, note=noted.append)
+    assert noted == [NOTE_EVERY * 2, NOTE_EVERY, NOTE_EVERY - 3]
+    case.journal.make_room(NOTE_EVERY)
+    assert noted[3:] == [0]
 
 
 def test_event_comes_after_all_before_it(case: Case) -> None:
