@@ -7,6 +7,7 @@ from typing import Any
 import click
 
 from dora_systemd.adapters.bus.systemd import Bus
+from dora_systemd.adapters.releases.incoming import Stream
 from dora_systemd.cli.inhibit_options import if_inhibited, inhibit_options
 from dora_systemd.cli.parameters import (
     acting_options,
@@ -16,6 +17,7 @@ from dora_systemd.cli.parameters import (
     print_json,
     print_outcomes,
     print_warnings,
+    serial_option,
     tell,
     wants_json,
 )
@@ -29,9 +31,11 @@ from dora_systemd.verbs.releases.deploy import (
     compare,
     deploy,
 )
+from dora_systemd.verbs.releases.receive import compare_sent, receive
 from dora_systemd.verbs.start.linger import ensure_linger
 from dora_systemd.verbs.start.plan import DEFAULT_FILE, StartRequest
 
+_INPUT = 0
 _SIGNS = {"added": "+", "changed": "~", "removed": "-"}
 
 
@@ -50,6 +54,8 @@ _SIGNS = {"added": "+", "changed": "~", "removed": "-"}
     help="Releases to keep; the present one and the one before stay in any case; default: 5.",
 )
 @click.option("--no-enable", is_flag=True, help="Do not start it at every boot.")
+@serial_option
+@click.option("--from-stdin", is_flag=True, help="Read what deploy -H of another host sends.")
 @click.option("--dry-run", is_flag=True, help="Print what would change, and change nothing.")
 @inhibit_options
 @acting_options
@@ -59,6 +65,8 @@ def command(
     soak: int,
     keep: int,
     no_enable: bool,
+    serial: int,
+    from_stdin: bool,
     dry_run: bool,
     force: bool,
     wait: bool,
@@ -70,16 +78,22 @@ def command(
     what every start and boot runs. If it fails, what ran before runs again, and the exit status is
     11. A reboot during the trial boots what ran before. Refused while a lock inhibits it.
 
+    With -H, FILE is a project here: each host gets it by ssh, one after the other, until a host has
+    rolled it back.
+
     Examples:
       doractl deploy --name robot                 the project in this directory
       doractl deploy /srv/robot --soak 5min
       doractl deploy flows/robot.yml --memory-limit 4G --restart-policy on-failure
       doractl deploy --dry-run                    files that differ from the last release
+      doractl -H base,arm deploy /srv/robot       the same for other hosts, one after the other
     """
+    del serial  # for -H, see cli/remote/
     scope = current_scope()
     start = StartRequest(dataflow, name, flags, os.environ)
     if dry_run:
-        return _print_changes(*compare(scope, start))
+        sent = compare_sent(scope, Stream(_INPUT)) if from_stdin else compare(scope, start)
+        return _print_changes(*sent)
     bus = Bus(scope)
     how = if_inhibited(force, wait)
     request = DeployRequest(start, soak, keep, not no_enable, how)
@@ -89,9 +103,17 @@ def command(
             stage.wipe()
             print_warnings([text])
 
-        done = deploy(bus, scope, request, stage, warn)
+        if from_stdin:
+            done = receive(bus, scope, request, Stream(_INPUT), _answer, stage, warn)
+        else:
+            done = deploy(bus, scope, request, stage, warn)
     print_warnings([ensure_linger(scope) if request.want_boot else ""])
     return print_outcomes([deployed_outcome(done, "deployed")])
+
+
+def _answer(line: str) -> None:
+    click.echo(line)
+    sys.stdout.flush()
 
 
 def deployed_outcome(done: Deployed, how: str) -> Outcome:

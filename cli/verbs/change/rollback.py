@@ -11,6 +11,7 @@ from dora_systemd.cli.parameters import (
     current_scope,
     duration_option,
     print_outcomes,
+    serial_option,
 )
 from dora_systemd.cli.stageline import StageLine
 from dora_systemd.cli.verbs.change.deploy import deployed_outcome
@@ -21,9 +22,12 @@ from dora_systemd.verbs.releases.rollback import roll_back
 @click.argument("selector")
 @click.argument("release", required=False, metavar="[RELEASE]")
 @duration_option("--soak", "Time without a fault that the release has to pass; default: 0s.", "0s")
+@serial_option
 @inhibit_options
 @acting_options
-def command(selector: str, release: str | None, soak: int, force: bool, wait: bool) -> int:
+def command(
+    selector: str, release: str | None, soak: int, serial: int, force: bool, wait: bool
+) -> int:
     """Run an older release of a dataflow: the one before the present one, or RELEASE.
 
     It is on trial until all its nodes are ready. If it fails, what ran before runs again, and the
@@ -33,6 +37,7 @@ def command(selector: str, release: str | None, soak: int, force: bool, wait: bo
       doractl rollback robot
       doractl rollback robot 20261121T220012-9f3c1a2
     """
+    del serial  # for -H, see cli/remote/
     how = if_inhibited(force, wait)
     scope = current_scope()
     with StageLine(sys.stderr) as stage:

@@ -96,13 +96,14 @@ def deploy(
     request: DeployRequest,
     tell: Tell,
     warn: Callable[[str], None],
+    source: Source | None = None,
 ) -> Deployed:
-    """Deploy a project. tell: gets each stage; warn: each warning.
+    """Deploy a project. tell: gets each stage; warn: each warning. source: it, if that is known.
 
     Raises DoraSystemdError: ROLLED_BACK if the release has failed its trial. After any other error
     everything is as before.
     """
-    source = find_source(scope, request.start)
+    source = source or find_source(scope, request.start)
     name = source.plan.options.name
     store, standing = store_of(scope, name), read_standing(manager, scope, unit_name(name))
     require_deployable(manager, scope, standing)
@@ -174,6 +175,7 @@ def _copy_project(source: Source, store: Store, standing: Standing, tell: Tell) 
     try:
         with opened_project(source.root, account_of(user)) as project:
             found, revision = find_files(project, source.named, _owners(source))
+            revision = source.revision if source.sent else revision
             draft = Draft(store)
             manifest = _fill(project, found, draft, last, source, revision, tell)
             shared = last.files if last else {}
@@ -212,7 +214,7 @@ def _fill(
         name=source.plan.options.name,
         uuid="",
         dataflow=source.dataflow,
-        source=source.root,
+        source=source.sent or source.root,
         user="" if user is None else user.pw_name,
         revision=revision,
         created_us=time.time_ns() // _MICROSECOND_NS,

@@ -7,8 +7,8 @@ reload leave out. Whatever the dataflow itself names belongs to them in any case
 import errno
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Protocol
 
-from dora_systemd.adapters.releases.draft import Draft
 from dora_systemd.decisions.releases.entries import (
     DIRECTORY,
     FILE,
@@ -29,6 +29,21 @@ from dora_systemd.trust.project import Project
 
 Progress = Callable[[int, int], None]
 """Called with the bytes that are done, and those of all files."""
+
+
+class Target(Protocol):
+    """Where files are copied to. All methods raise OSError."""
+
+    def write(self, path: str, chunks: Iterable[bytes], is_executable: bool) -> Stored:
+        """Write a file."""
+
+    def share(self, path: str, release_id: str) -> None:
+        """Take the file with the same path in another release."""
+
+    def link(self, path: str, target: str) -> Stored:
+        """Create a symbolic link."""
+
+
 _IGNORE_FILE = ".gitignore"
 _AGAIN = "wait until nothing writes to the project, then deploy again"
 
@@ -105,7 +120,7 @@ def digests(project: Project, found: Mapping[str, Found]) -> dict[str, Stored]:
 def copy_files(
     project: Project,
     found: Mapping[str, Found],
-    draft: Draft,
+    draft: Target,
     last: Manifest | None,
     progress: Progress,
 ) -> dict[str, Stored]:
@@ -126,7 +141,7 @@ def copy_files(
     return stored
 
 
-def _copy(project: Project, one: Found, draft: Draft, last: Manifest | None) -> Stored:
+def _copy(project: Project, one: Found, draft: Target, last: Manifest | None) -> Stored:
     if one.kind == LINK:
         return draft.link(one.path, one.target)
     old = last.files.get(one.path) if last else None

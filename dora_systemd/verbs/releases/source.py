@@ -1,7 +1,7 @@
 """The project of a deploy: where it is, and what cannot be deployed."""
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,7 +23,8 @@ class Source:
     """A project. root: its directory. origin: of its files, whose owner decides what they may say.
 
     plan: of a start from there. named: files that the dataflow names, relative to root. read: what
-    the files say that decide what root does, None for one that is not there.
+    the files say that decide what root does, None for one that is not there. sent: from where
+    another host has sent it, or "". revision: of git, for one that was sent.
     """
 
     root: str
@@ -31,6 +32,8 @@ class Source:
     plan: Plan
     named: tuple[str, ...]
     read: Mapping[str, bytes | None]
+    sent: str = ""
+    revision: str = ""
 
     @property
     def dataflow(self) -> str:
@@ -46,22 +49,36 @@ def find_source(scope: Scope, request: StartRequest) -> Source:
     plan = make_plan(scope, replace(request, dataflow=str(path)))
     written = read_file(path)
     dataflow = parse_dataflow(parse_yaml(decoded(written.data, path), path), str(path))
-    root = _root(path, plan)
+    directory = plan.options.working_directory
+    root = project_root(path, directory)
     _check(plan, dataflow, root)
-    named = (str(path), settings_path(str(path)), *_programs(dataflow, plan))
-    inside = [os.path.normpath(one) for one in (*named, *plan.settings[ENV_FILE])]
-    relative = (os.path.relpath(one, root) for one in inside if _is_below(one, root))
+    environment_files = plan.settings[ENV_FILE]
+    named = named_paths(dataflow, directory, root, environment_files)
     beside = settings_path(str(path))
     settings = read_file(beside) if exists(beside) else None
     origin = _origin(written.place, settings and settings.place)
     read: dict[str, bytes | None] = {
         os.path.relpath(one, root): read_file(one).data
-        for one in plan.settings[ENV_FILE]
+        for one in environment_files
         if _is_below(os.path.normpath(one), root) and one not in plan.settings.lent
     }
     read[os.path.relpath(path, root)] = written.data
     read[os.path.relpath(beside, root)] = settings and settings.data
-    return Source(root, origin, plan, tuple(dict.fromkeys(relative)), read)
+    return Source(root, origin, plan, named, read)
+
+
+def named_paths(
+    dataflow: Dataflow, directory: str, root: str, more: Iterable[str]
+) -> tuple[str, ...]:
+    """The files below `root` that belong to a release in any case, relative to it.
+
+    directory: the working directory. more: other absolute paths that count if they are below.
+    """
+    path = dataflow.source
+    named = (path, settings_path(path), *_programs(dataflow, directory), *more)
+    inside = (os.path.normpath(one) for one in named)
+    relative = (os.path.relpath(one, root) for one in inside if _is_below(one, root))
+    return tuple(dict.fromkeys(relative))
 
 
 def require_same(source: Source, tree: Path) -> None:
@@ -109,9 +126,12 @@ def _origin(place: Place, settings: Place | None) -> Place:
     return place if settings.uid == 0 and not settings.borrowed else settings
 
 
-def _root(path: Path, plan: Plan) -> str:
-    """The directory of the file, or the working directory if that is above it."""
-    directory = os.path.normpath(plan.options.working_directory)
+def project_root(path: Path, directory: str) -> str:
+    """The directory of the file, or the working directory if that is above it.
+
+    Raises DoraSystemdError (BAD_INPUT) if neither is above the other one.
+    """
+    directory = os.path.normpath(directory)
     above = str(path.parent)
     if _is_below(directory, above) or directory == above:
         return above
@@ -145,7 +165,7 @@ def _check(plan: Plan, dataflow: Dataflow, root: str) -> None:
             raise _refusal(f"node {node.id}: {reason}", hint)
 
 
-def _programs(dataflow: Dataflow, plan: Plan) -> Iterator[str]:
+def _programs(dataflow: Dataflow, working_directory: str) -> Iterator[str]:
     """The files that nodes and operators are started from, absolute, as far as they have a path."""
     for node in dataflow.nodes:
         raw = node.raw
@@ -153,7 +173,7 @@ def _programs(dataflow: Dataflow, plan: Plan) -> Iterator[str]:
         values = [node.path, raw.get("module"), *(_operator_file(one) for one in operators)]
         for one in values:
             if isinstance(one, str) and one and "://" not in one:
-                directory = Path(plan.options.working_directory, node.working_directory)
+                directory = Path(working_directory, node.working_directory)
                 yield str(directory / one)
 
 
