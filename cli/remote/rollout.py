@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+from dora_systemd.cli.edge import print_warning
 from dora_systemd.cli.remote.plan import Plan
 from dora_systemd.cli.remote.printers import Complaints
 from dora_systemd.cli.remote.several import run_on_all
@@ -55,7 +56,12 @@ def roll_out(hosts: Sequence[Host], plan: Plan) -> int:
 def _deploy(hosts: Sequence[Host], plan: Plan, stage: StageLine) -> int:
     options, words = plan.options, with_options(plan.words, _RECEIVE)
     request = StartRequest(options["dataflow"], options["name"], options)
-    with packed(request, stage) as package:
+
+    def warn(text: str) -> None:
+        stage.wipe()
+        print_warning(text, plan.wants_json)
+
+    with packed(request, stage, warn) as package:
         stage.wipe()
         opening = format_parcel(package.parcel)
         if options["dry_run"]:

@@ -31,7 +31,7 @@ from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.trust.files import read_file
 from dora_systemd.values import format_rounded_size
-from dora_systemd.verbs.inhibit.guard import require_uninhibited
+from dora_systemd.verbs.inhibit.guard import IfInhibited, require_uninhibited
 from dora_systemd.verbs.releases.deploy import Deployed, DeployRequest, deploy, newest
 from dora_systemd.verbs.releases.listing import root_of, store_of
 from dora_systemd.verbs.releases.soak import Tell
@@ -81,7 +81,8 @@ def receive(
     store = store_of(scope, parcel.name)
     standing = read_standing(manager, scope, unit_name(parcel.name))
     require_deployable(manager, scope, standing)
-    require_uninhibited(scope, standing.running, "deploy", request.how, tell)
+    if request.how is IfInhibited.REFUSE:  # a wait must see the end of `stream`: deploy() waits
+        require_uninhibited(scope, standing.running, "deploy", request.how, tell)
     root = root_of(scope)
     try:
         with _ends_quietly(parcel.name), incoming(root) as draft:

@@ -13,7 +13,7 @@ from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
 from dora_systemd.decisions.releases.entries import Found
 from dora_systemd.decisions.releases.parcel import Parcel
 from dora_systemd.decisions.settings.resolve import Settings, resolve_settings
-from dora_systemd.decisions.settings.table import ENV_FILE, WORKING_DIRECTORY
+from dora_systemd.decisions.settings.table import ENV_FILE, VENV, WORKING_DIRECTORY
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import settings_path
 from dora_systemd.scope import Scope
@@ -47,9 +47,14 @@ class _Sender(NamedTuple):
 
 
 @contextlib.contextmanager
-def packed(request: StartRequest, tell: Tell) -> Iterator[Packed]:
-    """The project that `request` names, which nobody changes any more. Raises DoraSystemdError."""
+def packed(request: StartRequest, tell: Tell, warn: Tell) -> Iterator[Packed]:
+    """The project that `request` names, which nobody changes any more.
+
+    tell: gets each stage; warn: each warning. Raises DoraSystemdError.
+    """
     sender = _find(request)
+    if note := _venv_note(sender):
+        warn(note)
     root, dataflow = sender.root, sender.dataflow
     directory = sender.directory or root
     environment_files = sender.settings[ENV_FILE]
@@ -90,6 +95,14 @@ def _find(request: StartRequest) -> _Sender:
     directory = "" if given is None else os.path.normpath(Path(given).absolute())
     root = project_root(path, directory or str(path.parent))
     return _Sender(written.place, dataflow, settings, root, directory)
+
+
+def _venv_note(sender: _Sender) -> str:
+    """The warning for a virtual environment that a deploy here would use, or ""."""
+    venv = str(Path(sender.dataflow.source).parent / ".venv")
+    if sender.settings.is_given(VENV) or not exists(f"{venv}/bin/python"):
+        return ""
+    return f"{shown(venv)} stays here: name a virtual environment of the hosts with --venv"
 
 
 def _document(path: Path) -> object:

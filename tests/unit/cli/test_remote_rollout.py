@@ -139,6 +139,15 @@ def test_dry_run(capsys: Printed) -> None:
     assert (out, err) == ("==> h1 <==\n~ a.py on h1\n\n==> h2 <==\n~ a.py on h2\n", "")
 
 
+def test_a_virtual_environment_stays_here(capsys: Printed) -> None:
+    venv = Path(".venv/bin/python")
+    venv.parent.mkdir(parents=True)
+    venv.touch()
+    for words, is_told in (([], True), (["--venv", "/opt/venv"], False)):
+        assert main.run(["deploy", "-H", "h1", *words]) == 0
+        assert ("/.venv stays here: name" in capsys.readouterr().err) == is_told
+
+
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
