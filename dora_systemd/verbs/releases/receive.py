@@ -3,6 +3,7 @@
 Who sends it has logged in as the user of this process, so the files belong to that user.
 """
 
+import errno
 import os
 import signal
 import threading
@@ -130,7 +131,7 @@ def _end_with(stream: Stream) -> None:
 def _require_space(draft: Draft, parcel: Parcel, wants: list[int]) -> None:
     contents = parcel.contents
     if total([contents[one] for one in wants]) > draft.free_bytes():
-        raise OSError(28, os.strerror(28))
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def _fill(
