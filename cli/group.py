@@ -63,7 +63,7 @@ def find_verbs() -> dict[str, Verb]:
 
 
 VERBS = find_verbs()
-ALIASES = {"ps": "list", "status": "list"}
+ALIASES = {"ps": "list", "status": "list", "reset-failed": "reset"}
 
 _EPILOG = """\b
 Examples:

@@ -122,6 +122,16 @@ def duration_option(flag: str, text: str, default: str = "infinity") -> Callable
     return click.option(flag, metavar="TIME", default=default, callback=callback, help=text)
 
 
+serial_option = click.option(
+    "--serial",
+    type=click.IntRange(min=1),
+    metavar="N",
+    default=1,
+    help="With -H: N hosts at a time, and none after a failed trial; default: 1.",
+)
+"""For what brings a release to hosts."""
+
+
 def current_scope() -> Scope:
     """The scope of the command line."""
     return scope_of(click.get_current_context().meta.get(_SCOPE_KEY))

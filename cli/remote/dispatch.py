@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from dora_systemd.cli.group import VerbGroup, doractl, run_verb
-from dora_systemd.cli.remote.plan import Plan, check_hosts, plan_of
+from dora_systemd.cli.remote.plan import ROLLOUTS, Plan, check_hosts, plan_of
 from dora_systemd.cli.remote.several import run_on_all
 from dora_systemd.cli.remote.single import is_terminal, pass_through, run_there
 from dora_systemd.decisions.remote.hosts import ALL, Host, given_words
@@ -96,6 +96,11 @@ def _run(context: click.Context, words: list[str], command_line: list[str]) -> i
 
 
 def _run_on(hosts: Sequence[Host], plan: Plan, is_several: bool) -> int:
+    if plan.verb == "deploy" or (plan.verb in ROLLOUTS and is_several):
+        # Imported late: it reads projects.
+        from dora_systemd.cli.remote.rollout import roll_out
+
+        return roll_out(hosts, plan)
     if is_several:
         return run_on_all(hosts, plan)
     return run_there(hosts[0], plan) if is_terminal() else pass_through(hosts[0], plan)

@@ -18,6 +18,8 @@ _ONE_HOST = {
     "dora": "use one host for each command",
 }
 """Verbs that belong to one terminal."""
+ROLLOUTS = ("deploy", "rollback")
+"""Verbs that some hosts get after others, and no more once a release has failed its trial."""
 _FILES = (".yml", ".yaml", ".json")
 _FOLLOWING = ("is_follow", "until_end", "want_logs")
 """Options by which a verb goes on until somebody ends it."""
@@ -52,7 +54,7 @@ class Plan(NamedTuple):
     @property
     def has_relative_file(self) -> bool:
         """Whether it starts a FILE that is not an absolute path; only the host knows its files."""
-        file = str(self.options.get("dataflow") or "/")
+        file = str(self.options.get("dataflow") or "/") if self.verb != "deploy" else "/"
         return not file.startswith("/") and ("/" in file or file.endswith(_FILES))
 
     @property
@@ -66,7 +68,7 @@ def plan_of(context: click.Context, words: list[str]) -> Plan:
     verb = _verb(context)
     options = dict(context.params)
     wants_json = _value(context, "output") == "json"
-    endless = any(options.get(name) for name in _FOLLOWING) or verb in ("run", "dora")
+    endless = any(options.get(name) for name in _FOLLOWING) or verb in ("run", "dora", *ROLLOUTS)
     endless |= verb == "top" and wants_json and not options.get("is_once")
     holds = verb == "inhibit" and options.get("selector") is not None
     # What waits or holds a lock over there must not go on when this command has ended.

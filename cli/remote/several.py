@@ -1,6 +1,7 @@
 """A verb on several hosts at the same time."""
 
 from collections.abc import Sequence
+from functools import partial
 
 from dora_systemd.cli.remote.logs import LogPrinter, words_of_logs
 from dora_systemd.cli.remote.plan import Plan
@@ -13,19 +14,22 @@ from dora_systemd.cli.remote.printers import (
 )
 from dora_systemd.cli.remote.single import Interrupts
 from dora_systemd.cli.remote.tables import TablePrinter
+from dora_systemd.decisions.remote.command import Way
 from dora_systemd.decisions.remote.hosts import Host
+from dora_systemd.decisions.remote.table import cells_of, format_hosts, format_releases, row_of
 from dora_systemd.decisions.remote.words import with_output
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.verbs.facts.selector import is_pattern
 from dora_systemd.verbs.remote.talk import Ended, Said, Talks
 
 
-def run_on_all(hosts: Sequence[Host], plan: Plan) -> int:
-    """Run the verb on all hosts; the highest exit status."""
+def run_on_all(hosts: Sequence[Host], plan: Plan, opening: bytes | None = None) -> int:
+    """Run the verb on all hosts; the highest exit status. opening: what each of them reads."""
     words, printer = _printer(hosts, plan)
     logs = printer if isinstance(printer, LogPrinter) else None
     is_full = logs.merge.is_full if logs else lambda _host: False
-    talks = Talks(hosts, plan.way, words, plan.most_seconds, is_full)
+    way = plan.way if opening is None else Way.FED
+    talks = Talks(hosts, way, words, plan.most_seconds, is_full, opening=opening)
     complaints = Complaints(plan.wants_json)
     statuses: list[int] = []
     with Interrupts(talks, plan) as interrupt:
@@ -52,8 +56,12 @@ def _printer(hosts: Sequence[Host], plan: Plan) -> tuple[list[str], Printer]:
         selector = plan.options["selector"]
         if selector is None or is_pattern(selector):
             nothing = "No dataflow." if _is_wide(plan) else "No dataflow is running."
-            table = TablePrinter(hosts, plan.options["sort_by"], nothing)
+            shown = partial(format_hosts, sort_by=plan.options["sort_by"])
+            table = TablePrinter(hosts, row_of, shown, nothing)
             return with_output(plan.words, "json"), table
+    if plan.verb == "releases" and not plan.wants_json:
+        releases = TablePrinter(hosts, cells_of, format_releases, "No release.")
+        return with_output(plan.words, "json"), releases
     if plan.has_lines and not plan.options.get("dry_run"):
         return plan.words, LinePrinter(plan.wants_json)
     return plan.words, JsonPrinter(hosts) if plan.wants_json else BlockPrinter(hosts)

@@ -1,8 +1,9 @@
-"""The table of `doractl list` of several hosts."""
+"""The tables of `doractl list` and `releases` of several hosts."""
 
 import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Generic, TypeVar
 
 import click
 
@@ -12,18 +13,29 @@ from dora_systemd.cli.remote.printers import Whole
 from dora_systemd.decisions.remote.failures import invalid
 from dora_systemd.decisions.remote.hosts import Host
 from dora_systemd.decisions.remote.stream import objects_of
-from dora_systemd.decisions.remote.table import format_hosts, row_of
-from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.errors import DoraSystemdError
 
+Row = TypeVar("Row")
+Shown = Callable[[Mapping[str, list[Row] | None], int | None, bool], str]
+"""The table of the rows by host, None for a dead one; for a terminal of that width, in colours."""
 
-class TablePrinter(Whole):
-    """One table with a column HOST. nothing: printed instead of an empty one."""
 
-    def __init__(self, hosts: Sequence[Host], sort_by: str | None, nothing: str) -> None:
+class TablePrinter(Whole, Generic[Row]):
+    """One table with a column HOST. nothing: printed instead of an empty one.
+
+    parse: the row of an object, None for what is none.
+    """
+
+    def __init__(
+        self,
+        hosts: Sequence[Host],
+        parse: Callable[[Mapping[str, Any]], Row | None],
+        shown: Shown[Row],
+        nothing: str,
+    ) -> None:
         super().__init__()
-        self._found: dict[str, list[DataflowRow] | None] = {one.text: None for one in hosts}
-        self._sort_by = sort_by
+        self._found: dict[str, list[Row] | None] = {one.text: None for one in hosts}
+        self._parse, self._shown = parse, shown
         self._nothing = nothing
 
     def ended(self, host: Host, error: DoraSystemdError | None) -> DoraSystemdError | None:
@@ -32,7 +44,7 @@ class TablePrinter(Whole):
         if error or not text:
             return None
         found = objects_of(text, host.text)
-        known = [row for row in map(row_of, found or ()) if row]
+        known = [row for row in map(self._parse, found or ()) if row is not None]
         if found is None or len(known) < len(found):
             return invalid(host)
         self._found[host.text] = known
@@ -41,7 +53,7 @@ class TablePrinter(Whole):
     def finish(self) -> None:
         """Print the table."""
         width = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
-        text = format_hosts(self._found, self._sort_by, width, wants_colors(sys.stdout))
+        text = self._shown(self._found, width, wants_colors(sys.stdout))
         if text:
             write_own(sys.stdout, f"{text}\n")
         else:

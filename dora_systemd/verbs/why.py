@@ -6,7 +6,7 @@ from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.journal.reader import JournalReader
-from dora_systemd.decisions.cell.status import CellStatus
+from dora_systemd.decisions.cell.status import HELD, CellStatus
 from dora_systemd.decisions.life import nodes as node_table
 from dora_systemd.decisions.logs.query import scope_matches, story_matches
 from dora_systemd.decisions.views.rows import DataflowRow
@@ -50,7 +50,14 @@ def explain(manager: Manager, scope: Scope, selector: str, journal: JournalReade
         budget = restart_budget(manager, scope, cell, read_status(scope, cell))
     words = _last_words(journal, scope, subject, verdict)
     inhibitors = read_holders(scope, [cell.name]).get(cell.name, ()) if cell else ()
-    return Report(subject, verdict, words, budget, inhibitors)
+    is_held = cell is not None and _is_held(scope, cell, verdict.node)
+    return Report(subject, verdict, words, budget, inhibitors, is_held)
+
+
+def _is_held(scope: Scope, cell: Cell, node: str) -> bool:
+    """Whether hot reload starts this node again when its files change."""
+    status = read_status(scope, cell).nodes.get(node) if node and cell.is_up else None
+    return status is not None and status.policy == HELD
 
 
 def _select(manager: Manager, scope: Scope, selector: str) -> tuple[Cell | None, Subject]:

@@ -1,12 +1,15 @@
 """Servers of ssh on loopback addresses, and the configuration that leads root there."""
 
 import subprocess
+import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
 from tests.system.cells import run, wait_for
 
+HERE, HERS = "127.0.0.2", "127.0.0.3"
+DEAD = "127.0.0.9"
 PATH = "/opt/lab/bin:/usr/bin:/bin"
 _SERVER = """
 ListenAddress {address}:22
@@ -71,6 +74,20 @@ class Servers:
         for child in self._children:
             child.terminate()
             child.wait()
+
+
+@contextmanager
+def three_hosts() -> Iterator[Servers]:
+    """The hosts base, which is root's, and arm, which is alice's; nobody listens at gone."""
+    with tempfile.TemporaryDirectory(dir="/var/tmp") as place:
+        servers = Servers(Path(place))
+        for address in (HERE, HERS):
+            servers.serve(address)
+        servers.name("base", HERE)
+        servers.name("arm", HERS, "alice")
+        servers.name("gone", DEAD)
+        yield servers
+        servers.end()
 
 
 def sessions() -> str:

@@ -6,7 +6,6 @@ import re
 import signal
 import socket
 import subprocess
-import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,28 +16,19 @@ from dora_systemd.errors import ExitCode
 from dora_systemd.scope import Scope
 from tests.lab.pace import bound
 from tests.system.cells import Cell, Project, run, sync_journal, wait_for
-from tests.system.sshds import Servers, sessions, shell_of
+from tests.system.sshds import HERE, Servers, sessions, shell_of, three_hosts
 from tests.system.terminal import Screen, Tmux, shown
 
 pytestmark = pytest.mark.lab
 
-HERE, HERS = "127.0.0.2", "127.0.0.3"
-DEAD = "127.0.0.9"
 HOSTILE = "x';touch /tmp/remote-was-here;echo '\\"
 
 
 @pytest.fixture
 def servers() -> Iterator[Servers]:
-    """The hosts base, which is root's, and arm, which is alice's; nobody listens at gone."""
-    with tempfile.TemporaryDirectory(dir="/var/tmp") as place:
-        servers = Servers(Path(place))
-        for address in (HERE, HERS):
-            servers.serve(address)
-        servers.name("base", HERE)
-        servers.name("arm", HERS, "alice")
-        servers.name("gone", DEAD)
+    """See three_hosts()."""
+    with three_hosts() as servers:
         yield servers
-        servers.end()
 
 
 def doractl(*words: str) -> subprocess.CompletedProcess[str]:

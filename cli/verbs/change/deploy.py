@@ -1,11 +1,13 @@
 """Copy a project into a release and run that, or what ran before."""
 
 import os
+import sys
 from typing import Any
 
 import click
 
 from dora_systemd.adapters.bus.systemd import Bus
+from dora_systemd.adapters.releases.incoming import Stream
 from dora_systemd.cli.inhibit_options import if_inhibited, inhibit_options
 from dora_systemd.cli.parameters import (
     acting_options,
@@ -14,6 +16,7 @@ from dora_systemd.cli.parameters import (
     name_option,
     print_json,
     print_outcomes,
+    serial_option,
     tell,
     wants_json,
 )
@@ -27,9 +30,11 @@ from dora_systemd.verbs.releases.deploy import (
     compare,
     deploy,
 )
+from dora_systemd.verbs.releases.receive import compare_sent, receive
 from dora_systemd.verbs.start.linger import ensure_linger
 from dora_systemd.verbs.start.plan import DEFAULT_FILE, StartRequest
 
+_INPUT = 0
 _SIGNS = {"added": "+", "changed": "~", "removed": "-"}
 
 
@@ -50,6 +55,8 @@ _SIGNS = {"added": "+", "changed": "~", "removed": "-"}
 @duration_option("--build-timeout", "Time that its build may take; default: 30min.", "30min")
 @click.option("--no-build", is_flag=True, help="Do not build; deploy what the project has.")
 @click.option("--no-enable", is_flag=True, help="Do not start it at every boot.")
+@serial_option
+@click.option("--from-stdin", is_flag=True, help="Read what deploy -H of another host sends.")
 @click.option("--dry-run", is_flag=True, help="Print what would change, and change nothing.")
 @quiet_option
 @inhibit_options
@@ -62,6 +69,8 @@ def command(
     build_timeout: int,
     no_build: bool,
     no_enable: bool,
+    serial: int,
+    from_stdin: bool,
     dry_run: bool,
     is_quiet: bool,
     force: bool,
@@ -76,26 +85,41 @@ def command(
     what every start and boot runs. If it fails, what ran before runs again, and the exit status is
     11. A reboot during the trial boots what ran before. Refused while a lock inhibits it.
 
+    With -H, FILE is a project here: each host gets it by ssh, one after the other, until a host has
+    rolled it back.
+
     Examples:
       doractl deploy --name robot                 the project in this directory
       doractl deploy /srv/robot --soak 5min
       doractl deploy flows/robot.yml --memory-limit 4G --restart-policy on-failure
       doractl deploy --dry-run                    files that differ from the last release
+      doractl -H base,arm deploy /srv/robot       the same for other hosts, one after the other
     """
+    del serial  # for -H, see cli/remote/
     scope = current_scope()
     start = StartRequest(dataflow, name, flags, os.environ)
     if dry_run:
-        found = compare(scope, start, not no_build)
-        return ExitCode.OK if is_quiet else _print_changes(*found)
+        build = not no_build
+        sent = compare_sent(scope, Stream(_INPUT)) if from_stdin else compare(scope, start, build)
+        return ExitCode.OK if is_quiet else _print_changes(*sent)
     if not build_timeout:
         raise DoraSystemdError("cannot build in no time", "give a --build-timeout", ExitCode.USAGE)
     bus = Bus(scope)
     how, build_timeout = if_inhibited(force, wait), 0 if no_build else build_timeout
     request = DeployRequest(start, soak, keep, not no_enable, how, build_timeout)
     with open_progress(is_quiet) as progress:
-        done = deploy(bus, scope, request, progress, progress.warn)
+        warn = progress.warn
+        if from_stdin:
+            done = receive(bus, scope, request, Stream(_INPUT), _answer, progress, warn)
+        else:
+            done = deploy(bus, scope, request, progress, warn)
     progress.warn(ensure_linger(scope) if request.want_boot else "")
     return print_outcomes([] if is_quiet else [deployed_outcome(done, "deployed")])
+
+
+def _answer(line: str) -> None:
+    click.echo(line)
+    sys.stdout.flush()
 
 
 def deployed_outcome(done: Deployed, how: str) -> Outcome:

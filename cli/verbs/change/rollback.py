@@ -9,6 +9,7 @@ from dora_systemd.cli.parameters import (
     current_scope,
     duration_option,
     print_outcomes,
+    serial_option,
 )
 from dora_systemd.cli.progress import open_progress, quiet_option
 from dora_systemd.cli.verbs.change.deploy import deployed_outcome
@@ -19,11 +20,18 @@ from dora_systemd.verbs.releases.rollback import roll_back
 @click.argument("selector")
 @click.argument("release", required=False, metavar="[RELEASE]")
 @duration_option("--soak", "Time without a fault that the release has to pass; default: 0s.", "0s")
+@serial_option
 @quiet_option
 @inhibit_options
 @acting_options
 def command(
-    selector: str, release: str | None, soak: int, is_quiet: bool, force: bool, wait: bool
+    selector: str,
+    release: str | None,
+    soak: int,
+    serial: int,
+    is_quiet: bool,
+    force: bool,
+    wait: bool,
 ) -> int:
     """Run an older release of a dataflow: the one before the present one, or RELEASE.
 
@@ -34,6 +42,7 @@ def command(
       doractl rollback robot
       doractl rollback robot 20261121T220012-9f3c1a2
     """
+    del serial  # for -H, see cli/remote/
     how = if_inhibited(force, wait)
     scope = current_scope()
     with open_progress(is_quiet) as progress:

@@ -122,7 +122,7 @@ class LogsCommand(click.Command):
     default="ALL",
     show_default=True,
     metavar="RUN",
-    help="CURRENT, PREVIOUS, ALL or the id of a run (DORA_RUN).",
+    help="CURRENT or 0, PREVIOUS or -1, -2 ..., ALL or the id of a run (DORA_RUN).",
 )
 @click.option(
     "--events", "is_events", is_flag=True, help="Only what happened to the dataflow and its nodes."

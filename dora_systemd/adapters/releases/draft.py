@@ -15,6 +15,7 @@ from dora_systemd.decisions.releases.entries import Stored
 from dora_systemd.decisions.releases.manifest import Manifest, format_manifest
 from dora_systemd.names import TREE
 
+_CHUNK = 256 * 1024
 _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 _LIBC = ctypes.CDLL(None, use_errno=True)
 
@@ -37,6 +38,11 @@ class Draft:
             self.discard()
             raise
 
+    @property
+    def tree(self) -> Path:
+        """The directory of its files."""
+        return self._tree
+
     def write(self, path: str, chunks: Iterable[bytes], is_executable: bool) -> Stored:
         """Write a file of the tree."""
         mode = 0o555 if is_executable else 0o444
@@ -51,8 +57,17 @@ class Draft:
 
     def share(self, path: str, release_id: str) -> None:
         """Share a file with the same path in another release."""
-        place = self._place(path)
-        place.hardlink_to(self._store.tree(release_id) / path)
+        self.adopt(path, self._store.tree(release_id) / path)
+
+    def adopt(self, path: str, file: Path) -> None:
+        """Share a file of another tree that nobody changes."""
+        self._place(path).hardlink_to(file)
+
+    def copy(self, path: str, file: Path, is_executable: bool) -> Stored:
+        """Copy a file of another tree that nobody changes."""
+        with file.open("rb") as opened:
+            chunks = iter(lambda: opened.read(_CHUNK), b"")
+            return self.write(path, chunks, is_executable)
 
     def link(self, path: str, target: str) -> Stored:
         """Create a symbolic link in the tree."""
@@ -65,14 +80,18 @@ class Draft:
         group: who may enter it besides its owner; None: nobody.
         """
         write_part(self._path, MANIFEST, format_manifest(manifest))
+        self.lend(group)
+        _sync_file_system(self._path)
+        self._path.rename(self._store.release(manifest.id))
+        sync(self._store.path)
+
+    def lend(self, group: int | None) -> None:
+        """Let a group read what nobody changes any more; None: nobody but its owner."""
         for directory in self._made:
             directory.chmod(0o555)
         if group is not None:
             os.chown(self._path, -1, group)
             self._path.chmod(0o750)
-        _sync_file_system(self._path)
-        self._path.rename(self._store.release(manifest.id))
-        sync(self._store.path)
 
     def discard(self) -> None:
         """Remove it, unless it has its name."""

@@ -11,7 +11,8 @@ from dora_systemd.adapters.ssh.program import read_now, start_ssh
 class Connection:
     """A running ssh whose output is read when it is there.
 
-    is_fed: it reads our standard input; else its input is empty, and stays open until hang_up().
+    is_fed: it reads our standard input; else its input is what write() gets, and stays open until
+    hang_up().
     """
 
     def __init__(self, arguments: Sequence[str], is_fed: bool = False) -> None:
@@ -26,19 +27,32 @@ class Connection:
         assert self._child.stdout and self._child.stderr
         self.output = self._child.stdout.fileno()
         self.errors = self._child.stderr.fileno()
-        for fd in (self.output, self.errors):
-            os.set_blocking(fd, False)
+        self._input = self._child.stdin
+        for stream in (self._child.stdout, self._child.stderr, self._input):
+            if stream:
+                os.set_blocking(stream.fileno(), False)
         self.ended = os.pidfd_open(self._child.pid)
 
     def read(self, fd: int) -> bytes | None:
         """As read_now()."""
         return read_now(fd)
 
+    @property
+    def input(self) -> int:
+        """The file descriptor to write to; -1 for none."""
+        return self._input.fileno() if self._input and not self._input.closed else -1
+
+    def write(self, data: bytes) -> int:
+        """Write as much as goes now; the number of bytes. Raises OSError if nobody reads it."""
+        with suppress(BlockingIOError):
+            return os.write(self.input, data)
+        return 0
+
     def hang_up(self) -> None:
         """End the input: what follows over there then ends, and says its last words."""
-        if self._child.stdin:
+        if self._input:
             with suppress(OSError):
-                self._child.stdin.close()
+                self._input.close()
 
     def close(self) -> int:
         """End it, if it has not ended; its exit status, negative for a signal."""

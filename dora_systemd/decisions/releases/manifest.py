@@ -41,7 +41,7 @@ class Manifest:
 def format_manifest(one: Manifest) -> str:
     """The text of release.json; only ASCII, whatever the names of files are."""
     value = {**vars(one), "schema": SCHEMA}
-    value["files"] = {path: _format_stored(stored) for path, stored in sorted(one.files.items())}
+    value["files"] = {path: format_stored(stored) for path, stored in sorted(one.files.items())}
     return json.dumps(value, indent=1) + "\n"
 
 
@@ -51,7 +51,7 @@ def parse_manifest(text: str, path: str) -> Manifest:
         value = json.loads(text)
         if value.pop("schema") != SCHEMA:
             raise ValueError("schema")
-        files = {one: _parse_stored(stored) for one, stored in value.pop("files").items()}
+        files = {one: parse_stored(stored) for one, stored in value.pop("files").items()}
         versions = {str(name): str(one) for name, one in value.pop("versions", {}).items()}
         return Manifest(**value, versions=versions, files=files)
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
@@ -60,14 +60,16 @@ def parse_manifest(text: str, path: str) -> Manifest:
         raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT) from error
 
 
-def _format_stored(one: Stored) -> dict[str, Any]:
+def format_stored(one: Stored) -> dict[str, Any]:
+    """A file for release.json."""
     built = {"built": True} if one.is_built else {}
     if one.target:
         return {"link": one.target, **built}
     return {"size": one.size, "executable": one.is_executable, "sha256": one.digest, **built}
 
 
-def _parse_stored(value: Mapping[str, Any]) -> Stored:
+def parse_stored(value: Mapping[str, Any]) -> Stored:
+    """A file of release.json. Raises ValueError, TypeError, KeyError."""
     is_built = bool(value.get("built", False))
     if "link" in value:
         return Stored(target=str(value["link"]), is_built=is_built)

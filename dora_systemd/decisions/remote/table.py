@@ -1,4 +1,4 @@
-"""The table of `doractl list` of several hosts. Pure."""
+"""The tables of `doractl list` and `releases` of several hosts. Pure."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -8,9 +8,12 @@ from dora_systemd.decisions.views.dataflows import (
     UNREACHABLE,
     dataflow_table,
     format_table,
+    local_time,
 )
+from dora_systemd.decisions.views.releases import HEADER as RELEASES
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.views.selection import sorted_rows
+from dora_systemd.values import format_rounded_size
 
 _TEXTS = ("uuid", "name", "unit", "status", "text", "problem")
 _NUMBERS = {
@@ -47,9 +50,9 @@ def _is_number(value: object) -> bool:
 
 def format_hosts(
     found: Mapping[str, Sequence[DataflowRow] | None],
-    sort_by: str | None = None,
     width: int | None = None,
     want_colors: bool = False,
+    sort_by: str | None = None,
 ) -> str:
     """The table, "" without a row. found: by host its rows, None for a host without an answer.
 
@@ -64,6 +67,35 @@ def format_hosts(
     return format_table(header, lines, width, want_colors) if lines else ""
 
 
-def _dead(host: str, header: Sequence[str]) -> list[str]:
-    known = {"HOST": host, "STATUS": UNREACHABLE}
+def cells_of(value: Mapping[str, Any]) -> list[str] | None:
+    """The cells of an object of `releases -o json`; None if it has not the types of one."""
+    texts = [value.get(key) for key in ("name", "release", "state")]
+    known = [value.get(key) for key in ("created_us", "size_bytes", "files")]
+    if not all(isinstance(one, str) for one in texts):
+        return None
+    if not all(one is None or _is_number(one) for one in known):
+        return None
+    created, size, files = known
+    numbers = [
+        local_time(int(created or 0)),
+        UNKNOWN if size is None else format_rounded_size(int(size)),
+        UNKNOWN if files is None else str(files),
+    ]
+    return [*map(str, texts), *numbers]
+
+
+def format_releases(
+    found: Mapping[str, Sequence[Sequence[str]] | None],
+    width: int | None = None,
+    want_colors: bool = False,
+) -> str:
+    """The table of releases, "" without one. found: as of format_hosts(), the cells of rows."""
+    header = ["HOST", *RELEASES]
+    lines = [[host, *cells] for host, some in found.items() for cells in some or ()]
+    lines += [_dead(host, header, "STATE") for host, some in found.items() if some is None]
+    return format_table(header, lines, width, want_colors) if lines else ""
+
+
+def _dead(host: str, header: Sequence[str], column: str = "STATUS") -> list[str]:
+    known = {"HOST": host, column: UNREACHABLE}
     return [known.get(title, UNKNOWN) for title in header]

@@ -75,5 +75,10 @@ def _next(rest: Iterator[str], option: str) -> str:
 
 def with_output(words: Sequence[str], form: str) -> list[str]:
     """The command line with `-o form`: the last one counts."""
+    return with_options(words, "-o", form)
+
+
+def with_options(words: Sequence[str], *options: str) -> list[str]:
+    """The command line with these options of the verb."""
     end = words.index("--") if "--" in words else len(words)
-    return [*words[:end], "-o", form, *words[end:]]
+    return [*words[:end], *options, *words[end:]]

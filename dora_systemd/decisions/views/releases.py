@@ -10,7 +10,7 @@ from dora_systemd.decisions.views.dataflows import UNKNOWN, format_table, local_
 from dora_systemd.decisions.views.objects import moment
 from dora_systemd.values import format_rounded_size
 
-_HEADER = ("NAME", "ID", "STATE", "CREATED", "SIZE", "FILES", "DORA", "PYTHON")
+HEADER = ("NAME", "ID", "STATE", "CREATED", "SIZE", "FILES", "DORA", "PYTHON")
 
 
 class ReleaseRow(NamedTuple):
@@ -27,7 +27,7 @@ def format_releases(
     rows: Sequence[ReleaseRow], width: int | None = None, want_colors: bool = False
 ) -> str:
     """The table, for a terminal of that width."""
-    return format_table(_HEADER, list(map(_cells, rows)), width, want_colors)
+    return format_table(HEADER, list(map(_cells, rows)), width, want_colors)
 
 
 def _cells(row: ReleaseRow) -> tuple[str, ...]:

@@ -77,6 +77,10 @@ _GIVEN_UP = "systemd has stopped restarting it; doractl restart {name} resets th
 _WAITING = "systemd restarts it automatically; doractl stop {name} prevents that"
 _AGAIN = "nothing: dora restarts {node} automatically"
 _AWAY = "{node} stays down until doractl restart {name}; the other nodes keep running"
+_HELD = (
+    "{node} stays down until its file is saved, which hot reload sees, or until "
+    "doractl reload {name} --node {node}; the other nodes keep running"
+)
 
 
 @dataclass(frozen=True)
@@ -95,7 +99,7 @@ class Subject:
 class Report:
     """The output of `doractl why`. words: the last lines, of verdict.node or of all nodes.
 
-    inhibitors: who inhibits a restart now.
+    inhibitors: who inhibits a restart now. is_held: verdict.node waits for a hot reload.
     """
 
     subject: Subject
@@ -103,6 +107,7 @@ class Report:
     words: tuple[Word, ...] = ()
     budget: Mapping[str, int | None] | None = None
     inhibitors: tuple[Holder, ...] = ()
+    is_held: bool = False
 
 
 def remedies(report: Report) -> list[str]:
@@ -111,7 +116,7 @@ def remedies(report: Report) -> list[str]:
     hint = known_remedy(one.text for one in report.words) if verdict.node else ""
     texts = [hint, _AGAIN if verdict.is_passing else _remedy(verdict)]
     if verdict.is_away:
-        texts.append(_AWAY)
+        texts.append(_HELD if report.is_held else _AWAY)
     if verdict.is_given_up:
         texts.append(_GIVEN_UP)
     elif verdict.status == RESTARTING:
@@ -125,6 +130,9 @@ def remedies(report: Report) -> list[str]:
         "pid": verdict.details.get("node_pid", "PID"),
     }
     filled = [text.format(**values) for text in texts if text]
+    if report.is_held and verdict.is_away:
+        again = f", then run: doractl restart {subject.name}"
+        return [text.replace(again, ", and save it") for text in filled]
     if release_of(subject.file) or any(one.name == ROLLED_BACK for one in verdict.timeline):
         fixed = f"doractl deploy --name {subject.name}"
         return [

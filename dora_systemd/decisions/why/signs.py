@@ -1,5 +1,7 @@
 """Recognizes failures of nodes by their last lines, and suggests a remedy."""
 
+import re
+import shlex
 from collections.abc import Iterable, Sequence
 
 _MORE = "see SANDBOX in dora-systemd(7)"
@@ -28,7 +30,25 @@ _SIGNS: Sequence[tuple[tuple[str, ...], str]] = (
 """Parts of lines of the C library, Python and Rust, the clearest signs first."""
 
 
+_FULL = re.compile(
+    r"(?:No space left on device|Disk quota exceeded|ENOSPC|EDQUOT)"
+    r"(?:[^\n'\"]{0,40}['\"](?P<path>/[^\n'\"]{1,200})['\"])?"
+)
+"""What fails with it often says nothing of the path; Python puts it behind."""
+
+
 def known_remedy(lines: Iterable[str]) -> str:
     """The remedy for a node with these last lines, or "" if they do not tell."""
     text = "\n".join(lines)
+    if full := _FULL.search(text):
+        return _space(full["path"])
     return next((help_ for signs, help_ in _SIGNS if any(one in text for one in signs)), "")
+
+
+def _space(path: str | None) -> str:
+    """The remedy for a full file system. path: of a file that could not be written."""
+    if path is None:
+        return "a file system that {node} writes to is full: df shows which one"
+    # The text is filled in like all other remedies.
+    quoted = shlex.quote(path).replace("{", "{{").replace("}", "}}")
+    return f"the file system of this file is full: df {quoted}"

@@ -1,5 +1,6 @@
 """Which records of the journal a user means: of which dataflows, nodes and runs."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from fnmatch import fnmatchcase
@@ -25,6 +26,10 @@ class _Recorded(NamedTuple):
     uuid: str = ""
 
 
+_WORDS = {"CURRENT": 0, "PREVIOUS": 1}
+_OFFSET = re.compile("-?0|-[1-9][0-9]{0,3}")
+
+
 def find_query(
     journal: JournalReader,
     query: LogQuery,
@@ -35,8 +40,8 @@ def find_query(
     """The query, with the names, nodes and runs that the journal has for it.
 
     selectors: names, units, UUIDs or patterns; none for all dataflows of the scope. nodes: names or
-    patterns as in glob(7). run: CURRENT, PREVIOUS, ALL, or dora's id of a run. Raises
-    DoraSystemdError: NOT_FOUND for a dataflow, node or run without any record.
+    patterns as in glob(7). run: CURRENT or 0, PREVIOUS or -1, -2 and so on, ALL, or dora's id of a
+    run. Raises DoraSystemdError: NOT_FOUND for a dataflow, node or run without any record.
     """
     named = list(filter(None, selectors))
     found = [query]
@@ -104,10 +109,16 @@ def _no_node(pattern: str, names: Sequence[str], known: Sequence[str]) -> DoraSy
     return DoraSystemdError(message, hint, ExitCode.NOT_FOUND)
 
 
+def _runs_before(run: str) -> int | None:
+    """How many runs before the last one this means, as in `journalctl --boot`; None for an id."""
+    return -int(run) if _OFFSET.fullmatch(run) else _WORDS.get(run)
+
+
 def _select_run(journal: JournalReader, query: LogQuery, run: str) -> LogQuery:
     if run == "ALL":
         return query
-    if run not in ("CURRENT", "PREVIOUS"):
+    index = _runs_before(run)
+    if index is None:
         if run and not journal.has_run(query.scope, query.name, run):
             message = f"cannot find the run {quoted(run)}"
             hint = "doractl list --all, or journalctl --field=DORA_RUN"
@@ -116,10 +127,10 @@ def _select_run(journal: JournalReader, query: LogQuery, run: str) -> LogQuery:
     if not query.name:
         hint = "say which dataflow: doractl logs NAME --run CURRENT"
         raise DoraSystemdError("cannot select a run of all dataflows", hint, ExitCode.USAGE)
-    index = 0 if run == "CURRENT" else 1
     lives = journal.invocations(query.scope, query.name, query.uuid)
     invocation = next(islice(lives, index, None), None)
     if invocation is None:
-        message = f"cannot find the {run.lower()} run of dataflow {query.name}"
+        which = f"{run.lower()} run" if run in _WORDS else f"run {run}"
+        message = f"cannot find the {which} of dataflow {query.name}"
         raise DoraSystemdError(message, "--run ALL shows all there is", ExitCode.NOT_FOUND)
     return replace(query, invocation=invocation)

@@ -73,6 +73,7 @@ def copy_project(
         with ExitStack() as held:
             project = held.enter_context(opened_project(source.root, account_of(user)))
             found, revision = find_files(project, source.named, repository_owners(source))
+            revision = source.revision if source.sent else revision
             manifest = _manifest(source, store, standing, last, revision)
             originals = found.keys()
             if commands := _commands(source, store, manifest, found):
@@ -110,7 +111,7 @@ def _manifest(
         name=source.plan.options.name,
         uuid=standing.uuid or (last.uuid if last else "") or str(uuid.uuid4()),
         dataflow=source.dataflow,
-        source=source.root,
+        source=source.sent or source.root,
         user="" if user is None else user.pw_name,
         revision=revision,
         created_us=created_us,

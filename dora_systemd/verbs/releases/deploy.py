@@ -95,13 +95,14 @@ def deploy(
     request: DeployRequest,
     tell: Tell,
     warn: Callable[[str], None],
+    source: Source | None = None,
 ) -> Deployed:
-    """Deploy a project. tell: gets each step; warn: each warning.
+    """Deploy a project. tell: gets each step; warn: each warning. source: it, if that is known.
 
     Raises DoraSystemdError: ROLLED_BACK if the release has failed its trial. After any other error
     everything is as before.
     """
-    source = find_source(scope, request.start, bool(request.build_timeout))
+    source = source or find_source(scope, request.start, bool(request.build_timeout))
     name = source.plan.options.name
     store, standing = store_of(scope, name), read_standing(manager, scope, unit_name(name))
     require_deployable(manager, scope, standing)

@@ -7,8 +7,8 @@ reload leave out. Whatever the dataflow itself names belongs to them in any case
 import errno
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Protocol
 
-from dora_systemd.adapters.releases.draft import Draft
 from dora_systemd.decisions.releases.entries import (
     DIRECTORY,
     FILE,
@@ -31,6 +31,21 @@ Progress = Callable[[int, int], None]
 """Called with the bytes that are done, and those of all files."""
 Count = Callable[[int], None]
 """Called with the bytes of one file that are read."""
+
+
+class Target(Protocol):
+    """Where files are copied to. All methods raise OSError."""
+
+    def write(self, path: str, chunks: Iterable[bytes], is_executable: bool) -> Stored:
+        """Write a file."""
+
+    def share(self, path: str, release_id: str) -> None:
+        """Take the file with the same path in another release."""
+
+    def link(self, path: str, target: str) -> Stored:
+        """Create a symbolic link."""
+
+
 _IGNORE_FILE = ".gitignore"
 _AGAIN = "wait until nothing writes to the project, then deploy again"
 
@@ -109,7 +124,7 @@ def digests(project: Project, found: Mapping[str, Found]) -> dict[str, Stored]:
 def copy_files(
     project: Project,
     found: Mapping[str, Found],
-    draft: Draft,
+    draft: Target,
     last: Manifest | None,
     progress: Progress,
 ) -> dict[str, Stored]:
@@ -135,7 +150,7 @@ def copy_files(
 
 
 def _copy(
-    project: Project, one: Found, draft: Draft, last: Manifest | None, count: Count
+    project: Project, one: Found, draft: Target, last: Manifest | None, count: Count
 ) -> Stored:
     if one.kind == LINK:
         return draft.link(one.path, one.target)

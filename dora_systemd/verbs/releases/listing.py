@@ -6,6 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.releases.incoming import leftovers
 from dora_systemd.adapters.releases.store import Store, is_locked, store_root
 from dora_systemd.decisions.releases.choice import UNKNOWN, UNPROVED, Known, state_of
 from dora_systemd.decisions.releases.manifest import Manifest
@@ -60,6 +61,9 @@ def _row(store: Store, standing: Standing, one: Known) -> ReleaseRow:
 
 def judge_releases(manager: Manager, scope: Scope) -> Iterator[Finding]:
     """The findings of `doractl doctor` about what a killed deploy has left."""
+    for path in leftovers(root_of(scope)):
+        text = f"{path} is the rest of a deploy -H that was killed"
+        yield Finding("releases", State.NOTE, text, "the next one removes it")
     for name in deployed_names(scope):
         store, standing = store_of(scope, name), read_standing(manager, scope, unit_name(name))
         if standing.trial:

@@ -1,7 +1,7 @@
 """The project of a deploy: where it is, and what cannot be deployed."""
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -26,7 +26,8 @@ class Source:
 
     plan: of a start from there. named: files that the dataflow names, relative to root. read: what
     the files say that decide what root does, None for one that is not there. dora, uv: the commands
-    that have something to build, "" otherwise.
+    that have something to build, "" otherwise. sent: from where another host has sent it, or "".
+    revision: of git, for one that was sent.
     """
 
     root: str
@@ -36,6 +37,8 @@ class Source:
     read: Mapping[str, bytes | None]
     dora: str = ""
     uv: str = ""
+    sent: str = ""
+    revision: str = ""
 
     @property
     def own_venv(self) -> str | None:
@@ -63,23 +66,37 @@ def find_source(scope: Scope, request: StartRequest, want_build: bool = True) ->
     dataflow = parse_dataflow(parse_yaml(decoded(written.data, path), path), str(path))
     is_unbuilt = want_build and bool(built_nodes(dataflow))
     plan = make_plan(scope, replace(request, dataflow=str(path), is_unbuilt=is_unbuilt))
-    root = _root(path, plan)
+    directory = plan.options.working_directory
+    root = project_root(path, directory)
     _check(plan, dataflow, root, want_build)
-    named = (str(path), settings_path(str(path)), *_programs(dataflow, plan))
-    inside = [os.path.normpath(one) for one in (*named, *plan.settings[ENV_FILE])]
-    relative = (os.path.relpath(one, root) for one in inside if _is_below(one, root))
+    environment_files = plan.settings[ENV_FILE]
+    named = named_paths(dataflow, directory, root, environment_files)
     beside = settings_path(str(path))
     settings = read_file(beside) if exists(beside) else None
     origin = _origin(written.place, settings and settings.place)
     read: dict[str, bytes | None] = {
         os.path.relpath(one, root): read_file(one).data
-        for one in plan.settings[ENV_FILE]
+        for one in environment_files
         if _is_below(os.path.normpath(one), root) and one not in plan.settings.lent
     }
     read[os.path.relpath(path, root)] = written.data
     read[os.path.relpath(beside, root)] = settings and settings.data
     builders = find_builders(plan, dataflow, root) if want_build else ()
-    return Source(root, origin, plan, tuple(dict.fromkeys(relative)), read, *builders)
+    return Source(root, origin, plan, named, read, *builders)
+
+
+def named_paths(
+    dataflow: Dataflow, directory: str, root: str, more: Iterable[str]
+) -> tuple[str, ...]:
+    """The files below `root` that belong to a release in any case, relative to it.
+
+    directory: the working directory. more: other absolute paths that count if they are below.
+    """
+    path = dataflow.source
+    named = (path, settings_path(path), *_programs(dataflow, directory), *more)
+    inside = (os.path.normpath(one) for one in named)
+    relative = (os.path.relpath(one, root) for one in inside if _is_below(one, root))
+    return tuple(dict.fromkeys(relative))
 
 
 def require_same(source: Source, tree: Path) -> None:
@@ -134,9 +151,12 @@ def _origin(place: Place, settings: Place | None) -> Place:
     return place if settings.uid == 0 and not settings.borrowed else settings
 
 
-def _root(path: Path, plan: Plan) -> str:
-    """The directory of the file, or the working directory if that is above it."""
-    directory = os.path.normpath(plan.options.working_directory)
+def project_root(path: Path, directory: str) -> str:
+    """The directory of the file, or the working directory if that is above it.
+
+    Raises DoraSystemdError (BAD_INPUT) if neither is above the other one.
+    """
+    directory = os.path.normpath(directory)
     above = str(path.parent)
     if _is_below(directory, above) or directory == above:
         return above
@@ -167,7 +187,7 @@ def _check(plan: Plan, dataflow: Dataflow, root: str, want_build: bool) -> None:
             raise _refusal(f"node {node.id}: {reason}", hint)
 
 
-def _programs(dataflow: Dataflow, plan: Plan) -> Iterator[str]:
+def _programs(dataflow: Dataflow, working_directory: str) -> Iterator[str]:
     """The files that nodes and operators are started from, absolute, as far as they have a path."""
     for node in dataflow.nodes:
         raw = node.raw
@@ -175,7 +195,7 @@ def _programs(dataflow: Dataflow, plan: Plan) -> Iterator[str]:
         values = [node.path, raw.get("module"), *(_operator_file(one) for one in operators)]
         for one in values:
             if isinstance(one, str) and one and "://" not in one:
-                directory = Path(plan.options.working_directory, node.working_directory)
+                directory = Path(working_directory, node.working_directory)
                 yield str(directory / one)
 
 

@@ -4,11 +4,12 @@ No host can hold up the others, or this process: a login, an answer and an idle 
 their bounds.
 """
 
+import itertools
 import os
 import select
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 from dora_systemd.adapters.ssh.connection import Connection
@@ -37,11 +38,15 @@ class Said(NamedTuple):
 
 
 class Ended(NamedTuple):
-    """The end of doractl on a host. error: why it was not reached, or is lost."""
+    """The end of doractl on a host. error: why it was not reached, or is lost.
+
+    was_in: whether doractl had begun there.
+    """
 
     host: Host
     status: int
     error: DoraSystemdError | None
+    was_in: bool = False
 
 
 Event = Said | Ended | None
@@ -49,15 +54,26 @@ Event = Said | Ended | None
 
 
 class Talk:
-    """The doractl of one host. most_seconds: for its answer, after the login; None: any time."""
+    """The doractl of one host. most_seconds: for its answer, after the login; None: any time.
+
+    opening: what it reads first; None: see Way.
+    """
 
     def __init__(
-        self, host: Host, way: Way, words: Sequence[str], most_seconds: float | None
+        self,
+        host: Host,
+        way: Way,
+        words: Sequence[str],
+        most_seconds: float | None,
+        opening: bytes | None = None,
     ) -> None:
         mark = f"doractl-{os.urandom(16).hex()}"
         arguments = ssh_arguments(host, way, remote_command(way, words, mark))
         self.host = host
-        self.connection = Connection(arguments, is_fed=way is Way.FED)
+        self.connection = Connection(arguments, is_fed=way is Way.FED and opening is None)
+        self._outbox = itertools.chain([opening or b""])
+        self._chunk = b""
+        self._has_more = opening is not None
         self._most = most_seconds
         self._deadline = time.monotonic() + LOGIN_SECONDS
         self._output, self._errors = AfterMark(mark), AfterMark(mark)
@@ -92,6 +108,24 @@ class Talk:
             shown = b"" if is_of_ssh(shown) else shown
         return [Said(self.host, shown, is_error)] if shown else []
 
+    @property
+    def wants_to_write(self) -> bool:
+        """Whether there is something to say, to a host that hears it."""
+        return self._has_more and self.is_in and self.connection.input >= 0
+
+    def say(self, chunks: Iterable[bytes]) -> None:
+        """Write this, too."""
+        self._outbox = itertools.chain(self._outbox, chunks)
+        self._has_more = True
+
+    def write(self) -> None:
+        """Write what goes now."""
+        try:
+            self._chunk = self._chunk or next(self._outbox)
+            self._chunk = self._chunk[self.connection.write(self._chunk) :]
+        except (OSError, StopIteration):  # who does not read any more says why
+            self._has_more = False
+
     def end(self) -> Iterator[Said | Ended]:
         """What is left, after the end of ssh."""
         for fd in (self.connection.output, self.connection.errors):
@@ -101,7 +135,7 @@ class Talk:
         complaint = self._complaint if self.is_in else self._errors.noise
         words = (one.decode("utf-8", "replace") for one in (self._output.noise, complaint))
         error = self._refusal or ending_error(self.host, status, self.is_in, *words)
-        yield Ended(self.host, status, error)
+        yield Ended(self.host, status, error, self.is_in)
 
     def refuse(self, error: DoraSystemdError) -> None:
         """Take no more of its answer."""
@@ -115,13 +149,16 @@ class Talk:
         """End a talk that has reached a bound."""
         status = self.connection.close()
         if self._refusal:
-            return Ended(self.host, status, self._refusal)
+            return Ended(self.host, status, self._refusal, self.is_in)
         what = ("no answer", self._most) if self.is_in else ("no login", LOGIN_SECONDS)
-        return Ended(self.host, status, silent(self.host, what[1] or 0, what[0]))
+        return Ended(self.host, status, silent(self.host, what[1] or 0, what[0]), self.is_in)
 
 
 class Talks:
-    """The talks with several hosts. is_full: whether the output of a host can wait."""
+    """The talks with several hosts. is_full: whether the output of a host can wait.
+
+    at_once: with how many at the same time. opening: what each of them reads first.
+    """
 
     def __init__(
         self,
@@ -130,8 +167,12 @@ class Talks:
         words: Sequence[str],
         most_seconds: float | None = None,
         is_full: Callable[[str], bool] = lambda _host: False,
+        at_once: int | None = None,
+        opening: bytes | None = None,
     ) -> None:
         self._waiting = deque(hosts)
+        self._at_once = at_once or len(hosts)
+        self._opening = opening
         self._how = way, words, most_seconds
         self._is_full = is_full
         self._live: list[Talk] = []
@@ -141,9 +182,24 @@ class Talks:
         """Whether every host was reached or given up."""
         return not self._waiting and all(one.is_in for one in self._live)
 
+    @property
+    def present(self) -> list[Host]:
+        """The hosts that are talked with now."""
+        return [one.host for one in self._live]
+
+    def say(self, host: Host, chunks: Iterable[bytes]) -> None:
+        """Let a host read this."""
+        for one in self._live:
+            if one.host == host:
+                one.say(chunks)
+
+    def begin_no_more(self) -> None:
+        """Talk with no host that is still waiting."""
+        self._waiting.clear()
+
     def hang_up(self) -> None:
         """End what follows, and let it say its last words."""
-        self._waiting.clear()
+        self.begin_no_more()
         for one in self._live:
             one.connection.hang_up()
 
@@ -164,17 +220,26 @@ class Talks:
                 one.connection.close()
 
     def _admit(self) -> None:
-        while self._waiting and sum(not one.is_in for one in self._live) < LOGINS:
-            self._live.append(Talk(self._waiting.popleft(), *self._how))
+        while self._waiting and self._has_room():
+            self._live.append(Talk(self._waiting.popleft(), *self._how, self._opening))
+
+    def _has_room(self) -> bool:
+        logins = sum(not one.is_in for one in self._live)
+        return logins < LOGINS and len(self._live) < self._at_once
 
     def _turn(self) -> Iterator[Event]:
         talks = {fd: one for one in self._live for fd in one.open_fds(self._is_full(one.host.text))}
         poll = select.poll()
         for fd in talks:
             poll.register(fd, select.POLLIN)
+        writers = {one.connection.input: one for one in self._live if one.wants_to_write}
+        for fd in writers:
+            poll.register(fd, select.POLLOUT)
         ready = [fd for fd, _ in poll.poll(_TURN_SECONDS * 1000)]
         for fd in ready:
-            if fd != talks[fd].connection.ended:
+            if fd in writers:
+                writers[fd].write()
+            elif fd != talks[fd].connection.ended:
                 yield from talks[fd].take(fd) or ()
         yield from self._ends([one for one in self._live if one.connection.ended in ready])
         yield None

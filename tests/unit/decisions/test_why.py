@@ -306,7 +306,11 @@ def test_running_degraded_and_restarting() -> None:
     assert (verdict.status, verdict.node, verdict.is_failure) == ("Degraded", "camera", True)
     text = format_report(Report(SUBJECT, verdict))
     assert "Why:      node camera: exit code 1 after 2 restarts\n  Now:      1/2\n" in text
-    assert "camera stays down" in text
+    assert "camera stays down until doractl restart robot;" in text
+    text = format_report(Report(SUBJECT, verdict, is_held=True))
+    assert "  fix camera, and save it\n  camera stays down until its file is saved, " in text
+    assert "doractl reload robot --node camera;" in text
+    assert "doractl restart" not in text
     waiting = Facts("Running", "1/2", restarting=("camera",))
     verdict = judge(*RUNS, CRASH, facts=waiting)
     assert (verdict.node, verdict.is_passing, verdict.is_failure) == ("camera", True, False)

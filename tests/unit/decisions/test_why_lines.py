@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from dora_systemd.decisions.why.last_lines import Word, choose_last, shown_last
-from dora_systemd.decisions.why.report import Report, Subject, format_report
+from dora_systemd.decisions.why.report import Report, Subject, format_report, remedies
 from dora_systemd.decisions.why.verdict import Verdict
 
 Record = Mapping[str, Any]
@@ -88,3 +88,22 @@ def test_report() -> None:
     subject = Subject("u", "robot", "dora-robot.service", "--system")
     report = Report(subject, Verdict("Failed", node="camera"), (Word(1, "camera", SLOW, 19),))
     assert "  ... 19 times" in format_report(report, width=80)
+
+
+FULL = "OSError: [Errno 28] No space left on device"
+
+
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        (FULL, "a file system that camera writes to is full: df shows which one"),
+        (f"{FULL}: '/srv/a b/{{x}}'", "the file system of this file is full: df '/srv/a b/{x}'"),
+        (f"{FULL}: 'a.bag'", "a file system that camera writes to is full"),
+        ("tar: x: Disk quota exceeded", "a file system that camera writes to is full"),
+        ('Os { code: 28, message: "No space left on device" }', "df shows which one"),
+    ],
+)
+def test_a_full_file_system(line: str, told: str) -> None:
+    subject = Subject("u", "robot", "dora-robot.service", "--system")
+    report = Report(subject, Verdict("Failed", node="camera"), (Word(1, "camera", line),))
+    assert told in remedies(report)[0]

@@ -35,6 +35,9 @@ LATE = {
             *("cli.foreground", "verbs.start.run", "verbs.why", "decisions.why.signs"),
         },
     },
+    "it reads projects: most verbs for other hosts do not": {
+        "cli.remote.dispatch": {"cli.remote.rollout"},
+    },
     "a restart of what runs makes no plan": {
         "cli.verbs.run.restart": {"verbs.restart"},
     },

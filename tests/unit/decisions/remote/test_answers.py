@@ -124,10 +124,10 @@ def test_the_table() -> None:
         ["d", "54f30e60", "arm\\x1b[2J", "Running"],
         ["b", "-", "-", "Unreachable"],
     ]
-    by_name = format_hosts({"a": [ROBOT], "d": [other]}, "name")
+    by_name = format_hosts({"a": [ROBOT], "d": [other]}, sort_by="name")
     assert [line.split()[0] for line in by_name.splitlines()[1:]] == ["d", "a"]
     assert format_hosts({"a": []}) == ""
-    assert max(map(len, format_hosts({"a" * 40: [ROBOT], "b": None}, None, 60).splitlines())) <= 60
+    assert max(map(len, format_hosts({"a" * 40: [ROBOT], "b": None}, 60).splitlines())) <= 60
 
 
 def taken(merge: Merge, now: float = 0.0) -> list[bytes]:

@@ -1,0 +1,116 @@
+"""A project that another host sends: the stream that it comes by, and where it waits."""
+
+import contextlib
+import fcntl
+import os
+import select
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from dora_systemd.adapters.releases.draft import Draft
+from dora_systemd.adapters.releases.store import Store, make_directories, remove_tree
+from dora_systemd.errors import DoraSystemdError
+
+_NAME = ".sent"
+"""No dataflow has such a name."""
+_SECONDS = 90.0
+"""Timeout for more bytes: who sends them may be stopped, or gone without a word."""
+_YOUNG_SECONDS = 60.0
+_CHUNK = 256 * 1024
+
+
+class Stream:
+    """The bytes of a file descriptor. All methods raise DoraSystemdError at an early end."""
+
+    def __init__(self, fd: int) -> None:
+        self._fd = fd
+        self._held = b""
+
+    def line(self, most: int) -> bytes:
+        """A line without its end, of at most `most` bytes."""
+        parts, size = [], 0
+        while True:
+            line, end, rest = (self._held or self._more()).partition(b"\n")
+            size += len(line)
+            if size > most:
+                raise _broken("its first line is too long")
+            parts.append(line)
+            self._held = rest
+            if end:
+                return b"".join(parts)
+
+    def chunks(self, size: int) -> Iterator[bytes]:
+        """The next `size` bytes."""
+        while size:
+            data = self._held or self._more()
+            data, self._held = data[:size], data[size:]
+            size -= len(data)
+            yield data
+
+    def wait_for_end(self) -> None:
+        """Return when whoever sends has ended."""
+        with contextlib.suppress(OSError):
+            while os.read(self._fd, _CHUNK):
+                pass
+
+    def _more(self) -> bytes:
+        if not select.select([self._fd], [], [], _SECONDS)[0]:
+            raise _broken(f"no more of it came for {_SECONDS:g}s")
+        if not (data := os.read(self._fd, _CHUNK)):
+            raise _broken("it ended too early")
+        return data
+
+
+def _broken(reason: str) -> DoraSystemdError:
+    message = f"cannot read a project from standard input: {reason}"
+    return DoraSystemdError(message, "nothing has changed; deploy again")
+
+
+@contextlib.contextmanager
+def incoming(root: Path) -> Iterator[Draft]:
+    """A place below `root` for files that are sent, until the end of the block. Raises OSError."""
+    store = Store(root, _NAME)
+    make_directories(store.path)
+    store.path.chmod(0o711)  # who may not read it cannot lock what is in it
+    _clean(store)
+    draft = Draft(store)
+    try:
+        with _locked(draft.tree.parent):
+            yield draft
+    finally:
+        draft.discard()
+        with contextlib.suppress(OSError):
+            store.path.rmdir()
+
+
+def leftovers(root: Path) -> list[Path]:
+    """What a doractl that was killed has left there."""
+    return [path for path in Store(root, _NAME).unfinished() if not _is_used(path)]
+
+
+def _clean(store: Store) -> None:
+    for path in leftovers(store.path.parent):
+        remove_tree(path)
+
+
+def _is_used(path: Path) -> bool:
+    """Whether a process writes to it, or may be about to lock it."""
+    try:
+        if abs(time.time() - path.stat().st_mtime) < _YOUNG_SECONDS:
+            return True
+        with _locked(path):
+            return False
+    except OSError:
+        return True
+
+
+@contextlib.contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Hold a lock on a directory; the kernel ends it with the process. Raises OSError."""
+    fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
+        os.close(fd)

@@ -1,0 +1,128 @@
+"""A release for one host after the other: what became of each, and whether to go on. Pure."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
+
+from dora_systemd.decisions.remote.command import NO_PROGRAM
+from dora_systemd.decisions.remote.hosts import Host
+from dora_systemd.errors import DoraSystemdError, ExitCode
+
+DONE = {"deploy": "deployed", "rollback": "rolled back"}
+UNDONE = {"deploy": "rolled back", "rollback": "undone"}
+INHIBITED, UNREACHABLE, LOST = "inhibited", "unreachable", "lost"
+FAILED, NOT_TRIED = "failed", "not tried"
+_RELEASE_WIDTH = 24
+"""Of an id with a revision of git."""
+_UNKNOWN = "-"
+
+
+class Verdict(NamedTuple):
+    """What became of a host. word: for people. release, former: ids, or ""."""
+
+    host: str
+    word: str
+    release: str = ""
+    former: str = ""
+
+
+class End(Protocol):
+    """The end of doractl on a host, see Ended in verbs/remote/talk.py."""
+
+    @property
+    def status(self) -> int:
+        """The exit status."""
+
+    @property
+    def was_in(self) -> bool:
+        """Whether doractl had begun there."""
+
+
+def verdict_of(
+    host: Host,
+    verb: str,
+    end: End,
+    error: DoraSystemdError | None,
+    outcome: Mapping[str, Any],
+) -> Verdict:
+    """The verdict about a host. error: why it was not reached, or is lost. outcome: its object."""
+    details = outcome.get("details")
+    known = details if isinstance(details, dict) else {}
+    texts = [known.get(key) for key in ("release", "former")]
+    release, former = (one[:_RELEASE_WIDTH] if isinstance(one, str) else "" for one in texts)
+    return Verdict(host.text, _word(verb, end, error), release, former)
+
+
+def _word(verb: str, end: End, error: DoraSystemdError | None) -> str:
+    if error is not None:
+        if error.code != ExitCode.NO_HOST:
+            return FAILED
+        return LOST if end.was_in and end.status != NO_PROGRAM else UNREACHABLE
+    words = {
+        int(ExitCode.OK): DONE[verb],
+        int(ExitCode.ROLLED_BACK): UNDONE[verb],
+        int(ExitCode.INHIBITED): INHIBITED,
+    }
+    return words.get(end.status, FAILED)
+
+
+def verdict_object(
+    one: Verdict, verb: str, name: str, problem: Mapping[str, Any] | None
+) -> dict[str, Any]:
+    """A verdict for JSON, where there is no outcome. problem: the object of an error."""
+    return {
+        "action": verb,
+        "name": name,
+        "uuid": None,
+        "unit": None,
+        "node": None,
+        "result": one.word,
+        "text": None,
+        "details": {},
+        "error": problem,
+    }
+
+
+def may_go_on(verb: str, word: str) -> bool:
+    """Whether the next hosts may get it: nothing speaks against the release."""
+    return word in (DONE[verb], INHIBITED, UNREACHABLE)
+
+
+def worst_status(statuses: Sequence[int]) -> int:
+    """The exit status of all: a trial that has failed counts most, else the highest."""
+    if ExitCode.ROLLED_BACK in statuses:
+        return ExitCode.ROLLED_BACK
+    return max(statuses, default=ExitCode.OK)
+
+
+def older(host: Host) -> DoraSystemdError:
+    """The error of a host whose doractl does not know what it is asked for."""
+    hint = f"install this version there; doractl -H {host.text} version tells which one it has"
+    message = f"cannot deploy to {host.text}: the version there is too old to receive a project"
+    return DoraSystemdError(message, hint, ExitCode.USAGE)
+
+
+class Columns:
+    """The table, a line at a time. width: of a terminal, None without one."""
+
+    def __init__(self, verb: str, hosts: Sequence[str], width: int | None) -> None:
+        words = (DONE[verb], UNDONE[verb], INHIBITED, UNREACHABLE, LOST, FAILED, NOT_TRIED)
+        columns = [("HOST", *hosts), ("RESULT", *words), ("RELEASE",), ("BEFORE",)]
+        widths = [max(map(len, column)) for column in columns]
+        widths[2:] = [_RELEASE_WIDTH] * 2
+        # What ran before is the first that a narrow terminal can do without.
+        while width is not None and len(widths) > 2 and sum(widths) + 2 * len(widths) > width:
+            widths.pop()
+        self._widths = widths
+
+    @property
+    def header(self) -> str:
+        """The first line."""
+        return self._line(("HOST", "RESULT", "RELEASE", "BEFORE"))
+
+    def row(self, one: Verdict) -> str:
+        """The line of a host."""
+        return self._line([cell or _UNKNOWN for cell in one])
+
+    def _line(self, cells: Sequence[str]) -> str:
+        shown = zip(cells, self._widths, strict=False)
+        return "  ".join(f"{cell:<{width}}" for cell, width in shown).rstrip()

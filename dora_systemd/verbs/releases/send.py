@@ -1,0 +1,144 @@
+"""Packs a project for `deploy -H`. The hosts decide whatever depends on a machine."""
+
+import contextlib
+import os
+import pwd
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+from dora_systemd.adapters.host.files import decoded, parse_yaml
+from dora_systemd.adapters.releases.spool import Spool, spooled
+from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
+from dora_systemd.decisions.releases.entries import Found
+from dora_systemd.decisions.releases.parcel import Parcel
+from dora_systemd.decisions.settings.resolve import Settings, resolve_settings
+from dora_systemd.decisions.settings.table import ENV_FILE, VENV, WORKING_DIRECTORY
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import settings_path
+from dora_systemd.scope import Scope
+from dora_systemd.trust.files import read_file
+from dora_systemd.trust.paths import Place, exists, is_directory, reached
+from dora_systemd.trust.programs import Account
+from dora_systemd.trust.project import opened_project
+from dora_systemd.values import format_rounded_size, shown
+from dora_systemd.verbs.releases.files import copy_files, find_files
+from dora_systemd.verbs.releases.source import named_paths, project_root
+from dora_systemd.verbs.start.account import DEFAULT_USER, account_of, choose_user
+from dora_systemd.verbs.start.plan import DEFAULT_FILE, StartRequest, request_name
+
+
+class Packed(NamedTuple):
+    """A parcel and the contents of its files."""
+
+    parcel: Parcel
+    spool: Spool
+
+
+class _Sender(NamedTuple):
+    """A project here. directory: its working directory, "" for that of the dataflow file."""
+
+    place: Place
+    dataflow: Dataflow
+    settings: Settings
+    root: str
+    directory: str
+
+
+@contextlib.contextmanager
+def packed(
+    request: StartRequest, tell: Callable[[str], None], warn: Callable[[str], None]
+) -> Iterator[Packed]:
+    """The project that `request` names, which nobody changes any more.
+
+    tell: gets each stage; warn: each warning. Raises DoraSystemdError.
+    """
+    sender = _find(request)
+    if note := _venv_note(sender):
+        warn(note)
+    root, dataflow = sender.root, sender.dataflow
+    directory = sender.directory or root
+    environment_files = sender.settings[ENV_FILE]
+    named = named_paths(dataflow, directory, root, environment_files)
+
+    def progress(done: int, total: int) -> None:
+        tell(f"packing: {format_rounded_size(done)} of {format_rounded_size(total)}")
+
+    with spooled() as spool:
+        reader = _reader(sender)
+        with opened_project(root, reader) as project:
+            found, revision = find_files(project, named, [0, os.geteuid(), sender.place.uid])
+            if reader is None and os.geteuid() == 0:
+                _require_roots(root, found)
+            _require_own(found, root, dataflow)
+            files = copy_files(project, found, spool, None, progress)
+        parcel = Parcel(
+            name=request_name(StartRequest(dataflow.source, request.name)),
+            source=root,
+            dataflow=os.path.relpath(dataflow.source, root),
+            directory=os.path.relpath(directory, root) if sender.directory else None,
+            revision=revision,
+            files=files,
+        )
+        yield Packed(parcel, spool)
+
+
+def _find(request: StartRequest) -> _Sender:
+    path = Path(request.dataflow).absolute()
+    path = path / DEFAULT_FILE if is_directory(path) else path
+    path = Path(os.path.normpath(path))
+    written = read_file(path)
+    dataflow = parse_dataflow(parse_yaml(decoded(written.data, path), path), str(path))
+    beside = Path(settings_path(str(path)))
+    documents = [(str(beside), _document(beside))] if exists(beside) else []
+    settings = resolve_settings(request.flags, {}, documents)
+    given = settings[WORKING_DIRECTORY]
+    directory = "" if given is None else os.path.normpath(Path(given).absolute())
+    root = project_root(path, directory or str(path.parent))
+    return _Sender(written.place, dataflow, settings, root, directory)
+
+
+def _venv_note(sender: _Sender) -> str:
+    """The warning for a virtual environment that a deploy here would use, or ""."""
+    venv = str(Path(sender.dataflow.source).parent / ".venv")
+    if sender.settings.is_given(VENV) or not exists(f"{venv}/bin/python"):
+        return ""
+    return f"{shown(venv)} stays here: name a virtual environment of the hosts with --venv"
+
+
+def _document(path: Path) -> object:
+    return parse_yaml(decoded(read_file(path).data, path), path, allow_empty=True)
+
+
+def _reader(sender: _Sender) -> Account | None:
+    """Who reads the project, None for the caller: never root what others can change."""
+    try:
+        pwd.getpwnam(DEFAULT_USER)
+    except KeyError:
+        if sender.place.uid == 0:
+            return None
+    if os.geteuid() != 0:
+        return None
+    return account_of(choose_user(Scope(is_user=False, uid=0), None, sender.place, sender.root))
+
+
+def _require_roots(root: str, found: Iterable[str]) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) unless only root can replace files of the project."""
+    for directory in sorted({Path(path).parent for path in found}):
+        with reached(Path(root, directory)) as (_, place):
+            if not place.is_roots:
+                message = f"cannot read {shown(place.path)} as root: others can change it"
+                hint = f"let its owner deploy it, or make the user {DEFAULT_USER}, who reads it"
+                raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+
+
+def _require_own(found: Mapping[str, Found], root: str, dataflow: Dataflow) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) for what is not in the parcel and only works here."""
+    if os.path.relpath(dataflow.source, root) not in found:
+        message = f"cannot send {shown(dataflow.source)}: it is not in the project"
+        raise DoraSystemdError(message, "deploy a file, no link to it", ExitCode.BAD_INPUT)
+    for node in dataflow.nodes:
+        if node.path.startswith(f"{root.rstrip('/')}/"):
+            message = f"cannot send node {node.id}: its path {shown(node.path)} is of this machine"
+            hint = f"write it relative to {shown(root)}"
+            raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)

@@ -1,0 +1,104 @@
+"""A project that another host sends: what of it is written, and where."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.adapters.releases import incoming as module
+from dora_systemd.adapters.releases.draft import Draft
+from dora_systemd.adapters.releases.incoming import Stream, incoming, leftovers
+from dora_systemd.adapters.releases.spool import spooled
+from dora_systemd.decisions.releases.entries import Stored
+from dora_systemd.decisions.releases.parcel import Parcel
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.verbs.releases.receive import Known, _fill
+
+
+def stream_of(data: bytes) -> Stream:
+    read, write = os.pipe()
+    os.write(write, data)
+    os.close(write)
+    return Stream(read)
+
+
+def stored(data: bytes, is_executable: bool = False) -> Stored:
+    with spooled() as spool:
+        return spool.write("", [data], is_executable)
+
+
+OLD, NEW = stored(b"old"), stored(b"newer")
+FILES = {
+    "dataflow.yml": OLD,
+    "moved.yml": OLD,
+    "bin/run": stored(b"newer", True),
+    "copy": NEW,
+    "link": Stored(target="bin/run"),
+}
+PARCEL = Parcel("robot", "/srv/robot", "dataflow.yml", None, "", FILES)
+
+
+def test_what_is_here_already_is_shared(tmp_path: Path) -> None:
+    tree = tmp_path / "last"
+    tree.mkdir()
+    (tree / "dataflow.yml").write_text("old")
+    with incoming(tmp_path) as draft:
+        known = Known(tree, {"dataflow.yml": OLD})
+        _fill(stream_of(b"newer"), PARCEL, [1], draft, known, lambda _: None)
+        found = {path: (draft.tree / path).read_text() for path in FILES}
+        assert found == {path: "old" if one == OLD else "newer" for path, one in FILES.items()}
+        assert (draft.tree / "dataflow.yml").samefile(tree / "dataflow.yml")
+        assert [os.access(draft.tree / one, os.X_OK) for one in ("bin/run", "copy")] == [
+            True,
+            False,
+        ]
+        assert (draft.tree / "link").readlink() == Path("bin/run")
+    assert [one.name for one in tmp_path.iterdir()] == ["last"]
+
+
+@pytest.mark.parametrize("data", [b"", b"new", b"other"])
+def test_what_is_not_what_was_announced(data: bytes, tmp_path: Path) -> None:
+    parcel = Parcel("robot", "", "copy", None, "", {"copy": NEW})
+    with pytest.raises(DoraSystemdError), incoming(tmp_path) as draft:
+        _fill(stream_of(data), parcel, [0], draft, Known(tmp_path, {}), lambda _: None)
+    assert not [*tmp_path.iterdir()]
+
+
+@pytest.mark.parametrize(
+    "read",
+    [
+        lambda stream: stream.line(10),
+        lambda stream: stream.line(2),
+        lambda stream: b"".join(stream.chunks(9)),
+    ],
+)
+def test_a_stream_that_ends(read: Callable[[Stream], bytes]) -> None:
+    with pytest.raises(DoraSystemdError, match="cannot read a project from standard input"):
+        read(stream_of(b"12345"))
+
+
+def test_a_stream() -> None:
+    stream = stream_of(b"head\nbody")
+    assert (stream.line(10), b"".join(stream.chunks(3))) == (b"head", b"bod")
+    stream.wait_for_end()
+
+
+def test_nobody_sends_any_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_SECONDS", 0.0)
+    read, write = os.pipe()
+    with pytest.raises(DoraSystemdError, match="no more of it came"):
+        Stream(read).line(10)
+    os.close(write)
+
+
+def test_what_a_killed_one_has_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It goes, unless somebody is still at it."""
+    with incoming(tmp_path) as other:
+        left = Draft(other._store)
+        assert leftovers(tmp_path) == []
+        monkeypatch.setattr(module, "_YOUNG_SECONDS", -1.0)
+        assert leftovers(tmp_path) == [left.tree.parent]
+        with incoming(tmp_path):
+            assert not left.tree.exists()
+            assert other.tree.exists()
