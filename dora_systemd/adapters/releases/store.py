@@ -202,8 +202,10 @@ def remove_tree(path: Path) -> None:
 
     A build may have filled it: rm(1) follows no link, and removes what is as deep as a path can be.
     """
+    if not os.path.lexists(path):
+        return
     steps = [("rm", "-rf", "--one-file-system", "--", str(path))]
-    if os.geteuid() != 0 and path.exists():
+    if os.geteuid() != 0:
         steps.insert(0, ("chmod", "-R", "u+rwX", "--", str(path)))
     for command in steps:
         with contextlib.suppress(OSError), spawn(command, None) as child:

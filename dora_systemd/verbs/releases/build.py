@@ -86,18 +86,22 @@ def built_project(
     try:
         files = copy_files(project, found, tree, None, lambda *amount: tell(copying(*amount)))
         tree.hand_over(files, None if user is None else (user.pw_uid, user.pw_gid))
-        _run_noted(manager, build, tree)
+        with _noted(build):
+            _run(manager, build, tree)
         root, place = build.source.root, str(tree.place)
         with opened_project(root, account_of(user), place) as built:
-            named, is_user = build.source.named, build.scope.is_user
-            yield built, find_built(built, named, build.place, is_user)
+            with _noted(build):
+                left = find_built(built, build.source.named, build.place, build.scope.is_user)
+            yield built, left
     finally:
         tree.discard()
 
 
-def _run_noted(manager: Manager, build: Build, tree: BuildTree) -> None:
+@contextmanager
+def _noted(build: Build) -> Iterator[None]:
+    """Write an event if the build fails."""
     try:
-        _run(manager, build, tree)
+        yield
     except DoraSystemdError as error:
         reason = error.message.removeprefix(f"cannot build {build.store.name}: ")
         details = {"scope": build.scope.word, "release": build.release, "reason": reason}
