@@ -48,7 +48,7 @@ _TABLE = {
     """,
     OWN: """
         adapters.dora.preparation adapters.host.files adapters.ssh.program cli.main
-        cli.verbs.look.logs decisions.cell.launch verbs.inhibit.hold verbs.start.credentials
+        cli.progress cli.verbs.look.logs decisions.cell.launch verbs.inhibit.hold verbs.start.credentials
         verbs.start.limits
     """,
     KERNEL: """
