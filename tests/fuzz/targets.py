@@ -46,6 +46,8 @@ from dora_systemd.decisions.logs.lines import (
     jsonl_fields,
 )
 from dora_systemd.decisions.properties.assignments import parse_property
+from dora_systemd.decisions.releases.progress import soaking
+from dora_systemd.decisions.releases.versions import parse_versions
 from dora_systemd.decisions.settings.resolve import resolve_settings
 from dora_systemd.decisions.settings.table import SETTINGS
 from dora_systemd.decisions.why.lives import find_lives, parse_happening
@@ -178,6 +180,8 @@ TARGETS = {
     "journal": Target(_happenings),
     "daemon-line": Target(lambda data: parse_daemon_line(text_of(data), 1)),
     "terminal": Target(_terminal),
+    "check-versions": Target(lambda data: parse_versions(text_of(data))),
+    "status-text": Target(lambda data: soaking(text_of(data), 1, 2)),
     "refusal": Target(lambda data: [parse_refusal(text_of(data), n) for n in range(80)]),
     "property": Target(lambda data: parse_property(text_of(data)), REFUSED),
     "values": Target(_of_text(parse_size, parse_duration, parse_cpu, parse_bool)),

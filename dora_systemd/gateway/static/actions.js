@@ -20,8 +20,8 @@ const ACTIONS = {
     "reloading"],
   enable: ["Start at boot", "It starts at every boot, as it runs now.", "enabling"],
   disable: ["Not at boot", "It no longer starts at boot; if it runs, it keeps running.", "disabling"],
-  rollback: ["Roll back", "That release starts in place of the present one. If not all of its nodes "
-    + "become ready, or one fails, the present one runs again.", "rolling back"],
+  rollback: ["Roll back", "The older release starts in place of the present one. If not all of its "
+    + "nodes become ready, or one fails, the present one runs again.", "rolling back"],
   set: SET,
   "hot-reload": ["Hot reload", "While it is on, nodes restart when their files change.", "changing"],
   "set node": SET,

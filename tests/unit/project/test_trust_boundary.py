@@ -48,8 +48,8 @@ _TABLE = {
     """,
     OWN: """
         adapters.dora.preparation adapters.host.files adapters.ssh.program cli.main
-        cli.verbs.look.logs decisions.cell.launch verbs.inhibit.hold verbs.start.credentials
-        verbs.start.limits
+        cli.progress cli.verbs.look.logs decisions.cell.launch verbs.inhibit.hold
+        verbs.start.credentials verbs.start.limits
     """,
     KERNEL: """
         adapters.cgroup.groups adapters.host.lock_table adapters.host.machine
