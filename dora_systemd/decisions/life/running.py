@@ -16,7 +16,7 @@ def node_exited(cell: Cell, event: life.NodeExited) -> Next:
     """A node exited: end the dataflow if it is essential and has failed for good."""
     after, actions = node_event(cell, event)
     before = cell.nodes.get(event.node)
-    if before is None or not event.is_essential or _is_replaced(before):
+    if before is None or not event.is_essential or _is_replaced(cell, before):
         return after, actions
     return _without(after, event.node, actions) if _is_lost(after, event.node) else (after, actions)
 
@@ -28,12 +28,18 @@ def reload_noted(cell: Cell, event: life.ReloadNoted) -> Next:
     return _without(after, lost[0], actions) if lost else (after, actions)
 
 
-def _is_replaced(node: NodeStatus) -> bool:
+def node_reloading(cell: Cell, event: life.Event) -> Next:
+    """A reload replaces a node: what the one before it has reported is not true any more."""
+    return node_event(replace(cell, notice=""), event)
+
+
+def _is_replaced(cell: Cell, node: NodeStatus) -> bool:
     """Whether this is the first process after a reload: the reloader goes back if it fails.
 
     While the dataflow runs, only such a process has never been ready and is no restart of dora's.
+    With a notice the reload is over: the process was too slow for it.
     """
-    return node.state == "starting" and not node.restarts
+    return node.state == "starting" and not node.restarts and not cell.notice
 
 
 def _is_lost(cell: Cell, ident: str) -> bool:

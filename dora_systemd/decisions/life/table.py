@@ -59,6 +59,7 @@ _RUNNING: dict[str, Handler] = {
     **_ALIVE,
     **_RELOADS,
     "NodeExited": running.node_exited,
+    "NodeReloading": running.node_reloading,
     "ReloadNoted": running.reload_noted,
 }
 _STOPPING: dict[str, Handler] = {

@@ -120,6 +120,17 @@ def test_a_failed_reload_ends_it_only_if_the_node_is_down(
     assert cell.failure == ("essential node a: exit code 1" if is_ended else "")
 
 
+def test_a_new_version_that_fails_after_the_reload_was_given_up() -> None:
+    late = life.ReloadNoted(2, "not reloaded: node a: not ready within 30s", essential=("a",))
+    nodes = {**running().nodes, "a": NodeStatus("starting", 9)}
+    cell, _ = live(replace(running(), nodes=nodes), late)
+    assert cell.state is State.RUNNING
+    again, _ = live(cell, life.NodeReloading(3, "a"), life.NodeSpawned(4, "a", 10), exited("a"))
+    assert (again.state, again.notice) == (State.RUNNING, ""), "the next reload is not over"
+    cell, _ = live(cell, exited("a"))
+    assert (cell.state, cell.failure) == (State.STOPPING, "essential node a: exit code 1")
+
+
 def test_a_stop_meanwhile_is_a_stop() -> None:
     stop = life.StopAsked(2, "SIGTERM")
     cell, actions = live(running(), exited("a"), stop, life.StopAnswered(3))
