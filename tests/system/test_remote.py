@@ -236,3 +236,47 @@ def test_a_connection_that_is_cut(cell: Cell, project: Project) -> None:
         assert child.wait(bound(20)) == ExitCode.NO_HOST
         assert child.stderr.read().startswith(b"doractl: the connection to base is lost")
     cell.wait_exchanging()
+
+
+@pytest.mark.usefixtures("servers")
+def test_a_host_that_dies_in_the_middle(cell: Cell, hers: Cell, project: Project) -> None:
+    """It is lost within its bound, and the lines of the others go on."""
+    flow = str(project.three_nodes())
+    run("doractl", "-H", "base", "start", flow, "--name", cell.name)
+    run("doractl", "-H", "arm", "start", flow, "--name", hers.name)
+    command = ["doractl", "logs", cell.name, "--node", "sink", "-H", "base,arm", "-f"]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as child:
+        assert child.stdout and child.stderr
+        while not child.stdout.readline().startswith("arm "):
+            pass
+        # As if its cable were pulled: nothing answers any more.
+        stopped = [int(one) for one in run("pgrep", "-f", "sshd-session: alice").stdout.split()]
+        for session in stopped:
+            os.kill(session, signal.SIGSTOP)
+        begun = time.monotonic()
+        try:
+            said = child.stderr.readline()
+            assert 10 < time.monotonic() - begun < bound(25)
+            assert said.startswith("doractl: the connection to arm is lost")
+            while not child.stdout.readline().startswith("base "):
+                pass
+        finally:
+            for session in stopped:
+                os.kill(session, signal.SIGCONT)
+        child.send_signal(signal.SIGINT)
+        child.communicate(timeout=bound(20))
+        assert child.returncode == ExitCode.INTERRUPTED
+    wait_for("nothing follows over there", lambda: not sessions())
+
+
+@pytest.mark.usefixtures("servers")
+def test_doctor_of_several_hosts() -> None:
+    """The findings of each with its host; one that is dead is a line."""
+    done = doractl("-H", "base,gone,arm", "doctor", "-o", "json")
+    found = json.loads(done.stdout)
+    assert {one["host"] for one in found} == {"base", "arm"}
+    assert done.returncode == ExitCode.NO_HOST
+    assert "cannot reach gone" in json.loads(done.stderr.splitlines()[0])["error"]["message"]
+    text = doractl("-H", "base,arm", "doctor").stdout
+    assert re.findall("==> (.*) <==", text) == ["base", "arm"]

@@ -114,7 +114,9 @@ def test_a_release_goes_from_host_to_host(base: Releases, project: Project) -> N
 
 
 @pytest.mark.usefixtures("arm")
-@pytest.mark.warns("exit code 1", "SystemExit", "the model is missing", "failed", "Failed")
+@pytest.mark.warns(
+    "node exited with error", "exit code 1", "the model is missing", "Failed", "status=1"
+)
 def test_it_stops_at_the_first_host_that_rolls_back(base: Releases, project: Project) -> None:
     name = base.cell.name
     write_version(project, "good")
@@ -126,7 +128,7 @@ def test_it_stops_at_the_first_host_that_rolls_back(base: Releases, project: Pro
         ["base", "rolled", "back"],
         ["arm", "not", "tried"],
     ]
-    assert f"of {name} was rolled back: a" in done.stderr
+    assert f"of {name} was rolled back: node a: exit code 1" in done.stderr
     assert done.returncode == ExitCode.ROLLED_BACK
     assert base.running() == base.current() == next(iter(good[0]))
     assert versions(base.cell, "arm") == good[1]
