@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from dora_systemd.decisions.releases.versions import PROGRAMS
 from dora_systemd.decisions.views.dataflows import (
     UNKNOWN,
     UNREACHABLE,
@@ -76,12 +77,16 @@ def cells_of(value: Mapping[str, Any]) -> list[str] | None:
     if not all(one is None or _is_number(one) for one in known):
         return None
     created, size, files = known
+    named = value.get("versions")  # an older version there does not tell them
+    versions = named if isinstance(named, dict) else {}
     numbers = [
         local_time(int(created or 0)),
         UNKNOWN if size is None else format_rounded_size(int(size)),
         UNKNOWN if files is None else str(files),
     ]
-    return [*map(str, texts), *numbers]
+    programs = (versions.get(one) for one in PROGRAMS)
+    shown = (one if isinstance(one, str) else UNKNOWN for one in programs)
+    return [*map(str, texts), *numbers, *shown]
 
 
 def format_releases(

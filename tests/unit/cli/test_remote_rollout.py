@@ -179,7 +179,7 @@ def test_releases(capsys: Printed) -> None:
     assert main.run(["releases", "-H", "h1,dead,h2"]) == ExitCode.NO_HOST
     out, err = capsys.readouterr()
     rows = [line.split() for line in out.splitlines()]
-    assert rows[0] == ["HOST", "NAME", "ID", "STATE", "CREATED", "SIZE", "FILES"]
+    assert rows[0] == ["HOST", "NAME", "ID", "STATE", "CREATED", "SIZE", "FILES", "DORA", "PYTHON"]
     assert [(row[0], row[3]) for row in rows[1:]] == [
         ("h1", "current"),
         ("h2", "current"),

@@ -5,6 +5,7 @@ import time
 import pytest
 
 from dora_systemd.decisions.cell.owed import Owed
+from dora_systemd.decisions.releases.progress import Step
 from dora_systemd.decisions.why.faults import Fault
 from dora_systemd.scope import Scope
 from dora_systemd.values import SECOND
@@ -19,8 +20,8 @@ IMAGE, DEPTH = Owed("camera", "image", SECOND, 3 * SECOND), Owed("camera", "dept
 def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """The time, which only a sleep changes."""
     now = [1000.0]
-    monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
-    monkeypatch.setattr(module.time, "monotonic_ns", lambda: int(now[0] * 1e9))
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(time, "monotonic_ns", lambda: int(now[0] * 1e9))
     monkeypatch.setattr(time, "sleep", lambda seconds: now.append(now.pop() + seconds))
     return now
 
@@ -31,11 +32,11 @@ def soaked(
     monkeypatch: pytest.MonkeyPatch,
     clock: list[float],
     comes: tuple[float, ...],
-) -> tuple[Fault | None, list[str]]:
+) -> tuple[Fault | None, list[Step]]:
     """What a trial of 2 s finds and tells, whose outputs come so many seconds after its begin."""
     runner = options(owes=(IMAGE, DEPTH)[: len(comes)])
     manager.add(runner, InvocationID=b"")
-    told: list[str] = []
+    told: list[Step] = []
     gate, begun = Gate(manager, scope, runner, told.append), clock[0]
 
     def heard(*_: object) -> tuple[int, ...]:
@@ -61,7 +62,8 @@ def test_it_lasts_until_all_has_come(
     seconds: float,
 ) -> None:
     found, told = soaked(manager, scope, monkeypatch, clock, comes)
-    assert (found, clock[0] - 1000) == (None, pytest.approx(seconds, abs=0.21))
+    assert found is None
+    assert clock[0] - 1000 == pytest.approx(seconds, abs=0.21)
     assert any("waits for camera/image" in one.text for one in told) == (seconds > 2)
 
 
