@@ -179,7 +179,9 @@ def make_directories(path: Path) -> None:
 
 
 def remove_tree(path: Path) -> None:
-    """Remove a directory with all in it, although it may have no write permissions."""
+    """Remove a file, or a directory with all in it, although it may have no write permissions."""
+    with contextlib.suppress(OSError):  # it is a directory, or gone
+        path.unlink()
     for directory, _, _ in os.walk(path):
         with contextlib.suppress(OSError):
             Path(directory).chmod(0o700)

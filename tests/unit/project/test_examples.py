@@ -146,8 +146,8 @@ def test_transcripts(path: Path) -> None:
     check(line for line in wanted if "doractl" in line)
 
 
-def test_there_are_twelve_transcripts() -> None:
-    assert len(TASKS) == 12
+def test_there_are_enough_transcripts() -> None:
+    assert len(TASKS) >= 14
 
 
 def test_commands_in_messages() -> None:

@@ -59,6 +59,7 @@ _TABLE = {
     """,
     ROOTS: """
         adapters.bus.connection adapters.bus.errors adapters.host.unit_files
+        adapters.host.guard
         adapters.releases.draft adapters.releases.store verbs.releases.trial
         adapters.journal.journalctl adapters.journal.reader adapters.journal.socket verbs.doctor
         verbs.facts.enabled verbs.facts.locks verbs.follow verbs.gateway verbs.needs.notes
