@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.system.cells import Project, wait_for
+from tests.system.cells import Project, run, wait_for
 from tests.system.releases import ETC, FLOW, STORE, Releases, write_version
 
 # They write to /etc and /var/lib.
@@ -132,8 +132,12 @@ def test_a_first_trial_that_was_killed_can_be_ended(releases: Releases, project:
     write_version(project, "first")
     with begin(releases, project, "1h") as child:
         wait_for("it runs", lambda: "version first" in cell.messages("a"))
+        # Its child first, which would end the trial.
+        for pid in run("pgrep", "--parent", str(child.pid)).stdout.split():
+            os.kill(int(pid), signal.SIGKILL)
         child.kill()
     assert "trial" in releases.states().values()
+    assert "on trial" in cell.doractl("doctor", check=False).stdout
     assert "its trial has ended" in cell.doractl("rollback", cell.name).stdout
     assert (releases.running(), list(releases.states().values())) == ("", ["unproved"])
     assert not releases.trial.exists()

@@ -198,7 +198,7 @@ def make_directories(path: Path) -> None:
 
 
 def remove_tree(path: Path) -> None:
-    """Remove a directory with all in it, although it may have no write permissions.
+    """Remove a file, or a directory with all in it, although it may have no write permissions.
 
     A build may have filled it: rm(1) follows no link, and removes what is as deep as a path can be.
     """

@@ -4,14 +4,13 @@ It needs no running process of ours.
 """
 
 import time
-from collections.abc import Container, Mapping
+from collections.abc import Container, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from dora_systemd.adapters.bus.manager import SETTLED, Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.decisions.cell.counters import WHOLE_CELL, CpuSample
-from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.decisions.resources.usage import Usage
 from dora_systemd.errors import DoraSystemdError
@@ -20,7 +19,8 @@ from dora_systemd.scope import Scope
 from dora_systemd.trust.cells import read_table, read_times
 from dora_systemd.verbs.facts.cells import Cell
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # the table of `list` does without
+    from dora_systemd.decisions.cell.owed import Owed
     from dora_systemd.verbs.facts.held import Held
 
 UP_SINCE = "ActiveEnterTimestampMonotonic"
@@ -84,7 +84,7 @@ def read_dataflow(
     nodes = cgroup.shown_groups(path, status.nodes) if not slice_path or not status.nodes else {}
     groups = {WHOLE_CELL: path, **nodes}
     usage = {key: cgroup.read_usage(group) for key, group in groups.items()}
-    heard = () if slice_path else read_heard(scope, cell.options)
+    heard = () if slice_path else read_heard(scope, cell.name, cell.options.owes)
     return Reading(cell, unit, status, problem, groups, usage, _monotonic_us(), heard)
 
 
@@ -96,13 +96,13 @@ def _read_held(manager: Manager, cell: Cell) -> Reading:
     return Reading(cell, unit, at_us=_monotonic_us(), held=read_held(manager, cell))
 
 
-def read_heard(scope: Scope, options: RunnerOptions) -> tuple[int, ...]:
-    """The last message of each owed output, CLOCK_MONOTONIC µs, 0 is never."""
-    if not (owes := options.owes):
+def read_heard(scope: Scope, name: str, owes: "Sequence[Owed]") -> tuple[int, ...]:
+    """The last message of each owed output of a dataflow, CLOCK_MONOTONIC µs, 0 is never."""
+    if not owes:
         return ()
     from dora_systemd.decisions.owes.probe import parse_times, size_of_times
 
-    data = read_times(scope.cell_directory(options.name), size_of_times(owes))
+    data = read_times(scope.cell_directory(name), size_of_times(owes))
     return parse_times(data, owes, _monotonic_us())[1]
 
 

@@ -167,7 +167,7 @@ def _end_killed(scope: Scope, standing: Standing, change: Change) -> None:
     now = read_standing(manager, scope, standing.boot.unit)
     if now.current != change.release or standing.current == change.release:
         _roll_back(manager, standing, change, Fault(_KILLED), lambda _: None)
-    elif now.path.exists():
+    else:
         end_trial(manager, now)
 
 

@@ -1,7 +1,6 @@
 """What a deploy or rollback that was killed has left: doctor names it, the next one removes it."""
 
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 
 from dora_systemd.adapters.host.unit_files import remains_of
@@ -20,8 +19,4 @@ def remains(store: Store, standing: Standing) -> Iterator[Path]:
 def clean(store: Store, standing: Standing) -> None:
     """Remove them. The caller holds the lock of the store."""
     for path in remains(store, standing):
-        if path.is_dir() and not path.is_symlink():
-            remove_tree(path)
-        else:
-            with suppress(OSError):
-                path.unlink()
+        remove_tree(path)

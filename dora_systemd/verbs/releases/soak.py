@@ -123,8 +123,8 @@ class Gate:
 
     def _unheard(self) -> Owed | None:
         """The owed output that the trial has to wait for the longest, if any has not come yet."""
-        heard = read_heard(self._scope, self._options)
-        pairs = zip(self._options.owes, heard, strict=True)
+        owes = self._options.owes
+        pairs = zip(owes, read_heard(self._scope, self._options.name, owes), strict=True)
         late = (one for one, at in pairs if at < self._since_monotonic_us)
         return max(late, key=lambda one: one.first, default=None)
 

@@ -38,10 +38,19 @@ def deploy_words(releases: Releases, place: Path, soak: str = "0s") -> tuple[str
     return ("deploy", str(place), "--name", releases.cell.name, "--soak", soak)
 
 
-def begin(releases: Releases, *words: str) -> "subprocess.Popen[str]":
-    """A doractl that goes on."""
-    command = ("doractl", releases.cell.scope.flag, *words)
-    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+def begin(releases: Releases, *words: str, is_group: bool = False) -> "subprocess.Popen[str]":
+    """A doractl that goes on. is_group: in a process group of its own."""
+    return _popen(("doractl", releases.cell.scope.flag, *words), is_group)
+
+
+def _popen(command: tuple[str, ...], is_group: bool = False) -> "subprocess.Popen[str]":
+    return subprocess.Popen(
+        command,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        process_group=0 if is_group else None,
+    )
 
 
 def begin_counted(
@@ -53,4 +62,4 @@ def begin_counted(
     """
     hook = _HOOK.replace("{COUNTED}", COUNTED).replace("{END}", end)
     command = (sys.executable, "-c", hook, str(change), releases.cell.scope.flag, *words)
-    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    return _popen(command)

@@ -59,9 +59,9 @@ _TABLE = {
     """,
     ROOTS: """
         adapters.bus.connection adapters.bus.errors adapters.host.unit_files
+        adapters.host.guard
         adapters.releases.build_tree adapters.releases.draft adapters.releases.incoming
-        adapters.releases.store
-        verbs.releases.trial
+        adapters.releases.store verbs.releases.trial
         adapters.journal.journalctl adapters.journal.reader adapters.journal.socket verbs.doctor
         verbs.facts.enabled verbs.facts.locks verbs.follow verbs.gateway verbs.needs.notes
         verbs.setup verbs.show verbs.start.enable verbs.up
