@@ -6,7 +6,6 @@ what runs.
 """
 
 from collections.abc import Mapping
-from signal import SIGKILL
 
 from dora_systemd.decisions.cell.environment import environment_entries
 from dora_systemd.decisions.properties.assignments import typed, with_assignments
@@ -65,8 +64,6 @@ def build_properties(
         TimeoutStartSec=timeout,
         TimeoutStopSec=_STOP,
         KillMode="control-group",
-        # What a build leaves may ignore another signal, and its unit would fail by that.
-        KillSignal=int(SIGKILL),
         CPUWeight=_SHARES,
         IOWeight=_SHARES,
         TasksMax=_MOST_TASKS,
