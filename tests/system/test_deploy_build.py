@@ -117,7 +117,6 @@ while ! [ -e {proof} ]; do sleep 0.05; done
 """
 
 
-@pytest.mark.warns("Killing", "Failed", "imed out")
 def test_no_process_of_a_build_is_left(releases: Releases, project: Project) -> None:
     cell, proof = releases.cell, "/tmp/build-proof"
     write_version(project, "1")
@@ -188,7 +187,8 @@ def check_venv(releases: Releases) -> None:
     assert releases.cell.messages("a") == [f"node {venv}", f"script {venv}"]
     assert releases.cell.show("ExecStart").count(f"--venv={venv}") == 1
     manifest = json.loads((venv.parents[1] / "release.json").read_text())
-    assert manifest["files"][".venv/bin/python"]["link"].startswith("/")
+    found = [one for path, one in manifest["files"].items() if ".venv/bin/python" in path]
+    assert any(one["link"].startswith("/") for one in found)
 
 
 def test_a_virtual_environment_works_where_it_was_built(

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePath
+from signal import SIGKILL
 
 from dora_systemd.adapters.bus.manager import DOWN, Manager, Property
 from dora_systemd.adapters.releases.build_tree import BuildTree
@@ -202,6 +203,8 @@ def _sent(manager: Manager, build: Build, tree: BuildTree, reading: int) -> list
         ("Description", "s", f"build of release {build.release} of dora dataflow {task.name}"),
         exec_start(build_command(sys.executable, format_task(task))),
         ("StandardInputFileDescriptor", "h", reading),
+        # What a build leaves may ignore another signal, and the unit would fail by that.
+        ("KillSignal", "i", int(SIGKILL)),
         ("CollectMode", "s", "inactive-or-failed"),
         ("AddRef", "b", True),
     ]
