@@ -104,7 +104,7 @@ def committed(releases: Releases) -> list[str]:
     return [json.loads(line)["DORA_BY"] for line in run(*command).stdout.splitlines()]
 
 
-@pytest.mark.warns("was rolled back: the gateway was stopped")
+@pytest.mark.warns("was rolled back: the gateway was stopped", "exited with error: Signal(15)")
 def test_a_gateway_that_is_stopped_ends_the_trial(
     browser: Browser, releases: Releases, project: Project, flag: Path
 ) -> None:
