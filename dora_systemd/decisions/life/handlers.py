@@ -151,7 +151,7 @@ def reload(cell: Cell, event: life.Event) -> Next:
 
 
 def wind_down(cell: Cell, *actions: Action) -> Next:
-    """Stop the nodes, if any has a process, and leave."""
+    """Have dora stop the nodes that have processes, or dismiss the daemon if there are none."""
     if not table.has_process(cell.nodes):
         return _leave(cell, *actions)
     return to(cell, State.STOPPING, *actions, Do.ASK_STOP, after=stop_timeout(cell.grace))

@@ -48,7 +48,7 @@ class Applier:
     """Carries out `change` in `run`. done: what was done, for people."""
 
     def __init__(self, run: Run, change: Change, options: RunnerOptions) -> None:
-        self._run = run
+        self.run = run
         self._change = change
         self._options = options
         self._begun: list[Step] = []
@@ -56,7 +56,7 @@ class Applier:
 
     def obstacle(self) -> str:
         """Why dora cannot change single nodes now, or ""."""
-        if self._run.pump.cell.state is not State.RUNNING:
+        if self.run.pump.cell.state is not State.RUNNING:
             return "not all nodes were ready"
         for step in self._change.steps:
             if reason := self._obstacle(step):
@@ -64,7 +64,7 @@ class Applier:
         return ""
 
     def _obstacle(self, step: Step) -> str:
-        old = self._run.pump.cell.nodes.get(step.node)
+        old = self.run.pump.cell.nodes.get(step.node)
         if old is not None and step.how is not How.ADD:
             is_gone = old.state in _GONE or (old.state == "failed" and old.policy != HELD)
             return f"the node {step.node} had ended" if is_gone else ""
@@ -77,7 +77,7 @@ class Applier:
         for step in self._change.steps:
             started = time.monotonic()
             self._begun.append(step)
-            with self._run.nodes.exchanging(step.node):
+            with self.run.nodes.exchanging(step.node):
                 await self._take(step, self._change.prepared)
             self._tell(step, time.monotonic() - started)
 
@@ -86,16 +86,16 @@ class Applier:
         for step in reversed(self._begun):
             back = Step(_BACK.get(step.how, step.how), step.node, step.file)
             try:
-                with self._run.nodes.exchanging(step.node):
+                with self.run.nodes.exchanging(step.node):
                     await self._take(back, before)
             except NotReady:
                 continue  # it has its old definition again, which may have failed before too
 
     async def _take(self, step: Step, prepared: Prepared) -> None:
-        swapper = self._run.swapper
+        swapper = self.run.swapper
         if step.how is How.REMOVE:
             await swapper.remove(step.node)
-            self._run.nodes.remove(step.node)
+            self.run.nodes.remove(step.node)
             return
         if step.how is How.OPERATOR:
             for operator, file in self._change.operators[step.node].items():
@@ -106,23 +106,23 @@ class Applier:
         if step.how is How.ADD:
             node = prepared.dataflow.node(step.node)
             assert node is not None
-            self._run.nodes.add(node, self._options.log_rates, self._options.node_limits)
+            self.run.nodes.add(node, self._options.log_rates, self._options.node_limits)
             await swapper.add(definition, kind)
         elif step.how is How.REWIRE:
             await swapper.rewire(definition, kind)
         else:
-            old = self._run.pump.cell.nodes[step.node]
+            old = self.run.pump.cell.nodes[step.node]
             starts_first = self._options.reload.starts_first(step.node)
             await swapper.swap(definition, kind, starts_first)
             if old.needs:  # two launchers must not go on
-                await self._run.nodes.wait_gone(step.node, old.pid)
+                await self.run.nodes.wait_gone(step.node, old.pid)
 
     def _tell(self, step: Step, seconds: float) -> None:
         file = self._relative(step.file)
         words = f"{file}, ready after {seconds:.2f}s" if step.how is not How.REMOVE else file
         self.done.append(f"the node {step.node} was {step.how.value}: {words}")
         node = None if step.how is How.REMOVE else step.node
-        self._run.pipes.write_event(
+        self.run.pipes.write_event(
             "node-reloaded",
             node,
             how=step.how.value,

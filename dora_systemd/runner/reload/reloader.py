@@ -208,11 +208,18 @@ class Reloader:
         return await self._restart(run, change, reason)
 
     async def _undo(self, applier: Applier, change: Change, error: NotReady) -> DoraSystemdError:
-        """Go back to the old descriptor; an old version of a program file no longer exists."""
+        """Go back to the old descriptor; an old version of a program file no longer exists.
+
+        Dora starts no node again that has failed for good: then the next run has the old version.
+        """
         if change.prepared is self.current:
             return DoraSystemdError(f"cannot use what was saved: {error}")
         assert self.current is not None
-        await applier.undo(self.current)
+        try:
+            await applier.undo(self.current)
+        except DoraSystemdError as refused:
+            back = replace(change, prepared=self.current)
+            await self._restart(applier.run, back, refused.message)
         again = "the previous version is running again"
         return DoraSystemdError(f"cannot use {self.options.dataflow}: {error}; {again}")
 

@@ -175,6 +175,27 @@ def test_a_descriptor_whose_node_does_not_start_gives_way_to_the_old_one(tmp_pat
     live(work)
 
 
+def test_what_dora_does_not_take_back_starts_again_as_a_whole(tmp_path: Path) -> None:
+    """It starts no node again that has failed for good."""
+
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        bench.begin()
+        before = bench.reloader.current
+        bench.dora.then["AddNode"] = bench.crash
+        bench.dora.refuses["RemoveNode"] = "no running node `c`"
+        bench.write("abc")
+        task = asyncio.create_task(bench.reloader._reload([str(bench.flow)]))
+        await until(lambda: bench.pump.cell.reload)
+        assert bench.reloader.current is before
+        assert bench.reloader.before is None
+        bench.reloader.has_started()
+        with pytest.raises(DoraSystemdError, match="the previous version is running again"):
+            await task
+
+    live(work)
+
+
 def test_a_program_that_does_not_start_has_no_version_before(tmp_path: Path) -> None:
     async def work() -> None:
         bench = Bench(tmp_path)
