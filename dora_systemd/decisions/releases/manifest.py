@@ -70,4 +70,7 @@ def parse_stored(value: Mapping[str, Any]) -> Stored:
     """A file of release.json. Raises ValueError, TypeError, KeyError."""
     if "link" in value:
         return Stored(target=str(value["link"]))
-    return Stored(int(value["size"]), bool(value["executable"]), str(value["sha256"]))
+    size = value["size"]
+    if type(size) is not int:
+        raise TypeError(size)
+    return Stored(size, bool(value["executable"]), str(value["sha256"]))
