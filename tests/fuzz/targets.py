@@ -46,6 +46,12 @@ from dora_systemd.decisions.logs.lines import (
     jsonl_fields,
 )
 from dora_systemd.decisions.properties.assignments import parse_property
+from dora_systemd.decisions.releases.parcel import (
+    format_parcel,
+    missing,
+    parse_parcel,
+    parse_wants,
+)
 from dora_systemd.decisions.releases.progress import soaking
 from dora_systemd.decisions.releases.versions import parse_versions
 from dora_systemd.decisions.settings.resolve import resolve_settings
@@ -157,6 +163,15 @@ def _of_text(*readers: Callable[[str], object]) -> Callable[[bytes], None]:
     return read
 
 
+def _parcel(data: bytes) -> None:
+    parcel = parse_parcel(data)
+    assert parse_parcel(format_parcel(parcel)) == parcel
+    assert parse_wants({"wants": missing(parcel, {})}, parcel) == parcel.contents
+    for path in (*parcel.files, parcel.dataflow, parcel.directory or "."):
+        path.encode()
+        assert not path.startswith("/")
+
+
 REFUSED = (DoraSystemdError,)
 
 TARGETS = {
@@ -188,6 +203,7 @@ TARGETS = {
     "names": Target(_of_text(parse_name, parse_uuid, name_from_path)),
     "limits": Target(_of_text(parse_changes, lambda text: parse_rates(text.split(";")))),
     "exit": Target(_of_text(parse_exit, parse_dora_error, parse_filter)),
+    "parcel": Target(_parcel, REFUSED),
     "dora-version": Target(
         lambda data: version_numbers(parse_dora_version(text_of(data)) or text_of(data))
     ),

@@ -99,7 +99,8 @@ def test_a_bad_build_changes_nothing(releases: Releases, project: Project) -> No
         timeout = ("--build-timeout", "2s") if how == "hangs" else ()
         said = releases.deploy(project.root, *timeout, status=status)
         assert words in said, how
-        assert len(said.splitlines()) <= 2, said
+        lines = [one for one in said.splitlines() if not one.startswith(("copying: ", "building"))]
+        assert len(lines) <= 2, said
         assert not list(releases.path.glob(".*")), how
         wait_for("the unit is unloaded", lambda: not is_loaded(built_unit(cell)))
     assert (cell.show("InvocationID"), releases.states()) == (life, known)

@@ -43,6 +43,15 @@ def test_bad_dataflows(cell: Cell, project: Project) -> None:
     )
 
 
+def test_an_input_that_dora_cannot_read(cell: Cell, project: Project) -> None:
+    """dora does not say which; the error names it and its value."""
+    project.three_nodes()
+    text = "nodes: [{id: a, path: source.py, inputs: {tick: dora/timer/millis/5milis}}]"
+    flow = project.write("input.yml", text)
+    told = "nodes[0].inputs.tick: 'dora/timer/millis/5milis' is not a timer such as"
+    check_refusals(cell, project, [Refusal([str(flow)], ExitCode.BAD_INPUT, told)])
+
+
 def test_a_dataflow_that_is_no_file(cell: Cell, project: Project) -> None:
     os.mkfifo(project.root / "pipe.yml")
     huge = project.write("huge.yml", "")

@@ -4,14 +4,18 @@ doractl does not run dora: that may be the user's own version, or another progra
 the user runs it, in the sandbox, with the environment of the nodes.
 """
 
+import contextlib
 import os
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import TypeVar
 
 from dora_systemd.adapters.dora.command import dora_version, find_dora, run_dora
+from dora_systemd.adapters.host.files import parse_yaml, read_text
 from dora_systemd.adapters.host.process import beside
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.dora.errors import parse_dora_error
+from dora_systemd.decisions.dora.inputs import UNNAMED, name_input
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.programs import own_account
 from dora_systemd.trust.sight import cannot_reach
@@ -77,7 +81,15 @@ def refusal_of_dora(options: RunnerOptions, environment: Mapping[str, str]) -> s
     done = run_dora(options.dora, arguments, own_account(), environment, directory)
     if done.status == 0:
         return ""
-    return parse_dora_error(done.stderr) or parse_dora_error(done.stdout) or "dora refuses it"
+    reason = parse_dora_error(done.stderr) or parse_dora_error(done.stdout) or "dora refuses it"
+    return name_input(reason, _document(options.dataflow)) if UNNAMED.search(reason) else reason
+
+
+def _document(dataflow: str) -> object:
+    path = Path(dataflow)
+    with contextlib.suppress(DoraSystemdError):
+        return parse_yaml(read_text(path), path)
+    return None
 
 
 def check_access(options: RunnerOptions) -> None:

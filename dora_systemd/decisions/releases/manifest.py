@@ -73,5 +73,8 @@ def parse_stored(value: Mapping[str, Any]) -> Stored:
     is_built = bool(value.get("built", False))
     if "link" in value:
         return Stored(target=str(value["link"]), is_built=is_built)
-    size, is_executable, digest = int(value["size"]), bool(value["executable"]), value["sha256"]
-    return Stored(size, is_executable, str(digest), is_built=is_built)
+    size = value["size"]
+    if type(size) is not int:
+        raise TypeError(size)
+    is_executable, digest = bool(value["executable"]), str(value["sha256"])
+    return Stored(size, is_executable, digest, is_built=is_built)

@@ -87,6 +87,8 @@ def _check_types(one: Parcel) -> None:
         raise ValueError(one.dataflow)
     if one.revision and not is_revision(one.revision):
         raise ValueError(one.revision)
+    if not one.source.isprintable():
+        raise ValueError(one.source)
 
 
 def _check_files(files: Mapping[str, Stored]) -> None:

@@ -18,6 +18,7 @@ from dora_systemd.adapters.bus.manager import DOWN, Manager, Property
 from dora_systemd.adapters.releases.build_tree import BuildTree
 from dora_systemd.adapters.releases.store import Store
 from dora_systemd.decisions.cell.options import build_command
+from dora_systemd.decisions.cell.status import FAILED_BECAUSE
 from dora_systemd.decisions.logs.events import BUILD_FAILED
 from dora_systemd.decisions.releases.build import (
     BuildTask,
@@ -152,7 +153,7 @@ def _wait(manager: Manager, build: Build, tree: BuildTree) -> None:
         if not is_queued and str(facts["ActiveState"]) in DOWN:
             return
         line = str(facts["StatusText"])
-        if line not in ("", told):
+        if line not in ("", told) and not line.startswith(FAILED_BECAUSE):  # an error tells that
             build.on_line(told := line)
         if tree.is_disk_full():
             reason = "it has left too little space on the disk"

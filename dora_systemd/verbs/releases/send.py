@@ -74,7 +74,7 @@ def packed(
             files = copy_files(project, found, spool, None, progress)
         parcel = Parcel(
             name=request_name(StartRequest(dataflow.source, request.name)),
-            source=root,
+            source=shown(root),
             dataflow=os.path.relpath(dataflow.source, root),
             directory=os.path.relpath(directory, root) if sender.directory else None,
             revision=revision,

@@ -44,6 +44,8 @@ def test_only_what_is_missing_is_asked_for() -> None:
         {"directory": "/etc"},
         {"revision": "; rm"},
         {"source": None},
+        {"source": "a\nb"},
+        {"files": {"x": {"size": float("inf"), "executable": False, "sha256": "a" * 64}}},
         {"files": []},
         {"more": 1},
         {"files": {"../x": {"size": 1, "executable": False, "sha256": "a" * 64}}},
