@@ -97,10 +97,9 @@ def test_a_bad_build_changes_nothing(releases: Releases, project: Project) -> No
     for how, (build, words, status) in BAD.items():
         write_build(project, build)
         timeout = ("--build-timeout", "2s") if how == "hangs" else ()
-        said = releases.deploy(project.root, *timeout, status=status)
+        said = releases.deploy(project.root, "-q", *timeout, status=status)
         assert words in said, how
-        lines = [one for one in said.splitlines() if not one.startswith(("copying: ", "building"))]
-        assert len(lines) <= 2, said
+        assert len(said.splitlines()) <= 2, said
         assert not list(releases.path.glob(".*")), how
         wait_for("the unit is unloaded", lambda: not is_loaded(built_unit(cell)))
     assert (cell.show("InvocationID"), releases.states()) == (life, known)

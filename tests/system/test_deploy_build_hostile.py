@@ -104,7 +104,7 @@ LEFT = {
 def test_what_no_build_may_leave(releases: Releases, eve: Home) -> None:
     for what, build in LEFT.items():
         eve.write("build.sh", build + "\ntrue\n")
-        said = releases.deploy(eve.root, status=5)
+        said = releases.deploy(eve.root, "-q", status=5)
         assert "Traceback" not in said, what
         assert len(said.splitlines()) <= 2, (what, said)
         assert not releases.path.exists() or not list(releases.path.iterdir()), what
