@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.terminal_text import cut
 from dora_systemd.trust import courier
 from dora_systemd.trust.programs import Account, account_of_uid
 from dora_systemd.trust.sight import start_reader
@@ -32,6 +33,8 @@ MOST_ANSWER = 64 * 1024 * 1024
 """Maximum bytes of an answer that is not the content of a file."""
 _BATCH = 500
 _MOST_SIZE = 2**63
+_SHORT = 500
+"""Maximum length of a path in an error."""
 _LONGEST = 4096
 """Maximum length of a text about a file, see PATH_MAX in limits.h(0p)."""
 
@@ -161,7 +164,7 @@ class Project:
         return self._refusal(path, "no answer", hint, ExitCode.FAILURE)
 
     def _refusal(self, path: str, reason: str, hint: str, code: ExitCode) -> DoraSystemdError:
-        place = shown(str(Path(self.root, path)))
+        place = cut(shown(str(Path(self.root, path))), _SHORT)
         return DoraSystemdError(
             f"cannot read {place} as user {self._account.name}: {reason}", hint, code
         )

@@ -21,13 +21,16 @@ from dora_systemd.decisions.releases.entries import (
     refusal,
     too_many,
 )
-from dora_systemd.errors import DoraSystemdError
+from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.paths import reached
 from dora_systemd.trust.project import Project
 
 _VENV, _CACHE = "pyvenv.cfg", "CACHEDIR.TAG"
 """Files whose directory is a virtual environment, or a cache such as Cargo's `target`."""
 _HINT = "the build has left it: have the build remove it, or make something else of it"
+_PYTHON_HINT = (
+    "create the virtual environment with a Python of the system, such as /usr/bin/python3"
+)
 _LEFT_OUT = (".git", "__pycache__")
 _LEFT_OUT_OF_CACHE = (*_LEFT_OUT, "build", "deps", "examples", "incremental", ".fingerprint")
 
@@ -40,20 +43,26 @@ def find_built(
     named: paths that belong to it although they are in a cache, such as Cargo's target. tree: where
     the files will be. Raises DoraSystemdError (BAD_INPUT) for what a release cannot have.
     """
+    try:
+        return _checked(project, named, tree, is_user)
+    except DoraSystemdError as error:
+        if error.code is not ExitCode.BAD_INPUT or error.hint == _PYTHON_HINT:
+            raise
+        # Not the hint for a file of the project.
+        raise DoraSystemdError(error.message, _HINT, error.code) from error
+
+
+def _checked(project: Project, named: Sequence[str], tree: Path, is_user: bool) -> dict[str, Found]:
     found, venvs = _walk(project)
     for row in project.facts(named) if named else ():
         if row is not None and row[1] != DIRECTORY and not _is_behind_link(row[0], found):
             found[row[0]] = Found(*row)
     if len(found) > MOST_FILES:
         raise too_many("")
-    others = [one for one in found.values() if not _is_interpreter(one, venvs, is_user)]
-    try:
-        for one in others:
+    for one in found.values():
+        if not _is_interpreter(one, venvs, is_user):
             check_found(_relative(one, tree))
-        check_amount(found.values())
-    except DoraSystemdError as error:
-        # Not the hint for a file of the project.
-        raise DoraSystemdError(error.message, _HINT, error.code) from error
+    check_amount(found.values())
     return dict(sorted(found.items()))
 
 
