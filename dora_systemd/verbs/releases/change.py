@@ -168,6 +168,7 @@ def _end_killed(scope: Scope, standing: Standing, change: Change) -> None:
     if now.current != change.release or standing.current == change.release:
         _roll_back(manager, standing, change, Fault(_KILLED), lambda _: None)
     else:
+        commit(manager, now, change.text, change.want_boot)  # it may lack its link
         end_trial(manager, now)
 
 
