@@ -98,13 +98,16 @@ def command(
     del serial  # for -H, see cli/remote/
     scope = current_scope()
     start = StartRequest(dataflow, name, flags, os.environ)
+    bus = Bus(scope)
     if dry_run:
-        build = not no_build
-        sent = compare_sent(scope, Stream(_INPUT)) if from_stdin else compare(scope, start, build)
-        return ExitCode.OK if is_quiet else _print_changes(*sent)
+        found = (
+            compare_sent(bus, scope, Stream(_INPUT))
+            if from_stdin
+            else compare(bus, scope, start, not no_build)
+        )
+        return ExitCode.OK if is_quiet else _print_changes(*found)
     if not build_timeout:
         raise DoraSystemdError("cannot build in no time", "give a --build-timeout", ExitCode.USAGE)
-    bus = Bus(scope)
     how, build_timeout = if_inhibited(force, wait), 0 if no_build else build_timeout
     request = DeployRequest(start, soak, keep, not no_enable, how, build_timeout)
     with open_progress(is_quiet) as progress:

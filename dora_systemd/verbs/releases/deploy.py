@@ -74,19 +74,26 @@ class Deployed(NamedTuple):
 
 
 def compare(
-    scope: Scope, request: StartRequest, want_build: bool = True
+    manager: Manager, scope: Scope, request: StartRequest, want_build: bool = True
 ) -> tuple[str, dict[str, list[str]]]:
-    """What a deploy would change: the newest release, and paths, but none that a build makes.
+    """What a deploy would change: the present release, and paths, but none that a build makes.
 
     Raises DoraSystemdError.
     """
     source = find_source(scope, request, want_build)
-    store = store_of(scope, source.plan.options.name)
-    last = newest(store)
+    last = present(manager, scope, store_of(scope, source.plan.options.name))
     old = {path: one for path, one in last.files.items() if not one.is_built} if last else {}
     with opened_project(source.root, account_of(source.plan.user)) as project:
         found, _ = find_files(project, source.named, repository_owners(source))
         return last.id if last else "", touched(old, digests(project, found))
+
+
+def present(manager: Manager, scope: Scope, store: Store) -> Manifest | None:
+    """The manifest of the release that every start runs, or of the newest one."""
+    current = read_standing(manager, scope, unit_name(store.name)).current
+    with suppress(DoraSystemdError):  # it is not readable, or "" is no release
+        return store.manifest(current)
+    return newest(store)
 
 
 def deploy(

@@ -34,7 +34,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.trust.files import read_file
 from dora_systemd.verbs.inhibit.guard import IfInhibited, require_uninhibited
 from dora_systemd.verbs.releases.copy import newest
-from dora_systemd.verbs.releases.deploy import Deployed, DeployRequest, deploy
+from dora_systemd.verbs.releases.deploy import Deployed, DeployRequest, deploy, present
 from dora_systemd.verbs.releases.listing import root_of, store_of
 from dora_systemd.verbs.releases.soak import Tell
 from dora_systemd.verbs.releases.source import Source, find_source
@@ -58,10 +58,12 @@ def _known(store: Store) -> Known:
     return Known(store.tree(last.id), last.files) if last else Known(store.path, {})
 
 
-def compare_sent(scope: Scope, stream: Stream) -> tuple[str, dict[str, list[str]]]:
+def compare_sent(
+    manager: Manager, scope: Scope, stream: Stream
+) -> tuple[str, dict[str, list[str]]]:
     """What a deploy would change, as compare(). Raises DoraSystemdError."""
     parcel = parse_parcel(stream.line(MOST_HEAD))
-    last = newest(store_of(scope, parcel.name))
+    last = present(manager, scope, store_of(scope, parcel.name))
     return last.id if last else "", touched(last.files if last else {}, parcel.files)
 
 
