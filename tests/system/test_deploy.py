@@ -53,6 +53,8 @@ def test_a_release_runs_and_is_not_what_it_was_copied_from(
     assert (releases.current(), releases.running()) == (first, first)
     assert sorted(releases.states().values()) == ["current", "proved"]
     assert f"Release:  {first}" in cell.doractl("list", cell.name).stdout
+    changed = cell.doractl("deploy", str(flow), "--name", cell.name, "--dry-run").stdout
+    assert changed == "~ a.py\n", "it differs from what runs, and not from the newest one"
 
 
 @pytest.mark.warns("crashed", "failed", "Failed", "exited", "exit code", "error", "Error")
