@@ -132,8 +132,13 @@ def _run(manager: Manager, build: Build, tree: BuildTree) -> None:
 def end_former(manager: Manager, unit: str) -> None:
     """Stop the build of a deploy that was killed: it notices that itself, unless it is hostile."""
     deadline = time.monotonic() + _GONE_SECONDS
-    while manager.list_units(unit) and time.monotonic() < deadline:
-        _stop(manager, unit)
+    while time.monotonic() < deadline:
+        # A unit that systemd has been asked about is listed for a while, but not loaded.
+        known = [one for one in manager.list_units(unit) if one.load == "loaded"]
+        if not known:
+            return
+        if known[0].active not in DOWN:
+            manager.run_jobs("StopUnit", [unit])
         with suppress(DoraSystemdError):  # systemd has unloaded it meanwhile
             manager.reset_failed(unit)
         time.sleep(_LOOK_SECONDS)
