@@ -168,8 +168,8 @@ class Rollout:
         self._sending[host] = ""
 
     def _show_stage(self) -> None:
-        now = (f"{one.text}{self._sending.get(one, '')}" for one in self._talks.present)
-        self._stage(f"{self._plan.verb}: {'; '.join(now)}")
+        if now := [f"{one.text}{self._sending.get(one, '')}" for one in self._talks.present]:
+            self._stage(f"{self._plan.verb}: {'; '.join(now)}")
 
     def _end(self, ended: Ended) -> None:
         host, answer = ended.host, self._answer(ended.host)
