@@ -8,6 +8,7 @@ import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import isfinite
 from typing import Any
 from uuid import uuid4
 
@@ -168,8 +169,9 @@ def parse_heartbeat(reply: Reply) -> int:
     daemons = _mapping(reply.result).get("ConnectedDaemons")
     if not isinstance(daemons, list):
         return 0
-    ages = (_mapping(one).get("last_heartbeat_ago_ms") or 0 for one in daemons)
-    return min((int(age) * 1000 for age in ages), default=INFINITY)
+    ages = (_mapping(one).get("last_heartbeat_ago_ms") for one in daemons)
+    known = (age if isinstance(age, int | float) and isfinite(age) else 0 for age in ages)
+    return min((int(age * 1000) for age in known), default=INFINITY)
 
 
 def parse_results(reply: Reply) -> dict[str, Exit] | None:

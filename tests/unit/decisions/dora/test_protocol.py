@@ -145,6 +145,7 @@ def test_no_reply_breaks_the_results(frame: object) -> None:
     [
         ({"ConnectedDaemons": [{"last_heartbeat_ago_ms": 2302}]}, 2_302_000),
         ({"ConnectedDaemons": [{"daemon_id": {}}]}, 0),
+        ({"ConnectedDaemons": [{"last_heartbeat_ago_ms": [None]}]}, 0),
         ({"ConnectedDaemons": []}, INFINITY),
         ({"ConnectedMachines": ["a"]}, 0),
         (None, 0),

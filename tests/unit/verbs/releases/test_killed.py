@@ -21,7 +21,7 @@ from tests.unit.verbs.releases.test_trial import (
 )
 
 CHANGE = Change(
-    NEW, text_of(NEW), release_options(NEW), 0, True, "doractl deploy", IfInhibited.REFUSE
+    NEW, text_of(NEW), release_options(NEW), 0, True, "deploy", IfInhibited.REFUSE, "doractl deploy"
 )
 
 
