@@ -9,6 +9,7 @@ import pytest
 from dora_systemd.cli import main
 from dora_systemd.decisions.releases.parcel import parse_parcel
 from dora_systemd.errors import ExitCode
+from dora_systemd.verbs.releases import send
 from tests.unit.fakes.programs import make_program
 
 SSH = """for command; do :; done
@@ -48,6 +49,8 @@ def asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     make_program(tmp_path / "bin/doractl", DORACTL)
     monkeypatch.setenv("PATH", f"{tmp_path}/bin:{os.environ['PATH']}")
     monkeypatch.setenv("TMPDIR", str(tmp_path))
+    # Where that user exists, it reads the project for root, and cannot read this one.
+    monkeypatch.setattr(send, "DEFAULT_USER", "nobody-has-this-name")
     (tmp_path / "robot").mkdir()
     (tmp_path / "robot/a.py").write_text("print")
     (tmp_path / "robot/dataflow.yml").write_text("nodes: [{id: a, path: a.py}]\n")
