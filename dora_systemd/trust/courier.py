@@ -112,7 +112,12 @@ def repository(owners: list[int]) -> str:
 
 
 def tracked(owners: list[int], most: int) -> dict[str, Any]:
-    """The files that git would track, None without git, and the revision."""
+    """The files that git would track, None without git, and the revision.
+
+    Without owners git is not called.
+    """
+    if not owners:
+        return {"files": None, "revision": ""}
     safe = repository(owners)
     names = git(("ls-files", "-z", "--cached", "--others", "--exclude-standard"), safe)
     if not names:  # nor if a git above ignores all of it

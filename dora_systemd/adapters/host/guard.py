@@ -1,7 +1,7 @@
 """A child process that does what this one leaves undone when it is killed, as by SIGKILL.
 
 The out-of-memory killer, too, takes one process without a word. Only the kernel tells of it, by the
-end of a connection. The child has the locks of its parent, see flock(2), so nobody else takes them
+end of a connection. The child has the lock of its parent, see flock(2), so nobody else takes it
 until it has done its work.
 """
 
@@ -10,6 +10,7 @@ import signal
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import NoReturn
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -19,16 +20,19 @@ _WORD = b"."
 
 
 @contextmanager
-def guarded(end: Callable[[], None]) -> Iterator[None]:
-    """Call `end` in another process if this one is killed in the block."""
+def guarded(end: Callable[[], None], lock: Path) -> Iterator[None]:
+    """Call `end` in another process if this one is killed in the block.
+
+    lock: the lock file that it goes on to hold; it holds nothing else that is open here.
+    """
     ours, theirs = socket.socketpair()
     child = os.fork()
     if not child:
         ours.close()
-        _guard(theirs, end)
+        _guard(theirs, end, lock)
     theirs.close()
-    ours.recv(1)  # it is out of reach of what ends this process group
     try:
+        ours.recv(1)  # it is out of reach of what ends this process group
         yield
     finally:
         with suppress(BrokenPipeError):
@@ -37,10 +41,11 @@ def guarded(end: Callable[[], None]) -> Iterator[None]:
         os.waitpid(child, 0)
 
 
-def _guard(parent: socket.socket, end: Callable[[], None]) -> NoReturn:
+def _guard(parent: socket.socket, end: Callable[[], None], lock: Path) -> NoReturn:
     status = 1
     try:
         os.setsid()
+        _close_others(parent.fileno(), lock)
         for one in SIGNALS:
             signal.signal(one, signal.SIG_IGN)
         nowhere = os.open(os.devnull, os.O_RDWR)
@@ -52,3 +57,13 @@ def _guard(parent: socket.socket, end: Callable[[], None]) -> NoReturn:
         status = 0
     finally:
         os._exit(status)
+
+
+def _close_others(kept: int, lock: Path) -> None:
+    """Close what belongs to others: their connections, and the locks of other guards' parents."""
+    own = lock.stat()
+    for fd in [int(one.name) for one in Path("/proc/self/fd").iterdir()]:
+        with suppress(OSError):  # that of the list is gone
+            is_lock = os.path.samestat(os.fstat(fd), own)
+            if fd > 2 and fd != kept and not is_lock:
+                os.close(fd)

@@ -12,6 +12,8 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 
 _WRITTEN_SECONDS = 60.0
 """A younger one may still be written."""
+_RANDOM = "[0-9a-f]" * 8
+"""The end of the name of a temporary file, see write_atomic()."""
 
 
 def read_unit_file(path: Path) -> str | None:
@@ -60,6 +62,8 @@ def write_unit_file(path: Path, text: str) -> None:
     made = [one for one in path.parents if not one.exists()]
     with _told("write", path):
         path.parent.mkdir(parents=True, exist_ok=True)
+        for directory in made:  # whatever the umask is, all may read units
+            directory.chmod(0o755)
         write_atomic(path, text, is_durable=True)
         # The content is on the disk by now; syncing the directories makes the names durable.
         for directory in (path.parent, *(one.parent for one in made)):
@@ -77,10 +81,12 @@ def _sync_directory(directory: Path) -> None:
 def remains_of(path: Path) -> list[Path]:
     """What a process that was killed while it wrote this unit file has left, see write_atomic()."""
     found = []
-    for one in path.parent.glob(f".{path.name}.*"):
+    # Not .NAME.swp: an editor's file is somebody's work.
+    for one in path.parent.glob(f".{path.name}.{_RANDOM}"):
         with contextlib.suppress(FileNotFoundError):  # it has just got its name
-            age = time.time() - one.lstat().st_mtime
-            found += [one] if not 0 <= age < _WRITTEN_SECONDS else []
+            status = one.lstat()
+            is_old = not 0 <= time.time() - status.st_mtime < _WRITTEN_SECONDS
+            found += [one] if stat.S_ISREG(status.st_mode) and is_old else []
     return sorted(found)
 
 

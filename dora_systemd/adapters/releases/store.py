@@ -7,11 +7,14 @@ name with a dot in front, and the next deploy removes it.
 
 import contextlib
 import fcntl
+import hashlib
 import os
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
 from dora_systemd.decisions.releases.choice import Known
+from dora_systemd.decisions.releases.entries import Stored
 from dora_systemd.decisions.releases.manifest import Manifest, format_manifest, parse_manifest
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import STORE, TREE, is_release_id
@@ -25,6 +28,7 @@ _PROVED = "proved"
 _LOCK = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
 MOST_MANIFEST = 64 * 1024 * 1024
 """Maximum bytes of release.json: 100,000 files have about 20 MB."""
+_REMOVE_SECONDS = 300.0
 SYSTEM_STATE = Path("/var/lib")
 
 
@@ -72,6 +76,15 @@ class Store:
         path = self.release(release_id) / MANIFEST
         text = read_file(path, MOST_MANIFEST).data.decode("utf-8", "replace")
         return parse_manifest(text, str(path))
+
+    def intact(self, manifest: Manifest) -> dict[str, Stored]:
+        """The files of a release that still are as its manifest says. Raises OSError."""
+        tree = self.tree(manifest.id)
+        return {
+            path: one
+            for path, one in manifest.files.items()
+            if one.target or one == _at(tree / path)
+        }
 
     def write_manifest(self, manifest: Manifest) -> None:
         """Write the manifest of a release anew. Raises OSError."""
@@ -204,12 +217,29 @@ def remove_tree(path: Path) -> None:
     """
     if not os.path.lexists(path):
         return
-    steps = [("rm", "-rf", "--one-file-system", "--", str(path))]
+    steps: list[tuple[str, ...]] = [("rm", "-rf", "--one-file-system", "--", str(path))]
     if os.geteuid() != 0:
-        steps.insert(0, ("chmod", "-R", "u+rwX", "--", str(path)))
+        # Directories alone: files are hard links of other releases.
+        chmod = ("-type", "d", "-exec", "chmod", "u+rwx", "{}", ";")
+        steps.insert(0, ("find", str(path), *chmod))
     for command in steps:
-        with contextlib.suppress(OSError), spawn(command, None) as child:
-            child.communicate()
+        nowhere = subprocess.DEVNULL  # it may complain of each file
+        with contextlib.suppress(OSError), spawn(command, None, stderr=nowhere) as child:
+            try:
+                child.wait(_REMOVE_SECONDS)
+            except subprocess.TimeoutExpired:  # somebody makes more of it meanwhile
+                child.kill()
+
+
+def _at(path: Path) -> Stored | None:
+    """A regular file, as a manifest describes it; None if there is none."""
+    try:
+        with path.open("rb") as file:
+            status = os.fstat(file.fileno())
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError:
+        return None
+    return Stored(status.st_size, bool(status.st_mode & 0o111), digest)
 
 
 def unusable(path: Path, error: OSError) -> DoraSystemdError:

@@ -29,7 +29,7 @@ def reload_noted(cell: Cell, event: life.ReloadNoted) -> Next:
 
 
 def node_reloading(cell: Cell, event: life.Event) -> Next:
-    """A reload replaces a node: what the one before it has reported is not true any more."""
+    """A reload replaces or adds a node: what the one before has reported is not true any more."""
     return node_event(replace(cell, notice=""), event)
 
 

@@ -60,6 +60,7 @@ _RUNNING: dict[str, Handler] = {
     **_RELOADS,
     "NodeExited": running.node_exited,
     "NodeReloading": running.node_reloading,
+    "NodeAdded": running.node_reloading,
     "ReloadNoted": running.reload_noted,
 }
 _STOPPING: dict[str, Handler] = {

@@ -21,10 +21,14 @@ def format_awaited(units: Iterable[str]) -> str:
     Units for which all services wait are named only if there is no other one.
     """
     known = sorted(units)
-    own = [one for one in known if one not in _OF_ALL and not one.endswith(".slice")]
-    words = list(dict.fromkeys(map(_need_word, own or known)))
+    words = list(dict.fromkeys(map(_need_word, own_units(known) or known)))
     more = len(words) - _MOST
     return ", ".join(words[:_MOST]) + (f" and {more} more" if more > 0 else "")
+
+
+def own_units(units: Iterable[str]) -> list[str]:
+    """Those of them for which not all services wait."""
+    return [one for one in units if one not in _OF_ALL and not one.endswith(".slice")]
 
 
 def _need_word(unit: str) -> str:

@@ -77,10 +77,16 @@ def _builds(node: Node) -> Iterator[object]:
 
 def has_builds(value: object) -> bool:
     """Whether a module's document has a key that `dora build` reads; those of its modules count."""
-    if isinstance(value, Mapping):
-        keys = ("build", "git", "module")
-        return any(value.get(key) for key in keys) or any(map(has_builds, value.values()))
-    return isinstance(value, list) and any(map(has_builds, value))
+    left, seen = [value], set[int]()  # an alias of YAML may lead anywhere, and back
+    while left:
+        one = left.pop()
+        if id(one) in seen or not isinstance(one, Mapping | list):
+            continue
+        seen.add(id(one))
+        if isinstance(one, Mapping) and any(one.get(key) for key in ("build", "git", "module")):
+            return True
+        left += one.values() if isinstance(one, Mapping) else one
+    return False
 
 
 def lock_places(dataflow: str) -> tuple[str, ...]:

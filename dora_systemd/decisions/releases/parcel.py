@@ -123,6 +123,8 @@ def parse_wants(value: Any, parcel: Parcel) -> list[Stored] | None:
         return None
     if not all(type(one) is int and 0 <= one < len(contents) for one in wants):
         return None
+    if len({*wants}) != len(wants):
+        return None
     return [contents[one] for one in wants]
 
 

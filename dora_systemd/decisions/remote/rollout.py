@@ -6,6 +6,7 @@ from typing import Any, NamedTuple, Protocol
 from dora_systemd.decisions.remote.command import NO_PROGRAM
 from dora_systemd.decisions.remote.hosts import Host
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import is_release_id
 
 DONE = {"deploy": "deployed", "rollback": "rolled back"}
 UNDONE = {"deploy": "rolled back", "rollback": "undone"}
@@ -48,7 +49,7 @@ def verdict_of(
     details = outcome.get("details")
     known = details if isinstance(details, dict) else {}
     texts = [known.get(key) for key in ("release", "former")]
-    release, former = (one[:_RELEASE_WIDTH] if isinstance(one, str) else "" for one in texts)
+    release, former = (one if isinstance(one, str) and is_release_id(one) else "" for one in texts)
     return Verdict(host.text, _word(verb, end, error), release, former)
 
 

@@ -32,7 +32,7 @@ from dora_systemd.decisions.unit.build import build_properties
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.trust.project import Project, opened_project
-from dora_systemd.values import format_duration
+from dora_systemd.values import INFINITY, SECOND, format_duration
 from dora_systemd.verbs.facts.reason import failure_reason, runners_refusal
 from dora_systemd.verbs.releases.built_files import find_built
 from dora_systemd.verbs.releases.files import copy_files
@@ -44,6 +44,8 @@ from dora_systemd.verbs.start.check import beside_properties, exec_start
 
 _LOOK_SECONDS = 0.2
 _GONE_SECONDS = 20.0
+_LATE_SECONDS = 30.0
+"""After which systemd's own bound does not hold: the main process may ask for more."""
 
 
 @dataclass(frozen=True)
@@ -113,6 +115,7 @@ def _noted(build: Build) -> Iterator[None]:
 
 def _run(manager: Manager, build: Build, tree: BuildTree) -> None:
     """Run the unit of the build to its end, which is also that of all its processes."""
+    end_former(manager, build.unit)
     reading, writing = os.pipe2(os.O_CLOEXEC)
     try:
         try:
@@ -150,8 +153,8 @@ def _stop(manager: Manager, unit: str) -> None:
 
 
 def _wait(manager: Manager, build: Build, tree: BuildTree) -> None:
-    """Wait for the end of the unit. Raises DoraSystemdError if it fills the disk."""
-    told = ""
+    """Wait for the end of the unit. Raises DoraSystemdError if it fills the disk, or has no end."""
+    told, deadline = "", time.monotonic() + build.timeout / SECOND + _LATE_SECONDS
     while True:
         facts = manager.read(build.unit, ["ActiveState", "Job", "StatusText"])
         is_queued = bool((facts["Job"] or (0,))[0])
@@ -160,6 +163,8 @@ def _wait(manager: Manager, build: Build, tree: BuildTree) -> None:
         line = str(facts["StatusText"])
         if line not in ("", told) and not line.startswith(FAILED_BECAUSE):  # an error tells that
             build.on_line(told := line)
+        if build.timeout != INFINITY and time.monotonic() > deadline:
+            raise _late(build, _hint(build))
         if tree.is_disk_full():
             reason = "it has left too little space on the disk"
             raise _refusal(build, reason, f"see df {build.store.path}", ExitCode.FAILURE)
@@ -168,17 +173,25 @@ def _wait(manager: Manager, build: Build, tree: BuildTree) -> None:
 
 def _check_end(manager: Manager, build: Build) -> None:
     """Raise DoraSystemdError (BAD_INPUT) unless the build has succeeded."""
-    own = "--user " if build.scope.is_user else ""
-    hint = f"journalctl {own}--unit {build.unit} has all that it printed"
+    hint = _hint(build)
     result = str(manager.read(build.unit, ["Result"])["Result"])
     if refusal := runners_refusal(manager, build.unit):
         raise DoraSystemdError(refusal.message, hint, ExitCode.BAD_INPUT)
     if result == "timeout":
-        most = format_duration(build.timeout)
-        hint = f"{hint}; --build-timeout allows more time"
-        raise _refusal(build, f"it did not end within {most}", hint)
+        raise _late(build, hint)
     if result != "success":
         raise _refusal(build, failure_reason(manager, build.unit), hint)
+
+
+def _late(build: Build, hint: str) -> DoraSystemdError:
+    most = format_duration(build.timeout)
+    hint = f"{hint}; --build-timeout allows more time"
+    return _refusal(build, f"it did not end within {most}", hint)
+
+
+def _hint(build: Build) -> str:
+    own = "--user " if build.scope.is_user else ""
+    return f"journalctl {own}--unit {build.unit} has all that it printed"
 
 
 def _refusal(

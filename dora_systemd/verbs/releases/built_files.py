@@ -6,6 +6,7 @@ anything.
 """
 
 import posixpath
+import stat
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from dora_systemd.decisions.releases.entries import (
     Found,
     check_amount,
     check_found,
+    is_plain_path,
     refusal,
     too_many,
 )
@@ -101,12 +103,12 @@ def _is_behind_link(path: str, found: Mapping[str, Found]) -> bool:
 
 def _relative(one: Found, tree: Path) -> Found:
     """The file, with an absolute target in the tree as a relative one."""
-    if one.kind != LINK or not one.target.startswith(f"{tree}/"):
+    if one.kind != LINK or not f"{one.target}/".startswith(f"{tree}/"):
         return one
-    inside = one.target.removeprefix(f"{tree}/")
+    inside = one.target.removeprefix(str(tree)).lstrip("/")
     if ".." in inside.split("/"):
         return one
-    return replace(one, target=posixpath.relpath(inside, posixpath.dirname(one.path) or "."))
+    return replace(one, target=posixpath.relpath(inside or ".", posixpath.dirname(one.path) or "."))
 
 
 def _is_interpreter(one: Found, venvs: set[str], is_user: bool) -> bool:
@@ -118,7 +120,8 @@ def _is_interpreter(one: Found, venvs: set[str], is_user: bool) -> bool:
     place, name = posixpath.split(one.path)
     venv = posixpath.dirname(place)
     is_python = posixpath.basename(place) == "bin" and name.startswith("python")
-    is_one = one.kind == LINK and is_python and venv in venvs and one.target.startswith("/")
+    is_one = one.kind == LINK and is_python and venv in venvs and is_plain_path(one.path)
+    is_one = is_one and one.target.startswith("/")
     if is_one and one.path.isprintable() and one.target.isprintable():
         if is_user or _is_roots(one.target):
             return True
@@ -133,6 +136,8 @@ def _is_interpreter(one: Found, venvs: set[str], is_user: bool) -> bool:
 def _is_roots(path: str) -> bool:
     try:
         with reached(path) as (_, place):
-            return place.is_roots
+            # Not a directory: what is behind it could be a link of anybody.
+            is_program = stat.S_ISREG(place.mode) and not path.startswith(("/proc/", "/dev/"))
+            return place.is_roots and is_program
     except (OSError, DoraSystemdError):
         return False

@@ -77,7 +77,7 @@ def _try(
     manager: Manager, scope: Scope, store: Store, standing: Standing, change: Change, tell: Tell
 ) -> None:
     # After this nothing is certain but what the journal and systemd say: undo it in any case.
-    with guarded(partial(_end_killed, scope, standing, change)), _interruptible():
+    with guarded(partial(_end_killed, scope, standing, change), store.lock), _interruptible():
         _begin(manager, standing, change.text)
         try:
             fault = Gate(manager, scope, change.options, tell).run(
@@ -106,7 +106,7 @@ def _begin(manager: Manager, standing: Standing, text: str) -> None:
     """Put the release on trial. Raises DoraSystemdError; what runs has not been touched then."""
     try:
         begin_trial(manager, standing, text)
-    except DoraSystemdError:
+    except (DoraSystemdError, KeyboardInterrupt):
         end_trial(manager, standing)
         raise
 
@@ -139,21 +139,17 @@ def _roll_back(
     if not fault.is_stop:
         _note_stop(manager, change)
     now = "nothing of it runs"
+    details = {"release": change.release, "former": former, "nodes": fault.node}
     try:
-        go_back(manager, standing, want_start)
+        try:
+            go_back(manager, standing, want_start)
+        finally:  # before the wait, in which this process may be killed
+            uuid = change.options.uuid
+            note_request(ROLLED_BACK, name, uuid, change.by, **details, reason=fault.reason)
         if want_start:
             now = f"{former or 'what was there before'} {_back(manager, standing, tell)}"
     except DoraSystemdError as error:
         now = f"the way back has failed, too: {error.message}"
-    details = {"release": change.release, "former": former, "nodes": fault.node}
-    note_request(
-        ROLLED_BACK,
-        name,
-        change.options.uuid,
-        change.by,
-        **details,
-        reason=fault.reason,
-    )
     return DoraSystemdError(
         f"release {change.release} of {name} was rolled back: {fault.reason}",
         f"{now}; doractl why {name} tells more",
@@ -215,6 +211,7 @@ def _interruptible() -> Iterator[None]:
 
 
 def _interrupt(*_arguments: object) -> None:
+    _ignore_signals()  # a session that ends sends two of them
     raise KeyboardInterrupt
 
 

@@ -1,5 +1,6 @@
 """Copies a project into a release, built if it has to be, that has its name then."""
 
+import errno
 import os
 import time
 import uuid
@@ -85,6 +86,7 @@ def copy_project(
                 at_work = built_project(manager, build, project, found, tell)
                 project, found = held.enter_context(at_work)
             draft = Draft(store)
+            _require_space(draft, found, last)
             files = _fill(project, found, draft, last, tell)
             files = {p: replace(one, is_built=p not in originals) for p, one in files.items()}
             manifest = replace(manifest, files=files)
@@ -98,6 +100,16 @@ def copy_project(
     finally:
         if draft is not None:
             draft.discard()
+
+
+def _require_space(draft: Draft, found: dict[str, Found], last: Manifest | None) -> None:
+    """Raise OSError unless what the last release lacks has room: some of it may be sparse."""
+    old = last.files if last else {}
+    sizes = (
+        one.size for path, one in found.items() if path not in old or old[path].size != one.size
+    )
+    if sum(sizes) > draft.free_bytes():
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def _manifest(

@@ -47,7 +47,7 @@ Warn = Callable[[str], None]
 
 
 class Known(NamedTuple):
-    """The files that are here already. tree: where they are."""
+    """The files that are here already, unchanged. tree: where they are."""
 
     tree: Path
     files: Mapping[str, Stored]
@@ -55,7 +55,7 @@ class Known(NamedTuple):
 
 def _known(store: Store) -> Known:
     last = newest(store)
-    return Known(store.tree(last.id), last.files) if last else Known(store.path, {})
+    return Known(store.tree(last.id), store.intact(last)) if last else Known(store.path, {})
 
 
 def compare_sent(

@@ -3,6 +3,7 @@
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.releases.store import Store, locked
 from dora_systemd.decisions.logs.events import ROLLED_BACK
+from dora_systemd.decisions.releases.build import build_unit
 from dora_systemd.decisions.releases.choice import before
 from dora_systemd.decisions.releases.progress import waiting
 from dora_systemd.decisions.unit.file import runner_of
@@ -13,6 +14,7 @@ from dora_systemd.trust.paths import is_directory
 from dora_systemd.values import quoted
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.inhibit.guard import IfInhibited, require_uninhibited
+from dora_systemd.verbs.releases.build import end_former
 from dora_systemd.verbs.releases.change import Change, change_release
 from dora_systemd.verbs.releases.deploy import Deployed
 from dora_systemd.verbs.releases.listing import deployed_names, store_of
@@ -46,6 +48,8 @@ def roll_back(
     with locked(store, make=False):
         standing = read_standing(manager, scope, unit_name(store.name))
         require_deployable(manager, scope, standing)
+        if store.unfinished():
+            end_former(manager, build_unit(store.name))
         clean(store, standing)
         if release is None and standing.trial and not standing.current:
             require_uninhibited(

@@ -26,6 +26,7 @@ from dora_systemd.verbs.releases.files import copy_files, find_files
 from dora_systemd.verbs.releases.source import named_paths, project_root
 from dora_systemd.verbs.start.account import DEFAULT_USER, account_of, choose_user
 from dora_systemd.verbs.start.plan import DEFAULT_FILE, StartRequest, request_name
+from dora_systemd.verbs.start.settings import require_modest
 
 
 class Packed(NamedTuple):
@@ -67,7 +68,7 @@ def packed(
     with spooled() as spool:
         reader = _reader(sender)
         with opened_project(root, reader) as project:
-            found, revision = find_files(project, named, [0, os.geteuid(), sender.place.uid])
+            found, revision = find_files(project, named, _owners(reader))
             if reader is None and os.geteuid() == 0:
                 _require_roots(root, found)
             _require_own(found, root, dataflow)
@@ -90,12 +91,22 @@ def _find(request: StartRequest) -> _Sender:
     written = read_file(path)
     dataflow = parse_dataflow(parse_yaml(decoded(written.data, path), path), str(path))
     beside = Path(settings_path(str(path)))
-    documents = [(str(beside), _document(beside))] if exists(beside) else []
+    documents = []
+    if exists(beside):
+        documents.append((str(beside), _document(beside)))
+        _require_trusted(beside)
     settings = resolve_settings(request.flags, {}, documents)
     given = settings[WORKING_DIRECTORY]
     directory = "" if given is None else os.path.normpath(Path(given).absolute())
     root = project_root(path, directory or str(path.parent))
     return _Sender(written.place, dataflow, settings, root, directory)
+
+
+def _require_trusted(settings: Path) -> None:
+    """Refuse settings by which another user would get the rights of the login over there."""
+    place = read_file(settings).place
+    if place.borrowed or place.uid not in (0, os.geteuid()):
+        require_modest(settings)
 
 
 def _venv_note(sender: _Sender) -> str:
@@ -120,6 +131,16 @@ def _reader(sender: _Sender) -> Account | None:
     if os.geteuid() != 0:
         return None
     return account_of(choose_user(Scope(is_user=False, uid=0), None, sender.place, sender.root))
+
+
+def _owners(reader: Account | None) -> list[int]:
+    """Whose repositories git may read: it runs programs that they name.
+
+    None where root reads: others may be able to write to a repository of root's.
+    """
+    if reader is not None:
+        return [0, reader.uid]
+    return [0, os.geteuid()] if os.geteuid() else []
 
 
 def _require_roots(root: str, found: Iterable[str]) -> None:

@@ -19,7 +19,7 @@ from dora_systemd.adapters.bus.manager import (
 )
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import FAILED_BECAUSE
-from dora_systemd.decisions.needs.awaited import format_awaited
+from dora_systemd.decisions.needs.awaited import format_awaited, own_units
 from dora_systemd.decisions.needs.words import START, format_wait
 from dora_systemd.decisions.unit.versions import transient_commands
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -137,7 +137,8 @@ def _wait_until_checked(manager: Manager, unit: str) -> None:
         state = manager.read(unit, ["ActiveState", "Job", "StatusText"])
         is_on_the_way = state["ActiveState"] in ON_THE_WAY or (state["Job"] or (0,))[0]
         goes_on = state["StatusText"] and not state["StatusText"].startswith(FAILED_BECAUSE)
-        is_held = state["ActiveState"] in DOWN and manager.awaited(unit)
+        # For a moment every start waits for its slice.
+        is_held = state["ActiveState"] in DOWN and own_units(manager.awaited(unit))
         if goes_on or is_held or not is_on_the_way:
             return
         select.select([manager.fileno()], [], [], _POLL_SECONDS)

@@ -78,6 +78,13 @@ def read_settings(
     return replace(settings, lent=frozenset(one for one in named if one not in by_root))
 
 
+def require_modest(path: Path) -> None:
+    """Raise DoraSystemdError for what a settings file may not say that is not the caller's."""
+    read = _read(path)
+    _check_trust(read)
+    _check_values(read)
+
+
 def _read(path: Path, origin: Place | None = None) -> _Read:
     text = read_file(path)
     document = parse_yaml(decoded(text.data, path), path, allow_empty=True)

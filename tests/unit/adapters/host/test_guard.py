@@ -9,12 +9,42 @@ import pytest
 
 from tests.lab.pace import bound
 
+_HOLDS = """
+import fcntl, os, socket, sys, time
+from pathlib import Path
+from dora_systemd.adapters.host.guard import guarded
+place = Path(sys.argv[1])
+own, other = (os.open(place / name, os.O_RDWR | os.O_CREAT) for name in ("own", "other"))
+for lock in (own, other):
+    fcntl.flock(lock, fcntl.LOCK_EX)
+here, there = socket.socketpair()
+with guarded(lambda: time.sleep(1000), place / "own"):
+    os.close(other)
+    fcntl.flock(os.open(place / "other", os.O_RDWR), fcntl.LOCK_EX | fcntl.LOCK_NB)
+    there.close()
+    assert here.recv(1) == b""
+    os.close(own)
+    try:
+        fcntl.flock(os.open(place / "own", os.O_RDWR), fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        print("held")
+"""
+
+
+def test_the_child_holds_nothing_but_its_lock(tmp_path: Path) -> None:
+    """A gateway does several things at once: the locks and connections of others are not its."""
+    command = [sys.executable, "-c", _HOLDS, str(tmp_path)]
+    done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=bound(60))
+    assert (done.stdout, done.stderr) == ("held\n", "")
+
+
 _PROGRAM = """
 import os, signal
 from pathlib import Path
 from dora_systemd.adapters.host.guard import guarded
 place = Path({place!r})
-with guarded(lambda: (place / "ended").touch()):
+(place / "lock").touch()
+with guarded(lambda: (place / "ended").touch(), place / "lock"):
     {body}
 (place / "left").touch()
 """

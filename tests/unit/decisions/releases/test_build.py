@@ -39,6 +39,11 @@ def test_modules_that_ask_for_a_build() -> None:
     assert has_builds({"nodes": [PLAIN, {**PLAIN, "build": "make"}]})
     assert has_builds({"nodes": [{"id": "n", "module": "other.yml"}]})
     assert not has_builds("build")
+    endless: list[object] = []
+    endless.append(endless)
+    for _ in range(100):
+        endless = [endless, endless]  # as aliases of YAML can
+    assert not has_builds(endless)
 
 
 def test_the_commands_and_their_order() -> None:

@@ -29,7 +29,7 @@ def test_only_what_is_missing_is_asked_for() -> None:
     assert missing(PARCEL, {}) == [0, 1]
     assert missing(PARCEL, {"other": B}) == [0]
     assert parse_wants({"wants": [1]}, PARCEL) == [B]
-    for wrong in (None, {}, {"wants": 1}, {"wants": [2]}, {"wants": [True]}, {"wants": [0] * 3}):
+    for wrong in (None, {}, {"wants": 1}, {"wants": [2]}, {"wants": [True]}, {"wants": [0, 0]}):
         assert parse_wants(wrong, PARCEL) is None
 
 

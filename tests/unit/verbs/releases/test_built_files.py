@@ -61,6 +61,21 @@ def test_the_interpreter_of_a_virtual_environment(root: Path, project: Project) 
         found_in(project, is_user=True)
 
 
+@pytest.mark.parametrize("target", ["/", "/usr/bin", "/dev/null", "/proc/self/exe"])
+def test_no_way_out_by_a_link_that_looks_like_an_interpreter(
+    root: Path, project: Project, target: str
+) -> None:
+    """Behind a directory there may be a link of anybody, which is read as root's later."""
+    (root / ".venv/bin/python-x").symlink_to(target)
+    with pytest.raises(DoraSystemdError, match="others than root can change"):
+        found_in(project)
+
+
+def test_a_link_to_the_whole_tree(root: Path, project: Project) -> None:
+    (root / "here").symlink_to(f"{TREE}/")
+    assert "here" in found_in(project)
+
+
 def test_links_by_the_path_of_the_release(root: Path, project: Project) -> None:
     (root / "built/link").symlink_to(TREE / "a.py")
     assert "built/link" in found_in(project)

@@ -39,6 +39,9 @@ def test_what_is_left(
     own, trial = leave(etc(manager), 100), leave(standing.path, 100)
     young, other = leave(etc(manager).with_name("x.service"), 100), etc(manager).with_suffix(".d")
     other.mkdir()
+    edited = etc(manager).with_name(f".{etc(manager).name}.swp")
+    edited.touch()
+    os.utime(edited, (0, 0))
     assert set(remains(store, standing)) == {draft, store.release(NEW), own, trial}
     told = [one.text for one in module.judge_releases(manager, scope)]
     assert [f"{one} is the rest of a deploy that was killed" for one in (draft, own)] == [
@@ -47,6 +50,7 @@ def test_what_is_left(
     clean(store, standing)
     assert list(remains(store, standing)) == []
     assert young.exists()
+    assert edited.exists(), "an administrator edits the unit file"
     assert sorted(path.name for path in store.path.iterdir()) == [OLD, "notes"]
 
 
