@@ -139,17 +139,16 @@ def _roll_back(
     if not fault.is_stop:
         _note_stop(manager, change)
     now = "nothing of it runs"
-    details = {"release": change.release, "former": former, "nodes": fault.node}
     try:
-        try:
-            go_back(manager, standing, want_start)
-        finally:  # before the wait, in which this process may be killed
-            uuid = change.options.uuid
-            note_request(ROLLED_BACK, name, uuid, change.by, **details, reason=fault.reason)
+        go_back(manager, standing, want_start)
         if want_start:
             now = f"{former or 'what was there before'} {_back(manager, standing, tell)}"
     except DoraSystemdError as error:
         now = f"the way back has failed, too: {error.message}"
+    # It belongs to the life that runs then.
+    uuid, details = change.options.uuid, {"release": change.release, "former": former}
+    reasons = {"nodes": fault.node, "reason": fault.reason}
+    note_request(ROLLED_BACK, name, uuid, change.by, **details, **reasons)
     return DoraSystemdError(
         f"release {change.release} of {name} was rolled back: {fault.reason}",
         f"{now}; doractl why {name} tells more",
