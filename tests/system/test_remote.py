@@ -112,6 +112,7 @@ def test_logs_of_several_hosts(cell: Cell, hers: Cell, project: Project) -> None
     run("doractl", "-H", "base", "start", flow, "--name", cell.name)
     run("doractl", "-H", "arm", "start", flow, "--name", hers.name)
     command = ["doractl", "logs", cell.name, "--node", "sink", "-H", "base,arm,gone"]
+    sync_journal()
     with subprocess.Popen([*command, "-f"], stdout=subprocess.PIPE, text=True) as child:
         assert child.stdout
         lines: list[str] = []

@@ -24,7 +24,7 @@ from dora_systemd.decisions.logs.query import (
 from dora_systemd.decisions.logs.terminal import ShownLines, TerminalLines
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import quoted
-from dora_systemd.verbs.facts.recorded import find_query
+from dora_systemd.verbs.facts.recorded import find_query, find_soon
 from dora_systemd.verbs.logs import pass_logs, read_logs, write_whole
 
 Lines = TerminalLines | ShownLines | None
@@ -179,7 +179,11 @@ def command(
     check_readable(scope)
     journal = JournalReader()
     wanted = LogQuery(scope, tail=tail, levels=parse_filter(log_filter), **options)
-    query = find_query(journal, wanted, selectors, (*nodes, *old_nodes), run)
+    query = find_soon(
+        lambda: find_query(JournalReader(), wanted, selectors, (*nodes, *old_nodes), run),
+        scope,
+        selectors,
+    )
     lines = _lines(journal, query)
     if until_end:
         # Imported late: only --until-end needs it.

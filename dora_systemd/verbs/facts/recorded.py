@@ -1,7 +1,9 @@
 """Which records of the journal a user means: of which dataflows, nodes and runs."""
 
 import re
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from fnmatch import fnmatchcase
 from itertools import islice
@@ -17,6 +19,36 @@ from dora_systemd.verbs.facts.selector import Selector, is_pattern, selectors_of
 
 _MOST_FITTING = 100
 """Maximum UUIDs with the same beginning: anybody can write records with more."""
+
+
+_BEHIND_SECONDS = 2.0
+"""How long journald may take on a busy machine for what a dataflow has said at its start."""
+_LOOK_SECONDS = 0.1
+
+
+def find_soon(find: Callable[[], LogQuery], scope: Scope, selectors: Sequence[str]) -> LogQuery:
+    """What `find` gives, as find_query(). A dataflow that runs may just not be recorded yet."""
+    deadline = time.monotonic() + _BEHIND_SECONDS
+    while True:
+        try:
+            return find()
+        except DoraSystemdError as error:
+            is_over = time.monotonic() > deadline or not selectors
+            if error.code is not ExitCode.NOT_FOUND or is_over or not _is_loaded(scope, selectors):
+                raise
+        time.sleep(_LOOK_SECONDS)
+
+
+def _is_loaded(scope: Scope, selectors: Sequence[str]) -> bool:
+    """Whether systemd has a dataflow that is meant; not if it is out of reach."""
+    # Imported late: the journal is read without systemd.
+    from dora_systemd.adapters.bus.systemd import Bus
+    from dora_systemd.verbs.facts.cells import read_cells
+
+    with suppress(DoraSystemdError):
+        cells = read_cells(Bus(scope))
+        return any(one.meant(cells) for one in map(Selector, selectors))
+    return False
 
 
 class _Recorded(NamedTuple):
