@@ -71,6 +71,8 @@ class _Page:
         self._is_due = asyncio.Event()
         self._stream: asyncio.Task[None] | None = None
         self.tasks: set[asyncio.Task[None]] = set()
+        # The last answer to a question is what the page shows: it must be the newest.
+        self._turns = {question: asyncio.Lock() for question in _QUESTIONS}
 
     async def show(self) -> None:
         """Send snapshots, forever."""
@@ -165,12 +167,13 @@ class _Page:
 
     async def _answer(self, message: PageMessage) -> None:
         values: dict[str, Any] = {"problem": ""}
-        try:
-            read = _QUESTIONS[message.type]
-            values |= await asyncio.to_thread(read, self._scope, message.dataflow)
-        except DoraSystemdError as error:
-            values["problem"] = error.message
-        await self._send(type=message.type, dataflow=message.dataflow, **values)
+        async with self._turns[message.type]:
+            try:
+                read = _QUESTIONS[message.type]
+                values |= await asyncio.to_thread(read, self._scope, message.dataflow)
+            except DoraSystemdError as error:
+                values["problem"] = error.message
+            await self._send(type=message.type, dataflow=message.dataflow, **values)
 
     async def _act(self, message: PageMessage) -> None:
         answer = {"text": "", "problem": "", "hint": ""}

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import threading
 from collections.abc import AsyncIterable, AsyncIterator, Awaitable, Callable
 from types import SimpleNamespace
 from typing import Any, cast
@@ -253,3 +254,29 @@ def test_a_page_that_leaves_at_the_moment_of_a_change_ends(
         assert showing.cancelled()
 
     asyncio.run(both())
+
+
+def test_the_newest_answer_comes_last(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What an action has changed must not be hidden by a slow answer of before."""
+    began, may_end = threading.Event(), threading.Event()
+    answers = iter(["old", "new"])
+
+    def read(_scope: Scope, _uuid: str) -> dict[str, Any]:
+        value = next(answers)
+        began.set()
+        if value == "old":
+            assert may_end.wait(10)
+        return {"value": value}
+
+    monkeypatch.setitem(live_talk._QUESTIONS, "about", read)
+
+    async def story(browser: Browser) -> None:
+        browser.say(type="about", dataflow=UUID)
+        await asyncio.to_thread(began.wait, 10)
+        browser.say(type="about", dataflow=UUID)
+        await asyncio.sleep(0.05)
+        may_end.set()
+        found = await browser.wait_for("about", 2)
+        assert [one["value"] for one in found] == ["old", "new"]
+
+    play(story)
