@@ -52,6 +52,7 @@ LATE = {
     },
     "seldom: what is not in systemd, has restarted, was killed, or enabled while it ran": {
         "verbs.facts.budget": {"adapters.journal.reader"},
+        "verbs.facts.recorded": {"adapters.bus.systemd", "verbs.facts.cells"},
         "verbs.facts.selector": {"verbs.facts.ended"},
         "verbs.list": {"verbs.facts.ended"},
         "runner.nodes.losses": {"adapters.journal.reader"},

@@ -17,10 +17,11 @@ from dora_systemd.decisions.logs.query import UNIT_ENDS, LogQuery, query_matches
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs import logs
-from dora_systemd.verbs.facts.recorded import find_query
+from dora_systemd.verbs.facts.recorded import find_query, find_soon
 from dora_systemd.verbs.follow import UnitWatch
 from dora_systemd.verbs.logs import FollowedLog, pass_logs
-from tests.unit.fakes.library import fake_journalctl
+from tests.unit.fakes.library import fake_journalctl, fake_systemd
+from tests.unit.fakes.manager import FakeManager, options
 from tests.unit.fakes.programs import make_program
 
 ROBOT = "550e8400-e29b-41d4-a716-446655440000"
@@ -301,3 +302,20 @@ def test_lines_go_on_after_an_automatic_restart(monkeypatch: pytest.MonkeyPatch)
         log.print_new()
     assert (printed, log.has_ended) == ([b"one", b"two"], True)
     os.close(writing)
+
+
+def test_journald_may_be_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A dataflow that systemd has loaded is looked for again; another one is not."""
+    answers = iter([DoraSystemdError("no dataflow", "", ExitCode.NOT_FOUND)] * 2)
+
+    def find() -> LogQuery:
+        for error in answers:
+            raise error
+        return QUERY
+
+    fake_systemd(monkeypatch, manager := FakeManager())
+    manager.add(options(name="robot"))
+    assert find_soon(find, QUERY.scope, ["robot"]) == QUERY
+    answers = iter([DoraSystemdError("no dataflow", "", ExitCode.NOT_FOUND)])
+    with pytest.raises(DoraSystemdError, match="no dataflow"):
+        find_soon(find, QUERY.scope, ["camera"])
