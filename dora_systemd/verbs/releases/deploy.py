@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.releases.store import Store, locked, unusable
-from dora_systemd.decisions.releases.build import build_unit
 from dora_systemd.decisions.releases.choice import surplus
 from dora_systemd.decisions.releases.entries import touched
 from dora_systemd.decisions.releases.manifest import Manifest
@@ -20,12 +19,11 @@ from dora_systemd.scope import Scope
 from dora_systemd.trust.project import opened_project
 from dora_systemd.values import SECOND
 from dora_systemd.verbs.inhibit.guard import IfInhibited, require_uninhibited
-from dora_systemd.verbs.releases.build import end_former
 from dora_systemd.verbs.releases.change import Change, change_release
+from dora_systemd.verbs.releases.clean import clean
 from dora_systemd.verbs.releases.copy import copy_project, newest, repository_owners
 from dora_systemd.verbs.releases.files import digests, find_files
 from dora_systemd.verbs.releases.listing import store_of
-from dora_systemd.verbs.releases.remains import clean
 from dora_systemd.verbs.releases.soak import Tell
 from dora_systemd.verbs.releases.source import (
     Source,
@@ -118,9 +116,7 @@ def deploy(
         require_uninhibited(
             scope, standing.running, "deploy", request.how, lambda text: tell(waiting(text))
         )
-        if store.unfinished():
-            end_former(manager, build_unit(name))
-        clean(store, standing)
+        clean(manager, store, standing)
         copy = copy_project(manager, scope, source, store, standing, request.build_timeout, tell)
         release = copy.manifest.id
         try:

@@ -1,10 +1,10 @@
-"""What a deploy or rollback that was killed has left: doctor names it, the next one removes it."""
+"""What a deploy or rollback that was killed has left: doctor names it, clean.py removes it."""
 
 from collections.abc import Iterator
 from pathlib import Path
 
 from dora_systemd.adapters.host.unit_files import remains_of
-from dora_systemd.adapters.releases.store import Store, remove_tree
+from dora_systemd.adapters.releases.store import Store
 from dora_systemd.verbs.releases.trial import Standing
 
 
@@ -14,9 +14,3 @@ def remains(store: Store, standing: Standing) -> Iterator[Path]:
     yield from (path for path in store.unfinished() if path not in used)
     for place in (standing.boot.path, standing.path):
         yield from remains_of(place)
-
-
-def clean(store: Store, standing: Standing) -> None:
-    """Remove them. The caller holds the lock of the store."""
-    for path in remains(store, standing):
-        remove_tree(path)

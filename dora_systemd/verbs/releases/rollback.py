@@ -3,7 +3,6 @@
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.releases.store import Store, locked
 from dora_systemd.decisions.logs.events import ROLLED_BACK
-from dora_systemd.decisions.releases.build import build_unit
 from dora_systemd.decisions.releases.choice import before
 from dora_systemd.decisions.releases.progress import waiting
 from dora_systemd.decisions.unit.file import runner_of
@@ -14,11 +13,10 @@ from dora_systemd.trust.paths import is_directory
 from dora_systemd.values import quoted
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.inhibit.guard import IfInhibited, require_uninhibited
-from dora_systemd.verbs.releases.build import end_former
 from dora_systemd.verbs.releases.change import Change, change_release
+from dora_systemd.verbs.releases.clean import clean
 from dora_systemd.verbs.releases.deploy import Deployed
 from dora_systemd.verbs.releases.listing import deployed_names, store_of
-from dora_systemd.verbs.releases.remains import clean
 from dora_systemd.verbs.releases.soak import Tell
 from dora_systemd.verbs.releases.trial import Standing, go_back, read_standing, require_deployable
 from dora_systemd.verbs.start.asked import note_request
@@ -48,9 +46,7 @@ def roll_back(
     with locked(store, make=False):
         standing = read_standing(manager, scope, unit_name(store.name))
         require_deployable(manager, scope, standing)
-        if store.unfinished():
-            end_former(manager, build_unit(store.name))
-        clean(store, standing)
+        clean(manager, store, standing)
         if release is None and standing.trial and not standing.current:
             require_uninhibited(
                 scope, standing.running, "rollback", how, lambda text: tell(waiting(text))

@@ -8,7 +8,8 @@ import pytest
 from dora_systemd.adapters.releases.store import Store
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.releases import listing as module
-from dora_systemd.verbs.releases.remains import clean, remains
+from dora_systemd.verbs.releases.clean import clean
+from dora_systemd.verbs.releases.remains import remains
 from dora_systemd.verbs.releases.trial import read_standing
 from tests.unit.fakes.manager import FakeManager
 from tests.unit.verbs.releases.test_trial import NEW, OLD, UNIT, deployed, etc, store
@@ -47,7 +48,7 @@ def test_what_is_left(
     assert [f"{one} is the rest of a deploy that was killed" for one in (draft, own)] == [
         one for one in told if str(draft) in one or str(own) in one
     ]
-    clean(store, standing)
+    clean(manager, store, standing)
     assert list(remains(store, standing)) == []
     assert young.exists()
     assert edited.exists(), "an administrator edits the unit file"
@@ -58,5 +59,5 @@ def test_what_is_being_written_stays(manager: FakeManager, scope: Scope, store: 
     deployed(manager)
     store.write_unit(NEW, "")
     left = leave(etc(manager), 1)
-    clean(store, read_standing(manager, scope, UNIT))
+    clean(manager, store, read_standing(manager, scope, UNIT))
     assert left.exists()
