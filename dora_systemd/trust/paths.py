@@ -134,6 +134,15 @@ def is_directory(path: str | Path) -> bool:
         return False
 
 
+def sync_directory(path: str | Path) -> None:
+    """Make the names in a directory durable, see fsync(2). Raises OSError."""
+    fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
+
+
 def user_name(uid: int, nameless: str = "uid ") -> str:
     """The name of a uid; where it has none its number, behind `nameless`."""
     try:

@@ -1,7 +1,6 @@
 """Reads and writes unit files; after a power failure either the old or the new one exists."""
 
 import contextlib
-import os
 import stat
 import time
 from collections.abc import Iterator
@@ -9,6 +8,7 @@ from pathlib import Path
 
 from dora_systemd.adapters.host.files import REFUSED, read_text, write_atomic
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.trust.paths import sync_directory
 
 _WRITTEN_SECONDS = 60.0
 """A younger one may still be written."""
@@ -67,15 +67,7 @@ def write_unit_file(path: Path, text: str) -> None:
         write_atomic(path, text, is_durable=True)
         # The content is on the disk by now; syncing the directories makes the names durable.
         for directory in (path.parent, *(one.parent for one in made)):
-            _sync_directory(directory)
-
-
-def _sync_directory(directory: Path) -> None:
-    descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+            sync_directory(directory)
 
 
 def remains_of(path: Path) -> list[Path]:
@@ -97,8 +89,8 @@ def sync_links(path: Path) -> None:
     """
     with _told("write", path):
         for link in path.parent.glob(f"*/{path.name}"):
-            _sync_directory(link.parent)
-        _sync_directory(path.parent)
+            sync_directory(link.parent)
+        sync_directory(path.parent)
 
 
 def remove_unit_file(path: Path) -> None:

@@ -3,6 +3,7 @@
 import io
 import json
 import os
+from itertools import count
 
 import pytest
 
@@ -13,19 +14,8 @@ from tests.unit.cli.test_stageline import Terminal
 STEPS = (copying(1, 3), copying(2, 3), copied(1, 3, 0), checking(), checking(), judged("X", ""))
 
 
-class Clock:
-    """One second later with each look at it."""
-
-    def __init__(self) -> None:
-        self.now = 0.0
-
-    def __call__(self) -> float:
-        self.now += 1
-        return self.now
-
-
 def show(stream: io.StringIO | None, *steps: Step, **how: bool) -> None:
-    with Progress(stream, clock=Clock(), **how) as progress:
+    with Progress(stream, clock=count(1.0).__next__, **how) as progress:
         for step in steps:
             progress(step)
 

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -52,17 +53,6 @@ class Systemd(FakeManager):
             self.units[unit]["ActiveState"] = "failed"
 
 
-class Clock:
-    """Every look at it is a second later."""
-
-    def __init__(self) -> None:
-        self.seconds = 0.0
-
-    def __call__(self) -> float:
-        self.seconds += 1
-        return self.seconds
-
-
 @pytest.fixture
 def systemd(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Systemd:
     for module in (destroy_module, stop_module):
@@ -71,7 +61,7 @@ def systemd(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Systemd:
 
 
 def destroy(systemd: Systemd, scope: ScopeIn, want_kill: bool = False) -> list[Outcome]:
-    return list(stop_all(systemd, scope, want_kill, Clock()))
+    return list(stop_all(systemd, scope, want_kill, count(1.0).__next__))
 
 
 @pytest.mark.parametrize("active", ["active", "activating", "deactivating", "reloading"])
@@ -118,7 +108,7 @@ def test_by_force(systemd: Systemd, scope: ScopeIn) -> None:
 def test_what_somebody_starts_meanwhile_is_stopped(systemd: Systemd, scope: ScopeIn) -> None:
     systemd.add(options("a"), TimeoutStopUSec=3_000_000)
     names = []
-    for ended in stop_all(systemd, scope, False, Clock()):
+    for ended in stop_all(systemd, scope, False, count(1.0).__next__):
         names.append(ended.subject.name)
         if len(names) == 1:
             systemd.add(options("late"), TimeoutStopUSec=3_000_000)
@@ -170,12 +160,12 @@ def test_processes_that_are_left(
     systemd: Systemd, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(cgroup, "mount_point", lambda: tmp_path)
-    assert processes_left(systemd, [], Clock()) == []
+    assert processes_left(systemd, [], count(1.0).__next__) == []
     for unit, pid in ((ROBOT, os.getpid()), ("foreign.service", os.getppid())):
         group = tmp_path / SLICE / unit / "node-a"
         group.mkdir(parents=True)
         (group / "cgroup.procs").write_text(f"{pid}\n")
         (group.parent / "cgroup.events").write_text("populated 1\n")
-    (left,) = processes_left(systemd, ["foreign.service"], Clock())
+    (left,) = processes_left(systemd, ["foreign.service"], count(1.0).__next__)
     assert {call[:2] for call in systemd.calls} == {("kill", ROBOT)}
     assert left.startswith(f"process {os.getpid()} (")
