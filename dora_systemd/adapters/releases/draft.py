@@ -10,10 +10,17 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from dora_systemd.adapters.releases.store import MANIFEST, Store, remove_tree, sync, write_part
+from dora_systemd.adapters.releases.store import (
+    MANIFEST,
+    Store,
+    remove_tree,
+    stored_at,
+    write_part,
+)
 from dora_systemd.decisions.releases.entries import Stored
 from dora_systemd.decisions.releases.manifest import Manifest, format_manifest
 from dora_systemd.names import TREE
+from dora_systemd.trust.paths import sync_directory
 
 _CHUNK = 256 * 1024
 _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
@@ -23,7 +30,8 @@ _LIBC = ctypes.CDLL(None, use_errno=True)
 class Draft:
     """A release of `store` without a name yet. All methods raise OSError.
 
-    kind: in the name of its directory.
+    kind: in the name of its directory. damaged: the files of another release that could not be
+    shared, because they are not as its manifest says.
     """
 
     def __init__(self, store: Store, kind: str = "new") -> None:
@@ -31,7 +39,8 @@ class Draft:
         self._path = store.path / f".{kind}-{os.urandom(6).hex()}"
         self._tree = self._path / TREE
         self._made = {self._tree}
-        self._path.mkdir(0o700, parents=True)  # others may not read what it gets
+        self.damaged: list[str] = []
+        self._path.mkdir(0o700)  # others may not read what it gets
         try:
             self._tree.mkdir()
         except OSError:  # no room
@@ -55,9 +64,19 @@ class Draft:
             os.fchmod(file.fileno(), mode)
         return Stored(size, is_executable, digest.hexdigest())
 
-    def share(self, path: str, release_id: str) -> None:
-        """Share a file with the same path in another release."""
-        self.adopt(path, self._store.tree(release_id) / path)
+    def share(self, path: str, release_id: str, stored: Stored) -> bool:
+        """Share a file with the same path in another release, where it was `stored`.
+
+        False if its content is another one by now, as on a bad disk: who shared that would copy the
+        damage from release to release, and no later deploy would heal it.
+        """
+        file = self._store.tree(release_id) / path
+        is_intact = stored_at(file) == stored
+        if is_intact:
+            self.adopt(path, file)
+        else:
+            self.damaged.append(path)
+        return is_intact
 
     def adopt(self, path: str, file: Path) -> None:
         """Share a file of another tree that nobody changes."""
@@ -83,7 +102,7 @@ class Draft:
         self.lend(group)
         _sync_file_system(self._path)
         self._path.rename(self._store.release(manifest.id))
-        sync(self._store.path)
+        sync_directory(self._store.path)
 
     def lend(self, group: int | None) -> None:
         """Let a group read what nobody changes any more; None: nobody but its owner."""

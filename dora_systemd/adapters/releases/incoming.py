@@ -17,6 +17,8 @@ _NAME = ".sent"
 _SECONDS = 90.0
 """Timeout for more bytes: who sends them may be stopped, or gone without a word."""
 _YOUNG_SECONDS = 60.0
+_RACES = 20
+"""Of others that remove the shared directory just then; each of them has ended then."""
 _CHUNK = 256 * 1024
 
 
@@ -71,10 +73,7 @@ def _broken(reason: str) -> DoraSystemdError:
 def incoming(root: Path) -> Iterator[Draft]:
     """A place below `root` for files that are sent, until the end of the block. Raises OSError."""
     store = Store(root, _NAME)
-    make_directories(store.path)
-    store.path.chmod(0o711)  # who may not read it cannot lock what is in it
-    _clean(store)
-    draft = Draft(store)
+    draft = _begun(store)
     try:
         with _locked(draft.tree.parent):
             yield draft
@@ -82,6 +81,24 @@ def incoming(root: Path) -> Iterator[Draft]:
         draft.discard()
         with contextlib.suppress(OSError):
             store.path.rmdir()
+
+
+def _begun(store: Store) -> Draft:
+    """A draft in the directory that all senders share. Raises OSError."""
+    for _ in range(_RACES):
+        # The last one removes it, perhaps between the moment that it was there and this draft.
+        with contextlib.suppress(FileNotFoundError):
+            return _begin(store)
+    return _begin(store)
+
+
+def _begin(store: Store) -> Draft:
+    make_directories(store.path.parent)
+    with contextlib.suppress(FileExistsError):
+        store.path.mkdir(0o711)
+    store.path.chmod(0o711)  # who may not read it cannot lock what is in it
+    _clean(store)
+    return Draft(store)
 
 
 def leftovers(root: Path) -> list[Path]:

@@ -41,9 +41,10 @@ class Spool:
             done += os.pwrite(self._fd, chunk[done:], at + done)
         return done
 
-    def share(self, path: str, release_id: str) -> None:
+    def share(self, path: str, release_id: str, stored: Stored) -> bool:
         """There is no other release."""
-        raise FileNotFoundError(path, release_id)
+        del path, release_id, stored
+        return False
 
     def link(self, path: str, target: str) -> Stored:
         """A symbolic link has no content."""

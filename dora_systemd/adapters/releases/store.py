@@ -19,6 +19,7 @@ from dora_systemd.decisions.releases.manifest import Manifest, format_manifest, 
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import STORE, TREE, is_release_id
 from dora_systemd.trust.files import read_file
+from dora_systemd.trust.paths import sync_directory
 from dora_systemd.trust.programs import spawn
 from dora_systemd.values import shown
 
@@ -32,7 +33,7 @@ _REMOVE_SECONDS = 300.0
 SYSTEM_STATE = Path("/var/lib")
 
 
-def store_root(is_user: bool, environment_home: str, state_home: str) -> Path:
+def store_root(is_user: bool, environment_home: str = "", state_home: str = "") -> Path:
     """The directory of the releases of all dataflows.
 
     environment_home, state_home: the variables HOME and XDG_STATE_HOME, for user scope.
@@ -83,7 +84,7 @@ class Store:
         return {
             path: one
             for path, one in manifest.files.items()
-            if one.target or one == _at(tree / path)
+            if one.target or one == stored_at(tree / path)
         }
 
     def write_manifest(self, manifest: Manifest) -> None:
@@ -231,8 +232,8 @@ def remove_tree(path: Path) -> None:
                 child.kill()
 
 
-def _at(path: Path) -> Stored | None:
-    """A regular file, as a manifest describes it; None if there is none."""
+def stored_at(path: Path) -> Stored | None:
+    """A file of a release, as a manifest describes it; None if there is none to read."""
     try:
         with path.open("rb") as file:
             status = os.fstat(file.fileno())
@@ -261,13 +262,4 @@ def write_part(directory: Path, name: str, text: str) -> None:
         file.flush()
         os.fsync(file.fileno())
     new.rename(directory / name)
-    sync(directory)
-
-
-def sync(directory: Path) -> None:
-    """Make the names in a directory durable. Raises OSError."""
-    fd = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)
+    sync_directory(directory)

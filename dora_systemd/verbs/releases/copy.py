@@ -4,6 +4,7 @@ import errno
 import os
 import time
 import uuid
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from typing import NamedTuple
@@ -31,10 +32,14 @@ _MICROSECOND_NS = 1000
 
 
 class Copied(NamedTuple):
-    """A copied project. copied: bytes of its files that the last release does not have."""
+    """A copied project. copied: bytes of its files that the last release does not have.
+
+    notes: what people have to know about the last release.
+    """
 
     manifest: Manifest
     copied: int
+    notes: tuple[str, ...] = ()
 
 
 def newest(store: Store) -> Manifest | None:
@@ -94,12 +99,20 @@ def copy_project(
             new = sum(one.size for path, one in files.items() if shared.get(path) != one)
             draft.publish(manifest, None if user is None else user.pw_gid)
             tell(copied(len(files), manifest.size, new))
-            return Copied(manifest, new)
+            return Copied(manifest, new, tuple(_damage(last, draft.damaged)))
     except OSError as error:
         raise unusable(store.path, error) from error
     finally:
         if draft is not None:
             draft.discard()
+
+
+def _damage(last: Manifest | None, paths: Sequence[str]) -> Iterator[str]:
+    """The warning about files of the last release that are not what was copied then."""
+    if last and paths:
+        more = f" and {len(paths) - 1} more" if len(paths) > 1 else ""
+        now = "the new release has its own copy; check the disk"
+        yield f"release {last.id} is damaged: {paths[0]}{more} changed on the disk; {now}"
 
 
 def _require_space(draft: Draft, found: dict[str, Found], last: Manifest | None) -> None:

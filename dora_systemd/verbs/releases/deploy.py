@@ -131,7 +131,7 @@ def deploy(
             raise
         options = runner_of(text)
         assert options is not None
-        for note in source_notes(source, store.tree(release)):
+        for note in (*copy.notes, *source_notes(source, store.tree(release))):
             warn(note)
         standing = read_standing(manager, scope, standing.boot.unit)  # the copy took its time
         require_deployable(manager, scope, standing)

@@ -39,8 +39,8 @@ class Target(Protocol):
     def write(self, path: str, chunks: Iterable[bytes], is_executable: bool) -> Stored:
         """Write a file."""
 
-    def share(self, path: str, release_id: str) -> None:
-        """Take the file with the same path in another release."""
+    def share(self, path: str, release_id: str, stored: Stored) -> bool:
+        """Take the file with the same path in another release, if it is as it was stored."""
 
     def link(self, path: str, target: str) -> Stored:
         """Create a symbolic link."""
@@ -157,8 +157,8 @@ def _copy(
     old = last.files.get(one.path) if last else None
     if last and old and not old.target and _is_same(project, one, old, count):
         try:
-            draft.share(one.path, last.id)
-            return old
+            if draft.share(one.path, last.id, old):
+                return old
         except OSError as error:
             if error.errno not in (errno.EMLINK, errno.EPERM, errno.ENOENT):
                 raise

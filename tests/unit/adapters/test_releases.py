@@ -64,7 +64,7 @@ def test_a_release(store: Store) -> None:
 def test_what_is_shared_survives_the_first_owner(store: Store) -> None:
     written(store, ONE)
     draft = Draft(store)
-    draft.share("d/a.py", ONE)
+    assert draft.share("d/a.py", ONE, store.manifest(ONE).files["d/a.py"])
     draft.publish(manifest(TWO, {}), None)
     shared = store.tree(TWO) / "d/a.py"
     assert shared.stat().st_nlink == 2
@@ -72,6 +72,26 @@ def test_what_is_shared_survives_the_first_owner(store: Store) -> None:
     assert shared.read_text() == "abc"
     assert [one.id for one in store.known()] == [TWO]
     store.remove(ONE)  # as by two at once
+
+
+@pytest.mark.parametrize("data", ["abd", "", None])
+def test_what_has_changed_on_the_disk_is_not_shared(store: Store, data: str | None) -> None:
+    """Same name, size and time, and another content; or a file that is gone."""
+    one = written(store, ONE)
+    path = store.tree(ONE) / "d/a.py"
+    before = path.stat()
+    if data is None:
+        path.unlink()
+    else:
+        path.chmod(0o755)
+        path.write_text(data)
+        path.chmod(0o555)
+        os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+    draft = Draft(store)
+    assert not draft.share("d/a.py", ONE, one.files["d/a.py"])
+    assert draft.damaged == ["d/a.py"]
+    assert not (draft.tree / "d/a.py").exists()
+    draft.discard()
 
 
 def test_an_unfinished_one_is_no_release(store: Store) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.adapters.releases.draft import Draft
-from dora_systemd.adapters.releases.store import Store, locked
+from dora_systemd.adapters.releases.store import Store
 from dora_systemd.decisions.releases.entries import Found, Stored
 from dora_systemd.decisions.releases.manifest import Manifest
 from dora_systemd.errors import DoraSystemdError
@@ -37,8 +37,8 @@ def project(root: Path) -> Iterator[Project]:
 @pytest.fixture
 def store(tmp_path: Path) -> Store:
     found = Store(tmp_path / "store", "robot")
-    with locked(found):
-        return found
+    found.path.mkdir(parents=True)
+    return found
 
 
 def test_without_git_all_but_rubbish(root: Path, project: Project) -> None:
@@ -114,6 +114,18 @@ def test_copies_share_what_is_the_same(root: Path, project: Project, store: Stor
     assert {one for one in first if first[one] != second[one]} == {"a.py"}
     links = {path: (store.tree(FIRST) / path).stat().st_nlink for path in first}
     assert links == {"a.py": 1, "models/m.onnx": 2, "target/release/node": 2}
+
+
+@pytest.mark.usefixtures("root")
+def test_copies_heal_what_the_disk_has_damaged(project: Project, store: Store) -> None:
+    found, _ = find_files(project, [], [])
+    copied(project, store, found)
+    damaged = store.tree(FIRST) / "models/m.onnx"
+    damaged.chmod(0o600)
+    damaged.write_text("models/m.onny")
+    second = copied(project, store, found)
+    assert second == digests(project, found)
+    assert store.intact(store.manifest("20261122T220012")) == second
 
 
 @pytest.mark.parametrize("text", ["longer than before", "", "b.py"])

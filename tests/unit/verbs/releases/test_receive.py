@@ -92,6 +92,22 @@ def test_nobody_sends_any_more(monkeypatch: pytest.MonkeyPatch) -> None:
     os.close(write)
 
 
+def test_another_sender_ends_while_this_one_begins(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It removes the directory that both share."""
+
+    def end(_store: object) -> None:
+        (tmp_path / ".sent").rmdir()
+        monkeypatch.undo()
+
+    monkeypatch.setattr(module, "_clean", end)
+    with incoming(tmp_path) as draft:
+        assert draft.tree.is_dir()
+        assert (tmp_path / ".sent").stat().st_mode & 0o777 == 0o711
+    assert not [*tmp_path.iterdir()]
+
+
 def test_what_a_killed_one_has_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It goes, unless somebody is still at it."""
     with incoming(tmp_path) as other:
