@@ -19,6 +19,7 @@ from dora_systemd.adapters.host.unit_files import (
     write_link,
     write_unit_file,
 )
+from dora_systemd.adapters.releases.store import store_root
 from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.unit.file import BOOT_TARGET
 from dora_systemd.decisions.unit.setup_files import (
@@ -104,6 +105,13 @@ def packaged_unit(scope: Scope) -> str:
     return str(path) if path.exists() else ""
 
 
+def leave_no_state(scope: Scope) -> None:
+    """Remove the directories of the system's releases, unless there are releases in them."""
+    place = store_root(False)
+    for directory in () if scope.is_user else (place, place.parent):
+        remove_empty(directory)
+
+
 def refuse_if_needed(manager: Manager, scope: Scope) -> None:
     """Raise DoraSystemdError while dora.target starts dataflows at boot."""
     links = own_directories(manager, scope)[0].glob(f"{BOOT_TARGET}.wants/*")
@@ -125,7 +133,8 @@ def tell_systemd(reach: Callable[[Scope], Manager], scope: Scope) -> tuple[str, 
         reach(scope).reload()
     if scope.is_user:
         return ()
-    commands = (["systemd-sysusers"], ["journalctl", "--update-catalog"])
+    state = ["systemd-tmpfiles", "--create", f"--prefix={store_root(False).parent}"]
+    commands = (["systemd-sysusers"], state, ["journalctl", "--update-catalog"])
     return tuple(filter(None, map(_run, commands)))
 
 

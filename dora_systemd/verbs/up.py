@@ -9,6 +9,7 @@ from dora_systemd.adapters.bus.manager import JOB_DONE, Manager
 from dora_systemd.adapters.host.loopback import port_error
 from dora_systemd.adapters.host.process_table import read_processes, socket_owners
 from dora_systemd.adapters.host.unit_files import put_unit_file, read_unit_file
+from dora_systemd.adapters.releases.store import make_directories, store_root
 from dora_systemd.decisions.gateway.place import (
     DEFAULT_PORT,
     SERVICE_UNIT,
@@ -39,6 +40,16 @@ def check_machine(reach: Callable[[Scope], Manager], scope: Scope) -> None:
             is_said = one.text.startswith("cannot ")
             message = one.text if is_said else f"cannot run dataflows here: {one.topic}: {one.text}"
             raise DoraSystemdError(message, one.remedy)
+
+
+def make_state(scope: Scope) -> None:
+    """Create the directory of the system's releases, as tmpfiles.d does where that is installed.
+
+    The gateway may only write to it if it is there when the gateway starts.
+    """
+    with suppress(OSError):  # of all that the gateway does, only a rollback needs it
+        if not scope.is_user:
+            make_directories(store_root(False).parent)
 
 
 def open_port(manager: Manager, scope: Scope, port: int | None) -> int:

@@ -13,6 +13,7 @@ from dora_systemd.decisions.views.outcome import Outcome, Thing
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.setup import (
+    leave_no_state,
     packaged_unit,
     plan_setup,
     put_in_place,
@@ -52,6 +53,8 @@ def command(want_removal: bool) -> int:
         Outcome(Thing(), f"{word}: {path}", details={"path": str(path)}) for path in changed
     )
     print_warnings(tell_systemd(Bus, scope))
+    if want_removal:
+        leave_no_state(scope)
     return status
 
 

@@ -9,7 +9,7 @@ from dora_systemd.cli.parameters import acting_options, current_scope, print_out
 from dora_systemd.decisions.gateway.place import SOCKET_UNIT, wanted_port
 from dora_systemd.decisions.views.outcome import Outcome, Thing
 from dora_systemd.verbs.gateway import check_answer, read_gateway
-from dora_systemd.verbs.up import check_machine, open_port, start_boot_target
+from dora_systemd.verbs.up import check_machine, make_state, open_port, start_boot_target
 
 _USE = """
 
@@ -44,6 +44,7 @@ def command(port: int | None) -> int:
         return _print_port("Daemon already running", now.port)
     tell("Starting dora daemon...")
     check_machine(Bus, scope)
+    make_state(scope)
     opened = open_port(bus, scope, wanted)
     tell(f"  ✓ Coordinator started on port {opened}")
     names = start_boot_target(bus, scope)

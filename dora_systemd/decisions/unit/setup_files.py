@@ -43,6 +43,7 @@ _FISH_OF_ALL = _FISH._replace(place="etc/fish/completions/doractl.fish")
 _SYSTEM_ONLY = (
     SetupFile(("templates", "dora-systemd.catalog"), "lib/systemd/catalog/dora-systemd.catalog"),
     SetupFile(("templates", "dora-systemd.sysusers"), "lib/sysusers.d/dora-systemd.conf"),
+    SetupFile(("templates", "dora-systemd.tmpfiles"), "lib/tmpfiles.d/dora-systemd.conf"),
     SANDBOX._replace(place=f"lib/systemd/system/{SANDBOX.place}"),
     _ZSH,
 )

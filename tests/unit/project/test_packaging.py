@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from dora_systemd import __version__
+from dora_systemd.adapters.releases.store import store_root
 from dora_systemd.decisions.unit.versions import MIN_VERSION
 from dora_systemd.names import SLICE
 from dora_systemd.verbs.start.account import DEFAULT_USER
@@ -79,6 +80,15 @@ def test_units_are_fixed_text_with_a_manual(unit: Path) -> None:
 def test_names_of_slice_and_user() -> None:
     assert (TEMPLATES / SLICE).is_file()
     assert f"\nu {DEFAULT_USER} " in (TEMPLATES / "dora-systemd.sysusers").read_text()
+
+
+def test_no_unit_owns_the_releases() -> None:
+    """systemctl clean removes what a unit owns; the gateway only writes there."""
+    place = str(store_root(False).parent)
+    texts = {path.name: path.read_text() for path in TEMPLATES.iterdir()}
+    assert not [name for name, text in texts.items() if re.search("^StateDirectory=", text, re.M)]
+    assert f"\nReadWritePaths=-{place}\n" in texts["dora-gateway-sandbox.conf"]
+    assert f"\nd {place} 0755 root root -\n" in texts["dora-systemd.tmpfiles"]
 
 
 def test_all_manuals_are_installed() -> None:
