@@ -118,18 +118,32 @@ def _run(manager: Manager, build: Build, tree: BuildTree) -> None:
     end_former(manager, build.unit)
     reading, writing = os.pipe2(os.O_CLOEXEC)
     try:
-        try:
-            sent = _sent(manager, build, tree, reading)
-            manager.start_transient(build.unit, sent, None, wait=False)
-        finally:
-            os.close(reading)
-        try:
+        with _stopped(manager, build.unit):
+            _start(manager, build, tree, reading)
             _wait(manager, build, tree)
-        finally:
-            _stop(manager, build.unit)
         _check_end(manager, build)
     finally:
         os.close(writing)  # our end is its end
+
+
+def _start(manager: Manager, build: Build, tree: BuildTree, reading: int) -> None:
+    try:
+        sent = _sent(manager, build, tree, reading)
+        manager.start_transient(build.unit, sent, None, wait=False)
+    finally:
+        os.close(reading)
+
+
+@contextmanager
+def _stopped(manager: Manager, unit: str) -> Iterator[None]:
+    """Stop a unit after an exception, also if systemd may or may not have got its start."""
+    try:
+        yield
+    except BaseException:
+        # Whatever its state is: a start that is queued is replaced by that.
+        with suppress(DoraSystemdError):  # the first error is the one to tell
+            manager.run_jobs("StopUnit", [unit])
+        raise
 
 
 def end_former(manager: Manager, unit: str) -> None:
@@ -145,11 +159,6 @@ def end_former(manager: Manager, unit: str) -> None:
         with suppress(DoraSystemdError):  # systemd has unloaded it meanwhile
             manager.reset_failed(unit)
         time.sleep(_LOOK_SECONDS)
-
-
-def _stop(manager: Manager, unit: str) -> None:
-    if manager.read(unit, ["ActiveState"])["ActiveState"] not in DOWN:
-        manager.run_jobs("StopUnit", [unit])
 
 
 def _wait(manager: Manager, build: Build, tree: BuildTree) -> None:
