@@ -5,12 +5,13 @@ deploy and rollback both end here, so this is the one place for what may forbid 
 
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
-from dora_systemd.adapters.bus.manager import SETTLED, UP, Manager
+from dora_systemd.adapters.bus.manager import SETTLED, UP, Manager, Observer
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.adapters.host.guard import SIGNALS, guarded
 from dora_systemd.adapters.host.unit_files import remove_unit_file
@@ -32,6 +33,7 @@ from dora_systemd.verbs.releases.trial import (
     commit,
     end_trial,
     go_back,
+    read_life,
     read_standing,
 )
 from dora_systemd.verbs.start.asked import note_request
@@ -77,7 +79,8 @@ def _try(
     manager: Manager, scope: Scope, store: Store, standing: Standing, change: Change, tell: Tell
 ) -> None:
     # After this nothing is certain but what the journal and systemd say: undo it in any case.
-    with guarded(partial(_end_killed, scope, standing, change), store.lock), _interruptible():
+    begun = partial(_end_killed, scope, standing, change, read_life(manager, standing.boot.unit))
+    with guarded(begun, store.lock), _interruptible():
         _begin(manager, standing, change.text)
         try:
             fault = Gate(manager, scope, change.options, tell).run(
@@ -140,7 +143,7 @@ def _roll_back(
         _note_stop(manager, change)
     now = "nothing of it runs"
     try:
-        go_back(manager, standing, want_start)
+        go_back(manager, standing, want_start, _stop_observer(standing, tell))
         if want_start:
             now = f"{former or 'what was there before'} {_back(manager, standing, tell)}"
     except DoraSystemdError as error:
@@ -156,15 +159,22 @@ def _roll_back(
     )
 
 
-def _end_killed(scope: Scope, standing: Standing, change: Change) -> None:
-    """Go back after this process was killed, unless the release was committed before that."""
-    manager = Bus(scope)  # that of the process that was killed is of no use, see sd_bus_new(3)
-    now = read_standing(manager, scope, standing.boot.unit)
-    if now.current != change.release or standing.current == change.release:
-        _roll_back(manager, standing, change, Fault(_KILLED), lambda _: None)
-    else:
+def _end_killed(scope: Scope, standing: Standing, change: Change, life: str) -> None:
+    """Go back after this process was killed, unless the release was committed before that.
+
+    life: of the unit before the trial. What has not been touched goes on.
+    """
+    manager, unit = Bus(scope), standing.boot.unit  # the other's is of no use, see sd_bus_new(3)
+    now = read_standing(manager, scope, unit)
+    if now.current == change.release != standing.current:
         commit(manager, now, change.text, change.want_boot)  # it may lack its link
         end_trial(manager, now)
+        return
+    if read_life(manager, unit) == life:
+        end_trial(manager, standing)
+    # Once more: a restart may have been on its way.
+    if read_life(manager, unit) != life:
+        _roll_back(manager, standing, change, Fault(_KILLED), lambda _: None)
 
 
 def _note_stop(manager: Manager, change: Change) -> None:
@@ -183,6 +193,15 @@ def _calm(tell: Tell) -> Tell:
             tell(step)
 
     return tell_on
+
+
+def _stop_observer(standing: Standing, tell: Tell) -> Observer:
+    """Tells that the way back lasts, while the release on trial is stopped."""
+
+    def observe(changes: Mapping[str, Any]) -> None:
+        tell(going_back(standing.current, str(changes.get("StatusText", ""))))
+
+    return observe
 
 
 def _back(manager: Manager, standing: Standing, tell: Tell) -> str:

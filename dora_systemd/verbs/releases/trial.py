@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.bus.manager import Manager, Observer
 from dora_systemd.adapters.host.unit_files import (
     read_unit_file,
     remove_unit_file,
@@ -129,19 +129,33 @@ def end_trial(manager: Manager, standing: Standing) -> None:
     _reload(manager)
 
 
-def go_back(manager: Manager, standing: Standing, want_start: bool) -> None:
+def go_back(
+    manager: Manager, standing: Standing, want_start: bool, observe: Observer | None = None
+) -> None:
     """End the trial, and start what ran before; without that, stop the unit.
 
-    Does not wait for the start. Raises DoraSystemdError.
+    Does not wait for the start. observe: called now and then during a stop. Raises
+    DoraSystemdError.
     """
     unit = standing.boot.unit
+    # The trial ends first: a stop can take longer than whoever waits for it lives. But a unit
+    # without any other file would lose what its stop needs.
+    if standing.has_base:
+        end_trial(manager, standing)
     if not want_start:
-        manager.run_jobs("StopUnit", [unit])
-    end_trial(manager, standing)
+        manager.run_jobs("StopUnit", [unit], observe)
+    if not standing.has_base:
+        end_trial(manager, standing)
     with suppress(DoraSystemdError):  # a unit that is gone has nothing to reset
         manager.reset_failed(unit)
     if want_start:
         manager.queue_job("RestartUnit", unit)
+
+
+def read_life(manager: Manager, unit: str) -> str:
+    """What changes as soon as systemd starts the unit, or is about to."""
+    facts = manager.read(unit, ["InvocationID", "Job"])
+    return f"{bytes(facts['InvocationID'] or b'').hex()} {(facts['Job'] or (0,))[0]}"
 
 
 def _reload(manager: Manager) -> None:

@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import socket
+import threading
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -22,6 +23,7 @@ from dora_systemd.gateway.control.forward import forward
 from dora_systemd.gateway.control.serve import HANDLERS
 from dora_systemd.gateway.control.talk import Talk
 from dora_systemd.gateway.live import act as acting
+from dora_systemd.gateway.live import acting as actions
 from dora_systemd.gateway.live.act import act, read_graph
 from dora_systemd.gateway.live.acting import acting as begun_action
 from dora_systemd.gateway.live.acting import end_actions, is_acting
@@ -200,14 +202,35 @@ def test_the_page_rolls_back(bench: Bench, monkeypatch: pytest.MonkeyPatch, rele
     assert not is_acting()
 
 
-def test_an_action_of_a_gateway_that_ends() -> None:
+@pytest.fixture
+def told(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """What systemd is told of the end of a gateway, which only these tests end."""
+    told: list[int] = []
+    monkeypatch.setattr(actions, "_ending", threading.Event())
+    monkeypatch.setattr(actions, "extend_timeout", told.append)
+    return told
+
+
+def test_an_action_of_a_gateway_that_ends(told: list[int]) -> None:
     with begun_action() as action:
         action.go_on()
         end_actions()
+        assert told == []
         with pytest.raises(DoraSystemdError, match="the gateway was stopped"):
             action.go_on()
         action.go_on()  # the way back is not stopped
+    assert told == [30_000_000] * 2
     end_actions()
+
+
+@pytest.mark.usefixtures("told")
+def test_a_gateway_that_ends_begins_nothing(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its thread was at something else when the others were told."""
+    monkeypatch.setattr(rollback, "roll_back", lambda *_, **__: pytest.fail("it has begun"))
+    end_actions()
+    with pytest.raises(DoraSystemdError, match="the gateway was stopped"):
+        act(bench.scope, PageMessage("act", UNIT, action="rollback"))
+    assert not is_acting()
 
 
 def test_the_drawing_of_a_dataflow_that_has_no_coordinator(bench: Bench) -> None:

@@ -8,7 +8,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.verbs.inhibit.guard import IfInhibited
 from dora_systemd.verbs.releases import change as module
 from dora_systemd.verbs.releases.change import Change
-from dora_systemd.verbs.releases.trial import Standing, begin_trial, read_standing
+from dora_systemd.verbs.releases.trial import Standing, begin_trial, read_life, read_standing
 from tests.unit.fakes.manager import FakeManager
 from tests.unit.verbs.releases.test_trial import (
     NEW,
@@ -32,7 +32,7 @@ def end(manager: FakeManager, scope: Scope, monkeypatch: pytest.MonkeyPatch) -> 
     deployed(manager)
     standing = read_standing(manager, scope, UNIT)
     begin_trial(manager, standing, text_of(NEW))
-    return partial(module._end_killed, scope, standing, CHANGE)
+    return partial(module._end_killed, scope, standing, CHANGE, read_life(manager, UNIT))
 
 
 def now(manager: FakeManager, scope: Scope) -> Standing:
@@ -41,9 +41,45 @@ def now(manager: FakeManager, scope: Scope) -> Standing:
     return standing
 
 
-def test_before_the_commit(manager: FakeManager, scope: Scope, end: "partial[None]") -> None:
+@pytest.fixture
+def notes(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The events that are written."""
+    notes: list[str] = []
+    monkeypatch.setattr(module, "note_request", lambda name, *_, **__: notes.append(name))
+    return notes
+
+
+@pytest.mark.parametrize("state", [{"Job": (7, "/org")}, {"InvocationID": b"\x01"}])
+def test_before_the_commit(
+    manager: FakeManager, scope: Scope, end: "partial[None]", state: dict[str, object]
+) -> None:
+    manager.units[UNIT] |= state
     end()
     assert now(manager, scope).current == OLD
+    assert ("RestartUnit", UNIT) in manager.calls
+
+
+def test_before_systemd_was_told(
+    manager: FakeManager, scope: Scope, end: "partial[None]", notes: list[str]
+) -> None:
+    """What runs has not been touched, so it goes on; and nobody tells of a trial."""
+    end()
+    assert now(manager, scope).current == OLD
+    assert "reload" in [call[0] for call in manager.calls]
+    assert "RestartUnit" not in [call[0] for call in manager.calls]
+    assert notes == []
+
+
+def test_while_systemd_was_told(
+    manager: FakeManager, end: "partial[None]", monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The restart comes out of the queue while the trial ends."""
+
+    def reload() -> None:
+        manager.units[UNIT]["Job"] = (7, "/org")
+
+    monkeypatch.setattr(manager, "reload", reload)
+    end()
     assert ("RestartUnit", UNIT) in manager.calls
 
 

@@ -1,11 +1,13 @@
 """The files of a trial, and what a reboot at any moment would find."""
 
 import signal
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
+from dora_systemd.adapters.bus.manager import Observer
 from dora_systemd.adapters.releases.store import Store, locked
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.settings.resolve import resolve_settings
@@ -150,6 +152,27 @@ def test_what_did_not_run_is_not_started(
         try_new(manager, scope, store, monkeypatch, Fault("x"))
     assert "RestartUnit" not in [call[0] for call in manager.calls]
     assert ("StopUnit", UNIT) in manager.calls
+
+
+def test_a_trial_ends_before_a_stop_that_may_take_long(
+    manager: FakeManager, scope: Scope, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever waits for the stop may be killed meanwhile, and what was told is told again."""
+    deployed(manager, "inactive")
+    told: list[str] = []
+    run_jobs = manager.run_jobs
+
+    def stop(method: str, units: Sequence[str], observer: Observer | None = None) -> dict[str, str]:
+        assert not read_standing(manager, scope, UNIT).path.exists()
+        assert observer is not None
+        observer({})
+        return run_jobs(method, units)
+
+    monkeypatch.setattr(manager, "run_jobs", stop)
+    with pytest.raises(DoraSystemdError):
+        try_new(manager, scope, store, monkeypatch, Fault("x"), lambda one: told.append(one.text))
+    assert ("StopUnit", UNIT) in manager.calls
+    assert f"going back to {OLD}" in told
 
 
 def test_who_stops_a_trial_wants_nothing_to_run(
