@@ -2,7 +2,8 @@
 
 The out-of-memory killer, too, takes one process without a word. Only the kernel tells of it, by the
 end of a connection. The child has the lock of its parent, see flock(2), so nobody else takes it
-until it has done its work.
+until it has done its work. It has a session of its own, and ignores what it can ignore, so only
+SIGKILL to the whole cgroup ends both: then nobody does the work, and the next command has to.
 """
 
 import os
@@ -14,7 +15,10 @@ from pathlib import Path
 from typing import NoReturn
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""Those that ask a process to end; the child ignores them."""
+"""Those that ask a process to end, and with it all others of its group or unit."""
+_MORE = (signal.SIGQUIT, signal.SIGABRT, signal.SIGUSR1, signal.SIGUSR2, signal.SIGALRM)
+"""Those that a unit or a terminal can have for that, too, see KillSignal= in systemd.kill(5). They
+end this process, as the caller wants; the child goes on."""
 
 _WORD = b"."
 
@@ -46,7 +50,7 @@ def _guard(parent: socket.socket, end: Callable[[], None], lock: Path) -> NoRetu
     try:
         os.setsid()
         _close_others(parent.fileno(), lock)
-        for one in SIGNALS:
+        for one in (*SIGNALS, *_MORE):
             signal.signal(one, signal.SIG_IGN)
         nowhere = os.open(os.devnull, os.O_RDWR)
         for stream in range(3):  # who waits for the end of our output does not wait for this

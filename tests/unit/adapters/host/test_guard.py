@@ -38,12 +38,19 @@ def test_the_child_holds_nothing_but_its_lock(tmp_path: Path) -> None:
     assert (done.stdout, done.stderr) == ("held\n", "")
 
 
+_KILL_BOTH = "kill_both"
+"""As systemd does with the processes of a cgroup."""
 _PROGRAM = """
 import os, signal
 from pathlib import Path
 from dora_systemd.adapters.host.guard import guarded
 place = Path({place!r})
 (place / "lock").touch()
+def kill_both(number):
+    children = Path(f"/proc/self/task/{{os.getpid()}}/children").read_text().split()
+    assert len(children) == 1
+    for pid in (*map(int, children), os.getpid()):
+        os.kill(pid, number)
 with guarded(lambda: (place / "ended").touch(), place / "lock"):
     {body}
 (place / "left").touch()
@@ -55,6 +62,8 @@ with guarded(lambda: (place / "ended").touch(), place / "lock"):
     [
         ("os.kill(os.getpid(), signal.SIGKILL)", True),
         ("os.killpg(0, signal.SIGKILL)", True),
+        ("os.killpg(0, signal.SIGQUIT)", True),  # as Ctrl+\\ does
+        *((f"{_KILL_BOTH}({one})", True) for one in ("signal.SIGQUIT", "signal.SIGABRT", 1, 15)),
         ("pass", False),
         ("raise SystemExit(3)", False),
     ],
