@@ -29,6 +29,13 @@ def if_inhibited(force: bool, wait: bool) -> IfInhibited:
     return IfInhibited.WAIT if wait else IfInhibited.REFUSE
 
 
-def tell_waiting(text: str) -> None:
-    """Tell a person what is waited for."""
-    tell(f"doractl: {text}", err=True)
+class TellWaiting:
+    """Tells a person what is waited for, each thing once."""
+
+    def __init__(self) -> None:
+        self._told = ""
+
+    def __call__(self, text: str) -> None:
+        if text != self._told:
+            tell(f"doractl: {text}", err=True)
+        self._told = text

@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from math import inf
 from typing import TextIO
 
 import click
@@ -24,6 +25,8 @@ from dora_systemd.terminal_text import one_line
 _TERMINAL_SECONDS = 0.1
 _JSON_SECONDS = 1.0
 _PIPE_SECONDS = 10.0
+SIGN_SECONDS = 30.0
+"""A program gets a sign of life at least so often; deploy -H gives up a host that sends none."""
 
 quiet_option = click.option(
     "-q", "--quiet", "is_quiet", is_flag=True, help="Print nothing but errors."
@@ -51,7 +54,8 @@ class Progress(AbstractContextManager["Progress"]):
         self._clock = clock
         self._line = StageLine(stream) if stream and is_terminal else None
         seconds = _JSON_SECONDS if is_json else _PIPE_SECONDS
-        self._pace = Pace(_TERMINAL_SECONDS if is_terminal else seconds)
+        silence = SIGN_SECONDS if is_json else inf
+        self._pace = Pace(_TERMINAL_SECONDS if is_terminal else seconds, silence)
 
     def __call__(self, step: Step) -> None:
         if not self._is_off and self._pace.takes(step, self._clock()):

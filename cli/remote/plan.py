@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import click
 
 from dora_systemd.decisions.remote.command import Way
+from dora_systemd.decisions.remote.words import without_flag
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.verbs.remote.talk import ANSWER_SECONDS
 
@@ -29,11 +30,12 @@ class Plan(NamedTuple):
     """A command for other hosts.
 
     verb: as typed, such as "node restart". acts: it prints an outcome in each line. is_endless:
-    somebody has to end it. options: by name, as click reads them.
+    somebody has to end it. options: by name, as click reads them. loud: the words without -q.
     """
 
     verb: str
     words: list[str]
+    loud: list[str]
     options: dict[str, Any]
     acts: bool
     wants_json: bool
@@ -74,7 +76,13 @@ def plan_of(context: click.Context, words: list[str]) -> Plan:
     # What waits or holds a lock over there must not go on when this command has ended.
     endless |= holds or (verb in ("restart", "reload") and bool(options.get("wait")))
     acts = _acts(context) and (holds or verb != "inhibit")  # the list of locks is one text
-    return Plan(verb, words, options, acts, wants_json, endless)
+    loud = without_flag(words, "-q", "--quiet", _valued(context.command))
+    return Plan(verb, words, loud, options, acts, wants_json, endless)
+
+
+def _valued(command: click.Command) -> set[str]:
+    options = (one for one in command.params if isinstance(one, click.Option) and not one.is_flag)
+    return {flag for one in options for flag in one.opts}
 
 
 def _verb(context: click.Context) -> str:

@@ -37,6 +37,10 @@ from dora_systemd.verbs.releases.send import Packed, packed
 from dora_systemd.verbs.remote.talk import Ended, Said, Talks
 from dora_systemd.verbs.start.plan import StartRequest
 
+SILENCE_SECONDS = 600.0
+"""After which a host is given up that says nothing and takes nothing: its doractl hangs, or its
+disk. ssh notices by itself when the network or sshd does. Each one tells every 30 s which step it
+is at, but not while it checks what it has, syncs 4 GiB to an SD card, or removes an old release."""
 _RECEIVE = "--from-stdin"
 _TOO_OLD = f"unknown option {_RECEIVE}".encode()
 _MOST = 1 << 20
@@ -48,9 +52,21 @@ def roll_out(hosts: Sequence[Host], plan: Plan) -> int:
     with StageLine(sys.stderr) as stage:
         if plan.verb == "deploy":
             return _deploy(hosts, plan, stage)
-        words = with_output(plan.words, "json")
-        talks = Talks(hosts, plan.way, words, at_once=plan.options["serial"])
-        return Rollout(talks, plan, stage).run(hosts)
+        return Rollout(_talks(hosts, plan, plan.way, plan.loud), plan, stage).run(hosts)
+
+
+def _talks(
+    hosts: Sequence[Host], plan: Plan, way: Way, words: list[str], opening: bytes | None = None
+) -> Talks:
+    """Talks in which each host tells its steps, also with -q: they are its signs of life."""
+    return Talks(
+        hosts,
+        way,
+        with_output(words, "json"),
+        at_once=plan.options["serial"],
+        opening=opening,
+        silence=SILENCE_SECONDS,
+    )
 
 
 def _deploy(hosts: Sequence[Host], plan: Plan, stage: StageLine) -> int:
@@ -66,8 +82,7 @@ def _deploy(hosts: Sequence[Host], plan: Plan, stage: StageLine) -> int:
         opening = format_parcel(package.parcel)
         if options["dry_run"]:
             return run_on_all(hosts, plan._replace(words=words), opening)
-        words = with_output(words, "json")
-        talks = Talks(hosts, Way.FED, words, at_once=options["serial"], opening=opening)
+        talks = _talks(hosts, plan, Way.FED, with_options(plan.loud, _RECEIVE), opening)
         return Rollout(talks, plan, stage, package).run(hosts)
 
 
@@ -91,6 +106,15 @@ class _Answer:
         values = (read_json(line) for line in self.complaint.decode(errors="replace").splitlines())
         found = [one["error"] for one in values if isinstance(one, dict) and one.get("error")]
         return found[-1] if found and isinstance(found[-1], dict) else None
+
+    @property
+    def errors(self) -> bytes:
+        """What it complains of, but for what -q leaves out."""
+        lines = self.complaint.splitlines(keepends=True)
+        values = ((line, read_json(line.decode(errors="replace"))) for line in lines)
+        return b"".join(
+            line for line, value in values if not isinstance(value, dict) or "error" in value
+        )
 
     def take_line(self) -> str | None:
         """The first line, None if it is not complete."""
@@ -177,9 +201,9 @@ class Rollout:
         error, outcome = ended.error, answer.outcome
         if _TOO_OLD in answer.complaint:
             error, answer.complaint = older(host), b""
-        elif not (error or ended.status or outcome or self._is_quiet):
+        elif not (error or ended.status or outcome):
             error = invalid(host)
-        self._complaints.said(host, answer.complaint)
+        self._complaints.said(host, answer.errors if self._is_quiet else answer.complaint)
         self._complaints.ended(host, error)
         self._statuses[host] = error.code if error else ended.status
         verdict = verdict_of(host, self._plan.verb, ended, error, outcome)

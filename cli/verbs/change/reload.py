@@ -3,7 +3,7 @@
 import click
 
 from dora_systemd.adapters.bus.systemd import Bus
-from dora_systemd.cli.inhibit_options import if_inhibited, inhibit_options, tell_waiting
+from dora_systemd.cli.inhibit_options import TellWaiting, if_inhibited, inhibit_options
 from dora_systemd.cli.parameters import acting_options, current_scope, print_outcomes
 from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.verbs.facts.selector import Selector
@@ -30,7 +30,7 @@ def command(selector: str, node: str | None, force: bool, wait: bool) -> int:
     how = if_inhibited(force, wait)
     scope = current_scope()
     cell = Selector(selector).find(Bus(scope))
-    require_uninhibited(scope, [cell], "reload", how, tell_waiting)
+    require_uninhibited(scope, [cell], "reload", how, TellWaiting())
     done = [f"{line[:1].upper()}{line[1:]}" for line in reload_cell(scope, cell, node)]
     text = "\n".join(done) or "Nothing has changed"
     outcome = Outcome(cell, text, is_news=bool(done), node=node or "", details={"changes": done})

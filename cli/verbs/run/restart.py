@@ -8,7 +8,7 @@ import click
 
 from dora_systemd.adapters.bus.manager import tell_stage
 from dora_systemd.adapters.bus.systemd import Bus
-from dora_systemd.cli.inhibit_options import if_inhibited, inhibit_options, tell_waiting
+from dora_systemd.cli.inhibit_options import TellWaiting, if_inhibited, inhibit_options
 from dora_systemd.cli.parameters import acting_options, current_scope, print_outcomes
 from dora_systemd.cli.stageline import StageLine
 from dora_systemd.verbs.inhibit.guard import uninhibited
@@ -34,7 +34,7 @@ def command(selectors: tuple[str, ...], force: bool, wait: bool) -> int:
     scope = current_scope()
     bus = Bus(scope)
     cells, ended = find_known(bus, scope, selectors)
-    with uninhibited(scope, cells, "restart", how, tell_waiting), StageLine(sys.stderr) as stage:
+    with uninhibited(scope, cells, "restart", how, TellWaiting()), StageLine(sys.stderr) as stage:
         note_stop(cells, "doractl restart")
         outcomes = restart_cells(bus, cells, partial(tell_stage, stage)) if cells else []
         if ended:

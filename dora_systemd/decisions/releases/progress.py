@@ -1,6 +1,7 @@
 """What deploy and rollback tell while they last, and which of it is worth a line. Pure."""
 
 import re
+from math import inf
 from typing import NamedTuple
 
 from dora_systemd.values import SECOND, format_duration, format_rounded_size
@@ -40,21 +41,25 @@ class Step(NamedTuple):
 class Pace:
     """Chooses the steps that are shown: what is new at once, what only grows now and then.
 
-    interval: seconds between two steps of the latter kind.
+    interval: seconds between two steps of the latter kind. silence: after so many one that is the
+    same is shown, too, as a sign of life.
     """
 
-    def __init__(self, interval: float) -> None:
-        self._interval = interval
+    def __init__(self, interval: float, silence: float = inf) -> None:
+        self._interval, self._silence = interval, silence
         self._last: Step | None = None
-        self._next = 0.0
+        self._at = 0.0
 
     def takes(self, step: Step, now: float) -> bool:
         """Whether the step is shown. now: seconds of any clock that only goes forward."""
-        last = self._last
-        is_same = last is not None and last.text == step.text
-        if is_same or (last is not None and last.news == step.news and now < self._next):
+        last, least = self._last, 0.0
+        if last is not None and last.text == step.text:
+            least = self._silence
+        elif last is not None and last.news == step.news:
+            least = self._interval
+        if now < self._at + least:
             return False
-        self._last, self._next = step, now + self._interval
+        self._last, self._at = step, now
         return True
 
 

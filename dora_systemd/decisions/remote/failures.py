@@ -51,6 +51,12 @@ def silent(host: Host, seconds: float, what: str) -> DoraSystemdError:
     return _error(message, f"try: ssh {_by_ssh(host)} true")
 
 
+def mute(host: Host, seconds: float) -> DoraSystemdError:
+    """The error of a host that has begun, and then gave no sign of life for so long."""
+    hint = f"what was asked may be done or not: doractl -H {host.text} releases"
+    return _error(f"the connection to {host.text} is lost: no word for {seconds:g}s", hint)
+
+
 def without_doractl(host: Host) -> DoraSystemdError:
     """The error of a host where no doractl was found."""
     return _error(f"cannot find doractl on {host.text}", _INSTALL)

@@ -61,6 +61,36 @@ def _take_short(word: str, rest: Iterator[str], valued: Set[str], parted: Parted
     parted.words.append(word)
 
 
+def without_flag(words: Sequence[str], flag: str, long: str, valued: Set[str]) -> list[str]:
+    """The command line of a verb without a flag, such as -q or --quiet.
+
+    valued: the options that have a value.
+    """
+    kept: list[str] = []
+    rest = iter(words)
+    for word in rest:
+        if word == "--":
+            kept.extend((word, *rest))
+        elif word.startswith("--") or word[:1] != "-" or word == "-":
+            kept.extend([] if word == long else [word])
+            kept.extend(_at_most_one(rest) if word in valued else ())
+        else:
+            letters, has_value = _without_letter(word[1:], flag[1:], valued)
+            kept.extend([f"-{letters}"] if letters else [])
+            kept.extend(_at_most_one(rest) if has_value else ())
+    return kept
+
+
+def _without_letter(letters: str, unwanted: str, valued: Set[str]) -> tuple[str, bool]:
+    """Some flags without one of them, and whether the next word is the value of the last."""
+    kept = ""
+    for place, letter in enumerate(letters):
+        if f"-{letter}" in valued:
+            return kept + letters[place:], place == len(letters) - 1
+        kept += "" if letter == unwanted else letter
+    return kept, False
+
+
 def _at_most_one(rest: Iterator[str]) -> list[str]:
     return [word for word in [next(rest, None)] if word is not None]
 

@@ -38,7 +38,7 @@ def uninhibited(
     """Hold the locks of the dataflows exclusively, so that no new lock can inhibit them meanwhile.
 
     A lock file that a restart replaces is not held any more. verb: what is done to them, for the
-    error. tell: called once with what is waited for.
+    error. tell: called again and again with what is waited for.
 
     Raises DoraSystemdError: INHIBITED if a lock of one of them is held, BAD_INPUT for a lock file
     that is not usable.
@@ -76,7 +76,6 @@ def _hold(
             raise error
         if tell is not None:
             tell(f"{error.message}; waiting for its end")
-            tell = None
         time.sleep(_POLL_SECONDS)
 
 

@@ -52,8 +52,8 @@ _LATE_SECONDS = 30.0
 class Build:
     """A build of a release of `source`.
 
-    release, uuid: ids of the release and the dataflow. timeout: µs. on_line: gets the lines that
-    the build prints, but not more than one each time that somebody looks.
+    release, uuid: ids of the release and the dataflow. timeout: µs. on_line: gets the last line
+    of what the build has printed, "" before the first, each time that somebody looks.
     """
 
     scope: Scope
@@ -171,7 +171,8 @@ def _wait(manager: Manager, build: Build, tree: BuildTree) -> None:
             return
         line = str(facts["StatusText"])
         if line not in ("", told) and not line.startswith(FAILED_BECAUSE):  # an error tells that
-            build.on_line(told := line)
+            told = line
+        build.on_line(told)
         if build.timeout != INFINITY and time.monotonic() > deadline:
             raise _late(build, _hint(build))
         if tree.is_disk_full():

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from dora_systemd.adapters.ssh.connection import Connection
 from dora_systemd.decisions.remote.command import Way, remote_command, ssh_arguments
-from dora_systemd.decisions.remote.failures import ending_error, is_of_ssh, silent
+from dora_systemd.decisions.remote.failures import ending_error, is_of_ssh, mute, silent
 from dora_systemd.decisions.remote.hosts import Host
 from dora_systemd.decisions.remote.stream import AfterMark
 from dora_systemd.errors import DoraSystemdError
@@ -56,6 +56,7 @@ Event = Said | Ended | None
 class Talk:
     """The doractl of one host. most_seconds: for its answer, after the login; None: any time.
 
+    silence: seconds without a byte, in either direction, after which it is given up; None: never.
     opening: what it reads first; None: see Way.
     """
 
@@ -66,6 +67,7 @@ class Talk:
         words: Sequence[str],
         most_seconds: float | None,
         opening: bytes | None = None,
+        silence: float | None = None,
     ) -> None:
         mark = f"doractl-{os.urandom(16).hex()}"
         arguments = ssh_arguments(host, way, remote_command(way, words, mark))
@@ -74,7 +76,7 @@ class Talk:
         self._outbox = itertools.chain([opening or b""])
         self._chunk = b""
         self._has_more = opening is not None
-        self._most = most_seconds
+        self._most, self._silence = most_seconds, silence
         self._deadline = time.monotonic() + LOGIN_SECONDS
         self._output, self._errors = AfterMark(mark), AfterMark(mark)
         self._complaint = b""
@@ -103,10 +105,15 @@ class Talk:
         if self.is_in and not was_in:
             most = float("inf") if self._most is None else self._most
             self._deadline = time.monotonic() + most
+        self._note_life()
         if is_error:
             self._complaint = (self._complaint + shown)[-_COMPLAINT:]
             shown = b"" if is_of_ssh(shown) else shown
         return [Said(self.host, shown, is_error)] if shown else []
+
+    def _note_life(self) -> None:
+        if self._silence is not None and self.is_in:
+            self._deadline = time.monotonic() + self._silence
 
     @property
     def wants_to_write(self) -> bool:
@@ -122,7 +129,10 @@ class Talk:
         """Write what goes now."""
         try:
             self._chunk = self._chunk or next(self._outbox)
-            self._chunk = self._chunk[self.connection.write(self._chunk) :]
+            written = self.connection.write(self._chunk)
+            self._chunk = self._chunk[written:]
+            if written:
+                self._note_life()
         except (OSError, StopIteration):  # who does not read any more says why
             self._has_more = False
 
@@ -151,13 +161,17 @@ class Talk:
         if self._refusal:
             return Ended(self.host, status, self._refusal, self.is_in)
         what = ("no answer", self._most) if self.is_in else ("no login", LOGIN_SECONDS)
-        return Ended(self.host, status, silent(self.host, what[1] or 0, what[0]), self.is_in)
+        error = silent(self.host, what[1] or 0, what[0])
+        if self.is_in and self._silence is not None:
+            error = mute(self.host, self._silence)
+        return Ended(self.host, status, error, self.is_in)
 
 
 class Talks:
     """The talks with several hosts. is_full: whether the output of a host can wait.
 
-    at_once: with how many at the same time. opening: what each of them reads first.
+    at_once: with how many at the same time. opening: what each of them reads first. silence: as of
+    Talk.
     """
 
     def __init__(
@@ -169,10 +183,11 @@ class Talks:
         is_full: Callable[[str], bool] = lambda _host: False,
         at_once: int | None = None,
         opening: bytes | None = None,
+        silence: float | None = None,
     ) -> None:
         self._waiting = deque(hosts)
         self._at_once = at_once or len(hosts)
-        self._opening = opening
+        self._opening, self._silence = opening, silence
         self._how = way, words, most_seconds
         self._is_full = is_full
         self._live: list[Talk] = []
@@ -221,7 +236,8 @@ class Talks:
 
     def _admit(self) -> None:
         while self._waiting and self._has_room():
-            self._live.append(Talk(self._waiting.popleft(), *self._how, self._opening))
+            host = self._waiting.popleft()
+            self._live.append(Talk(host, *self._how, self._opening, self._silence))
 
     def _has_room(self) -> bool:
         logins = sum(not one.is_in for one in self._live)

@@ -7,9 +7,11 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.cli import main
+from dora_systemd.cli.remote import rollout
 from dora_systemd.decisions.releases.parcel import parse_parcel
 from dora_systemd.errors import ExitCode
 from dora_systemd.verbs.releases import send
+from tests.lab.pace import bound
 from tests.unit.fakes.programs import make_program
 
 SSH = """for command; do :; done
@@ -34,6 +36,8 @@ case " $* " in *" rollback "*) ;; *)
 esac
 case $HOST in
     lost) echo "client_loop: send disconnect: Broken pipe" >&2; exit 255;;
+    mute) exec sleep 600;;
+    slow) for one in 1 2 3 4; do echo '{"progress": {"stage": "build"}}' >&2; sleep 0.5; done;;
     busy) echo '{"error": {"message": "busy", "exit_status": 10}}' >&2; exit 10;;
     bad*) echo '{"error": {"message": "was rolled back: a", "exit_status": 11}}' >&2; exit 11;;
 esac
@@ -108,6 +112,28 @@ def test_it_stops(host: str, words: list[str], status: int, capsys: Printed, ask
     assert rows[3][:3] == ["h2", "not", "tried"]
     assert host in err
     assert "h2" not in asked.read_text()
+
+
+@pytest.mark.parametrize("verb", [["deploy"], ["rollback", "robot"]])
+def test_a_host_that_falls_silent(
+    verb: list[str], capsys: Printed, asked: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that tells what it does may take any time."""
+    monkeypatch.setattr(rollout, "SILENCE_SECONDS", bound(1.2))
+    assert main.run([*verb, "-H", "slow,mute,h2", "-q"]) == ExitCode.NO_HOST
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("doractl: the connection to mute is lost: no word for ")
+    assert "slow" not in err
+    assert [line.split()[0] for line in asked.read_text().splitlines()] == ["slow", "mute"]
+    assert not any("-q" in line.split() for line in asked.read_text().splitlines())
+
+
+def test_quiet_is_quiet_for_programs_too(capsys: Printed) -> None:
+    assert main.run(["rollback", "robot", "-H", "slow,bad", "-qo", "json"]) == 11
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert [json.loads(line)["host"] for line in err.splitlines()] == ["bad"]
 
 
 def test_some_at_a_time(capsys: Printed, asked: Path) -> None:

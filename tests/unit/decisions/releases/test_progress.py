@@ -100,3 +100,11 @@ def test_numbers_for_programs() -> None:
 @pytest.mark.parametrize("status", ["", "x 1/2 nodes ready", "9999999/1 nodes ready", "1/2 nodes"])
 def test_a_text_without_numbers(status: str) -> None:
     assert starting(status).nodes is None
+
+
+def test_a_sign_of_life() -> None:
+    """Who waits for hours says so now and then, if that is asked for."""
+    one = waiting("it drives")
+    steps = [(0.0, one), (29.0, one), (30.0, one), (59.0, one), (61.0, one)]
+    assert len(shown(Pace(1, 30), *steps)) == 3
+    assert len(shown(Pace(1), *steps)) == 1

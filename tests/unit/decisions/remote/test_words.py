@@ -13,7 +13,7 @@ from dora_systemd.decisions.remote.hosts import (
     parse_host,
     parse_hosts_file,
 )
-from dora_systemd.decisions.remote.words import part_hosts, with_output
+from dora_systemd.decisions.remote.words import part_hosts, with_output, without_flag
 from dora_systemd.errors import DoraSystemdError, ExitCode
 
 VALUED = {"logs": {"-n", "--lines", "-g", "--grep"}, "stop": {"--name"}}
@@ -141,3 +141,21 @@ def test_the_command_of_ssh() -> None:
 )
 def test_another_output(line: str, expected: str) -> None:
     assert " ".join(with_output(line.split(), "json")) == expected
+
+
+@pytest.mark.parametrize(
+    ("line", "rest"),
+    [
+        ("deploy -q", "deploy"),
+        ("deploy . -o json --quiet --name q", "deploy . -o json --name q"),
+        ("deploy -qo json", "deploy -o json"),
+        ("deploy -xqy", "deploy -xy"),
+        ("deploy -oq", "deploy -oq"),
+        ("deploy -o -q", "deploy -o -q"),
+        ("deploy --name --quiet -q", "deploy --name --quiet"),
+        ("deploy -- -q", "deploy -- -q"),
+        ("deploy - -q -o", "deploy - -o"),
+    ],
+)
+def test_a_flag_is_left_out(line: str, rest: str) -> None:
+    assert " ".join(without_flag(line.split(), "-q", "--quiet", {"-o", "--name"})) == rest

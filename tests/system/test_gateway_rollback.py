@@ -1,0 +1,117 @@
+"""A rollback of the status page in the gateway's sandbox, without a browser, and its end."""
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from websockets.sync.client import ClientConnection, connect
+
+from dora_systemd.decisions.gateway.place import SERVICE_UNIT
+from tests.system.cells import Project, run, wait_for
+from tests.system.gateways import Front
+from tests.system.releases import STORE, Releases, write_version
+
+# They write to /etc and /var/lib.
+pytestmark = pytest.mark.lab
+
+FLAG = Path("/run/dora-test-stubborn")
+STUBBORN = f"""
+import pathlib, signal, time
+if pathlib.Path('{FLAG}').exists():
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    time.sleep(1000)
+"""
+"""A node that is not ready, and does not end when it is told to."""
+FAST = ("--soak", "0s")
+
+
+@pytest.fixture
+def flag() -> Iterator[Path]:
+    """A file whose presence makes a node stubborn."""
+    yield FLAG
+    FLAG.unlink(missing_ok=True)
+
+
+def two_versions(releases: Releases, project: Project, *options: str) -> tuple[str, str]:
+    """Two releases, of which the second runs."""
+    found = []
+    for version in ("1", "2"):
+        write_version(project, version, STUBBORN if version == "1" else "")
+        releases.deploy(project.root, *FAST, *options)
+        found.append(releases.current())
+    return found[0], found[1]
+
+
+def ask(page: ClientConnection, releases: Releases, release: str) -> None:
+    """Press the button that rolls back."""
+    (row,) = json.loads(releases.cell.doractl("list", releases.cell.name, "-o", "json").stdout)
+    message = {"type": "act", "action": "rollback", "dataflow": row["uuid"], "number": 7}
+    page.send(json.dumps({**message, "release": release}))
+
+
+def acted(page: ClientConnection) -> dict[str, str]:
+    """The answer to that."""
+    while True:
+        found: dict[str, str] = json.loads(page.recv(timeout=60))
+        if found["type"] == "acted":
+            return found
+
+
+def at_page(front: Front) -> ClientConnection:
+    return connect(f"ws://127.0.0.1:{front.port}/api/live", max_size=None)
+
+
+def test_clean_keeps_the_releases(front: Front, releases: Releases, project: Project) -> None:
+    """systemctl clean removes what belongs to a unit, and releases do not belong to the gateway."""
+    first, second = two_versions(releases, project)
+    front.up()
+    with at_page(front) as page:
+        page.recv()
+    front.systemctl("stop", SERVICE_UNIT)
+    for what in ("state", "all"):
+        front.systemctl("clean", f"--what={what}", SERVICE_UNIT, check=False)
+    assert front.show("StateDirectory") == ""
+    assert set(releases.states()) == {first, second}
+    # And what it may do, it can do in its sandbox.
+    with at_page(front) as page:
+        ask(page, releases, first)
+        assert acted(page)["text"].endswith(f"runs release {first}")
+    releases.check_only(first)
+
+
+def test_a_gateway_without_the_directory(front: Front) -> None:
+    """It starts, and up makes the directory where tmpfiles.d has not."""
+    place = STORE.parent
+    run("rm", "-rf", str(place))
+    front.up()
+    assert (place.stat().st_mode & 0o777, place.stat().st_uid) == (0o755, 0)
+    place.rmdir()
+    assert front.get("/health").status == 200
+
+
+@pytest.mark.warns("was rolled back: the gateway was stopped", "Signal(9)", "exited", "killed")
+def test_a_stop_that_takes_longer_than_the_gateway_has(
+    front: Front, releases: Releases, project: Project, flag: Path
+) -> None:
+    """A trial of a dataflow that was down: its end comes first, and the gateway waits for it all."""
+    cell = releases.cell
+    first, second = two_versions(releases, project, "--grace-duration", "8s")
+    cell.doractl("stop", cell.name)
+    flag.touch()
+    front.up()
+    drop_in = front.scope.runtime_root / f"systemd/system/{SERVICE_UNIT}.d/90-test.conf"
+    drop_in.parent.mkdir(exist_ok=True)
+    drop_in.write_text("[Service]\nTimeoutStopSec=3s\n")
+    front.systemctl("daemon-reload")
+    with at_page(front) as page:
+        ask(page, releases, first)
+        is_at_trial: Callable[[], bool] = lambda: cell.show("StatusText").startswith("0/1 nodes")
+        wait_for("it is on trial", is_at_trial)
+        front.systemctl("stop", SERVICE_UNIT)
+    assert front.show("Result") == "success"
+    assert not releases.trial.exists()
+    assert (releases.current(), cell.show("ActiveState")) == (second, "inactive")
+    name = f"DORA_DATAFLOW_NAME={cell.name}"
+    told = run("journalctl", "-q", "-o", "cat", name, "DORA_EVENT=release-rolled-back").stdout
+    assert "the gateway was stopped" in told
