@@ -1,7 +1,7 @@
 """A rollback of the status page in the gateway's sandbox, without a browser, and its end."""
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -94,7 +94,7 @@ def test_a_gateway_without_the_directory(front: Front) -> None:
 def test_a_stop_that_takes_longer_than_the_gateway_has(
     front: Front, releases: Releases, project: Project, flag: Path
 ) -> None:
-    """A trial of a dataflow that was down: its end comes first, and the gateway waits for it all."""
+    """A trial of a dataflow that was down: its end comes first, and the gateway waits for all."""
     cell = releases.cell
     first, second = two_versions(releases, project, "--grace-duration", "8s")
     cell.doractl("stop", cell.name)
@@ -106,8 +106,7 @@ def test_a_stop_that_takes_longer_than_the_gateway_has(
     front.systemctl("daemon-reload")
     with at_page(front) as page:
         ask(page, releases, first)
-        is_at_trial: Callable[[], bool] = lambda: cell.show("StatusText").startswith("0/1 nodes")
-        wait_for("it is on trial", is_at_trial)
+        wait_for("it is on trial", lambda: cell.show("StatusText").startswith("0/1 nodes"))
         front.systemctl("stop", SERVICE_UNIT)
     assert front.show("Result") == "success"
     assert not releases.trial.exists()

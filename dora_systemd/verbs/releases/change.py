@@ -143,7 +143,7 @@ def _roll_back(
         _note_stop(manager, change)
     now = "nothing of it runs"
     try:
-        go_back(manager, standing, want_start, _stop_observer(standing, tell))
+        go_back(manager, standing, want_start, stop_observer(standing, tell))
         if want_start:
             now = f"{former or 'what was there before'} {_back(manager, standing, tell)}"
     except DoraSystemdError as error:
@@ -195,11 +195,12 @@ def _calm(tell: Tell) -> Tell:
     return tell_on
 
 
-def _stop_observer(standing: Standing, tell: Tell) -> Observer:
+def stop_observer(standing: Standing, tell: Tell) -> Observer:
     """Tells that the way back lasts, while the release on trial is stopped."""
+    told = _calm(tell)
 
     def observe(changes: Mapping[str, Any]) -> None:
-        tell(going_back(standing.current, str(changes.get("StatusText", ""))))
+        told(going_back(standing.current, str(changes.get("StatusText", ""))))
 
     return observe
 

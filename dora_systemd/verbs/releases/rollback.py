@@ -13,7 +13,7 @@ from dora_systemd.trust.paths import is_directory
 from dora_systemd.values import quoted
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.inhibit.guard import IfInhibited, require_uninhibited
-from dora_systemd.verbs.releases.change import Change, change_release
+from dora_systemd.verbs.releases.change import Change, change_release, stop_observer
 from dora_systemd.verbs.releases.clean import clean
 from dora_systemd.verbs.releases.deploy import Deployed
 from dora_systemd.verbs.releases.listing import deployed_names, store_of
@@ -51,7 +51,7 @@ def roll_back(
             require_uninhibited(
                 scope, standing.running, "rollback", how, lambda text: tell(waiting(text))
             )
-            return _end_first(manager, store, standing, by)
+            return _end_first(manager, store, standing, by, tell)
         chosen = _choose(store, standing, release)
         text = store.unit(chosen)
         options, manifest = runner_of(text), store.manifest(chosen)
@@ -79,11 +79,11 @@ def deployed_name(manager: Manager, scope: Scope, selector: str) -> str:
     return name
 
 
-def _end_first(manager: Manager, store: Store, standing: Standing, by: str) -> Deployed:
+def _end_first(manager: Manager, store: Store, standing: Standing, by: str, tell: Tell) -> Deployed:
     """End the trial of a release that has none before it: what was there before runs again."""
     for cell in standing.running:
         note_request("stop-asked", cell.name, cell.uuid, by)
-    go_back(manager, standing, standing.was_up)
+    go_back(manager, standing, standing.was_up, stop_observer(standing, tell))
     uuid = standing.uuid or store.manifest(standing.trial).uuid
     details = {"release": standing.trial, "former": "", "nodes": "", "reason": _KILLED}
     note_request(ROLLED_BACK, store.name, uuid, by, **details)
