@@ -18,7 +18,7 @@ from dora_systemd.adapters.host.unit_files import remove_unit_file
 from dora_systemd.adapters.releases.store import Store, unusable
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.logs.events import ROLLED_BACK
-from dora_systemd.decisions.releases.progress import Step, going_back, judged, waiting
+from dora_systemd.decisions.releases.progress import Step, going_back, judged, stopping, waiting
 from dora_systemd.decisions.unit.file import is_boot_checked, with_boot_check
 from dora_systemd.decisions.why.faults import Fault
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -143,7 +143,7 @@ def _roll_back(
         _note_stop(manager, change)
     now = "nothing of it runs"
     try:
-        go_back(manager, standing, want_start, stop_observer(standing, tell))
+        go_back(manager, standing, want_start, stop_observer(tell))
         if want_start:
             now = f"{former or 'what was there before'} {_back(manager, standing, tell)}"
     except DoraSystemdError as error:
@@ -195,12 +195,14 @@ def _calm(tell: Tell) -> Tell:
     return tell_on
 
 
-def stop_observer(standing: Standing, tell: Tell) -> Observer:
-    """Tells that the way back lasts, while the release on trial is stopped."""
+def stop_observer(tell: Tell) -> Observer:
+    """Tells that a way back lasts, while the release on trial is stopped."""
     told = _calm(tell)
 
     def observe(changes: Mapping[str, Any]) -> None:
-        told(going_back(standing.current, str(changes.get("StatusText", ""))))
+        status = str(changes.get("StatusText", ""))
+        if not changes or "stopping" in status:
+            told(stopping(status))
 
     return observe
 

@@ -83,7 +83,7 @@ def _end_first(manager: Manager, store: Store, standing: Standing, by: str, tell
     """End the trial of a release that has none before it: what was there before runs again."""
     for cell in standing.running:
         note_request("stop-asked", cell.name, cell.uuid, by)
-    go_back(manager, standing, standing.was_up, stop_observer(standing, tell))
+    go_back(manager, standing, standing.was_up, stop_observer(tell))
     uuid = standing.uuid or store.manifest(standing.trial).uuid
     details = {"release": standing.trial, "former": "", "nodes": "", "reason": _KILLED}
     note_request(ROLLED_BACK, store.name, uuid, by, **details)

@@ -165,14 +165,16 @@ def test_a_trial_ends_before_a_stop_that_may_take_long(
     def stop(method: str, units: Sequence[str], observer: Observer | None = None) -> dict[str, str]:
         assert not read_standing(manager, scope, UNIT).path.exists()
         assert observer is not None
-        observer({})
+        for changes in ({"SubState": "x"}, {}, {"StatusText": "stopping, a left"}):
+            observer(changes)
         return run_jobs(method, units)
 
     monkeypatch.setattr(manager, "run_jobs", stop)
     with pytest.raises(DoraSystemdError):
         try_new(manager, scope, store, monkeypatch, Fault("x"), lambda one: told.append(one.text))
     assert ("StopUnit", UNIT) in manager.calls
-    assert f"going back to {OLD}" in told
+    assert told.count("stopping what runs now") == 1
+    assert "stopping what runs now: a left" in told
 
 
 def test_who_stops_a_trial_wants_nothing_to_run(
