@@ -90,8 +90,12 @@ def _error(message: str, hint: str) -> DoraSystemdError:
 
 
 def last_line(words: str) -> str:
-    """The last line of what ssh or a login shell has said, without the name of ssh."""
-    lines = [line.strip() for line in without_sequences(words).splitlines() if line.strip()]
+    """The last line of what ssh or a login shell has said, without the name of ssh.
+
+    Objects for programs are no words: those of doractl, which is asked for them.
+    """
+    lines = [line.strip() for line in without_sequences(words).splitlines()]
+    lines = [line for line in lines if line and not line.startswith("{")]
     return short_line(lines[-1].removeprefix("ssh: "), _MOST) if lines else ""
 
 

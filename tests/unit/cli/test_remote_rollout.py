@@ -35,6 +35,7 @@ case " $* " in *" rollback "*) ;; *)
     head -c 5 >"$0.content-$HOST";;
 esac
 case $HOST in
+    cut) echo '{"progress": {"stage": "soak"}}' >&2; exit 255;;
     lost) echo "client_loop: send disconnect: Broken pipe" >&2; exit 255;;
     mute) exec sleep 600;;
     slow) for one in 1 2 3 4; do echo '{"progress": {"stage": "build"}}' >&2; sleep 0.5; done;;
@@ -99,6 +100,7 @@ def test_each_host_gets_what_it_asks_for(capsys: Printed, asked: Path) -> None:
         ("old", ["failed"], ExitCode.NO_HOST),
         ("mad", ["lost"], ExitCode.NO_HOST),
         ("lost", ["lost"], ExitCode.NO_HOST),
+        ("cut", ["lost"], ExitCode.NO_HOST),
     ],
 )
 def test_it_stops(host: str, words: list[str], status: int, capsys: Printed, asked: Path) -> None:
@@ -111,6 +113,7 @@ def test_it_stops(host: str, words: list[str], status: int, capsys: Printed, ask
     ]
     assert rows[3][:3] == ["h2", "not", "tried"]
     assert host in err
+    assert "{" not in err
     assert "h2" not in asked.read_text()
 
 
