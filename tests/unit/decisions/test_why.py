@@ -132,10 +132,22 @@ CASES: dict[str, tuple[tuple[Record, ...], str, Cause, str, str]] = {
         *("Failed", Cause.WATCHDOG, "", "its runner hung"),
     ),
     "systemd could not begin": (
-        (unit("process-exited", EXIT_CODE="exited", MESSAGE="status=217/USER"),
+        (unit("process-exited", EXIT_CODE="exited", EXIT_STATUS="226"),
          unit("unit-failed", UNIT_RESULT="exit-code")),
         *("Failed", Cause.UNIT_FAILED, ""),
-        "systemd could not start the supervisor process: exit code 217/USER",
+        "its sandbox could not be set up (exit code 226/NAMESPACE)",
+    ),
+    "systemd could not begin, for a reason of which we say nothing": (
+        (unit("process-exited", EXIT_CODE="exited", EXIT_STATUS="225"),
+         unit("unit-failed", UNIT_RESULT="exit-code")),
+        *("Failed", Cause.UNIT_FAILED, ""),
+        "systemd could not start its process (exit code 225/NETWORK)",
+    ),
+    "without a word of ours": (
+        (unit("process-exited", EXIT_CODE="exited", EXIT_STATUS="1"),
+         unit("unit-failed", UNIT_RESULT="exit-code")),
+        *("Failed", Cause.UNIT_FAILED, ""),
+        "the supervisor process failed (exit code 1)",
     ),
     "the kernel and its limit, and nothing of ours survived": (
         (*RUNS, unit("unit-oom"),

@@ -52,6 +52,9 @@ LATE = {
     },
     "seldom: what is not in systemd, has restarted, was killed, or enabled while it ran": {
         "verbs.facts.budget": {"adapters.journal.reader"},
+        "verbs.facts.ended": {
+            *("decisions.why.postmortem", "decisions.why.verdict", "verbs.facts.lives"),
+        },
         "verbs.facts.recorded": {"adapters.bus.systemd", "verbs.facts.cells"},
         "verbs.facts.selector": {"verbs.facts.ended"},
         "verbs.list": {"verbs.facts.ended"},
