@@ -188,11 +188,16 @@ def _cut(lines: Iterable[str], width: int | None) -> list[str]:
 
 
 def _wrapped(lines: Iterable[str], width: int | None, indent: int) -> list[str]:
-    """Lines of at most `width` characters. indent: of all but the first of those from one line."""
+    """Lines of at most `width` characters. indent: of all but the first of those from one line.
+
+    A longer word runs over: a path in two lines cannot be copied.
+    """
     shown = _cut(lines, None)
     if width is None:
         return shown
-    wrapper = textwrap.TextWrapper(width, subsequent_indent=" " * indent, break_on_hyphens=False)
+    wrapper = textwrap.TextWrapper(
+        width, subsequent_indent=" " * indent, break_on_hyphens=False, break_long_words=False
+    )
     return [piece for line in shown for piece in wrapper.wrap(line)]
 
 
