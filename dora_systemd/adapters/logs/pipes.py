@@ -68,9 +68,13 @@ class LogPipes:
             os.mkfifo(path, 0o600)
         self._paths[node_id] = paths
 
-    def limit(self, node_id: str, limit: RateLimit) -> None:
+    def limit(self, node_id: str, limit: RateLimit | None) -> None:
         """Limit the rate of a node's lines from now on; an event counts the suppressed ones."""
-        self._source(node_id).limiter = LineLimiter(limit)
+        known = self._sources.get(node_id)
+        before = known.limiter.limit if known and known.limiter else None
+        if limit != before:
+            self._tell_suppressed(node_id)  # by the limit that has suppressed them
+            self._source(node_id).limiter = LineLimiter(limit) if limit else None
 
     def open(self, node_id: str) -> None:
         """Start reading a node's FIFOs, which unblocks its launcher's open(2). Raises OSError."""

@@ -15,6 +15,7 @@ from typing import Any
 from dora_systemd.adapters.dora.preparation import Prepared
 from dora_systemd.adapters.host.watch import change_time, changed_files, watch_rules
 from dora_systemd.decisions.cell.limits import check_nodes, merge_node_limits
+from dora_systemd.decisions.cell.line_rates import RateLimits, parse_rates
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.wiring import downstream_of
 from dora_systemd.decisions.life import events as life
@@ -238,10 +239,13 @@ class Reloader:
         return [f"the dataflow was reloaded: {text}"]
 
     async def answer(self, request: Mapping[str, Any]) -> Answer:
-        """Answer a request of doractl: {"verb": "reload"} or {"verb": "hot-reload", "on": true}.
+        """Answer a request of doractl.
 
-        Raises DoraSystemdError.
+        {"verb": "reload"}, {"verb": "hot-reload", "on": true}, or {"verb": "log-rates"} with all
+        limits. Raises DoraSystemdError.
         """
+        if request.get("verb") == "log-rates":
+            return await self._limit_lines(parse_rates(map(str, request.get("limits") or ())))
         if request.get("verb") == "hot-reload":
             return await self._switch(bool(request.get("on")))
         if request.get("verb") != "reload":
@@ -271,6 +275,13 @@ class Reloader:
             if self.current is not None:
                 self.current = self._sources.replan(self.current)
             self._watch(is_on)
+        return {"done": []}
+
+    async def _limit_lines(self, rates: RateLimits) -> Answer:
+        async with self._lock:
+            self.options = self.options._replace(log_rates=rates)
+            if self._run is not None:
+                self._run.nodes.limit_lines(rates)
         return {"done": []}
 
     def close(self) -> None:
