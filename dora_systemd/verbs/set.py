@@ -23,6 +23,7 @@ from dora_systemd.adapters.host.unit_files import (
     remove_empty,
     write_unit_file,
 )
+from dora_systemd.adapters.runner_socket.client import order
 from dora_systemd.decisions.cell import line_rates
 from dora_systemd.decisions.cell.limits import (
     BY_KEY,
@@ -46,7 +47,7 @@ from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.enabled import enabled_units
 from dora_systemd.verbs.facts.nodes import written_dataflow
 from dora_systemd.verbs.facts.reading import read_status
-from dora_systemd.verbs.log_rates import Ask, changed_rates, limit_lines, order
+from dora_systemd.verbs.reload import Ask, limit_lines
 from dora_systemd.verbs.start.limits import require_controllers
 
 _PROPERTIES = ("ControlGroup", "Environment", "FragmentPath", "Transient")
@@ -94,8 +95,7 @@ def set_limits(
             changes = merge_node_limits(parse_changes(before.get(CHANGES_VARIABLE, "")), nodes)
             _remember(unit, NODE_LIMITS_FILE, f"{CHANGES_VARIABLE}={format_changes(changes)}", undo)
         if rates:
-            text = f"{line_rates.CHANGES_VARIABLE}={changed_rates(before, rates)}"
-            _remember(unit, LOG_RATES_FILE, text, undo)
+            _remember(unit, LOG_RATES_FILE, _changed_rates(before, rates), undo)
         if rates and unit["ControlGroup"]:
             limit_lines(scope, cell, before, rates, undo, ask)
         if properties:
@@ -104,6 +104,12 @@ def set_limits(
     if nodes or rates:
         manager.reload()
     return (*warnings, *_unit_file_warnings(manager, scope, cell, unit))
+
+
+def _changed_rates(environment: Mapping[str, str], given: line_rates.RateLimits) -> str:
+    """The variable for the next runners."""
+    known = line_rates.parse_changes(environment.get(line_rates.CHANGES_VARIABLE, ""))
+    return f"{line_rates.CHANGES_VARIABLE}={line_rates.format_changes({**known, **given})}"
 
 
 def _unit_file_warnings(

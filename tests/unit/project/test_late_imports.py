@@ -18,6 +18,9 @@ LATE = {
         "gateway.live.about": {"decisions.views.releases", "verbs.releases.listing"},
         "gateway.live.act": {"verbs.releases.rollback"},
     },
+    "only some verbs wrap, and only on a terminal": {
+        "terminal_text": {"textwrap"},
+    },
     "the table of list does without it": {
         "cli.listing": {
             *("verbs.list", "verbs.facts.ended", "verbs.facts.list"),
