@@ -185,7 +185,8 @@ def test_a_hundred_requests_a_second(front: Front) -> None:
     front.up()
     paths = ("/health", "/nothing", "/metrics", "/")
     ask_steadily(front.port, paths, 4)  # threads are made, modules loaded
-    pid, growth = front.pid, []
+    pid = front.pid
+    growth: list[int] = []
     # A thread more takes memory once, and a leak again and again.
     while not growth or (growth[-1] >= 1024 * 1024 and len(growth) < 4):
         before = read_use(pid)

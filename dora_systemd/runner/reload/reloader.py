@@ -19,7 +19,6 @@ from dora_systemd.decisions.cell.line_rates import RateLimits, parse_rates
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.wiring import downstream_of
 from dora_systemd.decisions.life import events as life
-from dora_systemd.decisions.reload.steps import How, Step
 from dora_systemd.decisions.rights.node_rights import essential_nodes
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.runner.cell.begin import let_openssl_in
@@ -165,7 +164,7 @@ class Reloader:
             done = await self._take_settings(run) if self._settings.path in changed else []
             changed = [path for path in changed if path != self._settings.path]
             change = await asyncio.to_thread(self._sources.look, current, changed)
-            change = _with_node(change, node, self.options.dataflow)
+            change = change.with_node(node, self.options.dataflow) if node else change
             if change.steps or change.whole:
                 run.pipes.write_event("files-changed", files=", ".join(_names(change, changed)))
                 done += await self._apply(run, change)
@@ -287,17 +286,6 @@ class Reloader:
     def close(self) -> None:
         """Stop watching."""
         self._watch(False)
-
-
-def _with_node(change: Change, node: str, dataflow: str) -> Change:
-    """The change, with a reload of `node` added if it is missing."""
-    if not node or any(step.node == node for step in change.steps):
-        return change
-    operators = change.operators.get(node, {})
-    steps = [Step(How.OPERATOR, node, file) for name, file in operators.items() if name]
-    if not steps:
-        steps = [Step(How.SWAP, node, operators.get("", dataflow))]
-    return replace(change, steps=(*change.steps, *steps))
 
 
 def _files(change: Change) -> list[str]:
