@@ -5,12 +5,17 @@ stream for all output cannot be forgotten in any of them.
 """
 
 import io
+import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any, TextIO
 
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.terminal_text import escaped
+
+_STANDARD = ("stdin", "stdout", "stderr")
+"""By the number of their descriptors."""
 
 
 class Edge(io.TextIOWrapper):
@@ -25,16 +30,58 @@ class Edge(io.TextIOWrapper):
         super().write(text)
 
 
+class Messages(Edge):
+    """Standard error. What it cannot write changes neither what doractl does nor its exit status.
+
+    Its reader may be gone, its disk full.
+    """
+
+    def write(self, text: str) -> int:
+        """Write `text` with control characters escaped, if possible."""
+        with suppress(OSError):
+            super().write(text)
+        return len(text)
+
+    def write_own(self, text: str) -> None:
+        """Write `text` unchanged, if possible."""
+        with suppress(OSError):
+            super().write_own(text)
+
+    def flush(self) -> None:
+        """Write what is buffered, if possible."""
+        with suppress(OSError):
+            super().flush()
+
+
 def put_in_place() -> None:
-    """Replace standard output and error by escaping streams."""
-    sys.stdout, sys.stderr = (_edge(one) for one in (sys.stdout, sys.stderr))
+    """Replace standard output and error by escaping streams; open those that are closed."""
+    _open_closed()
+    sys.stdout, sys.stderr = _edge(sys.stdout, Edge), _edge(sys.stderr, Messages)
 
 
-def _edge(stream: TextIO) -> TextIO:
-    if not isinstance(stream, io.TextIOWrapper):  # no stream, or that of a test
+def _open_closed() -> None:
+    """Open /dev/null for each standard stream that is closed.
+
+    print() writes to standard output if there is no standard error, and the next file that anything
+    opens would get the number of the closed one.
+    """
+    if None not in (sys.stdin, sys.stdout, sys.stderr):
+        return
+    while (fd := os.open(os.devnull, os.O_RDWR)) < len(_STANDARD):
+        os.set_inheritable(fd, True)
+    os.close(fd)
+    for fd, name in enumerate(_STANDARD):
+        if getattr(sys, name) is None:
+            stream = os.fdopen(fd, "w" if fd else "r", encoding="utf-8")
+            setattr(sys, name, stream)
+            setattr(sys, f"__{name}__", stream)  # else garbage, which closes its descriptor
+
+
+def _edge(stream: TextIO, kind: type[Edge]) -> TextIO:
+    if not isinstance(stream, io.TextIOWrapper):  # that of a test
         return stream
     # File names need not be valid in the terminal's encoding.
-    return Edge(
+    return kind(
         stream.buffer,
         encoding=stream.encoding,
         errors="backslashreplace",

@@ -102,7 +102,7 @@ def print_dataflows(request: ListRequest) -> int:
     elif request.output == "json":
         _print_json(row)
     else:
-        _print_view(format_dataflow(row, _width(), want_colors=_wants_colors()))
+        _print_view(format_dataflow(row, terminal_width(), want_colors=_wants_colors()))
     return ExitCode.OK if is_up_word(row) else ExitCode.NOT_RUNNING
 
 
@@ -160,7 +160,7 @@ def _print_all(rows: list[DataflowRow], request: ListRequest) -> None:
     elif request.output == "json":
         _print_json(rows)
     elif rows:
-        width = _width()
+        width = terminal_width()
         _print_view(format_dataflows(rows, width, want_colors=_wants_colors()))
         if width is not None and not all(map(is_up_word, rows)):
             print(f"\n{_MORE}")
@@ -181,7 +181,7 @@ def _print_json(found: DataflowRow | list[DataflowRow]) -> None:
 
 def print_table(form: Callable[[int | None, bool], str]) -> None:
     """Print a table. form: makes it for a width, with or without colours."""
-    _print_view(form(_width(), _wants_colors()))
+    _print_view(form(terminal_width(), _wants_colors()))
 
 
 def _print_view(text: str) -> None:
@@ -198,7 +198,7 @@ def _wants_colors() -> bool:
     return wants_colors(sys.stdout)
 
 
-def _width() -> int | None:
+def terminal_width() -> int | None:
     """Columns of the terminal, None for a pipe; $COLUMNS has precedence, as in systemctl.
 
     Not by shutil, which imports every compressor. A pseudoterminal may have no size.

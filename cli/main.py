@@ -35,8 +35,7 @@ def _leave(status: int) -> NoReturn:
         sys.exit(status)  # it waits for the threads
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError):
-            if stream:
-                stream.flush()
+            stream.flush()
     os._exit(status)
 
 
@@ -44,8 +43,7 @@ def run(arguments: list[str]) -> int:
     """Run doractl; the exit status. Errors have been printed, in two lines or as JSON."""
     try:
         status = _dispatch(arguments)
-        if sys.stdout:
-            sys.stdout.flush()
+        sys.stdout.flush()
         return status
     except DoraSystemdError as error:
         problem = error
@@ -78,8 +76,7 @@ _OUTPUT_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 def _give_up_output() -> None:
     """Discard buffered output: writing it at exit would fail again."""
-    if sys.stdout:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _dispatch(arguments: list[str]) -> int:

@@ -4,7 +4,6 @@ On a terminal it is one line that is rewritten; in a pipe a line, or a JSON obje
 is something new.
 """
 
-import os
 import sys
 import time
 from collections.abc import Callable
@@ -35,39 +34,37 @@ quiet_option = click.option(
 
 
 class Progress(AbstractContextManager["Progress"]):
-    """Shows the steps that it is called with, until the `with` block ends.
-
-    Whoever reads them may go away: that is no reason to give up what is told.
-    """
+    """Shows the steps that it is called with, until the `with` block ends."""
 
     def __init__(
         self,
-        stream: TextIO | None,
+        stream: TextIO,
         is_json: bool = False,
         is_quiet: bool = False,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        is_terminal = bool(stream and stream.isatty()) and not is_json and not is_dumb()
+        is_terminal = stream.isatty() and not is_json and not is_dumb()
         self._stream = stream
         self._is_json = is_json
-        self._is_off = is_quiet or stream is None
+        self._is_off = is_quiet
         self._clock = clock
-        self._line = StageLine(stream) if stream and is_terminal else None
+        self._line = StageLine(stream) if is_terminal else None
         seconds = _JSON_SECONDS if is_json else _PIPE_SECONDS
         silence = SIGN_SECONDS if is_json else inf
         self._pace = Pace(_TERMINAL_SECONDS if is_terminal else seconds, silence)
 
     def __call__(self, step: Step) -> None:
         if not self._is_off and self._pace.takes(step, self._clock()):
-            self._guard(lambda: self._show(step))
+            self._show(step)
 
     def warn(self, text: str) -> None:
         """Print a warning."""
         if not self._is_off:
-            self._guard(lambda: self._warn(text))
+            self._wipe()
+            print_warnings([text])
 
     def __exit__(self, *_exception: object) -> None:
-        self._guard(self._wipe)
+        self._wipe()
 
     def _show(self, step: Step) -> None:
         if self._line:
@@ -77,30 +74,11 @@ class Progress(AbstractContextManager["Progress"]):
         else:
             print(one_line(step.text), file=self._stream, flush=True)
 
-    def _warn(self, text: str) -> None:
-        self._wipe()
-        print_warnings([text])
-
     def _wipe(self) -> None:
         if self._line:
             self._line.wipe()
-
-    def _guard(self, write: Callable[[], None]) -> None:
-        try:
-            write()
-        except OSError:
-            self._is_off, self._line = True, None
-            _discard(self._stream)
 
 
 def open_progress(is_quiet: bool) -> Progress:
     """That of this command line."""
     return Progress(sys.stderr, wants_json(), is_quiet)
-
-
-def _discard(stream: TextIO | None) -> None:
-    """Let what else is written to a stream without a reader go nowhere."""
-    nowhere = os.open(os.devnull, os.O_WRONLY | os.O_CLOEXEC)
-    if stream is not None:
-        os.dup2(nowhere, stream.fileno())
-    os.close(nowhere)

@@ -6,8 +6,7 @@ from typing import Any, TypeVar
 import click
 
 from dora_systemd.decisions.settings.kinds import Setting
-from dora_systemd.decisions.settings.limits import LIVE_SETTINGS
-from dora_systemd.decisions.settings.table import SECTIONS, SETTINGS
+from dora_systemd.decisions.settings.table import CHANGEABLE, SECTIONS, SETTINGS
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -37,7 +36,7 @@ def setting_options(function: F) -> F:
 
 def live_options(function: F) -> F:
     """The flags of settings that can be changed while a dataflow is running."""
-    return _options(LIVE_SETTINGS, function)
+    return _options(CHANGEABLE, function)
 
 
 def _options(settings: Sequence[Setting[Any]], function: F) -> F:

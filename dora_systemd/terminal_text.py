@@ -43,6 +43,23 @@ def short_line(text: str, most: int) -> str:
     return f"{line.encode()[: most - 3].decode(errors='ignore')}..."
 
 
+def wrapped(line: str, width: int, indent: int) -> list[str]:
+    """The pieces of a line that is wrapped at blanks. indent: of all but the first.
+
+    A longer word runs over: a path in two lines cannot be copied.
+    """
+    # Imported late: only some verbs wrap, and only on a terminal.
+    import textwrap
+
+    return textwrap.wrap(
+        line,
+        width,
+        subsequent_indent=" " * indent,
+        break_on_hyphens=False,
+        break_long_words=False,
+    )
+
+
 def cut(text: str, width: int | None) -> str:
     """`text` with at most `width` characters, None for any number; an ellipsis is the last one."""
     return text if width is None or len(text) <= width else f"{text[: max(width - 1, 0)]}…"

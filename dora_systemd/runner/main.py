@@ -42,7 +42,7 @@ from dora_systemd.runner.cell.clock import StopClock
 from dora_systemd.runner.cell.dialogue import Dialogue
 from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.cell.failure import Beside, words
-from dora_systemd.runner.cell.life import Life
+from dora_systemd.runner.cell.life import Life, is_first_life
 from dora_systemd.runner.cell.pause import forget_restarts, hold_back
 from dora_systemd.runner.cell.pump import Pump, now_us
 from dora_systemd.runner.needs.needs import wait_for_needs
@@ -77,7 +77,8 @@ async def run_cell(
     loop = asyncio.get_running_loop()
     journal, clock = JournalSocket(), StopClock(options.grace)
     # systemd holds the pipes too, so their content survives a kill of this process.
-    this_life = Life(options.uuid, fd_store.is_first_life())
+    is_first = is_first_life(options.restart, options.name, paths.is_of_user)
+    this_life = Life(options.uuid, is_first)
     fd_store.forget_inherited()
     origin = Origin(options.name, options.uuid)
     pipes = LogPipes(loop, journal, origin, fd_store.store, fd_store.forget)

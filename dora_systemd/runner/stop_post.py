@@ -20,7 +20,7 @@ from dora_systemd.adapters.cgroup.strain import read_oom
 from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.decisions.life.causes import UNIT_RESULTS, Cause
 from dora_systemd.decisions.logs.lines import Origin
-from dora_systemd.decisions.resources.oom import Owner, largest
+from dora_systemd.decisions.resources.oom import Owner, largest, owner_details
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.values import format_rounded_size
@@ -155,9 +155,9 @@ def out_of_memory(unit: Path) -> dict[str, str]:
         "cause": str(Cause.OUT_OF_MEMORY),
     }
     if not read_oom(unit).refusals:
-        return {**details, "owner": Owner.MACHINE.value}
+        return {**details, **owner_details(Owner.MACHINE)}
     limit = cgroup.read_usage(unit).memory_max or 0
-    return {**details, "owner": Owner.DATAFLOW.value, "limit": str(limit)}
+    return {**details, **owner_details(Owner.DATAFLOW, limit)}
 
 
 def kill_nodes(unit: Path, seconds: float) -> None:

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
+from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.trust.eyes import check_regular
 from dora_systemd.trust.files import unreadable
@@ -49,13 +50,19 @@ def place_of(lock: int) -> LockPlace:
     return LockPlace(status.st_dev, status.st_ino)
 
 
-def take_lock(lock: int, is_shared: bool) -> bool:
-    """Lock an open file, see flock(2); False if another one prevents it, or the kernel (ENOLCK)."""
+def take_lock(directory: Path, lock: int, is_shared: bool) -> bool:
+    """Lock the open lock file of a RuntimeDirectory, see flock(2); False if another one holds it.
+
+    Raises DoraSystemdError if the kernel cannot lock at all, such as for want of memory (ENOLCK).
+    """
     operation = fcntl.LOCK_SH if is_shared else fcntl.LOCK_EX
     try:
         fcntl.flock(lock, operation | fcntl.LOCK_NB)
-    except OSError:
+    except BlockingIOError:
         return False
+    except OSError as error:
+        message = f"cannot lock {CellPaths(directory).lock}: {error.strerror}"
+        raise DoraSystemdError(message, "see flock(2) for what this means") from error
     return True
 
 

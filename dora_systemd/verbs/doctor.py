@@ -227,7 +227,7 @@ def _user(scope: Scope) -> Iterator[Finding]:
 def _settings(_scope: Scope) -> Iterator[Finding]:
     """Check the settings files for all dataflows; `start` checks the one beside a dataflow."""
     for path in settings_files(Path("/dataflow.yml"), os.environ)[1:]:
-        if path.exists():
+        if exists(path):
             try:
                 read_yaml(path, allow_empty=True)
             except DoraSystemdError as error:

@@ -20,12 +20,14 @@ def all_rows(manager: Manager, scope: Scope, cells: Iterable[Cell]) -> list[Data
 def find_row(manager: Manager, scope: Scope, selector: str) -> DataflowRow:
     """The dataflow that `selector` means, which may have ended. Raises DoraSystemdError."""
     wanted, cells = Selector(selector), read_cells(manager)
+    # Imported late: the journal is slow, and what runs does not need it.
     if not wanted.meant(cells) and (row := wanted.ended(scope)):
-        return mark_enabled(manager, scope, [row])[0]
+        from dora_systemd.verbs.facts.ended import with_cause
+
+        return mark_enabled(manager, scope, [with_cause(scope, row)])[0]
     row = read_whole_rows(manager, scope, [wanted.loaded(cells)])[0]
     if is_up_word(row):
         return row
-    # Imported late: the journal is slow, and what runs does not need it.
     from dora_systemd.verbs.facts.ended import read_end
 
     return read_end(manager, scope, row)

@@ -1,6 +1,7 @@
-"""`doractl reload`, and `doractl set --hot-reload`: requests to the runner of a dataflow."""
+"""`doractl reload`, and parts of `doractl set`: requests to the runner of a dataflow."""
 
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,9 @@ from dora_systemd.adapters.host.unit_files import (
     write_unit_file,
 )
 from dora_systemd.adapters.runner_socket.client import done_of, order
+from dora_systemd.decisions.cell.environment import with_changes
 from dora_systemd.decisions.cell.hot_reload import CHANGE_VARIABLE
+from dora_systemd.decisions.cell.line_rates import RateLimits, format_rates
 from dora_systemd.decisions.properties.assignments import typed
 from dora_systemd.decisions.unit.properties import format_unit
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -52,6 +55,27 @@ def switch_hot_reload(
     directory = drop_in_directory(Path(unit["FragmentPath"]), bool(unit["Transient"]))
     write_unit_file(directory / HOT_RELOAD_FILE, f"# Written by doractl set.\n{text}")
     manager.reload()
+
+
+def limit_lines(
+    scope: Scope,
+    cell: Cell,
+    environment: Mapping[str, str],
+    given: RateLimits,
+    undo: ExitStack,
+    ask: Ask = order,
+) -> None:
+    """Have the runner apply limits of log lines, with those that it has. Raises DoraSystemdError.
+
+    environment: that of the unit before the change. undo: gets what restores the limits.
+    """
+    path, before = socket_of(scope, cell), with_changes(cell.options, environment).log_rates
+    ask(path, _rates_request({**before, **given}))
+    undo.callback(ask, path, _rates_request(before))
+
+
+def _rates_request(rates: RateLimits) -> Mapping[str, Any]:
+    return {"verb": "log-rates", "limits": format_rates(rates)}
 
 
 def _refuse_release(cell: Cell) -> None:

@@ -15,6 +15,7 @@ from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.adapters.host.machine import read_machine
 from dora_systemd.adapters.host.unit_files import (
+    LOG_RATES_FILE,
     NODE_LIMITS_FILE,
     drop_in_directory,
     put_unit_file,
@@ -22,6 +23,8 @@ from dora_systemd.adapters.host.unit_files import (
     remove_empty,
     write_unit_file,
 )
+from dora_systemd.adapters.runner_socket.client import order
+from dora_systemd.decisions.cell import line_rates
 from dora_systemd.decisions.cell.limits import (
     BY_KEY,
     CHANGES_VARIABLE,
@@ -34,8 +37,9 @@ from dora_systemd.decisions.cell.limits import (
 from dora_systemd.decisions.descriptor.nodes import UNEXPANDED
 from dora_systemd.decisions.properties.assignments import typed
 from dora_systemd.decisions.settings.limit_checks import check_cpus, check_use, size_warnings
-from dora_systemd.decisions.settings.limits import LIVE_SETTINGS, NODE_LIMIT
+from dora_systemd.decisions.settings.limits import NODE_LIMIT
 from dora_systemd.decisions.settings.resolve import resolve_settings
+from dora_systemd.decisions.settings.table import CHANGEABLE, LOG_RATE_LIMIT
 from dora_systemd.decisions.unit.properties import format_unit, settings_properties
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
@@ -43,6 +47,7 @@ from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.enabled import enabled_units
 from dora_systemd.verbs.facts.nodes import written_dataflow
 from dora_systemd.verbs.facts.reading import read_status
+from dora_systemd.verbs.reload import Ask, limit_lines
 from dora_systemd.verbs.start.limits import require_controllers
 
 _PROPERTIES = ("ControlGroup", "Environment", "FragmentPath", "Transient")
@@ -54,25 +59,28 @@ def set_limits(
     cell: Cell,
     flags: Mapping[str, object],
     is_forced: bool = False,
+    ask: Ask = order,
 ) -> tuple[str, ...]:
     """Change limits of a dataflow; warnings. If it does not run, they are those of its next start.
 
-    flags: raw values by name of LIVE_SETTINGS. is_forced: also memory limits below the current
-    usage. Raises DoraSystemdError; then nothing is changed.
+    flags: raw values by name of CHANGEABLE. is_forced: also memory limits below the current
+    usage. ask: of the runner. Raises DoraSystemdError; then nothing is changed.
     """
-    settings = resolve_settings(flags, {}, (), LIVE_SETTINGS)
+    settings = resolve_settings(flags, {}, (), CHANGEABLE)
     properties, nodes = settings_properties(settings), settings[NODE_LIMIT]
-    if not properties and not nodes:
+    rates = settings[LOG_RATE_LIMIT]
+    if not properties and not nodes and not rates:
         hint = "see doractl set --help"
         message = f"cannot change the limits of {cell.name}: none is given"
         raise DoraSystemdError(message, hint, ExitCode.USAGE)
     if not scope.is_user and os.geteuid() != 0:
         message = f"cannot change the limits of {cell.name}: permission denied"
         raise DoraSystemdError(message, "use sudo", ExitCode.NO_PERMISSION)
-    _check_nodes(scope, cell, nodes)
+    _check_nodes(scope, cell, nodes, rates)
     check_cpus(nodes, read_machine())
     require_controllers(manager, scope, properties, nodes)
     unit = manager.read(cell.unit, _PROPERTIES)
+    before = dict(entry.split("=", 1) for entry in unit["Environment"] or ())
     values = {limit.word: settings.values[key] for key, limit in BY_KEY.items()}
     warnings = size_warnings(values, nodes, read_machine())
     if unit["ControlGroup"] and not is_forced:
@@ -84,13 +92,24 @@ def set_limits(
     with ExitStack() as undo:
         _limit_groups(unit, nodes, undo)
         if nodes:
-            _remember(unit, nodes, undo)
+            changes = merge_node_limits(parse_changes(before.get(CHANGES_VARIABLE, "")), nodes)
+            _remember(unit, NODE_LIMITS_FILE, f"{CHANGES_VARIABLE}={format_changes(changes)}", undo)
+        if rates:
+            _remember(unit, LOG_RATES_FILE, _changed_rates(before, rates), undo)
+        if rates and unit["ControlGroup"]:
+            limit_lines(scope, cell, before, rates, undo, ask)
         if properties:
             manager.set_properties(cell.unit, list(properties.values()), is_fleeting)
         undo.pop_all()
-    if nodes:
+    if nodes or rates:
         manager.reload()
     return (*warnings, *_unit_file_warnings(manager, scope, cell, unit))
+
+
+def _changed_rates(environment: Mapping[str, str], given: line_rates.RateLimits) -> str:
+    """The variable for the next runners."""
+    known = line_rates.parse_changes(environment.get(line_rates.CHANGES_VARIABLE, ""))
+    return f"{line_rates.CHANGES_VARIABLE}={line_rates.format_changes({**known, **given})}"
 
 
 def _unit_file_warnings(
@@ -103,8 +122,10 @@ def _unit_file_warnings(
     return [f"the next boot has the old limits, unless you disable {name} and enable it again"]
 
 
-def _check_nodes(scope: Scope, cell: Cell, limits: tuple[NodeLimits, ...]) -> None:
-    if not limits:
+def _check_nodes(
+    scope: Scope, cell: Cell, limits: tuple[NodeLimits, ...], rates: line_rates.RateLimits
+) -> None:
+    if not limits and not rates:
         return
     kinds = {node: one.kind for node, one in read_status(scope, cell).nodes.items()}
     if not kinds:
@@ -112,6 +133,7 @@ def _check_nodes(scope: Scope, cell: Cell, limits: tuple[NodeLimits, ...]) -> No
         if any(node.kind in UNEXPANDED for node in written):
             return  # only the runner expands these nodes, and would refuse them at the next start
         kinds = {node.id: str(node.kind) for node in written}
+    line_rates.check_rates(rates, list(kinds))
     check_nodes(limits, kinds, [node for node, kind in kinds.items() if kind == "dynamic"])
 
 
@@ -120,13 +142,11 @@ def _held(group: Path) -> dict[str, int | None]:
     return {node: cgroup.read_usage(one).memory for node, one in cgroup.node_groups(group).items()}
 
 
-def _remember(unit: Mapping[str, Any], nodes: tuple[NodeLimits, ...], undo: ExitStack) -> None:
-    """Write the drop-in. Once systemd has loaded it, the next runner gets the limits."""
-    before = dict(entry.split("=", 1) for entry in unit["Environment"] or ())
-    changes = merge_node_limits(parse_changes(before.get(CHANGES_VARIABLE, "")), nodes)
-    text = format_unit(typed(Environment=(f"{CHANGES_VARIABLE}={format_changes(changes)}",)))
+def _remember(unit: Mapping[str, Any], name: str, assignment: str, undo: ExitStack) -> None:
+    """Write a drop-in. Once systemd has loaded it, the next runner gets the limits."""
+    text = format_unit(typed(Environment=(assignment,)))
     directory = drop_in_directory(Path(unit["FragmentPath"]), bool(unit["Transient"]))
-    path = directory / NODE_LIMITS_FILE
+    path = directory / name
     undo.callback(_put_back, path, read_unit_file(path))
     write_unit_file(path, f"# Written by doractl set.\n{text}")
 

@@ -1,17 +1,15 @@
 """`doractl why`: collects what systemd, the journal and the runner know about a dataflow."""
 
 from contextlib import suppress
-from itertools import islice
-from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.decisions.cell.status import HELD, CellStatus
 from dora_systemd.decisions.life import nodes as node_table
-from dora_systemd.decisions.logs.query import scope_matches, story_matches
+from dora_systemd.decisions.logs.query import scope_matches
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.why.last_lines import Word, choose_last, shown_last
-from dora_systemd.decisions.why.lives import SHUTDOWN_MESSAGE, Life, find_lives, parse_happening
+from dora_systemd.decisions.why.lives import SHUTDOWN_MESSAGE
 from dora_systemd.decisions.why.postmortem import examine
 from dora_systemd.decisions.why.report import LINES, Report, Subject
 from dora_systemd.decisions.why.verdict import Facts, Verdict
@@ -23,13 +21,12 @@ from dora_systemd.verbs.facts.cells import Cell, read_cell, read_cells
 from dora_systemd.verbs.facts.ended import not_recorded
 from dora_systemd.verbs.facts.held import read_held
 from dora_systemd.verbs.facts.list import mark_enabled
+from dora_systemd.verbs.facts.lives import now_boot, read_lives
 from dora_systemd.verbs.facts.locks import read_holders
 from dora_systemd.verbs.facts.reading import look_at_table, read_status
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.facts.whole import read_whole_rows
 
-_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
-_MOST_RECORDS = 1000
 _MOST_SHUTDOWNS = 20
 WORDS_OF_START = 10
 """Maximum number of lines that a failed start prints."""
@@ -41,8 +38,8 @@ def explain(manager: Manager, scope: Scope, selector: str, journal: JournalReade
     Raises DoraSystemdError: NOT_FOUND, USAGE if several match.
     """
     cell, subject = _select(manager, scope, selector)
-    lives = read_lives(journal, scope, subject)
-    facts = _facts(manager, scope, cell) if cell else Facts(now_boot=_now_boot())
+    lives = read_lives(journal, scope, subject.name, subject.uuid, subject.is_loaded)
+    facts = _facts(manager, scope, cell) if cell else Facts(now_boot=now_boot())
     shutdowns = _shutdowns(journal)
     verdict = examine(lives, facts, shutdowns)
     budget = None
@@ -94,7 +91,7 @@ def _facts(manager: Manager, scope: Scope, cell: Cell) -> Facts:
         problem or str(unit["StatusText"]),
         {key: spent.get(key, str(node.exit)) for key, node in nodes if node.state == "failed"},
         tuple(key for key, node in nodes if node.state == "restarting"),
-        _now_boot(),
+        now_boot(),
         unit["NRestarts"],
         {key: node.silent for key, node in nodes if node.silent},
     )
@@ -103,30 +100,7 @@ def _facts(manager: Manager, scope: Scope, cell: Cell) -> Facts:
 def _held_facts(manager: Manager, cell: Cell) -> Facts:
     held = read_held(manager, cell)
     restarts = manager.read(cell.unit, ["NRestarts"])["NRestarts"]
-    return Facts(held.word, held.text, {}, (), _now_boot(), restarts, is_held=True)
-
-
-def _now_boot() -> str:
-    try:
-        return _BOOT_ID.read_text().strip().replace("-", "")
-    except OSError:
-        return ""
-
-
-def read_lives(journal: JournalReader, scope: Scope, subject: Subject) -> list[Life]:
-    """The lives of the dataflow in the journal, oldest first, without others of the same name."""
-    matches = story_matches(scope, subject.name, subject.uuid)
-    records = islice(journal.newest(matches, None, is_whole=True), _MOST_RECORDS)
-    found = [one for one in map(parse_happening, records) if one is not None]
-    lives = find_lives(reversed(found))
-    own = [place for place, life in enumerate(lives) if _is_of(life, subject.uuid)]
-    # A life that failed before our code ran has no UUID: it belongs to the loaded dataflow.
-    begin = own[0] if own else -1
-    return lives[begin:] if subject.is_loaded else lives[begin : own[-1] + 1 if own else 0]
-
-
-def _is_of(life: Life, uuid: str) -> bool:
-    return any(one.detail("dataflow") == uuid for one in life.happenings)
+    return Facts(held.word, held.text, {}, (), now_boot(), restarts, is_held=True)
 
 
 def _shutdowns(journal: JournalReader) -> list[int]:

@@ -5,9 +5,12 @@ https://chromedevtools.github.io/devtools-protocol
 
 import base64
 import json
+import os
+import signal
 import subprocess
 import tempfile
 import urllib.request
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -33,7 +36,7 @@ class Browser:
         # Its helpers may write for a moment longer than it lives.
         self._home = tempfile.TemporaryDirectory(prefix="chromium-", ignore_cleanup_errors=True)
         command = [*COMMAND, f"--user-data-dir={self._home.name}", "about:blank"]
-        self._process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+        self._process = subprocess.Popen(command, stderr=subprocess.DEVNULL, start_new_session=True)
         told = Path(self._home.name, "DevToolsActivePort")
         port = wait_for("Chromium", lambda: told.read_text().split() if told.exists() else [])[0]
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list") as answer:
@@ -54,9 +57,22 @@ class Browser:
         traceback: TracebackType | None,
     ) -> None:
         self._link.close()
-        self._process.terminate()
-        self._process.wait(bound(20))
+        self._end()
         self._home.cleanup()
+
+    def _end(self) -> None:
+        """End all of it: the command is a shell script, and its page would keep the gateway up."""
+        with suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGTERM)
+        self._process.wait(bound(20))
+        wait_for("the end of Chromium", lambda: not self._has_processes())
+
+    def _has_processes(self) -> bool:
+        try:
+            os.killpg(self._process.pid, 0)
+        except ProcessLookupError:
+            return False
+        return True
 
     def call(self, method: str, **params: Any) -> dict[str, Any]:
         """A command of the protocol, and its result."""

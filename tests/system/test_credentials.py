@@ -112,7 +112,7 @@ def test_a_file_that_has_gone(cell: Cell, project: Project, token: Path) -> None
     token.unlink()
     done = cell.doractl("restart", cell.name, check=False)
     assert done.returncode == ExitCode.FAILURE
-    assert "a credential could not be read (exit code 243)" in done.stderr
+    assert "a credential could not be read (exit code 243/CREDENTIALS)" in done.stderr
 
 
 @pytest.mark.lab

@@ -135,3 +135,11 @@ def test_a_half_written_settings_file() -> None:
         assert run("doractl", "doctor", check=False).returncode == ExitCode.FAILURE
     finally:
         path.unlink()
+
+
+def test_in_the_environment_of_somebody_else() -> None:
+    """As by su without a dash: $HOME is a directory that the caller may not read."""
+    words = ("--reuid=1000", "--regid=1000", "--clear-groups", "env", "HOME=/root")
+    done = run("setpriv", *words, "doractl", "--system", "doctor", check=False)
+    assert "systemd" in done.stdout
+    assert done.stderr == ""

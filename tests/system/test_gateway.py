@@ -185,16 +185,18 @@ def test_a_hundred_requests_a_second(front: Front) -> None:
     front.up()
     paths = ("/health", "/nothing", "/metrics", "/")
     ask_steadily(front.port, paths, 4)  # threads are made, modules loaded
-    pid, before = front.pid, read_use(front.pid)
-    load = ask_steadily(front.port, paths, 8)
-    assert load.answers == dict.fromkeys(
-        ("/health 200", "/nothing 404", "/metrics 200", "/ 200"), 200
-    )
-    wait_for("connections end", lambda: read_use(pid).descriptors <= before.descriptors)
-    after = read_use(pid)
+    pid = front.pid
+    growth: list[int] = []
+    # A thread more takes memory once, and a leak again and again.
+    while not growth or (growth[-1] >= 1024 * 1024 and len(growth) < 4):
+        before = read_use(pid)
+        answers = ask_steadily(front.port, paths, 8).answers
+        assert {*answers} == {"/health 200", "/nothing 404", "/metrics 200", "/ 200"}
+        wait_for("connections end", lambda: read_use(pid).descriptors <= before.descriptors)  # noqa: B023
+        growth.append(read_use(pid).memory - before.memory)
     assert front.pid == pid
-    assert after.memory - before.memory < 1024 * 1024
-    assert after.threads <= (os.cpu_count() or 1) + 5  # as many as asyncio has, and one
+    assert growth[-1] < 1024 * 1024, growth
+    assert read_use(pid).threads <= (os.cpu_count() or 1) + 5  # as many as asyncio has, and one
     assert "Traceback" not in front.journal()
 
 

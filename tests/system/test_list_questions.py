@@ -66,7 +66,9 @@ def test_two_dataflows_take_as_many_questions_as_one(
     cell: Cell, other: Cell, project: Project
 ) -> None:
     flow = project.three_nodes()
-    cell.start(flow, "--restart-policy", "always")
+    # With a long delay it is certain on a slow machine, too, that no life was before the first.
+    delays = ("--restart-delay", "2s", "--max-restart-delay", "2s")
+    cell.start(flow, "--restart-policy", "always", *delays)
     first, rows = table_of(cell)
     other.start(flow)
     second, both = table_of(cell)

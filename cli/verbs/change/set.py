@@ -40,6 +40,7 @@ def command(selector: str, hot_reload: str | None, force: bool, **flags: Any) ->
       doractl set robot --memory-limit 6G
       doractl set robot --node-limit detector:memory=2G,cpu=1.5
       doractl set robot --cpu-limit infinity
+      doractl set robot --log-rate-limit camera=10/1s
       doractl set robot --hot-reload on
     """
     scope = current_scope()

@@ -5,6 +5,7 @@ from functools import partial
 import click
 
 from dora_systemd.adapters.bus.systemd import Bus
+from dora_systemd.cli.listing import terminal_width
 from dora_systemd.cli.parameters import current_scope, output_option, print_json, scope_options
 from dora_systemd.decisions.views.findings import finding_values, format_findings, has_problem
 from dora_systemd.errors import ExitCode
@@ -28,5 +29,5 @@ def command(output: str) -> int:
     if output == "json":
         print_json([finding_values(one) for one in findings])
     else:
-        click.echo(format_findings(findings))
+        click.echo(format_findings(findings, terminal_width()))
     return ExitCode.FAILURE if has_problem(findings) else ExitCode.OK

@@ -53,8 +53,6 @@ def count_life() -> None:
 def is_first_life() -> bool:
     """Whether no life before this one has counted itself since systemd loaded the unit.
 
-    So NRestarts= is 0, but for lives that ended before the runner had begun.
-
     False also if systemd, older than 254, does not tell whether it keeps descriptors: $FDSTORE in
     systemd.exec(5).
     """

@@ -8,10 +8,9 @@ import re
 from collections import defaultdict
 from collections.abc import Mapping
 from contextlib import suppress
-from pathlib import Path
 from typing import NamedTuple
 
-from dora_systemd.adapters.host.process_table import PROC
+from dora_systemd.adapters.host.process_table import PROC, beginning
 
 _MOST_BYTES = 8 * 1024 * 1024
 """Of /proc/locks: 100,000 locks."""
@@ -48,14 +47,10 @@ def read_lock_process(pid: int) -> LockProcess:
     """What the kernel knows of a process; for one that has gone, its pid only. uid: -1 then."""
     path = PROC / str(pid)
     with suppress(OSError, ValueError, KeyError, IndexError):
-        command = _beginning(path / "cmdline").decode(errors="replace").replace("\0", " ").strip()
-        group = _beginning(path / "cgroup").decode(errors="replace").rpartition("0::")[2].strip()
-        lines = _beginning(path / "status").decode(errors="replace").split("\n")
-        status = {key: text.split() for key, _, text in (line.partition(":") for line in lines)}
+        read = (beginning(path / one, _MOST_OF_PROCESS) for one in ("cmdline", "cgroup", "status"))
+        arguments, groups, rest = (data.decode(errors="replace") for data in read)
+        command, group = arguments.replace("\0", " ").strip(), groups.rpartition("0::")[2].strip()
+        lines = (line.partition(":") for line in rest.split("\n"))
+        status = {key: text.split() for key, _, text in lines}
         return LockProcess(pid, int(status["Uid"][1]), int(status["NSpid"][-1]), command, group)
     return LockProcess(pid, -1, pid, "", "")
-
-
-def _beginning(path: Path) -> bytes:
-    with path.open("rb") as file:
-        return file.read(_MOST_OF_PROCESS)

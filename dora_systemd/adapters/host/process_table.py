@@ -31,7 +31,7 @@ def socket_owners(inodes: Collection[int]) -> frozenset[int]:
 
 def _read_process(path: Path) -> Process | None:
     try:
-        command = _beginning(path / "cmdline").decode(errors="replace").split("\0")[:-1]
+        command = beginning(path / "cmdline").decode(errors="replace").split("\0")[:-1]
         # The name may contain blanks and parentheses; the fields after it do not.
         parent = int((path / "stat").read_text(errors="replace").rpartition(")")[2].split()[1])
         group = (path / "cgroup").read_text().rpartition("0::")[2].strip()
@@ -44,15 +44,18 @@ def _read_process(path: Path) -> Process | None:
 
 def _is_node(path: Path) -> bool:
     try:
-        return b"\0DORA_NODE_CONFIG=" in b"\0" + _beginning(path / "environ")
+        return b"\0DORA_NODE_CONFIG=" in b"\0" + beginning(path / "environ")
     except OSError:
         return False
 
 
-def _beginning(path: Path) -> bytes:
-    """The beginning of a file: arguments can have megabytes, and there are many processes."""
+def beginning(path: Path, size: int = _MOST_BYTES) -> bytes:
+    """At most `size` bytes of a file: arguments can have megabytes, and there are many processes.
+
+    Raises OSError.
+    """
     with path.open("rb") as file:
-        return file.read(_MOST_BYTES)
+        return file.read(size)
 
 
 def _holds(directory: Path, inodes: Collection[int]) -> bool:

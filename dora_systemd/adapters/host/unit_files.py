@@ -109,8 +109,9 @@ def put_unit_file(path: Path, text: str | None) -> None:
 
 NODE_LIMITS_FILE = "60-node-limits.conf"
 HOT_RELOAD_FILE = "60-hot-reload.conf"
-_CHANGES = ("50-*.conf", NODE_LIMITS_FILE, HOT_RELOAD_FILE)
-"""systemd's own drop-ins for changed properties, and ours for node limits and hot reload."""
+LOG_RATES_FILE = "60-log-rates.conf"
+_CHANGES = ("50-*.conf", NODE_LIMITS_FILE, HOT_RELOAD_FILE, LOG_RATES_FILE)
+"""systemd's own drop-ins for changed properties, and ours for what only the runner knows."""
 
 
 def drop_in_directory(fragment: Path, is_transient: bool) -> Path:

@@ -18,7 +18,7 @@ from dora_systemd.adapters.journal.journalctl import (
     open_journalctl,
 )
 from dora_systemd.decisions.cell.exits import KILLED
-from dora_systemd.decisions.logs.query import journal_timestamp, scope_matches
+from dora_systemd.decisions.logs.query import journal_timestamp, scope_matches, start_matches
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import is_name, is_node_id, is_uuid, name_from_unit, unit_name
 from dora_systemd.scope import Scope
@@ -150,10 +150,10 @@ class JournalReader:
         """Whether there is a record of the run with that id. name: of its dataflow, "" for any."""
         return any(self.newest([*scope_matches(scope, name), f"DORA_RUN={run}"], 1))
 
-    def starts(self, scope: Scope, uuid: str, limit: int) -> list[int]:
-        """Start times of the newest runs of a dataflow's unit, CLOCK_REALTIME µs, newest first."""
-        matches = [*scope_matches(scope), f"DORA_DATAFLOW={uuid}", "DORA_EVENT=dataflow-starting"]
-        return [int(one["__REALTIME_TIMESTAMP"]) for one in self.newest(matches, limit)]
+    def starts(self, scope: Scope, name: str, limit: int) -> list[int]:
+        """The newest starts of the unit of a dataflow, CLOCK_REALTIME µs, newest first."""
+        records = self.newest(start_matches(scope, name), limit)
+        return [int(one["__REALTIME_TIMESTAMP"]) for one in records]
 
     def killed_since(self, scope: Scope, name: str, uuid: str, since_us: int) -> list[str]:
         """The nodes of a dataflow that were killed while it stopped; CLOCK_REALTIME µs."""

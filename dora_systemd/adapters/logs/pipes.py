@@ -68,9 +68,12 @@ class LogPipes:
             os.mkfifo(path, 0o600)
         self._paths[node_id] = paths
 
-    def limit(self, node_id: str, limit: RateLimit) -> None:
+    def limit(self, node_id: str, limit: RateLimit | None) -> None:
         """Limit the rate of a node's lines from now on; an event counts the suppressed ones."""
-        self._source(node_id).limiter = LineLimiter(limit)
+        before = self._sources[node_id].limit if node_id in self._sources else None
+        if limit != before:
+            self._tell_suppressed(node_id)  # by the limit that has suppressed them
+            self._source(node_id).limiter = LineLimiter(limit) if limit else None
 
     def open(self, node_id: str) -> None:
         """Start reading a node's FIFOs, which unblocks its launcher's open(2). Raises OSError."""
@@ -269,13 +272,11 @@ class LogPipes:
 
     def _tell_suppressed(self, node_id: str) -> None:
         source = self._source(node_id)
-        limiter = source.limiter
         if source.report is not None:
             source.report.cancel()
             source.report = None
-        if limiter is not None and (count := limiter.take_suppressed()):
-            source.suppressed += count
-            limit = format_rate(limiter.limit)
+        if count := source.take_suppressed():
+            limit = format_rate(source.limit)
             self.write_event("lines-suppressed", node_id, count=count, limit=limit)
 
     def _read_output(self, label: str, fd: int, on_line: OnLine, said: bytes = b"") -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from dora_systemd.adapters.logs.held import HeldLines
+from dora_systemd.decisions.cell.line_rates import RateLimit
 from dora_systemd.decisions.logs.limiter import LineLimiter
 from dora_systemd.decisions.logs.lines import LineEncoder, LineSplitter, Origin
 from dora_systemd.paths import CellPaths
@@ -90,6 +91,17 @@ class Source:
     # Number of lines written, and of suppressed lines that were reported.
     written: int = 0
     suppressed: int = 0
+
+    @property
+    def limit(self) -> RateLimit | None:
+        """The limit on its lines."""
+        return self.limiter.limit if self.limiter else None
+
+    def take_suppressed(self) -> int:
+        """The number of suppressed lines that nobody has reported yet."""
+        count = self.limiter.take_suppressed() if self.limiter else 0
+        self.suppressed += count
+        return count
 
     def renew(self, **changes: Any) -> None:
         """Change the origin of the node's later lines."""

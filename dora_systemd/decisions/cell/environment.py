@@ -4,6 +4,7 @@ import re
 from collections.abc import Callable, Mapping
 from pathlib import Path, PurePath
 
+from dora_systemd.decisions.cell import line_rates
 from dora_systemd.decisions.cell.hot_reload import CHANGE_VARIABLE
 from dora_systemd.decisions.cell.limits import CHANGES_VARIABLE, merge_node_limits, parse_changes
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -25,6 +26,7 @@ MANAGER_VARIABLES = frozenset(
         *("MANAGERPID", "MANAGERPIDFDID", "WATCHDOG_PID", "WATCHDOG_USEC", "RUNTIME_DIRECTORY"),
         *("LISTEN_FDS", "LISTEN_FDNAMES", "LISTEN_PID", "LISTEN_PIDFDID", "FDSTORE"),
         *("MEMORY_PRESSURE_WATCH", "MEMORY_PRESSURE_WRITE", CHANGES_VARIABLE, CHANGE_VARIABLE),
+        line_rates.CHANGES_VARIABLE,
         LOCK_VARIABLE,
     }
 )
@@ -54,7 +56,12 @@ def with_changes(options: RunnerOptions, environment: Mapping[str, str]) -> Runn
     changes = parse_changes(environment.get(CHANGES_VARIABLE, ""))
     limits = merge_node_limits(options.node_limits, changes)
     is_on = parse_bool(environment.get(CHANGE_VARIABLE) or format_bool(options.hot_reload))
-    return options._replace(node_limits=limits, reload=options.reload._replace(is_on=is_on))
+    rates = line_rates.parse_changes(environment.get(line_rates.CHANGES_VARIABLE, ""))
+    return options._replace(
+        node_limits=limits,
+        log_rates={**options.log_rates, **rates},
+        reload=options.reload._replace(is_on=is_on),
+    )
 
 
 def parse_assignment(text: str) -> tuple[str, str]:

@@ -68,6 +68,20 @@ def format_rates(limits: RateLimits) -> list[str]:
     ]
 
 
+CHANGES_VARIABLE = "DORA_SYSTEMD_LOG_RATES"
+"""Passes changes by `doractl set` to the next runner, in Environment=."""
+
+
+def parse_changes(text: str) -> dict[str, RateLimit | None]:
+    """Parse CHANGES_VARIABLE. Raises DoraSystemdError (USAGE)."""
+    return parse_rates(filter(None, text.split(",")))
+
+
+def format_changes(limits: RateLimits) -> str:
+    """The inverse of parse_changes; node ids contain no commas."""
+    return ",".join(format_rates(limits))
+
+
 def rate_of(limits: RateLimits, node: str) -> RateLimit | None:
     """The limit of one node, or None."""
     return limits[node] if node in limits else limits.get(ALL_NODES)

@@ -6,6 +6,10 @@ ESSENTIAL = "essential "
 """Begins the reason of dataflow-failed if the failure of one node has ended all. `why` reads it."""
 
 
+NO_END = "its end is not recorded: it was killed, or the machine went down"
+"""Nobody has recorded why."""
+
+
 class Cause(StrEnum):
     """One reason for an end; NODE_SILENT and those up to OUT_OF_MEMORY occur in dataflow-failed."""
 
@@ -40,3 +44,15 @@ UNIT_RESULTS = {
     "oom-kill": (Cause.OUT_OF_MEMORY, "it ran out of memory"),
 }
 """What a Result= of systemd means, see SERVICE_RESULT in systemd.exec(5)."""
+
+_RESULTS = {
+    "protocol": "its supervisor process ended without a message",
+    "start-limit-hit": "it was started too often",
+    "resources": "systemd could not set it up",
+    "exec-condition": "a condition was not met",
+}
+
+
+def result_words(result: str) -> str:
+    """What a Result= of systemd means, "" if the end of the main process says more."""
+    return UNIT_RESULTS[result][1] if result in UNIT_RESULTS else _RESULTS.get(result, "")

@@ -21,6 +21,9 @@ LEVELS = {
     **{"notice": 5, "info": 6, "debug": 7, "trace": 7, "stdout": 7},
 }
 
+UNIT_STARTING = "7d4958e842da4a758f6c1cdc7b36dcc5"
+"""MESSAGE_ID of systemd's record when it begins to start a unit."""
+
 UNIT_ENDS = ("7ad2d189f7e94e70a38c781354912448", "d9b373ed55a64feb8242e02dbe79a49c")
 
 ALL_LINES = "all"
@@ -148,6 +151,11 @@ def _systemd_matches(scope: Scope, name: str) -> list[str]:
     if scope.is_user:
         return [f"USER_UNIT={unit}", f"_UID={scope.uid}"]
     return [f"UNIT={unit}", "_PID=1"]
+
+
+def start_matches(scope: Scope, name: str) -> list[str]:
+    """Matches for systemd's records of the starts of a unit, also of one that never began."""
+    return [*_systemd_matches(scope, name), f"MESSAGE_ID={UNIT_STARTING}"]
 
 
 def story_matches(scope: Scope, name: str, uuid: str) -> list[str]:

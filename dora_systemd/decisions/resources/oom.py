@@ -61,8 +61,7 @@ class Oom:
 
     def owner_details(self) -> dict[str, str]:
         """Whose memory was used up, in both that event and dataflow-failed."""
-        limit = {"limit": str(self.limit)} if self.limit else {}
-        return {"owner": self.owner.value, **limit}
+        return owner_details(self.owner, self.limit)
 
     def dataflow_details(self) -> dict[str, str]:
         """Details of the event dataflow-oom."""
@@ -73,6 +72,11 @@ class Oom:
             "most": self.most,
             "held": str(self.most_held),
         }
+
+
+def owner_details(owner: Owner, limit: int = 0) -> dict[str, str]:
+    """Details of an event: whose memory was used up, and the limit of that in bytes; 0 is none."""
+    return {"owner": owner.value, **({"limit": str(limit)} if limit else {})}
 
 
 def find_owner(

@@ -22,7 +22,7 @@ from dora_systemd.decisions.settings.kinds import (
     TEXT,
     Setting,
 )
-from dora_systemd.decisions.settings.limits import LIMIT_SETTINGS
+from dora_systemd.decisions.settings.limits import LIMIT_SETTINGS, LIVE_SETTINGS
 from dora_systemd.decisions.settings.needs import NEED_SETTINGS
 from dora_systemd.decisions.settings.owes import OWES_SETTINGS
 from dora_systemd.decisions.settings.reload import RELOAD_SETTINGS
@@ -93,6 +93,9 @@ LOG_RATE_LIMIT = Setting[RateLimits](
     variable="DORA_LOG_RATE_LIMIT",
     per_node=True,
 )
+
+CHANGEABLE: tuple[Setting[Any], ...] = (*LIVE_SETTINGS, LOG_RATE_LIMIT)
+"""Settings that `doractl set` changes while the dataflow is running."""
 
 SECTIONS: dict[str, tuple[Setting[Any], ...]] = {
     # All settings above, in this order, so that a setting is declared in one place only.

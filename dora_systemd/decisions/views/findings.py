@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
+from dora_systemd.terminal_text import wrapped
+
 
 class State(StrEnum):
     """The severity. Only a problem keeps dataflows from working."""
@@ -29,15 +31,17 @@ def has_problem(findings: Sequence[Finding]) -> bool:
     return any(one.state is State.PROBLEM for one in findings)
 
 
-def format_findings(findings: Sequence[Finding]) -> str:
-    """A line for each finding, and the remedy on the next line."""
-    width = max(len(one.topic) for one in findings)
+def format_findings(findings: Sequence[Finding], width: int | None = None) -> str:
+    """A line for each finding, and the remedy on the next line; wrapped to `width` columns."""
+    longest = max(len(one.topic) for one in findings)
     lines = []
     for one in findings:
-        lines.append(f"{one.state:<7}  {one.topic:<{width}}  {one.text}")
+        lines.append((longest + 11, f"{one.state:<7}  {one.topic:<{longest}}  {one.text}"))
         if one.remedy:
-            lines.append(f"{'':<{width + 11}}-> {one.remedy}")
-    return "\n".join(lines)
+            lines.append((longest + 14, f"{'':<{longest + 11}}-> {one.remedy}"))
+    if width is None:
+        return "\n".join(line for _, line in lines)
+    return "\n".join(piece for indent, line in lines for piece in wrapped(line, width, indent))
 
 
 def finding_values(one: Finding) -> dict[str, str | None]:

@@ -86,6 +86,7 @@ def _node_object(row: NodeRow, shares: Shares | None) -> dict[str, Any]:
         "max_restarts": row.max_restarts,
         "essential": row.essential,
         "scheduling": row.scheduling or None,
+        "cpus": row.cpus or None,
         "silent": row.silent or None,
         "outputs": [
             {"output": one.output, "age_us": one.age, "within_us": one.within, "then": one.then}

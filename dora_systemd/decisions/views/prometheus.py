@@ -79,7 +79,7 @@ SIGN_AGE = Family("watchdog_age_seconds", "Time since its last WATCHDOG=1.")
 SILENT = Family("silent", "1 while an output that it owes is missing.")
 LAST_OUTPUT = Family("last_output_age_seconds", "Time since the last message of an owed output.")
 INFO = Family("info", "UUID, unit and release of a dataflow; the value is always 1.")
-RIGHTS = Family("info", "What it is, and its scheduling; the value is always 1.")
+RIGHTS = Family("info", "What it is, its scheduling and CPUs; the value is always 1.")
 NODES = Family("nodes", "Nodes that the dataflow has.")
 ALIVE = Family("nodes_alive", "Nodes that are running.")
 LINES = Family("log_lines_total", "Lines sent to journald.")
@@ -152,7 +152,8 @@ def _ages(own: Labels, node: NodeRow) -> Iterator[Sample]:
 def _rights(node: NodeRow) -> Labels:
     """What is special about a node; most have nothing."""
     essential = {"essential": "yes"} if node.essential else {}
-    return essential | ({"scheduling": node.scheduling} if node.scheduling else {})
+    named = {"scheduling": node.scheduling, "cpus": node.cpus}
+    return essential | {key: text for key, text in named.items() if text}
 
 
 def _is_there(node: NodeRow) -> bool:

@@ -28,8 +28,9 @@ class NodeRow(NamedTuple):
     which its CPU limit throttled it, None without one. since: time of its last change of state,
     CLOCK_REALTIME µs, 0: unknown. text: its own STATUS=. watchdog, sign_age: the time in which it
     must send WATCHDOG=1, and how long ago it did, in µs. essential: whether its final failure ends
-    the dataflow. scheduling: as in the settings, or "". silent: what is missing of the outputs that
-    it owes, or "". needs: what it waits for, or "".
+    the dataflow. scheduling: as in the settings, or "". cpus: those that it may use, "" if the
+    settings name none. silent: what is missing of the outputs that it owes, or "". needs: what it
+    waits for, or "".
     """
 
     node: str
@@ -50,6 +51,7 @@ class NodeRow(NamedTuple):
     sign_age: int | None = None
     essential: bool | None = None
     scheduling: str = ""
+    cpus: str = ""
     silent: str = ""
     needs: str = ""
     outputs: tuple[OutputRow, ...] = ()

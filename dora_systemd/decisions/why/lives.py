@@ -9,10 +9,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from dora_systemd.decisions.logs.events import REQUESTS
+from dora_systemd.decisions.logs.query import UNIT_STARTING
 
 # https://github.com/systemd/systemd/blob/main/src/systemd/sd-messages.h
 UNIT_MESSAGES = {
-    "7d4958e842da4a758f6c1cdc7b36dcc5": "unit-starting",
+    UNIT_STARTING: "unit-starting",
     "39f53479d3a045ac8e11786248231fbf": "unit-started",
     "de5b426a63be47a7b6ac3eaac82e2f6f": "unit-stopping",
     "9d1aaa27d60140bd96365438aad20286": "unit-stopped",

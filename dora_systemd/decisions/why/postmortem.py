@@ -3,12 +3,12 @@
 If the cause is not recorded, the verdict says so; it never guesses.
 """
 
-import re
 from collections.abc import Sequence
 from dataclasses import replace
 
 from dora_systemd.decisions.cell.exits import KILLED, ExitKind, exit_of, parse_exit
-from dora_systemd.decisions.life.causes import ESSENTIAL, UNIT_RESULTS, Cause
+from dora_systemd.decisions.life.causes import ESSENTIAL, NO_END, UNIT_RESULTS, Cause, result_words
+from dora_systemd.decisions.life.setup_exits import setup_failure
 from dora_systemd.decisions.logs.events import NODE_END_EVENTS
 from dora_systemd.decisions.reload.steps import How
 from dora_systemd.decisions.signs.words import by_watchdog
@@ -24,10 +24,8 @@ _LOSSES = (Cause.DAEMON_LOST, Cause.COORDINATOR_LOST)
 _END_WORDS = {"dataflow-finished": FINISHED, "dataflow-stopped": STOPPED, "dataflow-failed": FAILED}
 _ENDS = (*_END_WORDS, "unit-succeeded", "unit-failed")
 _KILLED = "the supervisor process was killed"
-_STATUS = re.compile(r"status=(\S+)")
 _OOM_SPAN = 10 * SECOND
 """Maximum µs between systemd's records of an OOM kill and of the end of the killed process."""
-NO_END = "its end is not recorded: it was killed, or the machine went down"
 UNKNOWN_PERSON = "a request to systemd (by whom is not recorded)"
 
 
@@ -178,8 +176,9 @@ def _unit_failure(life: Life, end: Happening) -> Verdict:
     exit = life.last("process-exited")
     if exit is not None and _is_oom(exit, life):
         return _found(Cause.OUT_OF_MEMORY, f"{_KILLED}, out of memory", end)
-    how = _exit_words(exit) if exit else f"the unit failed: {result or 'systemd does not say how'}"
-    return _found(Cause.UNIT_FAILED, how, end)
+    how = result_words(result) or (_exit_words(exit) if exit else "")
+    said = how or f"the unit failed: {result or 'systemd does not say how'}"
+    return _found(Cause.UNIT_FAILED, said, end)
 
 
 def _is_oom(exit: Happening, life: Life) -> bool:
@@ -192,10 +191,8 @@ def _exit_words(exit: Happening) -> str:
     status = exit.detail("exit_status") or "unknown"
     if exit.detail("exit_code") != "exited":
         return f"{_KILLED} ({exit_of(-int(status)) if status.isdecimal() else f'signal {status}'})"
-    named = _STATUS.search(exit.text)  # such as "217/USER"
-    return (
-        f"systemd could not start the supervisor process: exit code {named[1] if named else status}"
-    )
+    refused = setup_failure(int(status)) if status.isdecimal() else ""
+    return refused or f"the supervisor process failed (exit code {status})"
 
 
 def _without_end(life: Life, facts: Facts) -> Verdict:

@@ -2,7 +2,6 @@
 
 import re
 import signal
-import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -23,7 +22,7 @@ from dora_systemd.decisions.why.last_lines import Word, shown_last
 from dora_systemd.decisions.why.signs import known_remedy
 from dora_systemd.decisions.why.verdict import Restart, Verdict
 from dora_systemd.names import release_of
-from dora_systemd.terminal_text import cut, one_line
+from dora_systemd.terminal_text import cut, one_line, wrapped
 from dora_systemd.values import SECOND, format_duration, format_rounded_size
 
 LINES = 20
@@ -188,12 +187,11 @@ def _cut(lines: Iterable[str], width: int | None) -> list[str]:
 
 
 def _wrapped(lines: Iterable[str], width: int | None, indent: int) -> list[str]:
-    """Lines of at most `width` characters. indent: of all but the first of those from one line."""
+    """Lines of at most `width` characters, as wrapped()."""
     shown = _cut(lines, None)
     if width is None:
         return shown
-    wrapper = textwrap.TextWrapper(width, subsequent_indent=" " * indent, break_on_hyphens=False)
-    return [piece for line in shown for piece in wrapper.wrap(line)]
+    return [piece for line in shown for piece in wrapped(line, width, indent)]
 
 
 def _facts(report: Report) -> list[str]:

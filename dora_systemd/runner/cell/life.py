@@ -1,6 +1,39 @@
 """What the node table tells of the life of a unit: the same for all its runs, as in systemd."""
 
+import os
 import time
+from pathlib import Path
+
+from dora_systemd.adapters.host import fd_store
+from dora_systemd.adapters.host.unit_files import written_us
+from dora_systemd.decisions.cell.restarts import RestartPolicy
+from dora_systemd.names import unit_name
+from dora_systemd.runner.cell.pause import age
+from dora_systemd.values import SECOND
+
+_TICK = SECOND // os.sysconf("SC_CLK_TCK")
+"""The accuracy of the start of a process."""
+
+
+def is_first_life(policy: RestartPolicy, name: str, is_user: bool) -> bool:
+    """Whether NRestarts= of the unit is certainly 0.
+
+    A life that ended before the runner had begun has left nothing in the descriptor store. So it
+    must also be too early for a restart: systemd writes the file of a transient unit when it queues
+    the start, and waits for RestartSec= after each life.
+    """
+    if policy.policy == "no":
+        return True
+    if not fd_store.is_first_life():
+        return False
+    began = time.time_ns() // 1000 - int(age() * SECOND)
+    return 0 <= began + _TICK - written_us(_transient(name, is_user)) < policy.unit_delay
+
+
+def _transient(name: str, is_user: bool) -> Path:
+    """The file of a transient unit, see UnitPath in systemd.unit(5)."""
+    root = os.environ.get("XDG_RUNTIME_DIR", "") if is_user else "/run"
+    return Path(root, "systemd/transient", unit_name(name))
 
 
 class Life:

@@ -78,8 +78,7 @@ class Nodes:
 
     def _make(self, node: Node, rates: RateLimits) -> None:
         cgroup.make_group(self._group(node.id))
-        if limit := rate_of(rates, node.id):
-            self._pipes.limit(node.id, limit)
+        self._pipes.limit(node.id, rate_of(rates, node.id))
         cgroup.kill_as_one(self._group(node.id))
         if is_launched(node):
             self._launched.add(node.id)
@@ -105,6 +104,11 @@ class Nodes:
             self._tails[node.id] = tail
         elif node.id in self._piped:
             self._pipes.open(node.id)
+
+    def limit_lines(self, rates: RateLimits) -> None:
+        """Change the limits on the lines of running nodes."""
+        for node in (*self._piped, *self._tails):
+            self._pipes.limit(node, rate_of(rates, node))
 
     def limit(self, limits: Iterable[NodeLimits]) -> None:
         """Change limits of running nodes. Raises DoraSystemdError if one does not take effect."""

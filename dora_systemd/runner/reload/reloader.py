@@ -15,10 +15,10 @@ from typing import Any
 from dora_systemd.adapters.dora.preparation import Prepared
 from dora_systemd.adapters.host.watch import change_time, changed_files, watch_rules
 from dora_systemd.decisions.cell.limits import check_nodes, merge_node_limits
+from dora_systemd.decisions.cell.line_rates import RateLimits, parse_rates
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.wiring import downstream_of
 from dora_systemd.decisions.life import events as life
-from dora_systemd.decisions.reload.steps import How, Step
 from dora_systemd.decisions.rights.node_rights import essential_nodes
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.runner.cell.begin import let_openssl_in
@@ -164,7 +164,7 @@ class Reloader:
             done = await self._take_settings(run) if self._settings.path in changed else []
             changed = [path for path in changed if path != self._settings.path]
             change = await asyncio.to_thread(self._sources.look, current, changed)
-            change = _with_node(change, node, self.options.dataflow)
+            change = change.with_node(node, self.options.dataflow) if node else change
             if change.steps or change.whole:
                 run.pipes.write_event("files-changed", files=", ".join(_names(change, changed)))
                 done += await self._apply(run, change)
@@ -238,10 +238,13 @@ class Reloader:
         return [f"the dataflow was reloaded: {text}"]
 
     async def answer(self, request: Mapping[str, Any]) -> Answer:
-        """Answer a request of doractl: {"verb": "reload"} or {"verb": "hot-reload", "on": true}.
+        """Answer a request of doractl.
 
-        Raises DoraSystemdError.
+        {"verb": "reload"}, {"verb": "hot-reload", "on": true}, or {"verb": "log-rates"} with all
+        limits. Raises DoraSystemdError.
         """
+        if request.get("verb") == "log-rates":
+            return await self._limit_lines(parse_rates(map(str, request.get("limits") or ())))
         if request.get("verb") == "hot-reload":
             return await self._switch(bool(request.get("on")))
         if request.get("verb") != "reload":
@@ -273,20 +276,16 @@ class Reloader:
             self._watch(is_on)
         return {"done": []}
 
+    async def _limit_lines(self, rates: RateLimits) -> Answer:
+        async with self._lock:
+            self.options = self.options._replace(log_rates=rates)
+            if self._run is not None:
+                self._run.nodes.limit_lines(rates)
+        return {"done": []}
+
     def close(self) -> None:
         """Stop watching."""
         self._watch(False)
-
-
-def _with_node(change: Change, node: str, dataflow: str) -> Change:
-    """The change, with a reload of `node` added if it is missing."""
-    if not node or any(step.node == node for step in change.steps):
-        return change
-    operators = change.operators.get(node, {})
-    steps = [Step(How.OPERATOR, node, file) for name, file in operators.items() if name]
-    if not steps:
-        steps = [Step(How.SWAP, node, operators.get("", dataflow))]
-    return replace(change, steps=(*change.steps, *steps))
 
 
 def _files(change: Change) -> list[str]:

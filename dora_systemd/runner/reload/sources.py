@@ -28,6 +28,16 @@ class Change:
     whole: str = ""
     operators: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
 
+    def with_node(self, node: str, dataflow: str) -> "Change":
+        """The change, with a reload of `node` added if it is missing."""
+        if any(step.node == node for step in self.steps):
+            return self
+        operators = self.operators.get(node, {})
+        steps = [Step(How.OPERATOR, node, file) for name, file in operators.items() if name]
+        if not steps:
+            steps = [Step(How.SWAP, node, operators.get("", dataflow))]
+        return replace(self, steps=(*self.steps, *steps))
+
 
 class Sources:
     """Reads files for a runner with these options. environment: that of the nodes."""

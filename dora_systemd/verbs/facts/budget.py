@@ -36,7 +36,7 @@ def restart_budget(
         return None
     most = max(facts["StartLimitBurst"] - 1, 0)
     budget = unit_budget(
-        _starts(scope, cell.uuid, facts["NRestarts"], (cell.state, facts[_READY_SINCE])),
+        _starts(scope, cell.name, facts["NRestarts"], (cell.uuid, cell.state, facts[_READY_SINCE])),
         most,
         window,
         time.time_ns() // 1000,
@@ -51,7 +51,7 @@ def restart_budget(
 
 
 @lru_cache
-def _starts(scope: Scope, uuid: str, restarts: int, _life: object) -> list[int]:
+def _starts(scope: Scope, name: str, restarts: int, _life: object) -> list[int]:
     """The starts that NRestarts= counts, and the one before them; CLOCK_REALTIME µs.
 
     _life: another one, or another state, asks the journal again; `top` and the page ask often.
@@ -62,7 +62,7 @@ def _starts(scope: Scope, uuid: str, restarts: int, _life: object) -> list[int]:
     from dora_systemd.adapters.journal.reader import JournalReader
 
     try:
-        found = JournalReader().starts(scope, uuid, min(restarts + 1, _MOST_STARTS))
+        found = JournalReader().starts(scope, name, min(restarts + 1, _MOST_STARTS))
     except DoraSystemdError:
         return []
     return sorted(found)

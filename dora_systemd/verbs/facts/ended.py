@@ -6,6 +6,7 @@ from typing import Any
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.journal.reader import JournalReader, LastEvent, is_volatile
+from dora_systemd.decisions.life.causes import NO_END
 from dora_systemd.decisions.views.dataflows import FAILED, FINISHED, STOPPED, is_up_word
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -14,7 +15,6 @@ from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.reason import failure_reason
 
 _WORDS = {"dataflow-finished": FINISHED, "dataflow-stopped": STOPPED, "dataflow-failed": FAILED}
-_NO_END = "its end is not recorded: it was killed, or the machine went down"
 _MOST_NAMES = 100
 _TIMES = ("InactiveEnterTimestamp", "InactiveExitTimestamp")
 
@@ -46,7 +46,27 @@ def newest_ended(
     known = {event.name: event for event in events}
     loaded = [_with_end(manager, row, known.get(row.name)) for row in rows if not is_up_word(row)]
     unloaded = [ended_row(known[name]) for name in known.keys() - {row.name for row in rows}]
-    return sorted([*loaded, *unloaded], key=lambda row: (-row.ended, row.name))[:limit]
+    shown = sorted([*loaded, *unloaded], key=lambda row: (-row.ended, row.name))[:limit]
+    return [with_cause(scope, row) for row in shown]
+
+
+def with_cause(scope: Scope, row: DataflowRow) -> DataflowRow:
+    """The row, with what `why` says if no event of ours has recorded the end."""
+    if row.text != NO_END:
+        return row
+    # Imported late: the end is recorded unless the machine went down, or nothing of ours ran.
+    from dora_systemd.decisions.why.postmortem import examine
+    from dora_systemd.decisions.why.verdict import Facts
+    from dora_systemd.verbs.facts.lives import now_boot, read_lives
+
+    with contextlib.suppress(DoraSystemdError):
+        lives = read_lives(JournalReader(), scope, row.name, row.uuid, is_loaded=False)
+        verdict = examine(lives, Facts(now_boot=now_boot()))
+        if lives:
+            return row._replace(
+                status=verdict.status, text=verdict.summary, ended=verdict.at_us or row.ended
+            )
+    return row
 
 
 def read_end(manager: Manager, scope: Scope, row: DataflowRow) -> DataflowRow:
@@ -76,7 +96,7 @@ def ended_row(event: LastEvent) -> DataflowRow:
         name=event.name,
         unit=unit_name(event.name),
         status=word or FAILED,
-        text=event.detail if word else _NO_END,
+        text=event.detail if word else NO_END,
         ended=event.at_us,
     )
 

@@ -11,11 +11,12 @@ from dora_systemd.decisions.cell.counters import (
     cpu_percent,
     throttled_percent,
 )
+from dora_systemd.decisions.cell.limits import CPUS, has_cpus
 from dora_systemd.decisions.cell.status import FAILED_BECAUSE, CellStatus, NodeStatus
 from dora_systemd.decisions.resources.usage import Usage
 from dora_systemd.decisions.views.rows import DataflowRow, NodeRow, OutputRow
 from dora_systemd.scope import Scope
-from dora_systemd.values import INFINITY, SECOND
+from dora_systemd.values import INFINITY, SECOND, format_cpus
 from dora_systemd.verbs.facts.cells import Cell, proven, read_cells
 from dora_systemd.verbs.facts.enabled import enabled_units
 from dora_systemd.verbs.facts.reading import (
@@ -127,6 +128,7 @@ def _usage(reading: Reading, known: tuple[CpuSample, ...]) -> dict[str, Any]:
                 },
             )._replace(
                 **_right_facts(rights, node),
+                cpus=_cpus(reading, node),
                 outputs=_outputs(reading, node),
             )
             for node in names
@@ -146,6 +148,18 @@ def _right_facts(rights: "dict[str, NodeRights] | None", node: str) -> dict[str,
         return {"essential": None if rights is None else False}
     own = rights[node]
     return {"essential": bool(own.essential), "scheduling": own.scheduling or ""}
+
+
+def _cpus(reading: Reading, node: str) -> str:
+    """The CPUs of a node, if the settings name some; "" in the table."""
+    options = reading.cell.known_options
+    asked = [one for one in options.node_limits if one.node == node] if options else []
+    if not any(map(has_cpus, asked)):
+        return ""
+    # `doractl set` may have changed them. Without a cpuset controller the launcher binds the node.
+    group = reading.groups.get(node)
+    now = cgroup.read_files(group, [cgroup.CPUS_FILE])[cgroup.CPUS_FILE] if group else ""
+    return now.strip() or format_cpus(dict(asked[0].limits)[CPUS])
 
 
 def _outputs(reading: Reading, node: str) -> tuple[OutputRow, ...]:

@@ -5,31 +5,14 @@ from typing import Any
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.cell.status import FAILED_BECAUSE
-from dora_systemd.decisions.life.causes import UNIT_RESULTS
+from dora_systemd.decisions.life.causes import result_words
 from dora_systemd.decisions.life.refusal import parse_refusal
+from dora_systemd.decisions.life.setup_exits import setup_failure
 from dora_systemd.errors import DoraSystemdError
 
 _PROPERTIES = ("Result", "StatusText", "ExecMainCode", "ExecMainStatus")
 _CLD_EXITED = 1
 """ExecMainCode of a process that exited, see waitid(2)."""
-
-_REFUSED = {
-    201: "the nice value was refused",
-    217: "its user, or the user namespace of its sandbox, could not be set up",
-    226: "its sandbox could not be set up",
-    243: "a credential could not be read",
-    214: "realtime scheduling was refused, see LimitRTPRIO= in systemd.exec(5)",
-}
-"""Failures of systemd before it executed the runner: exit statuses of systemd.exec(5)."""
-
-_WORDS = {
-    **{result: words for result, (_, words) in UNIT_RESULTS.items()},
-    "protocol": "its supervisor process ended without a message",
-    "timeout": "it did not end in time and was killed",
-    "start-limit-hit": "it was started too often",
-    "resources": "systemd could not set it up",
-    "exec-condition": "a condition was not met",
-}
 
 
 def job_reason(manager: Manager, unit: str, result: str) -> str:
@@ -56,7 +39,7 @@ def exit_status(manager: Manager, unit: str) -> int | None:
 def failure_reason(manager: Manager, unit: str) -> str:
     """One line about the end of `unit`: the runner's last STATUS=, else systemd's result."""
     facts = manager.read(unit, _PROPERTIES)
-    special = _WORDS.get(facts["Result"], "")
+    special = result_words(facts["Result"])
     last_words = str(facts["StatusText"]).removeprefix(FAILED_BECAUSE)
     if not last_words:
         return special or _exit_words(facts)
@@ -69,8 +52,7 @@ def failure_reason(manager: Manager, unit: str) -> str:
 def _exit_words(unit: dict[str, Any]) -> str:
     status = unit["ExecMainStatus"]
     if unit["ExecMainCode"] == _CLD_EXITED:
-        refused, how = _REFUSED.get(status), exit_of(status)
-        return f"{refused} ({how})" if refused else str(how)
+        return setup_failure(status) or str(exit_of(status))
     if status:
         return str(exit_of(-status))
     return "ended" if unit["Result"] == "success" else str(unit["Result"])

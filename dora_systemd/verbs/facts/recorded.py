@@ -75,10 +75,10 @@ def find_query(
     patterns as in glob(7). run: CURRENT or 0, PREVIOUS or -1, -2 and so on, ALL, or dora's id of a
     run. Raises DoraSystemdError: NOT_FOUND for a dataflow, node or run without any record.
     """
-    named = list(filter(None, selectors))
     found = [query]
-    if named:
-        found = [replace(query, **one._asdict()) for one in _dataflows(journal, query.scope, named)]
+    if selectors:
+        known = _dataflows(journal, query.scope, selectors)
+        found = [replace(query, **one._asdict()) for one in known]
     if nodes or query.levels:
         found = _with_nodes(journal, found, nodes)
     first, *others = (_select_run(journal, one, run) for one in found)

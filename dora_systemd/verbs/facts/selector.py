@@ -84,7 +84,8 @@ class Selector:
 
     def missing(self, names: Iterable[str]) -> DoraSystemdError:
         """The error (NOT_FOUND) if nothing matches. names: of the dataflows that are known."""
-        known = sorted(names)
+        # A unit of that very name is not ours, and no hint.
+        known = sorted({*names}.difference(self.names))
         hint = did_you_mean(self.text, known)
         if not hint and len(self.text) < MIN_PREFIX and is_uuid_prefix(self.text, 1):
             hint = f"the beginning of a UUID must have at least {MIN_PREFIX} characters"

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from enum import Enum
+from pathlib import Path
 
 from dora_systemd.decisions.views.inhibitors import format_holders
 from dora_systemd.decisions.views.rows import Holder
@@ -86,7 +87,7 @@ def _locked(held: ExitStack, scope: Scope, dataflows: Sequence[Named]) -> Named 
         if lock is None:
             continue
         held.callback(os.close, lock)
-        if not take_lock(lock, is_shared=False):
+        if not _take(scope.cell_directory(one.name), lock):
             return one
     return None
 
@@ -98,6 +99,14 @@ def _open(scope: Scope, dataflow: Named) -> int | None:
         if not read_cell_flocks(scope):
             return None  # whatever the file is, nobody holds a lock
         hint = "use sudo, or --force to do it in any case"
+        raise DoraSystemdError(error.message, hint, error.code) from error
+
+
+def _take(directory: Path, lock: int) -> bool:
+    try:
+        return take_lock(directory, lock, is_shared=False)
+    except DoraSystemdError as error:
+        hint = "whether it is inhibited is not known; --force does it anyway"
         raise DoraSystemdError(error.message, hint, error.code) from error
 
 

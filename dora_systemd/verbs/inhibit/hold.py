@@ -5,7 +5,7 @@ import select
 import signal
 import subprocess
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from dora_systemd.decisions.cell.inhibit import format_reason
@@ -34,14 +34,16 @@ class Lock:
     def take(self) -> bool:
         """Take the lock; False if another process holds it exclusively, or there is no file.
 
-        Raises DoraSystemdError for a file that is not usable.
+        Raises DoraSystemdError for a file that is not usable, or cannot be locked.
         """
         lock = open_lock(self._directory)
         if lock is None:
             return False
-        if not take_lock(lock, is_shared=True):
-            os.close(lock)
-            return False
+        with ExitStack() as refused:
+            refused.callback(os.close, lock)
+            if not take_lock(self._directory, lock, is_shared=True):
+                return False
+            refused.pop_all()
         write_reason(lock, format_reason(os.getpid(), self._reason))
         self.release()
         self._lock = lock

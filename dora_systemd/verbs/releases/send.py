@@ -25,7 +25,7 @@ from dora_systemd.values import format_rounded_size, shown
 from dora_systemd.verbs.releases.files import copy_files, find_files
 from dora_systemd.verbs.releases.source import named_paths, project_root
 from dora_systemd.verbs.start.account import DEFAULT_USER, account_of, choose_user
-from dora_systemd.verbs.start.plan import DEFAULT_FILE, StartRequest, request_name
+from dora_systemd.verbs.start.plan import DEFAULT_FILE, StartRequest, path_of, request_name
 from dora_systemd.verbs.start.settings import require_modest
 
 
@@ -85,7 +85,7 @@ def packed(
 
 
 def _find(request: StartRequest) -> _Sender:
-    path = Path(request.dataflow).absolute()
+    path = path_of(request)
     path = path / DEFAULT_FILE if is_directory(path) else path
     path = Path(os.path.normpath(path))
     written = read_file(path)

@@ -17,7 +17,7 @@ from dora_systemd.trust.files import read_file
 from dora_systemd.trust.paths import Place, exists, is_directory
 from dora_systemd.values import shown
 from dora_systemd.verbs.releases.builders import find_builders
-from dora_systemd.verbs.start.plan import DEFAULT_FILE, Plan, StartRequest, make_plan
+from dora_systemd.verbs.start.plan import DEFAULT_FILE, Plan, StartRequest, make_plan, path_of
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def find_source(scope: Scope, request: StartRequest, want_build: bool = True) ->
 
     want_build: what it needs is built in the release. Raises DoraSystemdError.
     """
-    path = Path(request.dataflow).absolute()
+    path = path_of(request)
     path = path / DEFAULT_FILE if is_directory(path) else path
     path = Path(os.path.normpath(path))
     written = read_file(path)

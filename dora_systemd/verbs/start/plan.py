@@ -85,7 +85,14 @@ def request_name(request: StartRequest) -> str:
     """The name of the dataflow. Raises DoraSystemdError (USAGE)."""
     if request.name is not None:
         return parse_name(request.name)
-    return name_from_path(str(Path(request.dataflow).absolute()))
+    return name_from_path(str(path_of(request)))
+
+
+def path_of(request: StartRequest) -> Path:
+    """The absolute path that was asked for. Raises DoraSystemdError (BAD_INPUT) if it is empty."""
+    if not request.dataflow:  # not the working directory: a variable of a script is not set
+        raise DoraSystemdError("cannot read '': no path", "name a file", ExitCode.BAD_INPUT)
+    return Path(request.dataflow).absolute()
 
 
 def make_plan(scope: Scope, request: StartRequest) -> Plan:
@@ -93,7 +100,7 @@ def make_plan(scope: Scope, request: StartRequest) -> Plan:
 
     Raises DoraSystemdError.
     """
-    path = Path(request.dataflow).absolute()
+    path = path_of(request)
     request_name(request)
     written = read_file(path)
     if request.origin is None:

@@ -326,6 +326,31 @@ def test_output_that_cannot_be_written(redirection: str, status: int, said: str,
     assert (done.returncode, done.stderr, done.stdout) == (status, said, "")
 
 
+CLOSED = ("", "<&-", ">&-", "2>&-", "<&- >&- 2>&-")
+
+
+@pytest.mark.parametrize("verb", ["nosuch", "stop", "list --last 0", "top -x", "list -q -o json"])
+def test_errors_that_cannot_be_printed(verb: str) -> None:
+    """Nobody reads them, their disk is full, or there is no such stream."""
+    doractl = f"{sys.executable} -m dora_systemd.cli.main {verb}"
+    for streams in (*CLOSED, "2>/dev/full", "2>/dev/full >&2"):
+        shell = ["/bin/sh", "-c", f"{doractl} {streams}"]
+        done = subprocess.run(shell, stdout=-1, stderr=-1, text=True, check=False)
+        assert done.returncode == ExitCode.USAGE, (streams, done.stderr)
+        assert done.stdout == ""
+        assert "2>" in streams or len(done.stderr.splitlines()) <= 2, done.stderr
+
+
+def test_errors_without_a_reader() -> None:
+    read, write = os.pipe()
+    os.close(read)
+    command = [sys.executable, "-m", "dora_systemd.cli.main", "list", "--last", "0"]
+    for stdout in (None, write):
+        done = subprocess.run(command, stdout=stdout, stderr=write, check=False)
+        assert done.returncode == ExitCode.USAGE
+    os.close(write)
+
+
 flags = st.sampled_from(
     ["--name", "--env", "--env-file", "--property", "--venv", "--dora", "--uid", "--grace-duration"]
 )

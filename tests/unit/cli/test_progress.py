@@ -2,7 +2,6 @@
 
 import io
 import json
-import os
 from itertools import count
 
 import pytest
@@ -14,7 +13,7 @@ from tests.unit.cli.test_stageline import Terminal
 STEPS = (copying(1, 3), copying(2, 3), copied(1, 3, 0), checking(), checking(), judged("X", ""))
 
 
-def show(stream: io.StringIO | None, *steps: Step, **how: bool) -> None:
+def show(stream: io.StringIO, *steps: Step, **how: bool) -> None:
     with Progress(stream, clock=count(1.0).__next__, **how) as progress:
         for step in steps:
             progress(step)
@@ -62,15 +61,3 @@ def test_quiet(capsys: pytest.CaptureFixture[str], is_json: bool) -> None:
         progress.warn("x")
     assert not stream.getvalue()
     assert capsys.readouterr() == ("", "")
-
-
-def test_without_standard_error() -> None:
-    show(None, *STEPS)
-
-
-def test_a_reader_that_is_gone_stops_nothing() -> None:
-    reading, writing = os.pipe()
-    os.close(reading)
-    with os.fdopen(writing, "w") as stream:
-        show(stream, *STEPS)  # type: ignore[arg-type]
-        print("the error at the end", file=stream, flush=True)

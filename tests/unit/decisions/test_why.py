@@ -132,10 +132,22 @@ CASES: dict[str, tuple[tuple[Record, ...], str, Cause, str, str]] = {
         *("Failed", Cause.WATCHDOG, "", "its runner hung"),
     ),
     "systemd could not begin": (
-        (unit("process-exited", EXIT_CODE="exited", MESSAGE="status=217/USER"),
+        (unit("process-exited", EXIT_CODE="exited", EXIT_STATUS="226"),
          unit("unit-failed", UNIT_RESULT="exit-code")),
         *("Failed", Cause.UNIT_FAILED, ""),
-        "systemd could not start the supervisor process: exit code 217/USER",
+        "its sandbox could not be set up (exit code 226/NAMESPACE)",
+    ),
+    "systemd could not begin, for a reason of which we say nothing": (
+        (unit("process-exited", EXIT_CODE="exited", EXIT_STATUS="225"),
+         unit("unit-failed", UNIT_RESULT="exit-code")),
+        *("Failed", Cause.UNIT_FAILED, ""),
+        "systemd could not start its process (exit code 225/NETWORK)",
+    ),
+    "without a word of ours": (
+        (unit("process-exited", EXIT_CODE="exited", EXIT_STATUS="1"),
+         unit("unit-failed", UNIT_RESULT="exit-code")),
+        *("Failed", Cause.UNIT_FAILED, ""),
+        "the supervisor process failed (exit code 1)",
     ),
     "the kernel and its limit, and nothing of ours survived": (
         (*RUNS, unit("unit-oom"),
@@ -337,6 +349,13 @@ def test_one_screen() -> None:
     assert re.sub(r"\x1b\[\d*m", "", colored) == text
 
 
+def test_a_path_is_never_broken() -> None:
+    path = "/srv/" + "a-long-name/" * 8 + "robot.yml"
+    text = format_report(Report(replace(SUBJECT, file=path), Verdict("Failed", Cause.REFUSED)), 60)
+    assert f"\n            {path}\n" in text
+    assert f"  fix\n  {path},\n  then run: " in text
+
+
 @pytest.mark.parametrize("width", [60, 80, 200])
 def test_what_to_do_is_whole_at_any_width(width: int) -> None:
     verdict = judge(*RUNS, OOM, NODE_FAILED)
@@ -344,7 +363,7 @@ def test_what_to_do_is_whole_at_any_width(width: int) -> None:
     words = tuple(Word(n, "camera", "x" * 300) for n in range(20))
     text = format_report(Report(subject, verdict, words), width)
     lines = text.splitlines()
-    assert max(map(len, lines)) <= width
+    assert not [line for line in lines if len(line) > width and subject.name not in line]
     assert lines[0].endswith(": Failed")
     whole = " ".join(text.partition("What to do:")[2].split())
     assert "look for a leak in camera, or run: doractl set" in whole

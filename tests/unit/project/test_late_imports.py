@@ -18,6 +18,9 @@ LATE = {
         "gateway.live.about": {"decisions.views.releases", "verbs.releases.listing"},
         "gateway.live.act": {"verbs.releases.rollback"},
     },
+    "only some verbs wrap, and only on a terminal": {
+        "terminal_text": {"textwrap"},
+    },
     "the table of list does without it": {
         "cli.listing": {
             *("verbs.list", "verbs.facts.ended", "verbs.facts.list"),
@@ -52,6 +55,9 @@ LATE = {
     },
     "seldom: what is not in systemd, has restarted, was killed, or enabled while it ran": {
         "verbs.facts.budget": {"adapters.journal.reader"},
+        "verbs.facts.ended": {
+            *("decisions.why.postmortem", "decisions.why.verdict", "verbs.facts.lives"),
+        },
         "verbs.facts.recorded": {"adapters.bus.systemd", "verbs.facts.cells"},
         "verbs.facts.selector": {"verbs.facts.ended"},
         "verbs.list": {"verbs.facts.ended"},

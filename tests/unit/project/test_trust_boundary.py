@@ -48,14 +48,14 @@ _TABLE = {
     """,
     OWN: """
         adapters.dora.preparation adapters.host.files adapters.ssh.program cli.main
-        cli.progress cli.verbs.look.logs decisions.cell.launch verbs.inhibit.hold
+        cli.edge cli.verbs.look.logs decisions.cell.launch verbs.inhibit.hold
         verbs.start.credentials verbs.start.limits
     """,
     KERNEL: """
         adapters.cgroup.groups adapters.host.lock_table adapters.host.machine
         adapters.host.process_table adapters.host.real_time adapters.host.rights
         runner.cell.pause trust.socket_table verbs.destroy
-        verbs.facts.reading verbs.start.sandbox verbs.why
+        verbs.facts.lives verbs.facts.reading verbs.start.sandbox
     """,
     ROOTS: """
         adapters.bus.connection adapters.bus.errors adapters.host.unit_files

@@ -17,7 +17,6 @@ import pytest
 from dora_systemd.decisions.cell.environment import LOCK_VARIABLE, node_environment
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.runner.cell.begin import make_lock
-from dora_systemd.trust.locks import take_lock
 from dora_systemd.verbs.facts.cells import Cell, read_cells
 from dora_systemd.verbs.facts.locks import read_holders
 from dora_systemd.verbs.inhibit.guard import IfInhibited, require_uninhibited, uninhibited
@@ -105,13 +104,24 @@ def test_the_reasons_of_others_do_not_count(scope: ScopeIn, lock: Path) -> None:
     assert holder.why == ""
 
 
-def test_a_file_system_without_locks(monkeypatch: pytest.MonkeyPatch, lock: Path) -> None:
+@pytest.mark.usefixtures("lock")
+def test_a_file_system_without_locks(
+    monkeypatch: pytest.MonkeyPatch, scope: ScopeIn, cell: Cell
+) -> None:
+    """Nobody inhibits it then, and nobody knows that."""
+
     def refuse(*_: int) -> None:
-        raise OSError(errno.ENOLCK, "no locks")
+        raise OSError(errno.ENOLCK, "No locks available")
 
     monkeypatch.setattr(fcntl, "flock", refuse)
-    with lock.open("a") as file:
-        assert not take_lock(file.fileno(), is_shared=True)
+    with pytest.raises(DoraSystemdError) as caught:
+        require_uninhibited(scope, [cell], "restart")
+    assert caught.value.message.startswith("cannot lock /")
+    assert caught.value.message.endswith(": No locks available")
+    assert "--force" in caught.value.hint
+    with pytest.raises(DoraSystemdError, match="cannot lock"):
+        Lock(scope.cell_directory("robot"), "x").take()
+    require_uninhibited(scope, [cell], "restart", IfInhibited.FORCE)
 
 
 def test_force(scope: ScopeIn, cell: Cell, lock: Path) -> None:

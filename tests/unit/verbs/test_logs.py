@@ -55,6 +55,11 @@ class FakeJournal(JournalReader):
         return iter(["i2", "i1"] if name == "robot" else [])
 
 
+def test_an_empty_name_is_not_all_dataflows() -> None:
+    with pytest.raises(DoraSystemdError, match="no dataflow named ''"):
+        find("")
+
+
 def find(selector: str = "robot", nodes: tuple[str, ...] = (), run: str = "ALL") -> LogQuery:
     return find_query(FakeJournal(), QUERY, [selector], nodes, run)
 
@@ -69,7 +74,6 @@ def find(selector: str = "robot", nodes: tuple[str, ...] = (), run: str = "ALL")
         ("550e84", "robot", ROBOT),
         ("550E99", "arm", ARM),
         ("550e", "550e", ""),
-        ("", "", ""),
     ],
 )
 def test_selector(selector: str, name: str, uuid: str) -> None:
@@ -187,7 +191,7 @@ def test_run() -> None:
 @pytest.mark.parametrize(("nodes", "run"), [(("a",), "ALL"), ((), "CURRENT")])
 def test_nodes_and_runs_are_those_of_one_dataflow(nodes: tuple[str, ...], run: str) -> None:
     with pytest.raises(DoraSystemdError) as caught:
-        find("", nodes=nodes, run=run)
+        find_query(FakeJournal(), QUERY, [], nodes, run)
     assert caught.value.code is ExitCode.USAGE
 
 

@@ -1,12 +1,20 @@
 """`doractl set`: what systemd is asked, what is remembered, and that bad input changes nothing."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from dora_systemd.adapters.host.unit_files import NODE_LIMITS_FILE, changed_files, remove_changes
+from dora_systemd.adapters.host.unit_files import (
+    LOG_RATES_FILE,
+    NODE_LIMITS_FILE,
+    changed_files,
+    remove_changes,
+)
+from dora_systemd.decisions.cell.environment import node_environment, with_changes
 from dora_systemd.decisions.cell.limits import parse_node_limits
+from dora_systemd.decisions.cell.line_rates import parse_rates
 from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import INFINITY
@@ -206,9 +214,76 @@ def test_root_is_needed_for_others(place: Place, monkeypatch: pytest.MonkeyPatch
     assert caught.value.code is ExitCode.NO_PERMISSION
 
 
-def test_the_runner_is_told() -> None:
-    from dora_systemd.decisions.cell.environment import node_environment, with_changes
+class Runner:
+    """Keeps what it is asked for; refuses if there is a problem."""
 
+    def __init__(self, problem: str = "") -> None:
+        self.asked: list[Any] = []
+        self.problem = problem
+
+    def __call__(self, path: Path, request: Mapping[str, Any]) -> dict[str, Any]:
+        assert path.name == "runner.sock"
+        self.asked.append(request["limits"])
+        if self.problem:
+            raise DoraSystemdError(self.problem)
+        return {"done": []}
+
+
+def rates(place: Place, *texts: str, runner: Runner, **flags: Any) -> None:
+    flags = {"log_rate_limit": texts, **flags}
+    set_limits(place.manager, place.scope, place.cell, flags, ask=runner)
+
+
+def test_lines_of_a_running_dataflow(place: Place) -> None:
+    runner = Runner()
+    place.manager.units[place.unit]["Environment"] = ["DORA_SYSTEMD_LOG_RATES=ui=9/1s,50/1min 30s"]
+    rates(place, "camera=10/1s", "100/1s", runner=runner)
+    assert runner.asked == [["ui=9/1s", "100/1s", "camera=10/1s"]]
+    text = place.drop_in.with_name(LOG_RATES_FILE).read_text()
+    assert "Environment=DORA_SYSTEMD_LOG_RATES=ui=9/1s,100/1s,camera=10/1s\n" in text
+    assert place.manager.calls == [("reload",)]
+
+
+def test_lines_of_one_that_does_not_run(place: Place) -> None:
+    runner = Runner()
+    place.manager.units[place.unit]["ControlGroup"] = ""
+    rates(place, "camera=infinity", runner=runner)
+    assert runner.asked == []
+    assert "camera=infinity" in place.drop_in.with_name(LOG_RATES_FILE).read_text()
+
+
+def test_a_rate_that_nobody_takes_changes_nothing(place: Place) -> None:
+    for texts in (["nobody=1/1s"], ["camera=1/1h", "1"]):
+        with pytest.raises(DoraSystemdError):
+            rates(place, *texts, runner=(runner := Runner()))
+        assert runner.asked == []
+    with pytest.raises(DoraSystemdError, match="it hangs"):
+        rates(place, "1/1s", runner=Runner("it hangs"))
+    assert not place.drop_in.parent.exists()
+    assert place.manager.calls == []
+
+
+def test_lines_that_systemd_refuses(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise DoraSystemdError("cannot change it: systemd says no")
+
+    monkeypatch.setattr(place.manager, "set_properties", refuse)
+    runner = Runner()
+    with pytest.raises(DoraSystemdError):
+        rates(place, "ui=1/1s", runner=runner, memory_limit="6M")
+    assert runner.asked == [["ui=1/1s"], []]
+    assert not place.drop_in.parent.exists()
+
+
+def test_lines_of_the_next_runner() -> None:
+    before = options(log_rates=parse_rates(["9/1s", "camera=8/1s"]))
+    variables = {"DORA_SYSTEMD_LOG_RATES": "camera=infinity,ui=50/1min 30s"}
+    expected = parse_rates(["9/1s", "camera=infinity", "ui=50/90s"])
+    assert with_changes(before, variables).log_rates == expected
+    assert node_environment(variables) == {}
+
+
+def test_the_runner_is_told() -> None:
     before = options(node_limits=(parse_node_limits("camera:cpu=1,memory=1G"),))
     variables = {"DORA_SYSTEMD_NODE_LIMITS": "camera:memory=2G ui:tasks=9"}
     assert with_changes(before, {}).node_limits == before.node_limits

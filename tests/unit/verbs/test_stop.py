@@ -71,7 +71,7 @@ def test_stop_that_had_to_kill_says_so() -> None:
     manager.add(options())
     manager.after_job[UNIT] = {"ActiveState": "failed", "Result": "timeout"}
     (outcome,) = stop_cells(manager, SCOPE, read_cells(manager))
-    assert outcome.text.endswith("(robot): it did not end in time and was killed")
+    assert outcome.text.endswith("(robot): it did not start or stop in time and was killed")
     assert outcome.problem == ""
 
 
@@ -119,7 +119,8 @@ def test_restart_that_fails() -> None:
         ({"Result": "exit-code", "ExecMainStatus": 78}, "exit code 78"),
         (
             {"Result": "exit-code", "ExecMainStatus": 214},
-            "realtime scheduling was refused, see LimitRTPRIO= in systemd.exec(5) (exit code 214)",
+            "realtime scheduling was refused, see LimitRTPRIO= in systemd.exec(5)"
+            " (exit code 214/SETSCHEDULER)",
         ),
         ({"Result": "signal", "ExecMainCode": 2, "ExecMainStatus": 9}, "signal SIGKILL"),
         ({"Result": "signal", "ExecMainCode": 2, "ExecMainStatus": 99}, "signal 99"),
@@ -129,7 +130,7 @@ def test_restart_that_fails() -> None:
         ),
         (
             {"Result": "timeout", "StatusText": "failed: node a hangs"},
-            "node a hangs (it did not end in time and was killed)",
+            "node a hangs (it did not start or stop in time and was killed)",
         ),
         ({"Result": "watchdog"}, "the supervisor process hung and was killed by the watchdog"),
         ({"Result": "brand-new", "ExecMainCode": 0}, "brand-new"),

@@ -145,6 +145,25 @@ def test_a_line_is_whole_though_an_event_comes_in_the_middle_of_it(tmp_path: Pat
     run(tmp_path, scenario)
 
 
+def test_a_limit_that_changes(tmp_path: Path) -> None:
+    async def scenario(cell: Cell) -> None:
+        cell.node("a")
+        path = cell.paths.node_stdout("a")
+        for limit in (RateLimit(1, 60 * SECOND), None, RateLimit(2, 60 * SECOND)):
+            cell.pipes.limit("a", limit)
+            cell.pipes.limit("a", limit)  # changes nothing
+            cell.write(path, b"1\n2\n3\n")
+            cell.pipes.drain("a")
+        cell.pipes.limit("unknown", None)
+        assert [entry["MESSAGE"] for entry in cell.received()] == [
+            *("1", "2 log lines of node a exceed its limit of 1/1min", "1", "2", "3"),
+            *("1", "2", "1 log lines of node a exceed its limit of 2/1min"),
+        ]
+        assert list(cell.pipes.line_counts()) == ["", "a"]
+
+    run(tmp_path, scenario)
+
+
 def test_what_a_limit_takes_is_counted(tmp_path: Path) -> None:
     async def scenario(cell: Cell) -> None:
         cell.node("a")

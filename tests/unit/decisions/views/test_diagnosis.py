@@ -125,6 +125,17 @@ FINDINGS = [
 ]
 
 
+def test_what_is_printed_on_a_narrow_terminal() -> None:
+    found = Finding("dora", State.NOTE, "one two three", "run /usr/bin/x y")
+    assert format_findings([found], 25).splitlines() == [
+        "note     dora  one two",
+        "               three",
+        "               -> run",
+        "                  /usr/bin/x",
+        "                  y",
+    ]
+
+
 def test_what_is_printed() -> None:
     assert format_findings(FINDINGS) == (
         "ok       dora     version 1.1.0\n"

@@ -122,13 +122,14 @@ def test_signs_of_life() -> None:
 
 def test_what_is_special_about_a_node() -> None:
     nodes = (
-        NodeRow("camera", "running", essential=True, scheduling="fifo:50"),
+        NodeRow("camera", "running", essential=True, scheduling="fifo:50", cpus="2-3"),
         NodeRow("plot", "running", essential=False),
     )
     (found,) = families(replace(ROBOT, row=ROBOT.row._replace(nodes=nodes)))[
         "dora_node_info"
     ].samples
-    expected = {"dataflow": "robot", "node": "camera", "essential": "yes", "scheduling": "fifo:50"}
+    rights = {"essential": "yes", "scheduling": "fifo:50", "cpus": "2-3"}
+    expected = {"dataflow": "robot", "node": "camera", **rights}
     assert (found.labels, found.value) == (expected, 1)
     assert "dora_node_info" not in families(ROBOT)
 

@@ -11,6 +11,7 @@ import pytest
 
 from dora_systemd.adapters.dora.preparation import Prepared, prepare
 from dora_systemd.decisions.cell.hot_reload import SettingsChange
+from dora_systemd.decisions.cell.line_rates import RateLimits, parse_rates
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.life import events as life
@@ -31,6 +32,7 @@ class Bench:
         self.root = root
         self.events: list[tuple[str, dict[str, Any]]] = []
         self.pushed: list[life.Event] = []
+        self.limited: list[RateLimits] = []
         self.flow = root / "flow.yml"
         self.settings = root / "flow.systemd.yml"
         self.copy = root / "settings.yml"
@@ -47,7 +49,7 @@ class Bench:
         cell = Cell(SECOND, 0, {"a": NodeStatus("running", 7)}, State.RUNNING)
         pump = SimpleNamespace(cell=cell, push=self.pushed.append)
         pipes = SimpleNamespace(write_event=self.write_event)
-        nodes = SimpleNamespace(limit=lambda _: None)
+        nodes = SimpleNamespace(limit=lambda _: None, limit_lines=self.limited.append)
         prepared = prepare(self.options, {})
         run = cast(Run, SimpleNamespace(pump=pump, pipes=pipes, nodes=nodes))
         self.reloader.begin(run, prepared, self.flow.stat().st_ctime_ns)
@@ -146,6 +148,25 @@ def test_hot_reload_takes_over_nothing_by_being_switched_on(tmp_path: Path) -> N
         assert current.plan.options.hot_reload, "how it treats nodes that fail is new"
         assert current.descriptor != before.descriptor
         assert bench.reloader._changed_since() == [str(bench.flow)], "reload will find it"
+        bench.reloader.close()
+
+    live(work)
+
+
+def test_limits_of_lines(tmp_path: Path) -> None:
+    """They hold for the nodes that run, for those that a reload adds, and for the next run."""
+    rates = parse_rates(["9/1s", "a=infinity"])
+
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        for begin in (lambda: None, bench.begin):
+            begin()
+            await bench.reloader.answer({"verb": "log-rates", "limits": ["9/1s", "a=infinity"]})
+            assert bench.reloader.options.log_rates == rates
+        assert bench.limited == [rates]
+        with pytest.raises(DoraSystemdError, match="cannot read 'x' as a rate"):
+            await bench.reloader.answer({"verb": "log-rates", "limits": ["x"]})
+        assert bench.reloader.options.log_rates == rates
         bench.reloader.close()
 
     live(work)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from dora_systemd.decisions.cell.limits import parse_node_limits
 from dora_systemd.decisions.cell.owed import Owed
 from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
 from dora_systemd.decisions.rights.node_rights import parse_node_rights
@@ -40,6 +41,20 @@ def test_ages(scope: Scope) -> None:
     assert image.age is not None
     assert 3 * SECOND <= image.age < 60 * SECOND
     assert (depth.output, depth.within, depth.then, depth.age) == ("depth", SECOND, "warn", None)
+
+
+@pytest.mark.parametrize("now", ["", "0-1\n"])
+def test_cpus(scope: Scope, unit_group: Path, now: str) -> None:
+    """With a cpuset controller, the kernel knows better than the settings."""
+    if now:
+        (unit_group / "node-camera/cpuset.cpus").write_text(now)
+    manager = FakeManager()
+    limits = (parse_node_limits("camera:cpus=2-3"), parse_node_limits("plot:memory=1G"))
+    manager.add(options(node_limits=limits), ControlGroup=GROUP)
+    nodes = {one: NodeStatus("running") for one in ("camera", "plot", "ui")}
+    write_status(scope, CellStatus(nodes=nodes))
+    rows = dataflow_row(manager, scope, read_cells(manager)[0]).nodes
+    assert [row.cpus for row in rows] == [now.strip() or "2-3", "", ""]
 
 
 @pytest.mark.usefixtures("unit_group")

@@ -91,6 +91,12 @@ def test_nothing_fits(cells: list[Cell], selector: str, hint: str) -> None:
     assert caught.value.hint == hint
 
 
+def test_a_foreign_unit_of_that_name_is_no_hint() -> None:
+    known = ["robot", "vision"]
+    assert Selector("vision").missing(known).hint == "known dataflows: robot"
+    assert Selector("dora-robot.service").missing(known).hint == "known dataflows: vision"
+
+
 @given(st.text())
 def test_any_selector_is_answered(selector: str) -> None:
     manager = FakeManager()

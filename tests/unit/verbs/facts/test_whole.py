@@ -58,7 +58,7 @@ def test_the_journal_is_asked_once_in_a_life(
 ) -> None:
     asked = []
 
-    def starts(_self: JournalReader, _scope: Scope, _uuid: str, limit: int) -> list[int]:
+    def starts(_self: JournalReader, _scope: Scope, _name: str, limit: int) -> list[int]:
         asked.append(limit)
         return []
 

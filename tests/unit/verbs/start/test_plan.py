@@ -4,6 +4,7 @@ import os
 import pwd
 import signal
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import Place, reached
 from dora_systemd.trust.sight import LentSight, Sight, sight_of
 from dora_systemd.verbs.facts.nodes import named_places
+from dora_systemd.verbs.releases.source import find_source
 from dora_systemd.verbs.start.account import account_of, choose_user
 from dora_systemd.verbs.start.check import check_plan
 from dora_systemd.verbs.start.plan import Plan, StartRequest, make_plan, request_name
@@ -128,6 +130,14 @@ def test_no_dora_runs_while_a_plan_is_made(project: Path) -> None:
     (project / "robot.yml").write_text("nodes: [{id: m, module: mod.yml}]\n")
     plan_of(project)
     assert not (project / "proof").exists()
+
+
+def test_an_empty_path_is_not_the_working_directory() -> None:
+    """In a script, a variable is not set."""
+    request = StartRequest("")
+    for use in (request_name, partial(make_plan, USER), partial(find_source, USER)):
+        with pytest.raises(DoraSystemdError, match="cannot read '': no path"):
+            use(request)
 
 
 def test_names() -> None:

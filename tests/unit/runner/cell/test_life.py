@@ -1,0 +1,47 @@
+"""Whether a life is the first one of its unit."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.decisions.cell.restarts import RestartPolicy
+from dora_systemd.runner.cell import life
+from dora_systemd.runner.cell.life import is_first_life
+from dora_systemd.values import SECOND
+
+POLICY = RestartPolicy("on-failure", delay=2 * SECOND)
+
+
+@pytest.fixture
+def unit_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """That of a transient unit that starts right now, for the first time."""
+    monkeypatch.setenv("FDSTORE", "4096")
+    monkeypatch.delenv("LISTEN_FDNAMES", raising=False)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setattr(life, "age", lambda: 0.5)
+    path = tmp_path / "systemd/transient/dora-robot.service"
+    path.parent.mkdir(parents=True)
+    path.touch()
+    os.utime(path, (path.stat().st_mtime - 0.6,) * 2)
+    return path
+
+
+@pytest.mark.usefixtures("unit_file")
+def test_a_start() -> None:
+    assert is_first_life(POLICY, "robot", is_user=True)
+    assert not is_first_life(POLICY, "other", is_user=True)
+
+
+@pytest.mark.parametrize("seconds", [-POLICY.unit_delay / SECOND, 60])
+def test_a_life_may_have_been_before(unit_file: Path, seconds: float) -> None:
+    """Or the clock was set."""
+    os.utime(unit_file, (unit_file.stat().st_mtime + seconds,) * 2)
+    assert not is_first_life(POLICY, "robot", is_user=True)
+    assert is_first_life(RestartPolicy("no"), "robot", is_user=True)
+
+
+@pytest.mark.usefixtures("unit_file")
+def test_a_life_was_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LISTEN_FDNAMES", "dora-life")
+    assert not is_first_life(POLICY, "robot", is_user=True)
