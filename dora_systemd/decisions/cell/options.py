@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from dora_systemd.decisions.cell.hot_reload import DEFAULT_RELOAD, HotReload, parse_of_node
 from dora_systemd.decisions.cell.limits import NodeLimits, format_node_limits, parse_node_limits
 from dora_systemd.decisions.cell.line_rates import UNLIMITED, RateLimits, format_rates, parse_rates
+from dora_systemd.decisions.cell.machines import Placed, parse_machine, parse_placed
 from dora_systemd.decisions.cell.needs import NodeNeed, parse_node_need
 from dora_systemd.decisions.cell.restarts import (
     DEFAULT,
@@ -69,6 +70,8 @@ class RunnerOptions(NamedTuple):
     watchdogs: nodes with a notify socket, see dora_systemd.decisions.signs.watchdogs.
     owes: outputs of nodes that have to come in time.
     needs: the paths that single nodes wait for.
+    placed: the nodes that run on other machines than the head.
+    machine: the name of this machine if it is a member; "" on the head and without members.
     """
 
     name: str
@@ -94,6 +97,8 @@ class RunnerOptions(NamedTuple):
     node_rights: "tuple[NodeRights, ...]" = ()
     owes: "tuple[Owed, ...]" = ()
     needs: tuple[NodeNeed, ...] = ()
+    placed: tuple[Placed, ...] = ()
+    machine: str = ""
 
     def __hash__(self) -> int:
         return hash(self.uuid)
@@ -186,6 +191,8 @@ _OPTIONS = (
     _each("owes", "owes", _parse_owed, _format_owed),
     Option("watchdog", "watchdogs", _parse_watchdogs, _format_watchdogs, is_repeated=True),
     _each("needs", "needs", parse_node_need, "=".join),
+    _each("placed", "placed", parse_placed, "=".join),
+    _unless_default("machine", "machine", parse_machine),
     _each("watch", "reload.watch"),
     _each("ignore", "reload.ignore"),
     _each("node-watch", "reload.node_watch", parse_of_node, "=".join),
