@@ -44,7 +44,7 @@ class Forwards:
 
 @dataclass(frozen=True)
 class Lost:
-    """Link to the runner of the head: ssh has ended. words: its last line, or why it has not begun."""
+    """Link to the runner of the head: ssh has ended. words: its last line, or why there is none."""
 
     words: str
 
