@@ -9,6 +9,7 @@ import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from dora_systemd.adapters.dora.preparation import Prepared, check_named_nodes
 from dora_systemd.adapters.host.files import decoded, parse_yaml, read_text
@@ -34,6 +35,9 @@ from dora_systemd.verbs.start.notes import plan_notes
 from dora_systemd.verbs.start.places import Look
 from dora_systemd.verbs.start.sandbox import make_sandbox
 from dora_systemd.verbs.start.settings import read_settings
+
+if TYPE_CHECKING:  # most dataflows run on one machine
+    from dora_systemd.decisions.machines.member import Member
 
 DEFAULT_FILE = "dataflow.yml"
 
@@ -64,7 +68,7 @@ class Plan:
     """A checked request.
 
     user: for User=, None in user scope. environment: all of Environment=. notes: for people, once
-    it has started.
+    it has started. members: the other machines, if it runs on several.
     """
 
     scope: Scope
@@ -74,6 +78,7 @@ class Plan:
     environment: Mapping[str, str]
     sandbox: Sandbox = field(default_factory=Sandbox)
     notes: tuple[str, ...] = ()
+    members: tuple["Member", ...] = ()
 
     @property
     def unit(self) -> str:
