@@ -15,6 +15,7 @@ from dora_systemd.adapters.dora.preparation import Prepared, check_named_nodes
 from dora_systemd.adapters.host.files import decoded, parse_yaml, read_text
 from dora_systemd.decisions.cell.environment import parse_environment_file, unit_environment
 from dora_systemd.decisions.cell.launch import LaunchPlan, launch_descriptor
+from dora_systemd.decisions.cell.machines import Placed
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
 from dora_systemd.decisions.descriptor.expansion import called_variables
@@ -49,7 +50,8 @@ class StartRequest:
     environment: the caller's variables. attached: the dataflow ends with the caller. caller: the
     variables that the dataflow may read. uuid: of a dataflow that is started again. origin: of a
     release, the file that its dataflow file was copied from: who owns that decides, not root, who
-    owns the copy. is_unbuilt: the programs of its nodes need not exist yet.
+    owns the copy. is_unbuilt: the programs of its nodes need not exist yet. machine, placed: of
+    the runner's options, if this machine is a member of the dataflow.
     """
 
     dataflow: str
@@ -61,6 +63,8 @@ class StartRequest:
     uuid: str = ""
     origin: Place | None = None
     is_unbuilt: bool = False
+    machine: str = ""
+    placed: tuple[Placed, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -146,6 +150,8 @@ def _make_plan(
         venv=venv,
         attached=request.attached,
         env_keys=tuple(variables),
+        placed=request.placed,
+        machine=request.machine,
     )
     options = with_settings(options, settings)
     called = called_variables(dataflow, request.caller)
