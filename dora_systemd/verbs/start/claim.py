@@ -18,6 +18,7 @@ from dora_systemd.verbs.start.enable import (
     drop_unit_files,
     install_unit_file,
     read_boot_unit,
+    refuse_machines,
     release_transient,
     wait_until_forgotten,
 )
@@ -81,6 +82,8 @@ def place_unit_file(
     enabled with other settings.
     """
     scope = plan.scope
+    if want_boot:
+        refuse_machines(plan.options)
     target = boot_target(manager, scope)
     text = persistent_unit(
         [format_unit(properties)], plan.options, scope.is_user, target, boot.is_checked

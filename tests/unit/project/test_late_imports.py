@@ -87,6 +87,9 @@ LATE = {
     "a program of its own: it makes room first, and it runs with the Python of the nodes": {
         "runner.owes.listen": {"dora"},
     },
+    "most dataflows run on one machine": {
+        "verbs.start.plan": {"decisions.machines.spread"},
+    },
     "hot reload only": {
         "adapters.host.watch": {"watchfiles"},
         "decisions.reload.watch_rules": {"pathspec"},
