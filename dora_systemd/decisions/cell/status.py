@@ -54,7 +54,7 @@ class NodeStatus(NamedTuple):
     policy: dora's restart policy, "never" if it has none, HELD or LATCHED. max_restarts: in one
     window, 0 without limit. hung: why dora's health check or its watchdog ended the process, or "".
     silent: which output that it owes has not come, or "". is_ended: the runner ends it for that.
-    needs: what it waits for, or "".
+    needs: what it waits for, or "". machine: the name of the other machine that it runs on, or "".
     """
 
     state: str = "starting"
@@ -69,6 +69,7 @@ class NodeStatus(NamedTuple):
     silent: str = ""
     is_ended: bool = False
     needs: str = ""
+    machine: str = ""
 
     @property
     def is_alive(self) -> bool:
@@ -188,6 +189,7 @@ def _parse_node(raw: Any) -> NodeStatus:
         silent=_text(known, "silent"),
         is_ended=known.get("is_ended") is True,
         needs=_text(known, "needs"),
+        machine=_text(known, "machine"),
     )
 
 
