@@ -13,7 +13,19 @@ Value = TypeVar("Value")
 
 UNMET = "unmet"
 """Stage of a dataflow with a node that waits for what it needs."""
-STAGES = ("starting", "restarting", "waiting", UNMET, "running", "degraded", "stopping", "ended")
+GATHERING = "gathering"
+"""Stage of a dataflow that waits for another machine."""
+STAGES = (
+    "starting",
+    "restarting",
+    "waiting",
+    UNMET,
+    GATHERING,
+    "running",
+    "degraded",
+    "stopping",
+    "ended",
+)
 NODE_STATES = (
     "starting",
     "waiting",
@@ -54,7 +66,7 @@ class NodeStatus(NamedTuple):
     policy: dora's restart policy, "never" if it has none, HELD or LATCHED. max_restarts: in one
     window, 0 without limit. hung: why dora's health check or its watchdog ended the process, or "".
     silent: which output that it owes has not come, or "". is_ended: the runner ends it for that.
-    needs: what it waits for, or "".
+    needs: what it waits for, or "". machine: the name of the other machine that it runs on, or "".
     """
 
     state: str = "starting"
@@ -69,6 +81,7 @@ class NodeStatus(NamedTuple):
     silent: str = ""
     is_ended: bool = False
     needs: str = ""
+    machine: str = ""
 
     @property
     def is_alive(self) -> bool:
@@ -188,6 +201,7 @@ def _parse_node(raw: Any) -> NodeStatus:
         silent=_text(known, "silent"),
         is_ended=known.get("is_ended") is True,
         needs=_text(known, "needs"),
+        machine=_text(known, "machine"),
     )
 
 

@@ -116,7 +116,14 @@ class StopPart:
     grace: int
 
 
-Message = Forwards | Lost | Part | Beat | Ready | Table | Refused | Ended | StopPart
+@dataclass(frozen=True)
+class Stopping:
+    """Head to member: the head is about to have dora stop all nodes. by: who asked for it."""
+
+    by: str = ""
+
+
+Message = Forwards | Lost | Part | Beat | Ready | Table | Refused | Ended | StopPart | Stopping
 M = TypeVar("M", bound=Message)
 
 _TYPES: Mapping[str, type[Any]] = {
@@ -129,6 +136,7 @@ _TYPES: Mapping[str, type[Any]] = {
     "refused": Refused,
     "ended": Ended,
     "stop": StopPart,
+    "stopping": Stopping,
 }
 _NAMES = {kind: name for name, kind in _TYPES.items()}
 _NUMBERS = {"coordinator", "zenoh", "grace", "version"}

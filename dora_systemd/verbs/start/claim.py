@@ -21,6 +21,7 @@ from dora_systemd.verbs.start.enable import (
     drop_unit_files,
     install_unit_file,
     read_boot_unit,
+    refuse_machines,
     release_transient,
     wait_until_forgotten,
 )
@@ -84,6 +85,8 @@ def place_unit_file(
     enabled with other settings.
     """
     scope = plan.scope
+    if want_boot:
+        refuse_machines(plan.options)
     target = boot_target(manager, scope)
     text = persistent_unit(
         [format_unit(properties)], plan.options, scope.is_user, target, boot.is_checked

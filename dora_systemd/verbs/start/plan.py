@@ -21,6 +21,7 @@ from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
 from dora_systemd.decisions.descriptor.expansion import called_variables
 from dora_systemd.decisions.descriptor.nodes import UNEXPANDED
 from dora_systemd.decisions.properties.sandbox import Sandbox
+from dora_systemd.decisions.settings.machines import MACHINES
 from dora_systemd.decisions.settings.resolve import Settings
 from dora_systemd.decisions.settings.runner_options import with_settings
 from dora_systemd.decisions.settings.table import ENV, ENV_FILE, USER, WORKING_DIRECTORY
@@ -154,6 +155,7 @@ def _make_plan(
         machine=request.machine,
     )
     options = with_settings(options, settings)
+    options, members = _spread(dataflow, options, settings, variables)
     called = called_variables(dataflow, request.caller)
     environment = unit_environment(search_path, venv, {**called, **variables})
     check_credentials(scope, credential_files(settings))
@@ -167,7 +169,20 @@ def _make_plan(
     prepared = Prepared(dataflow, launch, {})
     sandbox = make_sandbox(scope, settings, look.user, prepared, look.sight)
     notes = tuple(plan_notes(scope, dataflow, launch, look))
-    return Plan(scope, options, settings, look.user, environment, sandbox, notes)
+    return Plan(scope, options, settings, look.user, environment, sandbox, notes, members)
+
+
+def _spread(
+    dataflow: Dataflow, options: RunnerOptions, settings: Settings, variables: Mapping[str, str]
+) -> "tuple[RunnerOptions, tuple[Member, ...]]":
+    """The options of the runner here, and what other machines are told."""
+    is_spread = settings[MACHINES] or any("deploy" in node.raw for node in dataflow.nodes)
+    if options.machine or not is_spread:
+        return options, ()
+    # Imported late: most dataflows run on one machine.
+    from dora_systemd.decisions.machines.spread import spread
+
+    return spread(dataflow, options, settings, variables, os.uname().nodename)
 
 
 def _variables(settings: Settings, look: Look) -> dict[str, str]:

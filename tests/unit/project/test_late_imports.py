@@ -90,6 +90,7 @@ LATE = {
         "runner.owes.listen": {"dora"},
     },
     "most dataflows run on one machine, and most links are not lost": {
+        "verbs.start.plan": {"decisions.machines.spread"},
         "verbs.start.unit": {"decisions.machines.link_unit"},
         "verbs.start.claim": {"decisions.machines.link_unit"},
         "link.talk": {"link.parting"},
