@@ -138,10 +138,10 @@ def _unless_default(key: str, field: str, parse: Parse = str, to_text: Format = 
 
 
 def _each(key: str, field: str, parse: Parse = str, to_text: Format = str) -> Option:
-    def parse_all(texts: list[str]) -> tuple[Any, ...]:
-        return tuple(map(parse, texts))
+    def format_all(values: Any) -> list[str]:
+        return list(map(to_text, values))
 
-    return Option(key, field, parse_all, lambda values: list(map(to_text, values)), True)
+    return Option(key, field, lambda texts: tuple(map(parse, texts)), format_all, True)
 
 
 def _flag(key: str, field: str) -> Option:
@@ -157,9 +157,8 @@ def _late(module: str, name: str) -> Callable[[Any], Any]:
     return call
 
 
-_parse_rights, _format_rights = (
-    _late("rights.node_rights", name) for name in ("parse_node_rights", "format_node_rights")
-)
+_parse_rights = _late("rights.node_rights", "parse_node_rights")
+_format_rights = _late("rights.node_rights", "format_node_rights")
 _parse_owed, _format_owed = (_late("cell.owed", name) for name in ("parse_owed", "format_owed"))
 _parse_watchdogs = _late("signs.watchdogs", "parse_sockets")
 

@@ -13,7 +13,19 @@ Value = TypeVar("Value")
 
 UNMET = "unmet"
 """Stage of a dataflow with a node that waits for what it needs."""
-STAGES = ("starting", "restarting", "waiting", UNMET, "running", "degraded", "stopping", "ended")
+GATHERING = "gathering"
+"""Stage of a dataflow that waits for another machine."""
+STAGES = (
+    "starting",
+    "restarting",
+    "waiting",
+    UNMET,
+    GATHERING,
+    "running",
+    "degraded",
+    "stopping",
+    "ended",
+)
 NODE_STATES = (
     "starting",
     "waiting",

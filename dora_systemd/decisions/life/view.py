@@ -7,6 +7,7 @@ from dora_systemd.decisions.cell.counters import CpuSample, LineCount
 from dora_systemd.decisions.cell.restarts import HELD_SECONDS, LATCH_SECONDS
 from dora_systemd.decisions.cell.status import (
     FAILED_BECAUSE,
+    GATHERING,
     HELD,
     LATCHED,
     UNMET,
@@ -23,7 +24,7 @@ from dora_systemd.values import INFINITY, format_duration
 _SHOWN = {
     State.BOOTING: ("starting", "starting the dora coordinator"),
     State.JOINING: ("starting", "starting the dora daemon"),
-    State.GATHERING: ("waiting", ""),
+    State.GATHERING: (GATHERING, ""),
     State.STARTING: ("starting", "starting the nodes"),
     State.WAITING: ("waiting", ""),
     State.RUNNING: ("running", ""),

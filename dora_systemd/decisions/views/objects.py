@@ -66,6 +66,8 @@ def dataflow_object(row: DataflowRow, waits: Mapping[str, Shares] | None = None)
         **_usage(row, shares.get(WHOLE_CELL)),
         "restarts": row.restarts,
         "restart_budget": row.restart_budget,
+        "machine": row.machine or None,
+        "machines": list(row.machines),
         "nodes": [_node_object(one, shares.get(one.node)) for one in row.nodes],
     }
 
@@ -73,6 +75,7 @@ def dataflow_object(row: DataflowRow, waits: Mapping[str, Shares] | None = None)
 def _node_object(row: NodeRow, shares: Shares | None) -> dict[str, Any]:
     return {
         "node": row.node,
+        "machine": row.machine or None,
         "state": row.state,
         "pid": row.pid or None,
         "exit": row.exit or None,

@@ -11,6 +11,7 @@ from dora_systemd.decisions.cell.counters import (
     cpu_percent,
     throttled_percent,
 )
+from dora_systemd.decisions.cell.machines import members_of
 from dora_systemd.decisions.cell.status import FAILED_BECAUSE, CellStatus, NodeStatus
 from dora_systemd.decisions.resources.usage import Usage
 from dora_systemd.decisions.views.rows import DataflowRow, NodeRow, OutputRow
@@ -49,6 +50,7 @@ def row_of(reading: Reading, before: Reading | None = None) -> DataflowRow:
         "text": unit.get("StatusText", "").removeprefix(FAILED_BECAUSE),
         "restarts": unit["NRestarts"],
         "problem": reading.problem,
+        **_machines(cell),
     }
     if held := reading.held:
         facts |= {"status": held.word, "text": held.text}
@@ -59,6 +61,15 @@ def row_of(reading: Reading, before: Reading | None = None) -> DataflowRow:
         return DataflowRow(**facts)
     samples = (before.sample,) if before else status.samples
     return DataflowRow(**facts, **_life(reading), **_usage(reading, samples))
+
+
+def _machines(cell: Cell) -> dict[str, Any]:
+    """The machines of a dataflow; none in the table, for which nobody has asked for the options."""
+    options = cell.known_options
+    if options is None or not options.placed:
+        return {}
+    here = options.machine
+    return {"machine": here} if here else {"machines": members_of(options.placed)}
 
 
 def dataflow_row(manager: Manager, scope: Scope, cell: Cell) -> DataflowRow:
@@ -197,5 +208,6 @@ def _node_row(node: str, status: NodeStatus | None, numbers: dict[str, Any]) -> 
         "since": status.since_us,
         "silent": status.silent,
         "needs": status.needs,
+        "machine": status.machine,
     }
     return NodeRow(node, status.state, **facts, **numbers)  # type: ignore[arg-type]

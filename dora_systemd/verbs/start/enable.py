@@ -94,6 +94,7 @@ def enable_cell(
     is. Raises DoraSystemdError; then nothing has changed.
     """
     refuse_attached(cell)
+    refuse_machines(cell.options)
     if is_checked and scope.is_user:
         message = "cannot check the boot with a dataflow of a user"
         raise DoraSystemdError(message, "use --system", ExitCode.USAGE)
@@ -141,6 +142,16 @@ def refuse_attached(cell: Cell) -> None:
             "belongs to",
             "start it with doractl start",
             ExitCode.USAGE,
+        )
+
+
+def refuse_machines(options: RunnerOptions) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) for a dataflow on several machines, or a part of one."""
+    if options.placed:
+        raise DoraSystemdError(
+            f"cannot make a unit file of {options.name}: it runs on several machines",
+            "start it with doractl start",
+            ExitCode.BAD_INPUT,
         )
 
 
