@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from dora_systemd.adapters.dora.command import version_numbers
 from dora_systemd.adapters.dora.preparation import Prepared
 from dora_systemd.adapters.host import files
 from dora_systemd.adapters.host.process import run_command
@@ -40,11 +41,13 @@ from dora_systemd.runner.machines.ending import end_nodes
 from dora_systemd.runner.machines.engine import NOISE, MemberEngine
 from dora_systemd.runner.machines.lines import Lines
 from dora_systemd.runner.nodes.nodes import Nodes
+from dora_systemd.terminal_text import short_line
 from dora_systemd.values import INFINITY, SECOND
 
 if TYPE_CHECKING:
     from dora_systemd.adapters.dora.check import DoraCheck
 
+_LONGEST = 100
 _POLL_SECONDS = 0.05
 _EXPLAIN_SECONDS = 0.5
 """Time for the session to end, which says more than a lost connection to dora."""
@@ -61,7 +64,7 @@ class Member(Alone):
         self._lines: Lines | None = None
         self._dora: MemberEngine | None = None
         self._pump: Pump | None = None
-        self._table = self._told = ""
+        self._table = self._told = self._version = ""
         self.stops_by_head = False
 
     @property
@@ -84,7 +87,7 @@ class Member(Alone):
 
     def prepare(self, paths: CellPaths, prepared: Prepared, check: "DoraCheck") -> None:
         """Write how each node is started. Raises DoraSystemdError."""
-        del check
+        self._version = check.version()
         check_placed(self.options, prepared.dataflow)
         paths.launch.mkdir(mode=0o700, exist_ok=True)
         for node, text in launch_files(prepared.dataflow, prepared.plan).items():
@@ -135,6 +138,11 @@ class Member(Alone):
             await refuse(ends, error)
             return
         self._lines = Lines(ends, self._send_table)
+        if reason := self._other_version(part):
+            self._lines.send(wire.Refused(reason, "install the same version on both machines"))
+            ends.writer.close()
+            self._end_by_head(reason)
+            return
         dora.set_part(part)
         pump.push(life.CoordinatorListening(now_us()))
         why = await self._lines.talk(self._hear)
@@ -150,6 +158,12 @@ class Member(Alone):
         if self._dora is None or self._pump is None or self._pump.cell.state is not State.BOOTING:
             raise _refusal(f"machine {own.machine} has a head already")
         return part, self._dora, self._pump
+
+    def _other_version(self, part: wire.Part) -> str:
+        """Why two versions of dora do not work together, or ""."""
+        own, other = version_numbers(self._version)[:2], version_numbers(part.dora)[:2]
+        there = short_line(part.dora, _LONGEST)
+        return "" if own == other else f"it has dora {self._version}, the head has {there}"
 
     def _hear(self, message: wire.Message) -> None:
         if isinstance(message, wire.Stopping):
