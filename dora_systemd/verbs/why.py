@@ -6,7 +6,7 @@ from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.journal.reader import JournalReader
-from dora_systemd.decisions.cell.status import HELD, CellStatus
+from dora_systemd.decisions.cell.status import GATHERING, HELD, CellStatus
 from dora_systemd.decisions.life import nodes as node_table
 from dora_systemd.decisions.logs.query import scope_matches, story_matches
 from dora_systemd.decisions.views.rows import DataflowRow
@@ -97,6 +97,7 @@ def _facts(manager: Manager, scope: Scope, cell: Cell) -> Facts:
         _now_boot(),
         unit["NRestarts"],
         {key: node.silent for key, node in nodes if node.silent},
+        is_gathering=status.stage == GATHERING,
     )
 
 
