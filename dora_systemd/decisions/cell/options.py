@@ -71,7 +71,8 @@ class RunnerOptions(NamedTuple):
     owes: outputs of nodes that have to come in time.
     needs: the paths that single nodes wait for.
     placed: the nodes that run on other machines than the head.
-    machine: the name of this machine if it is a member; "" on the head and without members.
+    machine, head: on a member its name, and the host name of the head; "" on the head and without
+    members.
     """
 
     name: str
@@ -99,6 +100,7 @@ class RunnerOptions(NamedTuple):
     needs: tuple[NodeNeed, ...] = ()
     placed: tuple[Placed, ...] = ()
     machine: str = ""
+    head: str = ""
 
     def __hash__(self) -> int:
         return hash(self.uuid)
@@ -164,11 +166,7 @@ _parse_watchdogs = _late("signs.watchdogs", "parse_sockets")
 
 
 def _format_watchdogs(watchdogs: Mapping[str, int]) -> list[str]:
-    if not watchdogs:
-        return []
-    from dora_systemd.decisions.signs.watchdogs import format_watchdogs
-
-    return format_watchdogs(watchdogs)
+    return _late("signs.watchdogs", "format_watchdogs")(watchdogs) if watchdogs else []
 
 
 _REQUIRED = ("name", "uuid", "working-directory", "dora")
@@ -192,6 +190,7 @@ _OPTIONS = (
     _each("needs", "needs", parse_node_need, "=".join),
     _each("placed", "placed", parse_placed, "=".join),
     _unless_default("machine", "machine", parse_machine),
+    _unless_default("head", "head"),
     _each("watch", "reload.watch"),
     _each("ignore", "reload.ignore"),
     _each("node-watch", "reload.node_watch", parse_of_node, "=".join),

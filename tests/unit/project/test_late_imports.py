@@ -98,7 +98,6 @@ LATE = {
     "most dataflows have no notify sockets": {
         "runner.signs.hook": {"runner.signs.sockets"},
         "runner.cell.dialogue": {"runner.signs.watch"},
-        "decisions.cell.options": {"decisions.signs.watchdogs"},
         "verbs.facts.list": {"decisions.signs.table"},
     },
     "asyncio and WebSockets: of all verbs, a few need one of them": {
