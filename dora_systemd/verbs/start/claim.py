@@ -1,15 +1,18 @@
 """Checks that the name of a new dataflow is free, and cleans up after an ended one."""
 
+import sys
 from dataclasses import replace
 
-from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.bus.manager import Beside, Manager
 from dora_systemd.adapters.host.unit_files import remove_changes, remove_unit_file
 from dora_systemd.decisions.properties.assignments import Properties
 from dora_systemd.decisions.unit.file import persistent_unit, says_the_same
 from dora_systemd.decisions.unit.properties import format_unit
+from dora_systemd.decisions.unit.versions import drop_unsupported
 from dora_systemd.decisions.views.dataflows import local_time
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import release_of
+from dora_systemd.paths import CellPaths
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell, read_cell
 from dora_systemd.verbs.start.enable import (
@@ -102,6 +105,36 @@ def place_unit_file(
     elif not is_kept:
         drop_unit_files(manager, boot)
     return want_boot or is_kept
+
+
+def prepared_links(manager: Manager, plan: Plan, systemd: int) -> Beside:
+    """The links to the members of a plan. Those of an ended dataflow of that name are gone then.
+
+    Raises DoraSystemdError (NAME_IN_USE).
+    """
+    # Imported late: most dataflows run on one machine.
+    from dora_systemd.decisions.machines.link_unit import link_unit
+
+    options, is_user = plan.options, plan.scope.is_user
+    socket = str(CellPaths(plan.scope.cell_directory(options.name)).socket)
+    links = [link_unit(sys.executable, socket, options, one, is_user) for one in plan.members]
+    for unit in end_links(manager, options.name):
+        wait_until_forgotten(manager, unit)
+    kept = ((one.unit, drop_unsupported(one.properties, systemd)[0]) for one in links)
+    return [(unit, list(properties.values())) for unit, properties in kept]
+
+
+def end_links(manager: Manager, name: str) -> list[str]:
+    """Stop the links of a dataflow that has ended, and wait for that; their units.
+
+    systemd does so as well, a moment later.
+    """
+    from dora_systemd.decisions.machines.link_unit import links_pattern
+
+    loaded = [one.unit for one in manager.list_units(links_pattern(name)) if one.load == "loaded"]
+    if loaded:
+        manager.run_jobs("StopUnit", loaded)
+    return loaded
 
 
 def _refuse_deployed(name: str, boot: BootUnit) -> None:

@@ -4,6 +4,7 @@ import sys
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.dora.command import version_numbers
+from dora_systemd.decisions.properties.assignments import with_properties
 from dora_systemd.decisions.properties.kinds import Property
 from dora_systemd.decisions.settings.limits import DEVICE
 from dora_systemd.decisions.settings.needs import NEEDS
@@ -66,4 +67,10 @@ def _properties(plan: Plan) -> dict[str, Property]:
         sandbox=plan.sandbox,
         clock=clock_service(),
     )
-    return dict(unit_properties(plan.options, context, plan.settings))
+    properties = dict(unit_properties(plan.options, context, plan.settings))
+    if plan.members:
+        # Imported late: most dataflows run on one machine.
+        from dora_systemd.decisions.machines.link_unit import wanted_links
+
+        return with_properties(properties, wanted_links(plan.options))
+    return properties

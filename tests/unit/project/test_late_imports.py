@@ -56,7 +56,9 @@ LATE = {
         "verbs.facts.selector": {"verbs.facts.ended"},
         "verbs.list": {"verbs.facts.ended"},
         "runner.nodes.losses": {"adapters.journal.reader"},
-        "verbs.stop": {"adapters.journal.reader", "verbs.start.enable"},
+        "verbs.stop": {
+            *("adapters.journal.reader", "verbs.start.claim", "verbs.start.enable"),
+        },
     },
     "pydantic: only a settings file needs it": {
         "decisions.settings.resolve": {"decisions.settings.schema"},
@@ -87,8 +89,11 @@ LATE = {
     "a program of its own: it makes room first, and it runs with the Python of the nodes": {
         "runner.owes.listen": {"dora"},
     },
-    "most dataflows run on one machine": {
+    "most dataflows run on one machine, and most links are not lost": {
         "verbs.start.plan": {"decisions.machines.spread"},
+        "verbs.start.unit": {"decisions.machines.link_unit"},
+        "verbs.start.claim": {"decisions.machines.link_unit"},
+        "link.talk": {"link.parting"},
     },
     "hot reload only": {
         "adapters.host.watch": {"watchfiles"},

@@ -1,0 +1,71 @@
+"""Run the part of a dataflow on this machine, for the head that has started it."""
+
+import os
+import sys
+from typing import Any
+
+import click
+
+from dora_systemd.adapters.bus.systemd import Bus
+from dora_systemd.cli.parameters import current_scope, scope_options
+from dora_systemd.cli.settingoptions import SettingsCommand, setting_options
+from dora_systemd.decisions.cell.machines import parse_machine, parse_placed
+from dora_systemd.decisions.machines.wire import Refused
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import parse_name, parse_uuid
+from dora_systemd.verbs.machines.head import Head
+from dora_systemd.verbs.machines.member import (
+    MemberRequest,
+    become_relay,
+    is_passing,
+    start_member,
+)
+from dora_systemd.verbs.start.plan import StartRequest
+
+
+@click.command("member", cls=SettingsCommand, hidden=True)
+@click.argument("dataflow", metavar="FILE")
+@click.option("--name", required=True, metavar="NAME", help="Name of the dataflow.")
+@click.option("--uuid", required=True, metavar="UUID", help="Its UUID.")
+@click.option("--as", "machine", required=True, metavar="MACHINE", help="Name of this machine.")
+@click.option(
+    "--placed",
+    multiple=True,
+    required=True,
+    metavar="NODE=MACHINE",
+    help="Where a node runs that does not run on the head.",
+)
+@setting_options
+@scope_options
+def command(
+    dataflow: str, name: str, uuid: str, machine: str, placed: tuple[str, ...], **flags: Any
+) -> int:
+    """Run the nodes of FILE that belong to this machine, as the service dora-NAME.service.
+
+    Only the link of a head calls this, by ssh: it says where the coordinator is, and the nodes end
+    when it is gone. See MACHINES in dora-systemd(7).
+
+    Examples:
+      doractl member /srv/robot/dataflow.yml --name robot --uuid UUID --as gpu --placed yolo=gpu
+    """
+    if sys.stdin.isatty():
+        hint = "doractl start on the head starts the members"
+        raise DoraSystemdError("cannot run a member: no head is here", hint, ExitCode.USAGE)
+    start = StartRequest(
+        dataflow,
+        parse_name(name),
+        flags,
+        os.environ,
+        uuid=parse_uuid(uuid),
+        placed=tuple(map(parse_placed, placed)),
+        machine=parse_machine(machine),
+    )
+    scope = current_scope()
+    with Head() as head:
+        try:
+            runner = start_member(Bus(scope), MemberRequest(scope, start), head)
+        except DoraSystemdError as error:
+            if not is_passing(error):
+                head.tell(Refused(error.message, error.hint))
+            raise
+    become_relay(runner)
