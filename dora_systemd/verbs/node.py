@@ -176,6 +176,7 @@ def dora_environment(coordinator: Coordinator) -> dict[str, str]:
 
 def _checked_status(scope: Scope, cell: Cell, node: str) -> CellStatus:
     require_running(cell)
+    refuse_parts([cell], "control")
     runner_socket.require_access(socket_of(scope, cell))
     return require_node(scope, cell, node)
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from dora_systemd.decisions.cell.hot_reload import DEFAULT_RELOAD, HotReload, parse_of_node
 from dora_systemd.decisions.cell.limits import NodeLimits, format_node_limits, parse_node_limits
 from dora_systemd.decisions.cell.line_rates import UNLIMITED, RateLimits, format_rates, parse_rates
-from dora_systemd.decisions.cell.machines import Placed, parse_machine, parse_placed
+from dora_systemd.decisions.cell.machines import Placed, parse_head, parse_machine, parse_placed
 from dora_systemd.decisions.cell.needs import NodeNeed, parse_node_need
 from dora_systemd.decisions.cell.restarts import (
     DEFAULT,
@@ -190,7 +190,7 @@ _OPTIONS = (
     _each("needs", "needs", parse_node_need, "=".join),
     _each("placed", "placed", parse_placed, "=".join),
     _unless_default("machine", "machine", parse_machine),
-    _unless_default("head", "head"),
+    _unless_default("head", "head", parse_head),
     _each("watch", "reload.watch"),
     _each("ignore", "reload.ignore"),
     _each("node-watch", "reload.node_watch", parse_of_node, "=".join),
