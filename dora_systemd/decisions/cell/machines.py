@@ -44,7 +44,12 @@ def members_of(placed: Sequence[Placed]) -> tuple[str, ...]:
 
 def machine_of(placed: Sequence[Placed], node: str) -> str:
     """The member that runs the node, or HEAD."""
-    return next((one.machine for one in placed if one.node == node), HEAD)
+    return placed_on(placed, node) or HEAD
+
+
+def placed_on(placed: Sequence[Placed], node: str) -> str:
+    """The member that runs the node, or ""."""
+    return next((one.machine for one in placed if one.node == node), "")
 
 
 def _refusal(text: str, hint: str) -> DoraSystemdError:

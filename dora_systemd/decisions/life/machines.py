@@ -64,7 +64,14 @@ def machine_joined(cell: Cell, event: life.MachineJoined) -> Next:
 
 
 def machine_away(cell: Cell, event: life.MachineLost) -> Next:
-    """A member that had joined is gone, and nothing runs yet: wait for it."""
+    """A member that had joined is gone, and nothing runs yet: wait for it.
+
+    If somebody has stopped it there: its link would only start it again.
+    """
+    if event.by:
+        cell = _stopped_there(cell, event)
+        failed, actions = fail(cell, cell.failure, cell.exit)
+        return failed, (_lost(event.machine, event.reason), *actions)
     lost = cell.lost | {event.machine}
     return replace(cell, lost=lost), (_lost(event.machine, event.reason),)
 
@@ -76,14 +83,18 @@ def _lost(machine: str, reason: str) -> Record:
 def machine_lost(cell: Cell, event: life.MachineLost) -> Next:
     """A member is gone, and with it the run: end the nodes that are here."""
     if event.by:
-        cell = because(cell, Cause.STOPPED_ON_MACHINE)
-        failure = f"it was stopped on machine {event.machine} by {event.by}"
-        cell = replace(cell, failure=failure, exit=RunnerExit.STOPPED_ON_MACHINE)
+        cell = _stopped_there(cell, event)
     else:
         cell = because(cell, Cause.MACHINE_LOST)
         failure = f"machine {event.machine}: {event.reason}"
         cell = replace(cell, failure=failure, exit=RunnerExit.ENGINE_LOST)
     return _end_nodes(cell, event, _lost(event.machine, event.reason))
+
+
+def _stopped_there(cell: Cell, event: life.MachineLost) -> Cell:
+    failure = f"it was stopped on machine {event.machine} by {event.by}"
+    cell = because(cell, Cause.STOPPED_ON_MACHINE)
+    return replace(cell, failure=failure, exit=RunnerExit.STOPPED_ON_MACHINE)
 
 
 def machine_lost_stopping(cell: Cell, event: life.MachineLost) -> Next:

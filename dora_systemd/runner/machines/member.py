@@ -1,0 +1,290 @@
+"""A member of a dataflow with several machines: it runs the nodes that the head has placed on it.
+
+It has a daemon and no coordinator. It acts while one session lasts, which begins with a Part; when
+that ends it ends its nodes, by itself and with success: the head decides what follows. Whatever it
+has been told is in memory only.
+"""
+
+import asyncio
+import contextlib
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from dora_systemd.adapters.dora.command import version_numbers
+from dora_systemd.adapters.dora.preparation import Prepared
+from dora_systemd.adapters.host import files
+from dora_systemd.adapters.host.process import run_command
+from dora_systemd.adapters.logs.pipes import LogPipes
+from dora_systemd.adapters.runner_socket.client import Request
+from dora_systemd.adapters.runner_socket.listener import Session, refuse
+from dora_systemd.adapters.runner_socket.splice import Ends
+from dora_systemd.decisions.cell.machines import HEAD
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.status import CellStatus
+from dora_systemd.decisions.descriptor.dataflow import Dataflow
+from dora_systemd.decisions.dora import protocol
+from dora_systemd.decisions.life import events as life
+from dora_systemd.decisions.life.states import Cell, Do, State
+from dora_systemd.decisions.machines import wire
+from dora_systemd.decisions.machines.part import check_placed, is_here, launch_files, own_options
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.paths import CellPaths
+from dora_systemd.runner.cell.boot import Boot
+from dora_systemd.runner.cell.dialogue import Dialogue
+from dora_systemd.runner.cell.engine import Engine
+from dora_systemd.runner.cell.life import Life
+from dora_systemd.runner.cell.pump import Pump, now_us
+from dora_systemd.runner.cell.role import Alone
+from dora_systemd.runner.machines.ending import end_nodes
+from dora_systemd.runner.machines.engine import NOISE, MemberEngine
+from dora_systemd.runner.machines.lines import Lines
+from dora_systemd.runner.nodes.nodes import Nodes
+from dora_systemd.terminal_text import short_line
+from dora_systemd.values import INFINITY, SECOND
+
+if TYPE_CHECKING:
+    from dora_systemd.adapters.dora.check import DoraCheck
+
+_LONGEST = 100
+_POLL_SECONDS = 0.05
+_EXPLAIN_SECONDS = 0.5
+"""Time for the session to end, which says more than a lost connection to dora."""
+_ASK_SECONDS = 2.0
+_GOING_DOWN = "the machine is shutting down"
+_ENDING = (State.STOPPING, State.CLOSING, State.LEAVING, State.ENDED)
+
+
+class Member(Alone):
+    """A machine that another one has given nodes. paths: of its cell."""
+
+    def __init__(self, options: RunnerOptions, this_life: Life) -> None:
+        super().__init__(options._replace(owes=()), this_life)
+        self._lines: Lines | None = None
+        self._dora: MemberEngine | None = None
+        self._pump: Pump | None = None
+        self._table = self._told = self._version = ""
+        self.stops_by_head = False
+
+    @property
+    def sessions(self) -> Mapping[str, Session]:
+        """`doractl member` begins the only one."""
+        return {"part": self._part}
+
+    @property
+    def start_timeout(self) -> int:
+        """Never: the head sees to that."""
+        return INFINITY
+
+    def own(self, options: RunnerOptions) -> RunnerOptions:
+        """The options without what they say of other machines' nodes."""
+        return own_options(options)
+
+    def here(self, dataflow: Dataflow) -> Dataflow:
+        """The dataflow, which was read without other machines' nodes."""
+        return dataflow
+
+    def prepare(self, paths: CellPaths, prepared: Prepared, check: "DoraCheck") -> None:
+        """Write how each node is started. Raises DoraSystemdError."""
+        self._version = check.version()
+        check_placed(self.options, prepared.dataflow)
+        paths.launch.mkdir(mode=0o700, exist_ok=True)
+        for node, text in launch_files(prepared.dataflow, prepared.plan).items():
+            files.write_atomic(paths.launch / node, text, 0o600)
+
+    def engine(
+        self, dora: str, paths: CellPaths, environment: Mapping[str, str], boot: Boot | None
+    ) -> Engine:
+        """A daemon for the coordinator of the head."""
+        del boot
+        self._dora = MemberEngine(dora, paths, environment, self.options.machine)
+        return self._dora
+
+    def cell(self, cell: Cell) -> Cell:
+        """The cell of a member."""
+        return replace(cell, machine=self.options.machine)
+
+    def dialogue(
+        self, options: RunnerOptions, pump: Pump, dora: Engine, nodes: Nodes, pipes: LogPipes
+    ) -> Dialogue:
+        """What finds the run of the head, and judges its own nodes only."""
+        assert isinstance(dora, MemberEngine)
+        pipes.left_out = NOISE
+        self._pump, pump.amend = pump, self._note_table
+        dialogue = MemberDialogue(options, pump, dora, nodes, pipes)
+        dialogue.begin(self, dora)
+        return dialogue
+
+    def _note_table(self, table: CellStatus) -> CellStatus:
+        self._table = table.to_json()
+        return table
+
+    def _send_table(self) -> None:
+        """With each beat, if something is new."""
+        if self._table != self._told and len(self._table) < wire.MAX_LINE // 2:
+            self._told = self._table
+            self.send(wire.Table(self._table))
+
+    def send(self, message: wire.Message) -> None:
+        """Say something to the head, if it is there."""
+        if self._lines is not None:
+            self._lines.send(message)
+
+    async def _part(self, request: Request, ends: Ends) -> None:
+        try:
+            part, dora, pump = self._accept(request)
+        except DoraSystemdError as error:
+            await refuse(ends, error)
+            return
+        self._lines = Lines(ends, self._send_table)
+        if reason := self._other_version(part):
+            self._lines.send(wire.Refused(reason, "install the same version on both machines"))
+            ends.writer.close()
+            self._end_by_head(reason)
+            return
+        dora.set_part(part)
+        pump.push(life.CoordinatorListening(now_us()))
+        why = await self._lines.talk(self._hear)
+        self._lines = None
+        self._end_by_head(f"the head is lost: {why}")
+
+    def _accept(self, request: Request) -> tuple[wire.Part, MemberEngine, Pump]:
+        told = {**request, "type": "part"}
+        part = wire.expect(wire.parse_message(json.dumps(told).encode()), wire.Part)
+        own = self.options
+        if (part.name, part.uuid, part.machine) != (own.name, own.uuid, own.machine):
+            raise _refusal("this is the part of another dataflow")
+        if self._dora is None or self._pump is None or self._pump.cell.state is not State.BOOTING:
+            raise _refusal(f"machine {own.machine} has a head already")
+        return part, self._dora, self._pump
+
+    def _other_version(self, part: wire.Part) -> str:
+        """Why two versions of dora do not work together, or ""."""
+        own, other = version_numbers(self._version)[:2], version_numbers(part.dora)[:2]
+        there = short_line(part.dora, _LONGEST)
+        return "" if own == other else f"it has dora {self._version}, the head has {there}"
+
+    def _hear(self, message: wire.Message) -> None:
+        if isinstance(message, wire.Stopping):
+            self.stops_by_head = True
+            self._push(life.HeadStops(now_us(), message.by or HEAD))
+        if isinstance(message, wire.StopPart):
+            self._end_by_head("the head has lost another machine")
+
+    def _end_by_head(self, why: str) -> None:
+        self.stops_by_head = True
+        self._push(life.HeadLost(now_us(), why))
+
+    def _push(self, event: life.Event) -> None:
+        if self._pump is not None:
+            self._pump.push(event)
+
+
+def _refusal(message: str) -> DoraSystemdError:
+    return DoraSystemdError(message, "stop it first: doractl stop", ExitCode.NAME_IN_USE)
+
+
+class MemberDialogue(Dialogue):
+    """Carries out each Do of a member. Call begin() first."""
+
+    def begin(self, member: Member, dora: MemberEngine) -> None:
+        """member: talks with the head."""
+        self._member, self._dora = member, dora
+        self._has_told = False
+
+    def actions(
+        self, descriptor: Mapping[str, Any], variables: Mapping[str, str]
+    ) -> dict[Do, Callable[[], None]]:
+        """Those of one machine, without all that the head asks dora."""
+        own = super().actions(descriptor, variables)
+        return {
+            **own,
+            Do.GATHER: lambda: self._ask(Do.GATHER, self._find_run()),
+            Do.ASK_SPAWN: lambda: None,
+            Do.ASK_RESULT: self._tell_result,
+            Do.ASK_STOP: lambda: self._ask(Do.END_NODES, self._stop()),
+            Do.END_NODES: lambda: self._ask(Do.END_NODES, self._end_nodes()),
+            Do.EXIT: lambda: self._exit(own[Do.EXIT]),
+        }
+
+    async def _find_run(self) -> None:
+        """Tell the head that the daemon has joined, and wait for the run that it starts."""
+        _, paths = self._nodes.places
+        self._nodes.expect()
+        self._member.send(wire.Ready(str(paths.work)))
+        while not (run := await self._running()):
+            await asyncio.sleep(_POLL_SECONDS)
+        self._pipes.set_run(run)
+        self._pump.push(life.RunStarted(now_us(), run))
+
+    async def _running(self) -> str:
+        reply = await self._dora.ask_soon(protocol.LIST)
+        return protocol.parse_running(reply, self._options.name)
+
+    def _events_ended(self) -> None:
+        self.spawn("see why dora is silent", self._lose_head("the dora coordinator is gone"))
+
+    async def raised(self, what: str, error: Exception) -> None:
+        """Have an exception end the cell; what dora does not answer is because of the head."""
+        if isinstance(error, DoraSystemdError | TimeoutError):
+            await self._lose_head(str(error) or "dora does not answer")
+        else:
+            await super().raised(what, error)
+
+    async def _lose_head(self, why: str) -> None:
+        await asyncio.sleep(_EXPLAIN_SECONDS)
+        if self._pump.cell.state not in _ENDING:
+            self._has_told = True
+            self._member.send(wire.Ended(why))
+            self._pump.push(life.HeadLost(now_us(), f"the head is lost: {why}"))
+
+    def _is_here(self, node: str) -> bool:
+        return not node or is_here(self._options, node)
+
+    def _tell_result(self) -> None:
+        """How the own nodes have ended, from the own table: the head may be gone already."""
+        cell = self._pump.cell
+        if cell.state is State.CLOSING:
+            results = {ident: node.exit for ident, node in cell.nodes.items()}
+            self._pump.push(life.ResultKnown(now_us(), results))
+
+    async def _stop(self) -> None:
+        """Somebody stops this part here: the head has to know before the nodes end."""
+        await asyncio.to_thread(self._tell_end)
+        await self._end_nodes()
+
+    async def _end_nodes(self) -> None:
+        cell = self._pump.cell
+        await end_nodes(self._nodes, list(cell.nodes), cell.grace / SECOND)
+        self._pump.push(life.StopAnswered(now_us()))
+
+    def _exit(self, leave: Callable[[], None]) -> None:
+        self._tell_end()
+        leave()
+
+    def _tell_end(self) -> None:
+        """Say once why this part ends, unless the head knows."""
+        cell = self._pump.cell
+        if self._has_told or self._member.stops_by_head:
+            return
+        self._has_told = True
+        if cell.stop_by:
+            is_down = _is_going_down(self._is_of_user)
+            reason, by = (_GOING_DOWN, "") if is_down else ("", cell.stop_by)
+            self._member.send(wire.Ended(reason, by))
+        elif cell.failure:
+            self._member.send(wire.Ended(cell.failure))
+
+    @property
+    def _is_of_user(self) -> bool:
+        return self._nodes.places[1].is_of_user
+
+
+def _is_going_down(is_of_user: bool) -> bool:
+    """Whether systemd stops everything, and not only this unit. Also if it cannot be asked."""
+    scope = ["--user"] if is_of_user else []
+    with contextlib.suppress(DoraSystemdError):
+        done = run_command(["systemctl", *scope, "is-system-running"], _ASK_SECONDS)
+        return done.stdout.strip() in ("stopping", "")
+    return True
