@@ -29,7 +29,7 @@ class Plan(NamedTuple):
     """A command for other hosts.
 
     verb: as typed, such as "node restart". acts: it prints an outcome in each line. is_endless:
-    somebody has to end it. options: by name, as click reads them.
+    somebody has to end it. options: by name, as click reads them. key: what JSON calls a host.
     """
 
     verb: str
@@ -38,6 +38,7 @@ class Plan(NamedTuple):
     acts: bool
     wants_json: bool
     is_endless: bool
+    key: str = "host"
 
     @property
     def way(self) -> Way:

@@ -38,7 +38,7 @@ class Talk:
         self._rest = rest
         self._line = b""
         self._has_answered = False
-        self._is_over = False
+        self._is_over = self._has_hung_up = False
         self._excuse = ""
         self._poll = select.poll()
         self._takers: dict[int, Callable[[], None]] = {
@@ -63,7 +63,7 @@ class Talk:
 
     def _take(self, fd: int) -> None:
         if fd == self._runner.fileno() and not self._output.is_open:
-            self._end()
+            self._hang_up()
         elif not self._is_over:
             self._takers[fd]()
 
@@ -77,6 +77,11 @@ class Talk:
     def _end(self) -> None:
         self._is_over = True
 
+    def _hang_up(self) -> None:
+        """The runner has ended, or begun another session."""
+        self._has_hung_up = True
+        self._end()
+
     def _from_runner(self) -> None:
         data = b""
         with suppress(OSError):
@@ -84,7 +89,7 @@ class Talk:
         if data:
             self._to_member(data)
         else:
-            self._end()
+            self._hang_up()
 
     def _to_member(self, data: bytes) -> None:
         try:
@@ -127,8 +132,8 @@ class Talk:
     def _send(self, data: bytes) -> None:
         try:
             self._runner.sendall(data)
-        except OSError:  # the runner has ended
-            self._end()
+        except OSError:
+            self._hang_up()
 
     def part_from(self, host: str, status: int) -> None:
         """Tell the runner why the connection has ended. status: of ssh."""
@@ -136,7 +141,10 @@ class Talk:
             self._pass_on(self._output.feed(data))
         while data := read_now(self._ssh.errors):
             self._complain(data)
-        tell(self._runner, self._last_word(host, status))
+        word = self._last_word(host, status)
+        if not self._has_hung_up:
+            print(f"lost: {word.words}" if isinstance(word, Lost) else word.reason, flush=True)
+        tell(self._runner, word)
 
     def _last_word(self, host: str, status: int) -> Lost | Refused:
         # Imported late: most of the time nothing is lost.

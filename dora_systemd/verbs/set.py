@@ -42,6 +42,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.enabled import enabled_units
 from dora_systemd.verbs.facts.nodes import written_dataflow
+from dora_systemd.verbs.facts.parts import refuse_parts
 from dora_systemd.verbs.facts.reading import read_status
 from dora_systemd.verbs.start.limits import require_controllers
 
@@ -66,6 +67,8 @@ def set_limits(
         hint = "see doractl set --help"
         message = f"cannot change the limits of {cell.name}: none is given"
         raise DoraSystemdError(message, hint, ExitCode.USAGE)
+    refuse_parts([cell], "set")
+    _refuse_placed(cell, nodes)
     if not scope.is_user and os.geteuid() != 0:
         message = f"cannot change the limits of {cell.name}: permission denied"
         raise DoraSystemdError(message, "use sudo", ExitCode.NO_PERMISSION)
@@ -91,6 +94,16 @@ def set_limits(
     if nodes:
         manager.reload()
     return (*warnings, *_unit_file_warnings(manager, scope, cell, unit))
+
+
+def _refuse_placed(cell: Cell, limits: tuple[NodeLimits, ...]) -> None:
+    """Raise DoraSystemdError (USAGE) for limits of a node on another machine."""
+    placed = dict(cell.options.placed)
+    for one in limits:
+        if machine := placed.get(one.node):
+            message = f"cannot limit the node {one.node}: it runs on machine {machine}"
+            hint = f"stop {cell.name}, and start it with another --node-limit"
+            raise DoraSystemdError(message, hint, ExitCode.USAGE)
 
 
 def _unit_file_warnings(

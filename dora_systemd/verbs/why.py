@@ -6,7 +6,7 @@ from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.journal.reader import JournalReader
-from dora_systemd.decisions.cell.status import HELD, CellStatus
+from dora_systemd.decisions.cell.status import GATHERING, HELD, CellStatus
 from dora_systemd.decisions.life import nodes as node_table
 from dora_systemd.decisions.logs.query import scope_matches, story_matches
 from dora_systemd.decisions.views.rows import DataflowRow
@@ -51,7 +51,17 @@ def explain(manager: Manager, scope: Scope, selector: str, journal: JournalReade
     words = _last_words(journal, scope, subject, verdict)
     inhibitors = read_holders(scope, [cell.name]).get(cell.name, ()) if cell else ()
     is_held = cell is not None and _is_held(scope, cell, verdict.node)
-    return Report(subject, verdict, words, budget, inhibitors, is_held)
+    machines = _machines(manager, cell) if cell and cell.options.placed else {}
+    return Report(subject, verdict, words, budget, inhibitors, is_held, machines)
+
+
+def _machines(manager: Manager, cell: Cell) -> dict[str, str]:
+    """The other machines of a dataflow, each with its host."""
+    # Imported late: most dataflows run on one machine.
+    from dora_systemd.verbs.facts.machines import member_hosts
+
+    found = member_hosts(manager, cell.options)
+    return {machine: host.text if host else "" for machine, host in found.items()}
 
 
 def _is_held(scope: Scope, cell: Cell, node: str) -> bool:
@@ -97,6 +107,7 @@ def _facts(manager: Manager, scope: Scope, cell: Cell) -> Facts:
         _now_boot(),
         unit["NRestarts"],
         {key: node.silent for key, node in nodes if node.silent},
+        is_gathering=status.stage == GATHERING,
     )
 
 

@@ -9,7 +9,7 @@ import click
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.parameters import current_scope, scope_options
 from dora_systemd.cli.settingoptions import SettingsCommand, setting_options
-from dora_systemd.decisions.cell.machines import parse_machine, parse_placed
+from dora_systemd.decisions.cell.machines import parse_head, parse_machine, parse_placed
 from dora_systemd.decisions.machines.wire import Refused
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import parse_name, parse_uuid
@@ -35,10 +35,17 @@ from dora_systemd.verbs.start.plan import StartRequest
     metavar="NODE=MACHINE",
     help="Where a node runs that does not run on the head.",
 )
+@click.option("--head", default="", metavar="HOST", help="The host name of the head, for people.")
 @setting_options
 @scope_options
 def command(
-    dataflow: str, name: str, uuid: str, machine: str, placed: tuple[str, ...], **flags: Any
+    dataflow: str,
+    name: str,
+    uuid: str,
+    machine: str,
+    placed: tuple[str, ...],
+    head: str,
+    **flags: Any,
 ) -> int:
     """Run the nodes of FILE that belong to this machine, as the service dora-NAME.service.
 
@@ -59,13 +66,14 @@ def command(
         uuid=parse_uuid(uuid),
         placed=tuple(map(parse_placed, placed)),
         machine=parse_machine(machine),
+        head=parse_head(head),
     )
     scope = current_scope()
-    with Head() as head:
+    with Head() as told:
         try:
-            runner = start_member(Bus(scope), MemberRequest(scope, start), head)
+            runner = start_member(Bus(scope), MemberRequest(scope, start), told)
         except DoraSystemdError as error:
             if not is_passing(error):
-                head.tell(Refused(error.message, error.hint))
+                told.tell(Refused(error.message, error.hint))
             raise
     become_relay(runner)

@@ -4,6 +4,7 @@ The machine on which `doractl start` runs is the head. Every other one is a memb
 They are part of the runner's command line, which `list` parses: imports only what loads quickly.
 """
 
+import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -13,6 +14,7 @@ from dora_systemd.values import quoted
 
 HEAD = "head"
 """The machine of a node that runs on the head, where a word is needed; no member has this name."""
+_HOST_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,252}")
 
 
 class Placed(NamedTuple):
@@ -34,6 +36,18 @@ def parse_machine(text: str) -> str:
     """The name of a member. Raises DoraSystemdError (USAGE)."""
     if not is_name(text) or text == HEAD:
         raise _refusal(text, f"a machine has a name like a dataflow, and not {HEAD}")
+    return text
+
+
+def is_host_name(text: str) -> bool:
+    """Whether it can be that of the head."""
+    return _HOST_NAME.fullmatch(text) is not None
+
+
+def parse_head(text: str) -> str:
+    """The host name of the head, or "". Raises DoraSystemdError (USAGE)."""
+    if text and not is_host_name(text):
+        raise _refusal(text, "write the host name of the head")
     return text
 
 

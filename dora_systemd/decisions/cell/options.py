@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from dora_systemd.decisions.cell.hot_reload import DEFAULT_RELOAD, HotReload, parse_of_node
 from dora_systemd.decisions.cell.limits import NodeLimits, format_node_limits, parse_node_limits
 from dora_systemd.decisions.cell.line_rates import UNLIMITED, RateLimits, format_rates, parse_rates
-from dora_systemd.decisions.cell.machines import Placed, parse_machine, parse_placed
+from dora_systemd.decisions.cell.machines import Placed, parse_head, parse_machine, parse_placed
 from dora_systemd.decisions.cell.needs import NodeNeed, parse_node_need
 from dora_systemd.decisions.cell.restarts import (
     DEFAULT,
@@ -71,7 +71,8 @@ class RunnerOptions(NamedTuple):
     owes: outputs of nodes that have to come in time.
     needs: the paths that single nodes wait for.
     placed: the nodes that run on other machines than the head.
-    machine: the name of this machine if it is a member; "" on the head and without members.
+    machine, head: on a member its name, and the host name of the head; "" on the head and without
+    members.
     """
 
     name: str
@@ -99,6 +100,7 @@ class RunnerOptions(NamedTuple):
     needs: tuple[NodeNeed, ...] = ()
     placed: tuple[Placed, ...] = ()
     machine: str = ""
+    head: str = ""
 
     def __hash__(self) -> int:
         return hash(self.uuid)
@@ -164,11 +166,7 @@ _parse_watchdogs = _late("signs.watchdogs", "parse_sockets")
 
 
 def _format_watchdogs(watchdogs: Mapping[str, int]) -> list[str]:
-    if not watchdogs:
-        return []
-    from dora_systemd.decisions.signs.watchdogs import format_watchdogs
-
-    return format_watchdogs(watchdogs)
+    return _late("signs.watchdogs", "format_watchdogs")(watchdogs) if watchdogs else []
 
 
 _REQUIRED = ("name", "uuid", "working-directory", "dora")
@@ -192,6 +190,7 @@ _OPTIONS = (
     _each("needs", "needs", parse_node_need, "=".join),
     _each("placed", "placed", parse_placed, "=".join),
     _unless_default("machine", "machine", parse_machine),
+    _unless_default("head", "head", parse_head),
     _each("watch", "reload.watch"),
     _each("ignore", "reload.ignore"),
     _each("node-watch", "reload.node_watch", parse_of_node, "=".join),

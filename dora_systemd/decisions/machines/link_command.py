@@ -23,7 +23,8 @@ _OPTIONS = {
     # A machine that is gone is noticed after these two, which is before the lease ends.
     "ServerAliveInterval": "2",
     "ServerAliveCountMax": "3",
-    "ConnectTimeout": "4",
+    # Also for the first words of sshd, on a machine that is busy.
+    "ConnectTimeout": "8",
     # A connection of its own, whatever ssh_config(5) has.
     "ControlMaster": "no",
     "ControlPath": "none",

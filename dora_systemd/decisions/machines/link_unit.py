@@ -10,10 +10,9 @@ from dora_systemd.decisions.machines.member import Member
 from dora_systemd.decisions.properties.assignments import typed, with_assignments, with_properties
 from dora_systemd.decisions.properties.kinds import Property
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.names import SLICE, unit_name
+from dora_systemd.names import LINK_PREFIX, SLICE, UNIT_SUFFIX, unit_name
 from dora_systemd.values import SECOND
 
-PREFIX, SUFFIX = "doralink-", ".service"
 _BETWEEN = ":"
 """In no name of a dataflow or of a machine, so two links never have the same unit."""
 _MOST = 255
@@ -56,7 +55,7 @@ class LinkUnit(NamedTuple):
 
 def link_unit_name(name: str, machine: str) -> str:
     """The unit of the link to `machine`. Raises DoraSystemdError (BAD_INPUT) if it is too long."""
-    unit = f"{PREFIX}{name}{_BETWEEN}{machine}{SUFFIX}"
+    unit = f"{LINK_PREFIX}{name}{_BETWEEN}{machine}{UNIT_SUFFIX}"
     if len(unit) > _MOST:
         reason = f"a unit's name has at most {_MOST} characters"
         message = f"cannot link {name} to machine {machine}: {reason}"
@@ -73,7 +72,7 @@ def link_units_of(options: RunnerOptions) -> list[str]:
 
 def links_pattern(name: str) -> str:
     """A pattern for all links of a dataflow."""
-    return f"{PREFIX}{name}{_BETWEEN}*{SUFFIX}"
+    return f"{LINK_PREFIX}{name}{_BETWEEN}*{UNIT_SUFFIX}"
 
 
 def wanted_links(options: RunnerOptions) -> dict[str, Property]:

@@ -54,6 +54,7 @@ def on_head(options: RunnerOptions) -> RunnerOptions:
     """The options of the head's runner: without what only the runners of members need."""
     away = {one.node for one in options.placed}
     return options._replace(
+        head="",
         node_limits=tuple(one for one in options.node_limits if one.node not in away),
         node_rights=tuple(one for one in options.node_rights if one.node not in away),
         needs=tuple(one for one in options.needs if one.node not in away),
@@ -75,7 +76,8 @@ def member_of(
 ) -> Member:
     """What the machine is told. Raises DoraSystemdError (BAD_INPUT) if that is too long.
 
-    options: before on_head(). variables: of --env and of the environment files here.
+    options: before on_head(), with the name of the head. variables: of --env and of the
+    environment files here.
     """
     words = tuple(_words(machine, options, settings, variables))
     if sum(len(word.encode()) + 4 for word in words) > _MOST_BYTES:
@@ -97,6 +99,7 @@ def _words(
     yield from (VERB, str(PurePath(machine.directory or here.parent, here.name)))
     yield f"--name={options.name}"
     yield f"--uuid={options.uuid}"
+    yield from [f"--head={options.head}"] if options.head else []
     yield from (f"--placed={'='.join(one)}" for one in options.placed)
     nodes = [one.node for one in options.placed if one.machine == machine.name]
     given = [(one, settings[one]) for one in _SHARED if settings.is_given(one)]

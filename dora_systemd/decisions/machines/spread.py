@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 
-from dora_systemd.decisions.cell.machines import members_of
+from dora_systemd.decisions.cell.machines import is_host_name, members_of
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.machines.entry import parse_entry
@@ -37,7 +37,7 @@ def spread(
     placed = place_nodes(dataflow, machines, hostname)
     if not placed:
         return options, ()
-    whole = options._replace(placed=placed)
+    whole = options._replace(placed=placed, head=hostname if is_host_name(hostname) else "")
     _check(whole, settings)
     used = [machines[name] for name in members_of(placed)]
     told = tuple(member_of(one, whole, settings, variables) for one in used)

@@ -178,7 +178,8 @@ def _reached(manager: Manager, request: MemberRequest) -> socket.socket:
     while time.monotonic() < deadline:
         with suppress(OSError):
             return connect_unix(path, _START_SECONDS)
-        if manager.read(request.unit, ["ActiveState"])["ActiveState"] in DOWN:
+        state = manager.read(request.unit, ["Job", "ActiveState"])
+        if state["ActiveState"] in DOWN and not (state["Job"] or (0,))[0]:
             raise _failure(manager, request.unit)
         time.sleep(_POLL_SECONDS)
     raise DoraSystemdError(f"cannot start {request.unit}: its runner does not answer")

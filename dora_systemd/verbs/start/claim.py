@@ -1,6 +1,5 @@
 """Checks that the name of a new dataflow is free, and cleans up after an ended one."""
 
-import sys
 from dataclasses import replace
 
 from dora_systemd.adapters.bus.manager import Beside, Manager
@@ -12,7 +11,6 @@ from dora_systemd.decisions.unit.versions import drop_unsupported
 from dora_systemd.decisions.views.dataflows import local_time
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import release_of
-from dora_systemd.paths import CellPaths
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell, read_cell
 from dora_systemd.verbs.start.enable import (
@@ -26,6 +24,7 @@ from dora_systemd.verbs.start.enable import (
     wait_until_forgotten,
 )
 from dora_systemd.verbs.start.plan import Plan
+from dora_systemd.verbs.start.unit import plan_links
 
 
 def require_free_name(manager: Manager, scope: Scope, unit: str) -> BootUnit:
@@ -112,13 +111,8 @@ def prepared_links(manager: Manager, plan: Plan, systemd: int) -> Beside:
 
     Raises DoraSystemdError (NAME_IN_USE).
     """
-    # Imported late: most dataflows run on one machine.
-    from dora_systemd.decisions.machines.link_unit import link_unit
-
-    options, is_user = plan.options, plan.scope.is_user
-    socket = str(CellPaths(plan.scope.cell_directory(options.name)).socket)
-    links = [link_unit(sys.executable, socket, options, one, is_user) for one in plan.members]
-    for unit in end_links(manager, options.name):
+    links = plan_links(plan)
+    for unit in end_links(manager, plan.options.name):
         wait_until_forgotten(manager, unit)
     kept = ((one.unit, drop_unsupported(one.properties, systemd)[0]) for one in links)
     return [(unit, list(properties.values())) for unit, properties in kept]

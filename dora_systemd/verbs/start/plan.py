@@ -51,8 +51,8 @@ class StartRequest:
     environment: the caller's variables. attached: the dataflow ends with the caller. caller: the
     variables that the dataflow may read. uuid: of a dataflow that is started again. origin: of a
     release, the file that its dataflow file was copied from: who owns that decides, not root, who
-    owns the copy. is_unbuilt: the programs of its nodes need not exist yet. machine, placed: of
-    the runner's options, if this machine is a member of the dataflow.
+    owns the copy. is_unbuilt: the programs of its nodes need not exist yet. machine, head, placed:
+    of the runner's options, if this machine is a member of the dataflow.
     """
 
     dataflow: str
@@ -65,6 +65,7 @@ class StartRequest:
     origin: Place | None = None
     is_unbuilt: bool = False
     machine: str = ""
+    head: str = ""
     placed: tuple[Placed, ...] = ()
 
 
@@ -153,6 +154,7 @@ def _make_plan(
         env_keys=tuple(variables),
         placed=request.placed,
         machine=request.machine,
+        head=request.head,
     )
     options = with_settings(options, settings)
     options, members = _spread(dataflow, options, settings, variables)

@@ -70,7 +70,7 @@ LATE = {
     },
     "YAML, and every compressor: most who read a file need neither": {
         "adapters.host.files": {"yaml", "adapters.host.yaml_loader"},
-        "cli.verbs.look.logs": {"verbs.follow"},
+        "cli.verbs.look.logs": {"verbs.follow", "cli.remote.machines"},
     },
     "limits, CPUs or rights of single nodes only": {
         "decisions.cell.limits": {"node_words"},
@@ -93,6 +93,7 @@ LATE = {
         "decisions.cell.launch": {"decisions.cell.placed"},
         "runner.roles": {"runner.machines.head", "runner.machines.member"},
         "verbs.start.plan": {"decisions.machines.spread"},
+        "verbs.why": {"verbs.facts.machines"},
         "verbs.start.unit": {"decisions.machines.link_unit"},
         "verbs.start.claim": {"decisions.machines.link_unit"},
         "link.talk": {"link.parting"},
@@ -105,7 +106,6 @@ LATE = {
     "most dataflows have no notify sockets": {
         "runner.signs.hook": {"runner.signs.sockets"},
         "runner.cell.dialogue": {"runner.signs.watch"},
-        "decisions.cell.options": {"decisions.signs.watchdogs"},
         "verbs.facts.list": {"decisions.signs.table"},
     },
     "asyncio and WebSockets: of all verbs, a few need one of them": {

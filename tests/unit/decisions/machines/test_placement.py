@@ -101,6 +101,7 @@ def test_what_a_member_is_told() -> None:
         "/home/alice/robot/dataflow.yml",
         "--name=robot",
         f"--uuid={UUID}",
+        "--head=robot-1.lan",
         "--placed=yolo=gpu",
         "--sandbox=none",
         "--node-limit=yolo:memory=4G",

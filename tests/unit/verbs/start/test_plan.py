@@ -382,7 +382,7 @@ def test_a_dataflow_on_two_machines(project: Path) -> None:
     assert member.host.destination == "alice@gpu-box"
     assert member.words == (
         *("member", str(project / "robot.yml"), "--name=robot", f"--uuid={plan.options.uuid}"),
-        *("--placed=b=gpu", "--env=A=1"),
+        *(f"--head={os.uname().nodename}", "--placed=b=gpu", "--env=A=1"),
     )
     with pytest.raises(DoraSystemdError, match="node b: its machine 'gpu' is not declared"):
         plan_of(project)
