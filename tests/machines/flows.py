@@ -1,91 +1,119 @@
-"""One dataflow on a, the head, and b, its machine gpu."""
+"""A dataflow over the machines of the lab: its head is on a, its members are b and perhaps c."""
 
 import json
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 from tests.machines.wires import there
-from tests.system.cells import Cell, run, wait_for
+from tests.system.cells import DOUBLER, SINK, SOURCE, Cell, Project, dora_processes, wait_for
 
-FILE = "/src/tests/machines/flow/dataflow.yml"
-GRACE = 2
-"""Seconds."""
-_FLAGS = ("--machine", "gpu=b", "--restart-policy", "on-failure", "--grace-duration", f"{GRACE}s")
-_OURS = "dora daemon|dora coordinator|dora_systemd[.]runner|dora_systemd[.]link|flow/[a-z]+[.]py"
+PLACE = "/opt/flow"
+NAME = "flow"
+_DATAFLOW = """
+nodes:
+  - id: source
+    path: source.py
+    inputs: {{tick: dora/timer/millis/50}}
+    outputs: [number]
+  - id: doubler
+    path: doubler.py
+    inputs: {{number: {{source: source/number, queue_size: 1000}}}}
+    outputs: [double]
+    deploy: {{machine: gpu}}
+  - id: sink
+    path: sink.py
+    inputs: {{double: {{source: doubler/double, queue_size: 1000}}}}
+    deploy: {{machine: {sink}}}
+"""
+_PROCESSES = "'pgrep -af \"dora_systemd|dora (daemon|coordinator)|/opt/flow\" | grep -v pgrep'"
 
 
-class Flow(Cell):
-    """The part on the head; `there` is about the other one."""
+@dataclass(frozen=True)
+class Flow:
+    """A dataflow on a and `members`, machine by name of the dataflow."""
 
-    def begin(self, *more: str) -> subprocess.CompletedProcess[str]:
-        """Start it on both machines."""
-        return self.doractl("start", FILE, "--name", self.name, *_FLAGS, *more, check=False)
+    members: dict[str, str]
 
     @property
-    def life(self) -> tuple[str, str]:
-        """What changes with each life of the head, and with each run of dora."""
-        return self.show("InvocationID"), self.status.run
+    def cell(self) -> Cell:
+        """The unit of the head."""
+        return Cell(NAME)
 
-    def on_b(self, name: str) -> str:
-        """A property of the unit there."""
-        command = ("systemctl", "show", "--value", "--property", name, self.unit)
-        return there("b", *command).stdout.strip()
+    @property
+    def machines(self) -> Sequence[str]:
+        """All of them."""
+        return ("a", *self.members.values())
 
-    def kill_on_b(self, what: str) -> None:
-        """SIGKILL for a process there, by a pattern that does not match the shell around it."""
-        pattern = f"[{what[0]}]{what[1:]}"
-        assert there("b", "pkill", "-KILL", "-f", f"'{pattern}'").returncode == 0, what
+    def bring(self) -> None:
+        """The same files on all machines."""
+        place = Project(Path(PLACE), is_new=False)
+        for name, text in (("source", SOURCE), ("doubler", DOUBLER), ("sink", SINK)):
+            place.write(f"{name}.py", text)
+        place.write("dataflow.yml", _DATAFLOW.format(sink="arm" if "arm" in self.members else "a"))
+        for machine in self.members.values():
+            there(machine, "mkdir", "-p", PLACE)
+            command = ["scp", "-q", "-r", PLACE, f"root@{machine}:/opt"]
+            subprocess.run(command, check=True)
+
+    def flags(self) -> list[str]:
+        """For `doractl start`."""
+        return [f"--machine={name}={host}" for name, host in self.members.items()]
+
+    def start(self, *flags: str, check: bool = True) -> subprocess.CompletedProcess[str]:
+        """Start it, and wait for all of its nodes."""
+        file = Path(PLACE) / "dataflow.yml"
+        return self.cell.start(file, *self.flags(), *flags, check=check)
+
+    def status(self) -> str:
+        """The status of the head's unit for people."""
+        return self.cell.show("StatusText")
 
     def is_running(self) -> bool:
-        """Whether both parts are up."""
-        return self.show("ActiveState") == "active" and self.on_b("ActiveState") == "active"
+        """Whether all nodes are ready, as far as the head knows."""
+        return self.cell.show("ActiveState") == "active"
 
-    def wait_running(self) -> None:
-        """Return when messages cross the machines."""
-        wait_for("both machines run", self.is_running, 60)
+    def life(self) -> str:
+        """What is new with each run."""
+        return self.cell.show("InvocationID")
+
+    def wait_again(self, life: str) -> None:
+        """Return when another run than that of `life` is there, and messages flow."""
+        wait_for("it runs again", lambda: self.life() != life and self.is_running(), 60)
         self.wait_exchanging()
 
-    def waits(self) -> bool:
-        """Whether the head says that it waits for the other one."""
-        return self.show("StatusText").startswith("waiting for machine gpu (")
+    def wait_exchanging(self) -> None:
+        """Return when the sink has got something new."""
+        before = self.heard()
+        wait_for("the sink hears more", lambda: self.heard() != before)
 
-    def reasons(self) -> list[str]:
-        """Why lives of the head have failed, oldest first."""
-        records = self.journal("DORA_EVENT=dataflow-failed")
-        return [str(one.get("DORA_REASON", "")) for one in records]
+    def heard(self) -> str:
+        """The last that the sink has said, on whatever machine."""
+        command = f"journalctl -q -n 1 -o short-unix -t {NAME}/sink"
+        return there(self.members.get("arm", "a"), command).stdout
 
-    def close(self) -> None:
-        """Stop it, and see that nothing is left on any machine."""
-        self.doractl("stop", self.name, check=False)
-        wait_for("nothing is left", lambda: not any(left_on(name) for name in ("a", "b", "c")))
+    def pid(self, machine: str, pattern: str) -> str:
+        """The process of the unit on a machine whose command line has `pattern`."""
+        group = f"/sys/fs/cgroup/dora.slice/dora-{NAME}.service"
+        command = f'\'for p in $(cat $(find {group} -name cgroup.procs)); do tr "\\0" " " '
+        command += f'< /proc/$p/cmdline | grep -q -- "{pattern}" && echo $p; done\''
+        found = there(machine, "sh", "-c", command).stdout.split()
+        assert len(found) == 1, f"{pattern} on {machine}: {found}"
+        return found[0]
 
+    def kill(self, machine: str, pattern: str) -> None:
+        """Kill that process."""
+        assert there(machine, "kill", "-9", self.pid(machine, pattern)).returncode == 0
 
-def left_on(name: str) -> list[str]:
-    """Our processes on a machine."""
-    command = ("pgrep", "-fa", _OURS)
-    done = run(*command, check=False) if name == "a" else there(name, "pgrep", "-fa", f"'{_OURS}'")
-    found = done.stdout.splitlines()
-    return [line for line in found if "pgrep" not in line]
+    def left(self) -> str:
+        """What is left of it on any machine."""
+        found = [f"{pid} {words}" for pid, words in dora_processes().items()]
+        for machine in self.members.values():
+            found += there(machine, "sh", "-c", _PROCESSES).stdout.splitlines()
+        return "\n".join(found)
 
-
-def listeners(name: str) -> set[str]:
-    """Where a machine listens, but for loopback."""
-    command = ("ss", "-Hltn")
-    found = run(*command).stdout if name == "a" else there(name, *command).stdout
-    places = {line.split()[3] for line in found.splitlines()}
-    return {place for place in places if not place.startswith("127.0.0.1:")}
-
-
-def lifetime(flow: Flow) -> Iterator[Flow]:
-    """A fixture's block: it runs before, and nothing of it is left after."""
-    done = flow.begin()
-    assert done.returncode == 0, done.stderr
-    flow.wait_running()
-    yield flow
-    flow.close()
-
-
-def rows(name: str) -> dict[str, dict[str, object]]:
-    """The nodes in `list -o json`."""
-    found = json.loads(run("doractl", "list", name, "-o", "json").stdout)
-    return {one["id"]: one for one in found["nodes"]}
+    def table(self) -> dict[str, dict[str, object]]:
+        """The nodes as `list -o json` has them."""
+        (row,) = json.loads(self.cell.doractl("list", NAME, "-o", "json").stdout)
+        return {node["node"]: node for node in row["nodes"]}
