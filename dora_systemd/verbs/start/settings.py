@@ -78,6 +78,22 @@ def read_settings(
     return replace(settings, lent=frozenset(one for one in named if one not in by_root))
 
 
+def config_file(scope: Scope, environment: Mapping[str, str]) -> Path:
+    """The settings file for all dataflows of the scope; it need not exist."""
+    places = settings_files(Path("/"), environment)[1:]
+    return places[0] if scope.is_user else SYSTEM_FILE
+
+
+def read_config(scope: Scope, environment: Mapping[str, str]) -> Settings:
+    """The settings for all dataflows. Raises DoraSystemdError."""
+    found = [_read(one) for one in settings_files(Path("/"), environment)[1:] if exists(one)]
+    for one in found:
+        if not scope.is_user and not one.is_roots:
+            _check_trust(one)
+    documents = [(str(one.path), one.document) for one in found]
+    return resolve_settings({}, {}, documents, SETTINGS)
+
+
 def require_modest(path: Path) -> None:
     """Raise DoraSystemdError for what a settings file may not say that is not the caller's."""
     read = _read(path)
