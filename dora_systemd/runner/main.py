@@ -44,7 +44,6 @@ from dora_systemd.runner.cell.failure import Beside, words
 from dora_systemd.runner.cell.life import Life
 from dora_systemd.runner.cell.pause import forget_restarts, hold_back
 from dora_systemd.runner.cell.pump import Pump, now_us
-from dora_systemd.runner.cell.role import role_of
 from dora_systemd.runner.needs.needs import wait_for_needs
 from dora_systemd.runner.nodes.descriptors import wait_eof
 from dora_systemd.runner.nodes.losses import LossWatch, losses_of_user
@@ -55,6 +54,7 @@ from dora_systemd.runner.reload.apply import Run, tell_started
 from dora_systemd.runner.reload.reloader import Reloader
 from dora_systemd.runner.reload.settings_file import SettingsFile
 from dora_systemd.runner.reload.swap import Swapper
+from dora_systemd.runner.roles import role_of
 from dora_systemd.values import INFINITY, SECOND
 
 SAMPLE_SECONDS = 5.0

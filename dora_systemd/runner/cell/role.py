@@ -1,7 +1,6 @@
 """What is different in a cell if its dataflow has several machines.
 
-Alone is the cell of all others. The head and the members are in runner/machines/, which only their
-cells import.
+Alone is the cell of all others. The head and the members are in runner/machines/.
 """
 
 from collections.abc import Mapping
@@ -67,16 +66,3 @@ class Alone:
     ) -> Dialogue:
         """What carries out the actions of the run."""
         return Dialogue(options, pump, dora, nodes, pipes)
-
-
-def role_of(options: RunnerOptions, this_life: Life) -> Alone:
-    """What this machine is in the dataflow of `options`."""
-    if not options.placed:
-        return Alone(options, this_life)
-    if options.machine:
-        from dora_systemd.runner.machines.member import Member
-
-        return Member(options, this_life)
-    from dora_systemd.runner.machines.head import Head
-
-    return Head(options, this_life)

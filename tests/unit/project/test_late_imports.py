@@ -82,7 +82,7 @@ LATE = {
         "decisions.views.outcome": {"decisions.views.objects"},
     },
     "most dataflows owe nothing, and wait for nothing": {
-        "adapters.dora.preparation": {"adapters.dora.probe"},
+        "adapters.dora.preparation": {"adapters.dora.probe", "decisions.machines.part"},
         "runner.owes.begin": {"runner.owes.watch"},
         "verbs.facts.reading": {"decisions.owes.probe", "verbs.facts.held"},
     },
@@ -90,6 +90,8 @@ LATE = {
         "runner.owes.listen": {"dora"},
     },
     "most dataflows run on one machine, and most links are not lost": {
+        "decisions.cell.launch": {"decisions.cell.placed"},
+        "runner.roles": {"runner.machines.head", "runner.machines.member"},
         "verbs.start.plan": {"decisions.machines.spread"},
         "verbs.why": {"verbs.facts.machines"},
         "verbs.start.unit": {"decisions.machines.link_unit"},

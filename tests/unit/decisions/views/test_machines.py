@@ -41,7 +41,7 @@ def test_a_part_says_that_it_is_one() -> None:
 def test_objects() -> None:
     found = dataflow_object(ROBOT)
     assert (found["machine"], found["machines"]) == (None, ["gpu"])
-    assert [node["machine"] for node in found["nodes"]] == [None, "gpu"]
+    assert [node["machine"] for node in found["nodes"]] == ["head", "gpu"]
 
 
 def test_top_and_metrics() -> None:
