@@ -1,30 +1,14 @@
 """The keys of machines: files beside the settings, one for each machine."""
 
 import os
-from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
 from dora_systemd.adapters.host.process import run_command
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.scope import Scope
 from dora_systemd.trust.programs import own_account
 
-SYSTEM_PLACE = Path("/etc/dora-systemd/ssh")
-_USER_PLACE = Path("dora-systemd/ssh")
 _SECONDS = 30.0
-
-
-def key_place(scope: Scope, environment: Mapping[str, str]) -> Path:
-    """The directory of the keys. Raises DoraSystemdError (BAD_INPUT) for a user without a home."""
-    if not scope.is_user:
-        return SYSTEM_PLACE
-    home = environment.get("HOME", "")
-    config = environment.get("XDG_CONFIG_HOME", "") or (f"{home}/.config" if home else "")
-    if not config.startswith("/"):
-        hint = "set HOME"
-        raise DoraSystemdError("cannot find a place for keys", hint, ExitCode.BAD_INPUT)
-    return Path(config) / _USER_PLACE
 
 
 def make_key(place: Path, machine: str) -> Path:

@@ -16,10 +16,10 @@ from dora_systemd.decisions.settings.machines import MACHINES
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.values import quoted, shown
-from dora_systemd.verbs.machines.keys import key_place, make_key, public_key, remove_key
+from dora_systemd.verbs.machines.keys import make_key, public_key, remove_key
 from dora_systemd.verbs.machines.own import own_facts
 from dora_systemd.verbs.machines.probe import Probe, probe_as_caller, probe_as_link, run_there
-from dora_systemd.verbs.start.settings import config_file, read_config
+from dora_systemd.verbs.start.settings import config_file, key_place, read_config
 
 _INSTALL = (
     'umask 077; mkdir -p "$HOME/.ssh" && f="$HOME/.ssh/authorized_keys" && touch "$f" && '

@@ -84,6 +84,11 @@ def config_file(scope: Scope, environment: Mapping[str, str]) -> Path:
     return places[0] if scope.is_user else SYSTEM_FILE
 
 
+def key_place(scope: Scope, environment: Mapping[str, str]) -> Path:
+    """The directory with the keys of machines, one file each; it need not exist."""
+    return config_file(scope, environment).parent / "ssh"
+
+
 def read_config(scope: Scope, environment: Mapping[str, str]) -> Settings:
     """The settings for all dataflows. Raises DoraSystemdError."""
     found = [_read(one) for one in settings_files(Path("/"), environment)[1:] if exists(one)]
