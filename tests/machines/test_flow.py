@@ -42,7 +42,7 @@ def test_a_life(flow: Flow) -> None:
         "doubler": "gpu",
         "sink": "arm" if "arm" in flow.members else None,
     }
-    assert {one["state"] for one in nodes.values()} == {"Running"}
+    assert {one["state"] for one in nodes.values()} == {"running"}
     token = json.loads((flow.cell.paths.control).read_text())["token"]
     for machine in flow.machines:
         assert listeners(machine) == {"0.0.0.0:22", "[::]:22"}
