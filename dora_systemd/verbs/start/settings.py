@@ -18,6 +18,7 @@ from dora_systemd.values import shown
 
 SYSTEM_FILE = Path("/etc/dora-systemd/config.yml")
 USER_FILE = Path("dora-systemd/config.yml")
+_ANY_FILE = Path("/dataflow.yml")
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ def read_settings(
 
 def config_file(scope: Scope, environment: Mapping[str, str]) -> Path:
     """The settings file for all dataflows of the scope; it need not exist."""
-    places = settings_files(Path("/"), environment)[1:]
+    places = settings_files(_ANY_FILE, environment)[1:]
     return places[0] if scope.is_user else SYSTEM_FILE
 
 
@@ -91,7 +92,7 @@ def key_place(scope: Scope, environment: Mapping[str, str]) -> Path:
 
 def read_config(scope: Scope, environment: Mapping[str, str]) -> Settings:
     """The settings for all dataflows. Raises DoraSystemdError."""
-    found = [_read(one) for one in settings_files(Path("/"), environment)[1:] if exists(one)]
+    found = [_read(one) for one in settings_files(_ANY_FILE, environment)[1:] if exists(one)]
     for one in found:
         if not scope.is_user and not one.is_roots:
             _check_trust(one)
