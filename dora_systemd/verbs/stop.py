@@ -61,7 +61,7 @@ def stop_cells(
         _stop_outcome(manager, scope, cell, results.get(cell.unit), begin) for cell in cells
     ]
     release_enabled(manager, scope, up)
-    _end_links(manager, cells)
+    end_links_of(manager, cells)
     return outcomes
 
 
@@ -72,7 +72,7 @@ def stop_cells_within(
     up = [cell for cell in cells if cell.is_up]
     ended = {one.cell: one for one in stop_within(manager, up, most)}
     release_enabled(manager, scope, [cell.unit for cell in up])
-    _end_links(manager, cells)
+    end_links_of(manager, cells)
     return [
         Outcome(cell, _stopped(cell, ended[cell].note), ended[cell].problem)
         if cell in ended
@@ -129,7 +129,7 @@ def release_enabled(manager: Manager, scope: Scope, units: Sequence[str]) -> Non
         manager.reload()  # see lost_units()
 
 
-def _end_links(manager: Manager, cells: Sequence[Cell]) -> None:
+def end_links_of(manager: Manager, cells: Sequence[Cell]) -> None:
     """End the links of those that were the head of several machines."""
     known = (one.known_options for one in cells)
     heads = [one.name for one in known if one and one.placed and not one.machine]

@@ -115,5 +115,5 @@ class Flow:
 
     def table(self) -> dict[str, dict[str, object]]:
         """The nodes as `list -o json` has them."""
-        (row,) = json.loads(self.cell.doractl("list", NAME, "-o", "json").stdout)
+        row = json.loads(self.cell.doractl("list", NAME, "-o", "json").stdout)
         return {node["node"]: node for node in row["nodes"]}

@@ -7,9 +7,11 @@ from typing import Any
 import click
 
 from dora_systemd.adapters.bus.systemd import Bus
+from dora_systemd.cli.edge import write_exactly
 from dora_systemd.cli.parameters import current_scope, scope_options
 from dora_systemd.cli.settingoptions import SettingsCommand, setting_options
 from dora_systemd.decisions.cell.machines import parse_head, parse_machine, parse_placed
+from dora_systemd.decisions.machines.key import ORIGINAL, forced_words
 from dora_systemd.decisions.machines.wire import Refused
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import parse_name, parse_uuid
@@ -23,7 +25,28 @@ from dora_systemd.verbs.machines.member import (
 from dora_systemd.verbs.start.plan import StartRequest
 
 
-@click.command("member", cls=SettingsCommand, hidden=True)
+class MemberCommand(SettingsCommand):
+    """A verb that sshd may run in the place of what a key has asked for, see sshd(8)."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        original = os.environ.get(ORIGINAL, "")
+        if not args and original:
+            mark, args = forced_words(original)
+            for stream in (sys.stdout, sys.stderr):
+                print(mark, file=stream, flush=True)
+        return super().parse_args(ctx, args)
+
+
+def _print_facts(ctx: click.Context, param: click.Parameter, value: bool) -> None:
+    del param
+    if value:
+        from dora_systemd.verbs.machines.own import own_facts
+
+        write_exactly(f"{own_facts(current_scope()).to_json()}\n")
+        ctx.exit()
+
+
+@click.command("member", cls=MemberCommand, hidden=True)
 @click.argument("dataflow", metavar="FILE")
 @click.option("--name", required=True, metavar="NAME", help="Name of the dataflow.")
 @click.option("--uuid", required=True, metavar="UUID", help="Its UUID.")
@@ -36,6 +59,14 @@ from dora_systemd.verbs.start.plan import StartRequest
     help="Where a node runs that does not run on the head.",
 )
 @click.option("--head", default="", metavar="HOST", help="The host name of the head, for people.")
+@click.option(
+    "--facts",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_print_facts,
+    help="Only print what a head wants to know of this machine, as JSON.",
+)
 @setting_options
 @scope_options
 def command(

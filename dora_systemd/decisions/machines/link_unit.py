@@ -82,15 +82,21 @@ def wanted_links(options: RunnerOptions) -> dict[str, Property]:
 
 
 def link_unit(
-    python: str, socket: str, options: RunnerOptions, member: Member, is_user: bool
+    python: str,
+    socket: str,
+    options: RunnerOptions,
+    member: Member,
+    is_user: bool,
+    identity: str = "",
 ) -> LinkUnit:
     """The unit of the link to a member.
 
     python: absolute path of the interpreter of dora-systemd. socket: of the head's runner.
+    identity: the file with the key of the machine, or "" for the keys of the account.
     StopWhenUnneeded= ends it with the head's unit, but not while that waits for its restart. A
     stop of the machine ends the head first, which tells the members.
     """
-    link = LinkOptions(socket, member.machine, member.host.text, member.words)
+    link = LinkOptions(socket, member.machine, member.host.text, member.words, identity)
     argv = link_command(python, link)
     own = typed(
         Description=f"link of dora dataflow {options.name} to machine {member.machine}",

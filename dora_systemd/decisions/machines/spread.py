@@ -44,6 +44,16 @@ def spread(
     return on_head(whole), told
 
 
+def part(options: RunnerOptions, settings: Settings) -> RunnerOptions:
+    """The options of a member's runner. settings: those of its machine, with what the head tells.
+
+    The head looks after owed outputs. Raises DoraSystemdError (BAD_INPUT) as spread().
+    """
+    own = options._replace(owes=())
+    _check(own, settings)
+    return own
+
+
 def _check(options: RunnerOptions, settings: Settings) -> None:
     for reason, hint in _refused(options, settings):
         message = f"cannot start {shown(options.dataflow)} on several machines: {reason}"

@@ -179,11 +179,13 @@ def _spread(
 ) -> "tuple[RunnerOptions, tuple[Member, ...]]":
     """The options of the runner here, and what other machines are told."""
     is_spread = settings[MACHINES] or any("deploy" in node.raw for node in dataflow.nodes)
-    if options.machine or not is_spread:
+    if not (options.machine or is_spread):
         return options, ()
     # Imported late: most dataflows run on one machine.
-    from dora_systemd.decisions.machines.spread import spread
+    from dora_systemd.decisions.machines.spread import part, spread
 
+    if options.machine:
+        return part(options, settings), ()
     return spread(dataflow, options, settings, variables, os.uname().nodename)
 
 

@@ -1,5 +1,6 @@
 """The unit of a plan: its properties for systemd, and its text for people."""
 
+import os
 import sys
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
@@ -15,12 +16,14 @@ from dora_systemd.decisions.unit.file import persistent_unit
 from dora_systemd.decisions.unit.properties import UnitContext, format_unit, unit_properties
 from dora_systemd.decisions.unit.versions import MIN_VERSION, drop_unsupported
 from dora_systemd.paths import CellPaths
+from dora_systemd.trust.paths import exists
 from dora_systemd.verbs.needs.check import Needy, check_needs
 from dora_systemd.verbs.needs.notes import clock_service, needs_warnings
 from dora_systemd.verbs.start.credentials import credential_files
 from dora_systemd.verbs.start.limits import check_limits
 from dora_systemd.verbs.start.plan import Plan
 from dora_systemd.verbs.start.sandbox import sandbox_warnings
+from dora_systemd.verbs.start.settings import key_place
 from dora_systemd.verbs.start.watch import watch_warnings
 
 if TYPE_CHECKING:  # most dataflows run on one machine
@@ -60,7 +63,12 @@ def plan_links(plan: Plan) -> "list[LinkUnit]":
 
     options, is_user = plan.options, plan.scope.is_user
     socket = str(CellPaths(plan.scope.cell_directory(options.name)).socket)
-    return [link_unit(sys.executable, socket, options, one, is_user) for one in plan.members]
+    place = key_place(plan.scope, os.environ)
+    keys = {one.machine: str(path) for one in plan.members if exists(path := place / one.machine)}
+    return [
+        link_unit(sys.executable, socket, options, one, is_user, keys.get(one.machine, ""))
+        for one in plan.members
+    ]
 
 
 def format_plan(plan: Plan, target: str | None = None) -> str:

@@ -4,6 +4,7 @@ import os
 import pwd
 import signal
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -397,3 +398,6 @@ def test_a_part_of_a_dataflow(project: Path) -> None:
     request = StartRequest(file, environment=variables, machine="gpu", placed=placed)
     options = make_plan(USER, request).options
     assert (options.placed, options.machine) == (placed, "gpu")
+    flags = {"network": "private"}
+    with pytest.raises(DoraSystemdError, match="the network is private"):
+        make_plan(USER, replace(request, flags=flags))
