@@ -7,6 +7,7 @@ whole again.
 
 from dataclasses import replace
 
+from dora_systemd.decisions.cell.machines import HEAD
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life import handlers as handle
 from dora_systemd.decisions.life import nodes as table
@@ -23,6 +24,8 @@ from dora_systemd.decisions.life.states import Action, Cell, Do, Record, RunnerE
 from dora_systemd.decisions.life.stop_budget import stop_timeout
 from dora_systemd.values import SECOND
 
+HEAD_LOST = "the head is lost: "
+"""Begins the reason of a HeadLost."""
 _ENDED = ("failed", "finished", "stopped", "dynamic")
 
 
@@ -128,7 +131,8 @@ def head_stops(cell: Cell, event: life.HeadStops) -> Next:
 def head_lost(cell: Cell, event: life.HeadLost) -> Next:
     """A member alone: end the nodes, and with success, for the head decides what follows."""
     cell = replace(cell, stop_by=event.reason)
-    return _end_nodes(cell, event, _lost("head", event.reason), _stopping(event.reason))
+    why = event.reason.removeprefix(HEAD_LOST)
+    return _end_nodes(cell, event, _lost(HEAD, why), _stopping(event.reason))
 
 
 def head_lost_stopping(cell: Cell, event: life.HeadLost) -> Next:

@@ -26,6 +26,7 @@ from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.dora import protocol
 from dora_systemd.decisions.life import events as life
+from dora_systemd.decisions.life.machines import HEAD_LOST
 from dora_systemd.decisions.life.states import Cell, Do, State
 from dora_systemd.decisions.machines import wire
 from dora_systemd.decisions.machines.part import check_placed, is_here, launch_files, own_options
@@ -147,7 +148,7 @@ class Member(Alone):
         pump.push(life.CoordinatorListening(now_us()))
         why = await self._lines.talk(self._hear)
         self._lines = None
-        self._end_by_head(f"the head is lost: {why}")
+        self._end_by_head(f"{HEAD_LOST}{why}")
 
     def _accept(self, request: Request) -> tuple[wire.Part, MemberEngine, Pump]:
         told = {**request, "type": "part"}
@@ -237,7 +238,7 @@ class MemberDialogue(Dialogue):
         if self._pump.cell.state not in _ENDING:
             self._has_told = True
             self._member.send(wire.Ended(why))
-            self._pump.push(life.HeadLost(now_us(), f"the head is lost: {why}"))
+            self._pump.push(life.HeadLost(now_us(), f"{HEAD_LOST}{why}"))
 
     def _is_here(self, node: str) -> bool:
         return not node or is_here(self._options, node)
