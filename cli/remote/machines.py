@@ -7,6 +7,7 @@ import click
 from click.core import ParameterSource
 
 from dora_systemd.adapters.bus.systemd import Bus
+from dora_systemd.cli.parameters import print_warnings
 from dora_systemd.cli.remote.plan import Plan
 from dora_systemd.cli.remote.several import run_on_all
 from dora_systemd.cli.remote.single import pass_through
@@ -36,8 +37,7 @@ def print_machines(scope: Scope, context: click.Context) -> int | None:
         hint = "doractl logs NAME --machine MACHINE"
         message = "cannot use --machine without one dataflow"
         raise DoraSystemdError(message, hint, ExitCode.USAGE)
-    # Who is not the user of that scope has none of its keys for ssh.
-    if scope != scope_of(None) or wanted == HEAD or is_pattern(selectors[0]):
+    if wanted == HEAD or is_pattern(selectors[0]):
         return None
     bus = Bus(scope, for_reading=True)
     cell = _running(bus, selectors[0], wanted)
@@ -46,6 +46,11 @@ def print_machines(scope: Scope, context: click.Context) -> int | None:
         if wanted:
             message = f"cannot find machine {quoted(wanted)}: {selectors[0]} runs on this one only"
             raise DoraSystemdError(message, "doractl list NAME shows machines", ExitCode.USAGE)
+        return None
+    if scope != scope_of(None):
+        # Who is not the user of that scope has none of its keys for ssh.
+        if not given["is_quiet"]:
+            print_warnings([f"the logs of {', '.join(known)} are left out: use sudo"])
         return None
     names = [wanted] if wanted else _machines_of(cell.options.placed, given["nodes"], known)
     if names == [HEAD]:
@@ -94,7 +99,8 @@ def _print(hosts: Sequence[Host], name: str, context: click.Context) -> int:
     words = ["logs", name, *_given_words(context), f"--machine={HEAD}"]
     is_endless = bool(given["is_follow"] or given["until_end"])
     plan = Plan("logs", words, given, False, False, is_endless, "machine")
-    if len(hosts) > 1:
+    # Each object of a program says where it is from, also if there is one machine only.
+    if len(hosts) > 1 or given["output"] == "json":
         return run_on_all(hosts, plan)
     return pass_through(hosts[0], plan._replace(words=[*words, "-o", given["output"]]))
 
