@@ -24,8 +24,6 @@ from dora_systemd.decisions.life.states import Action, Cell, Do, Record, RunnerE
 from dora_systemd.decisions.life.stop_budget import stop_timeout
 from dora_systemd.values import SECOND
 
-HEAD_LOST = "the head is lost: "
-"""Begins the reason of a HeadLost."""
 _ENDED = ("failed", "finished", "stopped", "dynamic")
 
 
@@ -102,6 +100,10 @@ def _stopped_there(cell: Cell, event: life.MachineLost) -> Cell:
 
 def machine_lost_stopping(cell: Cell, event: life.MachineLost) -> Next:
     """A member is gone while dora stops all: it would wait for that machine."""
+    if not any(
+        cell.nodes[node].machine == event.machine for node in table.with_process(cell.nodes)
+    ):
+        return cell, ()
     return _end_nodes(cell, event, _lost(event.machine, event.reason))
 
 
@@ -130,9 +132,8 @@ def head_stops(cell: Cell, event: life.HeadStops) -> Next:
 
 def head_lost(cell: Cell, event: life.HeadLost) -> Next:
     """A member alone: end the nodes, and with success, for the head decides what follows."""
-    cell = replace(cell, stop_by=event.reason)
-    why = event.reason.removeprefix(HEAD_LOST)
-    return _end_nodes(cell, event, _lost(HEAD, why), _stopping(event.reason))
+    cell = replace(cell, stop_by=HEAD)
+    return _end_nodes(cell, event, _lost(HEAD, event.reason), _stopping(HEAD))
 
 
 def head_lost_stopping(cell: Cell, event: life.HeadLost) -> Next:
@@ -142,7 +143,7 @@ def head_lost_stopping(cell: Cell, event: life.HeadLost) -> Next:
 
 def end_early(cell: Cell, event: life.HeadLost | life.HeadStops) -> Next:
     """The head is gone before any node of a member runs."""
-    by = event.by if isinstance(event, life.HeadStops) else event.reason
+    by = event.by if isinstance(event, life.HeadStops) else HEAD
     return handle.stop_early(cell, life.StopAsked(event.at_us, by))
 
 

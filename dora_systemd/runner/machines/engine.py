@@ -19,8 +19,10 @@ dora must not wait for them either; it would for 1.5 s."""
 NOISE = (
     b"Gossip is disabled: cannot de-duplicate",
     b"Scouting delay elapsed before start conditions are met",
+    b"peer daemon disconnected",
+    b"WS coordinator connection error",
 )
-"""Warnings of zenoh about what zenoh-machines.json5 wants."""
+"""Warnings about what zenoh-machines.json5 wants, and about machines: we tell more of those."""
 _OVERLAYS = ("ZENOH_CONFIG", "DORA_ZENOH_CONFIG_OVERLAY")
 """Variables by which a user sets the same: dora refuses both."""
 

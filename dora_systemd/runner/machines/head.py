@@ -135,7 +135,7 @@ class HeadDialogue(Dialogue):
     def begin(self, roster: Roster, dora: HeadEngine, is_first: bool) -> None:
         """is_first: whether somebody waits for this start."""
         self._roster, self._dora, self._is_first = roster, dora, is_first
-        self._ends_at = 0.0
+        self._ends_at, self._is_ending = 0.0, False
 
     def actions(
         self, descriptor: Mapping[str, Any], variables: Mapping[str, str]
@@ -144,7 +144,7 @@ class HeadDialogue(Dialogue):
         return {
             **super().actions(descriptor, variables),
             Do.GATHER: lambda: self._ask(Do.GATHER, self._gather()),
-            Do.END_NODES: lambda: self._ask(Do.END_NODES, self._end_nodes()),
+            Do.END_NODES: self._end_without_dora,
         }
 
     async def _gather(self) -> None:
@@ -246,6 +246,7 @@ class HeadDialogue(Dialogue):
         self._begin_end()
         if silent := self._roster.silent():
             self._lose(silent, "it does not answer")
+            self._end_without_dora()
             return
         self._roster.tell(wire.Stopping(self._pump.cell.stop_by))
         await super()._ask_stop()
@@ -256,10 +257,16 @@ class HeadDialogue(Dialogue):
         self._ends_at = self._ends_at or now + self._pump.cell.grace / SECOND
         return max(self._ends_at - now, 0.0)
 
+    def _end_without_dora(self) -> None:
+        if not self._is_ending:
+            self._is_ending = True
+            self._ask(Do.END_NODES, self._end_nodes())
+
     async def _end_nodes(self) -> None:
         """End what is here, while the members do the same."""
         left = self._begin_end()
         self._roster.tell(wire.StopPart(round(left * SECOND)))
+        self._pipes.mute("coordinator", "daemon")  # they do not know that we end them
         own = [node for node in self._pump.cell.nodes if self._is_here(node)]
         await end_nodes(self._nodes, own, left)
         self._pump.push(life.StopAnswered(now_us()))

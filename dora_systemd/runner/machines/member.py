@@ -26,7 +26,6 @@ from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.dora import protocol
 from dora_systemd.decisions.life import events as life
-from dora_systemd.decisions.life.machines import HEAD_LOST
 from dora_systemd.decisions.life.states import Cell, Do, State
 from dora_systemd.decisions.machines import wire
 from dora_systemd.decisions.machines.part import check_placed, is_here, launch_files, own_options
@@ -58,7 +57,10 @@ _ENDING = (State.STOPPING, State.CLOSING, State.LEAVING, State.ENDED)
 
 
 class Member(Alone):
-    """A machine that another one has given nodes. paths: of its cell."""
+    """A machine that another one has given nodes.
+
+    stops_by_head: the head knows that this part ends.
+    """
 
     def __init__(self, options: RunnerOptions, this_life: Life) -> None:
         super().__init__(options._replace(owes=()), this_life)
@@ -67,6 +69,7 @@ class Member(Alone):
         self._pump: Pump | None = None
         self._table = self._told = self._version = ""
         self.stops_by_head = False
+        self.is_going_down = is_going_down
 
     @property
     def sessions(self) -> Mapping[str, Session]:
@@ -148,7 +151,7 @@ class Member(Alone):
         pump.push(life.CoordinatorListening(now_us()))
         why = await self._lines.talk(self._hear)
         self._lines = None
-        self._end_by_head(f"{HEAD_LOST}{why}")
+        self._end_by_head(why)
 
     def _accept(self, request: Request) -> tuple[wire.Part, MemberEngine, Pump]:
         told = {**request, "type": "part"}
@@ -238,7 +241,7 @@ class MemberDialogue(Dialogue):
         if self._pump.cell.state not in _ENDING:
             self._has_told = True
             self._member.send(wire.Ended(why))
-            self._pump.push(life.HeadLost(now_us(), f"{HEAD_LOST}{why}"))
+            self._pump.push(life.HeadLost(now_us(), why))
 
     def _is_here(self, node: str) -> bool:
         return not node or is_here(self._options, node)
@@ -257,6 +260,7 @@ class MemberDialogue(Dialogue):
 
     async def _end_nodes(self) -> None:
         cell = self._pump.cell
+        self._pipes.mute("daemon")  # it does not know that we end them
         await end_nodes(self._nodes, list(cell.nodes), cell.grace / SECOND)
         self._pump.push(life.StopAnswered(now_us()))
 
@@ -267,22 +271,20 @@ class MemberDialogue(Dialogue):
     def _tell_end(self) -> None:
         """Say once why this part ends, unless the head knows."""
         cell = self._pump.cell
-        if self._has_told or self._member.stops_by_head:
+        if self._has_told:
             return
         self._has_told = True
-        if cell.stop_by:
-            is_down = _is_going_down(self._is_of_user)
+        if self._member.stops_by_head:
+            self._member.send(wire.Ended())
+        elif cell.stop_by:
+            is_down = self._member.is_going_down(self._nodes.places[1].is_of_user)
             reason, by = (_GOING_DOWN, "") if is_down else ("", cell.stop_by)
             self._member.send(wire.Ended(reason, by))
-        elif cell.failure:
+        else:
             self._member.send(wire.Ended(cell.failure))
 
-    @property
-    def _is_of_user(self) -> bool:
-        return self._nodes.places[1].is_of_user
 
-
-def _is_going_down(is_of_user: bool) -> bool:
+def is_going_down(is_of_user: bool) -> bool:
     """Whether systemd stops everything, and not only this unit. Also if it cannot be asked."""
     scope = ["--user"] if is_of_user else []
     with contextlib.suppress(DoraSystemdError):

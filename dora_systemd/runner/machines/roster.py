@@ -35,7 +35,7 @@ class Member:
     """One member.
 
     lines: the talk with it, if there is one. work: dora's directory there, "" until it is ready.
-    words: why it is not ready. table: of its nodes.
+    words: why it is not ready. table: of its nodes. has_left: its part has ended in peace.
     """
 
     def __init__(self) -> None:
@@ -43,6 +43,7 @@ class Member:
         self.work = ""
         self.words = _NO_LINK
         self.table = CellStatus()
+        self.has_left = False
 
     @property
     def is_heard(self) -> bool:
@@ -151,7 +152,7 @@ class Roster:
         if was_ready or member.words in (_NO_LINK, _NOT_JOINED):
             member.words = why
         member.work = ""
-        if was_ready:
+        if was_ready and not member.has_left:
             self.push(life.MachineLost(now_us(), name, why))
         self.changed.set()
 
@@ -172,7 +173,7 @@ class Roster:
     def _ready(self, name: str, message: wire.Ready) -> None:
         if not message.work.startswith("/"):
             raise DoraSystemdError("its directory is not absolute")
-        self._members[name].work = message.work
+        self._members[name].work, self._members[name].has_left = message.work, False
         self.push(life.MachineJoined(now_us(), name))
         self.changed.set()
 
@@ -184,9 +185,10 @@ class Roster:
     def _ended(self, name: str, message: wire.Ended) -> None:
         """A member says why it ends, or its link why that is lost. The end of the talk follows."""
         reason, by = (short_line(one, _LONGEST) for one in (message.reason, message.by))
-        if not reason and not by:
-            return
         member = self._members[name]
+        if not reason and not by:
+            member.has_left = True
+            return
         was_ready, member.work = bool(member.work), ""
         member.words = reason or f"it was stopped there by {by}"
         if was_ready or by:

@@ -87,6 +87,12 @@ def test_a_machine_that_is_lost_while_dora_stops_is_not_waited_for() -> None:
     assert (cell.exit, events_of(actions)) == (RunnerExit.OK, ["dataflow-stopped"])
 
 
+def test_a_machine_without_nodes_may_leave_while_dora_stops_the_others() -> None:
+    cell, _ = step(head(State.RUNNING), life.StopAsked(1, "SIGTERM"))
+    cell, _ = step(cell, life.NodeExited(2, "there", Exit(), False))
+    assert step(cell, LOST) == (cell, ())
+
+
 def test_a_machine_that_refuses_is_no_reason_for_a_restart() -> None:
     refused = life.Refused(1, "machine gpu: no doractl", Cause.MACHINE_REFUSES)
     assert step(head(State.GATHERING), refused)[0].exit is RunnerExit.BAD_DATAFLOW

@@ -91,6 +91,18 @@ def test_a_member_that_ends_without_a_word() -> None:
     run(work)
 
 
+def test_a_member_that_has_ended_in_peace_is_not_lost() -> None:
+    async def work(bench: Bench) -> None:
+        other = await bench.link()
+        other.say(READY, wire.Ended())
+        other.reader.feed_eof()
+        await settle()
+        assert bench.heard() == [life.MachineJoined(0, "gpu")]
+        assert "gpu" in bench.roster.missing()
+
+    run(work)
+
+
 def test_the_last_words_count_once() -> None:
     async def work(bench: Bench) -> None:
         other = await bench.link()
