@@ -1,4 +1,4 @@
-"""Add, list, check or remove machines for dataflows that run on several."""
+"""Add, list, check or remove machines of dataflows."""
 
 import os
 from collections.abc import Sequence
@@ -6,11 +6,14 @@ from collections.abc import Sequence
 import click
 
 from dora_systemd.cli.parameters import (
+    acting_options,
     current_scope,
     output_option,
     print_json,
     print_warnings,
     scope_options,
+    tell,
+    wants_json,
 )
 from dora_systemd.decisions.machines.facts import summary
 from dora_systemd.decisions.remote.hosts import parse_host
@@ -28,7 +31,7 @@ from dora_systemd.verbs.machines.register import (
 @click.group("machine")
 @scope_options
 def command() -> None:
-    """Add, list, check or remove machines for dataflows that run on several.
+    """Add, list, check or remove machines of dataflows that run on several.
 
     A machine that was added can be named in deploy.machine of any dataflow, see MACHINES in
     dora-systemd(7).
@@ -42,19 +45,21 @@ def command() -> None:
 
 
 @command.command("add")
-@click.argument("host")
+@click.argument("destination", metavar="HOST")
 @click.option("--name", metavar="NAME", help="Its name in dataflows; default: that of HOST.")
-@scope_options
-def add(host: str, name: str | None) -> None:
-    """Let dataflows of this machine run nodes on [user@]HOST, without a password from now on.
+@acting_options
+def add(destination: str, name: str | None) -> None:
+    """Let dataflows run nodes on [user@]HOST, without a password from now on.
 
     Logs in once with your own keys, makes a key that can do nothing else over there, and declares
     the machine in config.yml.
     """
-    found = parse_host(host)
-    short = found.destination.rpartition("@")[2].partition(".")[0]
-    for line in add_machine(current_scope(), os.environ, found, name or short):
-        click.echo(line)
+    scope, host = current_scope(), parse_host(destination)
+    name = name or host.destination.rpartition("@")[2].partition(".")[0]
+    for line in add_machine(scope, os.environ, host, name):
+        tell(line)
+    if wants_json():
+        print_json([_object(one) for one in chosen(known_machines(scope, os.environ), (name,))])
 
 
 @command.command("list")
@@ -100,14 +105,16 @@ def check(names: tuple[str, ...], output: str) -> int:
 
 @command.command("remove")
 @click.argument("name")
-@scope_options
+@acting_options
 def remove(name: str) -> None:
     """Forget the machine NAME, and its key on both sides."""
     scope = current_scope()
     (machine,) = chosen(known_machines(scope, os.environ), (name,))
     *notes, last = remove_machine(scope, os.environ, machine)
     print_warnings(notes)
-    click.echo(last)
+    tell(last)
+    if wants_json():
+        print_json([_object(machine)])
 
 
 def _object(one: Known) -> dict[str, object]:

@@ -13,6 +13,7 @@ from dora_systemd.cli.settingoptions import SettingsCommand, setting_options
 from dora_systemd.decisions.cell.machines import parse_head, parse_machine, parse_placed
 from dora_systemd.decisions.machines.key import ORIGINAL, forced_words
 from dora_systemd.decisions.machines.wire import Refused
+from dora_systemd.decisions.settings.table import SETTINGS
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import parse_name, parse_uuid
 from dora_systemd.verbs.machines.head import Head
@@ -22,6 +23,7 @@ from dora_systemd.verbs.machines.member import (
     is_passing,
     start_member,
 )
+from dora_systemd.verbs.machines.own import own_facts
 from dora_systemd.verbs.start.plan import StartRequest
 
 
@@ -40,8 +42,6 @@ class MemberCommand(SettingsCommand):
 def _print_facts(ctx: click.Context, param: click.Parameter, value: bool) -> None:
     del param
     if value:
-        from dora_systemd.verbs.machines.own import own_facts
-
         write_exactly(f"{own_facts(current_scope()).to_json()}\n")
         ctx.exit()
 
@@ -108,3 +108,9 @@ def command(
                 told.tell(Refused(error.message, error.hint))
             raise
     become_relay(runner)
+
+
+for _one in command.params:
+    # Those of start; the head passes on what it was told.
+    if isinstance(_one, click.Option) and _one.name in {one.name for one in SETTINGS}:
+        _one.hidden = True

@@ -4,8 +4,11 @@ import os
 from contextlib import suppress
 from pathlib import Path
 
+from dora_systemd.adapters.host.files import decoded
 from dora_systemd.adapters.host.process import run_command
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.trust.files import read_file
+from dora_systemd.trust.paths import exists
 from dora_systemd.trust.programs import own_account
 
 _SECONDS = 30.0
@@ -14,7 +17,7 @@ _SECONDS = 30.0
 def make_key(place: Path, machine: str) -> Path:
     """The key of a machine, which is there then. Raises DoraSystemdError."""
     path = place / machine
-    if path.exists():
+    if exists(path):
         return path
     try:
         place.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -31,7 +34,8 @@ def make_key(place: Path, machine: str) -> Path:
 
 def public_key(path: Path) -> str:
     """The public part of a key."""
-    return path.with_name(f"{path.name}.pub").read_text().strip()
+    public = path.with_name(f"{path.name}.pub")
+    return decoded(read_file(public).data, public).strip()
 
 
 def remove_key(path: Path) -> None:

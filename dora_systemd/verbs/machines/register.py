@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from dora_systemd.adapters.host.files import parse_yaml
+from dora_systemd.adapters.host.files import decoded, parse_yaml
 from dora_systemd.adapters.host.unit_files import put_unit_file
 from dora_systemd.decisions.cell.machines import parse_machine
 from dora_systemd.decisions.machines.declared import with_machine, without_machine
@@ -15,6 +15,8 @@ from dora_systemd.decisions.remote.hosts import Host
 from dora_systemd.decisions.settings.machines import MACHINES
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
+from dora_systemd.trust.files import read_file
+from dora_systemd.trust.paths import exists
 from dora_systemd.values import quoted, shown
 from dora_systemd.verbs.machines.keys import make_key, public_key, remove_key
 from dora_systemd.verbs.machines.own import own_facts
@@ -111,7 +113,7 @@ def remove_machine(scope: Scope, environment: Mapping[str, str], machine: Known)
 
 def _key(place: Path, name: str) -> str:
     path = place / name
-    return str(path) if path.exists() else ""
+    return str(path) if exists(path) else ""
 
 
 def _with(file: Path, name: str, host: Host) -> str:
@@ -149,7 +151,7 @@ def _document(file: Path, text: str) -> dict[str, object]:
 
 
 def _text(file: Path) -> str:
-    return file.read_text() if file.exists() else ""
+    return decoded(read_file(file).data, file) if exists(file) else ""
 
 
 def _write(file: Path, text: str) -> None:

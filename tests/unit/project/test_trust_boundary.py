@@ -49,13 +49,13 @@ _TABLE = {
     OWN: """
         adapters.dora.preparation adapters.host.files adapters.ssh.program cli.main
         cli.progress cli.verbs.look.logs decisions.cell.launch verbs.inhibit.hold
-        verbs.start.credentials verbs.start.limits
+        verbs.machines.member verbs.start.credentials verbs.start.limits
     """,
     KERNEL: """
         adapters.cgroup.groups adapters.host.lock_table adapters.host.machine
         adapters.host.process_table adapters.host.real_time adapters.host.rights
         runner.cell.pause trust.socket_table verbs.destroy
-        verbs.facts.reading verbs.start.sandbox verbs.why
+        link.relay verbs.facts.reading verbs.start.sandbox verbs.why
     """,
     ROOTS: """
         adapters.bus.connection adapters.bus.errors adapters.host.unit_files
@@ -64,6 +64,7 @@ _TABLE = {
         adapters.releases.store verbs.releases.trial
         adapters.journal.journalctl adapters.journal.reader adapters.journal.socket verbs.doctor
         verbs.facts.enabled verbs.facts.locks verbs.follow verbs.gateway verbs.needs.notes
+        verbs.machines.keys
         verbs.setup verbs.show verbs.start.enable verbs.up
     """,
     INSTALLED: """
