@@ -199,6 +199,19 @@ def test_a_stop_does_not_ask_dora_if_one_is_silent(tmp_path: Path) -> None:
     run(tmp_path, work)
 
 
+def test_a_machine_that_falls_silent_during_a_stop_is_not_waited_for(tmp_path: Path) -> None:
+    async def work(bench: Bench) -> None:
+        await bench.link(READY)
+        bench.be(State.STOPPING, stop_by="SIGTERM")
+        bench.actions[Do.ASK_STOP]()
+        await asyncio.sleep(2)
+        assert not bench.heard(life.MachineLost)
+        await asyncio.sleep(2)
+        assert bench.heard(life.MachineLost) == [life.MachineLost(0, "gpu", "it does not answer")]
+
+    run(tmp_path, work)
+
+
 def test_a_daemon_that_is_gone_is_a_lost_machine(tmp_path: Path) -> None:
     async def work(bench: Bench) -> None:
         bench.actions[Do.GATHER]()
