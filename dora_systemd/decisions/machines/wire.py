@@ -20,7 +20,7 @@ from dora_systemd.names import parse_name, parse_uuid
 VERSION = 1
 BEAT_SECONDS = 1.0
 LEASE_SECONDS = 7.0
-"""TCP sends again up to 6.2 s after a gap has begun. Shorter than ssh takes to give up: this counts.
+"""TCP sends again up to 6.2 s after a gap has begun, and ssh gives up later: this alone counts.
 """
 MAX_LINE = 1 << 18
 """Bytes of a line, with its end."""
