@@ -20,7 +20,8 @@ from dora_systemd.names import parse_name, parse_uuid
 VERSION = 1
 BEAT_SECONDS = 1.0
 LEASE_SECONDS = 7.0
-"""Longer than ssh takes to see that a machine is gone (3 times 2 s)."""
+"""TCP sends again up to 6.2 s after a gap has begun, and ssh gives up later: this alone counts.
+"""
 MAX_LINE = 1 << 18
 """Bytes of a line, with its end."""
 MAX_TEXT = 1000

@@ -87,9 +87,9 @@ class Roster:
         """The members that are not ready, and why."""
         return {name: one.words for name, one in self._members.items() if not one.work}
 
-    def silent(self) -> str:
-        """A member that may be gone, or ""."""
-        return next((name for name, one in self._members.items() if not one.is_heard), "")
+    def silent(self) -> list[str]:
+        """The members that may be gone."""
+        return [name for name, one in self._members.items() if not one.is_heard]
 
     def tell(self, message: wire.Message) -> None:
         """Send a message to all that are there."""

@@ -86,7 +86,7 @@ def test_a_member_that_ends_without_a_word() -> None:
         other.reader.feed_eof()
         await settle()
         assert bench.heard()[1:] == [life.MachineLost(0, "gpu", "the connection has ended")]
-        assert bench.roster.silent() == "gpu"
+        assert bench.roster.silent() == ["gpu", "cam"]
 
     run(work)
 
