@@ -10,6 +10,7 @@ import contextlib
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from itertools import chain, repeat
 from typing import TYPE_CHECKING, Any
 
 from dora_systemd.adapters.dora.command import version_numbers
@@ -49,10 +50,12 @@ if TYPE_CHECKING:
     from dora_systemd.adapters.dora.check import DoraCheck
 
 _LONGEST = 100
-_POLL_SECONDS = 0.05
+_POLL_SECONDS, _SOON, _LATER_SECONDS = 0.05, 200, 0.5
+"""How often to look for the head's run: less after a while, another machine may be away for long."""
 _EXPLAIN_SECONDS = 0.5
 """Time for the session to end, which says more than a lost connection to dora."""
 _ASK_SECONDS = 2.0
+_UNKNOWN = ("", "offline", "unknown")
 _GOING_DOWN = "the machine is shutting down"
 _ENDING = (State.STOPPING, State.CLOSING, State.LEAVING, State.ENDED)
 
@@ -218,8 +221,9 @@ class MemberDialogue(Dialogue):
         _, paths = self._nodes.places
         self._nodes.expect()
         self._member.send(wire.Ready(str(paths.work)))
+        polls = chain([_POLL_SECONDS] * _SOON, repeat(_LATER_SECONDS))
         while not (run := await self._running()):
-            await asyncio.sleep(_POLL_SECONDS)
+            await asyncio.sleep(next(polls))
         self._pipes.set_run(run)
         self._pump.push(life.RunStarted(now_us(), run))
 
@@ -232,8 +236,8 @@ class MemberDialogue(Dialogue):
 
     async def raised(self, what: str, error: Exception) -> None:
         """Have an exception end the cell; what dora does not answer is because of the head."""
-        if isinstance(error, DoraSystemdError | TimeoutError):
-            await self._lose_head(str(error) or "dora does not answer")
+        if isinstance(error, DoraSystemdError):
+            await self._lose_head(error.message)
         else:
             await super().raised(what, error)
 
@@ -286,9 +290,13 @@ class MemberDialogue(Dialogue):
 
 
 def is_going_down(is_of_user: bool) -> bool:
-    """Whether systemd stops everything, and not only this unit. Also if it cannot be asked."""
+    """Whether systemd stops everything, and not only this unit; see is-system-running.
+
+    Also if it cannot be asked, as when the message bus has been stopped already: a head that starts
+    again for nothing does less harm than one that stays down after a reboot.
+    """
     scope = ["--user"] if is_of_user else []
     with contextlib.suppress(DoraSystemdError):
         done = run_command(["systemctl", *scope, "is-system-running"], _ASK_SECONDS)
-        return done.stdout.strip() in ("stopping", "")
+        return done.stdout.strip() in ("stopping", *_UNKNOWN)
     return True
