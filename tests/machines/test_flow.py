@@ -39,9 +39,9 @@ def test_a_life(flow: Flow) -> None:
     flow.wait_exchanging()
     nodes = flow.table()
     assert {node: one.get("machine") for node, one in nodes.items()} == {
-        "source": None,
+        "source": "head",
         "doubler": "gpu",
-        "sink": "arm" if "arm" in flow.members else None,
+        "sink": "arm" if "arm" in flow.members else "head",
     }
     assert {one["state"] for one in nodes.values()} == {"running"}
     token = json.loads((flow.cell.paths.control).read_text())["token"]
