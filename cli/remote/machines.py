@@ -62,7 +62,11 @@ def _running(bus: Bus, selector: str, wanted: str) -> Cell | None:
     """The dataflow, if systemd has it: an ended one has no links."""
     try:
         return Selector(selector).find(bus)
-    except DoraSystemdError:
+    except DoraSystemdError as error:
+        if wanted and error.code is ExitCode.NOT_FOUND:
+            message = f"cannot find machine {quoted(wanted)}: {selector} is not running"
+            hint = f"doractl -H HOST logs {selector}, with the host of the machine"
+            raise DoraSystemdError(message, hint, error.code) from error
         if wanted:
             raise
         return None

@@ -28,7 +28,7 @@ _SILENT_BEATS = 3
 """A member of which nothing was heard for so many beats may be gone, so dora is not asked."""
 _LONGEST = 300
 _NO_LINK = "it is not connected yet"
-_NOT_JOINED = "its dora daemon has not joined yet"
+_NOT_JOINED = "it has not answered yet"
 
 
 class Member:
@@ -126,7 +126,9 @@ class Roster:
         lines, options = self._members[name].lines, self._options
         if lines is None or not self._token:
             return
-        self._members[name].words = _NOT_JOINED
+        if self._members[name].words == _NO_LINK:
+            # Else the last words of ssh, or how it was lost, still tell more.
+            self._members[name].words = _NOT_JOINED
         lines.send(
             wire.Part(
                 name=options.name,
