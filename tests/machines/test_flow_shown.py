@@ -49,6 +49,7 @@ def test_the_part_of_a_member(flow: Flow) -> None:
     assert part["machine"] == "gpu"
     assert [node["node"] for node in part["nodes"]] == ["doubler"]
     assert part["nodes"][0]["memory_bytes"]
+    assert part["nodes"][0]["pid"]
     for command in ("stop flow", "restart flow", "reload flow", "set flow --memory-limit 1G"):
         done = there("b", "doractl", command)
         assert done.returncode == ExitCode.FAILURE, done.stderr

@@ -20,9 +20,9 @@ _MOST_MACHINES = 64
 _OPTIONS = {
     "BatchMode": "yes",
     "ExitOnForwardFailure": "yes",
-    # A machine that is gone is noticed after these two, which is before the lease ends.
+    # Later than the lease: after a gap of 4 s TCP needs two more to send again.
     "ServerAliveInterval": "2",
-    "ServerAliveCountMax": "3",
+    "ServerAliveCountMax": "5",
     # Also for the first words of sshd, on a machine that is busy.
     "ConnectTimeout": "8",
     # A connection of its own, whatever ssh_config(5) has.

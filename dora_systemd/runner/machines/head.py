@@ -24,6 +24,7 @@ from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.dora import life_events, protocol
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
+from dora_systemd.decisions.life.nodes import with_process
 from dora_systemd.decisions.life.states import Cell, Do, State
 from dora_systemd.decisions.machines import wire
 from dora_systemd.decisions.machines.part import (
@@ -55,6 +56,7 @@ if TYPE_CHECKING:
 FIRST_PATIENCE = 30 * SECOND
 """µs that the first start waits for members, if the settings have no start timeout."""
 _AGAIN_SECONDS = 0.05
+_LOOK_SECONDS = 0.2
 _WATCH_SECONDS = 2.0
 _WORD_SECONDS = 1.0
 """Time for a member to say itself why its daemon is gone."""
@@ -245,11 +247,24 @@ class HeadDialogue(Dialogue):
     async def _ask_stop(self) -> None:
         self._begin_end()
         if silent := self._roster.silent():
-            self._lose(silent, "it does not answer")
+            self._lose(silent[0], "it does not answer")
             self._end_without_dora()
             return
         self._roster.tell(wire.Stopping(self._pump.cell.stop_by))
+        self.spawn("see whether a machine falls silent", self._watch_silence())
         await super()._ask_stop()
+
+    def _lose_silent(self) -> bool:
+        """Do without dora if a machine falls silent that still has nodes."""
+        nodes = self._pump.cell.nodes
+        needed = {nodes[node].machine for node in with_process(nodes)}
+        if silent := next((name for name in self._roster.silent() if name in needed), ""):
+            self._lose(silent, "it does not answer")
+        return bool(silent)
+
+    async def _watch_silence(self) -> None:
+        while self._pump.cell.state is State.STOPPING and not self._lose_silent():
+            await asyncio.sleep(_LOOK_SECONDS)
 
     def _begin_end(self) -> float:
         """Seconds left of the grace duration, which begins with the first call."""
@@ -265,7 +280,7 @@ class HeadDialogue(Dialogue):
     async def _end_nodes(self) -> None:
         """End what is here, while the members do the same."""
         left = self._begin_end()
-        self._roster.tell(wire.StopPart(round(left * SECOND)))
+        self._roster.tell(wire.StopPart(min(round(left * SECOND), self._pump.cell.grace)))
         self._pipes.mute("coordinator", "daemon")  # they do not know that we end them
         own = [node for node in self._pump.cell.nodes if self._is_here(node)]
         await end_nodes(self._nodes, own, left)

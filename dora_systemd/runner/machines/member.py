@@ -40,6 +40,7 @@ from dora_systemd.runner.cell.role import Alone
 from dora_systemd.runner.machines.ending import end_nodes
 from dora_systemd.runner.machines.engine import NOISE, MemberEngine
 from dora_systemd.runner.machines.lines import Lines
+from dora_systemd.runner.machines.processes import find
 from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.terminal_text import short_line
 from dora_systemd.values import INFINITY, SECOND
@@ -205,7 +206,7 @@ class MemberDialogue(Dialogue):
         return {
             **own,
             Do.GATHER: lambda: self._ask(Do.GATHER, self._find_run()),
-            Do.ASK_SPAWN: lambda: None,
+            Do.ASK_SPAWN: lambda: self.spawn("find processes", find(self._pump, self._nodes)),
             Do.ASK_RESULT: self._tell_result,
             Do.ASK_STOP: lambda: self._ask(Do.END_NODES, self._stop()),
             Do.END_NODES: lambda: self._ask(Do.END_NODES, self._end_nodes()),

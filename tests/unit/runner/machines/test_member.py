@@ -20,6 +20,7 @@ from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.life import Life
 from dora_systemd.runner.machines.engine import MemberEngine
 from dora_systemd.runner.machines.member import Member, MemberDialogue
+from dora_systemd.runner.machines.processes import find
 from dora_systemd.values import SECOND
 from tests.unit.fakes.dialogue import Heard
 from tests.unit.fakes.ends import FakeEnds
@@ -195,3 +196,25 @@ def test_a_table_is_sent_when_it_is_new(tmp_path: Path) -> None:
         assert told == [UUID]
 
     run(tmp_path, work)
+
+
+def test_the_first_processes_are_those_that_the_launchers_note(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path, State.WAITING)
+        bench.be(nodes={"mid": NodeStatus("starting"), "late": NodeStatus("running", 8)})
+        noted = iter((0, 77))
+
+        def noted_pid(_node: str) -> int:
+            return next(noted)
+
+        bench.nodes.noted_pid = noted_pid  # type: ignore[attr-defined]
+        found = asyncio.ensure_future(find(bench.pump, bench.nodes))  # type: ignore[arg-type]
+        while not bench.pump.heard:
+            await asyncio.sleep(0.01)
+        (event,) = bench.pump.heard
+        assert isinstance(event, life.NodeSpawned)
+        assert (event.node, event.pid) == ("mid", 77)
+        bench.be(nodes={"mid": NodeStatus("starting", 77)})
+        await found
+
+    asyncio.run(work())

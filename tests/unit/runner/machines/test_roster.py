@@ -86,7 +86,7 @@ def test_a_member_that_ends_without_a_word() -> None:
         other.reader.feed_eof()
         await settle()
         assert bench.heard()[1:] == [life.MachineLost(0, "gpu", "the connection has ended")]
-        assert bench.roster.silent() == "gpu"
+        assert bench.roster.silent() == ["gpu", "cam"]
 
     run(work)
 
@@ -111,6 +111,17 @@ def test_the_last_words_count_once() -> None:
         await settle()
         reason = "the dora daemon is gone (signal SIGKILL)"
         assert bench.heard()[1:] == [life.MachineLost(0, "gpu", reason)]
+
+    run(work)
+
+
+def test_a_member_that_goes_on_after_its_end_is_not_heard() -> None:
+    async def work(bench: Bench) -> None:
+        other = await bench.link()
+        other.say(READY, READY, wire.Ended("gone"), READY)
+        await settle()
+        await settle()
+        assert [type(one).__name__ for one in bench.heard()] == ["MachineJoined", "MachineLost"]
 
     run(work)
 
