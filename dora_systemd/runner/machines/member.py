@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 
 _LONGEST = 100
 _POLL_SECONDS, _SOON, _LATER_SECONDS = 0.05, 200, 0.5
-"""How often to look for the head's run: less after a while, another machine may be away for long."""
+"""How often to look for the run of the head: less after a while, for it may be days away."""
 _EXPLAIN_SECONDS = 0.5
 """Time for the session to end, which says more than a lost connection to dora."""
 _ASK_SECONDS = 2.0
