@@ -102,9 +102,6 @@ class MemberEngine(SharedEngine):
         """Set how to reach the head. That is in memory only."""
         self._port, self._token, self._zenoh = part.coordinator, part.token, part.zenoh
 
-    def start_coordinator(self) -> None:
-        """There is none here."""
-
     def _spawn_daemon(self, environment: Mapping[str, str]) -> Daemon:
         more = ("--machine-id", self.machine, *zenoh_arguments(self._zenoh, environment))
         return start_daemon(self._dora, self._paths, self._port, environment, self._token, more)
