@@ -58,8 +58,8 @@ def stop_all(
             given_up |= {one.cell.unit} if one.problem else set()
             note = f" ({one.note})" if one.note else ""
             yield Outcome(one.cell, f"  ✓ {one.cell.name} stopped{note}", one.problem)
-        release_enabled(manager, scope, [cell.unit for cell in cells])
         end_links_of(manager, cells)
+        release_enabled(manager, scope, [cell.unit for cell in cells])
 
 
 def stop_gateway(manager: Manager, scope: Scope) -> bool:

@@ -60,8 +60,8 @@ def stop_cells(
     outcomes = [
         _stop_outcome(manager, scope, cell, results.get(cell.unit), begin) for cell in cells
     ]
-    release_enabled(manager, scope, up)
     end_links_of(manager, cells)
+    release_enabled(manager, scope, up)
     return outcomes
 
 
@@ -71,8 +71,8 @@ def stop_cells_within(
     """Stop dataflows as stop_cells() does, and kill those that still run after `most` µs."""
     up = [cell for cell in cells if cell.is_up]
     ended = {one.cell: one for one in stop_within(manager, up, most)}
-    release_enabled(manager, scope, [cell.unit for cell in up])
     end_links_of(manager, cells)
+    release_enabled(manager, scope, [cell.unit for cell in up])
     return [
         Outcome(cell, _stopped(cell, ended[cell].note), ended[cell].problem)
         if cell in ended

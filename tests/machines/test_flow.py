@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -38,9 +39,9 @@ def test_a_life(flow: Flow) -> None:
     flow.wait_exchanging()
     nodes = flow.table()
     assert {node: one.get("machine") for node, one in nodes.items()} == {
-        "source": None,
+        "source": "head",
         "doubler": "gpu",
-        "sink": "arm" if "arm" in flow.members else None,
+        "sink": "arm" if "arm" in flow.members else "head",
     }
     assert {one["state"] for one in nodes.values()} == {"running"}
     token = json.loads((flow.cell.paths.control).read_text())["token"]
@@ -106,3 +107,33 @@ class TestRefusals:
             self.refused(flow, "gpu", "Host key verification failed", code=ExitCode.BAD_INPUT)
         finally:
             run("mv", f"{known}.kept", known)
+
+
+@pytest.mark.parametrize("flow", [TWO], indirect=True)
+def test_the_head_alone_is_enabled(flow: Flow) -> None:
+    """Its unit file and those of its links start the whole; the member has none."""
+    link = Path(f"/etc/systemd/system/doralink-{NAME}:gpu.service")
+    flow.start()
+    try:
+        enabled = flow.cell.doractl("enable", NAME)
+        assert enabled.returncode == 0, enabled.stderr
+        assert link.exists()
+        flow.cell.doractl("stop", NAME)
+        assert not flow.left()
+        flow.cell.systemctl("start")  # as a boot does
+        flow.wait_exchanging()
+        assert flow.cell.show("FragmentPath") == str(link.with_name(flow.cell.unit))
+        fragment = run("systemctl", "show", "-P", "FragmentPath", link.name).stdout.strip()
+        assert fragment == str(link)
+        again = flow.start(check=False)
+        assert again.returncode == ExitCode.NAME_IN_USE
+        flow.cell.doractl("stop", NAME)
+        same = flow.start()
+        assert same.returncode == 0, same.stderr
+    finally:
+        flow.cell.doractl("disable", NAME)
+    assert not link.exists()
+    flow.wait_exchanging()
+    assert flow.cell.doractl("stop", NAME).returncode == 0
+    units = run("systemctl", "list-units", "--all", "--plain", "--no-legend", "dora*flow*").stdout
+    assert not units.strip()

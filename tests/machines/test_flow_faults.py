@@ -71,9 +71,10 @@ def test_the_link_is_killed(flow: Flow, what: str) -> None:
     elif what == "ssh":
         run("pkill", "-9", "-f", "ssh -T .* b exec")
     elif what == "relay":
-        there("b", "pkill", "-9", "-f", "dora_systemd.link.relay")
+        assert there("b", "pkill -9 -f '[d]ora_systemd.link.relay'").returncode == 0
     else:
-        there("b", "'kill -9 $(ps -o ppid= $(pgrep -f dora_systemd.link.relay))'")
+        relay = "pgrep -f '[d]ora_systemd.link.relay'"
+        assert there("b", f"kill -9 $(ps -o ppid= $({relay}))").returncode == 0
     flow.wait_again(life)
 
 

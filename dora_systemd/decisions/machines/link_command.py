@@ -33,6 +33,8 @@ _OPTIONS = {
     "ForwardAgent": "no",
     "ForwardX11": "no",
     "RemoteCommand": "none",
+    # The sandbox of the link lets it write nothing.
+    "UpdateHostKeys": "no",
     "LogLevel": "ERROR",
 }
 

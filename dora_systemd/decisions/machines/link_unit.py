@@ -1,14 +1,22 @@
 """The unit of a link: its name and its properties. Pure."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from dora_systemd.decisions.cell.machines import members_of
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.machines.link_command import LinkOptions, link_command
+from dora_systemd.decisions.machines.link_command import (
+    MODULE,
+    LinkOptions,
+    link_command,
+    parse_link_argv,
+)
 from dora_systemd.decisions.machines.member import Member
 from dora_systemd.decisions.properties.assignments import typed, with_assignments, with_properties
 from dora_systemd.decisions.properties.kinds import Property
+from dora_systemd.decisions.remote.hosts import parse_host
+from dora_systemd.decisions.unit.file import HEADER
+from dora_systemd.decisions.unit.properties import format_unit
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import LINK_PREFIX, SLICE, UNIT_SUFFIX, unit_name
 from dora_systemd.values import SECOND
@@ -20,7 +28,8 @@ _MOST = 255
 
 _ALL = (
     "NoNewPrivileges=yes",
-    "RestrictNamespaces=yes",
+    # Not yes, see decisions/properties/sandbox.py.
+    "RestrictNamespaces=uts",
     "RestrictSUIDSGID=yes",
     "RestrictRealtime=yes",
     "LockPersonality=yes",
@@ -115,6 +124,21 @@ def link_unit(
     )
     sandbox = with_assignments({}, (*_ALL, *(() if is_user else (*_SYSTEM, *_log(options)))))
     return LinkUnit(link_unit_name(options.name, member.machine), with_properties(own, sandbox))
+
+
+def link_file(link: LinkUnit) -> str:
+    """Its unit file, for a head that is started at boot; the unit of the head wants it."""
+    return HEADER + format_unit(link.properties)
+
+
+def link_from_command(
+    python: str, argv: Sequence[str], options: RunnerOptions, is_user: bool
+) -> LinkUnit:
+    """The unit of a link from its ExecStart=. Raises DoraSystemdError (USAGE) for another one."""
+    own = [*argv, MODULE]
+    link = parse_link_argv(own[own.index(MODULE) + 1 : -1])
+    member = Member(link.machine, parse_host(link.host), link.words)
+    return link_unit(python, link.socket, options, member, is_user, link.identity)
 
 
 def _log(options: RunnerOptions) -> Iterator[str]:

@@ -184,7 +184,7 @@ def _machine(text: str) -> str:
 
 
 def _number(value: object) -> int:
-    if type(value) is not int or not 0 <= value < 2**63:
+    if type(value) is not int or not 0 <= value < 2**64:
         raise ValueError(value)
     return value
 

@@ -280,7 +280,7 @@ class HeadDialogue(Dialogue):
     async def _end_nodes(self) -> None:
         """End what is here, while the members do the same."""
         left = self._begin_end()
-        self._roster.tell(wire.StopPart(round(left * SECOND)))
+        self._roster.tell(wire.StopPart(min(round(left * SECOND), self._pump.cell.grace)))
         self._pipes.mute("coordinator", "daemon")  # they do not know that we end them
         own = [node for node in self._pump.cell.nodes if self._is_here(node)]
         await end_nodes(self._nodes, own, left)

@@ -23,6 +23,8 @@ from dora_systemd.errors import DoraSystemdError
 _LEASE = round(LEASE_SECONDS / BEAT_SECONDS)
 _MOST_UNSENT = 4 * MAX_LINE
 """Bytes for a side that does not read: then the talk ends."""
+_MOST_LINES = 200
+"""In one beat: there are three, or those of a whole lease after a gap."""
 
 Hear = Callable[[Message], None]
 
@@ -34,7 +36,7 @@ class Lines:
         self._reader, self._writer = ends
         self._on_beat = on_beat
         self._why = "the connection has ended"
-        self.silent = 0
+        self.silent = self._heard = 0
 
     def send(self, message: Message) -> None:
         """Send a message, unless the talk has ended."""
@@ -66,13 +68,16 @@ class Lines:
     async def _read(self, hear: Hear) -> None:
         with contextlib.suppress(OSError):
             while line := await self._reader.readline():
-                self.silent = 0
+                self.silent, self._heard = 0, self._heard + 1
+                if self._heard > _MOST_LINES:
+                    self.end("the other side says too much")
                 hear(parse_message(line))
+                await asyncio.sleep(0)  # lines that are there already must not hold up the rest
 
     async def _beat(self) -> None:
         while self.silent < _LEASE:
             self._on_beat()
             self.send(Beat())
             await asyncio.sleep(BEAT_SECONDS)
-            self.silent += 1
+            self.silent, self._heard = self.silent + 1, 0
         self.end(f"no word for {LEASE_SECONDS:g}s")

@@ -36,6 +36,7 @@ class Member:
 
     lines: the talk with it, if there is one. work: dora's directory there, "" until it is ready.
     words: why it is not ready. table: of its nodes. has_left: its part has ended in peace.
+    is_over: it has said that its part ends, and is not ready again in this talk.
     """
 
     def __init__(self) -> None:
@@ -43,7 +44,7 @@ class Member:
         self.work = ""
         self.words = _NO_LINK
         self.table = CellStatus()
-        self.has_left = False
+        self.has_left = self.is_over = False
 
     @property
     def is_heard(self) -> bool:
@@ -120,7 +121,7 @@ class Roster:
         if (old := self._members[name].lines) is not None:
             self._lose(name, "it has a new link")
             old.end("there is a new link")
-        self._members[name].lines = lines
+        self._members[name].lines, self._members[name].is_over = lines, False
 
     def _send_part(self, name: str) -> None:
         lines, options = self._members[name].lines, self._options
@@ -173,7 +174,9 @@ class Roster:
     def _ready(self, name: str, message: wire.Ready) -> None:
         if not message.work.startswith("/"):
             raise DoraSystemdError("its directory is not absolute")
-        self._members[name].work, self._members[name].has_left = message.work, False
+        if (member := self._members[name]).work or member.is_over:
+            return
+        member.work, member.has_left = message.work, False
         self.push(life.MachineJoined(now_us(), name))
         self.changed.set()
 
@@ -189,7 +192,7 @@ class Roster:
         if not reason and not by:
             member.has_left = True
             return
-        was_ready, member.work = bool(member.work), ""
+        was_ready, member.work, member.is_over = bool(member.work), "", True
         member.words = reason or f"it was stopped there by {by}"
         if was_ready or by:
             self.push(life.MachineLost(now_us(), name, member.words, by))

@@ -49,5 +49,6 @@ def claim(
         check_plan(lambda: manager, plan)
     has_file = place_unit_file(manager, plan, properties, boot, want_boot)
     note_start(plan, request, command)
-    links = prepared_links(manager, plan, systemd_number(manager)) if plan.members else ()
+    has_links = bool(plan.members) and not has_file
+    links = prepared_links(manager, plan, systemd_number(manager)) if has_links else ()
     return Claim(plan, None if has_file else list(properties.values()), tuple(warnings), links)

@@ -96,6 +96,7 @@ LATE = {
         "verbs.why": {"verbs.facts.machines"},
         "verbs.start.unit": {"decisions.machines.link_unit"},
         "verbs.start.claim": {"decisions.machines.link_unit"},
+        "verbs.start.enable": {"decisions.machines.link_unit"},
         "link.talk": {"link.parting"},
     },
     "hot reload only": {

@@ -63,6 +63,15 @@ def test_what_is_no_line_of_ours_ends_it() -> None:
     live(work)
 
 
+def test_a_flood_ends_it() -> None:
+    async def work() -> None:
+        other, heard = FakeEnds(), list[Message]()
+        other.say(*[Beat()] * 1000)
+        assert await Lines(other.ends).talk(heard.append) == "the other side says too much"
+
+    live(work)
+
+
 def test_one_that_does_not_read_is_not_waited_for() -> None:
     async def work() -> None:
         other = FakeEnds()

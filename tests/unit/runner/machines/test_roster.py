@@ -115,6 +115,17 @@ def test_the_last_words_count_once() -> None:
     run(work)
 
 
+def test_a_member_that_goes_on_after_its_end_is_not_heard() -> None:
+    async def work(bench: Bench) -> None:
+        other = await bench.link()
+        other.say(READY, READY, wire.Ended("gone"), READY)
+        await settle()
+        await settle()
+        assert [type(one).__name__ for one in bench.heard()] == ["MachineJoined", "MachineLost"]
+
+    run(work)
+
+
 def test_what_ssh_says_is_shown_until_the_member_is_ready() -> None:
     async def work(bench: Bench) -> None:
         other = await bench.link()
