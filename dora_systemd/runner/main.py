@@ -178,7 +178,7 @@ async def run_once(runs: Runs, is_again: bool) -> Cell:
     role, own = runs.role, runs.role.own(options)
     dora = role.engine(options.dora, runs.paths, runs.environment, boot)
     try:
-        coordinator = dora.start_coordinator()
+        coordinator = role.start_coordinator(dora)
         prepared = reloader.current or prepare_first(runs, options)
         role.prepare(runs.paths, prepared, runs.check)
         runs.nodes.prepare(role.here(prepared.dataflow), own.log_rates, own.node_limits)

@@ -116,6 +116,16 @@ def test_a_machine_boots_again(flow: Flow) -> None:
     flow.wait_again(life)
 
 
+def test_a_machine_that_shuts_down_has_not_stopped_it(flow: Flow) -> None:
+    """systemd stops everything there; that is no request to stop this dataflow."""
+    life = flow.life()
+    there("b", "systemctl", "poweroff")
+    wait_for("the head waits", lambda: "waiting for machine" in flow.status(), 15)
+    with power_cut("b"):  # the lab needs that to switch it on again
+        pass
+    flow.wait_again(life)
+
+
 def test_somebody_stops_a_member(flow: Flow) -> None:
     """That ends the whole, and is no failure to restart."""
     assert there("b", "systemctl", "stop", f"dora-{NAME}").returncode == 0

@@ -10,7 +10,7 @@ from typing import Any
 
 import click
 
-from dora_systemd.adapters.host.unit_files import has_unit
+from dora_systemd.adapters.host.unit_names import has_unit
 from dora_systemd.adapters.journal.reader import JournalReader, check_readable
 from dora_systemd.cli.colors import is_dumb, wants_colors
 from dora_systemd.cli.parameters import current_scope, print_warnings, scope_options

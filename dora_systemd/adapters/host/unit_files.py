@@ -32,13 +32,6 @@ def read_unit_file(path: Path) -> str | None:
     return read_text(path)
 
 
-def has_unit(directory: Path, prefix: str) -> bool:
-    """Whether a unit in this directory has a name that begins so; False if it is not readable."""
-    with contextlib.suppress(OSError), os.scandir(directory) as entries:
-        return any(one.name.startswith(prefix) for one in entries)
-    return False
-
-
 def written_us(path: Path) -> int:
     """When a unit file was written, CLOCK_REALTIME µs; 0 if there is none."""
     try:

@@ -8,7 +8,7 @@ import contextlib
 import json
 import os
 import socket
-from collections.abc import Awaitable, Callable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Coroutine, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from dora_systemd.decisions.dora.coordinator import Coordinator
 from dora_systemd.errors import DoraSystemdError, ExitCode
 
 Answer = Callable[[Request], Awaitable[dict[str, Any]]]
-Session = Callable[[Request, Ends], Awaitable[None]]
+Session = Callable[[Request, Ends], Coroutine[Any, Any, None]]
 """Talks with the caller until one of both ends it, after the request that has begun it."""
 Reach = Callable[[], Coordinator]
 """The address of the coordinator. Raises DoraSystemdError (NOT_RUNNING) if it does not listen yet.

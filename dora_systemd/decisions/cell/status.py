@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, TypeVar
 from dora_systemd.decisions.cell.counters import WHOLE_CELL, CpuSample, LineCount
 from dora_systemd.decisions.cell.exits import Exit, parse_exit
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.names import is_node_id
+from dora_systemd.names import is_name, is_node_id
 
 Value = TypeVar("Value")
 
@@ -201,8 +201,15 @@ def _parse_node(raw: Any) -> NodeStatus:
         silent=_text(known, "silent"),
         is_ended=known.get("is_ended") is True,
         needs=_text(known, "needs"),
-        machine=_text(known, "machine"),
+        machine=_machine(known),
     )
+
+
+def _machine(raw: Mapping[str, Any]) -> str:
+    name = _text(raw, "machine")
+    if name and not is_name(name):
+        raise _Wrong("it has a machine without a name")
+    return name
 
 
 def _parse_sample(raw: Any) -> CpuSample:

@@ -53,11 +53,8 @@ class Engine:
         self._port = 0
         self._token = ""
 
-    def start_coordinator(self) -> engine.Child | None:
-        """Start the coordinator, unless it boots already; it prints its port. Raises OSError.
-
-        None if the dataflow has its coordinator on another machine.
-        """
+    def start_coordinator(self) -> engine.Child:
+        """Start the coordinator, unless it boots already; it prints its port. Raises OSError."""
         child = self._boot.coordinator if self._boot else self._spawn_coordinator()
         self._children[child.label] = child
         return child

@@ -6,6 +6,7 @@ Alone is the cell of all others. The head and the members are in runner/machines
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
+from dora_systemd.adapters.dora.engine import Child
 from dora_systemd.adapters.dora.preparation import Prepared
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.adapters.runner_socket.listener import Session
@@ -56,6 +57,10 @@ class Alone:
     ) -> Engine:
         """The dora of this machine."""
         return Engine(dora, paths, environment, boot)
+
+    def start_coordinator(self, dora: Engine) -> Child | None:
+        """Start the coordinator, if it runs on this machine. Raises OSError."""
+        return dora.start_coordinator()
 
     def cell(self, cell: Cell) -> Cell:
         """The cell at the beginning of a run."""

@@ -1,11 +1,13 @@
 """The dora of a machine that is one of several."""
 
+import asyncio
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from dora_systemd.adapters.dora import engine
 from dora_systemd.decisions.dora import protocol
 from dora_systemd.decisions.machines.wire import Part
+from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.begin import Daemon, start_coordinator, start_daemon
 from dora_systemd.runner.cell.engine import Engine
@@ -43,16 +45,17 @@ class SharedEngine(Engine):
         super().__init__(dora, paths, {**environment, **_NO_DIRECT})
 
     async def machines(self) -> list[str]:
-        """The machines whose daemon is connected. Raises TimeoutError and DoraSystemdError."""
+        """The machines whose daemon is connected. Raises DoraSystemdError."""
         reply = await self.ask_soon(protocol.CONNECTED_DAEMONS)
         return protocol.parse_machines(reply)
 
     async def ask_soon(self, params: protocol.Params) -> protocol.Reply:
-        """Send a request that dora answers at once. Raises DoraSystemdError, after ASK_SECONDS too.
-
-        On a connection of its own: the answer to one that has taken too long may still come.
-        """
-        return await self.ask_apart(params, ASK_SECONDS)
+        """Send a request. Raises DoraSystemdError, also if ASK_SECONDS are not enough."""
+        try:
+            async with asyncio.timeout(ASK_SECONDS):
+                return await self.ask(params)
+        except TimeoutError as error:
+            raise DoraSystemdError("the dora coordinator does not answer") from error
 
     async def is_joined(self) -> bool:
         """Whether the daemon of this machine has registered."""
@@ -98,9 +101,6 @@ class MemberEngine(SharedEngine):
     def set_part(self, part: Part) -> None:
         """Set how to reach the head. That is in memory only."""
         self._port, self._token, self._zenoh = part.coordinator, part.token, part.zenoh
-
-    def start_coordinator(self) -> None:
-        """There is none here."""
 
     def _spawn_daemon(self, environment: Mapping[str, str]) -> Daemon:
         more = ("--machine-id", self.machine, *zenoh_arguments(self._zenoh, environment))

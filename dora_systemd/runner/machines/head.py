@@ -169,7 +169,7 @@ class HeadDialogue(Dialogue):
             self.spawn("have systemd wait", self._extend_start())
         while True:
             self._roster.changed.clear()
-            self._pump.push(life.MachinesAwaited(now_us(), self._awaited()))
+            self._show_awaited()
             if not self._roster.missing() and await self._has_each():
                 return
             with contextlib.suppress(TimeoutError):
@@ -177,12 +177,16 @@ class HeadDialogue(Dialogue):
                 async with asyncio.timeout(_AGAIN_SECONDS if is_all else None):
                     await self._roster.changed.wait()
 
+    def _show_awaited(self) -> None:
+        if (text := self._awaited()) != self._pump.cell.awaited:
+            self._pump.push(life.MachinesAwaited(now_us(), text))
+
     async def _has_each(self) -> bool:
         """Whether dora has exactly one daemon of each member.
 
         The coordinator may still have the lost one of a machine that is back.
         """
-        with contextlib.suppress(DoraSystemdError, TimeoutError):
+        with contextlib.suppress(DoraSystemdError):
             found = await self._dora.machines()
             return all(found.count(name) == 1 for name in self._roster.names)
         return False
@@ -219,7 +223,7 @@ class HeadDialogue(Dialogue):
                 self._lose(lost, "its dora daemon is not connected any more")
 
     async def _find_lost(self) -> str:
-        with contextlib.suppress(DoraSystemdError, TimeoutError):
+        with contextlib.suppress(DoraSystemdError):
             found = await self._dora.machines()
             return next((name for name in self._roster.names if name not in found), "")
         return ""  # watch_dora sees that

@@ -5,17 +5,14 @@ that ends it ends its nodes, by itself and with success: the head decides what f
 has been told is in memory only.
 """
 
-import asyncio
-import contextlib
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from dora_systemd.adapters.dora.command import version_numbers
 from dora_systemd.adapters.dora.preparation import Prepared
 from dora_systemd.adapters.host import files
-from dora_systemd.adapters.host.process import run_command
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.adapters.runner_socket.client import Request
 from dora_systemd.adapters.runner_socket.listener import Session, refuse
@@ -24,11 +21,10 @@ from dora_systemd.decisions.cell.machines import HEAD
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
-from dora_systemd.decisions.dora import protocol
 from dora_systemd.decisions.life import events as life
-from dora_systemd.decisions.life.states import Cell, Do, State
+from dora_systemd.decisions.life.states import Cell, State
 from dora_systemd.decisions.machines import wire
-from dora_systemd.decisions.machines.part import check_placed, is_here, launch_files, own_options
+from dora_systemd.decisions.machines.part import check_placed, launch_files, own_options
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.boot import Boot
@@ -37,24 +33,17 @@ from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.cell.life import Life
 from dora_systemd.runner.cell.pump import Pump, now_us
 from dora_systemd.runner.cell.role import Alone
-from dora_systemd.runner.machines.ending import end_nodes
 from dora_systemd.runner.machines.engine import NOISE, MemberEngine
 from dora_systemd.runner.machines.lines import Lines
-from dora_systemd.runner.machines.processes import find
+from dora_systemd.runner.machines.member_dialogue import MemberDialogue, is_going_down
 from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.terminal_text import short_line
-from dora_systemd.values import INFINITY, SECOND
+from dora_systemd.values import INFINITY
 
 if TYPE_CHECKING:
     from dora_systemd.adapters.dora.check import DoraCheck
 
 _LONGEST = 100
-_POLL_SECONDS = 0.05
-_EXPLAIN_SECONDS = 0.5
-"""Time for the session to end, which says more than a lost connection to dora."""
-_ASK_SECONDS = 2.0
-_GOING_DOWN = "the machine is shutting down"
-_ENDING = (State.STOPPING, State.CLOSING, State.LEAVING, State.ENDED)
 
 
 class Member(Alone):
@@ -70,7 +59,7 @@ class Member(Alone):
         self._pump: Pump | None = None
         self._table = self._told = self._version = ""
         self.stops_by_head = False
-        self.is_going_down = is_going_down
+        self.is_going_down: Callable[[bool], bool] = is_going_down
 
     @property
     def sessions(self) -> Mapping[str, Session]:
@@ -105,6 +94,9 @@ class Member(Alone):
         del boot
         self._dora = MemberEngine(dora, paths, environment, self.options.machine)
         return self._dora
+
+    def start_coordinator(self, dora: Engine) -> None:
+        """The only one is the head's."""
 
     def cell(self, cell: Cell) -> Cell:
         """The cell of a member."""
@@ -188,107 +180,3 @@ class Member(Alone):
 
 def _refusal(message: str) -> DoraSystemdError:
     return DoraSystemdError(message, "stop it first: doractl stop", ExitCode.NAME_IN_USE)
-
-
-class MemberDialogue(Dialogue):
-    """Carries out each Do of a member. Call begin() first."""
-
-    def begin(self, member: Member, dora: MemberEngine) -> None:
-        """member: talks with the head."""
-        self._member, self._dora = member, dora
-        self._has_told = False
-
-    def actions(
-        self, descriptor: Mapping[str, Any], variables: Mapping[str, str]
-    ) -> dict[Do, Callable[[], None]]:
-        """Those of one machine, without all that the head asks dora."""
-        own = super().actions(descriptor, variables)
-        return {
-            **own,
-            Do.GATHER: lambda: self._ask(Do.GATHER, self._find_run()),
-            Do.ASK_SPAWN: lambda: self.spawn("find processes", find(self._pump, self._nodes)),
-            Do.ASK_RESULT: self._tell_result,
-            Do.ASK_STOP: lambda: self._ask(Do.END_NODES, self._stop()),
-            Do.END_NODES: lambda: self._ask(Do.END_NODES, self._end_nodes()),
-            Do.EXIT: lambda: self._exit(own[Do.EXIT]),
-        }
-
-    async def _find_run(self) -> None:
-        """Tell the head that the daemon has joined, and wait for the run that it starts."""
-        _, paths = self._nodes.places
-        self._nodes.expect()
-        self._member.send(wire.Ready(str(paths.work)))
-        while not (run := await self._running()):
-            await asyncio.sleep(_POLL_SECONDS)
-        self._pipes.set_run(run)
-        self._pump.push(life.RunStarted(now_us(), run))
-
-    async def _running(self) -> str:
-        reply = await self._dora.ask_soon(protocol.LIST)
-        return protocol.parse_running(reply, self._options.name)
-
-    def _events_ended(self) -> None:
-        self.spawn("see why dora is silent", self._lose_head("the dora coordinator is gone"))
-
-    async def raised(self, what: str, error: Exception) -> None:
-        """Have an exception end the cell; what dora does not answer is because of the head."""
-        if isinstance(error, DoraSystemdError | TimeoutError):
-            await self._lose_head(str(error) or "dora does not answer")
-        else:
-            await super().raised(what, error)
-
-    async def _lose_head(self, why: str) -> None:
-        await asyncio.sleep(_EXPLAIN_SECONDS)
-        if self._pump.cell.state not in _ENDING:
-            self._has_told = True
-            self._member.send(wire.Ended(why))
-            self._pump.push(life.HeadLost(now_us(), why))
-
-    def _is_here(self, node: str) -> bool:
-        return not node or is_here(self._options, node)
-
-    def _tell_result(self) -> None:
-        """How the own nodes have ended, from the own table: the head may be gone already."""
-        cell = self._pump.cell
-        if cell.state is State.CLOSING:
-            results = {ident: node.exit for ident, node in cell.nodes.items()}
-            self._pump.push(life.ResultKnown(now_us(), results))
-
-    async def _stop(self) -> None:
-        """Somebody stops this part here: the head has to know before the nodes end."""
-        await asyncio.to_thread(self._tell_end)
-        await self._end_nodes()
-
-    async def _end_nodes(self) -> None:
-        cell = self._pump.cell
-        self._pipes.mute("daemon")  # it does not know that we end them
-        await end_nodes(self._nodes, list(cell.nodes), cell.grace / SECOND)
-        self._pump.push(life.StopAnswered(now_us()))
-
-    def _exit(self, leave: Callable[[], None]) -> None:
-        self._tell_end()
-        leave()
-
-    def _tell_end(self) -> None:
-        """Say once why this part ends, unless the head knows."""
-        cell = self._pump.cell
-        if self._has_told:
-            return
-        self._has_told = True
-        if self._member.stops_by_head:
-            self._member.send(wire.Ended())
-        elif cell.stop_by:
-            is_down = self._member.is_going_down(self._nodes.places[1].is_of_user)
-            reason, by = (_GOING_DOWN, "") if is_down else ("", cell.stop_by)
-            self._member.send(wire.Ended(reason, by))
-        else:
-            self._member.send(wire.Ended(cell.failure))
-
-
-def is_going_down(is_of_user: bool) -> bool:
-    """Whether systemd stops everything, and not only this unit. Also if it cannot be asked."""
-    scope = ["--user"] if is_of_user else []
-    with contextlib.suppress(DoraSystemdError):
-        done = run_command(["systemctl", *scope, "is-system-running"], _ASK_SECONDS)
-        return done.stdout.strip() in ("stopping", "")
-    return True

@@ -2,16 +2,19 @@
 
 import os
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from dora_systemd.adapters.host.unit_names import has_unit
 from dora_systemd.cli.remote import machines
 from dora_systemd.cli.remote.plan import Plan
 from dora_systemd.cli.verbs.look.logs import command
 from dora_systemd.decisions.cell.machines import Placed
 from dora_systemd.decisions.remote.hosts import Host
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import LINK_PREFIX
 from dora_systemd.scope import scope_of
 from tests.unit.fakes.manager import FakeManager, options
 from tests.unit.verbs.facts.test_machines import WORDS
@@ -107,3 +110,11 @@ def test_another_scope_is_not_merged(asked: list[Any], capsys: pytest.CaptureFix
         assert machines.print_machines(other, context) is None
     assert not asked
     assert "the logs of gpu are left out" in capsys.readouterr().err
+
+
+def test_links_are_seen_without_a_question(tmp_path: Path) -> None:
+    assert not has_unit(tmp_path / "nothing", LINK_PREFIX)
+    (tmp_path / "dora-robot.service").touch()
+    assert not has_unit(tmp_path, LINK_PREFIX)
+    (tmp_path / "doralink-robot:gpu.service").touch()
+    assert has_unit(tmp_path, LINK_PREFIX)

@@ -59,6 +59,7 @@ _TABLE = {
     """,
     ROOTS: """
         adapters.bus.connection adapters.bus.errors adapters.host.unit_files
+        adapters.host.unit_names
         adapters.host.guard
         adapters.releases.build_tree adapters.releases.draft adapters.releases.incoming
         adapters.releases.store verbs.releases.trial

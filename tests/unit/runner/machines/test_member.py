@@ -19,7 +19,8 @@ from dora_systemd.decisions.machines import wire
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.life import Life
 from dora_systemd.runner.machines.engine import MemberEngine
-from dora_systemd.runner.machines.member import Member, MemberDialogue
+from dora_systemd.runner.machines.member import Member
+from dora_systemd.runner.machines.member_dialogue import MemberDialogue
 from dora_systemd.runner.machines.processes import find
 from dora_systemd.values import SECOND
 from tests.unit.fakes.dialogue import Heard
@@ -207,8 +208,8 @@ def test_the_first_processes_are_those_that_the_launchers_note(tmp_path: Path) -
         def noted_pid(_node: str) -> int:
             return next(noted)
 
-        bench.nodes.noted_pid = noted_pid  # type: ignore[attr-defined]
-        found = asyncio.ensure_future(find(bench.pump, bench.nodes))  # type: ignore[arg-type]
+        bench.nodes.noted_pid = noted_pid  # type: ignore[method-assign, assignment]
+        found = asyncio.ensure_future(find(bench.pump, bench.nodes))
         while not bench.pump.heard:
             await asyncio.sleep(0.01)
         (event,) = bench.pump.heard
