@@ -49,6 +49,11 @@ class Member(NamedTuple):
     host: Host
     words: tuple[str, ...]
 
+    def with_uuid(self, old: str, new: str) -> "Member":
+        """The same for a dataflow whose UUID turns out to be another one."""
+        told = {f"--uuid={old}": f"--uuid={new}"}
+        return self._replace(words=tuple(told.get(word, word) for word in self.words))
+
 
 def on_head(options: RunnerOptions) -> RunnerOptions:
     """The options of the head's runner: without what only the runners of members need."""

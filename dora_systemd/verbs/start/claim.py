@@ -77,7 +77,9 @@ def with_known_uuid(plan: Plan, boot: BootUnit) -> Plan:
     known = boot.options
     if not boot.is_enabled or known is None or known.dataflow != plan.options.dataflow:
         return plan
-    return replace(plan, options=plan.options._replace(uuid=known.uuid))
+    members = (one.with_uuid(plan.options.uuid, known.uuid) for one in plan.members)
+    options = plan.options._replace(uuid=known.uuid)
+    return replace(plan, options=options, members=tuple(members))
 
 
 def place_unit_file(

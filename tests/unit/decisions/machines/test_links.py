@@ -20,12 +20,13 @@ from dora_systemd.decisions.machines.wire import Forwards
 from dora_systemd.decisions.remote.hosts import parse_host
 from dora_systemd.decisions.unit.properties import format_unit
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from tests.unit.fakes.manager import options
+from tests.unit.fakes.manager import UUID, options
 
 SOCKET = "/run/dora-systemd/robot/runner.sock"
 WORDS = ("member", "/srv/it's $5/robot.yml", "--name=robot", "--placed=yolo=gpu")
 LINK = LinkOptions(SOCKET, "gpu", "alice@gpu-box:2222", WORDS)
 FORWARDS = Forwards(61001, {"head": 61002, "gpu": 61003, "arm": 61004})
+OLD = UUID.replace("5", "6")
 PLACED = (Placed("yolo", "gpu"), Placed("arm", "arm"), Placed("depth", "gpu"))
 
 
@@ -114,3 +115,8 @@ def test_a_link_lives_as_long_as_the_unit_of_the_head(is_user: bool) -> None:
     assert "StartLimitIntervalSec=0" in text
     assert ("ProtectSystem=strict" in text) is not is_user
     assert "token" not in text
+
+
+def test_a_member_hears_the_uuid_that_is_known() -> None:
+    member = Member("gpu", parse_host("b"), (*WORDS, f"--uuid={OLD}", f"--env=A=--uuid={OLD}"))
+    assert member.with_uuid(OLD, UUID).words == (*WORDS, f"--uuid={UUID}", f"--env=A=--uuid={OLD}")
