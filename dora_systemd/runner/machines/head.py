@@ -20,7 +20,6 @@ from dora_systemd.adapters.runner_socket.listener import Session, refuse
 from dora_systemd.adapters.runner_socket.splice import Ends
 from dora_systemd.decisions.cell.machines import HEAD, members_of, placed_on
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.dora import life_events, protocol
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
@@ -30,8 +29,6 @@ from dora_systemd.decisions.machines import wire
 from dora_systemd.decisions.machines.part import (
     check_placed,
     is_here,
-    own_dataflow,
-    own_options,
     with_works,
 )
 from dora_systemd.decisions.rights.node_rights import is_essential
@@ -42,11 +39,11 @@ from dora_systemd.runner.cell.dialogue import Dialogue
 from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.cell.life import Life
 from dora_systemd.runner.cell.pump import Pump, now_us
-from dora_systemd.runner.cell.role import Alone
 from dora_systemd.runner.machines.ending import end_nodes
 from dora_systemd.runner.machines.engine import NOISE, HeadEngine
 from dora_systemd.runner.machines.ports import choose_ports
 from dora_systemd.runner.machines.roster import Roster
+from dora_systemd.runner.machines.shared import Shared
 from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.values import INFINITY, SECOND, format_duration
 
@@ -63,7 +60,7 @@ _WORD_SECONDS = 1.0
 _EXTEND_SECONDS = 10.0
 
 
-class Head(Alone):
+class Head(Shared):
     """The machine where the dataflow was started."""
 
     def __init__(self, options: RunnerOptions, this_life: Life) -> None:
@@ -81,19 +78,6 @@ class Head(Alone):
         name = self.options.name
         message = f"cannot reload {name}: it runs on several machines"
         await refuse(ends, DoraSystemdError(message, f"run: doractl restart {name}"))
-
-    @property
-    def start_timeout(self) -> int:
-        """Never: the time begins when all members have joined."""
-        return INFINITY
-
-    def own(self, options: RunnerOptions) -> RunnerOptions:
-        """The options without what they say of other machines' nodes."""
-        return own_options(options)
-
-    def here(self, dataflow: Dataflow) -> Dataflow:
-        """The dataflow without other machines' nodes."""
-        return own_dataflow(self.options, dataflow)
 
     def prepare(self, paths: CellPaths, prepared: Prepared, check: "DoraCheck") -> None:
         """Note what the members have to compare."""

@@ -20,11 +20,10 @@ from dora_systemd.adapters.runner_socket.splice import Ends
 from dora_systemd.decisions.cell.machines import HEAD
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import CellStatus
-from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Cell, State
 from dora_systemd.decisions.machines import wire
-from dora_systemd.decisions.machines.part import check_placed, launch_files, own_options
+from dora_systemd.decisions.machines.part import check_placed, launch_files
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.boot import Boot
@@ -32,13 +31,12 @@ from dora_systemd.runner.cell.dialogue import Dialogue
 from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.cell.life import Life
 from dora_systemd.runner.cell.pump import Pump, now_us
-from dora_systemd.runner.cell.role import Alone
 from dora_systemd.runner.machines.engine import NOISE, MemberEngine
 from dora_systemd.runner.machines.lines import Lines
 from dora_systemd.runner.machines.member_dialogue import MemberDialogue, is_going_down
+from dora_systemd.runner.machines.shared import Shared
 from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.terminal_text import short_line
-from dora_systemd.values import INFINITY
 
 if TYPE_CHECKING:
     from dora_systemd.adapters.dora.check import DoraCheck
@@ -46,7 +44,7 @@ if TYPE_CHECKING:
 _LONGEST = 100
 
 
-class Member(Alone):
+class Member(Shared):
     """A machine that another one has given nodes.
 
     stops_by_head: the head knows that this part ends.
@@ -65,19 +63,6 @@ class Member(Alone):
     def sessions(self) -> Mapping[str, Session]:
         """`doractl member` begins the only one."""
         return {"part": self._part}
-
-    @property
-    def start_timeout(self) -> int:
-        """Never: the head sees to that."""
-        return INFINITY
-
-    def own(self, options: RunnerOptions) -> RunnerOptions:
-        """The options without what they say of other machines' nodes."""
-        return own_options(options)
-
-    def here(self, dataflow: Dataflow) -> Dataflow:
-        """The dataflow, which was read without other machines' nodes."""
-        return dataflow
 
     def prepare(self, paths: CellPaths, prepared: Prepared, check: "DoraCheck") -> None:
         """Write how each node is started. Raises DoraSystemdError."""
