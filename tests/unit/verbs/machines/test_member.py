@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -43,7 +44,7 @@ def refused(manager: FakeManager, tmp_path: Path, part: Part = PART) -> DoraSyst
 
 
 @pytest.mark.parametrize("change", [{"name": "other"}, {"uuid": OTHER}, {"machine": "arm"}])
-def test_a_runner_that_wants_something_else(change: dict[str, str], tmp_path: Path) -> None:
+def test_a_runner_that_wants_something_else(change: dict[str, Any], tmp_path: Path) -> None:
     """The words of the command line are those of root; the runner's are not."""
     error = refused(FakeManager(), tmp_path, replace(PART, **change))
     assert error.code is ExitCode.BAD_INPUT
