@@ -69,8 +69,10 @@ def start_unit(
     state = manager.read(unit, ["ActiveState"])["ActiveState"]
     has_failed = result != JOB_DONE or state == "failed"
     if has_failed and (refusal := runners_refusal(manager, unit)):
-        # It never ran, so do not keep its name in use.
+        # It never ran, so do not keep its name in use. Links would only try once more.
         with suppress(DoraSystemdError):
+            if beside:
+                manager.run_jobs("StopUnit", [link for link, _ in beside])
             manager.reset_failed(unit)
         raise refusal
     if has_failed and wait:
