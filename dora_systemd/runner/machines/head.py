@@ -141,7 +141,8 @@ class HeadDialogue(Dialogue):
             async with asyncio.timeout(most if self._is_first else None):
                 await self._all_joined()
         except TimeoutError:
-            reason = f"{self._awaited()} for {format_duration(round(most) * SECOND)}"
+            named, after = self._named(), format_duration(round(most) * SECOND)
+            reason = f"cannot reach {named}: no answer within {after}"
             self._pump.push(life.Refused(now_us(), reason, Cause.NO_MACHINE))
             return
         self._pump.push(life.Gathered(now_us()))
@@ -176,12 +177,15 @@ class HeadDialogue(Dialogue):
         return False
 
     def _awaited(self) -> str:
+        return f"waiting for {self._named()}"
+
+    def _named(self) -> str:
+        """The members that are missing, and why."""
         missing = self._roster.missing()
         if not missing:
-            return "waiting for the dora daemons of all machines"
+            return "the dora daemons of all machines"
         word = "machine" if len(missing) == 1 else "machines"
-        named = ", ".join(f"{name} ({why})" for name, why in missing.items())
-        return f"waiting for {word} {named}"
+        return f"{word} {', '.join(f'{name} ({why})' for name, why in missing.items())}"
 
     async def _extend_start(self) -> None:
         """Waiting for a machine is no part of TimeoutStartSec=, see sd_notify(3)."""

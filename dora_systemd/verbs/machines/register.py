@@ -3,9 +3,9 @@
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from stat import S_IMODE
 
-from dora_systemd.adapters.host.files import decoded, parse_yaml
-from dora_systemd.adapters.host.unit_files import put_unit_file
+from dora_systemd.adapters.host.files import decoded, parse_yaml, write_atomic
 from dora_systemd.decisions.cell.machines import parse_machine
 from dora_systemd.decisions.machines.declared import with_machine, without_machine
 from dora_systemd.decisions.machines.entry import parse_entry
@@ -30,8 +30,10 @@ _INSTALL = (
 )
 _REMOVE = (
     'f="$HOME/.ssh/authorized_keys"; [ -f "$f" ] || exit 0; umask 077; '
-    'grep -vF "$1" "$f" >"$f.doractl"; mv "$f.doractl" "$f"'
+    # grep has the status 1 if no line is left, and 2 if it cannot read or write.
+    'grep -vF "$1" "$f" >"$f.doractl"; [ $? -le 1 ] && mv "$f.doractl" "$f"'
 )
+_NEW_MODE = 0o644
 
 
 @dataclass(frozen=True)
@@ -138,7 +140,7 @@ def _checked(file: Path, before: str, text: str | None, name: str, added: str = 
         machines.pop(name, None)
     wanted = {key: value for key, value in wanted.items() if key != "machines"}
     wanted |= {"machines": machines} if machines else {}
-    if text is None or _document(file, text) != wanted:
+    if text is None or file.is_symlink() or _document(file, text) != wanted:
         what = f"write {name}: {{host: {added}}} below" if added else f"remove {name} below"
         message = f"cannot change {shown(str(file))} by itself"
         raise DoraSystemdError(message, f"{what} machines: there", ExitCode.BAD_INPUT)
@@ -160,4 +162,6 @@ def _write(file: Path, text: str) -> None:
     except OSError as error:
         message = f"cannot create {file.parent}: {error.strerror}"
         raise DoraSystemdError(message, "", ExitCode.NO_PERMISSION) from error
-    put_unit_file(file, text)
+    # It may have secrets, such as values of env.
+    mode = S_IMODE(read_file(file).place.mode) if exists(file) else _NEW_MODE
+    write_atomic(file, text, mode, is_durable=True)

@@ -65,7 +65,7 @@ _TABLE = {
         adapters.releases.store verbs.releases.trial
         adapters.journal.journalctl adapters.journal.reader adapters.journal.socket verbs.doctor
         verbs.facts.enabled verbs.facts.locks verbs.follow verbs.gateway verbs.needs.notes
-        verbs.machines.keys
+        verbs.machines.keys verbs.machines.register
         verbs.setup verbs.show verbs.start.enable verbs.up
     """,
     INSTALLED: """

@@ -139,8 +139,8 @@ def test_the_first_start_does_not_wait_without_end(tmp_path: Path) -> None:
         (refused,) = bench.heard(life.Refused)
         assert isinstance(refused, life.Refused)
         assert refused.cause is Cause.NO_MACHINE
-        assert "waiting for machine gpu (connect to host b port 22: No route" in refused.reason
-        assert refused.reason.endswith("for 30s")
+        assert "cannot reach machine gpu (connect to host b port 22: No route" in refused.reason
+        assert refused.reason.endswith("no answer within 30s")
 
     run(tmp_path, work)
 
