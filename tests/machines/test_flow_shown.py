@@ -73,10 +73,9 @@ def test_logs_of_all_machines(flow: Flow) -> None:
 
 
 def test_what_cannot_be_made_of_it(flow: Flow) -> None:
-    for words in (["enable", NAME], ["export", NAME]):
-        done = flow.cell.doractl(*words, check=False)
-        assert done.returncode == ExitCode.BAD_INPUT
-        assert "it runs on several machines" in done.stderr
+    done = flow.cell.doractl("export", NAME, check=False)
+    assert done.returncode == ExitCode.BAD_INPUT
+    assert "it runs on several machines" in done.stderr
     limit = flow.cell.doractl("set", NAME, "--node-limit=sink:memory=1G", check=False)
     assert "it runs on machine arm" in limit.stderr
 
@@ -102,7 +101,6 @@ def test_a_plan_shows_all_units() -> None:
         (["--machine=gpu=b", "--machine=npu=c"], "no node runs on machine npu"),
         (["--machine=gpu=b", "--network=private"], "the network is private"),
         (["--machine=gpu=b", "--hot-reload"], "hot reload"),
-        (["--machine=gpu=b", "--enable"], "it runs on several machines"),
     ],
 )
 def test_refusals_before_any_unit(words: list[str], text: str) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 
 import click
 
-from dora_systemd.adapters.host.unit_names import has_unit
+from dora_systemd.adapters.host.unit_names import has_unit, unit_places
 from dora_systemd.adapters.journal.reader import JournalReader, check_readable
 from dora_systemd.cli.colors import is_dumb, wants_colors
 from dora_systemd.cli.parameters import current_scope, print_warnings, scope_options
@@ -180,7 +180,8 @@ def command(
       journalctl -t robot/camera                  the same records, with systemd's own tool
     """
     scope = current_scope()
-    if machine or (len(selectors) == 1 and has_unit(scope.transient_units, LINK_PREFIX)):
+    places = unit_places(scope, os.environ)
+    if machine or (len(selectors) == 1 and has_unit(places, LINK_PREFIX)):
         # Imported late: most dataflows run on one machine.
         from dora_systemd.cli.remote.machines import print_machines
 

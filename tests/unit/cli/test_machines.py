@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from dora_systemd.adapters.host.unit_names import has_unit
+from dora_systemd.adapters.host.unit_names import has_unit, unit_places
 from dora_systemd.cli.remote import machines
 from dora_systemd.cli.remote.plan import Plan
 from dora_systemd.cli.verbs.look.logs import command
@@ -16,7 +16,7 @@ from dora_systemd.decisions.remote.hosts import Host
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import LINK_PREFIX
 from dora_systemd.scope import scope_of
-from tests.unit.fakes.manager import FakeManager, options
+from tests.unit.fakes.manager import FakeManager, ScopeIn, options
 from tests.unit.verbs.facts.test_machines import WORDS
 
 PLACED = (Placed("yolo", "gpu"),)
@@ -112,9 +112,17 @@ def test_another_scope_is_not_merged(asked: list[Any], capsys: pytest.CaptureFix
     assert "the logs of gpu are left out" in capsys.readouterr().err
 
 
-def test_links_are_seen_without_a_question(tmp_path: Path) -> None:
-    assert not has_unit(tmp_path / "nothing", LINK_PREFIX)
-    (tmp_path / "dora-robot.service").touch()
-    assert not has_unit(tmp_path, LINK_PREFIX)
-    (tmp_path / "doralink-robot:gpu.service").touch()
-    assert has_unit(tmp_path, LINK_PREFIX)
+@pytest.mark.parametrize("place", ["run/systemd/transient", "home/.config/systemd/user"])
+def test_links_are_seen_without_a_question(tmp_path: Path, place: str) -> None:
+    scope = ScopeIn(is_user=True, uid=1, root=tmp_path / "run")
+    environment = {"HOME": str(tmp_path / "home")}
+
+    def are_seen() -> bool:
+        return has_unit(unit_places(scope, environment), LINK_PREFIX)
+
+    assert not are_seen()
+    (tmp_path / place).mkdir(parents=True)
+    (tmp_path / place / "dora-robot.service").touch()
+    assert not are_seen()
+    (tmp_path / place / "doralink-robot:gpu.service").touch()
+    assert are_seen()
