@@ -8,7 +8,7 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
 
-from dora_systemd.adapters.bus.manager import Property
+from dora_systemd.adapters.bus.manager import Beside, Property
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.colors import wants_colors
 from dora_systemd.cli.parameters import print_warnings
@@ -34,7 +34,8 @@ class Foreground:
     """What to print of a dataflow, and what stops it.
 
     form: one of FORMATS. signals, stop_after: as for follow_unit(). notes: for people, printed once
-    the dataflow has been accepted. command: of doractl, for the journal.
+    the dataflow has been accepted. command: of doractl, for the journal. links: as for
+    start_unit().
     """
 
     shown: LogFilter = field(default_factory=LogFilter)
@@ -43,6 +44,7 @@ class Foreground:
     stop_after: int = INFINITY
     notes: Sequence[str] = ()
     command: str = "doractl run"
+    links: Beside = ()
 
 
 def print_until_end(
@@ -66,7 +68,7 @@ def print_until_end(
 
         followed = FollowedLog(plan.scope, options.name, options.uuid, since, write, form)
         with closing(followed) as logs:
-            start_unit(bus, plan.scope, options, properties, stage, wait=False)
+            start_unit(bus, plan.scope, options, properties, stage, False, how.links)
             stage.wipe()
             print_warnings(how.notes)
             by = partial(note_request, "stop-asked", options.name, options.uuid, how.command)

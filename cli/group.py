@@ -63,6 +63,8 @@ def find_verbs() -> dict[str, Verb]:
 
 
 VERBS = find_verbs()
+HIDDEN = ("member",)
+"""Verbs that other machines call, not people: they are not in --help."""
 ALIASES = {"ps": "list", "status": "list", "reset-failed": "reset"}
 
 _EPILOG = """\b
@@ -104,7 +106,8 @@ class VerbGroup(click.Group):
         del ctx
         width = max(map(len, VERBS))
         for section in SECTIONS:
-            rows = [(name, one.summary) for name, one in VERBS.items() if one.section == section]
+            shown = {name: one for name, one in VERBS.items() if name not in HIDDEN}
+            rows = [(name, one.summary) for name, one in shown.items() if one.section == section]
             with formatter.section(TITLES[section]):
                 formatter.write_dl([(name.ljust(width), summary) for name, summary in rows])
 

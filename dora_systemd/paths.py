@@ -31,6 +31,8 @@ class CellPaths:
         """Working directory of the daemon."""
         self.work = root / "work"
         """dora's working directory of the dataflow: keeps its `out/` out of the project."""
+        self.launch = root / "launch"
+        """On a member: how each of its nodes is started, see decisions/machines/part.py."""
         self.io = root / "io"
         """The directory of the nodes' output pipes."""
 

@@ -23,6 +23,11 @@ class Scope(NamedTuple):
         return self.runtime_root / RUNTIME_NAME / name
 
     @property
+    def transient_units(self) -> Path:
+        """Where the manager has its transient units, see systemd.unit(5)."""
+        return self.runtime_root / "systemd/transient"
+
+    @property
     def word(self) -> str:
         """The name of this scope."""
         return "user" if self.is_user else "system"

@@ -57,9 +57,15 @@ class _Records:
 
 
 class LogPrinter:
-    """Merges the records. is_complete of Talks decides when the first ones may be printed."""
+    """Merges the records. is_complete of Talks decides when the first ones may be printed.
 
-    def __init__(self, hosts: Sequence[Host], options: Mapping[str, Any]) -> None:
+    key: what JSON objects call the host.
+    """
+
+    def __init__(
+        self, hosts: Sequence[Host], options: Mapping[str, Any], key: str = "host"
+    ) -> None:
+        self._key = key
         self._form = str(options["output"])
         is_follow = bool(options["is_follow"] or options["until_end"])
         names = [one.text for one in hosts]
@@ -76,7 +82,7 @@ class LogPrinter:
         records, now = self._records[host], time.monotonic()
         if self._form == "json":
             for value in records.objects(data):
-                line = json.dumps(with_host(value, host.text)).encode() + b"\n"
+                line = json.dumps(with_host(value, host.text, self._key)).encode() + b"\n"
                 self.merge.add(host.text, _time(value.get(_TIME)), line, now)
             return None
         for record in records.exported(data):

@@ -31,6 +31,7 @@ class Plan(NamedTuple):
 
     verb: as typed, such as "node restart". acts: it prints an outcome in each line. is_endless:
     somebody has to end it. options: by name, as click reads them. loud: the words without -q.
+    key: what JSON calls a host.
     """
 
     verb: str
@@ -40,6 +41,7 @@ class Plan(NamedTuple):
     acts: bool
     wants_json: bool
     is_endless: bool
+    key: str = "host"
 
     @property
     def way(self) -> Way:

@@ -49,7 +49,7 @@ def run_on_all(hosts: Sequence[Host], plan: Plan, opening: bytes | None = None) 
 def _printer(hosts: Sequence[Host], plan: Plan) -> tuple[list[str], Printer]:
     """What the hosts are asked for, and what prints their answers."""
     if plan.verb == "logs":
-        return words_of_logs(plan), LogPrinter(hosts, plan.options)
+        return words_of_logs(plan), LogPrinter(hosts, plan.options, plan.key)
     if plan.verb == "list" and not plan.wants_json:
         if plan.options["is_quiet"]:
             return plan.words, LinePrinter(wants_json=False)

@@ -35,6 +35,8 @@ def begin(argv: list[str]) -> "tuple[Boot, DoraCheck] | None":
             unit = enter_supervisor()
             paths = CellPaths(Path(directory))
             pause(options, paths)
+            if options.placed:
+                return None  # the ports of the coordinator and the daemon come later
             environment = node_environment(os.environ)
             coordinator = start_coordinator(options.dora, paths, environment)
             from dora_systemd.adapters.dora.check import DoraCheck

@@ -40,7 +40,6 @@ from dora_systemd.runner.cell.begin import daemon_variables, enter_supervisor, m
 from dora_systemd.runner.cell.boot import Boot
 from dora_systemd.runner.cell.clock import StopClock
 from dora_systemd.runner.cell.dialogue import Dialogue
-from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.cell.failure import Beside, words
 from dora_systemd.runner.cell.life import Life, is_first_life
 from dora_systemd.runner.cell.pause import forget_restarts, hold_back
@@ -55,6 +54,7 @@ from dora_systemd.runner.reload.apply import Run, tell_started
 from dora_systemd.runner.reload.reloader import Reloader
 from dora_systemd.runner.reload.settings_file import SettingsFile
 from dora_systemd.runner.reload.swap import Swapper
+from dora_systemd.runner.roles import role_of
 from dora_systemd.values import INFINITY, SECOND
 
 SAMPLE_SECONDS = 5.0
@@ -121,7 +121,8 @@ class Runs:
         begun: Begun | None,
         this_life: Life,
     ) -> None:
-        self.this_life = this_life
+        self.this_life, self.role = this_life, role_of(options, this_life)
+        options = self.role.options
         self.paths, self.pipes, self.clock = paths, pipes, clock
         self.unit = enter_supervisor()
         for path in (paths.work, paths.io):
@@ -130,7 +131,7 @@ class Runs:
         self.environment = node_environment(os.environ)
         settings = SettingsFile(settings_path(options.dataflow), paths.settings)
         self.reloader = Reloader(options, self.environment, settings)
-        self.nodes = Nodes(self.unit, paths, pipes, options.watchdogs)
+        self.nodes = Nodes(self.unit, paths, pipes, self.role.own(options).watchdogs)
         self.beside = Beside(asyncio.get_running_loop())
         self.boot = begun[0] if begun else None
         self.check = begun[1] if begun else DoraCheck(options, self.environment)
@@ -142,7 +143,8 @@ async def live(runs: Runs, losses: LossWatch | None) -> RunnerExit:
     beside = runs.beside
     beside.spawn("reload", runs.reloader.work())
     beside.spawn("forget restarts", forget_restarts(runs.reloader.options))
-    beside.spawn("serve its socket", serve(runs.paths.socket, runs.reloader.answer, reach))
+    socket = serve(runs.paths.socket, runs.reloader.answer, reach, runs.role.sessions)
+    beside.spawn("serve its socket", socket)
     if losses is not None:
         beside.spawn("count what journald throws away", losses.run())
     try:
@@ -174,11 +176,13 @@ async def run_once(runs: Runs, is_again: bool) -> Cell:
     """One run of the dataflow with its own dora; the cell at the end. Raises DoraSystemdError."""
     started_us, options, reloader = now_us(), runs.reloader.options, runs.reloader
     boot = None if is_again else runs.boot
-    dora = Engine(options.dora, runs.paths, runs.environment, boot)
+    role, own = runs.role, runs.role.own(options)
+    dora = role.engine(options.dora, runs.paths, runs.environment, boot)
     try:
-        coordinator = dora.start_coordinator()
+        coordinator = role.start_coordinator(dora)
         prepared = reloader.current or prepare_first(runs, options)
-        runs.nodes.prepare(prepared.dataflow, options.log_rates, options.node_limits)
+        role.prepare(runs.paths, prepared, runs.check)
+        runs.nodes.prepare(role.here(prepared.dataflow), own.log_rates, own.node_limits)
         table = initial_nodes(
             kinds(prepared.dataflow, prepared.plan), prepared.descriptor, started_us
         )
@@ -190,16 +194,17 @@ async def run_once(runs: Runs, is_again: bool) -> Cell:
             notice=reloader.notice,
             is_attached=options.attached,
         )
-        pump = Pump(cell, runs.this_life, runs.paths, runs.nodes, runs.pipes)
-        dialogue = Dialogue(options, pump, dora, runs.nodes, runs.pipes)
-        variables = daemon_variables(options, runs.paths, runs.unit, runs.environment)
+        pump = Pump(role.cell(cell), runs.this_life, runs.paths, runs.nodes, runs.pipes)
+        dialogue = role.dialogue(options, pump, dora, runs.nodes, runs.pipes)
+        variables = daemon_variables(own, runs.paths, runs.unit, runs.environment)
         pump.connect(dialogue.actions(prepared.descriptor, variables))
         runs.pipes.mute()
         listen(runs, pump, dialogue)
-        dialogue.watch(coordinator, dialogue.read_coordinator)
+        if coordinator is not None:
+            dialogue.watch(coordinator, dialogue.read_coordinator)
         run = Run(pump, runs.nodes, runs.pipes, Swapper(pump, dora))
         reloader.begin(run, prepared, started_us * 1000)
-        wait_for_needs(run, options, reloader.definition, dialogue.spawn)
+        wait_for_needs(run, own, reloader.definition, dialogue.spawn)
         dialogue.spawn("tell that it has started", tell_started(run, reloader.has_started))
         begin_watch(run, prepared.plan, dora, dialogue)
         runs.beside.attach(pump.push)
@@ -220,7 +225,7 @@ async def run_once(runs: Runs, is_again: bool) -> Cell:
 def prepare_first(runs: Runs, options: RunnerOptions) -> Prepared:
     """Read the dataflow for the first run. Raises DoraSystemdError if it is refused."""
     prepared = runs.check.beside(lambda: prepare(options, runs.environment))
-    check_first(options, prepared.dataflow)
+    check_first(runs.role.own(options), prepared.dataflow)
     return prepared
 
 
@@ -236,7 +241,7 @@ def listen(runs: Runs, pump: Pump, dialogue: Dialogue) -> None:
         seconds = int(os.environ["WATCHDOG_USEC"]) / 1_000_000 / 3
         dialogue.spawn("feed the watchdog", dialogue.feed_watchdog(seconds))
         dialogue.spawn("watch dora", dialogue.watch_dora(seconds))
-    timeout = options.start_timeout
+    timeout = runs.role.start_timeout
     if pump.cell.is_trial:
         timeout = min(timeout, runs.reloader.patience * SECOND)
     if timeout != INFINITY:

@@ -7,6 +7,7 @@ from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
+from dora_systemd.verbs.facts.parts import refuse_parts
 from dora_systemd.verbs.inhibit.guard import uninhibited
 from dora_systemd.verbs.node import restart_node, stop_node
 from dora_systemd.verbs.stop import note_stop, restart_cells, stop_cells
@@ -28,6 +29,7 @@ def act_on(
     on_stage: called with each stage of a dataflow. Raises DoraSystemdError as the verbs of doractl
     do.
     """
+    refuse_parts([cell], action)
     if node:
         do = stop_node if action == "stop" else restart_node
         do(scope, cell, node)

@@ -24,6 +24,7 @@ from dora_systemd.verbs.facts.reading import slice_group
 from dora_systemd.verbs.stop import (
     KILLED_SECONDS,
     POLL_SECONDS,
+    end_links_of,
     release_enabled,
     stop_within,
 )
@@ -57,6 +58,7 @@ def stop_all(
             given_up |= {one.cell.unit} if one.problem else set()
             note = f" ({one.note})" if one.note else ""
             yield Outcome(one.cell, f"  ✓ {one.cell.name} stopped{note}", one.problem)
+        end_links_of(manager, cells)
         release_enabled(manager, scope, [cell.unit for cell in cells])
 
 

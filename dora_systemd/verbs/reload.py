@@ -22,6 +22,7 @@ from dora_systemd.names import release_of
 from dora_systemd.scope import Scope
 from dora_systemd.values import format_bool
 from dora_systemd.verbs.facts.cells import Cell
+from dora_systemd.verbs.facts.parts import refuse_parts
 from dora_systemd.verbs.node import require_node, require_running, socket_of
 
 Ask = Callable[[Path, Mapping[str, Any]], dict[str, Any]]
@@ -33,6 +34,7 @@ def reload_cell(scope: Scope, cell: Cell, node: str | None, ask: Ask = order) ->
     Raises DoraSystemdError; then the old version keeps running.
     """
     require_running(cell)
+    refuse_parts([cell], "reload")
     _refuse_release(cell)
     if node is not None:
         require_node(scope, cell, node)
@@ -48,6 +50,7 @@ def switch_hot_reload(
     Raises DoraSystemdError.
     """
     require_running(cell)
+    refuse_parts([cell], "set")
     _refuse_release(cell)
     unit = manager.read(cell.unit, ("FragmentPath", "Transient"))
     ask(socket_of(scope, cell), {"verb": "hot-reload", "on": is_on})

@@ -27,7 +27,7 @@ def restart_asked(
         request = asked.request(StartRequest(asked.dataflow, environment=environment))
         claimed = claim(manager, scope, request, "doractl restart")
         options = claimed.plan.options
-        start_unit(manager, scope, options, claimed.properties, on_stage, wait=True)
+        start_unit(manager, scope, options, claimed.properties, on_stage, True, claimed.links)
     except DoraSystemdError as error:
         return Outcome(asked, "", "; ".join(filter(None, (error.message, error.hint))))
     return Outcome(asked, f"Dataflow restarted: {asked.uuid} ({asked.name})")

@@ -46,6 +46,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.enabled import enabled_units
 from dora_systemd.verbs.facts.nodes import written_dataflow
+from dora_systemd.verbs.facts.parts import refuse_parts
 from dora_systemd.verbs.facts.reading import read_status
 from dora_systemd.verbs.reload import Ask, limit_lines
 from dora_systemd.verbs.start.limits import require_controllers
@@ -73,6 +74,8 @@ def set_limits(
         hint = "see doractl set --help"
         message = f"cannot change the limits of {cell.name}: none is given"
         raise DoraSystemdError(message, hint, ExitCode.USAGE)
+    refuse_parts([cell], "set")
+    _refuse_placed(cell, nodes)
     if not scope.is_user and os.geteuid() != 0:
         message = f"cannot change the limits of {cell.name}: permission denied"
         raise DoraSystemdError(message, "use sudo", ExitCode.NO_PERMISSION)
@@ -110,6 +113,16 @@ def _changed_rates(environment: Mapping[str, str], given: line_rates.RateLimits)
     """The variable for the next runners."""
     known = line_rates.parse_changes(environment.get(line_rates.CHANGES_VARIABLE, ""))
     return f"{line_rates.CHANGES_VARIABLE}={line_rates.format_changes({**known, **given})}"
+
+
+def _refuse_placed(cell: Cell, limits: tuple[NodeLimits, ...]) -> None:
+    """Raise DoraSystemdError (USAGE) for limits of a node on another machine."""
+    placed = dict(cell.options.placed)
+    for one in limits:
+        if machine := placed.get(one.node):
+            message = f"cannot limit the node {one.node}: it runs on machine {machine}"
+            hint = f"stop {cell.name}, and start it with another --node-limit"
+            raise DoraSystemdError(message, hint, ExitCode.USAGE)
 
 
 def _unit_file_warnings(

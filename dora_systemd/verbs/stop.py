@@ -60,6 +60,7 @@ def stop_cells(
     outcomes = [
         _stop_outcome(manager, scope, cell, results.get(cell.unit), begin) for cell in cells
     ]
+    end_links_of(manager, cells)
     release_enabled(manager, scope, up)
     return outcomes
 
@@ -70,6 +71,7 @@ def stop_cells_within(
     """Stop dataflows as stop_cells() does, and kill those that still run after `most` µs."""
     up = [cell for cell in cells if cell.is_up]
     ended = {one.cell: one for one in stop_within(manager, up, most)}
+    end_links_of(manager, cells)
     release_enabled(manager, scope, [cell.unit for cell in up])
     return [
         Outcome(cell, _stopped(cell, ended[cell].note), ended[cell].problem)
@@ -125,6 +127,18 @@ def release_enabled(manager: Manager, scope: Scope, units: Sequence[str]) -> Non
                     release_transient(manager, boot)
     if is_one_lost:
         manager.reload()  # see lost_units()
+
+
+def end_links_of(manager: Manager, cells: Sequence[Cell]) -> None:
+    """End the links of those that were the head of several machines."""
+    known = (one.known_options for one in cells)
+    heads = [one.name for one in known if one and one.placed and not one.machine]
+    if heads:
+        # Imported late: most dataflows run on one machine.
+        from dora_systemd.verbs.start.claim import end_links
+
+        for name in heads:
+            end_links(manager, name)
 
 
 def restart_cells(

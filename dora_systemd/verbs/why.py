@@ -4,7 +4,7 @@ from contextlib import suppress
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.journal.reader import JournalReader
-from dora_systemd.decisions.cell.status import HELD, CellStatus
+from dora_systemd.decisions.cell.status import GATHERING, HELD, CellStatus
 from dora_systemd.decisions.life import nodes as node_table
 from dora_systemd.decisions.logs.query import scope_matches
 from dora_systemd.decisions.views.rows import DataflowRow
@@ -48,7 +48,17 @@ def explain(manager: Manager, scope: Scope, selector: str, journal: JournalReade
     words = _last_words(journal, scope, subject, verdict)
     inhibitors = read_holders(scope, [cell.name]).get(cell.name, ()) if cell else ()
     is_held = cell is not None and _is_held(scope, cell, verdict.node)
-    return Report(subject, verdict, words, budget, inhibitors, is_held)
+    machines = _machines(manager, cell) if cell and cell.options.placed else {}
+    return Report(subject, verdict, words, budget, inhibitors, is_held, machines)
+
+
+def _machines(manager: Manager, cell: Cell) -> dict[str, str]:
+    """The other machines of a dataflow, each with its host."""
+    # Imported late: most dataflows run on one machine.
+    from dora_systemd.verbs.facts.machines import member_hosts
+
+    found = member_hosts(manager, cell.options)
+    return {machine: host.text if host else "" for machine, host in found.items()}
 
 
 def _is_held(scope: Scope, cell: Cell, node: str) -> bool:
@@ -94,6 +104,7 @@ def _facts(manager: Manager, scope: Scope, cell: Cell) -> Facts:
         now_boot(),
         unit["NRestarts"],
         {key: node.silent for key, node in nodes if node.silent},
+        is_gathering=status.stage == GATHERING,
     )
 
 

@@ -29,7 +29,9 @@ from dora_systemd.decisions.dora.protocol import (
     Reply,
     parse_frame,
     parse_heartbeat,
+    parse_machines,
     parse_results,
+    parse_running,
     parse_spawn_failure,
 )
 from dora_systemd.decisions.gateway.access import has_token, refuse_address
@@ -45,6 +47,7 @@ from dora_systemd.decisions.logs.lines import (
     json_fields,
     jsonl_fields,
 )
+from dora_systemd.decisions.machines import wire
 from dora_systemd.decisions.properties.assignments import parse_property
 from dora_systemd.decisions.releases.parcel import (
     format_parcel,
@@ -111,8 +114,15 @@ def _request(data: bytes) -> object:
 def _reply(data: bytes) -> object:
     reply = parse_frame(text_of(data))
     if isinstance(reply, Reply):
-        return parse_heartbeat(reply), parse_results(reply), parse_spawn_failure(reply)
+        daemons = (parse_heartbeat(reply), parse_machines(reply))
+        return daemons, parse_results(reply), parse_spawn_failure(reply), parse_running(reply, "")
     return parse_life_event(reply, 1) if isinstance(reply, LogRecord) else None
+
+
+def _machine_line(data: bytes) -> None:
+    """A message that is understood can be said again."""
+    message = wire.parse_message(data)
+    assert wire.parse_message(wire.format_message(message)) == message
 
 
 def _encoded(fields: Any) -> None:
@@ -184,6 +194,7 @@ TARGETS = {
     "dora-reply": Target(_reply),
     "page-message": Target(lambda data: parse_message(text_of(data)), REFUSED),
     "runner-socket": Target(parse_line),
+    "machine-line": Target(_machine_line, REFUSED),
     "coordinator": Target(lambda data: parse_coordinator(loaded(data)), (ValueError,)),
     "address": Target(lambda data: refuse_address([text_of(data)], [text_of(data)])),
     "token": Target(lambda data: has_token([text_of(data)], "0" * 64)),

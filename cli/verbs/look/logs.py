@@ -10,6 +10,7 @@ from typing import Any
 
 import click
 
+from dora_systemd.adapters.host.unit_names import has_unit, unit_places
 from dora_systemd.adapters.journal.reader import JournalReader, check_readable
 from dora_systemd.cli.colors import is_dumb, wants_colors
 from dora_systemd.cli.parameters import current_scope, print_warnings, scope_options
@@ -23,6 +24,7 @@ from dora_systemd.decisions.logs.query import (
 )
 from dora_systemd.decisions.logs.terminal import ShownLines, TerminalLines
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import LINK_PREFIX
 from dora_systemd.values import quoted
 from dora_systemd.verbs.facts.recorded import find_query, find_soon
 from dora_systemd.verbs.logs import pass_logs, read_logs, write_whole
@@ -144,6 +146,12 @@ class LogsCommand(click.Command):
     show_default=True,
     help="Output format, as in journalctl.",
 )
+@click.option(
+    "--machine",
+    default="",
+    metavar="MACHINE",
+    help="Only this one of several machines; head is the one with the coordinator.",
+)
 @click.option("--no-pager", is_flag=True, help="Do not use a pager.")
 @scope_options
 def command(
@@ -154,6 +162,7 @@ def command(
     until_end: bool,
     counts: tuple[str, ...],
     log_filter: str,
+    machine: str,
     **options: Any,
 ) -> int:
     """Print what the nodes of dataflows wrote, and what happened to them.
@@ -170,12 +179,20 @@ def command(
       doractl logs robot --run PREVIOUS --events  what happened to the run before this one
       journalctl -t robot/camera                  the same records, with systemd's own tool
     """
+    scope = current_scope()
+    places = unit_places(scope, os.environ)
+    if machine or (len(selectors) == 1 and has_unit(places, LINK_PREFIX)):
+        # Imported late: most dataflows run on one machine.
+        from dora_systemd.cli.remote.machines import print_machines
+
+        status = print_machines(scope, click.get_current_context())
+        if status is not None:
+            return status
     options.pop("all_nodes")
     options["level"] = parse_level(options["level"]) if options["level"] else ""
     tail, old_nodes = split_counts(counts)
     if old_nodes and not options["is_quiet"]:
         print_warnings([_OLD_N.format(old_nodes[0])])
-    scope = current_scope()
     check_readable(scope)
     journal = JournalReader()
     wanted = LogQuery(scope, tail=tail, levels=parse_filter(log_filter), **options)

@@ -11,6 +11,7 @@ from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.inhibit_options import TellWaiting, if_inhibited, inhibit_options
 from dora_systemd.cli.parameters import acting_options, current_scope, print_outcomes
 from dora_systemd.cli.stageline import StageLine
+from dora_systemd.verbs.facts.parts import refuse_parts
 from dora_systemd.verbs.inhibit.guard import uninhibited
 from dora_systemd.verbs.start.again import find_known
 from dora_systemd.verbs.stop import note_stop, restart_cells
@@ -34,6 +35,7 @@ def command(selectors: tuple[str, ...], force: bool, wait: bool) -> int:
     scope = current_scope()
     bus = Bus(scope)
     cells, ended = find_known(bus, scope, selectors)
+    refuse_parts(cells, "restart")
     with uninhibited(scope, cells, "restart", how, TellWaiting()), StageLine(sys.stderr) as stage:
         note_stop(cells, "doractl restart")
         outcomes = restart_cells(bus, cells, partial(tell_stage, stage)) if cells else []

@@ -115,7 +115,8 @@ def command(
         return _attach(bus, claimed, notes)
     options = claimed.plan.options
     with _last_words(bus, scope, options.uuid), StageLine(sys.stderr) as stage:
-        started = start_unit(bus, scope, options, claimed.properties, stage, not no_wait)
+        how = (claimed.properties, stage, not no_wait, claimed.links)
+        started = start_unit(bus, scope, options, *how)
     # Only after the start: a refusal must be one line and a hint.
     print_warnings([*notes, *waiting_notes(bus, options)])
     print_warnings(held_notes(bus, options.name) if no_wait else ())
@@ -127,7 +128,12 @@ def _attach(bus: Bus, claimed: Claim, notes: Sequence[str]) -> int:
     from dora_systemd.cli.foreground import Foreground, print_until_end
     from dora_systemd.verbs.start.run import HELD
 
-    how = Foreground(signals=(signal.SIGINT,), notes=notes, command="doractl start --attach")
+    how = Foreground(
+        signals=(signal.SIGINT,),
+        notes=notes,
+        command="doractl start --attach",
+        links=claimed.links,
+    )
     # What is started from a unit file stays loaded if it has failed.
     properties = None if claimed.properties is None else [*claimed.properties, HELD]
     return print_until_end(bus, claimed.plan, properties, how)

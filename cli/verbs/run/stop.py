@@ -24,6 +24,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.values import INFINITY
 from dora_systemd.verbs.facts.cells import Cell, proven, read_cells
 from dora_systemd.verbs.facts.locks import read_holders
+from dora_systemd.verbs.facts.parts import refuse_parts, without_parts
 from dora_systemd.verbs.facts.selector import Selector, selectors_of
 from dora_systemd.verbs.stop import not_running, note_stop, stop_cells, stop_cells_within
 
@@ -67,7 +68,8 @@ def command(
     bus = Bus(scope)
     cells = read_cells(bus)
     chosen = _named(scope, cells, texts) if texts else _running(cells, want_all)
-    return _stop(bus, scope, proven(chosen), most)
+    found = proven(chosen)
+    return _stop(bus, scope, without_parts(found) if want_all else found, most)
 
 
 def _running(cells: Sequence[Cell], want_all: bool) -> list[Cell]:
@@ -110,6 +112,7 @@ def _ask_inhibited(scope: Scope, cells: Sequence[Cell]) -> None:
 
 
 def _stop(bus: Bus, scope: Scope, cells: list[Cell], most: int) -> int:
+    refuse_parts(cells, "stop")
     if most > 0 and sys.stdin.isatty():
         _ask_inhibited(scope, cells)
     note_stop(cells)

@@ -16,6 +16,8 @@ START_JOBS = ("start", "restart")
 
 Property = tuple[str, str, Any]
 """Name, D-Bus signature and value of one unit property."""
+Beside = Sequence[tuple[str, Sequence[Property]]]
+"""Other units, by name, with their properties."""
 Observer = Callable[[Mapping[str, Any]], None]
 """Called with the changed properties of a unit during a wait; {}: nothing changes for a while."""
 
@@ -56,9 +58,17 @@ class Manager(Protocol):
         """Properties of a unit; if systemd does not find the unit, its LoadState is "not-found"."""
 
     def start_transient(
-        self, unit: str, properties: Sequence[Property], observer: Observer | None, wait: bool
+        self,
+        unit: str,
+        properties: Sequence[Property],
+        observer: Observer | None,
+        wait: bool,
+        beside: Beside = (),
     ) -> str:
-        """Create and start a unit; the result of the job. Without `wait`, JOB_DONE at once."""
+        """Create and start a unit; the result of the job. Without `wait`, JOB_DONE at once.
+
+        beside: units that are created at the same time, for this one to need them.
+        """
 
     def run_jobs(
         self, method: str, units: Sequence[str], observer: Observer | None = None

@@ -18,7 +18,7 @@ from typing import Any
 
 from dora_systemd.adapters.bus.connection import MANAGER_OBJECT, SERVICE, connect
 from dora_systemd.adapters.bus.errors import explained
-from dora_systemd.adapters.bus.manager import JOB_DONE, Observer, Property, UnitState
+from dora_systemd.adapters.bus.manager import JOB_DONE, Beside, Observer, Property, UnitState
 from dora_systemd.adapters.bus.wire import decoded, encoded
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
@@ -71,10 +71,15 @@ class Bus:
         return {name: self._read_one(unit, name) for name in names}
 
     def start_transient(
-        self, unit: str, properties: Sequence[Property], observer: Observer | None, wait: bool
+        self,
+        unit: str,
+        properties: Sequence[Property],
+        observer: Observer | None,
+        wait: bool,
+        beside: Beside = (),
     ) -> str:
         self._listen(unit)
-        arguments = (("s", unit), ("s", "fail"), _typed(properties), ("a(sa(sv))", ()))
+        arguments = (("s", unit), ("s", "fail"), _typed(properties), _others(beside))
         job = self._call(f"start {unit}", "StartTransientUnit", *arguments)
         return self._wait_for_jobs({job: unit}, observer)[unit] if wait else JOB_DONE
 
@@ -236,6 +241,10 @@ class Bus:
         poll = select.poll()
         poll.register(self.fileno(), select.POLLIN)
         return bool(poll.poll(seconds * 1000))
+
+
+def _others(beside: Beside) -> tuple[str, Any]:
+    return "a(sa(sv))", [(name, _typed(properties)[1]) for name, properties in beside]
 
 
 def _typed(properties: Sequence[Property]) -> tuple[str, Any]:

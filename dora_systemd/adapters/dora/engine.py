@@ -24,9 +24,12 @@ _PORT = re.compile(rf"^{LISTENING}(\d+)\n".encode(), re.MULTILINE)
 _CHUNK = 4096
 
 
-def coordinator_command(dora: str) -> list[str]:
-    """A coordinator on a free loopback port that creates its own token and stores nothing."""
-    flags = ("--interface", "127.0.0.1", "--port", "0", "--store", "memory", "--auth")
+def coordinator_command(dora: str, port: int = 0) -> list[str]:
+    """A coordinator on a loopback port that creates its own token and stores nothing.
+
+    port: 0 for one that is free.
+    """
+    flags = ("--interface", "127.0.0.1", "--port", str(port), "--store", "memory", "--auth")
     return [dora, "coordinator", *flags]
 
 

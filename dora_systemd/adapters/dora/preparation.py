@@ -57,6 +57,10 @@ def prepare(options: RunnerOptions, environment: Mapping[str, str]) -> Prepared:
     """
     dataflow = load_dataflow(options)
     _check_limited(options, dataflow)
+    if options.machine:
+        from dora_systemd.decisions.machines.part import own_dataflow
+
+        dataflow = own_dataflow(options, dataflow)
     sight = Sight()
     plan = LaunchPlan(
         options,

@@ -56,6 +56,7 @@ class LogPipes:
         self._paths: dict[str, CellPaths] = {}
         self._sources: dict[str, Source] = {}
         self._outputs: dict[int, LineSplitter] = {}
+        self.left_out: tuple[bytes, ...] = ()  # what their lines say that are no records
         self._muted: frozenset[str] = frozenset()
         self._lost = 0
 
@@ -285,7 +286,8 @@ class LogPipes:
         except BlockingIOError:
             return
         for line in self._outputs[fd].feed(data) if data else self._outputs[fd].flush():
-            if label not in self._muted and (fields := dora_log_fields(line)):
+            is_told = label not in self._muted and not any(map(line.__contains__, self.left_out))
+            if is_told and (fields := dora_log_fields(line)):
                 self._queue.put_record(label, self._entry(fields, label))
             if on_line is not None:
                 on_line(line.decode("utf-8", "replace"))

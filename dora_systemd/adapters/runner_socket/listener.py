@@ -8,7 +8,7 @@ import contextlib
 import json
 import os
 import socket
-from collections.abc import Awaitable, Callable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Coroutine, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,18 +18,32 @@ from dora_systemd.decisions.dora.coordinator import Coordinator
 from dora_systemd.errors import DoraSystemdError, ExitCode
 
 Answer = Callable[[Request], Awaitable[dict[str, Any]]]
+Session = Callable[[Request, Ends], Coroutine[Any, Any, None]]
+"""Talks with the caller until one of both ends it, after the request that has begun it."""
 Reach = Callable[[], Coordinator]
 """The address of the coordinator. Raises DoraSystemdError (NOT_RUNNING) if it does not listen yet.
 """
 
 
-async def serve(path: Path, answer: Answer, reach: Reach) -> None:
-    """Answer requests at `path` forever. An error is {"error": ..., "hint": ..., "code": ...}."""
+MAX_SESSION_LINE = 1 << 18
+
+
+async def serve(
+    path: Path, answer: Answer, reach: Reach, sessions: Mapping[str, Session] | None = None
+) -> None:
+    """Answer requests at `path` forever. An error is {"error": ..., "hint": ..., "code": ...}.
+
+    sessions: by the verb that begins one.
+    """
+    limit = MAX_SESSION_LINE if sessions else MAX_BYTES
 
     async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         with contextlib.suppress(OSError, ValueError):
             request = parse_line(await reader.readline())
-            if request is not None and request.get("verb") == "relay":
+            verb = str(request.get("verb")) if request else ""
+            if sessions and request and verb in sessions:
+                await sessions[verb](request, Ends(reader, writer))
+            elif verb == "relay":
                 await _relay(Ends(reader, writer), reach)
             else:
                 await _send(writer, await _answer(request, answer, reach))
@@ -39,7 +53,7 @@ async def serve(path: Path, answer: Answer, reach: Reach) -> None:
     with _short(path) as address, socket.socket(socket.AF_UNIX) as listener:
         listener.bind(address)
         path.chmod(0o600)
-        server = await asyncio.start_unix_server(talk, sock=listener, limit=MAX_BYTES)
+        server = await asyncio.start_unix_server(talk, sock=listener, limit=limit)
         async with server:
             await server.serve_forever()
 
@@ -82,6 +96,11 @@ async def _relay(caller: Ends, reach: Reach) -> None:
         return
     await _send(caller.writer, {"token": coordinator.token})
     await splice(caller, there)
+
+
+async def refuse(caller: Ends, error: DoraSystemdError) -> None:
+    """Answer with an error, instead of a session."""
+    await _send(caller.writer, _refusal(error))
 
 
 async def _send(writer: asyncio.StreamWriter, reply: Mapping[str, Any]) -> None:

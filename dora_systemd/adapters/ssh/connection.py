@@ -4,21 +4,24 @@ import os
 import subprocess
 from collections.abc import Sequence
 from contextlib import suppress
+from functools import partial
 
-from dora_systemd.adapters.ssh.program import read_now, start_ssh
+from dora_systemd.adapters.ssh.program import read_now, start_here, start_ssh
 
 
 class Connection:
     """A running ssh whose output is read when it is there.
 
     is_fed: it reads our standard input; else its input is what write() gets, and stays open until
-    hang_up().
+    hang_up(). is_here: no ssh, but the last of `arguments` on this machine.
     """
 
-    def __init__(self, arguments: Sequence[str], is_fed: bool = False) -> None:
+    def __init__(
+        self, arguments: Sequence[str], is_fed: bool = False, is_here: bool = False
+    ) -> None:
         # In a process group of its own: Ctrl+C is for doractl, which then says what ends.
-        self._child = start_ssh(
-            arguments,
+        start = partial(start_here, arguments[-1]) if is_here else partial(start_ssh, arguments)
+        self._child = start(
             stdin=None if is_fed else subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,

@@ -3,8 +3,10 @@
 import os
 import select
 import subprocess
+import sys
 from collections.abc import Sequence
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -23,6 +25,13 @@ def start_ssh(arguments: Sequence[str], **streams: Any) -> "subprocess.Popen[byt
     except OSError as error:
         message = f"cannot execute ssh: {error.strerror}"
         raise DoraSystemdError(message, "apt install openssh-client", ExitCode.NO_HOST) from error
+
+
+def start_here(command: str, **streams: Any) -> "subprocess.Popen[bytes]":
+    """The command of a login shell, on this machine. streams: as for subprocess.Popen()."""
+    # This doractl need not be one that a login shell would find.
+    path = f"{os.environ.get('PATH', os.defpath)}:{Path(sys.executable).parent}"
+    return subprocess.Popen(["sh", "-c", command], env={**os.environ, "PATH": path}, **streams)
 
 
 def read_now(fd: int, size: int = 1 << 16) -> bytes | None:

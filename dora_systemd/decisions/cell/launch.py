@@ -12,6 +12,7 @@ from typing import Any
 
 from dora_systemd.decisions.cell.environment import find_python
 from dora_systemd.decisions.cell.log_backlog import with_bounds
+from dora_systemd.decisions.cell.machines import placed_on
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.owed import owes_restart
 from dora_systemd.decisions.cell.restarts import DEFAULT, HELD_KEYS, LATCH_KEYS
@@ -100,20 +101,29 @@ def _launch_node(node: Node, source: str, plan: LaunchPlan) -> dict[str, Any]:
         raw["env"] = expanded(node.env, plan.environment)
     if raw.get("restart_policy", "never") == "never" and is_launched(node):
         raw |= _keys_of_kept(node.id, plan.options)
+    if machine := placed_on(plan.options.placed, node.id):
+        from dora_systemd.decisions.cell.placed import placed_node
+
+        return placed_node(node.id, raw, machine, PERL)
     if node.kind is NodeKind.OPERATOR:
         return _launch_operators(node, raw, plan.options.working_directory)
     if not has_pipes(node):
         raw = with_bounds(raw)
     if not is_launched(node):
         return raw
+    words = launcher_words(node, source, plan)
+    kept = {key: value for key, value in raw.items() if key not in PROGRAM_KEYS}
+    if isinstance(kept.get("deploy"), Mapping):
+        kept["deploy"] = {**kept["deploy"], "machine": None, "labels": {}, "working_dir": None}
+    return {**kept, "path": PERL, "args": shlex.join(words)}
+
+
+def launcher_words(node: Node, source: str, plan: LaunchPlan) -> list[str]:
+    """launcher.pl and its arguments for a node. Raises DoraSystemdError if it cannot run."""
     output = "keep" if node.keeps_output else "pipe"
     directory = _directory(node, source, plan)
     output += _notify_words(node, plan)
-    words = [plan.launcher, node.id, directory, output, *_command(node, directory, source, plan)]
-    kept = {key: value for key, value in raw.items() if key not in PROGRAM_KEYS}
-    if isinstance(kept.get("deploy"), Mapping):
-        kept["deploy"] = {**kept["deploy"], "working_dir": None}
-    return {**kept, "path": PERL, "args": shlex.join(words)}
+    return [plan.launcher, node.id, directory, output, *_command(node, directory, source, plan)]
 
 
 def _notify_words(node: Node, plan: LaunchPlan) -> str:

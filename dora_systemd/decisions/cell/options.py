@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from dora_systemd.decisions.cell.hot_reload import DEFAULT_RELOAD, HotReload, parse_of_node
 from dora_systemd.decisions.cell.limits import NodeLimits, format_node_limits, parse_node_limits
 from dora_systemd.decisions.cell.line_rates import UNLIMITED, RateLimits, format_rates, parse_rates
+from dora_systemd.decisions.cell.machines import Placed, parse_head, parse_machine, parse_placed
 from dora_systemd.decisions.cell.needs import NodeNeed, parse_node_need
 from dora_systemd.decisions.cell.restarts import (
     DEFAULT,
@@ -69,6 +70,9 @@ class RunnerOptions(NamedTuple):
     watchdogs: nodes with a notify socket, see dora_systemd.decisions.signs.watchdogs.
     owes: outputs of nodes that have to come in time.
     needs: the paths that single nodes wait for.
+    placed: the nodes that run on other machines than the head.
+    machine, head: on a member its name, and the host name of the head; "" on the head and without
+    members.
     """
 
     name: str
@@ -94,6 +98,9 @@ class RunnerOptions(NamedTuple):
     node_rights: "tuple[NodeRights, ...]" = ()
     owes: "tuple[Owed, ...]" = ()
     needs: tuple[NodeNeed, ...] = ()
+    placed: tuple[Placed, ...] = ()
+    machine: str = ""
+    head: str = ""
 
     def __hash__(self) -> int:
         return hash(self.uuid)
@@ -133,10 +140,10 @@ def _unless_default(key: str, field: str, parse: Parse = str, to_text: Format = 
 
 
 def _each(key: str, field: str, parse: Parse = str, to_text: Format = str) -> Option:
-    def parse_all(texts: list[str]) -> tuple[Any, ...]:
-        return tuple(map(parse, texts))
+    def format_all(values: Any) -> list[str]:
+        return list(map(to_text, values))
 
-    return Option(key, field, parse_all, lambda values: list(map(to_text, values)), True)
+    return Option(key, field, lambda texts: tuple(map(parse, texts)), format_all, True)
 
 
 def _flag(key: str, field: str) -> Option:
@@ -152,19 +159,14 @@ def _late(module: str, name: str) -> Callable[[Any], Any]:
     return call
 
 
-_parse_rights, _format_rights = (
-    _late("rights.node_rights", name) for name in ("parse_node_rights", "format_node_rights")
-)
+_parse_rights = _late("rights.node_rights", "parse_node_rights")
+_format_rights = _late("rights.node_rights", "format_node_rights")
 _parse_owed, _format_owed = (_late("cell.owed", name) for name in ("parse_owed", "format_owed"))
 _parse_watchdogs = _late("signs.watchdogs", "parse_sockets")
 
 
 def _format_watchdogs(watchdogs: Mapping[str, int]) -> list[str]:
-    if not watchdogs:
-        return []
-    from dora_systemd.decisions.signs.watchdogs import format_watchdogs
-
-    return format_watchdogs(watchdogs)
+    return _late("signs.watchdogs", "format_watchdogs")(watchdogs) if watchdogs else []
 
 
 _REQUIRED = ("name", "uuid", "working-directory", "dora")
@@ -186,6 +188,9 @@ _OPTIONS = (
     _each("owes", "owes", _parse_owed, _format_owed),
     Option("watchdog", "watchdogs", _parse_watchdogs, _format_watchdogs, is_repeated=True),
     _each("needs", "needs", parse_node_need, "=".join),
+    _each("placed", "placed", parse_placed, "=".join),
+    _unless_default("machine", "machine", parse_machine),
+    _unless_default("head", "head", parse_head),
     _each("watch", "reload.watch"),
     _each("ignore", "reload.ignore"),
     _each("node-watch", "reload.node_watch", parse_of_node, "=".join),

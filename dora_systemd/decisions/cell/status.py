@@ -7,13 +7,25 @@ from typing import Any, NamedTuple, TypeVar
 from dora_systemd.decisions.cell.counters import WHOLE_CELL, CpuSample, LineCount
 from dora_systemd.decisions.cell.exits import Exit, parse_exit
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.names import is_node_id
+from dora_systemd.names import is_name, is_node_id
 
 Value = TypeVar("Value")
 
 UNMET = "unmet"
 """Stage of a dataflow with a node that waits for what it needs."""
-STAGES = ("starting", "restarting", "waiting", UNMET, "running", "degraded", "stopping", "ended")
+GATHERING = "gathering"
+"""Stage of a dataflow that waits for another machine."""
+STAGES = (
+    "starting",
+    "restarting",
+    "waiting",
+    UNMET,
+    GATHERING,
+    "running",
+    "degraded",
+    "stopping",
+    "ended",
+)
 NODE_STATES = (
     "starting",
     "waiting",
@@ -54,7 +66,7 @@ class NodeStatus(NamedTuple):
     policy: dora's restart policy, "never" if it has none, HELD or LATCHED. max_restarts: in one
     window, 0 without limit. hung: why dora's health check or its watchdog ended the process, or "".
     silent: which output that it owes has not come, or "". is_ended: the runner ends it for that.
-    needs: what it waits for, or "".
+    needs: what it waits for, or "". machine: the name of the other machine that it runs on, or "".
     """
 
     state: str = "starting"
@@ -69,6 +81,7 @@ class NodeStatus(NamedTuple):
     silent: str = ""
     is_ended: bool = False
     needs: str = ""
+    machine: str = ""
 
     @property
     def is_alive(self) -> bool:
@@ -188,7 +201,15 @@ def _parse_node(raw: Any) -> NodeStatus:
         silent=_text(known, "silent"),
         is_ended=known.get("is_ended") is True,
         needs=_text(known, "needs"),
+        machine=_machine(known),
     )
+
+
+def _machine(raw: Mapping[str, Any]) -> str:
+    name = _text(raw, "machine")
+    if name and not is_name(name):
+        raise _Wrong("it has a machine without a name")
+    return name
 
 
 def _parse_sample(raw: Any) -> CpuSample:

@@ -174,6 +174,29 @@ def parse_heartbeat(reply: Reply) -> int:
     return min((int(age * 1000) for age in known), default=INFINITY)
 
 
+def parse_machines(reply: Reply) -> list[str]:
+    """The machine of each daemon in the reply to CONNECTED_DAEMONS; "" for one without a name."""
+    daemons = _mapping(reply.result).get("ConnectedDaemons")
+    idents = (_mapping(_mapping(one).get("daemon_id")) for one in _list(daemons))
+    return [str(one.get("machine_id") or "") for one in idents]
+
+
+LIST: Params = "List"
+
+
+def parse_running(reply: Reply, name: str) -> str:
+    """dora's id of the run with that name in the reply to LIST, or ""."""
+    for one in _list(_mapping(reply.result).get("DataflowList")):
+        ident = _mapping(_mapping(one).get("id"))
+        if ident.get("name") == name and _mapping(one).get("status") == "Running":
+            return str(ident.get("uuid") or "")
+    return ""
+
+
+def _list(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else []
+
+
 def parse_results(reply: Reply) -> dict[str, Exit] | None:
     """The reply to Check or Stop: None during the run, else how each node ended.
 

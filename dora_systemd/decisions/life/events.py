@@ -250,6 +250,47 @@ class ReloadAsked(Event):
     """The dataflow as a whole has to start again."""
 
 
+@dataclass(frozen=True)
+class MachinesAwaited(Event):
+    """Some member is not there. text: which one and why, for people."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class MachineJoined(Event):
+    """The dora daemon of a member has joined."""
+
+    machine: str
+
+
+class Gathered(Event):
+    """All members have joined."""
+
+
+@dataclass(frozen=True)
+class MachineLost(Event):
+    """Nothing is known of a member any more. by: who has stopped its part there, or ""."""
+
+    machine: str
+    reason: str
+    by: str = ""
+
+
+@dataclass(frozen=True)
+class HeadStops(Event):
+    """To a member: the head has dora stop all nodes. by: who asked for it there."""
+
+    by: str
+
+
+@dataclass(frozen=True)
+class HeadLost(Event):
+    """To a member: it is alone, or has to end its nodes by itself."""
+
+    reason: str
+
+
 class DeadlinePassed(Event):
     """The current state has lasted too long."""
 

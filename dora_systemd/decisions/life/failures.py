@@ -25,9 +25,16 @@ def to(cell: Cell, state: State, *actions: Action, after: int | None = None) -> 
     return replace(cell, state=state), (*actions, Deadline(after))
 
 
+_FINAL = {
+    Cause.NO_MACHINE: RunnerExit.NO_MACHINE,
+    Cause.MACHINE_REFUSES: RunnerExit.BAD_DATAFLOW,
+}
+
+
 def refused(cell: Cell, event: life.Refused) -> Next:
-    """dora refuses the dataflow, or a request of the runner."""
-    return fail(because(cell, event.cause), event.reason, RunnerExit.FAILED)
+    """dora refuses the dataflow or a request of the runner, or another machine does."""
+    code = _FINAL.get(event.cause, RunnerExit.FAILED)
+    return fail(because(cell, event.cause), event.reason, code)
 
 
 def because(cell: Cell, cause: Cause, nodes: Iterable[str] = ()) -> Cell:

@@ -16,6 +16,7 @@ _CODES = {
     RunnerExit.BAD_DATAFLOW: ExitCode.BAD_INPUT,
     RunnerExit.NO_ACCESS: ExitCode.NO_PERMISSION,
     RunnerExit.NO_DORA: ExitCode.NO_DORA,
+    RunnerExit.NO_MACHINE: ExitCode.NO_HOST,
 }
 
 

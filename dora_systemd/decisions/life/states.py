@@ -17,10 +17,12 @@ class RunnerExit(IntEnum):
 
     OK = 0
     FAILED = 1
+    NO_MACHINE = 68
     ENGINE_LOST = 69
     NODES_FAILED = 70
     FAILED_AT_STOP = 71
     NO_DORA = 72
+    STOPPED_ON_MACHINE = 73
     NO_ACCESS = 77
     BAD_DATAFLOW = 78
 
@@ -30,6 +32,7 @@ class State(Enum):
 
     BOOTING = "booting"
     JOINING = "joining"
+    GATHERING = "gathering"
     STARTING = "starting"
     WAITING = "waiting"
     RUNNING = "running"
@@ -43,12 +46,14 @@ class Do(Enum):
     """Actions of the runner that need nothing but the cell."""
 
     START_DAEMON = "start the daemon"
+    GATHER = "wait for the other machines"
     SEND_START = "send the descriptor"
     SUBSCRIBE = "subscribe to the life events of the run"
     OPEN_PIPES = "let the launchers go on"
     ASK_SPAWN = "ask whether all nodes could be executed"
     ASK_RESULT = "ask how the run ended"
     ASK_STOP = "ask dora to stop the run"
+    END_NODES = "end the nodes of this machine"
     DISMISS_DAEMON = "tell the daemon to end"
     EXIT = "kill what is left and exit"
 
@@ -83,7 +88,9 @@ class Cell:
     started this run. is_trial: whether the version before can come back. reload: whether the run
     ends for the next one. notice: the result of the last reload. is_attached: whether it belongs to
     `doractl run`, which tells how the nodes ended after a stop, too. met_us: when a node
-    last got what it needs, CLOCK_REALTIME µs.
+    last got what it needs, CLOCK_REALTIME µs. machine: the name of this machine if it is a member.
+    members: the other machines, if it is the head. awaited: which of them is not there, and why.
+    lost: those that had joined and were lost before the run began.
     """
 
     grace: int
@@ -104,3 +111,7 @@ class Cell:
     notice: str = ""
     is_attached: bool = False
     met_us: int = 0
+    machine: str = ""
+    members: tuple[str, ...] = ()
+    awaited: str = ""
+    lost: frozenset[str] = frozenset()

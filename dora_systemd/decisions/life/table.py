@@ -1,7 +1,7 @@
 """The runner's life as one total table: step(cell, event) -> (cell, actions). No I/O, no clock.
 
     booting -> joining -> starting -> waiting -> running -> closing -> leaving -> ended
-                                         \\----------\\-> stopping ---/
+                     \\-----/ gathering     \\----------\\-> stopping ---/
 
 Every pair of state and event has an entry in TABLE; its unit test takes them all.
 """
@@ -9,7 +9,7 @@ Every pair of state and event has an entry in TABLE; its unit test takes them al
 from collections.abc import Mapping
 
 from dora_systemd.decisions.life import events as life
-from dora_systemd.decisions.life import failures, running
+from dora_systemd.decisions.life import failures, machines, running
 from dora_systemd.decisions.life import handlers as handle
 from dora_systemd.decisions.life.failures import Handler, Next
 from dora_systemd.decisions.life.states import Cell, State
@@ -41,8 +41,17 @@ _LOST: dict[str, Handler] = {
     "Refused": failures.refused,
     "Failed": failures.broken,
 }
+_PART: dict[str, Handler] = {
+    "MachineLost": machines.machine_lost,
+    "HeadStops": machines.head_stops,
+    "HeadLost": machines.head_lost,
+}
 _EARLY: dict[str, Handler] = {
     **_LOST,
+    **dict.fromkeys(("HeadStops", "HeadLost"), machines.end_early),
+    "MachineJoined": machines.machine_joined,
+    "MachineLost": machines.machine_away,
+    "MachinesAwaited": machines.awaited,
     "StartTimedOut": handle.start_timed_out,
     "StopAsked": handle.stop_early,
     "DeadlinePassed": failures.engine_deadline,
@@ -51,6 +60,7 @@ _EARLY: dict[str, Handler] = {
 _ALIVE: dict[str, Handler] = {
     **_LOST,
     **_NODES,
+    **_PART,
     "RunFinished": handle.run_finished,
     "ResultKnown": handle.result,
     "StopAsked": handle.stop,
@@ -69,12 +79,20 @@ _STOPPING: dict[str, Handler] = {
     **dict.fromkeys(("ChildExited", "ConnectionLost"), handle.leave_now),
     "Failed": failures.broken,
     "StopAsked": handle.stop_again,
+    "MachineLost": machines.machine_lost_stopping,
+    "HeadLost": machines.head_lost_stopping,
 }
 
 TABLE: Mapping[State, Mapping[type[life.Event], Handler]] = {
-    State.BOOTING: _row(**_EARLY, CoordinatorListening=handle.listening),
-    State.JOINING: _row(**_EARLY, DaemonConnected=handle.joined),
-    State.STARTING: _row(**_EARLY, RunStarted=handle.started, Subscribed=handle.subscribed),
+    State.BOOTING: _row(
+        **{**_EARLY, "DeadlinePassed": machines.boot_deadline},
+        CoordinatorListening=handle.listening,
+    ),
+    State.JOINING: _row(**_EARLY, DaemonConnected=machines.joined),
+    State.GATHERING: _row(**_EARLY, Gathered=machines.gathered, RunStarted=machines.found),
+    State.STARTING: _row(
+        **{**_EARLY, **_PART}, RunStarted=handle.started, Subscribed=handle.subscribed
+    ),
     State.WAITING: _row(
         **{**_ALIVE, **_RELOADS, "NodeExited": handle.node_event_waiting},
         AllReady=handle.barrier_opened,

@@ -7,6 +7,7 @@ from dora_systemd.decisions.cell.counters import CpuSample, LineCount
 from dora_systemd.decisions.cell.restarts import HELD_SECONDS, LATCH_SECONDS
 from dora_systemd.decisions.cell.status import (
     FAILED_BECAUSE,
+    GATHERING,
     HELD,
     LATCHED,
     UNMET,
@@ -23,6 +24,7 @@ from dora_systemd.values import INFINITY, format_duration
 _SHOWN = {
     State.BOOTING: ("starting", "starting the dora coordinator"),
     State.JOINING: ("starting", "starting the dora daemon"),
+    State.GATHERING: (GATHERING, ""),
     State.STARTING: ("starting", "starting the nodes"),
     State.WAITING: ("waiting", ""),
     State.RUNNING: ("running", ""),
@@ -40,13 +42,22 @@ def format_status(cell: Cell) -> str:
     """One line for STATUS=, see sd_notify(3)."""
     if cell.failure:
         return f"{FAILED_BECAUSE}{cell.failure}"
-    if text := _SHOWN[cell.state][1]:
+    if text := _format_gathering(cell) or _SHOWN[cell.state][1]:
         return text
     if cell.state is State.ENDED:
         return "stopped" if cell.stop_by else "finished"
     if cell.state is State.STOPPING:
         return _format_stopping(cell)
     return _format_waiting(cell) if cell.state is State.WAITING else _format_running(cell)
+
+
+def _format_gathering(cell: Cell) -> str:
+    """What a machine waits for before there is a run; "" otherwise."""
+    if cell.machine and cell.state in (State.BOOTING, State.GATHERING):
+        return "waiting for the head"
+    if cell.state is not State.GATHERING:
+        return ""
+    return cell.awaited or f"waiting for {_names(list(cell.members))}"
 
 
 def _format_stopping(cell: Cell) -> str:

@@ -85,6 +85,21 @@ EVENTS = {
     "daemon-lost": EventKind(
         "4252b5e8e29d4cc4be2e3acdae5f3da4", ERR, "The daemon of dataflow {dataflow} is lost"
     ),
+    "machine-joined": EventKind(
+        "e0d2372561f3493282a806ca38df17b4",
+        INFO,
+        "Machine {machine} has joined dataflow {dataflow}",
+    ),
+    "machine-lost": EventKind(
+        "6a7f135594054f938f48dc3677136db0",
+        WARNING,
+        "Machine {machine} of dataflow {dataflow} is lost",
+    ),
+    "machine-back": EventKind(
+        "43c4e922fa22473fb5a01ef7c1346ef0",
+        NOTICE,
+        "Machine {machine} of dataflow {dataflow} is back",
+    ),
     "reloaded": _dataflow("6ddc74129bfd4d61bd13747edb506634", NOTICE, "was reloaded"),
     "files-changed": EventKind("902dc080ec514a37b5dfa7ecceb95347", INFO, "File changed: {files}"),
     "node-reloaded": EventKind("4c9f8decbcc94dfbb46948d6c865191d", NOTICE, "Node {node} was {how}"),

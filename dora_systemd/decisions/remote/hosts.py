@@ -23,7 +23,10 @@ _MAX_PORT = 65535
 
 
 class Host(NamedTuple):
-    """A host. text: as the user wrote it. destination, port: for ssh(1); port may be ""."""
+    """A host. text: as the user wrote it. destination, port: for ssh(1); port may be "".
+
+    Without a destination it is this machine.
+    """
 
     text: str
     destination: str

@@ -54,11 +54,11 @@ def read_json(text: str) -> Any:
         return None
 
 
-def with_host(value: dict[str, Any], host: str) -> dict[str, Any]:
-    """An object of -o json with the host that it comes from."""
+def with_host(value: dict[str, Any], host: str, key: str = "host") -> dict[str, Any]:
+    """An object of -o json with the host that it comes from. key: the name that it gets there."""
     schema = {"schema": value["schema"]} if "schema" in value else {}
-    rest = {key: one for key, one in value.items() if key not in ("schema", "host")}
-    return {**schema, "host": host, **rest}
+    rest = {name: one for name, one in value.items() if name not in ("schema", key)}
+    return {**schema, key: host, **rest}
 
 
 def objects_of(text: str, host: str) -> list[dict[str, Any]] | None:

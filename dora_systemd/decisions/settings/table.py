@@ -23,6 +23,7 @@ from dora_systemd.decisions.settings.kinds import (
     Setting,
 )
 from dora_systemd.decisions.settings.limits import LIMIT_SETTINGS, LIVE_SETTINGS
+from dora_systemd.decisions.settings.machines import MACHINE_SETTINGS
 from dora_systemd.decisions.settings.needs import NEED_SETTINGS
 from dora_systemd.decisions.settings.owes import OWES_SETTINGS
 from dora_systemd.decisions.settings.reload import RELOAD_SETTINGS
@@ -108,6 +109,7 @@ SECTIONS: dict[str, tuple[Setting[Any], ...]] = {
     "Owed outputs": OWES_SETTINGS,
     "Sandbox and secrets": (*CREDENTIAL_SETTINGS, *SANDBOX_SETTINGS),
     "Hot reload": RELOAD_SETTINGS,
+    "Machines": MACHINE_SETTINGS,
 }
 """All settings by concern, as --help shows them."""
 

@@ -158,7 +158,13 @@ def restart_properties(options: RunnerOptions) -> dict[str, Property]:
     # A restart does not help nodes that dora gave up, or a dataflow that is refused. An attached
     # dataflow that has finished stays finished.
     refused = (RunnerExit.BAD_DATAFLOW, RunnerExit.NO_ACCESS, RunnerExit.NO_DORA)
-    final = (RunnerExit.NODES_FAILED, *refused, *(_ENDS_OF_ATTACHED if options.attached else ()))
+    apart = (RunnerExit.NO_MACHINE, RunnerExit.STOPPED_ON_MACHINE) if options.placed else ()
+    final = (
+        RunnerExit.NODES_FAILED,
+        *refused,
+        *apart,
+        *(_ENDS_OF_ATTACHED if options.attached else ()),
+    )
     common = typed(RestartPreventExitStatus=(tuple(sorted(map(int, final))), ()))
     if policy.policy == "no":
         return common | typed(Restart="no")

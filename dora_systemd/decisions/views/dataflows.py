@@ -44,6 +44,8 @@ def status_word(active: str, sub: str, stage: str = "", is_held: bool = False) -
         return WAITING
     if sub.startswith("auto-restart") or (active == "activating" and stage == "restarting"):
         return RESTARTING
+    if active == "activating" and stage == "gathering":
+        return WAITING
     word = _BY_ACTIVE.get(active, STOPPED)
     return _BY_STAGE.get(stage, word) if word == RUNNING else word
 
@@ -95,7 +97,7 @@ def _prefix(uuid: str, others: Sequence[str]) -> str:
 _OPTIONAL = (
     *("PYTHON", "DORA", "FILES", "CREATED", "SIZE", "RELEASE", "BOOT", "PEAK", "PID"),
     *("THROTTLED%", "RESTARTS"),
-    *("UPTIME", "WAITS FOR", "MEM", "CPU%", "WATCHDOG", "NODES", "UUID"),
+    *("UPTIME", "WAITS FOR", "MEM", "CPU%", "WATCHDOG", "NODES", "UUID", "MACHINE"),
 )
 """Columns that a narrow terminal does without, in this order."""
 _LEAST = 12

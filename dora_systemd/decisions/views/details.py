@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+from dora_systemd.decisions.cell.machines import HEAD
 from dora_systemd.decisions.cell.restarts import budget_words
 from dora_systemd.decisions.signs.table import format_watchdog
 from dora_systemd.decisions.views.dataflows import (
@@ -24,23 +25,29 @@ from dora_systemd.terminal_text import cut, one_line
 
 
 def _format_nodes(rows: Sequence[NodeRow], width: int | None, want_colors: bool) -> str:
-    """The node table; with THROTTLED% if any node has a CPU limit, and with what nodes say."""
+    """The node table; with THROTTLED% if any node has a CPU limit, and with what nodes say.
+
+    With MACHINE if any runs on another one.
+    """
     cells = [_node_cells(row) for row in rows]
     is_limited = any(row.cpu_limit is not None for row in rows)
     idle = {title for title in _SIGNS if not any(row[title] for row in cells)}
     idle |= set() if is_limited else {_THROTTLED}
+    idle |= set() if any(row.machine for row in rows) else {_MACHINE}
     header = [title for title in cells[0] if title not in idle]
     lines = [[row[title] for title in header] for row in cells]
     return format_table(header, lines, width, want_colors)
 
 
 _THROTTLED = "THROTTLED%"
+_MACHINE = "MACHINE"
 _SIGNS = ("WATCHDOG", "STATUS TEXT")
 
 
 def _node_cells(row: NodeRow) -> dict[str, str]:
     return {
         "NODE": row.node,
+        _MACHINE: row.machine or HEAD,
         "STATE": row.word,
         "PID": str(row.pid) if row.pid else UNKNOWN,
         "CPU%": format_cpu(row),
@@ -73,6 +80,8 @@ def format_dataflow(row: DataflowRow, width: int | None = None, want_colors: boo
         ("Unit", row.unit),
         ("File", row.dataflow or UNKNOWN),
         ("Release", row.release),
+        ("Machine", f"{row.machine}, the head is another one" if row.machine else ""),
+        ("Machines", ", ".join((HEAD, *row.machines)) if row.machines else ""),
         ("Status", _status_words(row)),
         ("Uptime", format_uptime(row.uptime)),
         ("Started", zoned_time(row.started)),

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from dora_systemd.decisions.cell.counters import WHOLE_CELL
+from dora_systemd.decisions.cell.machines import HEAD
 from dora_systemd.decisions.views.inhibitors import holder_object
 from dora_systemd.decisions.views.rows import DataflowRow, NodeRow
 from dora_systemd.errors import DoraSystemdError
@@ -66,13 +67,16 @@ def dataflow_object(row: DataflowRow, waits: Mapping[str, Shares] | None = None)
         **_usage(row, shares.get(WHOLE_CELL)),
         "restarts": row.restarts,
         "restart_budget": row.restart_budget,
-        "nodes": [_node_object(one, shares.get(one.node)) for one in row.nodes],
+        "machine": row.machine or None,
+        "machines": list(row.machines),
+        "nodes": [_node_object(row, one, shares.get(one.node)) for one in row.nodes],
     }
 
 
-def _node_object(row: NodeRow, shares: Shares | None) -> dict[str, Any]:
+def _node_object(whole: DataflowRow, row: NodeRow, shares: Shares | None) -> dict[str, Any]:
     return {
         "node": row.node,
+        "machine": row.machine or (HEAD if whole.machines else None),
         "state": row.state,
         "pid": row.pid or None,
         "exit": row.exit or None,

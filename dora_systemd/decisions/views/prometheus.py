@@ -121,7 +121,7 @@ def _identity(row: DataflowRow) -> Labels:
 
 def _node_samples(observed: Sequence[Observed]) -> Iterator[tuple[Family, list[Sample]]]:
     places = [
-        ({"dataflow": one.row.name, "node": node.node}, one, node)
+        ({"dataflow": one.row.name, "node": node.node, **_place(node)}, one, node)
         for one in observed
         for node in one.row.nodes
     ]
@@ -141,6 +141,11 @@ def _node_samples(observed: Sequence[Observed]) -> Iterator[tuple[Family, list[S
     yield LINES, [(own, count.written) for own, count in counts]
     yield SUPPRESSED, [(own, count.suppressed) for own, count in counts]
     yield from _group_samples([(own, one, node.node) for own, one, node in places])
+
+
+def _place(node: NodeRow) -> Labels:
+    """Where it runs, unless that is here."""
+    return {"machine": node.machine} if node.machine else {}
 
 
 def _ages(own: Labels, node: NodeRow) -> Iterator[Sample]:

@@ -30,7 +30,7 @@ class NodeRow(NamedTuple):
     must send WATCHDOG=1, and how long ago it did, in µs. essential: whether its final failure ends
     the dataflow. scheduling: as in the settings, or "". cpus: those that it may use, "" if the
     settings name none. silent: what is missing of the outputs that it owes, or "". needs: what it
-    waits for, or "".
+    waits for, or "". machine: the other machine that it runs on, or "".
     """
 
     node: str
@@ -55,6 +55,7 @@ class NodeRow(NamedTuple):
     silent: str = ""
     needs: str = ""
     outputs: tuple[OutputRow, ...] = ()
+    machine: str = ""
 
     @property
     def word(self) -> str:
@@ -83,6 +84,8 @@ class DataflowRow(NamedTuple):
     problem: why its node table is not valid, or "". inhibitors: who inhibits its restart.
     listed_release: that in the Description= of its unit, for a row without `dataflow`. needs: what
     systemd waits for before it starts it, or ""; waits_since: since when, CLOCK_REALTIME µs.
+    machines: the others that run nodes of it. machine: the name of this one, if the head is
+    elsewhere, or "".
     """
 
     uuid: str
@@ -111,6 +114,8 @@ class DataflowRow(NamedTuple):
     listed_release: str = ""
     needs: str = ""
     waits_since: int = 0
+    machines: tuple[str, ...] = ()
+    machine: str = ""
 
     @property
     def release(self) -> str:

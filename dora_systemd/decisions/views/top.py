@@ -104,7 +104,8 @@ def _node_row(node: NodeRow, entry: TopEntry, look: Look) -> TopRow:
     word = node.word
     words = node.silent or (cut(node.text, _MOST_WORDS) if is_alive else node.exit)
     state = f"{word} ({words})" if words else word
-    cells = (f"  {node.node}", state, uptime, *_numbers(node, entry.waits, node.node))
+    place = f" on {node.machine}" if node.machine else ""
+    cells = (f"  {node.node}{place}", state, uptime, *_numbers(node, entry.waits, node.node))
     whole = entry.row
     return TopRow(whole.uuid, whole.name, node.node, word, cells)
 

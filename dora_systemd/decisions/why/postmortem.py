@@ -19,7 +19,7 @@ from dora_systemd.decisions.why.verdict import Facts, Restart, Verdict
 from dora_systemd.values import SECOND
 
 _CRASHES = ("node-crashed", "node-oom")
-_LOSSES = (Cause.DAEMON_LOST, Cause.COORDINATOR_LOST)
+_LOSSES = (Cause.DAEMON_LOST, Cause.COORDINATOR_LOST, Cause.MACHINE_LOST)
 """Their events have the same names."""
 _END_WORDS = {"dataflow-finished": FINISHED, "dataflow-stopped": STOPPED, "dataflow-failed": FAILED}
 _ENDS = (*_END_WORDS, "unit-succeeded", "unit-failed")
@@ -49,7 +49,9 @@ def examine(lives: Sequence[Life], facts: Facts, shutdowns: Sequence[int] = ()) 
     if facts.status == RESTARTING and len(chain) > 1 and only_begins:
         life = chain[-2]  # the runner of the last life still waits for its restart delay
     status = facts.status if facts.status in UP_WORDS else ended_word(life, facts.status)
-    if status in UP_WORDS and status != RESTARTING:
+    if facts.is_gathering:
+        found = _gathering(chain)
+    elif status in UP_WORDS and status != RESTARTING:
         found = _present(life, facts)
     else:
         found = _end(life, facts, shutdowns)
@@ -100,6 +102,15 @@ def _present(life: Life, facts: Facts) -> Verdict:
         at = said[-1] if said else None
         return _found(Cause.NODE_SILENT, f"node {node}: {missing}", at, node)
     return _found(Cause.NONE, "")
+
+
+def _gathering(chain: Sequence[Life]) -> Verdict:
+    """The loss of the machine that a dataflow waits for; nothing if it has never been there."""
+    lost = [one for life in chain for one in life.all(Cause.MACHINE_LOST)]
+    if not lost:
+        return _found(Cause.NONE, "")
+    machine, reason = (lost[-1].detail(key) for key in ("machine", "reason"))
+    return _found(Cause.MACHINE_LOST, f"machine {machine}: {reason}", lost[-1])
 
 
 def final_crashes(life: Life) -> list[Happening]:

@@ -1,13 +1,11 @@
 """Formats the verdict of `doractl why` as one screen of text."""
 
 import re
-import signal
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-from dora_systemd.decisions.cell.exits import ExitKind, parse_exit
+from dora_systemd.decisions.cell.machines import HEAD
 from dora_systemd.decisions.cell.restarts import budget_words
-from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.logs.events import BUILD_FAILED, ROLLED_BACK
 from dora_systemd.decisions.views.dataflows import (
     RESTARTING,
@@ -19,6 +17,7 @@ from dora_systemd.decisions.views.dataflows import (
 from dora_systemd.decisions.views.inhibitors import format_holders
 from dora_systemd.decisions.views.rows import Holder
 from dora_systemd.decisions.why.last_lines import Word, shown_last
+from dora_systemd.decisions.why.remedies import remedy_of
 from dora_systemd.decisions.why.signs import known_remedy
 from dora_systemd.decisions.why.verdict import Restart, Verdict
 from dora_systemd.names import release_of
@@ -32,48 +31,9 @@ _SIZE = re.compile("[1-9][0-9]{0,18}")
 _TITLE_WIDTH = 10
 _BOLD, _PLAIN = "\x1b[1m", "\x1b[0m"
 
-_AUTOMATIC = "run: doractl restart {name}; --restart-policy on-failure does this automatically"
-_OVERLOADED = "run: doractl restart {name}; check whether the machine was overloaded"
-_MORE_MEMORY = "doractl set {name} --memory-limit SIZE, or limit single nodes (--node-limit)"
-_REMEDIES = {
-    Cause.NODE_FAILED: "fix {node}, then run: doractl restart {name}",
-    Cause.NODE_HUNG: "find out what {node} waited for, or raise health_check_timeout: in its YAML",
-    Cause.NODE_WATCHDOG: "find out what {node} waited for (PYTHONFAULTHANDLER=1 prints that for "
-    "Python), or raise watchdog: in its settings",
-    Cause.NODE_SILENT: "find out why {node} sends nothing, or give it more time: "
-    "owes: in the settings file",
-    Cause.NODE_OUT_OF_MEMORY: "look for a leak in {node}, or run: "
-    "doractl set {name} --node-limit {node}:memory=SIZE",
-    Cause.START_TIMEOUT: "find out why {node} does not call Node(), or raise --start-timeout",
-    Cause.REFUSED: "fix {file}, then run: doractl restart {name}",
-    Cause.BAD_DATAFLOW: "fix {file}, then run: doractl restart {name}",
-    Cause.DAEMON_LOST: _AUTOMATIC,
-    Cause.COORDINATOR_LOST: _AUTOMATIC,
-    Cause.NO_ANSWER: _OVERLOADED,
-    Cause.DIRECTORY_LOST: "run: doractl restart {name}; only systemd may delete files there",
-    Cause.RUNNER_BROKEN: "run: doractl restart {name}; please report it, unless the machine "
-    "ran out of processes, files or disk space",
-    Cause.RUNNER_KILLED: _AUTOMATIC,
-    Cause.WATCHDOG: _OVERLOADED,
-    Cause.OUT_OF_MEMORY: _MORE_MEMORY,
-    Cause.UNIT_FAILED: "systemctl {flag} status {unit} shows what systemd did",
-    Cause.TIMEOUT: "raise --start-timeout or --grace-duration",
-    Cause.NO_END: "run: doractl start {file}; to start it at every boot, doractl enable {name}",
-}
-_MEMORY_REMEDIES = {
-    "dataflow": _MORE_MEMORY,
-    "machine": "the machine is short of memory: limit single nodes (--node-limit NODE:memory=SIZE)",
-}
-"""By the owner of the exceeded memory limit, unless it is the node."""
-_SIGNAL_REMEDIES: Mapping[int, str] = {
-    signal.SIGKILL: "find out who killed {node}: journalctl -k, or somebody's kill -9",
-    **dict.fromkeys(
-        (signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS, signal.SIGILL, signal.SIGFPE),
-        "fix {node}; coredumpctl info {pid} shows where it crashed",
-    ),
-}
 _GIVEN_UP = "systemd has stopped restarting it; doractl restart {name} resets the counter"
 _WAITING = "systemd restarts it automatically; doractl stop {name} prevents that"
+_THERE = "doractl -H {host} why {name} tells what machine {machine} has seen"
 _AGAIN = "nothing: dora restarts {node} automatically"
 _AWAY = "{node} stays down until doractl restart {name}; the other nodes keep running"
 _HELD = (
@@ -98,7 +58,8 @@ class Subject:
 class Report:
     """The output of `doractl why`. words: the last lines, of verdict.node or of all nodes.
 
-    inhibitors: who inhibits a restart now. is_held: verdict.node waits for a hot reload.
+    inhibitors: who inhibits a restart now. is_held: verdict.node waits for a hot reload. machines:
+    the other ones by name, each with its host, or "" if that is not known.
     """
 
     subject: Subject
@@ -107,13 +68,17 @@ class Report:
     budget: Mapping[str, int | None] | None = None
     inhibitors: tuple[Holder, ...] = ()
     is_held: bool = False
+    machines: Mapping[str, str] = field(default_factory=dict)
 
 
 def remedies(report: Report) -> list[str]:
     """What to do, one line each."""
     verdict, subject = report.verdict, report.subject
     hint = known_remedy(one.text for one in report.words) if verdict.node else ""
-    texts = [hint, _AGAIN if verdict.is_passing else _remedy(verdict)]
+    texts = [hint, _AGAIN if verdict.is_passing else remedy_of(verdict)]
+    machine = verdict.details.get("machine", "")
+    if host := report.machines.get(machine):
+        texts.append(_THERE)
     if verdict.is_away:
         texts.append(_HELD if report.is_held else _AWAY)
     if verdict.is_given_up:
@@ -127,6 +92,8 @@ def remedies(report: Report) -> list[str]:
         "unit": subject.unit,
         "flag": subject.flag,
         "pid": verdict.details.get("node_pid", "PID"),
+        "machine": machine,
+        "host": host,
     }
     filled = [text.format(**values) for text in texts if text]
     if report.is_held and verdict.is_away:
@@ -142,16 +109,6 @@ def remedies(report: Report) -> list[str]:
         return filled
     again = f"doractl start {values['file']} --name {subject.name}"
     return [text.replace(f"doractl restart {subject.name}", again) for text in filled]
-
-
-def _remedy(verdict: Verdict) -> str:
-    if verdict.cause in (Cause.NODE_OUT_OF_MEMORY, Cause.OUT_OF_MEMORY):
-        owner = verdict.details.get("owner", "")
-        return _MEMORY_REMEDIES.get(owner, _REMEDIES[verdict.cause])
-    exit = parse_exit(verdict.details.get("exit", ""))
-    if verdict.cause is Cause.NODE_FAILED and exit.kind is ExitKind.SIGNAL:
-        return _SIGNAL_REMEDIES.get(exit.number, _REMEDIES[verdict.cause])
-    return _REMEDIES.get(verdict.cause, "")
 
 
 def format_report(report: Report, width: int | None = None, want_colors: bool = False) -> str:
@@ -200,6 +157,7 @@ def _facts(report: Report) -> list[str]:
         "Why": verdict.summary,
         "Now": verdict.now,
         "When": _when(verdict),
+        "Machines": _machine_words(report.machines),
         "Memory": _memory_words(verdict.details),
         "Starved": ", ".join(verdict.starved),
         "Restarts": _restart_words(verdict.restarts),
@@ -212,6 +170,12 @@ def _facts(report: Report) -> list[str]:
         "Undone": _undone(verdict),
     }
     return [f"{key + ':':<{_TITLE_WIDTH}}{text}" for key, text in facts.items() if text]
+
+
+def _machine_words(machines: Mapping[str, str]) -> str:
+    """As "head, gpu (alice@gpu-box)"; nothing for one machine."""
+    others = (f"{name} ({host})" if host else name for name, host in machines.items())
+    return ", ".join((HEAD, *others)) if machines else ""
 
 
 def _undone(verdict: Verdict) -> str:

@@ -16,7 +16,8 @@ class Facts:
     status: a word of `list`. text: STATUS=. failed: nodes that have failed for good. restarting:
     nodes that wait for a restart. now_boot: id of this boot. restarts: NRestarts= of the unit, None
     if systemd has unloaded it. silent: nodes of which an owed output is missing, and which.
-    is_held: whether systemd has not begun the start that it has in its queue.
+    is_held: whether systemd has not begun the start that it has in its queue. is_gathering: whether
+    it waits for another machine.
     """
 
     status: str = ""
@@ -27,6 +28,7 @@ class Facts:
     restarts: int | None = None
     silent: Mapping[str, str] = field(default_factory=dict)
     is_held: bool = False
+    is_gathering: bool = False
 
 
 @dataclass(frozen=True)

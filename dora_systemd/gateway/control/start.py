@@ -68,7 +68,8 @@ def _start(scope: Scope, request: Request) -> str:
     wanted = StartRequest(str(path), name if isinstance(name, str) else None, flags, os.environ)
     bus = Bus(scope)
     claimed = claim(bus, scope, wanted, "dora start")
-    return start_unit(bus, scope, claimed.plan.options, claimed.properties, None, wait=False).uuid
+    options, links = claimed.plan.options, claimed.links
+    return start_unit(bus, scope, options, claimed.properties, None, False, links).uuid
 
 
 def find_file(directory: Path, session: str) -> Path:

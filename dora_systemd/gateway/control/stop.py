@@ -17,6 +17,7 @@ from dora_systemd.gateway.control.talk import Talk, find_by_uuid
 from dora_systemd.scope import Scope
 from dora_systemd.values import SECOND
 from dora_systemd.verbs.facts.cells import Cell
+from dora_systemd.verbs.facts.parts import refuse_parts
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.inhibit.guard import uninhibited
 from dora_systemd.verbs.stop import note_stop, restart_cells, stop_cells
@@ -34,6 +35,7 @@ async def stop(talk: Talk, request: Request) -> dict[str, Any]:
             f"doractl {scope.flag} why {cell.name} says how it ended",
             ExitCode.NOT_RUNNING,
         )
+    await asyncio.to_thread(refuse_parts, [cell], "stop")
     await asyncio.to_thread(note_stop, [cell], "dora stop")
     outcome = await _within(scope, cell, request, lambda: stop_cells(Bus(scope), scope, [cell])[0])
     if outcome.problem:
@@ -49,6 +51,7 @@ async def restart(talk: Talk, request: Request) -> dict[str, Any]:
     with ExitStack() as held:
         # Before the time of `_within` begins, which ends in a kill.
         await asyncio.to_thread(_hold, held, scope, cell)
+        await asyncio.to_thread(refuse_parts, [cell], "restart")
         await asyncio.to_thread(note_stop, [cell], "dora restart")
         outcome = await _within(scope, cell, request, lambda: restart_cells(Bus(scope), [cell])[0])
     if outcome.problem:

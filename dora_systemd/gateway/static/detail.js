@@ -168,6 +168,7 @@ export class Detail {
     facts.show("Uptime", up ? uptime(flow.uptime_us) : "");
     facts.show("Ended", !up && flow.ended_us ? since(flow.ended_us) : "");
     facts.show("Nodes", flow.nodes_total ? (up ? alive : String(flow.nodes_total)) : flow.problem);
+    facts.show("Machines", flow.machines?.length ? ["head", ...flow.machines].join(", ") : "");
     facts.show("Restarts", flow.restarts == null ? "" : String(flow.restarts));
     facts.show("Peak memory", flow.memory_peak_bytes == null ? "" : bytes(flow.memory_peak_bytes));
     const isKnown = known.sandbox != null;

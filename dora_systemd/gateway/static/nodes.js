@@ -20,6 +20,7 @@ export class NodeRow {
     this.badge = el("span", { class: "badge" });
     this.exit = el("span", { class: "exit" });
     this.said = el("span", { class: "said muted" });
+    this.machine = el("span", { class: "machine" });
     this.sign = el("span", { class: "sign" });
     this.rights = el("span", { class: "rights" });
     this.up = el("span", { class: "up" });
@@ -34,8 +35,8 @@ export class NodeRow {
       title: `Show the logs of ${name}`, onclick: () => choose(name) }, name);
     this.node = el("li", { "data-node": name },
       el("div", { class: "what" }, this.choose, this.badge, this.exit, this.said),
-      el("div", { class: "facts muted" }, this.up, this.restarts, this.rights, this.sign,
-        this.waits),
+      el("div", { class: "facts muted" }, this.machine, this.up, this.restarts, this.rights,
+        this.sign, this.waits),
       this.charts.cpu.node, this.charts.memory.node,
       el("div", { class: "buttons" }, this.buttons.restart, this.buttons.stop, this.limits));
   }
@@ -47,6 +48,7 @@ export class NodeRow {
     showState(this.badge, stateOf(facts));
     say(this.exit, silent ?? (isAlive ? "" : exit));
     say(this.said, isAlive ? facts.text : "");
+    say(this.machine, facts.machine ? `on ${facts.machine}` : "");
     const rights = [facts.essential ? "essential" : "", facts.scheduling];
     say(this.rights, rights.filter(Boolean).join(" "));
     say(this.sign, isAlive ? signWords(facts) : "");

@@ -2,7 +2,7 @@
 
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -55,11 +55,15 @@ def make_lock(path: Path) -> None:
     os.close(os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600))
 
 
-def start_coordinator(dora: str, paths: CellPaths, environment: Mapping[str, str]) -> engine.Child:
+def start_coordinator(
+    dora: str, paths: CellPaths, environment: Mapping[str, str], port: int = 0
+) -> engine.Child:
     """Start a coordinator, which prints its port. environment: of the nodes. Raises OSError."""
     paths.coordinator.mkdir(mode=0o700, exist_ok=True)
     own = engine.coordinator_environment(environment, paths.coordinator)
-    return engine.spawn("coordinator", engine.coordinator_command(dora), own, paths.coordinator)
+    return engine.spawn(
+        "coordinator", engine.coordinator_command(dora, port), own, paths.coordinator
+    )
 
 
 def daemon_variables(
@@ -102,15 +106,23 @@ class Daemon(NamedTuple):
     listen: int
 
 
-def start_daemon(dora: str, paths: CellPaths, port: int, environment: Mapping[str, str]) -> Daemon:
+def start_daemon(
+    dora: str,
+    paths: CellPaths,
+    port: int,
+    environment: Mapping[str, str],
+    token: str = "",
+    more: Sequence[str] = (),
+) -> Daemon:
     """Start a daemon for the coordinator on `port`. Raises OSError.
 
-    environment: of the nodes, with daemon_variables.
+    environment: of the nodes, with daemon_variables. token: if the coordinator is on another
+    machine. more: arguments.
     """
     paths.daemon.mkdir(mode=0o700, exist_ok=True)
     listen = engine.free_port()
-    own = {**environment, "DORA_AUTH_TOKEN": read_token(paths)}
-    command = engine.daemon_command(dora, port, listen)
+    own = {**environment, "DORA_AUTH_TOKEN": token or read_token(paths)}
+    command = [*engine.daemon_command(dora, port, listen), *more]
     return Daemon(engine.spawn("daemon", command, own, paths.daemon), listen)
 
 

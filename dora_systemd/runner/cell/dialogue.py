@@ -146,7 +146,19 @@ class Dialogue(Tasks):
 
         await self._engine.read_events(self._pump.cell.run, subscribed, self._hear)
         await asyncio.sleep(2 * _SETTLE_SECONDS)  # let ChildExited of the coordinator come first
+        self._events_ended()
+
+    def _events_ended(self) -> None:
+        """The coordinator tells no more of the run."""
         self._pump.push(life.ConnectionLost(now_us()))
+
+    def _is_here(self, node: str) -> bool:
+        """Whether the node runs on this machine; "" stands for the dataflow."""
+        del node
+        return True
+
+    def _hear_elsewhere(self, record: protocol.LogRecord) -> None:
+        """Handle what dora says of a node on another machine."""
 
     def _is_own(self, node: str) -> bool:
         """Whether it is no node of the dataflow, but one that this runner has added."""
@@ -154,6 +166,9 @@ class Dialogue(Tasks):
 
     def _hear(self, record: protocol.LogRecord) -> None:
         if self._is_own(record.node):
+            return
+        if not self._is_here(record.node):
+            self._hear_elsewhere(record)
             return
         event = life_events.parse_life_event(record, now_us())
         if isinstance(event, life.NodeSpawned):

@@ -12,7 +12,7 @@ from dora_systemd.adapters.host import files
 from dora_systemd.decisions.dora import protocol
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
-from dora_systemd.runner.cell.begin import read_token, start_coordinator, start_daemon
+from dora_systemd.runner.cell.begin import Daemon, read_token, start_coordinator, start_daemon
 from dora_systemd.runner.cell.boot import Boot
 from dora_systemd.values import SECOND
 
@@ -55,12 +55,15 @@ class Engine:
 
     def start_coordinator(self) -> engine.Child:
         """Start the coordinator, unless it boots already; it prints its port. Raises OSError."""
-        if self._boot is None:
-            child = start_coordinator(self._dora, self._paths, self._environment)
-        else:
-            child = self._boot.coordinator
+        child = self._boot.coordinator if self._boot else self._spawn_coordinator()
         self._children[child.label] = child
         return child
+
+    def _spawn_coordinator(self) -> engine.Child:
+        return start_coordinator(self._dora, self._paths, self._environment)
+
+    def _spawn_daemon(self, environment: Mapping[str, str]) -> Daemon:
+        return start_daemon(self._dora, self._paths, self._port, environment)
 
     def set_port(self, port: int) -> None:
         """Set the port of the coordinator, which has written its token by now. Raises OSError."""
@@ -73,12 +76,14 @@ class Engine:
         """
         daemon = self._boot.daemon() if self._boot else None
         if daemon is None:
-            environment = {**self._environment, **added}
-            daemon = start_daemon(self._dora, self._paths, self._port, environment)
+            daemon = self._spawn_daemon({**self._environment, **added})
         self._children[daemon.child.label] = daemon.child
+        self._write_access(daemon)
+        return daemon.child
+
+    def _write_access(self, daemon: Daemon) -> None:
         access = {"port": self._port, "token": self._token, "local_listen_port": daemon.listen}
         files.write_atomic(self._paths.control, json.dumps(access), 0o600)
-        return daemon.child
 
     async def wait_joined(self) -> None:
         """Connect to the coordinator, and return once the daemon has registered."""

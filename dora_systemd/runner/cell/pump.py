@@ -23,6 +23,7 @@ from pathlib import Path
 from dora_systemd.adapters.host import fd_store, files, notify
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.decisions.cell.counters import CpuSample, add_sample
+from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.life.failures import ENGINE_TIMEOUT
@@ -55,7 +56,8 @@ class Pump:
     """Holds the cell, changes it by events, and publishes its state.
 
     this_life: the same for all runs of a life. Call connect() before the first push().
-    end: resolves to the exit status, even if the action EXIT fails.
+    end: resolves to the exit status, even if the action EXIT fails. amend: adds to the table what
+    other machines say.
     """
 
     def __init__(
@@ -76,6 +78,7 @@ class Pump:
         self._text = ""
         self._is_ready = False
         self._is_unwritten = False
+        self.amend: Callable[[CellStatus], CellStatus] = lambda table: table
         self._waiting: list[tuple[Callable[[Cell], bool], asyncio.Future[None]]] = []
 
     def connect(self, actions: Mapping[Do, Callable[[], None]]) -> None:
@@ -214,7 +217,7 @@ class Pump:
     def _write_table(self) -> None:
         own, lines, signs = self._life, self._pipes.line_counts(), self._nodes.signs.table()
         table = cell_status(self.cell, own.uuid, self._samples, lines, signs)
-        table = table._replace(up_us=own.up_us, is_first=own.is_first)
+        table = self.amend(table._replace(up_us=own.up_us, is_first=own.is_first))
         try:
             files.write_atomic(self._paths.status, table.to_json(), 0o600)
         except DoraSystemdError as error:

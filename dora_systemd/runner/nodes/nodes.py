@@ -186,9 +186,15 @@ class Nodes:
         """
         if node not in self._launched:
             return
-        with contextlib.suppress(OSError, ValueError):
-            if int(self._paths.node_pid(node).read_text()) == pid:  # else the next one runs
+        with contextlib.suppress(OSError):
+            if self.noted_pid(node) == pid:  # else the next one runs
                 cgroup.kill_group(self._group(node))
+
+    def noted_pid(self, node: str) -> int:
+        """The process that the launcher of the node became, 0 if there is none yet."""
+        with contextlib.suppress(OSError, ValueError):
+            return int(self._paths.node_pid(node).read_text())
+        return 0
 
     def let_go(self) -> None:
         """The nodes are about to end: stop freezing them."""

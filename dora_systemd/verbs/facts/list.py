@@ -1,6 +1,6 @@
 """`doractl list`: dataflows and their resource usage, a row for each."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from dora_systemd.adapters.bus.manager import Manager
@@ -12,7 +12,13 @@ from dora_systemd.decisions.cell.counters import (
     throttled_percent,
 )
 from dora_systemd.decisions.cell.limits import CPUS, has_cpus
-from dora_systemd.decisions.cell.status import FAILED_BECAUSE, CellStatus, NodeStatus
+from dora_systemd.decisions.cell.machines import members_of
+from dora_systemd.decisions.cell.status import (
+    FAILED_BECAUSE,
+    GATHERING,
+    CellStatus,
+    NodeStatus,
+)
 from dora_systemd.decisions.resources.usage import Usage
 from dora_systemd.decisions.views.rows import DataflowRow, NodeRow, OutputRow
 from dora_systemd.scope import Scope
@@ -47,9 +53,10 @@ def row_of(reading: Reading, before: Reading | None = None) -> DataflowRow:
         "dataflow": cell.dataflow,
         "listed_release": cell.release,
         # The status says "failed" already.
-        "text": unit.get("StatusText", "").removeprefix(FAILED_BECAUSE),
+        "text": _text(unit, status).removeprefix(FAILED_BECAUSE),
         "restarts": unit["NRestarts"],
         "problem": reading.problem,
+        **_machines(cell),
     }
     if held := reading.held:
         facts |= {"status": held.word, "text": held.text}
@@ -60,6 +67,20 @@ def row_of(reading: Reading, before: Reading | None = None) -> DataflowRow:
         return DataflowRow(**facts)
     samples = (before.sample,) if before else status.samples
     return DataflowRow(**facts, **_life(reading), **_usage(reading, samples))
+
+
+def _text(unit: Mapping[str, Any], status: CellStatus) -> str:
+    """The STATUS= of a unit; the table does not ask for it, and needs it for what waits."""
+    return str(unit.get("StatusText", status.text if status.stage == GATHERING else ""))
+
+
+def _machines(cell: Cell) -> dict[str, Any]:
+    """The machines of a dataflow; none in the table, for which nobody has asked for the options."""
+    options = cell.known_options
+    if options is None or not options.placed:
+        return {}
+    here = options.machine
+    return {"machine": here} if here else {"machines": members_of(options.placed)}
 
 
 def dataflow_row(manager: Manager, scope: Scope, cell: Cell) -> DataflowRow:
@@ -211,5 +232,6 @@ def _node_row(node: str, status: NodeStatus | None, numbers: dict[str, Any]) -> 
         "since": status.since_us,
         "silent": status.silent,
         "needs": status.needs,
+        "machine": status.machine,
     }
     return NodeRow(node, status.state, **facts, **numbers)  # type: ignore[arg-type]

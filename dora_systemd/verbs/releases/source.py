@@ -179,6 +179,9 @@ def _check(plan: Plan, dataflow: Dataflow, root: str, want_build: bool) -> None:
     if plan.options.uv:
         reason = "uv is on, and would write to the release"
         raise _refusal(reason, "run uv sync in the project, and deploy with --venv .venv --no-uv")
+    if plan.members:
+        reason = "it runs on several machines"
+        raise _refusal(reason, "bring the files to each of them, and use doractl start")
     for node in dataflow.nodes:
         reason = hint = ""
         if node.git and not want_build:

@@ -72,7 +72,8 @@ class Talk:
         mark = f"doractl-{os.urandom(16).hex()}"
         arguments = ssh_arguments(host, way, remote_command(way, words, mark))
         self.host = host
-        self.connection = Connection(arguments, is_fed=way is Way.FED and opening is None)
+        is_fed = way is Way.FED and opening is None
+        self.connection = Connection(arguments, is_fed, is_here=not host.destination)
         self._outbox = itertools.chain([opening or b""])
         self._chunk = b""
         self._has_more = opening is not None

@@ -1,12 +1,18 @@
 """Checks that the name of a new dataflow is free, and cleans up after an ended one."""
 
+import itertools
 from dataclasses import replace
 
-from dora_systemd.adapters.bus.manager import Manager
-from dora_systemd.adapters.host.unit_files import remove_changes, remove_unit_file
+from dora_systemd.adapters.bus.manager import Beside, Manager
+from dora_systemd.adapters.host.unit_files import (
+    read_unit_file,
+    remove_changes,
+    remove_unit_file,
+)
 from dora_systemd.decisions.properties.assignments import Properties
 from dora_systemd.decisions.unit.file import persistent_unit, says_the_same
 from dora_systemd.decisions.unit.properties import format_unit
+from dora_systemd.decisions.unit.versions import drop_unsupported
 from dora_systemd.decisions.views.dataflows import local_time
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import release_of
@@ -17,11 +23,13 @@ from dora_systemd.verbs.start.enable import (
     boot_target,
     drop_unit_files,
     install_unit_file,
+    link_paths,
     read_boot_unit,
     release_transient,
     wait_until_forgotten,
 )
 from dora_systemd.verbs.start.plan import Plan
+from dora_systemd.verbs.start.unit import plan_links, systemd_number
 
 
 def require_free_name(manager: Manager, scope: Scope, unit: str) -> BootUnit:
@@ -69,7 +77,9 @@ def with_known_uuid(plan: Plan, boot: BootUnit) -> Plan:
     known = boot.options
     if not boot.is_enabled or known is None or known.dataflow != plan.options.dataflow:
         return plan
-    return replace(plan, options=plan.options._replace(uuid=known.uuid))
+    members = (one.with_uuid(plan.options.uuid, known.uuid) for one in plan.members)
+    options = plan.options._replace(uuid=known.uuid)
+    return replace(plan, options=options, members=tuple(members))
 
 
 def place_unit_file(
@@ -86,19 +96,68 @@ def place_unit_file(
         [format_unit(properties)], plan.options, scope.is_user, target, boot.is_checked
     )
     is_kept = boot.text is not None and boot.is_enabled and not want_boot
-    if is_kept and not says_the_same(text, boot.text or ""):
+    links = _link_files(plan, systemd_number(manager)) if plan.members else {}
+    is_same = says_the_same(text, boot.text or "") and all(
+        read_unit_file(boot.path.with_name(unit)) == of_link for unit, of_link in links.items()
+    )
+    if is_kept and not is_same:
         raise _differs(plan.options.name, boot)
     if not is_kept and not want_boot:
         _refuse_deployed(plan.options.name, boot)
     make_room(manager, boot)
+    if links:
+        _forget_links(manager, plan.options.name)
     if want_boot:
-        install_unit_file(manager, boot, text)
+        for path in itertools.chain(*link_paths(boot, boot.options)):
+            remove_unit_file(path)
+        install_unit_file(manager, boot, text, links)
         remove_changes(boot.path)
         remove_unit_file(boot.runtime)
         manager.reload()
     elif not is_kept:
         drop_unit_files(manager, boot)
     return want_boot or is_kept
+
+
+def _link_files(plan: Plan, systemd: int) -> dict[str, str]:
+    """The unit files of the links to the members, by unit."""
+    # Imported late: most dataflows run on one machine.
+    from dora_systemd.decisions.machines.link_unit import link_file
+
+    kept = (
+        one._replace(properties=drop_unsupported(one.properties, systemd)[0])
+        for one in plan_links(plan)
+    )
+    return {one.unit: link_file(one) for one in kept}
+
+
+def prepared_links(manager: Manager, plan: Plan, systemd: int) -> Beside:
+    """The links to the members of a plan. Those of an ended dataflow of that name are gone then.
+
+    Raises DoraSystemdError (NAME_IN_USE).
+    """
+    links = plan_links(plan)
+    _forget_links(manager, plan.options.name)
+    kept = ((one.unit, drop_unsupported(one.properties, systemd)[0]) for one in links)
+    return [(unit, list(properties.values())) for unit, properties in kept]
+
+
+def _forget_links(manager: Manager, name: str) -> None:
+    for unit in end_links(manager, name):
+        wait_until_forgotten(manager, unit)
+
+
+def end_links(manager: Manager, name: str) -> list[str]:
+    """Stop the links of a dataflow that has ended, and wait for that; their units.
+
+    systemd does so as well, a moment later.
+    """
+    from dora_systemd.decisions.machines.link_unit import links_pattern
+
+    there = [one.unit for one in manager.list_units(links_pattern(name))]
+    if there:
+        manager.run_jobs("StopUnit", there)
+    return there
 
 
 def _refuse_deployed(name: str, boot: BootUnit) -> None:

@@ -5,10 +5,13 @@ systemd looks into /run/systemd/transient first. Never remove that fragment whil
 loaded: systemd would delete the file in /etc instead when it unloads the unit.
 """
 
+import itertools
+import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from dora_systemd.adapters.bus.manager import Manager
@@ -94,6 +97,7 @@ def enable_cell(
     is. Raises DoraSystemdError; then nothing has changed.
     """
     refuse_attached(cell)
+    refuse_member(cell.options)
     if is_checked and scope.is_user:
         message = "cannot check the boot with a dataflow of a user"
         raise DoraSystemdError(message, "use --system", ExitCode.USAGE)
@@ -105,7 +109,8 @@ def enable_cell(
     if texts:
         target = boot_target(manager, scope)
         text = persistent_unit(texts, cell.options, scope.is_user, target, is_checked)
-        install_unit_file(manager, boot, text)
+        links = _loaded_links(manager, scope, cell.options) if cell.options.placed else {}
+        install_unit_file(manager, boot, text, links)
     else:
         _link(manager, cell.unit, cell.unit)
         sync_links(boot.path)
@@ -144,14 +149,70 @@ def refuse_attached(cell: Cell) -> None:
         )
 
 
-def install_unit_file(manager: Manager, boot: BootUnit, text: str) -> None:
-    """Write the unit file and link it; undo both on failure. Raises DoraSystemdError."""
+def refuse_member(options: RunnerOptions) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) for a part of a dataflow: its head starts it."""
+    if options.machine:
+        raise DoraSystemdError(
+            f"cannot make a unit file of {options.name}: its head is another machine",
+            "use doractl enable there",
+            ExitCode.BAD_INPUT,
+        )
+
+
+def _loaded_links(manager: Manager, scope: Scope, options: RunnerOptions) -> dict[str, str]:
+    """The unit files of the links of a dataflow that systemd has loaded, by unit."""
+    # Imported late: most dataflows run on one machine.
+    from dora_systemd.decisions.machines.link_unit import (
+        link_file,
+        link_from_command,
+        link_units_of,
+    )
+
+    found = {}
+    for unit in link_units_of(options):
+        commands = manager.read(unit, ["ExecStart"])["ExecStart"] or [("", ())]
+        link = link_from_command(sys.executable, commands[0][1], options, scope.is_user)
+        found[unit] = link_file(link)
+    return found
+
+
+def link_paths(boot: BootUnit, options: RunnerOptions | None) -> list[tuple[Path, Path]]:
+    """The unit files of all links of a dataflow: where they last, and where a reboot ends them."""
+    if options is None or not options.placed:
+        return []
+    from dora_systemd.decisions.machines.link_unit import link_units_of
+
+    places = (boot.path, boot.runtime)
+    return [(places[0].with_name(one), places[1].with_name(one)) for one in link_units_of(options)]
+
+
+def refuse_machines(options: RunnerOptions) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) for a dataflow on several machines, or a part of one."""
+    if options.placed:
+        raise DoraSystemdError(
+            f"cannot make a unit file of {options.name}: it runs on several machines",
+            "start it with doractl start",
+            ExitCode.BAD_INPUT,
+        )
+
+
+def install_unit_file(
+    manager: Manager, boot: BootUnit, text: str, links: Mapping[str, str] = MappingProxyType({})
+) -> None:
+    """Write the unit file and link it; undo both on failure. Raises DoraSystemdError.
+
+    links: unit files of the links to other machines, by unit.
+    """
+    for unit, of_link in links.items():
+        write_unit_file(boot.path.with_name(unit), of_link)
     write_unit_file(boot.path, text)
     try:
         _link(manager, str(boot.path), boot.unit)
         sync_links(boot.path)
     except DoraSystemdError as error:
         put_unit_file(boot.path, boot.text)
+        for unit in links if boot.text is None else ():
+            remove_unit_file(boot.path.with_name(unit))
         raise _no_link(boot.unit) if error.code is ExitCode.NOT_FOUND else error from error
 
 
@@ -175,8 +236,12 @@ def disable_cell(manager: Manager, scope: Scope, cell: Cell) -> bool:
     is_in_use = facts["FragmentPath"] == str(boot.path) and is_there
     if boot.text is not None and is_in_use:
         changes = [read_unit_file(path) or "" for path in changed_files(boot.path)]
+        for lasting, fleeting in link_paths(boot, boot.options):
+            write_unit_file(fleeting, read_unit_file(lasting) or "")
         write_unit_file(boot.runtime, without_install("\n".join([boot.text, *changes])))
     manager.disable_unit_files([cell.unit])
+    for lasting, _ in link_paths(boot, boot.options):
+        remove_unit_file(lasting)
     remove_unit_file(boot.path)
     remove_changes(boot.path)
     manager.reload()
@@ -186,6 +251,9 @@ def disable_cell(manager: Manager, scope: Scope, cell: Cell) -> bool:
 def drop_unit_files(manager: Manager, boot: BootUnit) -> None:
     """Remove unit files that are not needed: of a disabled dataflow that is not running."""
     if boot.text is not None or boot.runtime.exists():
+        text = boot.text if boot.text is not None else read_unit_file(boot.runtime)
+        for path in itertools.chain(*link_paths(boot, runner_of(text or ""))):
+            remove_unit_file(path)
         for path in (boot.path, boot.runtime):
             remove_unit_file(path)
             remove_changes(path)

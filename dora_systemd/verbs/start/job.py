@@ -11,6 +11,7 @@ from dora_systemd.adapters.bus.manager import (
     DOWN,
     JOB_DONE,
     ON_THE_WAY,
+    Beside,
     Manager,
     Observer,
     Property,
@@ -48,17 +49,18 @@ def start_unit(
     properties: Sequence[Property] | None,
     on_stage: StageObserver | None,
     wait: bool,
+    beside: Beside = (),
 ) -> Started:
     """Start the unit of a dataflow; if `wait`, wait until its nodes are ready.
 
-    properties: of a transient unit; None for a unit that systemd has loaded. Raises
-    DoraSystemdError with the reason when the start fails; the unit stays as failed. If the runner
-    refuses the dataflow, no unit is left.
+    properties: of a transient unit; None for a unit that systemd has loaded. beside: the links of
+    a dataflow on several machines. Raises DoraSystemdError with the reason when the start fails;
+    the unit stays as failed. If the runner refuses the dataflow, no unit is left.
     """
     unit = unit_name(options.name)
     try:
         observe = partial(_tell, manager, unit, on_stage)
-        result = _begin(manager, unit, properties, observe, wait)
+        result = _begin(manager, unit, properties, observe, wait, beside)
         if not wait:
             _wait_until_checked(manager, unit)
     except KeyboardInterrupt as error:
@@ -67,8 +69,10 @@ def start_unit(
     state = manager.read(unit, ["ActiveState"])["ActiveState"]
     has_failed = result != JOB_DONE or state == "failed"
     if has_failed and (refusal := runners_refusal(manager, unit)):
-        # It never ran, so do not keep its name in use.
+        # It never ran, so do not keep its name in use. Links would only try once more.
         with suppress(DoraSystemdError):
+            if beside:
+                manager.run_jobs("StopUnit", [link for link, _ in beside])
             manager.reset_failed(unit)
         raise refusal
     if has_failed and wait:
@@ -92,11 +96,14 @@ def _begin(
     properties: Sequence[Property] | None,
     observe: Observer,
     wait: bool,
+    beside: Beside,
 ) -> str:
     """Begin the start; the result of the job, which is that of a whole start only if `wait`."""
     if properties is not None:
-        told = transient_commands(properties, systemd_number(manager))
-        return manager.start_transient(unit, told, observe, wait)
+        number = systemd_number(manager)
+        links = [(link, transient_commands(of_it, number)) for link, of_it in beside]
+        told = transient_commands(properties, number)
+        return manager.start_transient(unit, told, observe, wait, links)
     if wait:
         return manager.run_jobs("StartUnit", [unit], observe)[unit]
     manager.queue_job("StartUnit", unit)

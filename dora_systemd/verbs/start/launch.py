@@ -3,23 +3,29 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from dora_systemd.adapters.bus.manager import Manager, Property
+from dora_systemd.adapters.bus.manager import Beside, Manager, Property
 from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.start.again import note_start
 from dora_systemd.verbs.start.check import check_plan
-from dora_systemd.verbs.start.claim import place_unit_file, require_free_name, with_known_uuid
+from dora_systemd.verbs.start.claim import (
+    place_unit_file,
+    prepared_links,
+    require_free_name,
+    with_known_uuid,
+)
 from dora_systemd.verbs.start.plan import Plan, StartRequest, make_plan, request_name
-from dora_systemd.verbs.start.unit import plan_properties
+from dora_systemd.verbs.start.unit import plan_properties, systemd_number
 
 
 @dataclass(frozen=True)
 class Claim:
-    """A dataflow whose name is free. properties: for start_plan()."""
+    """A dataflow whose name is free. properties, links: for start_unit()."""
 
     plan: Plan
     properties: Sequence[Property] | None
     warnings: tuple[str, ...]
+    links: Beside = ()
 
 
 def claim(
@@ -43,4 +49,6 @@ def claim(
         check_plan(lambda: manager, plan)
     has_file = place_unit_file(manager, plan, properties, boot, want_boot)
     note_start(plan, request, command)
-    return Claim(plan, None if has_file else list(properties.values()), tuple(warnings))
+    has_links = bool(plan.members) and not has_file
+    links = prepared_links(manager, plan, systemd_number(manager)) if has_links else ()
+    return Claim(plan, None if has_file else list(properties.values()), tuple(warnings), links)

@@ -50,9 +50,11 @@ def start_notes(plan: Plan, passwd: Path = PASSWD) -> Iterator[str]:
     users = _logins(passwd)
     others = [name for name in users if name != plan.user.pw_name]
     if len(users) > 1 and others:
+        # Machines only meet in the network of the host.
+        way = "" if plan.members else "--network private prevents it, "
         yield (
             f"{_names(others)} can log in here and can read, forge and end what the nodes "
-            "exchange; --network private prevents it, --network host is for those you trust"
+            f"exchange; {way}--network host is for those you trust"
         )
 
 

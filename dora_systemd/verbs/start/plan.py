@@ -9,16 +9,19 @@ import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from dora_systemd.adapters.dora.preparation import Prepared, check_named_nodes
 from dora_systemd.adapters.host.files import decoded, parse_yaml, read_text
 from dora_systemd.decisions.cell.environment import parse_environment_file, unit_environment
 from dora_systemd.decisions.cell.launch import LaunchPlan, launch_descriptor
+from dora_systemd.decisions.cell.machines import Placed
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
 from dora_systemd.decisions.descriptor.expansion import called_variables
 from dora_systemd.decisions.descriptor.nodes import UNEXPANDED
 from dora_systemd.decisions.properties.sandbox import Sandbox
+from dora_systemd.decisions.settings.machines import MACHINES
 from dora_systemd.decisions.settings.resolve import Settings
 from dora_systemd.decisions.settings.runner_options import with_settings
 from dora_systemd.decisions.settings.table import ENV, ENV_FILE, USER, WORKING_DIRECTORY
@@ -35,6 +38,9 @@ from dora_systemd.verbs.start.places import Look
 from dora_systemd.verbs.start.sandbox import make_sandbox
 from dora_systemd.verbs.start.settings import read_settings
 
+if TYPE_CHECKING:  # most dataflows run on one machine
+    from dora_systemd.decisions.machines.member import Member
+
 DEFAULT_FILE = "dataflow.yml"
 
 
@@ -45,7 +51,8 @@ class StartRequest:
     environment: the caller's variables. attached: the dataflow ends with the caller. caller: the
     variables that the dataflow may read. uuid: of a dataflow that is started again. origin: of a
     release, the file that its dataflow file was copied from: who owns that decides, not root, who
-    owns the copy. is_unbuilt: the programs of its nodes need not exist yet.
+    owns the copy. is_unbuilt: the programs of its nodes need not exist yet. machine, head, placed:
+    of the runner's options, if this machine is a member of the dataflow.
     """
 
     dataflow: str
@@ -57,6 +64,9 @@ class StartRequest:
     uuid: str = ""
     origin: Place | None = None
     is_unbuilt: bool = False
+    machine: str = ""
+    head: str = ""
+    placed: tuple[Placed, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -64,7 +74,7 @@ class Plan:
     """A checked request.
 
     user: for User=, None in user scope. environment: all of Environment=. notes: for people, once
-    it has started.
+    it has started. members: the other machines, if it runs on several.
     """
 
     scope: Scope
@@ -74,6 +84,7 @@ class Plan:
     environment: Mapping[str, str]
     sandbox: Sandbox = field(default_factory=Sandbox)
     notes: tuple[str, ...] = ()
+    members: tuple["Member", ...] = ()
 
     @property
     def unit(self) -> str:
@@ -148,8 +159,12 @@ def _make_plan(
         venv=venv,
         attached=request.attached,
         env_keys=tuple(variables),
+        placed=request.placed,
+        machine=request.machine,
+        head=request.head,
     )
     options = with_settings(options, settings)
+    options, members = _spread(dataflow, options, settings, variables)
     called = called_variables(dataflow, request.caller)
     environment = unit_environment(search_path, venv, {**called, **variables})
     check_credentials(scope, credential_files(settings))
@@ -163,7 +178,22 @@ def _make_plan(
     prepared = Prepared(dataflow, launch, {})
     sandbox = make_sandbox(scope, settings, look.user, prepared, look.sight)
     notes = tuple(plan_notes(scope, dataflow, launch, look))
-    return Plan(scope, options, settings, look.user, environment, sandbox, notes)
+    return Plan(scope, options, settings, look.user, environment, sandbox, notes, members)
+
+
+def _spread(
+    dataflow: Dataflow, options: RunnerOptions, settings: Settings, variables: Mapping[str, str]
+) -> "tuple[RunnerOptions, tuple[Member, ...]]":
+    """The options of the runner here, and what other machines are told."""
+    is_spread = settings[MACHINES] or any("deploy" in node.raw for node in dataflow.nodes)
+    if not (options.machine or is_spread):
+        return options, ()
+    # Imported late: most dataflows run on one machine.
+    from dora_systemd.decisions.machines.spread import part, spread
+
+    if options.machine:
+        return part(options, settings), ()
+    return spread(dataflow, options, settings, variables, os.uname().nodename)
 
 
 def _variables(settings: Settings, look: Look) -> dict[str, str]:

@@ -18,6 +18,7 @@ from dora_systemd.values import shown
 
 SYSTEM_FILE = Path("/etc/dora-systemd/config.yml")
 USER_FILE = Path("dora-systemd/config.yml")
+_ANY_FILE = Path("/dataflow.yml")
 
 
 @dataclass(frozen=True)
@@ -76,6 +77,27 @@ def read_settings(
     roots = resolve_settings(flags, environment, documents, SETTINGS)
     named, by_root = settings[ENV_FILE], roots[ENV_FILE]
     return replace(settings, lent=frozenset(one for one in named if one not in by_root))
+
+
+def config_file(scope: Scope, environment: Mapping[str, str]) -> Path:
+    """The settings file for all dataflows of the scope; it need not exist."""
+    places = settings_files(_ANY_FILE, environment)[1:]
+    return places[0] if scope.is_user else SYSTEM_FILE
+
+
+def key_place(scope: Scope, environment: Mapping[str, str]) -> Path:
+    """The directory with the keys of machines, one file each; it need not exist."""
+    return config_file(scope, environment).parent / "ssh"
+
+
+def read_config(scope: Scope, environment: Mapping[str, str]) -> Settings:
+    """The settings for all dataflows. Raises DoraSystemdError."""
+    found = [_read(one) for one in settings_files(_ANY_FILE, environment)[1:] if exists(one)]
+    for one in found:
+        if not scope.is_user and not one.is_roots:
+            _check_trust(one)
+    documents = [(str(one.path), one.document) for one in found]
+    return resolve_settings({}, {}, documents, SETTINGS)
 
 
 def require_modest(path: Path) -> None:

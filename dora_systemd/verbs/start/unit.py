@@ -1,9 +1,13 @@
 """The unit of a plan: its properties for systemd, and its text for people."""
 
+import os
 import sys
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.dora.command import version_numbers
+from dora_systemd.decisions.properties.assignments import with_properties
 from dora_systemd.decisions.properties.kinds import Property
 from dora_systemd.decisions.settings.limits import DEVICE
 from dora_systemd.decisions.settings.needs import NEEDS
@@ -11,13 +15,19 @@ from dora_systemd.decisions.settings.runner_options import idle_warnings
 from dora_systemd.decisions.unit.file import persistent_unit
 from dora_systemd.decisions.unit.properties import UnitContext, format_unit, unit_properties
 from dora_systemd.decisions.unit.versions import MIN_VERSION, drop_unsupported
+from dora_systemd.paths import CellPaths
+from dora_systemd.trust.paths import exists
 from dora_systemd.verbs.needs.check import Needy, check_needs
 from dora_systemd.verbs.needs.notes import clock_service, needs_warnings
 from dora_systemd.verbs.start.credentials import credential_files
 from dora_systemd.verbs.start.limits import check_limits
 from dora_systemd.verbs.start.plan import Plan
 from dora_systemd.verbs.start.sandbox import sandbox_warnings
+from dora_systemd.verbs.start.settings import key_place
 from dora_systemd.verbs.start.watch import watch_warnings
+
+if TYPE_CHECKING:  # most dataflows run on one machine
+    from dora_systemd.decisions.machines.link_unit import LinkUnit
 
 
 def plan_properties(plan: Plan, manager: Manager) -> tuple[dict[str, Property], tuple[str, ...]]:
@@ -44,16 +54,40 @@ def systemd_number(manager: Manager) -> int:
     return next(iter(version_numbers(manager.version())), MIN_VERSION)
 
 
+def plan_links(plan: Plan) -> "list[LinkUnit]":
+    """The units of the links to the members."""
+    if not plan.members:
+        return []
+    # Imported late: most dataflows run on one machine.
+    from dora_systemd.decisions.machines.link_unit import link_unit
+
+    options, is_user = plan.options, plan.scope.is_user
+    socket = str(CellPaths(plan.scope.cell_directory(options.name)).socket)
+    place = key_place(plan.scope, os.environ)
+    keys = {one.machine: str(path) for one in plan.members if exists(path := place / one.machine)}
+    return [
+        link_unit(sys.executable, socket, options, one, is_user, keys.get(one.machine, ""))
+        for one in plan.members
+    ]
+
+
 def format_plan(plan: Plan, target: str | None = None) -> str:
     """The unit as the text of a unit file, below comments with its name and sources.
 
-    target: the one that would start it at boot.
+    The units of links follow. Their ExecStart= has what the member is told. target: the one that
+    would start it at boot.
     """
     head = f"# {plan.unit}\n# source: {plan.options.dataflow}\n"
     text = format_unit(_properties(plan))
     if target is not None:
         text = persistent_unit([text], plan.options, plan.scope.is_user, target)
-    return head + text
+    return head + text + "".join(_format_links(plan))
+
+
+def _format_links(plan: Plan) -> Iterator[str]:
+    for member, link in zip(plan.members, plan_links(plan), strict=True):
+        yield f"\n# {link.unit}\n# machine {member.machine}: {member.host.text}\n"
+        yield format_unit(link.properties)
 
 
 def _properties(plan: Plan) -> dict[str, Property]:
@@ -66,4 +100,10 @@ def _properties(plan: Plan) -> dict[str, Property]:
         sandbox=plan.sandbox,
         clock=clock_service(),
     )
-    return dict(unit_properties(plan.options, context, plan.settings))
+    properties = dict(unit_properties(plan.options, context, plan.settings))
+    if plan.members:
+        # Imported late: most dataflows run on one machine.
+        from dora_systemd.decisions.machines.link_unit import wanted_links
+
+        return with_properties(properties, wanted_links(plan.options))
+    return properties

@@ -5,7 +5,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any, Self
 
-from dora_systemd.adapters.bus.manager import JOB_DONE, Observer, Property, UnitState
+from dora_systemd.adapters.bus.manager import JOB_DONE, Beside, Observer, Property, UnitState
 from dora_systemd.decisions.cell.options import RunnerOptions, runner_command
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import unit_description, unit_name
@@ -105,9 +105,17 @@ class FakeManager:
         return {name: facts.get(name, "") for name in names}
 
     def start_transient(
-        self, unit: str, properties: Sequence[Property], observer: Observer | None, wait: bool
+        self,
+        unit: str,
+        properties: Sequence[Property],
+        observer: Observer | None,
+        wait: bool,
+        beside: Beside = (),
     ) -> str:
         self.calls.append(("start", unit, wait))
+        for name, of_it in beside:
+            self.units[name] = {"LoadState": "loaded", "ActiveState": "active"}
+            self.units[name] |= {key: value for key, _, value in of_it}
         self._tell(observer)
         self.units.setdefault(unit, {"LoadState": "loaded", "ActiveState": "active"})
         self.units[unit] |= {name: value for name, _, value in properties}

@@ -247,7 +247,7 @@ def test_dora_starts_the_file_of_its_session(
     def claimed(_bus: object, _scope: object, wanted: StartRequest, by: str) -> SimpleNamespace:
         assert by == "dora start"
         asked.append(wanted)
-        return SimpleNamespace(plan=SimpleNamespace(options=None), properties={})
+        return SimpleNamespace(plan=SimpleNamespace(options=None), properties={}, links=())
 
     monkeypatch.setattr(starting, "claim", claimed)
     monkeypatch.setattr(starting, "start_unit", lambda *_, **__: SimpleNamespace(uuid=UUID))

@@ -62,7 +62,9 @@ LATE = {
         "verbs.facts.selector": {"verbs.facts.ended"},
         "verbs.list": {"verbs.facts.ended"},
         "runner.nodes.losses": {"adapters.journal.reader"},
-        "verbs.stop": {"adapters.journal.reader", "verbs.start.enable"},
+        "verbs.stop": {
+            *("adapters.journal.reader", "verbs.start.claim", "verbs.start.enable"),
+        },
     },
     "pydantic: only a settings file needs it": {
         "decisions.settings.resolve": {"decisions.settings.schema"},
@@ -74,7 +76,7 @@ LATE = {
     },
     "YAML, and every compressor: most who read a file need neither": {
         "adapters.host.files": {"yaml", "adapters.host.yaml_loader"},
-        "cli.verbs.look.logs": {"verbs.follow"},
+        "cli.verbs.look.logs": {"verbs.follow", "cli.remote.machines"},
     },
     "limits, CPUs or rights of single nodes only": {
         "decisions.cell.limits": {"node_words"},
@@ -86,12 +88,22 @@ LATE = {
         "decisions.views.outcome": {"decisions.views.objects"},
     },
     "most dataflows owe nothing, and wait for nothing": {
-        "adapters.dora.preparation": {"adapters.dora.probe"},
+        "adapters.dora.preparation": {"adapters.dora.probe", "decisions.machines.part"},
         "runner.owes.begin": {"runner.owes.watch"},
         "verbs.facts.reading": {"decisions.owes.probe", "verbs.facts.held"},
     },
     "a program of its own: it makes room first, and it runs with the Python of the nodes": {
         "runner.owes.listen": {"dora"},
+    },
+    "most dataflows run on one machine, and most links are not lost": {
+        "decisions.cell.launch": {"decisions.cell.placed"},
+        "runner.roles": {"runner.machines.head", "runner.machines.member"},
+        "verbs.start.plan": {"decisions.machines.spread"},
+        "verbs.why": {"verbs.facts.machines"},
+        "verbs.start.unit": {"decisions.machines.link_unit"},
+        "verbs.start.claim": {"decisions.machines.link_unit"},
+        "verbs.start.enable": {"decisions.machines.link_unit"},
+        "link.talk": {"link.parting"},
     },
     "hot reload only": {
         "adapters.host.watch": {"watchfiles"},
@@ -101,7 +113,6 @@ LATE = {
     "most dataflows have no notify sockets": {
         "runner.signs.hook": {"runner.signs.sockets"},
         "runner.cell.dialogue": {"runner.signs.watch"},
-        "decisions.cell.options": {"decisions.signs.watchdogs"},
         "verbs.facts.list": {"decisions.signs.table"},
     },
     "asyncio and WebSockets: of all verbs, a few need one of them": {

@@ -23,7 +23,7 @@ LAYERS = (
     {"decisions"},
     {"trust"},
     {"adapters"},
-    {"verbs", "runner"},
+    {"verbs", "runner", "link"},
     {"gateway"},
     {"cli"},
 )
@@ -261,6 +261,8 @@ STARTS_PROGRAMS = {
     "adapters.dora.engine": "dora's, in a cell",
     "adapters.journal.journalctl": "journalctl",
     "adapters.ssh.program": "ssh, as the caller",
+    "link.program": "ssh, as the caller of doractl start",
+    "verbs.machines.member": "itself, as a smaller program",
     "adapters.host.guard": "itself, without another program",
     "verbs.node": "dora, as the caller",
     "verbs.inhibit.hold": "what the caller has typed, as the caller",

@@ -49,21 +49,23 @@ _TABLE = {
     OWN: """
         adapters.dora.preparation adapters.host.files adapters.ssh.program cli.main
         cli.edge cli.verbs.look.logs decisions.cell.launch verbs.inhibit.hold
-        verbs.start.credentials verbs.start.limits
+        verbs.machines.member verbs.start.credentials verbs.start.limits
     """,
     KERNEL: """
         adapters.cgroup.groups adapters.host.lock_table adapters.host.machine
         adapters.host.process_table adapters.host.real_time adapters.host.rights
         runner.cell.pause trust.socket_table verbs.destroy
-        verbs.facts.lives verbs.facts.reading verbs.start.sandbox
+        link.relay verbs.facts.lives verbs.facts.reading verbs.start.sandbox verbs.why
     """,
     ROOTS: """
         adapters.bus.connection adapters.bus.errors adapters.host.unit_files
+        adapters.host.unit_names
         adapters.host.guard
         adapters.releases.build_tree adapters.releases.draft adapters.releases.incoming
         adapters.releases.store verbs.releases.trial
         adapters.journal.journalctl adapters.journal.reader adapters.journal.socket verbs.doctor
         verbs.facts.enabled verbs.facts.locks verbs.follow verbs.gateway verbs.needs.notes
+        verbs.machines.keys verbs.machines.register
         verbs.setup verbs.show verbs.start.enable verbs.up
     """,
     INSTALLED: """
@@ -75,7 +77,7 @@ _TABLE = {
         adapters.host.watch adapters.logs.held adapters.logs.jsonl adapters.logs.pipes
         adapters.runner_socket.listener adapters.runner_socket.relay runner.cell.begin
         adapters.host.presence runner.needs.needs runner.nodes.gate
-        runner.cell.engine runner.cell.pump runner.main runner.nodes.nodes
+        runner.cell.engine runner.cell.pump runner.machines.head runner.main runner.nodes.nodes
         runner.owes.listen runner.reload.settings_file runner.reload.sources runner.stop_post
     """,
     OTHERWISE: """

@@ -28,6 +28,7 @@ nodes = st.builds(
     NodeStatus,
     *(st.sampled_from(NODE_STATES), counts, counts, times, exits, st.text()),
     max_restarts=counts,
+    machine=st.sampled_from(["", "gpu"]),
 )
 samples = st.builds(
     CpuSample,

@@ -58,6 +58,15 @@ SAMPLES: dict[type[life.Event], tuple[life.Event, ...]] = {
     life.NodeRemoved: (life.NodeRemoved(1, "a"), life.NodeRemoved(1, "unknown")),
     life.ReloadNoted: (life.ReloadNoted(1, "a.py: line 3: invalid syntax"),),
     life.ReloadAsked: (life.ReloadAsked(1),),
+    life.MachinesAwaited: (life.MachinesAwaited(1, "waiting for machine gpu"),),
+    life.MachineJoined: (life.MachineJoined(1, "gpu"),),
+    life.Gathered: (life.Gathered(1),),
+    life.MachineLost: (
+        life.MachineLost(1, "gpu", "no word for 7s"),
+        life.MachineLost(1, "gpu", "", by="SIGTERM"),
+    ),
+    life.HeadStops: (life.HeadStops(1, "SIGTERM"),),
+    life.HeadLost: (life.HeadLost(1, "no word for 7s"),),
     life.DeadlinePassed: (life.DeadlinePassed(1),),
 }
 

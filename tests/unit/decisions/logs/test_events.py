@@ -35,6 +35,7 @@ def test_catalog_entry_says_what_and_what_to_do(name: str) -> None:
             "DORA_FILE",
             "DORA_COUNT",
             "DORA_LIMIT",
+            "DORA_MACHINE",
             "DORA_MOST",
             "DORA_OUTPUT",
             "DORA_THEN",

@@ -12,6 +12,7 @@ from dora_systemd.decisions.cell.line_rates import RateLimit
 from dora_systemd.decisions.cell.owed import Owed
 from dora_systemd.decisions.properties.sandbox import LEVELS, NETWORKS
 from dora_systemd.decisions.settings.kinds import DURATION, PATHS, TEXT, Setting
+from dora_systemd.decisions.settings.machines import Declared
 from dora_systemd.decisions.settings.resolve import (
     DEFAULT_SOURCE,
     Settings,
@@ -227,6 +228,9 @@ def test_values_and_back(data: st.DataObject) -> None:
         "writable": st.lists(texts).map(tuple),
         "credentials": st.dictionaries(
             st.from_regex(r"[a-z.]{3,9}", fullmatch=True), texts.filter(lambda x: x[-1] != "\\")
+        ),
+        "machines": st.dictionaries(
+            st.sampled_from(["gpu", "npu"]), texts.map(lambda x: Declared({"host": x}, (None,)))
         ),
         **LIMIT_VALUES,
         **RESTART_VALUES,

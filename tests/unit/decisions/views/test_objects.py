@@ -10,7 +10,7 @@ from dora_systemd.decisions.views.rows import DataflowRow, NodeRow
 from dora_systemd.values import SECOND
 
 UNKNOWN = DataflowRow("u", "robot", "dora-robot.service", "Failed", nodes=(NodeRow("a", "failed"),))
-KNOWN_OF_IT = {"name", "uuid", "unit", "status", "enabled", "nodes", "inhibitors"}
+KNOWN_OF_IT = {"name", "uuid", "unit", "status", "enabled", "machines", "nodes", "inhibitors"}
 KNOWN_OF_NODE = {"node", "state", "outputs"}
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from dora_systemd.adapters.bus.manager import Observer, Property
+from dora_systemd.adapters.bus.manager import Beside, Observer, Property
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.verbs.start.check import check_plan
 from tests.unit.fakes.manager import FakeManager
@@ -22,12 +22,17 @@ class CheckingManager(FakeManager):
         self.given: dict[str, Any] = {}
 
     def start_transient(
-        self, unit: str, properties: Sequence[Property], observer: Observer | None, wait: bool
+        self,
+        unit: str,
+        properties: Sequence[Property],
+        observer: Observer | None,
+        wait: bool,
+        beside: Beside = (),
     ) -> str:
         self.given = {name: value for name, _, value in properties}
         os.write(self.given["StandardOutputFileDescriptor"], self.said)
         self.after_job[unit] = {"ExecMainCode": 1, "ExecMainStatus": self.status}
-        return super().start_transient(unit, properties, observer, wait)
+        return super().start_transient(unit, properties, observer, wait, beside)
 
 
 @pytest.fixture(autouse=True)

@@ -4,6 +4,7 @@ import os
 import pwd
 import signal
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 import pytest
 
 from dora_systemd.adapters.dora.check import check_access
+from dora_systemd.decisions.cell.machines import Placed
 from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
 from dora_systemd.decisions.settings.table import ENV_FILE, SETTINGS, UV
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -173,6 +175,7 @@ ROOT_ONLY = {
     "realtime": "20",
     "cpu_weight": "10000",
     "io_weight": "10000",
+    "machines": "{gpu: {host: gpu-box}}",
 }
 
 
@@ -374,3 +377,37 @@ def test_a_build_that_is_missing_or_older_than_the_dataflow(project: Path) -> No
 
 def test_rust_log_of_the_owner(project: Path) -> None:
     assert plan_of(project, {"RUST_LOG": "debug"}).environment["RUST_LOG"] == "debug"
+
+
+MACHINES = """nodes:
+- {id: a, path: a.py, inputs: {t: dora/timer/millis/100}}
+- {id: b, path: a.py, inputs: {t: dora/timer/millis/100}, deploy: {machine: gpu}}
+"""
+
+
+def test_a_dataflow_on_two_machines(project: Path) -> None:
+    (project / "robot.yml").write_text(MACHINES)
+    plan = plan_of(project, machines=("gpu=alice@gpu-box",), env=("A=1",))
+    assert plan.options.placed == (Placed("b", "gpu"),)
+    (member,) = plan.members
+    assert member.host.destination == "alice@gpu-box"
+    assert member.words == (
+        *("member", str(project / "robot.yml"), "--name=robot", f"--uuid={plan.options.uuid}"),
+        *(f"--head={os.uname().nodename}", "--placed=b=gpu", "--env=A=1"),
+    )
+    with pytest.raises(DoraSystemdError, match="node b: its machine 'gpu' is not declared"):
+        plan_of(project)
+
+
+def test_a_part_of_a_dataflow(project: Path) -> None:
+    """A member needs no machines: it is told where the nodes run."""
+    (project / "robot.yml").write_text(MACHINES)
+    placed = (Placed("b", "gpu"),)
+    variables = {"PATH": f"{project}/bin:/usr/bin:/bin"}
+    file = str(project / "robot.yml")
+    request = StartRequest(file, environment=variables, machine="gpu", placed=placed)
+    options = make_plan(USER, request).options
+    assert (options.placed, options.machine) == (placed, "gpu")
+    flags = {"network": "private"}
+    with pytest.raises(DoraSystemdError, match="the network is private"):
+        make_plan(USER, replace(request, flags=flags))

@@ -1,0 +1,151 @@
+"""The handlers of what is different if a dataflow has several machines, see handlers.py.
+
+A lost machine is a lost run: dora cannot go on without one of its daemons, and to ask it to stop
+then takes half a minute. So each machine ends its own nodes, and systemd of the head starts the
+whole again.
+"""
+
+from dataclasses import replace
+
+from dora_systemd.decisions.cell.machines import HEAD
+from dora_systemd.decisions.life import events as life
+from dora_systemd.decisions.life import handlers as handle
+from dora_systemd.decisions.life import nodes as table
+from dora_systemd.decisions.life.causes import Cause
+from dora_systemd.decisions.life.failures import (
+    ENGINE_TIMEOUT,
+    Next,
+    because,
+    engine_deadline,
+    fail,
+    to,
+)
+from dora_systemd.decisions.life.states import Action, Cell, Do, Record, RunnerExit, State
+from dora_systemd.decisions.life.stop_budget import stop_timeout
+from dora_systemd.values import SECOND
+
+_ENDED = ("failed", "finished", "stopped", "dynamic")
+
+
+def boot_deadline(cell: Cell, event: life.DeadlinePassed) -> Next:
+    """Nothing has come of the first step: of a member, nobody has told it what to run."""
+    if not cell.machine:
+        return engine_deadline(cell, event)
+    reason = f"no head has said what to run within {ENGINE_TIMEOUT // SECOND} s"
+    return fail(because(cell, Cause.NO_ANSWER), reason, RunnerExit.FAILED)
+
+
+def joined(cell: Cell, event: life.DaemonConnected) -> Next:
+    """The daemon has registered: wait for the other machines, if there are any."""
+    if not cell.members and not cell.machine:
+        return handle.joined(cell, event)
+    return to(cell, State.GATHERING, Do.GATHER)
+
+
+def awaited(cell: Cell, event: life.MachinesAwaited) -> Next:
+    """Show what is missing."""
+    return replace(cell, awaited=event.text), ()
+
+
+def gathered(cell: Cell, event: life.Gathered) -> Next:
+    """All machines are there: send the descriptor."""
+    return handle.joined(replace(cell, awaited=""), life.DaemonConnected(event.at_us))
+
+
+def found(cell: Cell, event: life.RunStarted) -> Next:
+    """A member has found the run that the head has started: subscribe to its events."""
+    cell = replace(cell, run=event.run, awaited="")
+    return to(cell, State.STARTING, Do.SUBSCRIBE, after=ENGINE_TIMEOUT)
+
+
+def machine_joined(cell: Cell, event: life.MachineJoined) -> Next:
+    """A member can take nodes."""
+    name = "machine-back" if event.machine in cell.lost else "machine-joined"
+    return cell, (Record(name, "", {"machine": event.machine}),)
+
+
+def machine_away(cell: Cell, event: life.MachineLost) -> Next:
+    """A member that had joined is gone, and nothing runs yet: wait for it.
+
+    If somebody has stopped it there: its link would only start it again.
+    """
+    if event.by:
+        cell = _stopped_there(cell, event)
+        failed, actions = fail(cell, cell.failure, cell.exit)
+        return failed, (_lost(event.machine, event.reason), *actions)
+    lost = cell.lost | {event.machine}
+    return replace(cell, lost=lost), (_lost(event.machine, event.reason),)
+
+
+def _lost(machine: str, reason: str) -> Record:
+    return Record("machine-lost", "", {"machine": machine, "reason": reason})
+
+
+def machine_lost(cell: Cell, event: life.MachineLost) -> Next:
+    """A member is gone, and with it the run: end the nodes that are here."""
+    if event.by:
+        cell = _stopped_there(cell, event)
+    else:
+        cell = because(cell, Cause.MACHINE_LOST)
+        failure = f"machine {event.machine}: {event.reason}"
+        cell = replace(cell, failure=failure, exit=RunnerExit.ENGINE_LOST)
+    return _end_nodes(cell, event, _lost(event.machine, event.reason))
+
+
+def _stopped_there(cell: Cell, event: life.MachineLost) -> Cell:
+    failure = f"it was stopped on machine {event.machine} by {event.by}"
+    cell = because(cell, Cause.STOPPED_ON_MACHINE)
+    return replace(cell, failure=failure, exit=RunnerExit.STOPPED_ON_MACHINE)
+
+
+def machine_lost_stopping(cell: Cell, event: life.MachineLost) -> Next:
+    """A member is gone while dora stops all: it would wait for that machine."""
+    if not any(
+        cell.nodes[node].machine == event.machine for node in table.with_process(cell.nodes)
+    ):
+        return cell, ()
+    return _end_nodes(cell, event, _lost(event.machine, event.reason))
+
+
+def _end_nodes(cell: Cell, event: life.Event, *actions: Action) -> Next:
+    """End the nodes of this machine without dora; those of others end by themselves."""
+    cell = replace(cell, nodes=_without_others(cell, event.at_us))
+    return to(cell, State.STOPPING, *actions, Do.END_NODES, after=stop_timeout(cell.grace))
+
+
+def _without_others(cell: Cell, at_us: int) -> table.NodeTable:
+    return {
+        ident: node._replace(state="stopped", since_us=at_us)
+        if node.machine and node.state not in _ENDED
+        else node
+        for ident, node in cell.nodes.items()
+    }
+
+
+def head_stops(cell: Cell, event: life.HeadStops) -> Next:
+    """Dora is about to end the nodes, and nobody here has to ask it."""
+    cell = replace(cell, stop_by=event.by)
+    if not table.has_process(cell.nodes):
+        return handle.wind_down(cell, _stopping(event.by))
+    return to(cell, State.STOPPING, _stopping(event.by), after=stop_timeout(cell.grace))
+
+
+def head_lost(cell: Cell, event: life.HeadLost) -> Next:
+    """A member alone: end the nodes, and with success, for the head decides what follows."""
+    cell = replace(cell, stop_by=HEAD)
+    return _end_nodes(cell, event, _lost(HEAD, event.reason), _stopping(HEAD))
+
+
+def head_lost_stopping(cell: Cell, event: life.HeadLost) -> Next:
+    """The head is gone while dora stops all: do not wait for it."""
+    return _end_nodes(cell, event)
+
+
+def end_early(cell: Cell, event: life.HeadLost | life.HeadStops) -> Next:
+    """The head is gone before any node of a member runs."""
+    by = event.by if isinstance(event, life.HeadStops) else HEAD
+    return handle.stop_early(cell, life.StopAsked(event.at_us, by))
+
+
+def _stopping(by: str) -> Record:
+    return Record("dataflow-stopping", "", {"by": by})

@@ -1,0 +1,113 @@
+"""What an entry of `machines:` says about one machine. Pure.
+
+    gpu: {host: alice@gpu-box, directory: /home/alice/robot, venv: /opt/vision, memory_limit: 8G}
+
+Paths in it are paths on that machine; relative ones start in its directory.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import PurePath
+from typing import Any, NamedTuple
+
+from dora_systemd.decisions.remote.hosts import Host, parse_host
+from dora_systemd.decisions.settings.credentials import CREDENTIAL_SETTINGS
+from dora_systemd.decisions.settings.kinds import Scalar, Setting, one_text
+from dora_systemd.decisions.settings.limits import LIMIT_SETTINGS, NODE_LIMIT
+from dora_systemd.decisions.settings.machines import HOST, Declared
+from dora_systemd.decisions.settings.resolve import check_document
+from dora_systemd.decisions.settings.sandbox import SANDBOX, WRITABLE
+from dora_systemd.decisions.settings.table import DORA, ENV, ENV_FILE, PROPERTY, USER, VENV
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.values import quoted, scalar_text, shown
+
+LINKS = ("ssh",)
+_TEXT = one_text(Scalar, "a text", "TEXT", str)
+_LABELS = one_text(dict[str, Scalar], "a mapping, LABEL: VALUE", "", str)
+_OWN = (
+    Setting[str](HOST, _TEXT, "", ""),
+    Setting[str]("directory", _TEXT, "", ""),
+    Setting[str]("link", _TEXT, "", ""),
+    Setting[str]("labels", _LABELS, "", ""),
+)
+_UNIT: tuple[Setting[Any], ...] = (
+    *(ENV, ENV_FILE, VENV, PROPERTY, USER, DORA),
+    *(one for one in LIMIT_SETTINGS if one.flags and one is not NODE_LIMIT),
+    *CREDENTIAL_SETTINGS,
+    *(SANDBOX, WRITABLE),
+)
+OF_MACHINES = tuple(replace(one, per_node=False) for one in _UNIT)
+"""The settings of a unit that each machine may have of its own."""
+
+
+class Machine(NamedTuple):
+    """A declared machine.
+
+    directory: of the dataflow file there, absolute, or "" for the same as here. settings: with
+    their values. is_own: it is declared for this dataflow, and not for all in a config.yml.
+    """
+
+    name: str
+    host: Host
+    directory: str
+    labels: Mapping[str, str]
+    settings: Sequence[tuple[Setting[Any], Any]]
+    is_own: bool
+
+
+def parse_entry(name: str, declared: Declared, source: str, dataflow: str) -> Machine:
+    """The machine that is declared so.
+
+    source: the flags and files that declare machines. dataflow: its file here. Raises
+    DoraSystemdError (BAD_INPUT) that names source and key.
+    """
+    where = f"machines.{name} in {shown(source)}"
+    values = check_document(where, declared.values, (*_OWN, *OF_MACHINES))
+    here = PurePath(dataflow).parent
+    directory = _directory(values.get("directory"), where)
+    _check_link(values.get("link", LINKS[0]), where)
+    labels = values.get("labels", {})
+    return Machine(
+        name,
+        _host(values.get(HOST, name), where),
+        directory,
+        {key: scalar_text(value) for key, value in labels.items()},
+        tuple(_settings(values, PurePath(directory or here), where)),
+        any(base in (None, here) for base in declared.bases),
+    )
+
+
+def _settings(
+    values: Mapping[str, Any], base: PurePath, where: str
+) -> Iterator[tuple[Setting[Any], Any]]:
+    for setting in OF_MACHINES:
+        if setting.name in values:
+            try:
+                yield setting, setting.kind.parse(values[setting.name], base)
+            except DoraSystemdError as error:
+                raise _refusal(f"{setting.name} of {where}: {error.message}", error.hint) from error
+
+
+def _host(value: Any, where: str) -> Host:
+    try:
+        return parse_host(scalar_text(value))
+    except DoraSystemdError as error:
+        raise _refusal(f"{HOST} of {where}: {error.message}", "write [user@]HOST[:PORT]") from error
+
+
+def _directory(value: Any, where: str) -> str:
+    text = scalar_text(value) if value is not None else ""
+    if text and not (text.startswith("/") and text.isprintable() and ".." not in text.split("/")):
+        hint = "write an absolute path of that machine without '..'"
+        raise _refusal(f"directory of {where}: cannot use {quoted(text)}", hint)
+    return str(PurePath(text)) if text else ""
+
+
+def _check_link(value: Any, where: str) -> None:
+    if value not in LINKS:
+        hint = f"valid values: {', '.join(LINKS)}"
+        raise _refusal(f"link of {where}: cannot use {quoted(scalar_text(value))}", hint)
+
+
+def _refusal(message: str, hint: str) -> DoraSystemdError:
+    return DoraSystemdError(message, hint, ExitCode.BAD_INPUT)

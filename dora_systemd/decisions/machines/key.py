@@ -1,0 +1,56 @@
+"""The key of a machine, with which a link can log in there and do nothing else. Pure.
+
+See AUTHORIZED_KEYS FILE FORMAT in sshd(8). sshd runs the forced command, and puts what the link has
+asked for into a variable.
+"""
+
+import re
+import shlex
+
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.values import quoted
+
+ORIGINAL = "SSH_ORIGINAL_COMMAND"
+_SHELL = 5
+"""The words before the mark, see remote_command(): exec sh -c SCRIPT doractl."""
+_PUBLIC = re.compile(r"ssh-[a-z0-9-]+ [A-Za-z0-9+/=]+")
+_MARK = re.compile(r"[a-z]+-[0-9a-f]{32}")
+
+
+def authorized_line(program: str, public: str, comment: str) -> str:
+    """The line for authorized_keys. program: absolute path of doractl on that machine.
+
+    Forwards are for 127.0.0.1 only. Raises DoraSystemdError (BAD_INPUT) for what is no public key,
+    and for a path that cannot stand there.
+    """
+    if not re.fullmatch(r"/[A-Za-z0-9_./+-]+", program):
+        raise _refusal(f"cannot use {quoted(program)} there as doractl", "link it into /usr/bin")
+    found = _PUBLIC.match(public)
+    if not found:
+        raise _refusal("cannot read the public key", "see ssh-keygen(1)")
+    only = 'permitlisten="127.0.0.1:*",permitopen="127.0.0.1:*"'
+    return f'restrict,port-forwarding,{only},command="{program} member" {found[0]} {comment}'
+
+
+def forced_words(original: str) -> tuple[str, list[str]]:
+    """The mark to print, and the arguments of doractl, from what the link has asked for.
+
+    Raises DoraSystemdError (USAGE) for everything that is no part of a dataflow.
+    """
+    try:
+        words = shlex.split(original)
+    except ValueError as error:
+        raise _not_allowed() from error
+    mark, *arguments = words[_SHELL:] or [""]
+    if not _MARK.fullmatch(mark) or arguments[:1] != ["member"]:
+        raise _not_allowed()
+    return mark, arguments[1:]
+
+
+def _not_allowed() -> DoraSystemdError:
+    hint = "log in with another key"
+    return DoraSystemdError("this key can only run parts of dataflows", hint, ExitCode.USAGE)
+
+
+def _refusal(message: str, hint: str) -> DoraSystemdError:
+    return DoraSystemdError(message, hint, ExitCode.BAD_INPUT)

@@ -1,0 +1,122 @@
+"""The command line of a link, and that of its ssh(1). Pure.
+
+doractl writes the first one: nobody who runs nodes can tell root on another machine what to run.
+The link is a process for as long as the dataflow runs: imports only what is small.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from dora_systemd.decisions.cell.machines import HEAD
+from dora_systemd.decisions.machines.wire import PORT_RANGE, Forwards
+from dora_systemd.decisions.remote.command import Way, remote_command
+from dora_systemd.decisions.remote.hosts import parse_host
+from dora_systemd.errors import DoraSystemdError, ExitCode
+
+MODULE = "dora_systemd.link"
+RELAY_MODULE = "dora_systemd.link.relay"
+_KEYS = ("socket", "machine", "host", "identity")
+_MOST_MACHINES = 64
+_OPTIONS = {
+    "BatchMode": "yes",
+    "ExitOnForwardFailure": "yes",
+    # Later than the lease: after a gap of 4 s TCP needs two more to send again.
+    "ServerAliveInterval": "2",
+    "ServerAliveCountMax": "5",
+    # Also for the first words of sshd, on a machine that is busy.
+    "ConnectTimeout": "8",
+    # A connection of its own, whatever ssh_config(5) has.
+    "ControlMaster": "no",
+    "ControlPath": "none",
+    "ClearAllForwardings": "no",
+    "GatewayPorts": "no",
+    "ForwardAgent": "no",
+    "ForwardX11": "no",
+    "RemoteCommand": "none",
+    # The sandbox of the link lets it write nothing.
+    "UpdateHostKeys": "no",
+    "LogLevel": "ERROR",
+}
+
+
+class LinkOptions(NamedTuple):
+    """The command line of a link.
+
+    socket: absolute path, of the head's runner. machine: the member. host: for ssh(1), as in -H.
+    words: the arguments of doractl on the member. identity: a file with a key, or "".
+    """
+
+    socket: str
+    machine: str
+    host: str
+    words: tuple[str, ...]
+    identity: str = ""
+
+
+def link_command(python: str, link: LinkOptions) -> list[str]:
+    """ExecStart= of the unit. python: absolute path of the interpreter of dora-systemd."""
+    own = [f"--{key}={getattr(link, key)}" for key in _KEYS]
+    return [python, "-E", "-P", "-m", MODULE, *own, *link.words]
+
+
+def parse_link_argv(arguments: Sequence[str]) -> LinkOptions:
+    """The options in the arguments of link_command(). Raises DoraSystemdError (USAGE)."""
+    pairs = [one.partition("=") for one in arguments[: len(_KEYS)]]
+    words = tuple(arguments[len(_KEYS) :])
+    socket = pairs[0][2] if pairs else ""
+    if [key for key, _, _ in pairs] != [f"--{key}" for key in _KEYS] or not words:
+        raise _no_link()
+    if not socket.startswith("/"):
+        raise _no_link()
+    _, machine, host, identity = (value for _, _, value in pairs)
+    return LinkOptions(socket, machine, host, words, identity)
+
+
+def ssh_link_arguments(link: LinkOptions, forwards: Forwards, mark: str) -> list[str]:
+    """The arguments of ssh(1). mark: is printed first, see Way.
+
+    The numbers of ports are the same at both ends, so what dora tells of its addresses is true on
+    each machine. Raises DoraSystemdError (BAD_INPUT) for ports that are not safe to forward, and
+    for a host that is none.
+    """
+    check_forwards(forwards, link.machine)
+    host = parse_host(link.host)
+    own = forwards.zenoh[link.machine]
+    to_member = (port for name, port in forwards.zenoh.items() if name != link.machine)
+    words = [f"-o{key}={value}" for key, value in _OPTIONS.items()]
+    words += [f"-R{_same(port)}" for port in (forwards.coordinator, *to_member)]
+    words += [f"-L{_same(own)}"]
+    words += [f"-i{link.identity}", "-oIdentitiesOnly=yes"] if link.identity else []
+    words += [f"-p{host.port}"] if host.port else []
+    command = remote_command(Way.FED, member_words(link), mark)
+    return ["-T", *words, "--", host.destination, command]
+
+
+def member_words(link: LinkOptions) -> list[str]:
+    """The arguments of doractl on the member, with the name that the head has for it."""
+    verb, *rest = link.words
+    return [verb, f"--as={link.machine}", *rest]
+
+
+def check_forwards(forwards: Forwards, machine: str) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) for ports that a link does not forward.
+
+    The runner, whom the user of the nodes can replace, chooses them. All of its users can reach the
+    ports on both machines, so none may be that of a usual service.
+    """
+    ports = [forwards.coordinator, *forwards.zenoh.values()]
+    is_whole = {HEAD, machine} <= forwards.zenoh.keys() and len(ports) <= _MOST_MACHINES
+    if not is_whole or len(set(ports)) < len(ports) or any(one not in PORT_RANGE for one in ports):
+        first, last = PORT_RANGE[0], PORT_RANGE[-1]
+        hint = f"links take ports from {first} to {last}, each once"
+        message = f"cannot forward the ports to machine {machine}"
+        raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+
+
+def _same(port: int) -> str:
+    return f"127.0.0.1:{port}:127.0.0.1:{port}"
+
+
+def _no_link() -> DoraSystemdError:
+    hint = "doractl start starts the links of a dataflow"
+    return DoraSystemdError("cannot read the command line of a link", hint, ExitCode.USAGE)

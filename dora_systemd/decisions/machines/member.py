@@ -1,0 +1,154 @@
+"""What `doractl start` tells the members of a dataflow, and what is left to the head. Pure.
+
+What is said of nodes goes to the machine that runs them. What is said of the dataflow as a whole
+goes to all, as far as nodes see it: variables, the sandbox, the grace duration. Limits and other
+properties of the unit are those of the head; an entry of `machines:` has those of its machine.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import PurePath
+from typing import Any, NamedTuple
+
+from dora_systemd.decisions.cell.line_rates import ALL_NODES, RateLimits
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.machines.entry import Machine
+from dora_systemd.decisions.remote.hosts import Host
+from dora_systemd.decisions.settings.kinds import Setting
+from dora_systemd.decisions.settings.limits import NODE_LIMIT
+from dora_systemd.decisions.settings.needs import NEEDS
+from dora_systemd.decisions.settings.resolve import Settings
+from dora_systemd.decisions.settings.rights import NODE_RIGHTS
+from dora_systemd.decisions.settings.sandbox import SANDBOX
+from dora_systemd.decisions.settings.signs import NOTIFY, WATCHDOG
+from dora_systemd.decisions.settings.table import (
+    ALLOW_SHELL_NODES,
+    ENV,
+    GRACE_DURATION,
+    LOG_RATE_LIMIT,
+    UV,
+    WORKING_DIRECTORY,
+)
+from dora_systemd.decisions.signs.watchdogs import OFF, Watchdogs, watchdog_of
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.values import INFINITY
+
+VERB = "member"
+_SHARED: tuple[Setting[Any], ...] = (UV, ALLOW_SHELL_NODES, GRACE_DURATION, SANDBOX)
+_MOST_BYTES = 100_000
+"""Linux takes 128 KiB as one argument, and ssh(1) makes one of the whole command; see execve(2)."""
+
+
+class Member(NamedTuple):
+    """A machine that runs nodes of a dataflow whose head is here.
+
+    machine: its name. host: for ssh(1). words: the arguments of doractl there, which begin with
+    `member FILE`; nobody but doractl writes them, see dora_systemd.decisions.machines.wire.
+    """
+
+    machine: str
+    host: Host
+    words: tuple[str, ...]
+
+    def with_uuid(self, old: str, new: str) -> "Member":
+        """The same for a dataflow whose UUID turns out to be another one."""
+        told = {f"--uuid={old}": f"--uuid={new}"}
+        return self._replace(words=tuple(told.get(word, word) for word in self.words))
+
+
+def on_head(options: RunnerOptions) -> RunnerOptions:
+    """The options of the head's runner: without what only the runners of members need."""
+    away = {one.node for one in options.placed}
+    return options._replace(
+        head="",
+        node_limits=tuple(one for one in options.node_limits if one.node not in away),
+        node_rights=tuple(one for one in options.node_rights if one.node not in away),
+        needs=tuple(one for one in options.needs if one.node not in away),
+        log_rates={key: one for key, one in options.log_rates.items() if key not in away},
+        watchdogs=_without(options.watchdogs, away),
+    )
+
+
+def _without(watchdogs: Watchdogs, away: set[str]) -> Watchdogs:
+    kept = {node: limit for node, limit in watchdogs.items() if node not in away}
+    return {**kept, **dict.fromkeys(away, OFF)} if ALL_NODES in kept else kept
+
+
+def member_of(
+    machine: Machine,
+    options: RunnerOptions,
+    settings: Settings,
+    variables: Mapping[str, str],
+) -> Member:
+    """What the machine is told. Raises DoraSystemdError (BAD_INPUT) if that is too long.
+
+    options: before on_head(), with the name of the head. variables: of --env and of the
+    environment files here.
+    """
+    words = tuple(_words(machine, options, settings, variables))
+    if sum(len(word.encode()) + 4 for word in words) > _MOST_BYTES:
+        raise DoraSystemdError(
+            f"cannot start {options.name}: its settings are too long for machine {machine.name}",
+            "write them into the settings file on that machine",
+            ExitCode.BAD_INPUT,
+        )
+    return Member(machine.name, machine.host, words)
+
+
+def _words(
+    machine: Machine,
+    options: RunnerOptions,
+    settings: Settings,
+    variables: Mapping[str, str],
+) -> Iterator[str]:
+    here = PurePath(options.dataflow)
+    yield from (VERB, str(PurePath(machine.directory or here.parent, here.name)))
+    yield f"--name={options.name}"
+    yield f"--uuid={options.uuid}"
+    yield from [f"--head={options.head}"] if options.head else []
+    yield from (f"--placed={'='.join(one)}" for one in options.placed)
+    nodes = [one.node for one in options.placed if one.machine == machine.name]
+    given = [(one, settings[one]) for one in _SHARED if settings.is_given(one)]
+    given += _of_nodes(options, nodes)
+    if settings[WORKING_DIRECTORY] is not None:
+        given.append((WORKING_DIRECTORY, _directory(machine, options)))
+    own = {one.name: (one, value) for one, value in machine.settings}
+    _, env = own.pop(ENV.name, (ENV, {}))
+    given.append((ENV, {**variables, **env}))
+    kept = {one.name: (one, value) for one, value in given}
+    for setting, value in {**kept, **own}.values():
+        yield from _flags(setting, value)
+
+
+def _flags(setting: Setting[Any], value: Any) -> Iterator[str]:
+    flag = setting.flags[0]
+    if setting.kind.is_flag:
+        yield flag if value else flag.replace("--", "--no-", 1)
+    else:
+        yield from (f"{flag}={text}" for text in setting.kind.format(value))
+
+
+def _directory(machine: Machine, options: RunnerOptions) -> str:
+    """The working directory there: if it is below that of the dataflow file, it is so there."""
+    there, here = PurePath(options.working_directory), PurePath(options.dataflow).parent
+    if machine.directory and there.is_relative_to(here):
+        return str(PurePath(machine.directory, there.relative_to(here)))
+    return str(there)
+
+
+def _of_nodes(options: RunnerOptions, nodes: Sequence[str]) -> Iterator[tuple[Setting[Any], Any]]:
+    limits = {node: watchdog_of(options.watchdogs, node) for node in nodes}
+    yield NODE_LIMIT, _about(options.node_limits, nodes)
+    yield NODE_RIGHTS, _about(options.node_rights, nodes)
+    yield NEEDS, tuple("=".join(one) for one in options.needs if one.node in nodes)
+    yield LOG_RATE_LIMIT, _rates(options.log_rates, nodes)
+    yield WATCHDOG, {node: limit for node, limit in limits.items() if OFF < limit < INFINITY}
+    if INFINITY in limits.values():
+        yield NOTIFY, True
+
+
+def _about(given: Sequence[Any], nodes: Sequence[str]) -> tuple[Any, ...]:
+    return tuple(one for one in given if one.node in nodes)
+
+
+def _rates(rates: RateLimits, nodes: Sequence[str]) -> RateLimits:
+    return {node: one for node, one in rates.items() if node in (ALL_NODES, *nodes)}

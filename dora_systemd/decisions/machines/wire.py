@@ -1,0 +1,209 @@
+"""What head and member say to each other: lines of JSON through one ssh. Pure.
+
+    head's runner == link ==ssh== doractl member == member's runner
+
+The link gives the runner of the head a Link, and gets Forwards. Then it only carries lines. The
+first line to a member is a Part; after that each side says Beat every second. A side that hears
+nothing for LEASE ends its part of the dataflow. To the head a member is hostile, and the other way
+round: lines and texts are bounded, and every value has a type.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any, TypeVar
+
+from dora_systemd.decisions.cell.machines import HEAD, parse_machine
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import parse_name, parse_uuid
+
+VERSION = 1
+BEAT_SECONDS = 1.0
+LEASE_SECONDS = 7.0
+"""TCP sends again up to 6.2 s after a gap has begun, and ssh gives up later: this alone counts.
+"""
+MAX_LINE = 1 << 18
+"""Bytes of a line, with its end."""
+MAX_TEXT = 1000
+"""Characters of a text that people read; the rest is cut."""
+LOWEST_PORT, HIGHEST_PORT = 1024, 65535
+PORT_RANGE = range(61000, 65536)
+"""Where the head chooses ports that have to be free on all machines: outside of Linux's ephemeral
+ports, see ip_local_port_range in ip(7)."""
+
+
+@dataclass(frozen=True)
+class Forwards:
+    """Runner of the head to link: the ports of 127.0.0.1 that ssh makes the same on both machines.
+
+    coordinator: the head listens. zenoh: by machine, HEAD for the head; each listens on its own.
+    """
+
+    coordinator: int
+    zenoh: Mapping[str, int]
+
+
+@dataclass(frozen=True)
+class Lost:
+    """Link to the runner of the head: ssh has ended. words: its last line, or why there is none."""
+
+    words: str
+
+
+@dataclass(frozen=True)
+class Part:
+    """Head to member: what it shall run. The settings come from the command line of `member`.
+
+    name, uuid: of the dataflow. machine: the name of the member. token, coordinator: of the
+    coordinator. zenoh: where its daemon listens. digest: SHA-256 of the descriptor, hex. grace: µs.
+    doractl, dora: versions of the head.
+    """
+
+    name: str
+    uuid: str
+    machine: str
+    token: str
+    coordinator: int
+    zenoh: int
+    digest: str
+    grace: int
+    doractl: str
+    dora: str
+    version: int = VERSION
+
+
+@dataclass(frozen=True)
+class Beat:
+    """Either side is there."""
+
+
+@dataclass(frozen=True)
+class Ready:
+    """Member to head: its daemon has joined. work: its directory for dora, absolute."""
+
+    work: str
+
+
+@dataclass(frozen=True)
+class Table:
+    """Member to head: its live table, as CellStatus.to_json()."""
+
+    status: str
+
+
+@dataclass(frozen=True)
+class Refused:
+    """Member to head: it runs nothing, and a restart does not help."""
+
+    reason: str
+    hint: str = ""
+
+
+@dataclass(frozen=True)
+class Ended:
+    """Member to head: its part has ended or is about to. by: who asked for it, or "".
+
+    reason: one line, "" if all went well.
+    """
+
+    reason: str = ""
+    by: str = ""
+
+
+@dataclass(frozen=True)
+class StopPart:
+    """Head to member: end your nodes within `grace` µs, without asking dora."""
+
+    grace: int
+
+
+@dataclass(frozen=True)
+class Stopping:
+    """Head to member: the head is about to have dora stop all nodes. by: who asked for it."""
+
+    by: str = ""
+
+
+Message = Forwards | Lost | Part | Beat | Ready | Table | Refused | Ended | StopPart | Stopping
+M = TypeVar("M", bound=Message)
+
+_TYPES: Mapping[str, type[Any]] = {
+    "forwards": Forwards,
+    "lost": Lost,
+    "part": Part,
+    "beat": Beat,
+    "ready": Ready,
+    "table": Table,
+    "refused": Refused,
+    "ended": Ended,
+    "stop": StopPart,
+    "stopping": Stopping,
+}
+_NAMES = {kind: name for name, kind in _TYPES.items()}
+_NUMBERS = {"coordinator", "zenoh", "grace", "version"}
+_LONG = {"status"}
+
+
+def format_message(message: Message) -> bytes:
+    """One line."""
+    told = {"type": _NAMES[type(message)], **asdict(message)}
+    return json.dumps(told).encode() + b"\n"
+
+
+def parse_message(line: bytes) -> Message:
+    """The message in a line. Raises DoraSystemdError (FAILURE)."""
+    try:
+        found = json.loads(line)
+        kind = _TYPES[found.pop("type")]
+        names = {one.name for one in fields(kind)}
+        values = {key: _value(key, value) for key, value in found.items() if key in names}
+        return _checked(kind(**values))
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        raise _unreadable() from error
+
+
+def expect(message: Message, kind: type[M]) -> M:
+    """The message if it is of that kind. Raises DoraSystemdError (FAILURE)."""
+    if not isinstance(message, kind):
+        raise _unreadable()
+    return message
+
+
+def _value(key: str, value: object) -> object:
+    if isinstance(value, dict):
+        return {_machine(name): _number(one) for name, one in value.items()}
+    if key in _NUMBERS:
+        return _number(value)
+    if not isinstance(value, str):
+        raise ValueError(key)
+    return value if key in _LONG else value[:MAX_TEXT]
+
+
+def _machine(text: str) -> str:
+    return text if text == HEAD else parse_machine(text)
+
+
+def _number(value: object) -> int:
+    if type(value) is not int or not 0 <= value < 2**64:
+        raise ValueError(value)
+    return value
+
+
+def _checked(message: Any) -> Message:
+    if isinstance(message, Part):
+        parse_name(message.name), parse_uuid(message.uuid), parse_machine(message.machine)
+        _check_ports(message.coordinator, message.zenoh)
+    if isinstance(message, Forwards):
+        _check_ports(message.coordinator, *message.zenoh.values())
+    return message  # type: ignore[no-any-return]
+
+
+def _check_ports(*ports: int) -> None:
+    if not all(LOWEST_PORT <= port <= HIGHEST_PORT for port in ports):
+        raise ValueError("port")
+
+
+def _unreadable() -> DoraSystemdError:
+    hint = "both machines need the same version of dora-systemd"
+    message = "cannot read what the other machine says"
+    return DoraSystemdError(message, hint, ExitCode.FAILURE)

@@ -1,0 +1,69 @@
+"""What to do about each cause of an end: the texts of `doractl why`. Pure."""
+
+import signal
+from collections.abc import Mapping
+
+from dora_systemd.decisions.cell.exits import ExitKind, parse_exit
+from dora_systemd.decisions.life.causes import Cause
+from dora_systemd.decisions.views.dataflows import WAITING
+from dora_systemd.decisions.why.verdict import Verdict
+
+_AUTOMATIC = "run: doractl restart {name}; --restart-policy on-failure does this automatically"
+_OVERLOADED = "run: doractl restart {name}; check whether the machine was overloaded"
+_MORE_MEMORY = "doractl set {name} --memory-limit SIZE, or limit single nodes (--node-limit)"
+_REMEDIES = {
+    Cause.NODE_FAILED: "fix {node}, then run: doractl restart {name}",
+    Cause.NODE_HUNG: "find out what {node} waited for, or raise health_check_timeout: in its YAML",
+    Cause.NODE_WATCHDOG: "find out what {node} waited for (PYTHONFAULTHANDLER=1 prints that for "
+    "Python), or raise watchdog: in its settings",
+    Cause.NODE_SILENT: "find out why {node} sends nothing, or give it more time: "
+    "owes: in the settings file",
+    Cause.NODE_OUT_OF_MEMORY: "look for a leak in {node}, or run: "
+    "doractl set {name} --node-limit {node}:memory=SIZE",
+    Cause.START_TIMEOUT: "find out why {node} does not call Node(), or raise --start-timeout",
+    Cause.REFUSED: "fix {file}, then run: doractl restart {name}",
+    Cause.BAD_DATAFLOW: "fix {file}, then run: doractl restart {name}",
+    Cause.DAEMON_LOST: _AUTOMATIC,
+    Cause.COORDINATOR_LOST: _AUTOMATIC,
+    Cause.NO_ANSWER: _OVERLOADED,
+    Cause.MACHINE_LOST: _AUTOMATIC,
+    Cause.NO_MACHINE: "check that ssh reaches the machine without a password, then run: "
+    "doractl restart {name}",
+    Cause.MACHINE_REFUSES: "change that on the machine, then run: doractl restart {name}",
+    Cause.STOPPED_ON_MACHINE: "run: doractl restart {name}",
+    Cause.DIRECTORY_LOST: "run: doractl restart {name}; only systemd may delete files there",
+    Cause.RUNNER_BROKEN: "run: doractl restart {name}; please report it, unless the machine "
+    "ran out of processes, files or disk space",
+    Cause.RUNNER_KILLED: _AUTOMATIC,
+    Cause.WATCHDOG: _OVERLOADED,
+    Cause.OUT_OF_MEMORY: _MORE_MEMORY,
+    Cause.UNIT_FAILED: "systemctl {flag} status {unit} shows what systemd did",
+    Cause.TIMEOUT: "raise --start-timeout or --grace-duration",
+    Cause.NO_END: "run: doractl start {file}; to start it at every boot, doractl enable {name}",
+}
+_MEMORY_REMEDIES = {
+    "dataflow": _MORE_MEMORY,
+    "machine": "the machine is short of memory: limit single nodes (--node-limit NODE:memory=SIZE)",
+}
+"""By the owner of the exceeded memory limit, unless it is the node."""
+_SIGNAL_REMEDIES: Mapping[int, str] = {
+    signal.SIGKILL: "find out who killed {node}: journalctl -k, or somebody's kill -9",
+    **dict.fromkeys(
+        (signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS, signal.SIGILL, signal.SIGFPE),
+        "fix {node}; coredumpctl info {pid} shows where it crashed",
+    ),
+}
+_GATHERING = "nothing: it starts when all machines are there; doractl stop {name} gives up"
+
+
+def remedy_of(verdict: Verdict) -> str:
+    """The remedy, with names in braces that the report fills in; "" for none."""
+    if verdict.cause is Cause.MACHINE_LOST and verdict.status == WAITING:
+        return _GATHERING
+    if verdict.cause in (Cause.NODE_OUT_OF_MEMORY, Cause.OUT_OF_MEMORY):
+        owner = verdict.details.get("owner", "")
+        return _MEMORY_REMEDIES.get(owner, _REMEDIES[verdict.cause])
+    exit = parse_exit(verdict.details.get("exit", ""))
+    if verdict.cause is Cause.NODE_FAILED and exit.kind is ExitKind.SIGNAL:
+        return _SIGNAL_REMEDIES.get(exit.number, _REMEDIES[verdict.cause])
+    return _REMEDIES.get(verdict.cause, "")

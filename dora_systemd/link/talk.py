@@ -1,0 +1,163 @@
+"""Carries lines between the runner of the head and ssh(1), which has a member at its other end.
+
+To the head a member is hostile: what comes from it is passed on in whole lines that have a bound.
+"""
+
+import os
+import select
+import socket
+import time
+from collections.abc import Callable
+from contextlib import suppress
+
+from dora_systemd.decisions.machines.wire import (
+    BEAT_SECONDS,
+    MAX_LINE,
+    Beat,
+    Lost,
+    Message,
+    Refused,
+    format_message,
+)
+from dora_systemd.decisions.remote.stream import AfterMark
+from dora_systemd.link.program import Program, read_now
+
+ANSWER_SECONDS = 30.0
+"""For the first line of the member: a login, and doractl there, on a machine that is busy."""
+_CHUNK = 1 << 16
+_COMPLAINT = 4096
+
+
+class Talk:
+    """One connection. rest: what the runner has said already."""
+
+    def __init__(self, runner: socket.socket, ssh: Program, mark: str, rest: bytes) -> None:
+        self._runner, self._ssh = runner, ssh
+        self._output, self._errors = AfterMark(mark), AfterMark(mark)
+        self._complaint = b""
+        self._rest = rest
+        self._line = b""
+        self._has_answered = False
+        self._is_over = self._has_hung_up = False
+        self._excuse = ""
+        self._poll = select.poll()
+        self._takers: dict[int, Callable[[], None]] = {
+            runner.fileno(): self._from_runner,
+            ssh.output: self._from_member,
+            ssh.errors: self._from_errors,
+            ssh.ended: self._end,
+        }
+        for fd in self._takers:
+            self._poll.register(fd, select.POLLIN)
+        # Until the member is there, ssh's pipe must not fill: only the runner's end is heard.
+        self._poll.register(runner, select.POLLRDHUP)
+
+    def carry(self) -> None:
+        """Carry until either end has ended."""
+        deadline = time.monotonic() + ANSWER_SECONDS
+        while not self._is_over:
+            for fd, _ in self._poll.poll(BEAT_SECONDS * 1000):
+                self._take(fd)
+            if not self._has_answered:
+                self._wait_for_answer(deadline)
+
+    def _take(self, fd: int) -> None:
+        if fd == self._runner.fileno() and not self._output.is_open:
+            self._hang_up()
+        elif not self._is_over:
+            self._takers[fd]()
+
+    def _wait_for_answer(self, deadline: float) -> None:
+        """Tell the runner that ssh is on its way: the member cannot do so yet."""
+        self._send(format_message(Beat()))
+        if time.monotonic() > deadline:
+            self._excuse = f"no answer within {ANSWER_SECONDS:g} s"
+            self._end()
+
+    def _end(self) -> None:
+        self._is_over = True
+
+    def _hang_up(self) -> None:
+        """The runner has ended, or begun another session."""
+        self._has_hung_up = True
+        self._end()
+
+    def _from_runner(self) -> None:
+        data = b""
+        with suppress(OSError):
+            data = self._runner.recv(_CHUNK)
+        if data:
+            self._to_member(data)
+        else:
+            self._hang_up()
+
+    def _to_member(self, data: bytes) -> None:
+        try:
+            while data:
+                data = data[os.write(self._ssh.input, data) :]
+        except BrokenPipeError:  # ssh says why
+            self._poll.unregister(self._runner)
+
+    def _from_member(self) -> None:
+        data = os.read(self._ssh.output, _CHUNK)
+        if not data:
+            self._poll.unregister(self._ssh.output)
+            return
+        was_open = self._output.is_open
+        shown = self._output.feed(data)
+        if self._output.is_open and not was_open:
+            self._poll.register(self._runner, select.POLLIN)
+            self._to_member(self._rest)
+        self._pass_on(shown)
+
+    def _pass_on(self, data: bytes) -> None:
+        whole, newline, self._line = (self._line + data).rpartition(b"\n")
+        if len(self._line) > MAX_LINE:
+            self._excuse = "it says something else than a member does"
+            self._end()
+        elif whole:
+            self._has_answered = True
+            self._send(whole + newline)
+
+    def _from_errors(self) -> None:
+        data = os.read(self._ssh.errors, _CHUNK)
+        if data:
+            self._complain(data)
+        else:
+            self._poll.unregister(self._ssh.errors)
+
+    def _complain(self, data: bytes) -> None:
+        self._complaint = (self._complaint + self._errors.feed(data))[-_COMPLAINT:]
+
+    def _send(self, data: bytes) -> None:
+        try:
+            self._runner.sendall(data)
+        except OSError:
+            self._hang_up()
+
+    def part_from(self, host: str, status: int) -> None:
+        """Tell the runner why the connection has ended. status: of ssh."""
+        while data := read_now(self._ssh.output):
+            self._pass_on(self._output.feed(data))
+        while data := read_now(self._ssh.errors):
+            self._complain(data)
+        word = self._last_word(host, status)
+        if not self._has_hung_up:
+            print(f"lost: {word.words}" if isinstance(word, Lost) else word.reason, flush=True)
+        tell(self._runner, word)
+
+    def _last_word(self, host: str, status: int) -> Lost | Refused:
+        # Imported late: most of the time nothing is lost.
+        from dora_systemd.link.parting import last_word
+
+        if self._excuse:
+            return Lost(self._excuse)
+        noise = self._errors.noise if not self._output.is_open else self._complaint
+        said, complaint = (one.decode("utf-8", "replace") for one in (self._output.noise, noise))
+        return last_word(host, status, self._output.is_open, said, complaint)
+
+
+def tell(runner: socket.socket, message: Message) -> None:
+    """Say the last word to a runner, which may have ended."""
+    with suppress(OSError):
+        runner.sendall(format_message(message))

@@ -1,0 +1,73 @@
+"""What is different in a cell if its dataflow has several machines.
+
+Alone is the cell of all others. The head and the members are in runner/machines/.
+"""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from dora_systemd.adapters.dora.engine import Child
+from dora_systemd.adapters.dora.preparation import Prepared
+from dora_systemd.adapters.logs.pipes import LogPipes
+from dora_systemd.adapters.runner_socket.listener import Session
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.descriptor.dataflow import Dataflow
+from dora_systemd.decisions.life.states import Cell
+from dora_systemd.paths import CellPaths
+from dora_systemd.runner.cell.boot import Boot
+from dora_systemd.runner.cell.dialogue import Dialogue
+from dora_systemd.runner.cell.engine import Engine
+from dora_systemd.runner.cell.life import Life
+from dora_systemd.runner.cell.pump import Pump
+from dora_systemd.runner.nodes.nodes import Nodes
+
+if TYPE_CHECKING:
+    from dora_systemd.adapters.dora.check import DoraCheck
+
+
+class Alone:
+    """The cell of the only machine of its dataflow. options: of the runner."""
+
+    def __init__(self, options: RunnerOptions, this_life: Life) -> None:
+        self.options, self.this_life = options, this_life
+
+    @property
+    def sessions(self) -> Mapping[str, Session]:
+        """What its socket can do, besides answers to single requests."""
+        return {}
+
+    @property
+    def start_timeout(self) -> int:
+        """µs from the beginning of a run to StartTimedOut."""
+        return self.options.start_timeout
+
+    def own(self, options: RunnerOptions) -> RunnerOptions:
+        """The options with what they say of this machine's nodes."""
+        return options
+
+    def here(self, dataflow: Dataflow) -> Dataflow:
+        """The dataflow with this machine's nodes."""
+        return dataflow
+
+    def prepare(self, paths: CellPaths, prepared: Prepared, check: "DoraCheck") -> None:
+        """The dataflow has been read, and its run begins. Raises DoraSystemdError."""
+
+    def engine(
+        self, dora: str, paths: CellPaths, environment: Mapping[str, str], boot: Boot | None
+    ) -> Engine:
+        """The dora of this machine."""
+        return Engine(dora, paths, environment, boot)
+
+    def start_coordinator(self, dora: Engine) -> Child | None:
+        """Start the coordinator, if it runs on this machine. Raises OSError."""
+        return dora.start_coordinator()
+
+    def cell(self, cell: Cell) -> Cell:
+        """The cell at the beginning of a run."""
+        return cell
+
+    def dialogue(
+        self, options: RunnerOptions, pump: Pump, dora: Engine, nodes: Nodes, pipes: LogPipes
+    ) -> Dialogue:
+        """What carries out the actions of the run."""
+        return Dialogue(options, pump, dora, nodes, pipes)

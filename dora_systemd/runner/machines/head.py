@@ -1,0 +1,279 @@
+"""The head of a dataflow with several machines: it has the coordinator, and waits for its members.
+
+A member that is not there before the run is waited for. One that is lost later ends the run.
+"""
+
+import asyncio
+import contextlib
+import hashlib
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dora_systemd.adapters.dora.preparation import Prepared
+from dora_systemd.adapters.host import notify
+from dora_systemd.adapters.logs.pipes import LogPipes
+from dora_systemd.adapters.runner_socket.client import Request
+from dora_systemd.adapters.runner_socket.listener import Session, refuse
+from dora_systemd.adapters.runner_socket.splice import Ends
+from dora_systemd.decisions.cell.machines import HEAD, members_of, placed_on
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.dora import life_events, protocol
+from dora_systemd.decisions.life import events as life
+from dora_systemd.decisions.life.causes import Cause
+from dora_systemd.decisions.life.nodes import with_process
+from dora_systemd.decisions.life.states import Cell, Do, State
+from dora_systemd.decisions.machines import wire
+from dora_systemd.decisions.machines.part import (
+    check_placed,
+    is_here,
+    with_works,
+)
+from dora_systemd.decisions.rights.node_rights import is_essential
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.paths import CellPaths
+from dora_systemd.runner.cell.boot import Boot
+from dora_systemd.runner.cell.dialogue import Dialogue
+from dora_systemd.runner.cell.engine import Engine
+from dora_systemd.runner.cell.life import Life
+from dora_systemd.runner.cell.pump import Pump, now_us
+from dora_systemd.runner.machines.ending import end_nodes
+from dora_systemd.runner.machines.engine import NOISE, HeadEngine
+from dora_systemd.runner.machines.ports import choose_ports
+from dora_systemd.runner.machines.roster import Roster
+from dora_systemd.runner.machines.shared import Shared
+from dora_systemd.runner.nodes.nodes import Nodes
+from dora_systemd.values import INFINITY, SECOND, format_duration
+
+if TYPE_CHECKING:
+    from dora_systemd.adapters.dora.check import DoraCheck
+
+FIRST_PATIENCE = 30 * SECOND
+"""µs that the first start waits for members, if the settings have no start timeout."""
+_AGAIN_SECONDS = 0.05
+_LOOK_SECONDS = 0.2
+_WATCH_SECONDS = 2.0
+_WORD_SECONDS = 1.0
+"""Time for a member to say itself why its daemon is gone."""
+_EXTEND_SECONDS = 10.0
+
+
+class Head(Shared):
+    """The machine where the dataflow was started."""
+
+    def __init__(self, options: RunnerOptions, this_life: Life) -> None:
+        super().__init__(options, this_life)
+        self._ports = choose_ports(members_of(options.placed))
+        self.roster = Roster(options, self._ports)
+
+    @property
+    def sessions(self) -> Mapping[str, Session]:
+        """The link of each machine begins one."""
+        return {"link": self.roster.link, **dict.fromkeys(("reload", "hot-reload"), self._refuse)}
+
+    async def _refuse(self, request: Request, ends: Ends) -> None:
+        del request
+        name = self.options.name
+        message = f"cannot reload {name}: it runs on several machines"
+        await refuse(ends, DoraSystemdError(message, f"run: doractl restart {name}"))
+
+    def prepare(self, paths: CellPaths, prepared: Prepared, check: "DoraCheck") -> None:
+        """Note what the members have to compare."""
+        del paths
+        check_placed(self.options, prepared.dataflow)
+        content = Path(self.options.dataflow).read_bytes()
+        self.roster.set_facts(hashlib.sha256(content).hexdigest(), check.version())
+
+    def engine(
+        self, dora: str, paths: CellPaths, environment: Mapping[str, str], boot: Boot | None
+    ) -> Engine:
+        """A coordinator and a daemon on the ports that all machines know."""
+        del boot
+        ports = (self._ports.coordinator, self._ports.zenoh[HEAD])
+        return HeadEngine(dora, paths, environment, ports, self.roster.set_token)
+
+    def cell(self, cell: Cell) -> Cell:
+        """The cell, with the machine of each node."""
+        placed = self.options.placed
+        nodes = {
+            ident: node._replace(machine=placed_on(placed, ident))
+            for ident, node in cell.nodes.items()
+        }
+        return replace(cell, nodes=nodes, members=self.roster.names)
+
+    def dialogue(
+        self, options: RunnerOptions, pump: Pump, dora: Engine, nodes: Nodes, pipes: LogPipes
+    ) -> Dialogue:
+        """What also waits for the members, and does without dora if one is lost."""
+        assert isinstance(dora, HeadEngine)
+        pipes.left_out = NOISE
+        self.roster.push, pump.amend = pump.push, self.roster.amend
+        dialogue = HeadDialogue(options, pump, dora, nodes, pipes)
+        dialogue.begin(self.roster, dora, self.this_life.is_first)
+        return dialogue
+
+
+class HeadDialogue(Dialogue):
+    """Carries out each Do of a head. Call begin() first."""
+
+    def begin(self, roster: Roster, dora: HeadEngine, is_first: bool) -> None:
+        """is_first: whether somebody waits for this start."""
+        self._roster, self._dora, self._is_first = roster, dora, is_first
+        self._ends_at, self._is_ending = 0.0, False
+
+    def actions(
+        self, descriptor: Mapping[str, Any], variables: Mapping[str, str]
+    ) -> dict[Do, Callable[[], None]]:
+        """As for one machine, and what comes with several."""
+        return {
+            **super().actions(descriptor, variables),
+            Do.GATHER: lambda: self._ask(Do.GATHER, self._gather()),
+            Do.END_NODES: self._end_without_dora,
+        }
+
+    async def _gather(self) -> None:
+        """Wait for all members; at the first start not without end."""
+        given = self._options.start_timeout
+        most = (FIRST_PATIENCE if given == INFINITY else given) / SECOND
+        try:
+            async with asyncio.timeout(most if self._is_first else None):
+                await self._all_joined()
+        except TimeoutError:
+            named, after = self._named(), format_duration(round(most) * SECOND)
+            reason = f"cannot reach {named}: no answer within {after}"
+            self._pump.push(life.Refused(now_us(), reason, Cause.NO_MACHINE))
+            return
+        self._pump.push(life.Gathered(now_us()))
+        self._begin_start_timeout()
+        self.spawn("watch the other machines", self._watch_machines())
+
+    async def _all_joined(self) -> None:
+        if self._options.start_timeout != INFINITY:
+            self.spawn("have systemd wait", self._extend_start())
+        while True:
+            self._roster.changed.clear()
+            self._show_awaited()
+            if not self._roster.missing() and await self._has_each():
+                return
+            with contextlib.suppress(TimeoutError):
+                is_all = not self._roster.missing()
+                async with asyncio.timeout(_AGAIN_SECONDS if is_all else None):
+                    await self._roster.changed.wait()
+
+    def _show_awaited(self) -> None:
+        if (text := self._awaited()) != self._pump.cell.awaited:
+            self._pump.push(life.MachinesAwaited(now_us(), text))
+
+    async def _has_each(self) -> bool:
+        """Whether dora has exactly one daemon of each member.
+
+        The coordinator may still have the lost one of a machine that is back.
+        """
+        with contextlib.suppress(DoraSystemdError):
+            found = await self._dora.machines()
+            return all(found.count(name) == 1 for name in self._roster.names)
+        return False
+
+    def _awaited(self) -> str:
+        return f"waiting for {self._named()}"
+
+    def _named(self) -> str:
+        """The members that are missing, and why."""
+        missing = self._roster.missing()
+        if not missing:
+            return "the dora daemons of all machines"
+        word = "machine" if len(missing) == 1 else "machines"
+        return f"{word} {', '.join(f'{name} ({why})' for name, why in missing.items())}"
+
+    async def _extend_start(self) -> None:
+        """Waiting for a machine is no part of TimeoutStartSec=, see sd_notify(3)."""
+        while self._pump.cell.state is State.GATHERING:
+            notify.extend_timeout(round(3 * _EXTEND_SECONDS * SECOND))
+            await asyncio.sleep(_EXTEND_SECONDS)
+        notify.extend_timeout(2 * self._options.start_timeout)
+
+    def _begin_start_timeout(self) -> None:
+        after = self._options.start_timeout
+        if after != INFINITY:
+            late = life.StartTimedOut(now_us(), after)
+            self._loop.call_later(after / SECOND, self._pump.push, late)
+
+    async def _watch_machines(self) -> None:
+        """Find a member that is there, and whose daemon is not."""
+        while True:
+            await asyncio.sleep(_WATCH_SECONDS)
+            if self._pump.cell.state in (State.WAITING, State.RUNNING) and (
+                lost := await self._find_lost()
+            ):
+                await asyncio.sleep(_WORD_SECONDS)
+                self._lose(lost, "its dora daemon is not connected any more")
+
+    async def _find_lost(self) -> str:
+        with contextlib.suppress(DoraSystemdError):
+            found = await self._dora.machines()
+            return next((name for name in self._roster.names if name not in found), "")
+        return ""  # watch_dora sees that
+
+    def _lose(self, name: str, why: str) -> None:
+        if self._pump.cell.state in (State.WAITING, State.RUNNING, State.STOPPING):
+            self._pump.push(life.MachineLost(now_us(), name, why))
+
+    async def _send_start(self, descriptor: Mapping[str, Any]) -> None:
+        await super()._send_start(with_works(descriptor, self._roster.works()))
+
+    def _is_here(self, node: str) -> bool:
+        return not node or is_here(self._options, node)
+
+    def _hear_elsewhere(self, record: protocol.LogRecord) -> None:
+        event = life_events.parse_life_event(record, now_us())
+        if isinstance(event, life.NodeSpawned):
+            event = replace(event, pid=0)  # here another process has that number
+        if isinstance(event, life.NodeExited):
+            essential = is_essential(self._options.node_rights, event.node)
+            event = life_events.with_facts(event, False, None, essential)
+        if event is not None:
+            self._pump.push(event)
+
+    async def _ask_stop(self) -> None:
+        self._begin_end()
+        if silent := self._roster.silent():
+            self._lose(silent[0], "it does not answer")
+            self._end_without_dora()
+            return
+        self._roster.tell(wire.Stopping(self._pump.cell.stop_by))
+        self.spawn("see whether a machine falls silent", self._watch_silence())
+        await super()._ask_stop()
+
+    def _lose_silent(self) -> bool:
+        """Do without dora if a machine falls silent that still has nodes."""
+        nodes = self._pump.cell.nodes
+        needed = {nodes[node].machine for node in with_process(nodes)}
+        if silent := next((name for name in self._roster.silent() if name in needed), ""):
+            self._lose(silent, "it does not answer")
+        return bool(silent)
+
+    async def _watch_silence(self) -> None:
+        while self._pump.cell.state is State.STOPPING and not self._lose_silent():
+            await asyncio.sleep(_LOOK_SECONDS)
+
+    def _begin_end(self) -> float:
+        """Seconds left of the grace duration, which begins with the first call."""
+        now = time.monotonic()
+        self._ends_at = self._ends_at or now + self._pump.cell.grace / SECOND
+        return max(self._ends_at - now, 0.0)
+
+    def _end_without_dora(self) -> None:
+        if not self._is_ending:
+            self._is_ending = True
+            self._ask(Do.END_NODES, self._end_nodes())
+
+    async def _end_nodes(self) -> None:
+        """End what is here, while the members do the same."""
+        left = self._begin_end()
+        self._roster.tell(wire.StopPart(min(round(left * SECOND), self._pump.cell.grace)))
+        self._pipes.mute("coordinator", "daemon")  # they do not know that we end them
+        own = [node for node in self._pump.cell.nodes if self._is_here(node)]
+        await end_nodes(self._nodes, own, left)
+        self._pump.push(life.StopAnswered(now_us()))

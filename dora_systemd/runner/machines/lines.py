@@ -1,0 +1,83 @@
+"""One side of the talk between head and member, see decisions/machines/wire.py.
+
+A side is silent if nothing has come for LEASE_SECONDS. That is counted in own beats: a process that
+the kernel has held up itself must not take its own silence for that of the other side.
+"""
+
+import asyncio
+import contextlib
+from collections.abc import Callable
+
+from dora_systemd.adapters.runner_socket.splice import Ends
+from dora_systemd.decisions.machines.wire import (
+    BEAT_SECONDS,
+    LEASE_SECONDS,
+    MAX_LINE,
+    Beat,
+    Message,
+    format_message,
+    parse_message,
+)
+from dora_systemd.errors import DoraSystemdError
+
+_LEASE = round(LEASE_SECONDS / BEAT_SECONDS)
+_MOST_UNSENT = 4 * MAX_LINE
+"""Bytes for a side that does not read: then the talk ends."""
+_MOST_LINES = 200
+"""In one beat: there are three, or those of a whole lease after a gap."""
+
+Hear = Callable[[Message], None]
+
+
+class Lines:
+    """A talk. silent: beats since the last line came. on_beat: called before each own beat."""
+
+    def __init__(self, ends: Ends, on_beat: Callable[[], None] = lambda: None) -> None:
+        self._reader, self._writer = ends
+        self._on_beat = on_beat
+        self._why = "the connection has ended"
+        self.silent = self._heard = 0
+
+    def send(self, message: Message) -> None:
+        """Send a message, unless the talk has ended."""
+        if self._writer.is_closing():
+            return
+        self._writer.write(format_message(message))
+        if self._writer.transport.get_write_buffer_size() > _MOST_UNSENT:
+            self.end("the other side does not read")
+
+    def end(self, why: str) -> None:
+        """End the talk now."""
+        self._why = why
+        self._writer.transport.abort()
+
+    async def talk(self, hear: Hear) -> str:
+        """Pass messages to `hear` until the talk ends; the reason, one line."""
+        beats = asyncio.create_task(self._beat())
+        try:
+            await self._read(hear)
+        except DoraSystemdError as error:
+            self._why = error.message
+        except ValueError:
+            self._why = "a line is too long"
+        finally:
+            beats.cancel()
+            self._writer.close()
+        return self._why
+
+    async def _read(self, hear: Hear) -> None:
+        with contextlib.suppress(OSError):
+            while line := await self._reader.readline():
+                self.silent, self._heard = 0, self._heard + 1
+                if self._heard > _MOST_LINES:
+                    self.end("the other side says too much")
+                hear(parse_message(line))
+                await asyncio.sleep(0)  # lines that are there already must not hold up the rest
+
+    async def _beat(self) -> None:
+        while self.silent < _LEASE:
+            self._on_beat()
+            self.send(Beat())
+            await asyncio.sleep(BEAT_SECONDS)
+            self.silent, self._heard = self.silent + 1, 0
+        self.end(f"no word for {LEASE_SECONDS:g}s")

@@ -1,0 +1,167 @@
+"""A member of a dataflow with several machines: it runs the nodes that the head has placed on it.
+
+It has a daemon and no coordinator. It acts while one session lasts, which begins with a Part; when
+that ends it ends its nodes, by itself and with success: the head decides what follows. Whatever it
+has been told is in memory only.
+"""
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from dora_systemd.adapters.dora.command import version_numbers
+from dora_systemd.adapters.dora.preparation import Prepared
+from dora_systemd.adapters.host import files
+from dora_systemd.adapters.logs.pipes import LogPipes
+from dora_systemd.adapters.runner_socket.client import Request
+from dora_systemd.adapters.runner_socket.listener import Session, refuse
+from dora_systemd.adapters.runner_socket.splice import Ends
+from dora_systemd.decisions.cell.machines import HEAD
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.status import CellStatus
+from dora_systemd.decisions.life import events as life
+from dora_systemd.decisions.life.states import Cell, State
+from dora_systemd.decisions.machines import wire
+from dora_systemd.decisions.machines.part import check_placed, launch_files
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.paths import CellPaths
+from dora_systemd.runner.cell.boot import Boot
+from dora_systemd.runner.cell.dialogue import Dialogue
+from dora_systemd.runner.cell.engine import Engine
+from dora_systemd.runner.cell.life import Life
+from dora_systemd.runner.cell.pump import Pump, now_us
+from dora_systemd.runner.machines.engine import NOISE, MemberEngine
+from dora_systemd.runner.machines.lines import Lines
+from dora_systemd.runner.machines.member_dialogue import MemberDialogue, is_going_down
+from dora_systemd.runner.machines.shared import Shared
+from dora_systemd.runner.nodes.nodes import Nodes
+from dora_systemd.terminal_text import short_line
+
+if TYPE_CHECKING:
+    from dora_systemd.adapters.dora.check import DoraCheck
+
+_LONGEST = 100
+
+
+class Member(Shared):
+    """A machine that another one has given nodes.
+
+    stops_by_head: the head knows that this part ends.
+    """
+
+    def __init__(self, options: RunnerOptions, this_life: Life) -> None:
+        super().__init__(options._replace(owes=()), this_life)
+        self._lines: Lines | None = None
+        self._dora: MemberEngine | None = None
+        self._pump: Pump | None = None
+        self._table = self._told = self._version = ""
+        self.stops_by_head = False
+        self.is_going_down: Callable[[bool], bool] = is_going_down
+
+    @property
+    def sessions(self) -> Mapping[str, Session]:
+        """`doractl member` begins the only one."""
+        return {"part": self._part}
+
+    def prepare(self, paths: CellPaths, prepared: Prepared, check: "DoraCheck") -> None:
+        """Write how each node is started. Raises DoraSystemdError."""
+        self._version = check.version()
+        check_placed(self.options, prepared.dataflow)
+        paths.launch.mkdir(mode=0o700, exist_ok=True)
+        for node, text in launch_files(prepared.dataflow, prepared.plan).items():
+            files.write_atomic(paths.launch / node, text, 0o600)
+
+    def engine(
+        self, dora: str, paths: CellPaths, environment: Mapping[str, str], boot: Boot | None
+    ) -> Engine:
+        """A daemon for the coordinator of the head."""
+        del boot
+        self._dora = MemberEngine(dora, paths, environment, self.options.machine)
+        return self._dora
+
+    def start_coordinator(self, dora: Engine) -> None:
+        """The only one is the head's."""
+
+    def cell(self, cell: Cell) -> Cell:
+        """The cell of a member."""
+        return replace(cell, machine=self.options.machine)
+
+    def dialogue(
+        self, options: RunnerOptions, pump: Pump, dora: Engine, nodes: Nodes, pipes: LogPipes
+    ) -> Dialogue:
+        """What finds the run of the head, and judges its own nodes only."""
+        assert isinstance(dora, MemberEngine)
+        pipes.left_out = NOISE
+        self._pump, pump.amend = pump, self._note_table
+        dialogue = MemberDialogue(options, pump, dora, nodes, pipes)
+        dialogue.begin(self, dora)
+        return dialogue
+
+    def _note_table(self, table: CellStatus) -> CellStatus:
+        self._table = table.to_json()
+        return table
+
+    def _send_table(self) -> None:
+        """With each beat, if something is new."""
+        if self._table != self._told and len(self._table) < wire.MAX_LINE // 2:
+            self._told = self._table
+            self.send(wire.Table(self._table))
+
+    def send(self, message: wire.Message) -> None:
+        """Say something to the head, if it is there."""
+        if self._lines is not None:
+            self._lines.send(message)
+
+    async def _part(self, request: Request, ends: Ends) -> None:
+        try:
+            part, dora, pump = self._accept(request)
+        except DoraSystemdError as error:
+            await refuse(ends, error)
+            return
+        self._lines = Lines(ends, self._send_table)
+        if reason := self._other_version(part):
+            self._lines.send(wire.Refused(reason, "install the same version on both machines"))
+            ends.writer.close()
+            self._end_by_head(reason)
+            return
+        dora.set_part(part)
+        pump.push(life.CoordinatorListening(now_us()))
+        why = await self._lines.talk(self._hear)
+        self._lines = None
+        self._end_by_head(why)
+
+    def _accept(self, request: Request) -> tuple[wire.Part, MemberEngine, Pump]:
+        told = {**request, "type": "part"}
+        part = wire.expect(wire.parse_message(json.dumps(told).encode()), wire.Part)
+        own = self.options
+        if (part.name, part.uuid, part.machine) != (own.name, own.uuid, own.machine):
+            raise _refusal("this is the part of another dataflow")
+        if self._dora is None or self._pump is None or self._pump.cell.state is not State.BOOTING:
+            raise _refusal(f"machine {own.machine} has a head already")
+        return part, self._dora, self._pump
+
+    def _other_version(self, part: wire.Part) -> str:
+        """Why two versions of dora do not work together, or ""."""
+        own, other = version_numbers(self._version)[:2], version_numbers(part.dora)[:2]
+        there = short_line(part.dora, _LONGEST)
+        return "" if own == other else f"it has dora {self._version}, the head has {there}"
+
+    def _hear(self, message: wire.Message) -> None:
+        if isinstance(message, wire.Stopping):
+            self.stops_by_head = True
+            self._push(life.HeadStops(now_us(), message.by or HEAD))
+        if isinstance(message, wire.StopPart):
+            self._end_by_head("the head has lost another machine")
+
+    def _end_by_head(self, why: str) -> None:
+        self.stops_by_head = True
+        self._push(life.HeadLost(now_us(), why))
+
+    def _push(self, event: life.Event) -> None:
+        if self._pump is not None:
+            self._pump.push(event)
+
+
+def _refusal(message: str) -> DoraSystemdError:
+    return DoraSystemdError(message, "stop it first: doractl stop", ExitCode.NAME_IN_USE)

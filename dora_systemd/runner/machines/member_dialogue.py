@@ -1,0 +1,152 @@
+"""Carries out what a member does: it finds the run of the head, and judges its own nodes only."""
+
+import asyncio
+import contextlib
+from collections.abc import Callable, Mapping
+from itertools import chain, repeat
+from typing import Any, Protocol
+
+from dora_systemd.adapters.host.process import run_command
+from dora_systemd.decisions.dora import protocol
+from dora_systemd.decisions.life import events as life
+from dora_systemd.decisions.life.states import Do, State
+from dora_systemd.decisions.machines import wire
+from dora_systemd.decisions.machines.part import is_here
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.runner.cell.dialogue import Dialogue
+from dora_systemd.runner.cell.pump import now_us
+from dora_systemd.runner.machines.ending import end_nodes
+from dora_systemd.runner.machines.engine import MemberEngine
+from dora_systemd.runner.machines.processes import find
+from dora_systemd.values import SECOND
+
+_POLL_SECONDS, _SOON, _LATER_SECONDS = 0.05, 200, 0.5
+"""How often to look for the run of the head: less after a while, for it may be days away."""
+_EXPLAIN_SECONDS = 0.5
+"""Time for the session to end, which says more than a lost connection to dora."""
+_ASK_SECONDS = 2.0
+_UNKNOWN = ("", "offline", "unknown")
+_GOING_DOWN = "the machine is shutting down"
+_ENDING = (State.STOPPING, State.CLOSING, State.LEAVING, State.ENDED)
+
+
+class Voice(Protocol):
+    """What talks with the head. stops_by_head: the head knows that this part ends.
+
+    is_going_down: whether systemd, or that of the user, stops everything.
+    """
+
+    stops_by_head: bool
+    is_going_down: Callable[[bool], bool]
+
+    def send(self, message: wire.Message) -> None:
+        """Say something to the head, if it is there."""
+
+
+class MemberDialogue(Dialogue):
+    """Carries out each Do of a member. Call begin() first."""
+
+    def begin(self, voice: Voice, dora: MemberEngine) -> None:
+        """Set what the actions need."""
+        self._voice, self._dora = voice, dora
+        self._has_told = False
+
+    def actions(
+        self, descriptor: Mapping[str, Any], variables: Mapping[str, str]
+    ) -> dict[Do, Callable[[], None]]:
+        """Those of one machine, without all that the head asks dora."""
+        own = super().actions(descriptor, variables)
+        return {
+            **own,
+            Do.GATHER: lambda: self._ask(Do.GATHER, self._find_run()),
+            Do.ASK_SPAWN: lambda: self.spawn("find processes", find(self._pump, self._nodes)),
+            Do.ASK_RESULT: self._tell_result,
+            Do.ASK_STOP: lambda: self._ask(Do.END_NODES, self._stop()),
+            Do.END_NODES: lambda: self._ask(Do.END_NODES, self._end_nodes()),
+            Do.EXIT: lambda: self._exit(own[Do.EXIT]),
+        }
+
+    async def _find_run(self) -> None:
+        """Tell the head that the daemon has joined, and wait for the run that it starts."""
+        _, paths = self._nodes.places
+        self._nodes.expect()
+        self._voice.send(wire.Ready(str(paths.work)))
+        polls = chain([_POLL_SECONDS] * _SOON, repeat(_LATER_SECONDS))
+        while not (run := await self._running()):
+            await asyncio.sleep(next(polls))
+        self._pipes.set_run(run)
+        self._pump.push(life.RunStarted(now_us(), run))
+
+    async def _running(self) -> str:
+        reply = await self._dora.ask_soon(protocol.LIST)
+        return protocol.parse_running(reply, self._options.name)
+
+    def _events_ended(self) -> None:
+        self.spawn("see why dora is silent", self._lose_head("the dora coordinator is gone"))
+
+    async def raised(self, what: str, error: Exception) -> None:
+        """Have an exception end the cell; what dora does not answer is because of the head."""
+        if isinstance(error, DoraSystemdError):
+            await self._lose_head(error.message)
+        else:
+            await super().raised(what, error)
+
+    async def _lose_head(self, why: str) -> None:
+        await asyncio.sleep(_EXPLAIN_SECONDS)
+        if self._pump.cell.state not in _ENDING:
+            self._has_told = True
+            self._voice.send(wire.Ended(why))
+            self._pump.push(life.HeadLost(now_us(), why))
+
+    def _is_here(self, node: str) -> bool:
+        return not node or is_here(self._options, node)
+
+    def _tell_result(self) -> None:
+        """How the own nodes have ended, from the own table: the head may be gone already."""
+        cell = self._pump.cell
+        if cell.state is State.CLOSING:
+            results = {ident: node.exit for ident, node in cell.nodes.items()}
+            self._pump.push(life.ResultKnown(now_us(), results))
+
+    async def _stop(self) -> None:
+        """Somebody stops this part here: the head has to know before the nodes end."""
+        await asyncio.to_thread(self._tell_end)
+        await self._end_nodes()
+
+    async def _end_nodes(self) -> None:
+        cell = self._pump.cell
+        self._pipes.mute("daemon")  # it does not know that we end them
+        await end_nodes(self._nodes, list(cell.nodes), cell.grace / SECOND)
+        self._pump.push(life.StopAnswered(now_us()))
+
+    def _exit(self, leave: Callable[[], None]) -> None:
+        self._tell_end()
+        leave()
+
+    def _tell_end(self) -> None:
+        """Say once why this part ends, unless the head knows."""
+        cell = self._pump.cell
+        if self._has_told:
+            return
+        self._has_told = True
+        if self._voice.stops_by_head:
+            self._voice.send(wire.Ended())
+        elif cell.stop_by:
+            is_down = self._voice.is_going_down(self._nodes.places[1].is_of_user)
+            reason, by = (_GOING_DOWN, "") if is_down else ("", cell.stop_by)
+            self._voice.send(wire.Ended(reason, by))
+        else:
+            self._voice.send(wire.Ended(cell.failure))
+
+
+def is_going_down(is_of_user: bool) -> bool:
+    """Whether systemd stops everything, and not only this unit; see is-system-running.
+
+    Also if it cannot be asked, as when the message bus has been stopped already: a head that starts
+    again for nothing does less harm than one that stays down after a reboot.
+    """
+    scope = ["--user"] if is_of_user else []
+    with contextlib.suppress(DoraSystemdError):
+        done = run_command(["systemctl", *scope, "is-system-running"], _ASK_SECONDS)
+        return done.stdout.strip() in ("stopping", *_UNKNOWN)
+    return True

@@ -1,0 +1,199 @@
+"""What the head knows of its members, and its talks with them.
+
+Each member is a session at the head's socket, which the link to that machine begins.
+"""
+
+import asyncio
+from collections.abc import Callable, Mapping
+from functools import partial
+
+from dora_systemd import __version__
+from dora_systemd.adapters.runner_socket.client import Request
+from dora_systemd.adapters.runner_socket.listener import refuse
+from dora_systemd.adapters.runner_socket.splice import Ends
+from dora_systemd.decisions.cell.machines import members_of
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.status import CellStatus
+from dora_systemd.decisions.life import events as life
+from dora_systemd.decisions.life.causes import Cause
+from dora_systemd.decisions.machines import wire
+from dora_systemd.decisions.machines.tables import merged
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.runner.cell.pump import now_us
+from dora_systemd.runner.machines.lines import Lines
+from dora_systemd.terminal_text import short_line
+from dora_systemd.values import quoted
+
+_SILENT_BEATS = 3
+"""A member of which nothing was heard for so many beats may be gone, so dora is not asked."""
+_LONGEST = 300
+_NO_LINK = "it is not connected yet"
+_NOT_JOINED = "it has not answered yet"
+
+
+class Member:
+    """One member.
+
+    lines: the talk with it, if there is one. work: dora's directory there, "" until it is ready.
+    words: why it is not ready. table: of its nodes. has_left: its part has ended in peace.
+    is_over: it has said that its part ends, and is not ready again in this talk.
+    """
+
+    def __init__(self) -> None:
+        self.lines: Lines | None = None
+        self.work = ""
+        self.words = _NO_LINK
+        self.table = CellStatus()
+        self.has_left = self.is_over = False
+
+    @property
+    def is_heard(self) -> bool:
+        """Whether it is there now."""
+        return self.lines is not None and self.lines.silent < _SILENT_BEATS
+
+
+class Roster:
+    """All members of a dataflow. push: takes the events; it is set before the first talk.
+
+    changed: set whenever something is new of a member.
+    """
+
+    def __init__(self, options: RunnerOptions, ports: wire.Forwards) -> None:
+        self._options, self._ports = options, ports
+        self._members = {name: Member() for name in members_of(options.placed)}
+        self._token = self._digest = self._dora = ""
+        self.changed = asyncio.Event()
+        self.push: Callable[[life.Event], None] = lambda _: None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The members in the order of the dataflow."""
+        return tuple(self._members)
+
+    def set_facts(self, digest: str, dora: str) -> None:
+        """Set what members compare: see wire.Part."""
+        self._digest, self._dora = digest, dora
+
+    def set_token(self, token: str) -> None:
+        """The coordinator listens: tell those that are there already."""
+        self._token = token
+        for name in self._members:
+            self._send_part(name)
+
+    def works(self) -> Mapping[str, str]:
+        """dora's directory on each machine."""
+        return {name: one.work for name, one in self._members.items()}
+
+    def missing(self) -> dict[str, str]:
+        """The members that are not ready, and why."""
+        return {name: one.words for name, one in self._members.items() if not one.work}
+
+    def silent(self) -> list[str]:
+        """The members that may be gone."""
+        return [name for name, one in self._members.items() if not one.is_heard]
+
+    def tell(self, message: wire.Message) -> None:
+        """Send a message to all that are there."""
+        for one in self._members.values():
+            if one.lines is not None:
+                one.lines.send(message)
+
+    def amend(self, table: CellStatus) -> CellStatus:
+        """The table of the head, with what the members say of their nodes."""
+        return merged(table, {name: one.table for name, one in self._members.items()})
+
+    async def link(self, request: Request, ends: Ends) -> None:
+        """The session of a link."""
+        name = str(request.get("machine"))
+        if name not in self._members:
+            message = f"machine {quoted(name)} has no node of this dataflow"
+            await refuse(ends, DoraSystemdError(message, "", ExitCode.USAGE))
+            return
+        lines = Lines(ends)
+        self._replace(name, lines)
+        lines.send(self._ports)
+        self._send_part(name)
+        why = await lines.talk(partial(self._hear, name, lines))
+        if self._members[name].lines is lines:
+            self._lose(name, why)
+
+    def _replace(self, name: str, lines: Lines) -> None:
+        if (old := self._members[name].lines) is not None:
+            self._lose(name, "it has a new link")
+            old.end("there is a new link")
+        self._members[name].lines, self._members[name].is_over = lines, False
+
+    def _send_part(self, name: str) -> None:
+        lines, options = self._members[name].lines, self._options
+        if lines is None or not self._token:
+            return
+        if self._members[name].words == _NO_LINK:
+            # Else the last words of ssh, or how it was lost, still tell more.
+            self._members[name].words = _NOT_JOINED
+        lines.send(
+            wire.Part(
+                name=options.name,
+                uuid=options.uuid,
+                machine=name,
+                token=self._token,
+                coordinator=self._ports.coordinator,
+                zenoh=self._ports.zenoh[name],
+                digest=self._digest,
+                grace=options.grace,
+                doractl=__version__,
+                dora=self._dora,
+            )
+        )
+        self.changed.set()
+
+    def _lose(self, name: str, why: str) -> None:
+        """The talk has ended. Words that the link or the member has said explain more."""
+        member = self._members[name]
+        was_ready, member.lines, member.table = bool(member.work), None, CellStatus()
+        if was_ready or member.words in (_NO_LINK, _NOT_JOINED):
+            member.words = why
+        member.work = ""
+        if was_ready and not member.has_left:
+            self.push(life.MachineLost(now_us(), name, why))
+        self.changed.set()
+
+    def _hear(self, name: str, lines: Lines, message: wire.Message) -> None:
+        if self._members[name].lines is not lines:
+            return
+        if isinstance(message, wire.Ready):
+            self._ready(name, message)
+        elif isinstance(message, wire.Table):
+            self._members[name].table = CellStatus.from_json(message.status)
+        elif isinstance(message, wire.Refused):
+            self._refused(name, message)
+        elif isinstance(message, wire.Ended):
+            self._ended(name, message)
+        elif isinstance(message, wire.Lost):
+            self._ended(name, wire.Ended(message.words))
+
+    def _ready(self, name: str, message: wire.Ready) -> None:
+        if not message.work.startswith("/"):
+            raise DoraSystemdError("its directory is not absolute")
+        if (member := self._members[name]).work or member.is_over:
+            return
+        member.work, member.has_left = message.work, False
+        self.push(life.MachineJoined(now_us(), name))
+        self.changed.set()
+
+    def _refused(self, name: str, message: wire.Refused) -> None:
+        hint = f"; hint: {short_line(message.hint, _LONGEST)}" if message.hint else ""
+        reason = f"machine {name}: {short_line(message.reason, _LONGEST)}{hint}"
+        self.push(life.Refused(now_us(), reason, Cause.MACHINE_REFUSES))
+
+    def _ended(self, name: str, message: wire.Ended) -> None:
+        """A member says why it ends, or its link why that is lost. The end of the talk follows."""
+        reason, by = (short_line(one, _LONGEST) for one in (message.reason, message.by))
+        member = self._members[name]
+        if not reason and not by:
+            member.has_left = True
+            return
+        was_ready, member.work, member.is_over = bool(member.work), "", True
+        member.words = reason or f"it was stopped there by {by}"
+        if was_ready or by:
+            self.push(life.MachineLost(now_us(), name, member.words, by))
+        self.changed.set()

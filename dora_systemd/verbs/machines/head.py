@@ -1,0 +1,87 @@
+"""What `doractl member` hears from the head, and says to it, until its relay takes over."""
+
+import os
+import select
+import time
+from contextlib import suppress
+from threading import Event, Lock, Thread
+from types import TracebackType
+
+from dora_systemd.decisions.machines.wire import (
+    BEAT_SECONDS,
+    MAX_LINE,
+    Beat,
+    Message,
+    Part,
+    expect,
+    format_message,
+    parse_message,
+)
+from dora_systemd.errors import DoraSystemdError, ExitCode
+
+PART_SECONDS = 10.0
+"""For each line until the part."""
+_MOST_SECONDS = 60.0
+
+
+class Head:
+    """The head, by two file descriptors. Within its block it hears that this side is there."""
+
+    def __init__(self, reading: int = 0, writing: int = 1) -> None:
+        self._reading, self._writing = reading, writing
+        self._lock = Lock()
+        self._over = Event()
+        self._beats = Thread(target=self._beat, daemon=True)
+
+    def __enter__(self) -> "Head":
+        self._beats.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._over.set()
+        self._beats.join()
+
+    def part(self) -> Part:
+        """What to run. Raises DoraSystemdError (USAGE) if nobody says it."""
+        most = time.monotonic() + _MOST_SECONDS
+        while True:
+            deadline = min(most, time.monotonic() + PART_SECONDS)
+            message = parse_message(self._line(deadline))
+            if not isinstance(message, Beat):
+                return expect(message, Part)
+
+    def tell(self, message: Message) -> None:
+        """Say something, if the head is still there."""
+        self.say(format_message(message))
+
+    def say(self, line: bytes) -> None:
+        """Say a whole line."""
+        with self._lock, suppress(OSError):
+            os.write(self._writing, line)
+
+    def _beat(self) -> None:
+        while not self._over.is_set():
+            self.tell(Beat())
+            self._over.wait(BEAT_SECONDS)
+
+    def _line(self, deadline: float) -> bytes:
+        """One line, and not a byte more: what follows is for the relay."""
+        line = b""
+        while not line.endswith(b"\n") and len(line) < MAX_LINE:
+            seconds = max(deadline - time.monotonic(), 0)
+            is_there = select.select([self._reading], [], [], seconds)[0]
+            byte = os.read(self._reading, 1) if is_there else b""
+            if not byte:
+                raise _silent()
+            line += byte
+        return line
+
+
+def _silent() -> DoraSystemdError:
+    hint = "doractl start on the head starts the members"
+    return DoraSystemdError("cannot run a member: no head says what to run", hint, ExitCode.USAGE)

@@ -1,0 +1,213 @@
+"""`doractl member`: the part of a dataflow on this machine, for a head that has come by ssh.
+
+The command line says what runs here, and only the doractl of the head writes that. What the head's
+runner says, whose memory the nodes there can change, is where the coordinator is. The answer to it
+is a Refused if a new attempt is of no use, and else an exit status.
+"""
+
+import hashlib
+import json
+import os
+import socket
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from typing import NoReturn
+
+from dora_systemd import __version__
+from dora_systemd.adapters.bus.manager import DOWN, Manager
+from dora_systemd.adapters.dora.command import version_numbers
+from dora_systemd.decisions.cell.restarts import RestartPolicy
+from dora_systemd.decisions.machines.link_command import RELAY_MODULE
+from dora_systemd.decisions.machines.wire import LEASE_SECONDS, MAX_LINE, Part
+from dora_systemd.decisions.unit.versions import transient_commands
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import unit_name
+from dora_systemd.paths import CellPaths
+from dora_systemd.scope import Scope
+from dora_systemd.trust.files import read_file
+from dora_systemd.trust.sockets import connect_unix, plain
+from dora_systemd.values import INFINITY, SECOND
+from dora_systemd.verbs.facts.cells import read_cell
+from dora_systemd.verbs.facts.reason import failure_reason, runners_refusal
+from dora_systemd.verbs.machines.head import Head
+from dora_systemd.verbs.start.claim import make_room, refuse_unit_file, require_free_name
+from dora_systemd.verbs.start.linger import is_lingering, linger_command
+from dora_systemd.verbs.start.plan import Plan, StartRequest, make_plan
+from dora_systemd.verbs.start.unit import plan_properties, systemd_number
+
+_START_SECONDS = 30.0
+"""For the runner's socket, and for its first words."""
+_POLL_SECONDS = 0.02
+_MOST_GRACE = 3600 * SECOND
+"""µs. The head's runner says it: it must not keep this machine from a shutdown."""
+_PASSING = (ExitCode.FAILURE, ExitCode.NO_SYSTEMD)
+"""Errors that the next attempt may not meet, such as a machine that still boots."""
+
+
+@dataclass(frozen=True)
+class MemberRequest:
+    """The command line. start: what to run, with name, UUID, nodes and the name of this machine."""
+
+    scope: Scope
+    start: StartRequest
+
+    @property
+    def unit(self) -> str:
+        """The unit of the part."""
+        return unit_name(self.start.name or "")
+
+
+def is_passing(error: DoraSystemdError) -> bool:
+    """Whether a new attempt may help."""
+    return error.code in _PASSING
+
+
+def start_member(manager: Manager, request: MemberRequest, head: Head) -> socket.socket:
+    """Start the part that the head describes; the connection to its runner, which is its life.
+
+    The first line of the runner has been passed on. Raises DoraSystemdError; then nothing runs.
+    """
+    part = head.part()
+    _check_part(part, request.start)
+    _check_linger(request.scope)
+    _end_old_part(manager, request)
+    boot = require_free_name(manager, request.scope, request.unit)
+    refuse_unit_file(boot)
+    plan = _member_plan(make_plan(request.scope, request.start), part)
+    _check_same(part, plan)
+    properties, _ = plan_properties(plan, manager)
+    make_room(manager, boot)
+    told = transient_commands(list(properties.values()), systemd_number(manager))
+    _start_transient(manager, request.unit, told)
+    try:
+        return _joined(manager, request, part, head)
+    except BaseException:
+        with suppress(DoraSystemdError):
+            manager.run_jobs("StopUnit", [request.unit])
+        raise
+
+
+def become_relay(runner: socket.socket) -> NoReturn:
+    """Have a small process carry what both say, for as long as the part lives."""
+    runner.setblocking(True)
+    runner.set_inheritable(True)
+    words = ("-E", "-P", "-m", RELAY_MODULE, str(runner.fileno()), f"{LEASE_SECONDS:g}")
+    os.execv(sys.executable, [sys.executable, *words])
+
+
+def _check_part(part: Part, start: StartRequest) -> None:
+    """The head's doractl and its runner have to mean the same dataflow."""
+    if (part.name, part.uuid, part.machine) != (start.name, start.uuid, start.machine):
+        raise _refusal("the head's runner wants to run another dataflow than its doractl")
+
+
+def _check_linger(scope: Scope) -> None:
+    if scope.is_user and is_lingering(scope) is False:
+        hint = f"on that machine, as root: {linger_command(scope)}"
+        raise _refusal("the user there does not linger, so it would end with this session", hint)
+
+
+def _end_old_part(manager: Manager, request: MemberRequest) -> None:
+    """End a part of the same dataflow whose head has begun anew."""
+    cell = read_cell(manager, request.unit)
+    is_old = cell and cell.uuid == request.start.uuid and cell.options.machine
+    if cell and is_old and cell.has_begun:
+        manager.run_jobs("StopUnit", [request.unit])
+
+
+def _member_plan(plan: Plan, part: Part) -> Plan:
+    """The head owns restarts and the time of a start."""
+    options = plan.options._replace(
+        restart=RestartPolicy("no"),
+        start_timeout=INFINITY,
+        grace=min(part.grace, _MOST_GRACE),
+    )
+    return replace(plan, options=options)
+
+
+def _check_same(part: Part, plan: Plan) -> None:
+    """Raise DoraSystemdError unless both machines have the same file and the same doractl.
+
+    The runner asks dora for its version: root does not run it.
+    """
+    if version_numbers(part.doractl)[:2] != version_numbers(__version__)[:2]:
+        hint = "install the same version of dora-systemd on both machines"
+        there = plain(part.doractl)
+        raise _refusal(f"it has dora-systemd {__version__}, the head has {there}", hint)
+    path = plan.options.dataflow
+    if hashlib.sha256(read_file(path).data).hexdigest() != part.digest:
+        hint = "copy the directory of the dataflow to that machine"
+        raise _refusal(f"{path} is not the same file as on the head", hint)
+
+
+def _start_transient(
+    manager: Manager, unit: str, properties: Sequence[tuple[str, str, object]]
+) -> None:
+    try:
+        manager.start_transient(unit, properties, None, wait=False)
+    except DoraSystemdError as error:
+        if error.code is ExitCode.NAME_IN_USE:
+            # The session before this one was just starting it: it ends with that session.
+            raise DoraSystemdError(error.message, error.hint) from error
+        raise
+
+
+def _joined(manager: Manager, request: MemberRequest, part: Part, head: Head) -> socket.socket:
+    """The connection to the runner, which has got its part and answered."""
+    runner = _reached(manager, request)
+    try:
+        runner.sendall(json.dumps({"verb": "part", **asdict(part)}).encode() + b"\n")
+        line = _first_line(runner)
+        if not line.endswith(b"\n"):
+            raise _failure(manager, request.unit)
+        if refusal := _refusal_in(line):
+            raise refusal
+        head.say(line)
+        return runner
+    except BaseException:
+        runner.close()
+        raise
+
+
+def _reached(manager: Manager, request: MemberRequest) -> socket.socket:
+    path = CellPaths(request.scope.cell_directory(request.start.name or "")).socket
+    deadline = time.monotonic() + _START_SECONDS
+    while time.monotonic() < deadline:
+        with suppress(OSError):
+            return connect_unix(path, _START_SECONDS)
+        state = manager.read(request.unit, ["Job", "ActiveState"])
+        if state["ActiveState"] in DOWN and not (state["Job"] or (0,))[0]:
+            raise _failure(manager, request.unit)
+        time.sleep(_POLL_SECONDS)
+    raise DoraSystemdError(f"cannot start {request.unit}: its runner does not answer")
+
+
+def _failure(manager: Manager, unit: str) -> DoraSystemdError:
+    """Why the runner has ended."""
+    refusal = runners_refusal(manager, unit)
+    return refusal or DoraSystemdError(f"cannot start {unit}: {failure_reason(manager, unit)}")
+
+
+def _first_line(runner: socket.socket) -> bytes:
+    """One line, and not a byte more: what follows is for the relay."""
+    line = b""
+    with suppress(OSError):
+        while not line.endswith(b"\n") and len(line) < MAX_LINE and (byte := runner.recv(1)):
+            line += byte
+    return line
+
+
+def _refusal_in(line: bytes) -> DoraSystemdError | None:
+    """The error of a runner that does not take the part, as any refusal of it."""
+    with suppress(ValueError, RecursionError):
+        found = json.loads(line)
+        if isinstance(found, dict) and "error" in found:
+            return DoraSystemdError(plain(str(found["error"])), plain(str(found.get("hint", ""))))
+    return None
+
+
+def _refusal(reason: str, hint: str = "") -> DoraSystemdError:
+    return DoraSystemdError(reason, hint, ExitCode.BAD_INPUT)

@@ -1,0 +1,109 @@
+"""Asks a machine by ssh whether it can be a member, as its link would log in."""
+
+import itertools
+import os
+import random
+import subprocess
+import time
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from dora_systemd.adapters.host.loopback import port_error
+from dora_systemd.adapters.ssh.program import start_ssh
+from dora_systemd.decisions.cell.machines import HEAD
+from dora_systemd.decisions.machines.facts import Facts, parse_facts
+from dora_systemd.decisions.machines.link_command import LinkOptions, ssh_link_arguments
+from dora_systemd.decisions.machines.wire import PORT_RANGE, Forwards
+from dora_systemd.decisions.remote.command import Way, quote, remote_command, ssh_arguments
+from dora_systemd.decisions.remote.failures import ending_error, lost, silent
+from dora_systemd.decisions.remote.hosts import Host
+from dora_systemd.decisions.remote.stream import AfterMark
+
+SECONDS = 60.0
+_FACTS = ("member", "--facts")
+_TRIES = 100
+_MICROSECOND_NS = 1000
+
+
+class Probe(NamedTuple):
+    """What a machine has said. skew: µs that its clock is ahead of ours."""
+
+    facts: Facts
+    skew: int
+
+
+def probe_as_caller(host: Host) -> Probe:
+    """With the keys of the caller; on a terminal ssh may ask. Raises DoraSystemdError (NO_HOST)."""
+    mark = _mark()
+    arguments = ssh_arguments(host, Way.ONCE, remote_command(Way.ONCE, _FACTS, mark))
+    return _probe(host, _asking(arguments), mark)
+
+
+def probe_as_link(host: Host, machine: str, identity: str) -> Probe:
+    """As the link to the machine does, with forwards. identity: its key, or "".
+
+    Raises DoraSystemdError (NO_HOST).
+    """
+    mark = _mark()
+    free = (port for port in random.sample(PORT_RANGE, _TRIES) if not port_error(port))
+    coordinator, own, other = itertools.islice(free, 3)
+    forwards = Forwards(coordinator, {HEAD: own, machine: other})
+    link = LinkOptions("/", machine, host.text, _FACTS, identity)
+    return _probe(host, ssh_link_arguments(link, forwards, mark), mark)
+
+
+def run_there(host: Host, script: str, *words: str) -> None:
+    """Run a script of sh(1), on one line, as the caller. Raises DoraSystemdError (NO_HOST)."""
+    mark = _mark()
+    whole = f'echo "$1"; echo "$1" >&2; shift; {script}'
+    command = " ".join(["exec", "sh", "-c", *map(quote, (whole, "sh", mark, *words))])
+    status, output, errors = _run(host, _asking(ssh_arguments(host, Way.ONCE, command)))
+    _require(host, mark, output, errors, status)
+    if status:
+        raise lost(host, errors.decode("utf-8", "replace"))
+
+
+def _asking(arguments: Sequence[str]) -> list[str]:
+    """Without BatchMode: a person may be asked for a password, or about a host key."""
+    at = list(arguments).index("BatchMode=yes")
+    return [*arguments[: at - 1], *arguments[at + 1 :]]
+
+
+def _probe(host: Host, arguments: Sequence[str], mark: str) -> Probe:
+    begun = time.time_ns()
+    status, output, errors = _run(host, arguments)
+    ended = time.time_ns()
+    facts = parse_facts(_require(host, mark, output, errors, status))
+    return Probe(facts, _skew(facts.now, begun // _MICROSECOND_NS, ended // _MICROSECOND_NS))
+
+
+def _skew(now: int, begun: int, ended: int) -> int:
+    """How far its clock is ahead, at least: it was read between these two of ours."""
+    return min(now - begun, 0) + max(now - ended, 0)
+
+
+def _require(host: Host, mark: str, output: bytes, errors: bytes, status: int) -> str:
+    """What came after the mark. Raises DoraSystemdError (NO_HOST) if there is none."""
+    said, complained = AfterMark(mark), AfterMark(mark)
+    answer, complaint = said.feed(output), complained.feed(errors)
+    words = (said.noise, complaint if said.is_open else complained.noise)
+    texts = [one.decode("utf-8", "replace") for one in words]
+    if error := ending_error(host, status, said.is_open, *texts):
+        raise error
+    return answer.decode("utf-8", "replace")
+
+
+def _run(host: Host, arguments: Sequence[str]) -> tuple[int, bytes, bytes]:
+    pipe = subprocess.PIPE
+    null = subprocess.DEVNULL
+    with start_ssh(arguments, stdin=null, stdout=pipe, stderr=pipe) as child:
+        try:
+            output, errors = child.communicate(timeout=SECONDS)
+        except subprocess.TimeoutExpired as error:
+            child.kill()
+            raise silent(host, SECONDS, "no answer") from error
+        return child.returncode, output, errors
+
+
+def _mark() -> str:
+    return f"doractl-{os.urandom(16).hex()}"

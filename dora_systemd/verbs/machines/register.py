@@ -1,0 +1,167 @@
+"""`doractl machine add`, `list`, `check` and `remove`."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from stat import S_IMODE
+
+from dora_systemd.adapters.host.files import decoded, parse_yaml, write_atomic
+from dora_systemd.decisions.cell.machines import parse_machine
+from dora_systemd.decisions.machines.declared import with_machine, without_machine
+from dora_systemd.decisions.machines.entry import parse_entry
+from dora_systemd.decisions.machines.facts import problems, required
+from dora_systemd.decisions.machines.key import authorized_line
+from dora_systemd.decisions.remote.hosts import Host
+from dora_systemd.decisions.settings.machines import MACHINES
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.scope import Scope
+from dora_systemd.trust.files import read_file
+from dora_systemd.trust.paths import exists
+from dora_systemd.values import quoted, shown
+from dora_systemd.verbs.machines.keys import make_key, public_key, remove_key
+from dora_systemd.verbs.machines.own import own_facts
+from dora_systemd.verbs.machines.probe import Probe, probe_as_caller, probe_as_link, run_there
+from dora_systemd.verbs.start.settings import config_file, key_place, read_config
+
+_INSTALL = (
+    'umask 077; mkdir -p "$HOME/.ssh" && f="$HOME/.ssh/authorized_keys" && touch "$f" && '
+    '{ [ -z "$(tail -c1 "$f")" ] || echo >>"$f"; } && '
+    '{ grep -qF "$1" "$f" || printf "%s\\n" "$2" >>"$f"; }'
+)
+_REMOVE = (
+    'f="$HOME/.ssh/authorized_keys"; [ -f "$f" ] || exit 0; umask 077; '
+    # grep has the status 1 if no line is left, and 2 if it cannot read or write.
+    'grep -vF "$1" "$f" >"$f.doractl"; [ $? -le 1 ] && mv "$f.doractl" "$f"'
+)
+_NEW_MODE = 0o644
+
+
+@dataclass(frozen=True)
+class Known:
+    """A machine of a config.yml. key: the file of its own key, or "" for the keys of the caller."""
+
+    name: str
+    host: Host
+    key: str
+
+
+def known_machines(scope: Scope, environment: Mapping[str, str]) -> list[Known]:
+    """All of them. Raises DoraSystemdError."""
+    settings = read_config(scope, environment)
+    source = settings.source(MACHINES)
+    found = (
+        parse_entry(name, declared, source, "/dataflow.yml")
+        for name, declared in settings[MACHINES].items()
+    )
+    place = key_place(scope, environment)
+    return [Known(one.name, one.host, _key(place, one.name)) for one in found]
+
+
+def chosen(machines: list[Known], names: tuple[str, ...]) -> list[Known]:
+    """Those with these names; all without names. Raises DoraSystemdError (NOT_FOUND)."""
+    by_name = {one.name: one for one in machines}
+    for name in names:
+        if name not in by_name:
+            hint = f"machines: {', '.join(by_name)}" if by_name else "see doractl machine add"
+            raise DoraSystemdError(f"no machine named {quoted(name)}", hint, ExitCode.NOT_FOUND)
+    return [by_name[name] for name in names] if names else machines
+
+
+def check_machine(scope: Scope, machine: Known) -> tuple[Probe, list[tuple[str, str]]]:
+    """What a machine says, as its link logs in, and what is wrong. Raises DoraSystemdError."""
+    probe = probe_as_link(machine.host, machine.name, machine.key)
+    return probe, list(problems(own_facts(scope), probe.facts, probe.skew))
+
+
+def add_machine(
+    scope: Scope, environment: Mapping[str, str], host: Host, name: str
+) -> Iterator[str]:
+    """Make a key, let it in over there, and declare the machine; yields what was done.
+
+    Raises DoraSystemdError; then nothing is declared.
+    """
+    parse_machine(name)
+    if any(one.name == name for one in known_machines(scope, environment)):
+        hint = f"doractl machine check {name}, or choose another --name"
+        message = f"cannot add machine {name}: there is one of that name"
+        raise DoraSystemdError(message, hint, ExitCode.NAME_IN_USE)
+    file = config_file(scope, environment)
+    text = _with(file, name, host)
+    found = probe_as_caller(host)
+    required(problems(own_facts(scope), found.facts, found.skew), name)
+    key = make_key(key_place(scope, environment), name)
+    public = public_key(key)
+    line = authorized_line(found.facts.program, public, f"dora-systemd:{name}")
+    run_there(host, _INSTALL, public.split()[1], line)
+    yield f"Key {key} may run parts of dataflows there as {found.facts.user}"
+    probe_as_link(host, name, str(key))
+    _write(file, text)
+    yield f"Machine added: {name} ({host.text}), in {file}"
+
+
+def remove_machine(scope: Scope, environment: Mapping[str, str], machine: Known) -> Iterator[str]:
+    """Undo add_machine(). Raises DoraSystemdError."""
+    file = config_file(scope, environment)
+    text = _without(file, machine.name)
+    if machine.key:
+        try:
+            run_there(machine.host, _REMOVE, public_key(Path(machine.key)).split()[1])
+        except DoraSystemdError as error:
+            yield f"its key is still let in there: {error.message}"
+        remove_key(Path(machine.key))
+    _write(file, text)
+    yield f"Machine removed: {machine.name} ({machine.host.text})"
+
+
+def _key(place: Path, name: str) -> str:
+    path = place / name
+    return str(path) if exists(path) else ""
+
+
+def _with(file: Path, name: str, host: Host) -> str:
+    before = _text(file)
+    text = with_machine(before, name, host.text)
+    return _checked(file, before, text, name, added=host.text)
+
+
+def _without(file: Path, name: str) -> str:
+    before = _text(file)
+    return _checked(file, before, without_machine(before, name), name)
+
+
+def _checked(file: Path, before: str, text: str | None, name: str, added: str = "") -> str:
+    """The new text, if YAML reads exactly this change from it. Raises DoraSystemdError."""
+    wanted = dict(_document(file, before))
+    there = wanted.get("machines")
+    machines = dict(there) if isinstance(there, dict) else {}
+    if added:
+        machines[name] = {"host": added}
+    else:
+        machines.pop(name, None)
+    wanted = {key: value for key, value in wanted.items() if key != "machines"}
+    wanted |= {"machines": machines} if machines else {}
+    if text is None or file.is_symlink() or _document(file, text) != wanted:
+        what = f"write {name}: {{host: {added}}} below" if added else f"remove {name} below"
+        message = f"cannot change {shown(str(file))} by itself"
+        raise DoraSystemdError(message, f"{what} machines: there", ExitCode.BAD_INPUT)
+    return text
+
+
+def _document(file: Path, text: str) -> dict[str, object]:
+    found = parse_yaml(text, file, allow_empty=True)
+    return {str(key): value for key, value in found.items()} if isinstance(found, dict) else {}
+
+
+def _text(file: Path) -> str:
+    return decoded(read_file(file).data, file) if exists(file) else ""
+
+
+def _write(file: Path, text: str) -> None:
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        message = f"cannot create {file.parent}: {error.strerror}"
+        raise DoraSystemdError(message, "", ExitCode.NO_PERMISSION) from error
+    # It may have secrets, such as values of env.
+    mode = S_IMODE(read_file(file).place.mode) if exists(file) else _NEW_MODE
+    write_atomic(file, text, mode, is_durable=True)

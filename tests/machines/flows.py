@@ -1,0 +1,119 @@
+"""A dataflow over the machines of the lab: its head is on a, its members are b and perhaps c."""
+
+import json
+import subprocess
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from tests.machines.wires import there
+from tests.system.cells import DOUBLER, SINK, SOURCE, Cell, Project, dora_processes, wait_for
+
+PLACE = "/opt/flow"
+NAME = "flow"
+_DATAFLOW = """
+nodes:
+  - id: source
+    path: source.py
+    inputs: {{tick: dora/timer/millis/50}}
+    outputs: [number]
+  - id: doubler
+    path: doubler.py
+    inputs: {{number: {{source: source/number, queue_size: 1000}}}}
+    outputs: [double]
+    deploy: {{machine: gpu}}
+  - id: sink
+    path: sink.py
+    inputs: {{double: {{source: doubler/double, queue_size: 1000}}}}
+    deploy: {{machine: {sink}}}
+"""
+_PROCESSES = "'pgrep -af \"dora_systemd|dora (daemon|coordinator)|/opt/flow\" | grep -v pgrep'"
+
+
+@dataclass(frozen=True)
+class Flow:
+    """A dataflow on a and `members`, machine by name of the dataflow."""
+
+    members: dict[str, str]
+
+    @property
+    def cell(self) -> Cell:
+        """The unit of the head."""
+        return Cell(NAME)
+
+    @property
+    def machines(self) -> Sequence[str]:
+        """All of them."""
+        return ("a", *self.members.values())
+
+    def bring(self) -> None:
+        """The same files on all machines."""
+        place = Project(Path(PLACE), is_new=False)
+        for name, text in (("source", SOURCE), ("doubler", DOUBLER), ("sink", SINK)):
+            place.write(f"{name}.py", text)
+        place.write("dataflow.yml", _DATAFLOW.format(sink="arm" if "arm" in self.members else "a"))
+        for machine in self.members.values():
+            there(machine, "mkdir", "-p", PLACE)
+            command = ["scp", "-q", "-r", PLACE, f"root@{machine}:/opt"]
+            subprocess.run(command, check=True)
+
+    def flags(self) -> list[str]:
+        """For `doractl start`."""
+        return [f"--machine={name}={host}" for name, host in self.members.items()]
+
+    def start(self, *flags: str, check: bool = True) -> subprocess.CompletedProcess[str]:
+        """Start it, and wait for all of its nodes."""
+        file = Path(PLACE) / "dataflow.yml"
+        return self.cell.start(file, *self.flags(), *flags, check=check)
+
+    def status(self) -> str:
+        """The status of the head's unit for people."""
+        return self.cell.show("StatusText")
+
+    def is_running(self) -> bool:
+        """Whether all nodes are ready, as far as the head knows."""
+        return self.cell.show("ActiveState") == "active"
+
+    def life(self) -> str:
+        """What is new with each run."""
+        return self.cell.show("InvocationID")
+
+    def wait_again(self, life: str) -> None:
+        """Return when another run than that of `life` is there, and messages flow."""
+        wait_for("it runs again", lambda: self.life() != life and self.is_running(), 60)
+        self.wait_exchanging()
+
+    def wait_exchanging(self) -> None:
+        """Return when the sink has got something new."""
+        before = self.heard()
+        wait_for("the sink hears more", lambda: self.heard() != before)
+
+    def heard(self) -> str:
+        """The last that the sink has said, on whatever machine."""
+        command = f"journalctl -q -n 1 -o short-unix -t {NAME}/sink"
+        return there(self.members.get("arm", "a"), command).stdout
+
+    def pid(self, machine: str, pattern: str) -> str:
+        """The process of the unit on a machine whose command line has `pattern`."""
+        group = f"/sys/fs/cgroup/dora.slice/dora-{NAME}.service"
+        command = f'\'for p in $(cat $(find {group} -name cgroup.procs)); do tr "\\0" " " '
+        command += f'< /proc/$p/cmdline | grep -q -- "{pattern}" && echo $p; done\''
+        found = there(machine, "sh", "-c", command).stdout.split()
+        assert len(found) == 1, f"{pattern} on {machine}: {found}"
+        return found[0]
+
+    def kill(self, machine: str, pattern: str) -> None:
+        """Kill that process."""
+        assert there(machine, "kill", "-9", self.pid(machine, pattern)).returncode == 0
+
+    def left(self) -> str:
+        """What is left of it on any machine."""
+        found = [f"{pid} {words}" for pid, words in dora_processes().items()]
+        for machine in self.members.values():
+            found += there(machine, "sh", "-c", _PROCESSES).stdout.splitlines()
+        return "\n".join(found)
+
+    def table(self) -> dict[str, dict[str, object]]:
+        """The nodes as `list -o json` has them."""
+        row = json.loads(self.cell.doractl("list", NAME, "-o", "json").stdout)
+        return {node["node"]: node for node in row["nodes"]}

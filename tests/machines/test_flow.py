@@ -1,0 +1,139 @@
+"""One dataflow over several machines: from its start to its end."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.errors import ExitCode
+from tests.machines.flows import NAME, PLACE, Flow
+from tests.machines.wires import there
+from tests.system.cells import run, wait_for
+
+TWO = {"gpu": "b"}
+THREE = {"gpu": "b", "arm": "c"}
+
+
+@pytest.fixture(params=[TWO, THREE], ids=["two", "three"])
+def flow(request: pytest.FixtureRequest) -> Iterator[Flow]:
+    """A dataflow whose files are everywhere."""
+    flow = Flow(request.param)
+    flow.bring()
+    yield flow
+    flow.cell.doractl("stop", NAME, check=False)
+    flow.cell.end()
+    wait_for("nothing is left", lambda: not flow.left())
+
+
+def listeners(machine: str) -> set[str]:
+    """The addresses with a listener that others can reach."""
+    lines = there(machine, "ss", "-Hltn").stdout.splitlines()
+    found = {line.split()[3] for line in lines}
+    return {one for one in found if not one.startswith(("127.0.0.1:", "[::1]:"))}
+
+
+def test_a_life(flow: Flow) -> None:
+    started = flow.start()
+    assert started.returncode == 0, started.stderr
+    flow.wait_exchanging()
+    nodes = flow.table()
+    assert {node: one.get("machine") for node, one in nodes.items()} == {
+        "source": "head",
+        "doubler": "gpu",
+        "sink": "arm" if "arm" in flow.members else "head",
+    }
+    assert {one["state"] for one in nodes.values()} == {"running"}
+    token = json.loads((flow.cell.paths.control).read_text())["token"]
+    for machine in flow.machines:
+        assert listeners(machine) == {"0.0.0.0:22", "[::]:22"}
+        assert token not in there(machine, "cat /proc/[0-9]*/cmdline | tr '\\0' '\\n'").stdout
+    on_b = there("b", "journalctl", "-q", "-o", "cat", "-t", f"{NAME}/doubler").stdout
+    assert "ready" in on_b
+    stopped = flow.cell.doractl("stop", NAME)
+    assert stopped.returncode == 0
+    for machine in flow.machines:
+        assert not there(machine, "systemctl", "-q", "list-units", "doralink-*").stdout.strip()
+    assert not flow.left()
+
+
+def test_again_and_a_restart(flow: Flow) -> None:
+    flow.start()
+    life = flow.life()
+    done = flow.cell.doractl("restart", NAME)
+    assert done.returncode == 0, done.stderr
+    flow.wait_again(life)
+    flow.cell.doractl("stop", NAME)
+    flow.start()
+    flow.wait_exchanging()
+
+
+@pytest.mark.parametrize("flow", [TWO], indirect=True)
+class TestRefusals:
+    """One line, and nothing is left anywhere."""
+
+    def refused(self, flow: Flow, *words: str, code: int) -> None:
+        done = flow.start(check=False)
+        assert done.returncode == code, done.stderr
+        for word in words:
+            assert word in done.stderr
+        assert "Traceback" not in done.stderr
+        assert not flow.left()
+
+    def test_another_file_there(self, flow: Flow) -> None:
+        there("b", f"echo '# changed' >> {PLACE}/dataflow.yml")
+        self.refused(flow, "gpu", "not the same file", code=ExitCode.BAD_INPUT)
+
+    def test_the_name_is_taken_there(self, flow: Flow) -> None:
+        command = f"systemd-run -q --unit dora-{NAME} sleep 1000"
+        assert there("b", command).returncode == 0
+        try:
+            self.refused(flow, "gpu", "already exists", code=ExitCode.BAD_INPUT)
+        finally:
+            there("b", "systemctl", "stop", f"dora-{NAME}")
+
+    def test_no_doractl_there(self, flow: Flow) -> None:
+        there("b", "mv /opt/lab/bin/doractl /opt/lab/bin/doractl.away")
+        try:
+            self.refused(flow, "cannot find doractl on b", code=ExitCode.BAD_INPUT)
+        finally:
+            there("b", "mv /opt/lab/bin/doractl.away /opt/lab/bin/doractl")
+
+    def test_a_strange_host_key(self, flow: Flow) -> None:
+        known = "/root/.ssh/known_hosts"
+
+        run("sh", "-c", f"cp {known} {known}.kept; sed -i '/^b /d' {known}")
+        try:
+            self.refused(flow, "gpu", "Host key verification failed", code=ExitCode.BAD_INPUT)
+        finally:
+            run("mv", f"{known}.kept", known)
+
+
+@pytest.mark.parametrize("flow", [TWO], indirect=True)
+def test_the_head_alone_is_enabled(flow: Flow) -> None:
+    """Its unit file and those of its links start the whole; the member has none."""
+    link = Path(f"/etc/systemd/system/doralink-{NAME}:gpu.service")
+    flow.start()
+    try:
+        enabled = flow.cell.doractl("enable", NAME)
+        assert enabled.returncode == 0, enabled.stderr
+        assert link.exists()
+        flow.cell.doractl("stop", NAME)
+        assert not flow.left()
+        flow.cell.systemctl("start")  # as a boot does
+        flow.wait_exchanging()
+        assert flow.cell.show("FragmentPath") == str(link.with_name(flow.cell.unit))
+        fragment = run("systemctl", "show", "-P", "FragmentPath", link.name).stdout.strip()
+        assert fragment == str(link)
+        again = flow.start(check=False)
+        assert again.returncode == ExitCode.NAME_IN_USE
+        flow.cell.doractl("stop", NAME)
+        same = flow.start()
+        assert same.returncode == 0, same.stderr
+    finally:
+        flow.cell.doractl("disable", NAME)
+    assert not link.exists()
+    flow.wait_exchanging()
+    assert flow.cell.doractl("stop", NAME).returncode == 0
+    units = run("systemctl", "list-units", "--all", "--plain", "--no-legend", "dora*flow*").stdout
+    assert not units.strip()

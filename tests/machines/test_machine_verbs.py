@@ -1,0 +1,85 @@
+"""doractl machine: a machine with a key of its own, and what that key can do."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.errors import ExitCode
+from tests.machines.flows import NAME, PLACE, Flow
+from tests.machines.wires import cable, there
+from tests.system.cells import run, wait_for
+
+KEY = "/etc/dora-systemd/ssh/gpu"
+CONFIG = Path("/etc/dora-systemd/config.yml")
+LINE = "grep -c dora-systemd:gpu /root/.ssh/authorized_keys"
+BATCH = ("-oBatchMode=yes", "-oConnectTimeout=5")
+
+
+@pytest.fixture
+def gpu() -> Iterator[None]:
+    """b is the machine gpu."""
+    added = run("doractl", "machine", "add", "root@b", "--name", "gpu", check=False)
+    assert added.returncode == 0, added.stderr
+    assert "Machine added: gpu (root@b)" in added.stdout
+    yield
+    removed = run("doractl", "machine", "remove", "gpu", check=False)
+    assert removed.returncode == 0, removed.stderr
+    assert not Path(KEY).exists()
+    assert there("b", LINE).stdout == "0\n"
+    assert "gpu" not in CONFIG.read_text()
+
+
+def by_key(*words: str) -> str:
+    """What ssh says with that key alone."""
+    done = run(
+        "ssh", *BATCH, "-F/dev/null", "-oIdentitiesOnly=yes", f"-i{KEY}", *words, check=False
+    )
+    assert done.returncode != 0
+    return done.stdout + done.stderr
+
+
+def test_a_key_for_dataflows_only(gpu: None) -> None:
+    del gpu
+    assert there("b", LINE).stdout == "1\n"
+    assert "can only run parts of dataflows" in by_key("root@b", "id")
+    assert "can only run parts of dataflows" in by_key("root@b", "doractl", "stop", "--all")
+    listening = ("-oExitOnForwardFailure=yes", "-R", "10.77.0.2:61000:127.0.0.1:22")
+    assert "forwarding failed" in by_key(*listening, "root@b", "id")
+
+
+def test_a_dataflow_by_that_key(gpu: None) -> None:
+    """No flag is needed, and no other key is used."""
+    del gpu
+    flow = Flow({"gpu": "b"})
+    flow.bring()
+    try:
+        started = flow.cell.start(Path(PLACE) / "dataflow.yml")
+        assert started.returncode == 0, started.stderr
+        flow.wait_exchanging()
+        link = run("systemctl", "show", "-P", "ExecStart", f"doralink-{NAME}:gpu.service").stdout
+        assert f"--identity={KEY}" in link
+    finally:
+        flow.cell.doractl("stop", NAME, check=False)
+        flow.cell.end()
+    wait_for("nothing is left", lambda: not flow.left())
+
+
+def test_a_check(gpu: None) -> None:
+    del gpu
+    listed = run("doractl", "machine", "list").stdout.splitlines()
+    assert listed[1].split() == ["gpu", "root@b", KEY]
+    assert run("doractl", "machine", "check").stdout.startswith("ok       gpu: dora-systemd ")
+    with cable("b", "off"):
+        away = run("doractl", "machine", "check", "gpu", check=False)
+        assert away.returncode == ExitCode.NO_HOST
+        assert "cannot reach root@b" in away.stdout
+    twice = run("doractl", "machine", "add", "root@b", "--name", "gpu", check=False)
+    assert twice.returncode == ExitCode.NAME_IN_USE
+
+
+def test_no_such_machine() -> None:
+    for words in (("check", "arm"), ("remove", "arm")):
+        assert run("doractl", "machine", *words, check=False).returncode == ExitCode.NOT_FOUND
+    assert run("doractl", "machine", "add", "nowhere", check=False).returncode == ExitCode.NO_HOST
+    assert not Path("/etc/dora-systemd/ssh/nowhere").exists()

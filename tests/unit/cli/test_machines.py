@@ -1,0 +1,128 @@
+"""`doractl logs` of several machines: which ones, and with which options."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dora_systemd.adapters.host.unit_names import has_unit, unit_places
+from dora_systemd.cli.remote import machines
+from dora_systemd.cli.remote.plan import Plan
+from dora_systemd.cli.verbs.look.logs import command
+from dora_systemd.decisions.cell.machines import Placed
+from dora_systemd.decisions.remote.hosts import Host
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import LINK_PREFIX
+from dora_systemd.scope import scope_of
+from tests.unit.fakes.manager import FakeManager, ScopeIn, options
+from tests.unit.verbs.facts.test_machines import WORDS
+
+PLACED = (Placed("yolo", "gpu"),)
+GPU = Host("gpu", "alice@gpu-box", "2222")
+HEAD = Host("head", "")
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Sequence[Host], Plan]]:
+    """What the machines were asked for."""
+    found: list[tuple[Sequence[Host], Plan]] = []
+
+    def take(hosts: Sequence[Host] | Host, plan: Plan) -> int:
+        found.append(([hosts] if isinstance(hosts, Host) else hosts, plan))
+        return 0
+
+    manager = FakeManager()
+    manager.add(options("robot", placed=PLACED))
+    manager.add(options("alone", "660e8400-e29b-41d4-a716-446655440000"))
+    manager.units["doralink-robot:gpu.service"] = {"ExecStart": [[WORDS[0], WORDS, False]]}
+    monkeypatch.setattr(machines, "Bus", lambda *_, **__: manager)
+    monkeypatch.setattr(machines, "run_on_all", take)
+    monkeypatch.setattr(machines, "pass_through", take)
+    return found
+
+
+def printed(*words: str) -> int | None:
+    with command.make_context("logs", list(words)) as context:
+        return machines.print_machines(scope_of(None), context)
+
+
+def test_all_machines(asked: list[Any]) -> None:
+    assert printed("robot", "-n", "5", "--follow", "--since=1h", "-o", "json", "-b") == 0
+    ((hosts, plan),) = asked
+    assert hosts == [HEAD, GPU]
+    assert plan.words == [
+        *("logs", "robot", "--follow", "--tail=5", "--boot=0", "--since=1h", "--machine=head"),
+    ]
+    assert (plan.key, plan.is_endless, plan.options["output"]) == ("machine", True, "json")
+
+
+@pytest.mark.parametrize(
+    ("words", "hosts"),
+    [
+        (("--machine", "gpu"), [GPU]),
+        (("--node", "yolo"), [GPU]),
+        (("--node", "y*"), [HEAD, GPU]),
+        (("--node", "yolo", "--node", "camera"), [HEAD, GPU]),
+    ],
+)
+def test_some_machines(asked: list[Any], words: tuple[str, ...], hosts: list[Host]) -> None:
+    assert printed("robot", *words) == 0
+    assert asked[0][0] == hosts
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("robot", "--machine", "head"),
+        ("robot", "--node", "camera"),
+        ("alone",),
+        ("nothing",),
+        ("rob*",),
+    ],
+)
+def test_this_machine_only(asked: list[Any], words: tuple[str, ...]) -> None:
+    assert printed(*words) is None
+    assert not asked
+
+
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [
+        (("robot", "--machine", "gpx"), ExitCode.USAGE),
+        (("alone", "--machine", "gpu"), ExitCode.USAGE),
+        (("robot", "alone", "--machine", "gpu"), ExitCode.USAGE),
+        (("--machine", "gpu"), ExitCode.USAGE),
+        (("nothing", "--machine", "gpu"), ExitCode.NOT_FOUND),
+    ],
+)
+def test_wrong_machines(asked: list[Any], words: tuple[str, ...], code: ExitCode) -> None:
+    with pytest.raises(DoraSystemdError) as caught:
+        printed(*words)
+    assert caught.value.code is code
+    assert not asked
+
+
+def test_another_scope_is_not_merged(asked: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
+    other = scope_of(os.getuid() == 0)
+    with command.make_context("logs", ["robot"]) as context:
+        assert machines.print_machines(other, context) is None
+    assert not asked
+    assert "the logs of gpu are left out" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("place", ["run/systemd/transient", "home/.config/systemd/user"])
+def test_links_are_seen_without_a_question(tmp_path: Path, place: str) -> None:
+    scope = ScopeIn(is_user=True, uid=1, root=tmp_path / "run")
+    environment = {"HOME": str(tmp_path / "home")}
+
+    def are_seen() -> bool:
+        return has_unit(unit_places(scope, environment), LINK_PREFIX)
+
+    assert not are_seen()
+    (tmp_path / place).mkdir(parents=True)
+    (tmp_path / place / "dora-robot.service").touch()
+    assert not are_seen()
+    (tmp_path / place / "doralink-robot:gpu.service").touch()
+    assert are_seen()

@@ -1,0 +1,83 @@
+"""The part of a dataflow that one machine runs."""
+
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dora_systemd.decisions.cell.launch import LaunchPlan, launch_descriptor
+from dora_systemd.decisions.cell.machines import Placed
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
+from dora_systemd.decisions.machines.part import (
+    check_placed,
+    launch_files,
+    own_dataflow,
+    own_options,
+    with_works,
+)
+from dora_systemd.decisions.signs.watchdogs import Watchdogs
+from dora_systemd.errors import DoraSystemdError
+
+UUID = "550e8400-e29b-41d4-a716-446655440000"
+PLACED = (Placed("mid", "gpu"),)
+
+
+def plan(**changes: Any) -> LaunchPlan:
+    options = RunnerOptions("robot", UUID, "/p/flow.yml", "/p", "/bin/dora", placed=PLACED)
+    options = options._replace(**changes)
+    return LaunchPlan(options, "/l.pl", "/usr/bin", {"/p/a.py"}.__contains__, lambda _: b"")
+
+
+def dataflow(**mid: Any) -> Dataflow:
+    nodes = [
+        {"id": "source", "path": "a.py", "deploy": {"machine": "here", "labels": {"x": "y"}}},
+        {"id": "mid", "path": "only-there.py", "build": "make", "restart_policy": "always", **mid},
+    ]
+    return parse_dataflow({"nodes": nodes}, "flow.yml")
+
+
+def test_the_head_says_where_a_node_runs_and_not_how() -> None:
+    head = plan()
+    source, mid = launch_descriptor(dataflow(), head)["nodes"]
+    assert (source["deploy"]["machine"], source["deploy"]["labels"]) == (None, {})
+    assert mid["path"] == "/usr/bin/perl"
+    assert "launch/mid" in mid["args"]
+    assert "only-there" not in str(mid)
+    assert "build" not in mid
+    assert mid["restart_policy"] == "always"
+    finished = with_works({"nodes": [source, mid]}, {"gpu": "/run/user/5/work"})["nodes"]
+    assert finished[0] == source
+    assert finished[1]["deploy"] == {"machine": "gpu", "working_dir": "/run/user/5/work"}
+
+
+def test_each_machine_has_its_own_nodes() -> None:
+    head, member = plan().options, plan(machine="gpu").options
+    assert [node.id for node in own_dataflow(head, dataflow()).nodes] == ["source"]
+    assert [node.id for node in own_dataflow(member, dataflow()).nodes] == ["mid"]
+    watchdogs: Watchdogs = {"source": 1, "mid": 2}
+    assert own_options(head._replace(watchdogs=watchdogs)).watchdogs == {"source": 1}
+    assert own_options(member._replace(watchdogs=watchdogs)).watchdogs == {"mid": 2}
+
+
+def test_a_launch_file_starts_the_node_whatever_its_words_are(tmp_path: Path) -> None:
+    odd = 'it\'s \\ "$HOME" @ARGV\n ü'
+    given = plan(machine="gpu")
+    given = LaunchPlan(given.options, "/l.pl", "/usr/bin", lambda _: True, lambda _: b"")
+    only = own_dataflow(
+        given.options, dataflow(path="run", args="'" + odd.replace("'", "'\\''") + "'")
+    )
+    text = launch_files(only, given)["mid"]
+    assert "'/usr/bin/perl', '/l.pl', 'mid', '/p', 'pipe', '/p/run'" in text
+    show = text.replace("'/usr/bin/perl', '/l.pl'", "'/usr/bin/printf', '%s|'")
+    file = tmp_path / "launch"
+    file.write_text(show)
+    said = subprocess.run(["/usr/bin/perl", str(file)], capture_output=True, check=True).stdout
+    assert said.decode() == f"mid|/p|pipe|/p/run|{odd}|"
+
+
+def test_only_what_we_start_ourselves_can_be_elsewhere() -> None:
+    check_placed(plan().options, dataflow())
+    with pytest.raises(DoraSystemdError, match="node mid cannot run on machine gpu"):
+        check_placed(plan().options, dataflow(path="dynamic"))

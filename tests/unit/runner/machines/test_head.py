@@ -1,0 +1,241 @@
+"""A head: it waits for its members, and does without dora when one is lost."""
+
+import asyncio
+from collections.abc import Callable, Coroutine
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
+
+from dora_systemd.decisions.cell.exits import exit_of
+from dora_systemd.decisions.cell.machines import Placed
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.status import NodeStatus
+from dora_systemd.decisions.dora.protocol import LogRecord
+from dora_systemd.decisions.life import events as life
+from dora_systemd.decisions.life.causes import Cause
+from dora_systemd.decisions.life.states import Cell, Do, State
+from dora_systemd.decisions.machines import wire
+from dora_systemd.paths import CellPaths
+from dora_systemd.runner.cell.life import Life
+from dora_systemd.runner.machines.engine import HeadEngine
+from dora_systemd.runner.machines.head import HeadDialogue
+from dora_systemd.runner.machines.roster import Roster
+from dora_systemd.values import SECOND
+from tests.unit.fakes.dialogue import Heard
+from tests.unit.fakes.ends import FakeEnds
+from tests.unit.fakes.loop import live
+from tests.unit.fakes.run import FakeDora, FakeNodes, FakePipes
+
+UUID = "550e8400-e29b-41d4-a716-446655440000"
+OPTIONS = RunnerOptions(
+    *("robot", UUID, "/srv/flow.yml", "/srv", "/bin/dora"), placed=(Placed("mid", "gpu"),)
+)
+PORTS = wire.Forwards(61000, {"head": 61001, "gpu": 61002})
+READY = wire.Ready("/run/there/work")
+NODES = {
+    "here": NodeStatus("running", 7),
+    "mid": NodeStatus("running", 0, machine="gpu"),
+}
+MID = ("daemon", "mid")
+
+
+class FakeHead(FakeDora):
+    """daemons: of which machines dora has one; "" is that of the head."""
+
+    daemons: list[str]
+
+    async def machines(self) -> list[str]:
+        return self.daemons
+
+
+class Bench:
+    def __init__(self, root: Path, is_first: bool = True, **options: Any) -> None:
+        self.nodes, self.pipes = FakeNodes(), FakePipes()
+        self.dora = FakeHead()
+        self.dora.daemons = ["", "gpu"]
+        given = OPTIONS._replace(**options)
+        self.roster = Roster(given, PORTS)
+        cell = Cell(2 * SECOND, 0, NODES, State.GATHERING, run="run", members=("gpu",))
+        self.pump = Heard(cell, Life("uuid"), CellPaths(root), self.nodes, self.pipes)
+        self.pump.heard, self.pump.calls = [], []
+        self.roster.push = self.pump.push
+        self.dialogue = HeadDialogue(given, self.pump, self.dora, self.nodes, self.pipes)
+        self.dialogue.begin(self.roster, cast(HeadEngine, self.dora), is_first)
+        self.ended = 0
+        self.dialogue._end_nodes = self._end_nodes  # type: ignore[method-assign]
+        self.actions = self.dialogue.actions({"nodes": []}, {})
+
+    async def _end_nodes(self) -> None:
+        self.ended += 1
+
+    async def link(self, *said: wire.Message) -> FakeEnds:
+        other = FakeEnds()
+        self.talk = asyncio.create_task(self.roster.link({"machine": "gpu"}, other.ends))
+        other.say(*said)
+        await settle()
+        return other
+
+    def be(self, state: State, **changes: Any) -> None:
+        self.pump.cell = replace(self.pump.cell, state=state, **changes)
+
+    def heard(self, *kinds: type[life.Event]) -> list[life.Event]:
+        return [replace(one, at_us=0) for one in self.pump.heard if isinstance(one, kinds)]
+
+    def texts(self) -> list[str]:
+        heard = (one for one in self.pump.heard if isinstance(one, life.MachinesAwaited))
+        return list(dict.fromkeys(one.text for one in heard))
+
+
+async def settle() -> None:
+    for _ in range(5):
+        await asyncio.sleep(0)
+
+
+def run(root: Path, work: Callable[[Bench], Coroutine[Any, Any, None]], **options: Any) -> None:
+    async def on_loop() -> None:
+        bench = Bench(root, **options)
+        try:
+            await work(bench)
+        finally:
+            bench.dialogue.cancel()
+
+    live(on_loop)
+
+
+def test_it_goes_on_when_all_have_joined(tmp_path: Path) -> None:
+    async def work(bench: Bench) -> None:
+        bench.actions[Do.GATHER]()
+        await settle()
+        assert bench.texts() == ["waiting for machine gpu (it is not connected yet)"]
+        await bench.link(READY)
+        await settle()
+        assert bench.heard(life.Gathered) == [life.Gathered(0)]
+
+    run(tmp_path, work)
+
+
+def test_a_daemon_that_dora_has_not_forgotten_is_waited_out(tmp_path: Path) -> None:
+    async def work(bench: Bench) -> None:
+        bench.dora.daemons = ["", "gpu", "gpu"]
+        bench.actions[Do.GATHER]()
+        await bench.link(READY)
+        await asyncio.sleep(1)
+        assert not bench.heard(life.Gathered)
+        bench.dora.daemons = ["gpu", ""]
+        await asyncio.sleep(1)
+        assert bench.heard(life.Gathered)
+
+    run(tmp_path, work)
+
+
+def test_the_first_start_does_not_wait_without_end(tmp_path: Path) -> None:
+    async def work(bench: Bench) -> None:
+        bench.actions[Do.GATHER]()
+        other = await bench.link(wire.Lost("connect to host b port 22: No route to host"))
+        other.reader.feed_eof()
+        await asyncio.sleep(29)
+        assert not bench.heard(life.Refused)
+        await asyncio.sleep(2)
+        (refused,) = bench.heard(life.Refused)
+        assert isinstance(refused, life.Refused)
+        assert refused.cause is Cause.NO_MACHINE
+        assert "cannot reach machine gpu (connect to host b port 22: No route" in refused.reason
+        assert refused.reason.endswith("no answer within 30s")
+
+    run(tmp_path, work)
+
+
+def test_a_later_start_does(tmp_path: Path) -> None:
+    async def work(bench: Bench) -> None:
+        bench.actions[Do.GATHER]()
+        await asyncio.sleep(3000)
+        assert not bench.heard(life.Refused)
+        await bench.link(READY)
+        await settle()
+        assert bench.heard(life.Gathered)
+
+    run(tmp_path, work, is_first=False)
+
+
+def test_the_start_timeout_begins_when_all_have_joined(tmp_path: Path) -> None:
+    async def work(bench: Bench) -> None:
+        bench.actions[Do.GATHER]()
+        await asyncio.sleep(100)
+        await bench.link(READY)
+        await asyncio.sleep(1)
+        assert not bench.heard(life.StartTimedOut)
+        bench.be(State.WAITING)
+        await asyncio.sleep(5)
+        assert bench.heard(life.StartTimedOut)
+
+    run(tmp_path, work, is_first=False, start_timeout=5 * SECOND)
+
+
+def test_a_stop_asks_dora_while_all_are_there(tmp_path: Path) -> None:
+    async def work(bench: Bench) -> None:
+        other = await bench.link(READY)
+        bench.be(State.STOPPING, stop_by="SIGTERM")
+        bench.dora.answers["Stop"].append({})
+        bench.actions[Do.ASK_STOP]()
+        await settle()
+        assert {"type": "stopping", "by": "SIGTERM"} in other.heard()
+        assert bench.heard(life.StopAnswered)
+        assert not bench.ended
+
+    run(tmp_path, work)
+
+
+def test_a_stop_does_not_ask_dora_if_one_is_silent(tmp_path: Path) -> None:
+    async def work(bench: Bench) -> None:
+        bench.be(State.STOPPING, stop_by="SIGTERM")
+        bench.actions[Do.ASK_STOP]()
+        await settle()
+        assert bench.heard(life.MachineLost) == [life.MachineLost(0, "gpu", "it does not answer")]
+        bench.actions[Do.END_NODES]()  # as the table wants after that event
+        await settle()
+        assert bench.ended == 1
+        assert not bench.dora.asked
+
+    run(tmp_path, work)
+
+
+def test_a_machine_that_falls_silent_during_a_stop_is_not_waited_for(tmp_path: Path) -> None:
+    async def work(bench: Bench) -> None:
+        await bench.link(READY)
+        bench.be(State.STOPPING, stop_by="SIGTERM")
+        bench.actions[Do.ASK_STOP]()
+        await asyncio.sleep(2)
+        assert not bench.heard(life.MachineLost)
+        await asyncio.sleep(2)
+        assert bench.heard(life.MachineLost) == [life.MachineLost(0, "gpu", "it does not answer")]
+
+    run(tmp_path, work)
+
+
+def test_a_daemon_that_is_gone_is_a_lost_machine(tmp_path: Path) -> None:
+    async def work(bench: Bench) -> None:
+        bench.actions[Do.GATHER]()
+        other = await bench.link(READY)
+        await asyncio.sleep(0.5)
+        bench.be(State.RUNNING)
+        bench.dora.daemons = [""]
+        for _ in range(4):
+            await asyncio.sleep(1)
+            other.say(wire.Beat())
+        reason = "its dora daemon is not connected any more"
+        assert life.MachineLost(0, "gpu", reason) in bench.heard(life.MachineLost)
+
+    run(tmp_path, work)
+
+
+def test_a_pid_of_another_machine_means_nothing_here(tmp_path: Path) -> None:
+    async def work(bench: Bench) -> None:
+        bench.be(State.RUNNING)
+        bench.dialogue._hear(LogRecord("DEBUG", "spawner", "mid", "spawned node with pid 1"))
+        said = "handling node stop with exit status Signal(9) (restart: false"
+        bench.dialogue._hear(LogRecord("DEBUG", *MID, said))
+        assert bench.heard(life.NodeSpawned) == [life.NodeSpawned(0, "mid", 0)]
+        assert bench.heard(life.NodeExited) == [life.NodeExited(0, "mid", exit_of(-9), False)]
+        assert bench.nodes.calls == [], "no process here is touched"
+
+    run(tmp_path, work)

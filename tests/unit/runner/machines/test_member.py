@@ -1,0 +1,221 @@
+"""A member: what it says to the head, and what it does without one."""
+
+import asyncio
+import json
+from collections.abc import Callable, Coroutine
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dora_systemd.decisions.cell.exits import exit_of
+from dora_systemd.decisions.cell.machines import Placed
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
+from dora_systemd.decisions.life import events as life
+from dora_systemd.decisions.life.states import Cell, Do, State
+from dora_systemd.decisions.machines import wire
+from dora_systemd.paths import CellPaths
+from dora_systemd.runner.cell.life import Life
+from dora_systemd.runner.machines.engine import MemberEngine
+from dora_systemd.runner.machines.member import Member
+from dora_systemd.runner.machines.member_dialogue import MemberDialogue
+from dora_systemd.runner.machines.processes import find
+from dora_systemd.values import SECOND
+from tests.unit.fakes.dialogue import Heard
+from tests.unit.fakes.ends import FakeEnds
+from tests.unit.fakes.loop import live
+from tests.unit.fakes.run import FakeNodes, FakePipes
+
+UUID = "550e8400-e29b-41d4-a716-446655440000"
+OPTIONS = RunnerOptions(
+    *("robot", UUID, "/srv/flow.yml", "/srv", "/bin/dora"),
+    placed=(Placed("mid", "gpu"), Placed("eye", "cam")),
+    machine="gpu",
+)
+PART = wire.Part(
+    *("robot", UUID, "gpu", "secret", 61000, 61002, "abcd", 2 * SECOND, "0.1.0", "1.1.0")
+)
+
+
+class Bench:
+    def __init__(self, root: Path, state: State) -> None:
+        paths = CellPaths(root)
+        self.member = Member(OPTIONS, Life("uuid"))
+        self.member._version = "1.1.4"
+        self.nodes, self.pipes = FakeNodes(), FakePipes()
+        cell = Cell(2 * SECOND, 0, {"mid": NodeStatus("running", 7)}, state, run="run")
+        self.pump = Heard(self.member.cell(cell), Life("uuid"), paths, self.nodes, self.pipes)
+        self.pump.heard, self.pump.calls = [], []
+        dora = self.member.engine("/bin/dora", paths, {}, None)
+        dialogue = self.member.dialogue(OPTIONS, self.pump, dora, self.nodes, self.pipes)
+        assert isinstance(dialogue, MemberDialogue)
+        assert isinstance(dora, MemberEngine)
+        self.dialogue, self.dora = dialogue, dora
+        self.actions = dialogue.actions({"nodes": []}, {})
+
+    def be(self, **changes: Any) -> None:
+        self.pump.cell = replace(self.pump.cell, **changes)
+
+    async def head(self, part: wire.Part = PART) -> FakeEnds:
+        """A head that has sent its part."""
+        other = FakeEnds()
+        request = {"verb": "part", **asdict(part)}
+        self.talk = asyncio.create_task(self.member.sessions["part"](request, other.ends))
+        await settle()
+        return other
+
+    def heard(self) -> list[life.Event]:
+        return [replace(one, at_us=0) for one in self.pump.heard]
+
+
+async def settle() -> None:
+    for _ in range(5):
+        await asyncio.sleep(0)
+
+
+def run(
+    root: Path, work: Callable[[Bench], Coroutine[Any, Any, None]], state: State = State.BOOTING
+) -> None:
+    async def on_loop() -> None:
+        await work(Bench(root, state))
+
+    live(on_loop)
+
+
+def test_a_part_begins_its_life(tmp_path: Path) -> None:
+    async def work(bench: Bench) -> None:
+        other = await bench.head()
+        assert bench.heard() == [life.CoordinatorListening(0)]
+        assert other.heard(without="") == [{"type": "beat"}]
+        assert not bench.dora._paths.control.exists()
+        other.reader.feed_eof()
+        await settle()
+        assert bench.heard()[1:] == [life.HeadLost(0, "the connection has ended")]
+
+    run(tmp_path, work)
+
+
+@pytest.mark.parametrize("change", [{"machine": "cam"}, {"name": "other"}])
+def test_the_part_of_another_is_refused(tmp_path: Path, change: dict[str, str]) -> None:
+    async def work(bench: Bench) -> None:
+        other = await bench.head(replace(PART, **change))  # type: ignore[arg-type]
+        assert other.heard()[0]["error"] == "this is the part of another dataflow"
+        assert bench.heard() == []
+
+    run(tmp_path, work)
+
+
+def test_it_has_one_head(tmp_path: Path) -> None:
+    async def work(bench: Bench) -> None:
+        other = await bench.head()
+        assert other.heard()[0]["error"] == "machine gpu has a head already"
+
+    run(tmp_path, work, State.RUNNING)
+
+
+def test_another_version_of_dora_is_refused(tmp_path: Path) -> None:
+    async def work(bench: Bench) -> None:
+        other = await bench.head(replace(PART, dora="1.0.2"))
+        (refused,) = other.heard()
+        assert refused["type"] == "refused"
+        assert refused["reason"] == "it has dora 1.1.4, the head has 1.0.2"
+        assert other.writer.is_closed
+        assert isinstance(bench.heard()[0], life.HeadLost)
+
+    run(tmp_path, work)
+
+
+def test_what_the_head_says(tmp_path: Path) -> None:
+    async def work(bench: Bench) -> None:
+        other = await bench.head()
+        other.say(wire.Stopping("SIGTERM"), wire.StopPart(SECOND))
+        await settle()
+        assert bench.heard()[1:] == [
+            life.HeadStops(0, "SIGTERM"),
+            life.HeadLost(0, "the head has lost another machine"),
+        ]
+        bench.be(stop_by="SIGTERM")
+        bench.actions[Do.EXIT]()
+        assert other.heard() == [{"type": "ended", "reason": "", "by": ""}], "the head knows why"
+
+    run(tmp_path, work)
+
+
+@pytest.mark.parametrize(
+    ("is_down", "ended"),
+    [
+        (False, {"reason": "", "by": "SIGTERM"}),
+        (True, {"reason": "the machine is shutting down", "by": ""}),
+    ],
+)
+def test_who_stops_it_here_is_told_but_a_shutdown_is_nobody(
+    tmp_path: Path, is_down: bool, ended: dict[str, str]
+) -> None:
+    async def work(bench: Bench) -> None:
+        other = await bench.head()
+        bench.member.is_going_down = lambda _: is_down
+        bench.nodes._unit, bench.nodes._paths = tmp_path, CellPaths(tmp_path)
+        bench.be(stop_by="SIGTERM")
+        bench.actions[Do.EXIT]()
+        assert other.heard() == [{"type": "ended", **ended}]
+
+    run(tmp_path, work)
+
+
+def test_its_own_failure_is_told(tmp_path: Path) -> None:
+    async def work(bench: Bench) -> None:
+        other = await bench.head()
+        bench.be(failure="the dora daemon is gone (signal SIGKILL)")
+        bench.actions[Do.EXIT]()
+        reason = "the dora daemon is gone (signal SIGKILL)"
+        assert other.heard() == [{"type": "ended", "reason": reason, "by": ""}]
+
+    run(tmp_path, work)
+
+
+def test_it_judges_by_its_own_table(tmp_path: Path) -> None:
+    async def work(bench: Bench) -> None:
+        bench.actions[Do.ASK_RESULT]()
+        bench.actions[Do.ASK_SPAWN]()
+        assert bench.heard() == []
+        bench.be(state=State.CLOSING, nodes={"mid": NodeStatus("failed", 0, exit=exit_of(1))})
+        bench.actions[Do.ASK_RESULT]()
+        assert bench.heard() == [life.ResultKnown(0, {"mid": exit_of(1)})]
+
+    run(tmp_path, work, State.RUNNING)
+
+
+def test_a_table_is_sent_when_it_is_new(tmp_path: Path) -> None:
+    async def work(bench: Bench) -> None:
+        other = await bench.head()
+        bench.pump.amend(bench.pump.amend(CellStatus(uuid=UUID)))
+        await asyncio.sleep(1.5)
+        await asyncio.sleep(1)
+        told = [json.loads(one["status"])["uuid"] for one in other.heard()]
+        assert told == [UUID]
+
+    run(tmp_path, work)
+
+
+def test_the_first_processes_are_those_that_the_launchers_note(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path, State.WAITING)
+        bench.be(nodes={"mid": NodeStatus("starting"), "late": NodeStatus("running", 8)})
+        noted = iter((0, 77))
+
+        def noted_pid(_node: str) -> int:
+            return next(noted)
+
+        bench.nodes.noted_pid = noted_pid  # type: ignore[method-assign, assignment]
+        found = asyncio.ensure_future(find(bench.pump, bench.nodes))
+        while not bench.pump.heard:
+            await asyncio.sleep(0.01)
+        (event,) = bench.pump.heard
+        assert isinstance(event, life.NodeSpawned)
+        assert (event.node, event.pid) == ("mid", 77)
+        bench.be(nodes={"mid": NodeStatus("starting", 77)})
+        await found
+
+    asyncio.run(work())

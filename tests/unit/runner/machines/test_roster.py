@@ -1,0 +1,228 @@
+"""What the head knows of its members."""
+
+import asyncio
+from collections.abc import Callable, Coroutine
+from dataclasses import replace
+from typing import Any
+
+from dora_systemd.decisions.cell.exits import exit_of
+from dora_systemd.decisions.cell.machines import Placed
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
+from dora_systemd.decisions.life import events as life
+from dora_systemd.decisions.life.causes import Cause
+from dora_systemd.decisions.machines import wire
+from dora_systemd.runner.machines.roster import Roster
+from tests.unit.fakes.ends import FakeEnds
+from tests.unit.fakes.loop import live
+
+UUID = "550e8400-e29b-41d4-a716-446655440000"
+OPTIONS = RunnerOptions(
+    *("robot", UUID, "/srv/flow.yml", "/srv", "/bin/dora"),
+    placed=(Placed("mid", "gpu"), Placed("eye", "cam")),
+)
+PORTS = wire.Forwards(61000, {"head": 61001, "gpu": 61002, "cam": 61003})
+READY = wire.Ready("/run/dora-systemd/robot/work")
+
+
+class Bench:
+    def __init__(self) -> None:
+        self.events: list[life.Event] = []
+        self.roster = Roster(OPTIONS, PORTS)
+        self.roster.push = self.events.append
+        self.roster.set_facts("abcd", "1.1.0")
+
+    async def link(self, machine: str = "gpu") -> FakeEnds:
+        """A link of that machine, which has been heard."""
+        other = FakeEnds()
+        self.talk = asyncio.create_task(self.roster.link({"machine": machine}, other.ends))
+        await settle()
+        return other
+
+    def heard(self) -> list[life.Event]:
+        return [replace(one, at_us=0) for one in self.events]
+
+
+async def settle() -> None:
+    for _ in range(5):
+        await asyncio.sleep(0)
+
+
+def run(work: Callable[[Bench], Coroutine[Any, Any, None]]) -> None:
+    live(lambda: work(Bench()))
+
+
+def test_a_link_gets_the_ports_and_then_its_part() -> None:
+    async def work(bench: Bench) -> None:
+        other = await bench.link()
+        assert [one["type"] for one in other.heard()] == ["forwards"]
+        bench.roster.set_token("secret")
+        assert [one["type"] for one in other.heard()] == ["forwards", "part"]
+        part = other.heard()[1]
+        told = (part["machine"], part["zenoh"], part["token"], part["digest"], part["uuid"])
+        assert told == ("gpu", 61002, "secret", "abcd", UUID)
+
+    run(work)
+
+
+def test_a_member_that_is_ready_is_not_missing() -> None:
+    async def work(bench: Bench) -> None:
+        bench.roster.set_token("secret")
+        other = await bench.link()
+        assert bench.roster.missing()["gpu"] == "it has not answered yet"
+        other.say(READY)
+        await settle()
+        assert bench.roster.missing() == {"cam": "it is not connected yet"}
+        assert bench.roster.works()["gpu"] == READY.work
+        assert bench.heard() == [life.MachineJoined(0, "gpu")]
+
+    run(work)
+
+
+def test_a_member_that_ends_without_a_word() -> None:
+    async def work(bench: Bench) -> None:
+        other = await bench.link()
+        other.say(READY)
+        other.reader.feed_eof()
+        await settle()
+        assert bench.heard()[1:] == [life.MachineLost(0, "gpu", "the connection has ended")]
+        assert bench.roster.silent() == ["gpu", "cam"]
+
+    run(work)
+
+
+def test_a_member_that_has_ended_in_peace_is_not_lost() -> None:
+    async def work(bench: Bench) -> None:
+        other = await bench.link()
+        other.say(READY, wire.Ended())
+        other.reader.feed_eof()
+        await settle()
+        assert bench.heard() == [life.MachineJoined(0, "gpu")]
+        assert "gpu" in bench.roster.missing()
+
+    run(work)
+
+
+def test_the_last_words_count_once() -> None:
+    async def work(bench: Bench) -> None:
+        other = await bench.link()
+        other.say(READY, wire.Ended("the dora daemon is gone (signal SIGKILL)"), wire.Lost("bye"))
+        other.reader.feed_eof()
+        await settle()
+        reason = "the dora daemon is gone (signal SIGKILL)"
+        assert bench.heard()[1:] == [life.MachineLost(0, "gpu", reason)]
+
+    run(work)
+
+
+def test_a_member_that_goes_on_after_its_end_is_not_heard() -> None:
+    async def work(bench: Bench) -> None:
+        other = await bench.link()
+        other.say(READY, READY, wire.Ended("gone"), READY)
+        await settle()
+        await settle()
+        assert [type(one).__name__ for one in bench.heard()] == ["MachineJoined", "MachineLost"]
+
+    run(work)
+
+
+def test_what_ssh_says_is_shown_until_the_member_is_ready() -> None:
+    async def work(bench: Bench) -> None:
+        other = await bench.link()
+        other.say(wire.Lost("connect to host gpu port 22: No route to host"))
+        other.reader.feed_eof()
+        await settle()
+        assert bench.roster.missing()["gpu"] == "connect to host gpu port 22: No route to host"
+        assert bench.heard() == []
+        await bench.link()
+        assert "No route" in bench.roster.missing()["gpu"]
+        bench.roster.set_token("secret")
+        assert "No route" in bench.roster.missing()["gpu"]
+
+    run(work)
+
+
+def test_who_has_stopped_a_member_is_told_even_before_it_was_ready() -> None:
+    async def work(bench: Bench) -> None:
+        other = await bench.link()
+        other.say(wire.Ended(by="SIGTERM"))
+        await settle()
+        assert bench.heard() == [
+            life.MachineLost(0, "gpu", "it was stopped there by SIGTERM", "SIGTERM")
+        ]
+
+    run(work)
+
+
+def test_a_refusal_has_its_hint() -> None:
+    async def work(bench: Bench) -> None:
+        other = await bench.link()
+        other.say(wire.Refused("no\x1b such file", "copy it"))
+        await settle()
+        (event,) = bench.heard()
+        assert isinstance(event, life.Refused)
+        assert event.cause is Cause.MACHINE_REFUSES
+        assert event.reason.startswith("machine gpu: no")
+        assert event.reason.endswith("; hint: copy it")
+        assert "\x1b" not in event.reason
+
+    run(work)
+
+
+def test_a_second_link_replaces_the_first() -> None:
+    async def work(bench: Bench) -> None:
+        first = await bench.link()
+        first.say(READY)
+        await settle()
+        second = await bench.link()
+        assert first.writer.is_closed
+        assert bench.heard()[1:] == [life.MachineLost(0, "gpu", "it has a new link")]
+        second.say(READY)
+        await settle()
+        assert bench.heard()[2:] == [life.MachineJoined(0, "gpu")]
+
+    run(work)
+
+
+def test_a_machine_that_is_none_is_refused() -> None:
+    async def work(bench: Bench) -> None:
+        other = await bench.link("nobody")
+        assert "has no node of this dataflow" in other.heard()[0]["error"]
+
+    run(work)
+
+
+def test_a_member_is_believed_for_its_own_nodes_only() -> None:
+    async def work(bench: Bench) -> None:
+        other = await bench.link()
+        killed = exit_of(-9)._replace(words=" (out of memory)")
+        nodes = {name: NodeStatus("failed", 7, exit=killed) for name in ("mid", "here", "eye")}
+        other.reader._limit = 1 << 18  # type: ignore[attr-defined]
+        other.say(wire.Table(CellStatus(uuid=UUID, nodes=nodes).to_json()))
+        await settle()
+        own = NodeStatus("failed", 3, exit=exit_of(-9))
+        table = CellStatus(
+            nodes={
+                "here": own,
+                "mid": own._replace(pid=0, machine="gpu"),
+                "eye": own._replace(pid=0, machine="cam"),
+            }
+        )
+        shown = bench.roster.amend(table).nodes
+        assert shown["mid"].exit == killed
+        assert shown["mid"].pid == 0
+        assert shown["here"] == own
+        assert shown["eye"].exit == exit_of(-9)
+
+    run(work)
+
+
+def test_a_table_that_is_none_ends_the_talk() -> None:
+    async def work(bench: Bench) -> None:
+        other = await bench.link()
+        other.say(READY, wire.Table("{"))
+        await settle()
+        assert other.writer.is_closed
+        assert isinstance(bench.heard()[-1], life.MachineLost)
+
+    run(work)

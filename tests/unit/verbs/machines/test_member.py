@@ -1,0 +1,78 @@
+"""What a member refuses before it runs anything."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dora_systemd.decisions.cell.machines import Placed
+from dora_systemd.decisions.machines.wire import Part
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.verbs.machines import member
+from dora_systemd.verbs.machines.member import MemberRequest, is_passing, start_member
+from dora_systemd.verbs.start.plan import StartRequest
+from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
+
+OTHER = UUID.replace("5", "6")
+PART = Part("robot", UUID, "gpu", "s3cret", 61001, 61003, "0" * 64, 5, "0.1.0", "1.1.0")
+START = StartRequest(
+    "/srv/robot.yml",
+    "robot",
+    uuid=UUID,
+    machine="gpu",
+    placed=(Placed("yolo", "gpu"),),
+)
+
+
+class FakeHead:
+    """A head that has said what to run."""
+
+    def __init__(self, part: Part) -> None:
+        self._part = part
+
+    def part(self) -> Part:
+        return self._part
+
+
+def refused(manager: FakeManager, tmp_path: Path, part: Part = PART) -> DoraSystemdError:
+    request = MemberRequest(ScopeIn(False, 0, tmp_path), START)
+    with pytest.raises(DoraSystemdError) as caught:
+        start_member(manager, request, FakeHead(part))  # type: ignore[arg-type]
+    assert not [call for call in manager.calls if call[0] == "start"]
+    return caught.value
+
+
+@pytest.mark.parametrize("change", [{"name": "other"}, {"uuid": OTHER}, {"machine": "arm"}])
+def test_a_runner_that_wants_something_else(change: dict[str, Any], tmp_path: Path) -> None:
+    """The words of the command line are those of root; the runner's are not."""
+    error = refused(FakeManager(), tmp_path, replace(PART, **change))
+    assert error.code is ExitCode.BAD_INPUT
+    assert not is_passing(error)
+
+
+def test_a_name_in_use(tmp_path: Path) -> None:
+    manager = FakeManager()
+    manager.add(options(uuid=OTHER))
+    error = refused(manager, tmp_path)
+    assert error.code is ExitCode.NAME_IN_USE
+    assert OTHER in error.message
+
+
+def test_an_old_part_ends_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also if what comes then is refused."""
+    manager = FakeManager()
+    unit = manager.add(options(placed=START.placed, machine="gpu"))
+    manager.after_job[unit] = {"ActiveState": "inactive", "LoadState": "not-found"}
+    monkeypatch.setattr(member, "make_plan", _refuse)
+    assert refused(manager, tmp_path).message == "enough"
+    assert ("StopUnit", unit) in manager.calls
+
+
+def test_what_may_pass() -> None:
+    assert is_passing(DoraSystemdError("systemd boots", "", ExitCode.NO_SYSTEMD))
+    assert not is_passing(DoraSystemdError("another file", "", ExitCode.BAD_INPUT))
+
+
+def _refuse(*_: object) -> None:
+    raise DoraSystemdError("enough", "", ExitCode.BAD_INPUT)

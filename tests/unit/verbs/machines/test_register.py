@@ -1,0 +1,83 @@
+"""The machines of a config.yml, without ssh."""
+
+from pathlib import Path
+
+import pytest
+
+from dora_systemd.decisions.machines.facts import Facts
+from dora_systemd.decisions.remote.hosts import parse_host
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.scope import Scope
+from dora_systemd.verbs.machines import register
+from dora_systemd.verbs.machines.probe import Probe
+from dora_systemd.verbs.machines.register import (
+    add_machine,
+    chosen,
+    known_machines,
+    remove_machine,
+)
+
+FACTS = Facts("0.1.0", "1.1.0", "/usr/bin/doractl", "alice", True, 5)
+USER = Scope(True, 1000)
+GPU = parse_host("alice@gpu-box")
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A home whose machines all answer."""
+    told: list[tuple[str, ...]] = []
+    monkeypatch.setattr(register, "probe_as_caller", lambda _host: Probe(FACTS, 0))
+    monkeypatch.setattr(register, "probe_as_link", lambda *_: Probe(FACTS, 0))
+    monkeypatch.setattr(register, "own_facts", lambda _scope: FACTS)
+    monkeypatch.setattr(register, "run_there", lambda *words: told.append(words))
+    monkeypatch.setattr("dora_systemd.verbs.start.settings.SYSTEM_FILE", tmp_path / "none")
+    return tmp_path
+
+
+def environment(home: Path) -> dict[str, str]:
+    return {"HOME": str(home)}
+
+
+def test_there_and_back(home: Path) -> None:
+    file = home / ".config/dora-systemd/config.yml"
+    file.parent.mkdir(parents=True)
+    file.write_text("# mine\ngrace_duration: 3s\n")
+    file.chmod(0o600)
+    *_, last = add_machine(USER, environment(home), GPU, "gpu")
+    assert last == f"Machine added: gpu (alice@gpu-box), in {file}"
+    (known,) = known_machines(USER, environment(home))
+    assert (known.name, known.host, Path(known.key).parent.name) == ("gpu", GPU, "ssh")
+    assert file.stat().st_mode & 0o777 == 0o600
+    assert file.read_text().startswith("# mine\n")
+    *_, last = remove_machine(USER, environment(home), known)
+    assert last == "Machine removed: gpu (alice@gpu-box)"
+    assert file.read_text() == "# mine\ngrace_duration: 3s\n"
+    assert list((file.parent / "ssh").iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "code"),
+    [
+        ("machines:\n  gpu: {host: b}\n", "gpu", ExitCode.NAME_IN_USE),
+        ("machines: {arm: {host: c}}\n", "gpu", ExitCode.BAD_INPUT),
+        ("", "head", ExitCode.USAGE),
+    ],
+)
+def test_nothing_changes_then(home: Path, text: str, name: str, code: ExitCode) -> None:
+    file = home / ".config/dora-systemd/config.yml"
+    file.parent.mkdir(parents=True)
+    file.write_text(text)
+    with pytest.raises(DoraSystemdError) as caught:
+        list(add_machine(USER, environment(home), GPU, name))
+    assert caught.value.code is code
+    assert file.read_text() == text
+    assert not (file.parent / "ssh").exists()
+
+
+def test_machines_by_name(home: Path) -> None:
+    list(add_machine(USER, environment(home), GPU, "gpu"))
+    known = known_machines(USER, environment(home))
+    assert chosen(known, ()) == chosen(known, ("gpu",)) == known
+    with pytest.raises(DoraSystemdError) as caught:
+        chosen(known, ("arm",))
+    assert caught.value.code is ExitCode.NOT_FOUND
