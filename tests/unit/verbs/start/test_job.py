@@ -50,6 +50,20 @@ def test_a_start_that_fails(result: str, facts: dict[str, Any], reason: str) -> 
     assert caught.value.code is ExitCode.FAILURE
 
 
+def test_a_refusal_ends_the_links() -> None:
+    manager = FakeManager()
+    manager.add(options(), active="inactive")
+    manager.job_results[UNIT] = "failed"
+    said = "failed: cannot reach machine gpu (no route): no answer within 30s"
+    manager.after_job[UNIT] = {"ActiveState": "failed", "StatusText": said, "ExecMainStatus": 68}
+    link = "doralink-robot:gpu.service"
+    with pytest.raises(DoraSystemdError) as caught:
+        start_unit(manager, SCOPE, options(), [], None, wait=True, beside=[(link, [])])
+    assert caught.value.message.startswith("cannot reach machine gpu")
+    assert caught.value.code is ExitCode.NO_HOST
+    assert ("StopUnit", link) in manager.calls
+
+
 def test_what_start_prints() -> None:
     assert format_started(Started("u", "robot", UNIT, is_ready=True)) == (
         "Dataflow started: u\n"
