@@ -102,7 +102,7 @@ def _print(hosts: Sequence[Host], name: str, context: click.Context) -> int:
     given = context.params
     words = ["logs", name, *_given_words(context), f"--machine={HEAD}"]
     is_endless = bool(given["is_follow"] or given["until_end"])
-    plan = Plan("logs", words, given, False, False, is_endless, "machine")
+    plan = Plan("logs", words, words, given, False, False, is_endless, "machine")
     # Each object of a program says where it is from, also if there is one machine only.
     if len(hosts) > 1 or given["output"] == "json":
         return run_on_all(hosts, plan)

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from tests.system.cells import Project, dora_processes, run, wait_for
+from tests.system.cells import Project, dora_processes, run, wait_for, wait_no_process
 
 CHECKOUT = Path(__file__).parents[2]
 VENV = "/opt/dora-systemd"
@@ -39,7 +39,7 @@ def flow() -> Iterator[Path]:
         doractl(user, "disable", "robot", check=False)
         doractl(user, "stop", "robot", check=False)
     shutil.rmtree(root)
-    wait_for("no process is left", lambda: not dora_processes())
+    wait_no_process()
 
 
 def as_user(user: str, *words: str, check: bool = True) -> CompletedProcess[str]:

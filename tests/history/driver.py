@@ -18,7 +18,7 @@ from tests.history.recorder import (
 from tests.history.scene import Scene, inventory
 from tests.history.steps import CELLS, FAULTS, LOOK, Step, shell_of
 from tests.lab.pace import bound, pace
-from tests.system.cells import Cell, dora_processes, run, wait_for
+from tests.system.cells import Cell, run, wait_for, wait_no_process
 
 QUIET_SECONDS = 40.0
 HUNG_SECONDS = 120.0
@@ -146,7 +146,7 @@ class Driver:
         for text in END:
             status, out, err = self._shell(text)
             answers.append(Answer(-1, Step(text), status, out, err))
-        wait_for("no process is left", lambda: not dora_processes())
+        wait_no_process()
         return answers
 
     def clean(self) -> None:

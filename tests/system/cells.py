@@ -254,3 +254,20 @@ def dora_processes() -> dict[int, str]:
             "dora_systemd.runner" in words or "dora coordinator" in words or "dora daemon" in words
         )
     }
+
+
+def wait_no_process() -> None:
+    """Wait until no process of any dataflow is left; the failure says which are, and where."""
+    try:
+        wait_for("no process is left", lambda: not dora_processes())
+    except AssertionError as error:
+        left = [f"{pid} {words}: {group_of(pid)}" for pid, words in dora_processes().items()]
+        raise AssertionError("\n".join([str(error), *left])) from error
+
+
+def group_of(pid: int) -> str:
+    """The cgroup of a process, "" if it has just gone."""
+    try:
+        return Path(f"/proc/{pid}/cgroup").read_text().strip()
+    except OSError:
+        return ""

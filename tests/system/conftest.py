@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.lab.pace import bound
-from tests.system.cells import Cell, Project, dora_processes, run, wait_for
+from tests.system.cells import Cell, Project, run, wait_no_process
 from tests.system.chromium import Browser
 from tests.system.gateways import Front
 from tests.system.ports import reserve_ports
@@ -74,7 +74,7 @@ def cell(request: pytest.FixtureRequest, project: Project) -> Iterator[Cell]:
     cursor = _cursor()
     yield cell
     cell.end()
-    wait_for("no process is left", lambda: not dora_processes())
+    wait_no_process()
     expected = [m for mark in request.node.iter_markers("warns") for m in mark.args]
     unexpected = [w for w in _warnings(cursor) if not any(e in w for e in expected)]
     assert not unexpected, "unexpected warnings:\n" + "\n".join(unexpected)

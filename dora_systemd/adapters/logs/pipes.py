@@ -277,8 +277,8 @@ class LogPipes:
             source.report.cancel()
             source.report = None
         if count := source.take_suppressed():
-            limit = format_rate(source.limit)
-            self.write_event("lines-suppressed", node_id, count=count, limit=limit)
+            words = {"count": count, "limit": format_rate(source.limit)}
+            self.write_event("lines-suppressed", node_id, **words)
 
     def _read_output(self, label: str, fd: int, on_line: OnLine, said: bytes = b"") -> None:
         try:

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.deb.packages import ROBOT
-from tests.system.cells import dora_processes, run, wait_for
+from tests.system.cells import run, wait_no_process
 from tests.system.releases import STORE
 from tests.system.typed import Shell, replay
 
@@ -41,7 +41,7 @@ def shell() -> Iterator[Shell]:
     shutil.rmtree(STORE / "robot", ignore_errors=True)
     (STORE / ".robot.lock").unlink(missing_ok=True)
     shutil.rmtree(PLACE)
-    wait_for("no process is left", lambda: not dora_processes())
+    wait_no_process()
 
 
 def needs(path: Path) -> list[pytest.MarkDecorator]:

@@ -55,7 +55,7 @@ _TABLE = {
         adapters.cgroup.groups adapters.host.lock_table adapters.host.machine
         adapters.host.process_table adapters.host.real_time adapters.host.rights
         runner.cell.pause trust.socket_table verbs.destroy
-        link.relay verbs.facts.lives verbs.facts.reading verbs.start.sandbox verbs.why
+        link.relay verbs.facts.lives verbs.facts.reading verbs.start.sandbox
     """,
     ROOTS: """
         adapters.bus.connection adapters.bus.errors adapters.host.unit_files
