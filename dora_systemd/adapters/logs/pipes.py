@@ -48,9 +48,8 @@ class LogPipes:
         keep: Callable[[int, str], object] = lambda *_: None,
         release: Callable[[str], object] = lambda _: None,
     ) -> None:
-        self._loop = loop
+        self._loop, self._journal = loop, journal
         self._keep, self._release = keep, release
-        self._journal = journal
         self._queue = LogQueue(loop, journal, self._pause, self._resume)
         self._origin = origin
         self._paths: dict[str, CellPaths] = {}
@@ -277,8 +276,8 @@ class LogPipes:
             source.report.cancel()
             source.report = None
         if count := source.take_suppressed():
-            words = {"count": count, "limit": format_rate(source.limit)}
-            self.write_event("lines-suppressed", node_id, **words)
+            limit = format_rate(source.limit)
+            self.write_event("lines-suppressed", node_id, count=count, limit=limit)
 
     def _read_output(self, label: str, fd: int, on_line: OnLine, said: bytes = b"") -> None:
         try:
@@ -286,8 +285,8 @@ class LogPipes:
         except BlockingIOError:
             return
         for line in self._outputs[fd].feed(data) if data else self._outputs[fd].flush():
-            is_told = label not in self._muted and not any(map(line.__contains__, self.left_out))
-            if is_told and (fields := dora_log_fields(line)):
+            is_muted = label in self._muted or any(map(line.__contains__, self.left_out))
+            if not is_muted and (fields := dora_log_fields(line)):
                 self._queue.put_record(label, self._entry(fields, label))
             if on_line is not None:
                 on_line(line.decode("utf-8", "replace"))
