@@ -50,10 +50,10 @@ def beside_the_machine(before: str) -> list[Step]:
     restarted = replace(restarted, after=(packages.name, inside.name))
     installed = replace(packages_step(), after=(packages.name,))
     faults, first, second, browser = plan_system("container")
-    several = replace(machines_step(), after=(second.name,))
     second = replace(second, after=(first.name,))
-    browser = replace(browser, after=(restarted.name,))
-    return [packages, installed, faults, first, inside, restarted, second, several, browser]
+    several = replace(machines_step(), after=(restarted.name,))
+    browser = replace(browser, after=(several.name,))
+    return [packages, installed, faults, first, inside, restarted, several, second, browser]
 
 
 def in_venv(for_system_tests: bool = False) -> dict[str, str]:
@@ -150,7 +150,7 @@ def plan_machines(_form: str) -> list[Step]:
 
 
 def machines_step() -> Step:
-    return lab_step("several machines", "machines", ["tests/machines"], minutes=2)
+    return lab_step("several machines", "machines", ["tests/machines"], minutes=6)
 
 
 def plan_faults(form: str) -> list[Step]:
