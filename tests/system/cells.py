@@ -125,6 +125,10 @@ class Project:
         return self.write("dataflow.yml", THREE_NODES)
 
 
+NOT_LOADED = 5
+"""Exit status of systemctl(1) for a unit that systemd does not know."""
+
+
 class Cell:
     """The unit of dataflow `name`."""
 
@@ -222,8 +226,12 @@ class Cell:
         wait_for(f"{node} prints", lambda: len(self.messages(node)) > before)
 
     def end(self) -> None:
-        """Leave nothing of the unit."""
-        run("systemctl", self.scope.flag, "stop", self.unit, check=False)
+        """Leave nothing of the unit.
+
+        On a machine without time to spare systemctl can give up before systemd has answered.
+        """
+        stop = ("systemctl", self.scope.flag, "stop", self.unit)
+        wait_for("it is stopped", lambda: run(*stop, check=False).returncode in (0, NOT_LOADED))
         run("systemctl", self.scope.flag, "reset-failed", self.unit, check=False)
 
 

@@ -8,6 +8,7 @@ from dora_systemd.adapters.journal.reader import JournalReader, LastEvent
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
+from dora_systemd.verbs.facts import lives
 from dora_systemd.verbs.facts.ended import ended_row, newest_ended, not_recorded
 from dora_systemd.verbs.facts.list import read_rows
 from tests.unit.fakes.manager import UUID, FakeManager, options
@@ -73,6 +74,8 @@ def manager() -> FakeManager:
 def ended(manager: FakeManager, journal: Events, limit: int | None = None) -> list[DataflowRow]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(JournalReader, "last_events", lambda _self, *one, **two: journal(*one, **two))
+        # This machine may have a journal, with dataflows of these names in it.
+        patch.setattr(lives, "read_lives", lambda *_one, **_two: [])
         return newest_ended(manager, SCOPE, read_rows(manager, SCOPE), limit)
 
 
