@@ -83,7 +83,8 @@ def test_a_runner_that_never_ends_its_line(monkeypatch: pytest.MonkeyPatch) -> N
     own.shutdown(socket.SHUT_RDWR)
     for one in (talk, waiting):
         one.join()
-    runner.close(), own.close()
+    runner.close()
+    own.close()
     assert not is_stuck
 
 
