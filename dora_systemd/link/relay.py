@@ -78,11 +78,13 @@ def _write(fd: int, data: bytes) -> None:
 def _end_session() -> None:
     """End the sshd that this is a child of. It is of the same user, or the kernel refuses."""
     parent = os.getppid()
-    for number, seconds in ((signal.SIGTERM, _KILL_SECONDS), (signal.SIGKILL, 0)):
-        with suppress(OSError):
-            if _is_sshd(parent) and os.getppid() == parent:
-                os.kill(parent, number)
-        select.select([], [], [], seconds)
+    with suppress(OSError):
+        session = os.pidfd_open(parent)
+        # It is the parent now, so the descriptor is of no process that got its number later.
+        if os.getppid() == parent and _is_sshd(parent):
+            signal.pidfd_send_signal(session, signal.SIGTERM)
+            select.select([session], [], [], _KILL_SECONDS)
+            signal.pidfd_send_signal(session, signal.SIGKILL)
 
 
 def _is_sshd(pid: int) -> bool:

@@ -120,6 +120,12 @@ def loopback_listeners(port: int, tables: tuple[Path, ...] = TABLES) -> frozense
     return frozenset(int(fields[7]) for fields in found)
 
 
+def is_open_beyond(port: int, tables: tuple[Path, ...] = TABLES) -> bool:
+    """Whether something listens on a TCP port of another address than 127.0.0.1 and ::1."""
+    own = {_entry(("127.0.0.1", port)), _entry(("::1", port))}
+    return any(fields[1] not in own for fields in _listeners(port, tables))
+
+
 def _listeners(port: int, tables: tuple[Path, ...]) -> Iterator[list[bytes]]:
     ending = b":%04X" % port
     for fields in _lines(tables, ending):

@@ -123,8 +123,9 @@ class Bus:
         job = self._read_one(unit, "Job")[0]
         try:
             jobs = self._call(f"read the job of {unit}", "GetJobBefore", ("u", job)) if job else ()
-        except DoraSystemdError as error:
-            if error.code is not ExitCode.NOT_FOUND:
+        except DoraSystemdError:
+            # If the job has ended meanwhile: pystemd has no name for that error.
+            if self._read_one(unit, "Job")[0] == job:
                 raise
             return []
         return [one[1] for one in jobs or ()]

@@ -25,11 +25,22 @@ def authorized_line(program: str, public: str, comment: str) -> str:
     """
     if not re.fullmatch(r"/[A-Za-z0-9_./+-]+", program):
         raise _refusal(f"cannot use {quoted(program)} there as doractl", "link it into /usr/bin")
-    found = _PUBLIC.match(public)
+    key = _public(public)
+    only = 'permitlisten="127.0.0.1:*",permitopen="127.0.0.1:*"'
+    return f'restrict,port-forwarding,{only},command="{program} member" {key} {comment}'
+
+
+def key_text(public: str) -> str:
+    """What is in no other key. Raises DoraSystemdError (BAD_INPUT) for what is no public key."""
+    return _public(public).split()[1]
+
+
+def _public(text: str) -> str:
+    """The key without its comment."""
+    found = _PUBLIC.match(text)
     if not found:
         raise _refusal("cannot read the public key", "see ssh-keygen(1)")
-    only = 'permitlisten="127.0.0.1:*",permitopen="127.0.0.1:*"'
-    return f'restrict,port-forwarding,{only},command="{program} member" {found[0]} {comment}'
+    return found[0]
 
 
 def forced_words(original: str) -> tuple[str, list[str]]:

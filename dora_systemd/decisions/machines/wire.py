@@ -142,6 +142,7 @@ _TYPES: Mapping[str, type[Any]] = {
 _NAMES = {kind: name for name, kind in _TYPES.items()}
 _NUMBERS = {"coordinator", "zenoh", "grace", "version"}
 _LONG = {"status"}
+_BY_MACHINE = {(Forwards, "zenoh")}
 
 
 def format_message(message: Message) -> bytes:
@@ -156,7 +157,7 @@ def parse_message(line: bytes) -> Message:
         found = json.loads(line)
         kind = _TYPES[found.pop("type")]
         names = {one.name for one in fields(kind)}
-        values = {key: _value(key, value) for key, value in found.items() if key in names}
+        values = {key: _value(kind, key, one) for key, one in found.items() if key in names}
         return _checked(kind(**values))
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise _unreadable() from error
@@ -169,13 +170,14 @@ def expect(message: Message, kind: type[M]) -> M:
     return message
 
 
-def _value(key: str, value: object) -> object:
-    if isinstance(value, dict):
+def _value(kind: type[Any], key: str, value: object) -> object:
+    if (kind, key) in _BY_MACHINE and isinstance(value, dict):
         return {_machine(name): _number(one) for name, one in value.items()}
     if key in _NUMBERS:
         return _number(value)
-    if not isinstance(value, str):
+    if not isinstance(value, str) or "\0" in value:
         raise ValueError(key)
+    value.encode()  # JSON can have half a character, and nobody could write it
     return value if key in _LONG else value[:MAX_TEXT]
 
 

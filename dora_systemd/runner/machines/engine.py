@@ -1,6 +1,7 @@
 """The dora of a machine that is one of several."""
 
 import asyncio
+import signal
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -105,6 +106,15 @@ class MemberEngine(SharedEngine):
     def _spawn_daemon(self, environment: Mapping[str, str]) -> Daemon:
         more = ("--machine-id", self.machine, *zenoh_arguments(self._zenoh, environment))
         return start_daemon(self._dora, self._paths, self._port, environment, self._token, more)
+
+    def cut_off(self) -> None:
+        """Kill the daemon, because its coordinator is gone.
+
+        It would look for one again at the same port of 127.0.0.1, show it the token, and start
+        what it is told to. The link is gone as well, so any user here can listen there.
+        """
+        if daemon := self._children.get("daemon"):
+            daemon.send_signal(signal.SIGKILL)
 
     def _write_access(self, daemon: Daemon) -> None:
         """Requests to the coordinator are the head's."""

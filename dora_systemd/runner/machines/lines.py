@@ -25,6 +25,8 @@ _MOST_UNSENT = 4 * MAX_LINE
 """Bytes for a side that does not read: then the talk ends."""
 _MOST_LINES = 200
 """In one beat: there are three, or those of a whole lease after a gap."""
+_MOST_BYTES = 8 * MAX_LINE
+"""In one beat: to read them must not take the time of everything else."""
 
 Hear = Callable[[Message], None]
 
@@ -36,7 +38,7 @@ class Lines:
         self._reader, self._writer = ends
         self._on_beat = on_beat
         self._why = "the connection has ended"
-        self.silent = self._heard = 0
+        self.silent = self._heard = self._bytes = 0
 
     def send(self, message: Message) -> None:
         """Send a message, unless the talk has ended."""
@@ -60,6 +62,9 @@ class Lines:
             self._why = error.message
         except ValueError:
             self._why = "a line is too long"
+        except Exception as error:
+            # Else it would go on to count as there, and nobody would read what it says.
+            self._why = f"what it says cannot be handled: {type(error).__name__}"
         finally:
             beats.cancel()
             self._writer.close()
@@ -69,8 +74,10 @@ class Lines:
         with contextlib.suppress(OSError):
             while line := await self._reader.readline():
                 self.silent, self._heard = 0, self._heard + 1
-                if self._heard > _MOST_LINES:
+                self._bytes += len(line)
+                if self._heard > _MOST_LINES or self._bytes > _MOST_BYTES:
                     self.end("the other side says too much")
+                    return
                 hear(parse_message(line))
                 await asyncio.sleep(0)  # lines that are there already must not hold up the rest
 
@@ -79,5 +86,5 @@ class Lines:
             self._on_beat()
             self.send(Beat())
             await asyncio.sleep(BEAT_SECONDS)
-            self.silent, self._heard = self.silent + 1, 0
+            self.silent, self._heard, self._bytes = self.silent + 1, 0, 0
         self.end(f"no word for {LEASE_SECONDS:g}s")

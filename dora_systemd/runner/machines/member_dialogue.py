@@ -7,6 +7,7 @@ from itertools import chain, repeat
 from typing import Any, Protocol
 
 from dora_systemd.adapters.host.process import run_command
+from dora_systemd.decisions.cell.exits import Exit
 from dora_systemd.decisions.dora import protocol
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Do, State
@@ -49,7 +50,7 @@ class MemberDialogue(Dialogue):
     def begin(self, voice: Voice, dora: MemberEngine) -> None:
         """Set what the actions need."""
         self._voice, self._dora = voice, dora
-        self._has_told = False
+        self._has_told = self._is_cut_off = False
 
     def actions(
         self, descriptor: Mapping[str, Any], variables: Mapping[str, str]
@@ -62,7 +63,7 @@ class MemberDialogue(Dialogue):
             Do.ASK_SPAWN: lambda: self.spawn("find processes", find(self._pump, self._nodes)),
             Do.ASK_RESULT: self._tell_result,
             Do.ASK_STOP: lambda: self._ask(Do.END_NODES, self._stop()),
-            Do.END_NODES: lambda: self._ask(Do.END_NODES, self._end_nodes()),
+            Do.END_NODES: self._end_without_head,
             Do.EXIT: lambda: self._exit(own[Do.EXIT]),
         }
 
@@ -112,6 +113,16 @@ class MemberDialogue(Dialogue):
         """Somebody stops this part here: the head has to know before the nodes end."""
         await asyncio.to_thread(self._tell_end)
         await self._end_nodes()
+
+    def _end_without_head(self) -> None:
+        self._is_cut_off = True
+        self._dora.cut_off()
+        self._ask(Do.END_NODES, self._end_nodes())
+
+    def _child_exited(self, label: str, exit: Exit) -> None:
+        """Without a head the nodes have their grace duration, and no daemon."""
+        if not (self._is_cut_off and self._pump.cell.state is State.STOPPING):
+            super()._child_exited(label, exit)
 
     async def _end_nodes(self) -> None:
         cell = self._pump.cell

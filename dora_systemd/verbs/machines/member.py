@@ -28,6 +28,7 @@ from dora_systemd.names import unit_name
 from dora_systemd.paths import CellPaths
 from dora_systemd.scope import Scope
 from dora_systemd.trust.files import read_file
+from dora_systemd.trust.socket_table import is_open_beyond
 from dora_systemd.trust.sockets import connect_unix, plain
 from dora_systemd.values import INFINITY, SECOND
 from dora_systemd.verbs.facts.cells import read_cell
@@ -72,6 +73,7 @@ def start_member(manager: Manager, request: MemberRequest, head: Head) -> socket
     """
     part = head.part()
     _check_part(part, request.start)
+    _check_forwards(part)
     _check_linger(request.scope)
     _end_old_part(manager, request)
     boot = require_free_name(manager, request.scope, request.unit)
@@ -102,6 +104,13 @@ def _check_part(part: Part, start: StartRequest) -> None:
     """The head's doractl and its runner have to mean the same dataflow."""
     if (part.name, part.uuid, part.machine) != (start.name, start.uuid, start.machine):
         raise _refusal("the head's runner wants to run another dataflow than its doractl")
+
+
+def _check_forwards(part: Part) -> None:
+    """Nothing but sshd is open to the network, whatever GatewayPorts of sshd_config(5) says."""
+    if is_open_beyond(part.coordinator):
+        hint = "on that machine, in sshd_config: GatewayPorts no"
+        raise _refusal("sshd there opens forwarded ports to the whole network", hint)
 
 
 def _check_linger(scope: Scope) -> None:
@@ -194,8 +203,13 @@ def _failure(manager: Manager, unit: str) -> DoraSystemdError:
 def _first_line(runner: socket.socket) -> bytes:
     """One line, and not a byte more: what follows is for the relay."""
     line = b""
+    # A byte now and then must not keep root's process for days.
+    deadline = time.monotonic() + _START_SECONDS
     with suppress(OSError):
-        while not line.endswith(b"\n") and len(line) < MAX_LINE and (byte := runner.recv(1)):
+        while not line.endswith(b"\n") and len(line) < MAX_LINE:
+            runner.settimeout(max(deadline - time.monotonic(), 0.0))
+            if not (byte := runner.recv(1)):
+                break
             line += byte
     return line
 

@@ -10,7 +10,7 @@ from dora_systemd.decisions.cell.machines import parse_machine
 from dora_systemd.decisions.machines.declared import with_machine, without_machine
 from dora_systemd.decisions.machines.entry import parse_entry
 from dora_systemd.decisions.machines.facts import problems, required
-from dora_systemd.decisions.machines.key import authorized_line
+from dora_systemd.decisions.machines.key import authorized_line, key_text
 from dora_systemd.decisions.remote.hosts import Host
 from dora_systemd.decisions.settings.machines import MACHINES
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -92,7 +92,7 @@ def add_machine(
     key = make_key(key_place(scope, environment), name)
     public = public_key(key)
     line = authorized_line(found.facts.program, public, f"dora-systemd:{name}")
-    run_there(host, _INSTALL, public.split()[1], line)
+    run_there(host, _INSTALL, key_text(public), line)
     yield f"Key {key} may run parts of dataflows there as {found.facts.user}"
     probe_as_link(host, name, str(key))
     _write(file, text)
@@ -105,7 +105,7 @@ def remove_machine(scope: Scope, environment: Mapping[str, str], machine: Known)
     text = _without(file, machine.name)
     if machine.key:
         try:
-            run_there(machine.host, _REMOVE, public_key(Path(machine.key)).split()[1])
+            run_there(machine.host, _REMOVE, key_text(public_key(Path(machine.key))))
         except DoraSystemdError as error:
             yield f"its key is still let in there: {error.message}"
         remove_key(Path(machine.key))

@@ -169,3 +169,21 @@ def test_private_socket_where_a_user_has_no_bus(tmp_path: Path) -> None:
     assert connection._address(scope) == str(tmp_path / "systemd" / "private")
     (tmp_path / "bus").touch()
     assert connection._address(scope) == str(tmp_path / "bus")
+
+
+@pytest.mark.parametrize("now", [0, 8])
+def test_a_job_that_ends_while_it_is_asked_waits_for_nothing(now: int) -> None:
+    """The error has the class of ENOENT then, and no name."""
+    jobs = iter([7, now])
+
+    class OneJob(bus.Bus):
+        def _read_one(self, *_: Any) -> Any:
+            return next(jobs), "/"
+
+        def _call(self, *_: Any) -> Any:
+            raise DoraSystemdError("cannot read the job: Job 7 does not exist.")
+
+        def __init__(self) -> None:
+            pass
+
+    assert OneJob().awaited("dora-robot.service") == []

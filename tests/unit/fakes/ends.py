@@ -43,10 +43,10 @@ class FakeWriter(asyncio.StreamWriter):
 
 
 class FakeEnds:
-    """The other side says and hears."""
+    """The other side says and hears. limit: bytes of a line."""
 
-    def __init__(self) -> None:
-        self.reader = asyncio.StreamReader(limit=1000)
+    def __init__(self, limit: int = 1000) -> None:
+        self.reader = asyncio.StreamReader(limit=limit)
         self.writer = FakeWriter(self.reader)
         self.ends = Ends(self.reader, self.writer)
 

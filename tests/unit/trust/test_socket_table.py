@@ -13,6 +13,7 @@ from dora_systemd.trust.socket_table import (
     Lookup,
     Owner,
     find_owner,
+    is_open_beyond,
     listener_uids,
     peer_uid,
     read_owner,
@@ -115,3 +116,11 @@ def test_a_kernel_that_knows_of_no_socket_is_not_believed(monkeypatch: pytest.Mo
             assert found.uid == os.getuid()
     finally:
         socket_table._kernel_knows.cache_clear()
+
+
+@pytest.mark.parametrize(("address", "is_open"), [("127.0.0.1", False), ("127.0.0.2", True)])
+def test_a_port_that_is_open_beyond_the_loopback_address(address: str, is_open: bool) -> None:
+    with socket.create_server((address, 0)) as one:
+        port = one.getsockname()[1]
+        assert is_open_beyond(port) is is_open
+    assert not is_open_beyond(port)

@@ -2,7 +2,14 @@
 
 import asyncio
 
-from dora_systemd.decisions.machines.wire import LEASE_SECONDS, Beat, Message, StopPart
+from dora_systemd.decisions.machines.wire import (
+    LEASE_SECONDS,
+    MAX_LINE,
+    Beat,
+    Message,
+    StopPart,
+    Table,
+)
 from dora_systemd.runner.machines.lines import Lines
 from tests.unit.fakes.ends import FakeEnds
 from tests.unit.fakes.loop import live
@@ -68,6 +75,33 @@ def test_a_flood_ends_it() -> None:
         other, heard = FakeEnds(), list[Message]()
         other.say(*[Beat()] * 1000)
         assert await Lines(other.ends).talk(heard.append) == "the other side says too much"
+        assert len(heard) == 200
+
+    live(work)
+
+
+def test_a_flood_of_long_lines_ends_it() -> None:
+    async def work() -> None:
+        other, heard = FakeEnds(limit=MAX_LINE), list[Message]()
+        other.say(*[Table("x" * (MAX_LINE - 1000))] * 20)
+        assert await Lines(other.ends).talk(heard.append) == "the other side says too much"
+        assert len(heard) < 10
+
+    live(work)
+
+
+def test_words_that_nobody_can_handle_end_it() -> None:
+    """Else a lost machine would count as there."""
+
+    def hear(_: Message) -> None:
+        raise AttributeError("no such thing")
+
+    async def work() -> None:
+        other = FakeEnds()
+        other.say(Beat())
+        why = await Lines(other.ends).talk(hear)
+        assert why == "what it says cannot be handled: AttributeError"
+        assert other.writer.is_closed
 
     live(work)
 

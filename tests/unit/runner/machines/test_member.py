@@ -219,3 +219,19 @@ def test_the_first_processes_are_those_that_the_launchers_note(tmp_path: Path) -
         await found
 
     asyncio.run(work())
+
+
+def test_a_daemon_without_a_head_is_killed(tmp_path: Path) -> None:
+    """It would look for a coordinator where any user can listen now; nodes have their time."""
+
+    async def work(bench: Bench) -> None:
+        bench.nodes._unit, bench.nodes._paths = tmp_path, CellPaths(tmp_path)
+        killed: list[str] = []
+        bench.dora.cut_off = lambda: killed.append("daemon")  # type: ignore[method-assign]
+        bench.actions[Do.END_NODES]()
+        assert killed == ["daemon"]
+        bench.dialogue._child_exited("daemon", exit_of(-9))
+        await settle()
+        assert not [one for one in bench.heard() if isinstance(one, life.ChildExited)]
+
+    run(tmp_path, work, State.STOPPING)

@@ -1,7 +1,10 @@
 """What a member refuses before it runs anything."""
 
+import socket
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from threading import Event, Thread
 from typing import Any
 
 import pytest
@@ -49,6 +52,40 @@ def test_a_runner_that_wants_something_else(change: dict[str, Any], tmp_path: Pa
     error = refused(FakeManager(), tmp_path, replace(PART, **change))
     assert error.code is ExitCode.BAD_INPUT
     assert not is_passing(error)
+
+
+def test_an_sshd_that_opens_forwards_to_the_network(tmp_path: Path) -> None:
+    """Any other address than 127.0.0.1 is one too many."""
+    with socket.create_server(("127.0.0.2", 0)) as one:
+        part = replace(PART, coordinator=one.getsockname()[1])
+        error = refused(FakeManager(), tmp_path, part)
+    assert "GatewayPorts" in error.hint
+    assert not is_passing(error)
+
+
+def test_a_runner_that_never_ends_its_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(member, "_START_SECONDS", 0.3)
+    runner, own = socket.socketpair()
+    is_over = Event()
+
+    def dribble() -> None:
+        with suppress(OSError):
+            while not is_over.wait(0.01):
+                runner.sendall(b"x")
+
+    talk = Thread(target=dribble)
+    talk.start()
+    waiting = Thread(target=member._first_line, args=(own,), daemon=True)
+    waiting.start()
+    waiting.join(10)
+    is_stuck = waiting.is_alive()
+    is_over.set()
+    own.shutdown(socket.SHUT_RDWR)
+    for one in (talk, waiting):
+        one.join()
+    runner.close()
+    own.close()
+    assert not is_stuck
 
 
 def test_a_name_in_use(tmp_path: Path) -> None:

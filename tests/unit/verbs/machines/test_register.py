@@ -55,6 +55,17 @@ def test_there_and_back(home: Path) -> None:
     assert list((file.parent / "ssh").iterdir()) == []
 
 
+def test_a_damaged_key_can_be_removed(home: Path) -> None:
+    list(add_machine(USER, environment(home), GPU, "gpu"))
+    (known,) = known_machines(USER, environment(home))
+    public = Path(f"{known.key}.pub")
+    public.write_text("")
+    note, last = remove_machine(USER, environment(home), known)
+    assert "cannot read the public key" in note
+    assert last.startswith("Machine removed")
+    assert not public.exists()
+
+
 @pytest.mark.parametrize(
     ("text", "name", "code"),
     [
