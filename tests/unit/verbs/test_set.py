@@ -217,15 +217,15 @@ def test_root_is_needed_for_others(place: Place, monkeypatch: pytest.MonkeyPatch
 class Runner:
     """Keeps what it is asked for; refuses if there is a problem."""
 
-    def __init__(self, problem: str = "") -> None:
+    def __init__(self, problem: str = "", code: ExitCode = ExitCode.FAILURE) -> None:
         self.asked: list[Any] = []
-        self.problem = problem
+        self.problem, self.code = problem, code
 
     def __call__(self, path: Path, request: Mapping[str, Any]) -> dict[str, Any]:
         assert path.name == "runner.sock"
         self.asked.append(request["limits"])
         if self.problem:
-            raise DoraSystemdError(self.problem)
+            raise DoraSystemdError(self.problem, code=self.code)
         return {"done": []}
 
 
@@ -259,6 +259,9 @@ def test_a_rate_that_nobody_takes_changes_nothing(place: Place) -> None:
         assert runner.asked == []
     with pytest.raises(DoraSystemdError, match="it hangs"):
         rates(place, "1/1s", runner=Runner("it hangs"))
+    with pytest.raises(DoraSystemdError, match="its runner is of an older version") as caught:
+        rates(place, "1/1s", runner=Runner("cannot do {'verb': 'log-rates'}", ExitCode.USAGE))
+    assert caught.value.hint == "doractl restart robot, and once more"
     assert not place.drop_in.parent.exists()
     assert place.manager.calls == []
 
