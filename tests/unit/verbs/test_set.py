@@ -15,6 +15,8 @@ from dora_systemd.adapters.host.unit_files import (
 from dora_systemd.decisions.cell.environment import node_environment, with_changes
 from dora_systemd.decisions.cell.limits import parse_node_limits
 from dora_systemd.decisions.cell.line_rates import parse_rates
+from dora_systemd.decisions.cell.machines import Placed
+from dora_systemd.decisions.cell.options import runner_command
 from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import INFINITY
@@ -229,9 +231,9 @@ class Runner:
         return {"done": []}
 
 
-def rates(place: Place, *texts: str, runner: Runner, **flags: Any) -> None:
+def rates(place: Place, *texts: str, runner: Runner, **flags: Any) -> tuple[str, ...]:
     flags = {"log_rate_limit": texts, **flags}
-    set_limits(place.manager, place.scope, place.cell, flags, ask=runner)
+    return set_limits(place.manager, place.scope, place.cell, flags, ask=runner)
 
 
 def test_lines_of_a_running_dataflow(place: Place) -> None:
@@ -242,6 +244,13 @@ def test_lines_of_a_running_dataflow(place: Place) -> None:
     text = place.drop_in.with_name(LOG_RATES_FILE).read_text()
     assert "Environment=DORA_SYSTEMD_LOG_RATES=ui=9/1s,100/1s,camera=10/1s\n" in text
     assert place.manager.calls == [("reload",)]
+
+
+def test_lines_of_nodes_on_other_machines(place: Place) -> None:
+    command = runner_command("/usr/bin/python3", options(placed=(Placed("yolo", "gpu"),)))
+    place.manager.units[place.unit]["ExecStart"][0][1] = command
+    assert "the nodes on gpu keep their limits" in rates(place, "9/1s", runner=Runner())[0]
+    assert rates(place, "camera=9/1s", runner=Runner()) == ()
 
 
 def test_lines_of_one_that_does_not_run(place: Place) -> None:

@@ -52,3 +52,5 @@ def test_limits_of_a_node_elsewhere() -> None:
     (cell,) = read_cells(manager)
     with pytest.raises(DoraSystemdError, match="node yolo: it runs on machine gpu"):
         set_limits(manager, scope, cell, {"node_limit": ("yolo:memory=1G",)})
+    with pytest.raises(DoraSystemdError, match="node arm: it runs on machine pi"):
+        set_limits(manager, scope, cell, {"log_rate_limit": ("9/1s", "arm=1/1s")})
