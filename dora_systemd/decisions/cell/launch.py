@@ -105,6 +105,8 @@ def _launch_node(node: Node, source: str, plan: LaunchPlan) -> dict[str, Any]:
         from dora_systemd.decisions.cell.placed import placed_node
 
         return placed_node(node.id, raw, machine, PERL)
+    if isinstance(deploy := raw.get("deploy"), Mapping):  # this machine, whose daemon has no name
+        raw["deploy"] = {**deploy, "machine": None, "labels": {}}
     if node.kind is NodeKind.OPERATOR:
         return _launch_operators(node, raw, plan.options.working_directory)
     if not has_pipes(node):
@@ -114,7 +116,7 @@ def _launch_node(node: Node, source: str, plan: LaunchPlan) -> dict[str, Any]:
     words = launcher_words(node, source, plan)
     kept = {key: value for key, value in raw.items() if key not in PROGRAM_KEYS}
     if isinstance(kept.get("deploy"), Mapping):
-        kept["deploy"] = {**kept["deploy"], "machine": None, "labels": {}, "working_dir": None}
+        kept["deploy"] = {**kept["deploy"], "working_dir": None}
     return {**kept, "path": PERL, "args": shlex.join(words)}
 
 
