@@ -122,9 +122,8 @@ def _launch_node(node: Node, source: str, plan: LaunchPlan) -> dict[str, Any]:
 
 def launcher_words(node: Node, source: str, plan: LaunchPlan) -> list[str]:
     """launcher.pl and its arguments for a node. Raises DoraSystemdError if it cannot run."""
-    output = "keep" if node.keeps_output else "pipe"
+    output = ("keep" if node.keeps_output else "pipe") + _notify_words(node, plan)
     directory = _directory(node, source, plan)
-    output += _notify_words(node, plan)
     return [plan.launcher, node.id, directory, output, *_command(node, directory, source, plan)]
 
 
