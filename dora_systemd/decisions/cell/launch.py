@@ -113,11 +113,10 @@ def _launch_node(node: Node, source: str, plan: LaunchPlan) -> dict[str, Any]:
         raw = with_bounds(raw)
     if not is_launched(node):
         return raw
-    words = launcher_words(node, source, plan)
     kept = {key: value for key, value in raw.items() if key not in PROGRAM_KEYS}
     if isinstance(kept.get("deploy"), Mapping):
         kept["deploy"] = {**kept["deploy"], "working_dir": None}
-    return {**kept, "path": PERL, "args": shlex.join(words)}
+    return {**kept, "path": PERL, "args": shlex.join(launcher_words(node, source, plan))}
 
 
 def launcher_words(node: Node, source: str, plan: LaunchPlan) -> list[str]:
