@@ -41,7 +41,7 @@ from dora_systemd.runner.cell.boot import Boot
 from dora_systemd.runner.cell.clock import StopClock
 from dora_systemd.runner.cell.dialogue import Dialogue
 from dora_systemd.runner.cell.failure import Beside, words
-from dora_systemd.runner.cell.life import Life, is_first_life
+from dora_systemd.runner.cell.life import Life, begin_life, learn_first
 from dora_systemd.runner.cell.pause import forget_restarts, hold_back
 from dora_systemd.runner.cell.pump import Pump, now_us
 from dora_systemd.runner.needs.needs import wait_for_needs
@@ -77,8 +77,7 @@ async def run_cell(
     loop = asyncio.get_running_loop()
     journal, clock = JournalSocket(), StopClock(options.grace)
     # systemd holds the pipes too, so their content survives a kill of this process.
-    is_first = is_first_life(options.restart, options.name, paths.is_of_user)
-    this_life = Life(options.uuid, is_first)
+    this_life = begin_life(options, paths.is_of_user)
     fd_store.forget_inherited()
     origin = Origin(options.name, options.uuid)
     pipes = LogPipes(loop, journal, origin, fd_store.store, fd_store.forget)
@@ -142,7 +141,9 @@ async def live(runs: Runs, losses: LossWatch | None) -> RunnerExit:
     reach = partial(read_coordinator, runs.paths.control)
     beside = runs.beside
     beside.spawn("reload", runs.reloader.work())
-    beside.spawn("forget restarts", forget_restarts(runs.reloader.options))
+    options, is_user = runs.reloader.options, runs.paths.is_of_user
+    beside.spawn("forget restarts", forget_restarts(options))
+    beside.spawn("count restarts", learn_first(runs.this_life, options.name, is_user))
     socket = serve(runs.paths.socket, runs.reloader.answer, reach, runs.role.sessions)
     beside.spawn("serve its socket", socket)
     if losses is not None:

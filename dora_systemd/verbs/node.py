@@ -29,7 +29,7 @@ from dora_systemd.trust.sockets import plain, require_listener
 from dora_systemd.trust.terminals import run_apart
 from dora_systemd.values import quoted
 from dora_systemd.verbs.facts.cells import Cell
-from dora_systemd.verbs.facts.parts import refuse_parts
+from dora_systemd.verbs.facts.parts import CONTROL, refuse_parts
 from dora_systemd.verbs.facts.reading import read_status
 
 _NO_USER = 2**32 - 1
@@ -44,7 +44,7 @@ def read_coordinator(scope: Scope, cell: Cell) -> Coordinator:
     Raises DoraSystemdError: NOT_RUNNING, or NO_PERMISSION for another user's dataflow.
     """
     require_running(cell)
-    refuse_parts([cell], "control")
+    refuse_parts([cell], CONTROL)
     return runner_socket.ask_coordinator(socket_of(scope, cell))
 
 
@@ -176,7 +176,7 @@ def dora_environment(coordinator: Coordinator) -> dict[str, str]:
 
 def _checked_status(scope: Scope, cell: Cell, node: str) -> CellStatus:
     require_running(cell)
-    refuse_parts([cell], "control")
+    refuse_parts([cell], CONTROL)
     runner_socket.require_access(socket_of(scope, cell))
     return require_node(scope, cell, node)
 

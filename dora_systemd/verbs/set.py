@@ -6,7 +6,7 @@ unit file when the file is removed.
 """
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,7 @@ from dora_systemd.decisions.cell.limits import (
     merge_node_limits,
     parse_changes,
 )
+from dora_systemd.decisions.cell.machines import members_of
 from dora_systemd.decisions.descriptor.nodes import UNEXPANDED
 from dora_systemd.decisions.properties.assignments import typed
 from dora_systemd.decisions.settings.limit_checks import check_cpus, check_use, size_warnings
@@ -75,7 +76,7 @@ def set_limits(
         message = f"cannot change the limits of {cell.name}: none is given"
         raise DoraSystemdError(message, hint, ExitCode.USAGE)
     refuse_parts([cell], "set")
-    _refuse_placed(cell, nodes)
+    _refuse_placed(cell, [*(one.node for one in nodes), *rates])
     if not scope.is_user and os.geteuid() != 0:
         message = f"cannot change the limits of {cell.name}: permission denied"
         raise DoraSystemdError(message, "use sudo", ExitCode.NO_PERMISSION)
@@ -85,7 +86,7 @@ def set_limits(
     unit = manager.read(cell.unit, _PROPERTIES)
     before = dict(entry.split("=", 1) for entry in unit["Environment"] or ())
     values = {limit.word: settings.values[key] for key, limit in BY_KEY.items()}
-    warnings = size_warnings(values, nodes, read_machine())
+    warnings = (*size_warnings(values, nodes, read_machine()), *_placed_warnings(cell, rates))
     if unit["ControlGroup"] and not is_forced:
         group = cgroup.group_path(unit["ControlGroup"])
         check_use(values, nodes, cgroup.read_usage(group).memory, _held(group))
@@ -115,14 +116,21 @@ def _changed_rates(environment: Mapping[str, str], given: line_rates.RateLimits)
     return f"{line_rates.CHANGES_VARIABLE}={line_rates.format_changes({**known, **given})}"
 
 
-def _refuse_placed(cell: Cell, limits: tuple[NodeLimits, ...]) -> None:
-    """Raise DoraSystemdError (USAGE) for limits of a node on another machine."""
+def _refuse_placed(cell: Cell, nodes: Iterable[str]) -> None:
+    """Raise DoraSystemdError (USAGE) for a node on another machine."""
     placed = dict(cell.options.placed)
-    for one in limits:
-        if machine := placed.get(one.node):
-            message = f"cannot limit the node {one.node}: it runs on machine {machine}"
-            hint = f"stop {cell.name}, and start it with another --node-limit"
+    for node in nodes:
+        if machine := placed.get(node):
+            message = f"cannot limit the node {node}: it runs on machine {machine}"
+            hint = f"stop {cell.name}, and start it with another limit"
             raise DoraSystemdError(message, hint, ExitCode.USAGE)
+
+
+def _placed_warnings(cell: Cell, rates: line_rates.RateLimits) -> list[str]:
+    machines = members_of(cell.options.placed)
+    if not machines or line_rates.ALL_NODES not in rates:
+        return []
+    return [f"the nodes on {', '.join(machines)} keep their limits of log lines"]
 
 
 def _unit_file_warnings(

@@ -11,6 +11,8 @@ from tests.machines.flows import NAME, PLACE, Flow
 from tests.machines.wires import there
 from tests.system.cells import run, wait_for
 
+pytestmark = pytest.mark.usefixtures("quiet_journals")
+
 TWO = {"gpu": "b"}
 THREE = {"gpu": "b", "arm": "c"}
 
@@ -68,6 +70,7 @@ def test_again_and_a_restart(flow: Flow) -> None:
     flow.wait_exchanging()
 
 
+@pytest.mark.warns("flow failed: machine gpu: ", "Failed with result", "Failed to start")
 @pytest.mark.parametrize("flow", [TWO], indirect=True)
 class TestRefusals:
     """One line, and nothing is left anywhere."""

@@ -1,6 +1,5 @@
 """After every system test: no process is left over, and no unexpected warning in the journal."""
 
-import json
 import shutil
 import tempfile
 from collections.abc import Generator, Iterator
@@ -9,12 +8,12 @@ from pathlib import Path
 import pytest
 
 from tests.lab.pace import bound
-from tests.system.cells import Cell, Project, run, wait_no_process
+from tests.system.cells import Cell, Project, wait_no_process
 from tests.system.chromium import Browser
+from tests.system.complaints import complaints, end_of_journal
 from tests.system.gateways import Front
 from tests.system.ports import reserve_ports
 from tests.system.releases import Releases
-from tests.system.tolerated import is_tolerated
 
 FIRST_HALF = (
     *("test_cell", "test_kinds", "test_start", "test_start_refused", "test_logs_cli"),
@@ -71,12 +70,12 @@ def cell(request: pytest.FixtureRequest, project: Project) -> Iterator[Cell]:
     del project  # it outlives the cell, as files of a dataflow do
     name = request.node.name.removeprefix("test_").replace("[", "-").replace("]", "")
     cell = Cell("".join(c if c.isalnum() else "-" for c in name).strip("-")[:60])
-    cursor = _cursor()
+    cursor = end_of_journal()
     yield cell
     cell.end()
     wait_no_process()
     expected = [m for mark in request.node.iter_markers("warns") for m in mark.args]
-    unexpected = [w for w in _warnings(cursor) if not any(e in w for e in expected)]
+    unexpected = complaints(cursor, expected)
     assert not unexpected, "unexpected warnings:\n" + "\n".join(unexpected)
 
 
@@ -129,16 +128,3 @@ def browser(front: Front, gateway_up: None, cell: Cell) -> Iterator[Browser]:
         # Chromium draws the field of a time with pictures of its own.
         own = (f"http://{place}", f"ws://{place}", "blob:", "data:image/svg+xml;base64,")
         assert [url for url in browser.requests() if not url.startswith(own)] == []
-
-
-def _cursor() -> str:
-    done = run("journalctl", "-n", "0", "--show-cursor")
-    return done.stdout.rpartition("-- cursor: ")[2].strip()
-
-
-def _warnings(cursor: str) -> list[str]:
-    command = ("journalctl", "-o", "json", "--priority", "warning", f"--after-cursor={cursor}")
-    records = [json.loads(line) for line in run(*command, check=False).stdout.splitlines()]
-    ours = [r for r in records if "dora-" in r.get("_SYSTEMD_UNIT", "") + r.get("UNIT", "")]
-    lines = [f"{r.get('SYSLOG_IDENTIFIER')}: {r.get('MESSAGE')}" for r in ours]
-    return [line for line in lines if not is_tolerated(line)]

@@ -9,6 +9,7 @@ import pytest
 from websockets.sync.client import ClientConnection, connect
 
 from dora_systemd.decisions.gateway.place import SERVICE_UNIT
+from tests.lab.pace import bound
 from tests.system.cells import Project, run, wait_for
 from tests.system.gateways import Front
 from tests.system.releases import STORE, Releases, write_version
@@ -55,7 +56,7 @@ def ask(page: ClientConnection, releases: Releases, release: str) -> None:
 def acted(page: ClientConnection) -> dict[str, str]:
     """The answer to that."""
     while True:
-        found: dict[str, str] = json.loads(page.recv(timeout=60))
+        found: dict[str, str] = json.loads(page.recv(timeout=bound(60)))
         if found["type"] == "acted":
             return found
 
@@ -98,20 +99,21 @@ def test_a_stop_that_takes_longer_than_the_gateway_has(
 ) -> None:
     """A trial of a dataflow that was down: its end comes first, and the gateway waits for all."""
     cell = releases.cell
-    first, second = two_versions(releases, project, "--grace-duration", "8s")
+    seconds = round(bound(3))  # a slow gateway, too, has to say in time that it needs longer
+    first, second = two_versions(releases, project, "--grace-duration", f"{3 * seconds}s")
     cell.doractl("stop", cell.name)
     flag.touch()
     front.up()
     drop_in = front.scope.runtime_root / f"systemd/system/{SERVICE_UNIT}.d/90-test.conf"
     drop_in.parent.mkdir(exist_ok=True)
-    drop_in.write_text("[Service]\nTimeoutStopSec=3s\n")
+    drop_in.write_text(f"[Service]\nTimeoutStopSec={seconds}s\n")
     front.systemctl("daemon-reload")
     with at_page(front) as page:
         ask(page, releases, first)
         wait_for("it is on trial", lambda: cell.show("StatusText").startswith("0/1 nodes"))
         begun = time.monotonic()
         front.systemctl("stop", SERVICE_UNIT)
-        assert time.monotonic() - begun > 3
+        assert time.monotonic() - begun > seconds
     assert front.show("Result") == "success"
     assert not releases.trial.exists()
     assert (releases.current(), cell.show("ActiveState")) == (second, "inactive")

@@ -116,7 +116,9 @@ def test_operator(cell: Cell, project: Project) -> None:
         "        return DoraStatus.CONTINUE\n",
     )
     flow = project.write(
-        "dataflow.yml", f"nodes:\n  - id: one\n    operator: {{python: op.py, {TICK}}}\n"
+        "dataflow.yml",
+        f"nodes:\n  - id: one\n    operator: {{python: op.py, {TICK}}}\n"
+        f"    deploy: {{machine: {os.uname().nodename}}}\n",
     )
     cell.start(flow)
     check(cell, "one", project.root)

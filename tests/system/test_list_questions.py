@@ -13,6 +13,9 @@ from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.facts.list import table_rows
 from tests.system.cells import Cell, Project, is_alive, run, wait_for
+from tests.system.test_enable import boots
+
+__all__ = ["boots"]
 
 
 class CountingBus(Bus):
@@ -90,6 +93,23 @@ def test_two_dataflows_take_as_many_questions_as_one(
     check_truth(cell)
     cell.doractl("restart", cell.name)
     check_truth(cell)
+
+
+@pytest.mark.lab
+@pytest.mark.warns("code=killed", "Failed with result", "process was killed (")
+def test_an_enabled_dataflow_takes_none_of_its_own(boots: Cell, project: Project) -> None:
+    """Its unit file is old, so only systemd can tell whether there was a life before the first."""
+    boots.start(project.three_nodes(), "--restart-policy", "always")
+    boots.doractl("enable", boots.name)
+    boots.doractl("stop", boots.name)
+    boots.doractl("restart", boots.name)
+    assert boots.show("FragmentPath").startswith("/etc/")
+    check_truth(boots)
+    wait_for("its runner has asked", lambda: table_of(boots)[0] == 3)
+    check_truth(boots)
+    os.kill(boots.supervisor_pid("runner"), signal.SIGKILL)
+    wait_for("it is back", lambda: boots.show("NRestarts") == "1" and is_running(boots))
+    check_truth(boots)
 
 
 def test_a_dataflow_of_an_older_version(cell: Cell, project: Project) -> None:

@@ -35,7 +35,7 @@ def test_a_host_that_hangs(base: Releases, project: Project) -> None:
     good = base.current()
     write_version(project, "next")
     words = ("deploy", str(project.root), "--name", name, "--soak", "1h", "-H", "base,arm")
-    command = [sys.executable, "-c", _IMPATIENT, str(bound(5)), *words]
+    command = [sys.executable, "-c", _IMPATIENT, str(bound(10)), *words]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as child:

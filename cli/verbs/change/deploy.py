@@ -89,11 +89,11 @@ def command(
     rolled it back.
 
     Examples:
-      doractl deploy --name robot                 the project in this directory
+      doractl deploy --name robot             the project in this directory
       doractl deploy /srv/robot --soak 5min
       doractl deploy flows/robot.yml --memory-limit 4G --restart-policy on-failure
-      doractl deploy --dry-run                    files that differ from the last release
-      doractl -H base,arm deploy /srv/robot       the same for other hosts, one after the other
+      doractl deploy --dry-run                files that differ from the last one
+      doractl -H base,arm deploy /srv/robot   one host after the other
     """
     del serial  # for -H, see cli/remote/
     scope = current_scope()

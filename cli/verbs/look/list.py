@@ -49,9 +49,9 @@ def command(**options: Any) -> int:
 
     Examples:
       doractl list                      all that run
-      doractl list --last 5             also the five that failed or ended last, and why
+      doractl list --last 5             also the five that ended last, and why
       doractl list robot                the nodes of one
-      doractl list 'cam*' --all         those whose name begins so, also what failed or ended
+      doractl list 'cam*' --all         whose name begins so, also what has ended
       doractl list --status failed -q   UUIDs of all that failed
       doractl list -o json
     """

@@ -171,13 +171,13 @@ def command(
     have ended long ago. On a terminal, a line that repeats is shown once.
 
     Examples:
-      doractl logs robot                          all there is, in a pager
-      doractl logs robot --node camera --follow   what one node writes, from now on
-      doractl logs robot --until-end -o json      all until it ends, for a program
-      doractl logs robot -n 100 --level warn      the last 100 warnings and errors
-      doractl logs 'cam*' robot -b                several dataflows, since the machine booted
-      doractl logs robot --run PREVIOUS --events  what happened to the run before this one
-      journalctl -t robot/camera                  the same records, with systemd's own tool
+      doractl logs robot                      all there is, in a pager
+      doractl logs robot --node camera -f     what one node writes, from now on
+      doractl logs robot --until-end -o json  all until it ends, for a program
+      doractl logs robot -n 100 --level warn  the last 100 warnings and errors
+      doractl logs 'cam*' robot -b            several dataflows, since the boot
+      doractl logs robot --run -1 --events    what happened to the run before
+      journalctl -t robot/camera              the same, with systemd's own tool
     """
     scope = current_scope()
     places = unit_places(scope, os.environ)

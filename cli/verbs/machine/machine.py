@@ -33,7 +33,7 @@ from dora_systemd.verbs.machines.register import (
 def command() -> None:
     """Add, list, check or remove machines of dataflows that run on several.
 
-    A machine that was added can be named in deploy.machine of any dataflow, see MACHINES in
+    A machine that was added can be named in deploy.machine of any dataflow, see SEVERAL MACHINES in
     dora-systemd(7).
 
     Examples:

@@ -81,10 +81,10 @@ def command(
     """Run the nodes of FILE that belong to this machine, as the service dora-NAME.service.
 
     Only the link of a head calls this, by ssh: it says where the coordinator is, and the nodes end
-    when it is gone. See MACHINES in dora-systemd(7).
+    when it is gone. See SEVERAL MACHINES in dora-systemd(7).
 
     Examples:
-      doractl member /srv/robot/dataflow.yml --name robot --uuid UUID --as gpu --placed yolo=gpu
+      doractl member flow.yml --name robot --uuid UUID --as gpu --placed yolo=gpu
     """
     if sys.stdin.isatty():
         hint = "doractl start on the head starts the members"

@@ -75,7 +75,8 @@ def command(
       doractl run                          ./dataflow.yml
       doractl run dataflow.yml --name robot --env MODEL=yolov8n.pt
       doractl run dataflow.yml --hot-reload
-      doractl run dataflow.yml --stop-after 30s --log-level warn --log-filter camera=debug
+      doractl run dataflow.yml --stop-after 30s
+      doractl run dataflow.yml --log-level warn --log-filter camera=debug
     """
     scope = current_scope()
     request = StartRequest(dataflow, name, flags, os.environ, attached=True)

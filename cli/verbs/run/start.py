@@ -74,18 +74,18 @@ def command(
     that file.
 
     Examples:
-      doractl start                                    ./dataflow.yml
+      doractl start                           ./dataflow.yml
       doractl start dataflow.yml --name robot
       doractl start dataflow.yml --env MODEL=yolov8n.pt --venv .venv
-      doractl start dataflow.yml --memory-limit 4G --node-limit detector:memory=1G,cpu=1.5
+      doractl start dataflow.yml --memory-limit 4G --node-limit camera:cpu=1.5
       doractl start dataflow.yml --restart-policy on-failure --max-restarts 3
       doractl start dataflow.yml --credential token=/etc/robot/token
       doractl start dataflow.yml --hot-reload --watch "*.py,config/*"
       doractl start dataflow.yml --device /dev/video0 --writable /srv/recordings
-      doractl start dataflow.yml --enable              now and at every boot
-      doractl start dataflow.yml --attach              with its logs, as doractl run
+      doractl start dataflow.yml --enable     now and at every boot
+      doractl start dataflow.yml --attach     with its logs, as doractl run
       doractl start dataflow.yml --dry-run
-      doractl start robot                              what list --all shows, once more
+      doractl start robot                     what list --all shows, once more
     """
     if want_logs and (no_wait or wants_json()):
         hint = "leave out --no-wait and --output"

@@ -105,24 +105,24 @@ def _launch_node(node: Node, source: str, plan: LaunchPlan) -> dict[str, Any]:
         from dora_systemd.decisions.cell.placed import placed_node
 
         return placed_node(node.id, raw, machine, PERL)
+    if isinstance(deploy := raw.get("deploy"), Mapping):  # this machine, whose daemon has no name
+        raw["deploy"] = {**deploy, "machine": None, "labels": {}}
     if node.kind is NodeKind.OPERATOR:
         return _launch_operators(node, raw, plan.options.working_directory)
     if not has_pipes(node):
         raw = with_bounds(raw)
     if not is_launched(node):
         return raw
-    words = launcher_words(node, source, plan)
     kept = {key: value for key, value in raw.items() if key not in PROGRAM_KEYS}
     if isinstance(kept.get("deploy"), Mapping):
-        kept["deploy"] = {**kept["deploy"], "machine": None, "labels": {}, "working_dir": None}
-    return {**kept, "path": PERL, "args": shlex.join(words)}
+        kept["deploy"] = {**kept["deploy"], "working_dir": None}
+    return {**kept, "path": PERL, "args": shlex.join(launcher_words(node, source, plan))}
 
 
 def launcher_words(node: Node, source: str, plan: LaunchPlan) -> list[str]:
     """launcher.pl and its arguments for a node. Raises DoraSystemdError if it cannot run."""
-    output = "keep" if node.keeps_output else "pipe"
+    output = ("keep" if node.keeps_output else "pipe") + _notify_words(node, plan)
     directory = _directory(node, source, plan)
-    output += _notify_words(node, plan)
     return [plan.launcher, node.id, directory, output, *_command(node, directory, source, plan)]
 
 

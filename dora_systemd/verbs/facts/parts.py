@@ -5,6 +5,9 @@ from collections.abc import Iterable
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.verbs.facts.cells import Cell
 
+CONTROL = "control"
+"""What is done to single nodes, or by the dora command: no verb has this name."""
+
 
 def refuse_parts(cells: Iterable[Cell], verb: str) -> None:
     """Raise DoraSystemdError (FAILURE) for a part, which names the machine to go to."""
@@ -16,7 +19,8 @@ def refuse_parts(cells: Iterable[Cell], verb: str) -> None:
                 f"and the head is {head or 'another machine'}"
             )
             there = f"on {head}" if head else "on the head"
-            raise DoraSystemdError(message, f"{there}: doractl {verb} {cell.name}")
+            hint = f"{there}: doractl {verb} {cell.name}"
+            raise DoraSystemdError(message, f"use doractl {there}" if verb == CONTROL else hint)
 
 
 def without_parts(cells: Iterable[Cell]) -> list[Cell]:

@@ -67,10 +67,12 @@ def test_bare_doractl_prints_help(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize("name", [*VERBS, *ALIASES])
 @pytest.mark.parametrize("flag", ["-h", "--help"])
 def test_every_verb_has_help_with_examples(
-    name: str, flag: str, capsys: pytest.CaptureFixture[str]
+    name: str, flag: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
     assert main.run([name, flag]) == 0
     shown = capsys.readouterr().out
+    assert [line for line in shown.splitlines() if len(line) > 80] == []
     assert "Examples:" in shown
     assert f"doractl {ALIASES.get(name, name)}" in shown
 

@@ -15,6 +15,8 @@ from dora_systemd.adapters.host.unit_files import (
 from dora_systemd.decisions.cell.environment import node_environment, with_changes
 from dora_systemd.decisions.cell.limits import parse_node_limits
 from dora_systemd.decisions.cell.line_rates import parse_rates
+from dora_systemd.decisions.cell.machines import Placed
+from dora_systemd.decisions.cell.options import runner_command
 from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import INFINITY
@@ -217,21 +219,21 @@ def test_root_is_needed_for_others(place: Place, monkeypatch: pytest.MonkeyPatch
 class Runner:
     """Keeps what it is asked for; refuses if there is a problem."""
 
-    def __init__(self, problem: str = "") -> None:
+    def __init__(self, problem: str = "", code: ExitCode = ExitCode.FAILURE) -> None:
         self.asked: list[Any] = []
-        self.problem = problem
+        self.problem, self.code = problem, code
 
     def __call__(self, path: Path, request: Mapping[str, Any]) -> dict[str, Any]:
         assert path.name == "runner.sock"
         self.asked.append(request["limits"])
         if self.problem:
-            raise DoraSystemdError(self.problem)
+            raise DoraSystemdError(self.problem, code=self.code)
         return {"done": []}
 
 
-def rates(place: Place, *texts: str, runner: Runner, **flags: Any) -> None:
+def rates(place: Place, *texts: str, runner: Runner, **flags: Any) -> tuple[str, ...]:
     flags = {"log_rate_limit": texts, **flags}
-    set_limits(place.manager, place.scope, place.cell, flags, ask=runner)
+    return set_limits(place.manager, place.scope, place.cell, flags, ask=runner)
 
 
 def test_lines_of_a_running_dataflow(place: Place) -> None:
@@ -242,6 +244,13 @@ def test_lines_of_a_running_dataflow(place: Place) -> None:
     text = place.drop_in.with_name(LOG_RATES_FILE).read_text()
     assert "Environment=DORA_SYSTEMD_LOG_RATES=ui=9/1s,100/1s,camera=10/1s\n" in text
     assert place.manager.calls == [("reload",)]
+
+
+def test_lines_of_nodes_on_other_machines(place: Place) -> None:
+    command = runner_command("/usr/bin/python3", options(placed=(Placed("yolo", "gpu"),)))
+    place.manager.units[place.unit]["ExecStart"][0][1] = command
+    assert "the nodes on gpu keep their limits" in rates(place, "9/1s", runner=Runner())[0]
+    assert rates(place, "camera=9/1s", runner=Runner()) == ()
 
 
 def test_lines_of_one_that_does_not_run(place: Place) -> None:
@@ -259,6 +268,9 @@ def test_a_rate_that_nobody_takes_changes_nothing(place: Place) -> None:
         assert runner.asked == []
     with pytest.raises(DoraSystemdError, match="it hangs"):
         rates(place, "1/1s", runner=Runner("it hangs"))
+    with pytest.raises(DoraSystemdError, match="its runner is of an older version") as caught:
+        rates(place, "1/1s", runner=Runner("cannot do {'verb': 'log-rates'}", ExitCode.USAGE))
+    assert caught.value.hint == "doractl restart robot, and once more"
     assert not place.drop_in.parent.exists()
     assert place.manager.calls == []
 

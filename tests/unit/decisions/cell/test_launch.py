@@ -96,6 +96,15 @@ def test_commands(node: dict[str, Any], changes: dict[str, Any], expected: list[
     assert words(node, plan(**changes)) == ["/l.sh", "n", *expected]
 
 
+def test_dora_has_one_daemon_without_a_name() -> None:
+    """A node that dora starts itself may name its own machine, too."""
+    deploy = {"machine": "robot-1", "labels": {"arm": "yes"}, "working_dir": "sub"}
+    operator: dict[str, Any] = {"operator": {"python": "op.py", "inputs": {}}}
+    for more in ({"path": "a.py"}, operator):
+        launched = launch({**more, "deploy": deploy})["deploy"]
+        assert (launched["machine"], launched["labels"]) == (None, {})
+
+
 def test_builds() -> None:
     session = BuildSession({"n": "/clone"}, {"n": "/env"})
     node = {"path": "a.py", "git": "https://example.org/x.git", "build": "make", "rev": "1"}

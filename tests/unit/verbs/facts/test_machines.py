@@ -8,7 +8,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.facts.machines import member_hosts
-from dora_systemd.verbs.facts.parts import refuse_parts, without_parts
+from dora_systemd.verbs.facts.parts import CONTROL, refuse_parts, without_parts
 from dora_systemd.verbs.set import set_limits
 from tests.unit.fakes.manager import FakeManager, options
 
@@ -38,6 +38,10 @@ def test_a_part_is_changed_on_its_head() -> None:
     assert caught.value.code is ExitCode.FAILURE
     assert "machine gpu, and the head is robot-1" in caught.value.message
     assert caught.value.hint == "on robot-1: doractl stop robot"
+    with pytest.raises(DoraSystemdError) as caught:
+        refuse_parts(cells, CONTROL)
+    assert caught.value.message.startswith("cannot control robot here")
+    assert caught.value.hint == "use doractl on robot-1"
     assert [cell.name for cell in without_parts(cells)] == ["other"]
     refuse_parts(without_parts(cells), "stop")
 
@@ -48,3 +52,5 @@ def test_limits_of_a_node_elsewhere() -> None:
     (cell,) = read_cells(manager)
     with pytest.raises(DoraSystemdError, match="node yolo: it runs on machine gpu"):
         set_limits(manager, scope, cell, {"node_limit": ("yolo:memory=1G",)})
+    with pytest.raises(DoraSystemdError, match="node arm: it runs on machine pi"):
+        set_limits(manager, scope, cell, {"log_rate_limit": ("9/1s", "arm=1/1s")})
