@@ -180,7 +180,7 @@ def test_a_job_that_ends_while_it_is_asked_waits_for_nothing(now: int) -> None:
         def _read_one(self, *_: Any) -> Any:
             return next(jobs), "/"
 
-        def _call(self, *_: Any) -> Any:
+        def _call(self, *_: Any, **_named: Any) -> Any:
             raise DoraSystemdError("cannot read the job: Job 7 does not exist.")
 
         def __init__(self) -> None:
