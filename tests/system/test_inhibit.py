@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.errors import ExitCode
+from tests.lab.pace import bound
 from tests.system.cells import Cell, Project, is_alive, run, wait_for
 
 ARM = """
@@ -153,7 +154,7 @@ def test_stop_asks_on_a_terminal(cell: Cell, project: Project) -> None:
             capture_output=True,
             text=True,
             check=False,
-            timeout=60,
+            timeout=bound(60),
         )
         assert f"Stop {cell.name} anyway? [y/N]" in done.stdout
         assert "mission 12" in done.stdout
