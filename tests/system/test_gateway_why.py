@@ -89,7 +89,7 @@ def test_one_that_is_degraded(scheme: str, browser: Browser, cell: Cell, project
     degraded(cell, project)
     browser.wait_text("#detail .badge", "Degraded")
     browser.wait_text("#detail .why h2", "Why it is degraded")
-    assert f"node {LONG}: exit code 1" in browser.text("#detail .why .summary")
+    browser.wait_text("#detail .why .summary", f"node {LONG}: exit code 1")
     browser.wait_text("#detail .why .words", "<b>bold</b>")
     assert browser.js("document.querySelectorAll('#detail .why .words b').length") == 0
     browser.wait_text(f"{node(LONG)} .badge", "Failed")
