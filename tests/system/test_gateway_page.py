@@ -37,12 +37,12 @@ def test_what_runs(browser: Browser, cell: Cell, project: Project) -> None:
     browser.wait_text("#detail h1", cell.name)
     for name in ("source", "doubler", "sink"):
         browser.wait_text(f"{node(name)} .badge", "Running")
-    assert "3 of 3" in browser.text("#detail dl")
-    assert str(project.root / "dataflow.yml") in browser.text("#detail dl")
+    browser.wait_text("#detail dl", "3 of 3")
+    browser.wait_text("#detail dl", str(project.root / "dataflow.yml"))
     # From the second snapshot on there is a line to draw.
     browser.wait_js("document.querySelector('#detail .charts .line').getAttribute('d') !== ''")
-    assert "MiB" in browser.text("#detail .charts .memory .value")
-    assert "now" in browser.text("#detail .charts .axis")
+    browser.wait_text("#detail .charts .memory .value", "MiB")
+    browser.wait_text("#detail .charts .axis", "now")
     browser.point("#detail .charts svg", 0.98)
     browser.wait_text("#detail .charts .of", "at ")
     drawn = "[...document.querySelectorAll('.graph {}')].map((e) => e.textContent)"
@@ -183,7 +183,7 @@ def test_disconnected_and_back(
     front.systemctl("stop", SOCKET_UNIT)
     browser.wait_text("#link", "disconnected")
     assert browser.js("document.querySelector('#detail [data-action=stop]').disabled")
-    assert "doractl up" in browser.text("#problem")
+    browser.wait_text("#problem", "doractl up")
     front.systemctl("start", SOCKET_UNIT)
     browser.click("#again")
     browser.wait_text("#link", "live")

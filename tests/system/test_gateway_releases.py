@@ -54,7 +54,7 @@ def test_roll_back(browser: Browser, releases: Releases, project: Project, flag:
     browser.wait_text("#list .card", f"release {second}")
     browser.wait_text(f"{row(second)} .badge", "Current")
     browser.wait_text(f"{row(first)} .badge", "Proved")
-    assert second in browser.text("#detail dl")
+    browser.wait_text("#detail dl", second)
     shown = 'document.querySelector("{} button").checkVisibility()'
     assert [browser.js(shown.format(row(one))) for one in (first, second)] == [True, False]
     browser.resize(1200, 900)

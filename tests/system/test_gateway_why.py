@@ -63,13 +63,13 @@ def test_one_that_failed(scheme: str, browser: Browser, cell: Cell, project: Pro
     failed(cell)
     browser.wait_text("#detail .badge", "Failed")
     browser.wait_text("#detail .why h2", "Why it failed")
-    assert "node bad: exit code 1" in browser.text("#detail .why .summary")
+    browser.wait_text("#detail .why .summary", "node bad: exit code 1")
     assert "failed:" not in browser.text("#detail .title"), "the badge says it"
-    assert "ago" in browser.text("#detail .why dl")
+    browser.wait_text("#detail .why dl", "ago")
     assert "taker" in browser.text("#detail .why dl"), "the node without input"
     assert f"doractl restart {cell.name}" in browser.text("#detail .why .remedies code")
-    assert "RuntimeError: no camera" in browser.text("#detail .why .words")
-    assert "crashed" in browser.text("#detail .why .timeline")
+    browser.wait_text("#detail .why .words", "RuntimeError: no camera")
+    browser.wait_text("#detail .why .timeline", "crashed")
     # The true states, in the list and in the drawing.
     browser.wait_text(f"{node('bad')} .badge", "Failed")
     assert "exit code 1" in browser.text(node("bad"))
@@ -78,7 +78,7 @@ def test_one_that_failed(scheme: str, browser: Browser, cell: Cell, project: Pro
     assert "unknown" not in browser.text("#detail .nodes").lower()
     # No graph of nothing.
     assert not browser.js("document.querySelector('#detail .charts .chart').checkVisibility()")
-    assert "1 failed" in browser.text("#totals")
+    browser.wait_text("#totals", "1 failed")
     look(browser, "failed", scheme)
     assert browser.failures() == []
 
