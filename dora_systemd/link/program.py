@@ -4,7 +4,6 @@ import os
 import select
 import signal
 from contextlib import suppress
-from types import TracebackType
 
 _SECONDS = 2.0
 """For its end, before it is killed."""
@@ -39,12 +38,7 @@ class Program:
     def __enter__(self) -> "Program":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.end()
         for fd in (self.input, self.output, self.errors, self.ended):
             os.close(fd)

@@ -5,7 +5,6 @@ import select
 import time
 from contextlib import suppress
 from threading import Event, Lock, Thread
-from types import TracebackType
 
 from dora_systemd.decisions.machines.wire import (
     BEAT_SECONDS,
@@ -37,12 +36,7 @@ class Head:
         self._beats.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._over.set()
         self._beats.join()
 
@@ -51,7 +45,10 @@ class Head:
         most = time.monotonic() + _MOST_SECONDS
         while True:
             deadline = min(most, time.monotonic() + PART_SECONDS)
-            message = parse_message(self._line(deadline))
+            line = read_line(self._reading, deadline)
+            if not line.endswith(b"\n") and len(line) < MAX_LINE:
+                raise _silent()
+            message = parse_message(line)
             if not isinstance(message, Beat):
                 return expect(message, Part)
 
@@ -69,17 +66,21 @@ class Head:
             self.tell(Beat())
             self._over.wait(BEAT_SECONDS)
 
-    def _line(self, deadline: float) -> bytes:
-        """One line, and not a byte more: what follows is for the relay."""
-        line = b""
-        while not line.endswith(b"\n") and len(line) < MAX_LINE:
-            seconds = max(deadline - time.monotonic(), 0)
-            is_there = select.select([self._reading], [], [], seconds)[0]
-            byte = os.read(self._reading, 1) if is_there else b""
-            if not byte:
-                raise _silent()
-            line += byte
-        return line
+
+def read_line(fd: int, deadline: float) -> bytes:
+    """One line, and not a byte more: what follows is for the relay.
+
+    Without its end if nobody says more, or not before `deadline`, in seconds of the monotonic
+    clock. Raises OSError.
+    """
+    line = b""
+    while not line.endswith(b"\n") and len(line) < MAX_LINE:
+        seconds = max(deadline - time.monotonic(), 0)
+        byte = os.read(fd, 1) if select.select([fd], [], [], seconds)[0] else b""
+        if not byte:
+            break
+        line += byte
+    return line
 
 
 def _silent() -> DoraSystemdError:

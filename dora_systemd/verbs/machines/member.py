@@ -21,7 +21,7 @@ from dora_systemd.adapters.bus.manager import DOWN, Manager
 from dora_systemd.adapters.dora.command import version_numbers
 from dora_systemd.decisions.cell.restarts import RestartPolicy
 from dora_systemd.decisions.machines.link_command import RELAY_MODULE
-from dora_systemd.decisions.machines.wire import LEASE_SECONDS, MAX_LINE, Part
+from dora_systemd.decisions.machines.wire import LEASE_SECONDS, Part
 from dora_systemd.decisions.unit.versions import transient_commands
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import unit_name
@@ -33,7 +33,7 @@ from dora_systemd.trust.sockets import connect_unix, plain
 from dora_systemd.values import INFINITY, SECOND
 from dora_systemd.verbs.facts.cells import read_cell
 from dora_systemd.verbs.facts.reason import failure_reason, runners_refusal
-from dora_systemd.verbs.machines.head import Head
+from dora_systemd.verbs.machines.head import Head, read_line
 from dora_systemd.verbs.start.claim import make_room, refuse_unit_file, require_free_name
 from dora_systemd.verbs.start.linger import is_lingering, linger_command
 from dora_systemd.verbs.start.plan import Plan, StartRequest, make_plan
@@ -201,17 +201,10 @@ def _failure(manager: Manager, unit: str) -> DoraSystemdError:
 
 
 def _first_line(runner: socket.socket) -> bytes:
-    """One line, and not a byte more: what follows is for the relay."""
-    line = b""
-    # A byte now and then must not keep root's process for days.
-    deadline = time.monotonic() + _START_SECONDS
+    """Without its end if it does not come: a byte now and then must not keep root's process."""
     with suppress(OSError):
-        while not line.endswith(b"\n") and len(line) < MAX_LINE:
-            runner.settimeout(max(deadline - time.monotonic(), 0.0))
-            if not (byte := runner.recv(1)):
-                break
-            line += byte
-    return line
+        return read_line(runner.fileno(), time.monotonic() + _START_SECONDS)
+    return b""
 
 
 def _refusal_in(line: bytes) -> DoraSystemdError | None:

@@ -42,6 +42,7 @@ from dora_systemd.verbs.facts.enabled import own_directories, wanted_units
 
 _FORGET_SECONDS = 2.0
 _RETRY_SECONDS = 0.02
+_START = "start it with doractl start"
 
 
 @dataclass(frozen=True)
@@ -141,22 +142,14 @@ def _present_texts(boot: BootUnit, facts: Mapping[str, Any], is_checked: bool) -
 def refuse_attached(cell: Cell) -> None:
     """Raise DoraSystemdError for a dataflow of `doractl run`, which ends with that command."""
     if cell.options.attached:
-        raise DoraSystemdError(
-            f"cannot make a unit file of {cell.name}: it ends with the doractl run that it "
-            "belongs to",
-            "start it with doractl start",
-            ExitCode.USAGE,
-        )
+        why = "it ends with the doractl run that it belongs to"
+        raise _no_file(cell.name, why, _START, ExitCode.USAGE)
 
 
 def refuse_member(options: RunnerOptions) -> None:
     """Raise DoraSystemdError (BAD_INPUT) for a part of a dataflow: its head starts it."""
     if options.machine:
-        raise DoraSystemdError(
-            f"cannot make a unit file of {options.name}: its head is another machine",
-            "use doractl enable there",
-            ExitCode.BAD_INPUT,
-        )
+        raise _no_file(options.name, "its head is another machine", "use doractl enable there")
 
 
 def _loaded_links(manager: Manager, scope: Scope, options: RunnerOptions) -> dict[str, str]:
@@ -189,11 +182,13 @@ def link_paths(boot: BootUnit, options: RunnerOptions | None) -> list[tuple[Path
 def refuse_machines(options: RunnerOptions) -> None:
     """Raise DoraSystemdError (BAD_INPUT) for a dataflow on several machines, or a part of one."""
     if options.placed:
-        raise DoraSystemdError(
-            f"cannot make a unit file of {options.name}: it runs on several machines",
-            "start it with doractl start",
-            ExitCode.BAD_INPUT,
-        )
+        raise _no_file(options.name, "it runs on several machines", _START)
+
+
+def _no_file(
+    name: str, why: str, hint: str, code: ExitCode = ExitCode.BAD_INPUT
+) -> DoraSystemdError:
+    return DoraSystemdError(f"cannot make a unit file of {name}: {why}", hint, code)
 
 
 def install_unit_file(
