@@ -28,6 +28,7 @@ TITLES = {
     "messages": "Messages",
     "reload": "Hot reload",
     "owes": "Owed outputs",
+    "machines": "Several machines",
 }
 """The records in their order."""
 

@@ -20,8 +20,8 @@ from dora_systemd.link.greeting import Greeted, greeted
 from dora_systemd.link.program import Program
 from dora_systemd.link.talk import Talk, tell
 
-_FIRST_SECONDS, _LATER_SECONDS = 0.05, 0.25
-_QUICK_TRIES = 100
+_FIRST_SECONDS, _LATER_SECONDS = 0.01, 0.25
+_QUICK_TRIES = 500
 
 
 def main() -> int:

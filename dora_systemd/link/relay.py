@@ -3,20 +3,19 @@
 `doractl member` executes this in its place, because that has loaded what a start needs, and this
 runs as long as the dataflow. It gets the runner's connection as a file descriptor.
 
-    python3 -E -P -m dora_systemd.link.relay FD SECONDS
+    python3 -I -S relay.py FD SECONDS
 
 If the head says nothing for SECONDS, it may be gone, and ssh need not know: nobody tells it. Then
 the connection to the runner ends, which ends the part of the dataflow here, and this session ends,
 because its ports would keep the next one out.
+
+This is all of the program: imports only what Python itself has loaded, or takes no memory.
 """
 
 import os
 import select
-import signal
-import socket
 import sys
-from contextlib import suppress
-from pathlib import Path
+import time
 
 _CHUNK = 1 << 16
 _KILL_SECONDS = 2
@@ -26,43 +25,59 @@ class LeaseOver(Exception):
     """The head has been silent for too long."""
 
 
-def main() -> int:
-    """Carry until either end has ended; the exit status."""
-    runner = socket.socket(fileno=int(sys.argv[1]))
-    runner.set_inheritable(False)
-    lease = float(sys.argv[2])
-    signal.signal(signal.SIGALRM, _on_alarm)
-    signal.setitimer(signal.ITIMER_REAL, lease)
-    try:
-        _carry(runner, lease)
-    except LeaseOver:
-        runner.close()
-        _end_session()
-    return 0
+class Relay:
+    """The connections. runner: file descriptor. lease: seconds without a line from the head."""
 
+    def __init__(self, runner: int, lease: float) -> None:
+        self._runner, self._lease = runner, lease
+        self._ends_at = time.monotonic() + lease
+        for fd in (1, runner):
+            os.set_blocking(fd, False)
 
-def _on_alarm(*_: object) -> None:
-    # Also in the middle of a write to a connection that nobody reads any more.
-    raise LeaseOver
-
-
-def _carry(runner: socket.socket, lease: float) -> None:
-    poll = select.poll()
-    for fd in (0, runner.fileno()):
-        poll.register(fd, select.POLLIN)
-    with suppress(OSError):
+    def carry(self) -> None:
+        """Carry until either end has ended. Raises LeaseOver, and OSError."""
         while True:
-            for fd, _ in poll.poll():
+            for fd in self._wait((0, self._runner), select.POLLIN):
                 data = os.read(fd, _CHUNK)
                 if not data:
                     _say_end(fd)
                     return
-                if fd:
-                    _write(1, data)
-                    continue
-                if b"\n" in data:
-                    signal.setitimer(signal.ITIMER_REAL, lease)
-                _write(runner.fileno(), data)
+                if fd == 0 and b"\n" in data:
+                    self._ends_at = time.monotonic() + self._lease
+                self._write(1 if fd else self._runner, data)
+
+    def _write(self, fd: int, data: bytes) -> None:
+        """Write all, but no longer than the lease: nobody may read it any more."""
+        while data:
+            self._wait((fd,), select.POLLOUT)
+            try:
+                data = data[os.write(fd, data) :]
+            except BlockingIOError:
+                continue
+
+    def _wait(self, fds: tuple[int, ...], event: int) -> list[int]:
+        """The descriptors that are ready. Raises LeaseOver."""
+        poll = select.poll()
+        for fd in fds:
+            poll.register(fd, event)
+        found = poll.poll(max(self._ends_at - time.monotonic(), 0) * 1000)
+        if not found:
+            raise LeaseOver
+        return [fd for fd, _ in found]
+
+
+def main() -> int:
+    """Carry until either end has ended; the exit status."""
+    runner = int(sys.argv[1])
+    os.set_inheritable(runner, False)
+    try:
+        Relay(runner, float(sys.argv[2])).carry()
+    except LeaseOver:
+        os.close(runner)
+        _end_session()
+    except OSError:
+        pass
+    return 0
 
 
 def _say_end(fd: int) -> None:
@@ -70,25 +85,29 @@ def _say_end(fd: int) -> None:
         print("its supervisor process has ended", file=sys.stderr)
 
 
-def _write(fd: int, data: bytes) -> None:
-    while data:
-        data = data[os.write(fd, data) :]
-
-
 def _end_session() -> None:
     """End the sshd that this is a child of. It is of the same user, or the kernel refuses."""
+    # Imported late: it takes half a megabyte, and is needed at the end only.
+    import signal
+
     parent = os.getppid()
-    with suppress(OSError):
+    try:
         session = os.pidfd_open(parent)
         # It is the parent now, so the descriptor is of no process that got its number later.
         if os.getppid() == parent and _is_sshd(parent):
             signal.pidfd_send_signal(session, signal.SIGTERM)
             select.select([session], [], [], _KILL_SECONDS)
             signal.pidfd_send_signal(session, signal.SIGKILL)
+    except OSError:
+        pass
 
 
 def _is_sshd(pid: int) -> bool:
-    return Path(f"/proc/{pid}/comm").read_text().startswith("sshd")
+    comm = os.open(f"/proc/{pid}/comm", os.O_RDONLY)
+    try:
+        return os.read(comm, _CHUNK).startswith(b"sshd")
+    finally:
+        os.close(comm)
 
 
 if __name__ == "__main__":

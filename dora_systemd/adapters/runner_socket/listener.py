@@ -6,13 +6,13 @@ A relay request turns the connection into one to the coordinator, whatever netwo
 import asyncio
 import contextlib
 import json
-import os
-import socket
-from collections.abc import Awaitable, Callable, Coroutine, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from pathlib import Path
 from typing import Any
 
+from dora_systemd.adapters.runner_socket.address import listen
 from dora_systemd.adapters.runner_socket.client import MAX_BYTES, Request, parse_line
+from dora_systemd.adapters.runner_socket.door import Door, Kept
 from dora_systemd.adapters.runner_socket.splice import Ends, splice
 from dora_systemd.decisions.dora.coordinator import Coordinator
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -20,6 +20,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 Answer = Callable[[Request], Awaitable[dict[str, Any]]]
 Session = Callable[[Request, Ends], Coroutine[Any, Any, None]]
 """Talks with the caller until one of both ends it, after the request that has begun it."""
+Talk = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 Reach = Callable[[], Coordinator]
 """The address of the coordinator. Raises DoraSystemdError (NOT_RUNNING) if it does not listen yet.
 """
@@ -29,11 +30,15 @@ MAX_SESSION_LINE = 1 << 18
 
 
 async def serve(
-    path: Path, answer: Answer, reach: Reach, sessions: Mapping[str, Session] | None = None
+    path: Path,
+    answer: Answer,
+    reach: Reach,
+    sessions: Mapping[str, Session] | None = None,
+    door: Door | None = None,
 ) -> None:
     """Answer requests at `path` forever. An error is {"error": ..., "hint": ..., "code": ...}.
 
-    sessions: by the verb that begins one.
+    sessions: by the verb that begins one. door: listens at `path` already.
     """
     limit = MAX_SESSION_LINE if sessions else MAX_BYTES
 
@@ -49,23 +54,23 @@ async def serve(
                 await _send(writer, await _answer(request, answer, reach))
         writer.close()
 
-    path.unlink(missing_ok=True)
-    with _short(path) as address, socket.socket(socket.AF_UNIX) as listener:
-        listener.bind(address)
-        path.chmod(0o600)
+    listener, kept = door.hand_over() if door else (listen(path), [])
+    with listener:
         server = await asyncio.start_unix_server(talk, sock=listener, limit=limit)
+        for one in kept:
+            await _take(one, talk, limit)
         async with server:
             await server.serve_forever()
 
 
-@contextlib.contextmanager
-def _short(path: Path) -> Iterator[str]:
-    """A short path for the socket: an address has 107 bytes, see unix(7), and a name up to 200."""
-    directory = os.open(path.parent, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        yield f"/proc/self/fd/{directory}/{path.name}"
-    finally:
-        os.close(directory)
+async def _take(kept: Kept, talk: Talk, limit: int) -> None:
+    """Go on with a connection that has come before."""
+    loop = asyncio.get_running_loop()
+    reader = asyncio.StreamReader(limit, loop)
+    reader.feed_data(kept.said)
+    protocol = asyncio.StreamReaderProtocol(reader, talk, loop)
+    kept.connection.setblocking(False)
+    await loop.connect_accepted_socket(lambda: protocol, kept.connection)
 
 
 async def _answer(request: Request | None, answer: Answer, reach: Reach) -> dict[str, Any]:

@@ -6,10 +6,9 @@ from typing import NamedTuple
 from dora_systemd.decisions.cell.machines import members_of
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.machines.link_command import (
-    MODULE,
     LinkOptions,
     link_command,
-    parse_link_argv,
+    parse_link_command,
 )
 from dora_systemd.decisions.machines.member import Member
 from dora_systemd.decisions.properties.assignments import typed, with_assignments, with_properties
@@ -110,7 +109,8 @@ def link_unit(
     own = typed(
         Description=f"link of dora dataflow {options.name} to machine {member.machine}",
         Slice=SLICE,
-        Type="exec",
+        # Not exec: the unit of the head would wait for the sandbox of this one.
+        Type="simple",
         ExecStart=((argv[0], tuple(argv), ("no-env-expand",)),),
         Before=(unit_name(options.name),),
         After=("network.target",),
@@ -135,8 +135,7 @@ def link_from_command(
     python: str, argv: Sequence[str], options: RunnerOptions, is_user: bool
 ) -> LinkUnit:
     """The unit of a link from its ExecStart=. Raises DoraSystemdError (USAGE) for another one."""
-    own = [*argv, MODULE]
-    link = parse_link_argv(own[own.index(MODULE) + 1 : -1])
+    link = parse_link_command(argv)
     member = Member(link.machine, parse_host(link.host), link.words)
     return link_unit(python, link.socket, options, member, is_user, link.identity)
 

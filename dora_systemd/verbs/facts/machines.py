@@ -6,7 +6,7 @@ Only doractl writes these units, so a host in them is what the user has named.
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.decisions.cell.machines import members_of
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.machines.link_command import MODULE, parse_link_argv
+from dora_systemd.decisions.machines.link_command import parse_link_command
 from dora_systemd.decisions.machines.link_unit import link_unit_name
 from dora_systemd.decisions.remote.hosts import Host, parse_host
 from dora_systemd.errors import DoraSystemdError
@@ -23,7 +23,6 @@ def member_hosts(manager: Manager, options: RunnerOptions) -> dict[str, Host | N
 def _host(manager: Manager, unit: str) -> Host | None:
     commands = manager.read(unit, ["ExecStart"]).get("ExecStart") or []
     try:
-        words = list(commands[0][1])
-        return parse_host(parse_link_argv(words[words.index(MODULE) + 1 :]).host)
-    except (DoraSystemdError, IndexError, ValueError):
+        return parse_host(parse_link_command(commands[0][1]).host)
+    except (DoraSystemdError, IndexError):
         return None

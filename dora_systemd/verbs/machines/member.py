@@ -20,7 +20,7 @@ from dora_systemd import __version__
 from dora_systemd.adapters.bus.manager import DOWN, Manager
 from dora_systemd.adapters.dora.command import version_numbers
 from dora_systemd.decisions.cell.restarts import RestartPolicy
-from dora_systemd.decisions.machines.link_command import RELAY_MODULE
+from dora_systemd.decisions.machines.link_command import relay_command
 from dora_systemd.decisions.machines.wire import LEASE_SECONDS, Part
 from dora_systemd.decisions.unit.versions import transient_commands
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -96,8 +96,7 @@ def become_relay(runner: socket.socket) -> NoReturn:
     """Have a small process carry what both say, for as long as the part lives."""
     runner.setblocking(True)
     runner.set_inheritable(True)
-    words = ("-E", "-P", "-m", RELAY_MODULE, str(runner.fileno()), f"{LEASE_SECONDS:g}")
-    os.execv(sys.executable, [sys.executable, *words])
+    os.execv(sys.executable, relay_command(sys.executable, runner.fileno(), LEASE_SECONDS))
 
 
 def _check_part(part: Part, start: StartRequest) -> None:

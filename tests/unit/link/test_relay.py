@@ -6,12 +6,13 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from dora_systemd.decisions.machines.link_command import relay_command
+
 
 @contextmanager
 def relay(seconds: float) -> Iterator[tuple["subprocess.Popen[bytes]", socket.socket]]:
     runner, ours = socket.socketpair()
-    module = ("-E", "-P", "-m", "dora_systemd.link.relay")
-    command = [sys.executable, *module, str(ours.fileno()), f"{seconds}"]
+    command = relay_command(sys.executable, ours.fileno(), seconds)
     pipe = subprocess.PIPE
     with subprocess.Popen(
         command, stdin=pipe, stdout=pipe, stderr=pipe, pass_fds=[ours.fileno()]

@@ -104,6 +104,7 @@ LATE = {
         "verbs.start.claim": {"decisions.machines.link_unit"},
         "verbs.start.enable": {"decisions.machines.link_unit"},
         "link.talk": {"link.parting"},
+        "link.relay": {"signal"},
     },
     "hot reload only": {
         "adapters.host.watch": {"watchfiles"},

@@ -7,6 +7,7 @@ from dora_systemd.decisions.machines.link_command import (
     link_command,
     member_words,
     parse_link_argv,
+    parse_link_command,
     ssh_link_arguments,
 )
 from dora_systemd.decisions.machines.link_unit import (
@@ -32,8 +33,8 @@ PLACED = (Placed("yolo", "gpu"), Placed("arm", "arm"), Placed("depth", "gpu"))
 
 def test_the_command_line_of_a_link() -> None:
     command = link_command("/usr/bin/python3", LINK)
-    assert command[:5] == ["/usr/bin/python3", "-E", "-P", "-m", "dora_systemd.link"]
-    assert parse_link_argv(command[5:]) == LINK
+    assert command[:3] == ["/usr/bin/python3", "-I", "-S"]
+    assert parse_link_argv(command[4:]) == parse_link_command(command) == LINK
 
 
 @pytest.mark.parametrize(
