@@ -1,4 +1,7 @@
-"""One status line on a terminal that is rewritten during a wait; no output to a pipe."""
+"""One status line on a terminal that is rewritten during a wait.
+
+A pipe only gets what a start over several machines waits for.
+"""
 
 from contextlib import AbstractContextManager
 from typing import TextIO
@@ -19,6 +22,7 @@ class StageLine(AbstractContextManager["StageLine"]):
 
     def __call__(self, text: str) -> None:
         if not self._is_terminal:
+            self._tell_machine(text)
             return
         from shutil import get_terminal_size
 
@@ -27,9 +31,20 @@ class StageLine(AbstractContextManager["StageLine"]):
             self._write(f"{_BACK_AND_CLEAR}{shown}")
             self._shown = shown
 
+    def _tell_machine(self, text: str) -> None:
+        """Say which machine a start waits for: that may take a while."""
+        if not text.startswith("waiting for machine") or text == self._shown:
+            return
+        # Imported late: most dataflows run on one machine.
+        from dora_systemd.decisions.machines.awaited import is_news
+
+        if is_news(text):
+            self._shown = text
+            print(one_line(text), file=self._stream, flush=True)
+
     def wipe(self) -> None:
         """Make room for other output; the next stage is shown below it."""
-        if self._shown:
+        if self._shown and self._is_terminal:
             self._write(_BACK_AND_CLEAR)
             self._shown = ""
 

@@ -1,23 +1,49 @@
 """What the head is told when a connection has ended, from ssh's own words."""
 
-from dora_systemd.decisions.machines.wire import Lost, Refused
-from dora_systemd.decisions.remote.command import NO_PROGRAM
-from dora_systemd.decisions.remote.failures import ending_error, last_line
-from dora_systemd.decisions.remote.hosts import parse_host
+from dora_systemd.decisions.machines.wire import FromLink, Lost, Taken, Unreached
+from dora_systemd.decisions.remote.failures import SSH_FAILED, ending_error, last_line
+from dora_systemd.decisions.remote.hosts import Host, parse_host
+from dora_systemd.errors import DoraSystemdError, ExitCode
 
 _FINAL = ("HAS CHANGED", "Host key verification failed", "Permission denied")
 """What no new attempt changes: somebody has to."""
+_FORWARDING = ("forwarding failed for listen port", "Could not request local forwarding")
+_ONCE, _TWICE = 1, 2
+"""A new attempt may help a machine that boots. Who waits for a start has mistyped a name."""
+_VERSIONS = "install the same version of dora-systemd on both machines"
 
 
-def last_word(host: str, status: int, is_in: bool, said: str, complaint: str) -> Lost | Refused:
-    """Whether to try again, or why that is of no use. As ending_error()."""
+def last_word(host: str, status: int, is_in: bool, said: str, complaint: str) -> FromLink:
+    """Why the connection has ended, and whether to try again. As ending_error()."""
+    if any(one in complaint for one in _FORWARDING):
+        hint = "in sshd_config there: AllowTcpForwarding yes; each start takes other ports"
+        return Taken(f"cannot forward a port to {host}: {last_line(complaint)}", hint)
     error = ending_error(parse_host(host), status, is_in, said, complaint)
-    has_no_doractl = is_in and status == NO_PROGRAM and not complaint
-    if error and (has_no_doractl or _is_final(is_in, complaint)):
-        return Refused(error.message, error.hint)
+    if not is_in and error:
+        return _not_in(error, status, complaint)
+    if is_in and status not in (0, SSH_FAILED) and status > 0:
+        return _without_member(parse_host(host), error, status, complaint)
     words = last_line(complaint) or ("" if is_in else last_line(said))
     return Lost(words or (f"exit status {status}" if status else "it has ended"))
 
 
-def _is_final(is_in: bool, complaint: str) -> bool:
-    return not is_in and any(one in complaint for one in _FINAL)
+def _not_in(error: DoraSystemdError, status: int, complaint: str) -> Lost | Unreached:
+    """ssh or the login shell there has not run doractl."""
+    if any(one in complaint for one in _FINAL):
+        return Unreached(error.message, error.hint, 0)
+    if status != SSH_FAILED and status > 0:  # the login shell
+        return Unreached(error.message, error.hint, _TWICE)
+    if "Could not resolve" in complaint:
+        return Unreached(error.message, error.hint, _ONCE)
+    return Lost(last_line(complaint) or f"exit status {status}")
+
+
+def _without_member(
+    host: Host, error: DoraSystemdError | None, status: int, complaint: str
+) -> Unreached:
+    """doractl has not become a member there; what it refuses for good it has said itself."""
+    if error:
+        return Unreached(error.message, error.hint, 0)
+    words = last_line(complaint).removeprefix("doractl: ") or f"exit status {status}"
+    tries = 0 if status == ExitCode.USAGE else _TWICE
+    return Unreached(f"doractl on {host.text} has failed: {words}", _VERSIONS, tries)

@@ -8,11 +8,12 @@ import contextlib
 import gc
 import os
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dora_systemd.decisions.cell.environment import node_environment
-from dora_systemd.decisions.cell.options import parse_runner_argv
+from dora_systemd.decisions.cell.options import RunnerOptions, parse_runner_argv
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.begin import enter_supervisor, leave_out_openssl, start_coordinator
@@ -20,10 +21,12 @@ from dora_systemd.runner.cell.pause import pause
 
 if TYPE_CHECKING:
     from dora_systemd.adapters.dora.check import DoraCheck
-    from dora_systemd.runner.cell.boot import Boot
+    from dora_systemd.runner.cell.boot import EarlyDaemon
+
+    Begun = tuple[EarlyDaemon, DoraCheck]
 
 
-def begin(argv: list[str]) -> "tuple[Boot, DoraCheck] | None":
+def begin(argv: list[str]) -> "Begun | None":
     """Start the coordinator of the first run; its daemon and dora's checks follow in parallel.
 
     Returns None if that fails: run_cell() tries again and reports the error.
@@ -35,9 +38,9 @@ def begin(argv: list[str]) -> "tuple[Boot, DoraCheck] | None":
             unit = enter_supervisor()
             paths = CellPaths(Path(directory))
             pause(options, paths)
-            if options.placed:
-                return None  # the ports of the coordinator and the daemon come later
             environment = node_environment(os.environ)
+            if options.placed:
+                return begin_shared(options, paths, unit, environment)
             coordinator = start_coordinator(options.dora, paths, environment)
             from dora_systemd.adapters.dora.check import DoraCheck
             from dora_systemd.runner.cell.boot import Boot
@@ -45,6 +48,21 @@ def begin(argv: list[str]) -> "tuple[Boot, DoraCheck] | None":
             boot = Boot(coordinator, options, paths, unit, environment)
             return boot, DoraCheck(options, environment, boot.listens)
     return None
+
+
+def begin_shared(
+    options: RunnerOptions, paths: CellPaths, unit: Path, environment: Mapping[str, str]
+) -> "Begun":
+    """The same for one of several machines. Raises OSError, DoraSystemdError."""
+    if options.machine:
+        from dora_systemd.runner.machines.member_boot import MemberBoot as Shared
+    else:
+        from dora_systemd.runner.machines.head_boot import HeadBoot as Shared
+
+    boot = Shared(options, paths, unit, environment)
+    from dora_systemd.adapters.dora.check import DoraCheck
+
+    return boot, DoraCheck(options, environment)
 
 
 def main(argv: list[str]) -> int:

@@ -37,7 +37,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import settings_path
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.begin import daemon_variables, enter_supervisor, make_lock
-from dora_systemd.runner.cell.boot import Boot
+from dora_systemd.runner.cell.boot import EarlyDaemon
 from dora_systemd.runner.cell.clock import StopClock
 from dora_systemd.runner.cell.dialogue import Dialogue
 from dora_systemd.runner.cell.failure import Beside, words
@@ -63,7 +63,7 @@ CLOSE_SECONDS = 7.0
 LOSSES_SECONDS = 10.0
 CANCEL_SECONDS = 0.5
 
-Begun = tuple[Boot, DoraCheck]
+Begun = tuple[EarlyDaemon, DoraCheck]
 """Dora's processes that are starting, and dora's checks that run in parallel."""
 
 
@@ -120,10 +120,11 @@ class Runs:
         begun: Begun | None,
         this_life: Life,
     ) -> None:
-        self.this_life, self.role = this_life, role_of(options, this_life)
+        self.boot = begun[0] if begun else None
+        self.unit = enter_supervisor()
+        self.this_life, self.role = this_life, role_of(options, this_life, self.boot)
         options = self.role.options
         self.paths, self.pipes, self.clock = paths, pipes, clock
-        self.unit = enter_supervisor()
         for path in (paths.work, paths.io):
             path.mkdir(mode=0o700, exist_ok=True)
         make_lock(paths.lock)
@@ -132,7 +133,6 @@ class Runs:
         self.reloader = Reloader(options, self.environment, settings)
         self.nodes = Nodes(self.unit, paths, pipes, self.role.own(options).watchdogs)
         self.beside = Beside(asyncio.get_running_loop())
-        self.boot = begun[0] if begun else None
         self.check = begun[1] if begun else DoraCheck(options, self.environment)
 
 
@@ -144,7 +144,8 @@ async def live(runs: Runs, losses: LossWatch | None) -> RunnerExit:
     options, is_user = runs.reloader.options, runs.paths.is_of_user
     beside.spawn("forget restarts", forget_restarts(options))
     beside.spawn("count restarts", learn_first(runs.this_life, options.name, is_user))
-    socket = serve(runs.paths.socket, runs.reloader.answer, reach, runs.role.sessions)
+    role, answer = runs.role, runs.reloader.answer
+    socket = serve(runs.paths.socket, answer, reach, role.sessions, role.door)
     beside.spawn("serve its socket", socket)
     if losses is not None:
         beside.spawn("count what journald throws away", losses.run())

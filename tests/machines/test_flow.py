@@ -1,6 +1,7 @@
 """One dataflow over several machines: from its start to its end."""
 
 import json
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import pytest
 
 from dora_systemd.errors import ExitCode
 from tests.machines.flows import NAME, PLACE, Flow
-from tests.machines.wires import there
+from tests.machines.wires import there, wait_up
 from tests.system.cells import run, wait_for
 
 pytestmark = pytest.mark.usefixtures("quiet_journals")
@@ -98,7 +99,7 @@ class TestRefusals:
     def test_no_doractl_there(self, flow: Flow) -> None:
         there("b", "mv /opt/lab/bin/doractl /opt/lab/bin/doractl.away")
         try:
-            self.refused(flow, "cannot find doractl on b", code=ExitCode.BAD_INPUT)
+            self.refused(flow, "cannot find doractl on b", code=ExitCode.NO_HOST)
         finally:
             there("b", "mv /opt/lab/bin/doractl.away /opt/lab/bin/doractl")
 
@@ -107,9 +108,56 @@ class TestRefusals:
 
         run("sh", "-c", f"cp {known} {known}.kept; sed -i '/^b /d' {known}")
         try:
-            self.refused(flow, "gpu", "Host key verification failed", code=ExitCode.BAD_INPUT)
+            self.refused(flow, "gpu", "Host key verification failed", code=ExitCode.NO_HOST)
         finally:
             run("mv", f"{known}.kept", known)
+
+    def test_no_such_host(self, flow: Flow) -> None:
+        del flow
+        words = ("machine gpu: cannot reach nowhere", "Could not resolve hostname")
+        self.refused(Flow({"gpu": "nowhere"}), *words, code=ExitCode.NO_HOST)
+
+    def test_an_older_doractl_there(self, flow: Flow) -> None:
+        old = "#!/bin/sh\necho \"doractl: unknown command 'member'\" >&2; exit 2\n"
+        there("b", "mv /opt/lab/bin/doractl /opt/lab/bin/doractl.away")
+        there("b", f"printf '%s' {shlex.quote(old)} > /opt/lab/bin/doractl")
+        there("b", "chmod +x /opt/lab/bin/doractl")
+        try:
+            words = ("doractl on b has failed: unknown command 'member'", "the same version")
+            self.refused(flow, *words, code=ExitCode.NO_HOST)
+        finally:
+            there("b", "mv /opt/lab/bin/doractl.away /opt/lab/bin/doractl")
+
+    def test_a_login_shell_that_runs_nothing(self, flow: Flow) -> None:
+        del flow
+        assert there("b", "usermod -s /usr/sbin/nologin alice").returncode == 0
+        try:
+            words = ("cannot run doractl on alice@b", "not available")
+            self.refused(Flow({"gpu": "alice@b"}), *words, code=ExitCode.NO_HOST)
+        finally:
+            there("b", "usermod -s /bin/bash alice")
+
+    def test_an_sshd_that_forwards_nothing(self, flow: Flow) -> None:
+        here = "/etc/ssh/sshd_config.d/00-closed.conf"
+        there("b", f"mkdir -p /etc/ssh/sshd_config.d; echo AllowTcpForwarding no > {here}")
+        there("b", "systemctl restart ssh")
+        wait_up("b")
+        try:
+            words = ("cannot forward a port to b", "AllowTcpForwarding yes")
+            self.refused(flow, *words, code=ExitCode.NO_HOST)
+        finally:
+            there("b", f"rm {here}; systemctl restart ssh")
+            wait_up("b")
+
+    def test_a_machine_that_may_just_boot(self, flow: Flow) -> None:
+        """It is waited for, and a pipe hears that."""
+        away = Flow({"gpu": "b:2222"})
+        done = away.start("--start-timeout=5s", check=False)
+        assert done.returncode == ExitCode.NO_HOST, done.stderr
+        first, *_ = done.stderr.splitlines()
+        assert first.startswith("waiting for machine gpu (connect to host b port 2222: ")
+        assert "cannot reach machine gpu (connect to host b port 2222: " in done.stderr
+        assert not flow.left()
 
 
 @pytest.mark.parametrize("flow", [TWO], indirect=True)

@@ -47,14 +47,21 @@ class Door:
         os.close(self._over)
         return self._listener, self._kept
 
+    def close(self) -> None:
+        """End all that has begun: nobody takes it over."""
+        listener, kept = self.hand_over()
+        for one in (listener, *(one.connection for one in kept)):
+            one.close()
+
     def _keep(self) -> None:
         poll = select.poll()
         for fd in (self._over, self._listener.fileno()):
             poll.register(fd, select.POLLIN)
         while self._over not in {fd for fd, _ in poll.poll()}:
-            connection, _ = self._listener.accept()
-            connection.settimeout(_SECONDS)
-            self._kept.append(self._met(connection))
+            with suppress(OSError):
+                connection, _ = self._listener.accept()
+                connection.settimeout(_SECONDS)
+                self._kept.append(self._met(connection))
 
     def _met(self, connection: socket.socket) -> Kept:
         said = b""

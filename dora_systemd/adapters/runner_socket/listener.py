@@ -8,19 +8,20 @@ import contextlib
 import json
 from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from dora_systemd.adapters.runner_socket.address import listen
 from dora_systemd.adapters.runner_socket.client import MAX_BYTES, Request, parse_line
-from dora_systemd.adapters.runner_socket.door import Door, Kept
-from dora_systemd.adapters.runner_socket.splice import Ends, splice
+from dora_systemd.adapters.runner_socket.splice import Ends, splice, taken_over
 from dora_systemd.decisions.dora.coordinator import Coordinator
 from dora_systemd.errors import DoraSystemdError, ExitCode
+
+if TYPE_CHECKING:  # most dataflows run on one machine
+    from dora_systemd.adapters.runner_socket.door import Door
 
 Answer = Callable[[Request], Awaitable[dict[str, Any]]]
 Session = Callable[[Request, Ends], Coroutine[Any, Any, None]]
 """Talks with the caller until one of both ends it, after the request that has begun it."""
-Talk = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 Reach = Callable[[], Coordinator]
 """The address of the coordinator. Raises DoraSystemdError (NOT_RUNNING) if it does not listen yet.
 """
@@ -34,7 +35,7 @@ async def serve(
     answer: Answer,
     reach: Reach,
     sessions: Mapping[str, Session] | None = None,
-    door: Door | None = None,
+    door: "Door | None" = None,
 ) -> None:
     """Answer requests at `path` forever. An error is {"error": ..., "hint": ..., "code": ...}.
 
@@ -57,20 +58,14 @@ async def serve(
     listener, kept = door.hand_over() if door else (listen(path), [])
     with listener:
         server = await asyncio.start_unix_server(talk, sock=listener, limit=limit)
-        for one in kept:
-            await _take(one, talk, limit)
+        begun = [await taken_over(*one, limit) for one in kept]
+        talks = [asyncio.create_task(talk(*ends)) for ends in begun]
         async with server:
-            await server.serve_forever()
-
-
-async def _take(kept: Kept, talk: Talk, limit: int) -> None:
-    """Go on with a connection that has come before."""
-    loop = asyncio.get_running_loop()
-    reader = asyncio.StreamReader(limit, loop)
-    reader.feed_data(kept.said)
-    protocol = asyncio.StreamReaderProtocol(reader, talk, loop)
-    kept.connection.setblocking(False)
-    await loop.connect_accepted_socket(lambda: protocol, kept.connection)
+            try:
+                await server.serve_forever()
+            finally:
+                for one in talks:
+                    one.cancel()
 
 
 async def _answer(request: Request | None, answer: Answer, reach: Reach) -> dict[str, Any]:

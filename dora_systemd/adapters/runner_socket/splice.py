@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import socket
 from typing import NamedTuple
 
 _CHUNK = 1 << 16
@@ -12,6 +13,17 @@ class Ends(NamedTuple):
 
     reader: asyncio.StreamReader
     writer: asyncio.StreamWriter
+
+
+async def taken_over(connection: socket.socket, said: bytes, limit: int) -> Ends:
+    """A connection that was there before the loop. said: has been read. limit: bytes of a line."""
+    loop = asyncio.get_running_loop()
+    reader = asyncio.StreamReader(limit, loop)
+    reader.feed_data(said)
+    protocol = asyncio.StreamReaderProtocol(reader, loop=loop)
+    connection.setblocking(False)
+    transport, _ = await loop.connect_accepted_socket(lambda: protocol, connection)
+    return Ends(reader, asyncio.StreamWriter(transport, protocol, reader, loop))
 
 
 async def splice(one: Ends, other: Ends) -> None:

@@ -28,6 +28,7 @@ def to(cell: Cell, state: State, *actions: Action, after: int | None = None) -> 
 _FINAL = {
     Cause.NO_MACHINE: RunnerExit.NO_MACHINE,
     Cause.MACHINE_REFUSES: RunnerExit.BAD_DATAFLOW,
+    Cause.MACHINE_LOST: RunnerExit.ENGINE_LOST,
 }
 
 

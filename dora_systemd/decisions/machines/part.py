@@ -13,25 +13,11 @@ from dora_systemd.decisions.cell.launch import (
     is_launched,
     launcher_words,
 )
-from dora_systemd.decisions.cell.machines import HEAD, machine_of, placed_on
+from dora_systemd.decisions.cell.machines import placed_on
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
+from dora_systemd.decisions.machines.own import is_here
 from dora_systemd.errors import DoraSystemdError, ExitCode
-
-
-def is_here(options: RunnerOptions, node: str) -> bool:
-    """Whether this machine runs the node."""
-    return machine_of(options.placed, node) == (options.machine or HEAD)
-
-
-def own_options(options: RunnerOptions) -> RunnerOptions:
-    """The options with what they say of this machine's nodes only."""
-    return options._replace(
-        node_limits=tuple(one for one in options.node_limits if is_here(options, one.node)),
-        node_rights=tuple(one for one in options.node_rights if is_here(options, one.node)),
-        needs=tuple(one for one in options.needs if is_here(options, one.node)),
-        watchdogs={node: one for node, one in options.watchdogs.items() if is_here(options, node)},
-    )
 
 
 def own_dataflow(options: RunnerOptions, dataflow: Dataflow) -> Dataflow:

@@ -51,6 +51,26 @@ class Lost:
 
 
 @dataclass(frozen=True)
+class Unreached:
+    """Link to the runner of the head: no doractl runs there as a member.
+
+    tries: after so many in a row a start for which somebody waits is of no use; 0 if none is.
+    """
+
+    reason: str
+    hint: str
+    tries: int
+
+
+@dataclass(frozen=True)
+class Taken:
+    """Link to the runner of the head: one of its ports cannot be forwarded."""
+
+    reason: str
+    hint: str
+
+
+@dataclass(frozen=True)
 class Part:
     """Head to member: what it shall run. The settings come from the command line of `member`.
 
@@ -124,12 +144,15 @@ class Stopping:
     by: str = ""
 
 
-Message = Forwards | Lost | Part | Beat | Ready | Table | Refused | Ended | StopPart | Stopping
+FromLink = Lost | Unreached | Taken
+Message = Forwards | FromLink | Part | Beat | Ready | Table | Refused | Ended | StopPart | Stopping
 M = TypeVar("M", bound=Message)
 
 _TYPES: Mapping[str, type[Any]] = {
     "forwards": Forwards,
     "lost": Lost,
+    "unreached": Unreached,
+    "taken": Taken,
     "part": Part,
     "beat": Beat,
     "ready": Ready,
@@ -140,7 +163,7 @@ _TYPES: Mapping[str, type[Any]] = {
     "stopping": Stopping,
 }
 _NAMES = {kind: name for name, kind in _TYPES.items()}
-_NUMBERS = {"coordinator", "zenoh", "grace", "version"}
+_NUMBERS = {"coordinator", "zenoh", "grace", "version", "tries"}
 _LONG = {"status"}
 _BY_MACHINE = {(Forwards, "zenoh")}
 

@@ -16,21 +16,15 @@ LISTEN_SECONDS = 1.0
 and the checks need not wait for a coordinator that hangs."""
 
 
-class Boot:
+class EarlyDaemon:
     """Enables the controllers for the nodes, and starts the daemon once the coordinator listens.
 
-    coordinator: has been started. unit: cgroup directory. environment: of the nodes.
+    unit: cgroup directory. environment: of the nodes.
     """
 
     def __init__(
-        self,
-        coordinator: engine.Child,
-        options: RunnerOptions,
-        paths: CellPaths,
-        unit: Path,
-        environment: Mapping[str, str],
+        self, options: RunnerOptions, paths: CellPaths, unit: Path, environment: Mapping[str, str]
     ) -> None:
-        self.coordinator = coordinator
         self._dora, self._paths, self._unit = options.dora, paths, unit
         self._environment = {
             **environment,
@@ -43,17 +37,42 @@ class Boot:
         # The kernel lets this wait for some 10 ms. Nodes does it too, and reports errors.
         with contextlib.suppress(OSError):
             cgroup.enable_controllers(self._unit)
-        self._port = engine.read_port(self.coordinator, LISTEN_SECONDS)
+        self._port = self._find_port()
         with contextlib.suppress(OSError):  # Engine tries again, and reports it
             if self._port:
-                return start_daemon(self._dora, self._paths, self._port, self._environment)
+                return self._spawn_daemon()
         return None
+
+    def _find_port(self) -> int:
+        """The port of the coordinator; 0 if it does not listen, or not yet."""
+        raise NotImplementedError
+
+    def _spawn_daemon(self) -> Daemon:
+        return start_daemon(self._dora, self._paths, self._port, self._environment)
+
+    def daemon(self) -> Daemon | None:
+        """Wait for the daemon to be started; None if it is not, or not yet."""
+        return self._work.result()
+
+
+class Boot(EarlyDaemon):
+    """The same with the coordinator, which has been started."""
+
+    def __init__(
+        self,
+        coordinator: engine.Child,
+        options: RunnerOptions,
+        paths: CellPaths,
+        unit: Path,
+        environment: Mapping[str, str],
+    ) -> None:
+        self.coordinator = coordinator
+        super().__init__(options, paths, unit, environment)
+
+    def _find_port(self) -> int:
+        return engine.read_port(self.coordinator, LISTEN_SECONDS)
 
     def listens(self) -> bool:
         """Wait for the coordinator; False if it does not listen, or not yet."""
         self._work.result()
         return self._port > 0
-
-    def daemon(self) -> Daemon | None:
-        """Wait for the daemon to be started; None if it is not, or not yet."""
-        return self._work.result()

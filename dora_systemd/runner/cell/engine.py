@@ -13,7 +13,7 @@ from dora_systemd.decisions.dora import protocol
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.begin import Daemon, read_token, start_coordinator, start_daemon
-from dora_systemd.runner.cell.boot import Boot
+from dora_systemd.runner.cell.boot import Boot, EarlyDaemon
 from dora_systemd.values import SECOND
 
 POLL_SECONDS = 0.002
@@ -41,7 +41,7 @@ class Engine:
         dora: str,
         paths: CellPaths,
         environment: Mapping[str, str],
-        boot: Boot | None = None,
+        boot: EarlyDaemon | None = None,
     ) -> None:
         self._boot = boot
         self._dora = dora
@@ -55,7 +55,8 @@ class Engine:
 
     def start_coordinator(self) -> engine.Child:
         """Start the coordinator, unless it boots already; it prints its port. Raises OSError."""
-        child = self._boot.coordinator if self._boot else self._spawn_coordinator()
+        boot = self._boot if isinstance(self._boot, Boot) else None
+        child = boot.coordinator if boot else self._spawn_coordinator()
         self._children[child.label] = child
         return child
 

@@ -37,6 +37,11 @@ def is_first_life(policy: RestartPolicy, name: str, is_user: bool) -> bool:
     return 0 <= began + _TICK - written_us(_transient(name, is_user)) < policy.unit_delay
 
 
+def is_transient(name: str, is_user: bool) -> bool:
+    """Whether systemd has the unit from a client, and not from a file that a boot may start."""
+    return _transient(name, is_user).exists()
+
+
 def _transient(name: str, is_user: bool) -> Path:
     """The file of a transient unit, see UnitPath in systemd.unit(5)."""
     root = os.environ.get("XDG_RUNTIME_DIR", "") if is_user else "/run"

@@ -14,7 +14,7 @@ from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.life.states import Cell
 from dora_systemd.paths import CellPaths
-from dora_systemd.runner.cell.boot import Boot
+from dora_systemd.runner.cell.boot import EarlyDaemon
 from dora_systemd.runner.cell.dialogue import Dialogue
 from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.cell.life import Life
@@ -23,6 +23,7 @@ from dora_systemd.runner.nodes.nodes import Nodes
 
 if TYPE_CHECKING:
     from dora_systemd.adapters.dora.check import DoraCheck
+    from dora_systemd.adapters.runner_socket.door import Door
 
 
 class Alone:
@@ -35,6 +36,11 @@ class Alone:
     def sessions(self) -> Mapping[str, Session]:
         """What its socket can do, besides answers to single requests."""
         return {}
+
+    @property
+    def door(self) -> "Door | None":
+        """What has listened at its socket from the beginning."""
+        return None
 
     @property
     def start_timeout(self) -> int:
@@ -53,7 +59,7 @@ class Alone:
         """The dataflow has been read, and its run begins. Raises DoraSystemdError."""
 
     def engine(
-        self, dora: str, paths: CellPaths, environment: Mapping[str, str], boot: Boot | None
+        self, dora: str, paths: CellPaths, environment: Mapping[str, str], boot: EarlyDaemon | None
     ) -> Engine:
         """The dora of this machine."""
         return Engine(dora, paths, environment, boot)

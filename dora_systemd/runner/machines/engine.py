@@ -3,22 +3,19 @@
 import asyncio
 import signal
 from collections.abc import Callable, Mapping
-from pathlib import Path
 
 from dora_systemd.adapters.dora import engine
 from dora_systemd.decisions.dora import protocol
-from dora_systemd.decisions.machines.wire import Part
+from dora_systemd.decisions.machines.wire import Forwards, Part
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.begin import Daemon, start_coordinator, start_daemon
+from dora_systemd.runner.cell.boot import EarlyDaemon
 from dora_systemd.runner.cell.engine import Engine
+from dora_systemd.runner.machines.zenoh import NO_DIRECT, head_arguments, member_arguments
 
 ASK_SECONDS = 5.0
 """A coordinator that waits for a machine answers nobody for half a minute."""
-_ZENOH = Path(__file__).parents[2] / "zenoh-machines.json5"
-_NO_DIRECT = {"DORA_ZENOH_ENDPOINT_EXCHANGE_TIMEOUT_MS": "0"}
-"""Nodes of different machines do not dial each other: the addresses would be those of 127.0.0.1. So
-dora must not wait for them either; it would for 1.5 s."""
 NOISE = (
     b"Gossip is disabled: cannot de-duplicate",
     b"Scouting delay elapsed before start conditions are met",
@@ -26,15 +23,6 @@ NOISE = (
     b"WS coordinator connection error",
 )
 """Warnings about what zenoh-machines.json5 wants, and about machines: we tell more of those."""
-_OVERLAYS = ("ZENOH_CONFIG", "DORA_ZENOH_CONFIG_OVERLAY")
-"""Variables by which a user sets the same: dora refuses both."""
-
-
-def zenoh_arguments(port: int, environment: Mapping[str, str]) -> tuple[str, ...]:
-    """What a daemon needs to meet those of other machines."""
-    has_own = any(name in environment for name in _OVERLAYS)
-    overlay = () if has_own else ("--zenoh-config-overlay", str(_ZENOH))
-    return ("--zenoh-listen", f"127.0.0.1:{port}", *overlay)
 
 
 class SharedEngine(Engine):
@@ -42,8 +30,14 @@ class SharedEngine(Engine):
 
     machine = ""
 
-    def __init__(self, dora: str, paths: CellPaths, environment: Mapping[str, str]) -> None:
-        super().__init__(dora, paths, {**environment, **_NO_DIRECT})
+    def __init__(
+        self,
+        dora: str,
+        paths: CellPaths,
+        environment: Mapping[str, str],
+        boot: EarlyDaemon | None = None,
+    ) -> None:
+        super().__init__(dora, paths, {**environment, **NO_DIRECT}, boot)
 
     async def machines(self) -> list[str]:
         """The machines whose daemon is connected. Raises DoraSystemdError."""
@@ -71,17 +65,20 @@ class HeadEngine(SharedEngine):
         dora: str,
         paths: CellPaths,
         environment: Mapping[str, str],
-        ports: tuple[int, int],
+        ports: Forwards,
         on_access: Callable[[str], None],
+        boot: EarlyDaemon | None = None,
     ) -> None:
-        super().__init__(dora, paths, environment)
+        super().__init__(dora, paths, environment, boot)
         self._ports, self._on_access = ports, on_access
 
     def _spawn_coordinator(self) -> engine.Child:
-        return start_coordinator(self._dora, self._paths, self._environment, self._ports[0])
+        return start_coordinator(
+            self._dora, self._paths, self._environment, self._ports.coordinator
+        )
 
     def _spawn_daemon(self, environment: Mapping[str, str]) -> Daemon:
-        more = zenoh_arguments(self._ports[1], environment)
+        more = head_arguments(self._ports, environment)
         return start_daemon(self._dora, self._paths, self._port, environment, more=more)
 
     def set_port(self, port: int) -> None:
@@ -93,18 +90,25 @@ class HeadEngine(SharedEngine):
 class MemberEngine(SharedEngine):
     """The daemon of a member; its coordinator is on the head."""
 
+    _part: Part
+
     def __init__(
-        self, dora: str, paths: CellPaths, environment: Mapping[str, str], machine: str
+        self,
+        dora: str,
+        paths: CellPaths,
+        environment: Mapping[str, str],
+        machine: str,
+        boot: EarlyDaemon | None = None,
     ) -> None:
-        super().__init__(dora, paths, environment)
-        self.machine, self._zenoh = machine, 0
+        super().__init__(dora, paths, environment, boot)
+        self.machine = machine
 
     def set_part(self, part: Part) -> None:
         """Set how to reach the head. That is in memory only."""
-        self._port, self._token, self._zenoh = part.coordinator, part.token, part.zenoh
+        self._part, self._port, self._token = part, part.coordinator, part.token
 
     def _spawn_daemon(self, environment: Mapping[str, str]) -> Daemon:
-        more = ("--machine-id", self.machine, *zenoh_arguments(self._zenoh, environment))
+        more = member_arguments(self._part, environment)
         return start_daemon(self._dora, self._paths, self._port, environment, self._token, more)
 
     def cut_off(self) -> None:

@@ -16,9 +16,10 @@ from dora_systemd.adapters.dora.preparation import Prepared
 from dora_systemd.adapters.host import notify
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.adapters.runner_socket.client import Request
+from dora_systemd.adapters.runner_socket.door import Door
 from dora_systemd.adapters.runner_socket.listener import Session, refuse
 from dora_systemd.adapters.runner_socket.splice import Ends
-from dora_systemd.decisions.cell.machines import HEAD, members_of, placed_on
+from dora_systemd.decisions.cell.machines import members_of, placed_on
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.dora import life_events, protocol
 from dora_systemd.decisions.life import events as life
@@ -26,21 +27,20 @@ from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.life.nodes import with_process
 from dora_systemd.decisions.life.states import Cell, Do, State
 from dora_systemd.decisions.machines import wire
-from dora_systemd.decisions.machines.part import (
-    check_placed,
-    is_here,
-    with_works,
-)
+from dora_systemd.decisions.machines.awaited import format_missing
+from dora_systemd.decisions.machines.own import is_here
+from dora_systemd.decisions.machines.part import check_placed, with_works
 from dora_systemd.decisions.rights.node_rights import is_essential
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
-from dora_systemd.runner.cell.boot import Boot
+from dora_systemd.runner.cell.boot import EarlyDaemon
 from dora_systemd.runner.cell.dialogue import Dialogue
 from dora_systemd.runner.cell.engine import Engine
-from dora_systemd.runner.cell.life import Life
+from dora_systemd.runner.cell.life import Life, is_transient
 from dora_systemd.runner.cell.pump import Pump, now_us
 from dora_systemd.runner.machines.ending import end_nodes
 from dora_systemd.runner.machines.engine import NOISE, HeadEngine
+from dora_systemd.runner.machines.head_boot import HeadBoot
 from dora_systemd.runner.machines.ports import choose_ports
 from dora_systemd.runner.machines.roster import Roster
 from dora_systemd.runner.machines.shared import Shared
@@ -63,10 +63,17 @@ _EXTEND_SECONDS = 10.0
 class Head(Shared):
     """The machine where the dataflow was started."""
 
-    def __init__(self, options: RunnerOptions, this_life: Life) -> None:
+    def __init__(self, options: RunnerOptions, this_life: Life, boot: EarlyDaemon | None) -> None:
         super().__init__(options, this_life)
-        self._ports = choose_ports(members_of(options.placed))
+        early = boot if isinstance(boot, HeadBoot) else None
+        self._door = early.door if early else None
+        self._ports = early.ports if early else choose_ports(members_of(options.placed))
         self.roster = Roster(options, self._ports)
+
+    @property
+    def door(self) -> Door | None:
+        """It has told the links their ports."""
+        return self._door
 
     @property
     def sessions(self) -> Mapping[str, Session]:
@@ -81,18 +88,18 @@ class Head(Shared):
 
     def prepare(self, paths: CellPaths, prepared: Prepared, check: "DoraCheck") -> None:
         """Note what the members have to compare."""
-        del paths
+        self.roster.is_awaited = self.this_life.is_first and is_transient(
+            self.options.name, paths.is_of_user
+        )
         check_placed(self.options, prepared.dataflow)
         content = Path(self.options.dataflow).read_bytes()
         self.roster.set_facts(hashlib.sha256(content).hexdigest(), check.version())
 
     def engine(
-        self, dora: str, paths: CellPaths, environment: Mapping[str, str], boot: Boot | None
+        self, dora: str, paths: CellPaths, environment: Mapping[str, str], boot: EarlyDaemon | None
     ) -> Engine:
         """A coordinator and a daemon on the ports that all machines know."""
-        del boot
-        ports = (self._ports.coordinator, self._ports.zenoh[HEAD])
-        return HeadEngine(dora, paths, environment, ports, self.roster.set_token)
+        return HeadEngine(dora, paths, environment, self._ports, self.roster.set_token, boot)
 
     def cell(self, cell: Cell) -> Cell:
         """The cell, with the machine of each node."""
@@ -184,8 +191,7 @@ class HeadDialogue(Dialogue):
         missing = self._roster.missing()
         if not missing:
             return "the dora daemons of all machines"
-        word = "machine" if len(missing) == 1 else "machines"
-        return f"{word} {', '.join(f'{name} ({why})' for name, why in missing.items())}"
+        return format_missing(missing)
 
     async def _extend_start(self) -> None:
         """Waiting for a machine is no part of TimeoutStartSec=, see sd_notify(3)."""

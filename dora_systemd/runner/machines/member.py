@@ -5,7 +5,6 @@ that ends it ends its nodes, by itself and with success: the head decides what f
 has been told is in memory only.
 """
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -14,25 +13,23 @@ from dora_systemd.adapters.dora.command import version_numbers
 from dora_systemd.adapters.dora.preparation import Prepared
 from dora_systemd.adapters.host import files
 from dora_systemd.adapters.logs.pipes import LogPipes
-from dora_systemd.adapters.runner_socket.client import Request
-from dora_systemd.adapters.runner_socket.listener import Session, refuse
-from dora_systemd.adapters.runner_socket.splice import Ends
+from dora_systemd.adapters.runner_socket.splice import Ends, taken_over
 from dora_systemd.decisions.cell.machines import HEAD
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.decisions.life import events as life
-from dora_systemd.decisions.life.states import Cell, State
+from dora_systemd.decisions.life.states import Cell
 from dora_systemd.decisions.machines import wire
 from dora_systemd.decisions.machines.part import check_placed, launch_files
-from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.paths import CellPaths
-from dora_systemd.runner.cell.boot import Boot
+from dora_systemd.runner.cell.boot import EarlyDaemon
 from dora_systemd.runner.cell.dialogue import Dialogue
 from dora_systemd.runner.cell.engine import Engine
 from dora_systemd.runner.cell.life import Life
 from dora_systemd.runner.cell.pump import Pump, now_us
 from dora_systemd.runner.machines.engine import NOISE, MemberEngine
 from dora_systemd.runner.machines.lines import Lines
+from dora_systemd.runner.machines.member_boot import MemberBoot, no_head
 from dora_systemd.runner.machines.member_dialogue import MemberDialogue, is_going_down
 from dora_systemd.runner.machines.shared import Shared
 from dora_systemd.runner.nodes.nodes import Nodes
@@ -50,19 +47,17 @@ class Member(Shared):
     stops_by_head: the head knows that this part ends.
     """
 
-    def __init__(self, options: RunnerOptions, this_life: Life) -> None:
+    def __init__(self, options: RunnerOptions, this_life: Life, boot: EarlyDaemon | None) -> None:
         super().__init__(options._replace(owes=()), this_life)
+        if not isinstance(boot, MemberBoot):
+            raise no_head()
+        self._boot = boot
         self._lines: Lines | None = None
         self._dora: MemberEngine | None = None
         self._pump: Pump | None = None
         self._table = self._told = self._version = ""
         self.stops_by_head = False
         self.is_going_down: Callable[[bool], bool] = is_going_down
-
-    @property
-    def sessions(self) -> Mapping[str, Session]:
-        """`doractl member` begins the only one."""
-        return {"part": self._part}
 
     def prepare(self, paths: CellPaths, prepared: Prepared, check: "DoraCheck") -> None:
         """Write how each node is started. Raises DoraSystemdError."""
@@ -73,11 +68,10 @@ class Member(Shared):
             files.write_atomic(paths.launch / node, text, 0o600)
 
     def engine(
-        self, dora: str, paths: CellPaths, environment: Mapping[str, str], boot: Boot | None
+        self, dora: str, paths: CellPaths, environment: Mapping[str, str], boot: EarlyDaemon | None
     ) -> Engine:
         """A daemon for the coordinator of the head."""
-        del boot
-        self._dora = MemberEngine(dora, paths, environment, self.options.machine)
+        self._dora = MemberEngine(dora, paths, environment, self.options.machine, boot)
         return self._dora
 
     def start_coordinator(self, dora: Engine) -> None:
@@ -96,6 +90,7 @@ class Member(Shared):
         self._pump, pump.amend = pump, self._note_table
         dialogue = MemberDialogue(options, pump, dora, nodes, pipes)
         dialogue.begin(self, dora)
+        dialogue.spawn("hear the head", self._hear_head())
         return dialogue
 
     def _note_table(self, table: CellStatus) -> CellStatus:
@@ -113,33 +108,25 @@ class Member(Shared):
         if self._lines is not None:
             self._lines.send(message)
 
-    async def _part(self, request: Request, ends: Ends) -> None:
-        try:
-            part, dora, pump = self._accept(request)
-        except DoraSystemdError as error:
-            await refuse(ends, error)
-            return
+    async def _hear_head(self) -> None:
+        boot = self._boot
+        await self.talk(await taken_over(boot.connection, boot.rest, wire.MAX_LINE))
+
+    async def talk(self, ends: Ends) -> None:
+        """Do what the head says until it is gone."""
+        part = self._boot.part
         self._lines = Lines(ends, self._send_table)
         if reason := self._other_version(part):
             self._lines.send(wire.Refused(reason, "install the same version on both machines"))
             ends.writer.close()
             self._end_by_head(reason)
             return
-        dora.set_part(part)
-        pump.push(life.CoordinatorListening(now_us()))
+        assert self._dora is not None
+        self._dora.set_part(part)
+        self._push(life.CoordinatorListening(now_us()))
         why = await self._lines.talk(self._hear)
         self._lines = None
         self._end_by_head(why)
-
-    def _accept(self, request: Request) -> tuple[wire.Part, MemberEngine, Pump]:
-        told = {**request, "type": "part"}
-        part = wire.expect(wire.parse_message(json.dumps(told).encode()), wire.Part)
-        own = self.options
-        if (part.name, part.uuid, part.machine) != (own.name, own.uuid, own.machine):
-            raise _refusal("this is the part of another dataflow")
-        if self._dora is None or self._pump is None or self._pump.cell.state is not State.BOOTING:
-            raise _refusal(f"machine {own.machine} has a head already")
-        return part, self._dora, self._pump
 
     def _other_version(self, part: wire.Part) -> str:
         """Why two versions of dora do not work together, or ""."""
@@ -161,7 +148,3 @@ class Member(Shared):
     def _push(self, event: life.Event) -> None:
         if self._pump is not None:
             self._pump.push(event)
-
-
-def _refusal(message: str) -> DoraSystemdError:
-    return DoraSystemdError(message, "stop it first: doractl stop", ExitCode.NAME_IN_USE)

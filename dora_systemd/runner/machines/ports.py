@@ -1,6 +1,6 @@
 """The ports of 127.0.0.1 that are the same on all machines of a dataflow."""
 
-import random
+import os
 from collections.abc import Sequence
 
 from dora_systemd.adapters.host.loopback import port_error
@@ -11,8 +11,9 @@ from dora_systemd.errors import DoraSystemdError
 
 def choose_ports(members: Sequence[str]) -> Forwards:
     """Ports that are free here, other ones each time. Raises DoraSystemdError if there are none."""
-    shuffled = random.sample(PORT_RANGE, len(PORT_RANGE))
-    free = (port for port in shuffled if not port_error(port))
+    begin = int.from_bytes(os.urandom(4)) % len(PORT_RANGE)
+    turned = (*PORT_RANGE[begin:], *PORT_RANGE[:begin])
+    free = (port for port in turned if not port_error(port))
     try:
         return Forwards(next(free), {one: next(free) for one in (HEAD, *members)})
     except StopIteration:

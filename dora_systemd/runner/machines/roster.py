@@ -17,9 +17,11 @@ from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.machines import wire
+from dora_systemd.decisions.machines.awaited import NOT_CONNECTED, NOT_JOINED, USUAL
 from dora_systemd.decisions.machines.tables import merged
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.runner.cell.pump import now_us
+from dora_systemd.runner.machines.head_boot import GREETED
 from dora_systemd.runner.machines.lines import Lines
 from dora_systemd.terminal_text import short_line
 from dora_systemd.values import quoted
@@ -27,8 +29,6 @@ from dora_systemd.values import quoted
 _SILENT_BEATS = 3
 """A member of which nothing was heard for so many beats may be gone, so dora is not asked."""
 _LONGEST = 300
-_NO_LINK = "it is not connected yet"
-_NOT_JOINED = "it has not answered yet"
 
 
 class Member:
@@ -36,15 +36,17 @@ class Member:
 
     lines: the talk with it, if there is one. work: dora's directory there, "" until it is ready.
     words: why it is not ready. table: of its nodes. has_left: its part has ended in peace.
-    is_over: it has said that its part ends, and is not ready again in this talk.
+    is_over: it has said that its part ends, and is not ready again in this talk. failed: attempts
+    in a row that came to nothing.
     """
 
     def __init__(self) -> None:
         self.lines: Lines | None = None
         self.work = ""
-        self.words = _NO_LINK
+        self.words = NOT_CONNECTED
         self.table = CellStatus()
         self.has_left = self.is_over = False
+        self.failed = 0
 
     @property
     def is_heard(self) -> bool:
@@ -55,7 +57,8 @@ class Member:
 class Roster:
     """All members of a dataflow. push: takes the events; it is set before the first talk.
 
-    changed: set whenever something is new of a member.
+    changed: set whenever something is new of a member. is_awaited: whether a person waits for this
+    start, who can mend what a machine at its boot cannot.
     """
 
     def __init__(self, options: RunnerOptions, ports: wire.Forwards) -> None:
@@ -63,6 +66,7 @@ class Roster:
         self._members = {name: Member() for name in members_of(options.placed)}
         self._token = self._digest = self._dora = ""
         self.changed = asyncio.Event()
+        self.is_awaited = False
         self.push: Callable[[life.Event], None] = lambda _: None
 
     @property
@@ -111,7 +115,8 @@ class Roster:
             return
         lines = Lines(ends)
         self._replace(name, lines)
-        lines.send(self._ports)
+        if not request.get(GREETED):
+            lines.send(self._ports)
         self._send_part(name)
         why = await lines.talk(partial(self._hear, name, lines))
         if self._members[name].lines is lines:
@@ -127,9 +132,9 @@ class Roster:
         lines, options = self._members[name].lines, self._options
         if lines is None or not self._token:
             return
-        if self._members[name].words == _NO_LINK:
+        if self._members[name].words == NOT_CONNECTED:
             # Else the last words of ssh, or how it was lost, still tell more.
-            self._members[name].words = _NOT_JOINED
+            self._members[name].words = NOT_JOINED
         lines.send(
             wire.Part(
                 name=options.name,
@@ -150,7 +155,7 @@ class Roster:
         """The talk has ended. Words that the link or the member has said explain more."""
         member = self._members[name]
         was_ready, member.lines, member.table = bool(member.work), None, CellStatus()
-        if was_ready or member.words in (_NO_LINK, _NOT_JOINED):
+        if was_ready or member.words in USUAL:
             member.words = why
         member.work = ""
         if was_ready and not member.has_left:
@@ -165,25 +170,41 @@ class Roster:
         elif isinstance(message, wire.Table):
             self._members[name].table = CellStatus.from_json(message.status)
         elif isinstance(message, wire.Refused):
-            self._refused(name, message)
+            self._give_up(name, message, Cause.MACHINE_REFUSES)
         elif isinstance(message, wire.Ended):
             self._ended(name, message)
         elif isinstance(message, wire.Lost):
             self._ended(name, wire.Ended(message.words))
+        elif isinstance(message, wire.Unreached):
+            self._unreached(name, message)
+        elif isinstance(message, wire.Taken):
+            cause = Cause.NO_MACHINE if self.is_awaited else Cause.MACHINE_LOST
+            self._give_up(name, message, cause)
 
     def _ready(self, name: str, message: wire.Ready) -> None:
         if not message.work.startswith("/"):
             raise DoraSystemdError("its directory is not absolute")
         if (member := self._members[name]).work or member.is_over:
             return
-        member.work, member.has_left = message.work, False
+        member.work, member.has_left, member.failed = message.work, False, 0
         self.push(life.MachineJoined(now_us(), name))
         self.changed.set()
 
-    def _refused(self, name: str, message: wire.Refused) -> None:
+    def _unreached(self, name: str, message: wire.Unreached) -> None:
+        """Give up what nobody mends by waiting; else it is one more attempt."""
+        member = self._members[name]
+        member.failed += 1
+        if not message.tries or (self.is_awaited and member.failed >= message.tries):
+            self._give_up(name, message, Cause.NO_MACHINE)
+        else:
+            self._ended(name, wire.Ended(message.reason))
+
+    def _give_up(
+        self, name: str, message: wire.Refused | wire.Unreached | wire.Taken, cause: Cause
+    ) -> None:
         hint = f"; hint: {short_line(message.hint, _LONGEST)}" if message.hint else ""
         reason = f"machine {name}: {short_line(message.reason, _LONGEST)}{hint}"
-        self.push(life.Refused(now_us(), reason, Cause.MACHINE_REFUSES))
+        self.push(life.Refused(now_us(), reason, cause))
 
     def _ended(self, name: str, message: wire.Ended) -> None:
         """A member says why it ends, or its link why that is lost. The end of the talk follows."""

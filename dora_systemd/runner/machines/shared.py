@@ -2,7 +2,8 @@
 
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
-from dora_systemd.decisions.machines.part import own_dataflow, own_options
+from dora_systemd.decisions.machines.own import own_options
+from dora_systemd.decisions.machines.part import own_dataflow
 from dora_systemd.runner.cell.role import Alone
 from dora_systemd.values import INFINITY
 

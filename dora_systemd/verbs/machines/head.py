@@ -16,10 +16,10 @@ from dora_systemd.decisions.machines.wire import (
     format_message,
     parse_message,
 )
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError
 
-PART_SECONDS = 10.0
-"""For each line until the part."""
+PART_SECONDS = 30.0
+"""For each line until the part: the head may just start, and have much else to do."""
 _MOST_SECONDS = 60.0
 
 
@@ -41,7 +41,7 @@ class Head:
         self._beats.join()
 
     def part(self) -> Part:
-        """What to run. Raises DoraSystemdError (USAGE) if nobody says it."""
+        """What to run. Raises DoraSystemdError (FAILURE) if nobody says it."""
         most = time.monotonic() + _MOST_SECONDS
         while True:
             deadline = min(most, time.monotonic() + PART_SECONDS)
@@ -85,4 +85,4 @@ def read_line(fd: int, deadline: float) -> bytes:
 
 def _silent() -> DoraSystemdError:
     hint = "doractl start on the head starts the members"
-    return DoraSystemdError("cannot run a member: no head says what to run", hint, ExitCode.USAGE)
+    return DoraSystemdError("cannot run a member: no head says what to run", hint)

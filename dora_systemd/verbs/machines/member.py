@@ -6,14 +6,14 @@ is a Refused if a new attempt is of no use, and else an exit status.
 """
 
 import hashlib
-import json
 import os
+import select
 import socket
 import sys
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import NoReturn
 
 from dora_systemd import __version__
@@ -21,15 +21,14 @@ from dora_systemd.adapters.bus.manager import DOWN, Manager
 from dora_systemd.adapters.dora.command import version_numbers
 from dora_systemd.decisions.cell.restarts import RestartPolicy
 from dora_systemd.decisions.machines.link_command import relay_command
-from dora_systemd.decisions.machines.wire import LEASE_SECONDS, Part
+from dora_systemd.decisions.machines.wire import LEASE_SECONDS, Part, format_message
 from dora_systemd.decisions.unit.versions import transient_commands
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import unit_name
-from dora_systemd.paths import CellPaths
 from dora_systemd.scope import Scope
 from dora_systemd.trust.files import read_file
 from dora_systemd.trust.socket_table import is_open_beyond
-from dora_systemd.trust.sockets import connect_unix, plain
+from dora_systemd.trust.sockets import plain
 from dora_systemd.values import INFINITY, SECOND
 from dora_systemd.verbs.facts.cells import read_cell
 from dora_systemd.verbs.facts.reason import failure_reason, runners_refusal
@@ -39,9 +38,9 @@ from dora_systemd.verbs.start.linger import is_lingering, linger_command
 from dora_systemd.verbs.start.plan import Plan, StartRequest, make_plan
 from dora_systemd.verbs.start.unit import plan_properties, systemd_number
 
-_START_SECONDS = 30.0
-"""For the runner's socket, and for its first words."""
-_POLL_SECONDS = 0.02
+_START_SECONDS = 60.0
+"""For the first words of the runner."""
+_LOOK_SECONDS = 0.1
 _MOST_GRACE = 3600 * SECOND
 """µs. The head's runner says it: it must not keep this machine from a shutdown."""
 _PASSING = (ExitCode.FAILURE, ExitCode.NO_SYSTEMD)
@@ -71,25 +70,31 @@ def start_member(manager: Manager, request: MemberRequest, head: Head) -> socket
 
     The first line of the runner has been passed on. Raises DoraSystemdError; then nothing runs.
     """
+    _check_linger(request.scope)
+    _end_old_part(manager, request)
+    plan = make_plan(request.scope, request.start)
     part = head.part()
     _check_part(part, request.start)
     _check_forwards(part)
-    _check_linger(request.scope)
-    _end_old_part(manager, request)
     boot = require_free_name(manager, request.scope, request.unit)
     refuse_unit_file(boot)
-    plan = _member_plan(make_plan(request.scope, request.start), part)
+    plan = _member_plan(plan, part)
     _check_same(part, plan)
     properties, _ = plan_properties(plan, manager)
     make_room(manager, boot)
     told = transient_commands(list(properties.values()), systemd_number(manager))
-    _start_transient(manager, request.unit, told)
+    runner, stdin = _connected(part)
+    with stdin:
+        handed = ("StandardInputFileDescriptor", "h", stdin.fileno())
+        _start_transient(manager, request.unit, [*told, handed])
     try:
-        return _joined(manager, request, part, head)
+        head.say(_first_answer(manager, request.unit, runner))
     except BaseException:
+        runner.close()
         with suppress(DoraSystemdError):
             manager.run_jobs("StopUnit", [request.unit])
         raise
+    return runner
 
 
 def become_relay(runner: socket.socket) -> NoReturn:
@@ -163,34 +168,42 @@ def _start_transient(
         raise
 
 
-def _joined(manager: Manager, request: MemberRequest, part: Part, head: Head) -> socket.socket:
-    """The connection to the runner, which has got its part and answered."""
-    runner = _reached(manager, request)
-    try:
-        runner.sendall(json.dumps({"verb": "part", **asdict(part)}).encode() + b"\n")
-        line = _first_line(runner)
-        if not line.endswith(b"\n"):
-            raise _failure(manager, request.unit)
-        if refusal := _refusal_in(line):
-            raise refusal
-        head.say(line)
-        return runner
-    except BaseException:
-        runner.close()
-        raise
+def _connected(part: Part) -> tuple[socket.socket, socket.socket]:
+    """A connection to a runner that is yet to start, and what it shall have as standard input.
+
+    The runner finds the other end of the connection there, see runner/machines/member_boot.py.
+    """
+    own, theirs = socket.socketpair()
+    giving, stdin = socket.socketpair()
+    own.settimeout(_START_SECONDS)
+    with theirs, giving:
+        own.sendall(format_message(part))
+        socket.send_fds(giving, [b"\n"], [theirs.fileno()])
+    return own, stdin
 
 
-def _reached(manager: Manager, request: MemberRequest) -> socket.socket:
-    path = CellPaths(request.scope.cell_directory(request.start.name or "")).socket
+def _first_answer(manager: Manager, unit: str, runner: socket.socket) -> bytes:
+    """The first line of the runner, which has got its part. Raises DoraSystemdError."""
     deadline = time.monotonic() + _START_SECONDS
-    while time.monotonic() < deadline:
-        with suppress(OSError):
-            return connect_unix(path, _START_SECONDS)
-        state = manager.read(request.unit, ["Job", "ActiveState"])
-        if state["ActiveState"] in DOWN and not (state["Job"] or (0,))[0]:
-            raise _failure(manager, request.unit)
-        time.sleep(_POLL_SECONDS)
-    raise DoraSystemdError(f"cannot start {request.unit}: its runner does not answer")
+    # systemd keeps the runner's end of the connection if it cannot execute the runner.
+    while not _says_something(runner) and time.monotonic() < deadline:
+        if _is_down(manager, unit):
+            raise _failure(manager, unit)
+    line = _first_line(runner)
+    if not line.endswith(b"\n"):
+        while not _is_down(manager, unit) and time.monotonic() < deadline:
+            time.sleep(_LOOK_SECONDS)  # only then it says why
+        raise _failure(manager, unit)
+    return line
+
+
+def _says_something(runner: socket.socket) -> bool:
+    return bool(select.select([runner], [], [], _LOOK_SECONDS)[0])
+
+
+def _is_down(manager: Manager, unit: str) -> bool:
+    state = manager.read(unit, ["Job", "ActiveState"])
+    return state["ActiveState"] in DOWN and not (state["Job"] or (0,))[0]
 
 
 def _failure(manager: Manager, unit: str) -> DoraSystemdError:
@@ -204,15 +217,6 @@ def _first_line(runner: socket.socket) -> bytes:
     with suppress(OSError):
         return read_line(runner.fileno(), time.monotonic() + _START_SECONDS)
     return b""
-
-
-def _refusal_in(line: bytes) -> DoraSystemdError | None:
-    """The error of a runner that does not take the part, as any refusal of it."""
-    with suppress(ValueError, RecursionError):
-        found = json.loads(line)
-        if isinstance(found, dict) and "error" in found:
-            return DoraSystemdError(plain(str(found["error"])), plain(str(found.get("hint", ""))))
-    return None
 
 
 def _refusal(reason: str, hint: str = "") -> DoraSystemdError:

@@ -32,3 +32,13 @@ def test_nothing_to_a_pipe() -> None:
     with StageLine(stream) as stage:
         stage("starting")
     assert not stream.getvalue()
+
+
+def test_a_pipe_hears_once_which_machine_is_away() -> None:
+    stream = io.StringIO()
+    away = "waiting for machines gpu (it is not connected yet), pi (connection refused)"
+    with StageLine(stream) as stage:
+        stage("waiting for machine gpu (it is not connected yet)")
+        stage(away)
+        stage(away)
+    assert stream.getvalue() == f"{away}\n"

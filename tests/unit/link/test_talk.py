@@ -13,6 +13,8 @@ from dora_systemd.decisions.machines.wire import (
     Lost,
     Message,
     Refused,
+    Taken,
+    Unreached,
     format_message,
     parse_message,
 )
@@ -68,23 +70,43 @@ def test_the_words_of_ssh() -> None:
     assert far.run() == [Lost("connect to host b port 22: No route to host")]
 
 
+IN = "echo mark; echo mark >&2; "
+
+
 @pytest.mark.parametrize(
-    ("script", "reason"),
+    ("script", "reason", "tries"),
     [
-        ("echo 'Host key verification failed.' >&2; exit 255", "Host key verification failed."),
-        ("echo 'a@b: Permission denied (publickey).' >&2; exit 255", "Permission denied"),
-        ("echo mark; echo mark >&2; exit 127", "cannot find doractl on b"),
+        ("echo 'Host key verification failed.' >&2; exit 255", "Host key verification failed.", 0),
+        ("echo 'a@b: Permission denied (publickey).' >&2; exit 255", "Permission denied", 0),
+        (f"{IN}exit 127", "cannot find doractl on b", 0),
+        (f"{IN}echo 'doractl: unknown option --x' >&2; exit 2", "on b has failed: unknown opt", 0),
+        (
+            f"{IN}echo 'doractl: cannot reach systemd' >&2; exit 7",
+            "failed: cannot reach systemd",
+            2,
+        ),
+        ("echo 'ssh: Could not resolve hostname b: Name' >&2; exit 255", "resolve hostname b", 1),
+        ("echo 'This account is not available.'; exit 1", "This account is not available", 2),
     ],
 )
-def test_what_no_new_attempt_changes(script: str, reason: str) -> None:
+def test_what_keeps_doractl_from_being_a_member(script: str, reason: str, tries: int) -> None:
     (found,) = Far(script).run()
-    assert isinstance(found, Refused)
+    assert isinstance(found, Unreached)
     assert reason in found.reason
+    assert found.tries == tries
 
 
-def test_the_words_of_doractl() -> None:
-    far = Far("echo mark; echo mark >&2; echo 'doractl: cannot reach systemd' >&2; exit 7")
-    assert far.run() == [Lost("doractl: cannot reach systemd")]
+@pytest.mark.parametrize(
+    "words",
+    [
+        "Error: remote port forwarding failed for listen port 61000",
+        "Could not request local forwarding.",
+    ],
+)
+def test_a_port_that_is_taken(words: str) -> None:
+    (found,) = Far(f"echo '{words}' >&2; exit 255").run()
+    assert isinstance(found, Taken)
+    assert found.reason == f"cannot forward a port to b: {words}"
 
 
 def test_the_end_of_the_runner_ends_ssh(tmp_path: Path) -> None:

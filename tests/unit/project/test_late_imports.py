@@ -30,8 +30,8 @@ LATE = {
         "names": {"difflib"},
         "cli.edge": {"decisions.views.objects"},
     },
-    "shutil imports every compressor: only a terminal has a width": {
-        "cli.stageline": {"shutil"},
+    "shutil imports every compressor: only a terminal has a width; a pipe hears of machines": {
+        "cli.stageline": {"shutil", "decisions.machines.awaited"},
     },
     "a start that succeeds has no last words, and most follow no log": {
         "cli.verbs.run.start": {
@@ -125,7 +125,10 @@ LATE = {
         "adapters.host.notify": {"systemd.daemon"},
     },
     "the coordinator boots while the rest of the runner is imported": {
-        "runner.__main__": {"adapters.dora.check", "runner.cell.boot", "runner.main"},
+        "runner.__main__": {
+            *("adapters.dora.check", "runner.cell.boot", "runner.main"),
+            *("runner.machines.head_boot", "runner.machines.member_boot"),
+        },
         "runner.cell.pause": {
             *("adapters.host.process", "adapters.host.files", "adapters.host.notify"),
             *("decisions.cell.status", "asyncio"),

@@ -10,11 +10,11 @@ from dora_systemd.decisions.cell.launch import LaunchPlan, launch_descriptor
 from dora_systemd.decisions.cell.machines import Placed
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
+from dora_systemd.decisions.machines.own import own_options
 from dora_systemd.decisions.machines.part import (
     check_placed,
     launch_files,
     own_dataflow,
-    own_options,
     with_works,
 )
 from dora_systemd.decisions.signs.watchdogs import Watchdogs

@@ -2,8 +2,9 @@
 
 import asyncio
 import json
+import socket
 from collections.abc import Callable, Coroutine
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,12 @@ from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import Cell, Do, State
 from dora_systemd.decisions.machines import wire
+from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.life import Life
 from dora_systemd.runner.machines.engine import MemberEngine
 from dora_systemd.runner.machines.member import Member
+from dora_systemd.runner.machines.member_boot import MemberBoot
 from dora_systemd.runner.machines.member_dialogue import MemberDialogue
 from dora_systemd.runner.machines.processes import find
 from dora_systemd.values import SECOND
@@ -39,10 +42,19 @@ PART = wire.Part(
 )
 
 
+class FakeBoot(MemberBoot):
+    """The head has said its part, and its connection is the next thing to be taken over."""
+
+    def __init__(self) -> None:
+        self.part, self.rest = PART, b""
+        self.connection, self.far = socket.socketpair()
+
+
 class Bench:
     def __init__(self, root: Path, state: State) -> None:
         paths = CellPaths(root)
-        self.member = Member(OPTIONS, Life("uuid"))
+        self.boot = FakeBoot()
+        self.member = Member(OPTIONS, Life("uuid"), self.boot)
         self.member._version = "1.1.4"
         self.nodes, self.pipes = FakeNodes(), FakePipes()
         cell = Cell(2 * SECOND, 0, {"mid": NodeStatus("running", 7)}, state, run="run")
@@ -61,8 +73,9 @@ class Bench:
     async def head(self, part: wire.Part = PART) -> FakeEnds:
         """A head that has sent its part."""
         other = FakeEnds()
-        request = {"verb": "part", **asdict(part)}
-        self.talk = asyncio.create_task(self.member.sessions["part"](request, other.ends))
+        self.dialogue.cancel()
+        self.boot.part = part
+        self.talk = asyncio.create_task(self.member.talk(other.ends))
         await settle()
         return other
 
@@ -97,22 +110,9 @@ def test_a_part_begins_its_life(tmp_path: Path) -> None:
     run(tmp_path, work)
 
 
-@pytest.mark.parametrize("change", [{"machine": "cam"}, {"name": "other"}])
-def test_the_part_of_another_is_refused(tmp_path: Path, change: dict[str, str]) -> None:
-    async def work(bench: Bench) -> None:
-        other = await bench.head(replace(PART, **change))  # type: ignore[arg-type]
-        assert other.heard()[0]["error"] == "this is the part of another dataflow"
-        assert bench.heard() == []
-
-    run(tmp_path, work)
-
-
-def test_it_has_one_head(tmp_path: Path) -> None:
-    async def work(bench: Bench) -> None:
-        other = await bench.head()
-        assert other.heard()[0]["error"] == "machine gpu has a head already"
-
-    run(tmp_path, work, State.RUNNING)
+def test_nobody_has_said_what_to_run() -> None:
+    with pytest.raises(DoraSystemdError, match="no head says what to run"):
+        Member(OPTIONS, Life("uuid"), None)
 
 
 def test_another_version_of_dora_is_refused(tmp_path: Path) -> None:

@@ -5,6 +5,8 @@ from collections.abc import Callable, Coroutine
 from dataclasses import replace
 from typing import Any
 
+import pytest
+
 from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.cell.machines import Placed
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -138,6 +140,61 @@ def test_what_ssh_says_is_shown_until_the_member_is_ready() -> None:
         assert "No route" in bench.roster.missing()["gpu"]
         bench.roster.set_token("secret")
         assert "No route" in bench.roster.missing()["gpu"]
+
+    run(work)
+
+
+def refusals(bench: Bench) -> list[tuple[str, Cause]]:
+    return [(one.reason, one.cause) for one in bench.events if isinstance(one, life.Refused)]
+
+
+@pytest.mark.parametrize(
+    ("tries", "is_awaited", "most"), [(0, False, 1), (1, True, 1), (2, True, 2), (1, False, None)]
+)
+def test_a_machine_that_is_not_reached(tries: int, is_awaited: bool, most: int | None) -> None:
+    """A person who waits hears it soon; a robot that boots waits for its network."""
+
+    async def work(bench: Bench) -> None:
+        bench.roster.is_awaited = is_awaited
+        for number in range(1, 4):
+            other = await bench.link()
+            other.say(wire.Unreached("cannot reach b: no such host", "correct it", tries))
+            await settle()
+            has_ended = most is not None and number >= most
+            assert bool(refusals(bench)) is has_ended
+            if has_ended:
+                reason = "machine gpu: cannot reach b: no such host; hint: correct it"
+                assert refusals(bench)[0] == (reason, Cause.NO_MACHINE)
+                return
+        assert bench.roster.missing()["gpu"] == "cannot reach b: no such host"
+
+    run(work)
+
+
+@pytest.mark.parametrize(
+    ("is_awaited", "cause"), [(True, Cause.NO_MACHINE), (False, Cause.MACHINE_LOST)]
+)
+def test_a_port_that_is_taken_there(is_awaited: bool, cause: Cause) -> None:
+    """Restart= then brings other ports."""
+
+    async def work(bench: Bench) -> None:
+        bench.roster.is_awaited = is_awaited
+        other = await bench.link()
+        other.say(wire.Taken("cannot forward a port to b: 61000", ""))
+        await settle()
+        assert refusals(bench) == [("machine gpu: cannot forward a port to b: 61000", cause)]
+
+    run(work)
+
+
+def test_a_link_that_has_its_ports_gets_none() -> None:
+    async def work(bench: Bench) -> None:
+        other = FakeEnds()
+        request = {"machine": "gpu", "greeted": True}
+        bench.talk = asyncio.create_task(bench.roster.link(request, other.ends))
+        await settle()
+        bench.roster.set_token("secret")
+        assert [one["type"] for one in other.heard()] == ["part"]
 
     run(work)
 

@@ -1,0 +1,137 @@
+"""What head and member do before they import the rest of the runner."""
+
+import json
+import os
+import socket
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dora_systemd.adapters.runner_socket.door import Door
+from dora_systemd.decisions.cell.machines import Placed
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.machines.wire import Beat, Forwards, Part, format_message
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.paths import CellPaths
+from dora_systemd.runner.cell.begin import Daemon
+from dora_systemd.runner.machines.head_boot import GREETED, greeting
+from dora_systemd.runner.machines.member_boot import MemberBoot, received
+from tests.unit.fakes.manager import UUID
+
+PORTS = Forwards(61000, {"head": 61001, "gpu": 61002})
+OPTIONS = RunnerOptions(
+    *("robot", UUID, "/srv/flow.yml", "/srv", "/bin/dora"),
+    placed=(Placed("mid", "gpu"),),
+    machine="gpu",
+)
+PART = Part("robot", UUID, "gpu", "s3cret", 61001, 61003, "0" * 64, 5, "0.1.0", "1.1.0")
+
+
+def ask(path: Path, line: bytes) -> socket.socket:
+    link = socket.socket(socket.AF_UNIX)
+    link.settimeout(30)
+    link.connect(str(path))
+    link.sendall(line)
+    return link
+
+
+def test_a_link_gets_its_ports_before_anything_else_is_there(tmp_path: Path) -> None:
+    path = tmp_path / "runner.sock"
+    door = Door(path, lambda line: greeting(line, ("gpu",), PORTS))
+    wish = {"verb": "link", "machine": "gpu"}
+    with (
+        ask(path, json.dumps(wish).encode() + b"\nmore") as link,
+        ask(path, b'{"verb": "coordinator"}\n') as other,
+    ):
+        assert link.recv(1000) == format_message(PORTS)
+        wait_met(door, 2)
+        listener, kept = door.hand_over()
+        said = sorted(one.said for one in kept)
+        assert said[0] == b'{"verb": "coordinator"}\n'
+        line, _, rest = said[1].partition(b"\n")
+        assert (json.loads(line), rest) == ({**wish, GREETED: True}, b"more")
+        other.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            other.recv(1)
+        for one in (listener, *(one.connection for one in kept)):
+            one.close()
+    assert path.stat().st_mode & 0o777 == 0o600
+
+
+def wait_met(door: Door, count: int) -> None:
+    while len(door._kept) < count:
+        threading.Event().wait(0.01)
+
+
+@pytest.mark.parametrize(
+    "line", [b"", b"[]", b"{", b'{"verb": "link"}', b'{"verb": "link", "machine": "arm"}', b"\xff"]
+)
+def test_nobody_else_gets_ports(line: bytes) -> None:
+    assert greeting(line, ("gpu",), PORTS) == (b"", line)
+
+
+@contextmanager
+def standard_input(*said: bytes, is_given: bool = True) -> Iterator[None]:
+    """With a connection in it, in which somebody has said something."""
+    old = os.dup(0)
+    own, theirs = socket.socketpair()
+    giving, stdin = socket.socketpair()
+    own.sendall(b"".join(said))
+    if is_given:
+        socket.send_fds(giving, [b"\n"], [theirs.fileno()])
+    os.dup2(stdin.fileno(), 0)
+    try:
+        yield
+    finally:
+        os.dup2(old, 0)
+        os.close(old)
+        for one in (own, theirs, giving, stdin):
+            one.close()
+
+
+class Quiet(MemberBoot):
+    """Starts nothing."""
+
+    started: Mapping[str, Any] = {}
+
+    def _spawn_daemon(self) -> Daemon:
+        self.started = {"port": self._port, **self._environment}
+        raise OSError
+
+
+def test_a_member_is_told_by_its_standard_input(tmp_path: Path) -> None:
+    with standard_input(format_message(PART), format_message(Beat())):
+        boot = Quiet(OPTIONS, CellPaths(tmp_path), tmp_path, {})
+        assert str(Path("/proc/self/fd/0").readlink()) == os.devnull
+    assert boot.part == PART
+    assert boot.rest == format_message(Beat())
+    assert boot.daemon() is None
+    assert boot.started["port"] == PART.coordinator
+    assert "s3cret" not in str(boot.started)
+    assert not boot.connection.get_inheritable()
+    boot.connection.close()
+
+
+@pytest.mark.parametrize("said", [b"", b"hello\n", format_message(replace(PART, machine="arm"))])
+def test_a_member_that_is_told_something_else(tmp_path: Path, said: bytes) -> None:
+    with standard_input(said, b"\n"), pytest.raises(DoraSystemdError):
+        Quiet(OPTIONS, CellPaths(tmp_path), tmp_path, {})
+
+
+def test_a_member_that_nobody_has_started() -> None:
+    with standard_input(is_given=False), pytest.raises(OSError, match="temporarily unavailable"):
+        received()
+    with Path(os.devnull).open() as nothing:
+        old = os.dup(0)
+        os.dup2(nothing.fileno(), 0)
+        try:
+            with pytest.raises(OSError, match="socket"):
+                received()
+        finally:
+            os.dup2(old, 0)
+            os.close(old)
