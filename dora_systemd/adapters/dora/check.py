@@ -40,9 +40,13 @@ class DoraCheck:
         def check_version() -> str:
             return "" if listens() else dora_version(options.dora, own_account(), environment)
 
+        def check_dataflow() -> str:
+            # A member has the file of its head, and the same dora, which has accepted it there.
+            return "" if options.machine else refusal_of_dora(options, environment)
+
         self._options = options
         self._version = beside(check_version)
-        self._refusal = beside(lambda: refusal_of_dora(options, environment))
+        self._refusal = beside(check_dataflow)
 
     def beside(self, call: Callable[[], T]) -> T:
         """Call `call` while the checks run; its result. Errors of the checks take precedence."""

@@ -36,6 +36,12 @@ def test_without_a_coordinator_the_version_is_asked_for(options: RunnerOptions) 
         assert caught.value.code is ExitCode.NO_DORA
 
 
+def test_a_member_leaves_to_the_head_what_is_the_same_there(options: RunnerOptions) -> None:
+    check = DoraCheck(options._replace(machine="gpu"), os.environ, lambda: True)
+    assert check.beside(lambda: 7) == 7
+    assert not Path(f"{options.dora}.asked").exists()
+
+
 @pytest.mark.parametrize("is_ours_refused", [False, True])
 def test_what_dora_refuses_comes_before_what_we_refuse(
     options: RunnerOptions, is_ours_refused: bool
