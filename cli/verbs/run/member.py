@@ -11,6 +11,7 @@ from dora_systemd.cli.edge import write_exactly
 from dora_systemd.cli.parameters import current_scope, scope_options
 from dora_systemd.cli.settingoptions import SettingsCommand, setting_options
 from dora_systemd.decisions.cell.machines import parse_head, parse_machine, parse_placed
+from dora_systemd.decisions.machines.address import parse_address
 from dora_systemd.decisions.machines.key import ORIGINAL, forced_words
 from dora_systemd.decisions.machines.wire import Refused
 from dora_systemd.decisions.settings.table import SETTINGS
@@ -60,6 +61,12 @@ def _print_facts(ctx: click.Context, param: click.Parameter, value: bool) -> Non
 )
 @click.option("--head", default="", metavar="HOST", help="The host name of the head, for people.")
 @click.option(
+    "--address",
+    multiple=True,
+    metavar="ADDRESS",
+    help="With link: direct, the address of each machine; that of this one first.",
+)
+@click.option(
     "--facts",
     is_flag=True,
     is_eager=True,
@@ -76,6 +83,7 @@ def command(
     machine: str,
     placed: tuple[str, ...],
     head: str,
+    address: tuple[str, ...],
     **flags: Any,
 ) -> int:
     """Run the nodes of FILE that belong to this machine, as the service dora-NAME.service.
@@ -98,6 +106,7 @@ def command(
         placed=tuple(map(parse_placed, placed)),
         machine=parse_machine(machine),
         head=parse_head(head),
+        addresses=tuple(map(parse_address, address)),
     )
     scope = current_scope()
     with Head() as told:

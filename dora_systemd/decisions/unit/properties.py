@@ -94,6 +94,12 @@ def unit_properties(
         **device_properties(options, context),
     }
     properties = with_properties(own, settings_properties(settings))
+    if options.addresses:
+        # Imported late: most dataflows run on one machine.
+        from dora_systemd.decisions.machines.direct import direct_properties
+
+        direct = direct_properties(options.addresses, context.is_user)
+        properties = with_properties(properties, direct)
     assignments = settings[PROPERTY]
     try:
         return with_assignments(properties, assignments)
