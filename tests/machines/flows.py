@@ -46,12 +46,16 @@ class Flow:
         """All of them."""
         return ("a", *self.members.values())
 
-    def bring(self) -> None:
-        """The same files on all machines."""
+    def write(self) -> None:
+        """The files on a."""
         place = Project(Path(PLACE), is_new=False)
         for name, text in (("source", SOURCE), ("doubler", DOUBLER), ("sink", SINK)):
             place.write(f"{name}.py", text)
         place.write("dataflow.yml", _DATAFLOW.format(sink="arm" if "arm" in self.members else "a"))
+
+    def bring(self) -> None:
+        """The same files on all machines."""
+        self.write()
         for machine in self.members.values():
             there(machine, "mkdir", "-p", PLACE)
             command = ["scp", "-q", "-r", PLACE, f"root@{machine}:/opt"]

@@ -2,6 +2,7 @@
 
 import os
 import sys
+from pathlib import Path
 from typing import Any
 
 import click
@@ -13,6 +14,7 @@ from dora_systemd.cli.settingoptions import SettingsCommand, setting_options
 from dora_systemd.decisions.cell.machines import parse_head, parse_machine, parse_placed
 from dora_systemd.decisions.machines.address import parse_address
 from dora_systemd.decisions.machines.key import ORIGINAL, forced_words
+from dora_systemd.decisions.machines.push import PLACE, format_place
 from dora_systemd.decisions.machines.wire import Refused
 from dora_systemd.decisions.settings.table import SETTINGS
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -25,6 +27,7 @@ from dora_systemd.verbs.machines.member import (
     start_member,
 )
 from dora_systemd.verbs.machines.own import own_facts
+from dora_systemd.verbs.machines.push import place_problem
 from dora_systemd.verbs.start.plan import StartRequest
 
 
@@ -44,6 +47,14 @@ def _print_facts(ctx: click.Context, param: click.Parameter, value: bool) -> Non
     del param
     if value:
         write_exactly(f"{own_facts(current_scope()).to_json()}\n")
+        ctx.exit()
+
+
+def _print_place(ctx: click.Context, param: click.Parameter, value: str | None) -> None:
+    del param
+    if value is not None:
+        problem, hint = place_problem(Path(value)) or ("", "")
+        write_exactly(f"{format_place(problem, hint)}\n")
         ctx.exit()
 
 
@@ -73,6 +84,14 @@ def _print_facts(ctx: click.Context, param: click.Parameter, value: bool) -> Non
     expose_value=False,
     callback=_print_facts,
     help="Only print what a head wants to know of this machine, as JSON.",
+)
+@click.option(
+    PLACE,
+    metavar="DIRECTORY",
+    is_eager=True,
+    expose_value=False,
+    callback=_print_place,
+    help="Only print whether start --push may write there, as JSON.",
 )
 @setting_options
 @scope_options
