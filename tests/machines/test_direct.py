@@ -94,12 +94,9 @@ class TestRefusals:
         assert "Traceback" not in done.stderr
         assert not flow.left()
 
-    @pytest.mark.parametrize("address", ["0.0.0.0", "127.0.0.1", "224.0.0.1", "gpu-box", ""])
-    def test_no_address(self, flow: DirectFlow, address: str) -> None:
-        flow.write_settings(address=address)
-        self.refused(flow, "machines.gpu", "address", code=ExitCode.BAD_INPUT)
-
-    def test_an_address_of_the_head(self, flow: DirectFlow) -> None:
+    def test_an_address_that_cannot_be_one_of_that_machine(self, flow: DirectFlow) -> None:
+        flow.write_settings(address="127.0.0.1")
+        self.refused(flow, "machines.gpu", "address '127.0.0.1'", code=ExitCode.BAD_INPUT)
         flow.write_settings(address=ADDRESSES["a"])
         self.refused(flow, "gpu have the same address", code=ExitCode.BAD_INPUT)
         flow.write_settings(head_address="10.77.0.9")
