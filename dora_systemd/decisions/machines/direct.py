@@ -1,15 +1,12 @@
 """`link: direct`: zenoh between machines without ssh, on addresses that somebody has chosen. Pure.
 
 zenoh of dora has no password and no encryption. So it listens on these addresses and no others, and
-the units of all machines exchange packets with them and with no others.
+the units exchange packets with them and with no others, see decisions/unit/addresses.py.
 """
 
 from collections.abc import Callable, Sequence
 
 from dora_systemd.decisions.machines.entry import DIRECT, Machine
-from dora_systemd.decisions.needs.units import NETWORK_UNIT
-from dora_systemd.decisions.properties.assignments import with_assignments
-from dora_systemd.decisions.properties.kinds import Property
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import shown
 
@@ -64,19 +61,6 @@ def _check_different(found: dict[str, str], source: str) -> None:
             reason = f"{seen[address]} and {name} have the same address {address}"
             raise _refusal(source, reason, "write the address that each machine has of its own")
         seen[address] = name
-
-
-def direct_properties(addresses: Sequence[str], is_user: bool) -> dict[str, Property]:
-    """What the unit of a machine with these addresses needs, see systemd.resource-control(5).
-
-    A user's manager can neither filter packets nor wait for the network.
-    """
-    if not addresses or is_user:
-        return {}
-    lines = ["IPAddressDeny=any", "IPAddressAllow=localhost"]
-    lines += [f"IPAddressAllow={one}" for one in addresses]
-    lines += [f"{key}={NETWORK_UNIT}" for key in ("Wants", "After")]
-    return with_assignments({}, lines)
 
 
 def _refusal(source: str, reason: str, hint: str) -> DoraSystemdError:

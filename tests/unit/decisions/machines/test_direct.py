@@ -8,12 +8,12 @@ import pytest
 from dora_systemd.decisions.cell.options import RunnerOptions, format_runner_argv, parse_runner_argv
 from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
 from dora_systemd.decisions.machines.address import endpoint, parse_address
-from dora_systemd.decisions.machines.direct import direct_properties
 from dora_systemd.decisions.machines.link_command import LinkOptions, ssh_link_arguments
 from dora_systemd.decisions.machines.member import Member
 from dora_systemd.decisions.machines.spread import spread
 from dora_systemd.decisions.machines.wire import Forwards
 from dora_systemd.decisions.settings.resolve import resolve_settings
+from dora_systemd.decisions.unit.addresses import address_properties
 from dora_systemd.decisions.unit.properties import UnitContext, format_unit, unit_properties
 from dora_systemd.errors import DoraSystemdError, ExitCode
 
@@ -138,8 +138,8 @@ def test_a_unit_exchanges_packets_with_these_machines_only() -> None:
         "IPAddressAllow=127.0.0.0/8 ::1/128 10.99.0.1/32 10.99.0.2/32 10.99.0.3/32 192.0.2.0/24",
     ]
     assert "network-online.target" in next(one for one in lines if one.startswith("After="))
-    assert direct_properties(options.addresses, is_user=True) == {}
-    assert direct_properties((), is_user=False) == {}
+    assert address_properties(options.addresses, is_user=True) == {}
+    assert address_properties((), is_user=False) == {}
 
 
 def test_ssh_forwards_the_coordinator_only() -> None:
