@@ -70,6 +70,15 @@ class Flow:
         file = Path(PLACE) / "dataflow.yml"
         return self.cell.start(file, *self.flags(), *flags, check=check)
 
+    def refused(self, *words: str, code: int, flags: Sequence[str] = ()) -> None:
+        """Start it: one line with these words, and nothing is left anywhere."""
+        done = self.start(*flags, check=False)
+        assert done.returncode == code, done.stderr
+        for word in words:
+            assert word in done.stderr
+        assert "Traceback" not in done.stderr
+        assert not self.left()
+
     def status(self) -> str:
         """The status of the head's unit for people."""
         return self.cell.show("StatusText")
