@@ -5,7 +5,7 @@ import json
 from collections.abc import Callable, Coroutine
 from dataclasses import asdict, replace
 from pathlib import Path
-from threading import current_thread
+from threading import Thread, current_thread
 from typing import Any
 
 import pytest
@@ -167,7 +167,8 @@ def test_who_stops_it_here_is_told_but_a_shutdown_is_nobody(
 
 def test_systemd_is_asked_beside_the_loop_and_the_head_told_on_it(tmp_path: Path) -> None:
     async def work(bench: Bench) -> None:
-        other, asked = await bench.head(), []
+        other = await bench.head()
+        asked: list[Thread | None] = []
 
         def is_going_down(is_of_user: bool) -> bool:
             asked.append(current_thread())
