@@ -98,7 +98,7 @@ class TestRefusals:
     def test_an_address_of_another_machine(self, flow: DirectFlow) -> None:
         flow.write_settings(address=ADDRESSES["c"])
         words = ("machine gpu", f"has no address {ADDRESSES['c']}")
-        flow.refused(*words, code=ExitCode.NO_HOST)
+        flow.refused(*words, code=ExitCode.BAD_INPUT)
 
 
 def test_the_user_may_let_nodes_reach_more(flow: DirectFlow) -> None:

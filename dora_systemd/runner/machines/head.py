@@ -84,7 +84,8 @@ class Head(Shared):
         del paths
         check_placed(self.options, prepared.dataflow)
         content = Path(self.options.dataflow).read_bytes()
-        self.roster.set_facts(hashlib.sha256(content).hexdigest(), check.version())
+        digest, is_first = hashlib.sha256(content).hexdigest(), self.this_life.is_first
+        self.roster.set_facts(digest, check.version(), is_first)
 
     def engine(
         self, dora: str, paths: CellPaths, environment: Mapping[str, str], boot: Boot | None

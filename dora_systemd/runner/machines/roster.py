@@ -63,6 +63,7 @@ class Roster:
         self._options, self._ports = options, ports
         self._members = {name: Member() for name in members_of(options.placed)}
         self._token = self._digest = self._dora = ""
+        self._again = 0
         self.changed = asyncio.Event()
         self.push: Callable[[life.Event], None] = lambda _: None
 
@@ -71,9 +72,9 @@ class Roster:
         """The members in the order of the dataflow."""
         return tuple(self._members)
 
-    def set_facts(self, digest: str, dora: str) -> None:
-        """Set what members compare: see wire.Part."""
-        self._digest, self._dora = digest, dora
+    def set_facts(self, digest: str, dora: str, is_first: bool) -> None:
+        """Set what members compare: see wire.Part. is_first: whether somebody waits."""
+        self._digest, self._dora, self._again = digest, dora, int(not is_first)
 
     def set_token(self, token: str) -> None:
         """The coordinator listens: tell those that are there already."""
@@ -145,6 +146,7 @@ class Roster:
                 grace=options.grace,
                 doractl=__version__,
                 dora=self._dora,
+                again=self._again,
             )
         )
         self.changed.set()
