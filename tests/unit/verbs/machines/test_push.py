@@ -37,7 +37,7 @@ class Bench:
         self.done.append(f"ask {host.text} {words[1]}")
         return self.answers.get(host.text, format_place("", ""))
 
-    def _run(self, command: Sequence[str], seconds: float) -> Completed:
+    def _run(self, command: Sequence[str], _: float) -> Completed:
         self.done.append(f"copy {command[-1]}")
         return Completed(0, "", "")
 
