@@ -22,6 +22,7 @@ from dora_systemd.decisions.machines.tables import merged
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.runner.cell.pump import now_us
 from dora_systemd.runner.machines.lines import Lines
+from dora_systemd.runner.machines.reach import Endpoints
 from dora_systemd.terminal_text import short_line
 from dora_systemd.values import quoted
 
@@ -85,6 +86,11 @@ class Roster:
     def works(self) -> Mapping[str, str]:
         """dora's directory on each machine."""
         return {name: one.work for name, one in self._members.items()}
+
+    def endpoints(self) -> Endpoints:
+        """Where zenoh of each machine listens, if ssh is not on the way."""
+        addresses = dict(zip(self._members, self._options.addresses[1:], strict=False))
+        return {name: (one, self._ports.zenoh[name]) for name, one in addresses.items()}
 
     def missing(self) -> dict[str, str]:
         """The members that are not ready, and why."""
