@@ -1,117 +1,180 @@
-"""The same dataflow on one machine and on two.  `LAB=machines`, `python -m benchmarks.machines [N]`
+"""Latency and throughput between two machines.  `python -m benchmarks.machines [N]`
 
-A link is one login by ssh, so that is measured as well: no start over two machines can take less.
-Memory is that of all processes of a link, at both ends.
+Needs LAB=machines: the sender is on a, the receiver on b, and their CLOCK_MONOTONIC is the same.
+Bare dora has a coordinator and a daemon on the address of a, a daemon on that of b, no password.
 """
 
+import json
+import shlex
+import statistics
 import subprocess
 import sys
-import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
-from benchmarks.flows import CHECKOUT
-from benchmarks.rounds import OURS, Figure, alternate, keep, shown
+from benchmarks.rounds import OURS, Figure, keep, shown, take_turns
+from tests.machines.direct import ADDRESSES
 from tests.machines.wires import there
-from tests.system.cells import SINK, SOURCE, Cell, Project, run
+from tests.system.cells import Cell, Project, run, wait_for
 
 HOME = Path("/srv/bench")
-NAME = "spread"
-MEMBER = "b"
-ONE, LOGIN = "one machine", "ssh b true"
-_YAML = """nodes:
-  - {{id: source, path: source.py, inputs: {{tick: dora/timer/millis/50}}, outputs: [number]}}
-  - {{id: sink, path: sink.py, inputs: {{double: source/number}}{deploy}}}
+STAMPS = HOME / "stamps"
+RESULT = STAMPS / "machines.json"
+NAME = "across"
+SECONDS = 120.0
+"""For one run."""
+BARE = "dora"
+LINKS = ("link: direct", "link: ssh")
+HEAD, MEMBER = "a", "b"
+SENDER = """
+import time
+from dora import Node
+import numpy, pyarrow
+node = Node()
+time.sleep(3)
+def send(what, size, count, pause):
+    data = pyarrow.array(numpy.random.default_rng(0).integers(255, size=size, dtype="uint8"))
+    due = time.monotonic()
+    for number in range(count):
+        node.send_output("data", data, {"what": what, "sent": time.monotonic_ns()})
+        due += pause
+        time.sleep(max(due - time.monotonic(), 0))
+    time.sleep(1)
+send("", 40_960, 100, 0.01)
+send("41 kB", 40_960, 800, 0.01)
+send("1 MB", 1_000_000, 240, 1 / 30)
+send("fast", 40_960, 20_000, 0)
 """
-_OURS = r"dora_systemd\.link|^ssh .*-T.*127\.0\.0\.1|^sshd-session: root@notty"
-_MEMORY = f"""import glob, os, re
-total = 0
-for path in glob.glob("/proc/[0-9]*"):
-    try:
-        words = open(path + "/cmdline").read().replace("\\0", " ")
-        if re.search({_OURS!r}, words) and "{HOME}/memory.py" not in words:
-            fields = dict(line.split(":") for line in open(path + "/smaps_rollup").readlines()[1:])
-            print(int(fields["Rss"].split()[0]), int(fields["Pss"].split()[0]), words[:60])
-    except OSError:
-        pass
+RECEIVER = f"""
+import json, os, time
+from dora import Node
+found = []
+for event in Node():
+    if event["type"] == "INPUT":
+        about = event["metadata"]
+        found.append((about["what"], about["sent"], time.monotonic_ns()))
+with open("{RESULT}.new", "w") as file:
+    json.dump(found, file)
+os.rename("{RESULT}.new", "{RESULT}")
 """
+YAML = f"""nodes:
+  - {{id: sender, path: sender.py, outputs: [data]}}
+  - id: receiver
+    path: receiver.py
+    inputs: {{data: {{source: sender/data, queue_size: 1000}}}}
+    deploy: {{machine: {MEMBER}, working_dir: {HOME}}}
+"""
+SIZES = {"41 kB": 40_960, "1 MB": 1_000_000}
+GOALS = {LINKS[0]: "1.00 × dora", LINKS[1]: "41 kB 2.2 ×, 1 MB 5.4 ×, 0.23 ×"}
+"""For ssh what the trial has shown that came before all this."""
+Message = tuple[str, int, int]
+"""Which part of the pattern, when sent and when received in ns of CLOCK_MONOTONIC."""
 
 
-def make_home() -> dict[str, Path]:
-    """The files, the same on both machines; the dataflow of each contestant."""
-    install = ("pip", "install", "--no-deps", "--no-build-isolation", "--quiet", str(CHECKOUT))
-    run(*install)
-    assert there(MEMBER, *install).returncode == 0
+def results(messages: list[Message]) -> dict[str, float]:
+    """ms on the way, and MB a second."""
+    found: dict[str, float] = {}
+    for size in SIZES:
+        delays = sorted((came - sent) / 1e6 for what, sent, came in messages if what == size)
+        found[f"latency of {size}, median"] = statistics.median(delays)
+        found[f"latency of {size}, 99 of 100"] = delays[len(delays) * 99 // 100]
+    times = [came for what, _, came in messages if what == "fast"]
+    megabytes = (len(times) - 1) * SIZES["41 kB"] / 1e6
+    found["throughput of 41 kB messages"] = megabytes / ((times[-1] - times[0]) / 1e9)
+    return found
+
+
+def prepare() -> None:
+    """The same files on both machines."""
     project = Project(HOME)
-    project.write("source.py", SOURCE)
-    project.write("sink.py", SINK)
-    project.write("memory.py", _MEMORY)
-    files = {
-        OURS: project.write("two.yml", _YAML.format(deploy=", deploy: {machine: b}")),
-        ONE: project.write("one.yml", _YAML.format(deploy="")),
-    }
-    subprocess.run(["scp", "-q", "-r", str(HOME), f"root@{MEMBER}:{HOME.parent}"], check=True)
-    return files
+    STAMPS.mkdir()
+    STAMPS.chmod(0o777)
+    for name, text in (("sender.py", SENDER), ("receiver.py", RECEIVER), ("flow.yml", YAML)):
+        project.write(name, text)
+    there(MEMBER, "rm", "-rf", str(HOME))
+    subprocess.run(["scp", "-q", "-r", "-p", str(HOME), f"root@{MEMBER}:{HOME}"], check=True)
 
 
-def seconds_of(*command: str) -> float:
-    """How long a command takes."""
-    begun = time.monotonic()
-    run(*command)
-    return time.monotonic() - begun
+def start_ours(link: str) -> None:
+    """By doractl, with the settings beside the file."""
+    more = f", link: direct, address: {ADDRESSES[MEMBER]}" if link == LINKS[0] else ""
+    entry = f"{{host: {MEMBER}, writable: {STAMPS}{more}}}"
+    Project(HOME, is_new=False).write("flow.systemd.yml", f"machines:\n  {MEMBER}: {entry}\n")
+    words = ("--name", NAME, "--start-timeout=300s")
+    run("doractl", "start", str(HOME / "flow.yml"), *words)
 
 
-def start(file: Path) -> float:
-    """Start it; the seconds until all nodes are ready."""
-    flags = (f"--machine={MEMBER}={MEMBER}",) if file.stem == "two" else ()
-    return seconds_of("doractl", "start", str(file), "--name", NAME, *flags)
-
-
-def start_ms(file: Path) -> float:
-    """One start, and a stop behind the clock."""
-    seconds = start(file)
+def stop_ours() -> None:
+    """Also if it has ended by itself."""
+    with suppress(AssertionError):
+        run("doractl", "stop", NAME)
     Cell(NAME).end()
-    return seconds * 1000
 
 
-def login_ms() -> float:
-    """A login, and nothing else."""
-    return seconds_of("ssh", "-oBatchMode=yes", MEMBER, "true") * 1000
+def start_bare() -> None:
+    """As in dora's manual, but each process in a unit, which ends its children too."""
+    coordinator = ("--interface", ADDRESSES[HEAD], "--port", "6013")
+    where = ("--coordinator-addr", ADDRESSES[HEAD], "--coordinator-port", "6013")
+    daemon = ("daemon", *where, "--zenoh-no-multicast", "--zenoh-listen")
+    unit(HEAD, "coordinator", "coordinator", *coordinator)
+    wait_for("the coordinator listens", lambda: "6013" in run("ss", "-Hltn").stdout)
+    unit(HEAD, "daemon", *daemon, f"{ADDRESSES[HEAD]}:61001")
+    unit(MEMBER, "daemon", *daemon, f"{ADDRESSES[MEMBER]}:61002", "--machine-id", MEMBER)
+    start = ("dora", "start", str(HOME / "flow.yml"), "--detach", "--name", NAME, *where)
+    wait_for("dora starts it", lambda: run(*start, check=False).returncode == 0)
 
 
-def megabytes(machine: str) -> tuple[float, float]:
-    """RSS and PSS of the processes of the link on a machine, without those of this benchmark."""
-    command = ("python3", str(HOME / "memory.py"))
-    lines = (run(*command) if machine == "a" else there(machine, *command)).stdout.splitlines()
-    found = [tuple(map(int, line.split()[:2])) for line in lines]
-    return sum(one for one, _ in found) / 1000, sum(one for _, one in found) / 1000
+def unit(machine: str, name: str, *words: str) -> None:
+    """A dora process on a machine."""
+    place = ("-p", f"WorkingDirectory={HOME}", "-E", "HOME=/root", "-E", "PATH=/opt/lab/bin:/bin")
+    command = ("systemd-run", "-q", "--collect", f"--unit=bare-{name}", *place)
+    done = there(machine, shlex.join((*command, "/opt/lab/bin/dora", *words)))
+    assert done.returncode == 0, done.stderr
 
 
-def memory(file: Path) -> list[Figure]:
-    """Of a link at both ends, while the dataflow runs."""
-    start(file)
-    before = len(there(MEMBER, "pgrep", "-f", "sshd-session").stdout.split())
-    assert before
-    figures = []
-    for end, machine, goal in (("head", "a", "≤ 25 MB"), ("member", MEMBER, "≤ 20 MB")):
-        rss, pss = megabytes(machine)
-        figures.append(Figure(f"memory of a link at the {end}, RSS", "MB", {OURS: [rss]}, goal))
-        figures.append(Figure(f"memory of a link at the {end}, PSS", "MB", {OURS: [pss]}))
-    Cell(NAME).end()
-    return [*map(shown, figures)]
+def stop_bare() -> None:
+    """All processes on both machines."""
+    for machine in (HEAD, MEMBER):
+        there(machine, "systemctl", "stop", "bare-daemon", "bare-coordinator")
+
+
+def has_result() -> bool:
+    """Whether the receiver has ended."""
+    return there(MEMBER, "test", "-e", str(RESULT)).returncode == 0
+
+
+def life(start: Callable[[], None], stop: Callable[[], None]) -> dict[str, float]:
+    """One run of the dataflow."""
+    there(MEMBER, "rm", "-f", str(RESULT))
+    try:
+        start()
+        wait_for("all is received", has_result, SECONDS)
+        return results([tuple(one) for one in json.loads(there(MEMBER, "cat", str(RESULT)).stdout)])
+    finally:
+        stop()
+
+
+def figures_of(lives: Mapping[str, list[dict[str, float]]]) -> Iterator[Figure]:
+    """Each link beside bare dora."""
+    for link in LINKS:
+        for what in lives[BARE][0]:
+            unit = "MB/s" if what.startswith("throughput") else "ms"
+            pair = {OURS: lives[link], BARE: lives[BARE]}
+            values = {name: [one[what] for one in found] for name, found in pair.items()}
+            yield Figure(f"{what}, {link}", unit, values, GOALS[link])
 
 
 def measure(rounds: int) -> list[Figure]:
-    """Starts in turns, then the memory."""
-    files = make_home()
-    measures = {name: partial(start_ms, file) for name, file in files.items()}
-    measures[LOGIN] = login_ms
-    for warm_up in measures.values():
-        warm_up()
-    what = "start to all of 2 nodes ready, over two machines"
-    figure = alternate(what, "ms", measures, rounds, goal="≤ 1.3 × one machine")
-    return [figure, *memory(files[OURS])]
+    """All in turns."""
+    prepare()
+    contestants: dict[str, Callable[[], dict[str, float]]] = {
+        one: partial(life, partial(start_ours, one), stop_ours) for one in LINKS
+    }
+    contestants[BARE] = partial(life, start_bare, stop_bare)
+    return [shown(one) for one in figures_of(take_turns(contestants, rounds))]
 
 
 if __name__ == "__main__":
-    keep("machines", measure, int(sys.argv[1]) if len(sys.argv) > 1 else 7)
+    keep("machines", measure, int(sys.argv[1]) if len(sys.argv) > 1 else 5)

@@ -28,7 +28,8 @@ TITLES = {
     "messages": "Messages",
     "reload": "Hot reload",
     "owes": "Owed outputs",
-    "machines": "Several machines",
+    "machines": "Between machines",
+    "spread": "Start over two machines",
 }
 """The records in their order."""
 

@@ -10,6 +10,7 @@ _FINAL = ("HAS CHANGED", "Host key verification failed", "Permission denied")
 _FORWARDING = ("forwarding failed for listen port", "Could not request local forwarding")
 _ONCE, _TWICE = 1, 2
 """A new attempt may help a machine that boots. Who waits for a start has mistyped a name."""
+_HINT = "hint: "
 _VERSIONS = "install the same version of dora-systemd on both machines"
 
 
@@ -44,6 +45,9 @@ def _without_member(
     """doractl has not become a member there; what it refuses for good it has said itself."""
     if error:
         return Unreached(error.message, error.hint, 0)
-    words = last_line(complaint).removeprefix("doractl: ") or f"exit status {status}"
-    tries = 0 if status == ExitCode.USAGE else _TWICE
-    return Unreached(f"doractl on {host.text} has failed: {words}", _VERSIONS, tries)
+    said = [one.removeprefix("doractl: ") for one in complaint.splitlines()]
+    hints = [one.removeprefix(_HINT) for one in said if one.startswith(_HINT)]
+    words = last_line("\n".join(one for one in said if not one.startswith(_HINT)))
+    tries, hint = (0, _VERSIONS) if status == ExitCode.USAGE else (_TWICE, "".join(hints[-1:]))
+    reason = f"doractl on {host.text} has failed: {words or f'exit status {status}'}"
+    return Unreached(reason, hint, tries)

@@ -22,6 +22,9 @@ async def taken_over(connection: socket.socket, said: bytes, limit: int) -> Ends
     reader.feed_data(said)
     protocol = asyncio.StreamReaderProtocol(reader, loop=loop)
     connection.setblocking(False)
+    with contextlib.suppress(OSError):
+        # The other side may have said its last word: a write would fail, and nobody read that.
+        reader.feed_data(connection.recv(_CHUNK))
     transport, _ = await loop.connect_accepted_socket(lambda: protocol, connection)
     return Ends(reader, asyncio.StreamWriter(transport, protocol, reader, loop))
 

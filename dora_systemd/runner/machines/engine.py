@@ -2,7 +2,7 @@
 
 import asyncio
 import signal
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 from dora_systemd.adapters.dora import engine
 from dora_systemd.decisions.dora import protocol
@@ -12,7 +12,7 @@ from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.begin import Daemon, start_coordinator, start_daemon
 from dora_systemd.runner.cell.boot import EarlyDaemon
 from dora_systemd.runner.cell.engine import Engine
-from dora_systemd.runner.machines.zenoh import NO_DIRECT, head_arguments, member_arguments
+from dora_systemd.runner.machines.zenoh import head_arguments, member_arguments, shared_environment
 
 ASK_SECONDS = 5.0
 """A coordinator that waits for a machine answers nobody for half a minute."""
@@ -35,9 +35,11 @@ class SharedEngine(Engine):
         dora: str,
         paths: CellPaths,
         environment: Mapping[str, str],
+        addresses: Sequence[str],
         boot: EarlyDaemon | None = None,
     ) -> None:
-        super().__init__(dora, paths, {**environment, **NO_DIRECT}, boot)
+        super().__init__(dora, paths, shared_environment(environment, addresses), boot)
+        self._addresses = addresses
 
     async def machines(self) -> list[str]:
         """The machines whose daemon is connected. Raises DoraSystemdError."""
@@ -65,11 +67,12 @@ class HeadEngine(SharedEngine):
         dora: str,
         paths: CellPaths,
         environment: Mapping[str, str],
+        addresses: Sequence[str],
         ports: Forwards,
         on_access: Callable[[str], None],
         boot: EarlyDaemon | None = None,
     ) -> None:
-        super().__init__(dora, paths, environment, boot)
+        super().__init__(dora, paths, environment, addresses, boot)
         self._ports, self._on_access = ports, on_access
 
     def _spawn_coordinator(self) -> engine.Child:
@@ -78,7 +81,7 @@ class HeadEngine(SharedEngine):
         )
 
     def _spawn_daemon(self, environment: Mapping[str, str]) -> Daemon:
-        more = head_arguments(self._ports, environment)
+        more = head_arguments(self._ports, environment, self._addresses)
         return start_daemon(self._dora, self._paths, self._port, environment, more=more)
 
     def set_port(self, port: int) -> None:
@@ -97,10 +100,11 @@ class MemberEngine(SharedEngine):
         dora: str,
         paths: CellPaths,
         environment: Mapping[str, str],
+        addresses: Sequence[str],
         machine: str,
         boot: EarlyDaemon | None = None,
     ) -> None:
-        super().__init__(dora, paths, environment, boot)
+        super().__init__(dora, paths, environment, addresses, boot)
         self.machine = machine
 
     def set_part(self, part: Part) -> None:
@@ -108,7 +112,7 @@ class MemberEngine(SharedEngine):
         self._part, self._port, self._token = part, part.coordinator, part.token
 
     def _spawn_daemon(self, environment: Mapping[str, str]) -> Daemon:
-        more = member_arguments(self._part, environment)
+        more = member_arguments(self._part, environment, self._addresses)
         return start_daemon(self._dora, self._paths, self._port, environment, self._token, more)
 
     def cut_off(self) -> None:

@@ -42,6 +42,7 @@ from dora_systemd.runner.machines.ending import end_nodes
 from dora_systemd.runner.machines.engine import NOISE, HeadEngine
 from dora_systemd.runner.machines.head_boot import HeadBoot
 from dora_systemd.runner.machines.ports import choose_ports
+from dora_systemd.runner.machines.reach import unreached
 from dora_systemd.runner.machines.roster import Roster
 from dora_systemd.runner.machines.shared import Shared
 from dora_systemd.runner.nodes.nodes import Nodes
@@ -66,8 +67,9 @@ class Head(Shared):
     def __init__(self, options: RunnerOptions, this_life: Life, boot: EarlyDaemon | None) -> None:
         super().__init__(options, this_life)
         early = boot if isinstance(boot, HeadBoot) else None
+        members = members_of(options.placed)
         self._door = early.door if early else None
-        self._ports = early.ports if early else choose_ports(members_of(options.placed))
+        self._ports = early.ports if early else choose_ports(members, options.addresses)
         self.roster = Roster(options, self._ports)
 
     @property
@@ -88,18 +90,19 @@ class Head(Shared):
 
     def prepare(self, paths: CellPaths, prepared: Prepared, check: "DoraCheck") -> None:
         """Note what the members have to compare."""
-        self.roster.is_awaited = self.this_life.is_first and is_transient(
-            self.options.name, paths.is_of_user
-        )
         check_placed(self.options, prepared.dataflow)
         content = Path(self.options.dataflow).read_bytes()
-        self.roster.set_facts(hashlib.sha256(content).hexdigest(), check.version())
+        # Who has written a unit file may not be there when a boot starts it.
+        is_by_hand = is_transient(self.options.name, paths.is_of_user)
+        is_awaited = self.this_life.is_first and is_by_hand
+        self.roster.set_facts(hashlib.sha256(content).hexdigest(), check.version(), is_awaited)
 
     def engine(
         self, dora: str, paths: CellPaths, environment: Mapping[str, str], boot: EarlyDaemon | None
     ) -> Engine:
         """A coordinator and a daemon on the ports that all machines know."""
-        return HeadEngine(dora, paths, environment, self._ports, self.roster.set_token, boot)
+        told = (self.options.addresses, self._ports, self.roster.set_token)
+        return HeadEngine(dora, paths, environment, *told, boot)
 
     def cell(self, cell: Cell) -> Cell:
         """The cell, with the machine of each node."""
@@ -129,6 +132,7 @@ class HeadDialogue(Dialogue):
         """is_first: whether somebody waits for this start."""
         self._roster, self._dora, self._is_first = roster, dora, is_first
         self._ends_at, self._is_ending = 0.0, False
+        self._unreached: dict[str, str] = {}
 
     def actions(
         self, descriptor: Mapping[str, Any], variables: Mapping[str, str]
@@ -163,7 +167,9 @@ class HeadDialogue(Dialogue):
             self._roster.changed.clear()
             self._show_awaited()
             if not self._roster.missing() and await self._has_each():
-                return
+                self._unreached = await unreached(self._roster.endpoints())
+                if not self._unreached:
+                    return
             with contextlib.suppress(TimeoutError):
                 is_all = not self._roster.missing()
                 async with asyncio.timeout(_AGAIN_SECONDS if is_all else None):
@@ -188,7 +194,7 @@ class HeadDialogue(Dialogue):
 
     def _named(self) -> str:
         """The members that are missing, and why."""
-        missing = self._roster.missing()
+        missing = self._roster.missing() or self._unreached
         if not missing:
             return "the dora daemons of all machines"
         return format_missing(missing)

@@ -5,6 +5,7 @@ Imports only what loads quickly.
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from dora_systemd.adapters.runner_socket.door import Door
@@ -15,7 +16,7 @@ from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.begin import Daemon, start_coordinator, start_daemon
 from dora_systemd.runner.cell.boot import Boot
 from dora_systemd.runner.machines.ports import choose_ports
-from dora_systemd.runner.machines.zenoh import NO_DIRECT, head_arguments
+from dora_systemd.runner.machines.zenoh import head_arguments, shared_environment
 
 GREETED = "greeted"
 """A key of a request for a session that has got its ports already."""
@@ -28,9 +29,11 @@ class HeadBoot(Boot):
         self, options: RunnerOptions, paths: CellPaths, unit: Path, environment: Mapping[str, str]
     ) -> None:
         members = members_of(options.placed)
-        self.ports = choose_ports(members)
-        self.door = Door(paths.socket, lambda line: greeting(line, members, self.ports))
-        own = {**environment, **NO_DIRECT}
+        self._addresses = options.addresses
+        self.ports = choose_ports(members, options.addresses)
+        told = forwards(options, self.ports)
+        self.door = Door(paths.socket, lambda line: greeting(line, members, told))
+        own = shared_environment(environment, options.addresses)
         try:
             coordinator = start_coordinator(options.dora, paths, own, self.ports.coordinator)
         except OSError:
@@ -39,8 +42,13 @@ class HeadBoot(Boot):
         super().__init__(coordinator, options, paths, unit, own)
 
     def _spawn_daemon(self) -> Daemon:
-        more = head_arguments(self.ports, self._environment)
+        more = head_arguments(self.ports, self._environment, self._addresses)
         return start_daemon(self._dora, self._paths, self._port, self._environment, more=more)
+
+
+def forwards(options: RunnerOptions, ports: Forwards) -> Forwards:
+    """What a link is told. Without ssh on the way, zenoh's ports are those of other addresses."""
+    return replace(ports, zenoh={}) if options.addresses else ports
 
 
 def greeting(line: bytes, members: tuple[str, ...], ports: Forwards) -> tuple[bytes, bytes]:

@@ -71,7 +71,8 @@ class Member(Shared):
         self, dora: str, paths: CellPaths, environment: Mapping[str, str], boot: EarlyDaemon | None
     ) -> Engine:
         """A daemon for the coordinator of the head."""
-        self._dora = MemberEngine(dora, paths, environment, self.options.machine, boot)
+        own = self.options
+        self._dora = MemberEngine(dora, paths, environment, own.addresses, own.machine, boot)
         return self._dora
 
     def start_coordinator(self, dora: Engine) -> None:

@@ -18,7 +18,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.begin import Daemon, start_daemon
 from dora_systemd.runner.cell.boot import EarlyDaemon
-from dora_systemd.runner.machines.zenoh import NO_DIRECT, member_arguments
+from dora_systemd.runner.machines.zenoh import member_arguments, shared_environment
 
 
 class MemberBoot(EarlyDaemon):
@@ -35,14 +35,15 @@ class MemberBoot(EarlyDaemon):
         self.part = expect(parse_message(line), Part)
         if (self.part.name, self.part.machine) != (options.name, options.machine):
             raise no_head()
-        own = {**environment, **NO_DIRECT}
+        self._addresses = options.addresses
+        own = shared_environment(environment, options.addresses)
         super().__init__(own_options(options), paths, unit, own)
 
     def _find_port(self) -> int:
         return self.part.coordinator
 
     def _spawn_daemon(self) -> Daemon:
-        more = member_arguments(self.part, self._environment)
+        more = member_arguments(self.part, self._environment, self._addresses)
         given = (self._dora, self._paths, self._port, self._environment)
         return start_daemon(*given, self.part.token, more)
 

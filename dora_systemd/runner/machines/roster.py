@@ -21,8 +21,9 @@ from dora_systemd.decisions.machines.awaited import NOT_CONNECTED, NOT_JOINED, U
 from dora_systemd.decisions.machines.tables import merged
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.runner.cell.pump import now_us
-from dora_systemd.runner.machines.head_boot import GREETED
+from dora_systemd.runner.machines.head_boot import GREETED, forwards
 from dora_systemd.runner.machines.lines import Lines
+from dora_systemd.runner.machines.reach import Endpoints
 from dora_systemd.terminal_text import short_line
 from dora_systemd.values import quoted
 
@@ -74,9 +75,9 @@ class Roster:
         """The members in the order of the dataflow."""
         return tuple(self._members)
 
-    def set_facts(self, digest: str, dora: str) -> None:
-        """Set what members compare: see wire.Part."""
-        self._digest, self._dora = digest, dora
+    def set_facts(self, digest: str, dora: str, is_awaited: bool) -> None:
+        """Set what members compare: see wire.Part. is_awaited: see Roster."""
+        self._digest, self._dora, self.is_awaited = digest, dora, is_awaited
 
     def set_token(self, token: str) -> None:
         """The coordinator listens: tell those that are there already."""
@@ -87,6 +88,11 @@ class Roster:
     def works(self) -> Mapping[str, str]:
         """dora's directory on each machine."""
         return {name: one.work for name, one in self._members.items()}
+
+    def endpoints(self) -> Endpoints:
+        """Where zenoh of each machine listens, if ssh is not on the way."""
+        addresses = dict(zip(self._members, self._options.addresses[1:], strict=False))
+        return {name: (one, self._ports.zenoh[name]) for name, one in addresses.items()}
 
     def missing(self) -> dict[str, str]:
         """The members that are not ready, and why."""
@@ -116,7 +122,7 @@ class Roster:
         lines = Lines(ends)
         self._replace(name, lines)
         if not request.get(GREETED):
-            lines.send(self._ports)
+            lines.send(forwards(self._options, self._ports))
         self._send_part(name)
         why = await lines.talk(partial(self._hear, name, lines))
         if self._members[name].lines is lines:
@@ -147,6 +153,7 @@ class Roster:
                 grace=options.grace,
                 doractl=__version__,
                 dora=self._dora,
+                again=int(not self.is_awaited),
             )
         )
         self.changed.set()
