@@ -6,6 +6,8 @@ NOT_CONNECTED = "it is not connected yet"
 NOT_JOINED = "it has not answered yet"
 USUAL = (NOT_CONNECTED, NOT_JOINED)
 """What each start waits for, for a moment."""
+ENDED = "the connection has ended"
+"""Of a link before it says more."""
 _BEGIN = "waiting for machine"
 
 
@@ -17,6 +19,6 @@ def format_missing(missing: Mapping[str, str]) -> str:
 
 def is_news(text: str) -> bool:
     """Whether the stage of a start is more than what each start waits for."""
-    for one in USUAL:
+    for one in (*USUAL, ENDED):
         text = text.replace(f"({one})", "")
     return text.startswith(_BEGIN) and "(" in text

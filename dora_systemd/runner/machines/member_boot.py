@@ -8,7 +8,9 @@ Imports only what loads quickly.
 
 import os
 import socket
+import struct
 from collections.abc import Mapping
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -19,6 +21,8 @@ from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.begin import Daemon, start_daemon
 from dora_systemd.runner.cell.boot import EarlyDaemon
 from dora_systemd.runner.machines.zenoh import member_arguments, shared_environment
+
+_FD = struct.Struct("i")
 
 
 class MemberBoot(EarlyDaemon):
@@ -31,10 +35,13 @@ class MemberBoot(EarlyDaemon):
         self, options: RunnerOptions, paths: CellPaths, unit: Path, environment: Mapping[str, str]
     ) -> None:
         self.connection = received()
-        line, _, self.rest = self.connection.recv(MAX_LINE).partition(b"\n")
-        self.part = expect(parse_message(line), Part)
-        if (self.part.name, self.part.machine) != (options.name, options.machine):
-            raise no_head()
+        with ExitStack() as undo:
+            undo.callback(self.connection.close)
+            line, _, self.rest = _said(self.connection).partition(b"\n")
+            self.part = expect(parse_message(line), Part)
+            if (self.part.name, self.part.machine) != (options.name, options.machine):
+                raise no_head()
+            undo.pop_all()
         self._addresses = options.addresses
         own = shared_environment(environment, options.addresses)
         super().__init__(own_options(options), paths, unit, own)
@@ -48,6 +55,13 @@ class MemberBoot(EarlyDaemon):
         return start_daemon(*given, self.part.token, more)
 
 
+def _said(connection: socket.socket) -> bytes:
+    """What the head has said before this process began; b"" if nothing."""
+    with suppress(BlockingIOError):
+        return connection.recv(MAX_LINE, socket.MSG_DONTWAIT)
+    return b""
+
+
 def received() -> socket.socket:
     """The connection that waits in standard input, which is /dev/null from then on.
 
@@ -57,8 +71,11 @@ def received() -> socket.socket:
         nothing = os.open(os.devnull, os.O_RDWR | os.O_CLOEXEC)
         os.dup2(nothing, 0)
         os.close(nothing)
-        _, fds, _, _ = socket.recv_fds(stdin, 1, 1, socket.MSG_DONTWAIT | socket.MSG_CMSG_CLOEXEC)
-    if not fds:
+        # Not socket.recv_fds(), which leaves out these flags.
+        flags = socket.MSG_DONTWAIT | socket.MSG_CMSG_CLOEXEC
+        _, given, _, _ = stdin.recvmsg(1, socket.CMSG_SPACE(_FD.size), flags)
+    fds = [_FD.unpack(data)[0] for _, kind, data in given if kind == socket.SCM_RIGHTS]
+    if len(fds) != 1:
         raise no_head()
     return socket.socket(fileno=fds[0])
 

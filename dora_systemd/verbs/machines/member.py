@@ -71,16 +71,15 @@ def start_member(manager: Manager, request: MemberRequest, head: Head) -> socket
 
     The first line of the runner has been passed on. Raises DoraSystemdError; then nothing runs.
     """
-    _check_linger(request.scope)
-    _end_old_part(manager, request)
-    plan = make_plan(request.scope, request.start)
     part = head.part()
     _check_part(part, request.start)
     _check_forwards(part)
+    _check_linger(request.scope)
     _wait_for_address(request.start.addresses, is_passing=bool(part.again))
+    _end_old_part(manager, request)
     boot = require_free_name(manager, request.scope, request.unit)
     refuse_unit_file(boot)
-    plan = _member_plan(plan, part)
+    plan = _member_plan(make_plan(request.scope, request.start), part)
     _check_same(part, plan)
     properties, _ = plan_properties(plan, manager)
     make_room(manager, boot)

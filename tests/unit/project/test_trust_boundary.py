@@ -75,7 +75,9 @@ _TABLE = {
         adapters.dora.check adapters.dora.engine adapters.dora.websocket adapters.host.fd_store
         adapters.host.notify_socket adapters.host.shared_times
         adapters.host.watch adapters.logs.held adapters.logs.jsonl adapters.logs.pipes
+        adapters.runner_socket.address
         adapters.runner_socket.listener adapters.runner_socket.relay runner.cell.begin
+        runner.cell.life runner.machines.member_boot
         adapters.host.presence runner.needs.needs runner.nodes.gate
         runner.cell.engine runner.cell.pump runner.machines.head runner.machines.reach
         runner.main runner.nodes.nodes
