@@ -14,9 +14,9 @@ from dora_systemd.decisions.machines.wire import (
     BEAT_SECONDS,
     MAX_LINE,
     Beat,
+    FromLink,
     Lost,
     Message,
-    Refused,
     format_message,
 )
 from dora_systemd.decisions.remote.stream import AfterMark
@@ -146,7 +146,7 @@ class Talk:
             print(f"lost: {word.words}" if isinstance(word, Lost) else word.reason, flush=True)
         tell(self._runner, word)
 
-    def _last_word(self, host: str, status: int) -> Lost | Refused:
+    def _last_word(self, host: str, status: int) -> FromLink:
         # Imported late: most of the time nothing is lost.
         from dora_systemd.link.parting import last_word
 

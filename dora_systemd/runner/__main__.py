@@ -54,12 +54,15 @@ def begin_shared(
     options: RunnerOptions, paths: CellPaths, unit: Path, environment: Mapping[str, str]
 ) -> "Begun":
     """The same for one of several machines. Raises OSError, DoraSystemdError."""
+    boot: EarlyDaemon
     if options.machine:
-        from dora_systemd.runner.machines.member_boot import MemberBoot as Shared
-    else:
-        from dora_systemd.runner.machines.head_boot import HeadBoot as Shared
+        from dora_systemd.runner.machines.member_boot import MemberBoot
 
-    boot = Shared(options, paths, unit, environment)
+        boot = MemberBoot(options, paths, unit, environment)
+    else:
+        from dora_systemd.runner.machines.head_boot import HeadBoot
+
+        boot = HeadBoot(options, paths, unit, environment)
     from dora_systemd.adapters.dora.check import DoraCheck
 
     return boot, DoraCheck(options, environment)
