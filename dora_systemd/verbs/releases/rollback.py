@@ -4,13 +4,14 @@ from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.releases.store import Store, locked
 from dora_systemd.decisions.logs.events import ROLLED_BACK
 from dora_systemd.decisions.releases.choice import before
-from dora_systemd.decisions.releases.progress import waiting
+from dora_systemd.decisions.releases.manifest import Manifest
+from dora_systemd.decisions.releases.progress import checking, waiting
 from dora_systemd.decisions.unit.file import runner_of
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import did_you_mean, unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import is_directory
-from dora_systemd.values import quoted
+from dora_systemd.values import quoted, shown
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.inhibit.guard import IfInhibited, require_uninhibited
 from dora_systemd.verbs.releases.change import Change, change_release, stop_observer
@@ -59,6 +60,9 @@ def roll_back(
             hint = f"doractl releases {store.name} lists the others"
             message = f"cannot run release {chosen} of {store.name}: it has no unit file of ours"
             raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+        if chosen != standing.current:  # what every start runs anyway
+            tell(checking())
+            _require_intact(store, manifest)
         # One that was disabled stays so.
         change = Change(chosen, text, options, soak, False, "rollback", how, by)
         change_release(manager, scope, store, standing, change, tell)
@@ -77,6 +81,16 @@ def deployed_name(manager: Manager, scope: Scope, selector: str) -> str:
         hint = f"doractl deploy --name {name} makes the first one"
         raise DoraSystemdError(f"{name} has no release", hint, ExitCode.NOT_FOUND)
     return name
+
+
+def _require_intact(store: Store, manifest: Manifest) -> None:
+    """Refuse a release that is not what has proved itself; a trial may not notice the damage."""
+    if damaged := sorted(manifest.files.keys() - store.intact(manifest).keys()):
+        more = f" and {len(damaged) - 1} more" if len(damaged) > 1 else ""
+        reason = f"{shown(damaged[0])}{more} changed on the disk"
+        hint = f"check the disk; doractl releases {store.name} lists the others"
+        message = f"cannot run release {manifest.id} of {store.name}: it is damaged: {reason}"
+        raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
 
 
 def _end_first(manager: Manager, store: Store, standing: Standing, by: str, tell: Tell) -> Deployed:
