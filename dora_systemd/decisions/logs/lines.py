@@ -113,9 +113,9 @@ def json_fields(line: bytes) -> dict[str, Value] | None:
         return None
     try:
         record = json.loads(line)
-    except (ValueError, RecursionError):
+        return _record_fields(record) if isinstance(record, dict) else None
+    except (ValueError, RecursionError):  # also of json.dumps(), for almost too deep a nesting
         return None
-    return _record_fields(record) if isinstance(record, dict) else None
 
 
 def _record_fields(record: dict[str, object]) -> dict[str, Value] | None:
@@ -145,10 +145,10 @@ def jsonl_fields(line: bytes) -> dict[str, Value]:
         record = json.loads(line)
         stream, level = _text(str(record["stream"] or "stdout")), str(record["level"])
         text = _text(record["msg"])
+        own = _record_fields({**record, "timestamp": record.get("ts"), "message": text})
     except (ValueError, RecursionError, TypeError, KeyError):
         return {"PRIORITY": INFO, "MESSAGE": line}
-    renamed = {**record, "timestamp": record.get("ts"), "message": text}
-    fields = _record_fields(renamed) or {
+    fields = own or {
         "PRIORITY": PLAIN_PRIORITY.get(level if level == "stderr" else stream, INFO),
         "DORA_TIMESTAMP": _text(record.get("ts")),
         "MESSAGE": text,

@@ -213,3 +213,17 @@ def test_warning_of_coordinator_or_daemon(line: bytes, target: str) -> None:
 )
 def test_all_else_that_they_print_is_dropped(line: bytes) -> None:
     assert dora_log_fields(line) is None
+
+
+@pytest.mark.parametrize("key", ["message", "msg", "fields"])
+def test_no_depth_of_nesting_is_an_error(key: str) -> None:
+    """Some depths can be read and not be written again."""
+    encoder = LineEncoder(ORIGIN, "stdout")
+    for depth in range(900, 1001):
+        deep = b"[" * depth + b"]" * depth
+        value = b'{"x":%s}' % deep if key == "fields" else deep
+        start = b'{"level":"info","timestamp":"t","ts":"t","stream":"stdout","msg":"m",'
+        line = start.replace(b'"msg":"m",', b"") if key == "msg" else start
+        line += b'"%s":%s}' % (key.encode(), value)
+        assert encoder.entry(line)
+        assert jsonl_fields(line)["MESSAGE"]
