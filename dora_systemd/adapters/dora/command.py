@@ -101,11 +101,12 @@ def python_version(python: str, environment: Mapping[str, str]) -> str:
 
 def parse_dora_version(text: str) -> str | None:
     """The version in "dora-cli 1.1.0", or None."""
-    match = re.match(r"dora(?:-cli)?\s+(\d+\.\d+\S*)", text)
+    # Bounded: the program may be another user's.
+    match = re.match(r"dora(?:-cli)?\s+(\d{1,9}\.\d{1,9}\S{,40})(?!\S)", text)
     return match[1] if match else None
 
 
 def version_numbers(version: str) -> tuple[int, ...]:
     """The leading numbers of a version: (1, 1, 0) for "1.1.0-rc.1"."""
-    match = re.match(r"\d+(\.\d+)*", version)
+    match = re.match(r"\d{1,9}(\.\d{1,9})*", version)
     return tuple(map(int, match[0].split("."))) if match else ()
