@@ -260,3 +260,12 @@ def test_a_record_that_is_too_long_is_left_out(journalctl: Path) -> None:
 def test_values_that_can_be_no_uuids(journalctl: Path) -> None:
     make_program(journalctl, f"printf '%s\\n' robot ../x '\x1b]0;x' 'a b' {UUID}")
     assert JournalReader().known_uuids() == [UUID]
+
+
+def test_a_complaint_of_a_journal_that_is_read_to_a_bound_is_none(
+    journalctl: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(journal_reader, "MAX_BYTES", 10_000)
+    complaint = "system.journal is truncated, ignoring file."
+    make_program(journalctl, f"echo '{complaint}' >&2; exec yes dora-a")
+    assert set(JournalReader().unique("X")) == {"dora-a"}
