@@ -54,7 +54,10 @@ class Engine:
         self._token = ""
 
     def start_coordinator(self) -> engine.Child:
-        """Start the coordinator, unless it boots already; it prints its port. Raises OSError."""
+        """Start the coordinator, unless it boots already; it prints its port.
+
+        Raises as start_coordinator() does.
+        """
         child = self._boot.coordinator if self._boot else self._spawn_coordinator()
         self._children[child.label] = child
         return child

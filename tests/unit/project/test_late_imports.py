@@ -125,6 +125,7 @@ LATE = {
     },
     "the coordinator boots while the rest of the runner is imported": {
         "runner.__main__": {"adapters.dora.check", "runner.cell.boot", "runner.main"},
+        "runner.cell.begin": {"adapters.dora.command"},
         "runner.cell.pause": {
             *("adapters.host.process", "adapters.host.files", "adapters.host.notify"),
             *("decisions.cell.status", "asyncio"),
