@@ -68,7 +68,7 @@ def prepare(options: RunnerOptions, environment: Mapping[str, str]) -> Prepared:
         environment.get("PATH") or os.defpath,
         sight.exists,
         sight.read,
-        _load_session(options),
+        _load_session(options, sight),
         environment,
     )
     if options.owes:
@@ -127,8 +127,8 @@ def load_dataflow(options: RunnerOptions) -> Dataflow:
     return parse_dataflow(files.parse_yaml(done.stdout, path), str(path))
 
 
-def _load_session(options: RunnerOptions) -> BuildSession:
+def _load_session(options: RunnerOptions, sight: Sight) -> BuildSession:
     path = Path(session_path(options.dataflow))
-    if not path.exists():
+    if not sight.exists(str(path)):
         return BuildSession()
     return parse_session(files.read_yaml(path, allow_empty=True))

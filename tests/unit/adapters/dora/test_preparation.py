@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from dora_systemd.adapters.dora.preparation import resolved
+from dora_systemd.adapters.dora.preparation import prepare, resolved
 from dora_systemd.decisions.cell.options import RunnerOptions
 
 
@@ -15,3 +15,12 @@ def test_directories_are_resolved_and_the_file_is_not(tmp_path: Path) -> None:
     made = resolved(given)
     assert (made.dataflow, made.working_directory) == (f"{real}/now.yml", str(real))
     assert resolved(made) == made
+
+
+def test_a_name_that_leaves_no_room_for_a_session(tmp_path: Path) -> None:
+    path = tmp_path / f"{'x' * 245}.yml"
+    path.write_text("nodes: [{id: a, path: a.py}]\n")
+    (tmp_path / "a.py").touch()
+    (tmp_path / "out").mkdir()
+    options = RunnerOptions("robot", "uuid", str(path), str(tmp_path), "/bin/true")
+    assert [node.id for node in prepare(options, {}).dataflow.nodes] == ["a"]
