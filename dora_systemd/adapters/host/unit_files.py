@@ -59,8 +59,8 @@ def write_unit_file(path: Path, text: str) -> None:
 
     Raises DoraSystemdError; then `path` is unchanged, unless the disk is broken.
     """
-    made = [one for one in path.parents if not one.exists()]
     with _told("write", path):
+        made = [one for one in path.parents if not one.exists()]
         path.parent.mkdir(parents=True, exist_ok=True)
         for directory in made:  # whatever the umask is, all may read units
             directory.chmod(0o755)

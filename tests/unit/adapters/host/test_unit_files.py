@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.adapters.host.unit_files import write_unit_file
+from dora_systemd.errors import DoraSystemdError
 
 
 def test_a_unit_file_and_its_name_are_on_the_disk(
@@ -26,3 +27,9 @@ def test_a_unit_file_and_its_name_are_on_the_disk(
     synced.clear()
     write_unit_file(path, "[Unit]\n")
     assert synced[1:] == [str(path.parent)]
+
+
+def test_a_place_that_cannot_be_looked_at_is_an_error_that_names_it(tmp_path: Path) -> None:
+    path = tmp_path / ("x" * 256) / "dora-robot.service"
+    with pytest.raises(DoraSystemdError, match=f"^cannot write {path}: File name too long$"):
+        write_unit_file(path, "[Service]\n")
