@@ -90,9 +90,8 @@ class Output:
 
     def _write(self, line: bytes) -> None:
         entry = encode_entry({"MESSAGE": line, **self._fields})
-        for _ in range(int(_JOURNAL_SECONDS)):  # journald may restart
-            if self._journal.send(entry):
-                return
+        deadline = time.monotonic() + _JOURNAL_SECONDS  # journald may restart
+        while not self._journal.send(entry) and time.monotonic() < deadline:
             self._journal.wait_ready(1.0)
 
 

@@ -2,8 +2,10 @@
 
 import json
 import os
+import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -92,3 +94,13 @@ def test_it_ends_with_doractl(tmp_path: Path) -> None:
         assert child.stdin
         child.stdin.close()
         assert child.wait(60) == 1
+
+
+def test_no_line_is_lost_while_journald_restarts(tmp_path: Path) -> None:
+    """It may take longer than a refused connection, which comes back at once."""
+    path = tmp_path / "socket"
+    output = Output(BuildTask("robot", "uuid", "r", "/", ()), JournalSocket(str(path)))
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as server:
+        threading.Timer(1, server.bind, [str(path)]).start()
+        output.feed(b"one\n")
+        assert server.recv(1000).startswith(b"MESSAGE=one\n")
