@@ -64,7 +64,8 @@ def own_group() -> str:
 
 def group_of(process: int | str) -> str:
     """The group of a process, or "/" if it has exited: "0::" in /proc/PID/cgroup, cgroups(7)."""
-    for line in read_text(Path(f"/proc/{process}/cgroup")).splitlines():
+    # Not splitlines(): a name may contain what else that counts as the end of a line.
+    for line in read_text(f"/proc/{process}/cgroup").split("\n"):
         if line.startswith("0::"):
             return line[3:]
     return "/"
@@ -272,7 +273,7 @@ def read_text(path: str | Path) -> str:
     # A group can disappear at any moment, which counts as empty. FileIO: there are many of these
     # files, and Python's text layer takes longer than the kernel.
     with contextlib.suppress(OSError), io.FileIO(path) as file:
-        return file.readall().decode()
+        return os.fsdecode(file.readall())  # a name need not be UTF-8
     return ""
 
 

@@ -137,3 +137,9 @@ def test_groups_are_made_and_removed(tmp_path: Path) -> None:
 
 def test_own_group() -> None:
     assert cgroup.own_group().startswith("/")
+
+
+def test_a_group_whose_name_is_no_text(tmp_path: Path) -> None:
+    file = tmp_path / "cgroup"
+    file.write_bytes(b"0::/node-\xff\x0bx\n")
+    assert cgroup.group_of(f"self/root{file.parent}") == "/node-\udcff\x0bx"
