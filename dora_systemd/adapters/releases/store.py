@@ -84,7 +84,7 @@ class Store:
         return {path: one for path, one in manifest.files.items() if one == stored_at(tree / path)}
 
     def write_manifest(self, manifest: Manifest) -> None:
-        """Write the manifest of a release anew. Raises OSError."""
+        """Replace the manifest of a release. Raises OSError."""
         write_part(self.release(manifest.id), MANIFEST, format_manifest(manifest))
 
     def unit(self, release_id: str) -> str:
