@@ -265,7 +265,11 @@ def _write(path: Path, text: str) -> bool:
 def _put(path: Path, text: str) -> None:
     # Without O_CREAT, which a mode of FileIO would add: it hides that the file does not exist.
     with io.FileIO(os.open(path, os.O_WRONLY | os.O_CLOEXEC), "w") as control:
-        control.write(text.encode())
+        try:
+            control.write(text.encode())
+        except OSError as error:
+            error.filename = str(path)  # the kernel refuses by a number alone
+            raise
 
 
 def read_text(path: str | Path) -> str:
