@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from dora_systemd.adapters.host.process import Completed, run_command
+from dora_systemd.decisions.dora.errors import parse_dora_error
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.programs import Account, fresh_environment, own_account
 from dora_systemd.trust.sight import Sight
@@ -36,6 +37,11 @@ def run_dora(
     surroundings = {**(own if environment is None else environment)}
     surroundings |= {"RUST_BACKTRACE": "0", "NO_COLOR": "1"}
     return run_command((dora, *arguments), DORA_SECONDS, surroundings, directory, account)
+
+
+def refusal_reason(done: Completed) -> str:
+    """Why a dora command has failed, in one line."""
+    return parse_dora_error(done.stderr) or parse_dora_error(done.stdout) or "dora refuses it"
 
 
 def find_dora(

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dora_systemd.adapters.dora.command import run_dora
+from dora_systemd.adapters.dora.command import refusal_reason, run_dora
 from dora_systemd.adapters.host import files
 from dora_systemd.decisions.cell.hot_reload import check_reload_nodes
 from dora_systemd.decisions.cell.launch import (
@@ -27,7 +27,6 @@ from dora_systemd.decisions.descriptor.build_session import (
 )
 from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
 from dora_systemd.decisions.descriptor.nodes import UNEXPANDED, NodeKind
-from dora_systemd.decisions.dora.errors import parse_dora_error
 from dora_systemd.decisions.owes.check import check_owes
 from dora_systemd.decisions.rights.node_rights import check_rights_nodes
 from dora_systemd.decisions.signs.watchdogs import check_watchdogs
@@ -122,8 +121,9 @@ def load_dataflow(options: RunnerOptions) -> Dataflow:
     account, directory = own_account(), str(path.parent)
     done = run_dora(options.dora, ["expand", str(path)], account, os.environ, directory)
     if done.status != 0:
-        reason = parse_dora_error(done.stderr)
-        raise DoraSystemdError(f"cannot expand {path}: {reason}", "", ExitCode.BAD_INPUT)
+        message = f"cannot expand {path}: {refusal_reason(done)}"
+        hint = f"see {options.dora} expand {path}"
+        raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
     return parse_dataflow(files.parse_yaml(done.stdout, path), str(path))
 
 
