@@ -19,7 +19,7 @@ def main() -> int:
         path = CellPaths(Path(directory)).socket
         done = done_of(path, ask(path, {"verb": "reload"}))
     except DoraSystemdError as error:
-        print(error.message, file=sys.stderr)
+        print(f"{error.message}\n{error.hint}".strip(), file=sys.stderr)
         return error.code
     print("\n".join(done) or "Nothing has changed")
     return 0
