@@ -155,7 +155,11 @@ def build(task: BuildTask, output: Output) -> None:
 
 def main(argv: list[str]) -> int:
     """Carry out the task in `argv`; the exit status of a runner."""
-    task = parse_task(argv[0])
+    try:
+        task = parse_task(" ".join(argv))
+    except (ValueError, TypeError, KeyError):
+        print("cannot read what to build: doractl deploy starts this program", file=sys.stderr)
+        return RunnerExit.BAD_DATAFLOW
     output = Output(task, JournalSocket())
     try:
         build(task, output)

@@ -12,9 +12,10 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.adapters.journal.socket import JournalSocket
+from dora_systemd.decisions.life.states import RunnerExit
 from dora_systemd.decisions.releases.build import BuildTask
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.runner.build import Output, build
+from dora_systemd.runner.build import Output, build, main
 
 PROGRAM = (sys.executable, "-m", "dora_systemd.runner.build")
 
@@ -104,3 +105,9 @@ def test_no_line_is_lost_while_journald_restarts(tmp_path: Path) -> None:
         threading.Timer(1, server.bind, [str(path)]).start()
         output.feed(b"one\n")
         assert server.recv(1000).startswith(b"MESSAGE=one\n")
+
+
+@pytest.mark.parametrize("argv", [[], ["x"], ["5"], ["{}"], ['{"commands": 5}']])
+def test_by_hand(argv: list[str], capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(argv) == RunnerExit.BAD_DATAFLOW
+    assert capfd.readouterr().err.startswith("cannot read what to build: ")
