@@ -138,7 +138,7 @@ def read_logs_of_dora(
 
 def unit_group() -> Path:
     """The cgroup directory of this unit."""
-    unit = cgroup.group_path(cgroup.own_group())
+    unit = cgroup.group_path(cgroup.group_of())
     while unit.suffix != ".service" and unit != unit.parent:
         unit = unit.parent
     return unit

@@ -57,14 +57,9 @@ def group_path(group: str) -> Path:
     return mount_point() / group.lstrip("/")
 
 
-def own_group() -> str:
-    """The group of this process."""
-    return group_of("self")
-
-
-def group_of(process: int | str) -> str:
+def group_of(process: int | str = "self") -> str:
     """The group of a process, or "/" if it has exited: "0::" in /proc/PID/cgroup, cgroups(7)."""
-    # Not splitlines(): a name may contain what else that counts as the end of a line.
+    # Not by splitlines(): a name can contain other ends of a line.
     for line in read_text(f"/proc/{process}/cgroup").split("\n"):
         if line.startswith("0::"):
             return line[3:]

@@ -37,7 +37,7 @@ def enter_supervisor() -> Path:
 
     DelegateSubgroup= does this, but systemd before 254 does not have it. Raises OSError.
     """
-    own = cgroup.group_path(cgroup.own_group())
+    own = cgroup.group_path(cgroup.group_of())
     if own.name == cgroup.SUPERVISOR:
         return own.parent
     cgroup.make_group(own / cgroup.SUPERVISOR)
@@ -68,7 +68,7 @@ def start_coordinator(
     try:
         return engine.spawn("coordinator", command, own, paths.coordinator)
     except OSError:
-        # Imported late: most dataflows have a dora.
+        # Imported late: it takes a while, and most dataflows have a dora.
         from dora_systemd.adapters.dora.command import find_dora
 
         find_dora(dora, None, "")

@@ -136,7 +136,7 @@ def test_groups_are_made_and_removed(tmp_path: Path) -> None:
 
 
 def test_own_group() -> None:
-    assert cgroup.own_group().startswith("/")
+    assert cgroup.group_of().startswith("/")
 
 
 def test_a_group_whose_name_is_no_text(tmp_path: Path) -> None:

@@ -80,7 +80,6 @@ LATE = {
     },
     "limits, CPUs or rights of single nodes only": {
         "decisions.cell.limits": {"node_words"},
-        "runner.cell.begin": {"runner.nodes.rights"},
     },
     "uv only": {"decisions.cell.uv": {"tomllib"}},
     "JSON is for programs, and most who do something are people": {
@@ -125,7 +124,7 @@ LATE = {
     },
     "the coordinator boots while the rest of the runner is imported": {
         "runner.__main__": {"adapters.dora.check", "runner.cell.boot", "runner.main"},
-        "runner.cell.begin": {"adapters.dora.command"},
+        "runner.cell.begin": {"adapters.dora.command", "runner.nodes.rights"},
         "runner.cell.pause": {
             *("adapters.host.process", "adapters.host.files", "adapters.host.notify"),
             *("decisions.cell.status", "asyncio"),
