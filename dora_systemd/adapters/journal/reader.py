@@ -200,7 +200,9 @@ def _lines(arguments: Sequence[str]) -> Iterator[bytes]:
             # Keep just enough of a long line to see that it is too long.
             rest = (rest + last)[: MAX_LINE + 1]
         else:
-            return  # killed at a bound: what it has complained of is no reason to show nothing
+            child.kill()
+            if left < MAX_BYTES:
+                return  # what it has complained of is no reason to show nothing
         end_journalctl(child)
 
 

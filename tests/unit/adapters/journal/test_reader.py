@@ -269,3 +269,12 @@ def test_a_complaint_of_a_journal_that_is_read_to_a_bound_is_none(
     complaint = "system.journal is truncated, ignoring file."
     make_program(journalctl, f"echo '{complaint}' >&2; exec yes dora-a")
     assert set(JournalReader().unique("X")) == {"dora-a"}
+
+
+def test_a_complaint_of_a_journal_that_shows_nothing_is_told(
+    journalctl: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(journal_reader, "FIRST_SECONDS", 2.0)
+    make_program(journalctl, "echo 'Failed to wait: x' >&2; exec sleep 1000")
+    with pytest.raises(DoraSystemdError, match=r"^cannot read the journal: Failed to wait: x$"):
+        JournalReader().unique("X")
