@@ -45,7 +45,7 @@ def _read_process(path: Path) -> Process | None:
 def group_in(data: bytes) -> str:
     """The cgroup in the content of /proc/PID/cgroup, see cgroups(7); "" if there is none.
 
-    Any user can give a group of his own a name with any bytes, but for a newline.
+    Any user can have groups whose names are any bytes but a newline.
     """
     lines = data.decode(errors="replace").split("\n")
     return next((line[3:] for line in lines if line.startswith("0::")), "")

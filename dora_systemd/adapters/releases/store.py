@@ -203,7 +203,7 @@ def make_directories(path: Path) -> None:
     for one in (*reversed(path.parents), path):
         if not one.exists():
             with contextlib.suppress(FileExistsError):
-                one.mkdir(0o755)  # also with an umask of 0: nobody else may put anything there
+                one.mkdir(0o755)  # also with a umask of 0: nobody else may put anything there
                 one.chmod(0o755)
 
 
