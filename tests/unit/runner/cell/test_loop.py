@@ -12,7 +12,7 @@ from typing import Any, cast
 import pytest
 
 from dora_systemd.decisions.cell.exits import exit_of
-from dora_systemd.decisions.cell.options import RunnerOptions, runner_command
+from dora_systemd.decisions.cell.options import RunnerOptions, format_runner_argv
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.dora.protocol import Reply
 from dora_systemd.decisions.life import events as life
@@ -312,7 +312,7 @@ def test_a_directory_that_was_deleted_under_somebody(tmp_path: Path) -> None:
 def test_the_exit_status_does_not_depend_on_who_reads_standard_error() -> None:
     reading, writing = os.pipe()
     os.close(reading)
-    command = runner_command(sys.executable, OPTIONS)
+    command = (sys.executable, "-m", "dora_systemd.runner", *format_runner_argv(OPTIONS))
     environment = {key: text for key, text in os.environ.items() if key != "RUNTIME_DIRECTORY"}
     done = subprocess.run(command, stderr=writing, env=environment, check=False)
     os.close(writing)
