@@ -9,7 +9,14 @@ from hypothesis import strategies as st
 from dora_systemd.decisions.remote.failures import ending_error, is_of_ssh, last_line, unreached
 from dora_systemd.decisions.remote.hosts import Host, parse_host
 from dora_systemd.decisions.remote.merge import MOST_HELD, WINDOW_SECONDS, Merge
-from dora_systemd.decisions.remote.stream import MAX_LINE, AfterMark, Lines, objects_of, with_host
+from dora_systemd.decisions.remote.stream import (
+    MAX_LINE,
+    AfterMark,
+    Lines,
+    objects_of,
+    read_object,
+    with_host,
+)
 from dora_systemd.decisions.remote.table import format_hosts, row_of
 from dora_systemd.decisions.views.objects import dataflow_object, format_json
 from dora_systemd.decisions.views.rows import DataflowRow
@@ -62,8 +69,10 @@ def test_objects_have_their_host() -> None:
     )
     assert objects_of('[{"name": 1}, {}]', "a") == [{"host": "a", "name": 1}, {"host": "a"}]
     assert objects_of('{"name": 1}', "a") == [{"host": "a", "name": 1}]
+    assert read_object('{"name": 1}') == {"name": 1}
     for text in ("", "welcome", "[1]", "3", "[" * 100_000, "null"):
         assert objects_of(text, "a") is None
+        assert read_object(text) is None
 
 
 @pytest.mark.parametrize(
