@@ -52,7 +52,8 @@ def run(arguments: list[str]) -> int:
         _give_up_output()
         return ExitCode.PIPE_CLOSED
     except OSError as error:
-        _give_up_output()
+        if error.errno in _OUTPUT_ERRORS:
+            _give_up_output()
         problem = _failed(error)
     except KeyboardInterrupt:
         return ExitCode.INTERRUPTED

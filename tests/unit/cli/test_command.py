@@ -258,9 +258,11 @@ def test_any_error_of_the_system_is_one_line(
         raise error
 
     monkeypatch.setattr(listing, "print_dataflows", fail)
-    monkeypatch.setattr(main, "_give_up_output", lambda: None)
+    given_up: list[bool] = []
+    monkeypatch.setattr(main, "_give_up_output", lambda: given_up.append(True))
     assert main.run(["list"]) == ExitCode.FAILURE
     assert capsys.readouterr().err == f"doractl: {said}"
+    assert any(given_up) is ("write output" in said)  # else what was done would not be printed
 
 
 def test_a_reader_that_went_away_is_no_error() -> None:
