@@ -51,8 +51,8 @@ def expanded(env: Mapping[str, object], environment: Mapping[str, str]) -> dict[
 
     def replaced(match: re.Match[str]) -> str:
         found = match.groupdict()
-        name = found["plain"] or found.get("name")
-        value = environment.get(name, found.get("default")) if name else "$"
+        name: str | None = found["plain"] or found.get("name")
+        value: str | None = environment.get(name, found.get("default")) if name else "$"
         return match[0] if value is None else value.replace("$", _DOLLAR)
 
     def replaced_in(text: str) -> str:
