@@ -19,6 +19,7 @@ ERR, WARNING, NOTICE, INFO, DEBUG = 3, 4, 5, 6, 7
 PRIORITIES = {"error": ERR, "warn": WARNING, "info": INFO, "debug": DEBUG, "trace": DEBUG}
 PLAIN_PRIORITY = {"stdout": INFO, "stderr": NOTICE}
 
+_TOO_DEEP = "[nested too deeply]"
 _ANSI = re.compile(r"\x1b\[[0-9;]*m")
 _TRACING = re.compile(
     r"^(?P<timestamp>\d{4}-\d\d-\d\dT\S+Z)\s+(?P<level>ERROR|WARN)\s+(?P<message>.*)$"
@@ -171,7 +172,10 @@ def _structured(own: dict[str, object]) -> dict[str, Value]:
 def _text(value: object) -> str:
     if value is None:
         return ""
-    text = value if isinstance(value, str) else json.dumps(value)
+    try:
+        text = value if isinstance(value, str) else json.dumps(value)
+    except RecursionError:
+        return _TOO_DEEP  # json reads a level more than it writes
     # JSON may contain half of a surrogate pair, which UTF-8 cannot encode: escape it.
     return text.encode("utf-8", "backslashreplace").decode()
 

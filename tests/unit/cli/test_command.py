@@ -98,6 +98,7 @@ def test_every_option_says_what_it_does(name: str) -> None:
     [
         (["strat"], "unknown command 'strat'", "did you mean doractl start?"),
         (["qqq"], "unknown command 'qqq'", "doractl --help lists all commands"),
+        (["membe"], "unknown command 'membe'", "doractl --help lists all commands"),
         (["list", "--oll"], "unknown option --oll", "did you mean --all?"),
         (["stop"], "cannot stop: give names or --all", "doractl stop NAME, or doractl stop --all"),
         (["stop", "x", "--all"], "cannot stop: give names or --all", ""),
@@ -235,6 +236,33 @@ def test_exit_status_of_errors(
     assert main.run(["list"]) == status
     expected = "doractl: cannot do it\nhint: do that\n" if status != 130 else ""
     assert capsys.readouterr().err == expected
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (OSError(2, "No such file", "/x"), "cannot continue: No such file\nhint: /x\n"),
+        (OSError(9, "Bad file descriptor", 7), "cannot continue: Bad file descriptor\n"),
+        (OSError(28, "No space left"), "cannot write output: No space left\n"),
+        (TimeoutError("timed out"), "cannot continue: timed out\n"),
+        (TimeoutError(), "cannot continue: TimeoutError\n"),
+    ],
+)
+def test_any_error_of_the_system_is_one_line(
+    error: OSError,
+    said: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def fail(_request: ListRequest) -> int:
+        raise error
+
+    monkeypatch.setattr(listing, "print_dataflows", fail)
+    given_up: list[bool] = []
+    monkeypatch.setattr(main, "_give_up_output", lambda: given_up.append(True))
+    assert main.run(["list"]) == ExitCode.FAILURE
+    assert capsys.readouterr().err == f"doractl: {said}"
+    assert any(given_up) is ("write output" in said)  # else what was done would not be printed
 
 
 def test_a_reader_that_went_away_is_no_error() -> None:

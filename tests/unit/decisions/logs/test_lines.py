@@ -16,6 +16,7 @@ from dora_systemd.decisions.logs.lines import (
     jsonl_fields,
 )
 
+LOG = b'{"level":"info","timestamp":"t","message":"m"'
 ORIGIN = Origin("robot", "550e8400-e29b-41d4-a716-446655440000", "camera", "run1", 42)
 
 
@@ -155,6 +156,14 @@ def test_not_in_dora_form_is_plain(line: bytes) -> None:
 def test_half_a_surrogate_pair_is_no_error() -> None:
     line = b'{"level":"info","timestamp":"t","message":"\\ud800"}'
     assert b"MESSAGE=\\ud800\n" in LineEncoder(ORIGIN, "stdout").entry(line)
+
+
+def test_no_depth_is_an_error() -> None:
+    # Between what json reads and what it writes there is a level; which one depends on the stack.
+    for depth in range(1100):
+        value = b'"k":' + b"[" * depth + b"]" * depth
+        assert json_fields(LOG + b',"fields":{' + value + b"}}") != {}
+        assert jsonl_fields(b'{"stream":"stdout","level":"info","msg":"","fields":{%b}}' % value)
 
 
 def test_half_a_surrogate_pair_in_the_name_of_a_stream_is_no_error() -> None:
