@@ -283,6 +283,15 @@ def test_an_identity_is_not_borrowed(project: Path, tmp_path: Path) -> None:
         choose_user(SYSTEM, None, place_of(flow), str(project))
 
 
+@pytest.mark.parametrize("name", ["gone", f"{'n' * 256}", "robot.yml/in"])
+def test_an_identity_is_not_borrowed_while_the_directory_is_away(project: Path, name: str) -> None:
+    """Whoever owns it could take it away for a moment, and put it back after the check."""
+    place = place_of(project / "robot.yml")._replace(uid=65534, owners=frozenset((0, 1, 65534)))
+    with pytest.raises(DoraSystemdError, match="as working directory: it is not") as caught:
+        choose_user(SYSTEM, None, place, str(project / name))
+    assert caught.value.code is ExitCode.BAD_INPUT
+
+
 def test_a_user_that_is_asked_for(project: Path) -> None:
     place = place_of(project / "robot.yml")
     for wanted in ("root", "0"):
