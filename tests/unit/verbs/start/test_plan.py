@@ -159,6 +159,8 @@ def test_settings_files(tmp_path: Path) -> None:
     config = settings_files(flow, {**home, "XDG_CONFIG_HOME": "/c"})[1]
     assert config == Path("/c/dora-systemd/config.yml")
     assert settings_files(flow, {}) == [beside, system]
+    # A relative path in the variable is not valid.
+    assert settings_files(flow, {**home, "XDG_CONFIG_HOME": "c"})[1] == user
 
 
 def test_settings_beside_the_dataflow(project: Path) -> None:
