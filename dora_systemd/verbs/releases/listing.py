@@ -48,7 +48,8 @@ def read_releases(manager: Manager, scope: Scope, names: Sequence[str]) -> list[
     """
     rows = []
     for name in names:
-        store, standing = store_of(scope, name), None
+        store = store_of(scope, name)
+        standing: Standing | None = None
         try:
             standing = read_standing(manager, scope, unit_name(name))
         except DoraSystemdError:
