@@ -108,7 +108,8 @@ def _find(request: StartRequest) -> _Sender:
     given = settings[WORKING_DIRECTORY]
     directory = "" if given is None else os.path.normpath(Path(given).absolute())
     root = project_root(path, directory or str(path.parent))
-    return _Sender(written.place, dataflow, settings, root, directory, read and read.data)
+    said = read.data if read else None
+    return _Sender(written.place, dataflow, settings, root, directory, said)
 
 
 def _require_trusted(read: SettingsFile) -> None:
