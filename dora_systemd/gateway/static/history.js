@@ -31,6 +31,8 @@ export class History {
       this.last.set(flow.uuid, flow);
     }
     for (const key of this.groups.keys()) if (!seen.has(key)) this.groups.delete(key);
+    const known = new Set(dataflows.map((flow) => flow.uuid));
+    for (const uuid of this.last.keys()) if (!known.has(uuid)) this.last.delete(uuid);
   }
 
   #note(key, facts, now, before, window) {

@@ -14,7 +14,7 @@ from dora_systemd.trust.paths import is_directory
 from dora_systemd.values import quoted, shown
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.inhibit.guard import IfInhibited, require_uninhibited
-from dora_systemd.verbs.releases.change import Change, change_release, stop_observer
+from dora_systemd.verbs.releases.change import KILLED, Change, change_release, stop_observer
 from dora_systemd.verbs.releases.clean import clean
 from dora_systemd.verbs.releases.deploy import Deployed
 from dora_systemd.verbs.releases.listing import deployed_names, store_of
@@ -23,7 +23,6 @@ from dora_systemd.verbs.releases.trial import Standing, go_back, read_standing, 
 from dora_systemd.verbs.start.asked import note_request
 
 _COMMAND = "doractl rollback"
-_KILLED = "the command that tried it was killed"
 
 
 def roll_back(
@@ -99,7 +98,7 @@ def _end_first(manager: Manager, store: Store, standing: Standing, by: str, tell
         note_request("stop-asked", cell.name, cell.uuid, by)
     go_back(manager, standing, standing.was_up, stop_observer(tell))
     uuid = standing.uuid or store.manifest(standing.trial).uuid
-    details = {"release": standing.trial, "former": "", "nodes": "", "reason": _KILLED}
+    details = {"release": standing.trial, "former": "", "nodes": "", "reason": KILLED}
     note_request(ROLLED_BACK, store.name, uuid, by, **details)
     return Deployed(uuid, store.name, standing.boot.unit, "", standing.trial, 0, 0, 0)
 

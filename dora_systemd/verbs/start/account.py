@@ -2,7 +2,6 @@
 
 import os
 import pwd
-from contextlib import suppress
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
@@ -32,10 +31,20 @@ def choose_user(
         return None
     if wanted is not None:
         return _entry(wanted)
-    # A missing directory is reported later, by a check with that user's permissions.
-    with suppress(FileNotFoundError, NotADirectoryError), reached(directory) as (_, place):
-        check_identity(dataflow, place)
+    try:
+        with reached(directory) as (_, place):
+            check_identity(dataflow, place)
+    except OSError as error:
+        # Its owner could put it back after this, so what cannot be checked is refused. The words
+        # are those of Look.check_reach(): they do not tell what root can see.
+        raise no_directory(directory) from error
     return _default_entry() if dataflow.uid == 0 else _owner_entry(dataflow.uid, dataflow.path)
+
+
+def no_directory(directory: str) -> DoraSystemdError:
+    """The error for a working directory that is none."""
+    message = f"cannot use {shown(directory)} as working directory: it is not a directory"
+    return DoraSystemdError(message, "correct --working-directory", ExitCode.BAD_INPUT)
 
 
 def account_of(user: pwd.struct_passwd | None) -> Account | None:

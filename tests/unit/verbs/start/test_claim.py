@@ -51,6 +51,28 @@ def test_a_free_name(manager: FakeManager, scope: Scope) -> None:
     assert manager.calls == []
 
 
+def test_old_links_go_when_the_new_file_is_there(
+    manager: FakeManager, scope: Scope, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = make_plan(scope)
+    spread = replace(plan, options=plan.options._replace(placed=(("a", "gpu"),)))
+    place(manager, spread, want_boot=True)
+    link = unit_file(manager).with_name("doralink-robot:gpu.service")
+    link.write_text("")
+    before = unit_file(manager).read_text()
+
+    def refuse(_names: object) -> bool:
+        raise DoraSystemdError("No space left on device")
+
+    with monkeypatch.context() as context:
+        context.setattr(manager, "enable_unit_files", refuse)
+        with pytest.raises(DoraSystemdError, match="No space left"):
+            place(manager, plan, want_boot=True)
+    assert (link.exists(), unit_file(manager).read_text()) == (True, before)
+    place(manager, plan, want_boot=True)
+    assert not link.exists()
+
+
 @pytest.mark.parametrize("state", ["active", "activating", "deactivating", "reloading"])
 def test_a_name_in_use(state: str, manager: FakeManager, scope: Scope) -> None:
     manager.add(options(), active=state, InactiveExitTimestamp=1_700_000_000_000_000)
