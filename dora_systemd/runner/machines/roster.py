@@ -5,6 +5,7 @@ Each member is a session at the head's socket, which the link to that machine be
 
 import asyncio
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 
 from dora_systemd import __version__
@@ -21,6 +22,7 @@ from dora_systemd.decisions.machines.tables import merged
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.runner.cell.pump import now_us
 from dora_systemd.runner.machines.lines import Lines
+from dora_systemd.runner.machines.reach import Endpoints
 from dora_systemd.terminal_text import short_line
 from dora_systemd.values import quoted
 
@@ -62,6 +64,7 @@ class Roster:
         self._options, self._ports = options, ports
         self._members = {name: Member() for name in members_of(options.placed)}
         self._token = self._digest = self._dora = ""
+        self._again = 0
         self.changed = asyncio.Event()
         self.push: Callable[[life.Event], None] = lambda _: None
 
@@ -70,9 +73,9 @@ class Roster:
         """The members in the order of the dataflow."""
         return tuple(self._members)
 
-    def set_facts(self, digest: str, dora: str) -> None:
-        """Set what members compare: see wire.Part."""
-        self._digest, self._dora = digest, dora
+    def set_facts(self, digest: str, dora: str, is_first: bool) -> None:
+        """Set what members compare: see wire.Part. is_first: whether somebody waits."""
+        self._digest, self._dora, self._again = digest, dora, int(not is_first)
 
     def set_token(self, token: str) -> None:
         """The coordinator listens: tell those that are there already."""
@@ -83,6 +86,11 @@ class Roster:
     def works(self) -> Mapping[str, str]:
         """dora's directory on each machine."""
         return {name: one.work for name, one in self._members.items()}
+
+    def endpoints(self) -> Endpoints:
+        """Where zenoh of each machine listens, if ssh is not on the way."""
+        addresses = dict(zip(self._members, self._options.addresses[1:], strict=False))
+        return {name: (one, self._ports.zenoh[name]) for name, one in addresses.items()}
 
     def missing(self) -> dict[str, str]:
         """The members that are not ready, and why."""
@@ -111,7 +119,9 @@ class Roster:
             return
         lines = Lines(ends)
         self._replace(name, lines)
-        lines.send(self._ports)
+        # Without ssh on the way, zenoh's ports are those of other addresses.
+        is_direct = bool(self._options.addresses)
+        lines.send(replace(self._ports, zenoh={}) if is_direct else self._ports)
         self._send_part(name)
         why = await lines.talk(partial(self._hear, name, lines))
         if self._members[name].lines is lines:
@@ -142,6 +152,7 @@ class Roster:
                 grace=options.grace,
                 doractl=__version__,
                 dora=self._dora,
+                again=self._again,
             )
         )
         self.changed.set()
