@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 from dora_systemd.adapters.bus import systemd
+from dora_systemd.adapters.bus.connection import connect
 from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
 from dora_systemd.decisions.gateway.frames import Request
 from dora_systemd.decisions.gateway.page_messages import PageMessage
@@ -308,7 +309,7 @@ def test_the_next_life_of_a_unit_is_not_killed(bench: Bench) -> None:
 def test_what_only_looks_does_not_wait_for_a_silent_bus(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    connect, asked = systemd.connect, list[bool]()
+    asked: list[bool] = []
 
     def noted(scope: Scope, for_reading: bool) -> Any:
         asked.append(for_reading)

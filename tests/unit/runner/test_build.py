@@ -1,5 +1,6 @@
 """The program in the unit of a build."""
 
+import contextlib
 import json
 import os
 import socket
@@ -100,8 +101,12 @@ def test_it_ends_with_doractl(tmp_path: Path) -> None:
 def test_no_line_is_lost_while_journald_restarts(tmp_path: Path) -> None:
     """It may take longer than a refused connection, which comes back at once."""
     path = tmp_path / "socket"
-    output = Output(BuildTask("robot", "uuid", "r", "/", ()), JournalSocket(str(path)))
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as server:
+    journal = JournalSocket(str(path))
+    output = Output(BuildTask("robot", "uuid", "r", "/", ()), journal)
+    with (
+        contextlib.closing(journal),
+        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as server,
+    ):
         threading.Timer(1, server.bind, [str(path)]).start()
         output.feed(b"one\n")
         assert server.recv(1000).startswith(b"MESSAGE=one\n")

@@ -41,8 +41,8 @@ def test_no_umask_lets_others_write_or_keeps_them_from_reading(tmp_path: Path, u
     modes: list[int] = []
     made = Path.mkdir
 
-    def note(path: Path, *mode: int, **options: bool) -> None:
-        made(path, *mode, **options)
+    def note(path: Path, mode: int = 0o777, **options: bool) -> None:
+        made(path, mode, **options)
         modes.append(path.stat().st_mode & 0o777)
 
     before = os.umask(umask)

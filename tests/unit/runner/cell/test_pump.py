@@ -331,6 +331,8 @@ def test_a_warning_that_nobody_reads_ends_nothing(
         assert bench.pump.cell.state is State.RUNNING
 
     with os.fdopen(writing, "wb", buffering=0) as raw:
-        monkeypatch.setattr("sys.stderr", io.TextIOWrapper(raw, write_through=True))
+        text = io.TextIOWrapper(raw, write_through=True)
+        monkeypatch.setattr("sys.stderr", text)
         live(work)
         monkeypatch.undo()
+        text.detach()

@@ -10,6 +10,7 @@ import pytest
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.programs import own_account
 from dora_systemd.verbs.releases import send
+from dora_systemd.verbs.releases.files import find_files
 from dora_systemd.verbs.start.plan import StartRequest
 
 FLOW = "nodes: [{id: a, path: a.py}]\n"
@@ -40,7 +41,6 @@ def pack(project: Path) -> dict[str, Any]:
 
 def once(monkeypatch: pytest.MonkeyPatch, act: Callable[[], object]) -> None:
     """Have something happen after the settings are checked, and before they are packed."""
-    find_files = send.find_files
 
     def find(*arguments: Any) -> Any:
         act()

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from dora_systemd.decisions.cell.machines import Placed
 from dora_systemd.decisions.settings.resolve import resolve_settings
 from dora_systemd.decisions.unit.file import runner_of
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -55,7 +56,7 @@ def test_old_links_go_when_the_new_file_is_there(
     manager: FakeManager, scope: Scope, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plan = make_plan(scope)
-    spread = replace(plan, options=plan.options._replace(placed=(("a", "gpu"),)))
+    spread = replace(plan, options=plan.options._replace(placed=(Placed("a", "gpu"),)))
     place(manager, spread, want_boot=True)
     link = unit_file(manager).with_name("doralink-robot:gpu.service")
     link.write_text("")
