@@ -137,7 +137,7 @@ def doractl(ctx: click.Context) -> None:
 def run_verb(arguments: list[str], group: click.Group = doractl) -> int:
     """Run a command line; its exit status. Raises DoraSystemdError for a wrong one, too."""
     if arguments[:1] == ["help"]:
-        arguments = [*arguments[1:2], "--help"]
+        arguments = [*arguments[1:], "--help"]
     try:
         result = group.main(arguments, prog_name="doractl", standalone_mode=False)
     except click.ClickException as error:

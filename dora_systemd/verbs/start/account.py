@@ -10,6 +10,7 @@ from dora_systemd.trust.programs import Account, account_from
 from dora_systemd.values import quoted, shown
 
 DEFAULT_USER = "dora"
+_MOST_DIGITS = 10  # of a uid
 """Runs the dataflows whose files belong to root; the package creates this user."""
 
 
@@ -77,7 +78,8 @@ def _entry(wanted: str) -> pwd.struct_passwd:
     refusal = DoraSystemdError(
         f"cannot find a user {quoted(wanted)}", "see getent passwd", ExitCode.USAGE
     )
-    return _known(int(wanted) if wanted.isdecimal() else wanted, refusal)
+    is_number = wanted.isascii() and wanted.isdigit() and len(wanted) <= _MOST_DIGITS
+    return _known(int(wanted) if is_number else wanted, refusal)
 
 
 def _owner_entry(owner: int, dataflow: str) -> pwd.struct_passwd:

@@ -332,7 +332,7 @@ def test_settings_stand_by_concern_with_their_defaults(
 
 
 def test_help_is_a_word_too(capsys: pytest.CaptureFixture[str]) -> None:
-    for verb in ([], ["stop"], ["node"]):
+    for verb in ([], ["stop"], ["node"], ["node", "restart"]):
         assert main.run([*verb, "--help"]) == 0
         shown = capsys.readouterr().out
         assert main.run(["help", *verb]) == 0

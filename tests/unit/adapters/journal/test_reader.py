@@ -51,6 +51,14 @@ def test_complaints(journalctl: Path, complaint: str, message: str, code: ExitCo
     assert (caught.value.message, caught.value.code) == (message, code)
 
 
+def test_many_complaints_stop_nothing(journalctl: Path) -> None:
+    """Of damaged files; a pipe would be full before anybody reads it."""
+    many = "head -c 200000 /dev/zero | tr '\\0' '\\n' >&2"
+    make_program(journalctl, f"{many}; echo robot; echo 'Something else' >&2; exit 1")
+    with pytest.raises(DoraSystemdError, match=r"^cannot read the journal: Something else$"):
+        JournalReader().known_names(SYSTEM)
+
+
 def test_a_notice_is_no_complaint(journalctl: Path) -> None:
     notice = "      Pass -q to turn off this notice."
     make_program(journalctl, f"echo 'Hint: only your own' >&2; echo '{notice}' >&2; exit 1")
