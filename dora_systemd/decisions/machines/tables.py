@@ -8,15 +8,14 @@ from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
 def merged(table: CellStatus, others: Mapping[str, CellStatus]) -> CellStatus:
     """The table of the head. others: by machine; each is believed for its own nodes only.
 
-    The head itself hears from dora what nodes do. A member knows more of why, and counts the lines.
+    The head itself hears from dora what nodes do. A member knows more of why, counts the lines, and
+    reads what its nodes use.
     """
     nodes = {ident: _told(ident, node, others) for ident, node in table.nodes.items()}
-    lines = {
-        ident: others[node.machine].lines[ident]
-        for ident, node in table.nodes.items()
-        if node.machine in others and ident in others[node.machine].lines
-    }
-    return table._replace(nodes=nodes, lines={**table.lines, **lines})
+    away = {ident: others[n.machine] for ident, n in table.nodes.items() if n.machine in others}
+    lines = {ident: one.lines[ident] for ident, one in away.items() if ident in one.lines}
+    usage = {ident: one.usage[ident] for ident, one in away.items() if ident in one.usage}
+    return table._replace(nodes=nodes, lines={**table.lines, **lines}, usage=usage)
 
 
 def _told(ident: str, node: NodeStatus, others: Mapping[str, CellStatus]) -> NodeStatus:

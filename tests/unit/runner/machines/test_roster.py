@@ -52,6 +52,30 @@ def run(work: Callable[[Bench], Coroutine[Any, Any, None]]) -> None:
     live(lambda: work(Bench()))
 
 
+def test_a_new_table_is_shown_soon() -> None:
+    """One that comes a hundred times a second is not written as often."""
+
+    async def work(bench: Bench) -> None:
+        written = asyncio.Event()
+        times: list[int] = []
+
+        def refresh() -> None:
+            times.append(1)
+            written.set()
+
+        bench.roster.refresh = refresh
+        other = await bench.link()
+        for _ in range(50):
+            other.say(wire.Table(CellStatus(usage={"mid": (1.5,)}).to_json()))
+        await settle()
+        await written.wait()
+        assert len(times) < 5
+        node = NodeStatus("running", machine="gpu")
+        assert bench.roster.amend(CellStatus(nodes={"mid": node})).usage == {"mid": (1.5,)}
+
+    run(work)
+
+
 def test_a_link_gets_the_ports_and_then_its_part() -> None:
     async def work(bench: Bench) -> None:
         other = await bench.link()
