@@ -30,8 +30,8 @@ SECOND_ONE = replace(
     usage={"": Usage(0), "camera": Usage(2 * SECOND), "yolo": Usage(9 * SECOND)},
 )
 SHOW = """(async () => {
-  const { History } = await import("/history.js");
-  const { NodeRow } = await import("/nodes.js");
+  const { History } = await import("/page/history.js");
+  const { NodeRow } = await import("/page/nodes.js");
   const history = new History();
   const snapshots = %s;
   for (const one of snapshots) history.add([one]);
