@@ -28,6 +28,7 @@ TITLES = {
     "messages": "Messages",
     "reload": "Hot reload",
     "owes": "Owed outputs",
+    "machines": "Between machines",
 }
 """The records in their order."""
 

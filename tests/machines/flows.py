@@ -48,12 +48,16 @@ class Flow:
         """All of them."""
         return ("a", *self.members.values())
 
-    def bring(self) -> None:
-        """The same files on all machines."""
+    def write(self) -> None:
+        """The files on a."""
         place = Project(Path(PLACE), is_new=False)
         for name, text in (("source", SOURCE), ("doubler", DOUBLER), ("sink", SINK)):
             place.write(f"{name}.py", text)
         place.write("dataflow.yml", _DATAFLOW.format(sink="arm" if "arm" in self.members else "a"))
+
+    def bring(self) -> None:
+        """The same files on all machines."""
+        self.write()
         for machine in self.members.values():
             there(machine, "mkdir", "-p", PLACE)
             command = ["scp", "-q", "-r", PLACE, f"root@{machine}:/opt"]
@@ -67,6 +71,15 @@ class Flow:
         """Start it, and wait for all of its nodes."""
         file = Path(PLACE) / "dataflow.yml"
         return self.cell.start(file, *self.flags(), *flags, check=check)
+
+    def refused(self, *words: str, code: int, flags: Sequence[str] = ()) -> None:
+        """Start it: one line with these words, and nothing is left anywhere."""
+        done = self.start(*flags, check=False)
+        assert done.returncode == code, done.stderr
+        for word in words:
+            assert word in done.stderr
+        assert "Traceback" not in done.stderr
+        assert not self.left()
 
     def status(self) -> str:
         """The status of the head's unit for people."""

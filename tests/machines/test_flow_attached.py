@@ -9,7 +9,7 @@ import pytest
 
 from tests.lab.pace import bound
 from tests.machines.flows import NAME, PLACE, Flow, flow_on
-from tests.machines.test_flow_faults import LOST
+from tests.machines.test_flow_faults import BUSY, LOST
 from tests.machines.wires import cable
 from tests.system.cells import wait_for
 
@@ -17,9 +17,8 @@ from tests.system.cells import wait_for
 @pytest.fixture
 def flow() -> Iterator[Flow]:
     """Its files are everywhere; the sink, which prints, is on c."""
-    with flow_on(
-        {"gpu": "b", "arm": "c"}, (*LOST, "Machine arm of dataflow", "machine arm")
-    ) as flow:
+    of_arm = (one.replace("gpu", "arm") for one in LOST)
+    with flow_on({"gpu": "b", "arm": "c"}, (*LOST, *of_arm, *BUSY)) as flow:
         yield flow
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from tests.machines.flows import NAME, PLACE, Flow
 from tests.machines.journals import quiet_journals
-from tests.machines.test_flow_faults import LOST
+from tests.machines.test_flow_faults import BUSY, LOST
 from tests.machines.wires import power_cut, there
 from tests.system.cells import run, wait_for
 
@@ -34,7 +34,7 @@ def flow() -> Iterator[Flow]:
     flow.bring()
     run("scp", "-q", "-r", PLACE, f"root@{HEAD}:/opt")
     run("scp", "-q", *(f"/root/.ssh/{key}" for key in KEYS), f"root@{HEAD}:/root/.ssh/")
-    with quiet_journals(LOST):
+    with quiet_journals((*LOST, *BUSY)):
         more = ("--restart-policy=on-failure", "--enable", "--grace-duration=2s")
         head("start", f"{PLACE}/dataflow.yml", "--name", NAME, *flow.flags(), *more)
         try:

@@ -2,6 +2,7 @@
 
 import os
 import sys
+from pathlib import Path
 from typing import Any
 
 import click
@@ -11,7 +12,9 @@ from dora_systemd.cli.edge import write_exactly
 from dora_systemd.cli.parameters import current_scope, scope_options
 from dora_systemd.cli.settingoptions import SettingsCommand, setting_options
 from dora_systemd.decisions.cell.machines import parse_head, parse_machine, parse_placed
+from dora_systemd.decisions.machines.address import parse_address
 from dora_systemd.decisions.machines.key import ORIGINAL, forced_words
+from dora_systemd.decisions.machines.push import PLACE, format_place
 from dora_systemd.decisions.machines.wire import Refused
 from dora_systemd.decisions.settings.table import SETTINGS
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -24,6 +27,7 @@ from dora_systemd.verbs.machines.member import (
     start_member,
 )
 from dora_systemd.verbs.machines.own import own_facts
+from dora_systemd.verbs.machines.push import place_problem
 from dora_systemd.verbs.start.plan import StartRequest
 
 
@@ -46,6 +50,14 @@ def _print_facts(ctx: click.Context, param: click.Parameter, value: bool) -> Non
         ctx.exit()
 
 
+def _print_place(ctx: click.Context, param: click.Parameter, value: str | None) -> None:
+    del param
+    if value is not None:
+        problem, hint = place_problem(Path(value)) or ("", "")
+        write_exactly(f"{format_place(problem, hint)}\n")
+        ctx.exit()
+
+
 @click.command("member", cls=MemberCommand, hidden=True)
 @click.argument("dataflow", metavar="FILE")
 @click.option("--name", required=True, metavar="NAME", help="Name of the dataflow.")
@@ -60,12 +72,26 @@ def _print_facts(ctx: click.Context, param: click.Parameter, value: bool) -> Non
 )
 @click.option("--head", default="", metavar="HOST", help="The host name of the head, for people.")
 @click.option(
+    "--address",
+    multiple=True,
+    metavar="ADDRESS",
+    help="With link: direct, the address of each machine; that of this one first.",
+)
+@click.option(
     "--facts",
     is_flag=True,
     is_eager=True,
     expose_value=False,
     callback=_print_facts,
     help="Only print what a head wants to know of this machine, as JSON.",
+)
+@click.option(
+    PLACE,
+    metavar="DIRECTORY",
+    is_eager=True,
+    expose_value=False,
+    callback=_print_place,
+    help="Only print whether start --push may write there, as JSON.",
 )
 @setting_options
 @scope_options
@@ -76,6 +102,7 @@ def command(
     machine: str,
     placed: tuple[str, ...],
     head: str,
+    address: tuple[str, ...],
     **flags: Any,
 ) -> int:
     """Run the nodes of FILE that belong to this machine, as the service dora-NAME.service.
@@ -98,6 +125,7 @@ def command(
         placed=tuple(map(parse_placed, placed)),
         machine=parse_machine(machine),
         head=parse_head(head),
+        addresses=tuple(map(parse_address, address)),
     )
     scope = current_scope()
     with Head() as told:

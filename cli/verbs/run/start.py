@@ -25,18 +25,20 @@ from dora_systemd.cli.stageline import StageLine
 from dora_systemd.decisions.settings.resolve import is_given
 from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.needs.notes import held_notes, waiting_notes
 from dora_systemd.verbs.start.again import find_start, means_name
 from dora_systemd.verbs.start.check import check_plan
+from dora_systemd.verbs.start.claim import require_free_name
 from dora_systemd.verbs.start.enable import boot_target
 from dora_systemd.verbs.start.job import Started, format_started, start_unit
 from dora_systemd.verbs.start.launch import Claim, claim
 from dora_systemd.verbs.start.linger import ensure_linger
 from dora_systemd.verbs.start.logins import start_notes
-from dora_systemd.verbs.start.plan import DEFAULT_FILE, StartRequest, make_plan
+from dora_systemd.verbs.start.plan import DEFAULT_FILE, StartRequest, make_plan, request_name
 from dora_systemd.verbs.start.unit import format_plan
 from dora_systemd.verbs.start.watch import watched_patterns
 
@@ -54,6 +56,7 @@ from dora_systemd.verbs.start.watch import watched_patterns
 @click.option("--no-wait", is_flag=True, help="Do not wait until all nodes are ready.")
 @click.option("--enable", "want_boot", is_flag=True, help="Also start it at every boot.")
 @click.option("--dry-run", is_flag=True, help="Print the unit and start nothing.")
+@click.option("--push", "want_push", is_flag=True, help="First copy its files to all machines.")
 @acting_options
 def command(
     dataflow: str,
@@ -62,6 +65,7 @@ def command(
     no_wait: bool,
     want_boot: bool,
     dry_run: bool,
+    want_push: bool,
     **flags: Any,
 ) -> int:
     """Start the dataflow in FILE as the service dora-NAME.service.
@@ -85,6 +89,7 @@ def command(
       doractl start dataflow.yml --enable     now and at every boot
       doractl start dataflow.yml --attach     with its logs, as doractl run
       doractl start dataflow.yml --dry-run
+      doractl start dataflow.yml --push       to all of its machines first
       doractl start robot                     what list --all shows, once more
     """
     if want_logs and (no_wait or wants_json()):
@@ -94,7 +99,7 @@ def command(
     request = StartRequest(dataflow, name, flags, os.environ)
     if means_name(dataflow):
         bus = Bus(scope)
-        is_changed = bool(name or want_boot or dry_run or want_logs)
+        is_changed = bool(name or want_boot or dry_run or want_logs or want_push)
         is_changed |= any(map(is_given, flags.values()))
         known = find_start(bus, scope, Selector(dataflow), is_changed)
         if isinstance(known, Cell):
@@ -107,6 +112,8 @@ def command(
         write_exactly(format_plan(plan, target))
         return ExitCode.OK
     bus = Bus(scope)
+    if want_push:
+        _push(bus, scope, request)
     claimed = claim(bus, scope, request, "doractl start", want_boot)
     print_warnings(claimed.warnings)
     print_warnings([ensure_linger(scope) if want_boot else ""])
@@ -121,6 +128,15 @@ def command(
     print_warnings([*notes, *waiting_notes(bus, options)])
     print_warnings(held_notes(bus, options.name) if no_wait else ())
     return _print_started(started, options.dataflow, watched_patterns(claimed.plan))
+
+
+def _push(bus: Bus, scope: Scope, request: StartRequest) -> None:
+    """Copy the files to the other machines, unless the start would be refused before that."""
+    from dora_systemd.verbs.machines.push import push
+
+    require_free_name(bus, scope, unit_name(request_name(request)))
+    with StageLine(sys.stderr) as stage:
+        push(make_plan(scope, request), stage)
 
 
 def _attach(bus: Bus, claimed: Claim, notes: Sequence[str]) -> int:

@@ -61,8 +61,7 @@ class RunnerOptions(NamedTuple):
     exit_when_nodes_finish: overrides the descriptor's key of that name, unless None.
     env_keys: names of the variables that override the descriptor's `env:`.
     log_rates: rate limits of log lines, see dora_systemd.decisions.cell.line_rates.
-    node_limits: limits of single nodes.
-    node_rights: rights of single nodes.
+    node_limits, node_rights: of single nodes.
     restart: policy of nodes without one in the descriptor.
     node_restarts: policies of single nodes.
     start_timeout: µs for all nodes to become ready, or INFINITY.
@@ -71,8 +70,8 @@ class RunnerOptions(NamedTuple):
     owes: outputs of nodes that have to come in time.
     needs: the paths that single nodes wait for.
     placed: the nodes that run on other machines than the head.
-    machine, head: on a member its name, and the host name of the head; "" on the head and without
-    members.
+    machine, head: on a member its name, and the host name of the head; else "".
+    addresses: with `link: direct` those of all machines, the own one first.
     """
 
     name: str
@@ -101,6 +100,7 @@ class RunnerOptions(NamedTuple):
     placed: tuple[Placed, ...] = ()
     machine: str = ""
     head: str = ""
+    addresses: tuple[str, ...] = ()
 
     def __hash__(self) -> int:
         return hash(self.uuid)
@@ -191,6 +191,7 @@ _OPTIONS = (
     _each("placed", "placed", parse_placed, "=".join),
     _unless_default("machine", "machine", parse_machine),
     _unless_default("head", "head", parse_head),
+    _each("address", "addresses", _late("machines.address", "parse_address")),
     _each("watch", "reload.watch"),
     _each("ignore", "reload.ignore"),
     _each("node-watch", "reload.node_watch", parse_of_node, "=".join),

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import PurePath
 from typing import Any, NamedTuple
 
+from dora_systemd.decisions.machines.address import parse_address
 from dora_systemd.decisions.remote.hosts import Host, parse_host
 from dora_systemd.decisions.settings.credentials import CREDENTIAL_SETTINGS
 from dora_systemd.decisions.settings.kinds import Scalar, Setting, one_text
@@ -21,13 +22,17 @@ from dora_systemd.decisions.settings.table import DORA, ENV, ENV_FILE, PROPERTY,
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import quoted, scalar_text, shown
 
-LINKS = ("ssh",)
+DIRECT = "direct"
+LINKS = ("ssh", DIRECT)
+ADDRESS, HEAD_ADDRESS = "address", "head_address"
 _TEXT = one_text(Scalar, "a text", "TEXT", str)
 _LABELS = one_text(dict[str, Scalar], "a mapping, LABEL: VALUE", "", str)
 _OWN = (
     Setting[str](HOST, _TEXT, "", ""),
     Setting[str]("directory", _TEXT, "", ""),
     Setting[str]("link", _TEXT, "", ""),
+    Setting[str](ADDRESS, _TEXT, "", ""),
+    Setting[str](HEAD_ADDRESS, _TEXT, "", ""),
     Setting[str]("labels", _LABELS, "", ""),
 )
 _UNIT: tuple[Setting[Any], ...] = (
@@ -44,7 +49,8 @@ class Machine(NamedTuple):
     """A declared machine.
 
     directory: of the dataflow file there, absolute, or "" for the same as here. settings: with
-    their values. is_own: it is declared for this dataflow, and not for all in a config.yml.
+    their values. is_own: it is declared for this dataflow, and not for all in a config.yml. link:
+    one of LINKS. address, head_address: of the machine and of the head; "" if not given.
     """
 
     name: str
@@ -53,6 +59,9 @@ class Machine(NamedTuple):
     labels: Mapping[str, str]
     settings: Sequence[tuple[Setting[Any], Any]]
     is_own: bool
+    link: str = LINKS[0]
+    address: str = ""
+    head_address: str = ""
 
 
 def parse_entry(name: str, declared: Declared, source: str, dataflow: str) -> Machine:
@@ -65,7 +74,7 @@ def parse_entry(name: str, declared: Declared, source: str, dataflow: str) -> Ma
     values = check_document(where, declared.values, (*_OWN, *OF_MACHINES))
     here = PurePath(dataflow).parent
     directory = _directory(values.get("directory"), where)
-    _check_link(values.get("link", LINKS[0]), where)
+    link = _link(values, where)
     labels = values.get("labels", {})
     return Machine(
         name,
@@ -74,6 +83,8 @@ def parse_entry(name: str, declared: Declared, source: str, dataflow: str) -> Ma
         {key: scalar_text(value) for key, value in labels.items()},
         tuple(_settings(values, PurePath(directory or here), where)),
         any(base in (None, here) for base in declared.bases),
+        link,
+        *(_address(values.get(key), key, where) for key in (ADDRESS, HEAD_ADDRESS)),
     )
 
 
@@ -103,10 +114,26 @@ def _directory(value: Any, where: str) -> str:
     return str(PurePath(text)) if text else ""
 
 
-def _check_link(value: Any, where: str) -> None:
-    if value not in LINKS:
+def _link(values: Mapping[str, Any], where: str) -> str:
+    link = scalar_text(values.get("link", LINKS[0]))
+    if link not in LINKS:
         hint = f"valid values: {', '.join(LINKS)}"
-        raise _refusal(f"link of {where}: cannot use {quoted(scalar_text(value))}", hint)
+        raise _refusal(f"link of {where}: cannot use {quoted(link)}", hint)
+    if link == DIRECT and ADDRESS not in values:
+        hint = "write address: and the IP address on which the machine listens for the others"
+        raise _refusal(f"{where}: link: {DIRECT} needs an address", hint)
+    for key in (ADDRESS, HEAD_ADDRESS):
+        if link != DIRECT and key in values:
+            hint = f"write link: {DIRECT}, or leave {key} out"
+            raise _refusal(f"{where}: {key} is for link: {DIRECT} only", hint)
+    return link
+
+
+def _address(value: Any, key: str, where: str) -> str:
+    try:
+        return "" if value is None else parse_address(scalar_text(value))
+    except DoraSystemdError as error:
+        raise _refusal(f"{key} of {where}: {error.message}", error.hint) from error
 
 
 def _refusal(message: str, hint: str) -> DoraSystemdError:

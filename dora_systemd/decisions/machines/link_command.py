@@ -81,11 +81,11 @@ def ssh_link_arguments(link: LinkOptions, forwards: Forwards, mark: str) -> list
     """
     check_forwards(forwards, link.machine)
     host = parse_host(link.host)
-    own = forwards.zenoh[link.machine]
+    own = [port for name, port in forwards.zenoh.items() if name == link.machine]
     to_member = (port for name, port in forwards.zenoh.items() if name != link.machine)
     words = [f"-o{key}={value}" for key, value in _OPTIONS.items()]
     words += [f"-R{_same(port)}" for port in (forwards.coordinator, *to_member)]
-    words += [f"-L{_same(own)}"]
+    words += [f"-L{_same(port)}" for port in own]
     words += [f"-i{link.identity}", "-oIdentitiesOnly=yes"] if link.identity else []
     words += [f"-p{host.port}"] if host.port else []
     command = remote_command(Way.FED, member_words(link), mark)
@@ -105,7 +105,8 @@ def check_forwards(forwards: Forwards, machine: str) -> None:
     ports on both machines, so none may be that of a usual service.
     """
     ports = [forwards.coordinator, *forwards.zenoh.values()]
-    is_whole = {HEAD, machine} <= forwards.zenoh.keys() and len(ports) <= _MOST_MACHINES
+    is_whole = not forwards.zenoh or {HEAD, machine} <= forwards.zenoh.keys()
+    is_whole = is_whole and len(ports) <= _MOST_MACHINES
     if not is_whole or len(set(ports)) < len(ports) or any(one not in PORT_RANGE for one in ports):
         first, last = PORT_RANGE[0], PORT_RANGE[-1]
         hint = f"links take ports from {first} to {last}, each once"

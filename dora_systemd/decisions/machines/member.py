@@ -106,6 +106,7 @@ def _words(
     yield f"--uuid={options.uuid}"
     yield from [f"--head={options.head}"] if options.head else []
     yield from (f"--placed={'='.join(one)}" for one in options.placed)
+    yield from (f"--address={one}" for one in _own_first(options.addresses, machine.address))
     nodes = [one.node for one in options.placed if one.machine == machine.name]
     given = [(one, settings[one]) for one in _SHARED if settings.is_given(one)]
     given += _of_nodes(options, nodes)
@@ -117,6 +118,10 @@ def _words(
     kept = {one.name: (one, value) for one, value in given}
     for setting, value in {**kept, **own}.values():
         yield from _flags(setting, value)
+
+
+def _own_first(addresses: Sequence[str], own: str) -> list[str]:
+    return sorted(addresses, key=lambda one: one != own)
 
 
 def _flags(setting: Setting[Any], value: Any) -> Iterator[str]:

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping
 from dora_systemd.decisions.cell.machines import is_host_name, members_of
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
+from dora_systemd.decisions.machines.direct import Route, direct_addresses
 from dora_systemd.decisions.machines.entry import parse_entry
 from dora_systemd.decisions.machines.member import Member, member_of, on_head
 from dora_systemd.decisions.machines.placement import place_nodes
@@ -23,11 +24,13 @@ def spread(
     settings: Settings,
     variables: Mapping[str, str],
     hostname: str,
+    route: Route,
 ) -> tuple[RunnerOptions, tuple[Member, ...]]:
     """The options of the head's runner, and what the members are told.
 
-    variables: of --env and environment files. hostname: of the head. Raises DoraSystemdError
-    (BAD_INPUT) for a placement that does not work, and for what works on one machine only.
+    variables: of --env and environment files. hostname, route: of the head. Raises
+    DoraSystemdError (BAD_INPUT) for a placement that does not work, and for what works on one
+    machine only.
     """
     source = settings.source(MACHINES)
     machines = {
@@ -40,6 +43,7 @@ def spread(
     whole = options._replace(placed=placed, head=hostname if is_host_name(hostname) else "")
     _check(whole, settings)
     used = [machines[name] for name in members_of(placed)]
+    whole = whole._replace(addresses=direct_addresses(used, route, options.dataflow))
     told = tuple(member_of(one, whole, settings, variables) for one in used)
     return on_head(whole), told
 

@@ -37,6 +37,7 @@ class Forwards:
     """Runner of the head to link: the ports of 127.0.0.1 that ssh makes the same on both machines.
 
     coordinator: the head listens. zenoh: by machine, HEAD for the head; each listens on its own.
+    None if the machines reach each other without ssh.
     """
 
     coordinator: int

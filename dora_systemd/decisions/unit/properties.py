@@ -34,6 +34,7 @@ from dora_systemd.decisions.settings.limits import REALTIME
 from dora_systemd.decisions.settings.needs import NEEDS
 from dora_systemd.decisions.settings.resolve import Settings
 from dora_systemd.decisions.settings.table import PROPERTY
+from dora_systemd.decisions.unit.addresses import address_properties
 from dora_systemd.decisions.unit.file import format_sections
 from dora_systemd.decisions.unit.rights import rights_properties
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -94,6 +95,8 @@ def unit_properties(
         **device_properties(options, context),
     }
     properties = with_properties(own, settings_properties(settings))
+    of_machines = address_properties(options.addresses, context.is_user)
+    properties = with_properties(properties, of_machines)
     assignments = settings[PROPERTY]
     try:
         return with_assignments(properties, assignments)

@@ -2,11 +2,12 @@
 
 import asyncio
 import signal
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from dora_systemd.adapters.dora import engine
 from dora_systemd.decisions.dora import protocol
+from dora_systemd.decisions.machines.address import LOOPBACK, endpoint
 from dora_systemd.decisions.machines.wire import Part
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
@@ -17,8 +18,8 @@ ASK_SECONDS = 5.0
 """A coordinator that waits for a machine answers nobody for half a minute."""
 _ZENOH = Path(__file__).parents[2] / "zenoh-machines.json5"
 _NO_DIRECT = {"DORA_ZENOH_ENDPOINT_EXCHANGE_TIMEOUT_MS": "0"}
-"""Nodes of different machines do not dial each other: the addresses would be those of 127.0.0.1. So
-dora must not wait for them either; it would for 1.5 s."""
+"""Where ssh carries the messages, nodes of different machines do not dial each other: the addresses
+would be those of 127.0.0.1. So dora must not wait for them either; it would for 1.5 s."""
 NOISE = (
     b"Gossip is disabled: cannot de-duplicate",
     b"Scouting delay elapsed before start conditions are met",
@@ -30,20 +31,31 @@ _OVERLAYS = ("ZENOH_CONFIG", "DORA_ZENOH_CONFIG_OVERLAY")
 """Variables by which a user sets the same: dora refuses both."""
 
 
-def zenoh_arguments(port: int, environment: Mapping[str, str]) -> tuple[str, ...]:
-    """What a daemon needs to meet those of other machines."""
+def zenoh_arguments(port: int, environment: Mapping[str, str], address: str) -> tuple[str, ...]:
+    """What a daemon needs to meet those of other machines. address: where it listens."""
     has_own = any(name in environment for name in _OVERLAYS)
     overlay = () if has_own else ("--zenoh-config-overlay", str(_ZENOH))
-    return ("--zenoh-listen", f"127.0.0.1:{port}", *overlay)
+    return ("--zenoh-listen", endpoint(address, port), *overlay)
 
 
 class SharedEngine(Engine):
-    """The dora of a head or a member. machine: the name of its daemon, "" on the head."""
+    """The dora of a head or a member. machine: the name of its daemon, "" on the head.
+
+    addresses: of the options; the daemon listens on the first one.
+    """
 
     machine = ""
 
-    def __init__(self, dora: str, paths: CellPaths, environment: Mapping[str, str]) -> None:
-        super().__init__(dora, paths, {**environment, **_NO_DIRECT})
+    def __init__(
+        self,
+        dora: str,
+        paths: CellPaths,
+        environment: Mapping[str, str],
+        addresses: Sequence[str],
+    ) -> None:
+        more = {} if addresses else _NO_DIRECT
+        super().__init__(dora, paths, {**environment, **more})
+        self._address = [*addresses, LOOPBACK][0]
 
     async def machines(self) -> list[str]:
         """The machines whose daemon is connected. Raises DoraSystemdError."""
@@ -71,17 +83,18 @@ class HeadEngine(SharedEngine):
         dora: str,
         paths: CellPaths,
         environment: Mapping[str, str],
+        addresses: Sequence[str],
         ports: tuple[int, int],
         on_access: Callable[[str], None],
     ) -> None:
-        super().__init__(dora, paths, environment)
+        super().__init__(dora, paths, environment, addresses)
         self._ports, self._on_access = ports, on_access
 
     def _spawn_coordinator(self) -> engine.Child:
         return start_coordinator(self._dora, self._paths, self._environment, self._ports[0])
 
     def _spawn_daemon(self, environment: Mapping[str, str]) -> Daemon:
-        more = zenoh_arguments(self._ports[1], environment)
+        more = zenoh_arguments(self._ports[1], environment, self._address)
         return start_daemon(self._dora, self._paths, self._port, environment, more=more)
 
     def set_port(self, port: int) -> None:
@@ -94,9 +107,14 @@ class MemberEngine(SharedEngine):
     """The daemon of a member; its coordinator is on the head."""
 
     def __init__(
-        self, dora: str, paths: CellPaths, environment: Mapping[str, str], machine: str
+        self,
+        dora: str,
+        paths: CellPaths,
+        environment: Mapping[str, str],
+        addresses: Sequence[str],
+        machine: str,
     ) -> None:
-        super().__init__(dora, paths, environment)
+        super().__init__(dora, paths, environment, addresses)
         self.machine, self._zenoh = machine, 0
 
     def set_part(self, part: Part) -> None:
@@ -104,7 +122,8 @@ class MemberEngine(SharedEngine):
         self._port, self._token, self._zenoh = part.coordinator, part.token, part.zenoh
 
     def _spawn_daemon(self, environment: Mapping[str, str]) -> Daemon:
-        more = ("--machine-id", self.machine, *zenoh_arguments(self._zenoh, environment))
+        zenoh = zenoh_arguments(self._zenoh, environment, self._address)
+        more = ("--machine-id", self.machine, *zenoh)
         return start_daemon(self._dora, self._paths, self._port, environment, self._token, more)
 
     def cut_off(self) -> None:

@@ -65,7 +65,7 @@ class Head(Shared):
 
     def __init__(self, options: RunnerOptions, this_life: Life) -> None:
         super().__init__(options, this_life)
-        self._ports = choose_ports(members_of(options.placed))
+        self._ports = choose_ports(members_of(options.placed), options.addresses)
         self.roster = Roster(options, self._ports)
 
     @property
@@ -92,7 +92,8 @@ class Head(Shared):
         """A coordinator and a daemon on the ports that all machines know."""
         del boot
         ports = (self._ports.coordinator, self._ports.zenoh[HEAD])
-        return HeadEngine(dora, paths, environment, ports, self.roster.set_token)
+        addresses = self.options.addresses
+        return HeadEngine(dora, paths, environment, addresses, ports, self.roster.set_token)
 
     def cell(self, cell: Cell) -> Cell:
         """The cell, with the machine of each node."""

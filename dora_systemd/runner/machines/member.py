@@ -79,7 +79,8 @@ class Member(Shared):
     ) -> Engine:
         """A daemon for the coordinator of the head."""
         del boot
-        self._dora = MemberEngine(dora, paths, environment, self.options.machine)
+        own = self.options
+        self._dora = MemberEngine(dora, paths, environment, own.addresses, own.machine)
         return self._dora
 
     def start_coordinator(self, dora: Engine) -> None:

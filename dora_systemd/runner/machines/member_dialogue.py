@@ -111,8 +111,12 @@ class MemberDialogue(Dialogue):
 
     async def _stop(self) -> None:
         """Somebody stops this part here: the head has to know before the nodes end."""
-        await asyncio.to_thread(self._tell_end)
+        is_down = await asyncio.to_thread(self._is_going_down)
+        self._tell_end(lambda: is_down)  # on the loop: a connection is no thread's but its own
         await self._end_nodes()
+
+    def _is_going_down(self) -> bool:
+        return self._voice.is_going_down(self._nodes.places[1].is_of_user)
 
     def _end_without_head(self) -> None:
         self._is_cut_off = True
@@ -131,10 +135,10 @@ class MemberDialogue(Dialogue):
         self._pump.push(life.StopAnswered(now_us()))
 
     def _exit(self, leave: Callable[[], None]) -> None:
-        self._tell_end()
+        self._tell_end(self._is_going_down)
         leave()
 
-    def _tell_end(self) -> None:
+    def _tell_end(self, is_going_down: Callable[[], bool]) -> None:
         """Say once why this part ends, unless the head knows."""
         cell = self._pump.cell
         if self._has_told:
@@ -143,8 +147,7 @@ class MemberDialogue(Dialogue):
         if self._voice.stops_by_head:
             self._voice.send(wire.Ended())
         elif cell.stop_by:
-            is_down = self._voice.is_going_down(self._nodes.places[1].is_of_user)
-            reason, by = (_GOING_DOWN, "") if is_down else ("", cell.stop_by)
+            reason, by = (_GOING_DOWN, "") if is_going_down() else ("", cell.stop_by)
             self._voice.send(wire.Ended(reason, by))
         else:
             self._voice.send(wire.Ended(cell.failure))

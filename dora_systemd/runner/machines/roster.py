@@ -5,6 +5,7 @@ Each member is a session at the head's socket, which the link to that machine be
 
 import asyncio
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 
 from dora_systemd import __version__
@@ -116,7 +117,9 @@ class Roster:
             return
         lines = Lines(ends)
         self._replace(name, lines)
-        lines.send(self._ports)
+        # Without ssh on the way, zenoh's ports are those of other addresses.
+        is_direct = bool(self._options.addresses)
+        lines.send(replace(self._ports, zenoh={}) if is_direct else self._ports)
         self._send_part(name)
         why = await lines.talk(partial(self._hear, name, lines))
         if self._members[name].lines is lines:

@@ -19,6 +19,7 @@ from typing import NoReturn
 from dora_systemd import __version__
 from dora_systemd.adapters.bus.manager import DOWN, Manager
 from dora_systemd.adapters.dora.command import version_numbers
+from dora_systemd.adapters.host.addresses import is_own
 from dora_systemd.decisions.cell.restarts import RestartPolicy
 from dora_systemd.decisions.machines.link_command import RELAY_MODULE
 from dora_systemd.decisions.machines.wire import LEASE_SECONDS, Part
@@ -42,6 +43,7 @@ from dora_systemd.verbs.start.unit import plan_properties, systemd_number
 _START_SECONDS = 30.0
 """For the runner's socket, and for its first words."""
 _POLL_SECONDS = 0.02
+_ADDRESS_SECONDS, _LOOK_SECONDS = 10.0, 0.2
 _PASSING = (ExitCode.FAILURE, ExitCode.NO_SYSTEMD)
 """Errors that the next attempt may not meet, such as a machine that still boots."""
 
@@ -73,6 +75,7 @@ def start_member(manager: Manager, request: MemberRequest, head: Head) -> socket
     _check_part(part, request.start)
     _check_forwards(part)
     _check_linger(request.scope)
+    _wait_for_address(request.start.addresses)
     _end_old_part(manager, request)
     boot = require_free_name(manager, request.scope, request.unit)
     refuse_unit_file(boot)
@@ -115,6 +118,16 @@ def _check_linger(scope: Scope) -> None:
     if scope.is_user and is_lingering(scope) is False:
         hint = f"on that machine, as root: {linger_command(scope)}"
         raise _refusal("the user there does not linger, so it would end with this session", hint)
+
+
+def _wait_for_address(addresses: Sequence[str]) -> None:
+    """Return when this machine has its own one. It may be of a network that comes up late."""
+    deadline = time.monotonic() + _ADDRESS_SECONDS
+    while addresses and not is_own(addresses[0]):
+        if time.monotonic() > deadline:
+            hint = "see machines in dora-systemd.yml(5): address"
+            raise DoraSystemdError(f"that machine has no address {addresses[0]}", hint)
+        time.sleep(_LOOK_SECONDS)
 
 
 def _end_old_part(manager: Manager, request: MemberRequest) -> None:

@@ -39,6 +39,17 @@ def probe_as_caller(host: Host) -> Probe:
     return _probe(host, _asking(arguments), mark)
 
 
+def ask_as_caller(host: Host, words: Sequence[str]) -> str:
+    """What doractl there prints, with the keys of the caller. Raises DoraSystemdError (NO_HOST)."""
+    mark = _mark()
+    arguments = ssh_arguments(host, Way.ONCE, remote_command(Way.ONCE, words, mark))
+    status, output, errors = _run(host, arguments)
+    answer = _require(host, mark, output, errors, status)
+    if status:
+        raise lost(host, errors.decode("utf-8", "replace"))
+    return answer
+
+
 def probe_as_link(host: Host, machine: str, identity: str) -> Probe:
     """As the link to the machine does, with forwards. identity: its key, or "".
 

@@ -51,8 +51,8 @@ class StartRequest:
     environment: the caller's variables. attached: the dataflow ends with the caller. caller: the
     variables that the dataflow may read. uuid: of a dataflow that is started again. origin: of a
     release, the file that its dataflow file was copied from: who owns that decides, not root, who
-    owns the copy. is_unbuilt: the programs of its nodes need not exist yet. machine, head, placed:
-    of the runner's options, if this machine is a member of the dataflow.
+    owns the copy. is_unbuilt: the programs of its nodes need not exist yet. machine, head, placed,
+    addresses: of the runner's options, if this machine is a member of the dataflow.
     """
 
     dataflow: str
@@ -67,6 +67,7 @@ class StartRequest:
     machine: str = ""
     head: str = ""
     placed: tuple[Placed, ...] = ()
+    addresses: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -162,6 +163,7 @@ def _make_plan(
         placed=request.placed,
         machine=request.machine,
         head=request.head,
+        addresses=request.addresses,
     )
     options = with_settings(options, settings)
     options, members = _spread(dataflow, options, settings, variables)
@@ -193,7 +195,9 @@ def _spread(
 
     if options.machine:
         return part(options, settings), ()
-    return spread(dataflow, options, settings, variables, os.uname().nodename)
+    from dora_systemd.adapters.host.addresses import source_address
+
+    return spread(dataflow, options, settings, variables, os.uname().nodename, source_address)
 
 
 def _variables(settings: Settings, look: Look) -> dict[str, str]:

@@ -20,6 +20,7 @@ class FakeWriter(asyncio.StreamWriter):
         return self
 
     def write(self, data: bytes) -> None:  # type: ignore[override]
+        asyncio.get_running_loop()  # raises in a thread, where a real one would break
         self.data += data
 
     async def drain(self) -> None:

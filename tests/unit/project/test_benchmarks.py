@@ -6,6 +6,7 @@ from functools import partial
 
 import pytest
 
+from benchmarks import machines
 from benchmarks.messages import COUNT, SIZES, Message, name_of, results
 from benchmarks.plots import bar_chart, ceiling, line_chart
 from benchmarks.quick import compare
@@ -141,6 +142,21 @@ def test_latency_is_of_the_calm_messages_and_throughput_of_the_fast_ones() -> No
     found = results([(3, 0, 0, 10**12), *messages])
     assert found["latency of 4 MB"] == 500
     assert found["throughput of 0 B messages"] == pytest.approx(10_000)
+
+
+def test_each_link_stands_beside_bare_dora() -> None:
+    calm = [("41 kB", 0, 1_000_000 * number) for number in range(1, 101)]
+    large = [("1 MB", 0, 5_000_000)]
+    fast = [("fast", 0, number * 10**9) for number in range(3)]
+    found = machines.results([("", 0, 1), *calm, *large, *fast])
+    assert found["latency of 41 kB, median"] == 50.5
+    assert found["latency of 41 kB, 99 of 100"] == 100
+    assert found["latency of 1 MB, 99 of 100"] == 5
+    assert found["throughput of 41 kB messages"] == 0.04096
+    lives = {one: [found] for one in (machines.BARE, *machines.LINKS)}
+    figures = list(machines.figures_of(lives))
+    assert len(figures) == 2 * len(found)
+    assert {tuple(one.values) for one in figures} == {("doractl", "dora")}
 
 
 def test_a_few_messages_may_be_lost() -> None:

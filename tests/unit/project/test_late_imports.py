@@ -33,9 +33,10 @@ LATE = {
     "shutil imports every compressor: only a terminal has a width": {
         "cli.stageline": {"shutil"},
     },
-    "a start that succeeds has no last words, and most follow no log": {
+    "a start that succeeds has no last words, most follow no log and copy no files": {
         "cli.verbs.run.start": {
             *("cli.foreground", "verbs.start.run", "verbs.why", "decisions.why.signs"),
+            "verbs.machines.push",
         },
     },
     "it reads projects: most verbs for other hosts do not": {
@@ -103,7 +104,7 @@ LATE = {
         "gateway.control.logs": {"decisions.machines.elsewhere"},
         "gateway.live.lines": {"decisions.machines.elsewhere"},
         "cli.foreground": {"verbs.facts.machines", "verbs.remote.attached"},
-        "verbs.start.plan": {"decisions.machines.spread"},
+        "verbs.start.plan": {"adapters.host.addresses", "decisions.machines.spread"},
         "verbs.why": {"verbs.facts.machines"},
         "verbs.start.unit": {"decisions.machines.link_unit"},
         "verbs.start.claim": {"decisions.machines.link_unit"},

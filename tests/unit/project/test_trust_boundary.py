@@ -44,12 +44,12 @@ OTHERWISE = (
 _TABLE = {
     DOOR: """
         trust.courier trust.eyes trust.locks trust.paths trust.project trust.programs
-        trust.sight trust.sockets trust.terminals
+        trust.sight trust.sockets trust.terminals trust.tree
     """,
     OWN: """
         adapters.dora.preparation adapters.host.files adapters.ssh.program cli.main
         cli.edge cli.verbs.look.logs decisions.cell.launch verbs.inhibit.hold
-        verbs.machines.member verbs.start.credentials verbs.start.limits
+        verbs.machines.member verbs.machines.push verbs.start.credentials verbs.start.limits
     """,
     KERNEL: """
         adapters.cgroup.groups adapters.host.lock_table adapters.host.machine
@@ -81,7 +81,8 @@ _TABLE = {
         runner.owes.listen runner.reload.settings_file runner.reload.sources runner.stop_post
     """,
     OTHERWISE: """
-        adapters.dora.control adapters.host.loopback verbs.node verbs.start.places
+        adapters.dora.control adapters.host.addresses adapters.host.loopback verbs.node
+        verbs.start.places
     """,
 }
 TABLE = {name: reason for reason, names in _TABLE.items() for name in names.split()}

@@ -21,6 +21,10 @@ CONFIG = "/etc/dora-systemd/config.yml"
 UUID = "7d1ab6b8-9c14-4f53-8f6c-3a3ea1a2f0a1"
 
 
+def no_route(address: str, wanted: str) -> str:
+    raise AssertionError(address, wanted)
+
+
 def flow(*nodes: dict[str, Any]) -> Dataflow:
     return parse_dataflow({"nodes": [{"id": "camera", "path": "a.py"}, *nodes]}, FILE)
 
@@ -39,7 +43,7 @@ def spread_out(
     settings = resolve_settings(flags or {}, {}, [(source, document)])
     options = RunnerOptions("robot", UUID, FILE, "/srv/robot", "/usr/bin/dora", **of_options)
     options = with_settings(options, settings)
-    return spread(dataflow, options, settings, {}, "robot-1.lan")
+    return spread(dataflow, options, settings, {}, "robot-1.lan", no_route)
 
 
 def refusal(*given: Any, **more: Any) -> str:

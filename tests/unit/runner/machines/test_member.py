@@ -4,6 +4,7 @@ import asyncio
 from collections.abc import Callable, Coroutine
 from dataclasses import asdict, replace
 from pathlib import Path
+from threading import Thread, current_thread
 from typing import Any
 
 import pytest
@@ -159,6 +160,30 @@ def test_who_stops_it_here_is_told_but_a_shutdown_is_nobody(
         bench.be(stop_by="SIGTERM")
         bench.actions[Do.EXIT]()
         assert other.heard() == [{"type": "ended", **ended}]
+
+    run(tmp_path, work)
+
+
+def test_systemd_is_asked_beside_the_loop_and_the_head_told_on_it(tmp_path: Path) -> None:
+    async def work(bench: Bench) -> None:
+        other = await bench.head()
+        asked: list[Thread | None] = []
+
+        def is_going_down(is_of_user: bool) -> bool:
+            asked.append(current_thread())
+            return is_of_user
+
+        async def end_nodes() -> None:
+            assert other.heard() == [{"type": "ended", "reason": "", "by": "SIGTERM"}]
+            asked.append(None)
+
+        bench.member.is_going_down = is_going_down
+        bench.nodes._unit, bench.nodes._paths = tmp_path, CellPaths(tmp_path)
+        bench.dialogue._end_nodes = end_nodes  # type: ignore[method-assign]
+        bench.be(stop_by="SIGTERM")
+        await bench.dialogue._stop()
+        thread, last = asked
+        assert thread is not current_thread() and last is None
 
     run(tmp_path, work)
 

@@ -1,0 +1,43 @@
+"""The IP addresses of this machine."""
+
+import contextlib
+import errno
+import socket
+
+_ANY_PORT = 9
+"""Nothing is sent there: it is only for the choice of a route."""
+
+
+def source_address(address: str, wanted: str = "") -> str:
+    """The address of this machine from which it reaches another one, or "", see ip-route(8).
+
+    wanted: it has to be this one, unless "".
+    """
+    with contextlib.suppress(OSError), _socket(address, socket.SOCK_DGRAM) as one:
+        if wanted:
+            one.bind((wanted, 0))
+        one.connect((address, _ANY_PORT))
+        return str(one.getsockname()[0])
+    return ""
+
+
+def listen_error(address: str, port: int = 0) -> int:
+    """The errno of listening on a TCP port of an address, 0 for any port; 0 if that works."""
+    with _socket(address, socket.SOCK_STREAM) as trial:
+        # As zenoh does: remains of closed connections do not block the port.
+        trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            trial.bind((address, port))
+            trial.listen(1)
+        except OSError as error:
+            return error.errno or errno.EINVAL
+    return 0
+
+
+def is_own(address: str) -> bool:
+    """Whether this machine has the address now."""
+    return listen_error(address) != errno.EADDRNOTAVAIL
+
+
+def _socket(address: str, kind: socket.SocketKind) -> socket.socket:
+    return socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET, kind)

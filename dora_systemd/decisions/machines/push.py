@@ -1,0 +1,93 @@
+"""`start --push`: the command line of rsync(1), and what is not copied. Pure."""
+
+import json
+import shlex
+from collections.abc import Sequence
+from pathlib import PurePath
+
+from dora_systemd.decisions.machines.member import Member
+from dora_systemd.decisions.reload.watch_rules import NOT_OF_PROJECT
+from dora_systemd.decisions.remote.failures import SSH_FAILED, last_line, unreached
+from dora_systemd.decisions.remote.hosts import Host
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import settings_path
+from dora_systemd.terminal_text import short_line
+
+PLACE = "--place"
+"""The option of `doractl member` that asks whether a directory may be written."""
+INSTALL = "apt install rsync"
+_LONGEST = 300
+_SSH = (
+    *("ssh", "-T", "-oBatchMode=yes", "-oLogLevel=ERROR", "-oConnectTimeout=8"),
+    *("-oServerAliveInterval=5", "-oServerAliveCountMax=3"),
+    *("-oClearAllForwardings=yes", "-oRemoteCommand=none"),
+)
+# No owner and no group: all is that of the account there. No devices, and no --delete: what else is
+# in a directory that somebody has named by mistake stays.
+_RSYNC = ("rsync", "--recursive", "--links", "--perms", "--times", "--mkpath", "--secluded-args")
+
+
+def target_of(member: Member) -> str:
+    """The directory of the dataflow file on the machine."""
+    return str(PurePath(member.words[1]).parent)
+
+
+def rsync_command(member: Member, dataflow: str) -> list[str]:
+    """Copies the directory of the dataflow file to the machine. dataflow: its absolute path here.
+
+    A settings file is of its machine: that of the head says what the head has.
+    """
+    host = member.host
+    ssh = shlex.join([*_SSH, *([f"-p{host.port}"] if host.port else [])])
+    settings = PurePath(settings_path(dataflow)).name
+    left_out = [f"--exclude={one}" for one in (*NOT_OF_PROJECT, f"/{settings}")]
+    target = f"{_bracketed(host)}:{target_of(member)}/"
+    return [*_RSYNC, *left_out, f"--rsh={ssh}", "--", f"{PurePath(dataflow).parent}/", target]
+
+
+def _bracketed(host: Host) -> str:
+    """rsync takes two colons for a daemon of its own, so an IPv6 address is in brackets."""
+    user, at, name = host.destination.rpartition("@")
+    return f"{user}{at}[{name}]" if ":" in name else host.destination
+
+
+def place_words(member: Member) -> tuple[str, ...]:
+    """The arguments of doractl that ask the machine about its directory."""
+    return ("member", f"{PLACE}={target_of(member)}")
+
+
+def format_place(problem: str, hint: str) -> str:
+    """The answer, one line. problem: "" if files may be copied there."""
+    return json.dumps({"problem": problem, "hint": hint})
+
+
+def check_place(member: Member, answer: str) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) if the machine says that nothing may be copied there."""
+    try:
+        found = json.loads(answer.strip().splitlines()[-1])
+        problem, hint = (short_line(str(found[key]), _LONGEST) for key in ("problem", "hint"))
+    except (ValueError, TypeError, KeyError, IndexError, RecursionError):
+        problem = "its answer cannot be read"
+        hint = "both machines need the same version of dora-systemd"
+    if problem:
+        raise refusal(member, problem, hint)
+
+
+def check_copied(member: Member, status: int, said: str) -> None:
+    """Raise DoraSystemdError if rsync has failed. said: on standard error."""
+    if status == SSH_FAILED:
+        raise unreached(member.host, said)
+    if status:
+        raise refusal(member, _first_words(said) or f"rsync has the exit status {status}", "")
+
+
+def _first_words(said: str) -> str:
+    """rsync says last only that there were errors."""
+    lines: Sequence[str] = [one for one in said.splitlines() if one.strip()]
+    return last_line(lines[0]) if lines else ""
+
+
+def refusal(member: Member, reason: str, hint: str) -> DoraSystemdError:
+    """Nothing is started then."""
+    message = f"cannot copy the dataflow to machine {member.machine}: {reason}"
+    return DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
