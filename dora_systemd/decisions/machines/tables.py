@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
+from dora_systemd.decisions.machines.usage import parse_use
 
 
 def merged(table: CellStatus, others: Mapping[str, CellStatus]) -> CellStatus:
@@ -14,7 +15,8 @@ def merged(table: CellStatus, others: Mapping[str, CellStatus]) -> CellStatus:
     nodes = {ident: _told(ident, node, others) for ident, node in table.nodes.items()}
     away = {ident: others[n.machine] for ident, n in table.nodes.items() if n.machine in others}
     lines = {ident: one.lines[ident] for ident, one in away.items() if ident in one.lines}
-    usage = {ident: one.usage[ident] for ident, one in away.items() if ident in one.usage}
+    # Not what is none: a member must not fill the table of the head.
+    usage = {node: one.usage[node] for node, one in away.items() if parse_use(one.usage.get(node))}
     return table._replace(nodes=nodes, lines={**table.lines, **lines}, usage=usage)
 
 

@@ -11,9 +11,10 @@ from collections.abc import Callable, Iterator, Sequence
 from dora_systemd.decisions.logs.query import journal_timestamp
 from dora_systemd.decisions.logs.records import Record, record_text
 from dora_systemd.decisions.remote.command import Way
+from dora_systemd.decisions.remote.failures import too_much
 from dora_systemd.decisions.remote.hosts import Host
 from dora_systemd.decisions.remote.records import TIME, Records
-from dora_systemd.errors import ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.verbs.logs import FollowedLog
 from dora_systemd.verbs.remote.talk import Ended, Said, Talk
 
@@ -63,7 +64,10 @@ class MemberLines:
             yield from self._told(said)
         if _is_over(connection.ended):
             yield from self._end(self._talk.end())
-        elif self._talk.is_over(time.monotonic()) or self._records.is_too_much:
+            return
+        if self._records.is_too_much:
+            self._talk.refuse(too_much(self._host))
+        if self._talk.is_over(time.monotonic()):
             yield from self._end([self._talk.give_up()])
 
     def close(self) -> None:
@@ -78,7 +82,10 @@ class MemberLines:
         since = f"--since={journal_timestamp(self._since)}"
         words = ("logs", self._name, "--machine=head", "-f", since, "-a", "-q", "-o", "export")
         self._records = Records()
-        self._talk = Talk(self._host, Way.FOLLOWING, words, None)
+        try:
+            self._talk = Talk(self._host, Way.FOLLOWING, words, None)
+        except DoraSystemdError as error:  # there is no ssh
+            self._lose(Ended(self._host, error.code, error))
 
     def _end(self, events: "Iterator[Said | Ended] | list[Ended]") -> Iterator[Record]:
         for event in events:

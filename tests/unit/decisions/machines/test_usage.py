@@ -78,6 +78,8 @@ def test_other_forms(raw: object) -> None:
 
 def test_a_member_is_believed_for_its_own_nodes_only() -> None:
     said = CellStatus(usage={"eye": TOLD, "mid": TOLD, "nose": TOLD})
+    flood = CellStatus(usage={"mid": ["x" * 100_000]})
+    assert merged(CellStatus(nodes=NODES), {"gpu": flood}).usage == {}
     table = merged(CellStatus(nodes=NODES), {"gpu": said})
     assert set(table.usage) == {"mid"}
     again = CellStatus.from_json(table.to_json())

@@ -5,6 +5,7 @@ from collections.abc import Callable, Coroutine
 from dataclasses import replace
 from typing import Any
 
+from dora_systemd.decisions.cell.counters import LineCount
 from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.cell.machines import Placed
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -66,12 +67,13 @@ def test_a_new_table_is_shown_soon() -> None:
         bench.roster.refresh = refresh
         other = await bench.link()
         for _ in range(50):
-            other.say(wire.Table(CellStatus(usage={"mid": (1.5,)}).to_json()))
+            other.say(wire.Table(CellStatus(lines={"mid": LineCount(7)}).to_json()))
         await settle()
         await written.wait()
         assert len(times) < 5
         node = NodeStatus("running", machine="gpu")
-        assert bench.roster.amend(CellStatus(nodes={"mid": node})).usage == {"mid": (1.5,)}
+        table = bench.roster.amend(CellStatus(nodes={"mid": node}))
+        assert table.lines == {"mid": LineCount(7)}
 
     run(work)
 
