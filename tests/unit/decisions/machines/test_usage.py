@@ -87,5 +87,14 @@ def test_a_member_is_believed_for_its_own_nodes_only() -> None:
     assert merged(CellStatus(nodes=NODES), {}).usage == {}
 
 
+def test_what_a_node_says_of_itself() -> None:
+    """Not when: each machine has a clock of its own."""
+    said = CellStatus(signs={"mid": ("warm", 17, SECOND), "eye": ("cold", 17, 0)})
+    table = merged(CellStatus(nodes=NODES), {"gpu": said})
+    assert table.signs == {"mid": ("warm", 0, 0)}
+    strange = CellStatus(signs={"mid": ("x" * 100_000, "y")})
+    assert merged(CellStatus(nodes=NODES), {"gpu": strange}).signs == {"mid": ("", 0, 0)}
+
+
 def test_a_head_does_not_lie_about_its_own_nodes_either() -> None:
     assert uses_of(CellStatus(nodes=NODES, usage={"eye": TOLD, "nose": TOLD})) == {}
