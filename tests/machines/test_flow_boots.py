@@ -32,7 +32,9 @@ def flow() -> Iterator[Flow]:
     """It runs, it is enabled, and root of b can log in on c."""
     flow = Flow({"gpu": MEMBER})
     flow.bring()
-    run("scp", "-q", "-r", PLACE, f"root@{HEAD}:/opt")
+    run("sed", "-i", f"s/machine: a}}/machine: {HEAD}}}/", f"{PLACE}/dataflow.yml")
+    for machine in PROCESSES:
+        run("scp", "-q", "-r", PLACE, f"root@{machine}:/opt")
     run("scp", "-q", *(f"/root/.ssh/{key}" for key in KEYS), f"root@{HEAD}:/root/.ssh/")
     with quiet_journals((*LOST, *BUSY)):
         more = ("--restart-policy=on-failure", "--enable", "--grace-duration=2s")
