@@ -17,7 +17,7 @@ FILE = f"{PLACE}/dataflow.yml"
 @pytest.fixture(scope="module")
 def flow() -> Iterator[Flow]:
     """A dataflow that runs on a, b and c."""
-    reload_refused = ("Control process exited", "Reload failed for dora dataflow")
+    reload_refused = ("Control process exited", "Reload failed for dora-flow")
     with flow_on({"gpu": "b", "arm": "c"}, reload_refused) as flow:
         flow.start("--restart-policy=on-failure")
         flow.wait_exchanging()
