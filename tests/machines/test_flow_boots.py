@@ -3,6 +3,7 @@
 import json
 import subprocess
 from collections.abc import Iterator
+from functools import partial
 
 import pytest
 
@@ -13,7 +14,7 @@ from tests.machines.wires import power_cut, there
 from tests.system.cells import run, wait_for
 
 HEAD, MEMBER = "b", "c"
-KEYS = ("id_ed25519", "known_hosts")
+KEYS = ("id_ed25519", "id_ed25519.pub", "known_hosts")
 PROCESSES = {
     HEAD: ("dora_systemd.runner", "dora coordinator", "dora daemon", "source.py", "sink.py"),
     MEMBER: ("dora_systemd.runner", "dora daemon", "doubler.py"),
@@ -45,14 +46,22 @@ def flow() -> Iterator[Flow]:
             head("disable", NAME, check=False)
             head("stop", NAME, check=False)
         for machine in PROCESSES:
-            wait_for(f"nothing is left on {machine}", lambda m=machine: not processes(m))
-    there(HEAD, "rm", f"/root/.ssh/{KEYS[0]}")
+            wait_for(f"nothing is left on {machine}", partial(is_clear, machine))
+    there(HEAD, "rm", *(f"/root/.ssh/{key}" for key in KEYS))
 
 
 def processes(machine: str) -> list[str]:
     """The command lines of dora's processes and of the nodes, wherever they are."""
     found = there(machine, "pgrep -af '[d]ora_systemd|[d]ora (daemon|coordinator)|[/]opt/flow'")
     return found.stdout.splitlines()
+
+
+def is_clear(machine: str) -> bool:
+    return not processes(machine)
+
+
+def is_away(machine: str) -> bool:
+    return there(machine, "true").returncode != 0
 
 
 def heard() -> str:
@@ -80,7 +89,7 @@ def test_the_machines_boot_again(flow: Flow, how: str) -> None:
     for machine in (HEAD, MEMBER):
         if how == "shutdown":
             there(machine, "systemctl", "poweroff")
-            wait_for("its sshd is gone", lambda m=machine: there(m, "true").returncode != 0)
+            wait_for("its sshd is gone", partial(is_away, machine))
         with power_cut(machine):
             pass
         runs_once()
