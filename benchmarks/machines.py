@@ -23,6 +23,8 @@ HOME = Path("/srv/bench")
 STAMPS = HOME / "stamps"
 RESULT = STAMPS / "machines.json"
 NAME = "across"
+SECONDS = 120.0
+"""For one run."""
 BARE = "dora"
 LINKS = ("link: direct", "link: ssh")
 HEAD, MEMBER = "a", "b"
@@ -138,12 +140,17 @@ def stop_bare() -> None:
         there(machine, "systemctl", "stop", "bare-daemon", "bare-coordinator")
 
 
+def has_result() -> bool:
+    """Whether the receiver has ended."""
+    return there(MEMBER, "test", "-e", str(RESULT)).returncode == 0
+
+
 def life(start: Callable[[], None], stop: Callable[[], None]) -> dict[str, float]:
     """One run of the dataflow."""
     there(MEMBER, "rm", "-f", str(RESULT))
     try:
         start()
-        wait_for("it is received", lambda: not there(MEMBER, "test", "-e", str(RESULT)).returncode)
+        wait_for("all is received", has_result, SECONDS)
         return results([tuple(one) for one in json.loads(there(MEMBER, "cat", str(RESULT)).stdout)])
     finally:
         stop()

@@ -15,8 +15,14 @@ def last_word(host: str, status: int, is_in: bool, said: str, complaint: str) ->
     has_no_doractl = is_in and status == NO_PROGRAM and not complaint
     if error and (has_no_doractl or _is_final(is_in, complaint)):
         return Refused(error.message, error.hint)
-    words = last_line(complaint) or ("" if is_in else last_line(said))
+    words = last_line(_reason(complaint)) or ("" if is_in else last_line(said))
     return Lost(words or (f"exit status {status}" if status else "it has ended"))
+
+
+def _reason(complaint: str) -> str:
+    """What doractl there has said, without its name and its hint."""
+    lines = (one.removeprefix("doractl: ") for one in complaint.splitlines())
+    return "\n".join(one for one in lines if not one.startswith("hint: "))
 
 
 def _is_final(is_in: bool, complaint: str) -> bool:

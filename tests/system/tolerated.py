@@ -31,6 +31,7 @@ TOLERATED = (
     Word("Discarding event for input", _SLOW),
     Word("ms for handling event", _SLOW),
     Word("Didn't receive final reply for query", _SLOW),
+    Word("eply: Query not found!", _SLOW),
     Word("for unknown Query", _SLOW),
     Word("for unknown Request", _SLOW),
     Word("closing node connection after I/O error", _ENDING),

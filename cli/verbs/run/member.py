@@ -53,7 +53,8 @@ def _print_facts(ctx: click.Context, param: click.Parameter, value: bool) -> Non
 def _print_place(ctx: click.Context, param: click.Parameter, value: str | None) -> None:
     del param
     if value is not None:
-        problem, hint = place_problem(Path(value)) or ("", "")
+        way_out = "log in as its user: host: USER@HOST"
+        problem, hint = place_problem(Path(value), way_out) or ("", "")
         write_exactly(f"{format_place(problem, hint)}\n")
         ctx.exit()
 

@@ -57,7 +57,8 @@ class Part:
 
     name, uuid: of the dataflow. machine: the name of the member. token, coordinator: of the
     coordinator. zenoh: where its daemon listens. digest: SHA-256 of the descriptor, hex. grace: µs.
-    doractl, dora: versions of the head.
+    doractl, dora: versions of the head. again: 0 if somebody waits for this start; else
+    what is missing may come later.
     """
 
     name: str
@@ -70,6 +71,7 @@ class Part:
     grace: int
     doractl: str
     dora: str
+    again: int = 0
     version: int = VERSION
 
 
@@ -141,7 +143,7 @@ _TYPES: Mapping[str, type[Any]] = {
     "stopping": Stopping,
 }
 _NAMES = {kind: name for name, kind in _TYPES.items()}
-_NUMBERS = {"coordinator", "zenoh", "grace", "version"}
+_NUMBERS = {"coordinator", "zenoh", "grace", "again", "version"}
 _LONG = {"status"}
 _BY_MACHINE = {(Forwards, "zenoh")}
 

@@ -42,6 +42,7 @@ from dora_systemd.runner.cell.pump import Pump, now_us
 from dora_systemd.runner.machines.ending import end_nodes
 from dora_systemd.runner.machines.engine import NOISE, HeadEngine
 from dora_systemd.runner.machines.ports import choose_ports
+from dora_systemd.runner.machines.reach import unreached
 from dora_systemd.runner.machines.roster import Roster
 from dora_systemd.runner.machines.shared import Shared
 from dora_systemd.runner.nodes.nodes import Nodes
@@ -84,7 +85,8 @@ class Head(Shared):
         del paths
         check_placed(self.options, prepared.dataflow)
         content = Path(self.options.dataflow).read_bytes()
-        self.roster.set_facts(hashlib.sha256(content).hexdigest(), check.version())
+        digest, is_first = hashlib.sha256(content).hexdigest(), self.this_life.is_first
+        self.roster.set_facts(digest, check.version(), is_first)
 
     def engine(
         self, dora: str, paths: CellPaths, environment: Mapping[str, str], boot: Boot | None
@@ -124,6 +126,7 @@ class HeadDialogue(Dialogue):
         """is_first: whether somebody waits for this start."""
         self._roster, self._dora, self._is_first = roster, dora, is_first
         self._ends_at, self._is_ending = 0.0, False
+        self._unreached: dict[str, str] = {}
 
     def actions(
         self, descriptor: Mapping[str, Any], variables: Mapping[str, str]
@@ -158,7 +161,9 @@ class HeadDialogue(Dialogue):
             self._roster.changed.clear()
             self._show_awaited()
             if not self._roster.missing() and await self._has_each():
-                return
+                self._unreached = await unreached(self._roster.endpoints())
+                if not self._unreached:
+                    return
             with contextlib.suppress(TimeoutError):
                 is_all = not self._roster.missing()
                 async with asyncio.timeout(_AGAIN_SECONDS if is_all else None):
@@ -183,7 +188,7 @@ class HeadDialogue(Dialogue):
 
     def _named(self) -> str:
         """The members that are missing, and why."""
-        missing = self._roster.missing()
+        missing = self._roster.missing() or self._unreached
         if not missing:
             return "the dora daemons of all machines"
         word = "machine" if len(missing) == 1 else "machines"

@@ -22,6 +22,7 @@ from dora_systemd.decisions.machines.tables import merged
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.runner.cell.pump import now_us
 from dora_systemd.runner.machines.lines import Lines
+from dora_systemd.runner.machines.reach import Endpoints
 from dora_systemd.terminal_text import short_line
 from dora_systemd.values import quoted
 
@@ -66,6 +67,7 @@ class Roster:
         self._options, self._ports = options, ports
         self._members = {name: Member() for name in members_of(options.placed)}
         self._token = self._digest = self._dora = ""
+        self._again = 0
         self.changed = asyncio.Event()
         self.push: Callable[[life.Event], None] = lambda _: None
         self.refresh: Callable[[], None] = lambda: None
@@ -76,9 +78,9 @@ class Roster:
         """The members in the order of the dataflow."""
         return tuple(self._members)
 
-    def set_facts(self, digest: str, dora: str) -> None:
-        """Set what members compare: see wire.Part."""
-        self._digest, self._dora = digest, dora
+    def set_facts(self, digest: str, dora: str, is_first: bool) -> None:
+        """Set what members compare: see wire.Part. is_first: whether somebody waits."""
+        self._digest, self._dora, self._again = digest, dora, int(not is_first)
 
     def set_token(self, token: str) -> None:
         """The coordinator listens: tell those that are there already."""
@@ -89,6 +91,11 @@ class Roster:
     def works(self) -> Mapping[str, str]:
         """dora's directory on each machine."""
         return {name: one.work for name, one in self._members.items()}
+
+    def endpoints(self) -> Endpoints:
+        """Where zenoh of each machine listens, if ssh is not on the way."""
+        addresses = dict(zip(self._members, self._options.addresses[1:], strict=False))
+        return {name: (one, self._ports.zenoh[name]) for name, one in addresses.items()}
 
     def missing(self) -> dict[str, str]:
         """The members that are not ready, and why."""
@@ -150,6 +157,7 @@ class Roster:
                 grace=options.grace,
                 doractl=__version__,
                 dora=self._dora,
+                again=self._again,
             )
         )
         self.changed.set()

@@ -75,7 +75,7 @@ def start_member(manager: Manager, request: MemberRequest, head: Head) -> socket
     _check_part(part, request.start)
     _check_forwards(part)
     _check_linger(request.scope)
-    _wait_for_address(request.start.addresses)
+    _wait_for_address(request.start.addresses, is_passing=bool(part.again))
     _end_old_part(manager, request)
     boot = require_free_name(manager, request.scope, request.unit)
     refuse_unit_file(boot)
@@ -120,13 +120,14 @@ def _check_linger(scope: Scope) -> None:
         raise _refusal("the user there does not linger, so it would end with this session", hint)
 
 
-def _wait_for_address(addresses: Sequence[str]) -> None:
+def _wait_for_address(addresses: Sequence[str], is_passing: bool) -> None:
     """Return when this machine has its own one. It may be of a network that comes up late."""
     deadline = time.monotonic() + _ADDRESS_SECONDS
     while addresses and not is_own(addresses[0]):
         if time.monotonic() > deadline:
             hint = "see machines in dora-systemd.yml(5): address"
-            raise DoraSystemdError(f"that machine has no address {addresses[0]}", hint)
+            code = ExitCode.FAILURE if is_passing else ExitCode.BAD_INPUT
+            raise DoraSystemdError(f"it has no address {addresses[0]}", hint, code)
         time.sleep(_LOOK_SECONDS)
 
 

@@ -51,7 +51,7 @@ def push(plan: Plan, stage: Callable[[str], None]) -> None:
 
 
 def _check_here(directory: Path) -> None:
-    if problem := place_problem(directory):
+    if problem := place_problem(directory, "as the user of the nodes: doractl --user start"):
         reason, hint = problem
         message = f"cannot copy {shown(str(directory))}: {reason}"
         raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
@@ -66,11 +66,13 @@ def _copy(member: Member, dataflow: str) -> None:
     check_copied(member, done.status, done.stderr)
 
 
-def place_problem(directory: Path) -> tuple[str, str] | None:
-    """Why this account cannot copy from or to a directory of this machine, and a hint."""
+def place_problem(directory: Path, way_out: str) -> tuple[str, str] | None:
+    """Why this account cannot copy from or to a directory of this machine, and a hint.
+
+    way_out: for root, if the directory is not root's.
+    """
     if shutil.which("rsync") is None:
         return f"{_NONE} on {os.uname().nodename}", f"there: {INSTALL}"
     if os.geteuid() == 0 and (strange := strange_part(directory)):
-        hint = "as root only directories of root are copied; as their user: doractl --user start"
-        return strange, hint
+        return strange, f"root only copies what is root's; {way_out}"
     return None

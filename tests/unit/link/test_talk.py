@@ -83,8 +83,9 @@ def test_what_no_new_attempt_changes(script: str, reason: str) -> None:
 
 
 def test_the_words_of_doractl() -> None:
-    far = Far("echo mark; echo mark >&2; echo 'doractl: cannot reach systemd' >&2; exit 7")
-    assert far.run() == [Lost("doractl: cannot reach systemd")]
+    said = "echo 'doractl: cannot reach systemd' >&2; echo 'hint: boot it' >&2"
+    far = Far(f"echo mark; echo mark >&2; {said}; exit 7")
+    assert far.run() == [Lost("cannot reach systemd")]
 
 
 def test_the_end_of_the_runner_ends_ssh(tmp_path: Path) -> None:

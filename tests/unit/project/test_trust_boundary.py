@@ -77,7 +77,8 @@ _TABLE = {
         adapters.host.watch adapters.logs.held adapters.logs.jsonl adapters.logs.pipes
         adapters.runner_socket.listener adapters.runner_socket.relay runner.cell.begin
         adapters.host.presence runner.needs.needs runner.nodes.gate
-        runner.cell.engine runner.cell.pump runner.machines.head runner.main runner.nodes.nodes
+        runner.cell.engine runner.cell.pump runner.machines.head runner.machines.reach
+        runner.main runner.nodes.nodes
         runner.owes.listen runner.reload.settings_file runner.reload.sources runner.stop_post
     """,
     OTHERWISE: """

@@ -1,6 +1,7 @@
 """A head: it waits for its members, and does without dora when one is lost."""
 
 import asyncio
+import socket
 from collections.abc import Callable, Coroutine
 from dataclasses import replace
 from pathlib import Path
@@ -112,6 +113,24 @@ def test_it_goes_on_when_all_have_joined(tmp_path: Path) -> None:
         assert bench.heard(life.Gathered) == [life.Gathered(0)]
 
     run(tmp_path, work)
+
+
+def test_without_ssh_each_address_has_to_be_reached(tmp_path: Path) -> None:
+    async def work(bench: Bench) -> None:
+        with socket.create_server(("127.0.0.3", 0)) as one:
+            port = one.getsockname()[1]
+        bench.roster._ports = replace(PORTS, zenoh={"head": 61001, "gpu": port})
+        bench.actions[Do.GATHER]()
+        await bench.link(READY)
+        why = f"cannot connect to 127.0.0.3:{port}: Connection refused"
+        while f"waiting for machine gpu ({why})" not in bench.texts():
+            await asyncio.sleep(0.01)
+        assert not bench.heard(life.Gathered)
+        with socket.create_server(("127.0.0.3", port)):
+            while not bench.heard(life.Gathered):
+                await asyncio.sleep(0.01)
+
+    run(tmp_path, work, addresses=("127.0.0.1", "127.0.0.3"))
 
 
 def test_a_daemon_that_dora_has_not_forgotten_is_waited_out(tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ class Bench:
         self.events: list[life.Event] = []
         self.roster = Roster(OPTIONS, PORTS)
         self.roster.push = self.events.append
-        self.roster.set_facts("abcd", "1.1.0")
+        self.roster.set_facts("abcd", "1.1.0", is_first=True)
 
     async def link(self, machine: str = "gpu") -> FakeEnds:
         """A link of that machine, which has been heard."""
