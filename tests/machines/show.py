@@ -1,6 +1,6 @@
 """Prints docs/machines.md: what was typed and seen on the machines of the lab, and times of faults.
 
-    LAB=machines tests/lab/lab run -- python -m tests.machines.show >docs/machines.md
+    LAB=machines tests/lab/lab run -- python -m tests.machines.show [faults] >docs/machines.md
 
 The parts of the text are here; everything in a block was printed by doractl just then.
 """
@@ -21,6 +21,7 @@ from tests.machines.wires import cable, power_cut, there
 from tests.system.cells import run, wait_for
 
 _POLICY = ("--restart-policy=on-failure", "--max-restarts=50", "--grace-duration=2s")
+_DELAYS = ("--restart-delay=1s", "--max-restart-delay=1s")
 _HEADING = """# Several machines, as seen
 
 Written by `python -m tests.machines.show` in the lab `LAB=machines`: three containers with Debian
@@ -33,7 +34,7 @@ Written by `python -m tests.machines.show` in the lab `LAB=machines`: three cont
 _TABLE = """
 ## Faults
 
-The restart policy is `on-failure`, the grace duration 2 s. *knows*: seconds from the fault to the
+The restart policy is `on-failure` with a delay of 1 s, the grace duration 2 s. *knows*: seconds from the fault to the
 event in the journal of the head, and of b. *back*: seconds from the end of the fault until the
 sink has got a message of the next run. All machines share {count} processors, and what else ran
 there at the time made {load} processes wait for one: an idle machine is faster.
@@ -44,12 +45,14 @@ there at the time made {load} processes wait for one: an idle machine is faster.
 
 
 def main() -> None:
-    """Print all of it."""
-    print(_HEADING + "```")
-    _show_life()
+    """Print all of it, or the table alone."""
+    if sys.argv[1:] != ["faults"]:
+        print(_HEADING + "```")
+        _show_life()
+        print("```")
     load = Path("/proc/loadavg").read_text().split()[0]
     count = run("nproc").stdout.strip()
-    print("```\n" + _TABLE.format(count=count, load=load), end="")
+    print(_TABLE.format(count=count, load=load), end="", flush=True)
     two, three = (_times({"gpu": "b", **more}) for more in ({}, {"arm": "c"}))
     for fault in FAULTS:
         cells = [*two[fault.name], *three[fault.name]]
@@ -145,7 +148,7 @@ FAULTS = (
 def _times(members: dict[str, str]) -> dict[str, list[str]]:
     """The cells of each fault."""
     with flow_on(members, ("",)) as flow:  # its warnings are what this is about
-        flow.start(*_POLICY)
+        flow.start(*_POLICY, *_DELAYS)
         return {fault.name: _time(flow, fault) for fault in FAULTS}
 
 
