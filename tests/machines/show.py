@@ -34,10 +34,10 @@ Written by `python -m tests.machines.show` in the lab `LAB=machines`: three cont
 _TABLE = """
 ## Faults
 
-The restart policy is `on-failure` with a delay of 1 s, the grace duration 2 s. *knows*: seconds from the fault to the
-event in the journal of the head, and of b. *back*: seconds from the end of the fault until the
-sink has got a message of the next run. All machines share {count} processors, and what else ran
-there at the time made {load} processes wait for one: an idle machine is faster.
+The restart policy is `on-failure` with a delay of 1 s, the grace duration 2 s. *knows*: seconds
+from the fault to the event in the journal of the head, and of b. *back*: seconds from the end of
+the fault until the sink has got a message of the next run. All machines share {count} processors,
+and what else ran there at the time made {load} processes wait for one: an idle machine is faster.
 
 | fault | 2 machines: head knows | b knows | back | 3 machines: head knows | b knows | back |
 |---|---|---|---|---|---|---|
