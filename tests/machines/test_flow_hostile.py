@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import pytest
 
 from dora_systemd.errors import ExitCode
-from tests.machines.flows import NAME, PLACE, Flow
+from tests.machines.flows import PLACE, Flow, flow_on
+from tests.machines.journals import announced
 from tests.machines.wires import there, wait_up
-from tests.system.cells import wait_for
 
 _STUBBORN = "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN)"
 _THIEF = """
@@ -31,14 +31,10 @@ OPEN = "/etc/ssh/sshd_config.d/00-open.conf"
 
 
 @pytest.fixture
-def flow() -> Iterator[Flow]:
+def flow(request: pytest.FixtureRequest) -> Iterator[Flow]:
     """A dataflow whose files are everywhere."""
-    flow = Flow({"gpu": "b"})
-    flow.bring()
-    yield flow
-    flow.cell.doractl("stop", NAME, check=False)
-    flow.cell.end()
-    wait_for("nothing is left", lambda: not flow.left())
+    with flow_on({"gpu": "b"}, announced(request)) as flow:
+        yield flow
 
 
 @pytest.fixture

@@ -38,8 +38,8 @@ export class History {
   #note(key, facts, now, before, window) {
     if (!facts) return;
     const kept = this.groups.get(key) ?? series();
-    // A counter that went down belongs to another run.
-    const isSame = before && window > 0 && now.cpu_us >= before.cpu_us;
+    // A counter that went down belongs to another run; that of another machine is not sent.
+    const isSame = before && window > 0 && now.cpu_us !== null && now.cpu_us >= before.cpu_us;
     const share = (from, to) => (100 * Math.max(to - from, 0)) / window;
     kept.cpu.push(isSame ? share(before.cpu_us, now.cpu_us) : facts.cpu_percent ?? 0);
     kept.memory.push(facts.memory_bytes ?? 0);

@@ -28,6 +28,8 @@ from dora_systemd.values import quoted
 
 _SILENT_BEATS = 3
 """A member of which nothing was heard for so many beats may be gone, so dora is not asked."""
+_REFRESH_SECONDS = 0.5
+"""The table of the head is written at most so often because of the members."""
 _LONGEST = 300
 _NO_LINK = "it is not connected yet"
 _NOT_JOINED = "it has not answered yet"
@@ -57,7 +59,8 @@ class Member:
 class Roster:
     """All members of a dataflow. push: takes the events; it is set before the first talk.
 
-    changed: set whenever something is new of a member.
+    refresh: writes the table of the head, because that of a member is new. changed: set whenever
+    something is new of a member.
     """
 
     def __init__(self, options: RunnerOptions, ports: wire.Forwards) -> None:
@@ -67,6 +70,8 @@ class Roster:
         self._again = 0
         self.changed = asyncio.Event()
         self.push: Callable[[life.Event], None] = lambda _: None
+        self.refresh: Callable[[], None] = lambda: None
+        self._is_refreshing = False
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -175,12 +180,22 @@ class Roster:
             self._ready(name, message)
         elif isinstance(message, wire.Table):
             self._members[name].table = CellStatus.from_json(message.status)
+            self._refresh_soon()
         elif isinstance(message, wire.Refused):
             self._refused(name, message)
         elif isinstance(message, wire.Ended):
             self._ended(name, message)
         elif isinstance(message, wire.Lost):
             self._ended(name, wire.Ended(message.words))
+
+    def _refresh_soon(self) -> None:
+        if not self._is_refreshing:
+            self._is_refreshing = True
+            asyncio.get_running_loop().call_later(_REFRESH_SECONDS, self._refresh)
+
+    def _refresh(self) -> None:
+        self._is_refreshing = False
+        self.refresh()
 
     def _ready(self, name: str, message: wire.Ready) -> None:
         if not message.work.startswith("/"):
