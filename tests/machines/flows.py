@@ -51,6 +51,7 @@ class Flow:
     def write(self) -> None:
         """The files on a."""
         place = Project(Path(PLACE), is_new=False)
+        Path(PLACE, "dataflow.systemd.yml").unlink(missing_ok=True)  # of another test
         for name, text in (("source", SOURCE), ("doubler", DOUBLER), ("sink", SINK)):
             place.write(f"{name}.py", text)
         place.write("dataflow.yml", _DATAFLOW.format(sink="arm" if "arm" in self.members else "a"))

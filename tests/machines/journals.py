@@ -10,6 +10,14 @@ import pytest
 from tests.machines.wires import OTHERS, there
 from tests.system.complaints import Journalctl, complaints, end_of_journal, journalctl
 
+LOST = (
+    "flow: Machine gpu of dataflow flow is lost: ",
+    "flow: Dataflow flow failed: machine gpu: ",
+    "systemd: dora-flow.service: Failed with result 'exit-code'",
+    "flow: Machine head of dataflow flow is lost: ",
+)
+"""What all say when the head has lost a member."""
+
 
 def _journalctl(machine: str, *words: str) -> str:
     return there(machine, shlex.join(("journalctl", *words))).stdout

@@ -8,7 +8,7 @@ import pytest
 
 from dora_systemd.errors import ExitCode
 from tests.machines.flows import PLACE, Flow, flow_on
-from tests.machines.journals import announced
+from tests.machines.journals import LOST, announced
 from tests.machines.wires import there, wait_up
 
 _STUBBORN = "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN)"
@@ -49,6 +49,7 @@ def open_sshd() -> Iterator[None]:
     wait_up("b")
 
 
+@pytest.mark.warns(*LOST)
 def test_a_port_of_a_lost_link_is_a_trap(flow: Flow) -> None:
     """dora's daemon looks for its coordinator again, after 5 s, and shows it the token."""
     there("b", f"sed -i '1i {_STUBBORN}' {PLACE}/doubler.py")
@@ -65,6 +66,7 @@ def test_a_port_of_a_lost_link_is_a_trap(flow: Flow) -> None:
         assert said.stdout.read() == "nobody came\n"
 
 
+@pytest.mark.warns(*LOST, "Failed to start dora-flow.service")
 def test_an_sshd_that_opens_forwards(flow: Flow, open_sshd: None) -> None:
     """Nothing but sshd is reached from the network, so nothing runs."""
     del open_sshd
