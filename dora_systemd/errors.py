@@ -38,3 +38,7 @@ class DoraSystemdError(Exception):
         self.message = " ".join(message.split())
         self.hint = " ".join(hint.split())
         self.code = code
+
+
+class TimedOut(DoraSystemdError):
+    """A check took too long. It says nothing of what was checked, so a restart may help."""

@@ -9,7 +9,8 @@ import pytest
 
 from tests.lab.pace import bound
 from tests.machines.flows import NAME, PLACE, Flow, flow_on
-from tests.machines.test_flow_faults import BUSY, LOST
+from tests.machines.journals import LOST
+from tests.machines.test_flow_faults import BUSY
 from tests.machines.wires import cable
 from tests.system.cells import wait_for
 

@@ -39,6 +39,7 @@ TOLERATED = (
     Word("server disconnected unexpectedly", _ENDING),
     Word("failed to report outputs done to dora-daemon", _ENDING),
     Word("failed to close outputs on drop", _ENDING),
+    Word("failed to send metrics for dataflow: WS send channel closed", _ENDING),
     Word("dropping event because event `tx` was already closed", _ENDING),
     Word(
         "failed to stop dataflow: no running dataflow with ID",

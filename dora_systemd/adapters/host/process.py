@@ -13,7 +13,7 @@ from subprocess import Popen
 from threading import Thread
 from typing import TypeVar
 
-from dora_systemd.errors import DoraSystemdError
+from dora_systemd.errors import DoraSystemdError, TimedOut
 from dora_systemd.trust.programs import Account, spawn
 
 T = TypeVar("T")
@@ -119,5 +119,5 @@ def _wait(child: "Popen[bytes]", deadline: float, command: str) -> int:
     return child.wait()
 
 
-def _hangs(command: str) -> DoraSystemdError:
-    return DoraSystemdError(f"cannot wait for {command!r} any longer: it hangs")
+def _hangs(command: str) -> TimedOut:
+    return TimedOut(f"cannot wait for {command!r} any longer: it hangs")
