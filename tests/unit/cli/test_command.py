@@ -216,6 +216,15 @@ def test_what_list_selects(requests: list[ListRequest]) -> None:
     assert not ListRequest().is_filtered
 
 
+def fail_with(error: BaseException, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let `list` raise it."""
+
+    def fail(_request: ListRequest) -> int:
+        raise error
+
+    monkeypatch.setattr(listing, "print_dataflows", fail)
+
+
 @pytest.mark.parametrize(
     ("error", "status"),
     [
@@ -229,10 +238,7 @@ def test_exit_status_of_errors(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    def fail(_request: ListRequest) -> int:
-        raise error
-
-    monkeypatch.setattr(listing, "print_dataflows", fail)
+    fail_with(error, monkeypatch)
     assert main.run(["list"]) == status
     expected = "doractl: cannot do it\nhint: do that\n" if status != 130 else ""
     assert capsys.readouterr().err == expected
@@ -254,10 +260,7 @@ def test_any_error_of_the_system_is_one_line(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    def fail(_request: ListRequest) -> int:
-        raise error
-
-    monkeypatch.setattr(listing, "print_dataflows", fail)
+    fail_with(error, monkeypatch)
     given_up: list[bool] = []
     monkeypatch.setattr(main, "_give_up_output", lambda: given_up.append(True))
     assert main.run(["list"]) == ExitCode.FAILURE
