@@ -42,6 +42,10 @@ TOLERATED = (
     Word("failed to send metrics for dataflow: WS send channel closed", _ENDING),
     Word("dropping event because event `tx` was already closed", _ENDING),
     Word(
+        "failed to notify daemon of peer disconnect: WS daemon send channel closed",
+        "two daemons of a dataflow left the coordinator at nearly the same time",
+    ),
+    Word(
         "failed to stop dataflow: no running dataflow with ID",
         "the nodes of one machine had ended before dora's stop came to its daemon",
     ),
