@@ -60,7 +60,10 @@ with open("{RESULT}.new", "w") as file:
 os.rename("{RESULT}.new", "{RESULT}")
 """
 YAML = f"""nodes:
-  - {{id: sender, path: sender.py, outputs: [data]}}
+  - id: sender
+    path: sender.py
+    outputs: [data]
+    deploy: {{machine: {HEAD}, working_dir: {HOME}}}
   - id: receiver
     path: receiver.py
     inputs: {{data: {{source: sender/data, queue_size: 1000}}}}
@@ -120,10 +123,17 @@ def start_bare() -> None:
     daemon = ("daemon", *where, "--zenoh-no-multicast", "--zenoh-listen")
     unit(HEAD, "coordinator", "coordinator", *coordinator)
     wait_for("the coordinator listens", lambda: "6013" in run("ss", "-Hltn").stdout)
-    unit(HEAD, "daemon", *daemon, f"{ADDRESSES[HEAD]}:61001")
+    unit(HEAD, "daemon", *daemon, f"{ADDRESSES[HEAD]}:61001", "--machine-id", HEAD)
     unit(MEMBER, "daemon", *daemon, f"{ADDRESSES[MEMBER]}:61002", "--machine-id", MEMBER)
     start = ("dora", "start", str(HOME / "flow.yml"), "--detach", "--name", NAME, *where)
-    wait_for("dora starts it", lambda: run(*start, check=False).returncode == 0)
+    wait_for("both daemons are there", lambda: len(daemons(where)) == len((HEAD, MEMBER)))
+    run(*start)
+
+
+def daemons(where: tuple[str, ...]) -> list[str]:
+    """Those that the coordinator knows."""
+    lines = run("dora", "cluster", "status", *where, check=False).stdout.splitlines()
+    return [one for one in lines if one.startswith((f"{HEAD}-", f"{MEMBER}-"))]
 
 
 def unit(machine: str, name: str, *words: str) -> None:

@@ -7,6 +7,7 @@ Memory is that of all processes of a link, at both ends.
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -104,7 +105,9 @@ def memory(file: Path) -> list[Figure]:
 def measure(rounds: int) -> list[Figure]:
     """Starts in turns, then the memory."""
     files = make_home()
-    measures = {name: partial(start_ms, file) for name, file in files.items()}
+    measures: dict[str, Callable[[], float]] = {
+        name: partial(start_ms, file) for name, file in files.items()
+    }
     measures[LOGIN] = login_ms
     for warm_up in measures.values():
         warm_up()

@@ -17,7 +17,7 @@ from click.shell_completion import CompletionItem, shell_complete
 
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.adapters.journal.reader import JournalReader
-from dora_systemd.cli.group import VERBS, VerbGroup, doractl
+from dora_systemd.cli.group import SHOWN, VerbGroup, doractl
 from dora_systemd.cli.parameters import current_scope, is_elsewhere
 from dora_systemd.decisions.cell.hot_reload import REPLACE_WORDS
 from dora_systemd.decisions.cell.restarts import POLICIES
@@ -118,7 +118,9 @@ def release_ids(ctx: click.Context, _incomplete: str) -> list[str]:
     from dora_systemd.verbs.releases.listing import store_of
 
     name = ctx.params.get("selector") or next(iter(ctx.args), "")
-    return [one.id for one in store_of(current_scope(), name).known()] if is_name(name) else []
+    if is_elsewhere() or not is_name(name):
+        return []
+    return [one.id for one in store_of(current_scope(), name).known()]
 
 
 # By name of the parameter, for all verbs.
@@ -160,7 +162,7 @@ class CompletingGroup(VerbGroup):
         """Complete verbs from the table, without importing them, and options."""
         verbs = [
             CompletionItem(name, help=verb.summary)
-            for name, verb in VERBS.items()
+            for name, verb in SHOWN.items()
             if name.startswith(incomplete)
         ]
         return [*verbs, *click.Command.shell_complete(self, ctx, incomplete)]

@@ -3,10 +3,11 @@
 import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
+from typing import TYPE_CHECKING
 
 from dora_systemd.adapters.bus.manager import Beside, Property
 from dora_systemd.adapters.bus.systemd import Bus
@@ -16,12 +17,16 @@ from dora_systemd.cli.stageline import StageLine
 from dora_systemd.decisions.logs.filter import LogFilter
 from dora_systemd.decisions.logs.records import DoraLines, Record
 from dora_systemd.decisions.logs.terminal import TerminalLines
+from dora_systemd.scope import scope_of
 from dora_systemd.values import INFINITY
-from dora_systemd.verbs.logs import FollowedLog
+from dora_systemd.verbs.logs import FollowedLog, Write
 from dora_systemd.verbs.start.asked import note_request
 from dora_systemd.verbs.start.job import start_unit
 from dora_systemd.verbs.start.plan import Plan
 from dora_systemd.verbs.start.run import SIGNALS, follow_unit
+
+if TYPE_CHECKING:
+    from dora_systemd.verbs.remote.attached import MemberLines, SharedLog
 
 FORMATS = ("pretty", "json", "compact")
 """Those of `dora run --log-format`."""
@@ -66,13 +71,50 @@ def print_until_end(
         def form(record: Record) -> bytes:
             return lines.record(record) if how.shown.shows(record) else b""
 
+        def warn(text: str) -> None:
+            stage.wipe()
+            print_warnings([text])
+
         followed = FollowedLog(plan.scope, options.name, options.uuid, since, write, form)
-        with closing(followed) as logs:
+        with closing(_shared(followed, write, form) if options.placed else followed) as logs:
             start_unit(bus, plan.scope, options, properties, stage, False, how.links)
             stage.wipe()
             print_warnings(how.notes)
+            if not isinstance(logs, FollowedLog):
+                logs.others = _members(bus, plan, since, warn)
             by = partial(note_request, "stop-asked", options.name, options.uuid, how.command)
             return follow_unit(bus, plan.unit, logs, stage, how.signals, how.stop_after, by)
+
+
+def _shared(head: FollowedLog, write: Write, form: Callable[[Record], bytes]) -> "SharedLog":
+    from dora_systemd.verbs.remote.attached import SharedLog
+
+    return SharedLog(head, write, form)
+
+
+def _members(
+    bus: Bus, plan: Plan, since: int, warn: Callable[[str], object]
+) -> "list[MemberLines]":
+    """The lines of the other machines, as far as this user has keys for these."""
+    from dora_systemd.verbs.facts.machines import member_hosts
+    from dora_systemd.verbs.remote.attached import MemberLines
+
+    options = plan.options
+    hosts = member_hosts(bus, options)
+    if plan.scope != scope_of(None):
+        warn(f"the lines of {', '.join(hosts)} are left out: use sudo")
+        return []
+    return [
+        MemberLines(
+            host._replace(text=name),
+            (options.name, options.uuid),
+            [one.node for one in options.placed if one.machine == name],
+            since,
+            warn,
+        )
+        for name, host in hosts.items()
+        if host
+    ]
 
 
 def _lines(form: str, plan: Plan) -> TerminalLines | DoraLines:

@@ -64,7 +64,9 @@ def find_verbs() -> dict[str, Verb]:
 
 VERBS = find_verbs()
 HIDDEN = ("member",)
-"""Verbs that other machines call, not people: they are not in --help."""
+"""Verbs that other machines call, not people."""
+SHOWN = {name: verb for name, verb in VERBS.items() if name not in HIDDEN}
+"""The others: those in --help, completion and hints."""
 ALIASES = {"ps": "list", "status": "list", "reset-failed": "reset"}
 
 _EPILOG = """\b
@@ -82,7 +84,7 @@ class VerbGroup(click.Group):
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         del ctx
-        return list(VERBS)
+        return list(SHOWN)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         del ctx
@@ -97,17 +99,16 @@ class VerbGroup(click.Group):
             return super().resolve_command(ctx, args)
         from difflib import get_close_matches
 
-        near = get_close_matches(name, [*VERBS, *ALIASES], n=1)
+        near = get_close_matches(name, [*SHOWN, *ALIASES], n=1)
         hint = f"did you mean doractl {near[0]}?" if near else "doractl --help lists all commands"
         raise DoraSystemdError(f"unknown command {name!r}", hint, ExitCode.USAGE)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List the verbs and their summaries without importing them."""
         del ctx
-        width = max(map(len, VERBS))
+        width = max(map(len, SHOWN))
         for section in SECTIONS:
-            shown = {name: one for name, one in VERBS.items() if name not in HIDDEN}
-            rows = [(name, one.summary) for name, one in shown.items() if one.section == section]
+            rows = [(name, one.summary) for name, one in SHOWN.items() if one.section == section]
             with formatter.section(TITLES[section]):
                 formatter.write_dl([(name.ljust(width), summary) for name, summary in rows])
 
@@ -136,7 +137,7 @@ def doractl(ctx: click.Context) -> None:
 def run_verb(arguments: list[str], group: click.Group = doractl) -> int:
     """Run a command line; its exit status. Raises DoraSystemdError for a wrong one, too."""
     if arguments[:1] == ["help"]:
-        arguments = [*arguments[1:2], "--help"]
+        arguments = [*arguments[1:], "--help"]
     try:
         result = group.main(arguments, prog_name="doractl", standalone_mode=False)
     except click.ClickException as error:

@@ -180,7 +180,7 @@ def _print_json(found: DataflowRow | list[DataflowRow]) -> None:
 
 
 def print_table(form: Callable[[int | None, bool], str]) -> None:
-    """Print a table. form: makes it for a width, with or without colours."""
+    """Print a table or a report. form: makes it for a width, with or without colours."""
     _print_view(form(terminal_width(), _wants_colors()))
 
 
@@ -205,6 +205,9 @@ def terminal_width() -> int | None:
     """
     if not sys.stdout.isatty():
         return None
-    with suppress(OSError, ValueError):
-        return int(os.environ.get("COLUMNS", "0")) or os.get_terminal_size().columns or None
+    with suppress(ValueError):
+        if (columns := int(os.environ.get("COLUMNS", "0"))) > 0:
+            return columns
+    with suppress(OSError):
+        return os.get_terminal_size().columns or None
     return None

@@ -50,11 +50,11 @@ def run(arguments: list[str]) -> int:
     except BrokenPipeError:
         # The reader of our output is gone.
         _give_up_output()
-        return _SIGPIPE_STATUS
+        return ExitCode.PIPE_CLOSED
     except OSError as error:
-        _give_up_output()
-        what = "write output" if error.errno in _OUTPUT_ERRORS else "continue"
-        problem = DoraSystemdError(f"cannot {what}: {error.strerror}", error.filename or "")
+        if error.errno in _OUTPUT_ERRORS:
+            _give_up_output()
+        problem = _failed(error)
     except KeyboardInterrupt:
         return ExitCode.INTERRUPTED
     except Exception as error:
@@ -65,12 +65,19 @@ def run(arguments: list[str]) -> int:
     return problem.code
 
 
+def _failed(error: OSError) -> DoraSystemdError:
+    what = "write output" if error.errno in _OUTPUT_ERRORS else "continue"
+    # A file may be known by its descriptor, and an error without a number has its own words.
+    file = error.filename if isinstance(error.filename, str) else ""
+    reason = error.strerror or str(error) or type(error).__name__
+    return DoraSystemdError(f"cannot {what}: {reason}", file)
+
+
 def _mistake_of_ours(error: Exception) -> DoraSystemdError:
     what = f"internal error in doractl ({type(error).__name__}: {error})"
     return DoraSystemdError(what, "please report it; DORACTL_DEBUG=1 shows where it happened")
 
 
-_SIGPIPE_STATUS = 128 + 13
 _OUTPUT_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 

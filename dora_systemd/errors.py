@@ -4,7 +4,10 @@ from enum import IntEnum
 
 
 class ExitCode(IntEnum):
-    """Exit status of doractl, as doractl(1) lists it; 3 and 4 are those of systemctl(1)."""
+    """Exit status of doractl, as doractl(1) lists it.
+
+    3 and 4 are those of systemctl(1), the last two 128 and a signal, as in a shell.
+    """
 
     OK = 0
     FAILURE = 1
@@ -20,6 +23,7 @@ class ExitCode(IntEnum):
     ROLLED_BACK = 11
     NO_HOST = 12
     INTERRUPTED = 130
+    PIPE_CLOSED = 141
 
 
 class DoraSystemdError(Exception):
@@ -34,3 +38,7 @@ class DoraSystemdError(Exception):
         self.message = " ".join(message.split())
         self.hint = " ".join(hint.split())
         self.code = code
+
+
+class TimedOut(DoraSystemdError):
+    """A check took too long. It says nothing of what was checked, so a restart may help."""

@@ -22,7 +22,8 @@ RESERVED_NAMES = frozenset({"gateway"})
 MAX_NAME = 200
 """Maximum characters of a name: unit names have at most 255 (systemd.unit(5))."""
 
-_NAME = re.compile(rf"[A-Za-z0-9][A-Za-z0-9._-]{{0,{MAX_NAME - 1}}}")
+_NAME = re.compile(rf"[A-Za-z0-9][A-Za-z0-9._-]{{0,{MAX_NAME - 1}}}(?<!-)")
+"""No "-" at its end: drop-ins of dora-x-.service are of all units dora-x-*, see systemd.unit(5)."""
 MAX_NODE_ID = 200
 """Maximum characters: "node-ID" is a cgroup and "ID.out" a pipe, with names of at most 255 bytes.
 """
@@ -46,7 +47,8 @@ _DESCRIPTION = re.compile(rf"dora dataflow (\S+) \(({_UUID.pattern})\)(?:, relea
 MIN_PREFIX = 4
 """Minimum characters of the beginning of a UUID."""
 _HINT = (
-    f"a name is 1 to {MAX_NAME} letters, digits, '.', '_' or '-', and begins with a letter or digit"
+    f"a name is 1 to {MAX_NAME} letters, digits, '.', '_' or '-', begins with a letter or digit, "
+    "and does not end with '-'"
 )
 
 

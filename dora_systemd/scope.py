@@ -1,6 +1,7 @@
 """System scope or user scope: selects the manager and its directories."""
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -42,3 +43,14 @@ def scope_of(is_user: bool | None) -> Scope:
     """The requested scope; the default is the system's for root, else the user's."""
     uid = os.getuid()
     return Scope(is_user=uid != 0 if is_user is None else is_user, uid=uid)
+
+
+def config_home(environment: Mapping[str, str]) -> str:
+    """A user's directory of configuration, or "" if the variables name none.
+
+    As systemd does, this ignores a relative path in XDG_CONFIG_HOME, see sd_path_lookup(3).
+    """
+    home, given = environment.get("HOME", ""), environment.get("XDG_CONFIG_HOME", "")
+    if given.startswith("/"):
+        return given
+    return f"{home}/.config" if home.startswith("/") else ""

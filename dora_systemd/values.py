@@ -198,15 +198,15 @@ def parse_cpus(text: str) -> int:
     """The CPUs of a list, or INFINITY for all. Raises DoraSystemdError (USAGE)."""
     if text.strip() == "infinity":
         return INFINITY
-    cpus: set[int] = set()
+    bits = 0
     for part in text.split(","):
         match = _CPU_RANGE.fullmatch(part.strip())
         first, last = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
         if not first <= last < MOST_CPUS:
             hint = "write numbers and ranges such as 2-3 or 0,2; or infinity for all"
             raise DoraSystemdError(f"cannot use {quoted(text)} as cpus", hint, ExitCode.USAGE)
-        cpus.update(range(first, last + 1))
-    return cpu_bits(cpus)
+        bits |= (1 << (last + 1)) - (1 << first)
+    return bits << _FIRST_CPU
 
 
 def cpu_numbers(value: int) -> list[int]:

@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from dora_systemd.cli.group import VerbGroup, doractl, run_verb
-from dora_systemd.cli.remote.plan import ROLLOUTS, Plan, check_hosts, plan_of
+from dora_systemd.cli.remote.plan import ROLLOUTS, Plan, check_hosts, plan_of, valued_flags
 from dora_systemd.cli.remote.several import run_on_all
 from dora_systemd.cli.remote.single import is_terminal, pass_through, run_there
 from dora_systemd.decisions.remote.hosts import ALL, Host, given_words
@@ -66,20 +66,7 @@ def valued_options(verb: str) -> Set[str]:
     """The options of a verb that have a value."""
     command = doractl.get_command(click.Context(doractl), verb)
     members = getattr(command, "commands", {}).values()
-    commands = [one for one in (command, *members) if one]
-    return {
-        flag
-        for one in commands
-        for param in one.params
-        if isinstance(param, click.Option) and not param.is_flag and not _may_stand_alone(param)
-        for flag in param.opts
-    }
-
-
-def _may_stand_alone(option: click.Option) -> bool:
-    """Whether its value can be left out, as that of `logs --boot`."""
-    metavar = option.metavar or ""
-    return metavar.startswith("[") and metavar.endswith("]")
+    return {flag for one in (command, *members) if one for flag in valued_flags(one)}
 
 
 def _run(context: click.Context, words: list[str], command_line: list[str]) -> int:

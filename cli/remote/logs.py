@@ -3,29 +3,24 @@
 import json
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from dora_systemd.cli.colors import wants_colors
 from dora_systemd.cli.edge import write_own
 from dora_systemd.cli.remote.plan import Plan
-from dora_systemd.decisions.logs.fields import ExportReader
 from dora_systemd.decisions.logs.terminal import TerminalLines
 from dora_systemd.decisions.remote.failures import too_much
 from dora_systemd.decisions.remote.hosts import Host
 from dora_systemd.decisions.remote.merge import Merge
-from dora_systemd.decisions.remote.stream import Lines, read_json, with_host
+from dora_systemd.decisions.remote.records import TIME, Records, time_of
+from dora_systemd.decisions.remote.stream import with_host
 from dora_systemd.decisions.remote.words import with_output
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.terminal_text import shown_log
 
 FORMS = {"short": "export", "cat": "export", "json": "json"}
 """By the output that was asked for, the output that the hosts are asked for."""
-_MOST_BYTES = 4 << 20
-"""Of one record that is not complete."""
-_MOST_TIME = 253_370_764_800_000_000
-"""The year 9999, in µs."""
-_TIME = "__REALTIME_TIMESTAMP"
 
 
 def words_of_logs(plan: Plan) -> list[str]:
@@ -35,25 +30,6 @@ def words_of_logs(plan: Plan) -> list[str]:
         hint = f"-o {' or -o '.join(FORMS)}"
         raise DoraSystemdError(f"cannot merge -o {form} of several hosts", hint, ExitCode.USAGE)
     return with_output([*plan.words], FORMS[form])
-
-
-class _Records:
-    """The records of one host, from its output. Each has its time and what is printed of it."""
-
-    def __init__(self) -> None:
-        self.pending = 0
-        self._reader = ExportReader()
-        self._lines = Lines()
-
-    def exported(self, data: bytes) -> list[dict[str, bytes]]:
-        found = self._reader.feed(data)
-        self.pending = 0 if found else self.pending + len(data)
-        return found
-
-    def objects(self, data: bytes) -> Iterator[dict[str, Any]]:
-        for line in self._lines.feed(data):
-            if isinstance(value := read_json(line), dict):
-                yield value
 
 
 class LogPrinter:
@@ -70,7 +46,7 @@ class LogPrinter:
         is_follow = bool(options["is_follow"] or options["until_end"])
         names = [one.text for one in hosts]
         self.merge = Merge(names, is_follow, bool(options["is_reverse"]))
-        self._records = {one: _Records() for one in hosts}
+        self._records = {one: Records() for one in hosts}
         self._width = max(map(len, names))
         is_one = len(options["selectors"]) == 1
         has_colors = wants_colors(sys.stdout)
@@ -83,13 +59,11 @@ class LogPrinter:
         if self._form == "json":
             for value in records.objects(data):
                 line = json.dumps(with_host(value, host.text, self._key)).encode() + b"\n"
-                self.merge.add(host.text, _time(value.get(_TIME)), line, now)
+                self.merge.add(host.text, time_of(value.get(TIME)), line, now)
             return None
         for record in records.exported(data):
-            at_us = _time(record.get(_TIME))
-            record[_TIME] = b"%d" % at_us
-            self.merge.add(host.text, at_us, self._line(host, record), now)
-        return too_much(host) if records.pending > _MOST_BYTES else None
+            self.merge.add(host.text, int(record[TIME]), self._line(host, record), now)
+        return too_much(host) if records.is_too_much else None
 
     def ended(self, host: Host, error: DoraSystemdError | None) -> DoraSystemdError | None:
         """No more of this host."""
@@ -116,12 +90,3 @@ class LogPrinter:
         text = cat if self._form == "cat" else self._terminal.record(record)
         start = f"{host.text:<{self._width}} ".encode()
         return b"".join(start + line + b"\n" for line in text[:-1].split(b"\n"))
-
-
-def _time(value: object) -> int:
-    """A time of the journal as µs; 0 for what is none."""
-    try:
-        number = int(value) if isinstance(value, str | bytes) else 0
-    except ValueError:
-        return 0
-    return number if 0 <= number <= _MOST_TIME else 0

@@ -48,7 +48,7 @@ def print_machines(scope: Scope, context: click.Context) -> int | None:
             raise DoraSystemdError(message, "doractl list NAME shows machines", ExitCode.USAGE)
         return None
     if scope != scope_of(None):
-        # Who is not the user of that scope has none of its keys for ssh.
+        # Only the user of that scope has its keys for ssh.
         if not given["is_quiet"]:
             print_warnings([f"the logs of {', '.join(known)} are left out: use sudo"])
         return None

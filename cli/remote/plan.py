@@ -78,13 +78,21 @@ def plan_of(context: click.Context, words: list[str]) -> Plan:
     # What waits or holds a lock over there must not go on when this command has ended.
     endless |= holds or (verb in ("restart", "reload") and bool(options.get("wait")))
     acts = _acts(context) and (holds or verb != "inhibit")  # the list of locks is one text
-    loud = without_flag(words, "-q", "--quiet", _valued(context.command))
+    loud = without_flag(words, "-q", "--quiet", valued_flags(context.command))
     return Plan(verb, words, loud, options, acts, wants_json, endless)
 
 
-def _valued(command: click.Command) -> set[str]:
-    options = (one for one in command.params if isinstance(one, click.Option) and not one.is_flag)
-    return {flag for one in options for flag in one.opts}
+def valued_flags(command: click.Command) -> set[str]:
+    """The options of a command that have a value, but for those that can do without."""
+    options = (one for one in command.params if isinstance(one, click.Option))
+    valued = (one for one in options if not (one.is_flag or _may_stand_alone(one)))
+    return {flag for one in valued for flag in one.opts}
+
+
+def _may_stand_alone(option: click.Option) -> bool:
+    """Whether its value can be left out, as that of `logs --boot`."""
+    metavar = option.metavar or ""
+    return metavar.startswith("[") and metavar.endswith("]")
 
 
 def _verb(context: click.Context) -> str:

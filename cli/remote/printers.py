@@ -6,9 +6,10 @@ from typing import Protocol
 
 import click
 
+from dora_systemd.cli.edge import print_error
 from dora_systemd.decisions.remote.failures import invalid, too_much
 from dora_systemd.decisions.remote.hosts import Host
-from dora_systemd.decisions.remote.stream import Lines, objects_of, read_json, with_host
+from dora_systemd.decisions.remote.stream import Lines, objects_of, read_object, with_host
 from dora_systemd.decisions.views.objects import error_object, format_json
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.terminal_text import one_line
@@ -143,14 +144,13 @@ class Complaints:
         if error and self._is_json:
             self._print_object(host, {"error": error_object(error)})
         elif error:
-            print_host_error(error)
+            print_error(error, is_json=False)
 
     def _print(self, host: Host, line: str) -> None:
-        value = read_json(line)
+        value = read_object(line)
         if self._is_json:
-            is_object = isinstance(value, dict)
-            self._print_object(host, value if is_object else {"warning": {"message": line}})
-        elif isinstance(value, dict):  # asked for JSON, to read the answer
+            self._print_object(host, value or {"warning": {"message": line}})
+        elif value is not None:  # asked for JSON, to read the answer
             self._print_words(host, value)
         else:
             rest = line.removeprefix("doractl: ")
@@ -168,9 +168,3 @@ class Complaints:
 
     def _print_object(self, host: Host, value: dict[str, object]) -> None:
         print(format_json(with_host(value, host.text)), file=sys.stderr)
-
-
-def print_host_error(error: DoraSystemdError) -> None:
-    """The line and the hint of a host that was not reached."""
-    print(f"doractl: {error.message}", file=sys.stderr)
-    print(f"hint: {error.hint}", file=sys.stderr)

@@ -28,7 +28,7 @@ from dora_systemd.decisions.remote.rollout import (
     verdict_of,
     worst_status,
 )
-from dora_systemd.decisions.remote.stream import read_json, with_host
+from dora_systemd.decisions.remote.stream import read_json, read_object, with_host
 from dora_systemd.decisions.remote.words import with_options, with_output
 from dora_systemd.decisions.views.objects import error_object, format_json
 from dora_systemd.errors import ExitCode
@@ -97,24 +97,21 @@ class _Answer:
     @property
     def outcome(self) -> dict[str, Any]:
         """The object of its outcome, {} without one."""
-        value = read_json(self.text.decode("utf-8", "replace"))
-        return value if isinstance(value, dict) else {}
+        return read_object(self.text.decode("utf-8", "replace")) or {}
 
     @property
     def problem(self) -> dict[str, Any] | None:
         """The last error that it has complained of."""
-        values = (read_json(line) for line in self.complaint.decode(errors="replace").splitlines())
-        found = [one["error"] for one in values if isinstance(one, dict) and one.get("error")]
+        values = map(read_object, self.complaint.decode(errors="replace").splitlines())
+        found = [one["error"] for one in values if one and one.get("error")]
         return found[-1] if found and isinstance(found[-1], dict) else None
 
     @property
     def errors(self) -> bytes:
         """What it complains of, but for what -q leaves out."""
         lines = self.complaint.splitlines(keepends=True)
-        values = ((line, read_json(line.decode(errors="replace"))) for line in lines)
-        return b"".join(
-            line for line, value in values if not isinstance(value, dict) or "error" in value
-        )
+        values = ((line, read_object(line.decode(errors="replace"))) for line in lines)
+        return b"".join(line for line, value in values if value is None or "error" in value)
 
     def take_line(self) -> str | None:
         """The first line, None if it is not complete."""

@@ -10,6 +10,7 @@ import os
 import socket
 import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from http import HTTPStatus
 from typing import Any
 
@@ -45,6 +46,10 @@ _BACKLOG = 1024
 _REASON_BYTES = 120
 """Just below what a closing frame can have."""
 
+_THREADS = 64
+"""Blocking calls at the same time, such as stops of dataflows with a long grace duration. asyncio
+itself allows a few more than the machine has processors: one page could hold up all others."""
+
 _ALWAYS = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
 
 _quiet = logging.getLogger("dora_systemd.websockets")
@@ -64,8 +69,9 @@ class Gateway:
 
     async def run(self, sockets: Sequence[socket.socket], idle_seconds: float) -> None:
         """Serve until there was no connection for `idle_seconds`; cancel it to end at once."""
+        asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(_THREADS))
         while not await self._round(sockets, idle_seconds):
-            log.debug("somebody came at the last moment")
+            log.debug("a connection came at the last moment")
 
     async def _round(self, sockets: Sequence[socket.socket], idle_seconds: float) -> bool:
         """Listen until idle, then close; whether no connection came in between."""

@@ -82,6 +82,7 @@ def main(argv: list[str]) -> int:
 
 if __name__ == "__main__":
     status = main(sys.argv[1:])
-    sys.stderr.flush()
+    with contextlib.suppress(OSError):  # journald may have restarted, and read it no more
+        sys.stderr.flush()
     # Not sys.exit(): finalizing the interpreter takes a third of the time of a stop.
     os._exit(status)

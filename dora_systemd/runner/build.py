@@ -90,9 +90,8 @@ class Output:
 
     def _write(self, line: bytes) -> None:
         entry = encode_entry({"MESSAGE": line, **self._fields})
-        for _ in range(int(_JOURNAL_SECONDS)):  # journald may restart
-            if self._journal.send(entry):
-                return
+        deadline = time.monotonic() + _JOURNAL_SECONDS  # journald may restart
+        while not self._journal.send(entry) and time.monotonic() < deadline:
             self._journal.wait_ready(1.0)
 
 
@@ -156,7 +155,11 @@ def build(task: BuildTask, output: Output) -> None:
 
 def main(argv: list[str]) -> int:
     """Carry out the task in `argv`; the exit status of a runner."""
-    task = parse_task(argv[0])
+    try:
+        task = parse_task(" ".join(argv))
+    except (ValueError, TypeError, KeyError):
+        print("cannot read what to build: doractl deploy starts this program", file=sys.stderr)
+        return RunnerExit.BAD_DATAFLOW
     output = Output(task, JournalSocket())
     try:
         build(task, output)

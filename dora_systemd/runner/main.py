@@ -40,7 +40,7 @@ from dora_systemd.runner.cell.begin import daemon_variables, enter_supervisor, m
 from dora_systemd.runner.cell.boot import EarlyDaemon
 from dora_systemd.runner.cell.clock import StopClock
 from dora_systemd.runner.cell.dialogue import Dialogue
-from dora_systemd.runner.cell.failure import Beside, words
+from dora_systemd.runner.cell.failure import Beside, say, words
 from dora_systemd.runner.cell.life import Life, begin_life, learn_first
 from dora_systemd.runner.cell.pause import forget_restarts, hold_back
 from dora_systemd.runner.cell.pump import Pump, now_us
@@ -289,10 +289,10 @@ def run(argv: list[str], begun: Begun | None) -> int:
         hold_back(options, paths)
         return run_loop(run_cell(options, paths, begun))
     except DoraSystemdError as error:
-        print(f"{error.message}\n{error.hint}".strip(), file=sys.stderr)
+        say(f"{error.message}\n{error.hint}".strip())
         return refusal_exit(error)
     except Exception as error:
         if not isinstance(error, OSError):
-            traceback.print_exc()
-        print(f"cannot run the dataflow: {words(error)}", file=sys.stderr)
+            say(traceback.format_exc())
+        say(f"cannot run the dataflow: {words(error)}")
         return RunnerExit.FAILED

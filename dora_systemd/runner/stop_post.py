@@ -91,7 +91,7 @@ def write_last_words(
     loop = asyncio.new_event_loop()
     journal = JournalSocket(journal_socket or JOURNAL_SOCKET)
     pipes = LogPipes(loop, journal, Origin(name, uuid))
-    with contextlib.suppress(OSError, DoraSystemdError):
+    with contextlib.suppress(OSError, ValueError, DoraSystemdError):
         status = CellStatus.from_json(paths.status.read_text())
         pipes.set_run(status.run)
         for node, state in status.nodes.items():
@@ -122,9 +122,10 @@ def read_logs_of_dora(
 
     tails = {}
     for path in sorted(io.iterdir()):
-        if path.suffix == PLACE_SUFFIX:
-            tail = resume_tail(loop, path, partial(pipes.write_fields, node=path.stem))
-            if tail is not None:
+        put = partial(pipes.write_fields, node=path.stem)
+        # A damaged note of one node must not cost the lines of the others.
+        with contextlib.suppress(OSError, ValueError):
+            if path.suffix == PLACE_SUFFIX and (tail := resume_tail(loop, path, put)):
                 tails[path.stem] = tail
     deadline = time.monotonic() + seconds
     while sum(tail.drain() for tail in tails.values()) and time.monotonic() < deadline:
@@ -137,7 +138,7 @@ def read_logs_of_dora(
 
 def unit_group() -> Path:
     """The cgroup directory of this unit."""
-    unit = cgroup.group_path(cgroup.own_group())
+    unit = cgroup.group_path(cgroup.group_of())
     while unit.suffix != ".service" and unit != unit.parent:
         unit = unit.parent
     return unit

@@ -10,7 +10,6 @@ import contextlib
 import json
 import os
 import posixpath
-import select
 import signal
 import subprocess
 import sys
@@ -22,6 +21,7 @@ from typing import Any
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.terminal_text import cut
 from dora_systemd.trust import courier
+from dora_systemd.trust.pipes import receive, send
 from dora_systemd.trust.programs import Account, account_of_uid
 from dora_systemd.trust.sight import start_reader
 from dora_systemd.values import shown
@@ -119,7 +119,8 @@ class Project:
     def _ask(self, request: dict[str, Any], path: str) -> Iterator[bytes]:
         assert self._child.stdin
         try:
-            self._send(json.dumps(request).encode() + b"\n")
+            deadline = time.monotonic() + _SECONDS
+            send(self._child.stdin.fileno(), json.dumps(request).encode() + b"\n", deadline)
             while (frame := self._frame())[0] == b"+":
                 yield frame[1]
         except (BrokenPipeError, ValueError) as error:
@@ -130,34 +131,15 @@ class Project:
             hint = "let that user read it, or name it in .gitignore"
             raise self._refusal(path, shown(reason[:200]), hint, ExitCode.BAD_INPUT)
 
-    def _send(self, data: bytes) -> None:
-        assert self._child.stdin
-        fd = self._child.stdin.fileno()
-        os.set_blocking(fd, False)  # the child may be stopped, and a pipe has 64 KiB
-        while data:
-            if not select.select([], [fd], [], _SECONDS)[1]:
-                raise BrokenPipeError
-            data = data[os.write(fd, data) :]
-
     def _frame(self) -> tuple[bytes, bytes]:
-        deadline = time.monotonic() + _SECONDS
-        head = self._receive(_HEAD, deadline)
+        assert self._child.stdout
+        fd, deadline = self._child.stdout.fileno(), time.monotonic() + _SECONDS
+        head = receive(fd, _HEAD, deadline)
         if not head[1:].isdigit() or int(head[1:]) > courier.CHUNK:
             raise ValueError(head)
         if head[:1] == b"+" and not int(head[1:]):
             raise ValueError(head)  # else an answer could have no end
-        return head[:1], self._receive(int(head[1:]), deadline)
-
-    def _receive(self, count: int, deadline: float) -> bytes:
-        assert self._child.stdout
-        fd, received = self._child.stdout.fileno(), bytearray()
-        while len(received) < count:
-            ready = select.select([fd], [], [], max(deadline - time.monotonic(), 0))[0]
-            chunk = os.read(fd, count - len(received)) if ready else b""
-            if not chunk:
-                raise BrokenPipeError
-            received += chunk
-        return bytes(received)
+        return head[:1], receive(fd, int(head[1:]), deadline)
 
     def _broken(self, path: str) -> DoraSystemdError:
         hint = "see whether a mount of that user hangs"

@@ -7,7 +7,6 @@ can trace the child and make it lie, so callers trust an answer no more than the
 import contextlib
 import errno
 import os
-import select
 import subprocess
 import sys
 import time
@@ -17,6 +16,7 @@ from pathlib import Path
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust import eyes
 from dora_systemd.trust.files import MAX_BYTES
+from dora_systemd.trust.pipes import receive, send
 from dora_systemd.trust.programs import Account, spawn
 from dora_systemd.values import shown
 
@@ -28,7 +28,6 @@ _LONGEST = 4096
 _MOST_DIGITS = 4
 _MOST_TIME_DIGITS = 20
 _HEAD = 8
-_CHUNK = 65536
 
 
 class Sight:
@@ -93,10 +92,10 @@ class LentSight(Sight):
         begun = time.monotonic()
         deadline = begun + self._left
         try:
-            self._child.stdin.write(b"%s%07d%s" % (letter, len(question), question))
-            self._child.stdin.flush()
-            head = self._receive(_HEAD, deadline)
-            data = self._receive(min(int(head[1:]), MAX_BYTES + 1), deadline)
+            asked, told = self._child.stdin.fileno(), self._child.stdout.fileno()
+            send(asked, b"%s%07d%s" % (letter, len(question), question), deadline)
+            head = receive(told, _HEAD, deadline)
+            data = receive(told, min(int(head[1:]), MAX_BYTES + 1), deadline)
         except (BrokenPipeError, ValueError) as error:
             message = f"cannot look at {shown(path)} as user {self._account.name}: no answer"
             raise DoraSystemdError(message, "see whether a mount of that user hangs") from error
@@ -107,17 +106,6 @@ class LentSight(Sight):
             number = int(data) if is_number else errno.EINVAL
             raise OSError(number, os.strerror(number))
         return data
-
-    def _receive(self, count: int, deadline: float) -> bytes:
-        assert self._child.stdout
-        fd, received = self._child.stdout.fileno(), b""
-        while len(received) < count:
-            ready = select.select([fd], [], [], max(deadline - time.monotonic(), 0))[0]
-            chunk = os.read(fd, min(count - len(received), _CHUNK)) if ready else b""
-            if not chunk:
-                raise BrokenPipeError
-            received += chunk
-        return received
 
 
 @contextlib.contextmanager

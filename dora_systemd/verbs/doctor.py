@@ -16,7 +16,6 @@ from dora_systemd.adapters.dora.command import (
     find_dora,
     version_numbers,
 )
-from dora_systemd.adapters.host.files import read_yaml
 from dora_systemd.adapters.host.process import run_command
 from dora_systemd.adapters.host.process_table import read_processes, socket_owners
 from dora_systemd.adapters.host.real_time import read_real_time
@@ -47,7 +46,7 @@ from dora_systemd.verbs.start.account import DEFAULT_USER
 from dora_systemd.verbs.start.enable import boot_target
 from dora_systemd.verbs.start.linger import is_lingering, linger_command
 from dora_systemd.verbs.start.logins import judge_logins
-from dora_systemd.verbs.start.settings import settings_files
+from dora_systemd.verbs.start.settings import check_config, config_files
 
 _SECONDS = 20.0
 _BROKEN = ("bad-setting", "error")
@@ -69,12 +68,15 @@ def examine(reach: Callable[[Scope], Manager], scope: Scope) -> list[Finding]:
 def _guarded(
     check: Callable[[Manager, Scope], Iterator[Finding]], manager: Manager, scope: Scope
 ) -> list[Finding]:
-    """The findings of a check; a check that fails is a finding itself."""
-    topic = check.__name__.removeprefix("_")
+    """The findings of a check; its failure is one more."""
+    topic = check.__name__.removeprefix("_").removeprefix("judge_")
+    found: list[Finding] = []
     try:
-        return list(check(manager, scope))
+        for one in check(manager, scope):
+            found.append(one)
     except DoraSystemdError as error:
-        return [Finding(topic, State.WARNING, error.message, error.hint)]
+        found.append(Finding(topic, State.WARNING, error.message, error.hint))
+    return found
 
 
 def _controllers(manager: Manager, scope: Scope) -> Iterator[Finding]:
@@ -103,7 +105,7 @@ def _boot(manager: Manager, scope: Scope) -> Iterator[Finding]:
     directory = own_directories(manager, scope)[0]
     lost = lost_units(manager, scope)
     for unit in sorted(enabled_units(manager, scope)):
-        findings = list(_enabled(directory / unit))
+        findings = list(_enabled(directory / unit, scope))
         yield from findings
         if unit in lost and not findings:
             text = f"{unit} is enabled and systemd does not know it"
@@ -131,7 +133,7 @@ def _units(manager: Manager, scope: Scope) -> Iterator[Finding]:
             yield Finding("units", State.WARNING, text, remedy)
 
 
-def _enabled(path: Path) -> Iterator[Finding]:
+def _enabled(path: Path, scope: Scope) -> Iterator[Finding]:
     """Check that the dataflows that are started at boot can start."""
     try:
         text = read_unit_file(path)
@@ -141,7 +143,7 @@ def _enabled(path: Path) -> Iterator[Finding]:
     options = runner_of(text or "")
     if text is None or options is None:
         broken = "is gone" if text is None else "starts no dataflow"
-        remedy = f"systemctl disable {path.name}"
+        remedy = f"systemctl {scope.flag} disable {path.name}"
         yield Finding("boot", State.WARNING, f"{path} is enabled and {broken}", remedy)
     elif not exists(options.dataflow):
         text = f"{options.name} is enabled, but {options.dataflow} does not exist"
@@ -224,12 +226,12 @@ def _user(scope: Scope) -> Iterator[Finding]:
         yield Finding("user", State.OK, f"{DEFAULT_USER} runs the dataflows of root's files")
 
 
-def _settings(_scope: Scope) -> Iterator[Finding]:
+def _settings(scope: Scope) -> Iterator[Finding]:
     """Check the settings files for all dataflows; `start` checks the one beside a dataflow."""
-    for path in settings_files(Path("/dataflow.yml"), os.environ)[1:]:
+    for path in config_files(os.environ):
         if exists(path):
             try:
-                read_yaml(path, allow_empty=True)
+                check_config(scope, path)
             except DoraSystemdError as error:
                 yield Finding("settings", State.PROBLEM, error.message, error.hint)
             else:

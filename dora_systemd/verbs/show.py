@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.host.files import decoded
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.verbs.facts.cells import Cell
 
@@ -26,7 +27,7 @@ def format_unit_files(files: dict[str, str]) -> str:
 
 def _read(path: str) -> str:
     try:
-        return Path(path).read_text()
+        return decoded(Path(path).read_bytes(), Path(path))
     except OSError as error:
         raise DoraSystemdError(
             f"cannot read the unit file {path}: {error.strerror}",

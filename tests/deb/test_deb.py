@@ -229,6 +229,13 @@ def test_remove_stops_dataflows_and_leaves_configuration(before: set[str]) -> No
 
 
 def test_purge_leaves_nothing(before: set[str]) -> None:
+    enabled = Path("/etc/systemd/system/dora-kept.service")
+    for unit in (enabled, enabled.with_name("doralink-kept:gpu.service")):
+        unit.write_text("# Written by doractl(1). As enable --boot-check leaves it.\n")
+    for place in ("dora.target.wants", "boot-complete.target.requires"):
+        link = enabled.with_name(place) / enabled.name
+        link.parent.mkdir(exist_ok=True)
+        link.symlink_to(enabled)
     packages.apt("purge", "--yes", *packages.PACKAGES)
     assert left(before) == set()
     names = [entry.pw_name for entry in pwd.getpwall()]

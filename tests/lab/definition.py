@@ -19,7 +19,7 @@ PACKAGES = [
     "python3-websockets", "python3-pathspec", "bash-completion",
     "ca-certificates", "curl", "fish", "git", "iproute2", "kmod", "less", "lsof", "make", "man-db",
     "mandoc", "openssh-client", "openssh-server", "psmisc", "procps", "socat",
-    "strace", "tmux", "udev", "zsh",
+    "rsync", "strace", "tmux", "udev", "zsh",
 ]  # fmt: skip
 
 PYPI = [

@@ -2,10 +2,12 @@
 
 import json
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from tests.machines.journals import quiet_journals
 from tests.machines.wires import there
 from tests.system.cells import DOUBLER, SINK, SOURCE, Cell, Project, dora_processes, wait_for
 
@@ -49,6 +51,7 @@ class Flow:
     def write(self) -> None:
         """The files on a."""
         place = Project(Path(PLACE), is_new=False)
+        Path(PLACE, "dataflow.systemd.yml").unlink(missing_ok=True)  # of another test
         for name, text in (("source", SOURCE), ("doubler", DOUBLER), ("sink", SINK)):
             place.write(f"{name}.py", text)
         place.write("dataflow.yml", _DATAFLOW.format(sink="arm" if "arm" in self.members else "a"))
@@ -130,3 +133,21 @@ class Flow:
         """The nodes as `list -o json` has them."""
         row = json.loads(self.cell.doractl("list", NAME, "-o", "json").stdout)
         return {node["node"]: node for node in row["nodes"]}
+
+
+@contextmanager
+def flow_on(members: dict[str, str], expected: Iterable[str] = ()) -> Iterator[Flow]:
+    """A dataflow whose files are everywhere.
+
+    At its end it is stopped, nothing of it is left on any machine, and no journal has a warning
+    other than those that are `expected`.
+    """
+    flow = Flow(members)
+    flow.bring()
+    with quiet_journals(expected):
+        try:
+            yield flow
+        finally:
+            flow.cell.doractl("stop", NAME, check=False)
+            flow.cell.end()
+        wait_for("nothing is left", lambda: not flow.left())

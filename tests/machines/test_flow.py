@@ -8,11 +8,10 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.errors import ExitCode
-from tests.machines.flows import NAME, PLACE, Flow
+from tests.machines.flows import NAME, PLACE, Flow, flow_on
+from tests.machines.journals import announced
 from tests.machines.wires import there, wait_up
-from tests.system.cells import run, wait_for
-
-pytestmark = pytest.mark.usefixtures("quiet_journals")
+from tests.system.cells import run
 
 TWO = {"gpu": "b"}
 THREE = {"gpu": "b", "arm": "c"}
@@ -21,12 +20,8 @@ THREE = {"gpu": "b", "arm": "c"}
 @pytest.fixture(params=[TWO, THREE], ids=["two", "three"])
 def flow(request: pytest.FixtureRequest) -> Iterator[Flow]:
     """A dataflow whose files are everywhere."""
-    flow = Flow(request.param)
-    flow.bring()
-    yield flow
-    flow.cell.doractl("stop", NAME, check=False)
-    flow.cell.end()
-    wait_for("nothing is left", lambda: not flow.left())
+    with flow_on(request.param, announced(request)) as flow:
+        yield flow
 
 
 def listeners(machine: str) -> set[str]:

@@ -9,27 +9,30 @@ from collections.abc import Iterator
 import pytest
 
 from tests.lab.pace import bound
-from tests.machines.flows import NAME, Flow
+from tests.machines.flows import NAME, Flow, flow_on
+from tests.machines.journals import LOST, announced
 from tests.machines.wires import cable, power_cut, there
 from tests.system.cells import run, wait_for
 
 TWO = {"gpu": "b"}
 THREE = {"gpu": "b", "arm": "c"}
 GRACE = 2
+BUSY = ("node exited with error: Signal(15)", "State 'stop-post' timed out")
+"""Of a machine that gives a node too little time within the grace, or systemd's last command."""
+lost = pytest.mark.warns(*LOST)
+killed = pytest.mark.warns(
+    "Main process exited, code=killed, status=9/KILL", "Failed with result 'signal'"
+)
 
 
 @pytest.fixture(params=[TWO, THREE], ids=["two", "three"])
 def flow(request: pytest.FixtureRequest) -> Iterator[Flow]:
     """A dataflow that runs, and is started again whatever ends it."""
-    flow = Flow(request.param)
-    flow.bring()
     policy = ("--restart-policy=on-failure", "--max-restarts=50", f"--grace-duration={GRACE}s")
-    flow.start(*policy)
-    flow.wait_exchanging()
-    yield flow
-    flow.cell.doractl("stop", NAME, check=False)
-    flow.cell.end()
-    wait_for("nothing is left", lambda: not flow.left())
+    with flow_on(request.param, [*announced(request), *BUSY]) as flow:
+        flow.start(*policy)
+        flow.wait_exchanging()
+        yield flow
 
 
 def nothing_on(machine: str) -> bool:
@@ -37,6 +40,9 @@ def nothing_on(machine: str) -> bool:
     return not there(machine, "pgrep", "-f", "'/opt/flow|dora daemon'").stdout
 
 
+@lost
+@killed
+@pytest.mark.warns("SIGKILL", "b: systemd: dora-flow")
 @pytest.mark.parametrize(
     ("machine", "pattern"),
     [
@@ -53,6 +59,7 @@ def test_a_process_is_killed(flow: Flow, machine: str, pattern: str) -> None:
     flow.wait_again(life)
 
 
+@pytest.mark.warns("Node doubler crashed: ", "Node doubler is being restarted", "Signal(9)")
 def test_a_node_is_killed(flow: Flow) -> None:
     """dora restarts it there; the others run on."""
     life = flow.life()
@@ -62,6 +69,8 @@ def test_a_node_is_killed(flow: Flow) -> None:
     assert flow.life() == life
 
 
+@lost
+@killed
 @pytest.mark.parametrize("what", ["link", "ssh", "relay", "sshd"])
 def test_the_link_is_killed(flow: Flow, what: str) -> None:
     life = flow.life()
@@ -81,11 +90,12 @@ def test_the_link_is_killed(flow: Flow, what: str) -> None:
 def test_a_short_break_is_only_a_gap(flow: Flow) -> None:
     life = flow.life()
     with cable("b", "mute"):
-        time.sleep(3)  # the length of the break is what this is about
+        time.sleep(1.5)  # the length of the break is what this is about
     flow.wait_exchanging()
     assert flow.life() == life
 
 
+@lost
 @pytest.mark.parametrize("how", ["off", "mute"])
 def test_a_cable_is_out(flow: Flow, how: str) -> None:
     """Both sides end within seconds, and it runs again soon after; no restart is counted."""
@@ -99,6 +109,7 @@ def test_a_cable_is_out(flow: Flow, how: str) -> None:
     flow.wait_again(life)
 
 
+@lost
 def test_a_stop_while_a_machine_is_away(flow: Flow) -> None:
     with cable("b", "mute"):
         begun = time.monotonic()
@@ -109,6 +120,7 @@ def test_a_stop_while_a_machine_is_away(flow: Flow) -> None:
     wait_for("b has ended its part", lambda: nothing_on("b"))
 
 
+@lost
 def test_a_machine_boots_again(flow: Flow) -> None:
     life = flow.life()
     with power_cut("b"):
@@ -116,6 +128,7 @@ def test_a_machine_boots_again(flow: Flow) -> None:
     flow.wait_again(life)
 
 
+@lost
 def test_a_machine_that_shuts_down_has_not_stopped_it(flow: Flow) -> None:
     """systemd stops everything there; that is no request to stop this dataflow."""
     life = flow.life()
@@ -126,6 +139,8 @@ def test_a_machine_that_shuts_down_has_not_stopped_it(flow: Flow) -> None:
     flow.wait_again(life)
 
 
+@lost
+@pytest.mark.warns("flow: Dataflow flow failed: it was stopped on machine gpu by SIGTERM")
 def test_somebody_stops_a_member(flow: Flow) -> None:
     """That ends the whole, and is no failure to restart."""
     assert there("b", "systemctl", "stop", f"dora-{NAME}").returncode == 0

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import pytest
 
 from dora_systemd.errors import ExitCode
-from tests.machines.flows import NAME, PLACE, Flow
+from tests.machines.flows import PLACE, Flow, flow_on
+from tests.machines.journals import LOST, announced
 from tests.machines.wires import there, wait_up
-from tests.system.cells import wait_for
 
 _STUBBORN = "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN)"
 _THIEF = """
@@ -31,14 +31,10 @@ OPEN = "/etc/ssh/sshd_config.d/00-open.conf"
 
 
 @pytest.fixture
-def flow() -> Iterator[Flow]:
+def flow(request: pytest.FixtureRequest) -> Iterator[Flow]:
     """A dataflow whose files are everywhere."""
-    flow = Flow({"gpu": "b"})
-    flow.bring()
-    yield flow
-    flow.cell.doractl("stop", NAME, check=False)
-    flow.cell.end()
-    wait_for("nothing is left", lambda: not flow.left())
+    with flow_on({"gpu": "b"}, announced(request)) as flow:
+        yield flow
 
 
 @pytest.fixture
@@ -53,6 +49,7 @@ def open_sshd() -> Iterator[None]:
     wait_up("b")
 
 
+@pytest.mark.warns(*LOST)
 def test_a_port_of_a_lost_link_is_a_trap(flow: Flow) -> None:
     """dora's daemon looks for its coordinator again, after 5 s, and shows it the token."""
     there("b", f"sed -i '1i {_STUBBORN}' {PLACE}/doubler.py")
@@ -69,6 +66,7 @@ def test_a_port_of_a_lost_link_is_a_trap(flow: Flow) -> None:
         assert said.stdout.read() == "nobody came\n"
 
 
+@pytest.mark.warns(*LOST, "Failed to start dora-flow.service")
 def test_an_sshd_that_opens_forwards(flow: Flow, open_sshd: None) -> None:
     """Nothing but sshd is reached from the network, so nothing runs."""
     del open_sshd

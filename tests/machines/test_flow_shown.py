@@ -2,11 +2,12 @@
 
 import json
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
 from dora_systemd.errors import ExitCode
-from tests.machines.flows import NAME, PLACE, Flow
+from tests.machines.flows import NAME, PLACE, Flow, flow_on
 from tests.machines.wires import there
 from tests.system.cells import run, wait_for
 
@@ -16,14 +17,11 @@ FILE = f"{PLACE}/dataflow.yml"
 @pytest.fixture(scope="module")
 def flow() -> Iterator[Flow]:
     """A dataflow that runs on a, b and c."""
-    flow = Flow({"gpu": "b", "arm": "c"})
-    flow.bring()
-    flow.start("--restart-policy=on-failure")
-    flow.wait_exchanging()
-    yield flow
-    flow.cell.doractl("stop", NAME, check=False)
-    flow.cell.end()
-    wait_for("nothing is left", lambda: not flow.left())
+    reload_refused = ("Control process exited", "Reload failed for dora-flow")
+    with flow_on({"gpu": "b", "arm": "c"}, reload_refused) as flow:
+        flow.start("--restart-policy=on-failure")
+        flow.wait_exchanging()
+        yield flow
 
 
 def test_one_row_with_the_machine_of_each_node(flow: Flow) -> None:
@@ -41,6 +39,20 @@ def test_one_row_with_the_machine_of_each_node(flow: Flow) -> None:
     assert "doubler on gpu" in flow.cell.doractl("top", "--once").stdout
     why = flow.cell.doractl("why", NAME).stdout
     assert "Machines: head, gpu (b), arm (c)" in why
+
+
+def test_what_nodes_on_other_machines_use(flow: Flow) -> None:
+    def is_known(node: dict[str, Any]) -> bool:
+        return bool(node["memory_bytes"] and node["cpu_percent"])
+
+    wait_for("the members have told", lambda: all(map(is_known, flow.table().values())))
+    shown = [line.split() for line in flow.cell.doractl("list", NAME).stdout.splitlines()]
+    (doubler,) = [line for line in shown if line[:1] == ["doubler"]]
+    assert "-" not in doubler[4:6], "CPU% and MEM"
+    there_says = json.loads(there("b", "doractl", "list", NAME, "-o", "json").stdout)
+    known = flow.table()["doubler"]["memory_bytes"]
+    assert isinstance(known, int)
+    assert 0.5 < known / there_says["nodes"][0]["memory_bytes"] < 2
 
 
 def test_the_part_of_a_member(flow: Flow) -> None:
@@ -77,6 +89,14 @@ def test_what_cannot_be_made_of_it(flow: Flow) -> None:
     done = flow.cell.doractl("export", NAME, check=False)
     assert done.returncode == ExitCode.BAD_INPUT
     assert "it runs on several machines" in done.stderr
+    life = flow.life()
+    for words in (["reload", NAME], ["set", NAME, "--hot-reload=on"]):
+        done = flow.cell.doractl(*words, check=False)
+        assert done.returncode == ExitCode.FAILURE, done.stderr
+        assert "it runs on several machines" in done.stderr
+        assert "doractl restart flow" in done.stderr
+    assert run("systemctl", "reload", flow.cell.unit, check=False).returncode == 1
+    assert flow.life() == life
     limit = flow.cell.doractl("set", NAME, "--node-limit=sink:memory=1G", check=False)
     assert "it runs on machine arm" in limit.stderr
 

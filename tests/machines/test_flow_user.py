@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.machines.flows import NAME, PLACE, Flow
+from tests.machines.journals import quiet_journals
 from tests.machines.wires import there
 from tests.system.cells import run, wait_for
 
@@ -34,8 +35,9 @@ def flow() -> Iterator[Flow]:
     shutil.copytree(PLACE, HERE)
     run("chown", "-R", "alice:alice", str(HERE))
     assert there("b", f"cp -r {PLACE} {HERE} && chown -R alice:alice {HERE}").returncode == 0
-    yield flow
-    alice("doractl", "stop", NAME, check=False)
+    with quiet_journals():
+        yield flow
+        alice("doractl", "stop", NAME, check=False)
     shutil.rmtree(HERE)
     there("b", "rm", "-r", str(HERE))
     for key in KEYS:

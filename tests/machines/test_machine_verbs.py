@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.errors import ExitCode
-from tests.machines.flows import NAME, PLACE, Flow
+from tests.machines.flows import NAME, PLACE, flow_on
 from tests.machines.wires import cable, there
-from tests.system.cells import run, wait_for
+from tests.system.cells import run
 
 KEY = "/etc/dora-systemd/ssh/gpu"
 CONFIG = Path("/etc/dora-systemd/config.yml")
@@ -51,18 +51,12 @@ def test_a_key_for_dataflows_only(gpu: None) -> None:
 def test_a_dataflow_by_that_key(gpu: None) -> None:
     """No flag is needed, and no other key is used."""
     del gpu
-    flow = Flow({"gpu": "b"})
-    flow.bring()
-    try:
+    with flow_on({"gpu": "b"}) as flow:
         started = flow.cell.start(Path(PLACE) / "dataflow.yml")
         assert started.returncode == 0, started.stderr
         flow.wait_exchanging()
         link = run("systemctl", "show", "-P", "ExecStart", f"doralink-{NAME}:gpu.service").stdout
         assert f"--identity={KEY}" in link
-    finally:
-        flow.cell.doractl("stop", NAME, check=False)
-        flow.cell.end()
-    wait_for("nothing is left", lambda: not flow.left())
 
 
 def test_a_check(gpu: None) -> None:

@@ -11,10 +11,7 @@ from tests.machines.flows import NAME, PLACE, Flow
 from tests.machines.wires import there
 from tests.system.cells import Project, wait_for
 
-pytestmark = [
-    pytest.mark.usefixtures("quiet_journals"),
-    pytest.mark.skipif(not shutil.which("rsync"), reason="the image of the lab has no rsync"),
-]
+pytestmark = pytest.mark.usefixtures("quiet_journals")
 
 
 @pytest.fixture

@@ -38,3 +38,28 @@ def test_what_the_disk_has_changed_is_copied_again(releases: Releases, project: 
         "map.bin": 2,
     }
     assert "damaged" not in releases.deploy(project.root, *FAST)
+
+
+def test_a_damaged_release_does_not_come_back(releases: Releases, project: Project) -> None:
+    """A rollback runs what has proved itself, or nothing new."""
+    first, second = versions(releases, project)
+    file = releases.path / first / "tree/model.bin"
+    file.write_bytes(file.read_bytes()[:-1])
+    refused = releases.cell.doractl("rollback", releases.cell.name, check=False)
+    assert refused.returncode == 5
+    assert f"cannot run release {first} of" in refused.stderr
+    assert "it is damaged: model.bin changed on the disk" in refused.stderr
+    assert "check the disk" in refused.stderr
+    assert (releases.running(), releases.current()) == (second, second)
+
+
+def versions(releases: Releases, project: Project) -> tuple[str, str]:
+    """Deploy two; only the first one has its model."""
+    write_version(project, "1")
+    project.write("model.bin", "model")
+    releases.deploy(project.root, *FAST)
+    first = releases.current()
+    write_version(project, "2")
+    project.write("model.bin", "another")
+    releases.deploy(project.root, *FAST)
+    return first, releases.current()

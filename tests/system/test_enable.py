@@ -19,6 +19,7 @@ from dora_systemd.decisions.unit.file import persistent_unit
 from dora_systemd.decisions.unit.properties import UnitContext, format_unit, unit_properties
 from dora_systemd.errors import ExitCode
 from tests.system.cells import Cell, Project, run, wait_for
+from tests.system.refusals import IN_THE_JOURNAL
 
 # They write to /etc, or would make the user linger.
 pytestmark = pytest.mark.lab
@@ -481,3 +482,20 @@ def test_systemd_reads_what_was_meant(boots: Cell, texts: list[str], path: str) 
     assert found["LoadState"] == "loaded"
     assert found["Environment"] == [f"{key}={text}" for key, text in environment.items()]
     assert options_from_command(found["ExecStart"][0][1]) == told
+
+
+@pytest.mark.warns(*IN_THE_JOURNAL)
+def test_a_dora_that_is_gone_at_the_next_boot_is_no_reason_to_try_again(
+    boots: Cell, project: Project
+) -> None:
+    dora = project.write("dora", f'#!/bin/sh\nexec {shutil.which("dora")} "$@"\n')
+    dora.chmod(0o755)
+    options = (f"--dora={dora}", "--restart-policy", "on-failure")
+    boots.start(project.three_nodes(), *options)
+    boots.doractl("enable", boots.name)
+    boots.doractl("stop", boots.name)
+    dora.unlink()
+    assert run("systemctl", "start", boots.unit, check=False).returncode == 1
+    assert boots.show("ActiveState") == "failed"
+    assert (boots.show("ExecMainStatus"), boots.show("NRestarts")) == ("72", "0")
+    assert f"cannot run the dora command {dora}" in boots.doractl("why", boots.name).stdout

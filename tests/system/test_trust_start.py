@@ -154,6 +154,7 @@ def test_the_files_to_watch_are_not_walked_as_root(cell: Cell, mallory: Home) ->
     count = len(cell.events())
     mallory.write("a.py", NODE + "\n")
     wait_for("a reload", lambda: ("node-reloaded", "a") in cell.events()[count:])
+    cell.end()  # before her files go, which it would notice
 
 
 def test_what_is_there_is_not_told(cell: Cell, mallory: Home) -> None:

@@ -34,11 +34,21 @@ TOLERATED = (
     Word("eply: Query not found!", _SLOW),
     Word("for unknown Query", _SLOW),
     Word("for unknown Request", _SLOW),
+    Word("event channel full", _SLOW),
     Word("closing node connection after I/O error", _ENDING),
     Word("server disconnected unexpectedly", _ENDING),
     Word("failed to report outputs done to dora-daemon", _ENDING),
     Word("failed to close outputs on drop", _ENDING),
+    Word("failed to send metrics for dataflow: WS send channel closed", _ENDING),
     Word("dropping event because event `tx` was already closed", _ENDING),
+    Word(
+        "failed to notify daemon of peer disconnect: WS daemon send channel closed",
+        "two daemons of a dataflow left the coordinator at nearly the same time",
+    ),
+    Word(
+        "failed to stop dataflow: no running dataflow with ID",
+        "the nodes of one machine had ended before dora's stop came to its daemon",
+    ),
     # Its other reasons, that a node restarts or crashed, have events of their own in the journal.
     Word(
         "node has no daemon event stream (it may still be starting up",

@@ -1,13 +1,11 @@
 """Inhibit restarts of a dataflow, or list who does."""
 
-import shutil
 import sys
 
 import click
 
 from dora_systemd.adapters.bus.systemd import Bus
-from dora_systemd.cli.colors import wants_colors
-from dora_systemd.cli.edge import write_own
+from dora_systemd.cli.listing import print_table
 from dora_systemd.cli.parameters import (
     acting_options,
     current_scope,
@@ -18,7 +16,6 @@ from dora_systemd.cli.parameters import (
 )
 from dora_systemd.decisions.cell.inhibit import parse_reason
 from dora_systemd.decisions.views.inhibitors import (
-    Inhibited,
     format_inhibited,
     inhibited_objects,
 )
@@ -70,12 +67,7 @@ def _list(why: str | None) -> int:
     if wants_json():
         print_json(inhibited_objects(found))
     elif found:
-        _print_table(found)
+        print_table(lambda width, colors: format_inhibited(found, width, colors))
     else:
         click.echo("No dataflow is inhibited.")
     return ExitCode.OK
-
-
-def _print_table(found: list[Inhibited]) -> None:
-    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
-    write_own(sys.stdout, f"{format_inhibited(found, width, wants_colors(sys.stdout))}\n")

@@ -279,7 +279,7 @@ def pager_of(environ: Mapping[str, str]) -> tuple[str, dict[str, str]]:
     environment = {"LESS": "FRSXMK", **environ, **({"LESSSECURE": "1"} if is_secure else {})}
     if is_secure and not word:
         return "less", environment
-    names = (environ.get(name, "") for name in ("DORACTL_PAGER", "SYSTEMD_PAGER", "PAGER"))
+    names = (environ.get(name, "").strip() for name in ("DORACTL_PAGER", "SYSTEMD_PAGER", "PAGER"))
     return next(filter(None, names), "less"), environment
 
 

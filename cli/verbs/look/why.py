@@ -1,14 +1,10 @@
 """Explain what happened to a dataflow and why."""
 
-import shutil
-import sys
-
 import click
 
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.adapters.journal.reader import JournalReader, check_readable
-from dora_systemd.cli.colors import wants_colors
-from dora_systemd.cli.edge import write_own
+from dora_systemd.cli.listing import print_table
 from dora_systemd.cli.parameters import current_scope, output_option, print_json, scope_options
 from dora_systemd.decisions.why.report import format_report
 from dora_systemd.decisions.why.report_object import report_object
@@ -37,7 +33,5 @@ def command(selector: str, output: str) -> int:
     if output == "json":
         print_json(report_object(report, subject_row(bus, scope, report.subject)))
         return ExitCode.OK
-    is_terminal = sys.stdout.isatty()
-    width = shutil.get_terminal_size().columns if is_terminal else None
-    write_own(sys.stdout, f"{format_report(report, width, want_colors=wants_colors(sys.stdout))}\n")
+    print_table(lambda width, colors: format_report(report, width, colors))
     return ExitCode.OK

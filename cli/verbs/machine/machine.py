@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import click
 
+from dora_systemd.cli.listing import print_table
 from dora_systemd.cli.parameters import (
     acting_options,
     current_scope,
@@ -17,6 +18,7 @@ from dora_systemd.cli.parameters import (
 )
 from dora_systemd.decisions.machines.facts import summary
 from dora_systemd.decisions.remote.hosts import parse_host
+from dora_systemd.decisions.views.dataflows import format_table
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.verbs.machines.register import (
     Known,
@@ -26,6 +28,8 @@ from dora_systemd.verbs.machines.register import (
     known_machines,
     remove_machine,
 )
+
+_HEADER = ("NAME", "HOST", "KEY")
 
 
 @click.group("machine")
@@ -74,7 +78,7 @@ def show(output: str) -> None:
         click.echo("No machine is declared.")
     else:
         rows = [(one.name, one.host.text, one.key or "yours") for one in known]
-        _print_table([("NAME", "HOST", "KEY"), *rows])
+        print_table(lambda width, colors: format_table(_HEADER, rows, width, colors))
 
 
 @command.command("check")
@@ -132,10 +136,3 @@ def _print_check(one: Known, found: dict[str, object], wrong: Sequence[tuple[str
     for reason, hint in wrong:
         click.echo(f"problem  {one.name}: {reason}")
         click.echo(f"         {hint}")
-
-
-def _print_table(rows: Sequence[tuple[str, ...]]) -> None:
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
-        click.echo("  ".join(cells).rstrip())

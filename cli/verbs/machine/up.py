@@ -44,8 +44,8 @@ def command(port: int | None) -> int:
         return _print_port("Daemon already running", now.port)
     tell("Starting dora daemon...")
     check_machine(Bus, scope)
+    make_state(scope)  # before a client can have systemd start the gateway
     opened = open_port(bus, scope, wanted)
-    make_state(scope)
     tell(f"  ✓ Coordinator started on port {opened}")
     names = start_boot_target(bus, scope)
     check_answer(scope, opened)

@@ -98,8 +98,7 @@ def _asked(cells: Sequence[Cell]) -> Cell:
         click.echo(f"{number:3}  {cell.name}  {cell.uuid}", err=True)
     text = str(click.prompt("Number or name", err=True)).strip()
     numbers = {str(number): cell for number, cell in enumerate(cells, 1)}
-    by_text = {**numbers, **{cell.name: cell for cell in cells}}
-    return by_text.get(text) or Selector(text).loaded(cells)
+    return numbers.get(text) or Selector(text).loaded(cells)
 
 
 def _ask_inhibited(scope: Scope, cells: Sequence[Cell]) -> None:

@@ -4,7 +4,7 @@ import _thread
 import os
 import select
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -49,19 +49,20 @@ def _open(scope: Scope, address: str, seconds: float, patience: float) -> Any:
 
     # A manager's private socket is not a bus, so there is no Hello call.
     is_private = address.endswith("/private")
-    with connection_error(scope):
+    with connection_error(scope), ExitStack() as undo:
         bus = dbuslib.DBusAddress(f"unix:path={address}".encode(), peer_to_peer=is_private)
         with _deadline(seconds):
             bus.open()  # calls Hello
+        undo.callback(bus.close)
         # sd-bus itself would wait 90 s for the first message.
         poll = select.poll()
         poll.register(bus.get_fd(), select.POLLIN)
         if not poll.poll(patience * 1000):
-            bus.close()
             raise silent_bus(scope, is_private)
         if is_private:
             with _deadline(seconds):
                 bus.call_method(SERVICE, MANAGER_OBJECT, b"org.freedesktop.DBus.Peer", b"Ping", [])
+        undo.pop_all()
     return bus
 
 

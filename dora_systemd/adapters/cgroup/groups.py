@@ -57,14 +57,10 @@ def group_path(group: str) -> Path:
     return mount_point() / group.lstrip("/")
 
 
-def own_group() -> str:
-    """The group of this process."""
-    return group_of("self")
-
-
-def group_of(process: int | str) -> str:
+def group_of(process: int | str = "self") -> str:
     """The group of a process, or "/" if it has exited: "0::" in /proc/PID/cgroup, cgroups(7)."""
-    for line in read_text(Path(f"/proc/{process}/cgroup")).splitlines():
+    # Not by splitlines(): a name can contain other ends of a line.
+    for line in read_text(f"/proc/{process}/cgroup").split("\n"):
         if line.startswith("0::"):
             return line[3:]
     return "/"
@@ -264,7 +260,11 @@ def _write(path: Path, text: str) -> bool:
 def _put(path: Path, text: str) -> None:
     # Without O_CREAT, which a mode of FileIO would add: it hides that the file does not exist.
     with io.FileIO(os.open(path, os.O_WRONLY | os.O_CLOEXEC), "w") as control:
-        control.write(text.encode())
+        try:
+            control.write(text.encode())
+        except OSError as error:
+            error.filename = str(path)  # the kernel refuses by a number alone
+            raise
 
 
 def read_text(path: str | Path) -> str:
@@ -272,7 +272,7 @@ def read_text(path: str | Path) -> str:
     # A group can disappear at any moment, which counts as empty. FileIO: there are many of these
     # files, and Python's text layer takes longer than the kernel.
     with contextlib.suppress(OSError), io.FileIO(path) as file:
-        return file.readall().decode()
+        return os.fsdecode(file.readall())  # a name need not be UTF-8
     return ""
 
 

@@ -10,11 +10,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TypeVar
 
-from dora_systemd.adapters.dora.command import dora_version, find_dora, run_dora
+from dora_systemd.adapters.dora.command import dora_version, find_dora, refusal_reason, run_dora
 from dora_systemd.adapters.host.files import parse_yaml, read_text
 from dora_systemd.adapters.host.process import beside
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.dora.errors import parse_dora_error
 from dora_systemd.decisions.dora.inputs import UNNAMED, name_input
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.programs import own_account
@@ -85,7 +84,7 @@ def refusal_of_dora(options: RunnerOptions, environment: Mapping[str, str]) -> s
     done = run_dora(options.dora, arguments, own_account(), environment, directory)
     if done.status == 0:
         return ""
-    reason = parse_dora_error(done.stderr) or parse_dora_error(done.stdout) or "dora refuses it"
+    reason = refusal_reason(done)
     return name_input(reason, _document(options.dataflow)) if UNNAMED.search(reason) else reason
 
 

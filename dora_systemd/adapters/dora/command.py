@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from dora_systemd.adapters.host.process import Completed, run_command
+from dora_systemd.decisions.dora.errors import parse_dora_error
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.programs import Account, fresh_environment, own_account
 from dora_systemd.trust.sight import Sight
@@ -36,6 +37,11 @@ def run_dora(
     surroundings = {**(own if environment is None else environment)}
     surroundings |= {"RUST_BACKTRACE": "0", "NO_COLOR": "1"}
     return run_command((dora, *arguments), DORA_SECONDS, surroundings, directory, account)
+
+
+def refusal_reason(done: Completed) -> str:
+    """Why a dora command has failed, in one line."""
+    return parse_dora_error(done.stderr) or parse_dora_error(done.stdout) or "dora refuses it"
 
 
 def find_dora(
@@ -101,11 +107,12 @@ def python_version(python: str, environment: Mapping[str, str]) -> str:
 
 def parse_dora_version(text: str) -> str | None:
     """The version in "dora-cli 1.1.0", or None."""
-    match = re.match(r"dora(?:-cli)?\s+(\d+\.\d+\S*)", text)
+    # Bounded: the program may be another user's.
+    match = re.match(r"dora(?:-cli)?\s+(\d{1,9}\.\d{1,9}\S{,40})(?!\S)", text)
     return match[1] if match else None
 
 
 def version_numbers(version: str) -> tuple[int, ...]:
     """The leading numbers of a version: (1, 1, 0) for "1.1.0-rc.1"."""
-    match = re.match(r"\d+(\.\d+)*", version)
+    match = re.match(r"\d{1,9}(\.\d{1,9})*", version)
     return tuple(map(int, match[0].split("."))) if match else ()

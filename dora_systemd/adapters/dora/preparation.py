@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dora_systemd.adapters.dora.command import run_dora
+from dora_systemd.adapters.dora.command import refusal_reason, run_dora
 from dora_systemd.adapters.host import files
 from dora_systemd.decisions.cell.hot_reload import check_reload_nodes
 from dora_systemd.decisions.cell.launch import (
@@ -27,7 +27,6 @@ from dora_systemd.decisions.descriptor.build_session import (
 )
 from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
 from dora_systemd.decisions.descriptor.nodes import UNEXPANDED, NodeKind
-from dora_systemd.decisions.dora.errors import parse_dora_error
 from dora_systemd.decisions.owes.check import check_owes
 from dora_systemd.decisions.rights.node_rights import check_rights_nodes
 from dora_systemd.decisions.signs.watchdogs import check_watchdogs
@@ -68,7 +67,7 @@ def prepare(options: RunnerOptions, environment: Mapping[str, str]) -> Prepared:
         environment.get("PATH") or os.defpath,
         sight.exists,
         sight.read,
-        _load_session(options),
+        _load_session(options, sight),
         environment,
     )
     if options.owes:
@@ -122,13 +121,14 @@ def load_dataflow(options: RunnerOptions) -> Dataflow:
     account, directory = own_account(), str(path.parent)
     done = run_dora(options.dora, ["expand", str(path)], account, os.environ, directory)
     if done.status != 0:
-        reason = parse_dora_error(done.stderr)
-        raise DoraSystemdError(f"cannot expand {path}: {reason}", "", ExitCode.BAD_INPUT)
+        message = f"cannot expand {path}: {refusal_reason(done)}"
+        hint = f"see {options.dora} expand {path}"
+        raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
     return parse_dataflow(files.parse_yaml(done.stdout, path), str(path))
 
 
-def _load_session(options: RunnerOptions) -> BuildSession:
+def _load_session(options: RunnerOptions, sight: Sight) -> BuildSession:
     path = Path(session_path(options.dataflow))
-    if not path.exists():
+    if not sight.exists(str(path)):
         return BuildSession()
     return parse_session(files.read_yaml(path, allow_empty=True))

@@ -100,6 +100,8 @@ class WebSocket:
         else:
             self._protocol.receive_eof()
         self._flush()  # replies of the protocol layer itself, such as a pong
+        if self._writer.transport.get_write_buffer_size():
+            await self._writer.drain()  # a peer that reads none of them gets no more of them
         for event in self._protocol.events_received():
             if isinstance(event, Frame):
                 self._take(event)
@@ -111,7 +113,7 @@ class WebSocket:
         if frame.fin:
             data = b"".join(part.data for part in self._parts)
             is_text = self._parts[0].opcode is Opcode.TEXT
-            self._messages.append(data.decode() if is_text else data)
+            self._messages.append(data.decode(errors="replace") if is_text else data)
             self._parts.clear()
 
     def _flush(self) -> None:

@@ -24,7 +24,7 @@ def source_address(address: str, wanted: str = "") -> str:
 def listen_error(address: str, port: int = 0) -> int:
     """The errno of listening on a TCP port of an address, 0 for any port; 0 if that works."""
     with _socket(address, socket.SOCK_STREAM) as trial:
-        # As zenoh does: remains of closed connections do not block the port.
+        # As systemd and zenoh do: remains of closed connections do not block the port.
         trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             trial.bind((address, port))

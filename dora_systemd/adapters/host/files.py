@@ -74,7 +74,8 @@ def parse_yaml(text: str, path: Path, allow_empty: bool = False) -> object:
         document = yaml.load(text, Loader=Loader)
     except yaml.YAMLError as error:
         raise refusal(path, _yaml_reason(error), "correct the YAML there") from error
-    except (ValueError, OverflowError, RecursionError) as error:
+    except (ValueError, ArithmeticError, RecursionError, LookupError, AttributeError) as error:
+        # PyYAML raises the last two for tags such as `!!float ""` and `!!timestamp x`.
         raise refusal(path, "it is not YAML that can be read", "correct the YAML") from error
     if document is None and not allow_empty:
         raise refusal(path, "it is empty", "write something into it")

@@ -53,7 +53,7 @@ def _guard(parent: socket.socket, end: Callable[[], None], lock: Path) -> NoRetu
         for one in (*SIGNALS, *_MORE):
             signal.signal(one, signal.SIG_IGN)
         nowhere = os.open(os.devnull, os.O_RDWR)
-        for stream in range(3):  # who waits for the end of our output does not wait for this
+        for stream in range(3):  # whoever reads our output to its end does not wait for this
             os.dup2(nowhere, stream)
         parent.send(_WORD)
         if not parent.recv(1):

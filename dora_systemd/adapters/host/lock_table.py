@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from typing import NamedTuple
 
-from dora_systemd.adapters.host.process_table import PROC, beginning
+from dora_systemd.adapters.host.process_table import PROC, beginning, group_in
 
 _MOST_BYTES = 8 * 1024 * 1024
 """Of /proc/locks: 100,000 locks."""
@@ -48,9 +48,10 @@ def read_lock_process(pid: int) -> LockProcess:
     path = PROC / str(pid)
     with suppress(OSError, ValueError, KeyError, IndexError):
         read = (beginning(path / one, _MOST_OF_PROCESS) for one in ("cmdline", "cgroup", "status"))
-        arguments, groups, rest = (data.decode(errors="replace") for data in read)
-        command, group = arguments.replace("\0", " ").strip(), groups.rpartition("0::")[2].strip()
-        lines = (line.partition(":") for line in rest.split("\n"))
+        arguments, groups, rest = read
+        command = arguments.decode(errors="replace").replace("\0", " ").strip()
+        lines = (line.partition(":") for line in rest.decode(errors="replace").split("\n"))
         status = {key: text.split() for key, _, text in lines}
-        return LockProcess(pid, int(status["Uid"][1]), int(status["NSpid"][-1]), command, group)
+        uid, inner = int(status["Uid"][1]), int(status["NSpid"][-1])
+        return LockProcess(pid, uid, inner, command, group_in(groups))
     return LockProcess(pid, -1, pid, "", "")

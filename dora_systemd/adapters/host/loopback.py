@@ -4,6 +4,8 @@ import contextlib
 import socket
 import time
 
+from dora_systemd.adapters.host.addresses import listen_error
+
 _HOST = "127.0.0.1"
 _RETRY_SECONDS = 0.05
 _CHUNK = 65536
@@ -11,15 +13,7 @@ _CHUNK = 65536
 
 def port_error(port: int) -> int:
     """The errno of listening on the port; 0 if it is free."""
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as trial:
-        # As systemd does: remains of closed connections do not block the port.
-        trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            trial.bind((_HOST, port))
-            trial.listen(1)
-        except OSError as error:
-            return error.errno or 1
-    return 0
+    return listen_error(_HOST, port)
 
 
 def answers_health(port: int, seconds: float) -> bool:

@@ -12,7 +12,9 @@ def send_ready() -> None:
 
 def send_status(text: str) -> None:
     """STATUS=: one line for `systemctl status`."""
-    _notify(f"STATUS={' '.join(text.split())}")
+    # A file name need not be UTF-8, but this must be.
+    clean = text.encode(errors="backslashreplace").decode()
+    _notify(f"STATUS={' '.join(clean.split())}")
 
 
 def send_reloading() -> None:

@@ -1,8 +1,8 @@
 """A notify socket as service managers have it: receives messages of sd_notify(3).
 
-Each message comes with its sender, as the kernel knows it: SO_PASSCRED and SCM_RIGHTS of unix(7).
-SO_PASSPIDFD, since Linux 6.5, adds a pidfd, by which a process that has exited is not taken for the
-next one with its pid.
+Each message comes with its sender, as the kernel knows it: SO_PASSCRED and SCM_CREDENTIALS, see
+unix(7). SO_PASSPIDFD, since Linux 6.5, adds a pidfd, by which a process that has exited is not
+taken for the next one with its pid.
 """
 
 import contextlib
@@ -69,7 +69,7 @@ class NotifySocket:
 class Pending:
     """A message whose sender may wait: leaving the context lets it go on, see sd_notify_barrier(3).
 
-    data: "" if it was too long. pid: of the sender, 0 if that is not known.
+    data: b"" if it was too long. pid: of the sender, 0 if that is not known.
     """
 
     def __init__(self, data: bytes, control: list[tuple[int, int, bytes]]) -> None:

@@ -2,16 +2,18 @@
 
 import contextlib
 import os
+import select
 import selectors
 import signal
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
+from subprocess import Popen
 from threading import Thread
 from typing import TypeVar
 
-from dora_systemd.errors import DoraSystemdError
+from dora_systemd.errors import DoraSystemdError, TimedOut
 from dora_systemd.trust.programs import Account, spawn
 
 T = TypeVar("T")
@@ -42,6 +44,7 @@ def run_command(
     environment, account: as for programs.spawn. After `seconds`, its whole process group is killed.
     Raises DoraSystemdError if it must not run, cannot run or takes too long.
     """
+    deadline = time.monotonic() + seconds
     try:
         child = spawn(command, account, environment, directory)
     except OSError as error:
@@ -50,12 +53,13 @@ def run_command(
         try:
             assert child.stdout and child.stderr
             pipes = (child.stdout.fileno(), child.stderr.fileno())
-            streams = _collect(pipes, time.monotonic() + seconds, command[0])
+            streams = _collect(pipes, deadline, command[0])
+            status = _wait(child, deadline, command[0])
         except BaseException:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(child.pid, signal.SIGKILL)
             raise
-        return Completed(child.wait(), *(one.decode(errors="replace") for one in streams))
+        return Completed(status, *(one.decode(errors="replace") for one in streams))
 
 
 def beside(call: Callable[[], T]) -> "Future[T]":
@@ -64,6 +68,7 @@ def beside(call: Callable[[], T]) -> "Future[T]":
     Not a daemon thread, so that a child is reaped even if nothing uses the result.
     """
     future: Future[T] = Future()
+    future.set_running_or_notify_cancel()  # a task that waits for it may be cancelled, but not this
 
     def run() -> None:
         try:
@@ -93,10 +98,26 @@ def _collect(streams: Sequence[int], deadline: float, command: str) -> list[byte
         while selector.get_map():
             left = deadline - time.monotonic()
             if left <= 0:
-                raise DoraSystemdError(f"cannot wait for {command!r} any longer: it hangs")
+                raise _hangs(command)
             for key, _ in selector.select(left):
                 chunk = os.read(key.fd, _CHUNK)
                 kept[key.fd] += chunk[: OUTPUT_LIMIT - len(kept[key.fd])]
                 if not chunk:
                     selector.unregister(key.fd)
     return [bytes(one) for one in kept.values()]
+
+
+def _wait(child: "Popen[bytes]", deadline: float, command: str) -> int:
+    """The exit status of a child that has closed its streams: it may go on without them."""
+    poll, end = select.poll(), os.pidfd_open(child.pid)
+    poll.register(end, select.POLLIN)
+    try:
+        if not poll.poll(max(deadline - time.monotonic(), 0) * 1000):
+            raise _hangs(command)
+    finally:
+        os.close(end)
+    return child.wait()
+
+
+def _hangs(command: str) -> TimedOut:
+    return TimedOut(f"cannot wait for {command!r} any longer: it hangs")

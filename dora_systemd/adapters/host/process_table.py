@@ -34,12 +34,21 @@ def _read_process(path: Path) -> Process | None:
         command = beginning(path / "cmdline").decode(errors="replace").split("\0")[:-1]
         # The name may contain blanks and parentheses; the fields after it do not.
         parent = int((path / "stat").read_text(errors="replace").rpartition(")")[2].split()[1])
-        group = (path / "cgroup").read_text().rpartition("0::")[2].strip()
+        group = group_in(beginning(path / "cgroup"))
     except (OSError, IndexError, ValueError):
         return None
     if not command:
         return None
     return Process(int(path.name), parent, tuple(command), group, _is_node(path))
+
+
+def group_in(data: bytes) -> str:
+    """The cgroup in the content of /proc/PID/cgroup, see cgroups(7); "" if there is none.
+
+    Any user can have groups whose names are any bytes but a newline.
+    """
+    lines = data.decode(errors="replace").split("\n")
+    return next((line[3:] for line in lines if line.startswith("0::")), "")
 
 
 def _is_node(path: Path) -> bool:

@@ -59,10 +59,10 @@ def write_unit_file(path: Path, text: str) -> None:
 
     Raises DoraSystemdError; then `path` is unchanged, unless the disk is broken.
     """
-    made = [one for one in path.parents if not one.exists()]
     with _told("write", path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        for directory in made:  # whatever the umask is, all may read units
+        made = [one for one in path.parents if not one.exists()]
+        for directory in reversed(made):  # whatever the umask is, all may read units
+            directory.mkdir(0o755, exist_ok=True)
             directory.chmod(0o755)
         write_atomic(path, text, is_durable=True)
         # The content is on the disk by now; syncing the directories makes the names durable.

@@ -5,7 +5,7 @@ import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from dora_systemd.scope import Scope
+from dora_systemd.scope import Scope, config_home
 
 
 def unit_places(scope: Scope, environment: Mapping[str, str]) -> Iterator[Path]:
@@ -14,9 +14,7 @@ def unit_places(scope: Scope, environment: Mapping[str, str]) -> Iterator[Path]:
     if not scope.is_user:
         yield Path("/etc/systemd/system")
         return
-    home = environment.get("HOME", "")
-    config = environment.get("XDG_CONFIG_HOME", "") or (f"{home}/.config" if home else "")
-    if config.startswith("/"):
+    if config := config_home(environment):
         yield Path(config, "systemd/user")
 
 

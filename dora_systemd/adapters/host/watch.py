@@ -129,7 +129,8 @@ async def _bursts(rules: WatchRules) -> AsyncIterator[frozenset[str]]:
             if gone.intersection(directories) or any(map(rules.has_directory, there)):
                 return
     except FileNotFoundError:
-        return  # a directory disappeared while the watches were added
+        # A directory has gone, perhaps for good, as that of a dataflow file apart from its project.
+        await asyncio.sleep(_GONE_SECONDS)
     except OSError as error:
         if error.errno == errno.ENOSPC or "limit" in str(error).lower():
             message = f"cannot watch {rules.root}: the kernel gives no more inotify watches"

@@ -15,6 +15,7 @@ CHUNK = 1 << 18
 """Bytes of one read from it."""
 JOIN = "join the group systemd-journal or adm (usermod -aG) and log in again"
 """The hint to users who can only see their own records."""
+_MOST_COMPLAINT = 1 << 20
 _NOTICE = "to turn off this notice."
 """The end of journalctl's own hint to them."""
 
@@ -31,18 +32,22 @@ def open_journalctl(
     Raises DoraSystemdError (NO_SYSTEMD) if there is no journalctl.
     """
     environment = {**os.environ, "SYSTEMD_COLORS": "1" if want_colors else "0", "LC_ALL": "C.UTF-8"}
+    # Not a pipe: what it says of damaged files, before anybody reads it, can be more than that has.
+    complaints = os.fdopen(os.memfd_create("journalctl"), "rb")
     try:
         child = subprocess.Popen(
             ["journalctl", "--no-pager", *arguments],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
+            stderr=complaints,
             env=environment,
             process_group=0 if outlives_interrupt else None,
         )
     except OSError as error:
+        complaints.close()
         message = f"cannot execute journalctl: {error.strerror}"
         raise DoraSystemdError(message, "it is part of systemd", ExitCode.NO_SYSTEMD) from error
+    child.stderr = complaints
     with child:
         try:
             yield child
@@ -55,8 +60,11 @@ def end_journalctl(child: "subprocess.Popen[bytes]") -> int:
 
     Raises DoraSystemdError for its error message.
     """
-    complaint = child.stderr.read().decode("utf-8", "replace").strip() if child.stderr else ""
     status = child.wait()
+    assert child.stderr
+    size = os.fstat(child.stderr.fileno()).st_size
+    data = os.pread(child.stderr.fileno(), _MOST_COMPLAINT, max(size - _MOST_COMPLAINT, 0))
+    complaint = data.decode("utf-8", "replace").strip()
     if status and complaint and not complaint.endswith(_NOTICE):
         raise _complaint_error(complaint.splitlines()[-1])
     return status

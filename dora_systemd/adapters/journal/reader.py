@@ -201,6 +201,8 @@ def _lines(arguments: Sequence[str]) -> Iterator[bytes]:
             rest = (rest + last)[: MAX_LINE + 1]
         else:
             child.kill()
+            if left < MAX_BYTES:
+                return  # what it has complained of is no reason to show nothing
         end_journalctl(child)
 
 

@@ -138,8 +138,8 @@ class _Channel:
 
     def _send_memfd(self, sock: socket.socket, entry: bytes) -> bool:
         """Send a large entry as a sealed file, as sd_journal_send(3) does."""
-        fd = os.memfd_create("dora-journal-entry", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         try:
+            fd = os.memfd_create("dora-journal-entry", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
             with os.fdopen(fd, "wb") as file:
                 file.write(entry)
                 file.flush()
@@ -171,7 +171,7 @@ class _Channel:
             seconds = min(seconds, RETRY_SECONDS)
         else:
             poll.register(self._socket, select.POLLOUT)
-        poll.poll(seconds * 1000)
+        poll.poll(max(seconds, 0.0) * 1000)  # a negative number would mean forever
 
     def _refuse(self) -> None:
         if not self.refused:

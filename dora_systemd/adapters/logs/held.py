@@ -36,7 +36,8 @@ class HeldLines:
         self._size = self._done = self._noted = 0
         # The file would lack some bytes, so it stays empty.
         self._is_broken = False
-        self._begin(b"")
+        with contextlib.suppress(OSError):
+            self._begin(b"")
 
     def take(self, fd: int, size: int) -> bytes:
         """Read up to `size` bytes from the pipe `fd` and keep them; b"" at the end of the file.
@@ -88,7 +89,8 @@ class HeldLines:
 
     def close(self) -> None:
         """Close the file, and leave it in place."""
-        os.close(self._fd)
+        if self._fd >= 0:
+            os.close(self._fd)
         self._fd = -1  # later calls must not write to another file with this number
 
     def _empty(self) -> None:

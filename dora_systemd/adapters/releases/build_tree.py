@@ -23,13 +23,8 @@ class BuildTree(Draft):
     def __init__(self, store: Store) -> None:
         super().__init__(store, "build")
         self._least = tuple(
-            min(total // _LEAST_SHARE, free // 2) for total, free in _room(self.place)
+            min(total // _LEAST_SHARE, free // 2) for total, free in _room(self._tree)
         )
-
-    @property
-    def place(self) -> Path:
-        """Its directory."""
-        return self._tree
 
     def hand_over(self, files: Mapping[str, Stored], owner: tuple[int, int] | None) -> None:
         """Let the nodes' user write all of it.

@@ -56,7 +56,8 @@ class Draft:
         """Write a file of the tree."""
         mode = 0o555 if is_executable else 0o444
         digest, size = hashlib.sha256(), 0
-        with os.fdopen(os.open(self._place(path), _NEW, 0o600), "wb", buffering=0) as file:
+        # Not without a buffer: on a full disk write(2) may take a part, and raise nothing.
+        with os.fdopen(os.open(self._place(path), _NEW, 0o600), "wb") as file:
             for chunk in chunks:
                 digest.update(chunk)
                 size += len(chunk)
@@ -67,7 +68,7 @@ class Draft:
     def share(self, path: str, release_id: str, stored: Stored) -> bool:
         """Share a file with the same path in another release, where it was `stored`.
 
-        False if its content is another one by now, as on a bad disk: who shared that would copy the
+        False if its content is another one by now, as on a bad disk: sharing it would copy the
         damage from release to release, and no later deploy would heal it.
         """
         file = self._store.tree(release_id) / path

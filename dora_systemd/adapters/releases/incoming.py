@@ -15,7 +15,7 @@ from dora_systemd.errors import DoraSystemdError
 _NAME = ".sent"
 """No dataflow has such a name."""
 _SECONDS = 90.0
-"""Timeout for more bytes: who sends them may be stopped, or gone without a word."""
+"""Timeout for more bytes: the sender may be stopped, or gone without a word."""
 _YOUNG_SECONDS = 60.0
 _RACES = 20
 """Of others that remove the shared directory just then; each of them has ended then."""
@@ -96,7 +96,7 @@ def _begin(store: Store) -> Draft:
     make_directories(store.path.parent)
     with contextlib.suppress(FileExistsError):
         store.path.mkdir(0o711)
-    store.path.chmod(0o711)  # who may not read it cannot lock what is in it
+    store.path.chmod(0o711)  # users who may not read it cannot lock what is in it
     _clean(store)
     return Draft(store)
 

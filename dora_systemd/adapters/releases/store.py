@@ -79,16 +79,12 @@ class Store:
         return parse_manifest(text, str(path))
 
     def intact(self, manifest: Manifest) -> dict[str, Stored]:
-        """The files of a release that still are as its manifest says. Raises OSError."""
+        """The files of a release that still are as its manifest says."""
         tree = self.tree(manifest.id)
-        return {
-            path: one
-            for path, one in manifest.files.items()
-            if one.target or one == stored_at(tree / path)
-        }
+        return {path: one for path, one in manifest.files.items() if one == stored_at(tree / path)}
 
     def write_manifest(self, manifest: Manifest) -> None:
-        """Write the manifest of a release anew. Raises OSError."""
+        """Replace the manifest of a release. Raises OSError."""
         write_part(self.release(manifest.id), MANIFEST, format_manifest(manifest))
 
     def unit(self, release_id: str) -> str:
@@ -207,7 +203,7 @@ def make_directories(path: Path) -> None:
     for one in (*reversed(path.parents), path):
         if not one.exists():
             with contextlib.suppress(FileExistsError):
-                one.mkdir()
+                one.mkdir(0o755)  # also with a umask of 0: nobody else may put anything there
                 one.chmod(0o755)
 
 
@@ -235,6 +231,8 @@ def remove_tree(path: Path) -> None:
 def stored_at(path: Path) -> Stored | None:
     """A file of a release, as a manifest describes it; None if there is none to read."""
     try:
+        if path.is_symlink():
+            return Stored(target=str(path.readlink()))
         with path.open("rb") as file:
             status = os.fstat(file.fileno())
             digest = hashlib.file_digest(file, "sha256").hexdigest()

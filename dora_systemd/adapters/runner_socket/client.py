@@ -101,7 +101,8 @@ def _exchange(
         raise _unreadable(path)
     if "error" in reply:
         message, hint = (reply.get(key) for key in ("error", "hint"))
-        raise DoraSystemdError(_words(message), _words(hint), _code(reply.get("code")))
+        words = _words(message) or f"the runner of {path.parent.name} refuses that"
+        raise DoraSystemdError(words, _words(hint), _code(reply.get("code")))
     return reply
 
 

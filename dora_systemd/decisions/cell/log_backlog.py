@@ -11,7 +11,7 @@ from typing import Any
 
 _BOUNDS = {"max_log_size": "16MB", "max_rotated_files": 1}
 """Limits for these log files, which are in the RuntimeDirectory and so in memory."""
-_SIZE = re.compile(r"([0-9]+) *([KMG]?)B?", re.IGNORECASE)
+_SIZE = re.compile(r"([0-9]{1,18}) *([KMG]?)B?", re.IGNORECASE)
 _FACTORS = {"": 1, "K": 1000, "M": 1000**2, "G": 1000**3}
 BREATH = 0.02
 """Seconds that a node runs at least between two freezes: it has other work to do."""
@@ -52,9 +52,11 @@ def marks_of(raw: Mapping[str, Any]) -> Marks:
     A frozen node does not answer dora's health check: so one freeze takes a quarter of its timeout.
     """
     bounds, timeout = with_bounds(raw), raw.get("health_check_timeout")
-    hold = min(MARKS.hold, _capacity(bounds["max_log_size"], bounds["max_rotated_files"]) // 4)
+    capacity = _capacity(bounds["max_log_size"], bounds["max_rotated_files"])
+    # With a mark of 0, a node would be frozen for ever: nothing is less.
+    hold = max(min(MARKS.hold, capacity // 4), 1)
     longest = timeout / 4 if isinstance(timeout, int | float) else MARKS.longest
-    return Marks(hold, hold // 2, longest)
+    return Marks(hold, max(hold // 2, 1), longest)
 
 
 def _capacity(size: object, files: object) -> int:

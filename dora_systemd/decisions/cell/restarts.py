@@ -4,6 +4,7 @@ dora restarts nodes, and systemd restarts the dataflow. Both get the same policy
 systemd.service(5), systemd.unit(5) and dora's descriptor.
 """
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -23,6 +24,7 @@ holds the nodes back: the sandbox, Python and dora's coordinator are ready by th
 the shortest delay is systemd's own default, for a runner that does not get that far."""
 
 MAX_RESTARTS = 1_000_000
+_COUNT = re.compile(r"[0-9]{1,9}")
 
 
 class RestartPolicy(NamedTuple):
@@ -123,7 +125,7 @@ def parse_count(text: str) -> int:
     """A number of restarts, or INFINITY. Raises DoraSystemdError (USAGE)."""
     if text.strip() == "infinity":
         return INFINITY
-    if not text.strip().isdecimal() or not 1 <= int(text) <= MAX_RESTARTS:
+    if not _COUNT.fullmatch(text.strip()) or not 1 <= int(text) <= MAX_RESTARTS:
         raise DoraSystemdError(
             f"cannot use {quoted(text)} as a number of restarts",
             "write 1 or more, or infinity; for none use --restart-policy no",

@@ -97,7 +97,8 @@ class CellStatus(NamedTuple):
     SAMPLES_KEPT CPU samples, oldest first. lines: by node; lost ones count for WHOLE_CELL.
     up_us: CLOCK_MONOTONIC µs of READY=1, 0 before it, and in tables of older versions. is_first:
     whether NRestarts= of the unit is certainly 0. signs: of nodes with a notify socket, for
-    parse_sign() of dora_systemd.decisions.signs.table.
+    parse_sign() of dora_systemd.decisions.signs.table. usage: of nodes on other machines, for
+    parse_use() of dora_systemd.decisions.machines.usage.
     """
 
     uuid: str = ""
@@ -112,6 +113,7 @@ class CellStatus(NamedTuple):
     up_us: int = 0
     is_first: bool = False
     signs: Mapping[str, tuple[Any, ...]] = {}
+    usage: Mapping[str, Sequence[Any]] = {}
 
     @property
     def alive_count(self) -> int:
@@ -129,6 +131,7 @@ class CellStatus(NamedTuple):
             for one in self.samples
         ]
         values["lines"] = {**self.lines}
+        values["usage"] = {**self.usage}
         return json.dumps(values)
 
     @classmethod
@@ -183,6 +186,7 @@ def _parse_cell(raw: Any) -> CellStatus:
         up_us=_number(known, "up_us"),
         is_first=known.get("is_first") is True,
         signs=_by_node(known.get("signs", {}), tuple),
+        usage=_by_node(known.get("usage", {}), tuple),
     )
 
 

@@ -4,7 +4,7 @@ The checks report errors in one line for which dora prints ten lines, or nothing
 run forever, and only `dora validate` finds an input without a source. dora checks everything else.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -62,7 +62,7 @@ def parse_dataflow(document: object, source: str) -> Dataflow:
     exits = document.get("exit_when_nodes_finish")
     dataflow = Dataflow(
         source=source,
-        nodes=tuple(_with_kept_output(node, parsed) for node in parsed),
+        nodes=tuple(_with_kept_output(parsed)),
         env=mapping_of(document.get("env"), source, "'env'"),
         exit_when_nodes_finish=exits if isinstance(exits, bool) else None,
         raw=document,
@@ -81,11 +81,12 @@ def _with_finite_env(part: Any) -> Any:
     return {**part, "env": {**env, **odd}} if odd else part
 
 
-def _with_kept_output(node: Node, nodes: Iterable[Node]) -> Node:
-    """The node; dora must read its output if an input is dora/logs, dora/logs/LEVEL[/NODE]."""
+def _with_kept_output(nodes: Sequence[Node]) -> Iterator[Node]:
+    """The nodes; dora must read the output of those with an input dora/logs[/LEVEL[/NODE]]."""
     sources = (given.source.split("/", 3) for one in nodes for given in one.inputs)
-    is_read = any(one[:2] == ["dora", "logs"] and one[3:] in ([], [node.id]) for one in sources)
-    return replace(node, keeps_output=True) if is_read else node
+    read = {(*one[3:],) for one in sources if one[:2] == ["dora", "logs"]}
+    for node in nodes:
+        yield replace(node, keeps_output=True) if {(), (node.id,)} & read else node
 
 
 def _check_ids(dataflow: Dataflow) -> None:

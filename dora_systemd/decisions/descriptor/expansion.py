@@ -13,7 +13,10 @@ from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.descriptor.json_size import is_infinite
 
 _NAME = "[A-Za-z_][A-Za-z0-9_]*"
-_REFERENCE = re.compile(rf"\$\$|\$\{{({_NAME})(?::-([^}}]*))?\}}|\$({_NAME})")
+_SHORT = rf"\$\$|\$(?P<plain>{_NAME})"
+_LONG = rf"\$\{{(?P<name>{_NAME})(?::-(?P<default>[^}}]*))?\}}"
+_REFERENCE = re.compile(f"{_SHORT}|{_LONG}")
+_WITHOUT_BRACE = re.compile(_SHORT)
 
 _DOLLAR = "$$$$"
 """A "$" that coordinator and daemon have both halved."""
@@ -47,12 +50,17 @@ def expanded(env: Mapping[str, object], environment: Mapping[str, str]) -> dict[
     """
 
     def replaced(match: re.Match[str]) -> str:
-        name = match[1] or match[3]
-        value = environment.get(name, match[2]) if name else "$"
+        found = match.groupdict()
+        name: str | None = found["plain"] or found.get("name")
+        value: str | None = environment.get(name, found.get("default")) if name else "$"
         return match[0] if value is None else value.replace("$", _DOLLAR)
 
+    def replaced_in(text: str) -> str:
+        whole, rest = _parts(text)
+        return _REFERENCE.sub(replaced, whole) + _WITHOUT_BRACE.sub(replaced, rest)
+
     return {
-        key: _until_daemon(_REFERENCE.sub(replaced, value)) if isinstance(value, str) else value
+        key: _until_daemon(replaced_in(value)) if isinstance(value, str) else value
         for key, value in env.items()
     }
 
@@ -76,6 +84,14 @@ def _texts(dataflow: Dataflow) -> Iterator[str]:
 
 
 def _names(text: str) -> Iterator[str]:
-    for braced, _, plain in _REFERENCE.findall(text):
-        if braced or plain:
-            yield braced or plain
+    whole, rest = _parts(text)
+    for match in (*_REFERENCE.finditer(whole), *_WITHOUT_BRACE.finditer(rest)):
+        found = match.groupdict()
+        if name := found["plain"] or found.get("name"):
+            yield name
+
+
+def _parts(text: str) -> tuple[str, str]:
+    """The text up to its last "}", and the rest, in which each "${" would look for one in vain."""
+    head, brace, rest = text.rpartition("}")
+    return head + brace, rest

@@ -18,7 +18,9 @@ def downstream_of(dataflow: Dataflow) -> Downstream:
 
 
 def _reached(start: str, takers: Mapping[str, list[str]]) -> tuple[str, ...]:
-    found = [start]
-    for node in found:  # the list grows during the loop
-        found += [one for one in takers.get(node, ()) if one not in found]
-    return tuple(found[1:])
+    found, waiting = {start}, [start]
+    for node in waiting:  # the list grows during the loop
+        new = [one for one in takers.get(node, ()) if one not in found]
+        found.update(new)
+        waiting += new
+    return tuple(waiting[1:])

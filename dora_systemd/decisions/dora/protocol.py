@@ -8,6 +8,7 @@ import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import takewhile
 from math import isfinite
 from typing import Any
 from uuid import uuid4
@@ -18,6 +19,7 @@ from dora_systemd.values import INFINITY, SECOND
 
 Params = str | Mapping[str, Any]
 
+_BEHIND_ERROR = re.compile(r"\s*(?:Location|Stack backtrace|Suggestion)\b")
 _ENDED_ALREADY = re.compile(r"unknown dataflow\b")
 
 
@@ -249,5 +251,7 @@ def exit_value(kind: str, number: Any) -> Exit:
 
 def first_line(text: str) -> str:
     """An error of dora without the location and backtrace after it."""
-    head = re.split(r"\n\s*\n?(?:Location|Stack backtrace|Suggestion)\b", text, maxsplit=1)[0]
-    return " ".join(head.split())
+    # Line by line: nodes can have a coordinator of their own, which sends a million line ends.
+    first, *rest = text.split("\n")
+    head = takewhile(lambda line: not _BEHIND_ERROR.match(line), rest)
+    return " ".join(" ".join((first, *head)).split())

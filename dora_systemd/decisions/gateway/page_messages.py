@@ -135,7 +135,7 @@ def _printable(text: str) -> str:
 
 def saved_line(line: Mapping[str, Any]) -> str:
     """A line of line_values() in a file, with the time in UTC."""
-    origin = line["node"] or "dataflow"
+    origin = one_line(line["node"]) or "dataflow"
     return f"{format_moment(line['at_us'])} {origin}: {one_line(line['text'])}\n"
 
 

@@ -1,6 +1,7 @@
 """The units of the gateway, its port, and the file of its token."""
 
 import posixpath
+import re
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -21,6 +22,7 @@ DIRECTORY_NAME = "dora-systemd-gateway"
 PORT_VARIABLE = "DORA_DAEMON_PORT"
 ADDRESS_VARIABLE = "DORA_COORDINATOR_ADDR"
 
+_PORT = re.compile(r"[0-9]{1,5}")
 _LOOPBACK = ("localhost", ADDRESS)
 _REMOTE_HINT = "the gateway is for this machine; from another one: ssh -L PORT:127.0.0.1:PORT HOST"
 
@@ -67,7 +69,7 @@ def port_drop_in(port: int) -> str:
 def _parse(variable: str, text: str) -> int | None:
     if not text:
         return None
-    if not (text.isascii() and text.isdecimal() and 0 < int(text[:6]) < 65536):
+    if not _PORT.fullmatch(text) or not 0 < int(text) < 65536:
         message = f"cannot read {variable}: {quoted(text)} is not a port"
         raise DoraSystemdError(message, "a port is 1 to 65535", ExitCode.USAGE)
     return int(text)

@@ -223,7 +223,7 @@ def _state_after(event: life.NodeExited, is_stopping: bool) -> str:
 
 
 def spent(nodes: NodeTable) -> dict[str, str]:
-    """NodeTable that have failed for good because their restarts are used up."""
+    """By node that has failed for good because its restarts are used up, how it ended last."""
     return {
         ident: f"{str(node.exit) or 'ended'} after {_restarts(node.restarts)}"
         for ident, node in nodes.items()

@@ -6,7 +6,7 @@ may have another program in the runner's place, so the text is cleaned and cut, 
 
 from dora_systemd.decisions.cell.status import FAILED_BECAUSE
 from dora_systemd.decisions.life.states import RunnerExit
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, TimedOut
 from dora_systemd.terminal_text import short_line
 
 _HINT = "; hint: "
@@ -21,7 +21,12 @@ _CODES = {
 
 
 def refusal_exit(error: DoraSystemdError) -> RunnerExit:
-    """The runner's exit status for an error."""
+    """The runner's exit status for an error; with that of a check without an answer, it restarts.
+
+    A machine that boots may be too busy for one.
+    """
+    if isinstance(error, TimedOut):
+        return RunnerExit.FAILED
     return next(
         (status for status, code in _CODES.items() if code is error.code), RunnerExit.BAD_DATAFLOW
     )

@@ -26,9 +26,10 @@ def stop_timeout(grace: int) -> int:
 
 def unit_timeout(grace: int) -> int:
     """TimeoutStopSec= of the unit."""
-    return INFINITY if grace == INFINITY else kill_delay(grace) + STOP_MARGIN
+    return min(kill_delay(grace) + STOP_MARGIN, INFINITY)
 
 
 def runner_timeout(grace: int) -> int:
     """The time for the runner to exit."""
-    return INFINITY if grace == INFINITY else unit_timeout(grace) - RESERVE
+    timeout = unit_timeout(grace)
+    return INFINITY if timeout == INFINITY else timeout - RESERVE

@@ -19,6 +19,7 @@ ERR, WARNING, NOTICE, INFO, DEBUG = 3, 4, 5, 6, 7
 PRIORITIES = {"error": ERR, "warn": WARNING, "info": INFO, "debug": DEBUG, "trace": DEBUG}
 PLAIN_PRIORITY = {"stdout": INFO, "stderr": NOTICE}
 
+_TOO_DEEP = "[nested too deeply]"
 _ANSI = re.compile(r"\x1b\[[0-9;]*m")
 _TRACING = re.compile(
     r"^(?P<timestamp>\d{4}-\d\d-\d\dT\S+Z)\s+(?P<level>ERROR|WARN)\s+(?P<message>.*)$"
@@ -113,9 +114,9 @@ def json_fields(line: bytes) -> dict[str, Value] | None:
         return None
     try:
         record = json.loads(line)
-    except (ValueError, RecursionError):
+        return _record_fields(record) if isinstance(record, dict) else None
+    except (ValueError, RecursionError):  # also of json.dumps(), for almost too deep a nesting
         return None
-    return _record_fields(record) if isinstance(record, dict) else None
 
 
 def _record_fields(record: dict[str, object]) -> dict[str, Value] | None:
@@ -145,10 +146,10 @@ def jsonl_fields(line: bytes) -> dict[str, Value]:
         record = json.loads(line)
         stream, level = _text(str(record["stream"] or "stdout")), str(record["level"])
         text = _text(record["msg"])
+        own = _record_fields({**record, "timestamp": record.get("ts"), "message": text})
     except (ValueError, RecursionError, TypeError, KeyError):
         return {"PRIORITY": INFO, "MESSAGE": line}
-    renamed = {**record, "timestamp": record.get("ts"), "message": text}
-    fields = _record_fields(renamed) or {
+    fields = own or {
         "PRIORITY": PLAIN_PRIORITY.get(level if level == "stderr" else stream, INFO),
         "DORA_TIMESTAMP": _text(record.get("ts")),
         "MESSAGE": text,
@@ -171,7 +172,10 @@ def _structured(own: dict[str, object]) -> dict[str, Value]:
 def _text(value: object) -> str:
     if value is None:
         return ""
-    text = value if isinstance(value, str) else json.dumps(value)
+    try:
+        text = value if isinstance(value, str) else json.dumps(value)
+    except RecursionError:
+        return _TOO_DEEP  # json reads a level more than it writes
     # JSON may contain half of a surrogate pair, which UTF-8 cannot encode: escape it.
     return text.encode("utf-8", "backslashreplace").decode()
 

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from dora_systemd.decisions.logs.noise import is_same, is_told_by_event, repeated
+from dora_systemd.names import MAX_NAME, MAX_NODE_ID
 from dora_systemd.terminal_text import one_line, shown_log
 
 # The beginning of a line of `journalctl -o short`, with or without journalctl's own colours, or
@@ -26,6 +27,10 @@ _COLORS = (32, 34, 35, 36, 92, 94, 95, 96)
 # Colours of messages by PRIORITY, as in journalctl.
 _MESSAGE_COLORS = {b"3": b"\x1b[0;1;31m", b"4": b"\x1b[0;1;38:5:185m", b"7": b"\x1b[0;38:5:245m"}
 MAX_WIDTH = 24
+# What is kept of what was said: a node can write to the journal under any name, without end.
+MOST_NAMES = 2000
+_LONGEST_NAME = MAX_NAME + 1 + MAX_NODE_ID
+_LONGEST_TEXT = 16 * 1024
 _MARK = b"\0"
 """Before each record while it is rewritten: ShownLines leaves none in a text."""
 
@@ -89,8 +94,12 @@ class TerminalLines:
     def flush(self) -> bytes:
         """The rest: the last record, and how often the last line of each node came."""
         last, self._last = self._without_repeats(self._last), []
+        return last + self._endings()
+
+    def _endings(self) -> bytes:
+        """Forget what was said; what is still to be shown of it."""
         said, self._said = self._said, {}
-        return last + b"".join(one.ending() for one in said.values())
+        return b"".join(one.ending() for one in said.values())
 
     def _without_repeats(self, parts: Sequence[bytes]) -> bytes:
         """The lines of records, of which each has three parts: origin, begin of the line, rest."""
@@ -100,13 +109,17 @@ class TerminalLines:
                 continue
             said = self._said.get(name)
             if said is None:
-                said = self._said[name] = _Said()
+                if len(self._said) >= MOST_NAMES:
+                    shown.append(self._endings())
+                said = _Said()
+                if len(name) <= _LONGEST_NAME:
+                    self._said[name] = said
             elif is_same(said.text, text):
                 said.start, said.text, said.times = start, text, said.times + 1
                 continue
             elif said.times > 1:
                 shown.append(said.ending())
-            said.text, said.times = text, 1
+            said.text, said.times = text if len(text) <= _LONGEST_TEXT else b"", 1
             shown += (start, text)
         return b"".join(shown)
 
@@ -142,14 +155,19 @@ class TerminalLines:
         return b"%s %s " % (when, label)
 
     def _label(self, name: bytes) -> bytes:
-        text = one_line(name.decode("utf-8", "replace"))
-        if len(text) > self._width:
-            self._width = min(len(text), MAX_WIDTH)
+        text = one_line(name[:_LONGEST_NAME].decode("utf-8", "replace"))
+        if len(self._labels) >= MOST_NAMES:
+            self._labels.clear()
+        if (width := min(len(text), MAX_WIDTH)) > self._width:
+            self._width = width
             self._labels.clear()
         padded = f"{text:<{self._width}}"
         if self._want_colors:
             padded = f"\x1b[{color_of(text)}m{padded}\x1b[0m"
-        return self._labels.setdefault(name, padded.encode("utf-8", "replace"))
+        label = padded.encode("utf-8", "replace")
+        if len(name) <= _LONGEST_NAME:
+            self._labels[name] = label
+        return label
 
 
 class ShownLines:

@@ -6,7 +6,7 @@ from typing import Any
 from dora_systemd.decisions.properties.kinds import Property
 from dora_systemd.decisions.properties.table import RLIMITS, TABLE, Row
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.names import did_you_mean
+from dora_systemd.names import STORE, did_you_mean
 from dora_systemd.values import quoted, shown
 
 Properties = Mapping[str, Property]
@@ -49,6 +49,7 @@ def parse_property(assignment: str) -> dict[str, Property]:
     properties: dict[str, Property] = {}
     for one in _DOUBLE_KEYS.get(key, (key,)):
         _check_key(one)
+        _check_directory(one, text)
         properties |= parse_line(one, text)
     return properties
 
@@ -120,6 +121,15 @@ def _check_key(key: str) -> None:
     if key not in TABLE:
         hint = did_you_mean(key, TABLE.keys() - _REFUSED.keys()) or "see systemd.directives(7)"
         raise _refusal(f"{shown(key)}: services have no such property", hint)
+
+
+def _check_directory(key: str, text: str) -> None:
+    """Refuse our own directory: systemd gives all that is in a StateDirectory= to User=."""
+    ours = STORE.partition("/")[0]
+    tops = {word.partition("/")[0] for word in text.replace(":", " ").split()}
+    if key == "StateDirectory" and ours in tops:
+        reason = "the releases of dataflows are there, and nodes must not change them"
+        raise _refusal(f"{key} to {quoted(text)}: {reason}", "choose another name")
 
 
 def _parse_one(key: str, text: str) -> dict[str, Property]:

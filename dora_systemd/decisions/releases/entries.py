@@ -1,6 +1,6 @@
 """The files of a project, and which of them a release can have. Pure.
 
-Who owns the project names its files and links, so each is checked before root creates it.
+The owner of the project names its files and links, so each is checked before root creates it.
 """
 
 import posixpath

@@ -53,7 +53,9 @@ def parse_manifest(text: str, path: str) -> Manifest:
             raise ValueError("schema")
         files = {one: parse_stored(stored) for one, stored in value.pop("files").items()}
         versions = {str(name): str(one) for name, one in value.pop("versions", {}).items()}
-        return Manifest(**value, versions=versions, files=files)
+        created_us = _number(value.pop("created_us"))
+        texts = {key: _text(one) for key, one in value.items()}
+        return Manifest(**texts, created_us=created_us, versions=versions, files=files)
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         message = f"cannot use {shown(path)}: it does not describe a release"
         hint = "remove that release, or deploy again"
@@ -73,8 +75,18 @@ def parse_stored(value: Mapping[str, Any]) -> Stored:
     is_built = bool(value.get("built", False))
     if "link" in value:
         return Stored(target=str(value["link"]), is_built=is_built)
-    size = value["size"]
-    if type(size) is not int:
-        raise TypeError(size)
+    size = _number(value["size"])
     is_executable, digest = bool(value["executable"]), str(value["sha256"])
     return Stored(size, is_executable, digest, is_built=is_built)
+
+
+def _number(value: object) -> int:
+    if type(value) is not int:
+        raise TypeError(value)
+    return value
+
+
+def _text(value: object) -> str:
+    if type(value) is not str:
+        raise TypeError(value)
+    return value

@@ -20,6 +20,9 @@ from pathlib import PurePath
 Read = Callable[[str], str | None]
 """The text of a file, or None if there is no such file."""
 
+_NOT_PARSED = (SyntaxError, ValueError, RecursionError, MemoryError)
+"""What Python raises for a source; the last two for one that is nested too deeply."""
+
 
 def program_files(script: str, read: Read, places: Iterable[str] = ()) -> frozenset[str]:
     """The absolute paths of `script` and of all modules of the project that it imports.
@@ -42,7 +45,7 @@ def program_files(script: str, read: Read, places: Iterable[str] = ()) -> frozen
 def _imported(path: PurePath, source: str, roots: Sequence[PurePath]) -> Iterator[str]:
     try:
         tree = ast.parse(source)
-    except (SyntaxError, ValueError):
+    except _NOT_PARSED:
         return  # the file itself still counts, so a corrected version is noticed
     for statement in ast.walk(tree):
         if isinstance(statement, ast.Import):
@@ -77,6 +80,6 @@ def syntax_error(path: str, source: str) -> str:
         compile(source, path, "exec", dont_inherit=True)
     except SyntaxError as error:
         return f"line {error.lineno}: {error.msg}"
-    except ValueError as error:
-        return str(error)
+    except _NOT_PARSED as error:
+        return str(error) or "it is too complex for Python"
     return ""

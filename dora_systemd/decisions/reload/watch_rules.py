@@ -4,6 +4,7 @@ Patterns are those of gitignore(5): `*.py` matches any such file, `config/*` eve
 directory config at the top.
 """
 
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
@@ -87,14 +88,26 @@ def _spec(patterns: tuple[str, ...]) -> "GitIgnoreSpec":
     # Imported late: only hot reload needs it.
     from pathspec import GitIgnoreSpec
 
-    return GitIgnoreSpec.from_lines(patterns)
+    return GitIgnoreSpec.from_lines(filter(_is_pattern, patterns))
+
+
+def _is_pattern(line: str) -> bool:
+    """Whether it is a line of gitignore(5); one that is not matches nothing, as in git."""
+    from pathspec import GitIgnoreSpec  # see above
+
+    try:
+        GitIgnoreSpec.from_lines([line])
+    except (ValueError, re.error):
+        return False
+    return True
 
 
 def parse_patterns(texts: Iterable[str]) -> tuple[str, ...]:
     """The patterns in comma-separated lists. Raises DoraSystemdError (USAGE)."""
     patterns = [one.strip() for text in texts for one in text.split(",") if one.strip()]
     for pattern in patterns:
-        if not pattern.isprintable() or ".." in PurePath(pattern).parts or pattern == "!":
+        is_plain = pattern.isprintable() and ".." not in PurePath(pattern).parts
+        if not is_plain or not _is_pattern(pattern):
             hint = "write patterns as in gitignore(5), such as *.py or config/*"
             raise DoraSystemdError(f"cannot watch {quoted(pattern)}", hint, ExitCode.USAGE)
     return tuple(patterns)

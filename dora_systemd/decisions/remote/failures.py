@@ -27,7 +27,7 @@ _INSTALL = "install dora-systemd there, or link it into /usr/local/bin: ssh has 
 
 def unreached(host: Host, words: str) -> DoraSystemdError:
     """The error of a host to which ssh did not come. words: what ssh and the host have said."""
-    hint = next((hint for part, hint in _HINTS if part in words), f"try: ssh {host.text} true")
+    hint = next((hint for part, hint in _HINTS if part in words), "try: ssh {text} true")
     name = host.destination.rpartition("@")[2]
     hint = hint.format(text=_by_ssh(host), name=name)
     reason = "the host key has changed" if "HAS CHANGED" in words else last_line(words)

@@ -54,6 +54,12 @@ def read_json(text: str) -> Any:
         return None
 
 
+def read_object(text: str) -> dict[str, Any] | None:
+    """The object in a text; None for what is none, and for one that json could not write again."""
+    value = read_json(text)
+    return value if isinstance(value, dict) and _is_printable(value) else None
+
+
 def with_host(value: dict[str, Any], host: str, key: str = "host") -> dict[str, Any]:
     """An object of -o json with the host that it comes from. key: the name that it gets there."""
     schema = {"schema": value["schema"]} if "schema" in value else {}

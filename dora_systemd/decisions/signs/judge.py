@@ -1,11 +1,11 @@
 """Decides when a node has missed its watchdog. Pure: the time is in the arguments.
 
 The watchdog of a node starts when the node runs, as that of a unit does when its start-up is
-complete: before, Node() blocks until all nodes of the dataflow are ready. It starts anew with each
-process. A node that starts again while the others run has a limit for its start-up, too.
+complete: before, Node() blocks until all nodes of the dataflow are ready. Each process has a new
+one. A node that starts again while the others run has a limit for its start-up, too.
 
-A clock that leaves out the time in which the runner itself did not run makes a suspended machine, a
-stopped cell and a machine without time to spare no missed sign.
+The clock leaves out time in which the runner itself did not run. So no sign counts as missed
+because the machine was suspended or had no time to spare, or the cell was stopped.
 """
 
 from collections.abc import Iterable
@@ -96,7 +96,7 @@ class Watch(NamedTuple):
         return self if signed is None else self._replace(since=max(self.since, signed))
 
     def excused(self, now: int) -> "Watch":
-        """The node could not run, because of us: its watchdog starts anew."""
+        """The node could not run, because of us: its time starts again."""
         return self._replace(since=now)
 
     def act(self, limit: int, grace: int, now: int) -> Act:

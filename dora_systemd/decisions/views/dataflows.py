@@ -172,7 +172,7 @@ def _aligned(column: Sequence[str], want_colors: bool) -> list[str]:
     adjust = str.rjust if column[0] in _RIGHT_ALIGNED else str.ljust
     cells = [adjust(cell, _width(column)) for cell in column]
     if want_colors and column[0] in ("STATUS", "STATE"):
-        return [colored_state(cell, cell.split()[0]) for cell in cells]
+        return [colored_state(cell, cell.partition(" ")[0]) for cell in cells]
     return cells
 
 

@@ -85,7 +85,7 @@ def judge_controllers(available: Collection[str], is_user: bool) -> Finding:
 def judge_rate(config: str, is_user: bool) -> Finding:
     """The rate limit of journald, see journald.conf(5). config: that file and its drop-ins."""
     values = dict(_RATE_DEFAULTS)
-    for key, value in re.findall(r"^\s*(RateLimit\w+)\s*=\s*(\S*)", config, flags=re.M):
+    for key, value in re.findall(r"^[ \t]*(RateLimit\w+)[ \t]*=[ \t]*(\S*)", config, flags=re.M):
         values[key] = value or _RATE_DEFAULTS.get(key, "")
     interval, burst = values["RateLimitIntervalSec"], values["RateLimitBurst"]
     if interval in ("0", "0s") or burst == "0":

@@ -25,11 +25,11 @@ Sample = tuple[Labels, float | int]
 
 @dataclass(frozen=True)
 class Family:
-    """One metric. value: of one group, None if it has none."""
+    """One metric. value: of one group, None if it has none; nodes elsewhere have no Strain here."""
 
     name: str
     help: str
-    value: Callable[[Usage, Strain], float | int | None] = lambda _use, _strain: None
+    value: Callable[[Usage, Strain | None], float | int | None] = lambda _use, _strain: None
 
     @property
     def kind(self) -> str:
@@ -54,7 +54,7 @@ GROUP_FAMILIES = (
     Family(
         "cpu_throttled_seconds_total",
         "Time for which its CPU limit throttled it.",
-        lambda _, strain: strain.throttled / SECOND,
+        lambda _, strain: strain and strain.throttled / SECOND,
     ),
     Family("memory_bytes", "Memory used.", lambda use, _: use.memory),
     Family(
@@ -64,7 +64,7 @@ GROUP_FAMILIES = (
     Family(
         "oom_kills_total",
         "Processes killed by the kernel, out of memory.",
-        lambda _, strain: strain.oom_kills,
+        lambda _, strain: strain and strain.oom_kills,
     ),
 )
 PRESSURE = Family(
@@ -174,14 +174,13 @@ def _group_samples(
     places: Sequence[tuple[Labels, Observed, str]],
 ) -> Iterator[tuple[Family, list[Sample]]]:
     groups = [
-        (own, one.usage[key], one.strains.get(key, Strain()))
-        for own, one, key in places
-        if key in one.usage
+        (own, one.usage[key], one.strains.get(key)) for own, one, key in places if key in one.usage
     ]
     for family in GROUP_FAMILIES:
         values = [(own, family.value(use, strain)) for own, use, strain in groups]
         yield family, [(own, value) for own, value in values if value is not None]
-    yield PRESSURE, [sample for own, _, strain in groups for sample in _pressure(own, strain)]
+    strains = [(own, strain) for own, _, strain in groups if strain]
+    yield PRESSURE, [sample for own, strain in strains for sample in _pressure(own, strain)]
 
 
 def _pressure(own: Labels, strain: Strain) -> Iterator[Sample]:

@@ -31,7 +31,15 @@ class Observed:
 
 def observed_values(one: Observed) -> dict[str, Any]:
     """The snapshot for JSON; time counters in µs."""
-    groups = {key: _counters(use, one.strains.get(key, Strain())) for key, use in one.usage.items()}
+    away = {node.node for node in one.row.nodes if node.machine}
+    groups = {
+        key: {
+            **_counters(use, one.strains.get(key, Strain())),
+            # Not for shares of time: a member sends it now and then.
+            **({"cpu_us": None} if key in away else {}),
+        }
+        for key, use in one.usage.items()
+    }
     return {**dataflow_object(one.row), "monotonic_us": one.at_us, "groups": groups}
 
 

@@ -115,7 +115,7 @@ def parse_happening(record: Mapping[str, Any]) -> Happening | None:
     ids = keys if "DORA_EVENT" in texts else keys[1:]
     return Happening(
         name,
-        _number(texts.get("__REALTIME_TIMESTAMP", "")),
+        parse_number(texts.get("__REALTIME_TIMESTAMP", "")) or 0,
         texts.get("DORA_NODE", ""),
         texts.get("MESSAGE", ""),
         next((texts[key] for key in ids if texts.get(key)), ""),
@@ -124,8 +124,9 @@ def parse_happening(record: Mapping[str, Any]) -> Happening | None:
     )
 
 
-def _number(text: str) -> int:
-    return int(text) if text.isascii() and text.isdigit() else 0
+def parse_number(text: str) -> int | None:
+    """The number in a field; None for another text."""
+    return int(text) if text.isascii() and text.isdigit() else None
 
 
 def find_lives(happenings: Iterable[Happening]) -> list[Life]:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from dora_systemd.decisions.cell.exits import KILLED, ExitKind, exit_of, parse_exit
+from dora_systemd.decisions.cell.machines import HEAD
 from dora_systemd.decisions.life.causes import ESSENTIAL, NO_END, UNIT_RESULTS, Cause, result_words
 from dora_systemd.decisions.life.setup_exits import setup_failure
 from dora_systemd.decisions.logs.events import NODE_END_EVENTS
@@ -225,6 +226,9 @@ def stopped_by(life: Life, shutdowns: Sequence[int]) -> str:
     by = order.detail("by") if order else ""
     if by == "terminal":
         return "the end of its terminal"
+    if by == HEAD:
+        lost = life.last("machine-lost")
+        return f"the loss of its head ({lost.detail('reason')})" if lost else "its head"
     moments = [one.at_us for one in (order, job) if one is not None]
     if any(life.began_us <= shutdown <= max(moments, default=0) for shutdown in shutdowns):
         return "the shutdown of the machine"

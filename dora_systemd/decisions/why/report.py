@@ -74,8 +74,9 @@ class Report:
 def remedies(report: Report) -> list[str]:
     """What to do, one line each."""
     verdict, subject = report.verdict, report.subject
-    hint = known_remedy(one.text for one in report.words) if verdict.node else ""
-    texts = [hint, _AGAIN if verdict.is_passing else remedy_of(verdict)]
+    lines = (one.text for one in report.words)
+    hint = known_remedy(lines, verdict.node) if verdict.node else ""
+    texts = [_AGAIN if verdict.is_passing else remedy_of(verdict)]
     machine = verdict.details.get("machine", "")
     if host := report.machines.get(machine):
         texts.append(_THERE)
@@ -95,7 +96,7 @@ def remedies(report: Report) -> list[str]:
         "machine": machine,
         "host": host,
     }
-    filled = [text.format(**values) for text in texts if text]
+    filled = [*filter(None, [hint]), *(text.format(**values) for text in texts if text)]
     if report.is_held and verdict.is_away:
         again = f", then run: doractl restart {subject.name}"
         return [text.replace(again, ", and save it") for text in filled]

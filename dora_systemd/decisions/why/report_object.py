@@ -5,6 +5,7 @@ from typing import Any
 
 from dora_systemd.decisions.views.objects import dataflow_object, moment
 from dora_systemd.decisions.views.rows import DataflowRow
+from dora_systemd.decisions.why.lives import parse_number
 from dora_systemd.decisions.why.report import Report, remedies
 
 _TOLD = ("event", "node", "nodes", "dataflow", "dataflow_name", "downstream", "cause", "reason")
@@ -47,12 +48,8 @@ def report_object(report: Report, row: DataflowRow) -> dict[str, Any]:
 
 def _details(details: Mapping[str, str]) -> dict[str, str | int | None]:
     texts = {key: text for key, text in details.items() if key not in (*_TOLD, *_NUMBERS)}
-    numbers = {key: _number(details[own]) for own, key in _NUMBERS.items() if own in details}
+    numbers = {key: parse_number(details[own]) for own, key in _NUMBERS.items() if own in details}
     return {**texts, **numbers}
-
-
-def _number(text: str) -> int | None:
-    return int(text) if text.isascii() and text.isdigit() else None
 
 
 def _history(report: Report) -> dict[str, Any]:

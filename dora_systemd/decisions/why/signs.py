@@ -37,18 +37,16 @@ _FULL = re.compile(
 """What fails with it often says nothing of the path; Python puts it behind."""
 
 
-def known_remedy(lines: Iterable[str]) -> str:
+def known_remedy(lines: Iterable[str], node: str = "the node") -> str:
     """The remedy for a node with these last lines, or "" if they do not tell."""
     text = "\n".join(lines)
     if full := _FULL.search(text):
-        return _space(full["path"])
+        return _space(full["path"], node)
     return next((help_ for signs, help_ in _SIGNS if any(one in text for one in signs)), "")
 
 
-def _space(path: str | None) -> str:
+def _space(path: str | None, node: str) -> str:
     """The remedy for a full file system. path: of a file that could not be written."""
     if path is None:
-        return "a file system that {node} writes to is full: df shows which one"
-    # The text is filled in like all other remedies.
-    quoted = shlex.quote(path).replace("{", "{{").replace("}", "}}")
-    return f"the file system of this file is full: df {quoted}"
+        return f"a file system that {node} writes to is full: df shows which one"
+    return f"the file system of this file is full: df {shlex.quote(path)}"

@@ -70,7 +70,18 @@ def _read_logs(scope: Scope, request: Request, node: str) -> tuple[str, list[byt
             break
     if not lines:
         _check_node(scope, uuid, name, node)
-    return uuid, lines[::-1], place
+    return uuid, [*lines[::-1], *map(log_line, _elsewhere(scope, uuid, node, now))], place
+
+
+def _elsewhere(scope: Scope, uuid: str, node: str, now: int) -> list[Record]:
+    """Where more lines are, if the dataflow runs on several machines. node: "" for all."""
+    cell = find_if_loaded(scope, uuid)
+    if cell is None or cell.options.machine or not cell.options.placed:
+        return []
+    # Imported late: most dataflows run on one machine.
+    from dora_systemd.decisions.machines.elsewhere import lines_elsewhere
+
+    return lines_elsewhere(cell.name, cell.options.placed, node, now)
 
 
 def _uuid_of(scope: Scope, request: Request) -> str:
@@ -132,9 +143,15 @@ class Follower:
         since = f"--since={journal_timestamp(first)}"
         async with open_stream([*_EXPORT, "--follow", since, "--", *matches]) as (_, stream):
             if self._uuid in self._talk.started or await self._is_up():
+                await self._send_elsewhere()
                 await self._send_all(stream)
         if self._uuid not in self._talk.started:
             await self._talk.socket.close()
+
+    async def _send_elsewhere(self) -> None:
+        now = time.time_ns() // 1000
+        for record in await asyncio.to_thread(_elsewhere, self._talk.scope, self._uuid, "", now):
+            await self._talk.socket.send(format_event(log_payload(record, self._uuid)))
 
     async def _send_all(self, stream: asyncio.StreamReader) -> None:
         records = ExportReader()

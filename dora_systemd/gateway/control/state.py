@@ -37,7 +37,7 @@ _FRESH_SECONDS = 5.0
 
 def list_dataflows(scope: Scope) -> dict[str, Any]:
     """What is running, what has failed, and what ended last."""
-    rows = tuple(map(_row, read_cells(Bus(scope))))
+    rows = tuple(map(_row, read_cells(Bus(scope, for_reading=True))))
     return dataflow_list([*rows, *_ended(scope, rows, int(time.monotonic() / _FRESH_SECONDS))])
 
 
@@ -53,12 +53,12 @@ def _row(cell: Cell) -> DataflowRow:
 
 def list_nodes(scope: Scope) -> dict[str, Any]:
     """All nodes of all running dataflows, with their resource usage."""
-    return node_list(read_rows(Bus(scope), scope))
+    return node_list(read_rows(Bus(scope, for_reading=True), scope))
 
 
 def list_daemons(scope: Scope) -> dict[str, Any]:
     """The daemons of all running dataflows."""
-    return daemon_list(cell.uuid for cell in read_cells(Bus(scope)) if cell.is_up)
+    return daemon_list(cell.uuid for cell in read_cells(Bus(scope, for_reading=True)) if cell.is_up)
 
 
 def ended_descriptor(scope: Scope, uuid: str) -> tuple[str, dict[str, Any]]:
@@ -85,14 +85,14 @@ def find_name(scope: Scope, uuid: str) -> str:
 def check(scope: Scope, uuid: str) -> dict[str, Any]:
     """Whether a dataflow runs, or how it has ended. Raises DoraSystemdError (NOT_FOUND)."""
     cell = find_if_loaded(scope, uuid)
-    if cell is not None and is_unit_up(Bus(scope), cell.name):
+    if cell is not None and is_unit_up(Bus(scope, for_reading=True), cell.name):
         return {"DataflowSpawned": {"uuid": uuid}}
     return ended_result(scope, uuid)
 
 
 def ended_result(scope: Scope, uuid: str) -> dict[str, Any]:
     """How a dataflow has ended, with the last lines of the node. Raises DoraSystemdError."""
-    report = explain(Bus(scope), scope, uuid, JournalReader())
+    report = explain(Bus(scope, for_reading=True), scope, uuid, JournalReader())
     failed = report.verdict.status == FAILED
     failures = {report.verdict.node or report.subject.name: _account(report)} if failed else {}
     return stopped(uuid, time.time_ns() // 1000, failures)
@@ -113,7 +113,7 @@ def spawned(scope: Scope, uuid: str) -> dict[str, Any] | None:
     cell = find_if_loaded(scope, uuid)
     if cell is None:
         return _over(scope, uuid)
-    bus = Bus(scope)
+    bus = Bus(scope, for_reading=True)
     state = bus.read(cell.unit, ["ActiveState", "Job"])
     if state["ActiveState"] in SETTLED:
         return {"DataflowSpawned": {"uuid": uuid}}
@@ -129,7 +129,7 @@ def spawned(scope: Scope, uuid: str) -> dict[str, Any] | None:
 
 def _over(scope: Scope, uuid: str) -> dict[str, Any]:
     """The reply that tells the dora command that the dataflow ended right after its start."""
-    word = explain(Bus(scope), scope, uuid, JournalReader()).verdict.status
+    word = explain(Bus(scope, for_reading=True), scope, uuid, JournalReader()).verdict.status
     if word == FINISHED:
         return {"Error": f"unknown dataflow {uuid}: it has finished already"}
     raise DoraSystemdError(

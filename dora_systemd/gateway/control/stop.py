@@ -72,7 +72,9 @@ def _hold(held: ExitStack, scope: Scope, cell: Cell) -> None:
 
 async def _find(talk: Talk, request: Request) -> Cell:
     if request.name.endswith("ByName"):
-        return await asyncio.to_thread(lambda: Selector(request.text("name")).find(Bus(talk.scope)))
+        return await asyncio.to_thread(
+            lambda: Selector(request.text("name")).find(Bus(talk.scope, for_reading=True))
+        )
     return await asyncio.to_thread(find_by_uuid, talk.scope, request.dataflow)
 
 
@@ -98,7 +100,7 @@ def _patience(request: Request) -> float | None:
 
 
 def _life(scope: Scope, cell: Cell) -> object:
-    return Bus(scope).read(cell.unit, ["InvocationID"])["InvocationID"]
+    return Bus(scope, for_reading=True).read(cell.unit, ["InvocationID"])["InvocationID"]
 
 
 def _kill(scope: Scope, cell: Cell) -> None:

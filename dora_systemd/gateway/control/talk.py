@@ -43,8 +43,11 @@ class Talk:
     def after_reply(self, task: Task) -> None:
         """Run `task` after the reply to the current request, while the client is connected.
 
-        Raises DoraSystemdError if there are too many tasks.
+        Raises DoraSystemdError if it has disconnected, or there are too many tasks.
         """
+        if self.is_over:
+            task.close()
+            raise DoraSystemdError("cannot follow: the client has disconnected")
         if len(self._running) >= _MOST_TASKS:
             task.close()
             raise DoraSystemdError(f"cannot follow more: at most {_MOST_TASKS} on one connection")
@@ -59,10 +62,12 @@ class Talk:
         self._next.clear()
 
     async def end(self) -> None:
-        """The client has disconnected: end all of its tasks."""
+        """The client has disconnected: end all of its tasks, and close what they would have."""
         self.is_over = True
         for one in self._next:
             one.close()
+        for connection in self.topics.values():
+            connection.close()
         tasks = list(self._running)
         for task in tasks:
             task.cancel()

@@ -111,7 +111,7 @@ def read_graph(scope: Scope, uuid: str) -> dict[str, Any]:
 
     dora's own copy is what runs, with modules expanded; the file may have changed since the start.
     """
-    cell = Selector(uuid).find(Bus(scope))
+    cell = Selector(uuid).find(Bus(scope, for_reading=True))
     path = cell.options.dataflow
     running = _running_descriptor(scope, cell)
     return graph_values(parse_dataflow(running, path) if running else written_dataflow(path))

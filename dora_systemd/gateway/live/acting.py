@@ -12,12 +12,12 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.values import SECOND
 
 _LONGER = 30 * SECOND
-"""µs that systemd gives an end that is not through, from each moment on that tells of it. Without
+"""µs from each step of an action on that systemd gives the gateway to end, if it has to. Without
 that it would kill the gateway while a dataflow with a long grace duration stops."""
 
 
 class Action:
-    """One that is under way. must_end: the gateway is about to end, and it has not been told."""
+    """An action under way. must_end: the gateway is about to end, and the action does not know."""
 
     def __init__(self) -> None:
         self.must_end = False

@@ -2,6 +2,7 @@
 
 import asyncio
 import re
+import time
 from collections import deque
 from collections.abc import AsyncGenerator, AsyncIterator
 from contextlib import suppress
@@ -16,7 +17,7 @@ from dora_systemd.decisions.gateway.page_messages import LOG_FIELDS, PageMessage
 from dora_systemd.decisions.logs.fields import ExportReader
 from dora_systemd.decisions.logs.query import LogQuery, query_arguments
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.facts.cells import read_cells
+from dora_systemd.verbs.facts.cells import Cell, read_cells
 from dora_systemd.verbs.facts.recorded import find_query
 from dora_systemd.verbs.facts.selector import Selector
 
@@ -37,19 +38,37 @@ _CHUNK = 1 << 17
 Lines = list[dict[str, Any]]
 
 
-def log_query(scope: Scope, message: PageMessage) -> LogQuery:
-    """The records of a dataflow, which may have ended, or of a node. Raises DoraSystemdError."""
+def log_query(scope: Scope, message: PageMessage) -> tuple[LogQuery, Lines]:
+    """The records of a dataflow, which may have ended, or of a node, and what to say of others.
+
+    Raises DoraSystemdError.
+    """
     check_readable(scope)
     cells = read_cells(Bus(scope, for_reading=True))
     wanted = Selector(message.dataflow)
     ended = None if wanted.meant(cells) else wanted.ended(scope)
+    notes: Lines = []
     if ended is not None:
         # The name may have been used again.
         query = LogQuery(scope, name=ended.name, uuid=ended.uuid)
     else:
-        query = LogQuery(scope, name=wanted.loaded(cells).name)
+        cell = wanted.loaded(cells)
+        query = LogQuery(scope, name=cell.name)
+        notes = _notes(cell, message.node)
     nodes = (message.node,) if message.node else ()
-    return replace(query, nodes=nodes, want_unprintable=True, output="export")
+    return replace(query, nodes=nodes, want_unprintable=True, output="export"), notes
+
+
+def _notes(cell: Cell, node: str) -> Lines:
+    """Where the lines of nodes on other machines are."""
+    options = cell.options
+    if options.machine or not options.placed:
+        return []
+    # Imported late: most dataflows run on one machine.
+    from dora_systemd.decisions.machines.elsewhere import lines_elsewhere
+
+    records = lines_elsewhere(cell.name, options.placed, node, time.time_ns() // 1000)
+    return list(map(line_values, records))
 
 
 async def follow_lines(
@@ -59,8 +78,10 @@ async def follow_lines(
 
     Raises DoraSystemdError if the dataflow does not exist or the journal is not readable.
     """
-    query = await asyncio.to_thread(log_query, scope, message)
+    query, notes = await asyncio.to_thread(log_query, scope, message)
     query = replace(query, tail=str(FIRST_LINES), is_follow=True)
+    if notes:
+        yield notes, 0
     arguments = [f"--output-fields={LOG_FIELDS}", *query_arguments(query)]
     async with open_stream(arguments) as (child, stream):
         async for lines in _batches(stream):
@@ -98,7 +119,7 @@ async def find_lines(scope: Scope, message: PageMessage, most: int) -> tuple[Lin
 
     Raises DoraSystemdError: USAGE for a time that journalctl does not accept.
     """
-    query = await asyncio.to_thread(_query, scope, message)
+    query, notes = await asyncio.to_thread(_query, scope, message)
     arguments = [f"--output-fields={LOG_FIELDS}", *query_arguments(query)]
     reader, found, size, is_whole = ExportReader(), Lines(), 0, False
     with suppress(TimeoutError):
@@ -110,16 +131,17 @@ async def find_lines(scope: Scope, message: PageMessage, most: int) -> tuple[Lin
                 is_whole = not data
             if is_whole:
                 end_journalctl(child)
-    return found[:most][::-1], is_whole and len(found) <= most
+    return [*notes, *found[:most][::-1]], is_whole and len(found) <= most
 
 
-def _query(scope: Scope, message: PageMessage) -> LogQuery:
+def _query(scope: Scope, message: PageMessage) -> tuple[LogQuery, Lines]:
+    query, notes = log_query(scope, message)
     query = replace(
-        log_query(scope, message),
+        query,
         since=message.since,
         until=message.until,
         # People look for a text; journalctl ignores case if there is no capital in it.
         grep=re.escape(message.search),
         is_reverse=True,
     )
-    return find_query(JournalReader(), query, (), (), message.run or "ALL")
+    return find_query(JournalReader(), query, (), (), message.run or "ALL"), notes

@@ -20,7 +20,7 @@ export class Card {
     say(this.name, flow.name);
     showState(this.badge, flow.status);
     const ended = flow.ended_us ? since(flow.ended_us) : "";
-    const parts = [flow.waits_for || !isUp(flow) ? flow.text : `up ${uptime(flow.uptime_us)}`,
+    const parts = [flow.status === "Waiting" || !isUp(flow) ? flow.text : `up ${uptime(flow.uptime_us)}`,
       flow.nodes_total ? `${flow.nodes_alive}/${flow.nodes_total} nodes` : "",
       flow.restarts ? plural(flow.restarts, "restart") : "", ended,
       flow.release ? `release ${flow.release}` : ""];

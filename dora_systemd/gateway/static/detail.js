@@ -165,7 +165,7 @@ export class Detail {
     const known = this.about?.facts ?? {};
     const row = this.about?.row;
     const alive = `${flow.nodes_alive} of ${flow.nodes_total}`;
-    facts.show("Uptime", up ? uptime(flow.uptime_us) : "");
+    facts.show("Uptime", up && flow.uptime_us != null ? uptime(flow.uptime_us) : "");
     facts.show("Ended", !up && flow.ended_us ? since(flow.ended_us) : "");
     facts.show("Nodes", flow.nodes_total ? (up ? alive : String(flow.nodes_total)) : flow.problem);
     facts.show("Machines", flow.machines?.length ? ["head", ...flow.machines].join(", ") : "");

@@ -31,13 +31,15 @@ export class History {
       this.last.set(flow.uuid, flow);
     }
     for (const key of this.groups.keys()) if (!seen.has(key)) this.groups.delete(key);
+    const known = new Set(dataflows.map((flow) => flow.uuid));
+    for (const uuid of this.last.keys()) if (!known.has(uuid)) this.last.delete(uuid);
   }
 
   #note(key, facts, now, before, window) {
     if (!facts) return;
     const kept = this.groups.get(key) ?? series();
-    // A counter that went down belongs to another run.
-    const isSame = before && window > 0 && now.cpu_us >= before.cpu_us;
+    // A counter that went down belongs to another run; that of another machine is not sent.
+    const isSame = before && window > 0 && now.cpu_us !== null && now.cpu_us >= before.cpu_us;
     const share = (from, to) => (100 * Math.max(to - from, 0)) / window;
     kept.cpu.push(isSame ? share(before.cpu_us, now.cpu_us) : facts.cpu_percent ?? 0);
     kept.memory.push(facts.memory_bytes ?? 0);

@@ -44,7 +44,9 @@ function take(message) {
 function begin({ host, scope }) {
   say(by("place"), `${host} · ${scope === "system" ? "system" : `of ${scope}`}`);
   document.title = `dora on ${host}`;
+  // What was asked of the gateway before gets no answer any more.
   actions.clear();
+  if (detail) say(detail.buttons.pending, "");
   link.send({ type: "ended" });
   detail?.begin();
 }
@@ -160,8 +162,9 @@ function act(flow, action, node, values, release = "") {
 }
 
 function acted(message) {
+  const uuid = actions.get(message.number);
   actions.delete(message.number);
-  if (detail) {
+  if (detail && detail.uuid === uuid) {
     say(detail.buttons.pending, "");
     detail.askAbout();
   }

@@ -73,7 +73,7 @@ export function byNeed(a, b) {
   return rank(a) - rank(b) || (a.name < b.name ? -1 : 1);
 }
 
-const UP = ["Starting", "Running", "Degraded", "Stopping", "Restarting"];
+const UP = ["Starting", "Waiting", "Running", "Degraded", "Stopping", "Restarting"];
 export const isUp = (dataflow) => UP.includes(dataflow.status);
 
 const TIMES = { millis: "ms", secs: "s", micros: "µs", nanos: "ns" };

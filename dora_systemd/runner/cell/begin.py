@@ -37,7 +37,7 @@ def enter_supervisor() -> Path:
 
     DelegateSubgroup= does this, but systemd before 254 does not have it. Raises OSError.
     """
-    own = cgroup.group_path(cgroup.own_group())
+    own = cgroup.group_path(cgroup.group_of())
     if own.name == cgroup.SUPERVISOR:
         return own.parent
     cgroup.make_group(own / cgroup.SUPERVISOR)
@@ -58,12 +58,21 @@ def make_lock(path: Path) -> None:
 def start_coordinator(
     dora: str, paths: CellPaths, environment: Mapping[str, str], port: int = 0
 ) -> engine.Child:
-    """Start a coordinator, which prints its port. environment: of the nodes. Raises OSError."""
+    """Start a coordinator, which prints its port. environment: of the nodes.
+
+    Raises OSError, and DoraSystemdError (NO_DORA) if dora is no program.
+    """
     paths.coordinator.mkdir(mode=0o700, exist_ok=True)
     own = engine.coordinator_environment(environment, paths.coordinator)
-    return engine.spawn(
-        "coordinator", engine.coordinator_command(dora, port), own, paths.coordinator
-    )
+    command = engine.coordinator_command(dora, port)
+    try:
+        return engine.spawn("coordinator", command, own, paths.coordinator)
+    except OSError:
+        # Imported late: it takes a while, and most dataflows have a dora.
+        from dora_systemd.adapters.dora.command import find_dora
+
+        find_dora(dora, None, "")
+        raise
 
 
 def daemon_variables(

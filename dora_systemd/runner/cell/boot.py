@@ -34,7 +34,7 @@ class EarlyDaemon:
         self._work = beside(self._start_daemon)
 
     def _start_daemon(self) -> Daemon | None:
-        # The kernel lets this wait for some 10 ms. Nodes does it too, and reports errors.
+        # The kernel makes this wait for some 10 ms. Nodes does it too, and reports errors.
         with contextlib.suppress(OSError):
             cgroup.enable_controllers(self._unit)
         self._port = self._find_port()

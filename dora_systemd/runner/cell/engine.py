@@ -54,7 +54,10 @@ class Engine:
         self._token = ""
 
     def start_coordinator(self) -> engine.Child:
-        """Start the coordinator, unless it boots already; it prints its port. Raises OSError."""
+        """Start the coordinator, unless it boots already; it prints its port.
+
+        Raises as start_coordinator() does.
+        """
         boot = self._boot if isinstance(self._boot, Boot) else None
         child = boot.coordinator if boot else self._spawn_coordinator()
         self._children[child.label] = child

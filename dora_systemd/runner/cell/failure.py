@@ -20,10 +20,14 @@ def failed(what: str, error: Exception) -> life.Failed:
     if isinstance(error, DoraSystemdError):
         return life.Failed(at_us, what, error.message)
     lines = "".join(traceback.format_exception(error)).splitlines()
-    # Report the failure even if journald does not read standard error.
-    with contextlib.suppress(OSError, ValueError):
-        print("\n".join(f"<7>{line}" for line in lines), file=sys.stderr, flush=True)
+    say("\n".join(f"<7>{line}" for line in lines))
     return life.Failed(at_us, what, words(error))
+
+
+def say(text: str) -> None:
+    """Print to the journal, if journald still reads standard error: it may have restarted."""
+    with contextlib.suppress(OSError, ValueError):
+        print(text, file=sys.stderr, flush=True)
 
 
 def words(error: Exception) -> str:

@@ -83,7 +83,8 @@ def show(uuid: str, paths: CellPaths, seconds: float) -> None:
     begin_us = time.time_ns() // 1000 + duration
     text = f"restarting in {format_duration(-(-duration // SECOND) * SECOND)}"
     table = CellStatus(uuid=uuid, stage="restarting", text=text, started_us=begin_us)
-    files.write_atomic(paths.status, table.to_json(), 0o600)
+    with contextlib.suppress(DoraSystemdError):  # only `list` needs the table
+        files.write_atomic(paths.status, table.to_json(), 0o600)
     notify.send_status(text)
 
 

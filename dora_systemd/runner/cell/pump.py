@@ -13,7 +13,6 @@ loses an event's effect; after the second the cell would wait for an event that 
 
 import asyncio
 import contextlib
-import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
@@ -33,7 +32,7 @@ from dora_systemd.decisions.life.view import cell_status, format_status, has_sta
 from dora_systemd.decisions.logs.events import END_EVENTS, NODE_END_EVENTS
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
-from dora_systemd.runner.cell.failure import failed
+from dora_systemd.runner.cell.failure import failed, say
 from dora_systemd.runner.cell.life import Life
 from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.values import SECOND
@@ -167,7 +166,7 @@ class Pump:
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(seconds):
                 await future
-        return is_so(self.cell)
+        return future.done() and not future.cancelled()  # it may be over by now
 
     def _tell_waiting(self) -> None:
         for is_so, future in self._waiting:
@@ -220,6 +219,7 @@ class Pump:
         table = self.amend(table._replace(up_us=own.up_us, is_first=own.is_first))
         try:
             files.write_atomic(self._paths.status, table.to_json(), 0o600)
+            self._is_unwritten = False
         except DoraSystemdError as error:
             # Only `list` needs the table: the event that is being handled must go on.
             self._report_unwritten(error)
@@ -229,10 +229,9 @@ class Pump:
 
         The directory also has the nodes' pipes: without them dora cannot restart any node.
         """
-        if self._is_unwritten:
-            return
-        self._is_unwritten = True
-        print(f"<4>{error.message}", file=sys.stderr, flush=True)
+        if not self._is_unwritten:
+            self._is_unwritten = True
+            say(f"<4>{error.message}")
         if is_deleted(self._paths.root):
             reason = f"its directory {self._paths.root} is gone"
             lost = life.Refused(now_us(), reason, Cause.DIRECTORY_LOST)

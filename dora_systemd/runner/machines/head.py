@@ -119,7 +119,8 @@ class Head(Shared):
         """What also waits for the members, and does without dora if one is lost."""
         assert isinstance(dora, HeadEngine)
         pipes.left_out = NOISE
-        self.roster.push, pump.amend = pump.push, self.roster.amend
+        self.roster.push, self.roster.refresh = pump.push, pump.refresh
+        pump.amend = self.roster.amend
         dialogue = HeadDialogue(options, pump, dora, nodes, pipes)
         dialogue.begin(self.roster, dora, self.this_life.is_first)
         return dialogue

@@ -12,6 +12,7 @@ from dora_systemd.adapters.runner_socket.door import Door
 from dora_systemd.decisions.cell.machines import members_of
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.machines.wire import Forwards, format_message
+from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.begin import Daemon, start_coordinator, start_daemon
 from dora_systemd.runner.cell.boot import Boot
@@ -36,7 +37,7 @@ class HeadBoot(Boot):
         own = shared_environment(environment, options.addresses)
         try:
             coordinator = start_coordinator(options.dora, paths, own, self.ports.coordinator)
-        except OSError:
+        except (OSError, DoraSystemdError):
             self.door.close()
             raise
         super().__init__(coordinator, options, paths, unit, own)

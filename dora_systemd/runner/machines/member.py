@@ -7,6 +7,7 @@ has been told is in memory only.
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 from dora_systemd.adapters.dora.command import version_numbers
@@ -32,6 +33,7 @@ from dora_systemd.runner.machines.lines import Lines
 from dora_systemd.runner.machines.member_boot import MemberBoot, no_head
 from dora_systemd.runner.machines.member_dialogue import MemberDialogue, is_going_down
 from dora_systemd.runner.machines.shared import Shared
+from dora_systemd.runner.machines.uses import Uses
 from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.terminal_text import short_line
 
@@ -88,14 +90,14 @@ class Member(Shared):
         """What finds the run of the head, and judges its own nodes only."""
         assert isinstance(dora, MemberEngine)
         pipes.left_out = NOISE
-        self._pump, pump.amend = pump, self._note_table
+        self._pump, pump.amend = pump, partial(self._note_table, Uses(nodes))
         dialogue = MemberDialogue(options, pump, dora, nodes, pipes)
         dialogue.begin(self, dora)
         dialogue.spawn("hear the head", self._hear_head())
         return dialogue
 
-    def _note_table(self, table: CellStatus) -> CellStatus:
-        self._table = table.to_json()
+    def _note_table(self, uses: Uses, table: CellStatus) -> CellStatus:
+        self._table = uses.added(table).to_json()
         return table
 
     def _send_table(self) -> None:

@@ -29,6 +29,8 @@ from dora_systemd.values import quoted
 
 _SILENT_BEATS = 3
 """A member of which nothing was heard for so many beats may be gone, so dora is not asked."""
+_REFRESH_SECONDS = 0.5
+"""The table of the head is written at most so often because of the members."""
 _LONGEST = 300
 
 
@@ -58,8 +60,9 @@ class Member:
 class Roster:
     """All members of a dataflow. push: takes the events; it is set before the first talk.
 
-    changed: set whenever something is new of a member. is_awaited: whether a person waits for this
-    start, who can mend what a machine at its boot cannot.
+    refresh: writes the table of the head, because that of a member is new. changed: set whenever
+    something is new of a member. is_awaited: whether a person waits for this start, and can mend
+    what a machine at its boot cannot.
     """
 
     def __init__(self, options: RunnerOptions, ports: wire.Forwards) -> None:
@@ -69,6 +72,8 @@ class Roster:
         self.changed = asyncio.Event()
         self.is_awaited = False
         self.push: Callable[[life.Event], None] = lambda _: None
+        self.refresh: Callable[[], None] = lambda: None
+        self._is_refreshing = False
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -176,6 +181,7 @@ class Roster:
             self._ready(name, message)
         elif isinstance(message, wire.Table):
             self._members[name].table = CellStatus.from_json(message.status)
+            self._refresh_soon()
         elif isinstance(message, wire.Refused):
             self._give_up(name, message, Cause.MACHINE_REFUSES)
         elif isinstance(message, wire.Ended):
@@ -187,6 +193,15 @@ class Roster:
         elif isinstance(message, wire.Taken):
             cause = Cause.NO_MACHINE if self.is_awaited else Cause.MACHINE_LOST
             self._give_up(name, message, cause)
+
+    def _refresh_soon(self) -> None:
+        if not self._is_refreshing:
+            self._is_refreshing = True
+            asyncio.get_running_loop().call_later(_REFRESH_SECONDS, self._refresh)
+
+    def _refresh(self) -> None:
+        self._is_refreshing = False
+        self.refresh()
 
     def _ready(self, name: str, message: wire.Ready) -> None:
         if not message.work.startswith("/"):

@@ -39,11 +39,6 @@ class Watch:
         """Let the task look again."""
         self._event.set()
 
-    @property
-    def is_woken(self) -> bool:
-        """Whether something has changed since clear()."""
-        return self._event.is_set()
-
     async def wait(self, seconds: float) -> None:
         """Wait for a change, at most `seconds`."""
         with contextlib.suppress(TimeoutError):

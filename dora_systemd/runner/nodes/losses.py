@@ -64,7 +64,10 @@ class LossWatch:
         if sent - self._seen < WORTH and not self._is_open:
             return
         until = self._now_us()
-        self._stored += await asyncio.to_thread(self._count, self._since, until - 1)
+        try:
+            self._stored += await asyncio.to_thread(self._count, self._since, until - 1)
+        except (DoraSystemdError, RuntimeError):
+            return  # the journal, or a thread, is not to be had now: the next check counts it all
         self._since, self._seen = until, sent
         lost = sent - self._base - self._stored
         if lost - self._lost > tolerance:

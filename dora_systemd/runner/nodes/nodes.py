@@ -144,8 +144,8 @@ class Nodes:
     def expect(self) -> None:
         """The nodes are about to be started: each launcher moves itself into its group.
 
-        The kernel lets the first move in a while wait for some 10 ms. Have a move that changes
-        nothing wait for that now, in a thread.
+        The kernel makes the first move in a while wait for some 10 ms. A move that changes nothing
+        waits for that now, in a thread.
         """
         beside(partial(cgroup.move_process, self._unit / cgroup.SUPERVISOR, 0))
 
@@ -159,10 +159,14 @@ class Nodes:
             path = self._paths.work / "out" / run / f"log_{node}.jsonl"
             put = partial(self._pipes.write_fields, node=node)
             is_busy = partial(self._pipes.is_busy, node)
-            place, watch = self._paths.node_place(node), self._holds[node].look
+            place, watch = self._paths.node_place(node), partial(self._watch_backlog, node)
             tail = JsonlTail(loop, path, put, is_busy, place, watch)
             self._tails[node] = tail
             tail.start()
+
+    def _watch_backlog(self, node: str, backlog: int) -> None:
+        if hold := self._holds.get(node):  # another one since the node was removed and added
+            hold.look(backlog)
 
     def adopt(self, node: str, pid: int, rights: Sequence[NodeRights] = ()) -> None:
         """Dora has executed `node`: name its lines, and move it unless its launcher has done so.

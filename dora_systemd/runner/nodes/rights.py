@@ -35,6 +35,6 @@ def check_first(options: RunnerOptions, dataflow: Dataflow) -> None:
     """
     check_named_nodes(options, dataflow)
     # A dry run of a user is in no unit, and has the rights of that shell.
-    if _OF_UNITS.search(cgroup.own_group()):
+    if _OF_UNITS.search(cgroup.group_of()):
         check_cpus(options.node_limits)
         prove_rights(options.node_rights)

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 from dora_systemd.adapters.runner_socket.client import ask, done_of
-from dora_systemd.errors import DoraSystemdError
+from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.paths import CellPaths
 
 
@@ -16,10 +16,13 @@ def main() -> int:
     """Ask the runner of this unit; 0, or the exit status of doractl for the error."""
     directory = os.environ.get("RUNTIME_DIRECTORY", "")
     try:
+        if not directory:
+            hint = "systemd runs this: use `doractl reload`"
+            raise DoraSystemdError("cannot run without RUNTIME_DIRECTORY", hint, ExitCode.USAGE)
         path = CellPaths(Path(directory)).socket
         done = done_of(path, ask(path, {"verb": "reload"}))
     except DoraSystemdError as error:
-        print(error.message, file=sys.stderr)
+        print(f"{error.message}\n{error.hint}".strip(), file=sys.stderr)
         return error.code
     print("\n".join(done) or "Nothing has changed")
     return 0

@@ -15,6 +15,7 @@ from dora_systemd.decisions.cell.hot_reload import SettingsChange
 from dora_systemd.decisions.cell.limits import format_node_limits, parse_node_limits
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.programs import own_account
+from dora_systemd.trust.sight import Sight
 
 _SECONDS = 600.0
 """Timeout of the child, which takes 0.3 s. A machine under load can need a hundred times that, and
@@ -40,7 +41,7 @@ class SettingsFile:
     def take(self) -> None:
         """Read the file. Raises DoraSystemdError."""
         self._taken.unlink(missing_ok=True)
-        if Path(self.path).exists():
+        if Sight().exists(self.path):
             files.write_atomic(self._taken, files.read_text(Path(self.path)), 0o600)
 
     def accept(self) -> None:

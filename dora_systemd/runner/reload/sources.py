@@ -125,12 +125,14 @@ def _stubborn(steps: Iterable[Step], operators: Mapping[str, Mapping[str, str]])
 def check_programs(paths: Iterable[str]) -> None:
     """Raise DoraSystemdError (BAD_INPUT) for a program that is unreadable or does not compile."""
     for path in paths:
+        is_python = path.endswith(".py")
         try:
-            text = Path(path).read_text(errors="replace")
+            with Path(path).open(errors="replace") as file:
+                text = file.read() if is_python else ""  # a binary may have a gigabyte
         except OSError as error:
             message = f"cannot use {path}: {error.strerror}"
             raise DoraSystemdError(message, "", ExitCode.BAD_INPUT) from error
-        if path.endswith(".py") and (reason := syntax_error(path, text)):
+        if is_python and (reason := syntax_error(path, text)):
             raise DoraSystemdError(f"cannot use {path}: {reason}", "", ExitCode.BAD_INPUT)
 
 

@@ -119,7 +119,7 @@ def read_cells(manager: Manager) -> list[Cell]:
 def proven(cells: Iterable[Cell]) -> list[Cell]:
     """Those that are ours by their ExecStart=, with their options: one question for each.
 
-    For all who act on them, or need the options: systemd forgets them with the unit.
+    Whatever acts on them or needs their options starts here: systemd forgets these with the unit.
     """
     return [cell for cell in cells if cell.has_options]
 

@@ -130,6 +130,7 @@ def _life(reading: Reading) -> dict[str, Any]:
 
 def _usage(reading: Reading, known: tuple[CpuSample, ...]) -> dict[str, Any]:
     status, use, now = reading.status, reading.usage, reading.sample
+    away = {node: one.facts() for node, one in reading.away.items()}
     rights = _rights(reading.cell)
     samples = known or (CpuSample(reading.unit[STARTED]),)
     groups = {key: path for key, path in reading.groups.items() if key != WHOLE_CELL}
@@ -145,6 +146,7 @@ def _usage(reading: Reading, known: tuple[CpuSample, ...]) -> dict[str, Any]:
                 status.nodes.get(node),
                 {
                     **(_numbers(use[node], samples, now, node) if node in use else {}),
+                    **away.get(node, {}),
                     **_signs(status, node, now.at_us),
                 },
             )._replace(

@@ -21,6 +21,7 @@ from dora_systemd.verbs.facts.cells import Cell
 
 if TYPE_CHECKING:  # the table of `list` does without
     from dora_systemd.decisions.cell.owed import Owed
+    from dora_systemd.decisions.machines.usage import NodeUse
     from dora_systemd.verbs.facts.held import Held
 
 UP_SINCE = "ActiveEnterTimestampMonotonic"
@@ -56,6 +57,15 @@ class Reading(NamedTuple):
             {key: one.cpu_us for key, one in self.usage.items()},
             {key: one.throttling for key, one in self.usage.items()},
         )
+
+    @property
+    def away(self) -> "Mapping[str, NodeUse]":
+        """What nodes on other machines use, as those have said."""
+        if not self.status.usage:
+            return {}
+        from dora_systemd.decisions.machines.usage import uses_of
+
+        return uses_of(self.status)
 
 
 def read_dataflow(

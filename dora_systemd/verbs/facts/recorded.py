@@ -46,7 +46,7 @@ def _is_loaded(scope: Scope, selectors: Sequence[str]) -> bool:
     from dora_systemd.verbs.facts.cells import read_cells
 
     with suppress(DoraSystemdError):
-        cells = read_cells(Bus(scope))
+        cells = read_cells(Bus(scope, for_reading=True))
         return any(one.meant(cells) for one in map(Selector, selectors))
     return False
 

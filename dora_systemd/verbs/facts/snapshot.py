@@ -33,7 +33,7 @@ def _observe(reading: Reading, row: DataflowRow) -> Observed:
         row,
         reading.at_us,
         restarts,
-        reading.usage,
+        {**reading.usage, **{node: one.use for node, one in reading.away.items()}},
         read_strains(reading),
         reading.status.lines,
     )

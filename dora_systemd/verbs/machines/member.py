@@ -30,7 +30,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.trust.files import read_file
 from dora_systemd.trust.socket_table import is_open_beyond
 from dora_systemd.trust.sockets import plain
-from dora_systemd.values import INFINITY, SECOND
+from dora_systemd.values import INFINITY
 from dora_systemd.verbs.facts.cells import read_cell
 from dora_systemd.verbs.facts.reason import failure_reason, runners_refusal
 from dora_systemd.verbs.machines.head import Head, read_line
@@ -42,8 +42,6 @@ from dora_systemd.verbs.start.unit import plan_properties, systemd_number
 _START_SECONDS = 60.0
 """For the first words of the runner."""
 _ADDRESS_SECONDS, _LOOK_SECONDS = 10.0, 0.1
-_MOST_GRACE = 3600 * SECOND
-"""µs. The head's runner says it: it must not keep this machine from a shutdown."""
 _PASSING = (ExitCode.FAILURE, ExitCode.NO_SYSTEMD)
 """Errors that the next attempt may not meet, such as a machine that still boots."""
 
@@ -144,11 +142,15 @@ def _end_old_part(manager: Manager, request: MemberRequest) -> None:
 
 
 def _member_plan(plan: Plan, part: Part) -> Plan:
-    """The head owns restarts and the time of a start."""
+    """The head owns restarts and the time of a start.
+
+    Its runner can shorten the grace duration of the settings, which its doractl and this machine
+    have given. Longer, it could keep this machine from a shutdown.
+    """
     options = plan.options._replace(
         restart=RestartPolicy("no"),
         start_timeout=INFINITY,
-        grace=min(part.grace, _MOST_GRACE),
+        grace=min(part.grace, plan.options.grace),
     )
     return replace(plan, options=options)
 

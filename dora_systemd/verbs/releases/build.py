@@ -92,7 +92,7 @@ def built_project(
         tree.hand_over(files, None if user is None else (user.pw_uid, user.pw_gid))
         with _noted(build):
             _run(manager, build, tree)
-        root, place = build.source.root, str(tree.place)
+        root, place = build.source.root, str(tree.tree)
         with opened_project(root, account_of(user), place) as built:
             with _noted(build):
                 left = find_built(built, build.source.named, build.place, build.scope.is_user)
@@ -220,7 +220,7 @@ def _sent(manager: Manager, build: Build, tree: BuildTree, reading: int) -> list
     venv = None if own is None else str(place / own)
     properties = build_properties(
         beside_properties(manager, plan),
-        str(tree.place),
+        str(tree.tree),
         str(place),
         str(build.store.path.parent),
         build_environment(plan.environment, venv, plan.options.venv),

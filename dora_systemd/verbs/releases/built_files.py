@@ -126,10 +126,7 @@ def _is_interpreter(one: Found, venvs: set[str], is_user: bool) -> bool:
         if is_user or _is_roots(one.target):
             return True
         reason = f"it links to {one.target}, which others than root can change"
-        hint = (
-            "create the virtual environment with a Python of the system, such as /usr/bin/python3"
-        )
-        raise refusal(one.path, reason, hint)
+        raise refusal(one.path, reason, _PYTHON_HINT)
     return False
 
 

@@ -38,7 +38,7 @@ from dora_systemd.verbs.releases.trial import (
 )
 from dora_systemd.verbs.start.asked import note_request
 
-_KILLED = "the command that tried it was killed"
+KILLED = "the command that tried it was killed"
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,7 @@ def _end_killed(scope: Scope, standing: Standing, change: Change, life: str) -> 
         end_trial(manager, standing)
     # Once more: a restart may have been on its way.
     if read_life(manager, unit) != life:
-        _roll_back(manager, standing, change, Fault(_KILLED), lambda _: None)
+        _roll_back(manager, standing, change, Fault(KILLED), lambda _: None)
 
 
 def _note_stop(manager: Manager, change: Change) -> None:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.releases.store import Store, locked, unusable
 from dora_systemd.decisions.releases.choice import surplus
-from dora_systemd.decisions.releases.entries import touched
+from dora_systemd.decisions.releases.entries import Stored, touched
 from dora_systemd.decisions.releases.manifest import Manifest
 from dora_systemd.decisions.releases.progress import checking, waiting
 from dora_systemd.decisions.unit.file import persistent_unit, runner_of
@@ -80,10 +80,15 @@ def compare(
     """
     source = find_source(scope, request, want_build)
     last = present(manager, scope, store_of(scope, source.plan.options.name))
-    old = {path: one for path, one in last.files.items() if not one.is_built} if last else {}
     with opened_project(source.root, account_of(source.plan.user)) as project:
         found, _ = find_files(project, source.named, repository_owners(source))
-        return last.id if last else "", touched(old, digests(project, found))
+        return last.id if last else "", touched(of_project(last), digests(project, found))
+
+
+def of_project(release: Manifest | None) -> dict[str, Stored]:
+    """The files of a release that its project had, and no build has made."""
+    files = release.files if release else {}
+    return {path: one for path, one in files.items() if not one.is_built}
 
 
 def present(manager: Manager, scope: Scope, store: Store) -> Manifest | None:

@@ -41,19 +41,29 @@ def deployed_names(scope: Scope) -> list[str]:
 
 
 def read_releases(manager: Manager, scope: Scope, names: Sequence[str]) -> list[ReleaseRow]:
-    """All releases of these dataflows, the newest of each one first."""
+    """All releases of these dataflows, the newest of each one first.
+
+    Of several dataflows, one whose unit is not ours has releases in an unknown state. Raises
+    DoraSystemdError (NAME_IN_USE) for a single one.
+    """
     rows = []
     for name in names:
-        store, standing = store_of(scope, name), read_standing(manager, scope, unit_name(name))
+        store = store_of(scope, name)
+        standing: Standing | None = None
+        try:
+            standing = read_standing(manager, scope, unit_name(name))
+        except DoraSystemdError:
+            if len(names) == 1:
+                raise
         rows += [_row(store, standing, one) for one in reversed(store.known())]
     return rows
 
 
-def _row(store: Store, standing: Standing, one: Known) -> ReleaseRow:
+def _row(store: Store, standing: Standing | None, one: Known) -> ReleaseRow:
     manifest: Manifest | None = None
     with suppress(DoraSystemdError):  # others than root may not look into it
         manifest = store.manifest(one.id)
-    state = state_of(one, standing.current, standing.trial)
+    state = state_of(one, standing.current, standing.trial) if standing else UNKNOWN
     if manifest is None and state == UNPROVED:
         state = UNKNOWN
     return ReleaseRow(store.name, one.id, state, str(store.tree(one.id)), manifest)
@@ -65,11 +75,18 @@ def judge_releases(manager: Manager, scope: Scope) -> Iterator[Finding]:
         text = f"{path} is the rest of a deploy -H that was killed"
         yield Finding("releases", State.NOTE, text, "the next one removes it")
     for name in deployed_names(scope):
-        store, standing = store_of(scope, name), read_standing(manager, scope, unit_name(name))
-        if standing.trial:
-            text = f"{name} runs release {standing.trial} on trial, and the next boot does not"
-            remedy = f"doractl deploy --name {name}, or doractl rollback {name}"
-            yield Finding("releases", State.WARNING, text, remedy)
-        for path in () if is_locked(store) else remains(store, standing):
-            text = f"{path} is the rest of a deploy that was killed"
-            yield Finding("releases", State.NOTE, text, "the next deploy removes it")
+        try:
+            yield from _judge(manager, scope, name)
+        except DoraSystemdError as error:  # of one dataflow, which must not hide the others
+            yield Finding("releases", State.WARNING, error.message, error.hint)
+
+
+def _judge(manager: Manager, scope: Scope, name: str) -> Iterator[Finding]:
+    store, standing = store_of(scope, name), read_standing(manager, scope, unit_name(name))
+    if standing.trial:
+        text = f"{name} runs release {standing.trial} on trial, and the next boot does not"
+        remedy = f"doractl deploy --name {name}, or doractl rollback {name}"
+        yield Finding("releases", State.WARNING, text, remedy)
+    for path in () if is_locked(store) else remains(store, standing):
+        text = f"{path} is the rest of a deploy that was killed"
+        yield Finding("releases", State.NOTE, text, "the next deploy removes it")

@@ -34,7 +34,13 @@ from dora_systemd.scope import Scope
 from dora_systemd.trust.files import read_file
 from dora_systemd.verbs.inhibit.guard import IfInhibited, require_uninhibited
 from dora_systemd.verbs.releases.copy import newest
-from dora_systemd.verbs.releases.deploy import Deployed, DeployRequest, deploy, present
+from dora_systemd.verbs.releases.deploy import (
+    Deployed,
+    DeployRequest,
+    deploy,
+    of_project,
+    present,
+)
 from dora_systemd.verbs.releases.listing import root_of, store_of
 from dora_systemd.verbs.releases.soak import Tell
 from dora_systemd.verbs.releases.source import Source, find_source
@@ -64,7 +70,7 @@ def compare_sent(
     """What a deploy would change, as compare(). Raises DoraSystemdError."""
     parcel = parse_parcel(stream.line(MOST_HEAD))
     last = present(manager, scope, store_of(scope, parcel.name))
-    return last.id if last else "", touched(last.files if last else {}, parcel.files)
+    return last.id if last else "", touched(of_project(last), parcel.files)
 
 
 def receive(

@@ -4,16 +4,17 @@ from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.releases.store import Store, locked
 from dora_systemd.decisions.logs.events import ROLLED_BACK
 from dora_systemd.decisions.releases.choice import before
-from dora_systemd.decisions.releases.progress import waiting
+from dora_systemd.decisions.releases.manifest import Manifest
+from dora_systemd.decisions.releases.progress import checking, waiting
 from dora_systemd.decisions.unit.file import runner_of
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import did_you_mean, unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import is_directory
-from dora_systemd.values import quoted
+from dora_systemd.values import quoted, shown
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.inhibit.guard import IfInhibited, require_uninhibited
-from dora_systemd.verbs.releases.change import Change, change_release, stop_observer
+from dora_systemd.verbs.releases.change import KILLED, Change, change_release, stop_observer
 from dora_systemd.verbs.releases.clean import clean
 from dora_systemd.verbs.releases.deploy import Deployed
 from dora_systemd.verbs.releases.listing import deployed_names, store_of
@@ -22,7 +23,6 @@ from dora_systemd.verbs.releases.trial import Standing, go_back, read_standing, 
 from dora_systemd.verbs.start.asked import note_request
 
 _COMMAND = "doractl rollback"
-_KILLED = "the command that tried it was killed"
 
 
 def roll_back(
@@ -59,6 +59,9 @@ def roll_back(
             hint = f"doractl releases {store.name} lists the others"
             message = f"cannot run release {chosen} of {store.name}: it has no unit file of ours"
             raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+        if chosen != standing.current:  # what every start runs anyway
+            tell(checking())
+            _require_intact(store, manifest)
         # One that was disabled stays so.
         change = Change(chosen, text, options, soak, False, "rollback", how, by)
         change_release(manager, scope, store, standing, change, tell)
@@ -79,13 +82,23 @@ def deployed_name(manager: Manager, scope: Scope, selector: str) -> str:
     return name
 
 
+def _require_intact(store: Store, manifest: Manifest) -> None:
+    """Refuse a release that is not what has proved itself; a trial may not notice the damage."""
+    if damaged := sorted(manifest.files.keys() - store.intact(manifest).keys()):
+        more = f" and {len(damaged) - 1} more" if len(damaged) > 1 else ""
+        reason = f"{shown(damaged[0])}{more} changed on the disk"
+        hint = f"check the disk; doractl releases {store.name} lists the others"
+        message = f"cannot run release {manifest.id} of {store.name}: it is damaged: {reason}"
+        raise DoraSystemdError(message, hint, ExitCode.BAD_INPUT)
+
+
 def _end_first(manager: Manager, store: Store, standing: Standing, by: str, tell: Tell) -> Deployed:
     """End the trial of a release that has none before it: what was there before runs again."""
     for cell in standing.running:
         note_request("stop-asked", cell.name, cell.uuid, by)
     go_back(manager, standing, standing.was_up, stop_observer(tell))
     uuid = standing.uuid or store.manifest(standing.trial).uuid
-    details = {"release": standing.trial, "former": "", "nodes": "", "reason": _KILLED}
+    details = {"release": standing.trial, "former": "", "nodes": "", "reason": KILLED}
     note_request(ROLLED_BACK, store.name, uuid, by, **details)
     return Deployed(uuid, store.name, standing.boot.unit, "", standing.trial, 0, 0, 0)
 

@@ -1,32 +1,40 @@
 """Packs a project for `deploy -H`. The hosts decide whatever depends on a machine."""
 
 import contextlib
+import hashlib
 import os
+import posixpath
 import pwd
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from dora_systemd.adapters.host.files import decoded, parse_yaml
 from dora_systemd.adapters.releases.spool import Spool, spooled
-from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
-from dora_systemd.decisions.releases.entries import Found
+from dora_systemd.decisions.descriptor.dataflow import Dataflow
+from dora_systemd.decisions.releases.entries import Found, Stored, refusal
 from dora_systemd.decisions.releases.parcel import Parcel
 from dora_systemd.decisions.settings.resolve import Settings, resolve_settings
 from dora_systemd.decisions.settings.table import ENV_FILE, VENV, WORKING_DIRECTORY
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import settings_path
 from dora_systemd.scope import Scope
-from dora_systemd.trust.files import read_file
-from dora_systemd.trust.paths import Place, exists, is_directory, reached
+from dora_systemd.trust.paths import Place, exists, reached
 from dora_systemd.trust.programs import Account
 from dora_systemd.trust.project import opened_project
 from dora_systemd.values import format_rounded_size, shown
 from dora_systemd.verbs.releases.files import copy_files, find_files
-from dora_systemd.verbs.releases.source import named_paths, project_root
+from dora_systemd.verbs.releases.source import named_paths, project_root, read_dataflow
 from dora_systemd.verbs.start.account import DEFAULT_USER, account_of, choose_user
-from dora_systemd.verbs.start.plan import DEFAULT_FILE, StartRequest, path_of, request_name
-from dora_systemd.verbs.start.settings import require_modest
+from dora_systemd.verbs.start.plan import StartRequest, request_name
+from dora_systemd.verbs.start.settings import (
+    SettingsFile,
+    read_settings_file,
+    require_modest,
+)
+
+_NO_PLACE = "/dev/null"
+"""No file can be below it."""
+_MOST_LINKS = 40
 
 
 class Packed(NamedTuple):
@@ -37,13 +45,17 @@ class Packed(NamedTuple):
 
 
 class _Sender(NamedTuple):
-    """A project here. directory: its working directory, "" for that of the dataflow file."""
+    """A project here. directory: its working directory, "" for that of the dataflow file.
+
+    beside: what the settings file beside that says, None without one.
+    """
 
     place: Place
     dataflow: Dataflow
     settings: Settings
     root: str
     directory: str
+    beside: bytes | None
 
 
 @contextlib.contextmanager
@@ -73,6 +85,7 @@ def packed(
                 _require_roots(root, found)
             _require_own(found, root, dataflow)
             files = copy_files(project, found, spool, None, progress)
+            _require_same(sender, files)
         parcel = Parcel(
             name=request_name(StartRequest(dataflow.source, request.name)),
             source=shown(root),
@@ -85,28 +98,54 @@ def packed(
 
 
 def _find(request: StartRequest) -> _Sender:
-    path = path_of(request)
-    path = path / DEFAULT_FILE if is_directory(path) else path
-    path = Path(os.path.normpath(path))
-    written = read_file(path)
-    dataflow = parse_dataflow(parse_yaml(decoded(written.data, path), path), str(path))
+    path, written, dataflow = read_dataflow(request)
     beside = Path(settings_path(str(path)))
-    documents = []
-    if exists(beside):
-        documents.append((str(beside), _document(beside)))
-        _require_trusted(beside)
+    read = read_settings_file(beside) if exists(beside) else None
+    if read:
+        _require_trusted(read)
+    documents = [(str(beside), read.document)] if read else []
     settings = resolve_settings(request.flags, {}, documents)
     given = settings[WORKING_DIRECTORY]
     directory = "" if given is None else os.path.normpath(Path(given).absolute())
     root = project_root(path, directory or str(path.parent))
-    return _Sender(written.place, dataflow, settings, root, directory)
+    said = read.data if read else None
+    return _Sender(written.place, dataflow, settings, root, directory, said)
 
 
-def _require_trusted(settings: Path) -> None:
+def _require_trusted(read: SettingsFile) -> None:
     """Refuse settings by which another user would get the rights of the login over there."""
-    place = read_file(settings).place
-    if place.borrowed or place.uid not in (0, os.geteuid()):
-        require_modest(settings)
+    if not read.place.borrowed and read.place.uid in (0, os.geteuid()):
+        return
+    require_modest(read)
+    # Here its owner reads them, over there whoever logs in.
+    for file in resolve_settings({}, {}, [(f"{_NO_PLACE}/x.yml", read.document)])[ENV_FILE]:
+        if not os.path.normpath(file).startswith(f"{_NO_PLACE}/"):
+            message = f"cannot send {shown(str(read.path))}: env_file is not in the project"
+            hint = "name it relative to that file, or give it with --env-file"
+            raise DoraSystemdError(message, hint, ExitCode.NO_PERMISSION)
+
+
+def _require_same(sender: _Sender, files: Mapping[str, Stored]) -> None:
+    """Raise DoraSystemdError (BAD_INPUT) unless the settings that were checked are in the parcel.
+
+    The account that reads the project for root can change them meanwhile, or lie about them.
+    """
+    path = os.path.relpath(settings_path(sender.dataflow.source), sender.root)
+    packed_one = _behind_links(path, files)
+    wanted = None if sender.beside is None else hashlib.sha256(sender.beside).hexdigest()
+    if (packed_one and packed_one.digest) != wanted:
+        raise refusal(path, "it changed while it was packed", "deploy again")
+
+
+def _behind_links(path: str, files: Mapping[str, Stored]) -> Stored | None:
+    """The file that a path leads to, None if it is not in the parcel."""
+    one = files.get(path)
+    for _ in range(_MOST_LINKS):
+        if one is None or not one.target:
+            break
+        path = posixpath.normpath(posixpath.join(posixpath.dirname(path), one.target))
+        one = files.get(path)
+    return one
 
 
 def _venv_note(sender: _Sender) -> str:
@@ -115,10 +154,6 @@ def _venv_note(sender: _Sender) -> str:
     if sender.settings.is_given(VENV) or not exists(f"{venv}/bin/python"):
         return ""
     return f"{shown(venv)} stays here: name a virtual environment of the hosts with --venv"
-
-
-def _document(path: Path) -> object:
-    return parse_yaml(decoded(read_file(path).data, path), path, allow_empty=True)
 
 
 def _reader(sender: _Sender) -> Account | None:

@@ -13,7 +13,7 @@ from dora_systemd.decisions.settings.table import ENV_FILE, USER, VENV, WORKING_
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import settings_path
 from dora_systemd.scope import Scope
-from dora_systemd.trust.files import read_file
+from dora_systemd.trust.files import Text, read_file
 from dora_systemd.trust.paths import Place, exists, is_directory
 from dora_systemd.values import shown
 from dora_systemd.verbs.releases.builders import find_builders
@@ -59,11 +59,7 @@ def find_source(scope: Scope, request: StartRequest, want_build: bool = True) ->
 
     want_build: what it needs is built in the release. Raises DoraSystemdError.
     """
-    path = path_of(request)
-    path = path / DEFAULT_FILE if is_directory(path) else path
-    path = Path(os.path.normpath(path))
-    written = read_file(path)
-    dataflow = parse_dataflow(parse_yaml(decoded(written.data, path), path), str(path))
+    path, written, dataflow = read_dataflow(request)
     is_unbuilt = want_build and bool(built_nodes(dataflow))
     plan = make_plan(scope, replace(request, dataflow=str(path), is_unbuilt=is_unbuilt))
     directory = plan.options.working_directory
@@ -83,6 +79,19 @@ def find_source(scope: Scope, request: StartRequest, want_build: bool = True) ->
     read[os.path.relpath(beside, root)] = settings and settings.data
     builders = find_builders(plan, dataflow, root) if want_build else ()
     return Source(root, origin, plan, named, read, *builders)
+
+
+def read_dataflow(request: StartRequest) -> tuple[Path, Text, Dataflow]:
+    """The dataflow file that `request` names, itself or by its directory: its path and content.
+
+    Raises DoraSystemdError.
+    """
+    path = path_of(request)
+    path = path / DEFAULT_FILE if is_directory(path) else path
+    path = Path(os.path.normpath(path))
+    written = read_file(path)
+    dataflow = parse_dataflow(parse_yaml(decoded(written.data, path), path), str(path))
+    return path, written, dataflow
 
 
 def named_paths(

@@ -7,6 +7,7 @@ from pathlib import Path
 from dora_systemd.adapters.host.files import decoded
 from dora_systemd.decisions.remote.hosts import ALL, Host, parse_host, parse_hosts_file
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.scope import config_home
 from dora_systemd.trust.files import read_file
 from dora_systemd.trust.paths import exists
 
@@ -37,9 +38,8 @@ def listed_hosts(environment: Mapping[str, str]) -> list[Host]:
 
 def host_files(environment: Mapping[str, str]) -> list[Path]:
     """The files that may list hosts; the first that exists counts."""
-    home = environment.get("HOME", "")
-    config = environment.get("XDG_CONFIG_HOME", "") or (f"{home}/.config" if home else "")
-    return [*([Path(config) / USER_HOSTS] if config.startswith("/") else []), SYSTEM_HOSTS]
+    config = config_home(environment)
+    return [*([Path(config) / USER_HOSTS] if config else []), SYSTEM_HOSTS]
 
 
 def _read(path: Path) -> str:

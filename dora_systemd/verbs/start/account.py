@@ -2,7 +2,6 @@
 
 import os
 import pwd
-from contextlib import suppress
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
@@ -11,6 +10,7 @@ from dora_systemd.trust.programs import Account, account_from
 from dora_systemd.values import quoted, shown
 
 DEFAULT_USER = "dora"
+_MOST_DIGITS = 10  # of a uid
 """Runs the dataflows whose files belong to root; the package creates this user."""
 
 
@@ -32,10 +32,20 @@ def choose_user(
         return None
     if wanted is not None:
         return _entry(wanted)
-    # A missing directory is reported later, by a check with that user's permissions.
-    with suppress(FileNotFoundError, NotADirectoryError), reached(directory) as (_, place):
-        check_identity(dataflow, place)
+    try:
+        with reached(directory) as (_, place):
+            check_identity(dataflow, place)
+    except OSError as error:
+        # Its owner could put it back after this, so what cannot be checked is refused. The words
+        # are those of Look.check_reach(): they do not tell what root can see.
+        raise no_directory(directory) from error
     return _default_entry() if dataflow.uid == 0 else _owner_entry(dataflow.uid, dataflow.path)
+
+
+def no_directory(directory: str) -> DoraSystemdError:
+    """The error for a working directory that is none."""
+    message = f"cannot use {shown(directory)} as working directory: it is not a directory"
+    return DoraSystemdError(message, "correct --working-directory", ExitCode.BAD_INPUT)
 
 
 def account_of(user: pwd.struct_passwd | None) -> Account | None:
@@ -68,7 +78,8 @@ def _entry(wanted: str) -> pwd.struct_passwd:
     refusal = DoraSystemdError(
         f"cannot find a user {quoted(wanted)}", "see getent passwd", ExitCode.USAGE
     )
-    return _known(int(wanted) if wanted.isdecimal() else wanted, refusal)
+    is_number = wanted.isascii() and wanted.isdigit() and len(wanted) <= _MOST_DIGITS
+    return _known(int(wanted) if is_number else wanted, refusal)
 
 
 def _owner_entry(owner: int, dataflow: str) -> pwd.struct_passwd:

@@ -1,7 +1,7 @@
 """Checks that the name of a new dataflow is free, and cleans up after an ended one."""
 
-import itertools
 from dataclasses import replace
+from pathlib import Path
 
 from dora_systemd.adapters.bus.manager import Beside, Manager
 from dora_systemd.adapters.host.unit_files import (
@@ -108,9 +108,10 @@ def place_unit_file(
     if links:
         _forget_links(manager, plan.options.name)
     if want_boot:
-        for path in itertools.chain(*link_paths(boot, boot.options)):
-            remove_unit_file(path)
         install_unit_file(manager, boot, text, links)
+        old = set[Path]().union(*link_paths(boot, boot.options))
+        for path in old.difference(boot.path.with_name(unit) for unit in links):
+            remove_unit_file(path)
         remove_changes(boot.path)
         remove_unit_file(boot.runtime)
         manager.reload()

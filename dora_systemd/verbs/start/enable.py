@@ -9,6 +9,7 @@ import itertools
 import sys
 import time
 from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -198,17 +199,18 @@ def install_unit_file(
 
     links: unit files of the links to other machines, by unit.
     """
-    for unit, of_link in links.items():
-        write_unit_file(boot.path.with_name(unit), of_link)
-    write_unit_file(boot.path, text)
-    try:
-        _link(manager, str(boot.path), boot.unit)
-        sync_links(boot.path)
-    except DoraSystemdError as error:
-        put_unit_file(boot.path, boot.text)
-        for unit in links if boot.text is None else ():
-            remove_unit_file(boot.path.with_name(unit))
-        raise _no_link(boot.unit) if error.code is ExitCode.NOT_FOUND else error from error
+    files = {boot.path.with_name(unit): of_link for unit, of_link in links.items()}
+    with ExitStack() as undo:
+        for path, content in {**files, boot.path: text}.items():
+            before = read_unit_file(path)
+            write_unit_file(path, content)
+            undo.callback(put_unit_file, path, before)
+        try:
+            _link(manager, str(boot.path), boot.unit)
+            sync_links(boot.path)
+        except DoraSystemdError as error:
+            raise _no_link(boot.unit) if error.code is ExitCode.NOT_FOUND else error from error
+        undo.pop_all()
 
 
 def _no_link(unit: str) -> DoraSystemdError:

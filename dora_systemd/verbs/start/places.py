@@ -24,6 +24,7 @@ from dora_systemd.decisions.settings.table import DORA, VENV, WORKING_DIRECTORY
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.files import unreadable
 from dora_systemd.trust.sight import Sight, cannot_reach
+from dora_systemd.verbs.start.account import no_directory
 
 _OWN = Sight()
 
@@ -61,11 +62,7 @@ class Look:
         """Raise DoraSystemdError for a working directory, or files, that the user cannot access."""
         if not self.sight.is_directory(directory):
             self._blame(WORKING_DIRECTORY, directory, _OWN.is_directory(directory))
-            raise DoraSystemdError(
-                f"cannot use {directory} as working directory: it is not a directory",
-                "correct --working-directory",
-                ExitCode.BAD_INPUT,
-            )
+            raise no_directory(directory)
         for path in (dataflow, __file__):
             if self.user is not None and not self.sight.exists(path):
                 raise cannot_reach(self.user.pw_name, path)

@@ -11,22 +11,22 @@ from dora_systemd.decisions.settings.rights import NODE_RIGHTS
 from dora_systemd.decisions.settings.table import ENV_FILE, SETTINGS
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import settings_path
-from dora_systemd.scope import Scope
+from dora_systemd.scope import Scope, config_home
 from dora_systemd.trust.files import read_file
 from dora_systemd.trust.paths import Place, exists
 from dora_systemd.values import shown
 
 SYSTEM_FILE = Path("/etc/dora-systemd/config.yml")
 USER_FILE = Path("dora-systemd/config.yml")
-_ANY_FILE = Path("/dataflow.yml")
 
 
 @dataclass(frozen=True)
-class _Read:
-    """A settings file that was read, and its place."""
+class SettingsFile:
+    """A settings file that was read: its content, and its place."""
 
     path: Path
     place: Place
+    data: bytes
     document: object
 
     @property
@@ -41,11 +41,13 @@ class _Read:
 
 def settings_files(dataflow: Path, environment: Mapping[str, str]) -> list[Path]:
     """The settings files that may exist, highest precedence first."""
-    home = environment.get("HOME", "")
-    config = environment.get("XDG_CONFIG_HOME", "") or (f"{home}/.config" if home else "")
-    beside = Path(settings_path(str(dataflow)))
-    user = [Path(config) / USER_FILE] if config.startswith("/") else []
-    return [beside, *user, SYSTEM_FILE]
+    return [Path(settings_path(str(dataflow))), *config_files(environment)]
+
+
+def config_files(environment: Mapping[str, str]) -> list[Path]:
+    """The settings files for all dataflows that may exist, highest precedence first."""
+    config = config_home(environment)
+    return [*([Path(config) / USER_FILE] if config else []), SYSTEM_FILE]
 
 
 def read_settings(
@@ -63,13 +65,12 @@ def read_settings(
     file that was copied with it.
     """
     beside, *elsewhere = settings_files(dataflow, environment)
-    found = [_read(beside, origin)] if exists(beside) else []
-    found += [_read(path) for path in elsewhere if exists(path)]
+    found = [read_settings_file(beside, origin)] if exists(beside) else []
+    found += [read_settings_file(path) for path in elsewhere if exists(path)]
     documents = [(str(one.path), one.document) for one in found]
     others = [] if scope.is_user else [one for one in found if not one.is_roots]
     for one in others:
-        _check_trust(one)
-        _check_values(one)
+        require_modest(one)
     settings = resolve_settings(flags, environment, documents, SETTINGS)
     if not any(ENV_FILE.name in one.words() for one in others):
         return settings
@@ -81,8 +82,7 @@ def read_settings(
 
 def config_file(scope: Scope, environment: Mapping[str, str]) -> Path:
     """The settings file for all dataflows of the scope; it need not exist."""
-    places = settings_files(_ANY_FILE, environment)[1:]
-    return places[0] if scope.is_user else SYSTEM_FILE
+    return config_files(environment)[0] if scope.is_user else SYSTEM_FILE
 
 
 def key_place(scope: Scope, environment: Mapping[str, str]) -> Path:
@@ -92,7 +92,7 @@ def key_place(scope: Scope, environment: Mapping[str, str]) -> Path:
 
 def read_config(scope: Scope, environment: Mapping[str, str]) -> Settings:
     """The settings for all dataflows. Raises DoraSystemdError."""
-    found = [_read(one) for one in settings_files(_ANY_FILE, environment)[1:] if exists(one)]
+    found = [read_settings_file(one) for one in config_files(environment) if exists(one)]
     for one in found:
         if not scope.is_user and not one.is_roots:
             _check_trust(one)
@@ -100,20 +100,28 @@ def read_config(scope: Scope, environment: Mapping[str, str]) -> Settings:
     return resolve_settings({}, {}, documents, SETTINGS)
 
 
-def require_modest(path: Path) -> None:
+def check_config(scope: Scope, path: Path) -> None:
+    """Raise DoraSystemdError for a settings file with which no dataflow would start."""
+    read = read_settings_file(path)
+    if not scope.is_user and not read.is_roots:
+        require_modest(read)
+    resolve_settings({}, {}, [(str(path), read.document)], SETTINGS)
+
+
+def require_modest(read: SettingsFile) -> None:
     """Raise DoraSystemdError for what a settings file may not say that is not the caller's."""
-    read = _read(path)
     _check_trust(read)
     _check_values(read)
 
 
-def _read(path: Path, origin: Place | None = None) -> _Read:
+def read_settings_file(path: Path, origin: Place | None = None) -> SettingsFile:
+    """One settings file. origin: of a copy. Raises DoraSystemdError (BAD_INPUT)."""
     text = read_file(path)
     document = parse_yaml(decoded(text.data, path), path, allow_empty=True)
-    return _Read(path, origin or text.place, document)
+    return SettingsFile(path, origin or text.place, text.data, document)
 
 
-def _check_values(read: _Read) -> None:
+def _check_values(read: SettingsFile) -> None:
     """Refuse values by which another user's file would get more than that user has."""
     own = resolve_settings({}, {}, [(str(read.path), read.document)], SETTINGS)
     for key, flag in _raising(own):
@@ -132,7 +140,7 @@ def _raising(settings: Settings) -> Iterator[tuple[str, str]]:
                     yield f"nodes.{node}.{setting.name}", flag
 
 
-def _check_trust(read: _Read) -> None:
+def _check_trust(read: SettingsFile) -> None:
     """Refuse keys by which another user's file could make root read, run or grant something."""
     only = {setting.name: setting for setting in SETTINGS if setting.root_only}
     dangerous = [only[key] for key in read.words() if key in only]
@@ -140,7 +148,7 @@ def _check_trust(read: _Read) -> None:
         raise _untrusted(read, dangerous[0].name, dangerous[0].flags[0])
 
 
-def _untrusted(read: _Read, key: str, flag: str) -> DoraSystemdError:
+def _untrusted(read: SettingsFile, key: str, flag: str) -> DoraSystemdError:
     reason = "the file is not root's" if read.place.uid != 0 else read.place.borrowed
     return DoraSystemdError(
         f"cannot use {shown(str(read.path))}: {key} is set there, and {reason}",

@@ -136,4 +136,18 @@ def test_groups_are_made_and_removed(tmp_path: Path) -> None:
 
 
 def test_own_group() -> None:
-    assert cgroup.own_group().startswith("/")
+    assert cgroup.group_of().startswith("/")
+
+
+def test_a_group_whose_name_is_no_text(tmp_path: Path) -> None:
+    file = tmp_path / "cgroup"
+    file.write_bytes(b"0::/node-\xff\x0bx\n")
+    assert cgroup.group_of(f"self/root{file.parent}") == "/node-\udcff\x0bx"
+
+
+def test_what_the_kernel_refuses_names_the_file(unit: Path) -> None:
+    file = unit / "supervisor/cgroup.procs"
+    file.unlink()
+    file.symlink_to("/dev/full")
+    with pytest.raises(OSError, match=f"No space left on device: '{file}'"):
+        cgroup.move_process(unit / "supervisor", 0)

@@ -3,6 +3,7 @@
 import contextlib
 import fcntl
 import os
+import resource
 from pathlib import Path
 
 import pytest
@@ -179,3 +180,15 @@ def test_what_is_removed_follows_no_link_and_may_be_deep(tmp_path: Path) -> None
     remove_tree(place)
     assert not place.exists()
     assert kept.stat().st_mode & 0o777 == 0o750
+
+
+def test_a_disk_that_takes_half_a_file_is_an_error(store: Store) -> None:
+    """What is written last may be taken in part, without an error of its own."""
+    draft, limits = Draft(store), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            draft.write("a", [b"x" * 2000], is_executable=False)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        draft.discard()

@@ -310,6 +310,7 @@ def test_what_a_hostile_runner_answers(
         use(path)
     said = caught.value.message + caught.value.hint
     assert said.isprintable(), said
+    assert caught.value.message
     assert caught.value.code
 
 

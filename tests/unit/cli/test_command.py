@@ -98,6 +98,7 @@ def test_every_option_says_what_it_does(name: str) -> None:
     [
         (["strat"], "unknown command 'strat'", "did you mean doractl start?"),
         (["qqq"], "unknown command 'qqq'", "doractl --help lists all commands"),
+        (["membe"], "unknown command 'membe'", "doractl --help lists all commands"),
         (["list", "--oll"], "unknown option --oll", "did you mean --all?"),
         (["stop"], "cannot stop: give names or --all", "doractl stop NAME, or doractl stop --all"),
         (["stop", "x", "--all"], "cannot stop: give names or --all", ""),
@@ -215,6 +216,15 @@ def test_what_list_selects(requests: list[ListRequest]) -> None:
     assert not ListRequest().is_filtered
 
 
+def fail_with(error: BaseException, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let `list` raise it."""
+
+    def fail(_request: ListRequest) -> int:
+        raise error
+
+    monkeypatch.setattr(listing, "print_dataflows", fail)
+
+
 @pytest.mark.parametrize(
     ("error", "status"),
     [
@@ -228,13 +238,34 @@ def test_exit_status_of_errors(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    def fail(_request: ListRequest) -> int:
-        raise error
-
-    monkeypatch.setattr(listing, "print_dataflows", fail)
+    fail_with(error, monkeypatch)
     assert main.run(["list"]) == status
     expected = "doractl: cannot do it\nhint: do that\n" if status != 130 else ""
     assert capsys.readouterr().err == expected
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (OSError(2, "No such file", "/x"), "cannot continue: No such file\nhint: /x\n"),
+        (OSError(9, "Bad file descriptor", 7), "cannot continue: Bad file descriptor\n"),
+        (OSError(28, "No space left"), "cannot write output: No space left\n"),
+        (TimeoutError("timed out"), "cannot continue: timed out\n"),
+        (TimeoutError(), "cannot continue: TimeoutError\n"),
+    ],
+)
+def test_any_error_of_the_system_is_one_line(
+    error: OSError,
+    said: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    fail_with(error, monkeypatch)
+    given_up: list[bool] = []
+    monkeypatch.setattr(main, "_give_up_output", lambda: given_up.append(True))
+    assert main.run(["list"]) == ExitCode.FAILURE
+    assert capsys.readouterr().err == f"doractl: {said}"
+    assert any(given_up) is ("write output" in said)  # else what was done would not be printed
 
 
 def test_a_reader_that_went_away_is_no_error() -> None:
@@ -304,7 +335,7 @@ def test_settings_stand_by_concern_with_their_defaults(
 
 
 def test_help_is_a_word_too(capsys: pytest.CaptureFixture[str]) -> None:
-    for verb in ([], ["stop"], ["node"]):
+    for verb in ([], ["stop"], ["node"], ["node", "restart"]):
         assert main.run([*verb, "--help"]) == 0
         shown = capsys.readouterr().out
         assert main.run(["help", *verb]) == 0

@@ -9,7 +9,7 @@ import pytest
 
 from dora_systemd.cli import completion, main
 from dora_systemd.cli.completion import TYPES, VARIABLE, Live
-from dora_systemd.cli.group import VERBS, doractl
+from dora_systemd.cli.group import HIDDEN, VERBS, doractl
 from dora_systemd.errors import DoraSystemdError
 from tests.unit.checkout import CHECKOUT
 from tests.unit.fakes.programs import make_program
@@ -42,7 +42,7 @@ def running(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_verbs(complete: Complete) -> None:
-    assert complete("doractl ") == [f"plain,{name}" for name in VERBS]
+    assert complete("doractl ") == [f"plain,{name}" for name in VERBS if name not in HIDDEN]
     assert complete("doractl st", "zsh") == [
         *("plain", "start", VERBS["start"].summary),
         *("plain", "stop", VERBS["stop"].summary),
@@ -91,11 +91,13 @@ def test_hosts(complete: Complete, monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
 def test_dataflows_of_this_machine_are_not_there(
     complete: Complete, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail() -> None:
+    def fail(*_: object) -> None:
         raise AssertionError("the names are those of this machine")
 
     monkeypatch.setattr(completion, "_bus", fail)
-    for words in ("-H base stop ", "stop -H base ", "logs --host=base --node "):
+    monkeypatch.setattr("dora_systemd.verbs.releases.listing.store_of", fail)
+    lines = ("-H base stop ", "stop -H base ", "logs --host=base --node ", "-H base rollback x ")
+    for words in lines:
         assert complete(f"doractl {words}") == []
 
 

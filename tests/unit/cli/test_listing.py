@@ -1,5 +1,6 @@
 """Which dataflows `doractl list` shows, and how it prints them."""
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -102,6 +103,14 @@ def test_a_terminal_says_where_more_is(
     assert shown[0].startswith("\x1b[4m")
     assert (shown[-1] == listing._MORE) == (rows is ROWS)
     assert len(listing._MORE) <= 60
+
+
+def test_a_number_of_columns_that_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    monkeypatch.setattr("os.get_terminal_size", lambda: os.terminal_size((99, 24)))
+    for columns, width in (("60", 60), ("-5", 99), ("0", 99), ("", 99), ("many", 99)):
+        monkeypatch.setenv("COLUMNS", columns)
+        assert listing.terminal_width() == width
 
 
 def test_nothing(capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,6 +12,7 @@ MORE = {"PAGER": "more", "HOME": "/root"}
     [
         ({}, "less", False),
         (MORE, "more", False),
+        ({**MORE, "SYSTEMD_PAGER": " "}, "more", False),
         ({"SUDO_UID": "1000"}, "less", True),
         ({"SUDO_UID": "1000", **MORE}, "less", True),
         ({"PKEXEC_UID": "1000", **MORE}, "less", True),

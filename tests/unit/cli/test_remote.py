@@ -12,6 +12,8 @@ import pytest
 from dora_systemd.cli import main
 from dora_systemd.cli.group import VERBS, doractl
 from dora_systemd.cli.remote.dispatch import valued_options
+from dora_systemd.cli.remote.printers import Complaints
+from dora_systemd.decisions.remote.hosts import parse_host
 from dora_systemd.errors import ExitCode
 from dora_systemd.verbs.remote import talk
 from tests.unit.fakes.programs import make_program
@@ -110,6 +112,14 @@ def test_merged_logs(capsys: Printed) -> None:
     assert len(lines) == 4
     assert main.run(["logs", "-o", "export", "-H", "h1,h2"]) == ExitCode.USAGE
     assert "cannot merge -o export" in capsys.readouterr().err
+
+
+def test_what_was_read_can_be_printed(capsys: Printed) -> None:
+    # Between what json reads and what it writes there is a level; which one depends on the stack.
+    for depth in range(800, 1000):
+        line = b'{"x":' + b"[" * depth + b"]" * depth + b"}\n"
+        Complaints(is_json=True).said(parse_host("base"), line)
+    assert capsys.readouterr().err.count("\n") == 200
 
 
 def test_an_answer_that_is_none(capsys: Printed) -> None:

@@ -1,6 +1,7 @@
 """dora's control protocol as the gateway speaks it: frames and forms, without any system."""
 
 import asyncio
+import inspect
 import json
 import re
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dora_systemd.adapters.dora.control import Connection
 from dora_systemd.decisions.gateway.answers import (
     bare_descriptor,
     dataflow_list,
@@ -35,6 +37,7 @@ from dora_systemd.decisions.views.rows import DataflowRow, NodeRow
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.gateway.control.serve import HANDLERS, REFUSED, serve_control
 from dora_systemd.gateway.control.start import find_file
+from dora_systemd.gateway.control.talk import Talk
 from dora_systemd.scope import Scope
 from tests.unit.fakes.socket import FakeSocket
 
@@ -401,6 +404,31 @@ def test_a_conversation() -> None:
     assert "Dance" in sent[4]["result"]["Error"]
     assert "no dataflow_uuid" in sent[5]["result"]["Error"]
     assert sent[6]["result"]["CliAndDefaultDaemonIps"]["cli"] == "127.0.0.1"
+
+
+class FakeTopic(Connection):
+    """A connection to a dataflow that delivers nothing."""
+
+    def __init__(self) -> None:
+        self.is_closed = False
+
+    def close(self) -> None:
+        self.is_closed = True
+
+
+def test_a_client_that_leaves_before_its_reply_keeps_no_connection() -> None:
+    async def play() -> None:
+        mine, topic = Talk(FakeSocket([]), Scope(True, 1000)), FakeTopic()
+        mine.after_reply(asyncio.sleep(0))
+        mine.topics["id"] = topic
+        await mine.end()
+        assert topic.is_closed
+        late = asyncio.sleep(0)
+        with pytest.raises(DoraSystemdError, match="has disconnected"):
+            mine.after_reply(late)
+        assert inspect.getcoroutinestate(late) == inspect.CORO_CLOSED
+
+    asyncio.run(play())
 
 
 JSON = st.recursive(

@@ -13,6 +13,8 @@ from typing import Any
 
 import pytest
 
+from dora_systemd.adapters.bus import systemd
+from dora_systemd.adapters.bus.connection import connect
 from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
 from dora_systemd.decisions.gateway.frames import Request
 from dora_systemd.decisions.gateway.page_messages import PageMessage
@@ -302,6 +304,24 @@ def test_the_next_life_of_a_unit_is_not_killed(bench: Bench) -> None:
     bench.ask("RestartByName", name="robot", grace_duration={"secs": 0, "nanos": 0})
     assert bench.jobs == ["RestartUnit"]
     assert not [call for call in bench.manager.calls if call[0] == "kill"]
+
+
+def test_what_only_looks_does_not_wait_for_a_silent_bus(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[bool] = []
+
+    def noted(scope: Scope, for_reading: bool) -> Any:
+        asked.append(for_reading)
+        return connect(scope, for_reading)
+
+    monkeypatch.setattr(systemd, "connect", noted)
+    for variant in ("List", "GetNodeInfo", "ConnectedMachines"):
+        bench.ask(variant)
+    for variant in ("Check", "WaitForSpawn"):
+        bench.ask(variant, dataflow_uuid=UUID)
+    assert len(asked) >= 5
+    assert all(asked)
 
 
 def test_a_dora_restart(bench: Bench) -> None:

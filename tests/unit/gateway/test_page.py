@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.decisions.gateway.request import Answer, Request
+from dora_systemd.decisions.views.dataflows import UP_WORDS
 from dora_systemd.gateway.page import DIRECTORY, HEADERS, PREFIX, TYPES, page_routes
 from dora_systemd.scope import Scope
 
@@ -67,6 +68,15 @@ def test_what_is_asked_for_is_there(path: Path) -> None:
     wanted = re.findall(r'(?:src|href)="(/[^"#]+)"', text)
     wanted += [f"{PREFIX}{name}" for name in re.findall(r'from "\./([^"]+)"', text)]
     assert set(wanted) <= page_routes().keys()
+
+
+def test_the_page_knows_which_dataflows_are_up() -> None:
+    """It offers Stop for these, and Start for all others."""
+    words = (DIRECTORY / "words.js").read_text()
+    (listed,) = re.findall(r"const UP = \[([^]]+)\]", words)
+    assert set(re.findall(r'"(\w+)"', listed)) == UP_WORDS
+    (tones,) = re.findall(r"const TONES = \{([^}]+)\}", words)
+    assert set(re.findall(r"(\w+):", tones)) >= {word.lower() for word in UP_WORDS}
 
 
 def test_frames_are_refused() -> None:

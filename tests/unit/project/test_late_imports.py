@@ -81,17 +81,18 @@ LATE = {
     },
     "limits, CPUs or rights of single nodes only": {
         "decisions.cell.limits": {"node_words"},
-        "runner.cell.begin": {"runner.nodes.rights"},
     },
     "uv only": {"decisions.cell.uv": {"tomllib"}},
     "JSON is for programs, and most who do something are people": {
         "cli.parameters": {"decisions.views.objects"},
         "decisions.views.outcome": {"decisions.views.objects"},
     },
-    "most dataflows owe nothing, and wait for nothing": {
+    "most dataflows owe nothing, wait for nothing, and run on one machine": {
         "adapters.dora.preparation": {"adapters.dora.probe", "decisions.machines.part"},
         "runner.owes.begin": {"runner.owes.watch"},
-        "verbs.facts.reading": {"decisions.owes.probe", "verbs.facts.held"},
+        "verbs.facts.reading": {
+            *("decisions.machines.usage", "decisions.owes.probe", "verbs.facts.held"),
+        },
     },
     "a program of its own: it makes room first, and it runs with the Python of the nodes": {
         "runner.owes.listen": {"dora"},
@@ -99,6 +100,9 @@ LATE = {
     "most dataflows run on one machine, and most links are not lost": {
         "decisions.cell.launch": {"decisions.cell.placed"},
         "runner.roles": {"runner.machines.head", "runner.machines.member"},
+        "gateway.control.logs": {"decisions.machines.elsewhere"},
+        "gateway.live.lines": {"decisions.machines.elsewhere"},
+        "cli.foreground": {"verbs.facts.machines", "verbs.remote.attached"},
         "verbs.start.plan": {"adapters.host.addresses", "decisions.machines.spread"},
         "verbs.why": {"verbs.facts.machines"},
         "verbs.start.unit": {"decisions.machines.link_unit"},
@@ -130,6 +134,7 @@ LATE = {
             *("adapters.dora.check", "runner.cell.boot", "runner.main"),
             *("runner.machines.head_boot", "runner.machines.member_boot"),
         },
+        "runner.cell.begin": {"adapters.dora.command", "runner.nodes.rights"},
         "runner.cell.pause": {
             *("adapters.host.process", "adapters.host.files", "adapters.host.notify"),
             *("decisions.cell.status", "asyncio"),

@@ -9,6 +9,7 @@ import pytest
 
 from dora_systemd import __version__
 from dora_systemd.adapters.releases.store import store_root
+from dora_systemd.decisions.unit.file import HEADER
 from dora_systemd.decisions.unit.versions import MIN_VERSION
 from dora_systemd.names import SLICE
 from dora_systemd.verbs.start.account import DEFAULT_USER
@@ -131,3 +132,23 @@ def test_root_does_nothing_in_directories_of_users() -> None:
             is_meant = "/run/user" in line or '"$place' in line
             is_loop = line.lstrip().startswith(("#", "for place in "))
             assert not is_meant or is_loop or "as_owner " in line, f"{script.name}: {line}"
+
+
+def test_purge_takes_what_enable_has_written(tmp_path: Path) -> None:
+    """Also the links of enable --boot-check, and the units of links to other machines."""
+    etc = tmp_path / "systemd/system"
+    ours = [etc / "dora-robot.service", etc / "doralink-robot:gpu.service"]
+    for place in ("dora.target.wants", "boot-complete.target.requires"):
+        (etc / place).mkdir(parents=True)
+        (etc / place / ours[0].name).symlink_to(ours[0])
+    for path in ours:
+        path.write_text(HEADER)
+    others = [etc / "dora-foreign.service", etc / "boot-complete.target.requires/x.service"]
+    for path in others:
+        path.touch()
+    script = (PACKAGING / "debian/dora-systemd.postrm").read_text()
+    part = script[script.index("    for unit in /etc/") : script.index("    # Only the one that")]
+    subprocess.run(["sh", "-euc", part.replace("/etc/", f"{tmp_path}/")], check=True)
+    left = [path for path in tmp_path.rglob("*") if not path.is_dir() or path.is_symlink()]
+    assert sorted(left) == sorted(others)
+    assert not (etc / "dora.target.wants").exists()

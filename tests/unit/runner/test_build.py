@@ -1,18 +1,22 @@
 """The program in the unit of a build."""
 
+import contextlib
 import json
 import os
+import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from dora_systemd.adapters.journal.socket import JournalSocket
+from dora_systemd.decisions.life.states import RunnerExit
 from dora_systemd.decisions.releases.build import BuildTask
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.runner.build import Output, build
+from dora_systemd.runner.build import Output, build, main
 
 PROGRAM = (sys.executable, "-m", "dora_systemd.runner.build")
 
@@ -92,3 +96,23 @@ def test_it_ends_with_doractl(tmp_path: Path) -> None:
         assert child.stdin
         child.stdin.close()
         assert child.wait(60) == 1
+
+
+def test_no_line_is_lost_while_journald_restarts(tmp_path: Path) -> None:
+    """It may take longer than a refused connection, which comes back at once."""
+    path = tmp_path / "socket"
+    journal = JournalSocket(str(path))
+    output = Output(BuildTask("robot", "uuid", "r", "/", ()), journal)
+    with (
+        contextlib.closing(journal),
+        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as server,
+    ):
+        threading.Timer(1, server.bind, [str(path)]).start()
+        output.feed(b"one\n")
+        assert server.recv(1000).startswith(b"MESSAGE=one\n")
+
+
+@pytest.mark.parametrize("argv", [[], ["x"], ["5"], ["{}"], ['{"commands": 5}']])
+def test_by_hand(argv: list[str], capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(argv) == RunnerExit.BAD_DATAFLOW
+    assert capfd.readouterr().err.startswith("cannot read what to build: ")

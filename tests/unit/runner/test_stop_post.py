@@ -135,3 +135,18 @@ def test_no_python_is_started_after_a_runner_that_ended_by_itself() -> None:
             script, env={"EXIT_CODE": ended}, capture_output=True, text=True, check=True
         )
         assert done.stdout == printed
+
+
+def test_what_is_damaged_costs_nothing_else(tmp_path: Path) -> None:
+    (tmp_path / "status.json").write_bytes(b"\xff")
+    (tmp_path / "io").mkdir()
+    (tmp_path / "io/a.place").write_bytes(b"x y z")
+    log = tmp_path / "log"
+    log.write_text("last\n")
+    numbers = b"%020d %020d " % (log.stat().st_ino, 0)
+    (tmp_path / "io/b.place").write_bytes(numbers + bytes(log))
+    (tmp_path / "io/c.place").write_bytes(b"%020d %020d " % (log.stat().st_ino, -1) + bytes(log))
+    line, event = last_words(tmp_path)
+    assert b"MESSAGE=last\n" in line
+    assert b"DORA_NODE=b\n" in line
+    assert b"MESSAGE=Dataflow robot failed: killed\n" in event

@@ -1,5 +1,7 @@
 """doctor against a fake systemd, and without any."""
 
+import os
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -34,7 +36,7 @@ def manager(manager: FakeManager, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(doctor, "find_dora", lambda *_: "/bin/dora")
     monkeypatch.setattr(doctor, "dora_version", lambda _dora: "1.1.0")
     monkeypatch.setattr(doctor, "DEFAULT_USER", "root")
-    monkeypatch.setattr(doctor, "settings_files", lambda *_: [Path("/x")])
+    monkeypatch.setattr(doctor, "config_files", lambda _: [])
     monkeypatch.setattr(doctor, "read_processes", list)
     monkeypatch.setattr(doctor, "read_real_time", RealTime)
     monkeypatch.setattr(logins, "_logins", lambda _passwd: [])
@@ -124,7 +126,10 @@ def test_an_enabled_unit_that_starts_nothing(
     manager.enable_unit_files(["dora-robot.service"])
     if text is not None:
         path.write_bytes(text or b"")
-    assert part in found(manager, scope)["boot"].text
+    finding = found(manager, scope)["boot"]
+    assert part in finding.text
+    if isinstance(text, str) or text is None:
+        assert finding.remedy == "systemctl --system disable dora-robot.service"
 
 
 def test_a_half_written_settings_file(
@@ -132,10 +137,27 @@ def test_a_half_written_settings_file(
 ) -> None:
     path = tmp_path / "config.yml"
     path.write_text("env: {A: 1\n")
-    monkeypatch.setattr(doctor, "settings_files", lambda *_: [Path("/x"), path])
+    monkeypatch.setattr(doctor, "config_files", lambda _: [path])
     finding = found(manager, scope)["settings"]
     assert finding.state is State.PROBLEM
     assert finding.text.startswith(f"cannot read {path}: line ")
+    path.write_text("memory_limt: 1G\n")  # no dataflow would start with that either
+    finding = found(manager, scope)["settings"]
+    assert finding.state is State.PROBLEM
+    assert "memory_limt" in finding.text
+    path.write_text("memory_limit: 1G\n")
+    assert "settings" not in found(manager, scope)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs a file of somebody else")
+def test_a_settings_file_that_root_would_not_believe(
+    manager: FakeManager, scope: Scope, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "config.yml"
+    monkeypatch.setattr(doctor, "config_files", lambda _: [path])
+    path.write_text("user: root\n")
+    os.chown(path, 1, 1)
+    assert "the file is not root's" in found(manager, scope)["settings"].text
 
 
 def test_a_broken_unit(manager: FakeManager, scope: Scope) -> None:
@@ -172,3 +194,16 @@ def test_a_check_that_fails_is_a_finding(
 
     monkeypatch.setattr(cgroup, "mount_point", fail)
     assert "cannot find the cgroup v2" in found(manager, scope)["controllers"].text
+
+
+def test_what_a_check_has_found_before_it_fails_is_told(
+    manager: FakeManager, scope: Scope, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def judge_doors(*_: object) -> Iterator[Finding]:
+        yield Finding("front", State.WARNING, "it is open")
+        raise DoraSystemdError("cannot look at the other door")
+
+    monkeypatch.setattr(doctor, "_WITH_SYSTEMD", (judge_doors,))
+    told = found(manager, scope)
+    assert told["front"].text == "it is open"
+    assert told["doors"].text == "cannot look at the other door"

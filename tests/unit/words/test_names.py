@@ -16,7 +16,7 @@ from dora_systemd.names import (
 
 UUID = "550e8400-e29b-41d4-a716-446655440000"
 names = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9._-]{0,30}", fullmatch=True).filter(
-    lambda name: name != "gateway" and "." not in name
+    lambda name: name != "gateway" and "." not in name and not name.endswith("-")
 )
 
 
@@ -30,7 +30,7 @@ def test_names(name: str) -> None:
     "name",
     [
         *("", "a/b", "../x", "-x", ".", "..", "x.service", "x.slice", "x.target", "a b", "a\n"),
-        *("x" * 201, "röbot", "a@b", "a:b", "gateway", "a\0b", "%i", "$HOME", "٣"),
+        *("x" * 201, "röbot", "a@b", "a:b", "gateway", "a\0b", "%i", "$HOME", "٣", "a-", "a.-"),
     ],
 )
 def test_bad_names(name: str) -> None:
@@ -48,6 +48,7 @@ def test_any_text_is_a_name_or_refused(text: str) -> None:
     except DoraSystemdError:
         return
     assert len(unit) < 256
+    assert not unit.endswith("-.service")  # its drop-ins would be those of others, too
     assert unit.isascii()
     assert not set(unit) & set("/@ %$\\\n")
 

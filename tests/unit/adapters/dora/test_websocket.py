@@ -3,10 +3,13 @@
 import asyncio
 from collections.abc import Awaitable, Callable
 from http import HTTPStatus
+from typing import cast
 
 import pytest
 from websockets.asyncio.server import ServerConnection, serve
+from websockets.client import ClientProtocol
 from websockets.http11 import Request, Response
+from websockets.protocol import Protocol, Side
 
 from dora_systemd.adapters.dora.websocket import WebSocket, WebSocketException
 
@@ -118,3 +121,54 @@ def test_nobody_there_and_no_websocket() -> None:
             await WebSocket.connect(url(port), TOKEN)
 
     asyncio.run(both())
+
+
+def test_what_is_no_utf_8_is_shown_as_far_as_possible() -> None:
+    async def handler(socket: ServerConnection) -> None:
+        async with socket.send_context():
+            socket.protocol.send_text(b"a\xff")
+        await socket.wait_closed()
+
+    async def use(socket: WebSocket) -> str | bytes:
+        return await socket.recv()
+
+    assert talk(handler, use) == "a\ufffd"
+
+
+class Deaf:
+    """A writer, and its transport, whose peer reads nothing."""
+
+    def __init__(self) -> None:
+        self.size = self.drained = 0
+
+    @property
+    def transport(self) -> "Deaf":
+        return self
+
+    def get_write_buffer_size(self) -> int:
+        return self.size
+
+    def write(self, data: bytes) -> None:
+        self.size += len(data)
+
+    async def drain(self) -> None:
+        self.drained += 1
+        if self.size > 1000:
+            raise ConnectionResetError("it would wait")
+
+
+def test_a_peer_that_sends_pings_and_reads_nothing_has_to_wait() -> None:
+    """Else what it does not read would take all memory of root's gateway."""
+
+    async def work() -> None:
+        reader, writer = asyncio.StreamReader(), Deaf()
+        protocol = cast(ClientProtocol, Protocol(Side.CLIENT))
+        for _ in range(50):
+            reader.feed_data(b"\x89\x7d" + b"x" * 125)  # a ping with 125 bytes
+        socket = WebSocket(protocol, reader, cast(asyncio.StreamWriter, writer))
+        with pytest.raises(ConnectionResetError, match="it would wait"):
+            async with asyncio.timeout(30):
+                await socket.recv()
+        assert writer.drained == 1
+
+    asyncio.run(work())

@@ -103,6 +103,12 @@ def test_bad_yaml(yaml: Any, text: str | bytes, reason: str) -> None:
     assert caught.value.hint
 
 
+@pytest.mark.parametrize("value", ["!!float ''", "!!float _", "!!timestamp x", "!!int ''"])
+def test_a_tag_that_does_not_fit_its_value(yaml: Any, value: str) -> None:
+    with pytest.raises(DoraSystemdError, match="it is not YAML that can be read"):
+        yaml(f"a: {value}")
+
+
 def test_empty_yaml_may_be_allowed(tmp_path: Path) -> None:
     path = tmp_path / "x.yml"
     path.write_text("# all of it is a comment\n")

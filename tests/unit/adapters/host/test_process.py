@@ -33,6 +33,13 @@ def test_a_child_that_hangs_is_killed_with_its_children() -> None:
     assert time.monotonic() - begin < 90
 
 
+def test_a_child_that_closes_its_streams_and_goes_on_is_killed_too() -> None:
+    begin = time.monotonic()
+    with pytest.raises(DoraSystemdError, match=r"^cannot wait for '/bin/sh'"):
+        process.run_command(["/bin/sh", "-c", "exec >&- 2>&-; sleep 100"], 0.2)
+    assert time.monotonic() - begin < 90
+
+
 def test_what_cannot_be_run() -> None:
     with pytest.raises(DoraSystemdError, match=r"^cannot run /nowhere/x"):
         process.run_command(["/nowhere/x"], 1)
@@ -54,3 +61,12 @@ def test_nothing_that_ends_a_call_beside_makes_its_result_wait_forever() -> None
     call = process.beside(lambda: sys.exit(3))
     with pytest.raises(SystemExit):
         call.result(timeout=30)
+
+
+def test_a_call_beside_goes_on_when_nobody_waits_for_it_any_more() -> None:
+    """A task that is cancelled must not make its thread end with a traceback in the journal."""
+    over = threading.Event()
+    call = process.beside(over.wait)
+    assert not call.cancel()
+    over.set()
+    assert call.result(timeout=30)

@@ -9,6 +9,7 @@ import pytest
 
 from dora_systemd.adapters.host import process_table
 from dora_systemd.adapters.host.process_table import (
+    group_in,
     read_processes,
     socket_owners,
 )
@@ -54,3 +55,18 @@ def test_damaged_entries_are_passed_over(tmp_path: Path, monkeypatch: pytest.Mon
             (tmp_path / pid / name).write_text(text)
     (found,) = read_processes()
     assert (found.pid, found.parent, found.command, found.group) == (7, 5, ("a b", "c"), "/x")
+
+
+@pytest.mark.parametrize(
+    ("data", "group"),
+    [
+        (b"0::/dora.slice/dora-a.service/node-b\n", "/dora.slice/dora-a.service/node-b"),
+        (b"12:devices:/x\n0::/y\n", "/y"),
+        (b"1:name=systemd:/x\n", ""),
+        (b"0::/a/x0::/dora.slice/dora-b.service\n", "/a/x0::/dora.slice/dora-b.service"),
+        (b"0::/a\xff\x0bb\n", "/a\ufffd\x0bb"),
+        (b"", ""),
+    ],
+)
+def test_no_name_of_a_group_hides_it(data: bytes, group: str) -> None:
+    assert group_in(data) == group

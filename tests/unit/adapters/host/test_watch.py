@@ -81,3 +81,30 @@ def test_a_change_that_watchfiles_drops_is_found(
 
     monkeypatch.setattr(watchfiles, "awatch", drops)
     assert asyncio.run(batches()) == [{str(given)}, {str(dropped)}]
+
+
+def test_a_directory_that_has_gone_for_good_takes_no_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The dataflow file may be apart from its project; the project is still looked at."""
+    asked: list[tuple[str, ...]] = []
+    real = watchfiles.awatch
+
+    def count(*directories: str, **options: Any) -> AsyncIterator[Any]:
+        asked.append(directories)
+        return real(*directories, **options)
+
+    monkeypatch.setattr(watchfiles, "awatch", count)
+    flow, saved = tmp_path / "gone/flow.yml", tmp_path / "project/node.py"
+    saved.parent.mkdir()
+    rules = WatchRules(str(saved.parent), ("*.py",), files=frozenset({str(flow)}))
+
+    async def save() -> None:
+        await asyncio.sleep(1)
+        saved.write_text("")
+
+    async def both() -> frozenset[str]:
+        return (await asyncio.gather(first(rules), save()))[0]
+
+    assert asyncio.run(both()) == {str(saved)}
+    assert 0 < len(asked) < 10

@@ -51,6 +51,14 @@ def test_complaints(journalctl: Path, complaint: str, message: str, code: ExitCo
     assert (caught.value.message, caught.value.code) == (message, code)
 
 
+def test_many_complaints_stop_nothing(journalctl: Path) -> None:
+    """Of damaged files; a pipe would be full before anybody reads it."""
+    many = "head -c 200000 /dev/zero | tr '\\0' '\\n' >&2"
+    make_program(journalctl, f"{many}; echo robot; echo 'Something else' >&2; exit 1")
+    with pytest.raises(DoraSystemdError, match=r"^cannot read the journal: Something else$"):
+        JournalReader().known_names(SYSTEM)
+
+
 def test_a_notice_is_no_complaint(journalctl: Path) -> None:
     notice = "      Pass -q to turn off this notice."
     make_program(journalctl, f"echo 'Hint: only your own' >&2; echo '{notice}' >&2; exit 1")
@@ -260,3 +268,21 @@ def test_a_record_that_is_too_long_is_left_out(journalctl: Path) -> None:
 def test_values_that_can_be_no_uuids(journalctl: Path) -> None:
     make_program(journalctl, f"printf '%s\\n' robot ../x '\x1b]0;x' 'a b' {UUID}")
     assert JournalReader().known_uuids() == [UUID]
+
+
+def test_a_complaint_of_a_journal_that_is_read_to_a_bound_is_none(
+    journalctl: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(journal_reader, "MAX_BYTES", 10_000)
+    complaint = "system.journal is truncated, ignoring file."
+    make_program(journalctl, f"echo '{complaint}' >&2; exec yes dora-a")
+    assert set(JournalReader().unique("X")) == {"dora-a"}
+
+
+def test_a_complaint_of_a_journal_that_shows_nothing_is_told(
+    journalctl: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(journal_reader, "FIRST_SECONDS", 2.0)
+    make_program(journalctl, "echo 'Failed to wait: x' >&2; exec sleep 1000")
+    with pytest.raises(DoraSystemdError, match=r"^cannot read the journal: Failed to wait: x$"):
+        JournalReader().unique("X")

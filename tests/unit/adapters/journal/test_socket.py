@@ -2,6 +2,7 @@
 
 import array
 import asyncio
+import errno
 import os
 import socket
 import threading
@@ -211,3 +212,25 @@ def test_the_callback_comes_each_time(journal: JournalSocket, journald: Journald
         assert len(calls) == 4
 
     asyncio.run(scenario())
+
+
+def test_a_deadline_that_is_over_is_not_waited_for(journal: JournalSocket) -> None:
+    fill(journal)
+    waiting = threading.Thread(target=journal.wait_ready, args=(-0.0001,), daemon=True)
+    waiting.start()
+    waiting.join(30)
+    assert not waiting.is_alive()
+
+
+def test_no_file_descriptor_for_a_big_entry(
+    journal: JournalSocket, journald: Journald, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> int:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    entry = b"MESSAGE=" + b"x" * (1 << 20) + b"\n"
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "memfd_create", refuse)
+        assert not journal.send(entry)
+    assert journal.send(entry)
+    assert journald.all() == [entry]

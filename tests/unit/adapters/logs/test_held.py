@@ -163,3 +163,19 @@ def test_a_full_disk_is_no_reason_to_stop(fifo: Path) -> None:
     held.sent_all(1, b"rest")
     assert read_held(fifo) == (b"rest", 0)
     held.close()
+
+
+def test_no_file_for_what_is_held_loses_no_line(tmp_path: Path) -> None:
+    """As where the file system has no inode left: only a kill of the runner needs the file."""
+    reading, writing = os.pipe2(os.O_NONBLOCK)
+    held = HeldLines(tmp_path / "gone/a.out")
+    for data, rest in ((b"one\n", b""), (b"two", b"two"), (b"\n", b"")):
+        os.write(writing, data)
+        assert held.take(reading, 100) == data
+        held.add(b"x")
+        held.sent(0)
+        held.sent_all(1, rest)
+    held.close()
+    held.close()
+    os.close(reading)
+    os.close(writing)

@@ -32,6 +32,9 @@ def test_is_held(was_held: bool, seconds: float, backlog: int, is_held: bool) ->
         ({"max_log_size": None, "max_rotated_files": None}, MARKS),
         ({"max_log_size": "1GB"}, MARKS),
         ({"max_log_size": "what dora may know"}, MARKS),
+        ({"max_log_size": "9" * 5000}, MARKS),
+        ({"max_log_size": "0"}, Marks(1, 1)),
+        ({"max_log_size": "4B"}, Marks(1, 1)),
         ({"max_log_size": "400KB"}, Marks(100_000, 50_000)),
         ({"max_log_size": "400 kb", "max_rotated_files": 3}, Marks(300_000, 150_000)),
         ({"max_log_size": 4000, "max_rotated_files": 0}, Marks(1000, 500)),
@@ -40,6 +43,13 @@ def test_is_held(was_held: bool, seconds: float, backlog: int, is_held: bool) ->
 )
 def test_marks(keys: dict[str, Any], marks: Marks) -> None:
     assert marks_of({"id": "n", **keys}) == marks
+
+
+@pytest.mark.parametrize("size", ["0", "4", "1KB", "16MB"])
+def test_a_node_goes_on_when_all_is_read(size: str) -> None:
+    marks = marks_of({"id": "n", "max_log_size": size})
+    assert marks.is_held(False, 1, marks.hold)
+    assert not marks.is_held(True, 1, 0)
 
 
 def test_bounds_of_dora_s_files() -> None:

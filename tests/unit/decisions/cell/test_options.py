@@ -50,7 +50,9 @@ spans = st.integers(SHORTEST_TIME, 10**12)
 owed = st.builds(Owed, idents, outputs, spans, spans, st.sampled_from(THEN))
 options = st.builds(
     RunnerOptions,
-    name=st.from_regex(r"[a-z][a-z0-9_-]{0,20}", fullmatch=True).filter(lambda n: n != "gateway"),
+    name=st.from_regex(r"[a-z][a-z0-9_-]{0,20}(?<!-)", fullmatch=True).filter(
+        lambda n: n != "gateway"
+    ),
     uuid=st.uuids().map(str),
     dataflow=paths,
     working_directory=paths,

@@ -72,6 +72,8 @@ def test_warnings() -> None:
         ("max_restarts", "0"),
         ("max_restarts", "-1"),
         ("max_restarts", "many"),
+        ("max_restarts", "٣"),
+        ("max_restarts", "9" * 5000),
         ("restart_delay", "0"),
         ("restart_delay", "100ms"),
         ("restart_delay", "infinity"),

@@ -44,6 +44,7 @@ cells = st.builds(
     st.dictionaries(ids, st.builds(LineCount, counts, counts, counts)),
     *(counts, st.booleans()),
     st.dictionaries(ids, st.builds(Sign, st.text(max_size=MAX_STATUS), times, times)),
+    st.dictionaries(ids, st.lists(st.none() | counts, max_size=3).map(tuple)),
 )
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.text(),

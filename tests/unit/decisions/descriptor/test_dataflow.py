@@ -1,5 +1,6 @@
 """Descriptors: what is read, what is refused and how, and dora's own errors in one line."""
 
+import sys
 from typing import Any
 
 import pytest
@@ -300,6 +301,29 @@ def test_whose_output_dora_must_read() -> None:
     for node in ({"operator": operator}, {"operators": [{"id": "a", **operator}]}):
         assert flow({"id": "one", **node}).nodes[0].keeps_output
     assert flow({"id": "one", "path": "o.py", "min_log_level": "info"}).nodes[0].keeps_output
+
+
+def test_a_large_dataflow_is_no_more_than_its_nodes() -> None:
+    assert _calls(chain(200)) < 8 * _calls(chain(50))
+
+
+def chain(length: int) -> dict[str, Any]:
+    inputs = [{"i": f"a{place - 1}/o"} if place else {} for place in range(length)]
+    nodes = [
+        {"id": f"a{n}", "path": "x", "outputs": ["o"], "inputs": i} for n, i in enumerate(inputs)
+    ]
+    return {"nodes": nodes}
+
+
+def _calls(document: dict[str, Any]) -> int:
+    """Calls of functions of C while it is read: unlike time, the same on every machine."""
+    seen: list[str] = []
+    sys.setprofile(lambda _frame, event, _arg: seen.append(event))
+    try:
+        parse_dataflow(document, "f")
+    finally:
+        sys.setprofile(None)
+    return seen.count("c_call")
 
 
 def test_infinite_numbers_in_env_are_texts() -> None:

@@ -44,6 +44,13 @@ def test_what_is_sent(text: str, sent: str) -> None:
     assert expanded({"K": text, "N": 5}, {"A": "a", "P": "$x", "F": "NaN"}) == {"K": sent, "N": 5}
 
 
+def test_braces_that_nobody_closes() -> None:
+    text = "${A:-" * 200_000  # once took hours
+    dataflow = parse_dataflow({"nodes": [{"id": "a", "path": "a", "env": {"X": text}}]}, "f")
+    assert called_variables(dataflow, {"A": "a", "B": "b"}) == {}
+    assert expanded({"X": f"${{A}}{text}$A"}, {"A": "a"}) == {"X": f"a{text}a"}
+
+
 def test_what_the_coordinator_gets_again() -> None:
     env = {"A": "$$", "B": "${DORA_SYSTEMD_NUMBER:-inf}", "N": 5}
     again = sent_again({"id": "one", "env": env})

@@ -194,3 +194,18 @@ def test_what_nobody_who_is_dora_would_send() -> None:
 )
 def test_exit_value(kind: str, number: object, text: str) -> None:
     assert str(protocol.exit_value(kind, number)) == text
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("no\n\n  Location:\n    a.rs:1", "no"),
+        ("no\n room\nStack backtrace:\n 1", "no room"),
+        ("Location of x is unknown\nSuggestion: y", "Location of x is unknown"),
+        ("no\nLocations", "no Locations"),
+        ("\n" * 1_000_000 + "x", "x"),  # once took hours
+        ("", ""),
+    ],
+)
+def test_an_error_without_its_place(text: str, line: str) -> None:
+    assert protocol.first_line(text) == line

@@ -107,6 +107,7 @@ def test_lines_of_a_file() -> None:
     line = {"at_us": 1_700_000_000_000_017, "node": "camera", "text": "two\nlines", "priority": 3}
     assert saved_line(line) == "2023-11-14T22:13:20.000017Z camera: two lines\n"
     assert saved_line({**line, "node": ""}).endswith("Z dataflow: two lines\n")
+    assert saved_line({**line, "node": "a\n\x1b[2J"}).endswith("Z a \\x1b[2J: two lines\n")
 
 
 def test_values_for_the_page() -> None:

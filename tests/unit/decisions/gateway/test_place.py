@@ -30,6 +30,7 @@ def test_precedence(option: int | None, environ: Mapping[str, str], port: int | 
         {"DORA_DAEMON_PORT": "65536"},
         {"DORA_DAEMON_PORT": "٣"},
         {"DORA_DAEMON_PORT": "9" * 5000},
+        {"DORA_DAEMON_PORT": "0650001"},
         {"DORA_DAEMON_PORT": "x"},
         {"DORA_COORDINATOR_ADDR": "0.0.0.0"},
         {"DORA_COORDINATOR_ADDR": "192.168.1.5:53290"},

@@ -6,7 +6,8 @@ import pytest
 
 from dora_systemd.decisions.life.refusal import format_refusal, parse_refusal, refusal_exit
 from dora_systemd.decisions.life.states import RunnerExit
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.decisions.unit.properties import restart_properties
+from dora_systemd.errors import DoraSystemdError, ExitCode, TimedOut
 from dora_systemd.verbs.start.job import start_unit
 from tests.unit.fakes.manager import FakeManager, options
 from tests.unit.verbs.start.test_job import SCOPE, UNIT
@@ -23,6 +24,13 @@ def test_there_and_back(code: ExitCode, hint: str) -> None:
 
 def test_other_errors_are_bad_dataflows() -> None:
     assert refusal_exit(DoraSystemdError("cannot")) is RunnerExit.BAD_DATAFLOW
+
+
+def test_a_check_without_an_answer_is_no_bad_dataflow() -> None:
+    """As on a machine that is busy with its boot: Restart= may try again."""
+    status = refusal_exit(TimedOut("cannot wait"))
+    assert status is RunnerExit.FAILED
+    assert status not in restart_properties(options())["RestartPreventExitStatus"].value[0]
 
 
 def test_a_line_that_systemd_takes() -> None:

@@ -16,6 +16,7 @@ from dora_systemd.decisions.logs.lines import (
     jsonl_fields,
 )
 
+LOG = b'{"level":"info","timestamp":"t","message":"m"'
 ORIGIN = Origin("robot", "550e8400-e29b-41d4-a716-446655440000", "camera", "run1", 42)
 
 
@@ -157,6 +158,14 @@ def test_half_a_surrogate_pair_is_no_error() -> None:
     assert b"MESSAGE=\\ud800\n" in LineEncoder(ORIGIN, "stdout").entry(line)
 
 
+def test_no_depth_is_an_error() -> None:
+    # Between what json reads and what it writes there is a level; which one depends on the stack.
+    for depth in range(1100):
+        value = b'"k":' + b"[" * depth + b"]" * depth
+        assert json_fields(LOG + b',"fields":{' + value + b"}}") != {}
+        assert jsonl_fields(b'{"stream":"stdout","level":"info","msg":"","fields":{%b}}' % value)
+
+
 def test_half_a_surrogate_pair_in_the_name_of_a_stream_is_no_error() -> None:
     fields = jsonl_fields(b'{"ts":"t","level":"INFO","stream":"\\ud800","msg":"m"}')
     assert fields["DORA_STREAM"] == "\\ud800"
@@ -213,3 +222,17 @@ def test_warning_of_coordinator_or_daemon(line: bytes, target: str) -> None:
 )
 def test_all_else_that_they_print_is_dropped(line: bytes) -> None:
     assert dora_log_fields(line) is None
+
+
+@pytest.mark.parametrize("key", ["message", "msg", "fields"])
+def test_no_depth_of_nesting_is_an_error(key: str) -> None:
+    """Some depths can be read and not be written again."""
+    encoder = LineEncoder(ORIGIN, "stdout")
+    for depth in range(900, 1001):
+        deep = b"[" * depth + b"]" * depth
+        value = b'{"x":%s}' % deep if key == "fields" else deep
+        start = b'{"level":"info","timestamp":"t","ts":"t","stream":"stdout","msg":"m",'
+        line = start.replace(b'"msg":"m",', b"") if key == "msg" else start
+        line += b'"%s":%s}' % (key.encode(), value)
+        assert encoder.entry(line)
+        assert jsonl_fields(line)["MESSAGE"]

@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from dora_systemd.decisions.logs.terminal import TerminalLines, color_of
+from dora_systemd.decisions.logs.terminal import MOST_NAMES, TerminalLines, color_of
 
 SHORT = b"Nov 21 01:02:59 lab robot/camera[95]: "
 
@@ -51,6 +51,32 @@ def test_chunks_make_no_difference() -> None:
     lines = TerminalLines()
     pieces = b"".join(lines.feed(data[i : i + 1]) for i in range(len(data)))
     assert pieces + lines.flush() == whole
+
+
+def test_names_without_end_fill_no_memory() -> None:
+    lines, shown = TerminalLines(), b""
+    for number in range(2 * MOST_NAMES):
+        shown += lines.feed(SHORT.replace(b"camera", b"n%d" % number) + b"one\n")
+        assert len(lines._said) <= MOST_NAMES
+        assert len(lines._labels) <= MOST_NAMES
+    assert (shown + lines.flush()).count(b" one\n") == 2 * MOST_NAMES
+
+
+def test_long_names_and_texts_are_not_kept() -> None:
+    lines = TerminalLines()
+    long = SHORT.replace(b"camera", b"n" * 1000) + b"one\n"
+    found = fed(lines, long * 2 + (SHORT + b"x" * 20_000 + b"\n") * 2)
+    assert found.count(b"one\n") == 2
+    assert found.count(b"x" * 20_000) == 2
+    lines.feed(long * 3)
+    assert not lines._said
+    assert list(lines._labels) == [b"camera"]
+
+
+def test_repetitions_are_told_before_they_are_forgotten() -> None:
+    lines = TerminalLines()
+    others = b"".join(SHORT.replace(b"camera", b"n%d" % n) + b"hi\n" for n in range(MOST_NAMES))
+    assert b"camera ... 4 times\n" in plain(fed(lines, (SHORT + b"one\n") * 4 + others))
 
 
 def test_color_of_a_node_is_always_the_same() -> None:

@@ -2,7 +2,7 @@
 
 from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.why.lives import Happening, Life
-from dora_systemd.decisions.why.postmortem import examine
+from dora_systemd.decisions.why.postmortem import examine, stopped_by
 from dora_systemd.decisions.why.report import Report, Subject, format_report
 from dora_systemd.decisions.why.verdict import Facts, Verdict
 
@@ -58,3 +58,11 @@ def test_a_lost_machine_ended_it() -> None:
     text = report_of(found)
     assert "doractl restart robot; --restart-policy on-failure does this" in text
     assert "doractl -H alice@gpu-box why robot" in text
+
+
+def test_a_part_that_its_head_ends() -> None:
+    stopping = Happening("dataflow-stopping", 4_000_000, details={"by": "head"})
+    told = (Happening("dataflow-starting", 1_000_000), stopping)
+    assert stopped_by(Life(told), ()) == "its head"
+    lost = Happening("machine-lost", 3_000_000, details={"machine": "head", "reason": "no word"})
+    assert stopped_by(Life((told[0], lost, stopping)), ()) == "the loss of its head (no word)"

@@ -134,6 +134,8 @@ def test_timeout_sec_is_two_properties() -> None:
         ("LimitCORESoft=5", "services have no such property", "LimitCORE"),
         ("MemoryMaxScale=5", "services have no such property", "MemoryMax"),
         ("Nice=100", "cannot set property Nice to '100'", "between -20 and 19"),
+        ("StateDirectory=a dora-systemd/b", "cannot set property StateDirectory", "another name"),
+        ("StateDirectory=a:dora-systemd", "cannot set property StateDirectory", "another name"),
         ("Restart=yes", "cannot set property Restart to 'yes'", "on-failure"),
         ("MemoryMax=4 gigs", "cannot set property MemoryMax to '4 gigs'", "512M"),
         ("MemoryMax=101%", "cannot set property MemoryMax to '101%'", "percentage"),

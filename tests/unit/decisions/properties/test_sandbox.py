@@ -370,6 +370,8 @@ def test_absolute_paths(tmp_path: Path) -> None:
         ("FileNotFoundError: [Errno 2] No such file or directory: 'model.pt'", ""),
         ("ModuleNotFoundError: No module named 'dora'", "pip install dora-rs"),
         ("ModuleNotFoundError: No module named 'dora_extra'", ""),
+        ("OSError: [Errno 28] No space left on device", "that the node writes to"),
+        ("OSError: [Errno 28] No space left on device: '/a/{b}'", "df '/a/{b}'"),
         ("", ""),
     ],
 )

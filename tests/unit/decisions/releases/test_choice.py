@@ -1,5 +1,7 @@
 """Ids, manifests, which releases stay, and which one a rollback takes."""
 
+import json
+
 import pytest
 
 from dora_systemd.decisions.releases.choice import Known, before, state_of, surplus
@@ -76,6 +78,13 @@ def test_manifests() -> None:
     assert text.isascii()
     assert parse_manifest(text, "x") == MANIFEST
     assert MANIFEST.size == 3
+
+
+def test_texts_that_are_no_texts() -> None:
+    for key in ("uuid", "revision", "created_us"):
+        value = {**json.loads(format_manifest(MANIFEST)), key: None}
+        with pytest.raises(DoraSystemdError, match="does not describe a release"):
+            parse_manifest(json.dumps(value), "/x/release.json")
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[]", "null", '{"schema": 1}', "[" * 100_000])

@@ -60,3 +60,9 @@ def test_any_source_is_read(source: str) -> None:
 )
 def test_syntax(source: str, error: str) -> None:
     assert syntax_error("/p/a.py", source) == error
+
+
+@pytest.mark.parametrize("source", ["-" * 100_000 + "1", "+".join(["1"] * 20_000)])
+def test_a_source_that_python_cannot_hold(source: str) -> None:
+    assert program_files("/p/a.py", {"/p/a.py": source}.get) == {"/p/a.py"}
+    assert syntax_error("/p/a.py", source)

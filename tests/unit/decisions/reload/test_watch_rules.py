@@ -57,6 +57,13 @@ def test_what_git_ignores() -> None:
     assert rules.has("/p/sub/a.py")
 
 
+@pytest.mark.parametrize("line", ["!", "\\", "x\\", "!\\", "[z-a]"])
+def test_lines_that_git_takes_for_nothing(line: str) -> None:
+    rules = WatchRules("/p", gitignores={"": (line, "*.local.py")})
+    assert rules.has("/p/x.py")
+    assert not rules.has("/p/x.local.py")
+
+
 def test_directories() -> None:
     rules = WatchRules("/p", gitignores={"": ("/gen/",)})
     places = ["/p", "/p/sub", "/p/.git", "/p/sub/.venv", "/p/gen", "/p/out", "/q"]
@@ -67,7 +74,7 @@ def test_lists_of_patterns() -> None:
     assert parse_patterns(["*.py, *.yaml,", "config/*"]) == ("*.py", "*.yaml", "config/*")
 
 
-@pytest.mark.parametrize("text", ["../x/*.py", "a\nb", "x/../../y"])
+@pytest.mark.parametrize("text", ["../x/*.py", "a\nb", "x/../../y", "!", "x\\", "[z-a]"])
 def test_bad_patterns(text: str) -> None:
     with pytest.raises(DoraSystemdError) as caught:
         parse_patterns([text])

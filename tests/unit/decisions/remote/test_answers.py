@@ -6,10 +6,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dora_systemd.decisions.remote.failures import ending_error, is_of_ssh, last_line
-from dora_systemd.decisions.remote.hosts import Host
+from dora_systemd.decisions.remote.failures import ending_error, is_of_ssh, last_line, unreached
+from dora_systemd.decisions.remote.hosts import Host, parse_host
 from dora_systemd.decisions.remote.merge import MOST_HELD, WINDOW_SECONDS, Merge
-from dora_systemd.decisions.remote.stream import MAX_LINE, AfterMark, Lines, objects_of, with_host
+from dora_systemd.decisions.remote.stream import (
+    MAX_LINE,
+    AfterMark,
+    Lines,
+    objects_of,
+    read_object,
+    with_host,
+)
 from dora_systemd.decisions.remote.table import format_hosts, row_of
 from dora_systemd.decisions.views.objects import dataflow_object, format_json
 from dora_systemd.decisions.views.rows import DataflowRow
@@ -62,8 +69,10 @@ def test_objects_have_their_host() -> None:
     )
     assert objects_of('[{"name": 1}, {}]', "a") == [{"host": "a", "name": 1}, {"host": "a"}]
     assert objects_of('{"name": 1}', "a") == [{"host": "a", "name": 1}]
+    assert read_object('{"name": 1}') == {"name": 1}
     for text in ("", "welcome", "[1]", "3", "[" * 100_000, "null"):
         assert objects_of(text, "a") is None
+        assert read_object(text) is None
 
 
 @pytest.mark.parametrize(
@@ -93,6 +102,10 @@ def test_how_a_talk_ends(
     error = ending_error(A, status, is_in, said, complaint)
     assert (error and error.message) == message
     assert error is None or (error.code is ExitCode.NO_HOST and error.hint)
+
+
+def test_a_hint_is_a_command_of_ssh() -> None:
+    assert unreached(parse_host("a:2222"), "odd").hint == "try: ssh -p 2222 a true"
 
 
 def test_what_ssh_says_is_not_repeated() -> None:
@@ -127,6 +140,8 @@ def test_the_table() -> None:
     by_name = format_hosts({"a": [ROBOT], "d": [other]}, sort_by="name")
     assert [line.split()[0] for line in by_name.splitlines()[1:]] == ["d", "a"]
     assert format_hosts({"a": []}) == ""
+    for status in ("", " "):  # a host may say anything
+        assert "robot" in format_hosts({"a": [ROBOT._replace(status=status)]}, 80, want_colors=True)
     assert max(map(len, format_hosts({"a" * 40: [ROBOT], "b": None}, 60).splitlines())) <= 60
 
 

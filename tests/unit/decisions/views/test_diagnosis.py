@@ -55,6 +55,7 @@ def test_controllers() -> None:
         ("#RateLimitBurst=5\n", True, State.NOTE, "10000 lines in 30s"),
         ("RateLimitBurst=5\n RateLimitIntervalSec=1min\n", True, State.NOTE, "5 lines in 1min"),
         ("RateLimitBurst=5\nRateLimitBurst=\n", True, State.NOTE, "10000"),
+        ("RateLimitBurst=\nStorage=volatile\n", True, State.NOTE, "10000 lines in 30s"),
         ("RateLimitBurst=0\n", True, State.OK, "no rate limit"),
         ("RateLimitIntervalSec=0\n", True, State.OK, "no rate limit"),
         ("RateLimitIntervalSec=x\n", True, State.NOTE, "in x "),

@@ -3,7 +3,12 @@
 import pytest
 
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.life.stop_budget import LEAVE_TIMEOUT, runner_timeout, stop_timeout
+from dora_systemd.decisions.life.stop_budget import (
+    LEAVE_TIMEOUT,
+    runner_timeout,
+    stop_timeout,
+    unit_timeout,
+)
 from dora_systemd.decisions.unit.properties import stop_properties
 from dora_systemd.runner.cell.clock import BACKLOG_SECONDS, STOP_SECONDS, StopClock
 from dora_systemd.values import INFINITY, SECOND
@@ -24,6 +29,12 @@ def test_the_parts_fit_the_whole(grace: int) -> None:
     # All that the states of the table may take; the rest is journald's.
     states = stop_timeout(grace) + LEAVE_TIMEOUT
     assert states + 3 * SECOND <= runner_timeout(grace) < whole
+
+
+@pytest.mark.parametrize("grace", [INFINITY, INFINITY - 1, INFINITY // 3 * 2])
+def test_the_longest_times_are_infinite(grace: int) -> None:
+    assert unit_timeout(grace) == INFINITY  # D-Bus has 64 bits
+    assert runner_timeout(grace) == INFINITY
 
 
 @pytest.mark.parametrize("late", [0.0, 17.0, 22.0, 60.0])

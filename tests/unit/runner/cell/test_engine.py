@@ -16,7 +16,7 @@ from dora_systemd.adapters.dora import engine
 from dora_systemd.decisions.cell.exits import Exit, exit_of
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.dora.protocol import LogRecord
-from dora_systemd.errors import DoraSystemdError
+from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.begin import start_coordinator
 from dora_systemd.runner.cell.boot import Boot
@@ -341,3 +341,14 @@ def test_a_long_request_does_not_keep_the_others(tmp_path: Path) -> None:
         await settle()
 
     with_coordinator(tmp_path, dora, work)
+
+
+def test_a_dora_that_is_gone_is_refused_and_not_tried_again(tmp_path: Path) -> None:
+    paths = CellPaths(tmp_path)
+    with pytest.raises(DoraSystemdError, match=r"^cannot run the dora command /nowhere") as caught:
+        start_coordinator("/nowhere", paths, {})
+    assert caught.value.code is ExitCode.NO_DORA
+    (tmp_path / "dora").write_bytes(b"\0")  # found, and the kernel cannot execute it
+    (tmp_path / "dora").chmod(0o755)
+    with pytest.raises(OSError, match="Exec format error"):
+        start_coordinator(str(tmp_path / "dora"), paths, {})

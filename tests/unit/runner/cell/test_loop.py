@@ -2,6 +2,8 @@
 
 import asyncio
 import os
+import subprocess
+import sys
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,7 +12,7 @@ from typing import Any, cast
 import pytest
 
 from dora_systemd.decisions.cell.exits import exit_of
-from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.options import RunnerOptions, format_runner_argv
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.dora.protocol import Reply
 from dora_systemd.decisions.life import events as life
@@ -305,3 +307,13 @@ def test_a_directory_that_was_deleted_under_somebody(tmp_path: Path) -> None:
     assert is_deleted(place)
     assert is_deleted(Path(f"/proc/self/fd/{held}"))
     os.close(held)
+
+
+def test_the_exit_status_does_not_depend_on_who_reads_standard_error() -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    command = (sys.executable, "-m", "dora_systemd.runner", *format_runner_argv(OPTIONS))
+    environment = {key: text for key, text in os.environ.items() if key != "RUNTIME_DIRECTORY"}
+    done = subprocess.run(command, stderr=writing, env=environment, check=False)
+    os.close(writing)
+    assert done.returncode == RunnerExit.BAD_DATAFLOW

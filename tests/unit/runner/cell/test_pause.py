@@ -203,3 +203,9 @@ def test_without_systemd(monkeypatch: pytest.MonkeyPatch) -> None:
     for key, value in given.items():
         monkeypatch.setenv(key, value)
     assert fd_store.lives() == 0
+
+
+def test_a_table_that_cannot_be_written_makes_no_delay_shorter(unit: Unit) -> None:
+    unit.paths.status.mkdir()
+    pauses = [round(0.1 + unit.start(restarts), 6) for restarts in range(5)]
+    assert pauses == [0.1, 0.5, 1, 2, 4]

@@ -1,7 +1,9 @@
 """The pump: what the table wants done is done, in its order, and what becomes of it is shown."""
 
 import asyncio
+import io
 import json
+import os
 import time
 from pathlib import Path
 from typing import Any
@@ -281,3 +283,56 @@ def test_samples_and_what_is_said_about_them(tmp_path: Path, state: State, count
         assert len(bench.table["samples"]) == 1
 
     live(work)
+
+
+def test_what_was_so_for_a_moment_was_so(tmp_path: Path) -> None:
+    """The task that waits runs after the events: a reload must not wait for a start that was."""
+
+    async def work() -> None:
+        bench = Bench(tmp_path, State.RUNNING)
+        wait = asyncio.create_task(bench.pump.wait(lambda cell: cell.notice == "x", None))
+        await asyncio.sleep(0)
+        bench.push(life.ReloadNoted(1, "x"), life.ReloadNoted(2, ""))
+        assert await wait
+
+    live(work)
+
+
+def test_a_directory_that_is_lost_after_a_full_disk_ends_the_cell(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    async def work() -> None:
+        paths = CellPaths(tmp_path / "cell")
+        paths.status.mkdir(parents=True)
+        bench = Bench(paths.root, State.RUNNING)
+        bench.push(life.ReloadNoted(1, "x"))
+        paths.status.rmdir()
+        paths.root.rmdir()
+        bench.push(life.ReloadNoted(2, "y"))
+        await bench.pump.end
+        assert bench.pump.cell.cause is Cause.DIRECTORY_LOST
+
+    live(work)
+    assert capfd.readouterr().err.count("<4>") == 1
+
+
+def test_a_warning_that_nobody_reads_ends_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After a restart of journald the pipe of standard error may be broken."""
+    reading, writing = os.pipe()
+    os.close(reading)
+
+    async def work() -> None:
+        CellPaths(tmp_path).status.mkdir()
+        bench = Bench(tmp_path, State.RUNNING)
+        bench.push(life.ReloadNoted(1, "x"))
+        bench.pump.sample()
+        assert bench.pump.cell.state is State.RUNNING
+
+    with os.fdopen(writing, "wb", buffering=0) as raw:
+        text = io.TextIOWrapper(raw, write_through=True)
+        monkeypatch.setattr("sys.stderr", text)
+        live(work)
+        monkeypatch.undo()
+        text.detach()

@@ -1,7 +1,6 @@
 """A member: what it says to the head, and what it does without one."""
 
 import asyncio
-import json
 from collections.abc import Callable, Coroutine
 from dataclasses import replace
 from pathlib import Path
@@ -214,12 +213,20 @@ def test_it_judges_by_its_own_table(tmp_path: Path) -> None:
 
 def test_a_table_is_sent_when_it_is_new(tmp_path: Path) -> None:
     async def work(bench: Bench) -> None:
+        group = tmp_path / "node-mid"
+        group.mkdir()
+        (group / "memory.current").write_text("4096\n")
+        (tmp_path / "node-stranger").mkdir()
+        bench.nodes._unit, bench.nodes._paths = tmp_path, CellPaths(tmp_path)
         other = await bench.head()
-        bench.pump.amend(bench.pump.amend(CellStatus(uuid=UUID)))
+        table = CellStatus(uuid=UUID, nodes={"mid": NodeStatus("running", 7)})
+        assert bench.pump.amend(bench.pump.amend(table)) == table, "here the cgroup tells it"
         await asyncio.sleep(1.5)
         await asyncio.sleep(1)
-        told = [json.loads(one["status"])["uuid"] for one in other.heard()]
-        assert told == [UUID]
+        (told,) = [CellStatus.from_json(one["status"]) for one in other.heard()]
+        assert told.uuid == UUID
+        (use,) = told.usage.values()
+        assert 4096 in use
 
     run(tmp_path, work)
 

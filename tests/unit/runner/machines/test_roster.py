@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from dora_systemd.decisions.cell.counters import LineCount
 from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.cell.machines import Placed
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -52,6 +53,31 @@ async def settle() -> None:
 
 def run(work: Callable[[Bench], Coroutine[Any, Any, None]]) -> None:
     live(lambda: work(Bench()))
+
+
+def test_a_new_table_is_shown_soon() -> None:
+    """One that comes a hundred times a second is not written as often."""
+
+    async def work(bench: Bench) -> None:
+        written = asyncio.Event()
+        times: list[int] = []
+
+        def refresh() -> None:
+            times.append(1)
+            written.set()
+
+        bench.roster.refresh = refresh
+        other = await bench.link()
+        for _ in range(50):
+            other.say(wire.Table(CellStatus(lines={"mid": LineCount(7)}).to_json()))
+        await settle()
+        await written.wait()
+        assert len(times) < 5
+        node = NodeStatus("running", machine="gpu")
+        table = bench.roster.amend(CellStatus(nodes={"mid": node}))
+        assert table.lines == {"mid": LineCount(7)}
+
+    run(work)
 
 
 def test_a_link_gets_the_ports_and_then_its_part() -> None:

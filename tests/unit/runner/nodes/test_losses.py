@@ -2,6 +2,9 @@
 
 import asyncio
 
+import pytest
+
+from dora_systemd.errors import DoraSystemdError
 from dora_systemd.runner.nodes.losses import LossWatch
 
 
@@ -13,12 +16,15 @@ class Case:
         self.now = 0
         self.reported: list[int] = []
         self.windows: list[tuple[int, int]] = []
+        self.failure: Exception | None = None
         self.watch = LossWatch(
             lambda: self.sent, self.count, self.reported.append, lambda: self.now
         )
 
     def count(self, since: int, until: int) -> int:
         self.windows.append((since, until))
+        if self.failure is not None:
+            raise self.failure
         new, self.counted = self.stored - self.counted, self.stored
         return new
 
@@ -59,3 +65,15 @@ def test_windows_do_not_overlap() -> None:
     for now in (30, 60, 90):
         case.look(now, now * 1000, now * 1000)
     assert case.windows == [(0, 29), (30, 59), (60, 89)]
+
+
+@pytest.mark.parametrize("failure", [DoraSystemdError("no journal"), RuntimeError("no thread")])
+def test_a_journal_that_cannot_be_read_ends_nothing(failure: Exception) -> None:
+    case = Case()
+    case.failure = failure
+    case.look(30, 50_000, 32_000)
+    case.finish(40, 50_000, 32_000)
+    case.failure = None
+    case.look(60, 50_000, 32_000)
+    assert case.windows == [(0, 29), (0, 39), (0, 59)]
+    assert case.reported == [18_000]

@@ -11,12 +11,14 @@ import pytest
 
 from dora_systemd.adapters.host import process
 from dora_systemd.adapters.logs.pipes import LogPipes
+from dora_systemd.decisions.cell.log_backlog import Marks
 from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
 from dora_systemd.decisions.logs.lines import Origin
 from dora_systemd.decisions.rights.node_rights import parse_node_rights
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.nodes import nodes as nodes_module
 from dora_systemd.runner.nodes.descriptors import raise_file_limit
+from dora_systemd.runner.nodes.hold import Hold
 from dora_systemd.runner.nodes.nodes import Nodes, _with_descendants
 from tests.unit.adapters.logs.test_queue import SlowJournal
 
@@ -119,3 +121,38 @@ def test_an_operator_that_dies_while_it_is_adopted(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(os, "scandir", gone)
     monkeypatch.setattr(os, "listdir", gone)
     assert _with_descendants(os.getpid()) == [os.getpid()]
+
+
+def test_a_node_that_is_taken_back_is_held_as_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[Hold] = []
+    looked: list[Hold] = []
+
+    class Noted(Hold):
+        def __init__(self, group: Path, marks: Marks) -> None:
+            super().__init__(group, marks)
+            made.append(self)
+
+        def look(self, backlog: int) -> None:
+            looked.append(self)
+            super().look(backlog)
+
+    monkeypatch.setattr(nodes_module, "Hold", Noted)
+    raw = {"id": "a", "path": "a.py", "outputs": ["said"], "send_stdout_as": "said"}
+    dataflow = parse_dataflow({"nodes": [raw]}, "dataflow.yml")
+    (tmp_path / "io").mkdir()
+
+    async def live() -> None:
+        pipes = LogPipes(asyncio.get_running_loop(), SlowJournal(), Origin("robot", "uuid"))
+        nodes = Nodes(tmp_path, CellPaths(tmp_path), pipes)
+        nodes.prepare(dataflow, {}, ())
+        nodes.listen("run")
+        nodes.remove("a")
+        nodes.add(dataflow.nodes[0], {}, ())
+        async with asyncio.timeout(30):
+            while made[1] not in looked:
+                await asyncio.sleep(0.01)
+        nodes.close()
+
+    asyncio.run(live())

@@ -57,7 +57,7 @@ def test_rights_are_proved_in_a_unit(
 ) -> None:
     proved: list[object] = []
     monkeypatch.setattr(module, "prove_rights", proved.append)
-    monkeypatch.setattr(cgroup, "own_group", lambda: group)
+    monkeypatch.setattr(cgroup, "group_of", lambda: group)
     rights = (parse_node_rights("camera:nice=5"),)
     check_first(options(node_rights=rights), FLOW)
     assert proved == [rights] * is_proved

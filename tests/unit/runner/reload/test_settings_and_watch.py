@@ -20,6 +20,7 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.runner.reload.apply import Run
 from dora_systemd.runner.reload.reloader import Reloader
 from dora_systemd.runner.reload.settings_file import SettingsFile, main
+from dora_systemd.runner.reload.sources import check_programs
 from dora_systemd.values import SECOND
 
 FLOW = "nodes: [{{id: a, path: {path}}}]\n"
@@ -195,3 +196,19 @@ def test_a_settings_file_that_goes_and_comes(tmp_path: Path) -> None:
     path.mkdir()
     with pytest.raises(DoraSystemdError, match="it is a directory"):
         settings.keep()
+
+
+def test_a_program_that_is_no_python_is_not_read(tmp_path: Path) -> None:
+    """It may have a gigabyte, which the runner would take from its nodes."""
+    program, gone = tmp_path / "node", str(tmp_path / "gone")
+    with program.open("wb") as file:
+        file.truncate(1 << 40)
+    check_programs([str(program)])
+    with pytest.raises(DoraSystemdError, match=f"^cannot use {gone}: No such file"):
+        check_programs([gone])
+
+
+def test_a_name_that_leaves_no_room_for_settings(tmp_path: Path) -> None:
+    settings = SettingsFile(str(tmp_path / ("x" * 256)), tmp_path / "copy")
+    settings.keep()
+    assert not (tmp_path / "copy").exists()

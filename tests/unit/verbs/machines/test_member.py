@@ -11,10 +11,12 @@ import pytest
 
 from dora_systemd.decisions.cell.machines import Placed
 from dora_systemd.decisions.machines.wire import Part
+from dora_systemd.decisions.settings.resolve import resolve_settings
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.values import INFINITY, SECOND
 from dora_systemd.verbs.machines import member
 from dora_systemd.verbs.machines.member import MemberRequest, is_passing, start_member
-from dora_systemd.verbs.start.plan import StartRequest
+from dora_systemd.verbs.start.plan import Plan, StartRequest
 from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
 
 OTHER = UUID.replace("5", "6")
@@ -109,6 +111,14 @@ def test_a_name_in_use(tmp_path: Path) -> None:
     error = refused(manager, tmp_path)
     assert error.code is ExitCode.NAME_IN_USE
     assert OTHER in error.message
+
+
+def test_a_runner_can_only_shorten_the_grace(tmp_path: Path) -> None:
+    own = options()._replace(grace=5 * SECOND)
+    plan = Plan(ScopeIn(False, 0, tmp_path), own, resolve_settings({}, {}, []), None, {})
+    for said, taken in ((2 * SECOND, 2 * SECOND), (3600 * SECOND, 5 * SECOND), (2**63, 5 * SECOND)):
+        found = member._member_plan(plan, replace(PART, grace=said)).options
+        assert (found.grace, found.start_timeout) == (taken, INFINITY)
 
 
 def test_an_old_part_ends_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

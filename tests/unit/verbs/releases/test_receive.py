@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,9 +12,13 @@ from dora_systemd.adapters.releases.draft import Draft
 from dora_systemd.adapters.releases.incoming import Stream, incoming, leftovers
 from dora_systemd.adapters.releases.spool import spooled
 from dora_systemd.decisions.releases.entries import Stored
-from dora_systemd.decisions.releases.parcel import Parcel
+from dora_systemd.decisions.releases.manifest import Manifest
+from dora_systemd.decisions.releases.parcel import Parcel, format_parcel
 from dora_systemd.errors import DoraSystemdError
+from dora_systemd.scope import Scope
+from dora_systemd.verbs.releases import receive
 from dora_systemd.verbs.releases.receive import Known, _fill
+from tests.unit.fakes.manager import FakeManager
 
 
 def stream_of(data: bytes) -> Stream:
@@ -55,6 +60,18 @@ def test_what_is_here_already_is_shared(tmp_path: Path) -> None:
         ]
         assert (draft.tree / "link").readlink() == Path("bin/run")
     assert [one.name for one in tmp_path.iterdir()] == ["last"]
+
+
+def test_what_a_build_has_made_is_not_removed(
+    manager: FakeManager, scope: Scope, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A dry run compares projects, as one without -H."""
+    files = {"gone": OLD, "copy": OLD, ".venv/pyvenv.cfg": replace(NEW, is_built=True)}
+    last = Manifest("1", "robot", "", "dataflow.yml", "", "", "", 0, files=files)
+    monkeypatch.setattr(receive, "present", lambda *_: last)
+    parcel = Parcel("robot", "", "copy", None, "", {"copy": NEW})
+    found = receive.compare_sent(manager, scope, stream_of(format_parcel(parcel)))
+    assert found == ("1", {"added": [], "changed": ["copy"], "removed": ["gone"]})
 
 
 @pytest.mark.parametrize("data", [b"", b"new", b"other"])

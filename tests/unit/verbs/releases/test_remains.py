@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.adapters.releases.store import Store
+from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.releases import listing as module
 from dora_systemd.verbs.releases.clean import clean
@@ -61,3 +62,23 @@ def test_what_is_being_written_stays(manager: FakeManager, scope: Scope, store: 
     left = leave(etc(manager), 1)
     clean(manager, store, read_standing(manager, scope, UNIT))
     assert left.exists()
+
+
+def test_a_foreign_unit_hides_no_other_dataflow(
+    manager: FakeManager, scope: Scope, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "root_of", lambda _: store.path.parent)
+    other = store.path.with_name("other")
+    (other / OLD).mkdir(parents=True)
+    foreign = etc(manager).with_name("dora-other.service")
+    foreign.parent.mkdir(parents=True)
+    foreign.write_text("[Service]\nExecStart=/bin/true\n")
+    (store.path / ".new-0a1b2c3d4e5f").mkdir()
+    rows = module.read_releases(manager, scope, ["other", "robot"])
+    assert (rows[0].name, rows[0].id, rows[0].state) == ("other", OLD, "unknown")
+    assert {row.name for row in rows} == {"other", "robot"}
+    with pytest.raises(DoraSystemdError, match="is not doractl's"):
+        module.read_releases(manager, scope, ["other"])
+    told = [one.text for one in module.judge_releases(manager, scope)]
+    assert any("is not doractl's" in one for one in told)
+    assert any(".new-0a1b2c3d4e5f is the rest of" in one for one in told)

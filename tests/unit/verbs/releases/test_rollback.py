@@ -1,10 +1,13 @@
 """What a rollback does to a dataflow without a release before the present one, or disabled."""
 
+from dataclasses import replace
+
 import pytest
 
 from dora_systemd.adapters.releases.draft import Draft
 from dora_systemd.adapters.releases.store import Store
 from dora_systemd.decisions.releases.manifest import Manifest
+from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.releases import rollback as module
 from dora_systemd.verbs.releases.change import Change
@@ -42,11 +45,40 @@ def test_a_first_trial_that_was_killed_ends(
     assert "RestartUnit" not in [call[0] for call in manager.calls]
 
 
+@pytest.fixture
+def changes(monkeypatch: pytest.MonkeyPatch) -> list[Change]:
+    """Those that are asked for; nothing makes them."""
+    found: list[Change] = []
+    monkeypatch.setattr(module, "change_release", lambda *given: found.append(given[4]))
+    return found
+
+
 def test_what_is_disabled_stays_so(
-    manager: FakeManager, scope: Scope, monkeypatch: pytest.MonkeyPatch
+    manager: FakeManager, scope: Scope, changes: list[Change]
 ) -> None:
-    changes: list[Change] = []
-    monkeypatch.setattr(module, "change_release", lambda *given: changes.append(given[4]))
     manager.add(release_options(NEW), "active", Transient=False)
     roll_back(manager, scope, "robot", OLD, 0, print)
     assert [one.want_boot for one in changes] == [False]
+
+
+@pytest.mark.usefixtures("changes")
+@pytest.mark.parametrize("damage", ["other", "", None])
+def test_a_damaged_release_is_refused(
+    manager: FakeManager, scope: Scope, store: Store, damage: str | None
+) -> None:
+    """Its trial need not notice that a model has lost its weights."""
+    manager.add(release_options(NEW), "active", Transient=False)
+    files = {name: Draft(store).write(name, [b"model"], False) for name in ("a.onnx", "b.onnx")}
+    tree = store.tree(OLD)
+    tree.chmod(0o700)
+    for name in files:
+        (tree / name).write_bytes(b"model")
+    store.write_manifest(replace(store.manifest(OLD), files=files))
+    roll_back(manager, scope, "robot", OLD, 0, print)
+    if damage is None:
+        (tree / "b.onnx").unlink()
+    else:
+        (tree / "b.onnx").write_text(damage)
+    with pytest.raises(DoraSystemdError, match=r"it is damaged: b\.onnx changed") as caught:
+        roll_back(manager, scope, "robot", OLD, 0, print)
+    assert caught.value.code == ExitCode.BAD_INPUT

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from dora_systemd.decisions.cell.machines import Placed
 from dora_systemd.decisions.settings.resolve import resolve_settings
 from dora_systemd.decisions.unit.file import runner_of
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -49,6 +50,28 @@ def test_a_free_name(manager: FakeManager, scope: Scope) -> None:
     assert (boot.path, boot.text, boot.is_enabled) == (unit_file(manager), None, False)
     assert not place(manager, make_plan(scope))
     assert manager.calls == []
+
+
+def test_old_links_go_when_the_new_file_is_there(
+    manager: FakeManager, scope: Scope, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = make_plan(scope)
+    spread = replace(plan, options=plan.options._replace(placed=(Placed("a", "gpu"),)))
+    place(manager, spread, want_boot=True)
+    link = unit_file(manager).with_name("doralink-robot:gpu.service")
+    link.write_text("")
+    before = unit_file(manager).read_text()
+
+    def refuse(_names: object) -> bool:
+        raise DoraSystemdError("No space left on device")
+
+    with monkeypatch.context() as context:
+        context.setattr(manager, "enable_unit_files", refuse)
+        with pytest.raises(DoraSystemdError, match="No space left"):
+            place(manager, plan, want_boot=True)
+    assert (link.exists(), unit_file(manager).read_text()) == (True, before)
+    place(manager, plan, want_boot=True)
+    assert not link.exists()
 
 
 @pytest.mark.parametrize("state", ["active", "activating", "deactivating", "reloading"])

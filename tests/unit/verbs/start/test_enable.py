@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.adapters.host.process import Completed
+from dora_systemd.adapters.host.unit_files import put_unit_file, read_unit_file
 from dora_systemd.decisions.settings.resolve import resolve_settings
 from dora_systemd.decisions.unit.file import says_the_same
 from dora_systemd.decisions.unit.properties import UnitContext, format_unit, unit_properties
@@ -15,8 +16,15 @@ from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.enabled import enabled_units
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.list import find_row
+from dora_systemd.verbs.show import unit_files
 from dora_systemd.verbs.start import linger
-from dora_systemd.verbs.start.enable import boot_target, disable_cell, enable_cell
+from dora_systemd.verbs.start.enable import (
+    boot_target,
+    disable_cell,
+    enable_cell,
+    install_unit_file,
+    read_boot_unit,
+)
 from dora_systemd.verbs.start.linger import ensure_linger
 from dora_systemd.verbs.stop import stop_cells
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options
@@ -112,6 +120,35 @@ def test_nothing_is_left_when_it_cannot_be_linked(tmp_path: Path, scope: Scope) 
     with pytest.raises(DoraSystemdError, match="No space left"):
         enable_cell(manager, scope, cell)
     assert not path_of(manager).exists()
+
+
+@pytest.mark.parametrize("before", [None, "of the last start\n"])
+def test_a_failure_leaves_the_files_of_links_as_they_were(
+    tmp_path: Path, scope: Scope, before: str | None
+) -> None:
+    manager = Refusing()
+    manager.etc = tmp_path / "etc"
+    boot = read_boot_unit(manager, scope, UNIT)
+    links = [boot.path.with_name(f"doralink-robot:{one}.service") for one in ("a", "b")]
+    boot.path.parent.mkdir(parents=True)
+    for path in (*links, boot.path):
+        put_unit_file(path, before)
+    given = dict.fromkeys((path.name for path in links), "new")
+    with pytest.raises(DoraSystemdError, match="No space left"):
+        install_unit_file(manager, boot, "new", given)
+    assert {read_unit_file(path) for path in (*links, boot.path)} == {before}
+    links[1].unlink(missing_ok=True)
+    links[1].mkdir()  # a file that cannot be written, after one that can
+    with pytest.raises(DoraSystemdError, match="already exists"):
+        install_unit_file(manager, boot, "new", given)
+    assert {read_unit_file(path) for path in (links[0], boot.path)} == {before}
+
+
+def test_an_error_in_a_unit_file_that_is_not_utf_8(manager: FakeManager) -> None:
+    cell = started(manager)
+    Path(manager.units[UNIT]["FragmentPath"]).write_bytes(b"[Unit]\n# f\xfcr\n")
+    with pytest.raises(DoraSystemdError, match=r"service: line 2 is not UTF-8"):
+        unit_files(manager, cell)
 
 
 def test_attached_dataflows_cannot_outlive_their_terminal(

@@ -159,6 +159,8 @@ def test_settings_files(tmp_path: Path) -> None:
     config = settings_files(flow, {**home, "XDG_CONFIG_HOME": "/c"})[1]
     assert config == Path("/c/dora-systemd/config.yml")
     assert settings_files(flow, {}) == [beside, system]
+    # A relative path in the variable is not valid.
+    assert settings_files(flow, {**home, "XDG_CONFIG_HOME": "c"})[1] == user
 
 
 def test_settings_beside_the_dataflow(project: Path) -> None:
@@ -281,6 +283,15 @@ def test_an_identity_is_not_borrowed(project: Path, tmp_path: Path) -> None:
     os.chown(project, 1, 1)
     with pytest.raises(DoraSystemdError, match="owns a directory above it"):
         choose_user(SYSTEM, None, place_of(flow), str(project))
+
+
+@pytest.mark.parametrize("name", ["gone", f"{'n' * 256}", "robot.yml/in"])
+def test_an_identity_is_not_borrowed_while_the_directory_is_away(project: Path, name: str) -> None:
+    """Whoever owns it could take it away for a moment, and put it back after the check."""
+    place = place_of(project / "robot.yml")._replace(uid=65534, owners=frozenset((0, 1, 65534)))
+    with pytest.raises(DoraSystemdError, match="as working directory: it is not") as caught:
+        choose_user(SYSTEM, None, place, str(project / name))
+    assert caught.value.code is ExitCode.BAD_INPUT
 
 
 def test_a_user_that_is_asked_for(project: Path) -> None:

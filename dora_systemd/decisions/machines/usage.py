@@ -1,0 +1,82 @@
+"""What nodes on members use, in the tables that these send to the head. Pure.
+
+The head cannot read the cgroups of another machine, and a member can lie about its own nodes. Its
+numbers only have to be ones that can be.
+"""
+
+from typing import Any, NamedTuple
+
+from dora_systemd.decisions.cell.counters import CpuSample, cpu_percent, throttled_percent
+from dora_systemd.decisions.cell.status import CellStatus
+from dora_systemd.decisions.resources.usage import Usage
+from dora_systemd.values import INFINITY, SECOND
+
+_MOST = INFINITY // 2
+_MOST_PERCENT = 100 * 8192
+"""All of the processors that Linux can have."""
+
+
+class NodeUse(NamedTuple):
+    """The usage of a node that runs elsewhere.
+
+    cpu_percent, throttled: percentages as in a NodeRow, at the time when the member has read them.
+    """
+
+    use: Usage
+    cpu_percent: float
+    throttled: float
+
+    def facts(self) -> dict[str, Any]:
+        """The fields of a NodeRow."""
+        share = self.use.cpu_max
+        return {
+            "cpu_percent": self.cpu_percent,
+            "cpu_limit": None if share is None else 100 * share / SECOND,
+            "throttled": None if share is None else self.throttled,
+            "memory": self.use.memory,
+            "memory_peak": self.use.memory_peak,
+            "memory_limit": self.use.memory_max,
+        }
+
+
+def told_use(use: Usage, samples: tuple[CpuSample, ...], now: CpuSample, node: str) -> list[Any]:
+    """What a member writes into its table for parse_use(). now: the reading that `use` is from."""
+    shares = (cpu_percent(samples, now, node), throttled_percent(samples, now, node))
+    limits = (use.memory, use.memory_peak, use.memory_max, use.cpu_max)
+    counters = (use.cpu_us, *use.throttling)
+    # JSON has no INFINITY: no limit and no controller are shown alike.
+    return [
+        *(round(one, 1) for one in shares),
+        *counters,
+        *(one if one is not None and one < _MOST else None for one in limits),
+    ]
+
+
+def parse_use(raw: Any) -> NodeUse | None:
+    """The usage in a table that another machine has written; None for what is none."""
+    match raw:
+        case [float() as cpu, float() as throttled, used, periods, late, memory, peak, most, share]:
+            are_shares = 0 <= cpu <= _MOST_PERCENT and 0 <= throttled <= 100
+            are_counters = all(map(_is_number, (used, periods, late)))
+            if are_shares and are_counters and all(map(_is_limit, (memory, peak, most, share))):
+                use = Usage(used, memory, peak, most, share, (periods, late))
+                return NodeUse(use, cpu, throttled)
+    return None
+
+
+def _is_number(value: object) -> bool:
+    return type(value) is int and 0 <= value < _MOST
+
+
+def _is_limit(value: object) -> bool:
+    return value is None or _is_number(value)
+
+
+def uses_of(status: CellStatus) -> dict[str, NodeUse]:
+    """The usage of the nodes in the table of a head that run on members."""
+    found = {node: parse_use(raw) for node, raw in status.usage.items() if _is_away(status, node)}
+    return {node: one for node, one in found.items() if one is not None}
+
+
+def _is_away(status: CellStatus, node: str) -> bool:
+    return node in status.nodes and bool(status.nodes[node].machine)

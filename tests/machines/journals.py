@@ -1,0 +1,46 @@
+"""The journals of all machines: what in them nobody expects."""
+
+import shlex
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from functools import partial
+
+import pytest
+
+from tests.machines.wires import OTHERS, there
+from tests.system.complaints import Journalctl, complaints, end_of_journal, journalctl
+
+LOST = (
+    "flow: Machine gpu of dataflow flow is lost: ",
+    "flow: Dataflow flow failed: machine gpu: ",
+    "systemd: dora-flow.service: Failed with result 'exit-code'",
+    "flow: Machine head of dataflow flow is lost: ",
+)
+"""What all say when the head has lost a member."""
+
+
+def _journalctl(machine: str, *words: str) -> str:
+    return there(machine, shlex.join(("journalctl", *words))).stdout
+
+
+@contextmanager
+def quiet_journals(expected: Iterable[str] = ()) -> Iterator[None]:
+    """No machine's journal has an unexpected warning of our units from meanwhile."""
+    journals: dict[str, Journalctl] = {"a": journalctl}
+    journals |= {one: partial(_journalctl, one) for one in OTHERS}
+    begin = {machine: end_of_journal(ask) for machine, ask in journals.items()}
+    assert all(begin.values()), begin
+    yield
+    known = list(expected)
+    told = [
+        f"{machine}: {line}"
+        for machine, ask in journals.items()
+        for line in complaints(begin[machine], [], ask)
+    ]
+    told = [one for one in told if not any(words in one for words in known)]
+    assert not told, "unexpected warnings:\n" + "\n".join(told)
+
+
+def announced(request: pytest.FixtureRequest) -> list[str]:
+    """The warnings that a test expects, by its mark `warns`."""
+    return [one for mark in request.node.iter_markers("warns") for one in mark.args]

@@ -1,0 +1,108 @@
+"""What root packs of another user's project for `deploy -H`."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.trust.programs import own_account
+from dora_systemd.verbs.releases import send
+from dora_systemd.verbs.releases.files import find_files
+from dora_systemd.verbs.start.plan import StartRequest
+
+FLOW = "nodes: [{id: a, path: a.py}]\n"
+MODEST, IMMODEST = "restart_policy: always\n", "user: root\n"
+
+pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="gives files to somebody else")
+
+
+@pytest.fixture
+def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A project of another user, whom this reads it as."""
+    monkeypatch.setattr(send, "_reader", lambda _: own_account())
+    monkeypatch.setattr(send, "_owners", lambda _: [])
+    root = tmp_path / "robot"
+    root.mkdir()
+    for name, text in (("robot.yml", FLOW), ("a.py", ""), ("robot.systemd.yml", MODEST)):
+        (root / name).write_text(text)
+        os.chown(root / name, 1, 1)
+    os.chown(root, 1, 1)
+    return root
+
+
+def pack(project: Path) -> dict[str, Any]:
+    request = StartRequest(str(project / "robot.yml"))
+    with send.packed(request, lambda _: None, lambda _: None) as found:
+        return dict(found.parcel.files)
+
+
+def once(monkeypatch: pytest.MonkeyPatch, act: Callable[[], object]) -> None:
+    """Have something happen after the settings are checked, and before they are packed."""
+
+    def find(*arguments: Any) -> Any:
+        act()
+        return find_files(*arguments)
+
+    monkeypatch.setattr(send, "find_files", find)
+
+
+def test_a_project_of_another_user(project: Path) -> None:
+    assert pack(project).keys() == {"robot.yml", "a.py", "robot.systemd.yml"}
+    (project / "robot.systemd.yml").rename(project / "settings.yml")
+    (project / "robot.systemd.yml").symlink_to("settings.yml")
+    with pytest.raises(DoraSystemdError, match="symbolic link"):
+        pack(project)
+
+
+def test_settings_that_only_root_may_have(project: Path) -> None:
+    (project / "robot.systemd.yml").write_text(IMMODEST)
+    with pytest.raises(DoraSystemdError, match="the file is not root's") as caught:
+        pack(project)
+    assert caught.value.code is ExitCode.NO_PERMISSION
+
+
+@pytest.mark.parametrize("first", [MODEST, None])
+def test_settings_that_change_after_the_check(
+    project: Path, monkeypatch: pytest.MonkeyPatch, first: str | None
+) -> None:
+    """Over there they would be root's."""
+    beside = project / "robot.systemd.yml"
+    if first is None:
+        beside.unlink()
+    once(monkeypatch, lambda: beside.write_text(IMMODEST))
+    with pytest.raises(DoraSystemdError, match="changed while it was packed") as caught:
+        pack(project)
+    assert caught.value.code is ExitCode.BAD_INPUT
+
+
+def test_settings_that_are_hidden_after_the_check(
+    project: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    beside = project / "robot.systemd.yml"
+    once(monkeypatch, beside.unlink)
+    with pytest.raises(DoraSystemdError, match="changed while it was packed"):
+        pack(project)
+
+
+def test_settings_behind_a_link_of_roots(project: Path) -> None:
+    for path in (project, *project.iterdir()):
+        os.chown(path, 0, 0)
+    (project / "robot.systemd.yml").rename(project / "settings.yml")
+    (project / "robot.systemd.yml").symlink_to("settings.yml")
+    assert pack(project)["robot.systemd.yml"].target == "settings.yml"
+
+
+@pytest.mark.parametrize("file", ["/root/secret.env", "../secret.env"])
+def test_files_that_only_root_could_read_over_there(project: Path, file: str) -> None:
+    """Here they would be read as the owner of the settings."""
+    beside = project / "robot.systemd.yml"
+    beside.write_text(f"env_file: {file}\n")
+    with pytest.raises(DoraSystemdError, match="env_file is not in the project") as caught:
+        pack(project)
+    assert caught.value.code is ExitCode.NO_PERMISSION
+    (project / "own.env").write_text("A=1\n")
+    beside.write_text("env_file: own.env\n")
+    assert "own.env" in pack(project)
