@@ -130,6 +130,8 @@ class FakeManager:
 
     def queue_job(self, method: str, unit: str) -> str:
         self.calls.append((method, unit))
+        if unit in self.units:
+            self.units[unit]["Job"] = [0, "/"]  # it is done at once
         return "/job"
 
     def kill(self, unit: str, signal: int, whom: str = "all") -> None:
