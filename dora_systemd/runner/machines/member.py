@@ -5,6 +5,7 @@ that ends it ends its nodes, by itself and with success: the head decides what f
 has been told is in memory only.
 """
 
+import asyncio
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -46,7 +47,8 @@ _LONGEST = 100
 class Member(Shared):
     """A machine that another one has given nodes.
 
-    stops_by_head: the head knows that this part ends.
+    stops_by_head: the head knows that this part ends. is_answered: the head ends its own part, or
+    is gone.
     """
 
     def __init__(self, options: RunnerOptions, this_life: Life, boot: EarlyDaemon | None) -> None:
@@ -59,6 +61,7 @@ class Member(Shared):
         self._pump: Pump | None = None
         self._table = self._told = self._version = ""
         self.stops_by_head = False
+        self.is_answered = asyncio.Event()
         self.is_going_down: Callable[[bool], bool] = is_going_down
 
     def prepare(self, paths: CellPaths, prepared: Prepared, check: "DoraCheck") -> None:
@@ -146,6 +149,7 @@ class Member(Shared):
 
     def _end_by_head(self, why: str) -> None:
         self.stops_by_head = True
+        self.is_answered.set()
         self._push(life.HeadLost(now_us(), why))
 
     def _push(self, event: life.Event) -> None:

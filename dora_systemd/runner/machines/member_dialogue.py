@@ -26,6 +26,8 @@ _POLL_SECONDS, _SOON, _LATER_SECONDS = 0.05, 200, 0.5
 _EXPLAIN_SECONDS = 0.5
 """Time for the session to end, which says more than a lost connection to dora."""
 _ASK_SECONDS = 2.0
+_ANSWER_SECONDS = 1.0
+"""Time for the head to hear that this part ends; it is part of the time of a stop."""
 _UNKNOWN = ("", "offline", "unknown")
 _GOING_DOWN = "the machine is shutting down"
 _ENDING = (State.STOPPING, State.CLOSING, State.LEAVING, State.ENDED)
@@ -34,10 +36,12 @@ _ENDING = (State.STOPPING, State.CLOSING, State.LEAVING, State.ENDED)
 class Voice(Protocol):
     """What talks with the head. stops_by_head: the head knows that this part ends.
 
-    is_going_down: whether systemd, or that of the user, stops everything.
+    is_answered: the head ends its own part, or is gone. is_going_down: whether systemd, or that of
+    the user, stops everything.
     """
 
     stops_by_head: bool
+    is_answered: asyncio.Event
     is_going_down: Callable[[bool], bool]
 
     def send(self, message: wire.Message) -> None:
@@ -110,9 +114,15 @@ class MemberDialogue(Dialogue):
             self._pump.push(life.ResultKnown(now_us(), results))
 
     async def _stop(self) -> None:
-        """Somebody stops this part here: the head has to know before the nodes end."""
+        """Somebody stops this part here: the head has to know before the nodes end.
+
+        Else it may hear of them first, by dora, and take their ends for crashes.
+        """
         is_down = await asyncio.to_thread(self._is_going_down)
         self._tell_end(lambda: is_down)  # on the loop: a connection is no thread's but its own
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(_ANSWER_SECONDS):
+                await self._voice.is_answered.wait()
         await self._end_nodes()
 
     def _is_going_down(self) -> bool:

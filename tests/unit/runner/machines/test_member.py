@@ -19,6 +19,7 @@ from dora_systemd.decisions.machines import wire
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.life import Life
+from dora_systemd.runner.machines import member_dialogue
 from dora_systemd.runner.machines.engine import MemberEngine
 from dora_systemd.runner.machines.member import Member
 from dora_systemd.runner.machines.member_boot import MemberBoot
@@ -181,9 +182,37 @@ def test_systemd_is_asked_beside_the_loop_and_the_head_told_on_it(tmp_path: Path
         bench.nodes._unit, bench.nodes._paths = tmp_path, CellPaths(tmp_path)
         bench.dialogue._end_nodes = end_nodes  # type: ignore[method-assign]
         bench.be(stop_by="SIGTERM")
-        await bench.dialogue._stop()
+        stop = asyncio.create_task(bench.dialogue._stop())
+        while not asked:
+            await asyncio.sleep(0.001)
+        await settle()
+        assert len(asked) == 1, "the head has not answered yet"
+        other.say(wire.StopPart(SECOND))
+        await stop
         thread, last = asked
         assert thread is not current_thread() and last is None
+
+    run(tmp_path, work)
+
+
+def test_a_head_that_does_not_answer_holds_up_no_stop(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def work(bench: Bench) -> None:
+        await bench.head()
+        ended: list[None] = []
+
+        async def end_nodes() -> None:
+            ended.append(None)
+
+        bench.member.is_going_down = lambda _: False
+        bench.nodes._unit, bench.nodes._paths = tmp_path, CellPaths(tmp_path)
+        bench.dialogue._end_nodes = end_nodes  # type: ignore[method-assign]
+        bench.be(stop_by="SIGTERM")
+        await bench.dialogue._stop()
+        assert ended == [None]
+
+    monkeypatch.setattr(member_dialogue, "_ANSWER_SECONDS", 0.01)
 
     run(tmp_path, work)
 
