@@ -5,7 +5,7 @@ import select
 import shutil
 import socket
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -101,7 +101,12 @@ def nspawn_words(run: Run, root: Path, hostname: str) -> list[str]:
     ]  # fmt: skip
 
 
-def wait_ready(ready: socket.socket, nspawn: subprocess.Popen[bytes], run: Run) -> int:
+def wait_ready(
+    ready: socket.socket,
+    nspawn: subprocess.Popen[bytes],
+    run: Run,
+    on_leader: Callable[[], None] = lambda: None,
+) -> int:
     """nspawn tells the leader's pid when it forks it, and READY=1 when that has booted."""
     leader = 0
     ended = os.pidfd_open(nspawn.pid)
@@ -110,7 +115,9 @@ def wait_ready(ready: socket.socket, nspawn: subprocess.Popen[bytes], run: Run) 
         while select.select([told, ended], [], [], bound(BOOT_SECONDS))[0] == [told]:
             message = ready.recv(4096).decode().splitlines()
             fields = dict(line.partition("=")[::2] for line in message)
-            leader = int(fields.get("X_NSPAWN_LEADER_PID", leader))
+            if not leader and "X_NSPAWN_LEADER_PID" in fields:
+                leader = int(fields["X_NSPAWN_LEADER_PID"])
+                on_leader()
             if "READY" in fields and leader:
                 return leader
     finally:

@@ -135,7 +135,11 @@ class Machine:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ready:
             ready.bind(str(told))
             self._nspawn = start_nspawn(inner, [*enter, *self._command(inner)])
-            self.container = Container(wait_ready(ready, self._nspawn, inner), path / "supervisor")
+            leader = wait_ready(ready, self._nspawn, inner, self.plug)
+        self.container = Container(leader, path / "supervisor")
+
+    def plug(self) -> None:
+        """Before it has booted: an enabled dataflow may wait for the network until it has."""
         self.network.plug(self.cable)
 
     def power_off(self) -> None:

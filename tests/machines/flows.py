@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 from tests.machines.journals import quiet_journals
 from tests.machines.wires import there
@@ -135,14 +136,16 @@ class Flow:
         return {node["node"]: node for node in row["nodes"]}
 
 
+Kind = TypeVar("Kind", bound=Flow)
+
+
 @contextmanager
-def flow_on(members: dict[str, str], expected: Iterable[str] = ()) -> Iterator[Flow]:
-    """A dataflow whose files are everywhere.
+def flow_on(flow: Kind, expected: Iterable[str] = ()) -> Iterator[Kind]:
+    """The dataflow with its files everywhere.
 
     At its end it is stopped, nothing of it is left on any machine, and no journal has a warning
     other than those that are `expected`.
     """
-    flow = Flow(members)
     flow.bring()
     with quiet_journals(expected):
         try:

@@ -147,7 +147,7 @@ FAULTS = (
 
 def _times(members: dict[str, str]) -> dict[str, list[str]]:
     """The cells of each fault."""
-    with flow_on(members, ("",)) as flow:  # its warnings are what this is about
+    with flow_on(Flow(members), ("",)) as flow:  # its warnings are what this is about
         flow.start(*_POLICY, *_DELAYS)
         return {fault.name: _time(flow, fault) for fault in FAULTS}
 

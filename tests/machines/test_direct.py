@@ -6,23 +6,20 @@ import pytest
 
 from dora_systemd.errors import ExitCode
 from tests.machines.direct import ADDRESSES, THREE, TWO, DirectFlow
-from tests.machines.flows import NAME
+from tests.machines.flows import NAME, flow_on
+from tests.machines.journals import LOST, announced
+from tests.machines.test_flow_faults import BUSY
 from tests.machines.wires import cable, there
 from tests.system.cells import run, wait_for
 
-quiet = pytest.mark.usefixtures("quiet_journals")
 SSHD = {"0.0.0.0:22", "[::]:22"}
 
 
 @pytest.fixture(params=[TWO], ids=["two"])
 def flow(request: pytest.FixtureRequest) -> Iterator[DirectFlow]:
     """A dataflow whose files are everywhere."""
-    flow = DirectFlow(request.param)
-    flow.bring()
-    yield flow
-    flow.cell.doractl("stop", NAME, check=False)
-    flow.cell.end()
-    wait_for("nothing is left", lambda: not flow.left())
+    with flow_on(DirectFlow(request.param), announced(request)) as flow:
+        yield flow
 
 
 def listeners(machine: str) -> dict[str, str]:
@@ -39,7 +36,6 @@ def connected(machine: str) -> set[str]:
     return {one.rpartition(":")[0] for one in ends} - {"127.0.0.1", ADDRESSES[machine]}
 
 
-@quiet
 @pytest.mark.parametrize("flow", [TWO, THREE], ids=["two", "three"], indirect=True)
 def test_only_zenoh_listens_and_only_on_the_addresses(flow: DirectFlow) -> None:
     started = flow.start()
@@ -63,7 +59,6 @@ def test_only_zenoh_listens_and_only_on_the_addresses(flow: DirectFlow) -> None:
     assert all(listeners(machine).keys() == SSHD for machine in flow.machines)
 
 
-@quiet
 def test_nodes_meet_without_a_daemon_between(flow: DirectFlow) -> None:
     """The doubler on b is connected with a node on a, whose port no daemon has."""
     flow.start()
@@ -75,6 +70,7 @@ def test_nodes_meet_without_a_daemon_between(flow: DirectFlow) -> None:
     assert "python" in {theirs.get(one) for one in peers}, (peers, theirs)
 
 
+@pytest.mark.warns(*LOST, *BUSY)
 def test_a_cable_is_out(flow: DirectFlow) -> None:
     """Both sides end by the lease, as with ssh; it runs again, and no restart is counted."""
     flow.start("--restart-policy=on-failure", "--max-restarts=3", "--grace-duration=2s")
@@ -84,7 +80,6 @@ def test_a_cable_is_out(flow: DirectFlow) -> None:
     flow.wait_again(life)
 
 
-@quiet
 class TestRefusals:
     """One line, and nothing is left anywhere."""
 

@@ -20,7 +20,7 @@ THREE = {"gpu": "b", "arm": "c"}
 @pytest.fixture(params=[TWO, THREE], ids=["two", "three"])
 def flow(request: pytest.FixtureRequest) -> Iterator[Flow]:
     """A dataflow whose files are everywhere."""
-    with flow_on(request.param, announced(request)) as flow:
+    with flow_on(Flow(request.param), announced(request)) as flow:
         yield flow
 
 

@@ -19,7 +19,7 @@ from tests.system.cells import wait_for
 def flow() -> Iterator[Flow]:
     """Its files are everywhere; the sink, which prints, is on c."""
     of_arm = (one.replace("gpu", "arm") for one in LOST)
-    with flow_on({"gpu": "b", "arm": "c"}, (*LOST, *of_arm, *BUSY)) as flow:
+    with flow_on(Flow({"gpu": "b", "arm": "c"}), (*LOST, *of_arm, *BUSY)) as flow:
         yield flow
 
 

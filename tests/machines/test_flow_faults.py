@@ -29,7 +29,7 @@ killed = pytest.mark.warns(
 def flow(request: pytest.FixtureRequest) -> Iterator[Flow]:
     """A dataflow that runs, and is started again whatever ends it."""
     policy = ("--restart-policy=on-failure", "--max-restarts=50", f"--grace-duration={GRACE}s")
-    with flow_on(request.param, [*announced(request), *BUSY]) as flow:
+    with flow_on(Flow(request.param), [*announced(request), *BUSY]) as flow:
         flow.start(*policy)
         flow.wait_exchanging()
         yield flow

@@ -33,7 +33,7 @@ OPEN = "/etc/ssh/sshd_config.d/00-open.conf"
 @pytest.fixture
 def flow(request: pytest.FixtureRequest) -> Iterator[Flow]:
     """A dataflow whose files are everywhere."""
-    with flow_on({"gpu": "b"}, announced(request)) as flow:
+    with flow_on(Flow({"gpu": "b"}), announced(request)) as flow:
         yield flow
 
 

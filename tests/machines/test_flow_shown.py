@@ -18,7 +18,7 @@ FILE = f"{PLACE}/dataflow.yml"
 def flow() -> Iterator[Flow]:
     """A dataflow that runs on a, b and c."""
     reload_refused = ("Control process exited", "Reload failed for dora-flow")
-    with flow_on({"gpu": "b", "arm": "c"}, reload_refused) as flow:
+    with flow_on(Flow({"gpu": "b", "arm": "c"}), reload_refused) as flow:
         flow.start("--restart-policy=on-failure")
         flow.wait_exchanging()
         yield flow

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.errors import ExitCode
-from tests.machines.flows import NAME, PLACE, flow_on
+from tests.machines.flows import NAME, PLACE, Flow, flow_on
 from tests.machines.wires import cable, there
 from tests.system.cells import run
 
@@ -51,7 +51,7 @@ def test_a_key_for_dataflows_only(gpu: None) -> None:
 def test_a_dataflow_by_that_key(gpu: None) -> None:
     """No flag is needed, and no other key is used."""
     del gpu
-    with flow_on({"gpu": "b"}) as flow:
+    with flow_on(Flow({"gpu": "b"})) as flow:
         started = flow.cell.start(Path(PLACE) / "dataflow.yml")
         assert started.returncode == 0, started.stderr
         flow.wait_exchanging()

@@ -26,6 +26,7 @@ TOLERATED = (
     Word("Unable to connect to ", _ORDER),  # a locator, any of them, a newly scouted peer
     Word("in response to an OpenSyn", _ORDER),
     Word("Unknown subscriber", _ORDER),
+    Word("[Gossip] Received LinkStateList from unknown link", _ORDER),
     Word("Attempt to establish transport to itself", _ORDER),
     Word("zenoh teardown timed out", _SLOW),
     Word("Discarding event for input", _SLOW),

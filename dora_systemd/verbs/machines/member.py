@@ -35,6 +35,7 @@ from dora_systemd.verbs.facts.cells import read_cell
 from dora_systemd.verbs.facts.reason import failure_reason, runners_refusal
 from dora_systemd.verbs.machines.head import Head, read_line
 from dora_systemd.verbs.start.claim import make_room, refuse_unit_file, require_free_name
+from dora_systemd.verbs.start.enable import drop_unit_files
 from dora_systemd.verbs.start.linger import is_lingering, linger_command
 from dora_systemd.verbs.start.plan import Plan, StartRequest, make_plan
 from dora_systemd.verbs.start.unit import plan_properties, systemd_number
@@ -81,6 +82,7 @@ def start_member(manager: Manager, request: MemberRequest, head: Head) -> socket
     _check_same(part, plan)
     properties, _ = plan_properties(plan, manager)
     make_room(manager, boot)
+    drop_unit_files(manager, boot)
     told = transient_commands(list(properties.values()), systemd_number(manager))
     runner, stdin = _connected(part)
     with stdin:
