@@ -56,12 +56,12 @@ machines:  ## three machines on a network: doractl -H, pulled cables, power cuts
 	@$(PREPARE) machines
 	@$(CHECK) machines
 
-BENCHMARKS := start stop recovery startup many cost logs messages reload owes machines
+BENCHMARKS := start stop recovery startup many cost logs messages reload owes machines spread
 
 bench:  ## what supervision costs, against named rivals; WHAT="start ...", ROUNDS=n
 	@$(PREPARE) container
 	@for one in $(or $(WHAT),$(BENCHMARKS)); do \
-	    case $$one in machines) lab=machines;; *) lab=rivals;; esac; \
+	    case $$one in machines|spread) lab=machines;; *) lab=rivals;; esac; \
 	    LAB=$$lab LAB_OUT=benchmarks/data tests/lab/lab run -- python -m benchmarks.$$one $(ROUNDS) || exit; done
 	@/usr/bin/python3 -B -m benchmarks.report
 
