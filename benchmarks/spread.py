@@ -14,7 +14,7 @@ from pathlib import Path
 from benchmarks.flows import CHECKOUT
 from benchmarks.rounds import OURS, Figure, alternate, keep, shown
 from tests.machines.wires import there
-from tests.system.cells import SINK, SOURCE, Cell, Project, run
+from tests.system.cells import SINK, SOURCE, Cell, Project, run, wait_for
 
 HOME = Path("/srv/bench")
 NAME = "spread"
@@ -24,6 +24,7 @@ _YAML = """nodes:
   - {{id: source, path: source.py, inputs: {{tick: dora/timer/millis/50}}, outputs: [number]}}
   - {{id: sink, path: sink.py, inputs: {{double: source/number}}{deploy}}}
 """
+_LINKS = ("systemctl", "list-units", "--plain", "--no-legend", "doralink-*")
 _OURS = r"dora_systemd\.link|^ssh .*-T.*127\.0\.0\.1|^sshd-session: root@notty"
 _MEMORY = f"""import glob, os, re
 total = 0
@@ -72,6 +73,7 @@ def start_ms(file: Path) -> float:
     """One start, and a stop behind the clock."""
     seconds = start(file)
     Cell(NAME).end()
+    wait_for("the links have ended", lambda: not run(*_LINKS).stdout)
     return seconds * 1000
 
 
