@@ -1,17 +1,23 @@
-"""Reads a project for a release, as the account that runs this; imports the standard library only.
+"""Reads a project for a release, as the account that runs this.
+
+It imports the standard library only, and pathspec once rules of gitignore(5) are to be matched: a
+pattern can take for ever, so that is done where it can be killed, and never as root.
 
 project.py has a child process of that account run the text of this file. Requests are lines of
 JSON. An answer is frames: a letter, a length as 7 digits, and that many bytes; "+" has data, "."
 ends an answer, "-" ends it with the reason of a failure. All paths are relative to the project.
 """
 
+import contextlib
 import json
 import os
+import re
 import stat
 import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from functools import cache
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -20,6 +26,9 @@ CHUNK = 256 * 1024
 _GIT_SECONDS = 60
 MOST_PRINTED = 64 * 1024 * 1024
 """Maximum bytes that git may print."""
+IGNORE_FILE = ".gitignore"
+MOST_RULES = 1024 * 1024
+"""Maximum bytes of a .gitignore."""
 _KINDS = {
     **{stat.S_IFREG: "file", stat.S_IFLNK: "link", stat.S_IFDIR: "directory"},
     **{stat.S_IFIFO: "FIFO", stat.S_IFSOCK: "socket"},
@@ -46,12 +55,63 @@ def facts(path: str) -> list[Any] | None:
     return [path, kind, found.st_size, is_executable, target, signature]
 
 
-def listed(path: str, most: int) -> list[Any]:
-    """The facts of at most `most` entries of a directory."""
+def listed(path: str, most: int, rules: "Rules | None" = None) -> list[Any]:
+    """The facts of at most `most` entries of a directory, without those that rules leave out."""
     with os.scandir(path or ".") as entries:
-        names = sorted(entry.name for entry in islice(entries, most))
-    places = (f"{path}/{name}" if path else name for name in names)
-    return [one for one in map(facts, places) if one]
+        known = (entry for entry in entries if rules is None or not rules.ignore(path, entry))
+        names = sorted(entry.name for entry in islice(known, most))
+    return [one for one in (facts(joined(path, name)) for name in names) if one]
+
+
+def joined(directory: str, name: str) -> str:
+    """The path of a file; "" is the project itself."""
+    return f"{directory}/{name}" if directory else name
+
+
+class Rules:
+    """What a release leaves out: `always` anywhere, and what .gitignore says in its directory.
+
+    libraries: the directory that has pathspec.
+    """
+
+    def __init__(self, libraries: str, always: list[str]) -> None:
+        sys.path.append(libraries)
+        self._always, self._own = self._spec(always), dict[str, Any]()
+
+    @staticmethod
+    def _spec(lines: list[str]) -> Any:
+        """Of all lines that are patterns; one that is not matches nothing, as in git."""
+        from pathspec import GitIgnoreSpec
+
+        sound = []
+        for line in lines:
+            with contextlib.suppress(ValueError, re.error):
+                GitIgnoreSpec.from_lines([line])
+                sound.append(line)
+        return GitIgnoreSpec.from_lines(sound)
+
+    def enter(self, directory: str) -> None:
+        """Take the .gitignore of a directory, if there is one. Raises OSError."""
+        path = joined(directory, IGNORE_FILE)
+        prefix = joined(directory, "")
+        self._own.pop(prefix, None)
+        found = facts(path)
+        if found is None or found[1] != "file":
+            return
+        data = b"".join(islice(content(path), MOST_RULES // CHUNK + 1))
+        if len(data) > MOST_RULES:
+            raise OSError(0, "too large", path)
+        lines = data.decode(errors="replace").splitlines()
+        self._own[prefix] = self._spec(lines)
+
+    def ignore(self, directory: str, entry: "os.DirEntry[str]") -> bool:
+        """Whether an entry of a directory is left out."""
+        path = joined(directory, entry.name)
+        path += "/" if entry.is_dir(follow_symlinks=False) else ""
+        return bool(self._always.match_file(path)) or any(
+            path.startswith(prefix) and spec.match_file(path[len(prefix) :])
+            for prefix, spec in self._own.items()
+        )
 
 
 def content(path: str) -> Iterator[bytes]:
@@ -127,6 +187,12 @@ def tracked(owners: list[int], most: int) -> dict[str, Any]:
     return {"files": sorted({*files})[:most], "revision": os.fsdecode(about or b"").strip()}
 
 
+@cache
+def rules_of(libraries: str, *always: str) -> Rules:
+    """The rules of this process, which it gathers on its way down."""
+    return Rules(libraries, [*always])
+
+
 def answer(request: dict[str, Any]) -> Iterator[bytes]:
     """The data of an answer. Raises OSError."""
     what = request["ask"]
@@ -134,6 +200,10 @@ def answer(request: dict[str, Any]) -> Iterator[bytes]:
         yield from content(request["path"])
     elif what == "list":
         yield json.dumps(listed(request["path"], request["most"])).encode()
+    elif what == "walk":
+        rules = rules_of(request["libraries"], *request["always"])
+        rules.enter(request["path"])
+        yield json.dumps(listed(request["path"], request["most"], rules)).encode()
     elif what == "facts":
         yield json.dumps([facts(one) for one in request["paths"]]).encode()
     elif what == "git":

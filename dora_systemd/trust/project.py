@@ -15,6 +15,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -49,8 +50,21 @@ class Project:
 
     def listed(self, directory: str, most: int) -> list[list[Any]]:
         """The facts of at most `most` entries of a directory, see courier.facts()."""
-        value = self._value({"ask": "list", "path": directory, "most": most}, directory)
-        rows = self._rows(value, directory)
+        return self._entries({"ask": "list", "path": directory, "most": most})
+
+    def walked(self, directory: str, most: int, always: Sequence[str]) -> list[list[Any]]:
+        """The same without what .gitignore leaves out, here and above, and the patterns `always`.
+
+        Call it for each directory after the one that has it.
+        """
+        rules = {"always": list(always), "libraries": _libraries()}
+        ignore_file = courier.joined(directory, courier.IGNORE_FILE)
+        asked = {"ask": "walk", "path": directory, "most": most, "paths": [ignore_file]}
+        return self._entries({**asked, **rules})
+
+    def _entries(self, request: dict[str, Any]) -> list[list[Any]]:
+        directory, most = request["path"], request["most"]
+        rows = self._rows(self._value(request, directory), directory)
         if len(rows) > most or any(posixpath.dirname(row[0]) != directory for row in rows):
             raise self._broken(directory)
         return rows
@@ -150,6 +164,13 @@ class Project:
         return DoraSystemdError(
             f"cannot read {place} as user {self._account.name}: {reason}", hint, code
         )
+
+
+def _libraries() -> str:
+    """The directory that has pathspec, which the interpreter of the child does not look for."""
+    found = find_spec("pathspec")
+    assert found and found.origin
+    return str(Path(found.origin).parents[1])
 
 
 def _is_text(value: object) -> bool:

@@ -11,7 +11,6 @@ from typing import Protocol
 
 from dora_systemd.decisions.releases.entries import (
     DIRECTORY,
-    FILE,
     LINK,
     MOST_FILES,
     Found,
@@ -23,8 +22,7 @@ from dora_systemd.decisions.releases.entries import (
 )
 from dora_systemd.decisions.releases.ids import is_revision
 from dora_systemd.decisions.releases.manifest import Manifest
-from dora_systemd.decisions.reload.watch_rules import NOT_OF_PROJECT, WatchRules
-from dora_systemd.trust.files import MAX_BYTES
+from dora_systemd.decisions.reload.watch_rules import NOT_OF_PROJECT
 from dora_systemd.trust.project import Project
 
 Progress = Callable[[int, int], None]
@@ -46,7 +44,6 @@ class Target(Protocol):
         """Create a symbolic link."""
 
 
-_IGNORE_FILE = ".gitignore"
 _AGAIN = "wait until nothing writes to the project, then deploy again"
 
 
@@ -85,30 +82,19 @@ def _existing(project: Project, paths: Sequence[str]) -> Iterator[Found]:
 def _walk(project: Project, top: str) -> dict[str, Found]:
     """All files below a directory that no rule leaves out."""
     found: dict[str, Found] = {}
-    ignores: dict[str, tuple[str, ...]] = {}
     queue = [top]
     for directory in queue:
-        entries = [Found(*row) for row in project.listed(directory, MOST_FILES + 1)]
-        if len(entries) > MOST_FILES:  # the rest of them is not known
+        rows = project.walked(directory, MOST_FILES + 1, NOT_OF_PROJECT)
+        if len(rows) > MOST_FILES:  # the rest of them is not known
             raise too_many(directory)
-        if any(one.path.rpartition("/")[2] == _IGNORE_FILE and one.kind == FILE for one in entries):
-            ignores[directory] = _ignore_lines(project, directory)
-        rules = WatchRules(project.root, gitignores=ignores, always=NOT_OF_PROJECT)
-        for one in entries:
-            place = f"{project.root.rstrip('/')}/{one.path}"
+        for one in (Found(*row) for row in rows):
             if one.kind == DIRECTORY:
-                queue += [] if rules.is_ignored(f"{place}/") else [one.path]
-            elif not rules.is_ignored(place):
+                queue.append(one.path)
+            else:
                 found[one.path] = one
         if len(found) + len(queue) > MOST_FILES:
             raise too_many(directory)
     return found
-
-
-def _ignore_lines(project: Project, directory: str) -> tuple[str, ...]:
-    path = f"{directory}/{_IGNORE_FILE}" if directory else _IGNORE_FILE
-    data = b"".join(_bounded(project.read(path), path, MAX_BYTES))
-    return tuple(data.decode(errors="replace").splitlines())
 
 
 def digests(project: Project, found: Mapping[str, Found]) -> dict[str, Stored]:

@@ -111,6 +111,9 @@ LATE = {
         "link.talk": {"link.parting"},
         "link.relay": {"signal"},
     },
+    "in the child that reads a project, whose interpreter does not look for it": {
+        "trust.courier": {"pathspec"},
+    },
     "hot reload only": {
         "adapters.host.watch": {"watchfiles"},
         "decisions.reload.watch_rules": {"pathspec"},

@@ -158,3 +158,32 @@ def test_the_file_that_failed_is_named(project: Project) -> None:
     long = "x" * 300
     with pytest.raises(DoraSystemdError, match=f"cannot read .*/{long} as user .*: File name too"):
         project.facts(["dir/a.py", long])
+
+
+def test_a_walk_leaves_out_what_the_rules_say(root: Path, project: Project) -> None:
+    def paths(directory: str) -> list[str]:
+        return [row[0] for row in project.walked(directory, 10, ["*.pyc"])]
+
+    (root / "dir/b.pyc").touch()
+    assert paths("") == ["dir", "fifo", "link"]
+    assert paths("dir") == ["dir/a.py"]
+    (root / ".gitignore").write_text("[\n/link\ndir/*.txt\n")
+    (root / "dir/.gitignore").write_text("/a.py\n")
+    (root / "dir/c.txt").touch()
+    assert paths("") == [".gitignore", "dir", "fifo"]
+    assert paths("dir") == ["dir/.gitignore"]
+    (root / "dir/.gitignore").unlink()
+    assert paths("dir") == ["dir/a.py"]
+    (root / ".gitignore").write_bytes(b"a" * (courier.MOST_RULES + 1))
+    with pytest.raises(DoraSystemdError, match=r"\.gitignore as user .*: too large"):
+        paths("")
+
+
+def test_a_pattern_that_takes_for_ever_takes_none_of_our_time(
+    root: Path, project: Project, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (root / ("a" * 200)).touch()
+    (root / ".gitignore").write_text("*a" * 40 + "b\n")
+    monkeypatch.setattr(module, "_SECONDS", 0.5)
+    with pytest.raises(DoraSystemdError, match="no answer"):
+        project.walked("", 10, [])

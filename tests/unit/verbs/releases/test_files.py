@@ -79,7 +79,7 @@ class Many:
     def tracked(self, _owners: object, most: int) -> tuple[list[str] | None, str]:
         return [str(number) for number in range(1_000_000)[:most]] if self._has_git else None, ""
 
-    def listed(self, _directory: str, most: int) -> list[list[object]]:
+    def walked(self, _directory: str, most: int, _always: object) -> list[list[object]]:
         self.asked += 1
         return [[str(one), "file", 1, False, "", ""] for one in range(1_000_000)[:most]]
 
