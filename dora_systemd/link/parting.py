@@ -9,7 +9,7 @@ _FINAL = ("HAS CHANGED", "Host key verification failed", "Permission denied")
 """What no new attempt changes: somebody has to."""
 _FORWARDING = ("forwarding failed for listen port", "Could not request local forwarding")
 _ONCE, _TWICE = 1, 2
-"""A new attempt may help a machine that boots. Who waits for a start has mistyped a name."""
+"""A machine that boots may answer the next attempt. If a person waits, the name may be mistyped."""
 _HINT = "hint: "
 _VERSIONS = "install the same version of dora-systemd on both machines"
 
