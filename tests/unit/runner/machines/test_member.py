@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Callable, Coroutine
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from threading import Thread, current_thread
@@ -165,6 +166,18 @@ def test_who_stops_it_here_is_told_but_a_shutdown_is_nobody(
     run(tmp_path, work)
 
 
+@pytest.fixture
+def threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thread ends before the loop goes on, because its time would pass at once."""
+
+    async def to_thread(call: Callable[[], Any]) -> Any:
+        with ThreadPoolExecutor(1) as pool:
+            return pool.submit(call).result()
+
+    monkeypatch.setattr(asyncio, "to_thread", to_thread)
+
+
+@pytest.mark.usefixtures("threads")
 def test_systemd_is_asked_beside_the_loop_and_the_head_told_on_it(tmp_path: Path) -> None:
     async def work(bench: Bench) -> None:
         other = await bench.head()
@@ -183,8 +196,6 @@ def test_systemd_is_asked_beside_the_loop_and_the_head_told_on_it(tmp_path: Path
         bench.dialogue._end_nodes = end_nodes  # type: ignore[method-assign]
         bench.be(stop_by="SIGTERM")
         stop = asyncio.create_task(bench.dialogue._stop())
-        while not asked:
-            await asyncio.sleep(0.001)
         await settle()
         assert len(asked) == 1, "the head has not answered yet"
         other.say(wire.StopPart(SECOND))
@@ -195,6 +206,7 @@ def test_systemd_is_asked_beside_the_loop_and_the_head_told_on_it(tmp_path: Path
     run(tmp_path, work)
 
 
+@pytest.mark.usefixtures("threads")
 def test_a_head_that_does_not_answer_holds_up_no_stop(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
