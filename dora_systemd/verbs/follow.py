@@ -18,7 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from dora_systemd.adapters.bus.manager import DOWN, Manager
+from dora_systemd.adapters.bus.manager import Manager, is_at_rest
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.decisions.logs.query import (
     UNIT_ENDS,
@@ -154,8 +154,7 @@ def _wait_end(watch: UnitWatch) -> None:
 
 def is_unit_up(manager: Manager, name: str) -> bool:
     """Whether the unit of a dataflow runs or has a queued job."""
-    state = manager.read(unit_name(name), ("ActiveState", "Job"))
-    return state["ActiveState"] not in DOWN or bool(state["Job"][0])
+    return not is_at_rest(manager.read(unit_name(name), ("ActiveState", "Job")))
 
 
 def first_step(query: LogQuery, cursor: Path) -> LogQuery:

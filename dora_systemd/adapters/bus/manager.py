@@ -124,6 +124,16 @@ class Manager(Protocol):
         """The systemd version, as in "257.13-1"."""
 
 
+def queued_job(properties: Mapping[str, Any]) -> int:
+    """The id in Job=; 0 if no job is queued, or systemd has not found the unit."""
+    return int((properties["Job"] or (0,))[0])
+
+
+def is_at_rest(properties: Mapping[str, Any]) -> bool:
+    """Whether ActiveState= and Job= say that a unit is down and will stay so."""
+    return properties["ActiveState"] in DOWN and not queued_job(properties)
+
+
 def tell_stage(on_stage: StageObserver | None, changes: Mapping[str, Any]) -> None:
     """Call `on_stage` if a unit has changed its STATUS=; with partial() an Observer."""
     if on_stage and changes.get("StatusText"):

@@ -5,7 +5,7 @@ from contextlib import suppress
 from functools import lru_cache
 from typing import Any
 
-from dora_systemd.adapters.bus.manager import ON_THE_WAY, SETTLED
+from dora_systemd.adapters.bus.manager import ON_THE_WAY, SETTLED, queued_job
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.decisions.gateway.answers import (
@@ -117,7 +117,7 @@ def spawned(scope: Scope, uuid: str) -> dict[str, Any] | None:
     state = bus.read(cell.unit, ["ActiveState", "Job"])
     if state["ActiveState"] in SETTLED:
         return {"DataflowSpawned": {"uuid": uuid}}
-    if state["ActiveState"] in ON_THE_WAY or state["Job"][0]:
+    if state["ActiveState"] in ON_THE_WAY or queued_job(state):
         return None
     if state["ActiveState"] != "failed":
         return _over(scope, uuid)

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from typing import NoReturn
 
 from dora_systemd import __version__
-from dora_systemd.adapters.bus.manager import DOWN, Manager
+from dora_systemd.adapters.bus.manager import Manager, is_at_rest
 from dora_systemd.adapters.dora.command import version_numbers
 from dora_systemd.adapters.host.addresses import is_own
 from dora_systemd.decisions.cell.restarts import RestartPolicy
@@ -218,8 +218,7 @@ def _says_something(runner: socket.socket) -> bool:
 
 
 def _is_down(manager: Manager, unit: str) -> bool:
-    state = manager.read(unit, ["Job", "ActiveState"])
-    return state["ActiveState"] in DOWN and not (state["Job"] or (0,))[0]
+    return is_at_rest(manager.read(unit, ["Job", "ActiveState"]))
 
 
 def _failure(manager: Manager, unit: str) -> DoraSystemdError:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePath
 from signal import SIGKILL
 
-from dora_systemd.adapters.bus.manager import DOWN, Manager, Property
+from dora_systemd.adapters.bus.manager import DOWN, Manager, Property, is_at_rest
 from dora_systemd.adapters.releases.build_tree import BuildTree
 from dora_systemd.adapters.releases.store import Store
 from dora_systemd.decisions.cell.options import build_command
@@ -166,8 +166,7 @@ def _wait(manager: Manager, build: Build, tree: BuildTree) -> None:
     told, deadline = "", time.monotonic() + build.timeout / SECOND + _LATE_SECONDS
     while True:
         facts = manager.read(build.unit, ["ActiveState", "Job", "StatusText"])
-        is_queued = bool((facts["Job"] or (0,))[0])
-        if not is_queued and str(facts["ActiveState"]) in DOWN:
+        if is_at_rest(facts):
             return
         line = str(facts["StatusText"])
         if line not in ("", told) and not line.startswith(FAILED_BECAUSE):  # an error tells that

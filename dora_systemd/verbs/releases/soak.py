@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 
-from dora_systemd.adapters.bus.manager import ON_THE_WAY, SETTLED, Manager
+from dora_systemd.adapters.bus.manager import ON_THE_WAY, SETTLED, Manager, queued_job
 from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.owed import Owed
@@ -42,7 +42,7 @@ def settle(manager: Manager, unit: str, limit: int, tell: Callable[[str, str], N
     deadline = time.monotonic() + limit / SECOND
     while True:
         facts = manager.read(unit, ["ActiveState", "SubState", "Job", "StatusText"])
-        active, is_queued = str(facts["ActiveState"]), bool((facts["Job"] or (0,))[0])
+        active, is_queued = str(facts["ActiveState"]), bool(queued_job(facts))
         if not is_queued and str(facts["SubState"]).startswith("auto-restart"):
             return "failed"
         if not is_queued and active not in ON_THE_WAY:

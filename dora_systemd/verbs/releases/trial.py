@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from dora_systemd.adapters.bus.manager import Manager, Observer
+from dora_systemd.adapters.bus.manager import Manager, Observer, queued_job
 from dora_systemd.adapters.host.unit_files import (
     read_unit_file,
     remove_unit_file,
@@ -155,7 +155,7 @@ def go_back(
 def read_life(manager: Manager, unit: str) -> str:
     """What changes as soon as systemd starts the unit, or is about to."""
     facts = manager.read(unit, ["InvocationID", "Job"])
-    return f"{bytes(facts['InvocationID'] or b'').hex()} {(facts['Job'] or (0,))[0]}"
+    return f"{bytes(facts['InvocationID'] or b'').hex()} {queued_job(facts)}"
 
 
 def _reload(manager: Manager) -> None:

@@ -16,6 +16,7 @@ from dora_systemd.adapters.bus.manager import (
     Observer,
     Property,
     StageObserver,
+    queued_job,
     tell_stage,
 )
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -142,7 +143,7 @@ def _wait_until_checked(manager: Manager, unit: str) -> None:
     """Return once the runner has accepted the dataflow, or has ended, or systemd holds it."""
     while True:
         state = manager.read(unit, ["ActiveState", "Job", "StatusText"])
-        is_on_the_way = state["ActiveState"] in ON_THE_WAY or (state["Job"] or (0,))[0]
+        is_on_the_way = state["ActiveState"] in ON_THE_WAY or queued_job(state)
         goes_on = state["StatusText"] and not state["StatusText"].startswith(FAILED_BECAUSE)
         # For a moment every start waits for its slice.
         is_held = state["ActiveState"] in DOWN and own_units(manager.awaited(unit))

@@ -9,7 +9,13 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Protocol
 
-from dora_systemd.adapters.bus.manager import DOWN, Manager, Property, StageObserver, tell_stage
+from dora_systemd.adapters.bus.manager import (
+    Manager,
+    Property,
+    StageObserver,
+    is_at_rest,
+    tell_stage,
+)
 from dora_systemd.decisions.life.states import RunnerExit
 from dora_systemd.values import INFINITY, SECOND
 
@@ -142,7 +148,7 @@ class _Stop:
 def _exit_status(manager: Manager, unit: str) -> int | None:
     """The exit status of a unit that has ended, or 128 + signal, as in a shell."""
     state = manager.read(unit, _STATE)
-    if state["ActiveState"] not in DOWN or state["Job"][0]:
+    if not is_at_rest(state):
         return None
     status: int = state["ExecMainStatus"]
     if status in (RunnerExit.NODES_FAILED, RunnerExit.FAILED_AT_STOP):
