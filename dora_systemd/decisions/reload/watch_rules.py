@@ -45,8 +45,7 @@ class WatchRules:
 
     root: absolute directory that patterns are relative to. watched: patterns of files. ignored:
     patterns that take precedence. gitignores: by directory relative to root, lines of .gitignore.
-    files: absolute paths that are always watched. always: patterns that any
-    project ignores.
+    files: absolute paths that are always watched.
     """
 
     root: str
@@ -54,7 +53,6 @@ class WatchRules:
     ignored: tuple[str, ...] = ()
     gitignores: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     files: frozenset[str] = frozenset()
-    always: tuple[str, ...] = ALWAYS_IGNORED
 
     def has(self, path: str) -> bool:
         """Whether a change of the file `path` (absolute) causes a reload."""
@@ -67,7 +65,7 @@ class WatchRules:
 
     def is_ignored(self, path: str) -> bool:
         """Whether `path` (absolute) is ignored; a path that ends with / is a directory."""
-        relative, ignored = self._relative(path), _spec((*self.always, *self.ignored))
+        relative, ignored = self._relative(path), _spec((*ALWAYS_IGNORED, *self.ignored))
         return not relative or ignored.match_file(relative) or self._gitignores(relative)
 
     def _relative(self, path: str) -> str:
