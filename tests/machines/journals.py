@@ -17,6 +17,8 @@ LOST = (
     "flow: Machine head of dataflow flow is lost: ",
 )
 """What all say when the head has lost a member."""
+BUSY = ("node exited with error: Signal(15)", "State 'stop-post' timed out")
+"""Of a machine that gives a node too little time within the grace, or systemd's last command."""
 
 
 def _journalctl(machine: str, *words: str) -> str:

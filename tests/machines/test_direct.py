@@ -7,8 +7,7 @@ import pytest
 from dora_systemd.errors import ExitCode
 from tests.machines.direct import ADDRESSES, THREE, TWO, DirectFlow
 from tests.machines.flows import NAME, flow_on
-from tests.machines.journals import LOST, announced
-from tests.machines.test_flow_faults import BUSY
+from tests.machines.journals import BUSY, LOST, announced
 from tests.machines.wires import cable, there
 from tests.system.cells import run, wait_for
 

@@ -9,8 +9,7 @@ import pytest
 
 from tests.lab.pace import bound
 from tests.machines.flows import NAME, PLACE, Flow, flow_on
-from tests.machines.journals import LOST
-from tests.machines.test_flow_faults import BUSY
+from tests.machines.journals import BUSY, LOST
 from tests.machines.wires import cable
 from tests.system.cells import wait_for
 

@@ -8,8 +8,7 @@ from functools import partial
 import pytest
 
 from tests.machines.flows import NAME, PLACE, Flow
-from tests.machines.journals import LOST, quiet_journals
-from tests.machines.test_flow_faults import BUSY
+from tests.machines.journals import BUSY, LOST, quiet_journals
 from tests.machines.wires import power_cut, there
 from tests.system.cells import run, wait_for
 

@@ -10,15 +10,13 @@ import pytest
 
 from tests.lab.pace import bound
 from tests.machines.flows import NAME, Flow, flow_on
-from tests.machines.journals import LOST, announced
+from tests.machines.journals import BUSY, LOST, announced
 from tests.machines.wires import cable, power_cut, there
 from tests.system.cells import run, wait_for
 
 TWO = {"gpu": "b"}
 THREE = {"gpu": "b", "arm": "c"}
 GRACE = 2
-BUSY = ("node exited with error: Signal(15)", "State 'stop-post' timed out")
-"""Of a machine that gives a node too little time within the grace, or systemd's last command."""
 lost = pytest.mark.warns(*LOST)
 killed = pytest.mark.warns(
     "Main process exited, code=killed, status=9/KILL", "Failed with result 'signal'"
