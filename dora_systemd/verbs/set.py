@@ -13,6 +13,7 @@ from typing import Any
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
+from dora_systemd.adapters.cgroup.limits import limit_groups
 from dora_systemd.adapters.host.machine import read_machine
 from dora_systemd.adapters.host.unit_files import (
     LOG_RATES_FILE,
@@ -181,7 +182,6 @@ def _limit_groups(unit: Mapping[str, Any], nodes: tuple[NodeLimits, ...], undo: 
     if not nodes or not unit["ControlGroup"]:
         return
     groups = cgroup.node_groups(cgroup.group_path(unit["ControlGroup"]))
-    for one in nodes:
-        if group := groups.get(one.node):  # else its next start reads the drop-in
-            undo.callback(cgroup.restore_group, group, cgroup.read_files(group, one.files()))
-            cgroup.limit_group(group, one)
+    # A node that has no group reads the drop-in at its next start.
+    known = [(groups[one.node], one) for one in nodes if one.node in groups]
+    undo.enter_context(limit_groups(known))

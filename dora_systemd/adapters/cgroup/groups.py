@@ -9,12 +9,11 @@ import errno
 import io
 import os
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from functools import cache
 from itertools import islice
 from pathlib import Path
 
-from dora_systemd.decisions.cell.limits import NodeLimits
 from dora_systemd.decisions.resources.usage import Usage
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import is_node_id
@@ -159,55 +158,23 @@ def read_controllers(path: Path) -> frozenset[str]:
     return frozenset(read_text(path / "cgroup.controllers").split())
 
 
+def read_cpus(path: Path) -> str:
+    """The CPUs that a group itself is bound to, "" if to none."""
+    return read_text(path / CPUS_FILE).strip()
+
+
 def enable_controllers(path: Path) -> None:
     """Enable every controller of `path` for the groups below it.
 
     Ignores what the kernel does not offer: some containers have no controllers at all.
     """
     for name in sorted(read_controllers(path)):
-        _write(path / "cgroup.subtree_control", f"+{name}")
+        write_text(path / "cgroup.subtree_control", f"+{name}")
 
 
 def kill_as_one(path: Path) -> None:
     """Have the kernel's OOM killer kill all processes of the group together: memory.oom.group."""
-    _write(path / "memory.oom.group", "1")
-
-
-def limit_group(path: Path, limits: NodeLimits) -> None:
-    """Set the limits of a node's group. Raises DoraSystemdError if one does not take effect."""
-    for file, text in limits.files().items():
-        try:
-            is_limited = _write(path / file, text := _written(path, file, text))
-            reason = f"its group has no {file}"
-        except OSError as error:
-            is_limited, reason = False, f"{error.strerror} ({file}: {text})"
-        if is_limited and file == CPUS_FILE and text.strip():
-            used = read_text(path / f"{file}.effective").strip()
-            is_limited, reason = used == text, f"of the cpus {text} it may use {used}"
-        if not is_limited and text.strip() and not text.startswith("max"):
-            raise DoraSystemdError(
-                f"cannot limit the node {limits.node}: {reason}",
-                "the kernel or the container does not provide it to this dataflow",
-                ExitCode.NO_SYSTEMD,
-            )
-
-
-def read_files(path: Path, names: Iterable[str]) -> dict[str, str]:
-    """The texts of control files of a group, for restore_group."""
-    return {name: read_text(path / name) for name in names}
-
-
-def restore_group(path: Path, texts: Mapping[str, str]) -> None:
-    """Write back what read_files() has read, as far as the kernel accepts it."""
-    for name, text in texts.items():
-        with contextlib.suppress(OSError):
-            _write(path / name, _written(path, name, text.strip()))
-
-
-def _written(path: Path, file: str, text: str) -> str:
-    """What to write: for no CPUs those of the group above, or the kernel refuses it (EIO)."""
-    is_empty = file == CPUS_FILE and not text.strip()
-    return read_text(f"{path.parent}/{file}.effective").strip() if is_empty else text
+    write_text(path / "memory.oom.group", "1")
 
 
 def move_process(path: Path, pid: int) -> None:
@@ -220,7 +187,7 @@ def kill_group(path: Path) -> None:
 
     cgroup.kill exists since Linux 5.14; on older kernels each process gets a signal by its pid.
     """
-    if not _write(path / "cgroup.kill", "1"):
+    if not write_text(path / "cgroup.kill", "1"):
         for pid in pids(path):
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, 9)
@@ -233,7 +200,7 @@ def freeze_group(path: Path, is_frozen: bool) -> bool:
     since Linux 5.2.
     """
     with contextlib.suppress(OSError):
-        return _write(path / "cgroup.freeze", str(int(is_frozen)))
+        return write_text(path / "cgroup.freeze", str(int(is_frozen)))
     return False
 
 
@@ -246,8 +213,8 @@ def _tree(path: Path) -> Iterator[str]:
             left.extend(one.path for one in entries if one.is_dir(follow_symlinks=False))
 
 
-def _write(path: Path, text: str) -> bool:
-    """Write to a control file; False if the kernel has no such file or controller."""
+def write_text(path: Path, text: str) -> bool:
+    """Write to a control file; False if the kernel has no such file. Raises OSError."""
     try:
         _put(path, text)
     except OSError as error:

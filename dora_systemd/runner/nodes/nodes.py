@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from dora_systemd.adapters.cgroup import groups as cgroup
+from dora_systemd.adapters.cgroup.limits import limit_groups
 from dora_systemd.adapters.host.process import beside
 from dora_systemd.adapters.host.rights import lower_rights
 from dora_systemd.adapters.logs.jsonl import JsonlTail
@@ -111,9 +112,8 @@ class Nodes:
             self._pipes.limit(node, rate_of(rates, node))
 
     def limit(self, limits: Iterable[NodeLimits]) -> None:
-        """Change limits of running nodes. Raises DoraSystemdError if one does not take effect."""
-        for one in limits:
-            cgroup.limit_group(self._group(one.node), one)
+        """Change limits of nodes, all or none. Raises DoraSystemdError if one takes no effect."""
+        limit_groups((self._group(one.node), one) for one in limits)
 
     def remove(self, node: str) -> None:
         """Remove the group and pipes of a node that has ended for good. Raises OSError."""

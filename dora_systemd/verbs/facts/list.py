@@ -181,8 +181,8 @@ def _cpus(reading: Reading, node: str) -> str:
         return ""
     # `doractl set` may have changed them. Without a cpuset controller the launcher binds the node.
     group = reading.groups.get(node)
-    now = cgroup.read_files(group, [cgroup.CPUS_FILE])[cgroup.CPUS_FILE] if group else ""
-    return now.strip() or format_cpus(dict(asked[0].limits)[CPUS])
+    now = cgroup.read_cpus(group) if group else ""
+    return now or format_cpus(dict(asked[0].limits)[CPUS])
 
 
 def _outputs(reading: Reading, node: str) -> tuple[OutputRow, ...]:
