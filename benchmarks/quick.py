@@ -11,6 +11,8 @@ from benchmarks import logs, recovery, start, startup, stop
 from benchmarks.report import read_records
 from benchmarks.rounds import Figure
 
+WORSE = "; worse by more than its spread"
+
 PARTS: dict[str, Callable[[], list[Figure]]] = {
     "start": lambda: start.measure(3, (2,)),
     "stop": lambda: stop.measure(2),
@@ -21,10 +23,15 @@ PARTS: dict[str, Callable[[], list[Figure]]] = {
 
 
 def format_change(now: Figure, stored: Figure, rival: str) -> str:
-    """A line: the ratio then and now, and what has become of it."""
-    before = statistics.median(stored.ratios(rival))
-    after = statistics.median(now.ratios(rival))
-    return f"{now.what}, to {rival}: {before:.2f} stored, {after:.2f} now, {after / before:.2f} ×"
+    """A line: the ratio then and now, what has become of it, and if it is worse than it ever was.
+
+    Worse is outside the spread of the stored rounds, on the side that counts.
+    """
+    ratios = stored.ratios(rival)
+    before, after = statistics.median(ratios), statistics.median(now.ratios(rival))
+    is_worse = after < min(ratios) if now.unit.endswith("/s") else after > max(ratios)
+    change = f"{before:.2f} stored, {after:.2f} now, {after / before:.2f} ×"
+    return f"{now.what}, to {rival}: {change}{WORSE if is_worse else ''}"
 
 
 def compare(measured: Iterable[Figure], stored: Iterable[Figure]) -> list[str]:
@@ -40,13 +47,13 @@ def compare(measured: Iterable[Figure], stored: Iterable[Figure]) -> list[str]:
 
 
 def main(names: list[str]) -> None:
-    """Measure, then print all lines together."""
+    """Measure, then print all lines together, those that became worse at the end."""
     records = read_records()
     lines: list[str] = []
     for name in names or PARTS:
         stored = records[name].figures if name in records else ()
         lines += compare(PARTS[name](), stored)
-    print("\n".join(("", *lines)))
+    print("\n".join(("", *sorted(lines, key=lambda line: line.endswith(WORSE)))))
 
 
 if __name__ == "__main__":

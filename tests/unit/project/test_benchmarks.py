@@ -9,7 +9,7 @@ import pytest
 from benchmarks import machines
 from benchmarks.messages import COUNT, SIZES, Message, name_of, results
 from benchmarks.plots import bar_chart, ceiling, line_chart
-from benchmarks.quick import compare
+from benchmarks.quick import WORSE, compare
 from benchmarks.report import (
     BEGIN,
     END,
@@ -179,6 +179,22 @@ def test_quick_compares_ratios_not_times() -> None:
     assert compare(now, [FIGURE]) == [
         "start to all of 2 nodes ready, to dora run: 1.20 stored, 0.50 now, 0.42 ×"
     ]
+
+
+@pytest.mark.parametrize(
+    ("unit", "ours", "is_worse"),
+    [
+        *(("ms", 8.0, False), ("ms", 13.0, False), ("ms", 15.0, True)),
+        *(("1/s", 15.0, False), ("1/s", 9.0, False), ("1/s", 7.0, True)),
+    ],
+)
+def test_quick_says_what_became_worse_by_more_than_its_spread(
+    unit: str, ours: float, is_worse: bool
+) -> None:
+    stored = Figure("it", unit, {"doractl": [8.0, 10.0, 14.0], "pm2": [10.0] * 3})
+    now = replace(stored, values={"doractl": [ours], "pm2": [10.0]})
+    (line,) = compare([now], [stored])
+    assert line.endswith(WORSE) is is_worse
 
 
 def test_readme_and_plots_are_what_the_stored_data_say() -> None:
