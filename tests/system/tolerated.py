@@ -25,7 +25,11 @@ TOLERATED = (
     Word("Error syncing transport with peer", _ORDER),
     Word("Unable to connect to ", _ORDER),  # a locator, any of them, a newly scouted peer
     Word("in response to an OpenSyn", _ORDER),
+    # zenoh's router, when a peer takes back what this node has never heard of.
     Word("Unknown subscriber", _ORDER),
+    Word("Unknown token", _ORDER),
+    Word("Unknown id", _ORDER),  # of a queryable
+    Word("Unknown interest", _ORDER),
     Word("[Gossip] Received LinkStateList from unknown link", _ORDER),
     Word("Attempt to establish transport to itself", _ORDER),
     Word("zenoh teardown timed out", _SLOW),
