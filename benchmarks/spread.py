@@ -1,7 +1,7 @@
 """The same dataflow on one machine and on two.  `LAB=machines`, `python -m benchmarks.spread [N]`
 
 A link is one login by ssh, so that is measured as well: no start over two machines can take less.
-Memory is that of all processes of a link, at both ends.
+Memory and CPU are those of all processes of a link, at both ends.
 """
 
 import subprocess
@@ -19,24 +19,35 @@ from tests.system.cells import SINK, SOURCE, Cell, Project, run, wait_for
 HOME = Path("/srv/bench")
 NAME = "spread"
 MEMBER = "b"
+_IDLE_SECONDS = 60.0
 ONE, LOGIN = "one machine", "ssh b true"
 _YAML = """nodes:
   - {{id: source, path: source.py, inputs: {{tick: dora/timer/millis/50}}, outputs: [number]}}
   - {{id: sink, path: sink.py, inputs: {{double: source/number}}{deploy}}}
 """
 _LINKS = ("systemctl", "list-units", "--plain", "--no-legend", "doralink-*")
-_OURS = r"dora_systemd\.link|^ssh .*-T.*127\.0\.0\.1|^sshd-session: root@notty"
-_MEMORY = f"""import glob, os, re
-total = 0
-for path in glob.glob("/proc/[0-9]*"):
+_COSTS = """import os
+def read(pid, name):
+    with open(f"/proc/{pid}/{name}", errors="replace") as file:
+        return file.read()
+parents, ours = {}, set()
+for pid in filter(str.isdecimal, os.listdir("/proc")):
     try:
-        words = open(path + "/cmdline").read().replace("\\0", " ")
-        if re.search({_OURS!r}, words) and "{HOME}/memory.py" not in words:
-            fields = dict(line.split(":") for line in open(path + "/smaps_rollup").readlines()[1:])
-            print(int(fields["Rss"].split()[0]), int(fields["Pss"].split()[0]), words[:60])
+        parents[pid] = read(pid, "stat").rpartition(")")[2].split()[1]
+        if "dora_systemd/link/" in read(pid, "cmdline"):
+            ours.add(pid)
     except OSError:
         pass
+ssh = {pid for pid, parent in parents.items() if parent in ours}
+for pid in [*ours]:
+    while (pid := parents.get(pid, "")) and read(pid, "comm").startswith("sshd-session"):
+        ssh.add(pid)
+for pid in ours | ssh:
+    fields = dict(line.split(":") for line in read(pid, "smaps_rollup").splitlines()[1:])
+    on_cpu = read(pid, "schedstat").split()[0]
+    print(fields["Rss"].split()[0], fields["Pss"].split()[0], on_cpu, read(pid, "comm").strip())
 """
+"""Of the programs of a link here, the ssh that is a child of one, and the sshd that is a parent."""
 
 
 def make_home() -> dict[str, Path]:
@@ -47,7 +58,7 @@ def make_home() -> dict[str, Path]:
     project = Project(HOME)
     project.write("source.py", SOURCE)
     project.write("sink.py", SINK)
-    project.write("memory.py", _MEMORY)
+    project.write("costs.py", _COSTS)
     files = {
         OURS: project.write("two.yml", _YAML.format(deploy=", deploy: {machine: b}")),
         ONE: project.write("one.yml", _YAML.format(deploy="")),
@@ -82,30 +93,34 @@ def login_ms() -> float:
     return seconds_of("ssh", "-oBatchMode=yes", MEMBER, "true") * 1000
 
 
-def megabytes(machine: str) -> tuple[float, float]:
-    """RSS and PSS of the processes of the link on a machine, without those of this benchmark."""
-    command = ("python3", str(HOME / "memory.py"))
+def costs(machine: str) -> tuple[float, float, float]:
+    """Of a link on a machine: RSS and PSS in MB, seconds on a processor."""
+    command = ("python3", str(HOME / "costs.py"))
     lines = (run(*command) if machine == "a" else there(machine, *command)).stdout.splitlines()
-    found = [tuple(map(int, line.split()[:2])) for line in lines]
-    return sum(one for one, _ in found) / 1000, sum(one for _, one in found) / 1000
+    print(*lines, sep="\n")
+    found = [tuple(map(int, line.split()[:3])) for line in lines]
+    assert len(found) > 1, lines
+    rss, pss, on_cpu = (sum(column) for column in zip(*found, strict=True))
+    return rss / 1000, pss / 1000, on_cpu / 1e9
 
 
-def memory(file: Path) -> list[Figure]:
-    """Of a link at both ends, while the dataflow runs."""
+def idle(file: Path) -> list[Figure]:
+    """What a link costs at both ends, while the dataflow runs."""
     start(file)
-    before = len(there(MEMBER, "pgrep", "-f", "sshd-session").stdout.split())
-    assert before
     figures = []
     for end, machine, goal in (("head", "a", "≤ 25 MB"), ("member", MEMBER, "≤ 20 MB")):
-        rss, pss = megabytes(machine)
+        rss, pss, before = costs(machine)
+        time.sleep(_IDLE_SECONDS)
+        share = 100 * (costs(machine)[2] - before) / _IDLE_SECONDS
         figures.append(Figure(f"memory of a link at the {end}, RSS", "MB", {OURS: [rss]}, goal))
         figures.append(Figure(f"memory of a link at the {end}, PSS", "MB", {OURS: [pss]}))
+        figures.append(Figure(f"CPU of a link at the {end}", "%", {OURS: [share]}, "≤ 0.1 %"))
     Cell(NAME).end()
     return [*map(shown, figures)]
 
 
 def measure(rounds: int) -> list[Figure]:
-    """Starts in turns, then the memory."""
+    """Starts in turns, then what the link costs."""
     files = make_home()
     measures: dict[str, Callable[[], float]] = {
         name: partial(start_ms, file) for name, file in files.items()
@@ -115,7 +130,7 @@ def measure(rounds: int) -> list[Figure]:
         warm_up()
     what = "start to all of 2 nodes ready, over two machines"
     figure = alternate(what, "ms", measures, rounds, goal="≤ 1.3 × one machine")
-    return [figure, *memory(files[OURS])]
+    return [figure, *idle(files[OURS])]
 
 
 if __name__ == "__main__":
