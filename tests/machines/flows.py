@@ -10,7 +10,7 @@ from typing import TypeVar
 
 from tests.machines.journals import quiet_journals
 from tests.machines.wires import there
-from tests.system.cells import DOUBLER, SINK, SOURCE, Cell, Project, dora_processes, wait_for
+from tests.system.cells import DOUBLER, SINK, SOURCE, Cell, Project, dora_processes, run, wait_for
 
 PLACE = "/opt/flow"
 NAME = "flow"
@@ -136,6 +136,11 @@ class Flow:
         return {node["node"]: node for node in row["nodes"]}
 
 
+def links() -> str:
+    """The links of this machine, which end a moment after their dataflow."""
+    return run("pgrep", "-af", "dora_systemd/link/", check=False).stdout
+
+
 Kind = TypeVar("Kind", bound=Flow)
 
 
@@ -153,4 +158,4 @@ def flow_on(flow: Kind, expected: Iterable[str] = ()) -> Iterator[Kind]:
         finally:
             flow.cell.doractl("stop", NAME, check=False)
             flow.cell.end()
-        wait_for("nothing is left", lambda: not flow.left())
+        wait_for("nothing is left", lambda: not (flow.left() or links()))
