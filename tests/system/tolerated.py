@@ -8,11 +8,19 @@ from typing import NamedTuple
 
 
 class Word(NamedTuple):
-    """Part of a warning. reason: why it says nothing about us. dora: the version it was seen in."""
+    """Part of a warning. reason: why it says nothing about us. dora: the version it was seen in.
+
+    is_all: nothing else is in the warning, which may be short then.
+    """
 
     part: str
     reason: str
     dora: str = "1.1.0"
+    is_all: bool = False
+
+    def is_in(self, line: str) -> bool:
+        """Whether a line, `SOURCE: WARNING`, says it."""
+        return line.endswith(f": {self.part}") if self.is_all else self.part in line
 
 
 _ORDER = "a node opens zenoh before its peers do, or outlives them by milliseconds"
@@ -27,9 +35,9 @@ TOLERATED = (
     Word("in response to an OpenSyn", _ORDER),
     # zenoh's router, when a peer takes back what this node has never heard of.
     Word("Unknown subscriber", _ORDER),
-    Word("Unknown token", _ORDER),
-    Word("Unknown id", _ORDER),  # of a queryable
     Word("Unknown interest", _ORDER),
+    Word("Unknown token", _ORDER, is_all=True),
+    Word("Unknown id", _ORDER, is_all=True),  # of a queryable
     Word("[Gossip] Received LinkStateList from unknown link", _ORDER),
     Word("Attempt to establish transport to itself", _ORDER),
     Word("zenoh teardown timed out", _SLOW),
@@ -69,4 +77,4 @@ TOLERATED = (
 
 def is_tolerated(line: str) -> bool:
     """Whether a warning is one of them."""
-    return any(word.part in line for word in TOLERATED)
+    return any(word.is_in(line) for word in TOLERATED)
