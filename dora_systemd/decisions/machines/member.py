@@ -15,7 +15,6 @@ from dora_systemd.decisions.machines.entry import Machine
 from dora_systemd.decisions.remote.hosts import Host
 from dora_systemd.decisions.settings.kinds import Setting
 from dora_systemd.decisions.settings.limits import NODE_LIMIT
-from dora_systemd.decisions.settings.needs import NEEDS
 from dora_systemd.decisions.settings.resolve import Settings
 from dora_systemd.decisions.settings.rights import NODE_RIGHTS
 from dora_systemd.decisions.settings.sandbox import SANDBOX
@@ -62,7 +61,6 @@ def on_head(options: RunnerOptions) -> RunnerOptions:
         head="",
         node_limits=tuple(one for one in options.node_limits if one.node not in away),
         node_rights=tuple(one for one in options.node_rights if one.node not in away),
-        needs=tuple(one for one in options.needs if one.node not in away),
         log_rates={key: one for key, one in options.log_rates.items() if key not in away},
         watchdogs=_without(options.watchdogs, away),
     )
@@ -144,7 +142,6 @@ def _of_nodes(options: RunnerOptions, nodes: Sequence[str]) -> Iterator[tuple[Se
     limits = {node: watchdog_of(options.watchdogs, node) for node in nodes}
     yield NODE_LIMIT, _about(options.node_limits, nodes)
     yield NODE_RIGHTS, _about(options.node_rights, nodes)
-    yield NEEDS, tuple("=".join(one) for one in options.needs if one.node in nodes)
     yield LOG_RATE_LIMIT, _rates(options.log_rates, nodes)
     yield WATCHDOG, {node: limit for node, limit in limits.items() if OFF < limit < INFINITY}
     if INFINITY in limits.values():

@@ -78,3 +78,8 @@ def _refused(options: RunnerOptions, settings: Settings) -> Iterator[tuple[str, 
         if one.node in away:
             reason = f"node {one.node} is on machine {away[one.node]}, and owes an output"
             yield reason, "leave owes of this node out"
+    # The head asks dora for the nodes, and would take one that waits elsewhere for late.
+    for need in options.needs:
+        if need.node in away:
+            reason = f"node {need.node} is on machine {away[need.node]}, and waits for {need.path}"
+            yield reason, "leave needs of this node out"

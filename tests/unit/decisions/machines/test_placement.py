@@ -97,7 +97,7 @@ def test_what_a_member_is_told() -> None:
         "memory_limit": "1G",
         "sandbox": "strict",
         "nodes": {"yolo": {"memory_limit": "4G", "watchdog": "5s"}, "camera": {"cpu_limit": 1}},
-        "needs": ["yolo=/dev/nvidia0", "camera=/dev/video0"],
+        "needs": ["camera=/dev/video0"],
     }
     options, members = spread_out(flow(on("gpu")), document, {"working_directory": "/srv/robot"})
     assert words_of(members) == (
@@ -109,7 +109,6 @@ def test_what_a_member_is_told() -> None:
         "--placed=yolo=gpu",
         "--sandbox=none",
         "--node-limit=yolo:memory=4G",
-        "--needs=yolo=/dev/nvidia0",
         "--watchdog=yolo=5s",
         "--working-directory=/home/alice/robot",
         "--env=B=2",
@@ -169,6 +168,7 @@ def test_modules_and_equal_hosts() -> None:
         ({"hot_reload": True}, "hot reload"),
         ({"network": "private"}, "the network is private"),
         ({"owes": ("yolo/out:within=2s",)}, "node yolo is on machine gpu, and owes"),
+        ({"needs": ("yolo=/dev/nvidia0",)}, "node yolo is on machine gpu, and waits for /dev/nv"),
     ],
 )
 def test_what_works_on_one_machine_only(flags: dict[str, object], text: str) -> None:
