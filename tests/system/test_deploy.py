@@ -70,6 +70,25 @@ def test_a_first_version_that_is_bad_leaves_nothing_running(
     assert not releases.trial.exists()
 
 
+@pytest.mark.warns("crashed", "failed", "Failed", "exited", "exit code", "error", "Error")
+def test_after_a_start_that_has_failed_the_release_runs(
+    releases: Releases, project: Project
+) -> None:
+    """systemd still has the ended unit, whose file leads to the project."""
+    cell = releases.cell
+    flow = write_version(project, "bad", "raise SystemExit(3)\n")
+    cell.doractl("start", str(flow), "--name", cell.name, check=False)
+    wait_for("it has failed", lambda: cell.show("ActiveState") == "failed")
+    assert cell.show("Transient") == "yes"
+    write_version(project, "good")
+    releases.deploy(project.root, *FAST)
+    current = releases.current()
+    releases.check_only(current)
+    assert cell.show("FragmentPath") == str(ETC / cell.unit)
+    cell.systemctl("restart")
+    assert releases.running() == current
+
+
 REFUSED = {
     "dora refuses": ("nodes: [{id: a, path: a.py, unknown: 3}]", "unknown field"),
     "missing": ("nodes: [{id: a, path: gone.py}]", "gone.py"),

@@ -37,6 +37,7 @@ from dora_systemd.verbs.releases.trial import (
     read_standing,
 )
 from dora_systemd.verbs.start.asked import note_request
+from dora_systemd.verbs.start.claim import make_room
 
 KILLED = "the command that tried it was killed"
 
@@ -72,6 +73,9 @@ def change_release(
     with uninhibited(scope, running, verb, change.how, lambda text: tell(waiting(text))):
         for cell in running:
             note_request("stop-asked", cell.name, cell.uuid, change.by)
+        if not running:
+            # As an ended unit of doractl start is unloaded, systemd would remove the trial's file.
+            make_room(manager, standing.boot)
         _try(manager, scope, store, standing, change, tell)
 
 

@@ -223,6 +223,29 @@ def test_a_first_release_is_enabled(
     assert read_standing(manager, scope, UNIT).boot.is_enabled
 
 
+@pytest.mark.parametrize("active", ["failed", "inactive"])
+def test_what_start_has_started_and_has_ended_is_unloaded_before_the_trial(
+    manager: FakeManager,
+    scope: Scope,
+    store: Store,
+    monkeypatch: pytest.MonkeyPatch,
+    active: str,
+) -> None:
+    """Else systemd takes the file of the trial for that of the transient unit, and removes it."""
+    manager.add(options(), active)
+    trial = read_standing(manager, scope, UNIT).path
+    reset_failed = manager.reset_failed
+
+    def reset(unit: str) -> None:
+        assert not trial.exists()
+        reset_failed(unit)
+
+    monkeypatch.setattr(manager, "reset_failed", reset)
+    try_new(manager, scope, store, monkeypatch, None)
+    assert ("reset", UNIT) in manager.calls
+    assert read_standing(manager, scope, UNIT).current == NEW
+
+
 def test_killed_right_after_its_commit(manager: FakeManager, scope: Scope) -> None:
     deployed(manager)
     path = read_standing(manager, scope, UNIT).path
