@@ -3,7 +3,7 @@
 Root copies what another user owns. A child process that is that user reads it, see courier.py: so a
 release contains nothing that its nodes could not read before, and git and whatever the repository
 configures never run as root. That user can trace the child and make it lie, so every answer is
-bounded and checked on arrival.
+bounded and checked on arrival, and so is the time for all of them.
 """
 
 import contextlib
@@ -29,6 +29,10 @@ from dora_systemd.values import shown
 
 _SECONDS = 90.0
 """Timeout for each frame: git has 60 s, and a mount of the user may hang."""
+_TOTAL_SECONDS = 300.0
+_BYTES_PER_SECOND = 512 * 1024
+_SECONDS_PER_FILE = 0.05
+"""The child has all of these together: a byte for each frame must not hold root's lock for ever."""
 _HEAD = 8
 MOST_ANSWER = 64 * 1024 * 1024
 """Maximum bytes of an answer that is not the content of a file."""
@@ -40,11 +44,34 @@ _LONGEST = 4096
 """Maximum length of a text about a file, see PATH_MAX in limits.h(0p)."""
 
 
+class Patience:
+    """How long we wait for a child in all. left: seconds, which it earns by what it sends."""
+
+    def __init__(self) -> None:
+        self.left = _TOTAL_SECONDS
+
+    @contextlib.contextmanager
+    def waiting(self) -> Iterator[float]:
+        """Count the time of the block; its deadline. Raises BrokenPipeError if none is left."""
+        if self.left <= 0:
+            raise BrokenPipeError
+        begun = time.monotonic()
+        try:
+            yield begun + min(_SECONDS, self.left)
+        finally:
+            self.left -= time.monotonic() - begun
+
+    def earn(self, size: int = 0, files: int = 0) -> None:
+        """Add the time that a slow disk needs for so many bytes, and for so many files."""
+        self.left += size / _BYTES_PER_SECOND + files * _SECONDS_PER_FILE
+
+
 class Project:
     """The files of a project, as an account sees them. root: its absolute path."""
 
     def __init__(self, root: str, child: "subprocess.Popen[bytes]", account: Account) -> None:
         self.root = root
+        self.patience = Patience()
         self._child = child
         self._account = account
 
@@ -133,8 +160,9 @@ class Project:
     def _ask(self, request: dict[str, Any], path: str) -> Iterator[bytes]:
         assert self._child.stdin
         try:
-            deadline = time.monotonic() + _SECONDS
-            send(self._child.stdin.fileno(), json.dumps(request).encode() + b"\n", deadline)
+            self.patience.earn(files=1 + len(request.get("paths", ())))
+            with self.patience.waiting() as deadline:
+                send(self._child.stdin.fileno(), json.dumps(request).encode() + b"\n", deadline)
             while (frame := self._frame())[0] == b"+":
                 yield frame[1]
         except (BrokenPipeError, ValueError) as error:
@@ -147,17 +175,21 @@ class Project:
 
     def _frame(self) -> tuple[bytes, bytes]:
         assert self._child.stdout
-        fd, deadline = self._child.stdout.fileno(), time.monotonic() + _SECONDS
-        head = receive(fd, _HEAD, deadline)
-        if not head[1:].isdigit() or int(head[1:]) > courier.CHUNK:
-            raise ValueError(head)
-        if head[:1] == b"+" and not int(head[1:]):
-            raise ValueError(head)  # else an answer could have no end
-        return head[:1], receive(fd, int(head[1:]), deadline)
+        fd = self._child.stdout.fileno()
+        with self.patience.waiting() as deadline:
+            head = receive(fd, _HEAD, deadline)
+            if not head[1:].isdigit() or int(head[1:]) > courier.CHUNK:
+                raise ValueError(head)
+            if head[:1] == b"+" and not int(head[1:]):
+                raise ValueError(head)  # else an answer could have no end
+            data = receive(fd, int(head[1:]), deadline)
+        self.patience.earn(size=len(data))
+        return head[:1], data
 
     def _broken(self, path: str) -> DoraSystemdError:
         hint = "see whether a mount of that user hangs"
-        return self._refusal(path, "no answer", hint, ExitCode.FAILURE)
+        reason = "no answer" if self.patience.left > 0 else "it takes too long"
+        return self._refusal(path, reason, hint, ExitCode.FAILURE)
 
     def _refusal(self, path: str, reason: str, hint: str, code: ExitCode) -> DoraSystemdError:
         place = cut(shown(str(Path(self.root, path))), _SHORT)

@@ -29,7 +29,7 @@ from dora_systemd.decisions.dora.protocol import (
     Reply,
     parse_frame,
     parse_heartbeat,
-    parse_machines,
+    parse_heartbeats,
     parse_results,
     parse_running,
     parse_spawn_failure,
@@ -48,6 +48,7 @@ from dora_systemd.decisions.logs.lines import (
     jsonl_fields,
 )
 from dora_systemd.decisions.machines import wire
+from dora_systemd.decisions.machines.facts import Facts, parse_facts, problems, summary
 from dora_systemd.decisions.properties.assignments import parse_property
 from dora_systemd.decisions.releases.parcel import (
     format_parcel,
@@ -114,7 +115,7 @@ def _request(data: bytes) -> object:
 def _reply(data: bytes) -> object:
     reply = parse_frame(text_of(data))
     if isinstance(reply, Reply):
-        daemons = (parse_heartbeat(reply), parse_machines(reply))
+        daemons = (parse_heartbeat(reply), parse_heartbeats(reply))
         return daemons, parse_results(reply), parse_spawn_failure(reply), parse_running(reply, "")
     return parse_life_event(reply, 1) if isinstance(reply, LogRecord) else None
 
@@ -123,6 +124,15 @@ def _machine_line(data: bytes) -> None:
     """A message that is understood can be said again."""
     message = wire.parse_message(data)
     assert wire.parse_message(wire.format_message(message)) == message
+
+
+def _machine_facts(data: bytes) -> None:
+    """What is understood can be compared and shown."""
+    facts = parse_facts(text_of(data))
+    assert parse_facts(facts.to_json()) == facts
+    own = Facts("0.1.0", "1.1.0", "/usr/bin/doractl", "alice", True, 5)
+    shown = [*problems(own, facts, facts.now - own.now), summary(facts, facts.now - own.now)]
+    str(shown).encode()
 
 
 def _encoded(fields: Any) -> None:
@@ -195,6 +205,7 @@ TARGETS = {
     "page-message": Target(lambda data: parse_message(text_of(data)), REFUSED),
     "runner-socket": Target(parse_line),
     "machine-line": Target(_machine_line, REFUSED),
+    "machine-facts": Target(_machine_facts, REFUSED),
     "coordinator": Target(lambda data: parse_coordinator(loaded(data)), (ValueError,)),
     "address": Target(lambda data: refuse_address([text_of(data)], [text_of(data)])),
     "token": Target(lambda data: has_token([text_of(data)], "0" * 64)),

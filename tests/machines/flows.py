@@ -119,9 +119,9 @@ class Flow:
         assert len(found) == 1, f"{pattern} on {machine}: {found}"
         return found[0]
 
-    def kill(self, machine: str, pattern: str) -> None:
-        """Kill that process."""
-        assert there(machine, "kill", "-9", self.pid(machine, pattern)).returncode == 0
+    def kill(self, machine: str, pattern: str, signal: str = "KILL") -> None:
+        """Send that process a signal."""
+        assert there(machine, "kill", f"-{signal}", self.pid(machine, pattern)).returncode == 0
 
     def left(self) -> str:
         """What is left of it on any machine."""

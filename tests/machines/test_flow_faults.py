@@ -57,6 +57,16 @@ def test_a_process_is_killed(flow: Flow, machine: str, pattern: str) -> None:
     flow.wait_again(life)
 
 
+@lost
+@killed
+@pytest.mark.warns("SIGKILL", "b: systemd: dora-flow", "no heartbeat message from machine `gpu-")
+def test_a_daemon_hangs(flow: Flow) -> None:
+    """The daemon of a member, whose head is well: dora itself would let it go after 30 s."""
+    life = flow.life()
+    flow.kill("b", "dora daemon", "STOP")
+    flow.wait_again(life)
+
+
 @pytest.mark.warns("Node doubler crashed: ", "Node doubler is being restarted", "Signal(9)")
 def test_a_node_is_killed(flow: Flow) -> None:
     """dora restarts it there; the others run on."""

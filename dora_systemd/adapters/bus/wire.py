@@ -4,6 +4,7 @@ import os
 from typing import Any
 
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import is_readable
 
 _CLOSE = (-1, None)
 """pystemd's mark for the end of a container."""
@@ -28,15 +29,10 @@ def encoded(signature: str, value: Any) -> list[tuple[int, Any]]:
 
 
 def _text(value: str) -> bytes:
-    """UTF-8 without NUL: D-Bus allows no NUL, and C would silently cut the string there."""
-    try:
-        encoded_text = value.encode()
-    except UnicodeEncodeError:
-        encoded_text = b"\0"
-    if b"\0" in encoded_text:
-        hint = "write it as UTF-8 without NUL characters"
+    if not is_readable(value):
+        hint = "write it as UTF-8, without NUL and noncharacters"
         raise DoraSystemdError(f"cannot send {value!r} to systemd", hint, ExitCode.USAGE)
-    return encoded_text
+    return value.encode()
 
 
 def _split(signature: str) -> list[str]:

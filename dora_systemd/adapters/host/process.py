@@ -51,15 +51,24 @@ def run_command(
         raise DoraSystemdError(f"cannot run {command[0]}: {error.strerror}") from error
     with child:
         try:
-            assert child.stdout and child.stderr
-            pipes = (child.stdout.fileno(), child.stderr.fileno())
-            streams = _collect(pipes, deadline, command[0])
-            status = _wait(child, deadline, command[0])
+            status, streams = read_child(child, deadline, command[0])
         except BaseException:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(child.pid, signal.SIGKILL)
             raise
         return Completed(status, *(one.decode(errors="replace") for one in streams))
+
+
+def read_child(
+    child: "Popen[bytes]", deadline: float, command: str
+) -> tuple[int, tuple[bytes, bytes]]:
+    """Wait until a child exits; keep OUTPUT_LIMIT bytes of standard output and error, both pipes.
+
+    deadline: seconds of the monotonic clock. Raises TimedOut; then the child is still there.
+    """
+    assert child.stdout and child.stderr
+    output, errors = _collect((child.stdout.fileno(), child.stderr.fileno()), deadline, command)
+    return _wait(child, deadline, command), (output, errors)
 
 
 def beside(call: Callable[[], T]) -> "Future[T]":

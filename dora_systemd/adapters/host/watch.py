@@ -3,7 +3,7 @@
 import asyncio
 import errno
 import os
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -28,11 +28,14 @@ def watch_rules(options: RunnerOptions) -> WatchRules:
     return WatchRules(root, watched, given.ignore, read_gitignores(root), own)
 
 
-async def changed_files(rules: WatchRules) -> AsyncIterator[frozenset[str]]:
+async def changed_files(
+    rules: WatchRules, on_seen: Callable[[], object] = bool
+) -> AsyncIterator[frozenset[str]]:
     """Files that match `rules` and were written, created, renamed or deleted, in batches.
 
     Watches directories, not files, because editors save by renaming. Ignored directories cost
-    nothing. Raises DoraSystemdError if the kernel refuses more watches.
+    nothing. on_seen: is called when each later change is noticed, if not at once. Raises
+    DoraSystemdError if the kernel refuses more watches.
     """
     seen: dict[str, int] = {}
 
@@ -46,6 +49,7 @@ async def changed_files(rules: WatchRules) -> AsyncIterator[frozenset[str]]:
         return changed
 
     await missed()
+    on_seen()
     while True:
         await _wait_root(rules.root)
         is_first = is_unsure = True

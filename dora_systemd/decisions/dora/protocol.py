@@ -164,23 +164,33 @@ CONNECTED_DAEMONS: Params = "ConnectedMachines"
 
 
 def parse_heartbeat(reply: Reply) -> int:
-    """µs since the last heartbeat of the daemon, from the reply to CONNECTED_DAEMONS.
+    """µs since the last heartbeat of this machine's daemon, from the reply to CONNECTED_DAEMONS.
 
-    INFINITY if no daemon is connected, 0 if the reply does not tell.
+    Of several machines this is the head. INFINITY if its daemon is not connected, 0 if the reply
+    does not tell.
     """
-    daemons = _mapping(reply.result).get("ConnectedDaemons")
-    if not isinstance(daemons, list):
+    if not isinstance(_mapping(reply.result).get("ConnectedDaemons"), list):
         return 0
-    ages = (_mapping(one).get("last_heartbeat_ago_ms") for one in daemons)
-    known = (age if isinstance(age, int | float) and isfinite(age) else 0 for age in ages)
-    return min((int(age * 1000) for age in known), default=INFINITY)
+    return min((age for machine, age in parse_heartbeats(reply) if not machine), default=INFINITY)
 
 
-def parse_machines(reply: Reply) -> list[str]:
-    """The machine of each daemon in the reply to CONNECTED_DAEMONS; "" for one without a name."""
-    daemons = _mapping(reply.result).get("ConnectedDaemons")
-    idents = (_mapping(_mapping(one).get("daemon_id")) for one in _list(daemons))
-    return [str(one.get("machine_id") or "") for one in idents]
+def parse_heartbeats(reply: Reply) -> list[tuple[str, int]]:
+    """The machine of each daemon in the reply to CONNECTED_DAEMONS, and µs since it was heard.
+
+    "" is a machine without a name. A daemon of which the reply does not tell it has 0. A machine
+    that is back can be there twice.
+    """
+    daemons = _list(_mapping(reply.result).get("ConnectedDaemons"))
+    return [(_machine_of(one), _silence_of(one)) for one in map(_mapping, daemons)]
+
+
+def _machine_of(daemon: Mapping[str, Any]) -> str:
+    return str(_mapping(daemon.get("daemon_id")).get("machine_id") or "")
+
+
+def _silence_of(daemon: Mapping[str, Any]) -> int:
+    age = daemon.get("last_heartbeat_ago_ms")
+    return int(age * 1000) if isinstance(age, int | float) and isfinite(age) else 0
 
 
 LIST: Params = "List"

@@ -10,6 +10,8 @@ from dora_systemd.terminal_text import short_line
 MOST_SKEW = 500_000
 """µs between the clocks: dora orders events by them, and refuses more than that."""
 _LONGEST = 200
+_LAST = 2**63 - 1
+"""The last µs that a clock can have."""
 
 
 @dataclass(frozen=True)
@@ -38,10 +40,17 @@ def parse_facts(text: str) -> Facts:
         found = json.loads(text.strip().splitlines()[-1])
         names = ("doractl", "dora", "program", "user")
         texts = {name: short_line(str(found[name]), _LONGEST) for name in names}
-        return Facts(**texts, linger=bool(found["linger"]), now=int(found["now"]))
+        return Facts(**texts, linger=bool(found["linger"]), now=_clock(found["now"]))
     except (ValueError, TypeError, KeyError, IndexError, RecursionError) as error:
         hint = "both machines need the same version of dora-systemd"
         raise DoraSystemdError("cannot read what the machine says of itself", hint) from error
+
+
+def _clock(value: object) -> int:
+    """JSON has numbers that are infinite, or too large to be compared with others."""
+    if type(value) is not int or not 0 <= value <= _LAST:
+        raise ValueError(value)
+    return value
 
 
 def problems(here: Facts, there: Facts, skew: int) -> Iterator[tuple[str, str]]:

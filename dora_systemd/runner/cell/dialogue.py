@@ -118,8 +118,15 @@ class Dialogue(Tasks):
     def read_coordinator(self, line: str) -> None:
         """Handle a line that the coordinator printed; one of them has its port."""
         if line.startswith(engine.LISTENING) and self._pump.cell.state is State.BOOTING:
-            self._engine.set_port(int(line.removeprefix(engine.LISTENING)))
-            self._pump.push(life.CoordinatorListening(now_us()))
+            try:
+                self._engine.set_port(int(line.removeprefix(engine.LISTENING)))
+            except OSError:
+                reason = DoraSystemdError(
+                    "it has written no token; df /run shows whether it is full"
+                )
+                self._pump.push(failed("use the dora coordinator", reason))
+            else:
+                self._pump.push(life.CoordinatorListening(now_us()))
 
     def _start_daemon(self, variables: Mapping[str, str]) -> None:
         self.watch(self._engine.start_daemon(variables), self._read_daemon)

@@ -41,10 +41,13 @@ class SharedEngine(Engine):
         super().__init__(dora, paths, shared_environment(environment, addresses), boot)
         self._addresses = addresses
 
-    async def machines(self) -> list[str]:
-        """The machines whose daemon is connected. Raises DoraSystemdError."""
+    async def heartbeats(self) -> list[tuple[str, int]]:
+        """The machine of each daemon that is connected, and µs since it was heard.
+
+        Raises DoraSystemdError.
+        """
         reply = await self.ask_soon(protocol.CONNECTED_DAEMONS)
-        return protocol.parse_machines(reply)
+        return protocol.parse_heartbeats(reply)
 
     async def ask_soon(self, params: protocol.Params) -> protocol.Reply:
         """Send a request. Raises DoraSystemdError, also if ASK_SECONDS are not enough."""
@@ -56,7 +59,7 @@ class SharedEngine(Engine):
 
     async def is_joined(self) -> bool:
         """Whether the daemon of this machine has registered."""
-        return self.machine in await self.machines()
+        return any(machine == self.machine for machine, _ in await self.heartbeats())
 
 
 class HeadEngine(SharedEngine):

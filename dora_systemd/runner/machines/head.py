@@ -35,7 +35,7 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.boot import EarlyDaemon
 from dora_systemd.runner.cell.dialogue import Dialogue
-from dora_systemd.runner.cell.engine import Engine
+from dora_systemd.runner.cell.engine import SILENCE, Engine
 from dora_systemd.runner.cell.life import Life, is_transient
 from dora_systemd.runner.cell.pump import Pump, now_us
 from dora_systemd.runner.machines.ending import end_nodes
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from dora_systemd.adapters.dora.check import DoraCheck
 
 FIRST_PATIENCE = 30 * SECOND
-"""µs that the first start waits for members, if the settings have no start timeout."""
+"""µs that a start waits for members if somebody waits for it, and the settings have no timeout."""
 _AGAIN_SECONDS = 0.05
 _LOOK_SECONDS = 0.2
 _WATCH_SECONDS = 2.0
@@ -122,16 +122,16 @@ class Head(Shared):
         self.roster.push, self.roster.refresh = pump.push, pump.refresh
         pump.amend = self.roster.amend
         dialogue = HeadDialogue(options, pump, dora, nodes, pipes)
-        dialogue.begin(self.roster, dora, self.this_life.is_first)
+        dialogue.begin(self.roster, dora)
         return dialogue
 
 
 class HeadDialogue(Dialogue):
     """Carries out each Do of a head. Call begin() first."""
 
-    def begin(self, roster: Roster, dora: HeadEngine, is_first: bool) -> None:
-        """is_first: whether somebody waits for this start."""
-        self._roster, self._dora, self._is_first = roster, dora, is_first
+    def begin(self, roster: Roster, dora: HeadEngine) -> None:
+        """Set what the actions need."""
+        self._roster, self._dora = roster, dora
         self._ends_at, self._is_ending = 0.0, False
         self._unreached: dict[str, str] = {}
 
@@ -146,11 +146,11 @@ class HeadDialogue(Dialogue):
         }
 
     async def _gather(self) -> None:
-        """Wait for all members; at the first start not without end."""
+        """Wait for all members; not without end if somebody waits for this start."""
         given = self._options.start_timeout
         most = (FIRST_PATIENCE if given == INFINITY else given) / SECOND
         try:
-            async with asyncio.timeout(most if self._is_first else None):
+            async with asyncio.timeout(most if self._roster.is_awaited else None):
                 await self._all_joined()
         except TimeoutError:
             named, after = self._named(), format_duration(round(most) * SECOND)
@@ -186,7 +186,7 @@ class HeadDialogue(Dialogue):
         The coordinator may still have the lost one of a machine that is back.
         """
         with contextlib.suppress(DoraSystemdError):
-            found = await self._dora.machines()
+            found = [machine for machine, _ in await self._dora.heartbeats()]
             return all(found.count(name) == 1 for name in self._roster.names)
         return False
 
@@ -214,20 +214,24 @@ class HeadDialogue(Dialogue):
             self._loop.call_later(after / SECOND, self._pump.push, late)
 
     async def _watch_machines(self) -> None:
-        """Find a member that is there, and whose daemon is not."""
+        """Find a member that is there, and whose daemon is not or hangs."""
         while True:
             await asyncio.sleep(_WATCH_SECONDS)
             if self._pump.cell.state in (State.WAITING, State.RUNNING) and (
                 lost := await self._find_lost()
             ):
                 await asyncio.sleep(_WORD_SECONDS)
-                self._lose(lost, "its dora daemon is not connected any more")
+                self._lose(*lost)
 
-    async def _find_lost(self) -> str:
+    async def _find_lost(self) -> tuple[str, str] | None:
         with contextlib.suppress(DoraSystemdError):
-            found = await self._dora.machines()
-            return next((name for name in self._roster.names if name not in found), "")
-        return ""  # watch_dora sees that
+            ages = dict(await self._dora.heartbeats())
+            for name in self._roster.names:
+                if name not in ages:
+                    return name, "its dora daemon is not connected any more"
+                if ages[name] > SILENCE * SECOND:
+                    return name, "its dora daemon does not answer any more"
+        return None  # watch_dora sees a coordinator that does not answer
 
     def _lose(self, name: str, why: str) -> None:
         if self._pump.cell.state in (State.WAITING, State.RUNNING, State.STOPPING):

@@ -37,6 +37,7 @@ from dora_systemd.runner.machines.shared import Shared
 from dora_systemd.runner.machines.uses import Uses
 from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.terminal_text import short_line
+from dora_systemd.values import INFINITY
 
 if TYPE_CHECKING:
     from dora_systemd.adapters.dora.check import DoraCheck
@@ -48,7 +49,7 @@ class Member(Shared):
     """A machine that another one has given nodes.
 
     stops_by_head: the head knows that this part ends. is_answered: the head ends its own part, or
-    is gone.
+    is gone. grace: µs that the head leaves the nodes.
     """
 
     def __init__(self, options: RunnerOptions, this_life: Life, boot: EarlyDaemon | None) -> None:
@@ -61,6 +62,7 @@ class Member(Shared):
         self._pump: Pump | None = None
         self._table = self._told = self._version = ""
         self.stops_by_head = False
+        self.grace = INFINITY
         self.is_answered = asyncio.Event()
         self.is_going_down: Callable[[bool], bool] = is_going_down
 
@@ -145,6 +147,7 @@ class Member(Shared):
             self.stops_by_head = True
             self._push(life.HeadStops(now_us(), message.by or HEAD))
         if isinstance(message, wire.StopPart):
+            self.grace = message.grace
             self._end_by_head("the head has lost another machine")
 
     def _end_by_head(self, why: str) -> None:

@@ -36,11 +36,12 @@ _ENDING = (State.STOPPING, State.CLOSING, State.LEAVING, State.ENDED)
 class Voice(Protocol):
     """What talks with the head. stops_by_head: the head knows that this part ends.
 
-    is_answered: the head ends its own part, or is gone. is_going_down: whether systemd, or that of
-    the user, stops everything.
+    is_answered: the head ends its own part, or is gone. grace: µs that the head leaves the nodes.
+    is_going_down: whether systemd, or that of the user, stops everything.
     """
 
     stops_by_head: bool
+    grace: int
     is_answered: asyncio.Event
     is_going_down: Callable[[bool], bool]
 
@@ -141,7 +142,8 @@ class MemberDialogue(Dialogue):
     async def _end_nodes(self) -> None:
         cell = self._pump.cell
         self._pipes.mute("daemon")  # it does not know that we end them
-        await end_nodes(self._nodes, list(cell.nodes), cell.grace / SECOND)
+        grace = min(cell.grace, self._voice.grace)
+        await end_nodes(self._nodes, list(cell.nodes), grace / SECOND)
         self._pump.push(life.StopAnswered(now_us()))
 
     def _exit(self, leave: Callable[[], None]) -> None:

@@ -13,7 +13,7 @@ from pathlib import PurePath
 from typing import Any
 
 from dora_systemd.adapters.dora.preparation import Prepared
-from dora_systemd.adapters.host.watch import change_time, changed_files, watch_rules
+from dora_systemd.adapters.host.watch import change_time
 from dora_systemd.decisions.cell.limits import check_nodes, merge_node_limits
 from dora_systemd.decisions.cell.line_rates import RateLimits, parse_rates
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -21,13 +21,13 @@ from dora_systemd.decisions.descriptor.wiring import downstream_of
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.rights.node_rights import essential_nodes
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.runner.cell.begin import let_openssl_in
 from dora_systemd.runner.cell.failure import words
 from dora_systemd.runner.cell.pump import now_us
 from dora_systemd.runner.reload.apply import Applier, Run
 from dora_systemd.runner.reload.settings_file import SettingsFile
 from dora_systemd.runner.reload.sources import Change, Sources
 from dora_systemd.runner.reload.swap import NotReady, patience
+from dora_systemd.runner.reload.watcher import Watcher
 from dora_systemd.values import quoted
 
 PAUSE_SECONDS = 1.0
@@ -56,7 +56,7 @@ class Reloader:
         self._changed: set[str] = set()
         self._wake = asyncio.Event()
         self._begun = asyncio.Event()
-        self._watcher: asyncio.Task[None] | None = None
+        self._watcher = Watcher(self._take_files, self._refusing)
         self._run: Run | None = None
         self._outcome: asyncio.Future[str] | None = None
         self._untold: DoraSystemdError | None = None
@@ -109,7 +109,7 @@ class Reloader:
             self._settings.keep()
         except DoraSystemdError as error:
             self._refuse(error)  # of this file only: the others can be reloaded
-        self._watch(self.options.hot_reload)
+        self._watcher.watch(self.options if self.options.hot_reload else None)
         while True:
             await self._wake.wait()
             await self._begun.wait()
@@ -130,18 +130,9 @@ class Reloader:
         except Exception as error:
             self._refuse(DoraSystemdError(f"{what}: {words(error)}", "please report it"))
 
-    def _watch(self, is_on: bool) -> None:
-        if self._watcher is not None:
-            self._watcher.cancel()
-        self._watcher = asyncio.create_task(self._collect()) if is_on else None
-
-    async def _collect(self) -> None:
-        with self._refusing("cannot watch files any more"):
-            rules = await asyncio.to_thread(watch_rules, self.options)
-            let_openssl_in()  # watchfiles imports anyio, which imports ssl
-            async for files in changed_files(rules):
-                self._changed |= files
-                self._wake.set()
+    def _take_files(self, files: frozenset[str]) -> None:
+        self._changed |= files
+        self._wake.set()
 
     def _refuse(self, error: DoraSystemdError) -> None:
         """Report that the old version keeps running, in the notice as soon as there is a run."""
@@ -273,7 +264,9 @@ class Reloader:
             # This changes only how dora treats nodes that fail: each gets it with its next reload.
             if self.current is not None:
                 self.current = self._sources.replan(self.current)
-            self._watch(is_on)
+            self._watcher.watch(self.options if is_on else None)
+            # What is saved after the answer counts.
+            await self._watcher.wait_seeing()
         return {"done": []}
 
     async def _limit_lines(self, rates: RateLimits) -> Answer:
@@ -285,7 +278,7 @@ class Reloader:
 
     def close(self) -> None:
         """Stop watching."""
-        self._watch(False)
+        self._watcher.watch(None)
 
 
 def _files(change: Change) -> list[str]:

@@ -42,6 +42,8 @@ from dora_systemd.verbs.start.unit import plan_properties, systemd_number
 
 _START_SECONDS = 60.0
 """For the first words of the runner."""
+_END_SECONDS = 60.0
+"""For a part of a former start to end; an attempt later may find it gone."""
 _ADDRESS_SECONDS, _LOOK_SECONDS = 10.0, 0.1
 _PASSING = (ExitCode.FAILURE, ExitCode.NO_SYSTEMD)
 """Errors that the next attempt may not meet, such as a machine that still boots."""
@@ -136,11 +138,27 @@ def _wait_for_address(addresses: Sequence[str], is_passing: bool) -> None:
 
 
 def _end_old_part(manager: Manager, request: MemberRequest) -> None:
-    """End a part of the same dataflow whose head has begun anew."""
+    """End a part of the same dataflow whose head has begun anew.
+
+    One of a former start, with another UUID, ends by itself if its head is gone.
+    """
     cell = read_cell(manager, request.unit)
-    is_old = cell and cell.uuid == request.start.uuid and cell.options.machine
-    if cell and is_old and cell.has_begun:
+    if cell is None or not cell.options.machine:
+        return
+    if cell.uuid == request.start.uuid and cell.has_begun:
         manager.run_jobs("StopUnit", [request.unit])
+    elif cell.state.active == "deactivating":
+        _wait_for_end(manager, request)
+
+
+def _wait_for_end(manager: Manager, request: MemberRequest) -> None:
+    deadline = time.monotonic() + _END_SECONDS
+    while not _is_down(manager, request.unit):
+        if time.monotonic() > deadline:
+            message = f"cannot start {request.unit}: its former part is still being stopped"
+            hint = f"see systemctl {request.scope.flag} status {request.unit} on that machine"
+            raise DoraSystemdError(message, hint)
+        time.sleep(_LOOK_SECONDS)
 
 
 def _member_plan(plan: Plan, part: Part) -> Plan:

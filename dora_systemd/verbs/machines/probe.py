@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from dora_systemd.adapters.host.loopback import port_error
+from dora_systemd.adapters.host.process import read_child
 from dora_systemd.adapters.ssh.program import start_ssh
 from dora_systemd.decisions.cell.machines import HEAD
 from dora_systemd.decisions.machines.facts import Facts, parse_facts
@@ -18,6 +19,7 @@ from dora_systemd.decisions.remote.command import Way, quote, remote_command, ss
 from dora_systemd.decisions.remote.failures import ending_error, lost, silent
 from dora_systemd.decisions.remote.hosts import Host
 from dora_systemd.decisions.remote.stream import AfterMark
+from dora_systemd.errors import TimedOut
 
 SECONDS = 60.0
 _FACTS = ("member", "--facts")
@@ -105,15 +107,17 @@ def _require(host: Host, mark: str, output: bytes, errors: bytes, status: int) -
 
 
 def _run(host: Host, arguments: Sequence[str]) -> tuple[int, bytes, bytes]:
+    """Exit status of ssh, and what came by it, in bounds: the machine may talk for ever."""
     pipe = subprocess.PIPE
-    null = subprocess.DEVNULL
-    with start_ssh(arguments, stdin=null, stdout=pipe, stderr=pipe) as child:
+    deadline = time.monotonic() + SECONDS
+    with start_ssh(arguments, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe) as child:
         try:
-            output, errors = child.communicate(timeout=SECONDS)
-        except subprocess.TimeoutExpired as error:
-            child.kill()
+            status, (output, errors) = read_child(child, deadline, "ssh")
+        except TimedOut as error:
             raise silent(host, SECONDS, "no answer") from error
-        return child.returncode, output, errors
+        finally:
+            child.kill()  # nothing, if it has ended
+        return status, output, errors
 
 
 def _mark() -> str:

@@ -3,6 +3,7 @@
 import os
 import signal
 import subprocess
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.trust import courier
 from dora_systemd.trust import project as module
-from dora_systemd.trust.project import Project, opened_project
+from dora_systemd.trust.project import Patience, Project, opened_project
 
 
 @pytest.fixture
@@ -141,6 +142,46 @@ def test_a_child_that_stops(project: Project, monkeypatch: pytest.MonkeyPatch) -
     os.kill(project._child.pid, signal.SIGSTOP)
     with pytest.raises(DoraSystemdError, match="no answer"):
         project.facts(["x" * 4000] * 100)  # more than a pipe holds
+
+
+DRIBBLE = """
+import time
+while True:
+    sys.stdout.write("+0000001x")
+    sys.stdout.flush()
+    time.sleep(0.01)
+"""
+
+
+def test_a_child_that_dribbles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each frame comes in time, but the content would take for ever."""
+    liar = tmp_path / "liar.py"
+    liar.write_text(f"{_ANSWER}{DRIBBLE}")
+    monkeypatch.setattr(courier, "__file__", str(liar))
+    monkeypatch.setattr(module, "_TOTAL_SECONDS", 0.2, raising=False)
+    with (
+        opened_project(str(tmp_path), None) as project,
+        pytest.raises(DoraSystemdError, match=r"cannot read .*/large .*: it takes too long"),
+    ):
+        for at, _ in enumerate(project.read("large")):
+            assert at < 500
+
+
+def test_only_the_time_of_the_child_counts(root: Path, project: Project) -> None:
+    (root / "large").write_bytes(bytes(4 * courier.CHUNK))
+    before = project.patience.left
+    for _ in project.read("large"):
+        project.patience.left = 60.0
+        time.sleep(0.01)
+        assert project.patience.left == 60.0
+    assert before == 300.0
+
+
+def test_time_is_earned_by_bytes_and_files() -> None:
+    patience = Patience()
+    before = patience.left
+    patience.earn(size=1024 * 1024, files=20)
+    assert patience.left == before + 2.0 + 1.0
 
 
 def test_an_answer_about_another_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -140,11 +140,17 @@ def test_no_reply_breaks_the_results(frame: object) -> None:
     protocol.parse_results(reply)
 
 
+def _daemon(machine: str | None, age: int) -> dict[str, object]:
+    return {"daemon_id": {"machine_id": machine}, "last_heartbeat_ago_ms": age}
+
+
 @pytest.mark.parametrize(
     ("result", "age"),
     [
         ({"ConnectedDaemons": [{"last_heartbeat_ago_ms": 2302}]}, 2_302_000),
         ({"ConnectedDaemons": [{"daemon_id": {}}]}, 0),
+        ({"ConnectedDaemons": [_daemon("gpu", 10), _daemon(None, 30_000)]}, 30_000_000),
+        ({"ConnectedDaemons": [_daemon("gpu", 10)]}, INFINITY),
         ({"ConnectedDaemons": [{"last_heartbeat_ago_ms": [None]}]}, 0),
         ({"ConnectedDaemons": []}, INFINITY),
         ({"ConnectedMachines": ["a"]}, 0),
@@ -153,6 +159,13 @@ def test_no_reply_breaks_the_results(frame: object) -> None:
 )
 def test_heartbeat(result: object, age: int) -> None:
     assert protocol.parse_heartbeat(Reply("1", result, "")) == age
+
+
+def test_the_heartbeats_of_all_machines() -> None:
+    daemons = [_daemon("gpu", 10), _daemon(None, 30_000), {"daemon_id": {"machine_id": "arm"}}]
+    reply = Reply("1", {"ConnectedDaemons": daemons}, "")
+    assert protocol.parse_heartbeats(reply) == [("gpu", 10_000), ("", 30_000_000), ("arm", 0)]
+    assert protocol.parse_heartbeats(Reply("1", None, "")) == []
 
 
 @pytest.mark.parametrize(

@@ -194,6 +194,20 @@ def test_the_coordinator_tells_its_port_once(tmp_path: Path) -> None:
     live(work)
 
 
+def test_a_coordinator_without_a_token(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As with /run full: dora goes on without one."""
+
+    async def work() -> None:
+        bench = Bench(tmp_path, State.BOOTING)
+        monkeypatch.setattr(bench.dora, "set_port", lambda _: (tmp_path / "none").stat())
+        bench.dialogue.read_coordinator("Listening on port 4711")
+        (event,) = bench.heard
+        assert isinstance(event, life.Failed)
+        assert "df /run" in event.error
+
+    live(work)
+
+
 @pytest.mark.parametrize("oom", [None, Oom(Owner.DATAFLOW, 1 << 30, 1 << 30)])
 def test_the_daemon_from_its_start_to_its_end(tmp_path: Path, oom: Oom | None) -> None:
     given: list[Mapping[str, str]] = []

@@ -41,16 +41,17 @@ MID = ("daemon", "mid")
 
 
 class FakeHead(FakeDora):
-    """daemons: of which machines dora has one; "" is that of the head."""
+    """daemons: of which machines dora has one; "" is that of the head. age: µs of each."""
 
     daemons: list[str]
+    age = 0
 
-    async def machines(self) -> list[str]:
-        return self.daemons
+    async def heartbeats(self) -> list[tuple[str, int]]:
+        return [(machine, self.age) for machine in self.daemons]
 
 
 class Bench:
-    def __init__(self, root: Path, is_first: bool = True, **options: Any) -> None:
+    def __init__(self, root: Path, is_awaited: bool = True, **options: Any) -> None:
         self.nodes, self.pipes = FakeNodes(), FakePipes()
         self.dora = FakeHead()
         self.dora.daemons = ["", "gpu"]
@@ -61,7 +62,8 @@ class Bench:
         self.pump.heard, self.pump.calls = [], []
         self.roster.push = self.pump.push
         self.dialogue = HeadDialogue(given, self.pump, self.dora, self.nodes, self.pipes)
-        self.dialogue.begin(self.roster, cast(HeadEngine, self.dora), is_first)
+        self.roster.is_awaited = is_awaited
+        self.dialogue.begin(self.roster, cast(HeadEngine, self.dora))
         self.ended = 0
         self.dialogue._end_nodes = self._end_nodes  # type: ignore[method-assign]
         self.actions = self.dialogue.actions({"nodes": []}, {})
@@ -173,7 +175,7 @@ def test_a_later_start_does(tmp_path: Path) -> None:
         await settle()
         assert bench.heard(life.Gathered)
 
-    run(tmp_path, work, is_first=False)
+    run(tmp_path, work, is_awaited=False)
 
 
 def test_the_start_timeout_begins_when_all_have_joined(tmp_path: Path) -> None:
@@ -187,7 +189,7 @@ def test_the_start_timeout_begins_when_all_have_joined(tmp_path: Path) -> None:
         await asyncio.sleep(5)
         assert bench.heard(life.StartTimedOut)
 
-    run(tmp_path, work, is_first=False, start_timeout=5 * SECOND)
+    run(tmp_path, work, is_awaited=False, start_timeout=5 * SECOND)
 
 
 def test_a_stop_asks_dora_while_all_are_there(tmp_path: Path) -> None:
@@ -243,6 +245,18 @@ def test_a_daemon_that_is_gone_is_a_lost_machine(tmp_path: Path) -> None:
             other.say(wire.Beat())
         reason = "its dora daemon is not connected any more"
         assert life.MachineLost(0, "gpu", reason) in bench.heard(life.MachineLost)
+
+    run(tmp_path, work)
+
+
+def test_a_daemon_that_hangs_is_a_lost_machine(tmp_path: Path) -> None:
+    async def work(bench: Bench) -> None:
+        bench.be(State.RUNNING)
+        bench.dora.age = 21 * SECOND
+        lost = ("gpu", "its dora daemon does not answer any more")
+        assert await bench.dialogue._find_lost() == lost
+        bench.dora.age = 19 * SECOND
+        assert await bench.dialogue._find_lost() is None
 
     run(tmp_path, work)
 

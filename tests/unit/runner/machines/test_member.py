@@ -145,6 +145,30 @@ def test_what_the_head_says(tmp_path: Path) -> None:
     run(tmp_path, work)
 
 
+@pytest.mark.parametrize(("said", "seconds"), [(SECOND // 2, 0.5), (0, 0.0), (3600 * SECOND, 2.0)])
+def test_the_head_can_only_shorten_the_grace(
+    said: int, seconds: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its nodes end with those here, and its grace duration began before."""
+
+    async def work(bench: Bench) -> None:
+        given: list[float] = []
+
+        async def end_nodes(_nodes: object, _own: object, seconds: float) -> None:
+            given.append(seconds)
+
+        monkeypatch.setattr(member_dialogue, "end_nodes", end_nodes)
+        bench.dora.cut_off = lambda: None  # type: ignore[method-assign]
+        other = await bench.head()
+        other.say(wire.StopPart(said))
+        await settle()
+        bench.actions[Do.END_NODES]()
+        await settle()
+        assert given == [seconds]
+
+    run(tmp_path, work, State.STOPPING)
+
+
 @pytest.mark.parametrize(
     ("is_down", "ended"),
     [

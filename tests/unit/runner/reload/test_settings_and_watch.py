@@ -21,6 +21,7 @@ from dora_systemd.runner.reload.apply import Run
 from dora_systemd.runner.reload.reloader import Reloader
 from dora_systemd.runner.reload.settings_file import SettingsFile, main
 from dora_systemd.runner.reload.sources import check_programs
+from dora_systemd.runner.reload.watcher import Watcher
 from dora_systemd.values import SECOND
 
 FLOW = "nodes: [{{id: a, path: {path}}}]\n"
@@ -107,8 +108,7 @@ def test_watching_that_breaks_is_told(tmp_path: Path) -> None:
         bench = Bench(tmp_path)
         bench.begin()
         options = bench.options._replace(reload=cast(Any, None))
-        bench.reloader.options = options
-        await bench.reloader._collect()
+        await bench.reloader._watcher.collect(options)
         assert "cannot watch files any more: AttributeError" in bench.reasons[0]
 
     live(work)
@@ -212,3 +212,21 @@ def test_a_name_that_leaves_no_room_for_settings(tmp_path: Path) -> None:
     settings = SettingsFile(str(tmp_path / ("x" * 256)), tmp_path / "copy")
     settings.keep()
     assert not (tmp_path / "copy").exists()
+
+
+def test_whoever_switches_it_on_may_save_at_once(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        seen: list[str] = []
+        watcher = Watcher(seen.extend, bench.reloader._refusing)
+        watcher.watch(bench.options._replace(working_directory=str(tmp_path)))
+        await watcher.wait_seeing()
+        (tmp_path / "node.py").write_text("new")
+        async with asyncio.timeout(20):
+            while not seen:
+                await asyncio.sleep(0.01)
+        assert seen == [str(tmp_path / "node.py")]
+        watcher.watch(None)
+        await watcher.wait_seeing()
+
+    live(work)

@@ -131,6 +131,43 @@ def test_an_old_part_ends_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert ("StopUnit", unit) in manager.calls
 
 
+@pytest.fixture
+def dying(monkeypatch: pytest.MonkeyPatch) -> FakeManager:
+    """A part of a former start, which is down after three looks."""
+    manager = FakeManager()
+    unit = manager.add(options(uuid=OTHER, placed=START.placed, machine="gpu"), "deactivating")
+    looks = iter(range(3, 0, -1))
+
+    def sleep(_seconds: float) -> None:
+        if not next(looks, 0):
+            manager.units[unit].update(ActiveState="inactive", LoadState="not-found")
+
+    monkeypatch.setattr("time.sleep", sleep)
+    monkeypatch.setattr(member, "make_plan", _refuse)
+    return manager
+
+
+def test_a_part_of_a_former_start_that_ends_is_awaited(dying: FakeManager, tmp_path: Path) -> None:
+    """Its head is gone, and the name is about to be free."""
+    assert refused(dying, tmp_path).message == "enough"
+    assert not dying.calls, "it ends by itself"
+
+
+def test_a_part_that_does_not_end_may_do_so_later(
+    dying: FakeManager, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(member, "_END_SECONDS", 0.0)
+    error = refused(dying, tmp_path)
+    assert "still being stopped" in error.message
+    assert is_passing(error)
+
+
+def test_another_dataflow_that_ends_is_not_awaited(tmp_path: Path) -> None:
+    manager = FakeManager()
+    manager.add(options(uuid=OTHER), "deactivating")
+    assert refused(manager, tmp_path).code is ExitCode.NAME_IN_USE
+
+
 def test_what_may_pass() -> None:
     assert is_passing(DoraSystemdError("systemd boots", "", ExitCode.NO_SYSTEMD))
     assert not is_passing(DoraSystemdError("another file", "", ExitCode.BAD_INPUT))

@@ -1,0 +1,50 @@
+"""Watches the files of a dataflow while hot reload is on."""
+
+import asyncio
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+
+from dora_systemd.adapters.host.watch import changed_files, watch_rules
+from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.runner.cell.begin import let_openssl_in
+
+_LONGEST = 10.0
+"""Seconds that whoever switches it on waits for a large tree."""
+
+
+class Watcher:
+    """found: takes the files that have changed. refusing: reports an exception inside."""
+
+    def __init__(
+        self,
+        found: Callable[[frozenset[str]], None],
+        refusing: Callable[[str], AbstractContextManager[None]],
+    ) -> None:
+        self._found = found
+        self._refusing = refusing
+        self._task: asyncio.Task[None] | None = None
+        self._has_seen = asyncio.Event()
+
+    def watch(self, options: RunnerOptions | None) -> None:
+        """Watch the files of these options from now on; None: watch nothing."""
+        if self._task is not None:
+            self._task.cancel()
+        self._has_seen.clear()
+        self._task = None if options is None else asyncio.create_task(self.collect(options))
+
+    async def wait_seeing(self) -> None:
+        """Return once a file that changes is noticed, or watching has failed."""
+        if self._task is None:
+            return
+        seen = asyncio.create_task(self._has_seen.wait())
+        first = asyncio.FIRST_COMPLETED
+        await asyncio.wait({self._task, seen}, timeout=_LONGEST, return_when=first)
+        seen.cancel()
+
+    async def collect(self, options: RunnerOptions) -> None:
+        """Give the files that change to found(), without end."""
+        with self._refusing("cannot watch files any more"):
+            rules = await asyncio.to_thread(watch_rules, options)
+            let_openssl_in()  # watchfiles imports anyio, which imports ssl
+            async for files in changed_files(rules, self._has_seen.set):
+                self._found(files)
