@@ -5,12 +5,15 @@ import json
 import os
 import signal
 import subprocess
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
+from dora_systemd.values import SECOND
+from dora_systemd.verbs.releases.soak import START_LIMIT
 from tests.system.cells import Project, run, wait_for
 from tests.system.releases import ETC, FLOW, STORE, Releases, write_version
 
@@ -68,6 +71,22 @@ def test_a_first_version_that_is_bad_leaves_nothing_running(
     assert (releases.running(), list(releases.states().values())) == ("", ["unproved"])
     assert not (ETC / releases.cell.unit).exists()
     assert not releases.trial.exists()
+
+
+@pytest.mark.warns(
+    "crashed", "failed", "Failed", "exited", "exit code", "error", "Error", "restart"
+)
+def test_a_version_that_dora_starts_again_and_again_is_no_wait(
+    releases: Releases, project: Project
+) -> None:
+    """It is never ready and never failed: without a look at its crashes, two minutes."""
+    flow = write_version(project, "bad", "raise SystemExit(3)\n")
+    policy = "restart_policy: on-failure, max_restarts: 0, restart_delay: 0.1"
+    project.write(flow.name, FLOW.replace("}]", f", {policy}}}]"))
+    begun = time.monotonic()
+    said = releases.deploy(project.root, status=11)
+    assert "node a: exit code 3" in said
+    assert time.monotonic() - begun < START_LIMIT / SECOND, "it has seen the crash, not the end"
 
 
 @pytest.mark.warns("crashed", "failed", "Failed", "exited", "exit code", "error", "Error")

@@ -5,6 +5,7 @@ elsewhere. Files that are like those of the last release become hard links to th
 """
 
 import ctypes
+import errno
 import hashlib
 import os
 from collections.abc import Iterable
@@ -121,6 +122,11 @@ class Draft:
         """The space on its file system."""
         found = os.statvfs(self._path)
         return found.f_bavail * found.f_frsize
+
+    def require_space(self, size: int) -> None:
+        """Raise OSError (ENOSPC) unless it has room for `size` bytes."""
+        if size > self.free_bytes():
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def _place(self, path: str) -> Path:
         place = self._tree / path

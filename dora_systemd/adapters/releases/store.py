@@ -66,7 +66,7 @@ class Store:
     def known(self) -> list[Known]:
         """All releases, oldest first; those that this user may not enter count as not proved."""
         found = sorted(filter(is_release_id, self._names()))
-        return [Known(one, self._is_proved(one)) for one in found]
+        return [Known(one, self.is_proved(one)) for one in found]
 
     def unfinished(self) -> list[Path]:
         """What a deploy that was killed has left: a release gets its unit file last."""
@@ -96,9 +96,21 @@ class Store:
         """Write the unit file of a release. Raises OSError."""
         write_part(self.release(release_id), UNIT, text)
 
+    def is_proved(self, release_id: str) -> bool:
+        """Whether a release has passed a trial, as far as this user may know."""
+        try:
+            return (self.release(release_id) / _PROVED).exists()
+        except OSError:
+            return False
+
     def prove(self, release_id: str) -> None:
         """Note that a release has passed its trial. Raises OSError."""
         write_part(self.release(release_id), _PROVED, "")
+
+    def doubt(self, release_id: str) -> None:
+        """Undo prove(). Raises OSError."""
+        (self.release(release_id) / _PROVED).unlink(missing_ok=True)
+        sync_directory(self.release(release_id))
 
     def remove(self, release_id: str) -> None:
         """Remove a release: its name goes first, so that no half release is ever listed."""
@@ -121,12 +133,6 @@ class Store:
             is_release = is_release_id(name)
             return name.startswith(".") or (is_release and not (self.path / name / UNIT).exists())
         except OSError:  # others than root may not look into it
-            return False
-
-    def _is_proved(self, release_id: str) -> bool:
-        try:
-            return (self.release(release_id) / _PROVED).exists()
-        except OSError:
             return False
 
 

@@ -88,6 +88,7 @@ def built_project(
     user = build.source.plan.user
     tree = BuildTree(build.store)
     try:
+        tree.require_space(sum(one.size for one in found.values()))
         files = copy_files(project, found, tree, None, lambda *amount: tell(copying(*amount)))
         tree.hand_over(files, None if user is None else (user.pw_uid, user.pw_gid))
         with _noted(build):

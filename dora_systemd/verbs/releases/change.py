@@ -33,6 +33,7 @@ from dora_systemd.verbs.releases.trial import (
     commit,
     end_trial,
     go_back,
+    read_after_wait,
     read_life,
     read_standing,
 )
@@ -64,16 +65,17 @@ def change_release(
 ) -> None:
     """Run the release, and commit it or roll back.
 
-    Raises DoraSystemdError: ROLLED_BACK if it has failed its trial, INHIBITED before that. SIGINT,
-    SIGTERM and SIGHUP roll back, too.
+    Raises DoraSystemdError: ROLLED_BACK if it has failed its trial; INHIBITED before that, and
+    NOT_RUNNING if what ran has ended in a wait. SIGINT, SIGTERM and SIGHUP roll back, too.
     """
     if is_boot_checked(standing.boot.text or ""):
         change = replace(change, text=with_boot_check(change.text))
     running, verb = standing.running, change.verb
     with uninhibited(scope, running, verb, change.how, lambda text: tell(waiting(text))):
-        for cell in running:
+        standing = read_after_wait(manager, scope, standing, verb)
+        for cell in standing.running:
             note_request("stop-asked", cell.name, cell.uuid, change.by)
-        if not running:
+        if not standing.running:
             # As an ended unit of doractl start is unloaded, systemd would remove the trial's file.
             make_room(manager, standing.boot)
         _try(manager, scope, store, standing, change, tell)
@@ -83,7 +85,8 @@ def _try(
     manager: Manager, scope: Scope, store: Store, standing: Standing, change: Change, tell: Tell
 ) -> None:
     # After this nothing is certain but what the journal and systemd say: undo it in any case.
-    begun = partial(_end_killed, scope, standing, change, read_life(manager, standing.boot.unit))
+    mark, life = _Mark(store, change.release), read_life(manager, standing.boot.unit)
+    begun = partial(_end_killed, scope, standing, change, life, mark)
     with guarded(begun, store.lock), _interruptible():
         _begin(manager, standing, change.text)
         try:
@@ -92,7 +95,7 @@ def _try(
             )
             if fault is None:
                 _ignore_signals()
-                _prove(store, change.release)
+                mark.make()
                 commit(manager, standing, change.text, change.want_boot)
         except KeyboardInterrupt:
             fault = Fault("the command was interrupted")
@@ -102,7 +105,7 @@ def _try(
             fault = Fault(f"the command failed: {error}")
         if fault is not None:
             _ignore_signals()
-            raise _roll_back(manager, standing, change, fault, tell)
+            raise _roll_back(manager, standing, change, fault, mark, tell)
         _note_commit(scope, standing, change)
         remove_unit_file(standing.boot.runtime)
         end_trial(manager, standing)
@@ -129,17 +132,33 @@ def _limit(options: RunnerOptions) -> int:
     return max(START_LIMIT, own) if own != INFINITY else START_LIMIT
 
 
-def _prove(store: Store, release: str) -> None:
-    try:
-        store.prove(release)
-    except OSError as error:
-        raise unusable(store.release(release), error) from error
+class _Mark:
+    """The note that a release has passed its trial, which a commit that fails takes back."""
+
+    def __init__(self, store: Store, release: str) -> None:
+        self._store = store
+        self._release = release
+        self._was_there = store.is_proved(release)
+
+    def make(self) -> None:
+        """Make it. Raises DoraSystemdError."""
+        try:
+            self._store.prove(self._release)
+        except OSError as error:
+            raise unusable(self._store.release(self._release), error) from error
+
+    def take_back(self) -> None:
+        """Remove it, unless it is from an earlier trial."""
+        if not self._was_there:
+            with suppress(OSError):  # the way back is worth more
+                self._store.doubt(self._release)
 
 
 def _roll_back(
-    manager: Manager, standing: Standing, change: Change, fault: Fault, tell: Tell
+    manager: Manager, standing: Standing, change: Change, fault: Fault, mark: _Mark, tell: Tell
 ) -> DoraSystemdError:
     """Go back to what was there before; the error that tells it."""
+    mark.take_back()
     name, former, tell = change.options.name, standing.current, _calm(tell)
     tell(judged(change.release, fault.reason))
     want_start = standing.was_up and not fault.is_stop
@@ -163,7 +182,7 @@ def _roll_back(
     )
 
 
-def _end_killed(scope: Scope, standing: Standing, change: Change, life: str) -> None:
+def _end_killed(scope: Scope, standing: Standing, change: Change, life: str, mark: _Mark) -> None:
     """Go back after this process was killed, unless the release was committed before that.
 
     life: of the unit before the trial. What has not been touched goes on.
@@ -178,7 +197,7 @@ def _end_killed(scope: Scope, standing: Standing, change: Change, life: str) -> 
         end_trial(manager, standing)
     # Once more: a restart may have been on its way.
     if read_life(manager, unit) != life:
-        _roll_back(manager, standing, change, Fault(KILLED), lambda _: None)
+        _roll_back(manager, standing, change, Fault(KILLED), mark, lambda _: None)
 
 
 def _note_stop(manager: Manager, change: Change) -> None:

@@ -1,6 +1,5 @@
 """Copies a project into a release, built if it has to be, that has its name then."""
 
-import errno
 import os
 import time
 import uuid
@@ -91,7 +90,7 @@ def copy_project(
                 at_work = built_project(manager, build, project, found, tell)
                 project, found = held.enter_context(at_work)
             draft = Draft(store)
-            _require_space(draft, found, last)
+            draft.require_space(_lacking(found, last))
             files = _fill(project, found, draft, last, tell)
             files = {p: replace(one, is_built=p not in originals) for p, one in files.items()}
             manifest = replace(manifest, files=files)
@@ -115,14 +114,13 @@ def _damage(last: Manifest | None, paths: Sequence[str]) -> Iterator[str]:
         yield f"release {last.id} is damaged: {paths[0]}{more} changed on the disk; {now}"
 
 
-def _require_space(draft: Draft, found: dict[str, Found], last: Manifest | None) -> None:
-    """Raise OSError unless what the last release lacks has room: some of it may be sparse."""
+def _lacking(found: dict[str, Found], last: Manifest | None) -> int:
+    """The bytes that the last release lacks, as far as their size tells; some may be sparse."""
     old = last.files if last else {}
     sizes = (
         one.size for path, one in found.items() if path not in old or old[path].size != one.size
     )
-    if sum(sizes) > draft.free_bytes():
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    return sum(sizes)
 
 
 def _manifest(

@@ -32,7 +32,11 @@ from dora_systemd.verbs.releases.source import (
     require_same,
     source_notes,
 )
-from dora_systemd.verbs.releases.trial import read_standing, require_deployable
+from dora_systemd.verbs.releases.trial import (
+    read_after_wait,
+    read_standing,
+    require_deployable,
+)
 from dora_systemd.verbs.start.account import account_of
 from dora_systemd.verbs.start.check import check_plan
 from dora_systemd.verbs.start.enable import boot_target
@@ -121,6 +125,7 @@ def deploy(
         require_uninhibited(
             scope, standing.running, "deploy", request.how, lambda text: tell(waiting(text))
         )
+        standing = read_after_wait(manager, scope, standing, "deploy")
         clean(manager, store, standing)
         copy = copy_project(manager, scope, source, store, standing, request.build_timeout, tell)
         release = copy.manifest.id

@@ -6,6 +6,7 @@ reload leave out. Whatever the dataflow itself names belongs to them in any case
 
 import errno
 import hashlib
+import posixpath
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Protocol
 
@@ -44,6 +45,8 @@ class Target(Protocol):
         """Create a symbolic link."""
 
 
+_MOST_LINKS = 40
+"""As in Linux, see path_resolution(7)."""
 _AGAIN = "wait until nothing writes to the project, then deploy again"
 
 
@@ -61,16 +64,41 @@ def find_files(
         raise too_many("")
     if names is None:
         found = _walk(project, "")
-    paths = [*(name.rstrip("/") for name in names or ()), *named]
-    for one in _existing(project, list(dict.fromkeys(paths))):
-        # git names the directory of a repository in the repository, and nothing in it.
-        found |= _walk(project, one.path) if one.kind == DIRECTORY else {one.path: one}
+    found |= _below(project, [name.rstrip("/") for name in names or ()])
+    found |= _below(project, [path for path in (_real(one, found) for one in named) if path])
     if len(found) > MOST_FILES:
         raise too_many("")
     for one in found.values():
         check_found(one)
     check_amount(found.values())
     return dict(sorted(found.items())), revision if is_revision(revision) else ""
+
+
+def _below(project: Project, paths: Sequence[str]) -> dict[str, Found]:
+    """The files with these paths, as far as they exist, and those of directories."""
+    found: dict[str, Found] = {}
+    for one in _existing(project, list(dict.fromkeys(paths))):
+        # git names the directory of a repository in the repository, and nothing in it.
+        found |= _walk(project, one.path) if one.kind == DIRECTORY else {one.path: one}
+    return found
+
+
+def _real(path: str, found: Mapping[str, Found]) -> str:
+    """Where links of the release lead to; "" if that is not in the project.
+
+    A release cannot have a link and, with the same name, a directory.
+    """
+    for _ in range(_MOST_LINKS):
+        parts = path.split("/")
+        heads = ("/".join(parts[:count]) for count in range(1, len(parts)))
+        link = next((found[head] for head in heads if head in found), None)
+        if link is None:
+            return path
+        rest = path.removeprefix(f"{link.path}/")
+        path = posixpath.normpath(posixpath.join(posixpath.dirname(link.path), link.target, rest))
+        if path.startswith(("/", "../")):
+            break
+    return ""
 
 
 def _existing(project: Project, paths: Sequence[str]) -> Iterator[Found]:

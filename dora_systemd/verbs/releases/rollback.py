@@ -19,7 +19,13 @@ from dora_systemd.verbs.releases.clean import clean
 from dora_systemd.verbs.releases.deploy import Deployed
 from dora_systemd.verbs.releases.listing import deployed_names, store_of
 from dora_systemd.verbs.releases.soak import Tell
-from dora_systemd.verbs.releases.trial import Standing, go_back, read_standing, require_deployable
+from dora_systemd.verbs.releases.trial import (
+    Standing,
+    go_back,
+    read_after_wait,
+    read_standing,
+    require_deployable,
+)
 from dora_systemd.verbs.start.asked import note_request
 
 _COMMAND = "doractl rollback"
@@ -51,6 +57,7 @@ def roll_back(
             require_uninhibited(
                 scope, standing.running, "rollback", how, lambda text: tell(waiting(text))
             )
+            standing = read_after_wait(manager, scope, standing, "rollback")
             return _end_first(manager, store, standing, by, tell)
         chosen = _choose(store, standing, release)
         text = store.unit(chosen)

@@ -5,8 +5,9 @@ journal tells as well: every crash and restart of a node is an event there.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
+from typing import Any
 
 from dora_systemd.adapters.bus.manager import ON_THE_WAY, SETTLED, Manager, queued_job
 from dora_systemd.adapters.journal.reader import JournalReader
@@ -20,6 +21,7 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.values import SECOND, format_duration
+from dora_systemd.verbs.facts.lives import now_boot
 from dora_systemd.verbs.facts.reading import read_heard
 from dora_systemd.verbs.facts.reason import failure_reason, runners_refusal
 
@@ -33,11 +35,18 @@ _MOST_RECORDS = 200
 _MICROSECOND_NS = 1000
 
 
-def settle(manager: Manager, unit: str, limit: int, tell: Callable[[str, str], None]) -> str:
+def settle(
+    manager: Manager,
+    unit: str,
+    limit: int,
+    tell: Callable[[str, str], None],
+    is_over: Callable[[], bool] = bool,
+) -> str:
     """Wait until a unit that has a job to start is up or down: its ActiveState, or LATE.
 
     A unit that systemd is about to start again has failed. limit: µs. tell: gets its ActiveState
-    and its status text, again and again. Raises DoraSystemdError.
+    and its status text, again and again. is_over: whether to wait no longer. Raises
+    DoraSystemdError.
     """
     deadline = time.monotonic() + limit / SECOND
     while True:
@@ -47,7 +56,7 @@ def settle(manager: Manager, unit: str, limit: int, tell: Callable[[str, str], N
             return "failed"
         if not is_queued and active not in ON_THE_WAY:
             return active
-        if time.monotonic() > deadline:
+        if time.monotonic() > deadline or is_over():
             return LATE
         tell(active, str(facts["StatusText"]))
         time.sleep(_STEP_SECONDS)
@@ -62,9 +71,11 @@ class Gate:
         self._options = options
         self._unit = unit_name(options.name)
         self._tell = tell
-        self._since_us = time.time_ns() // _MICROSECOND_NS
+        # The other clock can be set back meanwhile, and then nothing would be since then.
         self._since_monotonic_us = time.monotonic_ns() // _MICROSECOND_NS
+        self._boot = now_boot()
         self._before = self._invocation()
+        self._looked = 0.0
 
     def run(self, start_limit: int, soak: int) -> Fault | None:
         """Restart the unit, and watch it for `soak` µs after its nodes are ready.
@@ -79,12 +90,22 @@ class Gate:
         return fault or self._soak(soak)
 
     def _wait_ready(self, limit: int) -> Fault | None:
-        state = settle(self._manager, self._unit, limit, self._tell_start)
+        state = settle(self._manager, self._unit, limit, self._tell_start, self._has_failed)
         if state in SETTLED:
             return None
         if state == LATE:
             return self._fault() or Fault(f"not all nodes are ready after {format_duration(limit)}")
         return self._end(state)
+
+    def _has_failed(self) -> bool:
+        """Whether a node has failed; looks once a second.
+
+        With a restart policy of its own it would be started again and again, until the limit.
+        """
+        if time.monotonic() < self._looked + _LOOK_SECONDS:
+            return False
+        self._looked = time.monotonic()
+        return self._fault() is not None
 
     def _tell_start(self, active: str, status: str) -> None:
         if active in (*SETTLED, "deactivating"):
@@ -131,7 +152,7 @@ class Gate:
     def _end(self, state: str) -> Fault | None:
         """What its end means: a dataflow may finish, everything else is a fault."""
         found = self._happenings()
-        if fault := find_fault(found, self._since_us, self._before):
+        if fault := find_fault(found, self._before):
             # The runner's own words have the number of restarts, and may name other nodes, too.
             words = failure_reason(self._manager, self._unit)
             is_same = words.startswith(f"node {fault.node}: ") and ", node " not in words
@@ -139,24 +160,27 @@ class Gate:
         if refusal := runners_refusal(self._manager, self._unit):
             return Fault(refusal.message)
         if state == "inactive":
-            is_done = is_finished(found, self._since_us)
+            is_done = is_finished(found)
             return None if is_done else Fault("it was stopped", is_stop=True)
         return Fault(failure_reason(self._manager, self._unit))
 
     def _fault(self) -> Fault | None:
-        return find_fault(self._happenings(), self._since_us, self._before)
+        return find_fault(self._happenings(), self._before)
 
     def _happenings(self) -> list[Happening]:
+        """What the journal has of the trial, newest first."""
         matches = [*scope_matches(self._scope, self._options.name)]
         matches += [f"MESSAGE_ID={one}" for one in FAULT_IDS]
         found: list[Happening] = []
         with suppress(DoraSystemdError):  # who may not read the journal has systemd's word only
-            for record in JournalReader().newest(matches, _MOST_RECORDS):
-                happening = parse_happening(record)
-                if happening and happening.at_us < self._since_us:
-                    break
-                found += [happening] if happening else []
+            records = JournalReader().newest(matches, _MOST_RECORDS)
+            for one in map(parse_happening, filter(self._is_new, records)):
+                found += [one] if one else []
         return found
+
+    def _is_new(self, record: Mapping[str, Any]) -> bool:
+        at_us = int(record.get("__MONOTONIC_TIMESTAMP", 0))
+        return record.get("_BOOT_ID") == self._boot and at_us >= self._since_monotonic_us
 
     def _invocation(self) -> str:
         raw = self._manager.read(self._unit, ["InvocationID"])["InvocationID"]

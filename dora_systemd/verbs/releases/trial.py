@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from dora_systemd.adapters.bus.manager import Manager, Observer, queued_job
+from dora_systemd.adapters.bus.manager import DOWN, Manager, Observer, queued_job
 from dora_systemd.adapters.host.unit_files import (
     read_unit_file,
     remove_unit_file,
@@ -104,6 +104,25 @@ def require_deployable(manager: Manager, scope: Scope, standing: Standing) -> No
             f"doractl stop {cell.name}, then deploy again; or choose another --name",
             ExitCode.NAME_IN_USE,
         )
+
+
+def read_after_wait(manager: Manager, scope: Scope, before: Standing, verb: str) -> Standing:
+    """What there is after a wait for locks of what ran `before`.
+
+    Raises DoraSystemdError: NOT_RUNNING if that has ended or somebody stops it, for the verb would
+    start it again; NAME_IN_USE for what a deploy must not replace.
+    """
+    for cell in before.running:
+        now = next(iter(manager.list_units(cell.unit)), None)
+        is_stopping = now is not None and now.job == "stop"
+        if now is None or is_stopping or (now.active in DOWN and not now.is_held):
+            reason = "it is being stopped" if is_stopping else "it has ended meanwhile"
+            hint = f"run doractl {verb} again if it is to run"
+            message = f"cannot {verb} {cell.name}: {reason}"
+            raise DoraSystemdError(message, hint, ExitCode.NOT_RUNNING)
+    standing = read_standing(manager, scope, before.boot.unit)
+    require_deployable(manager, scope, standing)
+    return standing
 
 
 def begin_trial(manager: Manager, standing: Standing, text: str) -> None:

@@ -47,6 +47,17 @@ def test_without_git_all_but_rubbish(root: Path, project: Project) -> None:
     assert set(find_files(project, [], [])[0]) == {".gitignore", "a.py", "target/release/node"}
 
 
+def test_what_is_named_behind_a_link_is_where_the_link_leads(root: Path, project: Project) -> None:
+    (root / "v2").mkdir()
+    (root / "v2/node.py").write_text("x")
+    (root / "current").symlink_to("latest")
+    (root / "latest").symlink_to("v2")
+    (root / "circle").symlink_to("circle")
+    found, _ = find_files(project, ["current/node.py", "circle/node.py"], [])
+    assert {"current", "latest", "v2/node.py"} < set(found)
+    assert not {"current/node.py", "circle/node.py"} & set(found)
+
+
 def test_what_the_dataflow_names_belongs_to_it(root: Path, project: Project) -> None:
     subprocess.run(["git", "init", "-q"], cwd=root, check=True)
     (root / ".gitignore").write_text("target/\n*.log\n.venv\n__pycache__\n")

@@ -4,6 +4,7 @@ from functools import partial
 
 import pytest
 
+from dora_systemd.adapters.releases.store import Store
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.inhibit.guard import IfInhibited
 from dora_systemd.verbs.releases import change as module
@@ -17,8 +18,11 @@ from tests.unit.verbs.releases.test_trial import (
     deployed,
     etc,
     release_options,
+    store,
     text_of,
 )
+
+__all__ = ["store"]
 
 CHANGE = Change(
     NEW, text_of(NEW), release_options(NEW), 0, True, "deploy", IfInhibited.REFUSE, "doractl deploy"
@@ -26,13 +30,16 @@ CHANGE = Change(
 
 
 @pytest.fixture
-def end(manager: FakeManager, scope: Scope, monkeypatch: pytest.MonkeyPatch) -> "partial[None]":
+def end(
+    manager: FakeManager, scope: Scope, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> "partial[None]":
     """The end of a change that has begun with the old release."""
     monkeypatch.setattr(module, "Bus", lambda _: manager)
     deployed(manager)
     standing = read_standing(manager, scope, UNIT)
     begin_trial(manager, standing, text_of(NEW))
-    return partial(module._end_killed, scope, standing, CHANGE, read_life(manager, UNIT))
+    mark = module._Mark(store, NEW)
+    return partial(module._end_killed, scope, standing, CHANGE, read_life(manager, UNIT), mark)
 
 
 def now(manager: FakeManager, scope: Scope) -> Standing:
@@ -51,10 +58,16 @@ def notes(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 @pytest.mark.parametrize("state", [{"Job": (7, "/org")}, {"InvocationID": b"\x01"}])
 def test_before_the_commit(
-    manager: FakeManager, scope: Scope, end: "partial[None]", state: dict[str, object]
+    manager: FakeManager,
+    scope: Scope,
+    store: Store,
+    end: "partial[None]",
+    state: dict[str, object],
 ) -> None:
     manager.units[UNIT] |= state
+    store.prove(NEW)
     end()
+    assert [one.is_proved for one in store.known()] == [False]
     assert now(manager, scope).current == OLD
     assert ("RestartUnit", UNIT) in manager.calls
 

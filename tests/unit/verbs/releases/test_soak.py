@@ -4,6 +4,7 @@ import time
 
 import pytest
 
+from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.decisions.cell.owed import Owed
 from dora_systemd.decisions.releases.progress import Step
 from dora_systemd.decisions.why.faults import Fault
@@ -73,3 +74,54 @@ def test_what_never_comes_fails_it(
     found, _ = soaked(manager, scope, monkeypatch, clock, (1e6, 0.1))
     words = "node camera: silent, no image within 3s of its start"
     assert (found, clock[0] < 1006) == (Fault(words, "camera"), True)
+
+
+def crash(at: float, boot: str = "b") -> dict[str, str]:
+    """A record of journalctl; its CLOCK_REALTIME is that of a clock that was set back."""
+    return {
+        "DORA_EVENT": "node-crashed",
+        "DORA_NODE": "camera",
+        "DORA_EXIT": "exit code 1",
+        "_SYSTEMD_INVOCATION_ID": "1",
+        "_BOOT_ID": boot,
+        "__REALTIME_TIMESTAMP": "5",
+        "__MONOTONIC_TIMESTAMP": str(int(at * SECOND)),
+    }
+
+
+@pytest.fixture
+def journal(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, str]]:
+    records: list[dict[str, str]] = []
+    monkeypatch.setattr(JournalReader, "newest", lambda *_: iter(records))
+    monkeypatch.setattr(module, "now_boot", lambda: "b")
+    return records
+
+
+@pytest.mark.parametrize(
+    ("record", "is_fault"), [(crash(1001), True), (crash(999), False), (crash(1001, "a"), False)]
+)
+def test_a_clock_that_is_set_back_hides_no_fault(
+    manager: FakeManager,
+    scope: Scope,
+    clock: list[float],
+    journal: list[dict[str, str]],
+    record: dict[str, str],
+    is_fault: bool,
+) -> None:
+    assert clock == [1000]
+    manager.add(options(), InvocationID=b"")
+    journal.append(record)
+    fault = Gate(manager, scope, options(), lambda _: None)._fault()
+    assert fault == (Fault("node camera: exit code 1", "camera") if is_fault else None)
+
+
+def test_a_crash_ends_the_wait_for_all_nodes(
+    manager: FakeManager, scope: Scope, clock: list[float], journal: list[dict[str, str]]
+) -> None:
+    """dora may start a node again and again, without end."""
+    unit = manager.add(options(), InvocationID=b"", ActiveState="activating", StatusText="")
+    gate = Gate(manager, scope, options(), lambda _: None)
+    journal.append(crash(1000.5))
+    manager.units[unit]["Job"] = (1, "/")
+    assert gate._wait_ready(120 * SECOND) == Fault("node camera: exit code 1", "camera")
+    assert clock[0] < 1002

@@ -1,8 +1,9 @@
 """The files of a trial, and what a reboot at any moment would find."""
 
 import signal
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -19,7 +20,7 @@ from dora_systemd.verbs.inhibit.guard import IfInhibited
 from dora_systemd.verbs.releases import change as module
 from dora_systemd.verbs.releases.change import Change, change_release
 from dora_systemd.verbs.releases.soak import Tell
-from dora_systemd.verbs.releases.trial import read_standing, require_deployable
+from dora_systemd.verbs.releases.trial import read_after_wait, read_standing, require_deployable
 from tests.unit.fakes.manager import FakeManager, options
 
 UNIT = "dora-robot.service"
@@ -199,6 +200,11 @@ def test_a_commit_that_fails_is_undone(
         try_new(manager, scope, store, monkeypatch, None)
     assert caught.value.code is ExitCode.ROLLED_BACK
     assert read_standing(manager, scope, UNIT).current == OLD
+    assert [one.is_proved for one in store.known()] == [False], "a rollback would take it"
+    store.prove(NEW)
+    with pytest.raises(DoraSystemdError, match="no space"):
+        try_new(manager, scope, store, monkeypatch, None)
+    assert [one.is_proved for one in store.known()] == [True], "it has passed another trial"
 
 
 def test_a_terminal_that_is_gone(
@@ -244,6 +250,54 @@ def test_what_start_has_started_and_has_ended_is_unloaded_before_the_trial(
     try_new(manager, scope, store, monkeypatch, None)
     assert ("reset", UNIT) in manager.calls
     assert read_standing(manager, scope, UNIT).current == NEW
+
+
+@pytest.mark.parametrize(
+    ("now", "reason"),
+    [
+        ({"ActiveState": "inactive"}, "it has ended meanwhile"),
+        ({"ActiveState": "deactivating", "JobType": "stop"}, "it is being stopped"),
+        ({"ActiveState": "active", "JobType": "stop"}, "it is being stopped"),
+    ],
+)
+def test_what_is_stopped_during_a_wait_is_not_started_again(
+    manager: FakeManager,
+    scope: Scope,
+    store: Store,
+    monkeypatch: pytest.MonkeyPatch,
+    now: dict[str, str],
+    reason: str,
+) -> None:
+    deployed(manager)
+
+    @contextmanager
+    def wait(*_: object) -> Iterator[None]:
+        manager.units[UNIT] |= now
+        yield
+
+    monkeypatch.setattr(module, "uninhibited", wait)
+    with pytest.raises(DoraSystemdError, match=f"cannot deploy robot: {reason}") as caught:
+        try_new(manager, scope, store, monkeypatch, None)
+    assert caught.value.code is ExitCode.NOT_RUNNING
+    assert "RestartUnit" not in [call[0] for call in manager.calls]
+    assert read_standing(manager, scope, UNIT).current == OLD
+
+
+@pytest.mark.parametrize(
+    "now",
+    [
+        {"ActiveState": "inactive", "JobType": "start"},
+        {"ActiveState": "deactivating", "JobType": "restart"},
+        {"ActiveState": "activating", "SubState": "auto-restart"},
+    ],
+)
+def test_what_restarts_during_a_wait_is_changed(
+    manager: FakeManager, scope: Scope, now: dict[str, str]
+) -> None:
+    deployed(manager)
+    before = read_standing(manager, scope, UNIT)
+    manager.units[UNIT] |= now
+    assert read_after_wait(manager, scope, before, "deploy").running
 
 
 def test_killed_right_after_its_commit(manager: FakeManager, scope: Scope) -> None:
