@@ -22,6 +22,9 @@ RESERVED_NAMES = frozenset({"gateway"})
 MAX_NAME = 200
 """Maximum characters of a name: unit names have at most 255 (systemd.unit(5))."""
 
+_LASTS = "".join(f"\\U{plane:04x}fffe\\U{plane:04x}ffff" for plane in range(17))
+_UNREADABLE = re.compile(f"[\\x00\\ud800-\\udfff\\ufdd0-\\ufdef{_LASTS}]")
+"""NUL, surrogates, and what Unicode calls noncharacters."""
 _NAME = re.compile(rf"[A-Za-z0-9][A-Za-z0-9._-]{{0,{MAX_NAME - 1}}}(?<!-)")
 """No "-" at its end: drop-ins of dora-x-.service are of all units dora-x-*, see systemd.unit(5)."""
 MAX_NODE_ID = 200
@@ -199,3 +202,12 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
         return f"did you mean {by_lower[wanted]}?"
     near = [by_lower[one] for one in difflib.get_close_matches(wanted, by_lower, n=3)]
     return f"did you mean {' or '.join(near)}?" if near else ""
+
+
+def is_readable(text: str) -> bool:
+    """Whether systemd takes `text` from D-Bus and from a unit file, see utf8_is_valid() in systemd.
+
+    Surrogates stand for bytes that are not UTF-8. D-Bus allows no NUL, and C would silently cut the
+    string there.
+    """
+    return not _UNREADABLE.search(text)

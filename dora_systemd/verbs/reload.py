@@ -9,6 +9,9 @@ from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.host.unit_files import (
     HOT_RELOAD_FILE,
     drop_in_directory,
+    put_unit_file,
+    read_unit_file,
+    remove_empty,
     write_unit_file,
 )
 from dora_systemd.adapters.runner_socket.client import done_of, order
@@ -53,11 +56,29 @@ def switch_hot_reload(
     refuse_parts([cell], "set")
     _refuse_release(cell)
     unit = manager.read(cell.unit, ("FragmentPath", "Transient"))
-    ask(socket_of(scope, cell), {"verb": "hot-reload", "on": is_on})
-    text = format_unit(typed(Environment=(f"{CHANGE_VARIABLE}={format_bool(is_on)}",)))
+    with ExitStack() as undo:
+        remember(unit, HOT_RELOAD_FILE, f"{CHANGE_VARIABLE}={format_bool(is_on)}", undo)
+        manager.reload()
+        ask(socket_of(scope, cell), {"verb": "hot-reload", "on": is_on})
+        undo.pop_all()
+
+
+def remember(unit: Mapping[str, Any], name: str, assignment: str, undo: ExitStack) -> None:
+    """Write a drop-in `name`. Once systemd has loaded it, the next runner gets the change.
+
+    assignment: of an environment variable. undo: gets what restores the file. Raises
+    DoraSystemdError.
+    """
+    text = format_unit(typed(Environment=(assignment,)))
     directory = drop_in_directory(Path(unit["FragmentPath"]), bool(unit["Transient"]))
-    write_unit_file(directory / HOT_RELOAD_FILE, f"# Written by doractl set.\n{text}")
-    manager.reload()
+    path = directory / name
+    undo.callback(_put_back, path, read_unit_file(path))
+    write_unit_file(path, f"# Written by doractl set.\n{text}")
+
+
+def _put_back(path: Path, text: str | None) -> None:
+    put_unit_file(path, text)
+    remove_empty(path.parent)
 
 
 def limit_lines(

@@ -18,11 +18,6 @@ from dora_systemd.adapters.host.machine import read_machine
 from dora_systemd.adapters.host.unit_files import (
     LOG_RATES_FILE,
     NODE_LIMITS_FILE,
-    drop_in_directory,
-    put_unit_file,
-    read_unit_file,
-    remove_empty,
-    write_unit_file,
 )
 from dora_systemd.adapters.runner_socket.client import order
 from dora_systemd.decisions.cell import line_rates
@@ -37,12 +32,11 @@ from dora_systemd.decisions.cell.limits import (
 )
 from dora_systemd.decisions.cell.machines import members_of
 from dora_systemd.decisions.descriptor.nodes import UNEXPANDED
-from dora_systemd.decisions.properties.assignments import typed
 from dora_systemd.decisions.settings.limit_checks import check_cpus, check_use, size_warnings
 from dora_systemd.decisions.settings.limits import NODE_LIMIT
 from dora_systemd.decisions.settings.resolve import resolve_settings
 from dora_systemd.decisions.settings.table import CHANGEABLE, LOG_RATE_LIMIT
-from dora_systemd.decisions.unit.properties import format_unit, settings_properties
+from dora_systemd.decisions.unit.properties import settings_properties
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
@@ -50,7 +44,7 @@ from dora_systemd.verbs.facts.enabled import enabled_units
 from dora_systemd.verbs.facts.nodes import written_dataflow
 from dora_systemd.verbs.facts.parts import refuse_parts
 from dora_systemd.verbs.facts.reading import read_status
-from dora_systemd.verbs.reload import Ask, limit_lines
+from dora_systemd.verbs.reload import Ask, limit_lines, remember
 from dora_systemd.verbs.start.limits import require_controllers
 
 _PROPERTIES = ("ControlGroup", "Environment", "FragmentPath", "Transient")
@@ -98,16 +92,16 @@ def set_limits(
         _limit_groups(unit, nodes, undo)
         if nodes:
             changes = merge_node_limits(parse_changes(before.get(CHANGES_VARIABLE, "")), nodes)
-            _remember(unit, NODE_LIMITS_FILE, f"{CHANGES_VARIABLE}={format_changes(changes)}", undo)
+            remember(unit, NODE_LIMITS_FILE, f"{CHANGES_VARIABLE}={format_changes(changes)}", undo)
         if rates:
-            _remember(unit, LOG_RATES_FILE, _changed_rates(before, rates), undo)
+            remember(unit, LOG_RATES_FILE, _changed_rates(before, rates), undo)
         if rates and unit["ControlGroup"]:
             limit_lines(scope, cell, before, rates, undo, ask)
         if properties:
             manager.set_properties(cell.unit, list(properties.values()), is_fleeting)
+        if nodes or rates:
+            manager.reload()
         undo.pop_all()
-    if nodes or rates:
-        manager.reload()
     return (*warnings, *_unit_file_warnings(manager, scope, cell, unit))
 
 
@@ -162,20 +156,6 @@ def _check_nodes(
 def _held(group: Path) -> dict[str, int | None]:
     """The memory of each node in bytes."""
     return {node: cgroup.read_usage(one).memory for node, one in cgroup.node_groups(group).items()}
-
-
-def _remember(unit: Mapping[str, Any], name: str, assignment: str, undo: ExitStack) -> None:
-    """Write a drop-in. Once systemd has loaded it, the next runner gets the limits."""
-    text = format_unit(typed(Environment=(assignment,)))
-    directory = drop_in_directory(Path(unit["FragmentPath"]), bool(unit["Transient"]))
-    path = directory / name
-    undo.callback(_put_back, path, read_unit_file(path))
-    write_unit_file(path, f"# Written by doractl set.\n{text}")
-
-
-def _put_back(path: Path, text: str | None) -> None:
-    put_unit_file(path, text)
-    remove_empty(path.parent)
 
 
 def _limit_groups(unit: Mapping[str, Any], nodes: tuple[NodeLimits, ...], undo: ExitStack) -> None:

@@ -29,7 +29,8 @@ def test_dataflows_and_nodes_that_run(shell: str, cell: Cell, project: Project) 
     (row,) = json.loads(cell.doractl("list", "-o", "json").stdout)
     assert ask(f"doractl --system show {row['uuid'][:8]}", ()) == [row["uuid"]]
     assert ask(f"doractl node restart {cell.name} so", ()) == ["source"]
-    assert ask(f"doractl logs {cell.name} --node d", ()) == ["doubler"]
+    nodes = f"doractl logs {cell.name} --node d"
+    assert ask(nodes, ()) == ["doubler"], f"bash: {SHELLS['bash'](nodes, ())}"
     assert cell.name not in ask(f"doractl stop {cell.name} {begun}", ()), "it is given already"
     assert ask("doractl sto", ()) == ["stop"]
     cell.doractl("stop", cell.name)

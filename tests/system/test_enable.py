@@ -18,6 +18,7 @@ from dora_systemd.decisions.settings.resolve import resolve_settings
 from dora_systemd.decisions.unit.file import persistent_unit
 from dora_systemd.decisions.unit.properties import UnitContext, format_unit, unit_properties
 from dora_systemd.errors import ExitCode
+from dora_systemd.names import is_readable
 from tests.system.cells import Cell, Project, run, wait_for
 from tests.system.refusals import IN_THE_JOURNAL
 
@@ -460,8 +461,8 @@ def test_a_dataflow_file_that_is_gone(boots: Cell, project: Project) -> None:
     assert (row["status"], row["enabled"]) == ("Failed", True)
 
 
-values = st.text(st.characters(exclude_categories=["Cc", "Cs"]), max_size=40)
-paths = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]), max_size=20)
+values = st.text(st.characters(exclude_categories=["Cc"]), max_size=40).filter(is_readable)
+paths = st.text(max_size=20).filter(is_readable)
 
 
 @settings(

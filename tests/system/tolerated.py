@@ -59,6 +59,10 @@ TOLERATED = (
         "two daemons of a dataflow left the coordinator at nearly the same time",
     ),
     Word(
+        "all daemons disconnected - entering reclaim window",
+        "the daemons of all machines left a coordinator that was about to end as well",
+    ),
+    Word(
         "failed to stop dataflow: no running dataflow with ID",
         "the nodes of one machine had ended before dora's stop came to its daemon",
     ),

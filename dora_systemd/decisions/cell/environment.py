@@ -9,6 +9,7 @@ from dora_systemd.decisions.cell.hot_reload import CHANGE_VARIABLE
 from dora_systemd.decisions.cell.limits import CHANGES_VARIABLE, merge_node_limits, parse_changes
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import is_readable
 from dora_systemd.paths import CellPaths
 from dora_systemd.values import format_bool, parse_bool, quoted, shown
 
@@ -83,7 +84,7 @@ def checked_variable(key: str, value: str) -> tuple[str, str]:
         raise _refusal(key, "a name is letters, digits and '_', and begins with no digit")
     if key in _RESERVED:
         raise _refusal(key, "systemd sets this one itself")
-    if _CONTROL.search(value) or not _is_unicode(value):
+    if _CONTROL.search(value) or not is_readable(value):
         raise _refusal(key, "a value is one line of text without control characters")
     if len(f"{key}={value}".encode()) > MAX_ENTRY:
         raise _refusal(key, "a value has at most 128 KiB: put it in a file and give its path")
@@ -171,12 +172,7 @@ def _unquoted(value: str) -> str:
 
 
 def _is_usable(entry: str) -> bool:
-    return entry.startswith("/") and not _CONTROL.search(entry) and _is_unicode(entry)
-
-
-def _is_unicode(text: str) -> bool:
-    """Whether `text` has no surrogates from bytes that are not UTF-8: D-Bus cannot send these."""
-    return not any("\ud800" <= char <= "\udfff" for char in text)
+    return entry.startswith("/") and not _CONTROL.search(entry) and is_readable(entry)
 
 
 def _refusal(key: str, hint: str) -> DoraSystemdError:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 from dora_systemd.decisions.properties.syntax import escape_specifiers
+from dora_systemd.names import is_readable
 from dora_systemd.values import (
     INFINITY,
     SECOND,
@@ -28,7 +29,7 @@ SCALE = 2**32 - 1
 _SIGNED = re.compile(r"[-+]?[0-9]{1,20}")
 _DIGITS = re.compile(r"[0-9]{1,19}")
 _PERCENT = re.compile(r"([0-9]{1,3}(?:\.[0-9]{1,2})?)%")
-_CONTROL = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
+_CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 
 
 class Property(NamedTuple):
@@ -61,7 +62,7 @@ def plain_text(text: str) -> str:
     """`text` without surrounding blanks. Raises ValueError if a unit file cannot contain it."""
     stripped = text.strip()
     # A backslash at the end of a line would continue it.
-    if _CONTROL.search(text) or stripped.endswith("\\"):
+    if _CONTROL.search(text) or not is_readable(text) or stripped.endswith("\\"):
         raise ValueError("control characters")
     return stripped
 

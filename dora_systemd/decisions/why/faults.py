@@ -1,6 +1,6 @@
 """What fails the trial of a release: the events of its nodes and of its cell. Pure."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from dora_systemd.decisions.logs.events import EVENTS
@@ -29,21 +29,24 @@ class Fault(NamedTuple):
     is_stop: bool = False
 
 
-def find_fault(happenings: Iterable[Happening], since_us: int, before: str) -> Fault | None:
-    """The first fault since then, None if there is none.
+def find_fault(happenings: Sequence[Happening], before: str) -> Fault | None:
+    """The first fault of a trial, None if there is none.
 
-    since_us: CLOCK_REALTIME µs. before: systemd's invocation id of what ran before the trial, which
-    may still write about its own end.
+    happenings: of the trial, newest first. before: systemd's invocation id of what ran before,
+    which may still write about its own end.
     """
-    own = [one for one in happenings if one.at_us >= since_us and one.invocation != before]
-    faults = sorted((one for one in own if one.name in FAULTS), key=lambda one: one.at_us)
-    return _fault(faults[0]) if faults else None
+    own = (one for one in reversed(happenings) if one.invocation != before)
+    first = next((one for one in own if one.name in FAULTS), None)
+    return _fault(first) if first else None
 
 
-def is_finished(happenings: Iterable[Happening], since_us: int) -> bool:
-    """Whether all nodes have ended by themselves since then, and nobody has stopped them."""
-    ends = [one for one in happenings if one.name in ENDS and one.at_us >= since_us]
-    return bool(ends) and max(ends, key=lambda one: one.at_us).name == "dataflow-finished"
+def is_finished(happenings: Iterable[Happening]) -> bool:
+    """Whether all nodes have ended by themselves, and nobody has stopped them.
+
+    happenings: newest first.
+    """
+    last = next((one for one in happenings if one.name in ENDS), None)
+    return last is not None and last.name == "dataflow-finished"
 
 
 def _how(one: Happening) -> str:

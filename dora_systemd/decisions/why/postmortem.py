@@ -38,6 +38,10 @@ def _found(
     return Verdict("", cause, summary, node=node, at_us=at_us, stopped_by=by, details=details)
 
 
+_CALLED_OFF = {"unit-starting", "stop-asked", "unit-stopping", "unit-succeeded", "unit-stopped"}
+"""What is recorded of a restart that was stopped before the runner had begun."""
+
+
 def examine(lives: Sequence[Life], facts: Facts, shutdowns: Sequence[int] = ()) -> Verdict:
     """The verdict on the last of `lives`, which are oldest first.
 
@@ -46,9 +50,8 @@ def examine(lives: Sequence[Life], facts: Facts, shutdowns: Sequence[int] = ()) 
     # What is recorded is of earlier lives, as long as systemd has not begun this one.
     chain = [] if facts.is_held else with_restarts(lives)
     life = chain[-1] if chain else Life()
-    only_begins = all(one.name == "unit-starting" for one in life.happenings)
-    if facts.status == RESTARTING and len(chain) > 1 and only_begins:
-        life = chain[-2]  # the runner of the last life still waits for its restart delay
+    if len(chain) > 1 and _says_nothing(life, facts):
+        life = chain[-2]
     status = facts.status if facts.status in UP_WORDS else ended_word(life, facts.status)
     if facts.is_gathering:
         found = _gathering(chain)
@@ -75,6 +78,14 @@ def examine(lives: Sequence[Life], facts: Facts, shutdowns: Sequence[int] = ()) 
         before_us=before.at_us,
         nodes=() if status in UP_WORDS else ended_nodes(life),
     )
+
+
+def _says_nothing(life: Life, facts: Facts) -> bool:
+    """Whether the runner of a restart still waits for its delay, or was stopped before it began."""
+    names = {one.name for one in life.happenings}
+    if facts.status == RESTARTING:
+        return names <= {"unit-starting"}
+    return facts.status not in UP_WORDS and names <= _CALLED_OFF and "unit-succeeded" in names
 
 
 def ended_word(life: Life, known: str = "") -> str:

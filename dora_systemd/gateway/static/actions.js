@@ -128,6 +128,8 @@ export function askFirst(action, node, flow, facts, act, release = "") {
   dialog.returnValue = "";
   dialog.onclose = () => {
     if (dialog.returnValue !== "yes") return;
+    // On a busy machine the event of an earlier "no" can come as late as that of this "yes".
+    dialog.returnValue = "";
     const values = isSet ? asSettings(node, limitsGiven(limits)) : hotReload;
     if (action === "hot-reload") act("set", "", values);
     else if (!isSet || Object.keys(values).length) act(action, node, isSet ? values : {}, release);

@@ -333,6 +333,20 @@ def test_running_degraded_and_restarting() -> None:
     assert "systemd restarts it automatically" in format_report(Report(SUBJECT, verdict))
 
 
+def test_a_restart_that_is_called_off_says_nothing() -> None:
+    """`list --all` knows the runner's own events alone, and says the same."""
+    lost = (*RUNS, failed("coordinator-lost", "gone"), unit("unit-failed"), unit("unit-restart"))
+    called_off = [
+        *(unit("unit-starting", "2"), event("stop-asked", life="2", by="root")),
+        *(unit("unit-stopping", "2"), unit("unit-succeeded", "2"), unit("unit-stopped", "2")),
+    ]
+    verdict = judge(*lost, *called_off)
+    assert (verdict.status, verdict.summary) == ("Failed", "gone")
+    begun = [*called_off[:2], event("dataflow-starting", life="2"), *called_off[2:]]
+    assert judge(*lost, *begun).status == "Stopped"
+    assert judge(*lost, unit("unit-starting", "2"), facts=Facts("Starting")).status == "Starting"
+
+
 def test_one_screen() -> None:
     crashes = [one for _ in range(50) for one in (CRASH, event("node-restarted", "camera"))]
     verdict = judge(*RUNS, *crashes, CRASH, NODE_FAILED)

@@ -21,6 +21,7 @@ from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import INFINITY
 from dora_systemd.verbs.facts.cells import Cell, read_cell
+from dora_systemd.verbs.reload import switch_hot_reload
 from dora_systemd.verbs.set import set_limits
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options
 
@@ -304,3 +305,21 @@ def test_the_runner_is_told() -> None:
         parse_node_limits("ui:tasks=9"),
     )
     assert node_environment(variables) == {}
+
+
+def test_a_reload_that_systemd_refuses_leaves_nothing(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As with /run nearly full. The drop-in would stay, and hold for the next of this name."""
+
+    def refuse() -> None:
+        raise DoraSystemdError("cannot reload systemd: not enough space available")
+
+    monkeypatch.setattr(place.manager, "reload", refuse)
+    with pytest.raises(DoraSystemdError, match="not enough space"):
+        place.set(node_limit=("camera:memory=2M",))
+    with pytest.raises(DoraSystemdError, match="not enough space"):
+        switch_hot_reload(place.manager, place.scope, place.cell, True, lambda *_: {})
+    assert not place.drop_in.parent.exists()
+    # Unlike one of the kernel's files, this one keeps the digits that are not written over.
+    assert (place.group / "memory.max").read_text() == "1" + str(2 << 20)[1:]

@@ -24,7 +24,20 @@ def test_assignments(key: str, value: str) -> None:
 @pytest.mark.parametrize(
     "text",
     [
-        *("", "A", "=x", "1A=x", "A B=x", "Ä=x", "A=x\ny", "A=\x1b[0m", "A=\udcff", "A\n=x"),
+        *(
+            "",
+            "A",
+            "=x",
+            "1A=x",
+            "A B=x",
+            "Ä=x",
+            "A=x\ny",
+            "A=\x1b[0m",
+            "A=\udcff",
+            "A=\ufdd0",
+            "A=\U0010fffe",
+            "A\n=x",
+        ),
         *("NOTIFY_SOCKET=/run/x", "INVOCATION_ID=x", "A=" + "x" * 131070),
     ],
 )
