@@ -1,11 +1,13 @@
 """Carries out the steps of a history, and records what comes of them."""
 
+import shutil
 import subprocess
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from dora_systemd.adapters.releases.store import store_root
 from tests.history.history import Answer, History, Look
 from tests.history.recorder import (
     Watcher,
@@ -21,6 +23,8 @@ from tests.lab.pace import bound, pace
 from tests.system.cells import Cell, run, wait_for, wait_no_process
 
 QUIET_SECONDS = 40.0
+LOOKS = 5
+"""A look during which something changed, as a node ending late, is taken again."""
 HUNG_SECONDS = 120.0
 ALIVE = frozenset({"running", "ready", "finished", "stopped", "failed"})
 END = ("doractl destroy", *(f"doractl disable {cell}" for cell in CELLS), "doractl reset --all")
@@ -134,9 +138,15 @@ class Driver:
         return process.returncode, out, err
 
     def _look(self, at: int) -> Look:
-        is_quiet = _becomes_quiet()
-        metrics = self.scene.front.get("/metrics").body
-        cells = {cell: view_of(cell, metrics) for cell in CELLS}
+        """One that saw nothing change, if such a one can be had."""
+        for _ in range(LOOKS):
+            is_quiet, before = _becomes_quiet(), _states()
+            metrics = self.scene.front.get("/metrics").body
+            cells = {cell: view_of(cell, metrics) for cell in CELLS}
+            if before == _states() or not is_quiet:
+                break
+        else:
+            is_quiet = False
         return Look(at, is_quiet, pace(), cells, vitals(dict(cells)), time.monotonic())
 
     def _end(self) -> list[Answer]:
@@ -157,6 +167,7 @@ class Driver:
         for cell in CELLS:
             Cell(cell).doractl("disable", cell, check=False)
             Cell(cell).end()
+            shutil.rmtree(store_root(is_user=False) / cell, ignore_errors=True)
         self.scene.front.end()
 
 
@@ -166,7 +177,7 @@ def _becomes_quiet() -> bool:
 
     def is_quiet() -> bool:
         nonlocal last
-        now = [_state_of(cell) for cell in CELLS]
+        now = _states()
         is_same, last = now == last, now
         return is_same and all(map(_is_steady, now))
 
@@ -174,6 +185,10 @@ def _becomes_quiet() -> bool:
         return wait_for("quiet", is_quiet, QUIET_SECONDS)
     except AssertionError:
         return False
+
+
+def _states() -> list[dict[str, str]]:
+    return [_state_of(cell) for cell in CELLS]
 
 
 def _state_of(cell: str) -> dict[str, str]:

@@ -20,6 +20,10 @@ PROPERTIES = (
 SERVICES = {"journald": "systemd-journald.service", "gateway": "dora-gateway.service"}
 
 
+_OF_DEPLOY = "/dora.slice/doractl-"
+"""Units in which a deploy checks and builds a release, before any life of it."""
+
+
 class Watcher:
     """Looks at all processes of the cells again and again, in a thread of its own."""
 
@@ -54,7 +58,8 @@ class Watcher:
                 environment = (directory / "environ").read_bytes().split(b"\0")
                 for cell, mark in self._marks.items():
                     if mark in environment:
-                        yield _sight(cell, directory, environment)
+                        sight = _sight(cell, directory, environment)
+                        yield from () if _OF_DEPLOY in sight.group else (sight,)
             except (OSError, IndexError):
                 continue  # it has ended meanwhile
 

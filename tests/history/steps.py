@@ -24,12 +24,14 @@ class Wish(StrEnum):
 
 @dataclass(frozen=True)
 class Command:
-    """An operator's command. wish: what it asks for. weight: how often it is drawn."""
+    """An operator's command. wish: what it asks for. weight: how often it is drawn. lives: how many
+    it may begin; a deploy that fails has what ran before run again."""
 
     shell: str
     wish: Wish = Wish.NOTHING
     weight: int = 1
     is_for_all: bool = False
+    lives: int = 0
 
 
 @dataclass(frozen=True)
@@ -44,17 +46,23 @@ class Fault:
     kills_runner: bool = False
 
 
-_START = (
-    'doractl start "$place/project/dataflow.yml" --name $name --env "NOTES=$place/notes" '
-    '--writable "$place/notes" --restart-policy on-failure'
+_FLAGS = (
+    '--name $name --env "NOTES=$place/notes" --writable "$place/notes" --restart-policy on-failure'
+)
+_START = f'doractl start "$place/project/dataflow.yml" {_FLAGS}'
+_DEPLOY = f'doractl deploy -q "$place/project/dataflow.yml" {_FLAGS} --soak 1s'
+_DEPLOY_BROKEN = (
+    'rm -rf "$place/broken"; cp -r "$place/project" "$place/broken" || exit 3; '
+    'echo "raise SystemExit(1)" >"$place/broken/node.py"; '
+    f'doractl deploy -q "$place/broken/dataflow.yml" {_FLAGS} --soak 1s'
 )
 
 COMMANDS = {
-    "start": Command(_START, Wish.RUN, 8),
-    "start-quick-grace": Command(f"{_START} --grace-duration 1s", Wish.RUN, 2),
+    "start": Command(_START, Wish.RUN, 8, lives=1),
+    "start-quick-grace": Command(f"{_START} --grace-duration 1s", Wish.RUN, 2, lives=1),
     "stop": Command("doractl stop $name", Wish.STOP, 3),
-    "restart": Command("doractl restart $name", Wish.RUN, 3),
-    "systemctl-restart": Command("systemctl restart $unit", Wish.RUN),
+    "restart": Command("doractl restart $name", Wish.RUN, 3, lives=1),
+    "systemctl-restart": Command("systemctl restart $unit", Wish.RUN, lives=1),
     "systemctl-stop": Command("systemctl stop $unit", Wish.STOP),
     "enable": Command("doractl enable $name"),
     "disable": Command("doractl disable $name"),
@@ -63,6 +71,20 @@ COMMANDS = {
     "set": Command("doractl set $name --hot-reload on", weight=2),
     "set-memory": Command("doractl set $name --memory-limit 3G"),
     "node-restart": Command("doractl node restart $name source", weight=2),
+    "node-stop": Command("doractl node stop $name sink"),
+    "run": Command(
+        f'doractl run "$place/project/dataflow.yml" {_FLAGS} --stop-after 2s >/dev/null',
+        Wish.STOP,
+        lives=1,
+    ),
+    "deploy": Command(_DEPLOY, Wish.RUN, 3, lives=2),
+    "deploy-edited": Command(
+        f'echo "# edited" >>"$place/project/node.py"; {_DEPLOY} --no-enable', Wish.RUN, lives=2
+    ),
+    "deploy-broken": Command(_DEPLOY_BROKEN, Wish.RUN, lives=2),
+    "rollback": Command("doractl rollback -q $name", Wish.RUN, 2, lives=2),
+    "releases": Command("doractl releases $name"),
+    "inhibit": Command("doractl inhibit $name --why driving -- sleep 1"),
     "reset": Command("doractl reset $name"),
     "list": Command("doractl list", is_for_all=True),
     "why": Command("doractl why $name", weight=2),

@@ -7,11 +7,18 @@ from dora_systemd.decisions.views.dataflows import UP_WORDS
 from tests.history.history import Answer, CellView, History, Look
 from tests.history.steps import CELLS, COMMANDS, Step, Wish
 
-UNCHANGED = frozenset({4, 6})
-"""Exit statuses of a command that changes nothing: not found, name in use."""
+UNCHANGED = frozenset({4, 6, 10, 11})
+"""Exit statuses of a command that changes nothing: not found, name in use, inhibited, and rolled
+back to what ran before."""
+_MAKE_A_UUID = ("start", "deploy", "rollback", "run")
 RUNNING = frozenset({"Running", "Degraded"})
 ENDED = frozenset({"Stopped", "Finished"})
-BY_STATE = {"active": RUNNING, "failed": frozenset({"Failed"}), "inactive": ENDED}
+BY_STATE = {
+    "active": RUNNING,
+    "failed": frozenset({"Failed"}),
+    # A stop that calls a restart off leaves systemd inactive, and the last life failed.
+    "inactive": ENDED | {"Failed"},
+}
 
 
 def quiet_looks(history: History) -> Iterator[tuple[Look, str, CellView]]:
@@ -150,4 +157,4 @@ def uuid_is_stable(history: History) -> Iterator[str]:
 
 def _was_started(history: History, cell: str, first: int, last: int) -> bool:
     asked = (one.step for one in history.answers if first < one.at < last)
-    return any(step.what.startswith("start") and step.cell == cell for step in asked)
+    return any(step.what.startswith(_MAKE_A_UUID) and step.cell == cell for step in asked)
