@@ -71,6 +71,10 @@ TOLERATED = (
         "node has no daemon event stream (it may still be starting up",
         "a node still sends to one that has just taken its stop, or has not subscribed yet",
     ),
+    Word(
+        "ignoring stale ProcessHandleReplaced event",
+        "a node was started once more before the daemon took the process of the start before",
+    ),
     Word("Timer event for unknown dataflow", "the daemon starts timers before it notes the run"),
     Word(
         "Unable to create POSIX shm segment",
