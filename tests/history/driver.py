@@ -14,6 +14,7 @@ from tests.history.recorder import (
     journal_lines,
     lost_lines,
     properties,
+    restart_times,
     view_of,
     vitals,
 )
@@ -85,6 +86,7 @@ class Driver:
             {cell: lost_lines(cell, since) for cell in CELLS},
             tuple(sorted(inventory() - before)),
             tuple(end),
+            {cell: restart_times(cell, since) for cell in CELLS},
         )
 
     def _do(self, at: int, step: Step) -> None:

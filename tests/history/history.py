@@ -90,8 +90,9 @@ class History:
     steps: as they were asked for. answers: in the order of their ends. sights: scans of all
     processes of cells, each in the order in which they were seen. printed: by cell and life of a
     node, how many lines it noted. lines: the journal's, in its order. lost: by cell, lines that the
-    journal has counted as lost. left: what is there at the end and was not at the beginning.
-    end: the answers of the commands that end the history.
+    journal has counted as lost. restarts: by cell, when systemd has said that it restarts the unit
+    by itself, CLOCK_MONOTONIC. left: what is there at the end and was not at the beginning. end:
+    the answers of the commands that end the history.
     """
 
     steps: tuple[Step, ...] = ()
@@ -103,3 +104,4 @@ class History:
     lost: Mapping[str, int] = field(default_factory=dict)
     left: tuple[str, ...] = ()
     end: tuple[Answer, ...] = ()
+    restarts: Mapping[str, tuple[float, ...]] = field(default_factory=dict)

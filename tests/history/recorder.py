@@ -17,6 +17,8 @@ PROPERTIES = (
     *("ActiveState", "SubState", "NRestarts", "InvocationID", "MainPID", "ControlGroup", "Result"),
     *("LoadState", "Job", "StatusText"),
 )
+RESTART_SCHEDULED = "5eb03494b6584870a536b337290809b3"
+"""SD_MESSAGE_UNIT_RESTART_SCHEDULED, see sd-messages.h."""
 SERVICES = {"journald": "systemd-journald.service", "gateway": "dora-gateway.service"}
 
 
@@ -141,6 +143,14 @@ def _lines_of(cell: str, since: float) -> Iterator[Line]:
         life, _, number = text.partition(" ")
         if life.partition(".")[0] in ("source", "sink") and number.isdecimal():
             yield Line(cell, life, int(number))
+
+
+def restart_times(cell: str, since: float) -> tuple[float, ...]:
+    """When systemd has said that it restarts the unit by itself, CLOCK_MONOTONIC."""
+    where = (f"UNIT=dora-{cell}.service", f"MESSAGE_ID={RESTART_SCHEDULED}", "_PID=1")
+    found = run("journalctl", "-q", "-o", "json", *where, f"--since=@{since:.6f}").stdout
+    records = map(json.loads, found.splitlines())
+    return tuple(int(one["__MONOTONIC_TIMESTAMP"]) / 1e6 for one in records)
 
 
 def lost_lines(cell: str, since: float) -> int:

@@ -167,6 +167,51 @@ def test_an_interrupted_trial_is_undone(releases: Releases, project: Project) ->
     assert not releases.trial.exists()
 
 
+def test_a_unit_on_trial_is_not_changed(releases: Releases, project: Project) -> None:
+    """What the trial commits, or goes back to, would undo half of the change."""
+    cell = releases.cell
+    write_version(project, "next")
+    with begin(releases, project, "1h") as child:
+        wait_for("it runs", lambda: "version next" in cell.messages("a"))
+        (release,) = releases.states()
+        changes = (("enable",), ("disable",), ("set", "--cpu-weight", "50"), ("set", "--hot-reload", "on"))
+        for verb, *more in changes:
+            refused = cell.doractl(verb, cell.name, *more, check=False)
+            said = f"cannot {verb} {cell.name}: release {release} is on trial"
+            assert (refused.returncode, said in refused.stderr) == (1, True), refused.stderr
+        assert not (ETC / cell.unit).exists()
+        child.send_signal(signal.SIGTERM)
+        assert child.wait() == 11
+    assert not releases.trial.exists()
+
+
+def test_a_disabled_release_is_not_taken_for_the_start_before_it(
+    releases: Releases, project: Project
+) -> None:
+    flow, cell = write_version(project, "started"), releases.cell
+    cell.start(flow)
+    cell.doractl("stop", cell.name)
+    write_version(project, "deployed")
+    releases.deploy(project.root, *FAST)
+    release = releases.current()
+    cell.doractl("stop", cell.name)
+    cell.doractl("disable", cell.name)
+    for verb in ("start", "restart"):
+        refused = cell.doractl(verb, cell.name, check=False)
+        assert f"its release {release} is disabled" in refused.stderr
+        assert f"doractl rollback {cell.name} {release}" in refused.stderr
+        assert (refused.returncode, releases.running()) == (4, "")
+    cell.doractl("rollback", cell.name, release)
+    assert (releases.current(), releases.running()) == (release, release)
+    cell.doractl("stop", cell.name)
+    cell.doractl("disable", cell.name)
+    cell.start(flow)
+    cell.doractl("stop", cell.name)
+    wait_for("systemd has forgotten it", lambda: cell.show("LoadState") == "not-found")
+    cell.doractl("start", cell.name)
+    assert releases.running() == ""
+
+
 def test_a_first_trial_that_was_killed_can_be_ended(releases: Releases, project: Project) -> None:
     cell = releases.cell
     write_version(project, "first")

@@ -12,6 +12,7 @@ from dora_systemd.cli.parameters import (
 from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.selector import find_all
+from dora_systemd.verbs.releases.on_trial import refuse_on_trial
 from dora_systemd.verbs.start.enable import BootUnit, enable_cell
 from dora_systemd.verbs.start.linger import ensure_linger
 
@@ -38,6 +39,8 @@ def command(selectors: tuple[str, ...], boot_check: bool) -> int:
     scope = current_scope()
     bus = Bus(scope)
     chosen = find_all(bus, scope, selectors)
+    for cell in chosen:
+        refuse_on_trial(scope, cell, "enable")
     status = print_outcomes(
         _enabled(cell, *enable_cell(bus, scope, cell, boot_check)) for cell in chosen
     )

@@ -19,6 +19,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.selector import Selector
 from dora_systemd.verbs.node import require_running
+from dora_systemd.verbs.releases.on_trial import refuse_on_trial
 from dora_systemd.verbs.reload import switch_hot_reload
 from dora_systemd.verbs.set import set_limits
 
@@ -46,6 +47,7 @@ def command(selector: str, hot_reload: str | None, force: bool, **flags: Any) ->
     scope = current_scope()
     bus = Bus(scope)
     cell = Selector(selector).find(bus)
+    refuse_on_trial(scope, cell, "set")
     if hot_reload is not None:
         require_running(cell)
     done = _changes(bus, scope, cell, hot_reload, flags, force)

@@ -166,9 +166,9 @@ def story_matches(scope: Scope, name: str, uuid: str) -> list[str]:
     return [*own, "+", *_systemd_matches(scope, name), "+", *asked]
 
 
-def request_matches(scope: Scope, event: str) -> list[str]:
+def request_matches(scope: Scope, *events: str) -> list[str]:
     """Matches for requests of root, or of the user, in that scope."""
-    return [*_asked_matches(scope, event), f"DORA_SCOPE={scope.word}"]
+    return [*_asked_matches(scope, *events), f"DORA_SCOPE={scope.word}"]
 
 
 def _asked_matches(scope: Scope, *events: str) -> list[str]:

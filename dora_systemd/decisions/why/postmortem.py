@@ -85,7 +85,9 @@ def _says_nothing(life: Life, facts: Facts) -> bool:
     names = {one.name for one in life.happenings}
     if facts.status == RESTARTING:
         return names <= {"unit-starting"}
-    return facts.status not in UP_WORDS and names <= _CALLED_OFF and "unit-succeeded" in names
+    # As long as systemd has the unit, everyone sees there that it was stopped.
+    is_known = facts.status in UP_WORDS or facts.status == STOPPED
+    return not is_known and names <= _CALLED_OFF and "unit-succeeded" in names
 
 
 def ended_word(life: Life, known: str = "") -> str:

@@ -55,12 +55,14 @@ def _act(manager: Manager, scope: Scope, cell: Cell, message: PageMessage) -> st
 
 
 def _enable(manager: Manager, scope: Scope, cell: Cell, _message: PageMessage) -> str:
+    _refuse_on_trial(scope, cell, "enable")
     boot, is_news = enable_cell(manager, scope, cell)
     done = f"Dataflow{'' if is_news else ' already'} enabled: {cell.uuid} ({cell.name})"
     return _joined(done, str(boot.path), ensure_linger(scope))
 
 
 def _disable(manager: Manager, scope: Scope, cell: Cell, _message: PageMessage) -> str:
+    _refuse_on_trial(scope, cell, "disable")
     done = disable_cell(manager, scope, cell)
     return f"Dataflow {'disabled' if done else 'not enabled'}: {cell.uuid} ({cell.name})"
 
@@ -71,6 +73,7 @@ def _reload(_manager: Manager, scope: Scope, cell: Cell, message: PageMessage) -
 
 
 def _set(manager: Manager, scope: Scope, cell: Cell, message: PageMessage) -> str:
+    _refuse_on_trial(scope, cell, "set")
     limits, switch = dict(message.values), message.values.get(HOT_RELOAD)
     limits.pop(HOT_RELOAD, None)
     done: list[str] = []
@@ -81,6 +84,13 @@ def _set(manager: Manager, scope: Scope, cell: Cell, message: PageMessage) -> st
         switch_hot_reload(manager, scope, cell, switch == "on")
         done.append(f"Hot reload {switch}: {cell.uuid} ({cell.name})")
     return _joined(*done)
+
+
+def _refuse_on_trial(scope: Scope, cell: Cell, verb: str) -> None:
+    # Imported late: few change a unit, and its imports are memory.
+    from dora_systemd.verbs.releases.on_trial import refuse_on_trial
+
+    refuse_on_trial(scope, cell, verb)
 
 
 def _roll_back(manager: Manager, scope: Scope, name: str, release: str) -> str:

@@ -68,11 +68,11 @@ def change_release(
     Raises DoraSystemdError: ROLLED_BACK if it has failed its trial; INHIBITED before that, and
     NOT_RUNNING if what ran has ended in a wait. SIGINT, SIGTERM and SIGHUP roll back, too.
     """
-    if is_boot_checked(standing.boot.text or ""):
-        change = replace(change, text=with_boot_check(change.text))
     running, verb = standing.running, change.verb
     with uninhibited(scope, running, verb, change.how, lambda text: tell(waiting(text))):
         standing = read_after_wait(manager, scope, standing, verb)
+        if is_boot_checked(standing.boot.text or ""):
+            change = replace(change, text=with_boot_check(change.text))
         for cell in standing.running:
             note_request("stop-asked", cell.name, cell.uuid, change.by)
         if not standing.running:

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from dora_systemd.verbs.start.plan import Plan, StartRequest
 
 EVENT = "start-asked"
+COMMITTED = "release-committed"
 _INIT = "1"
 """PID 1 adds LogExtraFields= of a unit to its own records, so the unit's owner writes in them."""
 
@@ -113,12 +114,14 @@ def find_start(
     """The dataflow that is meant: what systemd knows, else the last start in the journal.
 
     is_changed: the last start in any case, for other settings. Raises DoraSystemdError as
-    Selector.find_enabled() if there is neither, or this user may not read the journal.
+    Selector.find_enabled() if there is neither, or this user may not read the journal; NOT_FOUND
+    if it ran from a release after that start, for a start of the project is not what was deployed.
     """
     try:
         cell = selector.find_enabled(manager, scope)
     except DoraSystemdError as error:
         if error.code is ExitCode.NOT_FOUND and (found := _readable(scope, selector)):
+            _refuse_released(scope, found)
             return found
         raise
     if not is_changed:
@@ -134,6 +137,17 @@ def _readable(scope: Scope, selector: Selector) -> Asked | None:
     with suppress(DoraSystemdError):
         return find_asked(scope, selector)
     return None
+
+
+def _refuse_released(scope: Scope, asked: Asked) -> None:
+    name = f"DORA_DATAFLOW_NAME={asked.name}"
+    matches = [*request_matches(scope, EVENT, COMMITTED), name]
+    newest = next(JournalReader().newest(matches, 1), {})
+    if newest.get("DORA_EVENT") == COMMITTED:
+        release = newest.get("DORA_RELEASE")
+        message = f"cannot start {asked.name}: its release {release} is disabled"
+        hint = f"doractl rollback {asked.name} {release}, or doractl start {asked.dataflow}"
+        raise DoraSystemdError(message, hint, ExitCode.NOT_FOUND)
 
 
 def _asked(scope: Scope, matches: list[str]) -> Iterator[Asked]:

@@ -342,6 +342,8 @@ def test_a_restart_that_is_called_off_says_nothing() -> None:
     ]
     verdict = judge(*lost, *called_off)
     assert (verdict.status, verdict.summary) == ("Failed", "gone")
+    known = judge(*lost, *called_off, facts=Facts("Stopped"))  # `list` says what systemd does
+    assert (known.status, known.summary) == ("Stopped", "stopped by root")
     begun = [*called_off[:2], event("dataflow-starting", life="2"), *called_off[2:]]
     assert judge(*lost, *begun).status == "Stopped"
     assert judge(*lost, unit("unit-starting", "2"), facts=Facts("Starting")).status == "Starting"

@@ -121,6 +121,15 @@ def test_a_good_history_breaks_nothing() -> None:
     assert check(GOOD) == []
 
 
+def test_a_restart_before_a_start_counts() -> None:
+    """The start sets systemd's counter to 0 again."""
+    lives = {"sights": ((sight("i"), sight("j", seen_s=2.0), sight("k", seen_s=2.5)),)}
+    answers = {"answers": (answer(0, "start"), answer(2, "start"))}
+    assert check(replace(GOOD, **lives, **answers)) != []
+    assert check(replace(GOOD, **lives, **answers, restarts={A: (1.5,)})) == []
+    assert check(replace(GOOD, **lives, **answers, restarts={A: (0.5,), B: (1.5,)})) != []
+
+
 @pytest.mark.parametrize(("name", "changes"), BROKEN)
 def test_an_invariant_is_broken(name: str, changes: dict[str, Any]) -> None:
     complaints = check(replace(GOOD, **changes))
