@@ -13,6 +13,7 @@ from tests.history.recorder import (
     Watcher,
     journal_lines,
     lost_lines,
+    pids_of,
     properties,
     restart_times,
     view_of,
@@ -199,6 +200,8 @@ def _state_of(cell: str) -> dict[str, str]:
     status = Cell(cell).status if path.exists() else None
     states = status.nodes.values() if status else ()
     found["nodes"] = " ".join(node.state for node in states)
+    # A node can have died a moment before the runner hears of it.
+    found["pids"] = str({at: one for at, one in pids_of(found).items() if at.startswith("node-")})
     found["stage"] = status.stage if status else ""
     return found
 

@@ -110,7 +110,7 @@ def view_of(cell: str, metrics: str) -> CellView:
     listed = next((row for row in rows if row.get("name") == cell), None)
     why = ask("why", cell)
     why = why if isinstance(why, dict) and "summary" in why else None
-    return CellView(unit, listed, why, _metrics(metrics, cell), _pids(unit))
+    return CellView(unit, listed, why, _metrics(metrics, cell), pids_of(unit))
 
 
 def _metrics(text: str, cell: str) -> dict[str, float]:
@@ -124,7 +124,8 @@ def _metrics(text: str, cell: str) -> dict[str, float]:
     return found
 
 
-def _pids(unit: dict[str, str]) -> dict[str, tuple[int, ...]]:
+def pids_of(unit: dict[str, str]) -> dict[str, tuple[int, ...]]:
+    """The processes of a unit, by its groups."""
     if not unit.get("ControlGroup"):
         return {}
     root = cgroup.group_path(unit["ControlGroup"])

@@ -174,7 +174,12 @@ def test_a_unit_on_trial_is_not_changed(releases: Releases, project: Project) ->
     with begin(releases, project, "1h") as child:
         wait_for("it runs", lambda: "version next" in cell.messages("a"))
         (release,) = releases.states()
-        changes = (("enable",), ("disable",), ("set", "--cpu-weight", "50"), ("set", "--hot-reload", "on"))
+        changes = (
+            ("enable",),
+            ("disable",),
+            ("set", "--cpu-weight", "50"),
+            ("set", "--hot-reload", "on"),
+        )
         for verb, *more in changes:
             refused = cell.doractl(verb, cell.name, *more, check=False)
             said = f"cannot {verb} {cell.name}: release {release} is on trial"
