@@ -85,8 +85,7 @@ def _says_nothing(life: Life, facts: Facts) -> bool:
     names = {one.name for one in life.happenings}
     if facts.status == RESTARTING:
         return names <= {"unit-starting"}
-    # As long as systemd has the unit, everyone sees there that it was stopped.
-    is_known = facts.status in UP_WORDS or facts.status == STOPPED
+    is_known = facts.status in {*UP_WORDS, STOPPED}  # systemd has the unit, where anyone sees it
     return not is_known and names <= _CALLED_OFF and "unit-succeeded" in names
 
 

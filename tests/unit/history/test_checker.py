@@ -123,11 +123,11 @@ def test_a_good_history_breaks_nothing() -> None:
 
 def test_a_restart_before_a_start_counts() -> None:
     """The start sets systemd's counter to 0 again."""
-    lives = {"sights": ((sight("i"), sight("j", seen_s=2.0), sight("k", seen_s=2.5)),)}
-    answers = {"answers": (answer(0, "start"), answer(2, "start"))}
-    assert check(replace(GOOD, **lives, **answers)) != []
-    assert check(replace(GOOD, **lives, **answers, restarts={A: (1.5,)})) == []
-    assert check(replace(GOOD, **lives, **answers, restarts={A: (0.5,), B: (1.5,)})) != []
+    sights = ((sight("i"), sight("j", seen_s=2.0), sight("k", seen_s=2.5)),)
+    twice = replace(GOOD, sights=sights, answers=(answer(0, "start"), answer(2, "start")))
+    assert check(twice) != []
+    assert check(replace(twice, restarts={A: (1.5,)})) == []
+    assert check(replace(twice, restarts={A: (0.5,), B: (1.5,)})) != []
 
 
 @pytest.mark.parametrize(("name", "changes"), BROKEN)

@@ -16,7 +16,7 @@ LATE = {
     },
     "the gateway does without it until somebody looks at releases, or rolls back": {
         "gateway.live.about": {"decisions.views.releases", "verbs.releases.listing"},
-        "gateway.live.act": {"verbs.releases.rollback"},
+        "gateway.live.act": {"verbs.releases.on_trial", "verbs.releases.rollback"},
     },
     "only some verbs wrap, and only on a terminal": {
         "terminal_text": {"textwrap"},
