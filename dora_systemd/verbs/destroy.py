@@ -67,6 +67,9 @@ def stop_gateway(manager: Manager, scope: Scope) -> bool:
     up = [unit for unit in _GATEWAY if _state(manager, unit) not in DOWN]
     if up:
         manager.run_jobs("StopUnit", up)
+    for unit in _GATEWAY:
+        if _state(manager, unit) == "failed":  # as after SIGKILL; systemd would keep it
+            manager.reset_failed(unit)
     written = [path for path in written_files(manager, scope) if read_unit_file(path) is not None]
     for path in written:
         remove_unit_file(path)

@@ -83,10 +83,9 @@ def examine(lives: Sequence[Life], facts: Facts, shutdowns: Sequence[int] = ()) 
 def _says_nothing(life: Life, facts: Facts) -> bool:
     """Whether the runner of a restart still waits for its delay, or was stopped before it began."""
     names = {one.name for one in life.happenings}
-    if facts.status == RESTARTING:
-        return names <= {"unit-starting"}
-    is_known = facts.status in {*UP_WORDS, STOPPED}  # systemd has the unit, where anyone sees it
-    return not is_known and names <= _CALLED_OFF and "unit-succeeded" in names
+    if facts.status in {*UP_WORDS, STOPPED}:  # systemd has the unit, where anyone sees it
+        return facts.status == RESTARTING and names <= {"unit-starting"}
+    return names <= _CALLED_OFF and "unit-succeeded" in names
 
 
 def ended_word(life: Life, known: str = "") -> str:

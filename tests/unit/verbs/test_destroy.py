@@ -130,6 +130,16 @@ def test_the_gateway(systemd: Systemd, scope: ScopeIn) -> None:
     assert [path.name for path in runtime.iterdir()] == ["dora-other.service"]
 
 
+def test_a_gateway_that_was_killed_leaves_no_failed_unit(
+    systemd: Systemd, scope: ScopeIn, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    systemd.units[SERVICE_UNIT] = {"LoadState": "loaded", "ActiveState": "failed"}
+    done: list[str] = []
+    monkeypatch.setattr(systemd, "reset_failed", done.append)
+    stop_gateway(systemd, scope)
+    assert done == [SERVICE_UNIT]
+
+
 @pytest.mark.parametrize(
     ("others", "stopped", "told"),
     [
