@@ -1,5 +1,6 @@
 """The one error class, and the exit statuses of doractl."""
 
+import os
 from enum import IntEnum
 
 
@@ -42,3 +43,10 @@ class DoraSystemdError(Exception):
 
 class TimedOut(DoraSystemdError):
     """A check took too long. It says nothing of what was checked, so a restart may help."""
+
+
+def words_of(error: Exception) -> str:
+    """What an exception says, in the words of errno(3) alone if it has such a number."""
+    if isinstance(error, OSError) and error.errno:
+        return os.strerror(error.errno)
+    return str(error) or type(error).__name__

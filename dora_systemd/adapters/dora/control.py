@@ -15,7 +15,7 @@ from dora_systemd.decisions.dora.protocol import (
     encode_request,
     parse_frame,
 )
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, words_of
 from dora_systemd.trust.sockets import plain
 
 if TYPE_CHECKING:
@@ -134,7 +134,7 @@ def read_coordinator(path: Path) -> Coordinator:
 
 def _unreachable(where: str, error: Exception) -> DoraSystemdError:
     hint = "see `doractl list`; a dataflow that starts or stops has no coordinator for a moment"
-    reason = plain(str(error) or type(error).__name__)
+    reason = plain(words_of(error))
     return DoraSystemdError(f"cannot reach the dora coordinator{where}: {reason}", hint)
 
 

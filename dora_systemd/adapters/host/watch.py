@@ -8,7 +8,7 @@ from pathlib import Path
 
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.reload.watch_rules import DEFAULT_WATCH, WatchRules
-from dora_systemd.errors import DoraSystemdError
+from dora_systemd.errors import DoraSystemdError, words_of
 from dora_systemd.names import settings_path
 from dora_systemd.trust.files import read_file
 
@@ -140,7 +140,7 @@ async def _bursts(rules: WatchRules) -> AsyncIterator[frozenset[str]]:
             message = f"cannot watch {rules.root}: the kernel gives no more inotify watches"
             hint = "raise sysctl fs.inotify.max_user_watches, or exclude files with --ignore"
             raise DoraSystemdError(message, hint) from error
-        raise DoraSystemdError(f"cannot watch {rules.root}: {error}") from error
+        raise DoraSystemdError(f"cannot watch {rules.root}: {words_of(error)}") from error
     except RuntimeError as error:  # from watchfiles: the kernel has no inotify instance left
         hint = "raise sysctl fs.inotify.max_user_instances"
         raise DoraSystemdError(f"cannot watch {rules.root}: {error}", hint) from error

@@ -14,7 +14,7 @@ from dora_systemd.adapters.runner_socket.address import listen
 from dora_systemd.adapters.runner_socket.client import MAX_BYTES, Request, parse_line
 from dora_systemd.adapters.runner_socket.splice import Ends, splice, taken_over
 from dora_systemd.decisions.dora.coordinator import Coordinator
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, words_of
 
 if TYPE_CHECKING:  # most dataflows run on one machine
     from dora_systemd.adapters.runner_socket.door import Door
@@ -91,7 +91,7 @@ async def _relay(caller: Ends, reach: Reach) -> None:
         hint = "it may be starting or stopping; see doractl list"
         message = "cannot reach the dora coordinator"
         own = error if isinstance(error, DoraSystemdError) else None
-        lost = own or DoraSystemdError(f"{message}: {error}", hint, ExitCode.NOT_RUNNING)
+        lost = own or DoraSystemdError(f"{message}: {words_of(error)}", hint, ExitCode.NOT_RUNNING)
         await _send(caller.writer, _refusal(lost))
         return
     await _send(caller.writer, {"token": coordinator.token})

@@ -5,10 +5,10 @@ it. So the head looks before each run. zenoh says nothing of a connection that e
 """
 
 import asyncio
-import os
 from collections.abc import Mapping
 
 from dora_systemd.decisions.machines.address import endpoint
+from dora_systemd.errors import words_of
 
 _SECONDS = 3.0
 
@@ -30,6 +30,5 @@ async def _problem(address: str, port: int) -> str:
     except TimeoutError:
         return f"cannot connect to {endpoint(address, port)}: timed out"
     except OSError as error:
-        reason = os.strerror(error.errno) if error.errno else str(error)
-        return f"cannot connect to {endpoint(address, port)}: {reason}"
+        return f"cannot connect to {endpoint(address, port)}: {words_of(error)}"
     return ""

@@ -21,7 +21,7 @@ from dora_systemd.decisions.logs.events import ROLLED_BACK
 from dora_systemd.decisions.releases.progress import Step, going_back, judged, stopping, waiting
 from dora_systemd.decisions.unit.file import is_boot_checked, with_boot_check
 from dora_systemd.decisions.why.faults import Fault
-from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.errors import DoraSystemdError, ExitCode, words_of
 from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.values import INFINITY
@@ -102,7 +102,7 @@ def _try(
         except DoraSystemdError as error:
             fault = Fault(error.message)
         except Exception as error:  # a terminal that is gone, too
-            fault = Fault(f"the command failed: {error}")
+            fault = Fault(f"the command failed: {words_of(error)}")
         if fault is not None:
             _ignore_signals()
             raise _roll_back(manager, standing, change, fault, mark, tell)
