@@ -11,7 +11,7 @@ from dora_systemd.trust.paths import refusal
 from dora_systemd.values import shown
 
 MAX_DEPTH = 64
-"""Maximum nesting: libyaml's composer recurses in C and crashes on some 100,000 levels."""
+"""Maximum nesting: libyaml's composer recurses in C; before 0.2.6 some 100,000 levels crash it."""
 
 MAX_VALUES = 100_000
 """Maximum values in a YAML file: a small file can have enough of them to take seconds."""
@@ -73,6 +73,8 @@ def parse_yaml(text: str, path: Path, allow_empty: bool = False) -> object:
         _check_shape(text, path)
         document = yaml.load(text, Loader=Loader)
     except yaml.YAMLError as error:
+        if "maximum nesting depth" in str(error):
+            raise _too_deep(path) from error
         raise refusal(path, _yaml_reason(error), "correct the YAML there") from error
     except (ValueError, ArithmeticError, RecursionError, LookupError, AttributeError) as error:
         # PyYAML raises the last two for tags such as `!!float ""` and `!!timestamp x`.
@@ -120,10 +122,15 @@ def _check_shape(text: str, path: Path) -> None:
     for count, event in enumerate(yaml.parse(text, Loader=Loader)):
         depth += isinstance(event, yaml.CollectionStartEvent)
         depth -= isinstance(event, yaml.CollectionEndEvent)
-        if depth > MAX_DEPTH or count > MAX_VALUES:
-            what = f"nested more than {MAX_DEPTH} levels deep"
-            reason = what if depth > MAX_DEPTH else f"more than {MAX_VALUES} values"
-            raise refusal(path, f"it is {reason}", "make it simpler")
+        if depth > MAX_DEPTH:
+            raise _too_deep(path)
+        if count > MAX_VALUES:
+            raise refusal(path, f"it is more than {MAX_VALUES} values", "make it simpler")
+
+
+def _too_deep(path: Path) -> DoraSystemdError:
+    """The same text for our limit and for that of libyaml 0.2.6, which is 1000 levels."""
+    return refusal(path, f"it is nested more than {MAX_DEPTH} levels deep", "make it simpler")
 
 
 def _yaml_reason(error: Exception) -> str:
