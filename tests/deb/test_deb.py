@@ -71,7 +71,16 @@ def lines(user: str, node: str) -> list[str]:
 
 
 def wait_for_plot(user: str, seen: int = 0) -> None:
-    wait_for(f"{user}'s robot plots", lambda: len(lines(user, "plot")) > seen, 120)
+    try:
+        wait_for(f"{user}'s robot plots", lambda: len(lines(user, "plot")) > seen, 120)
+    except AssertionError as error:
+        raise AssertionError(f"{error}, after {seen} lines\n{last_words(user)}") from None
+
+
+def last_words(user: str) -> str:
+    """What a person would look at next."""
+    looks = ("list", "top --once", "why robot", "logs robot --lines 60 -o short-precise")
+    return "\n".join(sh(f"doractl {look} 2>&1", user, check=False).stdout for look in looks)
 
 
 def start(flows: dict[str, Path]) -> None:

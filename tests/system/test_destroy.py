@@ -3,6 +3,7 @@
 import json
 import os
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -25,9 +26,17 @@ FAILING = "import sys, dora\nnode = dora.Node()\nsys.exit(3)\n"
 SLICE = Path("/sys/fs/cgroup/dora.slice")
 
 
-def test_all_of_it(front: Front, cell: Cell, project: Project) -> None:
-    flow = project.three_nodes()
+@pytest.fixture
+def others(cell: Cell) -> Iterator[list[Cell]]:
+    """Two more dataflows, ended even if the test fails: what failed is the news then."""
     others = [Cell(f"{cell.name}-{n}") for n in (1, 2)]
+    yield others
+    for one in others:
+        one.end()
+
+
+def test_all_of_it(front: Front, cell: Cell, others: list[Cell], project: Project) -> None:
+    flow = project.three_nodes()
     for one in (cell, *others):
         one.start(flow)
     front.up()
