@@ -98,8 +98,8 @@ def node_event(cell: Cell, event: life.Event) -> Next:
     """Update the live table for an event of a node, and record what it means."""
     is_open = cell.ready_us > 0
     stops = _is_stopping(cell)
-    nodes, record = table.update(cell.nodes, event, is_stopping=stops, is_open=is_open)
-    actions = () if record is None else (table.with_downstream(record, cell.downstream),)
+    nodes, records = table.update(cell.nodes, event, is_stopping=stops, is_open=is_open)
+    actions = (table.with_downstream(one, cell.downstream) for one in records)
     return replace(cell, nodes=nodes), (*oom_of_all(event), *actions)
 
 

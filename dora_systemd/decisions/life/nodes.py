@@ -12,7 +12,7 @@ from dora_systemd.decisions.life.states import Record
 from dora_systemd.values import SECOND, format_duration
 
 NodeTable = Mapping[str, NodeStatus]
-Update = tuple[NodeTable, Record | None]
+Change = tuple[NodeTable, Record | None]
 """The table after an event, and the life event for the journal."""
 
 WITH_PROCESS = frozenset({"starting", "ready", "running"})
@@ -41,11 +41,27 @@ def all_ready(nodes: NodeTable, at_us: int) -> NodeTable:
     }
 
 
-def update(nodes: NodeTable, event: life.Event, *, is_stopping: bool, is_open: bool) -> Update:
-    """The table after an event, and the record for the journal.
+def update(
+    nodes: NodeTable, event: life.Event, *, is_stopping: bool, is_open: bool
+) -> tuple[NodeTable, tuple[Record, ...]]:
+    """The table after an event, and the records for the journal.
 
     is_open: whether dora's start barrier is open; then a ready node runs, even if it is alone.
+    Each restart that the table counts is recorded, so `list` and `why` have the same number.
     """
+    after, record = _changed(nodes, event, is_stopping, is_open)
+    return after, (*([record] if record else []), *_restarted(nodes, after))
+
+
+def _restarted(before: NodeTable, after: NodeTable) -> list[Record]:
+    return [
+        Record("node-restarted", ident, {"restarts": str(node.restarts)})
+        for ident, node in after.items()
+        if ident in before and node.restarts > before[ident].restarts
+    ]
+
+
+def _changed(nodes: NodeTable, event: life.Event, is_stopping: bool, is_open: bool) -> Change:
     record: Record | None = None
     match event:
         case life.NodeSpawned():
@@ -103,11 +119,11 @@ def is_held_up(nodes: NodeTable) -> bool:
     return bool(lacking(nodes)) and all(node.state in done for node in nodes.values())
 
 
-def _needs(nodes: NodeTable, event: life.NodeLacks | life.NodeMet) -> Update:
+def _needs(nodes: NodeTable, event: life.NodeLacks | life.NodeMet) -> Change:
     return _met(nodes, event) if isinstance(event, life.NodeMet) else _lacks(nodes, event)
 
 
-def _lacks(nodes: NodeTable, event: life.NodeLacks) -> Update:
+def _lacks(nodes: NodeTable, event: life.NodeLacks) -> Change:
     old = nodes.get(event.node, NodeStatus())
     # Its end is told as a wait: what was wrong with it before is over.
     ended: dict[str, str | int] = {"hung": "", "silent": "", "is_ended": False}
@@ -117,7 +133,7 @@ def _lacks(nodes: NodeTable, event: life.NodeLacks) -> Update:
     return nodes, Record("node-waiting", event.node, {"reason": event.needs})
 
 
-def _met(nodes: NodeTable, event: life.NodeMet) -> Update:
+def _met(nodes: NodeTable, event: life.NodeMet) -> Change:
     old = nodes.get(event.node, NodeStatus())
     if old.state != "waiting":
         return nodes, None
@@ -126,14 +142,14 @@ def _met(nodes: NodeTable, event: life.NodeMet) -> Update:
     return nodes, Record("node-needs-met", event.node, {"reason": f"after {after}"})
 
 
-def _hung(nodes: NodeTable, event: life.NodeHung) -> Update:
+def _hung(nodes: NodeTable, event: life.NodeHung) -> Change:
     if event.node not in nodes:
         return nodes, None
     nodes = {**nodes, event.node: nodes[event.node]._replace(hung=event.reason)}
     return nodes, Record(event.record, event.node, {"reason": event.reason, **event.details})
 
 
-def _heard(nodes: NodeTable, event: life.NodeSilent | life.NodeSpeaks) -> Update:
+def _heard(nodes: NodeTable, event: life.NodeSilent | life.NodeSpeaks) -> Change:
     """An owed output of a node is missing, or has come."""
     if event.node not in nodes:
         return nodes, None
@@ -146,20 +162,20 @@ def _heard(nodes: NodeTable, event: life.NodeSilent | life.NodeSpeaks) -> Update
     return {**nodes, event.node: changed}, record
 
 
-def _spawned(nodes: NodeTable, event: life.NodeSpawned) -> Update:
+def _spawned(nodes: NodeTable, event: life.NodeSpawned) -> Change:
     old = nodes.get(event.node, NodeStatus())
     if old.state == "failed" and old.policy == LATCHED:
         # Its launcher, which fails in its place: dora gives the node up.
         return {**nodes, event.node: old._replace(policy="never")}, None
     if old.state == "waiting":
         return {**nodes, event.node: old._replace(pid=event.pid)}, None
-    nodes = _set(nodes, event.node, event.at_us, state="starting", pid=event.pid)
-    if old.state != "restarting":
-        return nodes, None
-    return nodes, Record("node-restarted", event.node, {"restarts": str(old.restarts)})
+    # Counted only now: a node that is stopped before is not restarted.
+    count = old.restarts + (old.state == "restarting")
+    at_us, pid = event.at_us, event.pid
+    return _set(nodes, event.node, at_us, state="starting", pid=pid, restarts=count), None
 
 
-def _exited(nodes: NodeTable, event: life.NodeExited, is_stopping: bool) -> Update:
+def _exited(nodes: NodeTable, event: life.NodeExited, is_stopping: bool) -> Change:
     old = nodes.get(event.node, NodeStatus())
     if old.state == "reloading" and not is_stopping and not event.is_stale:
         nodes = {**nodes, event.node: old._replace(pid=0)}
@@ -194,7 +210,6 @@ def _exited(nodes: NodeTable, event: life.NodeExited, is_stopping: bool) -> Upda
         silent="",
         is_ended=False,
         needs="",
-        restarts=old.restarts + int(event.will_restart and not is_stopping),
     )
     return nodes, record
 

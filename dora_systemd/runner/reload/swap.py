@@ -137,7 +137,8 @@ def _is_settled(node: NodeStatus) -> bool:
 
 def _is_restartable(node: NodeStatus) -> bool:
     """Whether dora would start the node again: only then RestartNode is sent, as a restart."""
-    return node.policy != "never" and not 0 < node.max_restarts <= node.restarts
+    used = node.restarts + (node.state == "restarting")
+    return node.policy != "never" and not 0 < node.max_restarts <= used
 
 
 def _status(definition: Mapping[str, Any], kind: str) -> NodeStatus:

@@ -10,8 +10,8 @@ RUNNING = {"a": NodeStatus("running", 7, restarts=2, policy=HELD)}
 
 
 def reshape(nodes: NodeTable, event: life.Event) -> NodeTable:
-    after, record = update(nodes, event, is_stopping=False, is_open=True)
-    assert record is None
+    after, records = update(nodes, event, is_stopping=False, is_open=True)
+    assert not records
     return after
 
 
@@ -20,8 +20,8 @@ def updated(nodes: dict[str, NodeStatus], *events: life.Event) -> list[str]:
     found = []
     table: NodeTable = nodes
     for event in events:
-        table, record = update(table, event, is_stopping=False, is_open=True)
-        found.append(f"{table['a'].state} {record.event if record else ''}".strip())
+        table, records = update(table, event, is_stopping=False, is_open=True)
+        found.append(" ".join((table["a"].state, *(one.event for one in records))))
     return found
 
 
@@ -47,11 +47,34 @@ def test_the_old_one_may_end_after_its_successor_has_begun() -> None:
 
 
 def test_a_node_that_is_held_fails_and_is_not_restarted() -> None:
-    nodes, record = update(
+    nodes, (record,) = update(
         RUNNING, life.NodeExited(1, "a", exit_of(1), True), is_stopping=False, is_open=True
     )
-    assert record is not None
     assert (nodes["a"].state, nodes["a"].restarts, record.event) == ("failed", 2, "node-crashed")
+
+
+CRASHING = {"a": NodeStatus("running", 7, policy="on-failure")}
+
+
+def test_a_restart_counts_when_it_happens() -> None:
+    """A node that is stopped in its restart delay is not restarted; `why` would not list it."""
+    nodes, records = update(
+        CRASHING, life.NodeExited(1, "a", exit_of(1), True), is_stopping=False, is_open=True
+    )
+    assert [one.event for one in records] == ["node-crashed"]
+    assert (nodes["a"].state, nodes["a"].restarts) == ("restarting", 0)
+    nodes, records = update(nodes, life.NodeSpawned(2, "a", 8), is_stopping=False, is_open=True)
+    assert records == (Record("node-restarted", "a", {"restarts": "1"}),)
+    assert (nodes["a"].state, nodes["a"].restarts) == ("starting", 1)
+
+
+def test_an_exit_that_comes_after_the_restart_is_told_first() -> None:
+    assert updated(
+        CRASHING,
+        life.NodeSpawned(1, "a", 8),
+        life.NodeExited(2, "a", exit_of(1), True, is_stale=True),
+        life.NodeReady(3, "a"),
+    ) == ["starting", "starting node-crashed node-restarted", "running node-ready"]
 
 
 def test_processes_of_a_node_that_reloads() -> None:
