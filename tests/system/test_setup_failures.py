@@ -55,6 +55,23 @@ def test_one_cause_in_the_same_words(cell: Cell, project: Project) -> None:
 
 
 @pytest.mark.warns("Failed", "status=226", "No such file", "exited")
+def test_a_restart_that_never_began(cell: Cell, project: Project) -> None:
+    """The last that we have recorded is a stop."""
+    place, words = binds(project)
+    place.mkdir()
+    cell.start(project.three_nodes(), *words)
+    place.rmdir()
+    assert SANDBOX in cell.doractl("restart", cell.name, check=False).stderr
+    wait_failed(cell)
+    assert told(cell) == {SANDBOX}
+    cell.doractl("reset", cell.name)
+    wait_for("it is unloaded", lambda: cell.show("LoadState") == "not-found")
+    assert told(cell) == {SANDBOX}
+    rows = json.loads(cell.doractl("list", "--all", "-o", "json").stdout)
+    assert [one["status"] for one in rows if one["name"] == cell.name] == ["Failed"]
+
+
+@pytest.mark.warns("Failed", "status=226", "No such file", "exited")
 def test_lives_that_never_began_are_restarts(cell: Cell, project: Project) -> None:
     place, words = binds(project)
     policy = ("--restart-policy", "always", "--max-restarts", "1000")

@@ -18,7 +18,12 @@ from dora_systemd.adapters.journal.journalctl import (
     open_journalctl,
 )
 from dora_systemd.decisions.cell.exits import KILLED
-from dora_systemd.decisions.logs.query import journal_timestamp, scope_matches, start_matches
+from dora_systemd.decisions.logs.query import (
+    failure_matches,
+    journal_timestamp,
+    scope_matches,
+    start_matches,
+)
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import is_name, is_node_id, is_uuid, name_from_unit, unit_name
 from dora_systemd.scope import Scope
@@ -154,6 +159,15 @@ class JournalReader:
         """The newest starts of the unit of a dataflow, CLOCK_REALTIME µs, newest first."""
         records = self.newest(start_matches(scope, name), limit)
         return [int(one["__REALTIME_TIMESTAMP"]) for one in records]
+
+    def failures(self, scope: Scope) -> dict[str, int]:
+        """When the unit of each dataflow failed last by systemd's records, CLOCK_REALTIME µs."""
+        found: dict[str, int] = {}
+        field = "USER_UNIT" if scope.is_user else "UNIT"
+        for record in self.newest(failure_matches(scope), _MOST_NAMES):
+            if name := name_from_unit(str(record.get(field, ""))):
+                found.setdefault(name, int(record["__REALTIME_TIMESTAMP"]))
+        return found
 
     def killed_since(self, scope: Scope, name: str, uuid: str, since_us: int) -> list[str]:
         """The nodes of a dataflow that were killed while it stopped; CLOCK_REALTIME µs."""

@@ -24,7 +24,10 @@ LEVELS = {
 UNIT_STARTING = "7d4958e842da4a758f6c1cdc7b36dcc5"
 """MESSAGE_ID of systemd's record when it begins to start a unit."""
 
-UNIT_ENDS = ("7ad2d189f7e94e70a38c781354912448", "d9b373ed55a64feb8242e02dbe79a49c")
+UNIT_FAILED = "d9b373ed55a64feb8242e02dbe79a49c"
+"""MESSAGE_ID of systemd's record when a unit has failed."""
+
+UNIT_ENDS = ("7ad2d189f7e94e70a38c781354912448", UNIT_FAILED)
 
 ALL_LINES = "all"
 """As a number of lines: no restriction, and no default of --follow."""
@@ -156,6 +159,11 @@ def _systemd_matches(scope: Scope, name: str) -> list[str]:
 def start_matches(scope: Scope, name: str) -> list[str]:
     """Matches for systemd's records of the starts of a unit, also of one that never began."""
     return [*_systemd_matches(scope, name), f"MESSAGE_ID={UNIT_STARTING}"]
+
+
+def failure_matches(scope: Scope) -> list[str]:
+    """Matches for systemd's records of units that have failed, whosever they are."""
+    return [f"_UID={scope.uid}" if scope.is_user else "_PID=1", f"MESSAGE_ID={UNIT_FAILED}"]
 
 
 def story_matches(scope: Scope, name: str, uuid: str) -> list[str]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from dora_systemd.decisions.logs.events import REQUESTS
-from dora_systemd.decisions.logs.query import UNIT_STARTING
+from dora_systemd.decisions.logs.query import UNIT_FAILED, UNIT_STARTING
 
 # https://github.com/systemd/systemd/blob/main/src/systemd/sd-messages.h
 UNIT_MESSAGES = {
@@ -18,7 +18,7 @@ UNIT_MESSAGES = {
     "de5b426a63be47a7b6ac3eaac82e2f6f": "unit-stopping",
     "9d1aaa27d60140bd96365438aad20286": "unit-stopped",
     "7ad2d189f7e94e70a38c781354912448": "unit-succeeded",
-    "d9b373ed55a64feb8242e02dbe79a49c": "unit-failed",
+    UNIT_FAILED: "unit-failed",
     "98e322203f7a4ed290d09fe03c09fe15": "process-exited",
     "5eb03494b6584870a536b337290809b3": "unit-restart",
     "fe6faa94e7774663a0da52717891d8ef": "unit-oom",

@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 from dora_systemd.adapters.bus.manager import Manager
@@ -15,6 +16,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.reason import failure_reason
 
 _WORDS = {"dataflow-finished": FINISHED, "dataflow-stopped": STOPPED, "dataflow-failed": FAILED}
+_CLEAN = ("dataflow-finished", "dataflow-stopped")
 _MOST_NAMES = 100
 _TIMES = ("InactiveEnterTimestamp", "InactiveExitTimestamp")
 
@@ -104,5 +106,25 @@ def ended_row(event: LastEvent) -> DataflowRow:
 def _last_events(scope: Scope, **what: Any) -> list[LastEvent]:
     # Without access to the journal, the rows from systemd are still shown.
     with contextlib.suppress(DoraSystemdError):
-        return JournalReader().last_events(scope, **what)
+        events = JournalReader().last_events(scope, **what)
+        return _with_later_failures(scope, events)
     return []
+
+
+def _with_later_failures(scope: Scope, events: list[LastEvent]) -> list[LastEvent]:
+    """The events; the last start of a dataflow may have failed before our code recorded anything.
+
+    As when systemd cannot set up the sandbox for the second half of a restart.
+    """
+    if not any(event.event in _CLEAN for event in events):
+        return events
+    failures = JournalReader().failures(scope)
+    newest = {event.name: event for event in reversed(events)}
+    return [
+        replace(event, event="dataflow-starting", at_us=failures[event.name], detail="")
+        if event.event in _CLEAN
+        and event is newest[event.name]
+        and event.at_us < failures.get(event.name, 0)
+        else event
+        for event in events
+    ]

@@ -5,11 +5,12 @@ from typing import Any
 import pytest
 
 from dora_systemd.adapters.journal.reader import JournalReader, LastEvent
+from dora_systemd.decisions.life.causes import NO_END
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts import lives
-from dora_systemd.verbs.facts.ended import ended_row, newest_ended, not_recorded
+from dora_systemd.verbs.facts.ended import ended_row, ended_rows, newest_ended, not_recorded
 from dora_systemd.verbs.facts.list import read_rows
 from tests.unit.fakes.manager import UUID, FakeManager, options
 
@@ -57,6 +58,7 @@ class Events:
 
 
 SCOPE = Scope(is_user=False, uid=0)
+RUNS = ((UUID, 30), (OTHER, 25))
 
 
 @pytest.fixture
@@ -71,9 +73,15 @@ def manager() -> FakeManager:
     return found
 
 
-def ended(manager: FakeManager, journal: Events, limit: int | None = None) -> list[DataflowRow]:
+def ended(
+    manager: FakeManager,
+    journal: Events,
+    limit: int | None = None,
+    failures: dict[str, int] | None = None,
+) -> list[DataflowRow]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(JournalReader, "last_events", lambda _self, *one, **two: journal(*one, **two))
+        patch.setattr(JournalReader, "failures", lambda _self, _scope: failures or {})
         # This machine may have a journal, with dataflows of these names in it.
         patch.setattr(lives, "read_lives", lambda *_one, **_two: [])
         return newest_ended(manager, SCOPE, read_rows(manager, SCOPE), limit)
@@ -116,3 +124,25 @@ def test_an_enabled_one_that_systemd_has_loaded_again(manager: FakeManager) -> N
     manager.add(options("still"), "inactive", InactiveEnterTimestamp=0)
     event = LastEvent("still", UUID, "dataflow-stopped", 60, "")
     assert [row.ended for row in ended(manager, Events(event))] == [60, 20]
+
+
+def test_a_start_that_failed_before_it_recorded_anything(manager: FakeManager) -> None:
+    """Our last event is of the run before it, which was stopped, as by a restart."""
+    journal = Events(
+        LastEvent("gone", UUID, "dataflow-stopped", 30, ""),
+        LastEvent("done", OTHER, "dataflow-finished", 20, ""),
+    )
+    rows = {row.name: row for row in ended(manager, journal, failures={"gone": 31, "done": 19})}
+    assert (rows["gone"].status, rows["gone"].ended) == ("Failed", 31)
+    assert rows["gone"].text == NO_END
+    assert (rows["done"].status, rows["done"].ended) == ("Finished", 20)
+
+
+def test_a_failure_is_of_the_newest_run_of_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    stops = [LastEvent("gone", one, "dataflow-stopped", at, "") for one, at in RUNS]
+    monkeypatch.setattr(JournalReader, "last_events", lambda _self, _scope: stops)
+    monkeypatch.setattr(JournalReader, "failures", lambda _self, _scope: {"gone": 31})
+    assert [(row.uuid, row.status) for row in ended_rows(SCOPE)] == [
+        (UUID, "Failed"),
+        (OTHER, "Stopped"),
+    ]
