@@ -46,7 +46,8 @@ from pathlib import Path
 from dora_systemd.adapters.host.guard import guarded
 place = Path({place!r})
 (place / "lock").touch()
-signal.signal(signal.SIGQUIT, signal.SIG_DFL)  # a shell's "&" has it ignored
+for one in (signal.SIGQUIT, signal.SIGHUP):  # a shell's "&" and nohup have them ignored
+    signal.signal(one, signal.SIG_DFL)
 def kill_both(number):
     children = Path(f"/proc/self/task/{{os.getpid()}}/children").read_text().split()
     assert len(children) == 1
