@@ -32,6 +32,9 @@ from dora_systemd.verbs.setup import text_of
 
 PORT_FILE = f"{SOCKET_UNIT}.d/50-port.conf"
 
+_CONNECTION = "a connection, maybe one that ended within the last minute"
+"""The kernel can have given the port to a client of anything; it keeps it a while, see tcp(7)."""
+
 
 def check_machine(reach: Callable[[Scope], Manager], scope: Scope) -> None:
     """Raise DoraSystemdError for the first problem that `doractl doctor` finds."""
@@ -133,4 +136,4 @@ def _holder(port: int) -> str:
     if named:
         return str(named[-1])
     users = ", ".join(user_name(uid, nameless="the user ") for uid in sorted(listener_uids(port)))
-    return f"a process of {users}" if users else "another process"
+    return f"a process of {users}" if users else _CONNECTION

@@ -11,7 +11,6 @@ STEPS = 14
 
 @pytest.mark.lab
 @pytest.mark.parametrize("seed", [3])
-def test_history(seed: int, reserved_ports: None) -> None:
-    del reserved_ports
+def test_history(seed: int) -> None:
     complaints = check(run_history(generate(seed, STEPS)))
     assert not complaints, "\n".join(f"{one.invariant}: {one.text}" for one in complaints)
