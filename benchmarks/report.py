@@ -27,6 +27,7 @@ TITLES = {
     "logs": "Log path",
     "messages": "Messages",
     "reload": "Hot reload",
+    "deploy": "Deploy",
     "owes": "Owed outputs",
     "machines": "Between machines",
     "spread": "Start over two machines",
