@@ -55,8 +55,8 @@ def write_version(project: Project, version: int) -> None:
     """Write a version of the project: all of it, with a source that differs."""
     project.write("source.py", f"{SOURCE}# version {version}\n")
     project.write("sink.py", SINK)
-    project.write("flow.yml", SOURCE_YAML + SINK_YAML.format(1))
-    project.write("flow.systemd.yml", SETTINGS)
+    project.write("dataflow.yml", SOURCE_YAML + SINK_YAML.format(1))
+    project.write("dataflow.systemd.yml", SETTINGS)
 
 
 def deploy(project: Project, *more: str) -> None:
