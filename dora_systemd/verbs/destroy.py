@@ -20,10 +20,12 @@ from dora_systemd.errors import DoraSystemdError
 from dora_systemd.names import SLICE, name_from_unit
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell, proven, read_cell, read_cells
+from dora_systemd.verbs.facts.enabled import own_directories
 from dora_systemd.verbs.facts.reading import slice_group
 from dora_systemd.verbs.stop import (
     KILLED_SECONDS,
     POLL_SECONDS,
+    drop_disabled,
     end_links_of,
     release_enabled,
     stop_within,
@@ -53,13 +55,16 @@ def stop_all(
     for _ in range(_ROUNDS):
         cells = [cell for cell in running_cells(manager) if cell.unit not in given_up]
         if not cells:
-            return
+            break
         for one in stop_within(manager, cells, 0 if want_kill else None, now):
             given_up |= {one.cell.unit} if one.problem else set()
             note = f" ({one.note})" if one.note else ""
             yield Outcome(one.cell, f"  ✓ {one.cell.name} stopped{note}", one.problem)
         end_links_of(manager, cells)
         release_enabled(manager, scope, [cell.unit for cell in cells])
+    # Those that systemctl has stopped, too.
+    files = own_directories(manager, scope)[1].glob("dora-*.service")
+    drop_disabled(manager, scope, [path.name for path in files])
 
 
 def stop_gateway(manager: Manager, scope: Scope) -> bool:

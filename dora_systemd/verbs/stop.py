@@ -11,9 +11,10 @@ from dora_systemd.decisions.life.stop_budget import kill_delay
 from dora_systemd.decisions.views.outcome import Outcome, Subject
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.scope import Scope
+from dora_systemd.trust.paths import exists
 from dora_systemd.values import INFINITY, SECOND, format_duration
 from dora_systemd.verbs.facts.cells import Cell
-from dora_systemd.verbs.facts.enabled import enabled_units
+from dora_systemd.verbs.facts.enabled import enabled_units, own_directories
 from dora_systemd.verbs.facts.reason import failure_reason, job_reason
 from dora_systemd.verbs.start.asked import note_request
 
@@ -62,6 +63,7 @@ def stop_cells(
     ]
     end_links_of(manager, cells)
     release_enabled(manager, scope, up)
+    drop_disabled(manager, scope, [cell.unit for cell in cells])
     return outcomes
 
 
@@ -73,6 +75,7 @@ def stop_cells_within(
     ended = {one.cell: one for one in stop_within(manager, up, most)}
     end_links_of(manager, cells)
     release_enabled(manager, scope, [cell.unit for cell in up])
+    drop_disabled(manager, scope, [cell.unit for cell in cells])
     return [
         Outcome(cell, _stopped(cell, ended[cell].note), ended[cell].problem)
         if cell in ended
@@ -129,6 +132,25 @@ def release_enabled(manager: Manager, scope: Scope, units: Sequence[str]) -> Non
         manager.reload()  # see lost_units()
 
 
+def drop_disabled(manager: Manager, scope: Scope, units: Sequence[str]) -> None:
+    """For dataflows that were disabled while running, and are inactive: remove the unit file."""
+    if not units:
+        return
+    directory = own_directories(manager, scope)[1]
+    for unit in [one for one in units if exists(directory / one)]:
+        # Imported late, as above; and hardly ever needed.
+        from dora_systemd.adapters.host.unit_files import read_unit_file
+        from dora_systemd.decisions.unit.file import runner_of
+        from dora_systemd.verbs.start.enable import drop_unit_files, read_boot_unit
+
+        with suppress(DoraSystemdError):
+            boot = read_boot_unit(manager, scope, unit)
+            is_ours = runner_of(read_unit_file(boot.runtime) or "") is not None
+            state = manager.read(unit, ["ActiveState"])["ActiveState"]
+            if is_ours and boot.text is None and state == "inactive":
+                drop_unit_files(manager, boot)
+
+
 def end_links_of(manager: Manager, cells: Sequence[Cell]) -> None:
     """End the links of those that were the head of several machines."""
     known = (one.known_options for one in cells)
@@ -155,12 +177,14 @@ def restart_cells(
     return [_restart_outcome(manager, cell, results[cell.unit]) for cell in cells]
 
 
-def reset_cells(manager: Manager, cells: Sequence[Cell]) -> list[Outcome]:
+def reset_cells(manager: Manager, scope: Scope, cells: Sequence[Cell]) -> list[Outcome]:
     """Clear the restarts used up by each dataflow, and its failure; what runs goes on running.
 
     A failed unit that nothing else holds is gone from systemd then, its logs stay.
     """
-    return [_reset(manager, cell) for cell in cells]
+    outcomes = [_reset(manager, cell) for cell in cells]
+    drop_disabled(manager, scope, [cell.unit for cell in cells])
+    return outcomes
 
 
 def note_stop(cells: Iterable[Cell], command: str = "doractl stop") -> None:

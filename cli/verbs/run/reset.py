@@ -30,10 +30,11 @@ def command(selectors: tuple[str, ...], want_all: bool) -> int:
       doractl reset --all
     """
     require_names_or_all("reset", selectors, want_all)
-    bus = Bus(current_scope())
+    scope = current_scope()
+    bus = Bus(scope)
     cells = read_cells(bus)
     named = (one.loaded(cells) for one in selectors_of(selectors, cells))
     chosen = proven(cells) if want_all else list(named)
     if want_all and not chosen:
         tell("No dataflow.")
-    return print_outcomes(reset_cells(bus, list(dict.fromkeys(chosen))))
+    return print_outcomes(reset_cells(bus, scope, list(dict.fromkeys(chosen))))

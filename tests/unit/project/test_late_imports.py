@@ -64,7 +64,8 @@ LATE = {
         "verbs.list": {"verbs.facts.ended"},
         "runner.nodes.losses": {"adapters.journal.reader"},
         "verbs.stop": {
-            *("adapters.journal.reader", "verbs.start.claim", "verbs.start.enable"),
+            *("adapters.host.unit_files", "adapters.journal.reader", "decisions.unit.file"),
+            *("verbs.start.claim", "verbs.start.enable"),
         },
     },
     "pydantic: only a settings file needs it": {

@@ -169,10 +169,10 @@ UNIT = "dora-robot.service"
 def test_reset_of_what_runs() -> None:
     manager = FakeManager()
     manager.add(options(), NRestarts=3)
-    (outcome,) = reset_cells(manager, read_cells(manager))
+    (outcome,) = reset_cells(manager, SCOPE, read_cells(manager))
     assert outcome.text == f"Dataflow reset: {UUID} (robot, restart counter reset, was 3)"
     assert manager.calls == [("reset", UNIT)]
-    (again,) = reset_cells(manager, read_cells(manager))
+    (again,) = reset_cells(manager, SCOPE, read_cells(manager))
     assert again.text.endswith("(robot, restart counter reset, was 0)")
 
 
