@@ -1,8 +1,9 @@
 """Sequences of steps from a seed. Pure: the same seed gives the same steps, on every machine."""
 
+from collections.abc import Mapping
 from random import Random
 
-from tests.history.steps import CELLS, COMMANDS, FAULTS, LOOK, Step, Wish
+from tests.history.steps import CELLS, COMMANDS, FAULTS, LOOK, Fault, Step, Wish
 
 LOOK_EVERY = 6
 COMMAND_SHARE = 0.6
@@ -19,18 +20,22 @@ SOON_MS = (0, 30, 100, 300, 700)
 PAUSES_MS = (0, 0, 0, 50, 200, 600, 1500)
 
 
-def generate(seed: int, count: int) -> list[Step]:
-    """`count` steps, the looks among them not counted; the first starts a dataflow."""
+def generate(seed: int, count: int, has_machine: bool = False) -> list[Step]:
+    """`count` steps, the looks among them not counted; the first starts a dataflow.
+
+    has_machine: with the faults that need a machine of their own.
+    """
     random, up = Random(seed), {CELLS[0]}
+    faults = {name: one for name, one in FAULTS.items() if has_machine or not one.needs_machine}
     steps = [Step("start"), Step(LOOK)]
     for number in range(1, count):
-        steps.append(_step(random, up, steps[-1]))
+        steps.append(_step(random, up, steps[-1], faults))
         if number % LOOK_EVERY == 0:
             steps.append(Step(LOOK))
     return steps if steps[-1].what == LOOK else [*steps, Step(LOOK)]
 
 
-def _step(random: Random, up: set[str], before: Step) -> Step:
+def _step(random: Random, up: set[str], before: Step, faults: Mapping[str, Fault]) -> Step:
     """up: the cells that should run if all goes well; a fault needs something to hit."""
     if before.what in FAULTS and random.random() < ANSWERED_SHARE:
         what = random.choice(AFTER_FAULTS)
@@ -39,7 +44,7 @@ def _step(random: Random, up: set[str], before: Step) -> Step:
     if before.what in COMMANDS and random.random() < HIT_SHARE:
         return Step(random.choice(IN_COMMANDS), before.cell, random.choice(SOON_MS), is_joined=True)
     cell = random.choices(CELLS, (3, 1))[0]
-    what = _command(random) if random.random() < COMMAND_SHARE else _fault(random)
+    what = _command(random) if random.random() < COMMAND_SHARE else _fault(random, faults)
     if cell not in up and random.random() < START_SHARE:
         what = "start"
     _note_wish(what, cell, up)
@@ -59,6 +64,6 @@ def _command(random: Random) -> str:
     return random.choices(list(COMMANDS), [one.weight for one in COMMANDS.values()])[0]
 
 
-def _fault(random: Random) -> str:
-    weights = [one.weight for one in FAULTS.values()]
-    return random.choices(list(FAULTS), weights)[0]
+def _fault(random: Random, faults: Mapping[str, Fault]) -> str:
+    weights = [one.weight for one in faults.values()]
+    return random.choices(list(faults), weights)[0]

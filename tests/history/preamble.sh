@@ -67,3 +67,14 @@ empty_run() {
     [ -e "$WORK/run_size" ] || return 0
     mount -o "remount,size=$(cat "$WORK/run_size")" /run && rm "$WORK/run_size"
 }
+
+# clock HOW MUCH: the clock jumps
+clock() { date -s "@$(date -d "now $*" +%s.%N)" >/dev/null; }
+
+# fill_memory: a process takes all there is, until the kernel kills that one
+fill_memory() {
+    systemd-run --quiet --wait --property=OOMScoreAdjust=1000 \
+        /usr/bin/python3 -c 'kept = []
+while True: kept.append(b"x" * 2**24)'
+    return 0
+}

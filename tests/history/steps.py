@@ -38,12 +38,13 @@ class Command:
 class Fault:
     """A fault. undo: takes it back before the next look. weight: how often it is drawn, 0 only as
     an answer to a command. kills_runner: the runner may be killed between a line and the note that
-    it is written."""
+    it is written. needs_machine: only a machine with its own kernel can have it."""
 
     shell: str
     undo: str = ""
     weight: int = 2
     kills_runner: bool = False
+    needs_machine: bool = False
 
 
 _FLAGS = (
@@ -132,6 +133,9 @@ FAULTS = {
         'mountpoint -q "$place/project" && umount -l "$place/project"',
     ),
     "directory-deleted": Fault('rm -r "/run/dora-systemd/$name"', weight=1),
+    "clock-forward": Fault("clock +1 hour", "clock -1 hour", needs_machine=True),
+    "clock-to-new-year": Fault("clock +60 days", "clock -60 days", 1, needs_machine=True),
+    "memory-full": Fault("fill_memory", needs_machine=True),
 }
 
 

@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import pytest
 
+from tests.history.found import FOUND
 from tests.history.generator import generate
 from tests.history.scene import PREAMBLE
 from tests.history.script import format_script
@@ -20,12 +21,24 @@ def test_a_seed_gives_the_same_steps() -> None:
 
 
 def test_every_step_is_drawn_sooner_or_later() -> None:
-    drawn = {step.what for seed in SEEDS for step in generate(seed, 20)}
+    drawn = {step.what for seed in SEEDS for step in generate(seed, 20, has_machine=True)}
     assert drawn == {*COMMANDS, *FAULTS, LOOK}
+
+
+def test_a_container_has_no_faults_of_a_machine() -> None:
+    drawn = {step.what for seed in SEEDS for step in generate(seed, 20)}
+    assert FAULTS.keys() - drawn == {name for name, one in FAULTS.items() if one.needs_machine}
 
 
 def test_no_name_is_both() -> None:
     assert not COMMANDS.keys() & FAULTS.keys()
+
+
+@pytest.mark.parametrize("what", FOUND)
+def test_what_was_found_is_a_history(what: str) -> None:
+    steps = FOUND[what]
+    assert {step.what for step in steps} <= {*COMMANDS, *FAULTS, LOOK}
+    assert steps[0].what in ("start", "deploy")
 
 
 @pytest.mark.parametrize("seed", range(20))
