@@ -7,7 +7,7 @@ Memory and CPU are those of all processes of a link, at both ends.
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 
@@ -18,11 +18,12 @@ from tests.system.cells import SINK, SOURCE, Cell, Project, run, wait_for
 
 HOME = Path("/srv/bench")
 NAME = "spread"
+IDLE, BUSY = "idle", "20 messages/s"
 MEMBER = "b"
-_IDLE_SECONDS = 60.0
+_SECONDS = 60.0
 ONE, LOGIN = "one machine", "ssh b true"
 _YAML = """nodes:
-  - {{id: source, path: source.py, inputs: {{tick: dora/timer/millis/50}}, outputs: [number]}}
+  - {{id: source, path: source.py, inputs: {{tick: dora/timer/{tick}}}, outputs: [number]}}
   - {{id: sink, path: sink.py, inputs: {{double: source/number}}{deploy}}}
 """
 _LINKS = ("systemctl", "list-units", "--plain", "--no-legend", "doralink-*")
@@ -59,9 +60,11 @@ def make_home() -> dict[str, Path]:
     project.write("source.py", SOURCE)
     project.write("sink.py", SINK)
     project.write("costs.py", _COSTS)
+    spread, busy = ", deploy: {machine: b}", "millis/50"
     files = {
-        OURS: project.write("two.yml", _YAML.format(deploy=", deploy: {machine: b}")),
-        ONE: project.write("one.yml", _YAML.format(deploy="")),
+        OURS: project.write("two.yml", _YAML.format(deploy=spread, tick=busy)),
+        ONE: project.write("one.yml", _YAML.format(deploy="", tick=busy)),
+        IDLE: project.write("idle.yml", _YAML.format(deploy=spread, tick="secs/10")),
     }
     subprocess.run(["scp", "-q", "-r", str(HOME), f"root@{MEMBER}:{HOME.parent}"], check=True)
     return files
@@ -76,16 +79,21 @@ def seconds_of(*command: str) -> float:
 
 def start(file: Path) -> float:
     """Start it; the seconds until all nodes are ready."""
-    flags = (f"--machine={MEMBER}={MEMBER}",) if file.stem == "two" else ()
+    flags = () if file.stem == "one" else (f"--machine={MEMBER}={MEMBER}",)
     return seconds_of("doractl", "start", str(file), "--name", NAME, *flags)
 
 
 def start_ms(file: Path) -> float:
     """One start, and a stop behind the clock."""
     seconds = start(file)
+    end_cell()
+    return seconds * 1000
+
+
+def end_cell() -> None:
+    """Stop it, and wait for its links."""
     Cell(NAME).end()
     wait_for("the links have ended", lambda: not run(*_LINKS).stdout)
-    return seconds * 1000
 
 
 def login_ms() -> float:
@@ -104,18 +112,26 @@ def costs(machine: str) -> tuple[float, float, float]:
     return rss / 1000, pss / 1000, on_cpu / 1e9
 
 
-def idle(file: Path) -> list[Figure]:
-    """What a link costs at both ends, while the dataflow runs."""
-    start(file)
+def share(machine: str) -> float:
+    """Percent of a processor that a link takes there."""
+    before = costs(machine)[2]
+    time.sleep(_SECONDS)
+    return 100 * (costs(machine)[2] - before) / _SECONDS
+
+
+def link_costs(files: Mapping[str, Path]) -> list[Figure]:
+    """What a link takes at both ends, while the dataflow runs."""
     figures = []
-    for end, machine, goal in (("head", "a", "≤ 25 MB"), ("member", MEMBER, "≤ 20 MB")):
-        rss, pss, before = costs(machine)
-        time.sleep(_IDLE_SECONDS)
-        share = 100 * (costs(machine)[2] - before) / _IDLE_SECONDS
-        figures.append(Figure(f"memory of a link at the {end}, RSS", "MB", {OURS: [rss]}, goal))
-        figures.append(Figure(f"memory of a link at the {end}, PSS", "MB", {OURS: [pss]}))
-        figures.append(Figure(f"CPU of a link at the {end}", "%", {OURS: [share]}, "≤ 0.1 %"))
-    Cell(NAME).end()
+    for what, file in ((IDLE, files[IDLE]), (BUSY, files[OURS])):
+        start(file)
+        for end, machine, most in (("head", "a", 25), ("member", MEMBER, 20)):
+            link, goal = f"of a link at the {end}", "≤ 0.1 %" if what == IDLE else ""
+            if what == IDLE:
+                rss, pss, _ = costs(machine)
+                figures.append(Figure(f"memory {link}, RSS", "MB", {OURS: [rss]}, f"≤ {most} MB"))
+                figures.append(Figure(f"memory {link}, PSS", "MB", {OURS: [pss]}))
+            figures.append(Figure(f"CPU {link}, {what}", "%", {OURS: [share(machine)]}, goal))
+        end_cell()
     return [*map(shown, figures)]
 
 
@@ -123,14 +139,14 @@ def measure(rounds: int) -> list[Figure]:
     """Starts in turns, then what the link costs."""
     files = make_home()
     measures: dict[str, Callable[[], float]] = {
-        name: partial(start_ms, file) for name, file in files.items()
+        name: partial(start_ms, files[name]) for name in (OURS, ONE)
     }
     measures[LOGIN] = login_ms
     for warm_up in measures.values():
         warm_up()
     what = "start to all of 2 nodes ready, over two machines"
     figure = alternate(what, "ms", measures, rounds, goal="≤ 1.3 × one machine")
-    return [figure, *idle(files[OURS])]
+    return [figure, *link_costs(files)]
 
 
 if __name__ == "__main__":
