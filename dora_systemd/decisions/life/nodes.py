@@ -50,7 +50,10 @@ def update(
     Each restart that the table counts is recorded, so `list` and `why` have the same number.
     """
     after, record = _changed(nodes, event, is_stopping, is_open)
-    return after, (*([record] if record else []), *_restarted(nodes, after))
+    own, restarted = [record] if record else [], _restarted(nodes, after)
+    # A stale exit was before the restart. What else tells of a restart comes from the new process.
+    is_stale = isinstance(event, life.NodeExited) and event.is_stale
+    return after, (*own, *restarted) if is_stale else (*restarted, *own)
 
 
 def _restarted(before: NodeTable, after: NodeTable) -> list[Record]:
@@ -68,7 +71,8 @@ def _changed(nodes: NodeTable, event: life.Event, is_stopping: bool, is_open: bo
             nodes, record = _spawned(nodes, event)
         case life.NodeReady():
             state = "running" if is_open else "ready"
-            nodes = _set(nodes, event.node, event.at_us, state=state)
+            count = _count(nodes.get(event.node, NodeStatus()))
+            nodes = _set(nodes, event.node, event.at_us, state=state, restarts=count)
             record = Record("node-ready", event.node)
         case life.NodeExited():
             nodes, record = _exited(nodes, event, is_stopping)
@@ -162,6 +166,15 @@ def _heard(nodes: NodeTable, event: life.NodeSilent | life.NodeSpeaks) -> Change
     return {**nodes, event.node: changed}, record
 
 
+def _count(old: NodeStatus) -> int:
+    """The restarts of a node of which a process was heard.
+
+    Counted only then: a node that is stopped before is not restarted. That the process was executed
+    may be said before the exit of the one before, so any word of it counts.
+    """
+    return old.restarts + (old.state == "restarting")
+
+
 def _spawned(nodes: NodeTable, event: life.NodeSpawned) -> Change:
     old = nodes.get(event.node, NodeStatus())
     if old.state == "failed" and old.policy == LATCHED:
@@ -169,10 +182,8 @@ def _spawned(nodes: NodeTable, event: life.NodeSpawned) -> Change:
         return {**nodes, event.node: old._replace(policy="never")}, None
     if old.state == "waiting":
         return {**nodes, event.node: old._replace(pid=event.pid)}, None
-    # Counted only now: a node that is stopped before is not restarted.
-    count = old.restarts + (old.state == "restarting")
     at_us, pid = event.at_us, event.pid
-    return _set(nodes, event.node, at_us, state="starting", pid=pid, restarts=count), None
+    return _set(nodes, event.node, at_us, state="starting", pid=pid, restarts=_count(old)), None
 
 
 def _exited(nodes: NodeTable, event: life.NodeExited, is_stopping: bool) -> Change:
@@ -206,6 +217,7 @@ def _exited(nodes: NodeTable, event: life.NodeExited, is_stopping: bool) -> Chan
         state=_state_after(event, is_stopping),
         pid=0,
         exit=event.exit,
+        restarts=_count(old),
         hung="",
         silent="",
         is_ended=False,

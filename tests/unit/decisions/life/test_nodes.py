@@ -1,5 +1,7 @@
 """The live table while reloads change which nodes there are."""
 
+import pytest
+
 from dora_systemd.decisions.cell.exits import Exit, exit_of
 from dora_systemd.decisions.cell.status import HELD, NodeStatus
 from dora_systemd.decisions.life import events as life
@@ -75,6 +77,44 @@ def test_an_exit_that_comes_after_the_restart_is_told_first() -> None:
         life.NodeExited(2, "a", exit_of(1), True, is_stale=True),
         life.NodeReady(3, "a"),
     ) == ["starting", "starting node-crashed node-restarted", "running node-ready"]
+
+
+CRASH = exit_of(1)
+
+
+@pytest.mark.parametrize(
+    "events, expected",
+    [
+        # As on a head: it does not know whether the exit of a node elsewhere is stale.
+        (
+            (
+                life.NodeSpawned(1, "a", 0),
+                life.NodeExited(2, "a", CRASH, True),
+                life.NodeReady(3, "a"),
+            ),
+            ["starting", "restarting node-crashed", "running node-restarted node-ready"],
+        ),
+        # In a crash loop: the new process had ended, too, when dora said so of the old one.
+        (
+            (
+                life.NodeSpawned(1, "a", 8),
+                life.NodeExited(2, "a", CRASH, True),
+                life.NodeExited(3, "a", CRASH, True),
+                life.NodeSpawned(4, "a", 9),
+            ),
+            [
+                "starting",
+                "restarting node-crashed",
+                "restarting node-restarted node-crashed",
+                "starting node-restarted",
+            ],
+        ),
+    ],
+)
+def test_a_restart_counts_by_any_word_of_the_new_process(
+    events: tuple[life.Event, ...], expected: list[str]
+) -> None:
+    assert updated(CRASHING, *events) == expected
 
 
 def test_processes_of_a_node_that_reloads() -> None:
