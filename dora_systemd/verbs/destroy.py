@@ -55,16 +55,21 @@ def stop_all(
     for _ in range(_ROUNDS):
         cells = [cell for cell in running_cells(manager) if cell.unit not in given_up]
         if not cells:
-            break
+            return
         for one in stop_within(manager, cells, 0 if want_kill else None, now):
             given_up |= {one.cell.unit} if one.problem else set()
             note = f" ({one.note})" if one.note else ""
             yield Outcome(one.cell, f"  ✓ {one.cell.name} stopped{note}", one.problem)
         end_links_of(manager, cells)
         release_enabled(manager, scope, [cell.unit for cell in cells])
-    # Those that systemctl has stopped, too.
-    files = own_directories(manager, scope)[1].glob("dora-*.service")
-    drop_disabled(manager, scope, [path.name for path in files])
+
+
+def drop_all_disabled(manager: Manager, scope: Scope) -> None:
+    """Remove the unit files of disabled dataflows, also of those that systemctl has stopped."""
+    with suppress(DoraSystemdError):
+        files = own_directories(manager, scope)[1].glob("dora-*.service")
+        units = [path.name for path in files if name_from_unit(path.name)]
+        drop_disabled(manager, scope, units)
 
 
 def stop_gateway(manager: Manager, scope: Scope) -> bool:

@@ -5,8 +5,9 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 
-from dora_systemd.adapters.bus.manager import DOWN, JOB_DONE, Manager, Observer
+from dora_systemd.adapters.bus.manager import DOWN, JOB_DONE, Manager, Observer, is_at_rest
 from dora_systemd.decisions.life.stop_budget import kill_delay
 from dora_systemd.decisions.views.outcome import Outcome, Subject
 from dora_systemd.errors import DoraSystemdError
@@ -14,7 +15,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import exists
 from dora_systemd.values import INFINITY, SECOND, format_duration
 from dora_systemd.verbs.facts.cells import Cell
-from dora_systemd.verbs.facts.enabled import enabled_units, own_directories
+from dora_systemd.verbs.facts.enabled import enabled_units, own_directories, trial_path
 from dora_systemd.verbs.facts.reason import failure_reason, job_reason
 from dora_systemd.verbs.start.asked import note_request
 
@@ -136,19 +137,28 @@ def drop_disabled(manager: Manager, scope: Scope, units: Sequence[str]) -> None:
     """For dataflows that were disabled while running, and are inactive: remove the unit file."""
     if not units:
         return
-    directory = own_directories(manager, scope)[1]
-    for unit in [one for one in units if exists(directory / one)]:
-        # Imported late, as above; and hardly ever needed.
-        from dora_systemd.adapters.host.unit_files import read_unit_file
-        from dora_systemd.decisions.unit.file import runner_of
-        from dora_systemd.verbs.start.enable import drop_unit_files, read_boot_unit
+    with suppress(DoraSystemdError):
+        directory = own_directories(manager, scope)[1]
+        left = [directory / unit for unit in units if exists(directory / unit)]
+        if disabled := [one for one in left if _is_disabled(manager, scope, one)]:
+            # Imported late, as above; and hardly ever needed.
+            from dora_systemd.verbs.start.enable import remove_files
 
-        with suppress(DoraSystemdError):
-            boot = read_boot_unit(manager, scope, unit)
-            is_ours = runner_of(read_unit_file(boot.runtime) or "") is not None
-            state = manager.read(unit, ["ActiveState"])["ActiveState"]
-            if is_ours and boot.text is None and state == "inactive":
-                drop_unit_files(manager, boot)
+            remove_files(manager, disabled)
+
+
+def _is_disabled(manager: Manager, scope: Scope, copy: Path) -> bool:
+    """Whether it is what `disable` has kept of a dataflow that ran, and is of no more use."""
+    from dora_systemd.adapters.host.unit_files import read_unit_file
+    from dora_systemd.decisions.unit.file import is_without_install
+
+    with suppress(DoraSystemdError):
+        state = manager.read(copy.name, ["ActiveState", "Job"])
+        # A failed one can be started again, and what is on trial may go back to it.
+        is_over = is_at_rest(state) and state["ActiveState"] == "inactive"
+        is_needed = not is_over or exists(trial_path(scope, copy.name))
+        return not is_needed and is_without_install(read_unit_file(copy) or "", copy.name)
+    return False
 
 
 def end_links_of(manager: Manager, cells: Sequence[Cell]) -> None:

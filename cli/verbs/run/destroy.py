@@ -9,6 +9,7 @@ from dora_systemd.errors import ExitCode
 from dora_systemd.names import SLICE
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.destroy import (
+    drop_all_disabled,
     processes_left,
     running_cells,
     stop_all,
@@ -36,6 +37,7 @@ def command(force: bool) -> int:
     scope = current_scope()
     bus = Bus(scope)
     is_good = _stop_dataflows(bus, scope, force)
+    drop_all_disabled(bus, scope)
     was_up = read_gateway(bus).is_up
     if was_up:
         tell("Shutting down daemon...")

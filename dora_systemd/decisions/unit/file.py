@@ -19,7 +19,7 @@ from dora_systemd.decisions.properties.assignments import (
 from dora_systemd.decisions.properties.kinds import Property
 from dora_systemd.decisions.properties.structs import MS_REC
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.names import release_of, unit_description
+from dora_systemd.names import release_of, unit_description, unit_name
 
 BOOT_TARGET = "dora.target"
 """Starts the enabled dataflows at boot, if it is installed; no other unit waits for it."""
@@ -82,6 +82,13 @@ def without_install(text: str) -> str:
     sections = _sections([text])
     sections["Unit"] = [line for line in sections["Unit"] if line != _BOOT_CHECK_ORDER]
     return HEADER + format_sections(sections)
+
+
+def is_without_install(text: str, unit: str) -> bool:
+    """Whether it is what without_install() has made of the unit file of this unit."""
+    options = runner_of(text)
+    is_own = options is not None and unit_name(options.name) == unit
+    return is_own and text.startswith(HEADER) and "\n[Install]\n" not in text
 
 
 def with_boot_check(text: str) -> str:

@@ -45,3 +45,8 @@ def own_directories(manager: Manager, scope: Scope) -> tuple[Path, Path]:
     root = str(scope.runtime_root)
     lasting, fleeting = unit_directories(manager.unit_path(), scope.is_user, root)
     return Path(lasting), Path(fleeting)
+
+
+def trial_path(scope: Scope, unit: str) -> Path:
+    """The unit file of a trial, see verbs/releases/trial.py."""
+    return scope.runtime_root / "systemd" / f"{scope.word}.control" / unit

@@ -21,6 +21,7 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import release_of
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell, read_cell
+from dora_systemd.verbs.facts.enabled import trial_path
 from dora_systemd.verbs.start.claim import require_free_name
 from dora_systemd.verbs.start.enable import BootUnit, install_unit_file, read_boot_unit
 
@@ -69,11 +70,6 @@ class Standing:
         """The UUID of the dataflow, "" if it is new."""
         known = self.boot.options or (self.cell.options if self.cell else None)
         return known.uuid if known else ""
-
-
-def trial_path(scope: Scope, unit: str) -> Path:
-    """The unit file of a trial."""
-    return scope.runtime_root / "systemd" / f"{scope.word}.control" / unit
 
 
 def trial_options(scope: Scope, unit: str) -> RunnerOptions | None:

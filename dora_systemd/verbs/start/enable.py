@@ -5,10 +5,9 @@ systemd looks into /run/systemd/transient first. Never remove that fragment whil
 loaded: systemd would delete the file in /etc instead when it unloads the unit.
 """
 
-import itertools
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,7 +42,6 @@ from dora_systemd.verbs.facts.enabled import own_directories, wanted_units
 
 _FORGET_SECONDS = 2.0
 _RETRY_SECONDS = 0.02
-_START = "start it with doractl start"
 
 
 @dataclass(frozen=True)
@@ -144,13 +142,13 @@ def refuse_attached(cell: Cell) -> None:
     """Raise DoraSystemdError for a dataflow of `doractl run`, which ends with that command."""
     if cell.options.attached:
         why = "it ends with the doractl run that it belongs to"
-        raise _no_file(cell.name, why, _START, ExitCode.USAGE)
+        raise no_unit_file(cell.name, why, code=ExitCode.USAGE)
 
 
 def refuse_member(options: RunnerOptions) -> None:
     """Raise DoraSystemdError (BAD_INPUT) for a part of a dataflow: its head starts it."""
     if options.machine:
-        raise _no_file(options.name, "its head is another machine", "use doractl enable there")
+        raise no_unit_file(options.name, "its head is another machine", "use doractl enable there")
 
 
 def _loaded_links(manager: Manager, scope: Scope, options: RunnerOptions) -> dict[str, str]:
@@ -172,23 +170,26 @@ def _loaded_links(manager: Manager, scope: Scope, options: RunnerOptions) -> dic
 
 def link_paths(boot: BootUnit, options: RunnerOptions | None) -> list[tuple[Path, Path]]:
     """The unit files of all links of a dataflow: where they last, and where a reboot ends them."""
+    places = (boot.path, boot.runtime)
+    return [(places[0].with_name(one), places[1].with_name(one)) for one in _links_of(options)]
+
+
+def _links_of(options: RunnerOptions | None) -> list[str]:
+    """The units of all links of a dataflow."""
     if options is None or not options.placed:
         return []
     from dora_systemd.decisions.machines.link_unit import link_units_of
 
-    places = (boot.path, boot.runtime)
-    return [(places[0].with_name(one), places[1].with_name(one)) for one in link_units_of(options)]
+    return list(link_units_of(options))
 
 
-def refuse_machines(options: RunnerOptions) -> None:
-    """Raise DoraSystemdError (BAD_INPUT) for a dataflow on several machines, or a part of one."""
-    if options.placed:
-        raise _no_file(options.name, "it runs on several machines", _START)
-
-
-def _no_file(
-    name: str, why: str, hint: str, code: ExitCode = ExitCode.BAD_INPUT
+def no_unit_file(
+    name: str,
+    why: str,
+    hint: str = "start it with doractl start",
+    code: ExitCode = ExitCode.BAD_INPUT,
 ) -> DoraSystemdError:
+    """The error for a dataflow of which no unit file can be made."""
     return DoraSystemdError(f"cannot make a unit file of {name}: {why}", hint, code)
 
 
@@ -248,13 +249,17 @@ def disable_cell(manager: Manager, scope: Scope, cell: Cell) -> bool:
 def drop_unit_files(manager: Manager, boot: BootUnit) -> None:
     """Remove unit files that are not needed: of a disabled dataflow that is not running."""
     if boot.text is not None or boot.runtime.exists():
-        text = boot.text if boot.text is not None else read_unit_file(boot.runtime)
-        for path in itertools.chain(*link_paths(boot, runner_of(text or ""))):
-            remove_unit_file(path)
-        for path in (boot.path, boot.runtime):
-            remove_unit_file(path)
-            remove_changes(path)
-        manager.reload()
+        remove_files(manager, (boot.path, boot.runtime))
+
+
+def remove_files(manager: Manager, paths: Sequence[Path]) -> None:
+    """Remove unit files of dataflows, with those of their links, and their drop-ins."""
+    for path in paths:
+        links = _links_of(runner_of(read_unit_file(path) or ""))
+        for one in (*map(path.with_name, links), path):
+            remove_unit_file(one)
+        remove_changes(path)
+    manager.reload()
 
 
 def release_transient(manager: Manager, boot: BootUnit) -> None:

@@ -26,7 +26,7 @@ from dora_systemd.verbs.start.enable import (
     read_boot_unit,
 )
 from dora_systemd.verbs.start.linger import ensure_linger
-from dora_systemd.verbs.stop import drop_disabled, stop_cells
+from dora_systemd.verbs.stop import stop_cells
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options
 
 UNIT = "dora-robot.service"
@@ -185,23 +185,6 @@ def test_disabled_while_it_runs_from_its_file(manager: FakeManager, scope: Scope
     enable_cell(manager, scope, cell)
     assert path_of(manager).exists()
     assert not runtime.exists()
-
-
-def test_what_was_disabled_is_gone_with_its_end(manager: FakeManager, scope: Scope) -> None:
-    cell = started(manager)
-    enable_cell(manager, scope, cell)
-    manager.units[UNIT] |= {"FragmentPath": str(path_of(manager)), "Transient": False}
-    disable_cell(manager, scope, cell)
-    runtime = scope.runtime_root / "systemd/system" / UNIT
-    drop_disabled(manager, scope, [UNIT])
-    assert runtime.exists(), "it runs"
-    manager.after_job[UNIT] = {"ActiveState": "inactive"}
-    stop_cells(manager, scope, [cell])
-    assert not runtime.exists()
-    assert manager.calls[-1] == ("reload",)
-    runtime.write_text("[Service]\nExecStart=/bin/true\n")
-    drop_disabled(manager, scope, [UNIT])
-    assert runtime.exists(), "it is not ours"
 
 
 def test_after_its_end_the_file_counts(manager: FakeManager, scope: Scope) -> None:
