@@ -32,7 +32,7 @@ from dora_systemd.verbs.setup import text_of
 
 PORT_FILE = f"{SOCKET_UNIT}.d/50-port.conf"
 
-_CONNECTION = "a connection, maybe one that ended within the last minute"
+_NO_LISTENER = "a connection may have had it in the last minute: try again"
 """The kernel can have given the port to a client of anything; it keeps it a while, see tcp(7)."""
 
 
@@ -121,19 +121,21 @@ def _check_port(port: int) -> None:
         hint = "only root may open ports below 1024: doractl up --port 53291"
         raise DoraSystemdError(f"cannot open port {port}", hint, ExitCode.NO_PERMISSION)
     if number:
-        hint = (
-            f"stop that process, or take another port: doractl up --port {port + 1}, "
+        holder = _holder(port)
+        others = (
+            f"or take another port: doractl up --port {port + 1}, "
             "or use doractl start, which needs no port at all"
         )
-        message = f"cannot open port {port}: it is in use by {_holder(port)}"
-        raise DoraSystemdError(message, hint, ExitCode.NAME_IN_USE)
+        hint = f"{'stop that process' if holder else _NO_LISTENER}, {others}"
+        used = f"in use by {holder}" if holder else "in use, and nothing listens on it"
+        raise DoraSystemdError(f"cannot open port {port}: it is {used}", hint, ExitCode.NAME_IN_USE)
 
 
 def _holder(port: int) -> str:
-    """The listener on a port, as far as this user may see it."""
+    """The listener on a port, as far as this user may see it; "" if there is none."""
     owners = socket_owners(listening_sockets(port))
     named: Sequence[Process] = [one for one in read_processes() if one.pid in owners]
     if named:
         return str(named[-1])
     users = ", ".join(user_name(uid, nameless="the user ") for uid in sorted(listener_uids(port)))
-    return f"a process of {users}" if users else _CONNECTION
+    return f"a process of {users}" if users else ""

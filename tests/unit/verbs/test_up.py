@@ -116,6 +116,15 @@ def test_a_port_in_use(systemd: Systemd, scope: ScopeIn, used_port: int) -> None
     assert not list(scope.root.rglob("*"))
 
 
+def test_a_port_without_a_listener(systemd: Systemd, scope: ScopeIn) -> None:
+    """As of a client of anything, or of a process that does not listen yet."""
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        with pytest.raises(DoraSystemdError, match="in use, and nothing listens on it") as caught:
+            open_port(systemd, scope, one.getsockname()[1])
+    assert caught.value.hint.startswith("a connection may have had it in the last minute")
+
+
 def test_a_port_that_is_not_for_everyone(
     systemd: Systemd, scope: ScopeIn, monkeypatch: pytest.MonkeyPatch
 ) -> None:
