@@ -72,6 +72,22 @@ def test_a_restart_that_never_began(cell: Cell, project: Project) -> None:
 
 
 @pytest.mark.warns("Failed", "status=226", "No such file", "exited")
+def test_a_failure_of_another_dataflow_of_that_name(cell: Cell, project: Project) -> None:
+    """It has recorded nothing, and the one before it was stopped."""
+    place, words = binds(project)
+    cell.start(project.three_nodes())
+    cell.doractl("stop", cell.name)
+    assert SANDBOX in cell.start(project.three_nodes(), *words, check=False).stderr
+    assert not place.exists()
+    wait_failed(cell)
+    cell.doractl("reset", cell.name)
+    wait_for("it is unloaded", lambda: cell.show("LoadState") == "not-found")
+    sync_journal()
+    rows = json.loads(cell.doractl("list", "--all", "-o", "json").stdout)
+    assert [one["status"] for one in rows if one["name"] == cell.name] == ["Stopped"]
+
+
+@pytest.mark.warns("Failed", "status=226", "No such file", "exited")
 def test_lives_that_never_began_are_restarts(cell: Cell, project: Project) -> None:
     place, words = binds(project)
     policy = ("--restart-policy", "always", "--max-restarts", "1000")

@@ -19,7 +19,6 @@ from dora_systemd.adapters.journal.journalctl import (
 )
 from dora_systemd.decisions.cell.exits import KILLED
 from dora_systemd.decisions.logs.query import (
-    failure_matches,
     journal_timestamp,
     scope_matches,
     start_matches,
@@ -53,7 +52,7 @@ class LastEvent:
 
     event: such as "dataflow-failed"; a "dataflow-started" of a dataflow that systemd has unloaded
     means that its runner was killed, or that the machine lost power. at_us: CLOCK_REALTIME, µs.
-    detail: exit status or reason, or "".
+    detail: exit status or reason, or "". cursor: its place in the journal.
     """
 
     name: str
@@ -61,6 +60,7 @@ class LastEvent:
     event: str
     at_us: int
     detail: str
+    cursor: str = ""
 
 
 class JournalReader:
@@ -160,15 +160,6 @@ class JournalReader:
         records = self.newest(start_matches(scope, name), limit)
         return [int(one["__REALTIME_TIMESTAMP"]) for one in records]
 
-    def failures(self, scope: Scope) -> dict[str, int]:
-        """When the unit of each dataflow failed last by systemd's records, CLOCK_REALTIME µs."""
-        found: dict[str, int] = {}
-        field = "USER_UNIT" if scope.is_user else "UNIT"
-        for record in self.newest(failure_matches(scope), _MOST_NAMES):
-            if name := name_from_unit(str(record.get(field, ""))):
-                found.setdefault(name, int(record["__REALTIME_TIMESTAMP"]))
-        return found
-
     def killed_since(self, scope: Scope, name: str, uuid: str, since_us: int) -> list[str]:
         """The nodes of a dataflow that were killed while it stopped; CLOCK_REALTIME µs."""
         ends = ("DORA_EVENT=node-exited", f"DORA_EXIT={KILLED}", f"DORA_DATAFLOW={uuid}")
@@ -237,7 +228,8 @@ def _last_event(record: dict[str, Any]) -> LastEvent | None:
     if not name or not is_uuid(uuid) or event.removeprefix("dataflow-") not in _LIFE_EVENTS:
         return None
     detail = (ending or reason)[:_MOST_DETAIL]
-    return LastEvent(name, uuid, event, int(record["__REALTIME_TIMESTAMP"]), detail)
+    at_us, cursor = int(record["__REALTIME_TIMESTAMP"]), str(record.get("__CURSOR", ""))
+    return LastEvent(name, uuid, event, at_us, detail, cursor)
 
 
 def _system_files(top: Path) -> list[Path]:

@@ -161,9 +161,10 @@ def start_matches(scope: Scope, name: str) -> list[str]:
     return [*_systemd_matches(scope, name), f"MESSAGE_ID={UNIT_STARTING}"]
 
 
-def failure_matches(scope: Scope) -> list[str]:
-    """Matches for systemd's records of units that have failed, whosever they are."""
-    return [f"_UID={scope.uid}" if scope.is_user else "_PID=1", f"MESSAGE_ID={UNIT_FAILED}"]
+def failure_matches(uuids: Sequence[str]) -> list[str]:
+    """Matches for the system manager's records of the failures of dataflows."""
+    own = [f"DORA_DATAFLOW={uuid}" for uuid in uuids]
+    return ["_PID=1", f"MESSAGE_ID={UNIT_FAILED}", *own]
 
 
 def story_matches(scope: Scope, name: str, uuid: str) -> list[str]:

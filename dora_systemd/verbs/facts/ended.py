@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from dora_systemd.adapters.bus.manager import Manager
+from dora_systemd.adapters.journal.failures import later_failures
 from dora_systemd.adapters.journal.reader import JournalReader, LastEvent, is_volatile
 from dora_systemd.decisions.life.causes import NO_END
 from dora_systemd.decisions.views.dataflows import FAILED, FINISHED, STOPPED, is_up_word
@@ -106,25 +107,25 @@ def ended_row(event: LastEvent) -> DataflowRow:
 def _last_events(scope: Scope, **what: Any) -> list[LastEvent]:
     # Without access to the journal, the rows from systemd are still shown.
     with contextlib.suppress(DoraSystemdError):
-        events = JournalReader().last_events(scope, **what)
-        return _with_later_failures(scope, events)
+        return _with_later_failures(scope, JournalReader().last_events(scope, **what))
     return []
 
 
 def _with_later_failures(scope: Scope, events: list[LastEvent]) -> list[LastEvent]:
     """The events; the last start of a dataflow may have failed before our code recorded anything.
 
-    As when systemd cannot set up the sandbox for the second half of a restart.
+    As when systemd cannot set up the sandbox for the second half of a restart. For dataflows of a
+    user nothing says which one has failed.
     """
-    if not any(event.event in _CLEAN for event in events):
+    clean = [event for event in events if event.event in _CLEAN]
+    if scope.is_user or not clean:
         return events
-    failures = JournalReader().failures(scope)
-    newest = {event.name: event for event in reversed(events)}
+    failed: dict[str, int] = {}
+    with contextlib.suppress(DoraSystemdError):
+        failed = later_failures(clean)
     return [
-        replace(event, event="dataflow-starting", at_us=failures[event.name], detail="")
-        if event.event in _CLEAN
-        and event is newest[event.name]
-        and event.at_us < failures.get(event.name, 0)
+        replace(event, event="dataflow-starting", at_us=failed[event.uuid], detail="")
+        if event in clean and event.uuid in failed
         else event
         for event in events
     ]

@@ -134,16 +134,6 @@ def test_killed_nodes(journalctl: Path) -> None:
     assert JournalReader().killed_since(SYSTEM, "robot", UUID, 5) == ["a", "b"]
 
 
-def test_units_that_have_failed(journalctl: Path) -> None:
-    found = "".join(
-        f'{{"UNIT":"{unit}","__REALTIME_TIMESTAMP":"{at}"}}\n'
-        for unit, at in (("dora-a.service", 9), ("ssh.service", 8), ("dora-a.service", 7))
-    )
-    failed = "MESSAGE_ID=d9b373ed55a64feb8242e02dbe79a49c"
-    play_fields(journalctl, {}, {f"-- _PID=1 {failed}": found.rstrip()})
-    assert JournalReader().failures(SYSTEM) == {"a": 9}
-
-
 def test_a_run(journalctl: Path) -> None:
     play_fields(journalctl, {}, {"-- _SYSTEMD_UNIT=dora-robot.service DORA_RUN=r1": ANY})
     assert JournalReader().has_run(SYSTEM, "robot", "r1")

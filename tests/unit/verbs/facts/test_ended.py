@@ -9,6 +9,7 @@ from dora_systemd.decisions.life.causes import NO_END
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
+from dora_systemd.verbs.facts import ended as facts
 from dora_systemd.verbs.facts import lives
 from dora_systemd.verbs.facts.ended import ended_row, ended_rows, newest_ended, not_recorded
 from dora_systemd.verbs.facts.list import read_rows
@@ -58,7 +59,6 @@ class Events:
 
 
 SCOPE = Scope(is_user=False, uid=0)
-RUNS = ((UUID, 30), (OTHER, 25))
 
 
 @pytest.fixture
@@ -81,7 +81,7 @@ def ended(
 ) -> list[DataflowRow]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(JournalReader, "last_events", lambda _self, *one, **two: journal(*one, **two))
-        patch.setattr(JournalReader, "failures", lambda _self, _scope: failures or {})
+        patch.setattr(facts, "later_failures", lambda _events: failures or {})
         # This machine may have a journal, with dataflows of these names in it.
         patch.setattr(lives, "read_lives", lambda *_one, **_two: [])
         return newest_ended(manager, SCOPE, read_rows(manager, SCOPE), limit)
@@ -132,17 +132,27 @@ def test_a_start_that_failed_before_it_recorded_anything(manager: FakeManager) -
         LastEvent("gone", UUID, "dataflow-stopped", 30, ""),
         LastEvent("done", OTHER, "dataflow-finished", 20, ""),
     )
-    rows = {row.name: row for row in ended(manager, journal, failures={"gone": 31, "done": 19})}
+    rows = {row.name: row for row in ended(manager, journal, failures={UUID: 31})}
     assert (rows["gone"].status, rows["gone"].ended) == ("Failed", 31)
     assert rows["gone"].text == NO_END
     assert (rows["done"].status, rows["done"].ended) == ("Finished", 20)
 
 
-def test_a_failure_is_of_the_newest_run_of_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    stops = [LastEvent("gone", one, "dataflow-stopped", at, "") for one, at in RUNS]
-    monkeypatch.setattr(JournalReader, "last_events", lambda _self, _scope: stops)
-    monkeypatch.setattr(JournalReader, "failures", lambda _self, _scope: {"gone": 31})
-    assert [(row.uuid, row.status) for row in ended_rows(SCOPE)] == [
-        (UUID, "Failed"),
-        (OTHER, "Stopped"),
-    ]
+def test_nothing_says_whose_failure_it_is_to_a_user(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert [row.status for row in told(monkeypatch, Scope(True, 1000))] == ["Stopped"]
+
+
+def test_failures_that_cannot_be_read_hide_no_row(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert [row.status for row in told(monkeypatch, SCOPE)] == ["Stopped"]
+
+
+def told(monkeypatch: pytest.MonkeyPatch, scope: Scope) -> list[DataflowRow]:
+    """The rows of one that was stopped, without its failures."""
+
+    def fail(_events: object) -> dict[str, int]:
+        raise DoraSystemdError("cannot read the journal")
+
+    event = LastEvent("gone", UUID, "dataflow-stopped", 30, "")
+    monkeypatch.setattr(JournalReader, "last_events", lambda _self, _scope: [event])
+    monkeypatch.setattr(facts, "later_failures", fail)
+    return ended_rows(scope)
