@@ -76,11 +76,15 @@ class Look:
 
 @dataclass(frozen=True)
 class Line:
-    """A numbered line in the journal: the life of a node that printed it, and its number."""
+    """A numbered line in the journal: the life of a node that printed it, and its number.
+
+    has_unit: whether journald knew the unit that it came from.
+    """
 
     cell: str
     life: str
     number: int
+    has_unit: bool = True
 
 
 @dataclass(frozen=True)

@@ -21,11 +21,22 @@ def every_line_once(history: History) -> Iterator[str]:
         numbers = found[cell, life]
         missing[cell] += len(set(range(1, count + 1)) - set(numbers))
         yield from (f"{cell}: {life}: {text}" for text in _wrong(history, cell, numbers))
+    if (nameless := sum(not line.has_unit for line in history.lines)) and not _forgets(history):
+        yield f"journald does not know the unit of {nameless} lines"
     for cell, count in missing.items():
         if count > history.lost.get(cell, 0):
             counted = history.lost.get(cell, 0)
             gaps = _gaps(history, cell)
             yield f"{cell}: {count} lines are missing, {counted} are counted: {gaps}"
+
+
+def _forgets(history: History) -> bool:
+    """Whether journald was restarted, and a runner killed: of a process that has ended since the
+    line was sent, a new journald finds no unit."""
+    hits = [one.step.what for one in history.answers if one.status == 0]
+    return "journald-restarts" in hits and any(
+        what in FAULTS and FAULTS[what].kills_runner for what in hits
+    )
 
 
 def _wrong(history: History, cell: str, numbers: Sequence[int]) -> Iterator[str]:

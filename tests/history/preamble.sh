@@ -5,7 +5,7 @@ tree=/sys/fs/cgroup
 [ -e $tree/cgroup.controllers ] || tree=$tree/unified
 
 # of NAME: choose the dataflow that the next lines are about
-of() { name=$1 unit=dora-$1.service place=$WORK/$1; }
+of() { name=$1 unit=dora-$1.service place=$WORK/$1 device=/run/history-devices/$1; }
 
 group() { echo "$tree$(systemctl show -P ControlGroup "$unit")"; }
 main_pid() { systemctl show -P MainPID "$1" | grep -vx 0; }

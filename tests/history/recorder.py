@@ -139,11 +139,12 @@ def journal_lines(since: float) -> list[Line]:
 
 
 def _lines_of(cell: str, since: float) -> Iterator[Line]:
-    where = (f"_SYSTEMD_UNIT=dora-{cell}.service", "DORA_STREAM=stdout", f"--since=@{since:.6f}")
-    for text in run("journalctl", "-q", "-o", "cat", *where).stdout.splitlines():
-        life, _, number = text.partition(" ")
+    where = (f"DORA_DATAFLOW_NAME={cell}", "DORA_STREAM=stdout", f"--since=@{since:.6f}")
+    for record in run("journalctl", "-q", "-o", "json", *where).stdout.splitlines():
+        one = json.loads(record)
+        life, _, number = str(one.get("MESSAGE", "")).partition(" ")
         if life.partition(".")[0] in ("source", "sink") and number.isdecimal():
-            yield Line(cell, life, int(number))
+            yield Line(cell, life, int(number), one.get("_SYSTEMD_UNIT") == f"dora-{cell}.service")
 
 
 def restart_times(cell: str, since: float) -> tuple[float, ...]:

@@ -29,6 +29,8 @@ nodes:
     restart_policy: on-failure
     max_restarts: 0
 """
+DEVICES = Path("/run/history-devices")
+"""What stands for a device of each dataflow, which its sink needs."""
 PLACES = ("/run/dora-systemd", "/run/systemd", "/etc/systemd/system", "/run/dora-gateway")
 IGNORED = (
     *("/run/systemd/journal", "/run/systemd/sessions", "/run/systemd/users"),
@@ -43,6 +45,7 @@ class Scene:
     def __init__(self, root: Path) -> None:
         self.root = root
         self.front = Front()
+        DEVICES.mkdir(exist_ok=True)
         for name in CELLS:
             self._make_project(root / name)
         root.chmod(0o755)
@@ -53,6 +56,10 @@ class Scene:
         (place / "notes").chmod(0o777)
         shutil.copy(NODE, place / "project/node.py")
         (place / "project/dataflow.yml").write_text(FLOW)
+        device = DEVICES / place.name
+        settings = f"nodes: {{sink: {{needs: {device}}}}}\n"
+        (place / "project/dataflow.systemd.yml").write_text(settings)
+        device.touch()
 
     def notes(self, cell: str) -> Path:
         """Where the nodes of a dataflow note how many lines they have printed."""

@@ -1,8 +1,9 @@
 """What can be done in a history: an operator's commands and faults, each one a line of shell.
 
 A new verb or fault is one new line here. $name is the dataflow, $unit its unit, $place the
-directory of its project and notes; the functions are those of preamble.sh. The driver runs the same
-text that script.py prints, so that a person can do by hand what the driver did.
+directory of its project and notes, $device what its sink needs; the functions are those of
+preamble.sh. The driver runs the same text that script.py prints, so that a person can do by hand
+what the driver did.
 """
 
 from dataclasses import dataclass
@@ -118,6 +119,9 @@ FAULTS = {
     "node-daemonises": Fault("order sink daemonise"),
     "node-floods": Fault("order sink flood", weight=1),
     "node-ignores": Fault("order sink ignore", weight=1),
+    "device-unplugged": Fault(
+        'rm "$device" && hit KILL $(node sink); sleep 1; touch "$device"',
+    ),
     "journald-restarts": Fault("systemctl restart systemd-journald.service"),
     "bus-hangs": Fault("hit STOP $(main_pid dbus.service) && sleep 2; thaw", weight=1),
     "logind-restarts": Fault("systemctl restart systemd-logind.service", weight=1),

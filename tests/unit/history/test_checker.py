@@ -79,6 +79,9 @@ def last(of_a: CellView) -> dict[str, Any]:
     return {"looks": (look(1), look(3, of_a))}
 
 
+NAMELESS = tuple(replace(line, has_unit=False) for line in GOOD.lines)
+
+
 BROKEN: list[tuple[str, dict[str, Any]]] = [
     ("one_life_at_a_time", {"sights": ((sight("i"), sight("j", began=200)), (sight("i"),))}),
     ("one_life_at_a_time", {"sights": ((sight("j", began=200), sight("")),)}),
@@ -101,6 +104,8 @@ BROKEN: list[tuple[str, dict[str, Any]]] = [
     ("every_line_once", {"printed": {(A, "sink.1"): 4}}),
     ("every_line_once", {"lines": (*GOOD.lines, Line(A, "sink.1", 2))}),
     ("every_line_once", {"lines": GOOD.lines[::-1]}),
+    ("every_line_once", {"lines": NAMELESS}),
+    ("every_line_once", {"lines": NAMELESS, "answers": (answer(2, "kill-runner"),)}),
     ("quiet_comes", {"looks": (replace(look(1), is_quiet=False),)}),
     ("answers_are_orderly", {"answers": (answer(0, "start", -9),)}),
     ("answers_are_orderly", {"answers": (answer(0, "set", 2),)}),
@@ -154,6 +159,11 @@ def test_lines_may_repeat_where_the_runner_is_killed() -> None:
     twice = (*GOOD.lines, Line(A, "sink.1", 2))
     killed = (*GOOD.answers, answer(2, "kill-runner"))
     assert check(replace(GOOD, lines=twice, answers=killed)) == []
+
+
+def test_a_new_journald_knows_no_unit_of_a_process_that_was_killed() -> None:
+    faults = (answer(2, "kill-runner"), answer(2, "journald-restarts"))
+    assert check(replace(GOOD, lines=NAMELESS, answers=(*GOOD.answers, *faults))) == []
 
 
 def test_a_doractl_that_was_killed_may_end_by_a_signal() -> None:
