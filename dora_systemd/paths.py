@@ -7,13 +7,16 @@ from dora_systemd.errors import DoraSystemdError
 
 _UNIT_PATH_HINT = "systemctl show --property UnitPath; is SYSTEMD_UNIT_PATH set for systemd?"
 
+TABLE = "status.json"
+"""The live node table of a cell, in the RuntimeDirectory of its unit."""
+
 
 class CellPaths:
     """Paths in the RuntimeDirectory `root` (mode 0700), see systemd.exec(5)."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
-        self.status = root / "status.json"
+        self.status = root / TABLE
         """The live node table, which the runner replaces atomically."""
         self.control = root / "control.json"
         """Port and token of the cell's coordinator, mode 0600; only the runner reads it."""

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.paths import CellPaths
+from dora_systemd.paths import TABLE, CellPaths
 from dora_systemd.trust.files import read_file
 from dora_systemd.trust.paths import refusal
 
@@ -23,7 +23,7 @@ def read_table(directory: Path) -> CellStatus | None:
     Raises DoraSystemdError (BAD_INPUT) if the owner of the table does not own the directory, and
     DoraSystemdError for content that no runner writes.
     """
-    data = _read(CellPaths(directory).status, MAX_TABLE)
+    data = _read(f"{directory}/{TABLE}", MAX_TABLE)
     return None if data is None else CellStatus.from_json(data)
 
 
@@ -38,7 +38,7 @@ def read_times(directory: Path, size: int) -> bytes:
         return b""
 
 
-def _read(path: Path, most: int) -> bytes | None:
+def _read(path: str | Path, most: int) -> bytes | None:
     """A file that the owner of its directory owns, or None. Raises DoraSystemdError."""
     try:
         text = read_file(path, most)

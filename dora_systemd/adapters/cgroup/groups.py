@@ -30,6 +30,12 @@ MAX_GROUPS = 300
 MAX_PROCESSES = 5000
 """Maximum processes to count one by one without a memory controller."""
 _MAX_ENTRIES = 10_000
+_CHUNK = 1 << 14
+_SHORT = 2048
+"""Bytes of a read of a control file that is the last one: if more is to come, the kernel returns
+nearly a page, and a line is shorter than the rest of it."""
+_CHILDLESS = 2
+"""Links of a directory without directories in it, which cgroup2 counts; see inode(7)."""
 MOUNTS = (Path("/sys/fs/cgroup"), Path("/sys/fs/cgroup/unified"))
 
 _ABSENT = (errno.ENOENT, errno.ENODEV, errno.EOPNOTSUPP, errno.ENOTSUP)
@@ -63,6 +69,11 @@ def group_of(process: int | str = "self") -> str:
         if line.startswith("0::"):
             return line[3:]
     return "/"
+
+
+def has_group(path: Path) -> bool:
+    """Whether the group exists."""
+    return os.path.isdir(path)  # noqa: PTH112 - a Path takes longer
 
 
 def node_groups(path: Path) -> dict[str, Path]:
@@ -209,8 +220,15 @@ def _tree(path: Path) -> Iterator[str]:
     left = deque([str(path)])
     while left:
         yield (group := left.popleft())
-        with contextlib.suppress(OSError), os.scandir(group) as entries:
-            left.extend(one.path for one in entries if one.is_dir(follow_symlinks=False))
+        with contextlib.suppress(OSError):
+            # Most have none, and a list of the control files takes longer than all else.
+            if os.stat(group).st_nlink != _CHILDLESS:  # noqa: PTH116 - a Path takes longer
+                left.extend(_groups_in(group))
+
+
+def _groups_in(group: str) -> list[str]:
+    with os.scandir(group) as entries:
+        return [one.path for one in entries if one.is_dir(follow_symlinks=False)]
 
 
 def write_text(path: Path, text: str) -> bool:
@@ -236,11 +254,22 @@ def _put(path: Path, text: str) -> None:
 
 def read_text(path: str | Path) -> str:
     """The text of a control file; "" if the file or the group does not exist."""
-    # A group can disappear at any moment, which counts as empty. FileIO: there are many of these
-    # files, and Python's text layer takes longer than the kernel.
-    with contextlib.suppress(OSError), io.FileIO(path) as file:
-        return os.fsdecode(file.readall())  # a name need not be UTF-8
-    return ""
+    # A group can disappear at any moment, which counts as empty. Not by open(): there are many of
+    # these files, and Python's file objects take longer than the kernel.
+    try:
+        fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    except OSError:
+        return ""
+    try:
+        data = part = os.read(fd, _CHUNK)
+        while len(part) > _SHORT:
+            part = os.read(fd, _CHUNK)
+            data += part
+    except OSError:
+        return ""
+    finally:
+        os.close(fd)
+    return os.fsdecode(data)  # a name need not be UTF-8
 
 
 def read_number(path: str | Path) -> int | None:

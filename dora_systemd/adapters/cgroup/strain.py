@@ -14,10 +14,10 @@ _PRESSURE = re.compile(r"^(some|full) avg10=([0-9.]+) .*total=(\d+)$", re.M)
 
 def read_strain(path: Path) -> Strain:
     """The counters of a group and all groups below it; zeros if it no longer exists."""
-    stalls = {name: _read_stalls(path / f"{name}.pressure") for name in RESOURCES}
+    stalls = {name: _read_stalls(f"{path}/{name}.pressure") for name in RESOURCES}
     return Strain(
         stalled={name: stall for name, stall in stalls.items() if stall is not None},
-        throttled=read_numbers(path / "cpu.stat").get("throttled_usec", 0),
+        throttled=read_numbers(f"{path}/cpu.stat").get("throttled_usec", 0),
         oom_kills=read_oom(path).kills,
     )
 
@@ -25,8 +25,8 @@ def read_strain(path: Path) -> Strain:
 def read_oom(path: Path) -> OomCounts:
     """How often the kernel has killed in a group, and how often its own limit was the reason."""
     return OomCounts(
-        read_numbers(path / "memory.events").get("oom_kill", 0),
-        read_numbers(path / "memory.events.local").get("oom", 0),
+        read_numbers(f"{path}/memory.events").get("oom_kill", 0),
+        read_numbers(f"{path}/memory.events.local").get("oom", 0),
     )
 
 
@@ -43,7 +43,7 @@ def read_load(path: Path) -> Load:
     return Load(stat.get("anon", 0) + stat.get("shmem", 0), limit, _read_stalled(path))
 
 
-def _read_stalls(path: Path) -> tuple[int, int] | None:
+def _read_stalls(path: str) -> tuple[int, int] | None:
     """Both totals of a pressure file in µs; None if the kernel does not measure them."""
     totals = {kind: int(total) for kind, _, total in _PRESSURE.findall(read_text(path))}
     return (totals["some"], totals.get("full", 0)) if "some" in totals else None

@@ -3,6 +3,7 @@
 import asyncio
 import json
 import socket as sockets
+import time
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import aclosing, suppress
 from typing import Any
@@ -28,6 +29,10 @@ from dora_systemd.trust.paths import user_name
 from dora_systemd.verbs.facts.snapshot import read_snapshot
 
 INTERVAL_SECONDS = 2.0
+LONGEST_SECONDS = 10.0
+"""Between snapshots, of any number of dataflows."""
+SHARE = 0.02
+"""Of a processor, for the snapshots of a page: many dataflows are looked at less often."""
 SEND_SECONDS = 10.0
 """Close the connection of a page that accepts no data for this long; others would queue forever."""
 MAX_TASKS = 8
@@ -79,9 +84,11 @@ class _Page:
         await self._send(type="hello", **_greeting(self._scope))
         while True:
             self._is_due.clear()
+            before = time.process_time()
             await self._send_snapshot()
+            pause = pause_after(time.process_time() - before)
             with suppress(TimeoutError):
-                async with asyncio.timeout(INTERVAL_SECONDS):
+                async with asyncio.timeout(pause):
                     await self._is_due.wait()
 
     async def listen(self) -> None:
@@ -187,6 +194,11 @@ class _Page:
     async def _send(self, **values: Any) -> None:
         async with asyncio.timeout(SEND_SECONDS):
             await self._socket.send(json.dumps(values))
+
+
+def pause_after(on_cpu: float) -> float:
+    """Seconds until the next snapshot. on_cpu: seconds of a processor that the last one took."""
+    return min(max(INTERVAL_SECONDS, on_cpu / SHARE), LONGEST_SECONDS)
 
 
 def _greeting(scope: Scope) -> dict[str, str]:

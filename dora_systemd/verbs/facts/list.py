@@ -102,7 +102,7 @@ def table_rows(manager: Manager, scope: Scope, cells: Sequence[Cell]) -> list[Da
     those of an older version: each of them has some questions of its own.
     """
     slice_path = slice_group(manager) if cells else None
-    rows = [row_of(read_dataflow(manager, scope, cell, slice_path)) for cell in cells]
+    rows = [row_of(read_dataflow(manager, scope, cell, slice_path, is_row=True)) for cell in cells]
     return mark_enabled(manager, scope, rows) if rows else []
 
 

@@ -27,7 +27,8 @@ if TYPE_CHECKING:  # the table of `list` does without
 UP_SINCE = "ActiveEnterTimestampMonotonic"
 STARTED = "InactiveExitTimestampMonotonic"
 ENDED = "InactiveEnterTimestamp"
-_ALL = ("ControlGroup", "NRestarts", UP_SINCE, STARTED, "StatusText", "ActiveEnterTimestamp")
+_TEXT, _READY_AT = "StatusText", "ActiveEnterTimestamp"
+_ALL = ("ControlGroup", "NRestarts", UP_SINCE, STARTED, _TEXT, _READY_AT)
 
 
 class Reading(NamedTuple):
@@ -69,21 +70,25 @@ class Reading(NamedTuple):
 
 
 def read_dataflow(
-    manager: Manager, scope: Scope, cell: Cell, slice_path: Path | None = None
+    manager: Manager,
+    scope: Scope,
+    cell: Cell,
+    slice_path: Path | None = None,
+    is_row: bool = False,
 ) -> Reading:
     """Read one dataflow.
 
-    slice_path: where the groups of dataflows usually are; given if only the table of `list` is
-    wanted.
+    slice_path: where the groups of dataflows usually are, for a reader of all of them. Then systemd
+    is not asked for what the runner has in its table. is_row: only what the table of `list` shows.
     """
     if cell.state.is_held:
         return _read_held(manager, cell)
     status, problem = look_at_table(scope, cell) if cell.is_up else (CellStatus(), "")
     path = slice_path / cell.unit if slice_path else None
-    path = path if path and path.is_dir() else None
+    path = path if path and cgroup.has_group(path) else None
     if slice_path:
-        known = _known(cell, status)
-        unit = known | manager.read(cell.unit, _missing(cell, status, path, known))
+        known = _known(cell, status, is_row)
+        unit = known | manager.read(cell.unit, _missing(cell, status, path, known, is_row))
     else:
         unit = manager.read(cell.unit, _ALL if cell.is_up else (*_ALL, ENDED))
     if not cell.is_up or not (path or unit["ControlGroup"]):
@@ -91,10 +96,10 @@ def read_dataflow(
     path = path or cgroup.group_path(unit["ControlGroup"])
     # Without a node table the groups are all that is known of the nodes, and the dataflow's user
     # can create groups too. With a table, the groups of its nodes are enough.
-    nodes = cgroup.shown_groups(path, status.nodes) if not slice_path or not status.nodes else {}
+    nodes = {} if is_row and status.nodes else cgroup.shown_groups(path, status.nodes)
     groups = {WHOLE_CELL: path, **nodes}
     usage = {key: cgroup.read_usage(group) for key, group in groups.items()}
-    heard = () if slice_path else read_heard(scope, cell.name, cell.options.owes)
+    heard = () if is_row else read_heard(scope, cell.name, cell.options.owes)
     return Reading(cell, unit, status, problem, groups, usage, _monotonic_us(), heard)
 
 
@@ -116,7 +121,7 @@ def read_heard(scope: Scope, name: str, owes: "Sequence[Owed]") -> tuple[int, ..
     return parse_times(data, owes, _monotonic_us())[1]
 
 
-def _known(cell: Cell, status: CellStatus) -> dict[str, Any]:
+def _known(cell: Cell, status: CellStatus, is_row: bool) -> dict[str, Any]:
     """The properties that systemd need not be asked for, because the runner has them in its table.
 
     The dataflow's user can lie in the table, about the own row only.
@@ -127,17 +132,22 @@ def _known(cell: Cell, status: CellStatus) -> dict[str, Any]:
             known["NRestarts"] = 0  # the next restart begins another life, with another table
         if 0 < status.up_us <= _monotonic_us():
             known[UP_SINCE] = status.up_us
+        if status.text and not is_row:
+            known[_TEXT] = status.text
     return known
 
 
-def _missing(cell: Cell, status: CellStatus, path: Path | None, known: Container[str]) -> list[str]:
-    """The properties that a row of the table still needs: each one is a question to systemd."""
+def _missing(
+    cell: Cell, status: CellStatus, path: Path | None, known: Container[str], is_row: bool
+) -> list[str]:
+    """The properties that a reading still needs: each one is a question to systemd."""
+    more = () if is_row else (_TEXT, _READY_AT)
     if not cell.is_up:
-        return ["NRestarts", ENDED]
+        return ["NRestarts", ENDED, *more]
     names = ["NRestarts", UP_SINCE] if path else ["NRestarts", UP_SINCE, "ControlGroup"]
     # Not needed for a running unit whose runner has samples, which are younger.
     names += [] if cell.state.active in SETTLED and status.samples else [STARTED]
-    return [name for name in names if name not in known]
+    return [name for name in (*names, *more) if name not in known]
 
 
 def read_status(scope: Scope, cell: Cell) -> CellStatus:

@@ -10,7 +10,7 @@ from dora_systemd.decisions.views.snapshot import Observed
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import proven, read_cells
 from dora_systemd.verbs.facts.list import row_of
-from dora_systemd.verbs.facts.reading import Reading, read_dataflow
+from dora_systemd.verbs.facts.reading import Reading, read_dataflow, slice_group
 from dora_systemd.verbs.facts.whole import whole_rows
 
 
@@ -19,7 +19,9 @@ def read_snapshot(manager: Manager, scope: Scope, is_whole: bool = False) -> lis
 
     is_whole: with all that `list` knows of them, and not only what a reading shows.
     """
-    readings = [read_dataflow(manager, scope, cell) for cell in proven(read_cells(manager))]
+    cells = proven(read_cells(manager))
+    path = slice_group(manager) if cells else None
+    readings = [read_dataflow(manager, scope, cell, path) for cell in cells]
     rows = list(map(row_of, readings))
     if is_whole:
         rows = whole_rows(manager, scope, readings, rows)

@@ -256,6 +256,14 @@ def test_a_page_that_leaves_at_the_moment_of_a_change_ends(
     asyncio.run(both())
 
 
+@pytest.mark.parametrize(("on_cpu", "seconds"), [(0.0, 2.0), (0.04, 2.0), (0.1, 5.0), (1.0, 10.0)])
+def test_many_dataflows_are_looked_at_less_often(
+    monkeypatch: pytest.MonkeyPatch, on_cpu: float, seconds: float
+) -> None:
+    monkeypatch.setattr(live_talk, "INTERVAL_SECONDS", 2.0)
+    assert live_talk.pause_after(on_cpu) == pytest.approx(seconds)
+
+
 def test_the_newest_answer_comes_last(monkeypatch: pytest.MonkeyPatch) -> None:
     """What an action has changed must not be hidden by a slow answer of before."""
     began, may_end = threading.Event(), threading.Event()

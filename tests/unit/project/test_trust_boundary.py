@@ -22,6 +22,9 @@ MODULES = {
     "asyncio": "create_subprocess_exec create_subprocess_shell open_unix_connection "
     "open_connection",
 }
+_TESTS = "exists lexists isdir isfile islink ismount getsize getmtime samefile realpath"
+ON_PATHS = set(_TESTS.split())
+"""Of os.path."""
 CALLS = {(module, name) for module, names in MODULES.items() for name in names.split()}
 _METHODS = """
 read_text read_bytes write_text write_bytes open touch unlink rmdir resolve readlink
@@ -55,14 +58,14 @@ _TABLE = {
         adapters.cgroup.groups adapters.host.lock_table adapters.host.machine
         adapters.host.process_table adapters.host.real_time adapters.host.rights
         runner.cell.pause trust.socket_table verbs.destroy
-        link.relay verbs.facts.lives verbs.facts.reading verbs.start.sandbox
+        link.relay verbs.facts.lives verbs.start.sandbox
     """,
     ROOTS: """
         adapters.bus.connection adapters.bus.errors adapters.host.unit_files
         adapters.host.unit_names
         adapters.host.guard
         adapters.releases.build_tree adapters.releases.draft adapters.releases.incoming
-        adapters.releases.store verbs.releases.trial
+        adapters.releases.store verbs.releases.source verbs.releases.trial
         adapters.journal.journalctl adapters.journal.reader adapters.journal.socket verbs.doctor
         verbs.facts.enabled verbs.facts.locks verbs.follow verbs.gateway verbs.needs.notes
         verbs.machines.keys verbs.machines.register
@@ -105,6 +108,8 @@ def _reach(node: ast.Call) -> str:
         return function.id if function.id == "open" else ""
     if not isinstance(function, ast.Attribute):
         return ""
+    if ast.unparse(function.value) == "os.path":
+        return f"os.path.{function.attr}" if function.attr in ON_PATHS else ""
     owner = function.value.id if isinstance(function.value, ast.Name) else ""
     if (owner, function.attr) in CALLS:
         return f"{owner}.{function.attr}"

@@ -371,3 +371,32 @@ def test_a_table_of_a_life_that_is_over_tells_nothing(manager: FakeManager, scop
     manager.units["dora-robot0.service"] |= waiting
     _, (row,) = asked(manager, scope)
     assert (row.status, row.restarts) == ("Restarting", 1)
+
+
+def test_a_snapshot_takes_two_questions_of_each(manager: FakeManager, scope: Scope) -> None:
+    """Its ExecStart=, and when it was ready; the rest is in the table of its runner."""
+    for number in range(3):
+        add_ready(manager, scope, number, text="2/2 nodes ready")
+    manager.questions = 0
+    observed = read_snapshot(manager, scope)
+    few = manager.questions
+    add_ready(manager, scope, 3, text="2/2 nodes ready")
+    manager.questions = 0
+    read_snapshot(manager, scope)
+    assert manager.questions == few + 2
+    assert {one.row.text for one in observed} == {"2/2 nodes ready"}
+
+
+def test_a_snapshot_says_what_systemd_does(manager: FakeManager, scope: Scope) -> None:
+    text = "2/2 nodes ready"
+    add_ready(manager, scope, 0, text=text)
+    manager.units["dora-robot0.service"] |= {
+        "StatusText": text,
+        "ActiveEnterTimestamp": SECOND,
+        "InactiveExitTimestampMonotonic": 1,
+        "ControlGroup": "/dora.slice/dora-robot0.service",
+    }
+    (observed,), (row,) = read_snapshot(manager, scope), read_rows(manager, scope)
+    assert row.started == SECOND
+    alike: dict[str, Any] = {"uptime": 0, "cpu_percent": 0.0}
+    assert observed.row._replace(**alike) == row._replace(**alike)
