@@ -31,6 +31,8 @@ for event in node:
 LIGHT_YAML = "nodes: [{id: light, path: light.py, inputs: {tick: dora/timer/secs/10}}]"
 SLEEP_YAML = "nodes: [{id: asleep, path: /usr/bin/sleep, args: infinity}]"
 SLEEP = "/usr/bin/sleep infinity"
+COUNTS = (1, 10, 50, 200)
+"""How many of them are measured."""
 AT_ONCE = 3
 DORA_AT_MOST = 50
 """Beside 200 of ours `dora start` gives up: the one daemon of all reads all processes, too."""
@@ -57,14 +59,19 @@ class Crowd:
     def grow(self, count: int) -> None:
         """Have `count` of each."""
         self._forget()
-        fresh = [Cell(f"crowd-{number}") for number in range(len(self.cells), count)]
-        with ThreadPoolExecutor(AT_ONCE) as pool:
-            list(pool.map(lambda cell: cell.start(self.flow), fresh))
+        fresh = self.grow_ours(count)
         self.has_dora = count <= DORA_AT_MOST
         for cell in fresh if self.has_dora else []:
             self.dora.dora("start", str(self.asleep), "--name", cell.name, "--detach")
-        self.cells += fresh
         self._supervise([cell.name for cell in self.cells])
+
+    def grow_ours(self, count: int) -> list[Cell]:
+        """Have `count` of ours; those that were started for it."""
+        fresh = [Cell(f"crowd-{number}") for number in range(len(self.cells), count)]
+        with ThreadPoolExecutor(AT_ONCE) as pool:
+            list(pool.map(lambda cell: cell.start(self.flow), fresh))
+        self.cells += fresh
+        return fresh
 
     @property
     def rivals(self) -> list[Contestant]:

@@ -1,9 +1,10 @@
-"""The gateway beside many dataflows: a scrape of /metrics, and a page that is open.
+"""The gateway beside up to 200 dataflows: a scrape of /metrics, and a page that is open.
 
-`many.py` measures it with the dataflows that it has started anyway.
+`python -m benchmarks.gateway [N]`
 """
 
 import json
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,13 +13,15 @@ from functools import partial
 from websockets.sync.client import ClientConnection, connect
 
 from benchmarks.cost import cpu_seconds
-from benchmarks.rounds import OURS, Figure, Measure, alternate, shown
+from benchmarks.crowd import COUNTS, crowd
+from benchmarks.flows import make_home
+from benchmarks.rounds import OURS, Figure, Measure, alternate, keep, shown
 from benchmarks.startup import timed
 from tests.system.cells import run
 from tests.system.gateways import Front
 
 LOOKS = 5
-"""Snapshots of one round: one each two seconds."""
+"""Snapshots of one round: one each two to ten seconds."""
 
 
 @contextmanager
@@ -71,3 +74,18 @@ def wait_snapshot(page: ClientConnection) -> None:
     """The next snapshot of all dataflows."""
     while json.loads(page.recv(30))["type"] != "snapshot":
         pass
+
+
+def measure(rounds: int, counts: tuple[int, ...] = COUNTS) -> list[Figure]:
+    """Both at each number."""
+    scrapes, looks = [], []
+    with crowd(make_home()) as everyone, front() as gateway:
+        for count in counts:
+            everyone.grow_ours(count)
+            scrapes.append(scrape_figure(gateway, count, rounds))
+            looks.append(look_figure(gateway, count, max(rounds // 2, 1)))
+    return [*scrapes, *looks]
+
+
+if __name__ == "__main__":
+    keep("gateway", measure, int(sys.argv[1]) if len(sys.argv) > 1 else 10)

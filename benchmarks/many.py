@@ -1,18 +1,15 @@
-"""`list`, one more start, memory, the gateway, with up to 200.  `python -m benchmarks.many [N]`"""
+"""`list`, one more start, memory, with up to 200.  `python -m benchmarks.many [N]`"""
 
 import sys
 from functools import partial
 
 from benchmarks.contestants import Contestant, Doractl, DoraRun, SystemdRun, prepared
 from benchmarks.cost import private_mb
-from benchmarks.crowd import Crowd, crowd
+from benchmarks.crowd import COUNTS, Crowd, crowd
 from benchmarks.flows import make_home
-from benchmarks.gateway import front, look_figure, scrape_figure
 from benchmarks.rounds import OURS, Figure, alternate, keep, shown
 from benchmarks.start import start_ms
 from benchmarks.startup import listings
-
-COUNTS = (1, 10, 50, 200)
 
 
 def start_figure(contestants: list[Contestant], count: int, rounds: int) -> Figure:
@@ -33,8 +30,8 @@ def memory_figure(all_of_them: Crowd, count: int) -> Figure:
 def measure(rounds: int, counts: tuple[int, ...] = COUNTS) -> list[Figure]:
     """All of them at each number."""
     project = make_home()
-    lists, starts, memory, scrapes, looks = [], [], [], [], []
-    with crowd(project) as everyone, front() as gateway:
+    lists, starts, memory = [], [], []
+    with crowd(project) as everyone:
         for count in counts:
             everyone.grow(count)
             commands = listings(everyone.rivals)
@@ -45,9 +42,7 @@ def measure(rounds: int, counts: tuple[int, ...] = COUNTS) -> list[Figure]:
             with prepared((Doractl, SystemdRun, DoraRun), everyone.flow) as contestants:
                 starts.append(start_figure(contestants, count, max(rounds // 2, 1)))
             memory.append(memory_figure(everyone, count))
-            scrapes.append(scrape_figure(gateway, count, rounds))
-            looks.append(look_figure(gateway, count, max(rounds // 2, 1)))
-    return [*lists, *starts, *memory, *scrapes, *looks]
+    return [*lists, *starts, *memory]
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ TITLES = {
     "recovery": "Recovery",
     "startup": "The command itself",
     "many": "Many dataflows",
+    "gateway": "The gateway beside many dataflows",
     "cost": "Memory and idle CPU",
     "logs": "Log path",
     "messages": "Messages",
