@@ -37,7 +37,7 @@ faults:  ## every fault of tests/system/faults, ROUNDS=n times
 	@ROUNDS=$(ROUNDS) $(CHECK) faults
 
 history:  ## commands and faults in combination; SEED=n STEPS=n HOURS=n, LAB_OUT=DIR keeps records
-	@$(PREPARE) $(if $(filter vm,$(LAB)),container vm,container)
+	@$(PREPARE) $(if $(filter vm machines,$(LAB)),container $(LAB),container)
 	@SEED=$(SEED) STEPS=$(STEPS) HOURS=$(HOURS) $(CHECK) history
 
 power:  ## the power fails ROUNDS=n times in the middle of a deploy or rollback; SEED=n

@@ -23,7 +23,7 @@ from tests.history.report import Report
 from tests.history.scene import PREAMBLE, Scene
 from tests.history.script import format_script
 from tests.history.shrink import shrink
-from tests.history.steps import Step
+from tests.history.steps import ALONE, Step
 from tests.system.cells import run
 
 HOUR = 3600.0
@@ -42,7 +42,7 @@ def run_history(steps: Sequence[Step]) -> History:
 
 def run_seed(seed: int, count: int, report: Report, can_shrink: bool, out: Path | None) -> bool:
     """One history; whether it broke nothing. out: where the records of one that did are kept."""
-    steps, since = generate(seed, count, os.environ.get("LAB") == "vm"), time.time()
+    steps, since = generate(seed, count, os.environ.get("LAB", ALONE)), time.time()
     history = run_history(steps)
     complaints = check(history)
     if complaints and out:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dora_systemd.adapters.releases.store import store_root
+from tests.history import member
 from tests.history.history import Answer, History, Look
 from tests.history.recorder import (
     Watcher,
@@ -160,6 +161,7 @@ class Driver:
             status, out, err = self._shell(text)
             answers.append(Answer(-1, Step(text), status, out, err))
         wait_no_process()
+        member.wait_nothing_left()
         return answers
 
     def clean(self) -> None:
@@ -171,6 +173,7 @@ class Driver:
             Cell(cell).doractl("disable", cell, check=False)
             Cell(cell).end()
             shutil.rmtree(store_root(is_user=False) / cell, ignore_errors=True)
+        member.forget(self.scene.root)
         self.scene.front.end()
 
 

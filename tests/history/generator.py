@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from random import Random
 
-from tests.history.steps import CELLS, COMMANDS, FAULTS, LOOK, Fault, Step, Wish
+from tests.history.steps import ALONE, CELLS, COMMANDS, FAULTS, LOOK, Command, Fault, Step, Wish
 
 LOOK_EVERY = 6
 COMMAND_SHARE = 0.6
@@ -20,22 +20,29 @@ SOON_MS = (0, 30, 100, 300, 700)
 PAUSES_MS = (0, 0, 0, 50, 200, 600, 1500)
 
 
-def generate(seed: int, count: int, has_machine: bool = False) -> list[Step]:
+def generate(seed: int, count: int, lab: str = ALONE) -> list[Step]:
     """`count` steps, the looks among them not counted; the first starts a dataflow.
 
-    has_machine: with the faults that need a machine of their own.
+    lab: where it will happen, one of LABS.
     """
     random, up = Random(seed), {CELLS[0]}
-    faults = {name: one for name, one in FAULTS.items() if has_machine or not one.needs_machine}
+    commands = {name: one for name, one in COMMANDS.items() if lab in one.labs}
+    faults = {name: one for name, one in FAULTS.items() if lab in one.labs}
     steps = [Step("start"), Step(LOOK)]
     for number in range(1, count):
-        steps.append(_step(random, up, steps[-1], faults))
+        steps.append(_step(random, up, steps[-1], commands, faults))
         if number % LOOK_EVERY == 0:
             steps.append(Step(LOOK))
     return steps if steps[-1].what == LOOK else [*steps, Step(LOOK)]
 
 
-def _step(random: Random, up: set[str], before: Step, faults: Mapping[str, Fault]) -> Step:
+def _step(
+    random: Random,
+    up: set[str],
+    before: Step,
+    commands: Mapping[str, Command],
+    faults: Mapping[str, Fault],
+) -> Step:
     """up: the cells that should run if all goes well; a fault needs something to hit."""
     if before.what in FAULTS and random.random() < ANSWERED_SHARE:
         what = random.choice(AFTER_FAULTS)
@@ -44,7 +51,7 @@ def _step(random: Random, up: set[str], before: Step, faults: Mapping[str, Fault
     if before.what in COMMANDS and random.random() < HIT_SHARE:
         return Step(random.choice(IN_COMMANDS), before.cell, random.choice(SOON_MS), is_joined=True)
     cell = random.choices(CELLS, (3, 1))[0]
-    what = _command(random) if random.random() < COMMAND_SHARE else _fault(random, faults)
+    what = _drawn(random, commands if random.random() < COMMAND_SHARE else faults)
     if cell not in up and random.random() < START_SHARE:
         what = "start"
     _note_wish(what, cell, up)
@@ -60,10 +67,5 @@ def _note_wish(what: str, cell: str, up: set[str]) -> None:
         up -= set(CELLS) if command.is_for_all else {cell}
 
 
-def _command(random: Random) -> str:
-    return random.choices(list(COMMANDS), [one.weight for one in COMMANDS.values()])[0]
-
-
-def _fault(random: Random, faults: Mapping[str, Fault]) -> str:
-    weights = [one.weight for one in faults.values()]
-    return random.choices(list(faults), weights)[0]
+def _drawn(random: Random, some: Mapping[str, Command] | Mapping[str, Fault]) -> str:
+    return random.choices(list(some), [one.weight for one in some.values()])[0]

@@ -78,3 +78,28 @@ fill_memory() {
 while True: kept.append(b"x" * 2**24)'
     return 0
 }
+
+# there COMMAND: on the second machine
+there() { ssh -oBatchMode=yes -oConnectTimeout=2 b "$@"; }
+
+link() { main_pid "doralink-$name:b.service"; }
+
+# cable off|mute|on: that of the second machine, see tests/lab/machines.py
+cable() {
+    python3 -c 'import socket, sys
+lab = socket.socket(socket.AF_UNIX)
+lab.connect("/lab/control")
+lab.sendall(f"cable b {sys.argv[1]}\n".encode())
+answer = lab.makefile().readline()
+sys.exit(answer != "ok\n" and answer)' "$1"
+}
+
+# unplug off|mute SECONDS
+unplug() { cable "$1" && sleep "$2" && plug; }
+
+plug() { cable on && until there true; do sleep 0.1; done; }
+
+# freeze_member: the runner there, until thaw_member
+freeze_member() { there "pkill -STOP -f 'dora_systemd[.]runner'" || return 3; }
+
+thaw_member() { there "pkill -CONT -f 'dora_systemd[.]runner'"; return 0; }

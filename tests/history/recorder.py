@@ -5,8 +5,10 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from dora_systemd.adapters.cgroup import groups as cgroup
+from tests.history import member
 from tests.history.history import CellView, Line, Sight, Vital
 from tests.history.scene import Scene, ask
 from tests.history.steps import CELLS
@@ -140,11 +142,17 @@ def journal_lines(since: float) -> list[Line]:
 
 def _lines_of(cell: str, since: float) -> Iterator[Line]:
     where = (f"DORA_DATAFLOW_NAME={cell}", "DORA_STREAM=stdout", f"--since=@{since:.6f}")
-    for record in run("journalctl", "-q", "-o", "json", *where).stdout.splitlines():
-        one = json.loads(record)
+    for one in _records(cell, *where):
         life, _, number = str(one.get("MESSAGE", "")).partition(" ")
         if life.partition(".")[0] in ("source", "sink") and number.isdecimal():
             yield Line(cell, life, int(number), one.get("_SYSTEMD_UNIT") == f"dora-{cell}.service")
+
+
+def _records(cell: str, *where: str) -> Iterator[dict[str, Any]]:
+    """What the journals of all machines have of a cell."""
+    arguments = ("-q", "-o", "json", *where)
+    texts = (run("journalctl", *arguments).stdout, member.journal(cell, *arguments))
+    yield from (json.loads(line) for text in texts for line in text.splitlines())
 
 
 def restart_times(cell: str, since: float) -> tuple[float, ...]:
@@ -158,5 +166,4 @@ def restart_times(cell: str, since: float) -> tuple[float, ...]:
 def lost_lines(cell: str, since: float) -> int:
     """How many lines the journal has counted as lost."""
     where = (f"--unit=dora-{cell}.service", "DORA_EVENT=lines-lost", f"--since=@{since:.6f}")
-    found = run("journalctl", "-q", "-o", "json", *where).stdout.splitlines()
-    return sum(int(json.loads(record)["DORA_COUNT"]) for record in found)
+    return sum(int(one["DORA_COUNT"]) for one in _records(cell, *where))

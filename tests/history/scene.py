@@ -7,6 +7,7 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
+from tests.history import member
 from tests.history.steps import CELLS
 from tests.system.cells import run
 from tests.system.gateways import Front
@@ -30,7 +31,7 @@ nodes:
     max_restarts: 0
 """
 DEVICES = Path("/run/history-devices")
-"""What stands for a device of each dataflow, which its sink needs."""
+"""What stands for a device of each dataflow, which its sink needs; not one on another machine."""
 PLACES = ("/run/dora-systemd", "/run/systemd", "/etc/systemd/system", "/run/dora-gateway")
 IGNORED = (
     *("/run/systemd/journal", "/run/systemd/sessions", "/run/systemd/users"),
@@ -49,15 +50,18 @@ class Scene:
         for name in CELLS:
             self._make_project(root / name)
         root.chmod(0o755)
+        member.bring(root)
 
     def _make_project(self, place: Path) -> None:
         for part in ("project", "notes"):
             (place / part).mkdir(parents=True)
         (place / "notes").chmod(0o777)
         shutil.copy(NODE, place / "project/node.py")
-        (place / "project/dataflow.yml").write_text(FLOW)
+        (place / "project/dataflow.yml").write_text(FLOW + member.placement(place.name))
         device = DEVICES / place.name
         settings = f"nodes: {{sink: {{needs: {device}}}}}\n"
+        if member.is_spread(place.name):
+            settings = member.settings(place / "notes")
         (place / "project/dataflow.systemd.yml").write_text(settings)
         device.touch()
 
@@ -81,11 +85,16 @@ class Scene:
     def printed(self) -> dict[tuple[str, str], int]:
         """By dataflow and life of a node, how many lines it noted."""
         return {
-            (cell, note.name): int(note.read_text() or 0)
+            (cell, name): int(text or 0)
             for cell in CELLS
-            for note in self.notes(cell).iterdir()
-            if not note.name.startswith("order.")
+            for name, text in self._texts(cell).items()
+            if not name.startswith("order.")
         }
+
+    def _texts(self, cell: str) -> dict[str, str]:
+        place = self.notes(cell)
+        here = {note.name: note.read_text() for note in place.iterdir()}
+        return here | member.read_notes(place, cell)
 
 
 def ask(*words: str) -> Any:

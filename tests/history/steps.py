@@ -13,6 +13,9 @@ NO_TARGET = 3
 """Exit status of a fault that found nothing to hit; preamble.sh has it as well."""
 
 CELLS = ("history-a", "history-b")
+ALONE, VM, MACHINES = "container", "vm", "machines"
+LABS = (ALONE, VM, MACHINES)
+"""Where histories happen, see LAB in tests/lab/README.md."""
 
 
 class Wish(StrEnum):
@@ -26,28 +29,31 @@ class Wish(StrEnum):
 @dataclass(frozen=True)
 class Command:
     """An operator's command. wish: what it asks for. weight: how often it is drawn. lives: how many
-    it may begin; a deploy that fails has what ran before run again."""
+    it may begin; a deploy that fails has what ran before run again. labs: where it is drawn; a
+    dataflow over several machines is not deployed."""
 
     shell: str
     wish: Wish = Wish.NOTHING
     weight: int = 1
     is_for_all: bool = False
     lives: int = 0
+    labs: tuple[str, ...] = LABS
 
 
 @dataclass(frozen=True)
 class Fault:
     """A fault. undo: takes it back before the next look. weight: how often it is drawn, 0 only as
     an answer to a command. kills_runner: the runner may be killed between a line and the note that
-    it is written. needs_machine: only a machine with its own kernel can have it."""
+    it is written. labs: where it is drawn; not every one can have it."""
 
     shell: str
     undo: str = ""
     weight: int = 2
     kills_runner: bool = False
-    needs_machine: bool = False
+    labs: tuple[str, ...] = LABS
 
 
+_OF_ONE, _OF_VM, _OF_MACHINES = (ALONE, VM), (VM,), (MACHINES,)
 _FLAGS = (
     '--name $name --env "NOTES=$place/notes" --writable "$place/notes" --restart-policy on-failure'
 )
@@ -79,12 +85,15 @@ COMMANDS = {
         Wish.STOP,
         lives=1,
     ),
-    "deploy": Command(_DEPLOY, Wish.RUN, 3, lives=2),
+    "deploy": Command(_DEPLOY, Wish.RUN, 3, lives=2, labs=_OF_ONE),
     "deploy-edited": Command(
-        f'echo "# edited" >>"$place/project/node.py"; {_DEPLOY} --no-enable', Wish.RUN, lives=2
+        f'echo "# edited" >>"$place/project/node.py"; {_DEPLOY} --no-enable',
+        Wish.RUN,
+        lives=2,
+        labs=_OF_ONE,
     ),
-    "deploy-broken": Command(_DEPLOY_BROKEN, Wish.RUN, lives=2),
-    "rollback": Command("doractl rollback -q $name", Wish.RUN, 2, lives=2),
+    "deploy-broken": Command(_DEPLOY_BROKEN, Wish.RUN, lives=2, labs=_OF_ONE),
+    "rollback": Command("doractl rollback -q $name", Wish.RUN, 2, lives=2, labs=_OF_ONE),
     "releases": Command("doractl releases $name"),
     "inhibit": Command("doractl inhibit $name --why driving -- sleep 1"),
     "reset": Command("doractl reset $name"),
@@ -137,9 +146,23 @@ FAULTS = {
         'mountpoint -q "$place/project" && umount -l "$place/project"',
     ),
     "directory-deleted": Fault('rm -r "/run/dora-systemd/$name"', weight=1),
-    "clock-forward": Fault("clock +1 hour", "clock -1 hour", needs_machine=True),
-    "clock-to-new-year": Fault("clock +60 days", "clock -60 days", 1, needs_machine=True),
-    "memory-full": Fault("fill_memory", needs_machine=True),
+    "clock-forward": Fault("clock +1 hour", "clock -1 hour", labs=_OF_VM),
+    "clock-to-new-year": Fault("clock +60 days", "clock -60 days", 1, labs=_OF_VM),
+    "memory-full": Fault("fill_memory", labs=_OF_VM),
+    "cable-out": Fault("unplug off 2", "plug", 5, labs=_OF_MACHINES),
+    "cable-out-long": Fault("unplug off 12", "plug", 7, labs=_OF_MACHINES),
+    "cable-mute": Fault("unplug mute 12", "plug", 5, labs=_OF_MACHINES),
+    "kill-link": Fault("hit KILL $(link)", weight=5, labs=_OF_MACHINES),
+    "kill-member": Fault(
+        'there "systemctl kill --signal=KILL $unit" || exit 3', "", 5, True, _OF_MACHINES
+    ),
+    "kill-member-daemon": Fault(
+        "there \"pkill -KILL -f 'dora [d]aemon'\" || exit 3", weight=5, labs=_OF_MACHINES
+    ),
+    "kill-member-sink": Fault(
+        "there \"pkill -KILL -f '[n]ode.py sink'\" || exit 3", weight=5, labs=_OF_MACHINES
+    ),
+    "stop-member-runner": Fault("freeze_member", "thaw_member", 5, True, _OF_MACHINES),
 }
 
 

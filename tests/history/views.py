@@ -139,7 +139,8 @@ def nodes_are_real(history: History) -> Iterator[str]:
     for look, cell, view in quiet_looks(history):
         for node in (view.listed or {}).get("nodes", ()):
             pids = view.pids.get(f"node-{node['node']}", ())
-            if node["state"] == "running" and node["pid"] not in pids:
+            is_here = not node.get("machine")
+            if is_here and node["state"] == "running" and node["pid"] not in pids:
                 what = f"{node['node']} is {node['pid']}, its group has {pids}"
                 yield f"step {look.at}: {cell}: {what}"
 

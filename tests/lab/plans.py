@@ -165,13 +165,14 @@ def plan_faults(form: str) -> list[Step]:
 def plan_history(form: str) -> list[Step]:
     """Histories from SEED on, for HOURS or one; what breaks one is made shorter and printed.
 
-    With LAB=vm there are faults of a whole machine among them: its clock, and its memory.
+    With LAB=vm there are faults of a whole machine among them: its clock, and its memory. With
+    LAB=machines one dataflow has a node on a second machine, whose cable is pulled.
     """
     asked = ("--seed", "SEED", "1"), ("--steps", "STEPS", "40"), ("--hours", "HOURS", "0")
     chosen = [word for flag, name, usual in asked for word in (flag, os.environ.get(name) or usual)]
     kept = ["--out", "/out"] if os.environ.get("LAB_OUT") else []
     command = ["tests/lab/lab", "run", "--", "python", "-m", "tests.history", "--shrink"]
-    where = "vm" if form == "vm" else "container"
+    where = form if form in ("vm", "machines") else "container"
     return [Step(f"histories, {where}", [*command, *chosen, *kept], in_lab(where))]
 
 

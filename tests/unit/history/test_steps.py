@@ -11,7 +11,17 @@ from tests.history.generator import generate
 from tests.history.scene import PREAMBLE
 from tests.history.script import format_script
 from tests.history.shrink import shrink
-from tests.history.steps import COMMANDS, FAULTS, LOOK, NO_TARGET, Step, shell_of
+from tests.history.steps import (
+    COMMANDS,
+    FAULTS,
+    LABS,
+    LOOK,
+    NO_TARGET,
+    Command,
+    Fault,
+    Step,
+    shell_of,
+)
 
 SEEDS = range(300)
 
@@ -21,13 +31,17 @@ def test_a_seed_gives_the_same_steps() -> None:
 
 
 def test_every_step_is_drawn_sooner_or_later() -> None:
-    drawn = {step.what for seed in SEEDS for step in generate(seed, 20, has_machine=True)}
+    drawn = {step.what for lab in LABS for seed in SEEDS for step in generate(seed, 20, lab)}
     assert drawn == {*COMMANDS, *FAULTS, LOOK}
 
 
-def test_a_container_has_no_faults_of_a_machine() -> None:
-    drawn = {step.what for seed in SEEDS for step in generate(seed, 20)}
-    assert FAULTS.keys() - drawn == {name for name, one in FAULTS.items() if one.needs_machine}
+@pytest.mark.parametrize("lab", LABS)
+def test_what_a_lab_cannot_have_is_not_drawn(lab: str) -> None:
+    drawn = {step.what for seed in SEEDS for step in generate(seed, 20, lab)}
+    everything: dict[str, Command | Fault] = {**COMMANDS, **FAULTS}
+    assert everything.keys() - drawn == {
+        name for name, one in everything.items() if lab not in one.labs
+    }
 
 
 def test_no_name_is_both() -> None:
