@@ -16,6 +16,10 @@ test:  ## everything: unit tests, system tests in the vm, system tests
 	@$(PREPARE) $(if $(filter host,$(LAB)),host,container machines vm)
 	@$(CHECK) test
 
+check:  ## linters, types and unit tests, those of changed folders first: after every change
+	@$(PREPARE)
+	@$(CHECK) check
+
 unit:  ## unit tests, on this machine's Python
 	@$(PREPARE)
 	@$(CHECK) unit
@@ -92,4 +96,4 @@ autopkgtest:  ## debian/tests, by Debian's own autopkgtest, on what make deb has
 	@$(PREPARE) $(if $(filter vm,$(LAB)),container vm,container)
 	@packaging/autopkgtest
 
-.PHONY: help test unit system quick vm faults history power fuzz browser machines bench bench-quick bookworm lint demo clean deb autopkgtest
+.PHONY: help test check unit system quick vm faults history power fuzz browser machines bench bench-quick bookworm lint demo clean deb autopkgtest

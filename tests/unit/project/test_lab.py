@@ -14,6 +14,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from lab import cache, definition, initrd, pace, wire
+from lab.changed import find_rooms
 from lab.errors import LabError
 from lab.options import FORMS, parse_options
 from lab.plans import PLANS
@@ -256,3 +257,17 @@ def test_speed_is_percent() -> None:
     for text in ("0", "101", "-5", "half"):
         with pytest.raises(LabError, match="LAB_SPEED"):
             read_speed(text)
+
+
+@pytest.mark.parametrize(
+    ("path", "room"),
+    [
+        ("dora_systemd/trust/tree.py", "tests/unit/trust"),
+        ("dora_systemd/names.py", "tests/unit"),
+        ("cli/verbs/look/list.py", "tests/unit/cli/verbs/look"),
+        ("tests/unit/verbs/test_stop.py", "tests/unit/verbs"),
+        ("packaging/man/doractl.1", "tests/unit/project"),
+    ],
+)
+def test_the_room_of_a_changed_file(path: str, room: str) -> None:
+    assert find_rooms([path, ""]) == [room]
