@@ -98,17 +98,21 @@ class Connection:
 
 
 def request(
-    stream: "sockets.socket", token: str, params: Params, seconds: float = REQUEST_SECONDS
+    stream: "sockets.socket",
+    token: str,
+    params: Params,
+    seconds: float = REQUEST_SECONDS,
+    open_seconds: float = OPEN_SECONDS,
 ) -> Reply:
     """Send one request through a relay of a cell's runner, and close.
 
-    Not for a thread with a running loop. The reply may take `seconds`, including other messages
-    before it. Raises DoraSystemdError.
+    Not for a thread with a running loop. The handshake may take `open_seconds`, and the reply
+    `seconds`, including other messages before it. Raises DoraSystemdError.
     """
 
     async def ask() -> Reply:
         try:
-            async with asyncio.timeout(OPEN_SECONDS):
+            async with asyncio.timeout(open_seconds):
                 connection = await Connection.over(stream, token)
         except TimeoutError as error:
             raise _silent(params, error) from error

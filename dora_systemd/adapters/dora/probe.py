@@ -12,19 +12,20 @@ _SECONDS = 60.0
 _FIND = """
 import importlib.util, sys
 sys.path[:1] = [one for one in sys.path[:1] if one]
-spec = importlib.util.find_spec("dora")
+spec = importlib.util.find_spec(sys.argv[1])
 sys.exit(1) if spec is None or spec.origin is None else print(sys.executable)
 """
-"""Prints the interpreter if it has dora-rs. It does not import dora, which takes longer."""
+"""Prints the interpreter if it has the module. It does not import it, which takes longer."""
 
 
-def probe_python(plan: LaunchPlan) -> str:
+def probe_python(plan: LaunchPlan, module: str = "dora") -> str:
     """The absolute path of a Python with dora-rs: that of the nodes, else that of the runner.
 
-    Blocks for some 20 ms. Raises DoraSystemdError (BAD_INPUT) if there is none.
+    module: the name by which nodes import dora-rs. Blocks for some 20 ms. Raises DoraSystemdError
+    (BAD_INPUT) if there is none.
     """
     for command in _interpreters(plan):
-        if found := _with_dora(command, plan):
+        if found := _with_module(command, plan, module):
             return found
     python = " ".join(next(_interpreters(plan)))
     raise DoraSystemdError(
@@ -39,11 +40,11 @@ def _interpreters(plan: LaunchPlan) -> Iterator[Sequence[str]]:
     yield (sys.executable,)
 
 
-def _with_dora(command: Sequence[str], plan: LaunchPlan) -> str:
+def _with_module(command: Sequence[str], plan: LaunchPlan, module: str) -> str:
     directory = plan.options.working_directory
     try:
         done = run_command(
-            [*command, "-c", _FIND], _SECONDS, plan.environment, directory, own_account()
+            [*command, "-c", _FIND, module], _SECONDS, plan.environment, directory, own_account()
         )
     except DoraSystemdError:
         return ""  # there is no such program

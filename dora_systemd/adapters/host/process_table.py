@@ -17,9 +17,9 @@ _MOST_BYTES = 256 * 1024
 _SOCKET = re.compile(r"socket:\[(\d+)\]")
 
 
-def read_processes() -> list[Process]:
+def read_processes(proc: Path = PROC) -> list[Process]:
     """All readable processes, without kernel threads."""
-    found = (_read_process(path) for path in PROC.glob("[0-9]*"))
+    found = (_read_process(path) for path in proc.glob("[0-9]*"))
     return sorted((one for one in found if one), key=lambda one: one.pid)
 
 

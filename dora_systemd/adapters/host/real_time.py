@@ -10,53 +10,57 @@ from dora_systemd.adapters.host.process import run_command
 from dora_systemd.decisions.views.real_time import RealTime
 from dora_systemd.errors import DoraSystemdError
 
-_CPUS = Path("/sys/devices/system/cpu")
-_CONFIGS = ("/proc/config.gz", f"/boot/config-{os.uname().release}")
+_CPUS = "sys/devices/system/cpu"
+_CONFIGS = ("proc/config.gz", f"boot/config-{os.uname().release}")
 _OPTION = "CONFIG_RT_GROUP_SCHED"
 _MOST_BYTES = 4 * 1024 * 1024
 _GZIP = 16 + zlib.MAX_WBITS
 _SECONDS = 10.0
-_REALTIME = ("/usr/bin/chrt", "--fifo", "1", "/bin/true")
-_LIMIT = ("/usr/bin/prlimit", "--rtprio=99:99", "/bin/true")
+_REALTIME = ("usr/bin/chrt", "--fifo", "1", "/bin/true")
+_LIMIT = ("usr/bin/prlimit", "--rtprio=99:99", "/bin/true")
 
 
-def read_real_time() -> RealTime:
-    """All facts. As root it tries to get rights, in children that end at once."""
+def read_real_time(root: Path = Path("/")) -> RealTime:
+    """All facts. As root it tries to get rights, in children that end at once.
+
+    root: the directory with all files of the machine.
+    """
     return RealTime(
-        has_groups=_has_groups(),
-        is_granted=_can_run(_REALTIME),
-        can_raise=_can_run(_LIMIT),
-        isolated=_text(_CPUS / "isolated"),
-        governors=_governors(),
+        has_groups=_has_groups(root),
+        is_granted=_can_run(root, _REALTIME),
+        can_raise=_can_run(root, _LIMIT),
+        isolated=_text(root / _CPUS / "isolated"),
+        governors=_governors(root / _CPUS),
     )
 
 
-def _has_groups() -> bool | None:
-    lines = next(filter(None, map(_config, _CONFIGS)), "").splitlines()
+def _has_groups(root: Path) -> bool | None:
+    lines = next(filter(None, (_config(root / one) for one in _CONFIGS)), "").splitlines()
     return f"{_OPTION}=y" in lines if lines else None
 
 
-def _config(path: str) -> str:
+def _config(path: Path) -> str:
     """The configuration of the kernel, compressed or not; "" if it is not there."""
-    with contextlib.suppress(OSError, zlib.error), Path(path).open("rb") as file:
+    with contextlib.suppress(OSError, zlib.error), path.open("rb") as file:
         data = file.read(_MOST_BYTES)
-        plain = zlib.decompressobj(_GZIP).decompress(data, _MOST_BYTES) if "gz" in path else data
+        is_packed = path.suffix == ".gz"
+        plain = zlib.decompressobj(_GZIP).decompress(data, _MOST_BYTES) if is_packed else data
         return plain.decode(errors="replace")
     return ""
 
 
-def _can_run(command: Sequence[str]) -> bool | None:
+def _can_run(root: Path, command: Sequence[str]) -> bool | None:
     """Whether root can; None for others, and if the program is not there."""
     if os.geteuid() != 0:
         return None
     try:
-        return run_command(command, _SECONDS).status == 0
+        return run_command([str(root / command[0]), *command[1:]], _SECONDS).status == 0
     except DoraSystemdError:
         return None
 
 
-def _governors() -> tuple[str, ...]:
-    found = {_text(path) for path in _CPUS.glob("cpu[0-9]*/cpufreq/scaling_governor")}
+def _governors(cpus: Path) -> tuple[str, ...]:
+    found = {_text(path) for path in cpus.glob("cpu[0-9]*/cpufreq/scaling_governor")}
     return tuple(sorted(filter(None, found)))
 
 

@@ -3,10 +3,10 @@
 import contextlib
 import os
 import resource
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
-from dora_systemd.adapters.host.process import run_command
+from dora_systemd.adapters.host.process import Completed, run_command
 from dora_systemd.decisions.cell.limits import CPUS, NodeLimits
 from dora_systemd.decisions.rights.commands import (
     OTHERS,
@@ -32,8 +32,8 @@ def read_base(bound: Mapping[str, str] | None = None) -> Base:
     return Base(os.getpriority(os.PRIO_PROCESS, 0), oom, bound or {})
 
 
-def prove_rights(rights: Sequence[NodeRights]) -> None:
-    """Have a child of this process take the rights of each node.
+def prove_rights(rights: Sequence[NodeRights], run: Callable[..., Completed] = run_command) -> None:
+    """Have a child of this process take the rights of each node, by `run`.
 
     The kernel decides by limits, capabilities, cgroup and sandbox together, so nobody can foretell
     the answer. Raises DoraSystemdError (NO_PERMISSION) with the one that it refuses.
@@ -42,7 +42,7 @@ def prove_rights(rights: Sequence[NodeRights]) -> None:
         return
     named = {one.node: one for one in rights}
     for node, words in rights_commands(rights, read_base()).items():
-        done = run_command([*words, "/bin/true"], _SECONDS, _ENVIRONMENT, account=own_account())
+        done = run([*words, "/bin/true"], _SECONDS, _ENVIRONMENT, account=own_account())
         # nice(1) goes on without the priority, and complains.
         if done.status or done.stderr:
             raise _refusal(named.get(node), node, done.stderr)

@@ -15,7 +15,7 @@ from dora_systemd.trust.files import read_file
 DEBOUNCE_MS = 400
 """Maximum time to collect changes that follow each other quickly."""
 _STEP_MS = 100
-_IDLE_MS = 5000
+IDLE_MS = 5000
 """Time after which watchfiles reports that nothing has changed. Its watches exist by then."""
 _GONE_SECONDS = 0.25
 
@@ -29,13 +29,13 @@ def watch_rules(options: RunnerOptions) -> WatchRules:
 
 
 async def changed_files(
-    rules: WatchRules, on_seen: Callable[[], object] = bool
+    rules: WatchRules, on_seen: Callable[[], object] = bool, idle_ms: int = IDLE_MS
 ) -> AsyncIterator[frozenset[str]]:
     """Files that match `rules` and were written, created, renamed or deleted, in batches.
 
     Watches directories, not files, because editors save by renaming. Ignored directories cost
-    nothing. on_seen: is called when each later change is noticed, if not at once. Raises
-    DoraSystemdError if the kernel refuses more watches.
+    nothing. on_seen: is called when each later change is noticed, if not at once. idle_ms: as
+    IDLE_MS. Raises DoraSystemdError if the kernel refuses more watches.
     """
     seen: dict[str, int] = {}
 
@@ -53,7 +53,7 @@ async def changed_files(
     while True:
         await _wait_root(rules.root)
         is_first = is_unsure = True
-        async for paths in _bursts(rules):
+        async for paths in _bursts(rules, idle_ms):
             files = frozenset(path for path in paths if rules.has(path))
             seen.update((path, change_time(path)) for path in files)
             # Found by their time: changes before the new watches, and those that watchfiles drops
@@ -111,8 +111,8 @@ def change_time(path: str) -> int:
         return 0
 
 
-async def _bursts(rules: WatchRules) -> AsyncIterator[frozenset[str]]:
-    """Paths of changed files, until a directory is created or deleted; none each _IDLE_MS."""
+async def _bursts(rules: WatchRules, idle_ms: int) -> AsyncIterator[frozenset[str]]:
+    """Paths of changed files, until a directory is created or deleted; none each `idle_ms`."""
     # Imported late: only hot reload needs it.
     from watchfiles import Change, awatch
 
@@ -123,7 +123,7 @@ async def _bursts(rules: WatchRules) -> AsyncIterator[frozenset[str]]:
             watch_filter=None,
             debounce=DEBOUNCE_MS,
             step=_STEP_MS,
-            rust_timeout=_IDLE_MS,
+            rust_timeout=idle_ms,
             yield_on_timeout=True,
             recursive=False,
         ):

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby, islice, takewhile
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from dora_systemd.adapters.journal.journalctl import (
     CHUNK,
@@ -27,20 +27,15 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import is_name, is_node_id, is_uuid, name_from_unit, unit_name
 from dora_systemd.scope import Scope
 
-PERSISTENT = Path("/var/log/journal")
-VOLATILE = Path("/run/log/journal")
+_ROOT = Path("/")
+_PERSISTENT = "var/log/journal"
+_VOLATILE = "run/log/journal"
 
 _LIFE_EVENTS = ("starting", "started", "stopping", "finished", "stopped", "failed")
 _LIFE_FIELDS = ("DORA_DATAFLOW", "DORA_EVENT", "DORA_EXIT", "DORA_REASON")
 
 MAX_LINE = 1024 * 1024
 """Maximum bytes of a record, or of a value."""
-MAX_BYTES = 32 * 1024 * 1024
-"""Maximum bytes that one call reads."""
-FIRST_SECONDS = 20.0
-"""Timeout for the first record: journalctl may have to open large files on a slow disk."""
-READ_SECONDS = 2.0
-"""Timeout after the first record."""
 _MOST_FORGED = 100
 _MOST_NAMES = 1000
 _MOST_DETAIL = 300
@@ -63,12 +58,30 @@ class LastEvent:
     cursor: str = ""
 
 
+class Bounds(NamedTuple):
+    """The limits of one call.
+
+    size: maximum bytes. first_seconds: timeout for the first record: journalctl may have to open
+    large files on a slow disk. seconds: timeout after the first record.
+    """
+
+    size: int = 32 * 1024 * 1024
+    first_seconds: float = 20.0
+    seconds: float = 2.0
+
+
+_BOUNDS = Bounds()
+
+
 class JournalReader:
     """Queries of the journal."""
 
+    def __init__(self, bounds: Bounds = _BOUNDS) -> None:
+        self._bounds = bounds
+
     def unique(self, field: str) -> list[str]:
         """All values of `field` in the journal, sorted."""
-        lines = _lines([f"--field={field}", "--quiet"])
+        lines = _lines([f"--field={field}", "--quiet"], self._bounds)
         return sorted(line.decode("utf-8", "replace").rstrip("\n") for line in lines)
 
     def known_names(self, scope: Scope) -> list[str]:
@@ -132,7 +145,8 @@ class JournalReader:
         options = [] if limit is None else [f"--lines={limit}"]
         options += [f"--until={journal_timestamp(until_us)}"] if until_us else []
         options += ["--all"] if is_whole else []
-        for line in _lines(["--output=json", "--reverse", "--quiet", *options, "--", *matches]):
+        words = ["--output=json", "--reverse", "--quiet", *options, "--", *matches]
+        for line in _lines(words, self._bounds):
             yield json.loads(line)
 
     def last_events(
@@ -177,16 +191,16 @@ class JournalReader:
         yield from (invocation for invocation, _ in groupby(ids) if invocation)
 
 
-def _lines(arguments: Sequence[str]) -> Iterator[bytes]:
+def _lines(arguments: Sequence[str], bounds: Bounds) -> Iterator[bytes]:
     """The lines that journalctl prints, within limits. Raises DoraSystemdError for its error.
 
     Every node can write to the journal, and fill it with records of 32 MiB each. So this leaves out
-    lines that are too long, and ends after MAX_BYTES or the timeout.
+    lines that are too long, and ends after so many bytes or the timeout.
     """
     with open_journalctl(arguments) as child:
         assert child.stdout
-        fd, rest, left = child.stdout.fileno(), b"", MAX_BYTES
-        deadline = time.monotonic() + FIRST_SECONDS
+        fd, rest, left = child.stdout.fileno(), b"", bounds.size
+        deadline = time.monotonic() + bounds.first_seconds
         poll = select.poll()
         poll.register(fd, select.POLLIN)
         while left > 0 and poll.poll(max(deadline - time.monotonic(), 0.0) * 1000):
@@ -194,8 +208,8 @@ def _lines(arguments: Sequence[str]) -> Iterator[bytes]:
                 if rest and len(rest) <= MAX_LINE:
                     yield rest
                 break
-            if left == MAX_BYTES:
-                deadline = time.monotonic() + READ_SECONDS
+            if left == bounds.size:
+                deadline = time.monotonic() + bounds.seconds
             left -= len(data)
             *lines, last = data.split(b"\n")
             for line in lines:
@@ -206,7 +220,7 @@ def _lines(arguments: Sequence[str]) -> Iterator[bytes]:
             rest = (rest + last)[: MAX_LINE + 1]
         else:
             child.kill()
-            if left < MAX_BYTES:
+            if left < bounds.size:
                 return  # what it has complained of is no reason to show nothing
         end_journalctl(child)
 
@@ -241,14 +255,17 @@ def _system_files(top: Path) -> list[Path]:
     return [path for path in files if not os.access(path.parent, os.X_OK) or path.exists()]
 
 
-def is_volatile() -> bool:
-    """Whether the journal is lost at a reboot, see Storage= in journald.conf(5)."""
-    return not _system_files(PERSISTENT)
+def is_volatile(root: Path = _ROOT) -> bool:
+    """Whether the journal below `root` is lost at a reboot, see Storage= in journald.conf(5)."""
+    return not _system_files(root / _PERSISTENT)
 
 
-def check_readable(scope: Scope) -> None:
-    """Raise DoraSystemdError if this user may not read the records of dataflows of `scope`."""
-    files = [*_system_files(PERSISTENT), *_system_files(VOLATILE)]
+def check_readable(scope: Scope, root: Path = _ROOT) -> None:
+    """Raise DoraSystemdError if this user may not read the records of dataflows of `scope`.
+
+    root: the directory with all files of the machine.
+    """
+    files = [*_system_files(root / _PERSISTENT), *_system_files(root / _VOLATILE)]
     if any(os.access(path, os.R_OK) for path in files):
         return
     if not files:
@@ -256,7 +273,7 @@ def check_readable(scope: Scope) -> None:
         raise DoraSystemdError("cannot find a journal on this machine", hint, ExitCode.NO_SYSTEMD)
     if not scope.is_user:
         raise DoraSystemdError("cannot read the system's journal", JOIN, ExitCode.NO_PERMISSION)
-    if is_volatile():
+    if is_volatile(root):
         hint = f"it is volatile: {JOIN}, or have Storage=persistent set in journald.conf(5)"
         message = "cannot read the records of user services in this machine's journal"
         raise DoraSystemdError(message, hint, ExitCode.NO_PERMISSION)

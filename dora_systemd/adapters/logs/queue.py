@@ -89,10 +89,12 @@ class LogQueue:
         journal: Journal,
         pause: Callable[[str], None],
         resume: Callable[[str], None],
+        max_records: int = MAX_RECORDS,
     ) -> None:
         self._journal = journal
         self._pause = pause
         self._resume = resume
+        self._max_records = max_records
         self._lanes: defaultdict[str, _Lane] = defaultdict(_Lane)
         self._events: deque[_Event] = deque()
         self._turn = 0
@@ -113,9 +115,9 @@ class LogQueue:
             self._pause(node)
 
     def put_record(self, node: str, entry: bytes) -> None:
-        """Send one entry that no paused pipe holds back; above MAX_RECORDS count it as lost."""
+        """Send one entry that no paused pipe holds back; above max_records count it as lost."""
         lane = self._lanes[node]
-        if lane.records >= MAX_RECORDS:
+        if lane.records >= self._max_records:
             self._lost += 1
             return
         lane.records += 1
@@ -123,7 +125,7 @@ class LogQueue:
 
     def put_event(self, entry: bytes) -> None:
         """Send an entry after all entries of all nodes that were put before it."""
-        if len(self._events) >= MAX_RECORDS:
+        if len(self._events) >= self._max_records:
             self._lost += 1
             return
         behind = {node for node, lane in self._lanes.items() if lane.waiting}

@@ -35,15 +35,15 @@ def ask(path: Path, request: Request, seconds: float = ANSWER_SECONDS) -> dict[s
         return _exchange(stream, path, request, seconds)
 
 
-def order(path: Path, request: Request) -> dict[str, Any]:
+def order(path: Path, request: Request, seconds: float = RELAY_SECONDS) -> dict[str, Any]:
     """Send a request that may take long, to a runner that responds now. Raises DoraSystemdError.
 
-    A runner that is stopped, or does not answer on purpose, fails after RELAY_SECONDS.
+    A runner that is stopped, or does not answer on purpose, fails after `seconds`.
     """
     # A refusal counts as a response: a reload does not need a coordinator.
     refused = contextlib.suppress(DoraSystemdError)
-    with _reaching(path), connect_unix(path, RELAY_SECONDS) as stream, refused:
-        _exchange(stream, path, {"verb": "coordinator"}, RELAY_SECONDS)
+    with _reaching(path), connect_unix(path, seconds) as stream, refused:
+        _exchange(stream, path, {"verb": "coordinator"}, seconds)
     return ask(path, request)
 
 

@@ -13,7 +13,6 @@ from dora_systemd.adapters.bus import systemd as bus
 from dora_systemd.adapters.bus.wire import decoded, encoded
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
-from tests.unit.fakes import library
 from tests.unit.fakes.library import fake_systemd
 from tests.unit.fakes.manager import FakeManager, ScopeIn
 
@@ -202,11 +201,7 @@ def test_a_systemd_that_accepts_and_does_not_answer_costs_no_descriptor(
 ) -> None:
     """pystemd closes them only on request, and the gateway tries again and again."""
     systemd = fake_systemd(monkeypatch, FakeManager())
-
-    def refuse(*_: object) -> None:
-        raise DBusBaseError
-
-    monkeypatch.setattr(library.Connection, "call_method", refuse)
+    systemd.refuses = DBusBaseError()
     with pytest.raises(DoraSystemdError, match=r"^cannot reach systemd: Connection timed out$"):
         connection._open(SYSTEM, "/nowhere/private", 5.0, 1.0)
     assert not systemd.connections

@@ -118,7 +118,9 @@ def test_controllers_are_enabled_one_by_one(unit: Path) -> None:
 
 def test_no_controllers_is_no_error(unit: Path) -> None:
     (unit / "cgroup.controllers").write_text("\n")
+    (unit / "cgroup.subtree_control").write_text("")
     cgroup.enable_controllers(unit)
+    assert not (unit / "cgroup.subtree_control").read_text()
 
 
 def test_populated(unit: Path) -> None:

@@ -100,16 +100,13 @@ def test_an_order_for_a_runner_whose_coordinator_is_nowhere(tmp_path: Path) -> N
         assert order(path, {"verb": "reload"}) == {"done": ["reload"]}
 
 
-def test_an_order_for_a_runner_that_is_silent(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("dora_systemd.adapters.runner_socket.client.RELAY_SECONDS", 0.05)
+def test_an_order_for_a_runner_that_is_silent(tmp_path: Path) -> None:
     path = tmp_path / "runner.sock"
     with socket.socket(socket.AF_UNIX) as listener:
         listener.bind(str(path))
         listener.listen()
         with pytest.raises(DoraSystemdError, match="timed out") as caught:
-            order(path, {"verb": "reload"})
+            order(path, {"verb": "reload"}, 0.05)
     assert caught.value.code == ExitCode.NOT_RUNNING
 
 

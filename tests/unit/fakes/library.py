@@ -3,10 +3,11 @@
 It knows the calls of the gateway's doers, and no types: a word is a value of its signature.
 """
 
+import json
 import os
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from types import ModuleType
@@ -38,11 +39,15 @@ class Message:
 
 
 class FakeSystemd:
-    """is_slow: jobs end with the first kill, or finish(). lives: InvocationID, one by one."""
+    """is_slow: jobs end with the first kill, or finish(). lives: InvocationID, one by one.
+
+    refuses: an error that it answers each call with.
+    """
 
     def __init__(self, manager: FakeManager) -> None:
         self.manager = manager
         self.is_slow = False
+        self.refuses: Exception | None = None
         self.lives: list[Callable[[], str]] = []
         self.connections: list[Connection] = []
         self._waiting: list[tuple[str, str]] = []
@@ -54,6 +59,8 @@ class FakeSystemd:
             return self.connections[-1]
 
     def call(self, path: bytes, method: str, words: list[str]) -> Any:
+        if self.refuses:
+            raise self.refuses
         with self._lock:
             if method in JOBS:
                 return self._job(method, words[0])
@@ -158,8 +165,12 @@ def fake_systemd(patch: pytest.MonkeyPatch, manager: FakeManager) -> FakeSystemd
     return systemd
 
 
-def fake_journalctl(patch: pytest.MonkeyPatch, directory: Path, records: bytes) -> Path:
+def fake_journalctl(
+    patch: pytest.MonkeyPatch, directory: Path, records: bytes | Iterable[Mapping[str, Any]]
+) -> Path:
     """From now on journalctl prints `records`; the file with the arguments of each call."""
+    if not isinstance(records, bytes):
+        records = "".join(json.dumps(one) + "\n" for one in records).encode()
     (directory / "records").write_bytes(records)
     calls = directory / "calls"
     make_program(directory / "journalctl", f'echo "$@" >> {calls}\ncat {directory}/records')

@@ -67,11 +67,10 @@ def test_no_reply(handler: Handler, reason: str) -> None:
         ask(handler, 0.5)
 
 
-def test_no_handshake(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(control, "OPEN_SECONDS", 0.1)
+def test_no_handshake() -> None:
     near, far = socket.socketpair()
     with far, pytest.raises(DoraSystemdError, match=r"to Any: no reply in time$"):
-        control.request(near, "token", "Any")
+        control.request(near, "token", "Any", open_seconds=0.1)
     assert near.fileno() == -1, "the connection is closed"
 
 

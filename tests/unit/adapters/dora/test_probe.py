@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from dora_systemd.adapters.dora import probe
 from dora_systemd.adapters.dora.probe import probe_python
 from dora_systemd.decisions.cell.launch import LaunchPlan
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -30,16 +29,13 @@ def test_the_interpreter_itself(tmp_path: Path) -> None:
     assert Path(found).samefile(sys.executable)
 
 
-def test_a_directory_of_the_project_is_no_library(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_directory_of_the_project_is_no_library(tmp_path: Path) -> None:
     """Whoever has a directory named dora beside the dataflow still needs dora-rs."""
-    # Another name: the Python that runs this test may have dora-rs.
-    monkeypatch.setattr(probe, "_FIND", probe._FIND.replace('"dora"', '"dora_of_ours"'))
     (tmp_path / "dora_of_ours").mkdir()
     (tmp_path / "dora_of_ours" / "__init__.py").touch()
     with pytest.raises(DoraSystemdError) as caught:
-        probe_python(plan(tmp_path, {}))
+        # Another name: the Python that runs this test may have dora-rs.
+        probe_python(plan(tmp_path, {}), "dora_of_ours")
     assert caught.value.message.endswith("/python has no dora-rs")
     assert "pip install dora-rs" in caught.value.hint
     assert caught.value.code == ExitCode.BAD_INPUT

@@ -4,6 +4,7 @@ import os
 import socket
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -12,12 +13,12 @@ from dora_systemd.adapters.host import fd_store
 
 
 @pytest.fixture
-def manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> socket.socket:
-    server = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-    server.bind(str(tmp_path / "notify"))
-    server.settimeout(5)
-    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
-    return server
+def manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as server:
+        server.bind(str(tmp_path / "notify"))
+        server.settimeout(5)
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+        yield server
 
 
 def test_store(manager: socket.socket) -> None:
@@ -32,15 +33,19 @@ def test_store(manager: socket.socket) -> None:
     os.close(writer)
     fd_store.forget("m1.camera")
     assert manager.recv(100) == b"FDSTOREREMOVE=1\nFDNAME=dora-log-m1.camera"
-    manager.close()
 
 
-def test_without_systemd(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
-    fd_store.store(0, "a")
-    monkeypatch.setenv("NOTIFY_SOCKET", "/nonexistent")
-    fd_store.store(0, "a")
-    fd_store.forget_inherited()
+def test_without_systemd(manager: socket.socket, monkeypatch: pytest.MonkeyPatch) -> None:
+    for key in ("LISTEN_PID", "LISTEN_FDNAMES", "LISTEN_FDS"):
+        monkeypatch.delenv(key, raising=False)
+    for where in ("", "/nonexistent"):
+        monkeypatch.setenv("NOTIFY_SOCKET", where)
+        fd_store.store(0, "a")
+        fd_store.forget_inherited()
+    os.fstat(0)  # what was to be stored is still open
+    manager.setblocking(False)
+    with pytest.raises(BlockingIOError):
+        manager.recv(100)
 
 
 def test_the_first_life(monkeypatch: pytest.MonkeyPatch) -> None:

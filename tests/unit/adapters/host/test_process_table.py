@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from dora_systemd.adapters.host import process_table
 from dora_systemd.adapters.host.process_table import (
     group_in,
     read_processes,
@@ -46,15 +45,14 @@ def test_who_listens() -> None:
     assert socket_owners(inodes) == set()
 
 
-def test_damaged_entries_are_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(process_table, "PROC", tmp_path)
+def test_damaged_entries_are_passed_over(tmp_path: Path) -> None:
     whole = {"cmdline": "a b\0c\0", "stat": "7 (a) b) S 5 7 7", "cgroup": "0::/x\n", "environ": ""}
     entries = {"7": whole, "8": whole | {"stat": ""}, "9": whole | {"cmdline": ""}, "10": {}}
     for pid, files in entries.items():
         (tmp_path / pid).mkdir()
         for name, text in files.items():
             (tmp_path / pid / name).write_text(text)
-    (found,) = read_processes()
+    (found,) = read_processes(tmp_path)
     assert (found.pid, found.parent, found.command, found.group) == (7, 5, ("a b", "c"), "/x")
 
 

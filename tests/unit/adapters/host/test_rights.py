@@ -4,10 +4,11 @@ import os
 import resource
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from dora_systemd.adapters.host import rights as host
+from dora_systemd.adapters.host.process import Completed, run_command
 from dora_systemd.adapters.host.rights import (
     check_cpus,
     lower_rights,
@@ -15,7 +16,7 @@ from dora_systemd.adapters.host.rights import (
     read_base,
 )
 from dora_systemd.decisions.cell.limits import parse_node_limits
-from dora_systemd.decisions.rights.commands import BEHIND_ESSENTIAL, Base
+from dora_systemd.decisions.rights.commands import BEHIND_ESSENTIAL
 from dora_systemd.decisions.rights.node_rights import NodeRights, parse_node_rights
 from dora_systemd.errors import DoraSystemdError, ExitCode
 
@@ -27,30 +28,47 @@ def test_base_of_this_process() -> None:
     assert base.bound == {"a": "0"}
 
 
+class Prover:
+    """Runs what takes the rights, and notes it. instead: runs this in its place."""
+
+    def __init__(self, *instead: str) -> None:
+        self.instead = instead
+        self.done: list[Completed] = []
+        self.commands: list[list[str]] = []
+
+    def __call__(self, command: list[str], *words: Any, **more: Any) -> Completed:
+        self.commands.append(command)
+        self.done.append(run_command(self.instead or command, *words, **more))
+        return self.done[-1]
+
+
 def test_what_everybody_may_have_is_proved() -> None:
-    prove_rights([])
-    prove_rights([parse_node_rights("a:scheduling=idle,essential"), parse_node_rights("b:nice=19")])
+    prove_rights([], prove := Prover())
+    assert not prove.commands
+    rights = [parse_node_rights("a:scheduling=idle,essential"), parse_node_rights("b:nice=19")]
+    prove_rights(rights, prove)
+    assert prove.done == [Completed(0, "", "")] * 3
+    idle, nice, _ = prove.commands
+    assert idle[-4:] == ["/usr/bin/chrt", "--idle", "0", "/bin/true"]
+    assert nice[-4] == "/usr/bin/nice"
 
 
-def test_what_the_kernel_refuses_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_the_kernel_refuses_is_an_error() -> None:
     """The lower the wanted value, the less any kernel would allow: this one is below all."""
-    monkeypatch.setattr(host, "read_base", lambda: Base())
-    words = {"camera": ["/usr/bin/choom", "-n", "-2000", "--"], "*": []}
-    monkeypatch.setattr(host, "rights_commands", lambda *_: words)
+    prove = Prover("/usr/bin/choom", "-n", "-2000", "--", "/bin/true")
     with pytest.raises(DoraSystemdError) as caught:
-        prove_rights([NodeRights("camera", oom_score_adjust=-1000)])
+        prove_rights([NodeRights("camera", oom_score_adjust=-1000)], prove)
     start = "cannot give the node camera its rights (oom_score_adjust -1000): choom: "
     assert caught.value.message.startswith(start)
     assert "\n" not in caught.value.message
     assert caught.value.code is ExitCode.NO_PERMISSION
 
 
-def test_a_program_that_only_complains_is_a_refusal(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_program_that_only_complains_is_a_refusal() -> None:
     """nice(1) runs the program without the priority."""
-    script = ["/bin/sh", "-c", "echo 'nice: cannot set niceness' >&2"]
-    monkeypatch.setattr(host, "rights_commands", lambda *_: {"*": script})
-    with pytest.raises(DoraSystemdError, match="the other nodes its rights: nice: cannot"):
-        prove_rights([NodeRights("camera", nice=-5)])
+    prove = Prover("/bin/sh", "-c", "echo 'nice: cannot set niceness' >&2")
+    with pytest.raises(DoraSystemdError, match=r"camera its rights \(nice -5\): nice: cannot"):
+        prove_rights([NodeRights("camera", nice=-5)], prove)
 
 
 def test_cpus_of_this_process() -> None:

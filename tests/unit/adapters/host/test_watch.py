@@ -14,10 +14,12 @@ from dora_systemd.decisions.reload.watch_rules import WatchRules
 SECONDS = 20.0
 
 
-async def first(rules: WatchRules) -> frozenset[str]:
+async def first(
+    rules: WatchRules, idle_ms: int = watch.IDLE_MS, seconds: float = SECONDS
+) -> frozenset[str]:
     """The first batch of changed files."""
-    async with asyncio.timeout(SECONDS):
-        async for files in watch.changed_files(rules):
+    async with asyncio.timeout(seconds):
+        async for files in watch.changed_files(rules, idle_ms=idle_ms):
             return files
     raise AssertionError
 
@@ -43,17 +45,14 @@ def test_a_save_before_the_watches_exist_is_found(
             (tmp_path / name).write_text("")
 
     monkeypatch.setattr(watchfiles, "awatch", late)
-    monkeypatch.setattr(watch, "_IDLE_MS", 1000)
-    found = asyncio.run(first(WatchRules(str(tmp_path), ("*.py",))))
+    found = asyncio.run(first(WatchRules(str(tmp_path), ("*.py",)), 1000))
     assert found == {str(saved), *(str(tmp_path / name) for name in others)}
 
 
-def test_what_is_unchanged_is_not_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_unchanged_is_not_told(tmp_path: Path) -> None:
     (tmp_path / "node.py").write_text("")
-    monkeypatch.setattr(watch, "_IDLE_MS", 100)
-    monkeypatch.setattr("tests.unit.adapters.host.test_watch.SECONDS", 1.0)
     with pytest.raises(TimeoutError):
-        asyncio.run(first(WatchRules(str(tmp_path), ("*.py",))))
+        asyncio.run(first(WatchRules(str(tmp_path), ("*.py",)), 100, seconds=1.0))
 
 
 def test_a_change_that_watchfiles_drops_is_found(

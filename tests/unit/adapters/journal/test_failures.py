@@ -1,11 +1,13 @@
 """Which dataflows have failed after the last that our code recorded."""
 
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from dora_systemd.adapters.journal.failures import later_failures
-from dora_systemd.adapters.journal.reader import JournalReader, LastEvent
+from dora_systemd.adapters.journal.reader import LastEvent
+from tests.unit.fakes.library import fake_journalctl
 from tests.unit.fakes.manager import UUID
 
 OTHER = UUID[:-1] + "1"
@@ -32,15 +34,13 @@ def record(at_us: int, cursor: str = "", uuid: str = UUID, **more: Any) -> dict[
     ],
 )
 def test_failures(
-    found: list[dict[str, Any]], expected: dict[str, int], monkeypatch: pytest.MonkeyPatch
+    found: list[dict[str, Any]],
+    expected: dict[str, int],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    asked: list[list[str]] = []
-
-    def newest(_self: JournalReader, matches: list[str], _limit: int) -> list[dict[str, Any]]:
-        asked.append(matches)
-        return found
-
-    monkeypatch.setattr(JournalReader, "newest", newest)
+    calls = fake_journalctl(monkeypatch, tmp_path, found)
     assert later_failures([STOPPED]) == expected
+    (asked,) = calls.read_text().splitlines()
     failed = "MESSAGE_ID=d9b373ed55a64feb8242e02dbe79a49c"
-    assert asked == [["_PID=1", failed, f"DORA_DATAFLOW={UUID}"]]
+    assert asked.endswith(f" -- _PID=1 {failed} DORA_DATAFLOW={UUID}")

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from dora_systemd.adapters.journal import reader as journal_reader
-from dora_systemd.adapters.journal.reader import JournalReader, check_readable
+from dora_systemd.adapters.journal.reader import Bounds, JournalReader, check_readable
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from tests.unit.fakes.programs import make_program
@@ -191,9 +190,9 @@ def test_count(journalctl: Path) -> None:
 @pytest.mark.parametrize(
     ("scope", "where", "code", "word"),
     [
-        (SYSTEM, "persistent", ExitCode.NO_PERMISSION, "systemd-journal"),
-        (USER, "persistent", None, ""),
-        (USER, "volatile", ExitCode.NO_PERMISSION, "Storage=persistent"),
+        (SYSTEM, "var", ExitCode.NO_PERMISSION, "systemd-journal"),
+        (USER, "var", None, ""),
+        (USER, "run", ExitCode.NO_PERMISSION, "Storage=persistent"),
         (SYSTEM, "none", ExitCode.NO_SYSTEMD, "journald"),
     ],
 )
@@ -205,17 +204,16 @@ def test_unreadable(
     code: ExitCode | None,
     word: str,
 ) -> None:
-    for name in ("persistent", "volatile"):
-        monkeypatch.setattr(journal_reader, name.upper(), tmp_path / name)
     if where != "none":
-        (tmp_path / where / "machine").mkdir(parents=True)
-        (tmp_path / where / "machine" / "system.journal").touch()
+        directory = tmp_path / where / "log/journal/machine"
+        directory.mkdir(parents=True)
+        (directory / "system.journal").touch()
     monkeypatch.setattr("os.access", lambda *_: False)
     if code is None:
-        check_readable(scope)
+        check_readable(scope, tmp_path)
         return
     with pytest.raises(DoraSystemdError) as caught:
-        check_readable(scope)
+        check_readable(scope, tmp_path)
     assert caught.value.code is code
     assert word in caught.value.hint
 
@@ -244,18 +242,14 @@ def test_records_in_the_name_of_others_are_left_out(journalctl: Path) -> None:
     assert JournalReader().name_of(SYSTEM, UUID) == "a"
 
 
-def test_an_endless_journal_has_an_end(journalctl: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(journal_reader, "MAX_BYTES", 1 << 20)
+def test_an_endless_journal_has_an_end(journalctl: Path) -> None:
     make_program(journalctl, """while :; do printf '{"MESSAGE":"%02000d"}\\n' 7; done""")
-    assert 0 < len(list(JournalReader().newest([], None))) < 600
+    assert 0 < len(list(JournalReader(Bounds(1 << 20)).newest([], None))) < 600
 
 
-def test_a_journal_that_stops_in_the_middle(
-    journalctl: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(journal_reader, "READ_SECONDS", 0.3)
+def test_a_journal_that_stops_in_the_middle(journalctl: Path) -> None:
     make_program(journalctl, """echo '{"MESSAGE":"x"}'; exec sleep 60""")
-    assert list(JournalReader().newest([], None)) == [{"MESSAGE": "x"}]
+    assert list(JournalReader(Bounds(seconds=0.3)).newest([], None)) == [{"MESSAGE": "x"}]
 
 
 def test_a_record_that_is_too_long_is_left_out(journalctl: Path) -> None:
@@ -270,19 +264,13 @@ def test_values_that_can_be_no_uuids(journalctl: Path) -> None:
     assert JournalReader().known_uuids() == [UUID]
 
 
-def test_a_complaint_of_a_journal_that_is_read_to_a_bound_is_none(
-    journalctl: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(journal_reader, "MAX_BYTES", 10_000)
+def test_a_complaint_of_a_journal_that_is_read_to_a_bound_is_none(journalctl: Path) -> None:
     complaint = "system.journal is truncated, ignoring file."
     make_program(journalctl, f"echo '{complaint}' >&2; exec yes dora-a")
-    assert set(JournalReader().unique("X")) == {"dora-a"}
+    assert set(JournalReader(Bounds(10_000)).unique("X")) == {"dora-a"}
 
 
-def test_a_complaint_of_a_journal_that_shows_nothing_is_told(
-    journalctl: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(journal_reader, "FIRST_SECONDS", 2.0)
+def test_a_complaint_of_a_journal_that_shows_nothing_is_told(journalctl: Path) -> None:
     make_program(journalctl, "echo 'Failed to wait: x' >&2; exec sleep 1000")
     with pytest.raises(DoraSystemdError, match=r"^cannot read the journal: Failed to wait: x$"):
-        JournalReader().unique("X")
+        JournalReader(Bounds(first_seconds=2.0)).unique("X")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from dora_systemd.adapters.journal.socket import JournalSocket
 from dora_systemd.adapters.logs.pipes import LogPipes
-from dora_systemd.decisions.cell.counters import LineCount
+from dora_systemd.decisions.cell.counters import WHOLE_CELL, LineCount
 from dora_systemd.decisions.cell.line_rates import RateLimit
 from dora_systemd.decisions.logs.lines import Origin
 from dora_systemd.paths import CellPaths
@@ -305,8 +305,11 @@ def test_close_counts_what_it_cannot_write(tmp_path: Path) -> None:
         cell.write(cell.paths.node_stdout("a"), b"1\n2\n")
         cell.pipes.drain("a")
         cell.server = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+        cell.server.bind(str(tmp_path / "socket"))  # journald is back, and no time is left
         cell.pipes.close(0.0)
-        cell.server.bind(str(tmp_path / "socket"))
+        (entry,) = cell.received()
+        assert (entry["DORA_EVENT"], entry["DORA_COUNT"]) == ("lines-lost", "2")
+        assert cell.pipes.line_counts()[WHOLE_CELL] == LineCount(lost=2)
 
     run(tmp_path, scenario)
 

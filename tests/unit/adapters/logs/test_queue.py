@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dora_systemd.adapters.logs import queue as log_queue
-from dora_systemd.adapters.logs.queue import NOTE_EVERY, LogQueue
+from dora_systemd.adapters.logs.queue import MAX_RECORDS, NOTE_EVERY, LogQueue
 
 
 class SlowJournal:
@@ -44,10 +43,11 @@ class SlowJournal:
 
 
 class Case:
-    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+    def __init__(self, loop: asyncio.AbstractEventLoop, max_records: int = MAX_RECORDS) -> None:
         self.journal = SlowJournal()
         self.paused: set[str] = set()
-        self.queue = LogQueue(loop, self.journal, self.paused.add, self.paused.discard)
+        pause, resume = self.paused.add, self.paused.discard
+        self.queue = LogQueue(loop, self.journal, pause, resume, max_records)
 
     def put(self, node: str, entries: list[bytes]) -> None:
         self.queue.put(node, lambda: entries)
@@ -101,8 +101,8 @@ def test_event_comes_after_all_before_it(case: Case) -> None:
     assert case.journal.taken.index(b"end") > case.journal.taken.index(b"a2")
 
 
-def test_records_are_bounded_and_counted(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(log_queue, "MAX_RECORDS", 3)
+def test_records_are_bounded_and_counted(loop: asyncio.AbstractEventLoop) -> None:
+    case = Case(loop, max_records=3)
     for _ in range(5):
         case.queue.put_record("a", b"x")
         case.queue.put_event(b"e")
