@@ -23,7 +23,13 @@ from dora_systemd.decisions.dora.errors import parse_dora_error
 from dora_systemd.decisions.life.refusal import format_refusal
 from dora_systemd.decisions.life.states import RunnerExit
 from dora_systemd.decisions.logs.fields import encode_entry
-from dora_systemd.decisions.releases.build import BuildTask, is_output, parse_task, shown_line
+from dora_systemd.decisions.releases.build import (
+    BuildTask,
+    is_output,
+    parse_task,
+    parse_uv_error,
+    shown_line,
+)
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.trust.programs import own_account, spawn
 from dora_systemd.values import quoted
@@ -56,12 +62,14 @@ class Output:
         }
         self._told = 0.0
         self._rest = b""
+        self._is_dora = False
         self.tail = ""
         self.last = ""
 
-    def begin(self) -> None:
-        """The next command begins."""
+    def begin(self, command: Sequence[str]) -> None:
+        """Forget the last command's output. What dora itself prints is not its nodes' output."""
         self.tail = self.last = ""
+        self._is_dora = not _is_uv(command)
 
     def feed(self, data: bytes) -> None:
         """Take what a command has printed; b"" for its end."""
@@ -82,7 +90,7 @@ class Output:
         if not (words := shown_line(text)):
             return
         self._write(line)
-        if is_output(text) or not self.last:
+        if is_output(text) or not self._is_dora:
             self.last = words
         if time.monotonic() > self._told + _STATUS_SECONDS:
             send_status(words)
@@ -97,7 +105,7 @@ class Output:
 
 def run_command(command: Sequence[str], directory: str, output: Output) -> int:
     """Run a command to its end: its exit status. Raises Gone, OSError and DoraSystemdError."""
-    output.begin()
+    output.begin(command)
     environment = {**node_environment(os.environ), "RUST_BACKTRACE": "0", "NO_COLOR": "1"}
     child = spawn(command, own_account(), environment, directory, stderr=subprocess.STDOUT)
     assert child.stdout
@@ -136,10 +144,16 @@ def _read(pipe: int, output: Output) -> bool:
 
 def failure(task: BuildTask, command: Sequence[str], status: int, output: Output) -> str:
     """Why the build failed, in one line."""
-    reason = "" if PurePath(command[0]).name == "uv" else parse_dora_error(output.tail)
-    reason = reason or f"{quoted(' '.join(command))} failed: {exit_of(status)}"
-    last = f"; its last line: {output.last}" if output.last else ""
-    return f"cannot build {task.name}: {reason}{last}"
+    parse = parse_uv_error if _is_uv(command) else parse_dora_error
+    said = parse(output.tail)
+    reason = said or f"{quoted(' '.join(command))} failed: {exit_of(status)}"
+    # uv's error has its last lines.
+    last = "" if said and _is_uv(command) else output.last
+    return f"cannot build {task.name}: {reason}" + (f"; its last line: {last}" if last else "")
+
+
+def _is_uv(command: Sequence[str]) -> bool:
+    return PurePath(command[0]).name == "uv"
 
 
 def build(task: BuildTask, output: Output) -> None:

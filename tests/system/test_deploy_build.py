@@ -6,6 +6,8 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+import textwrap
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -168,6 +170,9 @@ PYPROJECT = """
 name = "robot"
 version = "1"
 requires-python = ">=3.11"
+dependencies = ["robot-camera"]
+[tool.uv.sources]
+robot-camera = {path = "robot_camera-1-py3-none-any.whl"}
 """
 USES_VENV = """
 import subprocess, sys
@@ -202,13 +207,47 @@ def test_a_virtual_environment_works_where_it_was_built(
     check_venv(releases)
 
 
-def test_uv_sync_makes_the_virtual_environment(releases: Releases, project: Project) -> None:
+CLONE = "nodes: [{id: a, path: robot-camera, inputs: {t: dora/timer/millis/50}}]"
+ENTRY_POINTS = """
+[console_scripts]
+robot-camera = robot_camera:main
+script = script_of_lab:main
+"""
+WHEEL = {
+    "robot_camera.py": "def main():\n" + textwrap.indent(USES_VENV, "    "),
+    "script_of_lab.py": "import sys\ndef main():\n    print('script', sys.prefix)\n",
+    "lab.pth": PACKAGES,
+    "robot_camera-1.dist-info/METADATA": "Metadata-Version: 2.1\nName: robot-camera\nVersion: 1\n",
+    "robot_camera-1.dist-info/WHEEL": "Wheel-Version: 1.0\nRoot-Is-Purelib: true\n",
+    "robot_camera-1.dist-info/entry_points.txt": ENTRY_POINTS,
+}
+
+
+def write_clone(project: Project) -> None:
+    """A project with a locked package, which has its node, as git clones it: without .venv."""
     project.write("pyproject.toml", PYPROJECT)
-    project.write("a.py", USES_VENV)
+    project.write("dataflow.yml", CLONE)
+    record = "robot_camera-1.dist-info/RECORD"
+    with zipfile.ZipFile(project.root / "robot_camera-1-py3-none-any.whl", "w") as wheel:
+        for path, text in WHEEL.items():
+            wheel.writestr(path, text)
+        wheel.writestr(record, "".join(f"{path},,\n" for path in (*WHEEL, record)))
     run("uv", "lock", "--offline", cwd=project.root)
-    write_build(project, IN_VENV, VENV_FLOW)
+
+
+@pytest.mark.warns("error")
+def test_uv_sync_makes_the_virtual_environment_of_a_clone(
+    releases: Releases, project: Project
+) -> None:
+    write_clone(project)
     releases.deploy(project.root, *FAST)
     check_venv(releases)
+    venv = releases.path / releases.current() / "tree/.venv"
+    (compiled,) = venv.glob("lib/python3*/site-packages/__pycache__/robot_camera.*.pyc")
+    assert compiled.read_bytes()[4] == 0b11  # valid by the source's content
+    project.write("uv.lock", "[[")
+    said = releases.deploy(project.root, "-q", status=5)
+    assert "uv: Failed to parse `uv.lock`: TOML parse error" in said
 
 
 @pytest.fixture

@@ -24,7 +24,7 @@ from dora_systemd.decisions.descriptor.expansion import expanded
 from dora_systemd.decisions.descriptor.nodes import Node, NodeKind
 from dora_systemd.decisions.signs.watchdogs import watchdog_of
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.values import INFINITY, SECOND, quoted
+from dora_systemd.values import INFINITY, SECOND, quoted, shown
 
 LAUNCHED = frozenset({NodeKind.PYTHON, NodeKind.EXECUTABLE, NodeKind.SHELL})
 PROGRAM_KEYS = ("path", "args", "build", "git", "branch", "tag", "rev")
@@ -178,7 +178,8 @@ def _seconds(node: Node, key: str, default: float) -> float:
 def _directory(node: Node, source: str, plan: LaunchPlan) -> str:
     if node.git:
         if node.id not in plan.session.directories:
-            raise _refusal(source, node, "it comes from git and was not built", "run `dora build`")
+            reason = "it comes from git and was not built"
+            raise _refusal(source, node, reason, _build_hint(source, plan))
         return plan.session.directories[node.id]
     return str(PurePath(plan.options.working_directory, node.working_directory))
 
@@ -227,8 +228,23 @@ def _find(node: Node, directory: str, source: str, plan: LaunchPlan) -> str:
         if plan.exists(path):
             return path
     reason = f"its path {quoted(node.path)} is neither in {directory} nor in PATH"
-    hint = "run `dora build` first" if node.build else "correct the path of the node"
-    raise _refusal(source, node, reason, hint)
+    raise _refusal(source, node, reason, _hint(node, directory, source, plan))
+
+
+def _hint(node: Node, directory: str, source: str, plan: LaunchPlan) -> str:
+    """What to do about a program that is not there."""
+    if node.build:
+        return _build_hint(source, plan)
+    places = dict.fromkeys((directory, plan.options.working_directory))
+    locked = next((one for one in places if plan.exists(f"{one}/uv.lock")), None)
+    if locked and "/" not in node.path:  # a console script of a package
+        return f"run `uv sync` in {locked} first, or correct the path of the node"
+    return "correct the path of the node"
+
+
+def _build_hint(source: str, plan: LaunchPlan) -> str:
+    uv = "--uv " if plan.options.uv else ""
+    return f"run `dora build {uv}{shown(source)}` first"
 
 
 def _uv_places(directory: str, plan: LaunchPlan) -> list[str]:

@@ -15,11 +15,12 @@ _LONGEST = 300
 """Maximum characters of a line of the build in an error or on a terminal."""
 _OF_NODE = re.compile(r"(?P<node>[\w.-]+): +(?P<level>stdout|stderr|[A-Z]+) +(?P<text>\S.*)")
 """A line that dora prints: "a: stdout   text", or "a: INFO     running build command"."""
+_UV_ERROR = re.compile(r"^(?:error: | +× )", re.MULTILINE)
+_UV_CAUSE = re.compile(r"\n +(?:cause:|Caused by:|[├╰]─▶) *")
 _ALWAYS = {
     # Bytecode is valid by its source's content, for the files get new times; and equal builds have
-    # equal files, which releases share.
+    # equal files, which releases share. Python, pip and uv have this mode by this variable alone.
     "SOURCE_DATE_EPOCH": "315532800",
-    "PYC_INVALIDATION_MODE": "checked-hash",
     "UV_COMPILE_BYTECODE": "1",
     # The sandbox makes homes read-only, and a Python in one of them is no part of the release.
     "UV_NO_CACHE": "1",
@@ -134,3 +135,11 @@ def is_output(line: str) -> bool:
     """Whether a build command has printed the line, and not dora itself."""
     found = _OF_NODE.fullmatch(without_sequences(line).strip())
     return found is not None and not found["level"].isupper()
+
+
+def parse_uv_error(printed: str) -> str:
+    """The last error in uv's output with its causes, on one line; "" if uv names none."""
+    text = without_sequences(printed)
+    *_, begin = (0, *(found.end() for found in _UV_ERROR.finditer(text)))
+    error, _, _ = text[begin:].partition("\nhint: ")
+    return short_line(f"uv: {_UV_CAUSE.sub(': ', error)}", _LONGEST) if begin else ""

@@ -7,7 +7,6 @@ from pathlib import Path
 
 from dora_systemd.adapters.host.files import decoded, parse_yaml
 from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
-from dora_systemd.decisions.releases.build import built_nodes
 from dora_systemd.decisions.releases.entries import refusal
 from dora_systemd.decisions.settings.table import ENV_FILE, USER, VENV, WORKING_DIRECTORY
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -45,7 +44,10 @@ class Source:
         """The virtual environment of the nodes, relative to root; None for one that is given."""
         if self.plan.settings.is_given(VENV):
             return None
-        venv = self.plan.options.venv or str(Path(self.plan.options.dataflow).parent / ".venv")
+        venv = self.plan.options.venv
+        # uv makes one for the project, whichever one the caller has activated.
+        if not venv or (self.uv and not _is_below(venv, self.root)):
+            venv = str(Path(self.plan.options.dataflow).parent / ".venv")
         return os.path.relpath(venv, self.root) if _is_below(venv, self.root) else None
 
     @property
@@ -60,8 +62,7 @@ def find_source(scope: Scope, request: StartRequest, want_build: bool = True) ->
     want_build: what it needs is built in the release. Raises DoraSystemdError.
     """
     path, written, dataflow = read_dataflow(request)
-    is_unbuilt = want_build and bool(built_nodes(dataflow))
-    plan = make_plan(scope, replace(request, dataflow=str(path), is_unbuilt=is_unbuilt))
+    plan = make_plan(scope, replace(request, dataflow=str(path), is_unbuilt=want_build))
     directory = plan.options.working_directory
     root = project_root(path, directory)
     _check(plan, dataflow, root, want_build)
@@ -77,7 +78,9 @@ def find_source(scope: Scope, request: StartRequest, want_build: bool = True) ->
     }
     read[os.path.relpath(path, root)] = written.data
     read[os.path.relpath(beside, root)] = settings and settings.data
-    builders = find_builders(plan, dataflow, root) if want_build else ()
+    builders = find_builders(plan, dataflow, root) if want_build else ("", "")
+    if plan.missing and not any(builders):
+        raise plan.missing
     return Source(root, origin, plan, named, read, *builders)
 
 

@@ -51,8 +51,9 @@ class StartRequest:
     environment: the caller's variables. attached: the dataflow ends with the caller. caller: the
     variables that the dataflow may read. uuid: of a dataflow that is started again. origin: of a
     release, the file that its dataflow file was copied from: who owns that decides, not root, who
-    owns the copy. is_unbuilt: the programs of its nodes need not exist yet. machine, head, placed,
-    addresses: of the runner's options, if this machine is a member of the dataflow.
+    owns the copy. is_unbuilt: a build may make the programs of its nodes, see Plan.missing.
+    machine, head, placed, addresses: of the runner's options, if this machine is a member of the
+    dataflow.
     """
 
     dataflow: str
@@ -86,6 +87,7 @@ class Plan:
     sandbox: Sandbox = field(default_factory=Sandbox)
     notes: tuple[str, ...] = ()
     members: tuple["Member", ...] = ()
+    missing: DoraSystemdError | None = None
 
     @property
     def unit(self) -> str:
@@ -172,15 +174,28 @@ def _make_plan(
     check_credentials(scope, credential_files(settings))
     sight, session = look.sight, look.read_session(path)
     launch = LaunchPlan(options, "", environment["PATH"], sight.exists, sight.read, session)
+    missing = None
     if not any(node.kind in UNEXPANDED for node in dataflow.nodes):
         # The runner repeats this, but an error here needs no unit.
         check_named_nodes(options, dataflow)
-        if not request.is_unbuilt:
-            launch_descriptor(dataflow, launch)
+        missing = _find_missing(dataflow, launch, request.is_unbuilt)
     prepared = Prepared(dataflow, launch, {})
     sandbox = make_sandbox(scope, settings, look.user, prepared, look.sight)
     notes = tuple(plan_notes(scope, dataflow, launch, look))
-    return Plan(scope, options, settings, look.user, environment, sandbox, notes, members)
+    return Plan(scope, options, settings, look.user, environment, sandbox, notes, members, missing)
+
+
+def _find_missing(
+    dataflow: Dataflow, launch: LaunchPlan, is_unbuilt: bool
+) -> DoraSystemdError | None:
+    """Check the programs of the nodes; return the error if a build may make a missing one."""
+    try:
+        launch_descriptor(dataflow, launch)
+    except DoraSystemdError as error:
+        if not is_unbuilt:
+            raise
+        return error
+    return None
 
 
 def _spread(

@@ -72,6 +72,26 @@ def test_the_first_command_that_fails_is_the_last(tmp_path: Path) -> None:
     assert not (tmp_path / "proof").exists()
 
 
+UV = {
+    "echo first; echo last; exit 3": "failed: exit code 3; its last line: last",
+    "echo first; echo 'error: it is lost'; echo '  cause: nobody knows'; exit 2": (
+        "cannot build robot: uv: it is lost: nobody knows"
+    ),
+}
+
+
+@pytest.mark.usefixtures("stdin")
+@pytest.mark.parametrize(("script", "expected"), UV.items())
+def test_what_is_said_of_uv(tmp_path: Path, script: str, expected: str) -> None:
+    uv = tmp_path / "uv"
+    uv.write_text(f"#!/bin/sh\n{script}\n")
+    uv.chmod(0o755)
+    task = BuildTask("robot", "uuid", "20260101T000000", str(tmp_path), ((str(uv), "sync"),))
+    with pytest.raises(DoraSystemdError) as caught:
+        build(task, Output(task, Journal()))
+    assert caught.value.message.endswith(expected)
+
+
 @pytest.mark.usefixtures("stdin")
 def test_a_process_in_the_background_is_not_waited_for(tmp_path: Path) -> None:
     entries, error = output_of("while sleep 0.1; do echo x; done & echo $!", directory=tmp_path)

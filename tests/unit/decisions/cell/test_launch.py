@@ -1,6 +1,7 @@
 """The descriptor as dora gets it: every program replaced by the launcher."""
 
 import shlex
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -198,6 +199,24 @@ def test_refusals(node: dict[str, Any], words: str) -> None:
         launch(node)
     assert words in caught.value.message
     assert caught.value.hint
+
+
+HINTS: tuple[tuple[dict[str, Any], tuple[str, ...], str], ...] = (
+    ({"path": "robot-camera"}, (), "correct the path of the node"),
+    ({"path": "robot-camera"}, ("/p/uv.lock",), "run `uv sync` in /p first"),
+    ({"path": "src/nope.py"}, ("/p/uv.lock",), "correct the path of the node"),
+    ({"path": "robot-camera", "build": "make"}, ("/p/uv.lock",), "run `dora build flow.yml` first"),
+    ({"path": "a.py", "git": "https://example.org/x"}, (), "run `dora build flow.yml` first"),
+)
+
+
+@pytest.mark.parametrize(("node", "files", "expected"), HINTS)
+def test_what_makes_a_missing_program(
+    node: dict[str, Any], files: tuple[str, ...], expected: str
+) -> None:
+    with pytest.raises(DoraSystemdError) as caught:
+        launch(node, replace(plan(), exists=files.__contains__))
+    assert str(caught.value.hint).startswith(expected)
 
 
 @given(st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"])))

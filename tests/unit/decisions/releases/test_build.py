@@ -14,6 +14,7 @@ from dora_systemd.decisions.releases.build import (
     has_builds,
     is_output,
     parse_task,
+    parse_uv_error,
     shown_line,
 )
 
@@ -87,3 +88,24 @@ def test_lines(line: str, expected: tuple[str | None, bool]) -> None:
 def test_a_task_as_text() -> None:
     task = BuildTask("robot", "u", "20260101T000000", "/r/tree", (("uv", "sync"), ("dora", "b $x")))
     assert parse_task(format_task(task)) == task
+
+
+UV = {
+    "Using CPython 3.13.5\nerror: Failed to parse\n  cause: TOML error\n   2 | [[\n     |   ^": (
+        "uv: Failed to parse: TOML error 2 | [[ | ^"
+    ),
+    "error: no\nerror: Failed to build `bad`\n  cause: it failed\n\n     [stderr]\n     No module\n"
+    "\nhint: `bad` was included\n\nhint: more": (
+        "uv: Failed to build `bad`: it failed [stderr] No module"
+    ),
+    "\x1b[31m  ×\x1b[0m Failed to build `bad`\n  ├─▶ it failed\n  ╰─▶ so": (
+        "uv: Failed to build `bad`: it failed: so"
+    ),
+    "Using CPython 3.13.5\nKilled": "",
+    "": "",
+}
+
+
+@pytest.mark.parametrize(("printed", "expected"), UV.items())
+def test_what_uv_gives_as_its_reason(printed: str, expected: str) -> None:
+    assert parse_uv_error(printed) == expected

@@ -50,3 +50,31 @@ def test_settings_that_only_the_copy_has(tmp_path: Path) -> None:
     (tree / SETTINGS).write_text("user: root\n")
     with pytest.raises(DoraSystemdError, match="it changed"):
         require_same(source, tree)
+
+
+CLONE = "nodes: [{id: a, path: robot-camera}]\n"
+
+
+def clone_of(tmp_path: Path, activated: str = "") -> Source:
+    """A project with uv.lock that was never built. activated: the caller's VIRTUAL_ENV."""
+    root = tmp_path / "clone"
+    root.mkdir()
+    (root / FLOW).write_text(CLONE)
+    (root / "uv.lock").write_text("version = 1\n")
+    environment = {"PATH": str(tmp_path / "bin"), "VIRTUAL_ENV": activated}
+    dora = make_program(tmp_path / "dora")
+    return find_source(USER, StartRequest(str(root), None, {"dora": dora}, environment))
+
+
+def test_uv_makes_the_programs_of_a_clone(tmp_path: Path) -> None:
+    uv = make_program(tmp_path / "bin/uv")
+    make_program(tmp_path / "other/bin/python")
+    source = clone_of(tmp_path, str(tmp_path / "other"))
+    assert (source.uv, source.dora) == (uv, "")
+    assert source.own_venv == ".venv"  # and not the activated one
+
+
+def test_nothing_makes_the_programs_of_a_clone_without_uv(tmp_path: Path) -> None:
+    with pytest.raises(DoraSystemdError, match=r"'robot-camera' is neither in") as caught:
+        clone_of(tmp_path)
+    assert f"run `uv sync` in {tmp_path}/clone first" in str(caught.value.hint)
