@@ -142,19 +142,21 @@ def git(command: tuple[str, ...], safe: str) -> bytes | None:
     return printed(child)
 
 
-def printed(child: "subprocess.Popen[bytes]") -> bytes | None:
+def printed(
+    child: "subprocess.Popen[bytes]", seconds: float = _GIT_SECONDS, most: int = MOST_PRINTED
+) -> bytes | None:
     """What a child prints, None if it fails or is late. Raises OSError if that is too much."""
     assert child.stdout
-    late = threading.Timer(_GIT_SECONDS, child.kill)
+    late = threading.Timer(seconds, child.kill)
     late.start()
     try:
         with child:
-            data = child.stdout.read(MOST_PRINTED + 1)
-            if len(data) > MOST_PRINTED:
+            data = child.stdout.read(most + 1)
+            if len(data) > most:
                 child.kill()
     finally:
         late.cancel()
-    if len(data) > MOST_PRINTED:
+    if len(data) > most:
         raise OSError(0, "git lists too many files")
     return None if child.returncode else data
 

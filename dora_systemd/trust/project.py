@@ -45,10 +45,14 @@ _LONGEST = 4096
 
 
 class Patience:
-    """How long we wait for a child in all. left: seconds, which it earns by what it sends."""
+    """How long we wait for a child in all. left: seconds, which it earns by what it sends.
 
-    def __init__(self) -> None:
-        self.left = _TOTAL_SECONDS
+    most: seconds for each frame.
+    """
+
+    def __init__(self, left: float = _TOTAL_SECONDS, most: float = _SECONDS) -> None:
+        self.left = left
+        self._most = most
 
     @contextlib.contextmanager
     def waiting(self) -> Iterator[float]:
@@ -57,7 +61,7 @@ class Patience:
             raise BrokenPipeError
         begun = time.monotonic()
         try:
-            yield begun + min(_SECONDS, self.left)
+            yield begun + min(self._most, self.left)
         finally:
             self.left -= time.monotonic() - begun
 
@@ -211,15 +215,16 @@ def _is_text(value: object) -> bool:
 
 @contextlib.contextmanager
 def opened_project(
-    root: str, account: Account | None, place: str | None = None
+    root: str, account: Account | None, place: str | None = None, program: str = courier.__file__
 ) -> Iterator[Project]:
     """The project in the directory `root` as the account sees it; None: as the caller does.
 
-    place: where its files are instead, in a directory that the account could not reach. Raises
-    DoraSystemdError (NO_PERMISSION) if the account cannot execute our Python interpreter.
+    place: where its files are instead, in a directory that the account could not reach. program:
+    what the child runs. Raises DoraSystemdError (NO_PERMISSION) if the account cannot execute our
+    Python interpreter.
     """
     account = account or account_of_uid(os.geteuid())
-    text = Path(courier.__file__).read_text(encoding="utf-8")
+    text = Path(program).read_text(encoding="utf-8")
     command = (sys.executable, "-I", "-S", "-c", text, "." if place else root)
     child = start_reader(command, account, place or "/")
     try:

@@ -78,10 +78,12 @@ class LentSight(Sight):
     Raises DoraSystemdError if its child is silent.
     """
 
-    def __init__(self, child: "subprocess.Popen[bytes]", account: Account) -> None:
+    def __init__(
+        self, child: "subprocess.Popen[bytes]", account: Account, seconds: float = _SECONDS
+    ) -> None:
         self._child = child
         self._account = account
-        self._left = _SECONDS
+        self._left = seconds
 
     def _ask(self, letter: bytes, path: str) -> bytes:
         """Send one request to the child. Raises the OSError that the account got."""
@@ -109,10 +111,11 @@ class LentSight(Sight):
 
 
 @contextlib.contextmanager
-def sight_of(account: Account | None) -> Iterator[Sight]:
+def sight_of(account: Account | None, seconds: float = _SECONDS) -> Iterator[Sight]:
     """How the account sees paths; as the caller does for None, or if the caller is not root.
 
-    Raises DoraSystemdError (NO_PERMISSION) if the account cannot execute our Python interpreter.
+    seconds: timeout for all answers together. Raises DoraSystemdError (NO_PERMISSION) if the
+    account cannot execute our Python interpreter.
     """
     if account is None or account.uid == os.geteuid() or os.geteuid() != 0:
         yield Sight()
@@ -121,7 +124,7 @@ def sight_of(account: Account | None) -> Iterator[Sight]:
     command = (sys.executable, "-I", "-S", "-c", text, str(MAX_BYTES + 1))
     child = start_reader(command, account)
     try:
-        yield LentSight(child, account)
+        yield LentSight(child, account, seconds)
     finally:
         child.kill()
         # Closes its streams, of which the first may still have bytes for it, and waits for it.

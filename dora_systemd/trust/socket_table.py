@@ -45,6 +45,7 @@ class Owner(NamedTuple):
     inode: int
 
 
+Ask = Callable[[Address, Address], Owner]
 Lookup = Callable[[Address, Address], Owner | None]
 
 
@@ -64,29 +65,32 @@ def peer_uid(peer: Address, own: Address, look: Lookup | None = None) -> int | N
     return None
 
 
-def find_owner(peer: Address, own: Address) -> Owner | None:
+def find_owner(
+    peer: Address, own: Address, ask: Ask | None = None, read: Lookup | None = None
+) -> Owner | None:
     """The owner of the socket that is bound to `peer` and connected to `own`.
 
     Reading the table takes milliseconds. A client that connects and disconnects at once must not
-    cause a reading each time.
+    cause a reading each time. ask, read: ask the kernel, and read the table.
     """
+    ask, read = ask or _ask_kernel, read or read_owner
     try:
-        return _ask_kernel(peer, own)
+        return ask(peer, own)
     except FileNotFoundError:
         # No such socket, or a kernel that does not support TCP here.
-        if _kernel_knows():
+        if _kernel_knows(ask):
             return None
     except (OSError, struct.error):
         pass
-    return read_owner(peer, own)
+    return read(peer, own)
 
 
 @cache
-def _kernel_knows() -> bool:
+def _kernel_knows(ask: Ask) -> bool:
     """Whether the kernel answers for a socket that exists."""
     try:
         with socket.create_server(("127.0.0.1", 0)) as one:
-            return _ask_kernel(one.getsockname(), ("0.0.0.0", 0)).inode != 0
+            return ask(one.getsockname(), ("0.0.0.0", 0)).inode != 0
     except (OSError, struct.error):
         return False
 

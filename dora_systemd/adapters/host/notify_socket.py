@@ -7,10 +7,10 @@ taken for the next one with its pid.
 
 import contextlib
 import os
+import signal
 import socket
 import struct
 from pathlib import Path
-from signal import pidfd_send_signal
 
 from dora_systemd.decisions.signs.messages import MAX_BYTES
 from dora_systemd.errors import DoraSystemdError, ExitCode
@@ -97,7 +97,7 @@ class Pending:
         if self._pidfd < 0:
             return False
         try:
-            pidfd_send_signal(self._pidfd, 0)
+            signal.pidfd_send_signal(self._pidfd, 0)
         except OSError as error:
             # EPERM: of another user. EINVAL: of a PID namespace that is not below ours.
             if isinstance(error, ProcessLookupError):

@@ -69,14 +69,15 @@ def begin_life(options: RunnerOptions, is_user: bool) -> Life:
     return Life(options.uuid, is_first, not is_first and fd_store.is_first_life())
 
 
-async def learn_first(life: Life, name: str, is_user: bool) -> None:
+async def learn_first(life: Life, name: str, is_user: bool, seconds: float = ASK_SECONDS) -> None:
     """Ask systemd once whether it has restarted the unit, if that is all that is not known.
 
     That is so of each unit that doractl enable has written. Without it every `list` would ask: the
-    number does not change before the next life, and a reset only makes it 0.
+    number does not change before the next life, and a reset only makes it 0. seconds: to wait
+    before that.
     """
     if life.may_be_first:
-        await asyncio.sleep(ASK_SECONDS)
+        await asyncio.sleep(seconds)
         # No thread or process may be left for it: then list asks.
         with contextlib.suppress(OSError, RuntimeError):
             question = beside(partial(asked, "NRestarts", name, is_user, 1))

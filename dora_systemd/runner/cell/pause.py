@@ -39,12 +39,15 @@ def pause(options: RunnerOptions, paths: CellPaths) -> None:
     fd_store.count_life()
 
 
-def hold_back(options: RunnerOptions, paths: CellPaths) -> None:
+def hold_back(options: RunnerOptions, paths: CellPaths, old: float | None = None) -> None:
     """Wait for the rest of a short delay: at most HEAD_START, from when systemd began this process.
 
-    A start, also after a requested stop, has no lives before it, and waits for nothing.
+    A start, also after a requested stop, has no lives before it, and waits for nothing. old:
+    seconds since systemd began this process, None to ask the kernel.
     """
-    if fd_store.lives() and (seconds := HEAD_START / SECOND - age()) > 0:
+    if not fd_store.lives():
+        return
+    if (seconds := HEAD_START / SECOND - (age() if old is None else old)) > 0:
         # systemd's timers are up to 250 ms late, and the delay begins before ExecStopPost=.
         ended = asked("ActiveExitTimestampMonotonic", options.name, paths.is_of_user, 0)
         since = time.clock_gettime(time.CLOCK_MONOTONIC) - ended / SECOND

@@ -1,6 +1,7 @@
 """The rights of single nodes in the cell: what the launcher sets, and proof that it can."""
 
 import re
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from dora_systemd.adapters.cgroup import groups as cgroup
@@ -10,6 +11,7 @@ from dora_systemd.decisions.cell.limits import CPUS, has_cpus
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
 from dora_systemd.decisions.rights.commands import format_commands, rights_commands
+from dora_systemd.decisions.rights.node_rights import NodeRights
 from dora_systemd.values import format_cpus
 
 _OF_UNITS = re.compile(r"/(dora-|doractl-check-)[^/]+\.service(/|$)")
@@ -28,13 +30,19 @@ def launcher_rights(options: RunnerOptions, unit: Path) -> str:
     return format_commands(rights_commands(options.node_rights, read_base(bound)))
 
 
-def check_first(options: RunnerOptions, dataflow: Dataflow) -> None:
+def check_first(
+    options: RunnerOptions,
+    dataflow: Dataflow,
+    group: str | None = None,
+    prove: Callable[[Sequence[NodeRights]], None] = prove_rights,
+) -> None:
     """Check what the options say of single nodes, and prove that this machine grants their rights.
 
-    Raises DoraSystemdError. dataflow: with modules expanded.
+    Raises DoraSystemdError. dataflow: with modules expanded. group: that of this process, None to
+    ask the kernel.
     """
     check_named_nodes(options, dataflow)
     # A dry run of a user is in no unit, and has the rights of that shell.
-    if _OF_UNITS.search(cgroup.group_of()):
+    if _OF_UNITS.search(group or cgroup.group_of()):
         check_cpus(options.node_limits)
-        prove_rights(options.node_rights)
+        prove(options.node_rights)

@@ -30,6 +30,10 @@ _REFUSALS = 60 * SECOND
 """µs between two events about messages that are not believed, for each node."""
 
 
+def _monotonic_us() -> int:
+    return time.monotonic_ns() // 1000
+
+
 @dataclass
 class Ear:
     """The socket of one node, and what its present process has said.
@@ -61,22 +65,31 @@ class Ear:
 class Signs(NoSigns):
     """The sockets of the nodes that `watchdogs` gives one. unit: its cgroup directory.
 
-    tell: writes a life event. on_news: is called after each message.
+    tell: writes a life event. is_in: whether a process is in a group. clock_us: CLOCK_MONOTONIC.
+    on_news: is called after each message.
     """
 
     is_used = True
 
     def __init__(
-        self, watchdogs: Watchdogs, unit: Path, paths: CellPaths, tell: Callable[..., None]
+        self,
+        watchdogs: Watchdogs,
+        unit: Path,
+        paths: CellPaths,
+        tell: Callable[..., None],
+        is_in: Callable[[Path, int], bool] = is_member,
+        clock_us: Callable[[], int] = _monotonic_us,
     ) -> None:
         self._watchdogs = watchdogs
         self._unit = unit
         self._paths = paths
         self._tell = tell
+        self._is_in = is_in
+        self._clock_us = clock_us
         self._loop = asyncio.get_running_loop()
         self._ears: dict[str, Ear] = {}
         limits = filter(None, watchdogs.values())
-        self.clock = Clock(period_of(limits), _monotonic_us())
+        self.clock = Clock(period_of(limits), clock_us())
         self.on_news: Callable[[], None] = lambda: None
 
     def make(self, node: str) -> None:
@@ -114,7 +127,7 @@ class Signs(NoSigns):
 
     def look(self) -> int:
         """Read the clock: the time that has passed for the nodes."""
-        self.clock = self.clock.at(_monotonic_us())
+        self.clock = self.clock.at(self._clock_us())
         return self.clock.now
 
     def drain(self, node: str, ear: Ear) -> None:
@@ -150,7 +163,7 @@ class Signs(NoSigns):
 
     def _doubt(self, node: str, pending: Pending) -> str:
         """Why the message is not believed, or ""."""
-        is_own = is_member(self.group(node), pending.pid)
+        is_own = self._is_in(self.group(node), pending.pid)
         if not pending.is_there():
             return "its sender had exited; one that waits, as systemd-notify does, is known"
         return "" if is_own else f"process {pending.pid} is not in the cgroup of the node"
@@ -161,7 +174,3 @@ class Signs(NoSigns):
         if ear.refused_us is None or now - ear.refused_us >= _REFUSALS:
             ear.refused_us = now
             self._tell("notify-refused", node, reason=reason, sender=str(pending.pid))
-
-
-def _monotonic_us() -> int:
-    return time.monotonic_ns() // 1000

@@ -6,7 +6,8 @@ dora then restarts the node by its policy, as after any other crash.
 import asyncio
 import time
 from collections.abc import Callable
-from signal import SIGABRT
+from pathlib import Path
+from signal import SIGABRT, Signals
 from typing import Protocol
 
 from dora_systemd.adapters.cgroup.groups import kill_group
@@ -50,15 +51,21 @@ async def watch_nodes(
 
 
 class SignWatch:
-    """Watches over the nodes of one run of the dataflow."""
+    """Watches over the nodes of one run of the dataflow. send: sends a signal to a group."""
 
     def __init__(
-        self, signs: Signs, pump: Pump, is_blocked: IsBlocked, options: RunnerOptions
+        self,
+        signs: Signs,
+        pump: Pump,
+        is_blocked: IsBlocked,
+        options: RunnerOptions,
+        send: Callable[[Path, Signals, int], None] = signal_group,
     ) -> None:
         self._signs = signs
         self._pump = pump
         self._is_blocked = is_blocked
         self._options = options
+        self._send = send
         self._loop = asyncio.get_running_loop()
         self._watches: dict[str, Watch] = {}
         self._published = 0.0
@@ -125,4 +132,4 @@ class SignWatch:
         details = {"status": ear.status} if ear.status else {}
         at_us = time.time_ns() // 1000
         self._pump.push(life.NodeHung(at_us, node, reason, "node-watchdog", details))
-        signal_group(self._signs.group(node), SIGABRT, pid)
+        self._send(self._signs.group(node), SIGABRT, pid)

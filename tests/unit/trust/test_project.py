@@ -5,13 +5,13 @@ import signal
 import subprocess
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.trust import courier
-from dora_systemd.trust import project as module
 from dora_systemd.trust.project import Patience, Project, opened_project
 
 
@@ -73,16 +73,13 @@ def test_with_git(root: Path, project: Project) -> None:
     assert project.tracked([os.getuid()], 10)[1] == f"{revision}+"
 
 
-def test_git_prints_too_much(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(courier, "MOST_PRINTED", 1000)
+def test_git_prints_too_much() -> None:
     endless = subprocess.Popen(["yes"], stdout=subprocess.PIPE)
     with pytest.raises(OSError, match="too many"):
-        courier.printed(endless)
+        courier.printed(endless, most=1000)
     assert endless.returncode == -signal.SIGKILL
-    monkeypatch.setattr(courier, "_GIT_SECONDS", 0.05)
-    assert courier.printed(subprocess.Popen(["sleep", "100"], stdout=subprocess.PIPE)) is None
+    silent = subprocess.Popen(["sleep", "100"], stdout=subprocess.PIPE)
+    assert courier.printed(silent, 0.05) is None
 
 
 def test_a_git_above_that_ignores_all_of_it(root: Path) -> None:
@@ -111,7 +108,7 @@ LIARS = {
     "other rows": "sys.stdout.write('+0000013[[1,2,3,4,5]].0000000')",
     "negative": """sys.stdout.write('+0000033[["a","file",-1,false,"","s"]]   .0000000')""",
     "empty frames": "[sys.stdout.write('+0000000') for _ in range(5000)]",
-    "endless": "[sys.stdout.write('+0001000' + ' ' * 1000) for _ in range(5000)]",
+    "endless": "while True: sys.stdout.write('+0262144' + ' ' * 262144)",
 }
 
 
@@ -124,21 +121,26 @@ sys.stdin.readline()
 """
 
 
+@contextmanager
+def opened_liar(directory: Path, text: str) -> Iterator[Project]:
+    """A project whose child takes a request and runs this code."""
+    program = directory / "liar.py"
+    program.write_text(f"{_ANSWER}{text}\nsys.stdout.flush()\n")
+    with opened_project(str(directory), None, program=str(program)) as project:
+        yield project
+
+
 @pytest.mark.parametrize("lie", LIARS)
-def test_a_child_that_lies(lie: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    liar = tmp_path / "liar.py"
-    liar.write_text(f"{_ANSWER}{LIARS[lie]}\nsys.stdout.flush()\n")
-    monkeypatch.setattr(courier, "__file__", str(liar))
-    monkeypatch.setattr(module, "MOST_ANSWER", 100_000)
+def test_a_child_that_lies(lie: str, tmp_path: Path) -> None:
     with (
-        opened_project(str(tmp_path), None) as project,
+        opened_liar(tmp_path, LIARS[lie]) as project,
         pytest.raises(DoraSystemdError, match="no answer"),
     ):
         project.listed("", 10)
 
 
-def test_a_child_that_stops(project: Project, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_SECONDS", 0.1)
+def test_a_child_that_stops(project: Project) -> None:
+    project.patience = Patience(most=0.1)
     os.kill(project._child.pid, signal.SIGSTOP)
     with pytest.raises(DoraSystemdError, match="no answer"):
         project.facts(["x" * 4000] * 100)  # more than a pipe holds
@@ -153,16 +155,13 @@ while True:
 """
 
 
-def test_a_child_that_dribbles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_child_that_dribbles(tmp_path: Path) -> None:
     """Each frame comes in time, but the content would take for ever."""
-    liar = tmp_path / "liar.py"
-    liar.write_text(f"{_ANSWER}{DRIBBLE}")
-    monkeypatch.setattr(courier, "__file__", str(liar))
-    monkeypatch.setattr(module, "_TOTAL_SECONDS", 0.2, raising=False)
     with (
-        opened_project(str(tmp_path), None) as project,
+        opened_liar(tmp_path, DRIBBLE) as project,
         pytest.raises(DoraSystemdError, match=r"cannot read .*/large .*: it takes too long"),
     ):
+        project.patience = Patience(0.2)
         for at, _ in enumerate(project.read("large")):
             assert at < 500
 
@@ -184,12 +183,9 @@ def test_time_is_earned_by_bytes_and_files() -> None:
     assert patience.left == before + 2.0 + 1.0
 
 
-def test_an_answer_about_another_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    liar = tmp_path / "liar.py"
-    liar.write_text(f"{_ANSWER}{row('b')}\nsys.stdout.flush()\n")
-    monkeypatch.setattr(courier, "__file__", str(liar))
+def test_an_answer_about_another_file(tmp_path: Path) -> None:
     with (
-        opened_project(str(tmp_path), None) as project,
+        opened_liar(tmp_path, row("b")) as project,
         pytest.raises(DoraSystemdError, match="no answer"),
     ):
         project.facts(["a"])
@@ -220,11 +216,9 @@ def test_a_walk_leaves_out_what_the_rules_say(root: Path, project: Project) -> N
         paths("")
 
 
-def test_a_pattern_that_takes_for_ever_takes_none_of_our_time(
-    root: Path, project: Project, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_pattern_that_takes_for_ever_takes_none_of_our_time(root: Path, project: Project) -> None:
     (root / ("a" * 200)).touch()
     (root / ".gitignore").write_text("*a" * 40 + "b\n")
-    monkeypatch.setattr(module, "_SECONDS", 0.5)
+    project.patience = Patience(most=0.5)
     with pytest.raises(DoraSystemdError, match="no answer"):
         project.walked("", 10, [])

@@ -12,13 +12,12 @@ LONG = "/" + "x" * 4000
 """A pipe is full after some of these."""
 
 
-def test_answers_to_questions_that_nobody_reads(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_answers_to_questions_that_nobody_reads() -> None:
     """The account can trace the child and have it say yes to all, without a look."""
-    monkeypatch.setattr("dora_systemd.trust.sight._SECONDS", 2.0)
     command = ["sh", "-c", "exec yes +00000011 | tr -d '\\n'"]
     pipe = subprocess.PIPE
     with subprocess.Popen(command, stdin=pipe, stdout=pipe) as child:
-        sight = LentSight(child, own_account())
+        sight = LentSight(child, own_account(), 2.0)
         assert sight.exists("/nowhere")
         with pytest.raises(DoraSystemdError, match="no answer"):
             for _ in range(64):

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from dora_systemd.trust import socket_table
 from dora_systemd.trust.socket_table import (
     Address,
     Lookup,
@@ -86,36 +85,28 @@ def ends(connection: socket.socket) -> tuple[Address, Address]:
     return (peer[0], peer[1]), (own[0], own[1])
 
 
-def test_a_socket_that_has_gone_costs_no_table(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_socket_that_has_gone_costs_no_table() -> None:
     """Who connects and vanishes again and again would keep the gateway reading."""
-    read: list[object] = []
-    monkeypatch.setattr(socket_table, "read_owner", lambda *ends: read.append(ends))
     with socket.create_server(("127.0.0.1", 0)) as server:
         with socket.create_connection(server.getsockname()) as client:
             peer, own = client.getsockname(), client.getpeername()
             if find_owner(peer, own) is None:
                 pytest.skip("the kernel does not tell of single sockets")
             client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-        assert find_owner(peer, own) is None
-    assert not read
+        assert find_owner(peer, own, read=lambda *_: pytest.fail("it reads")) is None
 
 
-def test_a_kernel_that_knows_of_no_socket_is_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_kernel_that_knows_of_no_socket_is_not_believed() -> None:
     def ignorant(*_ends: object) -> Owner:
         raise FileNotFoundError
 
-    monkeypatch.setattr(socket_table, "_ask_kernel", ignorant)
-    socket_table._kernel_knows.cache_clear()
-    try:
-        with (
-            socket.create_server(("127.0.0.1", 0)) as server,
-            socket.create_connection(server.getsockname()) as client,
-        ):
-            found = find_owner(client.getsockname(), client.getpeername())
-            assert found is not None
-            assert found.uid == os.getuid()
-    finally:
-        socket_table._kernel_knows.cache_clear()
+    with (
+        socket.create_server(("127.0.0.1", 0)) as server,
+        socket.create_connection(server.getsockname()) as client,
+    ):
+        found = find_owner(client.getsockname(), client.getpeername(), ignorant)
+        assert found is not None
+        assert found.uid == os.getuid()
 
 
 @pytest.mark.parametrize(("address", "is_open"), [("127.0.0.1", False), ("127.0.0.2", True)])

@@ -1,28 +1,29 @@
 """What root does not work in, because others can change it."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 
-from dora_systemd.trust import tree
 from dora_systemd.trust.tree import strange_part
 
 pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="only root has files of others")
 
 
 @pytest.fixture
-def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A directory of root. The way to it is not, so each part of it counts as root's."""
-    monkeypatch.setattr(tree, "firm_part", str)
-    place = tmp_path / "robot"
-    (place / "models").mkdir(parents=True)
-    (place / "a.py").write_text("")
-    (place / "models" / "m.bin").write_text("")
-    (place / "link").symlink_to("/etc/passwd")
-    for one in (place, place / "models"):
-        one.chmod(0o755)
-    return place
+def project() -> Iterator[Path]:
+    """A directory of root, and so is all of the way to it."""
+    with TemporaryDirectory(dir="/var/lib", prefix="dora-systemd-") as directory:
+        place = Path(directory, "robot")
+        (place / "models").mkdir(parents=True)
+        (place / "a.py").write_text("")
+        (place / "models" / "m.bin").write_text("")
+        (place / "link").symlink_to("/etc/passwd")
+        for one in (place, place / "models"):
+            one.chmod(0o755)
+        yield place
 
 
 def test_all_of_it_is_roots(project: Path) -> None:

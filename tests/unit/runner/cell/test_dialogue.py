@@ -244,23 +244,22 @@ def test_the_daemon_from_its_start_to_its_end(tmp_path: Path, oom: Oom | None) -
     asyncio.run(work())
 
 
-def test_a_signal_is_heard_before_the_exit_of_a_child_that_it_has_killed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_signal_is_heard_before_the_exit_of_a_child_that_it_has_killed(tmp_path: Path) -> None:
     killed = exit_of(-signal.SIGTERM)
-    monkeypatch.setattr(engine, "watch", lambda _, child, tell: tell(child.label, killed))
 
     async def work() -> None:
         bench = Bench(tmp_path)
-        child = engine.spawn("daemon", ["/bin/true"], {}, tmp_path)
+        child = engine.spawn("daemon", ["/bin/sleep", "60"], {}, tmp_path)
+        child.popen.terminate()
+        os.waitid(os.P_PID, child.popen.pid, os.WEXITED | os.WNOWAIT)
         loop, stop = asyncio.get_running_loop(), life.StopAsked(0, "SIGTERM")
         loop.add_signal_handler(signal.SIGTERM, bench.pump.push, stop)
-        os.kill(os.getpid(), signal.SIGTERM)
-        bench.dialogue.watch(child)  # in the same turn of the loop, which reads the signal later
-        await settle()
+        bench.dialogue.watch(child)
+        os.kill(os.getpid(), signal.SIGTERM)  # the loop hears of both at once, of this one last
+        while len(bench.heard) < 2:
+            await asyncio.sleep(0)
         assert bench.heard == [stop, life.ChildExited(0, "daemon", killed)]
         loop.remove_signal_handler(signal.SIGTERM)
-        child.popen.wait()
         os.close(child.pidfd)
         os.close(child.output)
 

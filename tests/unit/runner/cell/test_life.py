@@ -2,15 +2,19 @@
 
 import asyncio
 import os
+import threading
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from dora_systemd.decisions.cell.restarts import RestartPolicy
-from dora_systemd.runner.cell import life
 from dora_systemd.runner.cell.life import begin_life, is_first_life, learn_first
+from dora_systemd.runner.cell.pause import age
 from dora_systemd.values import SECOND
 from tests.unit.fakes.manager import options
+from tests.unit.fakes.programs import make_program
 
 POLICY = RestartPolicy("on-failure", delay=2 * SECOND)
 
@@ -21,11 +25,10 @@ def unit_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("FDSTORE", "4096")
     monkeypatch.delenv("LISTEN_FDNAMES", raising=False)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    monkeypatch.setattr(life, "age", lambda: 0.5)
     path = tmp_path / "systemd/transient/dora-robot.service"
     path.parent.mkdir(parents=True)
     path.touch()
-    os.utime(path, (path.stat().st_mtime - 0.6,) * 2)
+    os.utime(path, (time.time() - age() - 0.1,) * 2)
     return path
 
 
@@ -49,35 +52,41 @@ def test_a_life_was_before(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not is_first_life(POLICY, "robot", is_user=True)
 
 
-def learned(monkeypatch: pytest.MonkeyPatch, name: str, restarts: int) -> tuple[bool, list[str]]:
-    """Whether a life knows in the end that it is the first one, and what it has asked."""
-    asked: list[str] = []
+Learn = Callable[[str, int], tuple[bool, list[str]]]
+ASKED = ["--user show --value --property=NRestarts dora-enabled.service"]
 
-    def answer(what: str, of: str, is_user: bool, otherwise: int) -> int:
-        del is_user, otherwise
-        asked.append(f"{what} of {of}")
-        return restarts
 
-    monkeypatch.setattr(life, "asked", answer)
-    monkeypatch.setattr(life, "ASK_SECONDS", 0.0)
-    begun = begin_life(options(name, restart=POLICY), is_user=True)
-    asyncio.run(learn_first(begun, name, is_user=True))
-    return begun.is_first, asked
+@pytest.fixture
+def learned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Learn:
+    """Whether a life knows in the end that it is the first one, and what it has asked systemctl."""
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    asked = tmp_path / "asked"
+
+    def learn(name: str, restarts: int) -> tuple[bool, list[str]]:
+        asked.write_text("")
+        make_program(tmp_path / "systemctl", f'echo "$@" >> {asked}; echo {restarts}')
+        begun = begin_life(options(name, restart=POLICY), is_user=True)
+        asyncio.run(learn_first(begun, name, is_user=True, seconds=0.0))
+        return begun.is_first, asked.read_text().splitlines()
+
+    return learn
 
 
 @pytest.mark.usefixtures("unit_file")
-def test_systemd_is_asked_once_for_what_only_it_knows(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert learned(monkeypatch, "robot", 0) == (True, [])
-    assert learned(monkeypatch, "enabled", 0) == (True, ["NRestarts of enabled"])
-    assert learned(monkeypatch, "enabled", 1) == (False, ["NRestarts of enabled"])
+def test_systemd_is_asked_once_for_what_only_it_knows(
+    learned: Learn, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert learned("robot", 0) == (True, [])
+    assert learned("enabled", 0) == (True, ASKED)
+    assert learned("enabled", 1) == (False, ASKED)
     monkeypatch.setenv("LISTEN_FDNAMES", "dora-life")
-    assert learned(monkeypatch, "enabled", 0) == (False, [])
+    assert learned("enabled", 0) == (False, [])
 
 
 @pytest.mark.usefixtures("unit_file")
-def test_no_thread_is_left_to_ask(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(_call: object) -> None:
+def test_no_thread_is_left_to_ask(learned: Learn, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(_thread: object) -> None:
         raise RuntimeError("can't start new thread")
 
-    monkeypatch.setattr(life, "beside", refuse)
-    assert learned(monkeypatch, "enabled", 0) == (False, [])
+    monkeypatch.setattr(threading.Thread, "start", refuse)
+    assert learned("enabled", 0) == (False, [])

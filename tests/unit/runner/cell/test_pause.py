@@ -19,7 +19,6 @@ from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.cell.restarts import RestartPolicy
 from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.paths import CellPaths
-from dora_systemd.runner.cell import pause as pause_module
 from dora_systemd.runner.cell.pause import (
     asked,
     forget_restarts,
@@ -34,10 +33,13 @@ POLICY = RestartPolicy("always", 1000, 600 * SECOND, DELAY, 30 * SECOND)
 
 
 class Unit:
-    """A unit that is restarted: systemd's store of descriptors, NRestarts=, and who sleeps."""
+    """A unit that is restarted: systemd's store of descriptors, NRestarts=, and who sleeps.
+
+    old: seconds since systemd began the process.
+    """
 
     def __init__(self, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.paths, self.slept = CellPaths(root), 0.0
+        self.paths, self.slept, self.old = CellPaths(root), 0.0, 0.0
         self.monkeypatch = monkeypatch
         self.server = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
         self.server.bind(str(root / "notify"))
@@ -48,7 +50,6 @@ class Unit:
         now = time.clock_gettime(time.CLOCK_MONOTONIC)
         monkeypatch.setattr(time, "clock_gettime", lambda _: now)
         self.end(1000)
-        monkeypatch.setattr(pause_module, "age", lambda: self.slept)
         library = SimpleNamespace(notify=lambda _: None)
         monkeypatch.setitem(sys.modules, "systemd", SimpleNamespace(daemon=library))
         monkeypatch.setitem(sys.modules, "systemd.daemon", library)
@@ -94,7 +95,7 @@ class Unit:
         (self.paths.root / "restarts").write_text(f"{restarts}\n")
         self.slept = 0.0
         pause(self.options(policy), self.paths)
-        hold_back(self.options(policy), self.paths)
+        hold_back(self.options(policy), self.paths, self.old + self.slept)
         self.keep_store()
         return self.slept
 
@@ -142,24 +143,22 @@ def test_a_requested_stop_is_no_life_to_wait_after(unit: Unit) -> None:
     assert unit.start(5) == 0
 
 
-def test_only_what_is_left_of_the_delay_is_waited_for(
-    unit: Unit, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_what_is_left_of_the_delay_is_waited_for(unit: Unit) -> None:
     unit.start(0)
-    monkeypatch.setattr(pause_module, "age", lambda: 0.5)
+    unit.old = 0.5
     assert unit.start(1) == 0
     assert not unit.asked
-    monkeypatch.setattr(pause_module, "age", lambda: 0.25)
+    unit.old = 0.25
     assert unit.start(0) == pytest.approx(0.15)
 
 
 @pytest.mark.parametrize(("since", "left"), [(0.42, 0.08), (0.1, 0.15), (0.9, 0), (60, 0.15)])
 def test_the_delay_begins_when_the_last_life_has_ended(
-    unit: Unit, monkeypatch: pytest.MonkeyPatch, since: float, left: float
+    unit: Unit, since: float, left: float
 ) -> None:
     """systemd was late, or ExecStopPost= took its time; but 60 s ago was another life."""
     unit.start(0)
-    monkeypatch.setattr(pause_module, "age", lambda: 0.25)
+    unit.old = 0.25
     unit.end(since)
     assert unit.start(0) == pytest.approx(left, abs=1e-5)
 

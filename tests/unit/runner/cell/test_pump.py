@@ -4,13 +4,13 @@ import asyncio
 import io
 import json
 import os
+import socket
 import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from dora_systemd.adapters.host import fd_store
 from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.life import events as life
@@ -181,7 +181,9 @@ def test_a_state_without_deadline_has_that_of_no_other(tmp_path: Path) -> None:
 
 def test_systemd_is_told_each_state_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     told = hear_notifications(monkeypatch)
-    monkeypatch.setattr(fd_store, "forget_lives", lambda: told.append("no lives"))
+    store = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+    store.bind(str(tmp_path / "notify"))
+    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
 
     async def work() -> None:
         bench = Bench(tmp_path, State.WAITING, ready_us=0)
@@ -190,11 +192,16 @@ def test_systemd_is_told_each_state_once(tmp_path: Path, monkeypatch: pytest.Mon
         assert told.pop() == "READY=1"
         bench.push(life.ReloadNoted(6, "not reloaded: x"), life.ReloadNoted(7, ""))
         assert "READY=1" not in told
-        assert "STOPPING=1" not in told and "no lives" not in told
+        assert "STOPPING=1" not in told
+        with pytest.raises(BlockingIOError):
+            store.recv(1000)
         bench.push(life.StopAsked(8, "SIGTERM"))
-        assert "STOPPING=1" in told and "no lives" in told
+        assert "STOPPING=1" in told
+        assert store.recv(1000).startswith(b"FDSTORE=1")
+        assert store.recv(1000) == b"FDSTOREREMOVE=1\nFDNAME=dora-life", "no lives are counted"
 
-    live(work)
+    with store:
+        live(work)
 
 
 def test_the_table_is_there_before_anybody_hears_that_it_runs(

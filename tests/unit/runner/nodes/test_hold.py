@@ -66,12 +66,16 @@ def test_an_end_meanwhile_is_an_end(hold: Hold, group: Path) -> None:
 def test_a_group_that_cannot_be_frozen(tmp_path: Path) -> None:
     hold = Hold(tmp_path / "gone", Marks(hold=10, free=7))
     hold.look(10)
+    assert not hold.is_held
     hold.look(10)
     hold.end()
+    assert not (tmp_path / "gone").exists()
 
 
 def test_a_group_that_has_gone(hold: Hold, group: Path) -> None:
     hold.look(10)
     (group / "cgroup.freeze").unlink()
     hold.look(0)
+    assert not hold.is_held
     hold.end()
+    assert not (group / "cgroup.freeze").exists()

@@ -3,22 +3,19 @@
 import asyncio
 import os
 import resource
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future
+import subprocess
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from dora_systemd.adapters.host import process
 from dora_systemd.adapters.logs.pipes import LogPipes
-from dora_systemd.decisions.cell.log_backlog import Marks
 from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
 from dora_systemd.decisions.logs.lines import Origin
 from dora_systemd.decisions.rights.node_rights import parse_node_rights
 from dora_systemd.paths import CellPaths
-from dora_systemd.runner.nodes import nodes as nodes_module
 from dora_systemd.runner.nodes.descriptors import raise_file_limit
-from dora_systemd.runner.nodes.hold import Hold
 from dora_systemd.runner.nodes.nodes import Nodes, _with_descendants
 from tests.unit.adapters.logs.test_queue import SlowJournal
 
@@ -39,16 +36,9 @@ def test_more_nodes_than_a_process_has_files() -> None:
 
 
 @pytest.mark.parametrize("is_there", [True, False])
-def test_the_kernel_is_told_before_the_nodes_move(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_there: bool
-) -> None:
+def test_the_kernel_is_told_before_the_nodes_move(tmp_path: Path, is_there: bool) -> None:
     """It moves the runner to where it is, and no error of that is one of the cell."""
-    threads: list[Future[None]] = []
-
-    def beside(call: Callable[[], None]) -> None:
-        threads.append(process.beside(call))
-
-    monkeypatch.setattr(nodes_module, "beside", beside)
+    before = set(threading.enumerate())
     procs = tmp_path / "supervisor/cgroup.procs"
     if is_there:
         procs.parent.mkdir()
@@ -59,9 +49,9 @@ def test_the_kernel_is_told_before_the_nodes_move(
         Nodes(tmp_path, CellPaths(tmp_path), pipes).expect()
 
     asyncio.run(live())
-    if is_there:
-        threads[0].result()
-        assert procs.read_text() == "0"
+    for one in {*threading.enumerate()} - before:
+        one.join()
+    assert (procs.read_text() if procs.exists() else None) == ("0" if is_there else None)
 
 
 def test_a_node_that_dora_reads_is_removed_and_taken_back(tmp_path: Path) -> None:
@@ -93,25 +83,29 @@ OPERATOR = {"id": "a", "operator": {"python": "a.py"}}
 
 @pytest.mark.parametrize(("raw", "is_lowered"), [(SHA, True), (OPERATOR, False)])
 def test_only_a_node_without_a_launcher_is_lowered_from_outside(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, raw: dict[str, object], is_lowered: bool
+    tmp_path: Path, raw: dict[str, object], is_lowered: bool
 ) -> None:
     """The launcher of an operator takes the limits by itself, once it has used them."""
-    lowered: list[object] = []
-    monkeypatch.setattr(nodes_module, "lower_rights", lambda *given: lowered.append(given))
-    monkeypatch.setattr(nodes_module, "_with_descendants", lambda pid: [pid])
-    rights = (parse_node_rights("b:scheduling=fifo:5"),)
+    rights = (parse_node_rights("b:essential"),)
     (tmp_path / "io").mkdir()
+
+    def score(child: subprocess.Popen[bytes]) -> int:
+        return int(Path(f"/proc/{child.pid}/oom_score_adj").read_text())
 
     async def live() -> None:
         pipes = LogPipes(asyncio.get_running_loop(), SlowJournal(), Origin("robot", "uuid"))
         nodes = Nodes(tmp_path, CellPaths(tmp_path), pipes)
         nodes.prepare(parse_dataflow({"nodes": [raw]}, "dataflow.yml"), {}, ())
-        nodes.adopt("a", 7)
-        nodes.adopt("a", 7, rights)
+        with subprocess.Popen(["sleep", "60"]) as child:
+            before = score(child)
+            nodes.adopt("a", child.pid)
+            assert score(child) == before
+            nodes.adopt("a", child.pid, rights)
+            assert (score(child) > before) is is_lowered
+            child.kill()
         nodes.close()
 
     asyncio.run(live())
-    assert lowered == [(7, "a", rights)] * is_lowered
 
 
 def test_an_operator_that_dies_while_it_is_adopted(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -123,25 +117,14 @@ def test_an_operator_that_dies_while_it_is_adopted(monkeypatch: pytest.MonkeyPat
     assert _with_descendants(os.getpid()) == [os.getpid()]
 
 
-def test_a_node_that_is_taken_back_is_held_as_before(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made: list[Hold] = []
-    looked: list[Hold] = []
-
-    class Noted(Hold):
-        def __init__(self, group: Path, marks: Marks) -> None:
-            super().__init__(group, marks)
-            made.append(self)
-
-        def look(self, backlog: int) -> None:
-            looked.append(self)
-            super().look(backlog)
-
-    monkeypatch.setattr(nodes_module, "Hold", Noted)
+def test_a_node_that_is_taken_back_is_held_as_before(tmp_path: Path) -> None:
+    """dora has written more than the node may have unread, and the journal takes nothing."""
     raw = {"id": "a", "path": "a.py", "outputs": ["said"], "send_stdout_as": "said"}
-    dataflow = parse_dataflow({"nodes": [raw]}, "dataflow.yml")
+    dataflow = parse_dataflow({"nodes": [raw | {"max_log_size": "1KB"}]}, "dataflow.yml")
     (tmp_path / "io").mkdir()
+    freeze = tmp_path / "node-a/cgroup.freeze"
+    log = tmp_path / "work/out/run/log_a.jsonl"
+    log.parent.mkdir(parents=True)
 
     async def live() -> None:
         pipes = LogPipes(asyncio.get_running_loop(), SlowJournal(), Origin("robot", "uuid"))
@@ -150,9 +133,13 @@ def test_a_node_that_is_taken_back_is_held_as_before(
         nodes.listen("run")
         nodes.remove("a")
         nodes.add(dataflow.nodes[0], {}, ())
+        freeze.write_text("0")
+        log.write_text(f"{'x' * 999}\n" * 100)
         async with asyncio.timeout(30):
-            while made[1] not in looked:
+            while freeze.read_text() == "0":
                 await asyncio.sleep(0.01)
+        assert nodes.is_held("a")
         nodes.close()
+        assert freeze.read_text() == "0"
 
     asyncio.run(live())

@@ -5,7 +5,6 @@ from typing import Any
 
 import pytest
 
-from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.decisions.cell.limits import parse_node_limits
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
@@ -13,7 +12,6 @@ from dora_systemd.decisions.rights.node_rights import parse_node_rights
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.begin import daemon_variables
-from dora_systemd.runner.nodes import rights as module
 from dora_systemd.runner.nodes.rights import check_first, launcher_rights
 from tests.unit.fakes.manager import options
 
@@ -52,14 +50,10 @@ def test_the_launcher_binds_nodes_only_where_no_cgroup_does(tmp_path: Path) -> N
         ("/user.slice/user-1000.slice/session-1.scope", False),
     ],
 )
-def test_rights_are_proved_in_a_unit(
-    monkeypatch: pytest.MonkeyPatch, group: str, is_proved: bool
-) -> None:
+def test_rights_are_proved_in_a_unit(group: str, is_proved: bool) -> None:
     proved: list[object] = []
-    monkeypatch.setattr(module, "prove_rights", proved.append)
-    monkeypatch.setattr(cgroup, "group_of", lambda: group)
     rights = (parse_node_rights("camera:nice=5"),)
-    check_first(options(node_rights=rights), FLOW)
+    check_first(options(node_rights=rights), FLOW, group, proved.append)
     assert proved == [rights] * is_proved
 
 

@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import signal
 import socket
 import struct
 import subprocess
@@ -14,17 +15,17 @@ from signal import SIGABRT
 
 import pytest
 
-from dora_systemd.adapters.cgroup import members
+from dora_systemd.adapters.cgroup.members import is_member, signal_group
 from dora_systemd.adapters.host import notify_socket
 from dora_systemd.adapters.host.notify_socket import NotifySocket
 from dora_systemd.decisions.signs.table import Sign
 from dora_systemd.decisions.signs.watchdogs import Watchdogs
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
-from dora_systemd.runner.signs import sockets
 from dora_systemd.runner.signs.hook import signs_of
 from dora_systemd.runner.signs.sockets import Signs
 from dora_systemd.values import INFINITY, SECOND
+from tests.unit.fakes.cgroups import fake_cgroups
 
 WATCHDOGS: Watchdogs = {"cam": 5 * SECOND, "plot": INFINITY}
 
@@ -32,19 +33,17 @@ WATCHDOGS: Watchdogs = {"cam": 5 * SECOND, "plot": INFINITY}
 class Bench:
     """Two nodes with sockets. own: pids of the node cam. told: life events."""
 
-    def __init__(self, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def __init__(self, root: Path) -> None:
         self.own = {os.getpid()}
         self.told: list[tuple[str, str, str]] = []
         self.news = 0
         paths = CellPaths(root)
         paths.io.mkdir()
-        monkeypatch.setattr(sockets, "is_member", self.is_member)
-        signs = signs_of(WATCHDOGS, root, paths, self.tell)
-        assert isinstance(signs, Signs)
-        self.signs, self.place = signs, str(paths.node_notify("cam"))
+        self.signs = Signs(WATCHDOGS, root, paths, self.tell, self.is_member)
+        self.place = str(paths.node_notify("cam"))
         for node in ("cam", "plot", "other"):
-            signs.make(node)
-        signs.on_news = self.count
+            self.signs.make(node)
+        self.signs.on_news = self.count
 
     def is_member(self, path: Path, pid: int) -> bool:
         return path.name == "node-cam" and pid in self.own
@@ -75,8 +74,17 @@ Open = Callable[[], AbstractContextManager[Bench]]
 
 
 @pytest.fixture
-def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Open:
-    return lambda: closing(Bench(tmp_path, monkeypatch))
+def bench(tmp_path: Path) -> Open:
+    return lambda: closing(Bench(tmp_path))
+
+
+def test_only_a_watchdog_needs_sockets(tmp_path: Path) -> None:
+    async def live() -> None:
+        for watchdogs in ({}, WATCHDOGS):
+            signs = signs_of(watchdogs, tmp_path, CellPaths(tmp_path), pytest.fail)
+            assert signs.is_used is bool(watchdogs)
+
+    asyncio.run(live())
 
 
 def test_what_a_node_says(bench: Open, tmp_path: Path) -> None:
@@ -172,19 +180,33 @@ def test_a_path_that_is_too_long(tmp_path: Path) -> None:
         NotifySocket(tmp_path / ("n" * 107))
 
 
-def test_members(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Who is in a group gets a signal, the main process first; who has left it gets none."""
+def test_members(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    mount = fake_cgroups(monkeypatch, tmp_path)
     groups = {3: "/u/node-a", 5: "/u/node-a/below", 7: "/u/node-ab"}
-    sent: list[int] = []
-    monkeypatch.setattr(members, "group_of", lambda pid: groups.get(pid, "/"))
-    monkeypatch.setattr(members, "group_path", lambda group: tmp_path / group.lstrip("/"))
-    monkeypatch.setattr(members, "pids", lambda _: [3, 5, 7, 9])
-    monkeypatch.setattr(os, "pidfd_open", lambda pid: os.dup(0) if pid != 9 else os.dup(-1))
-    monkeypatch.setattr(members, "pidfd_send_signal", lambda _, number: sent.append(number))
-    group = tmp_path / "u/node-a"
-    assert [members.is_member(group, pid) for pid in (3, 5, 7, 9)] == [True, True, False, False]
-    members.signal_group(group, SIGABRT, 5)
-    assert sent == [6, 6]
+    found = [
+        is_member(mount / "u/node-a", pid, lambda pid: groups.get(pid, "/")) for pid in (3, 5, 7, 9)
+    ]
+    assert found == [True, True, False, False]
+
+
+def test_who_is_in_a_group_gets_a_signal(tmp_path: Path) -> None:
+    """The main process first; who has left the group gets none."""
+    children = [subprocess.Popen(["sleep", "60"]) for _ in range(3)]
+    one, main, left = children
+    asked: list[int] = []
+
+    def is_in(_group: Path, pid: int) -> bool:
+        asked.append(pid)
+        return pid != left.pid
+
+    (tmp_path / "cgroup.procs").write_text("".join(f"{child.pid}\n" for child in children))
+    signal_group(tmp_path, SIGABRT, main.pid, is_in)
+    assert [one.wait(), main.wait(), left.poll()] == [-SIGABRT, -SIGABRT, None]
+    assert asked == [main.pid, one.pid, left.pid]
+    left.kill()
+    left.wait()
+    signal_group(tmp_path, SIGABRT, main.pid, is_in)
+    assert len(asked) == 3, "all have exited"
 
 
 @pytest.mark.parametrize(
@@ -197,7 +219,7 @@ def test_a_sender_that_gets_no_signal_of_ours(
         if number:
             raise OSError(number, "no")
 
-    monkeypatch.setattr(notify_socket, "pidfd_send_signal", refuse)
+    monkeypatch.setattr(signal, "pidfd_send_signal", refuse)
     credentials = socket.SOL_SOCKET, socket.SCM_CREDENTIALS, struct.pack("iII", 7, 0, 0)
     read, write = os.pipe()
     os.close(write)

@@ -345,8 +345,7 @@ def test_what_a_user_sees(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
 def test_a_child_that_is_stopped_costs_one_budget(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its user may stop it, and slow each answer: all of them together have so much time."""
     monkeypatch.setattr(sys, "executable", "/usr/bin/python3")
-    monkeypatch.setattr("dora_systemd.trust.sight._SECONDS", 0.5)
-    with sight_of(account_of(pwd.getpwuid(65534))) as sight:
+    with sight_of(account_of(pwd.getpwuid(65534)), 0.5) as sight:
         assert not sight.exists("/" + "x" * 100_000)
         assert isinstance(sight, LentSight)
         os.kill(sight._child.pid, signal.SIGSTOP)
