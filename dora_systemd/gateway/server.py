@@ -29,7 +29,7 @@ from dora_systemd.decisions.gateway.access import (
 )
 from dora_systemd.decisions.gateway.request import Answer, Request, text_answer
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.gateway.live.acting import is_acting
+from dora_systemd.gateway.live.acting import ACTIONS
 from dora_systemd.gateway.routes import GET, OPEN_TO_ALL, SOCKETS
 from dora_systemd.scope import Scope
 from dora_systemd.trust.socket_table import peer_uid
@@ -88,7 +88,7 @@ class Gateway:
         return self._count == 0
 
     def _idle_left(self, idle_seconds: float) -> float:
-        if self._count or is_acting():
+        if self._count or ACTIONS.is_acting:
             return idle_seconds
         return self._since + idle_seconds - time.monotonic()
 

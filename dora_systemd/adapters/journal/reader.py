@@ -27,7 +27,8 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import is_name, is_node_id, is_uuid, name_from_unit, unit_name
 from dora_systemd.scope import Scope
 
-_ROOT = Path("/")
+ROOT = Path("/")
+"""The directory with all files of the machine."""
 _PERSISTENT = "var/log/journal"
 _VOLATILE = "run/log/journal"
 
@@ -255,16 +256,17 @@ def _system_files(top: Path) -> list[Path]:
     return [path for path in files if not os.access(path.parent, os.X_OK) or path.exists()]
 
 
-def is_volatile(root: Path = _ROOT) -> bool:
-    """Whether the journal below `root` is lost at a reboot, see Storage= in journald.conf(5)."""
-    return not _system_files(root / _PERSISTENT)
+def is_volatile(root: Path | None = None) -> bool:
+    """Whether the journal is lost at a reboot, see Storage= in journald.conf(5). root: as ROOT."""
+    return not _system_files((root or ROOT) / _PERSISTENT)
 
 
-def check_readable(scope: Scope, root: Path = _ROOT) -> None:
+def check_readable(scope: Scope, root: Path | None = None) -> None:
     """Raise DoraSystemdError if this user may not read the records of dataflows of `scope`.
 
-    root: the directory with all files of the machine.
+    root: as ROOT.
     """
+    root = root or ROOT
     files = [*_system_files(root / _PERSISTENT), *_system_files(root / _VOLATILE)]
     if any(os.access(path, os.R_OK) for path in files):
         return

@@ -57,6 +57,15 @@ async def wait_for_spawn(talk: Talk, request: Request) -> Result:
 
 
 def _start(scope: Scope, request: Request) -> str:
+    wanted = wanted_start(request)
+    bus = Bus(scope)
+    claimed = claim(bus, scope, wanted, "dora start")
+    options, links = claimed.plan.options, claimed.links
+    return start_unit(bus, scope, options, claimed.properties, None, False, links).uuid
+
+
+def wanted_start(request: Request) -> StartRequest:
+    """What a Start asks for. Raises DoraSystemdError."""
     if request.body.get("write_events_to") is not None:
         hint = "unset DORA_WRITE_EVENTS_TO, or use dora run"
         raise DoraSystemdError("cannot write the events of a supervised dataflow", hint)
@@ -65,11 +74,7 @@ def _start(scope: Scope, request: Request) -> str:
     name = request.body.get("name")
     path = find_file(Path(request.text("local_working_dir")), request.text("session_id"))
     flags = sent_flags(request, written_dataflow(str(path)).raw)
-    wanted = StartRequest(str(path), name if isinstance(name, str) else None, flags, os.environ)
-    bus = Bus(scope)
-    claimed = claim(bus, scope, wanted, "dora start")
-    options, links = claimed.plan.options, claimed.links
-    return start_unit(bus, scope, options, claimed.properties, None, False, links).uuid
+    return StartRequest(str(path), name if isinstance(name, str) else None, flags, os.environ)
 
 
 def find_file(directory: Path, session: str) -> Path:

@@ -10,7 +10,7 @@ from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.decisions.descriptor.dataflow import parse_dataflow
 from dora_systemd.decisions.gateway.page_messages import HOT_RELOAD, PageMessage, graph_values
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.gateway.live.acting import acting
+from dora_systemd.gateway.live.acting import ACTIONS
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.act import act_on, told
 from dora_systemd.verbs.facts.cells import Cell
@@ -31,12 +31,13 @@ _BY = "status page"
 Action = Callable[[Manager, Scope, Cell, PageMessage], str]
 
 
-def act(scope: Scope, message: PageMessage) -> str:
+def act(scope: Scope, message: PageMessage, manager: Manager | None = None) -> str:
     """Carry out an action on a dataflow or one of its nodes; what was done, for the page.
 
-    Raises DoraSystemdError as the verbs of doractl do.
+    manager: None for a new connection to systemd. Raises DoraSystemdError as the verbs of doractl
+    do.
     """
-    bus = Bus(scope)
+    bus = manager or Bus(scope)
     known = find_start(bus, scope, Selector(message.dataflow))
     if message.action == "rollback":
         return _roll_back(bus, scope, known.name, message.release)
@@ -97,7 +98,7 @@ def _roll_back(manager: Manager, scope: Scope, name: str, release: str) -> str:
     # Imported late: few roll back, and its imports are memory.
     from dora_systemd.verbs.releases.rollback import roll_back
 
-    with acting() as action:
+    with ACTIONS.acting() as action:
         done = roll_back(manager, scope, name, release or None, 0, action.go_on, by=_BY)
     how = f"runs release {done.release}" if done.release else "has ended its trial"
     return f"Dataflow rolled back: {done.uuid} ({name}) {how}"

@@ -4,9 +4,16 @@ import asyncio
 import json
 import socket as sockets
 import time
-from collections.abc import AsyncIterator, Callable, Coroutine
+from collections.abc import (
+    AsyncGenerator,
+    AsyncIterator,
+    Awaitable,
+    Callable,
+    Coroutine,
+    Mapping,
+)
 from contextlib import aclosing, suppress
-from typing import Any
+from typing import Any, NamedTuple
 
 from dora_systemd import __version__
 from dora_systemd.adapters.bus.systemd import Bus
@@ -33,12 +40,10 @@ LONGEST_SECONDS = 10.0
 """Between snapshots, of any number of dataflows."""
 SHARE = 0.02
 """Of a processor, for the snapshots of a page: many dataflows are looked at less often."""
-SEND_SECONDS = 10.0
-"""Close the connection of a page that accepts no data for this long; others would queue forever."""
 MAX_TASKS = 8
 """Maximum parallel questions and actions of one page."""
 
-_QUESTIONS: dict[str, Callable[[Scope, str], dict[str, Any]]] = {
+QUESTIONS: Mapping[str, Callable[[Scope, str], dict[str, Any]]] = {
     "graph": read_graph,
     "about": read_about,
     "ended": read_ended,
@@ -48,9 +53,26 @@ _STREAMS = ("follow", "find", "unfollow")
 """Each ends the one before it."""
 
 
-async def talk(socket: Socket, request: Request) -> None:
+class Means(NamedTuple):
+    """How a page is served.
+
+    interval: seconds between snapshots, at least. send_seconds: until a page that accepts no data
+    is given up; others would queue forever. follow, find: the lines of a dataflow.
+    """
+
+    interval: float = INTERVAL_SECONDS
+    send_seconds: float = 10.0
+    questions: Mapping[str, Callable[[Scope, str], dict[str, Any]]] = QUESTIONS
+    follow: Callable[[Scope, PageMessage], AsyncGenerator[tuple[Lines, int], None]] = follow_lines
+    find: Callable[[Scope, PageMessage, int], Awaitable[tuple[Lines, bool]]] = find_lines
+
+
+_MEANS = Means()
+
+
+async def talk(socket: Socket, request: Request, means: Means = _MEANS) -> None:
     """Serve one page until it disconnects."""
-    page = _Page(socket, request.scope)
+    page = Page(socket, request.scope, means)
     jobs = {asyncio.ensure_future(page.show()), asyncio.ensure_future(page.listen())}
     try:
         done, _ = await asyncio.wait(jobs, return_when=asyncio.FIRST_COMPLETED)
@@ -67,29 +89,30 @@ async def _end(tasks: set["asyncio.Task[None]"]) -> None:
     await asyncio.gather(*tasks, return_exceptions=True)
 
 
-class _Page:
-    """One page in a browser."""
+class Page:
+    """One page in a browser. is_due: a snapshot is."""
 
-    def __init__(self, socket: Socket, scope: Scope) -> None:
+    def __init__(self, socket: Socket, scope: Scope, means: Means = _MEANS) -> None:
         self._socket = socket
         self._scope = scope
-        self._is_due = asyncio.Event()
+        self._means = means
+        self.is_due = asyncio.Event()
         self._stream: asyncio.Task[None] | None = None
         self.tasks: set[asyncio.Task[None]] = set()
         # The last answer to a question is what the page shows: it must be the newest.
-        self._turns = {question: asyncio.Lock() for question in _QUESTIONS}
+        self._turns = {question: asyncio.Lock() for question in means.questions}
 
     async def show(self) -> None:
         """Send snapshots, forever."""
         await self._send(type="hello", **_greeting(self._scope))
         while True:
-            self._is_due.clear()
+            self.is_due.clear()
             before = time.process_time()
             await self._send_snapshot()
-            pause = pause_after(time.process_time() - before)
+            pause = pause_after(time.process_time() - before, self._means.interval)
             with suppress(TimeoutError):
                 async with asyncio.timeout(pause):
-                    await self._is_due.wait()
+                    await self.is_due.wait()
 
     async def listen(self) -> None:
         """Handle the messages of the page until it disconnects."""
@@ -134,7 +157,7 @@ class _Page:
 
     async def _follow(self, message: PageMessage) -> None:
         try:
-            async with aclosing(follow_lines(self._scope, message)) as batches:
+            async with aclosing(self._means.follow(self._scope, message)) as batches:
                 async for lines, skipped in batches:
                     values = {"number": message.number, "lines": lines, "skipped": skipped}
                     await self._send(type="lines", **values)
@@ -153,7 +176,7 @@ class _Page:
     async def _parts(self, message: PageMessage, most: int) -> AsyncIterator[Lines]:
         """What a search has found, in parts; then tells the page how it ended."""
         try:
-            found, is_whole = await find_lines(self._scope, message, most)
+            found, is_whole = await self._means.find(self._scope, message, most)
         except DoraSystemdError as error:
             await self._send_found(message, error=error)
             return
@@ -176,7 +199,7 @@ class _Page:
         values: dict[str, Any] = {"problem": ""}
         async with self._turns[message.type]:
             try:
-                read = _QUESTIONS[message.type]
+                read = self._means.questions[message.type]
                 values |= await asyncio.to_thread(read, self._scope, message.dataflow)
             except DoraSystemdError as error:
                 values["problem"] = error.message
@@ -188,17 +211,17 @@ class _Page:
             answer["text"] = await asyncio.to_thread(act, self._scope, message)
         except DoraSystemdError as error:
             answer |= {"problem": error.message, "hint": error.hint}
-        self._is_due.set()
+        self.is_due.set()
         await self._send(type="acted", number=message.number, **answer)
 
     async def _send(self, **values: Any) -> None:
-        async with asyncio.timeout(SEND_SECONDS):
+        async with asyncio.timeout(self._means.send_seconds):
             await self._socket.send(json.dumps(values))
 
 
-def pause_after(on_cpu: float) -> float:
+def pause_after(on_cpu: float, interval: float = INTERVAL_SECONDS) -> float:
     """Seconds until the next snapshot. on_cpu: seconds of a processor that the last one took."""
-    return min(max(INTERVAL_SECONDS, on_cpu / SHARE), LONGEST_SECONDS)
+    return min(max(interval, on_cpu / SHARE), LONGEST_SECONDS)
 
 
 def _greeting(scope: Scope) -> dict[str, str]:

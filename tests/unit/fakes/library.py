@@ -41,13 +41,14 @@ class Message:
 class FakeSystemd:
     """is_slow: jobs end with the first kill, or finish(). lives: InvocationID, one by one.
 
-    refuses: an error that it answers each call with.
+    refuses: an error that it answers each call with. timeouts: for an answer, of each connection.
     """
 
     def __init__(self, manager: FakeManager) -> None:
         self.manager = manager
         self.is_slow = False
         self.refuses: Exception | None = None
+        self.timeouts: list[str] = []
         self.lives: list[Callable[[], str]] = []
         self.connections: list[Connection] = []
         self._waiting: list[tuple[str, str]] = []
@@ -120,6 +121,7 @@ class Connection:
 
     def open(self) -> None:
         """The other side has spoken already: its descriptor is readable."""
+        self._systemd.timeouts.append(os.environ["SYSTEMD_BUS_TIMEOUT"])
 
     def get_fd(self) -> int:
         return self._fd

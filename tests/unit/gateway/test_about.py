@@ -9,14 +9,12 @@ from typing import Any
 import pytest
 
 from dora_systemd.decisions.gateway.page_messages import MAX_ITEMS, MAX_TEXT, PageMessage
-from dora_systemd.decisions.views.releases import ReleaseRow
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.gateway.live import about
-from dora_systemd.gateway.live import lines as lines_module
 from dora_systemd.gateway.live.about import read_about, read_ended, read_own_releases
 from dora_systemd.gateway.live.lines import find_lines
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.releases import listing
+from dora_systemd.verbs.releases.listing import store_of
+from tests.unit.fakes.journal import FakeJournal
 from tests.unit.fakes.library import fake_journalctl, fake_systemd
 from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
 from tests.unit.fakes.programs import make_program
@@ -55,8 +53,7 @@ class Bench:
         self.manager.add(options(), active="failed", StatusText="failed: node a: exit code 3")
         self.scope: Scope = ScopeIn(is_user=False, uid=os.getuid(), root=root)
         fake_systemd(patch, self.manager)
-        for module in (about, lines_module):
-            patch.setattr(module, "check_readable", lambda _scope: None)
+        self.records = FakeJournal(patch, root)
 
     def journal(self, *records: bytes) -> Path:
         return fake_journalctl(self.patch, self.root, b"".join(records))
@@ -92,13 +89,9 @@ def test_texts_of_others_are_shown_and_bounded(bench: Bench) -> None:
 
 
 def test_without_a_journal_the_settings_are_there(bench: Bench) -> None:
-    def refuse(_scope: Scope) -> None:
-        raise DoraSystemdError("cannot read the system's journal")
-
-    bench.journal()
-    bench.patch.setattr(about, "check_readable", refuse)
+    (bench.records.directory / "system.journal").unlink()
     found = read_about(bench.scope, UUID)
-    assert found["problem"] == "cannot read the system's journal"
+    assert found["problem"] == "cannot find a journal on this machine"
     assert found["why"] is None
     assert found["row"]["name"] == "robot"
     assert found["facts"]["sandbox"] == "none"
@@ -178,15 +171,11 @@ def test_a_time_that_journalctl_does_not_take(bench: Bench, tmp_path: Path) -> N
 
 def test_the_releases_of_a_dataflow(bench: Bench) -> None:
     bench.journal()
-    asked: list[list[str]] = []
-
-    def read(_manager: object, _scope: object, names: list[str]) -> list[ReleaseRow]:
-        asked.append(names)
-        ids = (f"2026{number:04}T220012" for number in range(200, 0, -1))
-        return [ReleaseRow("robot", one, "proved", "/x\x1b[2J", None) for one in ids]
-
-    bench.patch.setattr(listing, "read_releases", read)
+    bench.scope = ScopeIn(is_user=True, uid=os.getuid(), root=bench.root)
+    state = bench.root / "state\x1b[2J"
+    bench.patch.setenv("XDG_STATE_HOME", str(state))
+    for number in range(1, MAX_ITEMS + 50):
+        store_of(bench.scope, "robot").tree(f"2026{number:04}T220012").mkdir(parents=True)
     found = read_own_releases(bench.scope, UUID)["releases"]
-    assert asked == [["robot"]]
-    assert (len(found), found[0]["release"]) == (MAX_ITEMS, "20260200T220012")
-    assert found[0]["tree"] == "/x"
+    assert (len(found), found[0]["release"]) == (MAX_ITEMS, f"2026{MAX_ITEMS + 49:04}T220012")
+    assert found[0]["tree"].startswith(f"{bench.root}/state/")

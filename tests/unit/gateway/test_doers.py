@@ -6,37 +6,29 @@ import json
 import os
 import signal
 import socket
-import threading
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from dora_systemd.adapters.bus import systemd
-from dora_systemd.adapters.bus.connection import connect
 from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
 from dora_systemd.decisions.gateway.frames import Request
 from dora_systemd.decisions.gateway.page_messages import PageMessage
-from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.gateway.control import start as starting
 from dora_systemd.gateway.control.forward import forward
 from dora_systemd.gateway.control.serve import HANDLERS
+from dora_systemd.gateway.control.start import wanted_start
 from dora_systemd.gateway.control.talk import Talk
-from dora_systemd.gateway.live import act as acting
-from dora_systemd.gateway.live import acting as actions
 from dora_systemd.gateway.live.act import act, read_graph
-from dora_systemd.gateway.live.acting import acting as begun_action
-from dora_systemd.gateway.live.acting import end_actions, is_acting
+from dora_systemd.gateway.live.acting import Actions
 from dora_systemd.runner.cell.begin import make_lock
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.releases import rollback
-from dora_systemd.verbs.releases.deploy import Deployed
-from dora_systemd.verbs.start.again import Asked
-from dora_systemd.verbs.start.plan import StartRequest
+from tests.unit.fakes.cgroups import fake_cgroups
+from tests.unit.fakes.journal import FakeJournal
 from tests.unit.fakes.library import FakeSystemd, fake_journalctl, fake_systemd
 from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
+from tests.unit.fakes.programs import make_program
+from tests.unit.fakes.runner import fake_runner
 from tests.unit.fakes.socket import FakeSocket
 
 UNIT = "dora-robot.service"
@@ -57,6 +49,11 @@ class Bench:
 
     def act(self, action: str, dataflow: str = UUID, node: str = "", **values: str) -> str:
         return act(self.scope, PageMessage("act", dataflow, node, action, values=values))
+
+    def change(self, action: str, node: str = "", **values: str) -> str:
+        """The same with a systemd that knows all changes."""
+        message = PageMessage("act", UUID, node, action, values=values)
+        return act(self.scope, message, self.manager)
 
     def ask(self, variant: str, **body: Any) -> Any:
         talk = Talk(FakeSocket([]), self.scope)
@@ -121,19 +118,16 @@ def test_the_page_starts_what_has_failed(tmp_path: Path, monkeypatch: pytest.Mon
     assert bench.jobs == ["RestartUnit"]
 
 
-@pytest.mark.parametrize("action", ["start", "enable"])
 def test_the_page_starts_what_has_ended(
-    action: str, bench: Bench, monkeypatch: pytest.MonkeyPatch
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked = Asked("arm", NOBODY, "/srv/arm.yml", {})
-    done = Outcome(asked, "Dataflow restarted")
-    monkeypatch.setattr(acting, "find_start", lambda *_: asked)
-    monkeypatch.setattr(acting, "restart_asked", lambda *_: done)
-    if action == "start":
-        assert bench.act(action, NOBODY) == "Dataflow restarted"
-        return
+    flow = str(tmp_path / "gone.yml")
+    own = {"DORA_DATAFLOW_NAME": "arm", "DORA_DATAFLOW": NOBODY, "DORA_FILE": flow}
+    FakeJournal(monkeypatch, tmp_path).write({"_PID": "7", "DORA_SETTINGS": "{}", **own})
+    with pytest.raises(DoraSystemdError, match=f"{flow}"):
+        bench.act("start", NOBODY)
     with pytest.raises(DoraSystemdError, match="cannot enable arm: it has ended") as caught:
-        bench.act(action, NOBODY)
+        bench.act("enable", NOBODY)
     assert caught.value.hint == "doractl start arm"
 
 
@@ -156,110 +150,78 @@ def test_what_the_verbs_refuse_the_page_refuses(
     assert not bench.manager.calls
 
 
-def test_the_page_sets_limits(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[object] = []
-
-    def note(*given: object) -> tuple[str, ...]:
-        asked.append(given[-1])
-        return ()
-
-    monkeypatch.setattr(acting, "set_limits", note)
-    monkeypatch.setattr(acting, "switch_hot_reload", note)
-    done = bench.act("set", memory_limit="6G", hot_reload="off")
+def test_the_page_sets_limits(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mount = fake_cgroups(monkeypatch, tmp_path)
+    (mount / "cgroup.controllers").write_text("memory")
+    bench.manager.units[UNIT]["FragmentPath"] = str(tmp_path / UNIT)
+    with fake_runner(bench.scope.cell_directory("robot")) as asked:
+        done = bench.change("set", memory_limit="6G", hot_reload="off")
     assert done == f"Limits changed: {UUID} (robot); Hot reload off: {UUID} (robot)"
-    assert asked == [{"memory_limit": "6G"}, False]
+    changed, reloaded = bench.manager.calls
+    assert changed == ("set", UNIT, [("MemoryMax", "t", 6 << 30)], False)
+    assert reloaded == ("reload",)
+    assert asked[-1] == {"verb": "hot-reload", "on": False}
 
 
-def test_the_page_reloads(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    done = {None: [], "a": ["a was restarted", "b was restarted"]}
-    monkeypatch.setattr(acting, "reload_cell", lambda _scope, _cell, node: done[node])
-    assert bench.act("reload") == "Nothing has changed"
-    assert bench.act("reload", node="a") == "a was restarted; b was restarted"
+def test_the_page_reloads(bench: Bench) -> None:
+    _run(bench, "run")
+    with fake_runner(bench.scope.cell_directory("robot")) as asked:
+        assert bench.change("reload") == "Nothing has changed"
+        assert asked[-1] == {"verb": "reload", "node": None}
+    with fake_runner(bench.scope.cell_directory("robot"), "a was restarted", "b was") as asked:
+        assert bench.change("reload", node="a") == "a was restarted; b was"
+        assert asked[-1] == {"verb": "reload", "node": "a"}
 
 
-def test_the_page_enables_and_disables(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    boot = SimpleNamespace(path=Path("/etc/robot"))
-    monkeypatch.setattr(acting, "enable_cell", lambda *_: (boot, True))
-    monkeypatch.setattr(acting, "disable_cell", lambda *_: False)
-    monkeypatch.setattr(acting, "ensure_linger", lambda _scope: "lingering is now on")
-    done = bench.act("enable")
-    assert done == f"Dataflow enabled: {UUID} (robot); /etc/robot; lingering is now on"
-    assert bench.act("disable") == f"Dataflow not enabled: {UUID} (robot)"
+def test_the_page_enables_and_disables(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make_program(tmp_path / "bin/loginctl", "exit 1")
+    monkeypatch.setenv("PATH", f"{tmp_path}/bin:{os.environ['PATH']}")
+    bench.scope = ScopeIn(is_user=True, uid=os.getuid(), root=tmp_path / "run")
+    bench.manager.etc = tmp_path / "etc"
+    assert bench.change("disable") == f"Dataflow not enabled: {UUID} (robot)"
+    enabled, path, linger = bench.change("enable").split("; ", 2)
+    assert enabled == f"Dataflow enabled: {UUID} (robot)"
+    assert Path(path).is_relative_to(tmp_path)
+    assert "as root: loginctl enable-linger" in linger
 
 
-@pytest.mark.parametrize("release", ["", "20261121T220012"])
-def test_the_page_rolls_back(bench: Bench, monkeypatch: pytest.MonkeyPatch, release: str) -> None:
-    asked: list[object] = []
-
-    def note(_manager: object, _scope: object, *given: Any, by: str) -> Deployed:
-        assert is_acting()
-        asked.extend((*given[:3], by))
-        return Deployed(UUID, "robot", UNIT, release, "20261122T220012", 1, 2, 0)
-
-    monkeypatch.setattr(rollback, "roll_back", note)
-    done = act(bench.scope, PageMessage("act", UNIT, action="rollback", release=release))
-    assert asked == ["robot", release or None, 0, "status page"]
-    how = f"runs release {release}" if release else "has ended its trial"
-    assert done == f"Dataflow rolled back: {UUID} (robot) {how}"
-    assert not is_acting()
-
-
-@pytest.fixture
-def told(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """What systemd is told of the end of a gateway, which only these tests end."""
+def test_an_action_of_a_gateway_that_ends() -> None:
     told: list[int] = []
-    monkeypatch.setattr(actions, "_ending", threading.Event())
-    monkeypatch.setattr(actions, "extend_timeout", told.append)
-    return told
-
-
-def test_an_action_of_a_gateway_that_ends(told: list[int]) -> None:
-    with begun_action() as action:
+    actions = Actions(told.append)
+    with actions.acting() as action:
+        assert actions.is_acting
         action.go_on()
-        end_actions()
+        actions.end()
         assert told == []
         with pytest.raises(DoraSystemdError, match="the gateway was stopped"):
             action.go_on()
         action.go_on()  # the way back is not stopped
     assert told == [30_000_000] * 2
-    end_actions()
-
-
-@pytest.mark.usefixtures("told")
-def test_a_gateway_that_ends_begins_nothing(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its thread was at something else when the others were told."""
-    monkeypatch.setattr(rollback, "roll_back", lambda *_, **__: pytest.fail("it has begun"))
-    end_actions()
-    with pytest.raises(DoraSystemdError, match="the gateway was stopped"):
-        act(bench.scope, PageMessage("act", UNIT, action="rollback"))
-    assert not is_acting()
+    # A thread was at something else when the others were told: it begins nothing.
+    with pytest.raises(DoraSystemdError, match="the gateway was stopped"), actions.acting():
+        pytest.fail("it has begun")
+    assert not actions.is_acting
 
 
 def test_the_drawing_of_a_dataflow_that_has_no_coordinator(bench: Bench) -> None:
     assert read_graph(bench.scope, UUID)["nodes"] == [{"id": "a", "kind": "python"}]
 
 
-def test_dora_starts_the_file_of_its_session(
-    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_dora_starts_the_file_of_its_session(bench: Bench, tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "flow.dora-session.yaml").write_text("session_id: one\n")
-    asked: list[StartRequest] = []
-
-    def claimed(_bus: object, _scope: object, wanted: StartRequest, by: str) -> SimpleNamespace:
-        assert by == "dora start"
-        asked.append(wanted)
-        return SimpleNamespace(plan=SimpleNamespace(options=None), properties={}, links=())
-
-    monkeypatch.setattr(starting, "claim", claimed)
-    monkeypatch.setattr(starting, "start_unit", lambda *_, **__: SimpleNamespace(uuid=UUID))
     sent = {"nodes": [{"id": "a"}], "env": {"A": "b"}}
     body = {"dataflow": sent, "local_working_dir": str(tmp_path), "session_id": "one"}
-    answer = bench.ask("Start", **body, name="robot", uv=True)
-    assert answer == {"DataflowStartTriggered": {"uuid": UUID}}
-    (wanted,) = asked
+    wanted = wanted_start(Request("x", "Start", {**body, "name": "robot", "uv": True}))
     assert (wanted.dataflow, wanted.name) == (str(tmp_path / "flow.yml"), "robot")
     assert wanted.flags == {"env": ("A=b",), "uv": True}
+    with pytest.raises(DoraSystemdError, match="cannot tell which file this dataflow is from"):
+        bench.ask("Start", **body | {"session_id": "two"})
+    assert not bench.manager.calls
 
 
 @pytest.mark.parametrize("name", ["Stop", "Restart"])
@@ -306,22 +268,13 @@ def test_the_next_life_of_a_unit_is_not_killed(bench: Bench) -> None:
     assert not [call for call in bench.manager.calls if call[0] == "kill"]
 
 
-def test_what_only_looks_does_not_wait_for_a_silent_bus(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[bool] = []
-
-    def noted(scope: Scope, for_reading: bool) -> Any:
-        asked.append(for_reading)
-        return connect(scope, for_reading)
-
-    monkeypatch.setattr(systemd, "connect", noted)
+def test_what_only_looks_does_not_wait_for_a_silent_bus(bench: Bench) -> None:
     for variant in ("List", "GetNodeInfo", "ConnectedMachines"):
         bench.ask(variant)
     for variant in ("Check", "WaitForSpawn"):
         bench.ask(variant, dataflow_uuid=UUID)
-    assert len(asked) >= 5
-    assert all(asked)
+    assert len(bench.systemd.timeouts) >= 5
+    assert {*bench.systemd.timeouts} == {"5s"}
 
 
 def test_a_dora_restart(bench: Bench) -> None:

@@ -12,9 +12,8 @@ import pytest
 from dora_systemd.decisions.gateway.page_messages import PageMessage
 from dora_systemd.decisions.gateway.request import Request
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.gateway.live import talk as live_talk
 from dora_systemd.gateway.live.lines import MAX_LINES
-from dora_systemd.gateway.live.talk import MAX_TASKS, talk
+from dora_systemd.gateway.live.talk import MAX_TASKS, Means, Page, pause_after, talk
 from dora_systemd.scope import Scope
 from tests.unit.fakes.library import FakeSystemd, fake_systemd
 from tests.unit.fakes.loop import within
@@ -64,10 +63,12 @@ class Browser:
 Story = Callable[[Browser], Awaitable[None]]
 
 
-def play(story: Story) -> Browser:
+def play(story: Story, **means: Any) -> Browser:
+    """A page that looks very often. means: others than the real ones."""
+
     async def both() -> Browser:
         browser = Browser()
-        talking = asyncio.ensure_future(talk(browser, REQUEST))
+        talking = asyncio.ensure_future(talk(browser, REQUEST, Means(0.01, **means)))
         await story(browser)
         browser.leave()
         await within(10, talking)
@@ -79,8 +80,7 @@ def play(story: Story) -> Browser:
 
 @pytest.fixture(autouse=True)
 def systemd(monkeypatch: pytest.MonkeyPatch) -> FakeSystemd:
-    """A systemd with the dataflow robot, which is looked at very often."""
-    monkeypatch.setattr(live_talk, "INTERVAL_SECONDS", 0.01)
+    """A systemd with the dataflow robot."""
     manager = FakeManager()
     manager.add(options(), active="failed")
     return fake_systemd(monkeypatch, manager)
@@ -135,7 +135,7 @@ def test_actions(systemd: FakeSystemd) -> None:
     assert ("RestartUnit", "dora-robot.service") in systemd.manager.calls
 
 
-def test_what_is_followed_takes_the_place_of_the_last(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_followed_takes_the_place_of_the_last() -> None:
     followed: list[str] = []
 
     async def follow(_scope: Scope, message: PageMessage) -> AsyncIterator[tuple[list[Any], int]]:
@@ -147,8 +147,6 @@ def test_what_is_followed_takes_the_place_of_the_last(monkeypatch: pytest.Monkey
         finally:
             followed.append(f"-{message.node}")
 
-    monkeypatch.setattr(live_talk, "follow_lines", follow)
-
     async def story(browser: Browser) -> None:
         browser.say(type="follow", node="a", number=1)
         await browser.wait_for("lines")
@@ -159,15 +157,14 @@ def test_what_is_followed_takes_the_place_of_the_last(monkeypatch: pytest.Monkey
         await browser.wait_for("snapshot", len(browser.got) + 2)
         assert followed == ["+a", "-a", "+b", "-b"]
 
-    play(story)
+    play(story, follow=follow)
 
 
-def test_questions(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_questions() -> None:
     def refuse(_scope: Scope, uuid: str) -> dict[str, Any]:
         raise DoraSystemdError(f"no dataflow named {uuid!r}")
 
     answers = {"about": lambda *_: {"row": {}, "problem": "x"}, "graph": refuse}
-    monkeypatch.setattr(live_talk, "_QUESTIONS", answers)
 
     async def story(browser: Browser) -> None:
         browser.say(type="about", dataflow=UUID)
@@ -178,18 +175,16 @@ def test_questions(monkeypatch: pytest.MonkeyPatch) -> None:
         (graph,) = await browser.wait_for("graph")
         assert (graph["dataflow"], graph["problem"]) == ("y", "no dataflow named 'y'")
 
-    play(story)
+    play(story, questions=answers)
 
 
-def test_a_search_comes_in_parts_and_ends_the_stream(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_search_comes_in_parts_and_ends_the_stream() -> None:
     lines = [{"at_us": at, "node": "a", "text": str(at)} for at in range(MAX_LINES + 1)]
 
     async def find(_scope: Scope, message: PageMessage, most: int) -> tuple[list[Any], bool]:
         if message.since == "x":
             raise DoraSystemdError("cannot read the time", "see systemd.time(7)")
         return lines[:most], False
-
-    monkeypatch.setattr(live_talk, "find_lines", find)
 
     async def story(browser: Browser) -> None:
         browser.say(type="find", number=1)
@@ -206,7 +201,7 @@ def test_a_search_comes_in_parts_and_ends_the_stream(monkeypatch: pytest.MonkeyP
         assert (problem["number"], problem["problem"]) == (3, "cannot read the time")
         assert problem["hint"] == "see systemd.time(7)"
 
-    play(story)
+    play(story, find=find)
 
 
 def test_not_too_much_at_once(systemd: FakeSystemd) -> None:
@@ -224,29 +219,23 @@ def test_not_too_much_at_once(systemd: FakeSystemd) -> None:
     play(story)
 
 
-def test_a_page_that_takes_nothing_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live_talk, "SEND_SECONDS", 0.05)
-
+def test_a_page_that_takes_nothing_is_given_up() -> None:
     async def both() -> None:
         browser = Browser()
         browser.is_stuck = True
-        await within(10, talk(browser, REQUEST))
+        await within(10, talk(browser, REQUEST, Means(send_seconds=0.05)))
 
     asyncio.run(both())
 
 
 @pytest.mark.parametrize("turns", range(6))
-def test_a_page_that_leaves_at_the_moment_of_a_change_ends(
-    monkeypatch: pytest.MonkeyPatch, turns: int
-) -> None:
-    monkeypatch.setattr(live_talk, "INTERVAL_SECONDS", 60)
-
+def test_a_page_that_leaves_at_the_moment_of_a_change_ends(turns: int) -> None:
     async def both() -> None:
         browser = Browser()
-        page = live_talk._Page(browser, REQUEST.scope)
+        page = Page(browser, REQUEST.scope, Means(60))
         showing = asyncio.ensure_future(page.show())
         await browser.wait_for("snapshot")
-        page._is_due.set()
+        page.is_due.set()
         for _ in range(turns):
             await asyncio.sleep(0)
         showing.cancel()
@@ -257,14 +246,11 @@ def test_a_page_that_leaves_at_the_moment_of_a_change_ends(
 
 
 @pytest.mark.parametrize(("on_cpu", "seconds"), [(0.0, 2.0), (0.04, 2.0), (0.1, 5.0), (1.0, 10.0)])
-def test_many_dataflows_are_looked_at_less_often(
-    monkeypatch: pytest.MonkeyPatch, on_cpu: float, seconds: float
-) -> None:
-    monkeypatch.setattr(live_talk, "INTERVAL_SECONDS", 2.0)
-    assert live_talk.pause_after(on_cpu) == pytest.approx(seconds)
+def test_many_dataflows_are_looked_at_less_often(on_cpu: float, seconds: float) -> None:
+    assert pause_after(on_cpu) == pytest.approx(seconds)
 
 
-def test_the_newest_answer_comes_last(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_newest_answer_comes_last() -> None:
     """What an action has changed must not be hidden by a slow answer of before."""
     began, may_end = threading.Event(), threading.Event()
     answers = iter(["old", "new"])
@@ -276,8 +262,6 @@ def test_the_newest_answer_comes_last(monkeypatch: pytest.MonkeyPatch) -> None:
             assert may_end.wait(10)
         return {"value": value}
 
-    monkeypatch.setitem(live_talk._QUESTIONS, "about", read)
-
     async def story(browser: Browser) -> None:
         browser.say(type="about", dataflow=UUID)
         await asyncio.to_thread(began.wait, 10)
@@ -287,4 +271,4 @@ def test_the_newest_answer_comes_last(monkeypatch: pytest.MonkeyPatch) -> None:
         found = await browser.wait_for("about", 2)
         assert [one["value"] for one in found] == ["old", "new"]
 
-    play(story)
+    play(story, questions={"about": read})
