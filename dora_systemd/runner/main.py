@@ -68,13 +68,14 @@ Begun = tuple[EarlyDaemon, DoraCheck]
 
 
 async def run_cell(
-    options: RunnerOptions, paths: CellPaths, begun: Begun | None = None
+    given: RunnerOptions, paths: CellPaths, begun: Begun | None = None
 ) -> RunnerExit:
     """Live the life of one cell: one run of the dataflow after another.
 
-    begun: the parts of the first run that exist already. Raises what prevents a run.
+    given: the options, with links in their paths. begun: the parts of the first run that exist
+    already. Raises what prevents a run.
     """
-    loop = asyncio.get_running_loop()
+    loop, options = asyncio.get_running_loop(), resolved(given)
     journal, clock = JournalSocket(), StopClock(options.grace)
     # systemd holds the pipes too, so their content survives a kill of this process.
     this_life = begin_life(options, paths.is_of_user)
@@ -83,7 +84,7 @@ async def run_cell(
     pipes = LogPipes(loop, journal, origin, fd_store.store, fd_store.forget)
     try:
         pipes.write_event("dataflow-starting")
-        runs = Runs(options, paths, pipes, clock, begun, this_life)
+        runs = Runs(given, options, paths, pipes, clock, begun, this_life)
         return await live(runs, losses_of_user(journal, pipes) if paths.is_of_user else None)
     except DoraSystemdError as error:
         tell_failure(pipes, error, Cause.BAD_DATAFLOW)
@@ -106,13 +107,14 @@ def tell_failure(pipes: LogPipes, error: DoraSystemdError, cause: Cause) -> None
 class Runs:
     """What all runs of the dataflow share. Raises OSError if the unit's cgroup is not ours.
 
-    unit: cgroup directory. environment: that of the nodes. check: dora's, for the first run.
-    beside: tasks that outlast a run. clock: that of the stop that ends the last run. boot: dora's
-    processes of the first run, if they exist already.
+    given: the options before links were resolved. unit: cgroup directory. environment: that of the
+    nodes. check: dora's, for the first run. beside: tasks that outlast a run. clock: that of the
+    stop that ends the last run. boot: dora's processes of the first run, if they exist already.
     """
 
     def __init__(
         self,
+        given: RunnerOptions,
         options: RunnerOptions,
         paths: CellPaths,
         pipes: LogPipes,
@@ -130,7 +132,7 @@ class Runs:
         make_lock(paths.lock)
         self.environment = node_environment(os.environ)
         settings = SettingsFile(settings_path(options.dataflow), paths.settings)
-        self.reloader = Reloader(options, self.environment, settings)
+        self.reloader = Reloader(options, self.environment, settings, given)
         self.nodes = Nodes(self.unit, paths, pipes, self.role.own(options).watchdogs)
         self.beside = Beside(asyncio.get_running_loop())
         self.check = begun[1] if begun else DoraCheck(options, self.environment)
@@ -280,7 +282,7 @@ def run_loop(cell: Coroutine[Any, Any, RunnerExit]) -> RunnerExit:
 def run(argv: list[str], begun: Begun | None) -> int:
     """Run the cell that `argv` describes; the exit status. begun: see run_cell."""
     try:
-        options = resolved(with_changes(parse_runner_argv(argv), os.environ))
+        options = with_changes(parse_runner_argv(argv), os.environ)
         directory = os.environ.get("RUNTIME_DIRECTORY")
         if not directory:
             hint = "it is started by systemd: use `doractl start`"

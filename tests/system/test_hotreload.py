@@ -222,6 +222,7 @@ def test_the_version_before_comes_back(cell: Cell, project: Project) -> None:
 @pytest.mark.warns(*OVERLAP)
 def test_by_hand(cell: Cell, project: Project) -> None:
     """Without --hot-reload nothing happens by itself; reload takes over what has changed."""
+    project.write("other.py", OTHER_SINK)
     cell.start(project.three_nodes())
     before = pids(cell)
     assert cell.doractl("reload", cell.name).stdout == "Nothing has changed\n"
@@ -236,6 +237,19 @@ def test_by_hand(cell: Cell, project: Project) -> None:
     project.write("sink.py", SINK)
     cell.systemctl("reload")
     assert len(reloads(cell)) == 3
+    # A link in its place, which leads to an older file.
+    (project.root / "link").symlink_to("other.py")
+    (project.root / "link").rename(project.root / "sink.py")
+    done = cell.doractl("reload", cell.name)
+    assert "The node sink was reloaded: sink.py" in done.stdout
+    assert cell.doractl("reload", cell.name).stdout == "Nothing has changed\n"
+    # A node that is added with its program.
+    project.write("second.py", SINK)
+    second = "  - {id: second, path: second.py, inputs: {n: source/number}}\n"
+    project.write("dataflow.yml", THREE_NODES + second)
+    done = cell.doractl("reload", cell.name)
+    assert "The node second was added: dataflow.yml" in done.stdout
+    assert cell.doractl("reload", cell.name).stdout == "Nothing has changed\n"
     cell.wait_exchanging()
 
 

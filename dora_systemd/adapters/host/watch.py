@@ -1,10 +1,12 @@
 """Watches the files below a directory, by inotify(7). Only this module imports watchfiles."""
 
 import asyncio
+import contextlib
 import errno
 import os
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterable, Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.reload.watch_rules import DEFAULT_WATCH, WatchRules
@@ -17,7 +19,34 @@ DEBOUNCE_MS = 400
 _STEP_MS = 100
 IDLE_MS = 5000
 """Time after which watchfiles reports that nothing has changed. Its watches exist by then."""
+_NEW_SECONDS = 0.25
+"""Time after which new watches usually exist."""
 _GONE_SECONDS = 0.25
+
+
+class Identity(NamedTuple):
+    """What tells one version of a file from another one.
+
+    Times alone do not: the clock may be set back, a server has a clock of its own, and a file that
+    is moved there is older than the one before. path: without links.
+    """
+
+    path: str
+    device: int
+    inode: int
+    size: int
+    written_ns: int
+    changed_ns: int
+
+
+def identity(path: str) -> Identity | None:
+    """Return the identity of the file that `path` leads to, or None if there is none."""
+    try:
+        found = Path(path).stat()
+        times = found.st_mtime_ns, found.st_ctime_ns
+        return Identity(os.path.realpath(path), found.st_dev, found.st_ino, found.st_size, *times)
+    except (OSError, ValueError):
+        return None
 
 
 def watch_rules(options: RunnerOptions) -> WatchRules:
@@ -29,53 +58,87 @@ def watch_rules(options: RunnerOptions) -> WatchRules:
 
 
 async def changed_files(
-    rules: WatchRules, on_seen: Callable[[], object] = bool, idle_ms: int = IDLE_MS
+    rules: WatchRules,
+    on_seen: Callable[[], object] = bool,
+    has_moved: Callable[[], bool] = bool,
+    idle_ms: int = IDLE_MS,
 ) -> AsyncIterator[frozenset[str]]:
     """Files that match `rules` and were written, created, renamed or deleted, in batches.
 
     Watches directories, not files, because editors save by renaming. Ignored directories cost
-    nothing. on_seen: is called when each later change is noticed, if not at once. idle_ms: as
-    IDLE_MS. Raises DoraSystemdError if the kernel refuses more watches.
+    nothing. on_seen: is called when each later change is noticed, if not at once. has_moved:
+    whether a link leads elsewhere than to the root of the rules; is called from time to time, and
+    the root is reported then. idle_ms: as IDLE_MS. Raises DoraSystemdError if the kernel refuses
+    more watches.
     """
-    seen: dict[str, int] = {}
-
-    async def missed() -> frozenset[str]:
-        """The files that have changed since they were seen last."""
-        # In a thread: a large tree takes seconds, and the loop of the runner feeds the watchdog.
-        now = await asyncio.to_thread(watched_files, rules)
-        changed = frozenset(path for path in {*seen, *now} if seen.get(path) != now.get(path))
-        seen.clear()
-        seen.update(now)
-        return changed
-
-    await missed()
+    seen = Seen(rules)
+    # In a thread: a large tree takes seconds, and the loop of the runner feeds the watchdog.
+    await asyncio.to_thread(seen.missed)
     on_seen()
     while True:
         await _wait_root(rules.root)
-        is_first = is_unsure = True
-        async for paths in _bursts(rules, idle_ms):
-            files = frozenset(path for path in paths if rules.has(path))
-            seen.update((path, change_time(path)) for path in files)
-            # Found by their time: changes before the new watches, and those that watchfiles drops
-            # because they arrive between its copy of others and the clearing of its list.
-            if is_first or (is_unsure and not paths):
-                files |= await missed()
-            is_first, is_unsure = False, bool(paths)
+        is_unsure = True
+        async for paths, is_new in _with_start(_bursts(rules, idle_ms)):
+            files = seen.take(path for path in paths if rules.has(path))
+            # Found by their identity: changes before the new watches, and those that watchfiles
+            # drops because they arrive between its copy of others and the clearing of its list.
+            if is_new or (is_unsure and not paths):
+                files |= await asyncio.to_thread(seen.missed)
+            is_unsure = bool(paths) or is_new
+            if not paths and has_moved():
+                files |= {rules.root}
             if files:
                 yield files
         # Directories came or went.
-        if files := await missed():
+        if files := await asyncio.to_thread(seen.missed):
             yield files
 
 
-def watched_files(rules: WatchRules) -> dict[str, int]:
-    """The files that match `rules` now, with their times of change in ns."""
-    return {
-        entry.path: change_time(entry.path)
+class Seen:
+    """The files that match `rules`, as they were seen last."""
+
+    def __init__(self, rules: WatchRules) -> None:
+        self._rules = rules
+        self._seen: dict[str, Identity] = {}
+        self._gone: set[str] = set()
+
+    def take(self, paths: Iterable[str]) -> frozenset[str]:
+        """Note how `paths` are now; the paths."""
+        files = frozenset(paths)
+        self._note({path: identity(path) for path in files})
+        return files
+
+    def missed(self) -> frozenset[str]:
+        """Return the files that have changed since they were seen last, and note how they are now.
+
+        A file that was away and comes back as it was has not changed, unless it is one of
+        rules.files: settings do not apply while their file is away.
+        """
+        now = watched_files(self._rules)
+        gone = self._seen.keys() - now.keys() - self._gone
+        back = self._gone & now.keys() & self._rules.files
+        changed = {path for path, one in now.items() if one != self._seen.get(path)}
+        self._note({**now, **dict.fromkeys(gone)})
+        return frozenset(changed | gone | back)
+
+    def _note(self, found: Mapping[str, Identity | None]) -> None:
+        for path, one in found.items():
+            if one is None:
+                self._gone.add(path)
+            else:
+                self._seen[path] = one
+                self._gone.discard(path)
+
+
+def watched_files(rules: WatchRules) -> dict[str, Identity]:
+    """The files that match `rules` now."""
+    found = {
+        entry.path: identity(entry.path)
         for directory in watched_directories(rules)
         for entry in _entries(directory)
         if rules.has(entry.path) and not entry.is_dir(follow_symlinks=False)
     }
+    return {path: one for path, one in found.items() if one is not None}
 
 
 def watched_directories(rules: WatchRules) -> list[str]:
@@ -103,20 +166,33 @@ def read_gitignores(root: str) -> dict[str, tuple[str, ...]]:
     return found
 
 
-def change_time(path: str) -> int:
-    """When a file was written or moved there, in ns since the epoch; 0 if it does not exist."""
+async def _with_start(
+    bursts: AsyncGenerator[frozenset[str]],
+) -> AsyncIterator[tuple[frozenset[str], bool]]:
+    """The same bursts. True stands beside the first one, and beside an early one without paths.
+
+    The early one comes when the watches should exist, the first one when they certainly do.
+    """
+    first = asyncio.ensure_future(anext(bursts))
     try:
-        return Path(path).stat().st_ctime_ns
-    except OSError:
-        return 0
+        done, _ = await asyncio.wait({first}, timeout=_NEW_SECONDS)
+        if not done:
+            yield frozenset(), True
+        with contextlib.suppress(StopAsyncIteration):
+            yield await first, True
+            async for paths in bursts:
+                yield paths, False
+    finally:
+        first.cancel()
 
 
-async def _bursts(rules: WatchRules, idle_ms: int) -> AsyncIterator[frozenset[str]]:
+async def _bursts(rules: WatchRules, idle_ms: int) -> AsyncGenerator[frozenset[str]]:
     """Paths of changed files, until a directory is created or deleted; none each `idle_ms`."""
     # Imported late: only hot reload needs it.
     from watchfiles import Change, awatch
 
     directories = await asyncio.to_thread(watched_directories, rules)
+    before = await asyncio.to_thread(_inodes, directories)
     try:
         async for changes in awatch(
             *directories,
@@ -131,6 +207,9 @@ async def _bursts(rules: WatchRules, idle_ms: int) -> AsyncIterator[frozenset[st
             gone = {path for change, path in changes if change is Change.deleted}
             there = (path for _, path in changes if Path(path).is_dir())
             if gone.intersection(directories) or any(map(rules.has_directory, there)):
+                return
+            # Nothing is reported if a directory above them is replaced.
+            if not changes and before != await asyncio.to_thread(_inodes, directories):
                 return
     except FileNotFoundError:
         # A directory has gone, perhaps for good, as that of a dataflow file apart from its project.
@@ -150,6 +229,11 @@ async def _wait_root(root: str) -> None:
     """Wait until a root that was moved away is back."""
     while not Path(root).is_dir():
         await asyncio.sleep(_GONE_SECONDS)
+
+
+def _inodes(paths: Iterable[str]) -> list[tuple[int, int]]:
+    found = (identity(path) for path in paths)
+    return [(one.device, one.inode) if one else (0, 0) for one in found]
 
 
 def _entries(directory: str) -> list["os.DirEntry[str]"]:

@@ -18,11 +18,13 @@ class NodeSources:
 
     files: absolute paths of its program and the modules that it imports. text: its whole
     definition, which may contain names of configuration files. rules: its own `watch` patterns.
+    fresh: those of the files that it runs in their present version.
     """
 
     files: frozenset[str] = frozenset()
     text: str = ""
     rules: WatchRules | None = None
+    fresh: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -39,8 +41,9 @@ class Touched:
 def touched(changed: Iterable[str], dataflow: str, nodes: Mapping[str, NodeSources]) -> Touched:
     """The nodes that the files `changed` affect.
 
-    A file of a program affects the nodes with that program. Any other file affects the nodes that
-    watch or mention it; if there are none, it affects all nodes, because each may read it.
+    A file of a program affects the nodes that run another version of it. Any other file affects
+    the nodes that watch or mention it; if there are none, it affects all nodes, because each may
+    read it.
     """
     found: dict[str, str] = {}
     paths = sorted(changed)
@@ -58,7 +61,7 @@ def _owners(path: str, nodes: Mapping[str, NodeSources]) -> list[str]:
         if path in sources.files or (sources.rules is not None and sources.rules.has(path))
     ]
     if owners or path.endswith(".py"):
-        return owners
+        return [node for node in owners if path not in nodes[node].fresh]
     name = PurePath(path).name
     return [node for node, sources in nodes.items() if name in sources.text] or list(nodes)
 

@@ -35,7 +35,7 @@ def plan_steps(
     """
     changed = {How.REMOVE: change.removed, How.REWIRE: change.rewired, How.SWAP: change.replaced}
     steps = [Step(how, node, dataflow) for how, nodes in changed.items() for node in nodes]
-    done = {step.node for step in steps}
+    done = {step.node for step in steps}.union(change.added)
     for node, file in found.nodes.items():
         if node not in done and kinds.get(node) != "dynamic":
             how = How.OPERATOR if kinds.get(node) == "operator" else How.SWAP

@@ -19,6 +19,7 @@ from dora_systemd.runner.cell.pump import Pump
 from dora_systemd.runner.nodes.nodes import Nodes
 from dora_systemd.runner.reload.sources import Change
 from dora_systemd.runner.reload.swap import NotReady, Swapper
+from dora_systemd.runner.reload.versions import Versions
 
 _GONE = ("finished", "stopped")
 _BACK = {How.ADD: How.REMOVE, How.REMOVE: How.ADD}
@@ -45,10 +46,16 @@ async def tell_started(run: Run, tell: Callable[[], None]) -> None:
 
 
 class Applier:
-    """Carries out `change` in `run`. done: what was done, for people."""
+    """Carries out `change` in `run`. done: what was done, human-readable.
 
-    def __init__(self, run: Run, change: Change, options: RunnerOptions) -> None:
+    versions: of the files that the nodes run.
+    """
+
+    def __init__(
+        self, run: Run, change: Change, options: RunnerOptions, versions: Versions
+    ) -> None:
         self.run = run
+        self._versions = versions
         self._change = change
         self._options = options
         self._begun: list[Step] = []
@@ -65,7 +72,9 @@ class Applier:
 
     def _obstacle(self, step: Step) -> str:
         old = self.run.pump.cell.nodes.get(step.node)
-        if old is not None and step.how is not How.ADD:
+        if step.how is not How.ADD:
+            if old is None:
+                return "" if step.how is How.REMOVE else f"the node {step.node} had been removed"
             is_gone = old.state in _GONE or (old.state == "failed" and old.policy != HELD)
             return f"the node {step.node} had ended" if is_gone else ""
         node = self._change.prepared.dataflow.node(step.node)
@@ -75,10 +84,16 @@ class Applier:
     async def apply(self) -> None:
         """Carry out all steps. Raises DoraSystemdError when dora refuses one, and NotReady."""
         for step in self._change.steps:
+            if step.how is How.REMOVE and step.node not in self.run.pump.cell.nodes:
+                continue
             started = time.monotonic()
             self._begun.append(step)
+            # Before the node starts: a later version may or may not be the one that it reads.
+            taken = Versions()
+            taken.take(step.node, self._change.files.get(step.node, ()))
             with self.run.nodes.exchanging(step.node):
                 await self._take(step, self._change.prepared)
+            self._versions.merge(taken)
             self._tell(step, time.monotonic() - started)
 
     async def undo(self, before: Prepared) -> None:

@@ -6,14 +6,15 @@ run ends and the next one begins, in the same unit and the same process.
 
 import asyncio
 import contextlib
+import threading
 import time
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from pathlib import PurePath
 from typing import Any
 
-from dora_systemd.adapters.dora.preparation import Prepared
-from dora_systemd.adapters.host.watch import change_time
+from dora_systemd.adapters.dora.preparation import Prepared, resolved
+from dora_systemd.adapters.host.watch import identity
 from dora_systemd.decisions.cell.limits import check_nodes, merge_node_limits
 from dora_systemd.decisions.cell.line_rates import RateLimits, parse_rates
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -21,12 +22,14 @@ from dora_systemd.decisions.descriptor.wiring import downstream_of
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.rights.node_rights import essential_nodes
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import settings_path
 from dora_systemd.runner.cell.failure import words
 from dora_systemd.runner.cell.pump import now_us
 from dora_systemd.runner.reload.apply import Applier, Run
 from dora_systemd.runner.reload.settings_file import SettingsFile
 from dora_systemd.runner.reload.sources import Change, Sources
 from dora_systemd.runner.reload.swap import NotReady, patience
+from dora_systemd.runner.reload.versions import Versions
 from dora_systemd.runner.reload.watcher import Watcher
 from dora_systemd.values import quoted
 
@@ -39,16 +42,22 @@ Answer = dict[str, Any]
 class Reloader:
     """Watches files and reloads. options: of the runner. environment: of the nodes.
 
-    settings: the settings file beside the dataflow. current: the version that runs. before: the
+    given: the options before links in paths were resolved, unless they had none. settings: the
+    settings file of the dataflow. current: the version that runs. before: the
     version before a reload of the whole dataflow whose nodes are not all ready yet, or None.
     patience: seconds that the current version may take to be ready. notice: what the last reload
     reports, as long as it is true.
     """
 
     def __init__(
-        self, options: RunnerOptions, environment: Mapping[str, str], settings: SettingsFile
+        self,
+        options: RunnerOptions,
+        environment: Mapping[str, str],
+        settings: SettingsFile,
+        given: RunnerOptions | None = None,
     ) -> None:
         self.options = options
+        self._given = given or options
         self._settings = settings
         self._environment = environment
         self._sources = Sources(options, environment)
@@ -56,21 +65,29 @@ class Reloader:
         self._changed: set[str] = set()
         self._wake = asyncio.Event()
         self._begun = asyncio.Event()
-        self._watcher = Watcher(self._take_files, self._refusing)
+        self._watcher = Watcher(self._take_files, self._refusing, self._has_moved)
         self._run: Run | None = None
         self._outcome: asyncio.Future[str] | None = None
         self._untold: DoraSystemdError | None = None
-        # Times of reading, in ns: of the whole dataflow at first, then of single files.
-        self._read_ns = 0
-        self._taken: dict[str, int] = {}
+        self._begun_ns = 0
+        self._versions = Versions()
+        self._has_imports = False
+        self._noting_lock = threading.Lock()
+        self._tried: RunnerOptions | None = None
+        for path in (options.dataflow, settings.path):
+            self._versions.take(path, [path])
         self.current: Prepared | None = None
         self.before: Prepared | None = None
         self.patience = 0
         self.notice = ""
 
-    def begin(self, run: Run, prepared: Prepared, read_ns: int) -> None:
-        """A run of the dataflow begins. read_ns: its files were read after this, CLOCK_REALTIME."""
-        self._run, self.current, self._read_ns = run, prepared, read_ns
+    def begin(self, run: Run, prepared: Prepared, begun_ns: int) -> None:
+        """A run of the dataflow begins. begun_ns: before its nodes start, CLOCK_REALTIME."""
+        self._run, self.current, self._begun_ns = run, prepared, begun_ns
+        self._has_imports = False
+        if not self.options.placed:  # no reload
+            for node, files in self._sources.programs(prepared).items():
+                self._versions.take(node, files)
         self._begun.set()
         if self._untold is not None:
             self._refuse(self._untold)
@@ -84,6 +101,18 @@ class Reloader:
         """All nodes of the run are ready: the version before is not needed any more."""
         self.before = None
         self._settle("")
+        if not self.options.placed:
+            # Only now: a start should not wait until all sources of a large project are parsed.
+            self._noting = asyncio.create_task(asyncio.to_thread(self._note_imports))
+
+    def _note_imports(self) -> None:
+        """Note the versions of modules, unless that was done in this run. Blocks."""
+        with self._noting_lock, contextlib.suppress(DoraSystemdError):  # a program has gone
+            current, now_ns = self.current, time.time_ns()
+            if current is not None and not self._has_imports:
+                self._has_imports = True
+                for node, files in self._sources.files(current).items():
+                    self._versions.add(node, files, self._begun_ns, now_ns)
 
     def go_back(self, reason: str) -> bool:
         """Switch back if a run failed before it had started; whether there is a version before."""
@@ -91,6 +120,7 @@ class Reloader:
         if self.before is None:
             return False
         self.current, self.before = self.before, None
+        self._follow(self.current.plan.options)
         self.notice = f"not reloaded: {reason}"
         return True
 
@@ -151,20 +181,60 @@ class Reloader:
             if run is None or current is None:
                 hint = "wait until it has started"
                 raise DoraSystemdError("cannot reload: no node runs", hint, ExitCode.NOT_RUNNING)
-            taken = {path: change_time(path) for path in changed}
+            moved = await asyncio.to_thread(self._moved)
+            if moved is not None:
+                return await self._follow_link(run, moved)
+            taken = Versions()
+            for path in {self.options.dataflow, self._settings.path}.intersection(changed):
+                taken.take(path, [path])
             done = await self._take_settings(run) if self._settings.path in changed else []
             changed = [path for path in changed if path != self._settings.path]
-            change = await asyncio.to_thread(self._sources.look, current, changed)
+            try:
+                look = self._sources.look
+                change = await asyncio.to_thread(look, current, changed, self._versions)
+            except DoraSystemdError:
+                self._changed |= set(changed)  # the next change may be what was missing
+                raise
             change = change.with_node(node, self.options.dataflow) if node else change
             if change.steps or change.whole:
                 run.pipes.write_event("files-changed", files=", ".join(_names(change, changed)))
                 done += await self._apply(run, change)
-            self._taken |= taken
+            self._versions.merge(taken)
         self.notice = ""
         if self._run is not None and (done or self._run.pump.cell.notice):
             fed = downstream_of(change.prepared.dataflow)
             self._run.pump.push(life.ReloadNoted(now_us(), "", fed))
         return done
+
+    def _has_moved(self) -> bool:
+        """Whether links lead to a dataflow that has not been tried."""
+        return self._moved() not in (None, self._tried)
+
+    def _moved(self) -> RunnerOptions | None:
+        """The options with the present paths of the dataflow, if links lead elsewhere. Blocks."""
+        now = resolved(self._given)
+        is_there = self.options.placed or _place(now) == _place(self.options)
+        return None if is_there else _at(self.options, now)
+
+    async def _follow_link(self, run: Run, moved: RunnerOptions) -> list[str]:
+        """Run the dataflow that a link leads to now, all of it: its daemon knows directories."""
+        self._tried = moved
+        taken = Versions()
+        taken.take(moved.dataflow, [moved.dataflow])
+        change = await asyncio.to_thread(Sources(moved, self._environment).look_elsewhere)
+        run.pipes.write_event("files-changed", files=moved.dataflow)
+        self._follow(moved)
+        done = await self._apply(run, change)
+        self._versions.merge(taken)
+        return done
+
+    def _follow(self, moved: RunnerOptions) -> None:
+        """Use the paths of these options from now on."""
+        if _place(moved) != _place(self.options):
+            self.options = _at(self.options, moved)
+            self._sources = Sources(self.options, self._environment)
+            self._settings.path = settings_path(moved.dataflow)
+            self._watcher.watch(self.options if self.options.hot_reload else None)
 
     async def _take_settings(self, run: Run) -> list[str]:
         """Apply changed node limits at once; other settings wait for the next start."""
@@ -184,7 +254,7 @@ class Reloader:
         return [f"the node {one.node} was given new limits: {name}" for one in change.limits]
 
     async def _apply(self, run: Run, change: Change) -> list[str]:
-        applier = Applier(run, change, self.options)
+        applier = Applier(run, change, self.options, self._versions)
         reason = change.whole or applier.obstacle()
         if not reason:
             try:
@@ -222,7 +292,7 @@ class Reloader:
         self._outcome = asyncio.get_running_loop().create_future()
         run.pump.push(life.ReloadAsked(now_us()))
         if failure := await self._outcome:
-            raise DoraSystemdError(f"cannot use {self.options.dataflow}: {failure}")
+            raise DoraSystemdError(f"cannot use {change.prepared.dataflow.source}: {failure}")
         took = f"{time.monotonic() - begun:.2f}s"
         text = f"{reason}; ready after {took}"
         run.pipes.write_event("reloaded", reason=text, file=", ".join(_files(change)))
@@ -249,12 +319,20 @@ class Reloader:
             raise
 
     def _changed_since(self) -> list[str]:
-        if self.current is None:
+        """The files that differ from what runs. Blocks. Raises DoraSystemdError."""
+        current, dataflow = self.current, self.options.dataflow
+        if current is None or self._moved() is not None:
             return []
-        paths = {self._settings.path, *self._sources.files(self.current)}
-        now = {path: change_time(path) for path in paths}
-        taken = self._taken
-        return [path for path, at in now.items() if at > self._read_ns and taken.get(path) != at]
+        if identity(dataflow) is None:
+            hint = "put it back, or stop the dataflow"
+            message = f"cannot read {dataflow}: there is no such file"
+            raise DoraSystemdError(message, hint, ExitCode.NOT_FOUND)
+        self._note_imports()
+        versions = self._versions
+        stale = {path for path in (dataflow, self._settings.path) if versions.differ(path)}
+        for node, files in self._sources.files(current).items():
+            stale |= versions.stale(node, files)
+        return sorted(stale)
 
     async def _switch(self, is_on: bool) -> Answer:
         async with self._lock:
@@ -279,6 +357,16 @@ class Reloader:
     def close(self) -> None:
         """Stop watching."""
         self._watcher.watch(None)
+
+
+def _place(options: RunnerOptions) -> tuple[str, str]:
+    return options.dataflow, options.working_directory
+
+
+def _at(options: RunnerOptions, place: RunnerOptions) -> RunnerOptions:
+    """The options with the paths of `place`."""
+    dataflow, directory = _place(place)
+    return options._replace(dataflow=dataflow, working_directory=directory)
 
 
 def _files(change: Change) -> list[str]:

@@ -1,13 +1,13 @@
 """Reads the files of a dataflow, and finds what has changed and what that means."""
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from pathlib import Path, PurePath
 
 from dora_systemd.adapters.dora.check import refusal_of_dora
 from dora_systemd.adapters.dora.preparation import Prepared, prepare
-from dora_systemd.adapters.host.watch import change_time
+from dora_systemd.adapters.host.watch import identity
 from dora_systemd.decisions.cell.hot_reload import HotReload
 from dora_systemd.decisions.cell.launch import kinds, launch_descriptor, sources
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -17,21 +17,29 @@ from dora_systemd.decisions.reload.imports import program_files, syntax_error
 from dora_systemd.decisions.reload.steps import How, Step, plan_steps
 from dora_systemd.decisions.reload.watch_rules import WatchRules
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.runner.reload.versions import Versions
 
 
 @dataclass(frozen=True)
 class Change:
-    """What changed files mean. whole: why the whole dataflow has to start again, or ""."""
+    """What changed files mean. whole: why the whole dataflow has to start again, or "".
+
+    files: of the programs, by node.
+    """
 
     prepared: Prepared
     steps: tuple[Step, ...] = ()
     whole: str = ""
     operators: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    files: Mapping[str, frozenset[str]] = field(default_factory=dict)
 
     def with_node(self, node: str, dataflow: str) -> "Change":
-        """The change, with a reload of `node` added if it is missing."""
+        """The change, with a reload of `node` added if it is missing. Raises DoraSystemdError."""
         if any(step.node == node for step in self.steps):
             return self
+        if self.prepared.dataflow.node(node) is None:
+            message = f"cannot reload the node {node}: it is not in {dataflow}"
+            raise DoraSystemdError(message, "add it to that file", ExitCode.BAD_INPUT)
         operators = self.operators.get(node, {})
         steps = [Step(How.OPERATOR, node, file) for name, file in operators.items() if name]
         if not steps:
@@ -46,18 +54,21 @@ class Sources:
         self._options = options
         self._environment = environment
 
-    def look(self, current: Prepared, changed: Iterable[str]) -> Change:
+    def look(self, current: Prepared, changed: Collection[str], versions: Versions) -> Change:
         """What the files `changed` mean for the running version `current`.
 
-        Blocks: do not call it in the loop's thread. Raises DoraSystemdError if a file is not valid;
-        then nothing should be changed.
+        versions: of the files that the nodes run. Blocks: do not call it in the loop's thread.
+        Raises DoraSystemdError if a file is not valid; then nothing should be changed.
         """
         # A deleted file cannot be loaded. It may be back in a moment, as with git checkout.
-        paths = frozenset(path for path in changed if change_time(path))
+        paths = frozenset(path for path in changed if identity(path))
+        if changed and not paths:
+            return Change(current)
         dataflow = self._options.dataflow
         prepared = self.prepare() if dataflow in paths else current
         programs = sources(prepared.dataflow, prepared.plan)
-        found = touched(paths, dataflow, self._nodes(prepared, programs))
+        nodes = self._nodes(prepared, programs, versions)
+        found = touched(paths, dataflow, nodes)
         check_programs(found.nodes.values())
         difference_ = (
             difference(current.descriptor, prepared.descriptor)
@@ -67,7 +78,16 @@ class Sources:
         how = kinds(prepared.dataflow, prepared.plan)
         steps = plan_steps(found, difference_, how, dataflow)
         whole = difference_.whole or _stubborn(steps, programs)
-        return Change(prepared, steps, whole, programs)
+        files = {node: one.files for node, one in nodes.items()}
+        return Change(prepared, steps, whole, programs, files)
+
+    def look_elsewhere(self) -> Change:
+        """The change to the dataflow of these options from another one. Raises DoraSystemdError."""
+        prepared = self.prepare()
+        for files in self.files(prepared).values():
+            check_programs(files)
+        directory = PurePath(self._options.dataflow).parent
+        return Change(prepared, whole=f"its path leads to {directory} now")
 
     def prepare(self) -> Prepared:
         """Read the dataflow again, as at a start. Raises DoraSystemdError."""
@@ -84,23 +104,33 @@ class Sources:
         descriptor = launch_descriptor(current.dataflow, plan)
         return Prepared(current.dataflow, plan, descriptor)
 
-    def files(self, current: Prepared) -> set[str]:
-        """The files that the dataflow consists of, as absolute paths."""
-        nodes = self._nodes(current, sources(current.dataflow, current.plan)).values()
-        return {self._options.dataflow, *(path for node in nodes for path in node.files)}
+    def programs(self, current: Prepared) -> dict[str, list[str]]:
+        """The files that each node is started from. Raises DoraSystemdError."""
+        programs = sources(current.dataflow, current.plan)
+        return {node: list(files.values()) for node, files in programs.items()}
+
+    def files(self, current: Prepared) -> dict[str, frozenset[str]]:
+        """The files of the programs, by node, as absolute paths. Raises DoraSystemdError."""
+        programs = sources(current.dataflow, current.plan)
+        return {
+            node.id: self._files(programs[node.id].values(), node.kind)
+            for node in current.dataflow.nodes
+        }
 
     def _nodes(
-        self, prepared: Prepared, programs: Mapping[str, Mapping[str, str]]
+        self, prepared: Prepared, programs: Mapping[str, Mapping[str, str]], versions: Versions
     ) -> dict[str, NodeSources]:
         rules: HotReload = self._options.reload
         root = self._options.working_directory
         found = {}
         for node in prepared.dataflow.nodes:
             patterns = rules.watched_by(node.id)
+            files = self._files(programs[node.id].values(), node.kind)
             found[node.id] = NodeSources(
-                self._files(programs[node.id].values(), node.kind),
+                files,
                 json.dumps(node.raw, default=str),
                 WatchRules(root, patterns) if patterns else None,
+                files - versions.stale(node.id, files),
             )
         return found
 

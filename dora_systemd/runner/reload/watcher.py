@@ -13,14 +13,20 @@ _LONGEST = 10.0
 
 
 class Watcher:
-    """found: takes the files that have changed. refusing: reports an exception inside."""
+    """Reports changed files.
+
+    found: takes the files that have changed. refusing: reports an exception inside. has_moved:
+    whether links lead to another dataflow.
+    """
 
     def __init__(
         self,
         found: Callable[[frozenset[str]], None],
         refusing: Callable[[str], AbstractContextManager[None]],
+        has_moved: Callable[[], bool] = bool,
     ) -> None:
         self._found = found
+        self._has_moved = has_moved
         self._refusing = refusing
         self._task: asyncio.Task[None] | None = None
         self._has_seen = asyncio.Event()
@@ -46,5 +52,5 @@ class Watcher:
         with self._refusing("cannot watch files any more"):
             rules = await asyncio.to_thread(watch_rules, options)
             let_openssl_in()  # watchfiles imports anyio, which imports ssl
-            async for files in changed_files(rules, self._has_seen.set):
+            async for files in changed_files(rules, self._has_seen.set, self._has_moved):
                 self._found(files)

@@ -17,6 +17,7 @@ from dora_systemd.runner.cell.pump import Pump
 from dora_systemd.runner.reload.apply import Applier, Run
 from dora_systemd.runner.reload.sources import Change
 from dora_systemd.runner.reload.swap import Swapper
+from dora_systemd.runner.reload.versions import Versions
 from dora_systemd.values import SECOND
 from tests.unit.fakes.run import Calls, FakeDora, FakeNodes, FakePipes
 
@@ -42,6 +43,7 @@ class ReloadBench:
             ("Reload", lambda: None),
         ):
             self.dora.then[name] = then
+        self.versions = Versions()
         self.flow = root / "flow.yml"
         self.options = RunnerOptions("robot", "uuid", str(self.flow), str(root), "/bin/true")
         self.prepared = self.write("abc")
@@ -72,7 +74,8 @@ class ReloadBench:
 
     def applier(self, *steps: tuple[How, str], **more: Any) -> Applier:
         found = tuple(Step(how, node, f"{self.root}/{node}.py") for how, node in steps)
-        return Applier(self.run, Change(self.prepared, found, **more), self.options)
+        change = Change(self.prepared, found, **more)
+        return Applier(self.run, change, self.options, self.versions)
 
     @property
     def asked(self) -> list[tuple[Any, ...]]:

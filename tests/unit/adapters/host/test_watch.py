@@ -107,3 +107,47 @@ def test_a_directory_that_has_gone_for_good_takes_no_time(
 
     assert asyncio.run(both()) == {str(saved)}
     assert 0 < len(asked) < 10
+
+
+REPLACED = {
+    "moved away, and back later": ("project", True, 0),
+    "its parent moved away, and another one there": ("", False, 1),
+    "another one there at once": ("project", False, 1),
+}
+
+
+@pytest.mark.parametrize(("name", "is_back", "count"), REPLACED.values(), ids=REPLACED)
+def test_a_project_that_is_replaced(tmp_path: Path, name: str, is_back: bool, count: int) -> None:
+    """What is saved in the new one is noticed; what comes back as it was is not reported."""
+    place = tmp_path / "place"
+    for one in ("place", "other"):
+        (tmp_path / one / "project").mkdir(parents=True)
+        (tmp_path / one / "project/node.py").write_text(one)
+    node = place / "project/node.py"
+    rules = WatchRules(str(place / "project"), ("*.py",))
+    batches: list[frozenset[str]] = []
+
+    async def collect() -> None:
+        async for files in watch.changed_files(rules, idle_ms=1000):
+            batches.append(frozenset(path for path in files if Path(path).exists()))
+
+    async def until_found(number: int) -> None:
+        async with asyncio.timeout(SECONDS):
+            while len([one for one in batches if one]) < number:
+                await asyncio.sleep(0.01)
+
+    async def work() -> None:
+        task = asyncio.create_task(collect())
+        await asyncio.sleep(1)
+        (place / name).rename(tmp_path / "before")
+        if is_back:
+            await asyncio.sleep(1)
+        (tmp_path / ("before" if is_back else f"other/{name}")).rename(place / name)
+        await until_found(count)
+        await asyncio.sleep(1)
+        assert [one for one in batches if one] == [{str(node)}] * count
+        node.write_text("new")
+        await until_found(count + 1)
+        task.cancel()
+
+    asyncio.run(work())

@@ -28,3 +28,9 @@ def test_each_node_once_and_dynamic_ones_never() -> None:
         Step(How.SWAP, "b", "/p/b.py"),
         Step(How.OPERATOR, "c", "/p/c.py"),
     )
+
+
+def test_a_node_that_is_added_with_its_program_is_added_once() -> None:
+    found = Touched({"n": "/p/n.py"}, True)
+    steps = plan_steps(found, Difference(added=("n",)), {**KINDS, "n": "python"}, FLOW)
+    assert steps == (Step(How.ADD, "n", FLOW),)

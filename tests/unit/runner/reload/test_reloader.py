@@ -1,6 +1,7 @@
 """Reloads from the save of a file to what the operator is told about it."""
 
 import asyncio
+import time
 from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any
@@ -8,6 +9,7 @@ from typing import Any
 import pytest
 
 from dora_systemd.adapters.dora.preparation import prepare
+from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life.states import State
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.runner.reload.reloader import Reloader
@@ -26,10 +28,12 @@ class Bench(ReloadBench):
         self.reloader = Reloader(self.options, {}, settings)
 
     def begin(self) -> None:
-        self.reloader.begin(self.run, prepare(self.options, {}), 0)
+        self.reloader.begin(self.run, prepare(self.options, {}), time.time_ns())
 
     def see(self, *names: str) -> None:
-        """What the watch of files does when these are saved."""
+        """Save these, and do what the watch of files does then."""
+        for name in names:
+            (self.root / name).write_text(f"# {len(self.asked)}\n")
         self.reloader._changed |= {str(self.root / name) for name in names}
         self.reloader._wake.set()
 
@@ -92,11 +96,15 @@ def test_a_save_between_two_runs_waits_for_the_next_one(tmp_path: Path) -> None:
     async def work() -> None:
         bench = Bench(tmp_path)
         task = asyncio.create_task(bench.reloader.work())
-        bench.see("a.py")
+        prepared = prepare(bench.options, {})
+        bench.write("abc")
+        bench.see("flow.yml", "a.py")
+        bench.write("abc")
         await asyncio.sleep(0.01)
         assert not bench.asked
-        bench.begin()
-        await until(lambda: bench.reloaded == ["a"])
+        bench.reloader.begin(bench.run, prepared, time.time_ns())
+        await until(lambda: bench.asked)
+        assert bench.asked == [("AddNode", "c")], "it begins with the present program"
         task.cancel()
 
     live(work)
@@ -131,6 +139,192 @@ def test_a_later_save_takes_the_notice_away(tmp_path: Path) -> None:
         (done,) = [one for one in await bench.by_hand() if "node a" in one]
         assert done.startswith("the node a was reloaded: a.py, ready after ")
         assert bench.pump.cell.notice == bench.reloader.notice == ""
+
+    live(work)
+
+
+def swap_directory(root: Path) -> None:
+    """Move a directory away, and another one there, which is older."""
+    root.rename(root.with_name("before"))
+    root.with_name("other").rename(root)
+
+
+def swap_program(root: Path) -> None:
+    """Have a link lead to another program, which is older."""
+    (root / "link").unlink()
+    (root / "link").symlink_to("b2.py")
+
+
+def swap_module(root: Path) -> None:
+    """Move an older module there."""
+    (root / "lib").rename(root / "lib1")
+    (root / "lib2").rename(root / "lib")
+
+
+SWAPS = [
+    (swap_directory, ["a", "b"]),
+    (swap_program, ["b"]),
+    (swap_module, ["a"]),
+    (lambda _: None, []),
+]
+
+
+@pytest.mark.parametrize(("swap", "expected"), SWAPS)
+def test_another_file_behind_a_path(
+    tmp_path: Path, swap: Callable[[Path], None], expected: list[str]
+) -> None:
+    """All files are older than the run, as where the clock was set back."""
+
+    async def work() -> None:
+        for name in ("other", "project"):
+            (root := tmp_path / name).mkdir()
+            for module in ("lib", "lib2"):
+                (root / module).mkdir()
+                (root / module / "part.py").write_text(f"NAME = {module!r}\n")
+            (root / "b1.py").touch()
+            (root / "b2.py").touch()
+            (root / "link").symlink_to("b1.py")
+            bench = Bench(root)
+            (root / "a.py").write_text("import lib.part\n")
+            (root / "b.py").unlink()
+            (root / "b.py").symlink_to("link")
+            (root / "b2.py").write_text("pass\n")
+        bench.begin()
+        bench.reloader.has_started()
+        assert await bench.by_hand() == []
+        swap(root)
+        assert len(await bench.by_hand()) == len(expected)
+        assert sorted(bench.reloaded) == expected
+        assert await bench.by_hand() == []
+
+    live(work)
+
+
+def test_a_file_that_is_away_and_comes_back_as_it_was(tmp_path: Path) -> None:
+    async def work() -> None:
+        (root := tmp_path / "project").mkdir()
+        bench = Bench(root)
+        bench.begin()
+        root.rename(tmp_path / "away")
+        with pytest.raises(DoraSystemdError, match="there is no such file") as caught:
+            await bench.by_hand()
+        assert caught.value.code is ExitCode.NOT_FOUND
+        (tmp_path / "away").rename(root)
+        await bench.reloader._reload([str(root / "a.py")])
+        assert await bench.by_hand() == []
+        assert not bench.asked
+
+    live(work)
+
+
+def test_a_node_that_is_added_with_its_program(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        bench.begin()
+        (tmp_path / "c.py").touch()
+        with bench.flow.open("a") as file:
+            file.write("  - {id: c, path: c.py}\n")
+        (done,) = await bench.reloader._reload([str(bench.flow), str(tmp_path / "c.py")])
+        assert done.startswith("the node c was added: ")
+        assert await bench.by_hand() == []
+        assert bench.asked == [("AddNode", "c")]
+        (tmp_path / "c.py").write_text("pass\n")
+        await bench.by_hand()
+        assert bench.reloaded == ["c"]
+
+    live(work)
+
+
+def test_one_node_by_hand_takes_its_files_and_no_others(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        for name in "ab":
+            (tmp_path / f"{name}.py").write_text("import shared\n")
+        (tmp_path / "shared.py").touch()
+        bench.begin()
+        bench.reloader.has_started()
+        assert await bench.by_hand() == []
+        (tmp_path / "shared.py").write_text("pass\n")
+        for node in ("a", "", ""):
+            await bench.by_hand(node)
+        assert bench.reloaded == ["a", "b"]
+
+    live(work)
+
+
+def test_what_was_refused_together_is_not_lost(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        bench.begin()
+        task = asyncio.create_task(bench.reloader.work())
+        bench.see("a.py")
+        (tmp_path / "b.py").write_text("def broken(:\n")
+        bench.reloader._changed.add(str(tmp_path / "b.py"))
+        await until(lambda: bench.pipes.reasons("reload-failed"))
+        assert not bench.reloaded
+        bench.see("b.py")
+        await until(lambda: len(bench.reloaded) == 2)
+        assert sorted(bench.reloaded) == ["a", "b"]
+        task.cancel()
+
+    live(work)
+
+
+def test_a_node_that_somebody_has_removed_or_added(tmp_path: Path) -> None:
+    async def work() -> None:
+        bench = Bench(tmp_path)
+        bench.begin()
+        with pytest.raises(DoraSystemdError, match=r"cannot reload the node z: it is not in "):
+            await bench.by_hand("z")
+        bench.pump.push(life.NodeRemoved(5, "b"))
+        (tmp_path / "b.py").write_text("pass\n")
+        task = asyncio.create_task(bench.by_hand())
+        await until(lambda: bench.pump.cell.reload)
+        bench.reloader.has_started()
+        (done,) = await task
+        assert "the node b had been removed" in done
+
+    live(work)
+
+
+def test_a_link_that_leads_to_another_dataflow(tmp_path: Path) -> None:
+    """All of it starts again, and comes back if the other one does not start."""
+
+    async def work() -> None:
+        for name in ("2", "1"):
+            (tmp_path / name).mkdir()
+            bench = Bench(tmp_path / name)
+        link = tmp_path / "current"
+        link.symlink_to("1")
+        given = bench.options._replace(dataflow=str(link / "flow.yml"), working_directory=str(link))
+        settings = SettingsFile(str(tmp_path / "1/flow.systemd.yml"), tmp_path / "settings.yml")
+        reloader = bench.reloader = Reloader(bench.options, {}, settings, given)
+        bench.begin()
+        assert await bench.by_hand() == []
+        link.unlink()
+        link.symlink_to("2")
+        (tmp_path / "2/b.py").write_text("def broken(:\n")
+        assert reloader._has_moved()
+        with pytest.raises(DoraSystemdError, match=r"cannot use .*/2/b\.py"):
+            await bench.by_hand()
+        assert not reloader._has_moved(), "hot reload tries it once"
+        assert reloader.options.dataflow == str(bench.flow)
+        (tmp_path / "2/b.py").write_text("")
+        cell = bench.pump.cell
+        for outcome in ("node a: exit code 1", ""):
+            bench.pump.cell = cell
+            task = asyncio.create_task(bench.by_hand())
+            await until(lambda: bench.pump.cell.reload)
+            assert reloader.options.dataflow == str(tmp_path / "2/flow.yml")
+            if outcome:
+                assert reloader.go_back(outcome)
+                with pytest.raises(DoraSystemdError, match=r"cannot use .*/2/flow\.yml: node a"):
+                    await task
+                assert reloader.options.dataflow == str(bench.flow)
+        reloader.has_started()
+        (done,) = await task
+        assert f"its path leads to {tmp_path}/2 now" in done
+        reloader.close()
 
     live(work)
 
