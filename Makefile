@@ -4,7 +4,7 @@
 #   LAB=host       system tests right here, on a machine booted with systemd
 
 LAB ?= container
-export LAB
+export LAB PYTEST
 
 PREPARE := tests/lab/prepare
 CHECK := /usr/bin/python3 tests/lab/check
@@ -16,7 +16,7 @@ test:  ## everything: unit tests, system tests in the vm, system tests
 	@$(PREPARE) $(if $(filter host,$(LAB)),host,container machines vm)
 	@$(CHECK) test
 
-check:  ## linters, types and unit tests, those of changed folders first: after every change
+check:  ## linters, types and unit tests, those of changed folders first; PYTEST="FILE -k WORD"
 	@$(PREPARE)
 	@$(CHECK) check
 
@@ -47,6 +47,18 @@ history:  ## commands and faults in combination; SEED=n STEPS=n HOURS=n, LAB_OUT
 power:  ## the power fails ROUNDS=n times in the middle of a deploy or rollback; SEED=n
 	@$(PREPARE) container vm
 	@ROUNDS=$(ROUNDS) SEED=$(SEED) $(CHECK) power
+
+other-python:  ## unit tests of what touches the system, on the Python of the lab
+	@$(PREPARE) container
+	@$(CHECK) other-python
+
+lab:  ## tests of the lab itself
+	@$(PREPARE) container vm
+	@$(CHECK) lab
+
+packages:  ## the Debian packages: built, installed, used, through a reboot and a power cut
+	@$(PREPARE) container vm
+	@$(CHECK) packages
 
 fuzz:  ## feed what reads other people's bytes, for SECONDS=n
 	@$(PREPARE)
@@ -96,4 +108,4 @@ autopkgtest:  ## debian/tests, by Debian's own autopkgtest, on what make deb has
 	@$(PREPARE) $(if $(filter vm,$(LAB)),container vm,container)
 	@packaging/autopkgtest
 
-.PHONY: help test check unit system quick vm faults history power fuzz browser machines bench bench-quick bookworm lint demo clean deb autopkgtest
+.PHONY: help test check unit other-python lab packages system quick vm faults history power fuzz browser machines bench bench-quick bookworm lint demo clean deb autopkgtest

@@ -1,7 +1,11 @@
 """What the steps of `make test` and its parts are."""
 
+import atexit
 import os
+import shlex
+import shutil
 import sys
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -16,10 +20,13 @@ from lab.venv import ensure_venv, venv_environment, write_package
 
 LAB_PYTHON = (3, 13)
 FAULTS = "tests/system/faults"
+# Containers at the same time. Most of the time of a test is waiting, and one more than three makes
+# two cores so busy that the tests wait for each other.
+CONTAINERS = 3
 # A dataflow as a service, from start to stop: what to run after every change.
 QUICK = (
-    ("cell", "start", "bus", "lab"),
-    ("stop", "list", "kinds", "start_refused", "start_run", "cli"),
+    *("cell", "start", "bus", "lab", "stop", "list", "kinds"),
+    *("start_refused", "start_run", "cli"),
 )
 
 
@@ -39,22 +46,14 @@ def main(arguments: Sequence[str]) -> int:
 def plan_test(form: str) -> list[Step]:
     if form == "host":
         return [*plan_unit(form), *plan_system(form)]
-    own = [*plan_unit(form), *unit_in_lab(), *plan_lab(form)]
-    return [*own, *beside_the_machine(own[-1].name)]
-
-
-def beside_the_machine(before: str) -> list[Step]:
-    """The virtual machine is emulated by one processor; the other has the containers meanwhile."""
-    packages = replace(build_step(), after=(before,))
-    inside, restarted = limits_step(), reboot_step()
-    inside = replace(inside, after=(before,))
-    restarted = replace(restarted, after=(packages.name, inside.name))
-    installed = replace(packages_step(), after=(packages.name,))
-    faults, first, second, browser = plan_system("container")
-    second = replace(second, after=(first.name,))
-    several = replace(machines_step(), after=(restarted.name,))
-    browser = replace(browser, after=(several.name,))
-    return [packages, installed, faults, first, inside, restarted, several, second, browser]
+    (unit,) = plan_unit(form)
+    build, inside = build_step(), limits_step()
+    restarted = replace(reboot_step(), after=(build.name, inside.name))
+    installed = replace(packages_step(), after=(build.name,))
+    beside = [build, inside, *plan_lab(form), *plan_other_python(form), *plan_system("container")]
+    several = replace(machines_step(), after=(installed.name,))
+    beside = [replace(one, after=(unit.name,)) for one in beside]
+    return [unit, *beside, installed, restarted, several]
 
 
 def in_venv(for_system_tests: bool = False) -> dict[str, str]:
@@ -70,7 +69,10 @@ def plan_unit(_form: str) -> list[Step]:
 
 
 def plan_check(_form: str) -> list[Step]:
-    """Linters, types and unit tests; those of what has changed come first."""
+    """Linters, types and unit tests, those of what has changed first; or what PYTEST names."""
+    chosen = shlex.split(os.environ.get("PYTEST", ""))
+    if chosen:
+        return [Step("unit tests", ["python", "-m", "pytest", *chosen], in_venv)]
     return [unit_step([f"--first={','.join(changed_rooms())}"])]
 
 
@@ -81,15 +83,16 @@ def unit_step(options: Sequence[str]) -> Step:
     return Step(f"unit tests, Python {version}", [*command, *options], in_venv, minutes=1)
 
 
-def unit_in_lab() -> list[Step]:
+def plan_other_python(_form: str) -> list[Step]:
+    """What may differ with the version of Python: whatever touches the system, and all imports.
+
+    The system tests prove the rest there. Pure decisions are the same everywhere.
+    """
     if sys.version_info[:2] == LAB_PYTHON:
         return []
     version = ".".join(map(str, LAB_PYTHON))
-    # The linters, and Prometheus' parser, say the same of every Python; the image does without.
-    without = ("project/test_linters", "decisions/views/test_prometheus")
-    arguments = ["tests/unit", *(f"--ignore=tests/unit/{name}.py" for name in without)]
-    step = lab_step(f"unit tests, Python {version}", "container", arguments, minutes=1)
-    return [replace(step, after=())]
+    folders = [f"tests/unit/{name}" for name in ("adapters", "gateway", "link", "runner", "trust")]
+    return [lab_step(f"unit tests, Python {version}", "container", folders, minutes=1)]
 
 
 def plan_lab(_form: str) -> list[Step]:
@@ -98,8 +101,7 @@ def plan_lab(_form: str) -> list[Step]:
 
 
 def plan_vm(_form: str) -> list[Step]:
-    inside, build, restarted = limits_step(), build_step(), reboot_step()
-    return [inside, replace(build, after=()), replace(restarted, after=(inside.name, build.name))]
+    return [limits_step()]
 
 
 def limits_step() -> Step:
@@ -122,8 +124,9 @@ def reboot_step() -> Step:
 
 
 def plan_packages(_form: str) -> list[Step]:
-    """The real .deb files, as a user installs them."""
-    return [build_step(), packages_step(), reboot_step()]
+    """The real .deb files, as a user installs them, and as a reboot finds them."""
+    build = build_step()
+    return [build, *(replace(one, after=(build.name,)) for one in (packages_step(), reboot_step()))]
 
 
 def packages_step() -> Step:
@@ -137,10 +140,9 @@ def plan_bookworm(_form: str) -> list[Step]:
 
 def plan_system(form: str) -> list[Step]:
     here = " and not lab" if form == "host" else ""
-    arguments = ["tests/system", "-m", f"not vm and not browser{here}"]
+    arguments = ["tests/system", "-m", f"not vm{here}"]
     if form == "container":
-        halves = two_halves([*arguments, f"--ignore={FAULTS}"])
-        return [*plan_faults(form), *halves, *plan_browser(form)]
+        return queue_steps("system tests", "browser", arguments, minutes=14)
     if form != "host":
         return [lab_step(f"system tests, {form}", form, arguments)]
     if not Path("/run/systemd/system").is_dir():
@@ -200,25 +202,28 @@ def plan_fuzz(_form: str) -> list[Step]:
 
 
 def plan_quick(_form: str) -> list[Step]:
-    """The heart of the system tests, two containers at the same time."""
-    first, second = (
-        quick_step(word, [f"tests/system/test_{name}.py" for name in half])
-        for word, half in zip(("first", "second"), QUICK, strict=True)
-    )
-    return [first, replace(second, after=())]
+    """The heart of the system tests."""
+    files = [f"tests/system/test_{name}.py" for name in QUICK]
+    return queue_steps("quick system tests", "container", [*files, "-m", "not vm"])
 
 
-def quick_step(half: str, files: Sequence[str]) -> Step:
-    return lab_step(f"quick system tests, {half} half", "container", [*files, "-m", "not vm"])
-
-
-def two_halves(arguments: Sequence[str]) -> list[Step]:
-    """Two containers at the same time; a test that measures or floods has its half for itself."""
-    first = lab_step("system tests, first half", "container", [*arguments, "--half=1"], minutes=7)
-    second = lab_step(
-        "system tests, second half", "container", [*arguments, "--half=2"], minutes=18
-    )
-    return [first, replace(second, after=("faults, container",))]
+def queue_steps(name: str, form: str, arguments: Sequence[str], minutes: int = 0) -> list[Step]:
+    """Containers at the same time, each of which runs the modules that no other one has taken."""
+    given = os.environ.get("LAB_OUT")
+    queue = Path(tempfile.mkdtemp(prefix="queue-", dir=given))
+    atexit.register(shutil.rmtree, queue, ignore_errors=True)
+    place = f"/out/{queue.name}" if given else "/out"
+    env = {**os.environ, "LAB": form, "LAB_OUT": given or str(queue)}
+    return [
+        Step(
+            f"{name}, container {number} of {CONTAINERS}",
+            ["tests/lab/lab", "run", "--", "pytest", f"--queue={place}", *arguments],
+            env.copy,
+            minutes=minutes,
+            after=(),
+        )
+        for number in range(1, CONTAINERS + 1)
+    ]
 
 
 def lab_step(name: str, form: str, arguments: Sequence[str], minutes: int = 0) -> Step:
@@ -246,6 +251,7 @@ PLANS: dict[str, Callable[[str], list[Step]]] = {
     "history": plan_history,
     "power": plan_power,
     "fuzz": plan_fuzz,
+    "other-python": plan_other_python,
     "lab": plan_lab,
     "vm": plan_vm,
     "packages": plan_packages,

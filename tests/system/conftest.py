@@ -15,31 +15,35 @@ from tests.system.complaints import complaints, end_of_journal
 from tests.system.gateways import Front
 from tests.system.ports import reserve_ports
 from tests.system.releases import Releases
+from tests.system.work_queue import longest_first, run_queue
 
-FIRST_HALF = (
-    *("test_cell", "test_kinds", "test_start", "test_start_refused", "test_logs_cli"),
-    *("test_doctor", "test_enable", "test_hotreload", "test_limits", "test_setup"),
-    *("test_destroy", "test_gateway", "test_top"),
-)
-"""Files of about half the time, which `make test` runs beside the others in a lab of their own."""
-
+LONGEST = ()
+"""Modules that take longest, which a queue begins with."""
 
 LONGEST_SECONDS = 300
 """No test takes a tenth of it: one that hangs fails, shows where it stood, and the others run."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--half", choices=["1", "2"], help="only this half of the system tests")
+    parser.addoption("--queue", type=Path, help="run only modules that no other container takes")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    here, half = Path(__file__).parent, config.getoption("--half")
+    here = Path(__file__).parent
     for item in items:
         if here in item.path.parents:
             item.add_marker(pytest.mark.system)
             item.add_marker(pytest.mark.timeout(bound(LONGEST_SECONDS)))
-    if half:
-        items[:] = [item for item in items if (item.path.stem in FIRST_HALF) == (half == "1")]
+    if config.getoption("--queue"):
+        items[:] = longest_first(items, LONGEST)
+
+
+def pytest_runtestloop(session: pytest.Session) -> bool | None:
+    queue = session.config.getoption("--queue")
+    if not queue or session.config.option.collectonly:
+        return None
+    run_queue(session, queue)
+    return True
 
 
 @pytest.hookimpl(wrapper=True)

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import yaml
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
@@ -271,3 +272,13 @@ def test_speed_is_percent() -> None:
 )
 def test_the_room_of_a_changed_file(path: str, room: str) -> None:
     assert find_rooms([path, ""]) == [room]
+
+
+def test_the_jobs_of_the_workflow_are_all_steps_of_make_test() -> None:
+    workflow = definition.read_part(definition.CHECKOUT / ".github/workflows/test.yml")
+    jobs = yaml.safe_load(workflow)["jobs"]["test"]["strategy"]["matrix"]["what"]
+    makefile = definition.read_part(definition.CHECKOUT / "Makefile")
+    targets = re.findall(r"^([a-z-]+):", makefile, re.MULTILINE)
+    assert set(jobs) <= set(targets)
+    done = {step.name for job in jobs for step in PLANS[job]("container")}
+    assert done >= {step.name for step in PLANS["test"]("container")}

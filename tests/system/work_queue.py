@@ -1,0 +1,59 @@
+"""One queue of test modules for several containers: each runs the modules that it takes first."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+import pytest
+
+
+class InModule(Protocol):
+    """What is looked at of a pytest.Item."""
+
+    @property
+    def path(self) -> Path: ...
+
+
+Item = TypeVar("Item", bound=InModule)
+
+
+def take_items(items: Iterable[Item], queue: Path) -> Iterator[Item]:
+    """Yield the tests of the modules that nobody else has taken, a module at a time.
+
+    mkdir(2) of the name of a module takes it: one of the containers succeeds.
+    """
+    modules: dict[Path, list[Item]] = {}
+    for item in items:
+        modules.setdefault(item.path, []).append(item)
+    for path, tests in modules.items():
+        if _take(queue / f"{path.parent.name}-{path.stem}"):
+            yield from tests
+
+
+def _take(place: Path) -> bool:
+    try:
+        place.mkdir()
+    except FileExistsError:
+        return False
+    return True
+
+
+def longest_first(items: Iterable[Item], longest: Sequence[str]) -> list[Item]:
+    """Sort by module: a long one that is taken last would run alone at the end."""
+    order = {name: place for place, name in enumerate(longest)}
+    return sorted(items, key=lambda item: order.get(item.path.stem, len(order)))
+
+
+def run_queue(session: pytest.Session, queue: Path) -> None:
+    """Run what this container takes; raise what ends a session early, as pytest's own loop."""
+    taken = take_items(session.items, queue)
+    item = next(taken, None)
+    while item:
+        # Taken before `item` runs: pytest keeps the fixtures that the next test needs too.
+        following = next(taken, None)
+        item.config.hook.pytest_runtest_protocol(item=item, nextitem=following)
+        if session.shouldfail:
+            raise session.Failed(session.shouldfail)
+        if session.shouldstop:
+            raise session.Interrupted(session.shouldstop)
+        item = following
