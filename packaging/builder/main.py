@@ -8,14 +8,16 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from lab.cache import find_cache
+from lab import definition
+from lab.cache import Layer, ensure, find_cache
 from lab.errors import LabError, Stage, say
 from lab.process import need_root
 
 from builder.compare import compare_builds, describe
 from builder.room import build_dependencies, ensure_room, run_in_room
-from builder.sources import CHECKOUT, SOURCES, Source, ensure_wheels, stage
+from builder.sources import CHECKOUT, SOURCES, Source, ensure_wheels, list_checkout, stage
 
+HERE = Path(__file__).resolve().parent
 # Two builds of the same source that have nothing else in common.
 VARIATIONS = (
     {"TZ": "UTC", "LANG": "C.UTF-8"},
@@ -57,11 +59,22 @@ def build_all(cache: Path, place: Path, is_once: bool) -> list[Path]:
     controls = [source.debian / "control" for source in SOURCES]
     room = ensure_room(cache, build_dependencies(*controls))
     wheels = ensure_wheels(cache, room)
-    return [
-        package
-        for source in SOURCES
-        for package in build_source(source, place, room, wheels, is_once)
-    ]
+    own, dora = SOURCES
+
+    def build_dora(path: Path) -> None:
+        for package in build_source(dora, place, room, wheels, is_once):
+            shutil.copy(package, path)
+
+    kept = ensure(cache, Layer("dora-packages", dora_key(dora, room, is_once), build_dora))
+    return [*build_source(own, place, room, wheels, is_once), *sorted(kept.glob("*.deb"))]
+
+
+def dora_key(source: Source, room: Path, is_once: bool) -> str:
+    """What the packages of dora's command are made of: it changes with dora's versions only."""
+    debian, builder = source.debian.relative_to(CHECKOUT), HERE.relative_to(CHECKOUT)
+    files = [path for path in list_checkout() if {debian, builder} & {*path.parents}]
+    parts = [(str(path), definition.read_part(CHECKOUT / path)) for path in files]
+    return definition.digest(parts, room.name, is_once)
 
 
 def build_source(
