@@ -249,11 +249,13 @@ def test_groups_that_are_nested_deeply(tmp_path: Path) -> None:
     for group in groups:
         group.mkdir()
     (groups[-1] / "cgroup.procs").write_text(f"{os.getpid()}\n")
-    found = cgroup.pids(tmp_path)
-    memory = cgroup.read_usage(tmp_path).memory
-    (groups[-1] / "cgroup.procs").unlink()
-    for group in reversed(groups):  # pytest's own way to remove them is recursive
-        group.rmdir()
+    try:
+        found = cgroup.pids(tmp_path)
+        memory = cgroup.read_usage(tmp_path).memory
+    finally:
+        (groups[-1] / "cgroup.procs").unlink()
+        for group in reversed(groups):  # pytest's own way to remove them is recursive
+            group.rmdir()
     assert found == [os.getpid()]
     assert memory == 0  # so deep, it is not looked for
 
