@@ -154,7 +154,7 @@ async def live(runs: Runs, losses: LossWatch | None) -> RunnerExit:
     try:
         last = await run_once(runs, is_again=False)
         while goes_on(runs, last):
-            notify.send_reloading()
+            begin_again(runs, last)
             last = await run_once(runs, is_again=True)
         if losses is not None:
             with contextlib.suppress(TimeoutError):
@@ -166,8 +166,21 @@ async def live(runs: Runs, losses: LossWatch | None) -> RunnerExit:
         beside.cancel()
 
 
+def begin_again(runs: Runs, last: Cell) -> None:
+    """Another run begins in this process. After the loss of a machine it reads the files again."""
+    if runs.this_life.up_us:
+        notify.send_reloading()
+    runs.role.begin_again(last)
+    if last.members:  # with several machines nothing is reloaded
+        runs.reloader.current = None
+        runs.check = DoraCheck(runs.role.options, runs.environment)
+
+
 def goes_on(runs: Runs, last: Cell) -> bool:
-    """Whether another run follows: a reload, or the version before a reload that has failed."""
+    """Whether another run follows: after a reload, or a lost machine.
+
+    Or it is the version before a reload that has failed.
+    """
     if last.reload:
         return True
     if not last.is_trial or last.ready_us or last.stop_by:

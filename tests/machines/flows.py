@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from tests.machines.journals import quiet_journals
 from tests.machines.wires import there
@@ -93,7 +93,9 @@ class Flow:
 
     def life(self) -> str:
         """What is new with each run."""
-        return self.cell.show("InvocationID")
+        table = Path(f"/run/dora-systemd/{NAME}/status.json")
+        run = json.loads(table.read_text())["run"] if table.exists() else ""
+        return f"{self.cell.show('InvocationID')} {run}"
 
     def wait_again(self, life: str) -> None:
         """Return when another run than that of `life` is there, and messages flow."""
@@ -132,8 +134,12 @@ class Flow:
 
     def table(self) -> dict[str, dict[str, object]]:
         """The nodes as `list -o json` has them."""
-        row = json.loads(self.cell.doractl("list", NAME, "-o", "json").stdout)
-        return {node["node"]: node for node in row["nodes"]}
+        return {node["node"]: node for node in self.row()["nodes"]}
+
+    def row(self) -> dict[str, Any]:
+        """The dataflow as `list -o json` has it."""
+        row: dict[str, Any] = json.loads(self.cell.doractl("list", NAME, "-o", "json").stdout)
+        return row
 
 
 def links() -> str:

@@ -115,6 +115,8 @@ def test_a_cable_is_out(flow: Flow, how: str) -> None:
         assert "gpu" in flow.status()
     assert nothing_on("b") or flow.life() != life
     flow.wait_again(life)
+    assert flow.cell.show("NRestarts") == "0"
+    assert "Restarts:" not in flow.cell.doractl("why", NAME).stdout
 
 
 @lost
@@ -133,7 +135,9 @@ def test_a_machine_boots_again(flow: Flow) -> None:
     life = flow.life()
     with power_cut("b"):
         wait_for("the head knows", lambda: "waiting for machine" in flow.status(), 15)
+        assert flow.row()["status"] == "Waiting"
     flow.wait_again(life)
+    assert flow.cell.show("NRestarts") == "0"
 
 
 @lost

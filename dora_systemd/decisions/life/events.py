@@ -270,11 +270,16 @@ class Gathered(Event):
 
 @dataclass(frozen=True)
 class MachineLost(Event):
-    """Nothing is known of a member any more. by: who has stopped its part there, or ""."""
+    """A member does not take part in the run any more.
+
+    by: who has stopped its part there, or "". is_failure: whether its part has failed, while the
+    machine and the way to it are well.
+    """
 
     machine: str
     reason: str
     by: str = ""
+    is_failure: bool = False
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,10 @@
 """The handlers of what is different if a dataflow has several machines, see handlers.py.
 
 A lost machine is a lost run: dora cannot go on without one of its daemons, and to ask it to stop
-then takes half a minute. So each machine ends its own nodes, and systemd of the head starts the
-whole again.
+then takes half a minute. So each machine ends its own nodes. With a restart policy the head waits
+for the machine, and starts the next run in the same process: a restart by systemd would use up
+StartLimitBurst=, and lengthen the delay of the next one. The failure of a part is a failure of the
+dataflow, which systemd restarts.
 """
 
 from dataclasses import replace
@@ -85,6 +87,8 @@ def machine_lost(cell: Cell, event: life.MachineLost) -> Next:
     """A member is gone, and with it the run: end the nodes that are here."""
     if event.by:
         cell = _stopped_there(cell, event)
+    elif cell.waits_for_lost and not event.is_failure:
+        cell = replace(cell, reload=True, lost=cell.lost | {event.machine})
     else:
         cell = because(cell, Cause.MACHINE_LOST)
         failure = f"machine {event.machine}: {event.reason}"

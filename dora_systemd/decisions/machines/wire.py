@@ -126,11 +126,13 @@ class Refused:
 class Ended:
     """Member to head: its part has ended or is about to. by: who asked for it, or "".
 
-    reason: one line, "" if all went well.
+    reason: one line, "" if all went well. failed: 1 if its part has failed by itself; 0 also if its
+    machine shuts down, or it has lost the head.
     """
 
     reason: str = ""
     by: str = ""
+    failed: int = 0
 
 
 @dataclass(frozen=True)
@@ -147,6 +149,8 @@ class Stopping:
     by: str = ""
 
 
+RUNNER_ENDED = "its supervisor process has ended"
+"""words of a Lost: what the relay of a member says when its runner has ended without a word."""
 FromLink = Lost | Unreached | Taken
 Message = Forwards | FromLink | Part | Beat | Ready | Table | Refused | Ended | StopPart | Stopping
 M = TypeVar("M", bound=Message)
@@ -166,7 +170,7 @@ _TYPES: Mapping[str, type[Any]] = {
     "stopping": Stopping,
 }
 _NAMES = {kind: name for name, kind in _TYPES.items()}
-_NUMBERS = {"coordinator", "zenoh", "grace", "again", "version", "tries"}
+_NUMBERS = {"coordinator", "zenoh", "grace", "again", "version", "tries", "failed"}
 _LONG = {"status"}
 _BY_MACHINE = {(Forwards, "zenoh")}
 

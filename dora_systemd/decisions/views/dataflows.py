@@ -25,6 +25,7 @@ _BY_ACTIVE = {
     "failed": FAILED,
     "inactive": STOPPED,
 }
+_ALIVE = ("activating", "active", "reloading", "refreshing")
 _BY_STAGE = {"degraded": DEGRADED, "unmet": WAITING, "stopping": STOPPING}
 
 UNKNOWN = "-"
@@ -44,7 +45,7 @@ def status_word(active: str, sub: str, stage: str = "", is_held: bool = False) -
         return WAITING
     if sub.startswith("auto-restart") or (active == "activating" and stage == "restarting"):
         return RESTARTING
-    if active == "activating" and stage == "gathering":
+    if active in _ALIVE and stage == "gathering":
         return WAITING
     word = _BY_ACTIVE.get(active, STOPPED)
     return _BY_STAGE.get(stage, word) if word == RUNNING else word

@@ -277,7 +277,11 @@ def restarts_of(chain: Sequence[Life]) -> list[Restart]:
     return found
 
 
-_FRESH = {"node-reloaded": (How.SWAP.value, How.REWIRE.value), "reloaded": ("",)}
+_FRESH = {
+    "node-reloaded": (How.SWAP.value, How.REWIRE.value),
+    "reloaded": ("",),
+    "machine-lost": ("",),
+}
 """Events after which dora counts from zero, by what was done."""
 
 

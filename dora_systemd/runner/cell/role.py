@@ -58,6 +58,9 @@ class Alone:
     def prepare(self, paths: CellPaths, prepared: Prepared, check: "DoraCheck") -> None:
         """The dataflow has been read, and its run begins. Raises DoraSystemdError."""
 
+    def begin_again(self, last: Cell) -> None:
+        """Another run begins in this process. last: the cell of the one before, at its end."""
+
     def engine(
         self, dora: str, paths: CellPaths, environment: Mapping[str, str], boot: EarlyDaemon | None
     ) -> Engine:

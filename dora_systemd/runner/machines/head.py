@@ -94,8 +94,14 @@ class Head(Shared):
         content = Path(self.options.dataflow).read_bytes()
         # Who has written a unit file may not be there when a boot starts it.
         is_by_hand = is_transient(self.options.name, paths.is_of_user)
-        is_awaited = self.this_life.is_first and is_by_hand
+        is_awaited = self.this_life.is_first and is_by_hand and not self.this_life.up_us
         self.roster.set_facts(hashlib.sha256(content).hexdigest(), check.version(), is_awaited)
+
+    def begin_again(self, last: Cell) -> None:
+        """Take other ports: on a machine that was lost, sshd may still have those of the last run.
+        """
+        self._ports = choose_ports(self.roster.names, self.options.addresses)
+        self.roster.begin_again(self._ports, last.lost)
 
     def engine(
         self, dora: str, paths: CellPaths, environment: Mapping[str, str], boot: EarlyDaemon | None
@@ -111,7 +117,13 @@ class Head(Shared):
             ident: node._replace(machine=placed_on(placed, ident))
             for ident, node in cell.nodes.items()
         }
-        return replace(cell, nodes=nodes, members=self.roster.names)
+        return replace(
+            cell,
+            nodes=nodes,
+            members=self.roster.names,
+            lost=self.roster.lost,
+            waits_for_lost=self.options.restart.policy != "no",
+        )
 
     def dialogue(
         self, options: RunnerOptions, pump: Pump, dora: Engine, nodes: Nodes, pipes: LogPipes
@@ -221,7 +233,7 @@ class HeadDialogue(Dialogue):
                 lost := await self._find_lost()
             ):
                 await asyncio.sleep(_WORD_SECONDS)
-                self._lose(*lost)
+                self._lose(*lost, is_failure=lost[0] not in self._roster.silent())
 
     async def _find_lost(self) -> tuple[str, str] | None:
         with contextlib.suppress(DoraSystemdError):
@@ -233,9 +245,9 @@ class HeadDialogue(Dialogue):
                     return name, "its dora daemon does not answer any more"
         return None  # watch_dora sees a coordinator that does not answer
 
-    def _lose(self, name: str, why: str) -> None:
+    def _lose(self, name: str, why: str, is_failure: bool = False) -> None:
         if self._pump.cell.state in (State.WAITING, State.RUNNING, State.STOPPING):
-            self._pump.push(life.MachineLost(now_us(), name, why))
+            self._pump.push(life.MachineLost(now_us(), name, why, is_failure=is_failure))
 
     async def _send_start(self, descriptor: Mapping[str, Any]) -> None:
         await super()._send_start(with_works(descriptor, self._roster.works()))
@@ -289,6 +301,7 @@ class HeadDialogue(Dialogue):
     async def _end_nodes(self) -> None:
         """End what is here, while the members do the same."""
         left = self._begin_end()
+        self._roster.close()
         self._roster.tell(wire.StopPart(min(round(left * SECOND), self._pump.cell.grace)))
         self._pipes.mute("coordinator", "daemon")  # they do not know that we end them
         own = [node for node in self._pump.cell.nodes if self._is_here(node)]

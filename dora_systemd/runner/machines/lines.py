@@ -32,12 +32,16 @@ Hear = Callable[[Message], None]
 
 
 class Lines:
-    """A talk. silent: beats since the last line came. on_beat: called before each own beat."""
+    """A talk. silent: beats since the last line came. on_beat: called before each own beat.
+
+    is_broken: it has ended because of what the other side has said.
+    """
 
     def __init__(self, ends: Ends, on_beat: Callable[[], None] = lambda: None) -> None:
         self._reader, self._writer = ends
         self._on_beat = on_beat
         self._why = "the connection has ended"
+        self.is_broken = False
         self.silent = self._heard = self._bytes = 0
 
     def send(self, message: Message) -> None:
@@ -59,12 +63,12 @@ class Lines:
         try:
             await self._read(hear)
         except DoraSystemdError as error:
-            self._why = error.message
+            self._break(error.message)
         except ValueError:
-            self._why = "a line is too long"
+            self._break("a line is too long")
         except Exception as error:
             # Else it would go on to count as there, and nobody would read what it says.
-            self._why = f"what it says cannot be handled: {type(error).__name__}"
+            self._break(f"what it says cannot be handled: {type(error).__name__}")
         finally:
             beats.cancel()
             self._writer.close()
@@ -76,10 +80,14 @@ class Lines:
                 self.silent, self._heard = 0, self._heard + 1
                 self._bytes += len(line)
                 if self._heard > _MOST_LINES or self._bytes > _MOST_BYTES:
-                    self.end("the other side says too much")
+                    self._break("the other side says too much")
+                    self.end(self._why)
                     return
                 hear(parse_message(line))
                 await asyncio.sleep(0)  # lines that are there already must not hold up the rest
+
+    def _break(self, why: str) -> None:
+        self._why, self.is_broken = why, True
 
     async def _beat(self) -> None:
         while self.silent < _LEASE:

@@ -162,7 +162,7 @@ class MemberDialogue(Dialogue):
             reason, by = (_GOING_DOWN, "") if is_going_down() else ("", cell.stop_by)
             self._voice.send(wire.Ended(reason, by))
         else:
-            self._voice.send(wire.Ended(cell.failure))
+            self._voice.send(wire.Ended(cell.failure, failed=int(bool(cell.failure))))
 
 
 def is_going_down(is_of_user: bool) -> bool:

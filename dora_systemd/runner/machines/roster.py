@@ -61,8 +61,9 @@ class Roster:
     """All members of a dataflow. push: takes the events; it is set before the first talk.
 
     refresh: writes the table of the head, because that of a member is new. changed: set whenever
-    something is new of a member. is_awaited: whether a person waits for this start, and can mend
-    what a machine at its boot cannot.
+    something is new of a member. lost: the members that were lost in the run before this one.
+    is_awaited: whether a person waits for this start, and can mend what a machine at its boot
+    cannot.
     """
 
     def __init__(self, options: RunnerOptions, ports: wire.Forwards) -> None:
@@ -70,7 +71,8 @@ class Roster:
         self._members = {name: Member() for name in members_of(options.placed)}
         self._token = self._digest = self._dora = ""
         self.changed = asyncio.Event()
-        self.is_awaited = False
+        self.lost: frozenset[str] = frozenset()
+        self.is_awaited = self._is_closed = False
         self.push: Callable[[life.Event], None] = lambda _: None
         self.refresh: Callable[[], None] = lambda: None
         self._is_refreshing = False
@@ -83,6 +85,19 @@ class Roster:
     def set_facts(self, digest: str, dora: str, is_awaited: bool) -> None:
         """Set what members compare: see wire.Part. is_awaited: see Roster."""
         self._digest, self._dora, self.is_awaited = digest, dora, is_awaited
+
+    def close(self) -> None:
+        """The run is about to end: its ports and its token are of no use to a new link."""
+        self._is_closed = True
+
+    def begin_again(self, ports: wire.Forwards, lost: frozenset[str]) -> None:
+        """Another run begins in this process: end the talks of the last one."""
+        self._ports, self._token, self._is_closed, self.lost = ports, "", False, lost
+        for member in self._members.values():
+            lines, member.lines = member.lines, None
+            if lines is not None:
+                lines.end("the run has ended")
+            member.work, member.has_left, member.failed = "", False, 0
 
     def set_token(self, token: str) -> None:
         """The coordinator listens: tell those that are there already."""
@@ -124,6 +139,9 @@ class Roster:
             message = f"machine {quoted(name)} has no node of this dataflow"
             await refuse(ends, DoraSystemdError(message, "", ExitCode.USAGE))
             return
+        if self._is_closed:
+            await refuse(ends, DoraSystemdError("the run ends", "the next one has other ports"))
+            return
         lines = Lines(ends)
         self._replace(name, lines)
         if not request.get(GREETED):
@@ -131,7 +149,7 @@ class Roster:
         self._send_part(name)
         why = await lines.talk(partial(self._hear, name, lines))
         if self._members[name].lines is lines:
-            self._lose(name, why)
+            self._lose(name, why, lines.is_broken)
 
     def _replace(self, name: str, lines: Lines) -> None:
         if (old := self._members[name].lines) is not None:
@@ -163,7 +181,7 @@ class Roster:
         )
         self.changed.set()
 
-    def _lose(self, name: str, why: str) -> None:
+    def _lose(self, name: str, why: str, is_failure: bool = False) -> None:
         """The talk has ended. Words that the link or the member has said explain more."""
         member = self._members[name]
         was_ready, member.lines, member.table = bool(member.work), None, CellStatus()
@@ -171,7 +189,7 @@ class Roster:
             member.words = why
         member.work = ""
         if was_ready and not member.has_left:
-            self.push(life.MachineLost(now_us(), name, why))
+            self.push(life.MachineLost(now_us(), name, why, is_failure=is_failure))
         self.changed.set()
 
     def _hear(self, name: str, lines: Lines, message: wire.Message) -> None:
@@ -187,7 +205,8 @@ class Roster:
         elif isinstance(message, wire.Ended):
             self._ended(name, message)
         elif isinstance(message, wire.Lost):
-            self._ended(name, wire.Ended(message.words))
+            has_failed = message.words == wire.RUNNER_ENDED
+            self._ended(name, wire.Ended(message.words, failed=int(has_failed)))
         elif isinstance(message, wire.Unreached):
             self._unreached(name, message)
         elif isinstance(message, wire.Taken):
@@ -238,5 +257,5 @@ class Roster:
         was_ready, member.work, member.is_over = bool(member.work), "", True
         member.words = reason or f"it was stopped there by {by}"
         if was_ready or by:
-            self.push(life.MachineLost(now_us(), name, member.words, by))
+            self.push(life.MachineLost(now_us(), name, member.words, by, bool(message.failed)))
         self.changed.set()

@@ -61,6 +61,14 @@ class Gates:
             with contextlib.suppress(OSError):  # the whole directory may be gone
                 self._fill(node, _LEAVE, is_last=True)
 
+    def remove(self) -> None:
+        """Remove the gates: the next run of the dataflow makes those that it needs."""
+        for node in self._known:
+            self.close(node)
+            with contextlib.suppress(OSError):
+                self._paths.node_gate(node).unlink()
+        self._known = set()
+
     def _fill(self, node: str, word: bytes, is_last: bool = False) -> None:
         if self._is_over and not is_last:
             return

@@ -48,6 +48,7 @@ class Nodes:
         self._piped: set[str] = set()
         self._launched: set[str] = set()
         self._bare: set[str] = set()
+        self._limited: set[str] = set()
         self._tails: dict[str, JsonlTail | None] = {}
         self._holds: dict[str, Hold] = {}
         self.resources = Resources(unit)
@@ -70,7 +71,9 @@ class Nodes:
         self._bare.clear()
         for node in dataflow.nodes:
             self._make(node, rates)
-        self._limit_first(limits)
+        # Later runs keep what doractl set has changed since the first one.
+        self._limit_first(one for one in limits if one.node not in self._limited)
+        self._limited |= {node.id for node in dataflow.nodes}
 
     def _limit_first(self, limits: Iterable[NodeLimits]) -> None:
         """Set the limits of nodes that have not started, but not CPUs that launchers bind to."""
@@ -126,6 +129,7 @@ class Nodes:
         self._piped.discard(node)
         self._launched.discard(node)
         self._bare.discard(node)
+        self._limited.discard(node)
         with contextlib.suppress(OSError):  # a dying process keeps the group for a moment
             cgroup.remove_group(self._group(node))
 
@@ -259,6 +263,7 @@ class Nodes:
             if tail.loss:
                 self._pipes.write_event("lines-lost", node, count="Some", reason=tail.loss)
         self.let_go()
+        self.gates.remove()
         self._holds.clear()
         self._tails.clear()
 

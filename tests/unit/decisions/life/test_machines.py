@@ -69,6 +69,40 @@ def test_a_lost_machine_ends_the_run_without_dora(state: State) -> None:
     assert events_of(actions) == ["dataflow-failed"]
 
 
+@pytest.mark.parametrize("state", [State.STARTING, State.WAITING, State.RUNNING])
+def test_with_a_restart_policy_the_next_run_waits_for_the_machine(state: State) -> None:
+    """In the same process: a restart by systemd would use up one."""
+    cell, actions = step(head(state, waits_for_lost=True), LOST)
+    assert (cell.state, events_of(actions)) == (State.STOPPING, ["machine-lost"])
+    assert Do.END_NODES in actions
+    cell, _ = step(cell, life.StopAnswered(6))
+    cell, actions = step(cell, life.ChildExited(7, "daemon", Exit()))
+    assert (cell.state, cell.reload, cell.exit) == (State.ENDED, True, RunnerExit.OK)
+    assert (*cell.lost, *events_of(actions)) == ("gpu",)
+    _, actions = step(
+        head(State.GATHERING, lost=frozenset({"gpu"})), life.MachineJoined(8, "gpu")
+    )
+    assert events_of(actions) == ["machine-back"]
+
+
+def test_the_failure_of_a_part_is_one_of_the_dataflow_whatever_the_policy() -> None:
+    failed = replace(LOST, reason="the dora daemon is gone (signal SIGKILL)", is_failure=True)
+    cell, _ = step(head(State.RUNNING, waits_for_lost=True), failed)
+    cell, _ = step(cell, life.StopAnswered(6))
+    cell, actions = step(cell, life.ChildExited(7, "daemon", Exit()))
+    assert (cell.reload, cell.exit) == (False, RunnerExit.ENGINE_LOST)
+    assert events_of(actions) == ["dataflow-failed"]
+
+
+def test_a_stop_while_a_lost_machine_ends_the_run_is_a_stop() -> None:
+    cell, _ = step(head(State.RUNNING, waits_for_lost=True), LOST)
+    cell, _ = step(cell, life.StopAsked(6, "SIGTERM"))
+    cell, _ = step(cell, life.StopAnswered(7))
+    cell, actions = step(cell, life.ChildExited(8, "daemon", Exit()))
+    assert (cell.reload, cell.exit) == (False, RunnerExit.OK)
+    assert events_of(actions) == ["dataflow-stopped"]
+
+
 def test_who_stops_a_member_stops_the_dataflow() -> None:
     cell, _ = step(head(State.RUNNING), life.MachineLost(5, "gpu", "", by="SIGTERM"))
     cell, _ = step(cell, life.StopAnswered(6))

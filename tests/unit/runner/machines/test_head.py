@@ -244,7 +244,8 @@ def test_a_daemon_that_is_gone_is_a_lost_machine(tmp_path: Path) -> None:
             await asyncio.sleep(1)
             other.say(wire.Beat())
         reason = "its dora daemon is not connected any more"
-        assert life.MachineLost(0, "gpu", reason) in bench.heard(life.MachineLost)
+        lost = life.MachineLost(0, "gpu", reason, is_failure=True)
+        assert lost in bench.heard(life.MachineLost)
 
     run(tmp_path, work)
 

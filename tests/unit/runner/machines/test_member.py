@@ -140,7 +140,7 @@ def test_what_the_head_says(tmp_path: Path) -> None:
         ]
         bench.be(stop_by="SIGTERM")
         bench.actions[Do.EXIT]()
-        assert other.heard() == [{"type": "ended", "reason": "", "by": ""}], "the head knows why"
+        assert other.heard() == [{"type": "ended", "reason": "", "by": "", "failed": 0}], "the head knows why"
 
     run(tmp_path, work)
 
@@ -185,7 +185,7 @@ def test_who_stops_it_here_is_told_but_a_shutdown_is_nobody(
         bench.nodes._unit, bench.nodes._paths = tmp_path, CellPaths(tmp_path)
         bench.be(stop_by="SIGTERM")
         bench.actions[Do.EXIT]()
-        assert other.heard() == [{"type": "ended", **ended}]
+        assert other.heard() == [{"type": "ended", **ended, "failed": 0}]
 
     run(tmp_path, work)
 
@@ -212,7 +212,7 @@ def test_systemd_is_asked_beside_the_loop_and_the_head_told_on_it(tmp_path: Path
             return is_of_user
 
         async def end_nodes() -> None:
-            assert other.heard() == [{"type": "ended", "reason": "", "by": "SIGTERM"}]
+            assert other.heard() == [{"type": "ended", "reason": "", "by": "SIGTERM", "failed": 0}]
             asked.append(None)
 
         bench.member.is_going_down = is_going_down
@@ -259,7 +259,7 @@ def test_its_own_failure_is_told(tmp_path: Path) -> None:
         bench.be(failure="the dora daemon is gone (signal SIGKILL)")
         bench.actions[Do.EXIT]()
         reason = "the dora daemon is gone (signal SIGKILL)"
-        assert other.heard() == [{"type": "ended", "reason": reason, "by": ""}]
+        assert other.heard() == [{"type": "ended", "reason": reason, "by": "", "failed": 1}]
 
     run(tmp_path, work)
 

@@ -134,11 +134,11 @@ def test_a_member_that_has_ended_in_peace_is_not_lost() -> None:
 def test_the_last_words_count_once() -> None:
     async def work(bench: Bench) -> None:
         other = await bench.link()
-        other.say(READY, wire.Ended("the dora daemon is gone (signal SIGKILL)"), wire.Lost("bye"))
+        reason = "the dora daemon is gone (signal SIGKILL)"
+        other.say(READY, wire.Ended(reason, failed=1), wire.Lost("bye"))
         other.reader.feed_eof()
         await settle()
-        reason = "the dora daemon is gone (signal SIGKILL)"
-        assert bench.heard()[1:] == [life.MachineLost(0, "gpu", reason)]
+        assert bench.heard()[1:] == [life.MachineLost(0, "gpu", reason, is_failure=True)]
 
     run(work)
 
@@ -306,6 +306,51 @@ def test_a_table_that_is_none_ends_the_talk() -> None:
         other.say(READY, wire.Table("{"))
         await settle()
         assert other.writer.is_closed
-        assert isinstance(bench.heard()[-1], life.MachineLost)
+        lost = bench.heard()[-1]
+        assert isinstance(lost, life.MachineLost)
+        assert lost.is_failure, "else the head would start it for ever"
+
+    run(work)
+
+
+@pytest.mark.parametrize(
+    ("word", "is_failure"),
+    [
+        (wire.Lost("Connection to gpu closed by remote host."), False),
+        (wire.Ended("the machine is shutting down"), False),
+        (wire.Ended("the dora coordinator is gone"), False),
+        (wire.Lost(wire.RUNNER_ENDED), True),
+        (wire.Ended("the dora daemon is gone (signal SIGKILL)", failed=1), True),
+    ],
+)
+def test_a_machine_that_is_away_has_not_failed(word: wire.Message, is_failure: bool) -> None:
+    async def work(bench: Bench) -> None:
+        other = await bench.link()
+        other.say(READY, word)
+        await settle()
+        lost = bench.heard()[-1]
+        assert isinstance(lost, life.MachineLost)
+        assert lost.is_failure == is_failure
+
+    run(work)
+
+
+def test_another_run_has_other_ports_and_nothing_of_the_last_one() -> None:
+    async def work(bench: Bench) -> None:
+        bench.roster.set_token("secret")
+        first = await bench.link()
+        first.say(READY)
+        await settle()
+        bench.roster.close()
+        late = await bench.link("cam")
+        assert "the run ends" in late.heard()[0]["error"]
+        ports = wire.Forwards(62000, {"head": 62001, "gpu": 62002, "cam": 62003})
+        bench.roster.begin_again(ports, frozenset({"gpu"}))
+        await settle()
+        assert first.writer.is_closed
+        assert [type(one) for one in bench.heard()] == [life.MachineJoined], "no new loss"
+        assert bench.roster.works() == {"gpu": "", "cam": ""}
+        again = await bench.link()
+        assert [one.get("coordinator") for one in again.heard()] == [62000], "and no old token"
 
     run(work)

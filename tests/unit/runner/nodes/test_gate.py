@@ -111,3 +111,12 @@ def test_a_gate_that_somebody_has_replaced_is_no_gate(gates: Gates, tmp_path: Pa
         gates.open("one")
     assert not (tmp_path / "elsewhere").exists()
     gate.unlink()
+
+
+def test_the_next_run_finds_no_gate_of_the_last_one(gates: Gates, tmp_path: Path) -> None:
+    """Its launchers would leave at one that has been dismissed."""
+    gates.dismiss()
+    gates.remove()
+    assert not CellPaths(tmp_path).node_gate("one").exists()
+    gates.dismiss()
+    assert not CellPaths(tmp_path).node_gate("one").exists()
