@@ -19,6 +19,8 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.link.greeting import Greeted, greeted
 from dora_systemd.link.program import Program
 from dora_systemd.link.talk import Talk, tell
+from dora_systemd.link.watchdog import Watchdog
+from dora_systemd.trust.paths import exists
 
 _FIRST_SECONDS, _LATER_SECONDS = 0.01, 0.25
 _QUICK_TRIES = 500
@@ -35,21 +37,27 @@ def main() -> int:
 
 
 def _carry(link: LinkOptions) -> int:
-    tries = 0
+    tries, watchdog = 0, Watchdog()
     while (found := greeted(Path(link.socket), link.machine)) is None:
+        watchdog.feed()
         # The runner starts, or waits for its restart: systemd ends this unit if it does neither.
         time.sleep(_FIRST_SECONDS if tries < _QUICK_TRIES else _LATER_SECONDS)
         tries += 1
     with found.runner:
         try:
-            _connect(link, found)
+            _connect(link, found, watchdog)
         except DoraSystemdError as error:
             tell(found.runner, Refused(error.message, error.hint))
     return ExitCode.OK
 
 
-def _connect(link: LinkOptions, found: Greeted) -> None:
+def _connect(link: LinkOptions, found: Greeted, watchdog: Watchdog) -> None:
     """Run ssh until either end has ended. Raises DoraSystemdError if that is of no use."""
+    if link.identity and not exists(Path(link.identity)):
+        # ssh would say nothing, and log in with another key.
+        message = f"cannot log in: the key {link.identity} is gone"
+        hint = f"doractl machine remove --force {link.machine}, then doractl machine add"
+        raise DoraSystemdError(message, hint, ExitCode.NO_HOST)
     mark = f"doralink-{os.urandom(16).hex()}"
     arguments = ssh_link_arguments(link, found.forwards, mark)
     try:
@@ -58,7 +66,7 @@ def _connect(link: LinkOptions, found: Greeted) -> None:
         message = f"cannot execute ssh: {error.strerror}"
         raise DoraSystemdError(message, "apt install openssh-client", ExitCode.NO_HOST) from error
     with ssh:
-        talk = Talk(found.runner, ssh, mark, found.rest)
+        talk = Talk(found.runner, ssh, mark, found.rest, watchdog.feed)
         talk.carry()
         talk.part_from(link.host, ssh.end())
 

@@ -1,7 +1,12 @@
 """What the head is told when a connection has ended, from ssh's own words."""
 
 from dora_systemd.decisions.machines.wire import FromLink, Lost, Taken, Unreached
-from dora_systemd.decisions.remote.failures import SSH_FAILED, ending_error, last_line
+from dora_systemd.decisions.remote.failures import (
+    SSH_FAILED,
+    ending_error,
+    failed_there,
+    last_line,
+)
 from dora_systemd.decisions.remote.hosts import Host, parse_host
 from dora_systemd.errors import DoraSystemdError, ExitCode
 
@@ -10,7 +15,6 @@ _FINAL = ("HAS CHANGED", "Host key verification failed", "Permission denied")
 _FORWARDING = ("forwarding failed for listen port", "Could not request local forwarding")
 _ONCE, _TWICE = 1, 2
 """A machine that boots may answer the next attempt. If a person waits, the name may be mistyped."""
-_HINT = "hint: "
 _VERSIONS = "install the same version of dora-systemd on both machines"
 
 
@@ -45,9 +49,10 @@ def _without_member(
     """doractl has not become a member there; what it refuses for good it has said itself."""
     if error:
         return Unreached(error.message, error.hint, 0)
-    said = [one.removeprefix("doractl: ") for one in complaint.splitlines()]
-    hints = [one.removeprefix(_HINT) for one in said if one.startswith(_HINT)]
-    words = last_line("\n".join(one for one in said if not one.startswith(_HINT)))
-    tries, hint = (0, _VERSIONS) if status == ExitCode.USAGE else (_TWICE, "".join(hints[-1:]))
-    reason = f"doractl on {host.text} has failed: {words or f'exit status {status}'}"
+    failed, tries = failed_there(host, complaint, status), _TWICE
+    reason, hint = failed.message, failed.hint
+    if status == ExitCode.USAGE:
+        tries, hint = 0, _VERSIONS
+    if status == ExitCode.NO_PERMISSION:  # another key has logged in, see RESTRICTED
+        tries = 0
     return Unreached(reason, hint, tries)

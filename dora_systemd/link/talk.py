@@ -29,9 +29,17 @@ _COMPLAINT = 4096
 
 
 class Talk:
-    """One connection. rest: what the runner has said already."""
+    """One connection. rest: what the runner has said already. on_turn: called every second."""
 
-    def __init__(self, runner: socket.socket, ssh: Program, mark: str, rest: bytes) -> None:
+    def __init__(
+        self,
+        runner: socket.socket,
+        ssh: Program,
+        mark: str,
+        rest: bytes,
+        on_turn: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._on_turn = on_turn
         self._runner, self._ssh = runner, ssh
         self._output, self._errors = AfterMark(mark), AfterMark(mark)
         self._complaint = b""
@@ -56,6 +64,7 @@ class Talk:
         """Carry until either end has ended."""
         deadline = time.monotonic() + ANSWER_SECONDS
         while not self._is_over:
+            self._on_turn()
             for fd, _ in self._poll.poll(BEAT_SECONDS * 1000):
                 self._take(fd)
             if not self._has_answered:

@@ -95,6 +95,18 @@ def test_the_link_is_killed(flow: Flow, what: str) -> None:
     flow.wait_again(life)
 
 
+@lost
+@killed
+@pytest.mark.warns("Watchdog timeout (limit 25s)", "Killing process", "with result 'watchdog'")
+@pytest.mark.parametrize("flow", [TWO], indirect=True)
+def test_a_link_hangs(flow: Flow) -> None:
+    """The head takes the machine for lost, and systemd ends the link."""
+    life = flow.life()
+    run("systemctl", "kill", "-s", "STOP", f"doralink-{NAME}:gpu.service")
+    flow.wait_again(life)
+    assert flow.cell.show("NRestarts") == "0"
+
+
 def test_a_short_break_is_only_a_gap(flow: Flow) -> None:
     life = flow.life()
     with cable("b", "mute"):

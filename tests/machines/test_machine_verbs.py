@@ -44,8 +44,36 @@ def test_a_key_for_dataflows_only(gpu: None) -> None:
     assert there("b", LINE).stdout == "1\n"
     assert "can only run parts of dataflows" in by_key("root@b", "id")
     assert "can only run parts of dataflows" in by_key("root@b", "doractl", "stop", "--all")
-    listening = ("-oExitOnForwardFailure=yes", "-R", "10.77.0.2:61000:127.0.0.1:22")
-    assert "forwarding failed" in by_key(*listening, "root@b", "id")
+    for wanted in ("10.77.0.2:61000", "127.0.0.1:5432"):
+        listening = ("-oExitOnForwardFailure=yes", "-R", f"{wanted}:127.0.0.1:22")
+        assert "forwarding failed" in by_key(*listening, "root@b", "id")
+    assert "administratively prohibited" in by_key("-W127.0.0.1:22", "root@b")
+
+
+def test_no_other_key_takes_its_place(gpu: None) -> None:
+    """root of a may log in as root of b: a link that has lost its key must not."""
+    del gpu
+    lines, kept = "/root/.ssh/authorized_keys", "/root/authorized_keys"
+    there("b", f"'cp {lines} {kept}; sed -i /dora-systemd:gpu/d {lines}'")
+    try:
+        with flow_on(Flow({"gpu": "b"})) as flow:
+            refused = flow.cell.start(Path(PLACE) / "dataflow.yml", check=False)
+            checked = run("doractl", "machine", "check", "gpu", check=False)
+    finally:
+        there("b", "mv", kept, lines)
+    assert refused.returncode != 0
+    for said in (refused.stderr, checked.stdout):
+        assert "the key of the machine is not let in" in said
+        assert "doractl machine add" in said
+
+
+def test_a_machine_that_is_away_is_not_removed(gpu: None) -> None:
+    del gpu
+    with cable("b", "off"):
+        away = run("doractl", "machine", "remove", "gpu", check=False)
+        assert away.returncode == ExitCode.NO_HOST
+        assert "--force" in away.stderr
+    assert Path(KEY).exists()
 
 
 def test_a_dataflow_by_that_key(gpu: None) -> None:

@@ -109,12 +109,16 @@ def check(names: tuple[str, ...], output: str) -> int:
 
 @command.command("remove")
 @click.argument("name")
+@click.option("--force", is_flag=True, help="Forget it here, even if its key stays over there.")
 @acting_options
-def remove(name: str) -> None:
-    """Forget the machine NAME, and its key on both sides."""
+def remove(name: str, force: bool) -> None:
+    """Forget the machine NAME, and its key on both sides.
+
+    Without --force nothing is removed if the machine cannot be reached.
+    """
     scope = current_scope()
     (machine,) = chosen(known_machines(scope, os.environ), (name,))
-    *notes, last = remove_machine(scope, os.environ, machine)
+    *notes, last = remove_machine(scope, os.environ, machine, force)
     print_warnings(notes)
     tell(last)
     if wants_json():

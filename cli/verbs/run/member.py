@@ -14,6 +14,7 @@ from dora_systemd.cli.settingoptions import SettingsCommand, setting_options
 from dora_systemd.decisions.cell.machines import parse_head, parse_machine, parse_placed
 from dora_systemd.decisions.machines.address import parse_address
 from dora_systemd.decisions.machines.key import ORIGINAL, forced_words
+from dora_systemd.decisions.machines.link_command import RESTRICTED
 from dora_systemd.decisions.machines.push import PLACE, format_place
 from dora_systemd.decisions.machines.wire import Refused
 from dora_systemd.decisions.settings.table import SETTINGS
@@ -30,6 +31,8 @@ from dora_systemd.verbs.machines.own import own_facts
 from dora_systemd.verbs.machines.push import place_problem
 from dora_systemd.verbs.start.plan import StartRequest
 
+_FORCED = "dora_systemd.member.forced"
+
 
 class MemberCommand(SettingsCommand):
     """A verb that sshd may run in the place of what a key has asked for, see sshd(8)."""
@@ -38,9 +41,18 @@ class MemberCommand(SettingsCommand):
         original = os.environ.get(ORIGINAL, "")
         if not args and original:
             mark, args = forced_words(original)
+            ctx.meta[_FORCED] = True
             for stream in (sys.stdout, sys.stderr):
                 print(mark, file=stream, flush=True)
         return super().parse_args(ctx, args)
+
+
+def _require_forced(ctx: click.Context, param: click.Parameter, value: bool) -> None:
+    del param
+    if value and not ctx.meta.get(_FORCED):
+        message = "the key of the machine is not let in, and another one was used"
+        hint = "on the head: doractl machine remove --force NAME, then doractl machine add"
+        raise DoraSystemdError(message, hint, ExitCode.NO_PERMISSION)
 
 
 def _print_facts(ctx: click.Context, param: click.Parameter, value: bool) -> None:
@@ -77,6 +89,14 @@ def _print_place(ctx: click.Context, param: click.Parameter, value: str | None) 
     multiple=True,
     metavar="ADDRESS",
     help="With link: direct, the address of each machine; that of this one first.",
+)
+@click.option(
+    RESTRICTED,
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_require_forced,
+    help="Refuse to run unless sshd has forced this command, for the key of machine add.",
 )
 @click.option(
     "--facts",

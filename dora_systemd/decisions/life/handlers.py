@@ -17,7 +17,15 @@ from dora_systemd.decisions.cell.status import HELD, LATCHED
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life import nodes as table
 from dora_systemd.decisions.life.causes import Cause
-from dora_systemd.decisions.life.failures import ENGINE_TIMEOUT, Next, because, fail, oom_of_all, to
+from dora_systemd.decisions.life.failures import (
+    ENGINE_TIMEOUT,
+    Next,
+    because,
+    broken,
+    fail,
+    oom_of_all,
+    to,
+)
 from dora_systemd.decisions.life.states import Action, Cell, Deadline, Do, Record, RunnerExit, State
 from dora_systemd.decisions.life.stop_budget import LEAVE_TIMEOUT, stop_timeout
 from dora_systemd.values import SECOND, format_duration
@@ -240,6 +248,11 @@ def end(cell: Cell, event: life.Event) -> Next:
     if cell.failure:
         return fail(cell, cell.failure, cell.exit)
     return to(cell, State.ENDED, Record("dataflow-finished"), Do.EXIT)
+
+
+def raised_leaving(cell: Cell, event: life.Failed) -> Next:
+    """The result is known by now, and stays; but no run follows that should have."""
+    return broken(cell, event) if cell.reload else end(cell, event)
 
 
 def _exit_of_stop(cell: Cell) -> RunnerExit:

@@ -79,6 +79,11 @@ def machine_away(cell: Cell, event: life.MachineLost) -> Next:
     return replace(cell, lost=lost), (_lost(event.machine, event.reason),)
 
 
+def take_other_ports(cell: Cell, event: life.ReloadAsked) -> Next:
+    """Begin again: a machine has no room for the ports of this run."""
+    return handle.leave_now(replace(cell, reload=True), event)
+
+
 def _lost(machine: str, reason: str) -> Record:
     return Record("machine-lost", "", {"machine": machine, "reason": reason})
 

@@ -87,11 +87,11 @@ class Cell:
     caused it. downstream: the nodes that depend on each node. is_again: whether this process has
     had a run before. is_trial: whether the version before can come back. reload: whether the run
     ends for the next one in this process. notice: the result of the last reload. is_attached:
-    whether it belongs to `doractl run`, which tells how the nodes ended after a stop, too. met_us: when a node
-    last got what it needs, CLOCK_REALTIME µs. machine: the name of this machine if it is a member.
-    members: the other machines, if it is the head. awaited: which of them is not there, and why.
-    lost: those that had joined and were lost. waits_for_lost: whether the loss of a machine leads to
-    another run in this process.
+    whether it belongs to `doractl run`, which tells how the nodes ended after a stop, too. met_us:
+    when a node last got what it needs, CLOCK_REALTIME µs. machine: the name of this machine if it
+    is a member. members: the other machines, if it is the head. awaited: which of them is not
+    there, and why. lost: those that had joined and were lost. waits_for_lost: whether the loss of a
+    machine leads to another run in this process.
     """
 
     grace: int

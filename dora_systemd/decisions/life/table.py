@@ -89,7 +89,12 @@ TABLE: Mapping[State, Mapping[type[life.Event], Handler]] = {
         CoordinatorListening=handle.listening,
     ),
     State.JOINING: _row(**_EARLY, DaemonConnected=machines.joined),
-    State.GATHERING: _row(**_EARLY, Gathered=machines.gathered, RunStarted=machines.found),
+    State.GATHERING: _row(
+        **_EARLY,
+        Gathered=machines.gathered,
+        RunStarted=machines.found,
+        ReloadAsked=machines.take_other_ports,
+    ),
     State.STARTING: _row(
         **{**_EARLY, **_PART}, RunStarted=handle.started, Subscribed=handle.subscribed
     ),
@@ -114,8 +119,8 @@ TABLE: Mapping[State, Mapping[type[life.Event], Handler]] = {
     State.LEAVING: _row(
         **_NODES,
         ChildExited=handle.daemon_left,
-        # The result is known by now, and stays.
-        **dict.fromkeys(("DeadlinePassed", "Failed"), handle.end),
+        DeadlinePassed=handle.end,
+        Failed=handle.raised_leaving,
         StopAsked=handle.stop_leaving,
     ),
     State.ENDED: _row(),

@@ -7,6 +7,7 @@ asked for into a variable.
 import re
 import shlex
 
+from dora_systemd.decisions.machines.wire import PORT_RANGE
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.values import quoted
 
@@ -20,14 +21,20 @@ _MARK = re.compile(r"[a-z]+-[0-9a-f]{32}")
 def authorized_line(program: str, public: str, comment: str) -> str:
     """The line for authorized_keys. program: absolute path of doractl on that machine.
 
-    Forwards are for 127.0.0.1 only. Raises DoraSystemdError (BAD_INPUT) for what is no public key,
-    and for a path that cannot stand there.
+    Forwards are for the ports of links on 127.0.0.1 only. Raises DoraSystemdError (BAD_INPUT) for
+    what is no public key, and for a path that cannot stand there.
     """
     if not re.fullmatch(r"/[A-Za-z0-9_./+-]+", program):
         raise _refusal(f"cannot use {quoted(program)} there as doractl", "link it into /usr/bin")
     key = _public(public)
-    only = 'permitlisten="127.0.0.1:*",permitopen="127.0.0.1:*"'
-    return f'restrict,port-forwarding,{only},command="{program} member" {key} {comment}'
+    # sshd(8) has no ranges there, and * would be each service that listens on that machine.
+    only = ",".join(
+        f'{option}="127.0.0.1:{port}"'
+        for option in ("permitlisten", "permitopen")
+        for port in PORT_RANGE
+    )
+    forced = f'command="{program} member"'
+    return f"restrict,port-forwarding,{only},{forced} {key} {comment}"
 
 
 def key_text(public: str) -> str:

@@ -17,6 +17,8 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 _PROGRAMS = Path(__file__).parents[2] / "link"
 _QUICK = ("-I", "-S")
 """Without site-packages Python starts in half the time, and both programs need none."""
+RESTRICTED = "--restricted"
+"""The option of `doractl member` that a link gives if it has the key of `machine add`."""
 _KEYS = ("socket", "machine", "host", "identity")
 _MOST_MACHINES = 64
 _OPTIONS = {
@@ -107,9 +109,14 @@ def ssh_link_arguments(link: LinkOptions, forwards: Forwards, mark: str) -> list
 
 
 def member_words(link: LinkOptions) -> list[str]:
-    """The arguments of doractl on the member, with the name that the head has for it."""
+    """The arguments of doractl on the member, with the name that the head has for it.
+
+    A link with a key of its own says so: ssh also tries what else ssh_config(5) names, and such a
+    key of the account can do everything.
+    """
     verb, *rest = link.words
-    return [verb, f"--as={link.machine}", *rest]
+    restricted = [RESTRICTED] if link.identity else []
+    return [verb, *restricted, f"--as={link.machine}", *rest]
 
 
 def check_forwards(forwards: Forwards, machine: str) -> None:

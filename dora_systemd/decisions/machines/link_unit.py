@@ -1,5 +1,6 @@
 """The unit of a link: its name and its properties. Pure."""
 
+import signal
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -22,6 +23,8 @@ from dora_systemd.values import SECOND
 
 _BETWEEN = ":"
 """In no name of a dataflow or of a machine, so two links never have the same unit."""
+_WATCHDOG = 25 * SECOND
+"""µs without a word of a link: longer than all that it waits for, on a machine that is busy too."""
 _MOST = 255
 """Bytes of a unit's name, see systemd.unit(5)."""
 
@@ -118,6 +121,9 @@ def link_unit(
         Restart="always",
         RestartSec=SECOND,
         StartLimitIntervalSec=0,
+        WatchdogSec=_WATCHDOG,
+        # A process that is stopped, or waits in the kernel, takes no other signal.
+        WatchdogSignal=signal.SIGKILL,
         WorkingDirectory="/",
         TimeoutStopSec=5 * SECOND,
         SyslogIdentifier=options.name,

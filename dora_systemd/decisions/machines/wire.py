@@ -27,9 +27,9 @@ MAX_LINE = 1 << 18
 MAX_TEXT = 1000
 """Characters of a text that people read; the rest is cut."""
 LOWEST_PORT, HIGHEST_PORT = 1024, 65535
-PORT_RANGE = range(61000, 65536)
+PORT_RANGE = range(61000, 61200)
 """Where the head chooses ports that have to be free on all machines: outside of Linux's ephemeral
-ports, see ip_local_port_range in ip(7)."""
+ports, see ip_local_port_range in ip(7). The key of a machine names each of them, see key.py."""
 
 
 @dataclass(frozen=True)

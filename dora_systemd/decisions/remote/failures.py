@@ -13,6 +13,7 @@ _OF_SSH = re.compile(
     rb"|client_loop: [^\n]*)\r?\n"
 )
 _MOST = 200
+_HINT = "hint: "
 _HINTS = (
     ("HAS CHANGED", "if the host was installed again: ssh-keygen -R {name}, then ssh {text}"),
     ("Host key verification failed", "log in once to see and accept its key: ssh {text}"),
@@ -97,6 +98,20 @@ def last_line(words: str) -> str:
     lines = [line.strip() for line in without_sequences(words).splitlines()]
     lines = [line for line in lines if line and not line.startswith("{")]
     return short_line(lines[-1].removeprefix("ssh: "), _MOST) if lines else ""
+
+
+def words_of_doractl(complaint: str) -> tuple[str, str]:
+    """The last error of a doractl over there, and its hint, from its standard error."""
+    said = [one.removeprefix("doractl: ") for one in complaint.splitlines()]
+    hints = [one.removeprefix(_HINT) for one in said if one.startswith(_HINT)]
+    words = last_line("\n".join(one for one in said if not one.startswith(_HINT)))
+    return words, short_line("".join(hints[-1:]), _MOST)
+
+
+def failed_there(host: Host, complaint: str, status: int) -> DoraSystemdError:
+    """The error of a host whose doractl has failed."""
+    words, hint = words_of_doractl(complaint)
+    return _error(f"doractl on {host.text} has failed: {words or f'exit status {status}'}", hint)
 
 
 def ending_error(

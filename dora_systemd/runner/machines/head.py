@@ -98,8 +98,7 @@ class Head(Shared):
         self.roster.set_facts(hashlib.sha256(content).hexdigest(), check.version(), is_awaited)
 
     def begin_again(self, last: Cell) -> None:
-        """Take other ports: on a machine that was lost, sshd may still have those of the last run.
-        """
+        """Take other ports: sshd may still have those of the last run on a lost machine."""
         self._ports = choose_ports(self.roster.names, self.options.addresses)
         self.roster.begin_again(self._ports, last.lost)
 

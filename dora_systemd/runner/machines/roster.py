@@ -31,6 +31,8 @@ _SILENT_BEATS = 3
 """A member of which nothing was heard for so many beats may be gone, so dora is not asked."""
 _REFRESH_SECONDS = 0.5
 """The table of the head is written at most so often because of the members."""
+_MOST_TAKEN = 4
+"""Attempts in a row with ports that are taken on some machine."""
 _LONGEST = 300
 
 
@@ -73,6 +75,7 @@ class Roster:
         self.changed = asyncio.Event()
         self.lost: frozenset[str] = frozenset()
         self.is_awaited = self._is_closed = False
+        self._taken = 0
         self.push: Callable[[life.Event], None] = lambda _: None
         self.refresh: Callable[[], None] = lambda: None
         self._is_refreshing = False
@@ -210,6 +213,14 @@ class Roster:
         elif isinstance(message, wire.Unreached):
             self._unreached(name, message)
         elif isinstance(message, wire.Taken):
+            self._take_others(name, message)
+
+    def _take_others(self, name: str, message: wire.Taken) -> None:
+        """Begin again with other ports, unless that machine may forward none at all."""
+        self._taken += 1
+        if self._taken < _MOST_TAKEN:
+            self.push(life.ReloadAsked(now_us()))
+        else:
             cause = Cause.NO_MACHINE if self.is_awaited else Cause.MACHINE_LOST
             self._give_up(name, message, cause)
 
@@ -228,6 +239,7 @@ class Roster:
         if (member := self._members[name]).work or member.is_over:
             return
         member.work, member.has_left, member.failed = message.work, False, 0
+        self._taken = 0
         self.push(life.MachineJoined(now_us(), name))
         self.changed.set()
 

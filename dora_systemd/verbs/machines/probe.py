@@ -16,7 +16,7 @@ from dora_systemd.decisions.machines.facts import Facts, parse_facts
 from dora_systemd.decisions.machines.link_command import LinkOptions, ssh_link_arguments
 from dora_systemd.decisions.machines.wire import PORT_RANGE, Forwards
 from dora_systemd.decisions.remote.command import Way, quote, remote_command, ssh_arguments
-from dora_systemd.decisions.remote.failures import ending_error, lost, silent
+from dora_systemd.decisions.remote.failures import ending_error, failed_there, lost, silent
 from dora_systemd.decisions.remote.hosts import Host
 from dora_systemd.decisions.remote.stream import AfterMark
 from dora_systemd.errors import TimedOut
@@ -86,7 +86,11 @@ def _probe(host: Host, arguments: Sequence[str], mark: str) -> Probe:
     begun = time.time_ns()
     status, output, errors = _run(host, arguments)
     ended = time.time_ns()
-    facts = parse_facts(_require(host, mark, output, errors, status))
+    answer = _require(host, mark, output, errors, status)
+    if status:
+        complained = AfterMark(mark).feed(errors).decode("utf-8", "replace")
+        raise failed_there(host, complained, status)
+    facts = parse_facts(answer)
     return Probe(facts, _skew(facts.now, begun // _MICROSECOND_NS, ended // _MICROSECOND_NS))
 
 

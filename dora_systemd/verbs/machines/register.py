@@ -91,7 +91,7 @@ def add_machine(
     required(problems(own_facts(scope), found.facts, found.skew), name)
     key = make_key(key_place(scope, environment), name)
     public = public_key(key)
-    line = authorized_line(found.facts.program, public, f"dora-systemd:{name}")
+    line = authorized_line(found.facts.program, public, _comment(name))
     run_there(host, _INSTALL, key_text(public), line)
     yield f"Key {key} may run parts of dataflows there as {found.facts.user}"
     probe_as_link(host, name, str(key))
@@ -99,18 +99,38 @@ def add_machine(
     yield f"Machine added: {name} ({host.text}), in {file}"
 
 
-def remove_machine(scope: Scope, environment: Mapping[str, str], machine: Known) -> Iterator[str]:
-    """Undo add_machine(). Raises DoraSystemdError."""
+def remove_machine(
+    scope: Scope, environment: Mapping[str, str], machine: Known, is_forced: bool = False
+) -> Iterator[str]:
+    """Undo add_machine(); yields what was done.
+
+    is_forced: also if the machine keeps the line with its key. Raises DoraSystemdError; then
+    nothing is removed.
+    """
     file = config_file(scope, environment)
     text = _without(file, machine.name)
     if machine.key:
         try:
             run_there(machine.host, _REMOVE, key_text(public_key(Path(machine.key))))
         except DoraSystemdError as error:
-            yield f"its key is still let in there: {error.message}"
+            if not is_forced:
+                raise _not_removed(machine, error) from error
+            line = f"delete the line that ends in {_comment(machine.name)} there"
+            yield f"~/.ssh/authorized_keys of {machine.host.text} still has its key: {line}"
         remove_key(Path(machine.key))
     _write(file, text)
     yield f"Machine removed: {machine.name} ({machine.host.text})"
+
+
+def _comment(name: str) -> str:
+    """The end of the line in authorized_keys."""
+    return f"dora-systemd:{name}"
+
+
+def _not_removed(machine: Known, error: DoraSystemdError) -> DoraSystemdError:
+    message = f"cannot remove the key of machine {machine.name} there: {error.message}"
+    hint = f"try again later, or forget it here: doractl machine remove --force {machine.name}"
+    return DoraSystemdError(message, hint, error.code)
 
 
 def _key(place: Path, name: str) -> str:

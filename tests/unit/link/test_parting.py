@@ -22,6 +22,12 @@ def test_what_may_pass(status: int, said: str, complaint: str, words: str) -> No
     assert found.words.startswith(words)
 
 
+def test_another_key_than_that_of_the_machine_is_no_way_in() -> None:
+    found = last_word("b", 8, True, "", OF_DORACTL)
+    assert isinstance(found, Unreached)
+    assert (found.tries, found.hint) == (0, "see machines in dora-systemd.yml(5)")
+
+
 @pytest.mark.parametrize("reason", ["No route to host", "Connection refused", "timed out"])
 def test_a_machine_that_may_boot(reason: str) -> None:
     words = f"connect to host b port 22: {reason}"

@@ -79,10 +79,14 @@ def test_with_a_restart_policy_the_next_run_waits_for_the_machine(state: State) 
     cell, actions = step(cell, life.ChildExited(7, "daemon", Exit()))
     assert (cell.state, cell.reload, cell.exit) == (State.ENDED, True, RunnerExit.OK)
     assert (*cell.lost, *events_of(actions)) == ("gpu",)
-    _, actions = step(
-        head(State.GATHERING, lost=frozenset({"gpu"})), life.MachineJoined(8, "gpu")
-    )
+    _, actions = step(head(State.GATHERING, lost=frozenset({"gpu"})), life.MachineJoined(8, "gpu"))
     assert events_of(actions) == ["machine-back"]
+
+
+def test_a_port_that_is_taken_there_is_no_failure() -> None:
+    cell, _ = step(head(State.GATHERING), life.ReloadAsked(1))
+    cell, actions = step(cell, life.ChildExited(7, "daemon", Exit()))
+    assert (cell.state, cell.reload, events_of(actions)) == (State.ENDED, True, [])
 
 
 def test_the_failure_of_a_part_is_one_of_the_dataflow_whatever_the_policy() -> None:

@@ -14,7 +14,8 @@ MARK = f"doralink-{'0' * 32}"
 def test_a_key_can_do_nothing_else() -> None:
     line = authorized_line("/usr/bin/doractl", PUBLIC, "dora-systemd:gpu")
     assert line.startswith("restrict,port-forwarding,permitlisten=")
-    assert 'permitopen="127.0.0.1:*"' in line
+    assert 'permitopen="127.0.0.1:61000"' in line
+    assert "*" not in line, "that would be each service of the machine"
     assert 'command="/usr/bin/doractl member" ssh-ed25519 AAAAC3NzaC1lZDI1NTE5 dora' in line
 
 

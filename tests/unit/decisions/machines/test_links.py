@@ -55,6 +55,8 @@ def test_no_command_line_of_a_link(argv: list[str]) -> None:
 
 def test_the_member_hears_its_own_name_first() -> None:
     assert member_words(LINK) == ["member", "--as=gpu", *WORDS[1:]]
+    with_key = member_words(LINK._replace(identity="/etc/key"))
+    assert with_key == ["member", "--restricted", "--as=gpu", *WORDS[1:]]
 
 
 def test_ports_are_the_same_on_both_machines() -> None:
@@ -111,7 +113,10 @@ def test_a_link_lives_as_long_as_the_unit_of_the_head(is_user: bool) -> None:
     found = link_unit("/usr/bin/python3", SOCKET, options(placed=PLACED), member, is_user)
     text = format_unit(found.properties)
     assert found.unit == "doralink-robot:gpu.service"
-    for line in ("StopWhenUnneeded=yes", "Restart=always", "Before=dora-robot.service"):
+    for line in (
+        *("StopWhenUnneeded=yes", "Restart=always", "Before=dora-robot.service"),
+        *("WatchdogSec=25s", "WatchdogSignal=SIGKILL"),
+    ):
         assert line in text
     assert "StartLimitIntervalSec=0" in text
     assert ("ProtectSystem=strict" in text) is not is_user

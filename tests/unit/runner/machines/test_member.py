@@ -140,7 +140,7 @@ def test_what_the_head_says(tmp_path: Path) -> None:
         ]
         bench.be(stop_by="SIGTERM")
         bench.actions[Do.EXIT]()
-        assert other.heard() == [{"type": "ended", "reason": "", "by": "", "failed": 0}], "the head knows why"
+        assert other.heard() == [{"type": "ended", "reason": "", "by": "", "failed": 0}]
 
     run(tmp_path, work)
 

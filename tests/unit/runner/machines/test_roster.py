@@ -201,13 +201,16 @@ def test_a_machine_that_is_not_reached(tries: int, is_awaited: bool, most: int |
     ("is_awaited", "cause"), [(True, Cause.NO_MACHINE), (False, Cause.MACHINE_LOST)]
 )
 def test_a_port_that_is_taken_there(is_awaited: bool, cause: Cause) -> None:
-    """Restart= then brings other ports."""
+    """Another run has other ports; a machine that forwards none is not asked for ever."""
 
     async def work(bench: Bench) -> None:
         bench.roster.is_awaited = is_awaited
-        other = await bench.link()
-        other.say(wire.Taken("cannot forward a port to b: 61000", ""))
-        await settle()
+        for _ in range(4):
+            assert {type(one) for one in bench.heard()} <= {life.ReloadAsked}
+            other = await bench.link()
+            other.say(wire.Taken("cannot forward a port to b: 61000", ""))
+            await settle()
+        assert len(bench.heard()) == 4
         assert refusals(bench) == [("machine gpu: cannot forward a port to b: 61000", cause)]
 
     run(work)

@@ -60,10 +60,32 @@ def test_a_damaged_key_can_be_removed(home: Path) -> None:
     (known,) = known_machines(USER, environment(home))
     public = Path(f"{known.key}.pub")
     public.write_text("")
-    note, last = remove_machine(USER, environment(home), known)
-    assert "cannot read the public key" in note
+    with pytest.raises(DoraSystemdError, match="cannot read the public key"):
+        list(remove_machine(USER, environment(home), known))
+    note, last = remove_machine(USER, environment(home), known, is_forced=True)
+    assert "the line that ends in dora-systemd:gpu" in note
     assert last.startswith("Machine removed")
     assert not public.exists()
+
+
+def test_a_machine_that_is_away_is_not_removed(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else its key would be let in there for ever, and nobody here would know which one."""
+    list(add_machine(USER, environment(home), GPU, "gpu"))
+    (known,) = known_machines(USER, environment(home))
+
+    def away(*_: object) -> None:
+        raise DoraSystemdError("cannot reach alice@gpu-box", "", ExitCode.NO_HOST)
+
+    monkeypatch.setattr(register, "run_there", away)
+    with pytest.raises(DoraSystemdError) as caught:
+        list(remove_machine(USER, environment(home), known))
+    assert caught.value.code is ExitCode.NO_HOST
+    assert "--force" in caught.value.hint
+    assert known_machines(USER, environment(home)) == [known]
+    assert Path(known.key).exists()
+    note, _ = remove_machine(USER, environment(home), known, is_forced=True)
+    assert note.startswith("~/.ssh/authorized_keys of alice@gpu-box still has its key")
+    assert not Path(known.key).exists()
 
 
 @pytest.mark.parametrize(
