@@ -17,6 +17,7 @@ from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Protocol
 
 from dora_systemd.adapters.bus.manager import Manager, is_at_rest
 from dora_systemd.adapters.bus.systemd import Bus
@@ -41,6 +42,16 @@ FIRST_LINES = 10
 """The default of journalctl --follow."""
 
 _CHUNK = 1 << 18
+
+
+class Watch(Protocol):
+    """What tells follow_steps() that there is something new: a UnitWatch."""
+
+    def wait(self, seconds: float) -> bool:
+        """Wait for a new record, at most `seconds`; whether there is one."""
+
+    def take_end(self) -> bool:
+        """Whether systemd has logged an end of the unit since the last call."""
 
 
 class UnitWatch(Follower):
@@ -122,12 +133,15 @@ def _with_cursor(query: LogQuery, cursor: Path) -> LogQuery:
 
 
 def follow_steps(
-    print_step: Callable[[], object], watch: UnitWatch, is_up: Callable[[], bool]
+    print_step: Callable[[], object],
+    watch: Watch,
+    is_up: Callable[[], bool],
+    end_seconds: float = END_SECONDS,
 ) -> None:
     """Call `print_step` whenever there are new records, and once after the end.
 
     is_up: whether the unit runs or is about to. A record of its end alone does not count, because
-    a restart writes one too.
+    a restart writes one too; end_seconds: how long to wait for that record.
     """
     has_more = is_up()
     while True:
@@ -140,14 +154,14 @@ def follow_steps(
         if has_ended or not has_news:
             has_more = is_up()
         if not (has_more or has_ended):
-            _wait_end(watch)
+            _wait_end(watch, end_seconds)
         elif has_more and has_news:
             time.sleep(max(printed + STEP_SECONDS - time.monotonic(), 0))
 
 
-def _wait_end(watch: UnitWatch) -> None:
-    """Wait for systemd's record of the unit's end, at most END_SECONDS."""
-    deadline = time.monotonic() + END_SECONDS
+def _wait_end(watch: Watch, seconds: float) -> None:
+    """Wait for systemd's record of the unit's end, at most `seconds`."""
+    deadline = time.monotonic() + seconds
     while not watch.take_end() and time.monotonic() < deadline:
         watch.wait(STEP_SECONDS)
 

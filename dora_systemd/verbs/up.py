@@ -1,7 +1,7 @@
 """`doractl up`: opens the port on which systemd starts the gateway."""
 
 import errno
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from dora_systemd.decisions.gateway.place import (
 from dora_systemd.decisions.unit.file import BOOT_TARGET
 from dora_systemd.decisions.unit.setup_files import gateway_files
 from dora_systemd.decisions.views.diagnosis import Process
-from dora_systemd.decisions.views.findings import State
+from dora_systemd.decisions.views.findings import Finding, State
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.trust.paths import user_name
@@ -38,7 +38,12 @@ _NO_LISTENER = "a connection may have had it in the last minute: try again"
 
 def check_machine(reach: Callable[[Scope], Manager], scope: Scope) -> None:
     """Raise DoraSystemdError for the first problem that `doractl doctor` finds."""
-    for one in examine(reach, scope):
+    refuse_problems(examine(reach, scope))
+
+
+def refuse_problems(findings: Iterable[Finding]) -> None:
+    """Raise DoraSystemdError for the first of them that is a problem."""
+    for one in findings:
         if one.state is State.PROBLEM:
             is_said = one.text.startswith("cannot ")
             message = one.text if is_said else f"cannot run dataflows here: {one.topic}: {one.text}"

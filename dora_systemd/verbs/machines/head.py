@@ -18,13 +18,15 @@ from dora_systemd.decisions.machines.wire import (
 )
 from dora_systemd.errors import DoraSystemdError
 
-PART_SECONDS = 30.0
-"""For each line until the part: the head may just start, and have much else to do."""
-_MOST_SECONDS = 60.0
-
 
 class Head:
-    """The head, by two file descriptors. Within its block it hears that this side is there."""
+    """The head, by two file descriptors. Within its block it hears that this side is there.
+
+    line_seconds: for each line until the part: the head may just start, and have much else to do.
+    """
+
+    line_seconds = 30.0
+    most_seconds = 60.0
 
     def __init__(self, reading: int = 0, writing: int = 1) -> None:
         self._reading, self._writing = reading, writing
@@ -42,9 +44,9 @@ class Head:
 
     def part(self) -> Part:
         """What to run. Raises DoraSystemdError (FAILURE) if nobody says it."""
-        most = time.monotonic() + _MOST_SECONDS
+        most = time.monotonic() + self.most_seconds
         while True:
-            deadline = min(most, time.monotonic() + PART_SECONDS)
+            deadline = min(most, time.monotonic() + self.line_seconds)
             line = read_line(self._reading, deadline)
             if not line.endswith(b"\n") and len(line) < MAX_LINE:
                 raise _silent()
@@ -67,14 +69,14 @@ class Head:
             self._over.wait(BEAT_SECONDS)
 
 
-def read_line(fd: int, deadline: float) -> bytes:
+def read_line(fd: int, deadline: float, most: int = MAX_LINE) -> bytes:
     """One line, and not a byte more: what follows is for the relay.
 
     Without its end if nobody says more, or not before `deadline`, in seconds of the monotonic
-    clock. Raises OSError.
+    clock, or after `most` bytes. Raises OSError.
     """
     line = b""
-    while not line.endswith(b"\n") and len(line) < MAX_LINE:
+    while not line.endswith(b"\n") and len(line) < most:
         seconds = max(deadline - time.monotonic(), 0)
         byte = os.read(fd, 1) if select.select([fd], [], [], seconds)[0] else b""
         if not byte:

@@ -14,7 +14,7 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import NoReturn
+from typing import NoReturn, Protocol
 
 from dora_systemd import __version__
 from dora_systemd.adapters.bus.manager import Manager, is_at_rest
@@ -33,7 +33,7 @@ from dora_systemd.trust.sockets import plain
 from dora_systemd.values import INFINITY
 from dora_systemd.verbs.facts.cells import read_cell
 from dora_systemd.verbs.facts.reason import failure_reason, runners_refusal
-from dora_systemd.verbs.machines.head import Head, read_line
+from dora_systemd.verbs.machines.head import read_line
 from dora_systemd.verbs.start.claim import make_room, refuse_unit_file, require_free_name
 from dora_systemd.verbs.start.enable import drop_unit_files
 from dora_systemd.verbs.start.linger import is_lingering, linger_command
@@ -42,19 +42,23 @@ from dora_systemd.verbs.start.unit import plan_properties, systemd_number
 
 _START_SECONDS = 60.0
 """For the first words of the runner."""
-_END_SECONDS = 60.0
-"""For a part of a former start to end; an attempt later may find it gone."""
-_ADDRESS_SECONDS, _LOOK_SECONDS = 10.0, 0.1
+_LOOK_SECONDS = 0.1
 _PASSING = (ExitCode.FAILURE, ExitCode.NO_SYSTEMD)
 """Errors that the next attempt may not meet, such as a machine that still boots."""
 
 
 @dataclass(frozen=True)
 class MemberRequest:
-    """The command line. start: what to run, with name, UUID, nodes and the name of this machine."""
+    """The command line. start: what to run, with name, UUID, nodes and the name of this machine.
+
+    address_seconds: until this machine must have its address. end_seconds: for a part of a former
+    start to end; an attempt later may find it gone.
+    """
 
     scope: Scope
     start: StartRequest
+    address_seconds: float = 10.0
+    end_seconds: float = 60.0
 
     @property
     def unit(self) -> str:
@@ -67,7 +71,17 @@ def is_passing(error: DoraSystemdError) -> bool:
     return error.code in _PASSING
 
 
-def start_member(manager: Manager, request: MemberRequest, head: Head) -> socket.socket:
+class Teller(Protocol):
+    """Who says what to run: the part of a Head that a start needs."""
+
+    def part(self) -> Part:
+        """What to run. Raises DoraSystemdError."""
+
+    def say(self, line: bytes) -> None:
+        """Say a whole line."""
+
+
+def start_member(manager: Manager, request: MemberRequest, head: Teller) -> socket.socket:
     """Start the part that the head describes; the connection to its runner, which is its life.
 
     The first line of the runner has been passed on. Raises DoraSystemdError; then nothing runs.
@@ -76,7 +90,7 @@ def start_member(manager: Manager, request: MemberRequest, head: Head) -> socket
     _check_part(part, request.start)
     _check_forwards(part)
     _check_linger(request.scope)
-    _wait_for_address(request.start.addresses, is_passing=bool(part.again))
+    _wait_for_address(request, is_passing=bool(part.again))
     _end_old_part(manager, request)
     boot = require_free_name(manager, request.scope, request.unit)
     refuse_unit_file(boot)
@@ -126,9 +140,9 @@ def _check_linger(scope: Scope) -> None:
         raise _refusal("the user there does not linger, so it would end with this session", hint)
 
 
-def _wait_for_address(addresses: Sequence[str], is_passing: bool) -> None:
+def _wait_for_address(request: MemberRequest, is_passing: bool) -> None:
     """Return when this machine has its own one. It may be of a network that comes up late."""
-    deadline = time.monotonic() + _ADDRESS_SECONDS
+    addresses, deadline = request.start.addresses, time.monotonic() + request.address_seconds
     while addresses and not is_own(addresses[0]):
         if time.monotonic() > deadline:
             hint = "see machines in dora-systemd.yml(5): address"
@@ -152,7 +166,7 @@ def _end_old_part(manager: Manager, request: MemberRequest) -> None:
 
 
 def _wait_for_end(manager: Manager, request: MemberRequest) -> None:
-    deadline = time.monotonic() + _END_SECONDS
+    deadline = time.monotonic() + request.end_seconds
     while not _is_down(manager, request.unit):
         if time.monotonic() > deadline:
             message = f"cannot start {request.unit}: its former part is still being stopped"
@@ -245,10 +259,10 @@ def _failure(manager: Manager, unit: str) -> DoraSystemdError:
     return refusal or DoraSystemdError(f"cannot start {unit}: {failure_reason(manager, unit)}")
 
 
-def _first_line(runner: socket.socket) -> bytes:
+def _first_line(runner: socket.socket, seconds: float = _START_SECONDS) -> bytes:
     """Without its end if it does not come: a byte now and then must not keep root's process."""
     with suppress(OSError):
-        return read_line(runner.fileno(), time.monotonic() + _START_SECONDS)
+        return read_line(runner.fileno(), time.monotonic() + seconds)
     return b""
 
 

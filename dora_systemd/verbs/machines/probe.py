@@ -110,15 +110,17 @@ def _require(host: Host, mark: str, output: bytes, errors: bytes, status: int) -
     return answer.decode("utf-8", "replace")
 
 
-def _run(host: Host, arguments: Sequence[str]) -> tuple[int, bytes, bytes]:
+def _run(
+    host: Host, arguments: Sequence[str], seconds: float = SECONDS
+) -> tuple[int, bytes, bytes]:
     """Exit status of ssh, and what came by it, in bounds: the machine may talk for ever."""
     pipe = subprocess.PIPE
-    deadline = time.monotonic() + SECONDS
+    deadline = time.monotonic() + seconds
     with start_ssh(arguments, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe) as child:
         try:
             status, (output, errors) = read_child(child, deadline, "ssh")
         except TimedOut as error:
-            raise silent(host, SECONDS, "no answer") from error
+            raise silent(host, seconds, "no answer") from error
         finally:
             child.kill()  # nothing, if it has ended
         return status, output, errors

@@ -6,7 +6,7 @@ either end, the whole directory has to be root's.
 
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from dora_systemd.adapters.host.process import run_command
@@ -20,6 +20,7 @@ from dora_systemd.decisions.machines.push import (
     rsync_command,
     target_of,
 )
+from dora_systemd.decisions.remote.hosts import Host
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.trust.tree import strange_part
 from dora_systemd.values import shown
@@ -31,10 +32,15 @@ _SECONDS = 24 * 3600.0
 _NONE = "rsync is not installed"
 
 
-def push(plan: Plan, stage: Callable[[str], None]) -> None:
+def push(
+    plan: Plan,
+    stage: Callable[[str], None],
+    ask: Callable[[Host, Sequence[str]], str] = ask_as_caller,
+) -> None:
     """Copy the directory of the dataflow to each member. stage: is told what happens.
 
-    All machines are asked before the first copy. Raises DoraSystemdError.
+    ask: gives what doractl prints on a host. All machines are asked before the first copy. Raises
+    DoraSystemdError.
     """
     dataflow = plan.options.dataflow
     if not plan.members:
@@ -44,7 +50,7 @@ def push(plan: Plan, stage: Callable[[str], None]) -> None:
     _check_here(Path(dataflow).parent)
     for member in plan.members:
         stage(f"asking machine {member.machine}")
-        check_place(member, ask_as_caller(member.host, place_words(member)))
+        check_place(member, ask(member.host, place_words(member)))
     for member in plan.members:
         stage(f"copying files to machine {member.machine}, {target_of(member)}")
         _copy(member, dataflow)

@@ -18,8 +18,8 @@ from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.verbs.logs import FollowedLog
 from dora_systemd.verbs.remote.talk import Ended, Said, Talk
 
-_SOON_SECONDS, _LATER_SECONDS = 0.5, 5.0
-"""Before the next attempt: the part there is not begun yet, or the machine is away."""
+_PAUSES = (0.5, 5.0)
+"""Seconds before the next attempt: the part there is not begun yet, or the machine is away."""
 _TURNS = 16
 """Reads at one look: a flood of lines must not keep the caller here."""
 _LAST_SECONDS, _QUIET_SECONDS, _LOOK_SECONDS = 2.0, 0.7, 0.05
@@ -31,7 +31,7 @@ _EARLIER = 1_000_000
 class MemberLines:
     """The lines of the nodes of one machine, from `since_us` (CLOCK_REALTIME) on.
 
-    warn: is told once why there are none.
+    warn: is told once why there are none. pauses: as _PAUSES.
     """
 
     def __init__(
@@ -41,9 +41,11 @@ class MemberLines:
         nodes: Sequence[str],
         since_us: int,
         warn: Callable[[str], object],
+        pauses: tuple[float, float] = _PAUSES,
     ) -> None:
         self._host, self._nodes, self._warn = host, frozenset(nodes), warn
         self._name, self._uuid = dataflow
+        self._soon, self._later = pauses
         self._since = since_us - _EARLIER
         self._records = Records()
         self._talk: Talk | None = None
@@ -97,7 +99,7 @@ class MemberLines:
     def _lose(self, ended: Ended) -> None:
         self._talk = None
         is_early = ended.error is None and ended.status == ExitCode.NOT_FOUND
-        self._due = time.monotonic() + (_SOON_SECONDS if is_early else _LATER_SECONDS)
+        self._due = time.monotonic() + (self._soon if is_early else self._later)
         if not is_early and not self._has_warned:
             self._has_warned = True
             why = ended.error.message if ended.error else f"exit status {ended.status}"

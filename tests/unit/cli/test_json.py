@@ -13,6 +13,7 @@ from dora_systemd.cli.group import VERBS
 from dora_systemd.cli.parameters import print_warnings
 from dora_systemd.errors import ExitCode
 from dora_systemd.scope import Scope
+from tests.unit.fakes.journal import FakeJournal
 from tests.unit.fakes.library import fake_systemd
 from tests.unit.fakes.manager import UUID, FakeManager, options
 
@@ -34,7 +35,7 @@ def manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FakeManager:
     (wants / UNIT).symlink_to(f"../{UNIT}")
     fake_systemd(monkeypatch, manager)
     monkeypatch.setattr(Scope, "runtime_root", tmp_path / "run")
-    monkeypatch.setattr("dora_systemd.verbs.facts.ended._last_events", lambda _scope: [])
+    FakeJournal(monkeypatch, tmp_path)
     return manager
 
 

@@ -6,32 +6,24 @@ from typing import Any
 
 import pytest
 
-from dora_systemd.adapters.journal.reader import JournalReader, LastEvent
 from dora_systemd.cli import listing
 from dora_systemd.cli.listing import ListRequest
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.errors import DoraSystemdError
+from dora_systemd.scope import Scope
+from tests.unit.fakes.journal import FakeJournal, life_record
 from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
 
 OTHER = UUID[:-1] + "1"
 
 
-class Journal:
-    """Two dataflows that systemd does not know; counts how often it is asked."""
-
-    def __init__(self) -> None:
-        self.limits: list[int] = []
-
-    def __call__(self, _scope: object, limit: int, **_what: Any) -> list[LastEvent]:
-        self.limits.append(limit)
-        names = (("old", "dataflow-failed"), ("older", "dataflow-stopped"))
-        return [LastEvent(name, OTHER, event, 9, "it broke") for name, event in names][:limit]
-
-
 @pytest.fixture
-def journal(monkeypatch: pytest.MonkeyPatch) -> Journal:
-    found = Journal()
-    monkeypatch.setattr(JournalReader, "last_events", lambda _, *one, **two: found(*one, **two))
+def journal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FakeJournal:
+    """Two dataflows that systemd does not know."""
+    found = FakeJournal(monkeypatch, tmp_path)
+    names = (("old", "dataflow-failed"), ("older", "dataflow-stopped"))
+    more: dict[str, Any] = {"scope": Scope(True, 1000), "DORA_REASON": "it broke"}
+    found.write(*(life_record(event, 9, name, OTHER, **more) for name, event in names))
     return found
 
 
@@ -46,14 +38,15 @@ def names(place: Path, **request: Any) -> str:
     return " ".join(row.name for row in rows)
 
 
-def test_what_runs_needs_no_journal(tmp_path: Path, journal: Journal) -> None:
+def test_what_runs_needs_no_journal(tmp_path: Path, journal: FakeJournal) -> None:
     assert names(tmp_path) == "a b-arm"
     assert names(tmp_path, pattern="ARM") == "b-arm"
     assert names(tmp_path, status="running", sort_by="name") == "a b-arm"
-    assert journal.limits == []
+    assert journal.asked == []
 
 
-def test_what_ended_is_below_it(tmp_path: Path, journal: Journal) -> None:
+@pytest.mark.usefixtures("journal")
+def test_what_ended_is_below_it(tmp_path: Path) -> None:
     assert names(tmp_path, want_all=True) == "a b-arm old older bad"
     assert names(tmp_path, want_all=True, sort_by="name") == "a b-arm bad old older"
     assert names(tmp_path, last=1) == "a b-arm old"
@@ -61,7 +54,6 @@ def test_what_ended_is_below_it(tmp_path: Path, journal: Journal) -> None:
     # The newest of those that match, not those that match of the newest.
     assert names(tmp_path, status="failed", pattern="bad", last=1) == "bad"
     assert names(tmp_path, status="stopped", last=5) == "older"
-    assert journal.limits == [103, 103, 4, 103, 103, 103]
 
 
 ROWS = [

@@ -10,8 +10,11 @@ from typing import Any
 
 
 @contextmanager
-def fake_runner(directory: Path, *done: str) -> Iterator[list[dict[str, Any]]]:
-    """A runner with its socket in `directory`, which reports to have done that: its requests."""
+def fake_runner(directory: Path, *done: str, **more: object) -> Iterator[list[dict[str, Any]]]:
+    """A runner with its socket in `directory`, which reports to have done that: its requests.
+
+    more: keys of each answer.
+    """
     directory.mkdir(parents=True, exist_ok=True)
     path = directory / "runner.sock"
     asked: list[dict[str, Any]] = []
@@ -22,7 +25,7 @@ def fake_runner(directory: Path, *done: str) -> Iterator[list[dict[str, Any]]]:
                 stream, _ = listener.accept()
                 with stream, stream.makefile("rb") as lines:
                     asked.append(json.loads(lines.readline()))
-                    stream.sendall(json.dumps({"done": done}).encode() + b"\n")
+                    stream.sendall(json.dumps({"done": done, **more}).encode() + b"\n")
 
     with socket.socket(socket.AF_UNIX) as listener:
         listener.bind(str(path))

@@ -123,7 +123,16 @@ def test_the_page_starts_what_has_ended(
 ) -> None:
     flow = str(tmp_path / "gone.yml")
     own = {"DORA_DATAFLOW_NAME": "arm", "DORA_DATAFLOW": NOBODY, "DORA_FILE": flow}
-    FakeJournal(monkeypatch, tmp_path).write({"_PID": "7", "DORA_SETTINGS": "{}", **own})
+    FakeJournal(monkeypatch, tmp_path).write(
+        {
+            "_PID": "7",
+            "_UID": str(os.getuid()),
+            "DORA_EVENT": "start-asked",
+            "DORA_SCOPE": "user",
+            "DORA_SETTINGS": "{}",
+            **own,
+        }
+    )
     with pytest.raises(DoraSystemdError, match=f"{flow}"):
         bench.act("start", NOBODY)
     with pytest.raises(DoraSystemdError, match="cannot enable arm: it has ended") as caught:

@@ -8,7 +8,6 @@ import pytest
 
 from dora_systemd.decisions.logs.records import Record
 from dora_systemd.decisions.remote.hosts import Host
-from dora_systemd.verbs.remote import attached
 from dora_systemd.verbs.remote.attached import MemberLines, SharedLog
 
 UUID = "550e8400-e29b-41d4-a716-446655440000"
@@ -39,7 +38,7 @@ class Bench:
         doractl.write_text(f'#!/bin/sh\necho "$@" >>{self.asked}\ncat {root}/said\nexit {status}\n')
         doractl.chmod(0o755)
         told = (HERE, ("robot", UUID), ["mid"], BEGUN_US, self.warnings.append)
-        self.lines = MemberLines(*told)
+        self.lines = MemberLines(*told, pauses=(0.0, 0.0))
 
     def look_until(self, is_so: Callable[[list[Record]], bool]) -> list[Record]:
         found: list[Record] = []
@@ -58,8 +57,6 @@ class Bench:
 @pytest.fixture
 def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, int], Bench]:
     monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
-    monkeypatch.setattr(attached, "_SOON_SECONDS", 0.0)
-    monkeypatch.setattr(attached, "_LATER_SECONDS", 0.0)
     return lambda said, status: Bench(tmp_path, said, status)
 
 

@@ -8,15 +8,13 @@ from typing import Any
 
 import pytest
 
-from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.decisions.gateway.place import SERVICE_UNIT, SOCKET_UNIT
 from dora_systemd.decisions.unit.file import BOOT_TARGET
 from dora_systemd.decisions.views.outcome import Outcome
 from dora_systemd.names import SLICE
-from dora_systemd.verbs import destroy as destroy_module
-from dora_systemd.verbs import stop as stop_module
 from dora_systemd.verbs.destroy import processes_left, stop_all, stop_gateway, stop_slice
 from dora_systemd.verbs.up import PORT_FILE
+from tests.unit.fakes.cgroups import fake_cgroups
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options
 
 ROBOT = "dora-robot.service"
@@ -55,8 +53,7 @@ class Systemd(FakeManager):
 
 @pytest.fixture
 def systemd(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Systemd:
-    for module in (destroy_module, stop_module):
-        monkeypatch.setattr(module, "POLL_SECONDS", 0)
+    monkeypatch.setattr("time.sleep", lambda _seconds: None)
     return Systemd(tmp_path / "etc")
 
 
@@ -169,10 +166,10 @@ def test_the_slice(
 def test_processes_that_are_left(
     systemd: Systemd, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cgroup, "mount_point", lambda: tmp_path)
+    mount = fake_cgroups(monkeypatch, tmp_path)
     assert processes_left(systemd, [], count(1.0).__next__) == []
     for unit, pid in ((ROBOT, os.getpid()), ("foreign.service", os.getppid())):
-        group = tmp_path / SLICE / unit / "node-a"
+        group = mount / SLICE / unit / "node-a"
         group.mkdir(parents=True)
         (group / "cgroup.procs").write_text(f"{pid}\n")
         (group.parent / "cgroup.events").write_text("populated 1\n")

@@ -9,9 +9,7 @@ import pytest
 from dora_systemd.decisions.logs.query import LogQuery, query_arguments
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
-from dora_systemd.verbs import follow as follow_module
 from dora_systemd.verbs.follow import (
-    UnitWatch,
     check_until_end,
     first_step,
     follow_steps,
@@ -23,7 +21,7 @@ from tests.unit.fakes.manager import FakeManager, options
 QUERY = LogQuery(Scope(is_user=False, uid=0), name="robot", is_follow=True)
 
 
-class History(UnitWatch):
+class History:
     """What happens, one item for each wait: "line", "end", "" (silence), "up" or "down"."""
 
     def __init__(self, *happens: str) -> None:
@@ -51,15 +49,15 @@ class History(UnitWatch):
     def print_step(self) -> None:
         self.shown = list(self.log)
 
-    def follow(self) -> list[str]:
-        follow_steps(self.print_step, self, lambda: self.up)
+    def follow(self, end_seconds: float = 3.0) -> list[str]:
+        follow_steps(self.print_step, self, lambda: self.up, end_seconds)
         assert list(self.happens) == []
         return self.shown
 
 
 @pytest.fixture(autouse=True)
 def short_times(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(follow_module, "STEP_SECONDS", 0.0)
+    monkeypatch.setattr("time.sleep", lambda _seconds: None)
 
 
 def test_until_the_end() -> None:
@@ -82,9 +80,8 @@ def test_systemd_is_asked_in_silence() -> None:
     assert History("line", "down", "", "line", "end").follow() == ["first", "line", "line"]
 
 
-def test_an_end_that_nobody_tells_is_an_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(follow_module, "END_SECONDS", 0.0)
-    assert History("line", "down", "").follow() == ["first", "line"]
+def test_an_end_that_nobody_tells_is_an_end() -> None:
+    assert History("line", "down", "").follow(0.0) == ["first", "line"]
 
 
 def test_steps(tmp_path: Path) -> None:

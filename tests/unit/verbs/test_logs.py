@@ -4,10 +4,9 @@ import os
 import select
 import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -16,7 +15,6 @@ from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.decisions.logs.query import UNIT_ENDS, LogQuery, query_matches
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
-from dora_systemd.verbs import logs
 from dora_systemd.verbs.facts.recorded import find_query, find_soon
 from dora_systemd.verbs.follow import UnitWatch
 from dora_systemd.verbs.logs import FollowedLog, pass_logs
@@ -242,7 +240,6 @@ def test_lines_go_on_after_journalctl_has_died(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """With the record after the last whole one; and nothing is asked meanwhile."""
-    monkeypatch.setattr(logs, "AGAIN_SECONDS", 0.5)
     calls, script = tmp_path / "calls", tmp_path / "journalctl"
     make_program(
         script,
@@ -285,25 +282,25 @@ def test_a_watch_goes_on_after_journalctl_has_died(
         assert len(calls.read_text().splitlines()) == 2
 
 
-def test_lines_go_on_after_an_automatic_restart(monkeypatch: pytest.MonkeyPatch) -> None:
-    reading, writing = os.pipe()
-
-    @contextmanager
-    def journalctl(*_: object, **__: object) -> Iterator[SimpleNamespace]:
-        with os.fdopen(reading, "rb") as stdout:
-            yield SimpleNamespace(stdout=stdout)
-
-    monkeypatch.setattr(logs, "open_journalctl", journalctl)
+def test_lines_go_on_after_an_automatic_restart(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    os.mkfifo(tmp_path / "lines")
+    writing = os.open(tmp_path / "lines", os.O_RDWR)
+    make_program(tmp_path / "journalctl", f"exec cat {tmp_path}/lines")
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
     printed: list[bytes] = []
     log = FollowedLog(QUERY.scope, "robot", ROBOT, 0, printed.append, lambda one: one["MESSAGE"])
     end = b"MESSAGE_ID=%s\nMESSAGE=end\n\n" % UNIT_ENDS[1].encode()
     with closing(log):
         os.write(writing, b"MESSAGE=one\n\n" + end)
-        log.print_new()
-        assert log.has_ended
+        while not log.has_ended:
+            assert log.is_readable(20)
+            log.print_new()
         os.write(writing, b"MESSAGE=two\n\n" + end)
-        log.finish()
-        log.print_new()
+        while printed[-1] == b"one":
+            assert log.is_readable(20)
+            log.finish()
     assert (printed, log.has_ended) == ([b"one", b"two"], True)
     os.close(writing)
 

@@ -3,6 +3,8 @@
 import os
 import socket
 from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.verbs import node
 from dora_systemd.verbs.facts.cells import Cell, read_cells
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options
+from tests.unit.fakes.runner import fake_runner
 
 
 @pytest.fixture
@@ -144,13 +147,11 @@ def test_words_of_dora_are_no_orders_for_a_terminal(scope: Scope, cell: Cell) ->
     assert "Location" not in caught.value.message
 
 
-def test_a_port_of_somebody_else(scope: Scope, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_port_of_somebody_else(scope: Scope) -> None:
     """What the runner names is its user's to say: root gives no token to another's port."""
-    with socket.create_server(("127.0.0.1", 0)) as other:
+    with socket.create_server(("127.0.0.1", 0)) as other, ExitStack() as held:
         told = Coordinator(other.getsockname()[1], "secret", 4712)
-        monkeypatch.setattr(
-            "dora_systemd.adapters.runner_socket.client.ask_coordinator", lambda _: told
-        )
+        held.enter_context(fake_runner(scope.cell_directory("robot"), **asdict(told)))
         manager = FakeManager()
         manager.add(options())
         (cell,) = read_cells(manager)

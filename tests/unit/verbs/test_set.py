@@ -23,6 +23,7 @@ from dora_systemd.values import INFINITY
 from dora_systemd.verbs.facts.cells import Cell, read_cell
 from dora_systemd.verbs.reload import switch_hot_reload
 from dora_systemd.verbs.set import set_limits
+from tests.unit.fakes.cgroups import fake_cgroups
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options
 
 NODES = {"camera": NodeStatus("running", 5, kind="python"), "ui": NodeStatus(kind="dynamic")}
@@ -73,9 +74,7 @@ class Place:
 
 @pytest.fixture
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Place:
-    monkeypatch.setattr(
-        "dora_systemd.adapters.cgroup.groups.mount_point", lambda: tmp_path / "cgroup"
-    )
+    fake_cgroups(monkeypatch, tmp_path)
     return Place(tmp_path)
 
 

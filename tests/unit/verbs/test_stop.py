@@ -15,7 +15,6 @@ from dora_systemd.decisions.cell.restarts import RestartPolicy
 from dora_systemd.decisions.cell.status import CellStatus
 from dora_systemd.scope import Scope
 from dora_systemd.values import SECOND
-from dora_systemd.verbs.facts import budget as budget_module
 from dora_systemd.verbs.facts.budget import restart_budget
 from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.facts.reason import failure_reason
@@ -26,6 +25,7 @@ from dora_systemd.verbs.stop import (
     stop_cells,
     stop_cells_within,
 )
+from tests.unit.fakes.journal import FakeJournal
 from tests.unit.fakes.library import fake_journalctl
 from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
 
@@ -183,7 +183,8 @@ def test_no_budget_without_policy() -> None:
     assert restart_budget(manager, ScopeIn(True, 1000), cell, CellStatus()) is None
 
 
-def test_budget(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_budget(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    FakeJournal(monkeypatch, tmp_path)
     manager = FakeManager()
     facts = {"Restart": "on-failure", "StartLimitBurst": 4, "StartLimitIntervalUSec": 60 * SECOND}
     manager.add(
@@ -196,7 +197,6 @@ def test_budget(monkeypatch: pytest.MonkeyPatch) -> None:
         **facts,
     )
     (cell,) = read_cells(manager)
-    monkeypatch.setattr(budget_module, "_starts", lambda *_: [])
     assert restart_budget(manager, ScopeIn(True, 1000), cell, CellStatus()) == {
         "used": 0,
         "max": 3,

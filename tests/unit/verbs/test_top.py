@@ -1,14 +1,15 @@
 """Looks of `doractl top`, at a fake systemd and a fake cgroup tree."""
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from dora_systemd.adapters.cgroup import groups as cgroup
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.top import Top
+from tests.unit.fakes.cgroups import fake_cgroups
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options
 
 GROUP = "/dora.slice/dora-robot.service"
@@ -26,8 +27,7 @@ Use = Callable[[int], None]
 @pytest.fixture
 def use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Use:
     """Sets the CPU time and the waits of a cgroup tree with one node, in seconds."""
-    monkeypatch.setattr(cgroup, "mount_point", lambda: tmp_path / "cgroup")
-    node = tmp_path / "cgroup" / GROUP[1:] / "node-camera"
+    node = fake_cgroups(monkeypatch, tmp_path) / GROUP[1:] / "node-camera"
     node.mkdir(parents=True)
 
     def use(seconds: int) -> None:
@@ -51,7 +51,7 @@ def manager_of(*states: str) -> FakeManager:
 def clock(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """The monotonic clock in µs, which stands still."""
     now = [SECOND]
-    monkeypatch.setattr("dora_systemd.verbs.facts.reading._monotonic_us", lambda: now[0])
+    monkeypatch.setattr(time, "clock_gettime_ns", lambda _clock: now[0] * 1000)
     return now
 
 

@@ -11,12 +11,11 @@ from dora_systemd.decisions.gateway.place import SERVICE_UNIT, SOCKET_UNIT
 from dora_systemd.decisions.unit.file import BOOT_TARGET
 from dora_systemd.decisions.views.findings import Finding, State
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.verbs import up
 from dora_systemd.verbs.gateway import read_gateway
 from dora_systemd.verbs.up import (
     PORT_FILE,
-    check_machine,
     open_port,
+    refuse_problems,
     start_boot_target,
 )
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options
@@ -128,19 +127,21 @@ def test_a_port_without_a_listener(systemd: Systemd, scope: ScopeIn) -> None:
 def test_a_port_that_is_not_for_everyone(
     systemd: Systemd, scope: ScopeIn, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(up, "port_error", lambda _port: errno.EACCES)
+    def refuse(*_: object) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(socket.socket, "bind", refuse)
     with pytest.raises(DoraSystemdError, match="cannot open port 80") as caught:
         open_port(systemd, scope, 80)
     assert caught.value.code is ExitCode.NO_PERMISSION
 
 
-def test_problems_of_the_machine(monkeypatch: pytest.MonkeyPatch, scope: ScopeIn) -> None:
+def test_problems_of_the_machine() -> None:
     found = [Finding("linger", State.WARNING, "x"), Finding("dora", State.OK, "y")]
-    monkeypatch.setattr(up, "examine", lambda _reach, _scope: found)
-    check_machine(lambda _: FakeManager(), scope)
+    refuse_problems(found)
     found.append(Finding("systemd", State.PROBLEM, "version 1 is too old", "upgrade"))
     with pytest.raises(DoraSystemdError, match="cannot run dataflows here: systemd: version 1"):
-        check_machine(lambda _: FakeManager(), scope)
+        refuse_problems(found)
 
 
 @pytest.mark.parametrize(("active", "started"), [("inactive", ["robot"]), ("active", [])])

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from dora_systemd.adapters.journal.reader import JournalReader
+from dora_systemd.decisions.logs.events import EVENTS
 from dora_systemd.decisions.views.dataflows import format_dataflows
 from dora_systemd.decisions.views.objects import dataflow_object
 from dora_systemd.decisions.why.report import format_report
@@ -15,6 +16,7 @@ from dora_systemd.verbs.facts.whole import read_whole_rows
 from dora_systemd.verbs.needs.notes import held_notes
 from dora_systemd.verbs.top import Top
 from dora_systemd.verbs.why import explain
+from tests.unit.fakes.journal import FakeJournal, life_record
 from tests.unit.fakes.manager import FakeManager, options
 
 UNIT = "dora-robot.service"
@@ -66,9 +68,9 @@ def test_why_says_it_and_how_the_last_life_ended(
     manager: FakeManager, scope: Scope, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hold(manager, tmp_path / UNIT)
-    own = {"DORA_EVENT": "dataflow-finished", "DORA_DATAFLOW": options().uuid}
-    record = {**own, "INVOCATION_ID": "1", "__REALTIME_TIMESTAMP": "1"}
-    monkeypatch.setattr(JournalReader, "newest", lambda _, *__, **___: iter([record]))
+    message = EVENTS["dataflow-finished"].message_id
+    finished = life_record("dataflow-finished", 1, MESSAGE_ID=message, INVOCATION_ID="1")
+    FakeJournal(monkeypatch, tmp_path).write(finished)
     shown = format_report(explain(manager, scope, "robot", JournalReader()))
     assert shown.startswith("robot: Waiting\n  Now:      the start waits for network since ")
     assert "Before:   all nodes ended by themselves" in shown

@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 
 from dora_systemd.adapters.cgroup import groups as cgroup
-from dora_systemd.adapters.journal.reader import JournalReader, LastEvent
 from dora_systemd.decisions.cell.counters import CpuSample
 from dora_systemd.decisions.cell.exits import exit_of
 from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
@@ -27,6 +26,8 @@ from dora_systemd.verbs.facts.list import dataflow_row, read_rows, table_rows
 from dora_systemd.verbs.facts.reading import read_dataflow, read_status
 from dora_systemd.verbs.facts.snapshot import read_snapshot
 from dora_systemd.verbs.list import find_row
+from tests.unit.fakes.cgroups import fake_cgroups
+from tests.unit.fakes.journal import FakeJournal
 from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
 
 GROUP = "/dora.slice/dora-robot.service"
@@ -46,8 +47,7 @@ def scope(tmp_path: Path) -> Scope:
 @pytest.fixture
 def unit_group(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A cgroup tree with one node that used 2 s of CPU and 1 MiB, and an empty RuntimeDirectory."""
-    monkeypatch.setattr(cgroup, "mount_point", lambda: tmp_path / "cgroup")
-    group = tmp_path / "cgroup" / GROUP[1:]
+    group = fake_cgroups(monkeypatch, tmp_path) / GROUP[1:]
     node = group / "node-camera"
     node.mkdir(parents=True)
     for place, cpu, memory in ((group, 4 * SECOND, 3 << 20), (node, 2 * SECOND, 1 << 20)):
@@ -289,14 +289,10 @@ def test_failed_dataflow(scope: Scope) -> None:
     assert row_of(manager, scope).ended == 0
 
 
-def test_a_row_is_found_by_selector(scope: Scope, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[dict[str, Any]] = []
-
-    def last_events(*_: object, **what: Any) -> list[LastEvent]:
-        asked.append(what)
-        return []
-
-    monkeypatch.setattr(JournalReader, "last_events", last_events)
+def test_a_row_is_found_by_selector(
+    scope: Scope, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    journal = FakeJournal(monkeypatch, tmp_path)
     manager = FakeManager()
     manager.add(
         options(),
@@ -306,7 +302,8 @@ def test_a_row_is_found_by_selector(scope: Scope, monkeypatch: pytest.MonkeyPatc
     )
     row = find_row(manager, scope, "robot")
     assert (row.name, row.text, row.ended) == ("robot", "node a: exit code 1", 7)
-    assert asked == [{"limit": 1, "name": "robot"}]
+    (asked,) = journal.asked
+    assert "_SYSTEMD_USER_UNIT=dora-robot.service" in asked
     assert read_status(scope, read_cells(manager)[0]) == CellStatus()
 
 

@@ -7,11 +7,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dora_systemd.adapters.bus.manager import UnitState
-from dora_systemd.adapters.journal.reader import JournalReader, LastEvent
+from dora_systemd.adapters.journal.reader import LastEvent
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.verbs.facts.cells import Cell, read_cells
 from dora_systemd.verbs.facts.ended import ended_row
 from dora_systemd.verbs.facts.selector import Selector, find_all
+from tests.unit.fakes.journal import FakeJournal, life_record
 from tests.unit.fakes.manager import UUID, FakeManager, ScopeIn, options
 
 OTHER = "550e8400-0000-41d4-a716-446655440000"
@@ -125,10 +126,11 @@ def test_selectors_of_ended_ones(selector: str, fits: bool) -> None:
 
 
 def test_the_newest_one_that_has_ended(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    names = (("other", OTHER), ("robot", UUID), ("robot", OTHER))
-    events = [LastEvent(name, uuid, "dataflow-stopped", 1, "") for name, uuid in names]
-    monkeypatch.setattr(JournalReader, "last_events", lambda _self, _scope: events)
+    names = (("other", THIRD), ("robot", UUID), ("robot", OTHER))
     scope = ScopeIn(is_user=True, uid=1000, root=tmp_path)
+    records = [life_record("dataflow-stopped", 1, *one, scope=scope) for one in names]
+    FakeJournal(monkeypatch, tmp_path).write(*records)
+    events = [LastEvent(*one, "dataflow-stopped", 1, "") for one in names]
     assert Selector("robot").ended(scope) == ended_row(events[1])
     assert Selector("dora-other.service").ended(scope) == ended_row(events[0])
     assert Selector("nobody").ended(scope) is None

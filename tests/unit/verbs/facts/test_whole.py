@@ -5,12 +5,11 @@ from typing import Any
 
 import pytest
 
-from dora_systemd.adapters.journal.reader import JournalReader
+from dora_systemd.decisions.logs.query import UNIT_STARTING
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.why.report import Subject
 from dora_systemd.scope import Scope
 from dora_systemd.values import SECOND
-from dora_systemd.verbs.facts import ended
 from dora_systemd.verbs.facts.budget import _starts
 from dora_systemd.verbs.facts.cells import read_cells
 from dora_systemd.verbs.facts.list import mark_enabled
@@ -18,6 +17,7 @@ from dora_systemd.verbs.facts.snapshot import read_snapshot
 from dora_systemd.verbs.facts.whole import read_whole_rows
 from dora_systemd.verbs.top import Top
 from dora_systemd.verbs.why import subject_row
+from tests.unit.fakes.journal import FakeJournal, life_record
 from tests.unit.fakes.manager import UUID, FakeManager, options
 
 UNIT = "dora-robot.service"
@@ -39,6 +39,11 @@ def enabled(manager: FakeManager) -> FakeManager:
     return manager
 
 
+@pytest.fixture
+def journal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FakeJournal:
+    return FakeJournal(monkeypatch, tmp_path)
+
+
 def test_all_who_look_know_it(enabled: FakeManager, scope: Scope) -> None:
     (listed,) = read_whole_rows(enabled, scope, read_cells(enabled))
     (seen,) = Top(enabled, scope).look().entries
@@ -54,32 +59,26 @@ def test_an_older_one_of_that_name_is_not_enabled(enabled: FakeManager, scope: S
 
 
 def test_the_journal_is_asked_once_in_a_life(
-    enabled: FakeManager, scope: Scope, monkeypatch: pytest.MonkeyPatch
+    enabled: FakeManager, scope: Scope, journal: FakeJournal
 ) -> None:
-    asked = []
+    def asked() -> list[bool]:
+        return ["--lines=3 " in one for one in journal.asked if UNIT_STARTING in one]
 
-    def starts(_self: JournalReader, _scope: Scope, _name: str, limit: int) -> list[int]:
-        asked.append(limit)
-        return []
-
-    monkeypatch.setattr(JournalReader, "starts", starts)
     _starts.cache_clear()
     facts = enabled.units[UNIT]
     facts["NRestarts"] = 2
     for state in ("running", "running", "reload", "running"):
         facts["SubState"] = state
         read_whole_rows(enabled, scope, read_cells(enabled))
-    assert asked == [3, 3]
+    assert asked() == [True] * 2
     facts["ActiveEnterTimestampMonotonic"] = SECOND
     read_whole_rows(enabled, scope, read_cells(enabled))
-    assert asked == [3, 3, 3]
+    assert asked() == [True] * 3
 
 
-def test_the_subject_of_a_report(
-    enabled: FakeManager, scope: Scope, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_subject_of_a_report(enabled: FakeManager, scope: Scope, journal: FakeJournal) -> None:
     gone = DataflowRow(UUID, "gone", "dora-gone.service", "Finished", ended=1)
-    monkeypatch.setattr(ended, "ended_rows", lambda *_: [gone])
+    journal.write(life_record("dataflow-finished", 1, "gone"))
     loaded = Subject(UUID, "robot", UNIT, "--system", is_loaded=True)
     assert subject_row(enabled, scope, loaded).restart_budget == NEVER_YET
     assert subject_row(enabled, scope, Subject(UUID, "gone", gone.unit, "--system")) == gone

@@ -1,14 +1,14 @@
 """What a member hears before it runs anything, by pipes in the place of ssh."""
 
 import os
+import time
 from collections.abc import Iterator
 
 import pytest
 
 from dora_systemd.decisions.machines.wire import Beat, Part, Ready, format_message, parse_message
 from dora_systemd.errors import DoraSystemdError
-from dora_systemd.verbs.machines import head as module
-from dora_systemd.verbs.machines.head import Head
+from dora_systemd.verbs.machines.head import Head, read_line
 from tests.unit.fakes.manager import UUID
 
 PART = Part("robot", UUID, "gpu", "s3cret", 61001, 61003, "0" * 64, 5, "0.1.0", "1.1.0")
@@ -36,22 +36,25 @@ def test_what_follows_the_part_is_left_to_the_relay(pipes: tuple[int, int, int, 
 
 
 @pytest.mark.parametrize("said", [b"", b"hello\n", format_message(Ready("/x")), b"x" * 300_000])
-def test_a_head_that_says_something_else(
-    pipes: tuple[int, int, int, int], said: bytes, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_head_that_says_something_else(pipes: tuple[int, int, int, int], said: bytes) -> None:
     reading, far_write, _, writing = pipes
-    monkeypatch.setattr(module, "PART_SECONDS", 0.2)
-    monkeypatch.setattr(module, "MAX_LINE", 1000)
     os.write(far_write, said[:60_000])
+    head = Head(reading, writing)
+    head.line_seconds = 0.2
     with pytest.raises(DoraSystemdError):
-        Head(reading, writing).part()
+        head.part()
 
 
-def test_a_head_that_only_beats(
-    pipes: tuple[int, int, int, int], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_line_without_an_end_is_read_to_a_bound(pipes: tuple[int, int, int, int]) -> None:
+    reading, far_write, _, _ = pipes
+    os.write(far_write, b"x" * 3000)
+    assert read_line(reading, time.monotonic() + 60, 1000) == b"x" * 1000
+
+
+def test_a_head_that_only_beats(pipes: tuple[int, int, int, int]) -> None:
     reading, far_write, _, writing = pipes
-    monkeypatch.setattr(module, "_MOST_SECONDS", 0.2)
     os.write(far_write, format_message(Beat()) * 3)
+    head = Head(reading, writing)
+    head.most_seconds = 0.2
     with pytest.raises(DoraSystemdError, match="no head says what to run"):
-        Head(reading, writing).part()
+        head.part()

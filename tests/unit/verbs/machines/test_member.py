@@ -39,11 +39,16 @@ class FakeHead:
     def part(self) -> Part:
         return self._part
 
+    def say(self, line: bytes) -> None:
+        raise AssertionError(line)
 
-def refused(manager: FakeManager, tmp_path: Path, part: Part = PART) -> DoraSystemdError:
-    request = MemberRequest(ScopeIn(False, 0, tmp_path), START)
+
+def refused(
+    manager: FakeManager, tmp_path: Path, part: Part = PART, **seconds: float
+) -> DoraSystemdError:
+    request = MemberRequest(ScopeIn(False, 0, tmp_path), START, **seconds)
     with pytest.raises(DoraSystemdError) as caught:
-        start_member(manager, request, FakeHead(part))  # type: ignore[arg-type]
+        start_member(manager, request, FakeHead(part))
     assert not [call for call in manager.calls if call[0] == "start"]
     return caught.value
 
@@ -65,23 +70,21 @@ def test_an_sshd_that_opens_forwards_to_the_network(tmp_path: Path) -> None:
     assert not is_passing(error)
 
 
-def test_an_address_that_this_machine_does_not_have(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_an_address_that_this_machine_does_not_have(tmp_path: Path) -> None:
     """At a restart another attempt may help: its network may come up late."""
-    monkeypatch.setattr(member, "_ADDRESS_SECONDS", 0.0)
     start = replace(START, addresses=("192.0.2.1", "127.0.0.1"))
-    request = MemberRequest(ScopeIn(False, 0, tmp_path), start)
+    request = MemberRequest(ScopeIn(False, 0, tmp_path), start, address_seconds=0.0)
     for again in (0, 1):
         part = replace(PART, again=again)
         with pytest.raises(DoraSystemdError, match="no address") as caught:
-            start_member(FakeManager(), request, FakeHead(part))  # type: ignore[arg-type]
+            start_member(FakeManager(), request, FakeHead(part))
         assert is_passing(caught.value) == bool(again)
-    member._wait_for_address(("127.0.0.1", "192.0.2.1"), is_passing=False)
+    own = replace(request, start=replace(START, addresses=("127.0.0.1", "192.0.2.1")))
+    with pytest.raises(DoraSystemdError, match=START.dataflow):
+        start_member(FakeManager(), own, FakeHead(PART))
 
 
-def test_a_runner_that_never_ends_its_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(member, "_START_SECONDS", 0.3)
+def test_a_runner_that_never_ends_its_line() -> None:
     runner, own = socket.socketpair()
     is_over = Event()
 
@@ -92,7 +95,7 @@ def test_a_runner_that_never_ends_its_line(monkeypatch: pytest.MonkeyPatch) -> N
 
     talk = Thread(target=dribble)
     talk.start()
-    waiting = Thread(target=member._first_line, args=(own,), daemon=True)
+    waiting = Thread(target=member._first_line, args=(own, 0.3), daemon=True)
     waiting.start()
     waiting.join(10)
     is_stuck = waiting.is_alive()
@@ -121,13 +124,12 @@ def test_a_runner_can_only_shorten_the_grace(tmp_path: Path) -> None:
         assert (found.grace, found.start_timeout) == (taken, INFINITY)
 
 
-def test_an_old_part_ends_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also if what comes then is refused."""
+def test_an_old_part_ends_first(tmp_path: Path) -> None:
+    """Also if what comes then is refused: there is no such file."""
     manager = FakeManager()
     unit = manager.add(options(placed=START.placed, machine="gpu"))
     manager.after_job[unit] = {"ActiveState": "inactive", "LoadState": "not-found"}
-    monkeypatch.setattr(member, "make_plan", _refuse)
-    assert refused(manager, tmp_path).message == "enough"
+    assert START.dataflow in refused(manager, tmp_path).message
     assert ("StopUnit", unit) in manager.calls
 
 
@@ -143,21 +145,17 @@ def dying(monkeypatch: pytest.MonkeyPatch) -> FakeManager:
             manager.units[unit].update(ActiveState="inactive", LoadState="not-found")
 
     monkeypatch.setattr("time.sleep", sleep)
-    monkeypatch.setattr(member, "make_plan", _refuse)
     return manager
 
 
 def test_a_part_of_a_former_start_that_ends_is_awaited(dying: FakeManager, tmp_path: Path) -> None:
     """Its head is gone, and the name is about to be free."""
-    assert refused(dying, tmp_path).message == "enough"
+    assert START.dataflow in refused(dying, tmp_path).message
     assert not dying.calls, "it ends by itself"
 
 
-def test_a_part_that_does_not_end_may_do_so_later(
-    dying: FakeManager, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(member, "_END_SECONDS", 0.0)
-    error = refused(dying, tmp_path)
+def test_a_part_that_does_not_end_may_do_so_later(dying: FakeManager, tmp_path: Path) -> None:
+    error = refused(dying, tmp_path, end_seconds=0.0)
     assert "still being stopped" in error.message
     assert is_passing(error)
 
@@ -171,7 +169,3 @@ def test_another_dataflow_that_ends_is_not_awaited(tmp_path: Path) -> None:
 def test_what_may_pass() -> None:
     assert is_passing(DoraSystemdError("systemd boots", "", ExitCode.NO_SYSTEMD))
     assert not is_passing(DoraSystemdError("another file", "", ExitCode.BAD_INPUT))
-
-
-def _refuse(*_: object) -> None:
-    raise DoraSystemdError("enough", "", ExitCode.BAD_INPUT)

@@ -37,8 +37,7 @@ def test_a_machine_that_never_stops_talking_fills_no_memory(
 def test_a_machine_that_does_not_end(
     script: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(probe, "SECONDS", 0.2)
     ssh(tmp_path, monkeypatch, script)
     with pytest.raises(DoraSystemdError, match="cannot reach alice@gpu-box: no answer") as caught:
-        probe._run(GPU, [])
+        probe._run(GPU, [], 0.2)
     assert caught.value.code is ExitCode.NO_HOST

@@ -7,42 +7,42 @@ from pathlib import Path
 
 import pytest
 
-from dora_systemd.adapters.host.process import Completed
 from dora_systemd.decisions.machines.member import Member
 from dora_systemd.decisions.machines.push import format_place
 from dora_systemd.decisions.remote.hosts import Host, parse_host
 from dora_systemd.decisions.settings.resolve import resolve_settings
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.verbs.machines import push as module
 from dora_systemd.verbs.machines.push import place_problem, push
 from dora_systemd.verbs.start.plan import Plan
 from tests.unit.fakes.manager import ScopeIn, options
+from tests.unit.fakes.programs import make_program
 
 
 class Bench:
     """What a push does, in its order. answers: by host."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-        self.done: list[str] = []
+        self.log = tmp_path / "done"
+        self.log.touch()
         self.answers: dict[str, str] = {}
-        self.problem: tuple[str, str] | None = None
-        monkeypatch.setattr(module, "place_problem", lambda *_: self.problem)
-        monkeypatch.setattr(module, "ask_as_caller", self._ask)
-        monkeypatch.setattr(module, "run_command", self._run)
+        copy = f'for one; do last=$one; done; echo "copy $last" >> {self.log}'
+        make_program(tmp_path / "bin/rsync", copy)
+        monkeypatch.setenv("PATH", f"{tmp_path}/bin:/bin")
         members = [Member(one, parse_host(one), ("member", "/srv/r/f.yml")) for one in ("b", "c")]
         scope, settings = ScopeIn(True, 1000, tmp_path), resolve_settings({}, {}, [])
         self.plan = Plan(scope, options(), settings, None, {}, members=tuple(members))
 
     def _ask(self, host: Host, words: Sequence[str]) -> str:
-        self.done.append(f"ask {host.text} {words[1]}")
+        with self.log.open("a") as log:
+            log.write(f"ask {host.text} {words[1]}\n")
         return self.answers.get(host.text, format_place("", ""))
 
-    def _run(self, command: Sequence[str], _: float) -> Completed:
-        self.done.append(f"copy {command[-1]}")
-        return Completed(0, "", "")
+    @property
+    def done(self) -> list[str]:
+        return self.log.read_text().splitlines()
 
     def push(self) -> None:
-        push(self.plan, lambda _: None)
+        push(self.plan, lambda _: None, self._ask)
 
 
 @pytest.fixture
@@ -65,9 +65,11 @@ def test_one_machine_that_takes_nothing_is_enough(bench: Bench) -> None:
     assert not [one for one in bench.done if one.startswith("copy")]
 
 
-def test_what_is_wrong_here_comes_first(bench: Bench) -> None:
-    bench.problem = "/srv/r/x belongs to bob", "hint"
-    with pytest.raises(DoraSystemdError, match="belongs to bob") as caught:
+def test_what_is_wrong_here_comes_first(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(DoraSystemdError, match=r"^cannot copy /srv: rsync is not inst") as caught:
         bench.push()
     assert caught.value.code is ExitCode.BAD_INPUT
     assert not bench.done

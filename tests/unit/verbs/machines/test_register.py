@@ -1,23 +1,23 @@
 """The machines of a config.yml, without ssh."""
 
+import json
 from pathlib import Path
 
 import pytest
 
-from dora_systemd.decisions.machines.facts import Facts
+from dora_systemd import __version__
 from dora_systemd.decisions.remote.hosts import parse_host
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
-from dora_systemd.verbs.machines import register
-from dora_systemd.verbs.machines.probe import Probe
 from dora_systemd.verbs.machines.register import (
     add_machine,
     chosen,
     known_machines,
     remove_machine,
 )
+from tests.unit.fakes.programs import make_dora
+from tests.unit.fakes.ssh import fake_ssh
 
-FACTS = Facts("0.1.0", "1.1.0", "/usr/bin/doractl", "alice", True, 5)
 USER = Scope(True, 1000)
 GPU = parse_host("alice@gpu-box")
 
@@ -25,11 +25,11 @@ GPU = parse_host("alice@gpu-box")
 @pytest.fixture
 def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A home whose machines all answer."""
-    told: list[tuple[str, ...]] = []
-    monkeypatch.setattr(register, "probe_as_caller", lambda _host: Probe(FACTS, 0))
-    monkeypatch.setattr(register, "probe_as_link", lambda *_: Probe(FACTS, 0))
-    monkeypatch.setattr(register, "own_facts", lambda _scope: FACTS)
-    monkeypatch.setattr(register, "run_there", lambda *words: told.append(words))
+    facts = {"program": "/usr/bin/doractl", "user": "alice", "linger": True, "now": 0}
+    said = json.dumps({"doractl": __version__, "dora": "1.1.0", **facts})
+    fake_ssh(monkeypatch, tmp_path, f"echo '{said}' | sed \"s/: 0}}/: $(date +%s%6N)}}/\"")
+    make_dora(tmp_path / "bin/dora", "1.1.0")
+    monkeypatch.delenv("VIRTUAL_ENV", raising=False)
     monkeypatch.setattr("dora_systemd.verbs.start.settings.SYSTEM_FILE", tmp_path / "none")
     return tmp_path
 
@@ -43,7 +43,9 @@ def test_there_and_back(home: Path) -> None:
     file.parent.mkdir(parents=True)
     file.write_text("# mine\ngrace_duration: 3s\n")
     file.chmod(0o600)
+    let_in = home / "there/.ssh/authorized_keys"
     *_, last = add_machine(USER, environment(home), GPU, "gpu")
+    assert "/usr/bin/doractl" in let_in.read_text()
     assert last == f"Machine added: gpu (alice@gpu-box), in {file}"
     (known,) = known_machines(USER, environment(home))
     assert (known.name, known.host, Path(known.key).parent.name) == ("gpu", GPU, "ssh")
@@ -53,6 +55,7 @@ def test_there_and_back(home: Path) -> None:
     assert last == "Machine removed: gpu (alice@gpu-box)"
     assert file.read_text() == "# mine\ngrace_duration: 3s\n"
     assert list((file.parent / "ssh").iterdir()) == []
+    assert let_in.read_text() == ""
 
 
 def test_a_damaged_key_can_be_removed(home: Path) -> None:

@@ -1,19 +1,17 @@
 """What a start leaves in the journal, and a start by name."""
 
 import json
-from collections.abc import Iterator
+import socket
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.decisions.settings.resolve import resolve_settings
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.selector import Selector
-from dora_systemd.verbs.start import asked as asked_module
 from dora_systemd.verbs.start.again import (
     Asked,
     find_known,
@@ -22,6 +20,7 @@ from dora_systemd.verbs.start.again import (
     note_start,
 )
 from dora_systemd.verbs.start.plan import Plan, StartRequest
+from tests.unit.fakes.journal import FakeJournal
 from tests.unit.fakes.manager import UUID, FakeManager, options
 
 SCOPE = Scope(is_user=False, uid=0)
@@ -38,27 +37,18 @@ KEPT = {
 def record(name: str = "robot", uuid: str = UUID, **fields: Any) -> dict[str, Any]:
     settings = json.dumps(KEPT)
     own = {"DORA_DATAFLOW_NAME": name, "DORA_DATAFLOW": uuid, "DORA_FILE": f"/srv/{name}.yml"}
+    own |= {"_UID": "0", "DORA_EVENT": "start-asked", "DORA_SCOPE": "system"}
     return {"_PID": "77", "DORA_SETTINGS": settings, **own, **fields}
 
 
 @pytest.fixture
-def journal(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
-    """The records of starts, newest first; journalctl's own matches are left out."""
-    records: list[dict[str, Any]] = []
-
-    def newest(_: object, matches: list[str], *__: object, **___: object) -> Iterator[Any]:
-        names = [one.partition("=")[2] for one in matches if one.startswith("DORA_DATAFLOW_NAME=")]
-        for one in records:
-            if not names or one["DORA_DATAFLOW_NAME"] in names:
-                yield one
-
-    monkeypatch.setattr(JournalReader, "newest", newest)
-    return records
+def journal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FakeJournal:
+    return FakeJournal(monkeypatch, tmp_path)
 
 
 def test_a_start_is_noted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     sent: list[bytes] = []
-    monkeypatch.setattr(asked_module, "send_note", sent.append)
+    monkeypatch.setattr(socket.socket, "sendto", lambda _, data, *__: sent.append(data))
     monkeypatch.chdir(tmp_path)
     plan = Plan(SCOPE, options(), resolve_settings({}, {}, []), None, {})
     request = StartRequest("robot.yml", flags=FLAGS, environment={"DORA_GRACE_DURATION": "3s"})
@@ -75,8 +65,9 @@ def test_a_start_is_noted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> No
 @pytest.mark.parametrize(
     "text", ["robot", "dora-robot", "dora-robot.service", UUID, UUID[:8], UUID[:8].upper()]
 )
-def test_the_last_start(text: str, journal: list[dict[str, Any]]) -> None:
-    journal += [record("other", UUID.replace("5", "6")), record(), record(DORA_FILE="/srv/old.yml")]
+def test_the_last_start(text: str, journal: FakeJournal) -> None:
+    other, old = record("other", UUID.replace("5", "6")), record(DORA_FILE="/srv/old.yml")
+    journal.write(other, record(), old)
     found = find_start(FakeManager(), SCOPE, Selector(text))
     assert isinstance(found, Asked)
     assert found == Asked("robot", UUID, "/srv/robot.yml", KEPT)
@@ -102,33 +93,30 @@ FORGED: list[dict[str, Any]] = [
 
 
 @pytest.mark.parametrize("fields", FORGED)
-def test_records_that_are_none(fields: dict[str, Any], journal: list[dict[str, Any]]) -> None:
-    journal.append(record(**fields))
+def test_records_that_are_none(fields: dict[str, Any], journal: FakeJournal) -> None:
+    journal.write(record(**fields))
     with pytest.raises(DoraSystemdError) as caught:
         find_start(FakeManager(), SCOPE, Selector("robot"))
     assert caught.value.code is ExitCode.NOT_FOUND
 
 
-def test_what_systemd_knows_comes_first(journal: list[dict[str, Any]]) -> None:
+def test_what_systemd_knows_comes_first(journal: FakeJournal) -> None:
     manager = FakeManager()
     manager.add(options(), active="failed")
-    journal += [record(), record("gone", UUID.replace("5", "6"))]
+    journal.write(record(), record("gone", UUID.replace("5", "6")))
     found = find_start(manager, SCOPE, Selector("robot"))
     assert isinstance(found, Cell)
     cells, ended = find_known(manager, SCOPE, ["robot", "gone", "dora-gone", "rob*"])
     assert ([one.name for one in cells], [one.name for one in ended]) == (["robot"], ["gone"])
     # Other settings are for the plan of the last start.
     assert isinstance(find_start(manager, SCOPE, Selector("robot"), is_changed=True), Asked)
-    journal.clear()
+    journal.write()
     with pytest.raises(DoraSystemdError, match="the journal does not have its start"):
         find_start(manager, SCOPE, Selector("robot"), is_changed=True)
 
 
-def test_a_journal_that_cannot_be_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refused(*_: object, **__: object) -> Iterator[Any]:
-        raise DoraSystemdError("cannot read the journal", "", ExitCode.NO_PERMISSION)
-
-    monkeypatch.setattr(JournalReader, "newest", refused)
+def test_a_journal_that_cannot_be_read(journal: FakeJournal) -> None:
+    journal.complain("No journal files were opened due to insufficient permissions.")
     with pytest.raises(DoraSystemdError, match="no dataflow named 'robot'"):
         find_start(FakeManager(), SCOPE, Selector("robot"))
 
