@@ -15,7 +15,7 @@ from dora_systemd.verbs.machines.register import (
     known_machines,
     remove_machine,
 )
-from tests.unit.fakes.programs import make_dora
+from tests.unit.fakes.programs import make_dora, make_program
 from tests.unit.fakes.ssh import fake_ssh
 
 USER = Scope(True, 1000)
@@ -71,15 +71,11 @@ def test_a_damaged_key_can_be_removed(home: Path) -> None:
     assert not public.exists()
 
 
-def test_a_machine_that_is_away_is_not_removed(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_machine_that_is_away_is_not_removed(home: Path, tmp_path: Path) -> None:
     """Else its key would be let in there for ever, and nobody here would know which one."""
     list(add_machine(USER, environment(home), GPU, "gpu"))
     (known,) = known_machines(USER, environment(home))
-
-    def away(*_: object) -> None:
-        raise DoraSystemdError("cannot reach alice@gpu-box", "", ExitCode.NO_HOST)
-
-    monkeypatch.setattr(register, "run_there", away)
+    make_program(tmp_path / "bin/ssh", "echo 'No route to host' >&2; exit 255")
     with pytest.raises(DoraSystemdError) as caught:
         list(remove_machine(USER, environment(home), known))
     assert caught.value.code is ExitCode.NO_HOST
