@@ -6,6 +6,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, NamedTuple
 
+from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.bus.systemd import Bus
 from dora_systemd.cli.edge import write_own
 from dora_systemd.decisions.views.dataflows import format_dataflows, is_up_word
@@ -114,9 +115,9 @@ def _check(request: ListRequest) -> None:
         raise DoraSystemdError("cannot filter a single dataflow", hint, ExitCode.USAGE)
 
 
-def _rows(bus: Bus, scope: Scope, request: ListRequest) -> list[DataflowRow]:
+def _rows(bus: Manager, scope: Scope, request: ListRequest) -> list[DataflowRow]:
     is_plain = not request.want_all and not request.is_filtered
-    cells = [cell for cell in read_cells(bus) if cell.is_up or not is_plain]
+    cells = [cell for cell in read_cells(bus) if cell.is_up or cell.has_failed or not is_plain]
     if is_plain and not cells:
         return []
     # Where nothing runs, a script that asks each second waits for none of these.
@@ -130,7 +131,8 @@ def _rows(bus: Bus, scope: Scope, request: ListRequest) -> list[DataflowRow]:
         rows = table_rows(bus, scope, cells)
     found = [row for row in rows if is_up_word(row)]
     if is_plain:
-        return found
+        # The UUIDs are for commands that act on what runs.
+        return found if request.is_quiet else [*_failed(bus, scope, rows), *found]
     # Only dataflows that have ended need the journal, and few commands select some rows.
     from dora_systemd.decisions.views.selection import is_of_the_past, matching_rows, sorted_rows
     from dora_systemd.verbs.facts.ended import newest_ended
@@ -142,6 +144,16 @@ def _rows(bus: Bus, scope: Scope, request: ListRequest) -> list[DataflowRow]:
         past = mark_enabled(bus, scope, past)
         found += matching_rows(past, request.status, request.pattern)[: request.last]
     return sorted_rows(found, request.sort_by)
+
+
+def _failed(bus: Manager, scope: Scope, rows: list[DataflowRow]) -> list[DataflowRow]:
+    """The failed dataflows that systemd keeps, with the reason; only these need the journal."""
+    failed = [row for row in rows if not is_up_word(row)]
+    if not failed:
+        return []
+    from dora_systemd.verbs.facts.ended import read_end, with_cause
+
+    return [with_cause(scope, read_end(bus, scope, row)) for row in failed]
 
 
 def _fitting(rows: list[DataflowRow], request: ListRequest) -> list[DataflowRow]:
@@ -165,8 +177,24 @@ def _print_all(rows: list[DataflowRow], request: ListRequest) -> None:
         if width is not None and not all(map(is_up_word, rows)):
             print(f"\n{_MORE}")
     else:
-        is_all = request.want_all or request.is_filtered
-        print("No dataflow." if is_all else "No dataflow is running.")
+        _print_nothing(request)
+
+
+def _print_nothing(request: ListRequest) -> None:
+    """Say that there is no row, and to an ordinary user where dataflows of the system are."""
+    if request.want_all or request.is_filtered:
+        print("No dataflow.")
+        return
+    print("No dataflow is running.")
+    if not scope_of(request.is_user).is_user:
+        return
+    # Imported late: most lists have a row.
+    from dora_systemd.adapters.cgroup.groups import count_units
+    from dora_systemd.names import SLICE
+
+    with suppress(DoraSystemdError):
+        if count := count_units(SLICE):
+            print(f"In system scope: {count} (doractl list --system)")
 
 
 def _print_json(found: DataflowRow | list[DataflowRow]) -> None:

@@ -26,6 +26,18 @@ def test_no_dataflow() -> None:
     assert json.loads(run("doractl", "list", "-o", "json").stdout) == []
 
 
+@pytest.mark.warns("killed", "failed", "Failed", "ended")
+def test_what_failed_comes_first_with_its_reason(cell: Cell, project: Project) -> None:
+    cell.start(project.three_nodes())
+    os.kill(int(cell.show("MainPID")), signal.SIGKILL)
+    wait_for("it has failed", lambda: cell.show("ActiveState") == "failed")
+    (row,) = listed(cell).values()
+    assert (row["name"], row["status"]) == (cell.name, "Failed")
+    assert "killed" in row["text"]
+    assert row["text"] in cell.doractl("list").stdout
+    assert cell.doractl("list", "-q").stdout == ""
+
+
 def test_table(cell: Cell, project: Project) -> None:
     cell.start(project.three_nodes())
     header, row = cell.doractl("list").stdout.splitlines()
@@ -243,6 +255,7 @@ def test_a_user_has_dataflows_of_his_own(cell: Cell, project: Project) -> None:
         assert (row["name"], row["nodes_alive"], row["status"]) == ("hers", 3, "Running")
         assert "hers" not in listed(cell)
         done = run("su", "bob", "-s", "/bin/sh", "-c", "exec doractl list")
-        assert done.stdout == "No dataflow is running.\n"
+        other = "In system scope: 1 (doractl list --system)\n"
+        assert done.stdout == f"No dataflow is running.\n{other}"
     finally:
         as_alice("stop", "--all")

@@ -37,7 +37,12 @@ from dora_systemd.decisions.views.selection import SORTS, STATUSES
     metavar="COLUMN",
     help=f"Sort by {', '.join(SORTS)}; highest first.",
 )
-@click.option("-q", "--quiet", "is_quiet", is_flag=True, help="Print UUIDs only, one a line.")
+@click.option("-q",
+    "--quiet",
+    "is_quiet",
+    is_flag=True,
+    help="Print UUIDs only, one a line; without --all of what runs.",
+)
 @output_option
 @scope_options
 def command(**options: Any) -> int:
@@ -48,7 +53,7 @@ def command(**options: Any) -> int:
     status is 3 unless that dataflow is running, as with systemctl status.
 
     Examples:
-      doractl list                      all that run
+      doractl list                      what failed, and all that run
       doractl list --last 5             also the five that ended last, and why
       doractl list robot                the nodes of one
       doractl list 'cam*' --all         whose name begins so, also what has ended

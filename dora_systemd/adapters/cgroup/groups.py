@@ -16,7 +16,7 @@ from pathlib import Path
 
 from dora_systemd.decisions.resources.usage import Usage
 from dora_systemd.errors import DoraSystemdError, ExitCode
-from dora_systemd.names import is_node_id
+from dora_systemd.names import UNIT_SUFFIX, is_node_id
 from dora_systemd.values import INFINITY, SECOND
 
 NODE_PREFIX = "node-"
@@ -90,6 +90,11 @@ def shown_groups(path: Path, nodes: Iterable[str] = ()) -> dict[str, Path]:
         return _by_node(path, names)
     found = filter(_is_node_group, islice(_names(path), _MAX_ENTRIES))
     return _by_node(path, sorted(found)[:MAX_GROUPS])
+
+
+def count_units(slice_name: str) -> int:
+    """Count the unit groups of a top-level slice of the system manager, 0 if it has none."""
+    return sum(one.endswith(UNIT_SUFFIX) for one in _names(group_path(f"/{slice_name}")))
 
 
 def _names(path: Path) -> Iterator[str]:

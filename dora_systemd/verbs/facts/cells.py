@@ -61,6 +61,11 @@ class Cell:
         """Whether systemd has begun its start, so that there may be processes of it."""
         return self.state.active in UP
 
+    @property
+    def has_failed(self) -> bool:
+        """Whether systemd keeps its unit because it has failed."""
+        return self.state.active == "failed" and not self.state.is_held
+
     def word(self, stage: str = "") -> str:
         """Its status in one word, as status_word(). stage: the runner's own."""
         return status_word(self.state.active, self.state.sub, stage, self.state.is_held)

@@ -115,7 +115,7 @@ def test_the_same_dataflow_in_list_and_top(
     assert main.run(["--system", "list", "robot", "-o", "json"]) == 0
     one = json.loads(capsys.readouterr().out)
     assert main.run(["list", "--system", "-o", "json"]) == 0
-    (listed,) = json.loads(capsys.readouterr().out)
+    _, listed = json.loads(capsys.readouterr().out)  # below the failed one
     (look,) = objects(capsys, "top", "--once")
     assert listed == one == {"schema": 1, **look["dataflows"][0]}
     assert listed["enabled"] is True
@@ -130,7 +130,7 @@ def test_the_budget_is_the_same_in_list_and_top(
     manager.units[UNIT] |= {"Restart": "on-failure", "StartLimitBurst": 6}
     expected = {"used": 0, "max": 5, "next_us": None, "resets_us": None}
     main.run(["list", "--system", "-o", "json"])
-    (listed,) = json.loads(capsys.readouterr().out)
+    _, listed = json.loads(capsys.readouterr().out)
     (look,) = objects(capsys, "top", "--once")
     assert listed["restart_budget"] == look["dataflows"][0]["restart_budget"] == expected
 

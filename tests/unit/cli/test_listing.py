@@ -34,12 +34,15 @@ def names(place: Path, **request: Any) -> str:
     manager.add(options("a"))
     manager.add(options("bad"), "failed", InactiveEnterTimestamp=5, ExecMainStatus=1)
     scope = ScopeIn(is_user=True, uid=1000, root=place)
-    rows = listing._rows(manager, scope, ListRequest(**request))  # type: ignore[arg-type]
+    rows = listing._rows(manager, scope, ListRequest(**request))
     return " ".join(row.name for row in rows)
 
 
+def test_what_failed_comes_first(tmp_path: Path) -> None:
+    assert names(tmp_path) == "bad a b-arm"
+
+
 def test_what_runs_needs_no_journal(tmp_path: Path, journal: FakeJournal) -> None:
-    assert names(tmp_path) == "a b-arm"
     assert names(tmp_path, pattern="ARM") == "b-arm"
     assert names(tmp_path, status="running", sort_by="name") == "a b-arm"
     assert journal.asked == []
