@@ -214,7 +214,7 @@ def test_start_timeout_names_the_late(cell: Cell, project: Project) -> None:
     assert cell.show("ActiveState") == "failed"
 
 
-@pytest.mark.warns("hang", "unresponsive", "crashed", "SIGKILL", "Signal(9)", "restarted", "after")
+@pytest.mark.warns("hang", "unresponsive", "was end", "SIGKILL", "Signal(9)", "restarted", "after")
 def test_a_hang_is_called_one(cell: Cell, project: Project) -> None:
     project.write("hang.py", HANGING)
     project.write("source.py", project.three_nodes().with_name("source.py").read_text())
@@ -227,7 +227,7 @@ def test_a_hang_is_called_one(cell: Cell, project: Project) -> None:
     cell.start(project.write("flow.yml", text), *ON_FAILURE)
     wait_for("it is found out", lambda: ("node-hung", "hang") in cell.events(), 60)
     wait_for("it is restarted", lambda: ("node-restarted", "hang") in cell.events())
-    (crash, *_) = [one for one in cell.journal() if one.get("DORA_EVENT") == "node-crashed"]
+    (crash, *_) = [one for one in cell.journal() if one.get("DORA_EVENT") == "node-ended"]
     assert crash["DORA_EXIT"].startswith("hung, unresponsive for ")
 
 

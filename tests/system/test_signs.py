@@ -14,7 +14,7 @@ from tests.system.gateways import Front
 from tests.system.refusals import Refusal, check_refusals
 
 ON_FAILURE = ("--restart-policy", "on-failure", "--max-restarts", "3")
-ENDED = ("is ended by its watchdog", "crashed", "is being restarted", "node exited with error")
+ENDED = ("is ended by its watchdog", "was ended", "is being restarted", "node exited with error")
 
 # As in dora-systemd(7), without a library.
 SAY = """
@@ -144,7 +144,7 @@ def test_a_node_that_falls_silent_is_restarted(front: Front, cell: Cell, project
     missed = f"no WATCHDOG=1 for {seconds}s"
     assert events["node-watchdog"]["MESSAGE"].endswith(f"by its watchdog: {missed}")
     assert events["node-watchdog"]["DORA_STATUS"] == said["feeder"]
-    assert events["node-crashed"]["DORA_EXIT"] == f"hung, {missed}"
+    assert events["node-ended"]["DORA_EXIT"] == f"hung, {missed}"
     assert "Fatal Python error: Aborted" in cell.messages("feeder")
     assert cell.pids("node-feeder") != [before["feeder"]]
     assert [cell.pids(f"node-{one}")[0] for one in OTHERS] == [before[one] for one in OTHERS]
@@ -182,7 +182,7 @@ def test_no_node_speaks_for_another(cell: Cell, project: Project) -> None:
 def test_nothing_is_left_of_a_node_that_is_not_restarted(cell: Cell, project: Project) -> None:
     project.write("flow.systemd.yml", f"nodes: {{parent: {{watchdog: {limit()}s}}}}")
     cell.start(project.root / write_flow(project, parent=PARENT, idle=IDLE))
-    wait_for("it has failed", lambda: ("node-crashed", "parent") in cell.events())
+    wait_for("it has failed", lambda: ("node-ended", "parent") in cell.events())
     wait_for("nothing is left of it", lambda: not cell.pids("node-parent"))
     assert cell.status.nodes["parent"].state == "failed"
     assert cell.status.nodes["idle"].state == "running"

@@ -14,7 +14,7 @@ from dora_systemd.decisions.cell.environment import find_python
 from dora_systemd.decisions.cell.log_backlog import with_bounds
 from dora_systemd.decisions.cell.machines import placed_on
 from dora_systemd.decisions.cell.options import RunnerOptions
-from dora_systemd.decisions.cell.owed import owes_restart
+from dora_systemd.decisions.cell.owed import base_of
 from dora_systemd.decisions.cell.restarts import DEFAULT, HELD_KEYS, LATCH_KEYS
 from dora_systemd.decisions.cell.uv import Read, uv_project
 from dora_systemd.decisions.descriptor.arguments import split_arguments
@@ -32,6 +32,7 @@ PROGRAM_KEYS = ("path", "args", "build", "git", "branch", "tag", "rev")
 PERL = "/usr/bin/perl"
 """The interpreter of launcher.pl."""
 _UV_RUN = ("uv", "run")
+_BUDGET = ("max_restarts", "restart_window")
 DEFAULT_OPERATOR = "op"
 """dora's id of the operator in a node with a single operator."""
 
@@ -154,10 +155,11 @@ def _restart_keys(node: Node, options: RunnerOptions) -> dict[str, Any]:
         return _restart_bounds(node)
     # dora does not restart nodes made of operators, nor dynamic nodes.
     is_restarted = node.kind not in (NodeKind.OPERATOR, NodeKind.DYNAMIC)
-    policy = options.restart
-    if policy.policy == "no" and owes_restart(options.owes, node.id):
-        policy = policy._replace(policy="on-failure")
-    return policy.dora_keys() if is_restarted and policy.policy != "no" else {}
+    policy = base_of(options.restart, options.owes, node.id)
+    if not is_restarted or policy.policy == "no":
+        return {}
+    own = node.backoff if options.restart.policy == "no" else {}  # it restarts by its owes alone
+    return {**policy.dora_keys(), **{key: own[key] for key in _BUDGET if key in own}}
 
 
 def _restart_bounds(node: Node) -> dict[str, Any]:

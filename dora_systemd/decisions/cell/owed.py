@@ -6,6 +6,7 @@ They are part of the runner's command line, which `list` parses: imports only wh
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
+from dora_systemd.decisions.cell.restarts import RestartPolicy
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import did_you_mean
 from dora_systemd.values import INFINITY, SECOND, format_duration, parse_duration, quoted
@@ -108,6 +109,12 @@ def merge_owed(*given: Iterable[Owed]) -> tuple[Owed, ...]:
 def owes_restart(owes: Iterable[Owed], node: str) -> bool:
     """Whether `node` is restarted if it is silent."""
     return any(one.node == node and one.then == RESTART for one in owes)
+
+
+def base_of(policy: RestartPolicy, owes: Iterable[Owed], node: str) -> RestartPolicy:
+    """The policy of a node without one of its own, from that of the dataflow."""
+    is_needed = policy.policy == "no" and owes_restart(owes, node)
+    return policy._replace(policy="on-failure") if is_needed else policy
 
 
 def is_probe(node: str) -> bool:

@@ -17,6 +17,8 @@ Change = tuple[NodeTable, Record | None]
 
 WITH_PROCESS = frozenset({"starting", "ready", "running"})
 _MAYBE = ("reloading", "waiting")
+FAILURES = ("node-crashed", "node-ended", "node-oom")
+"""The events of a process that has failed."""
 
 
 def has_process(nodes: NodeTable) -> bool:
@@ -229,7 +231,7 @@ def _exited(nodes: NodeTable, event: life.NodeExited, is_stopping: bool) -> Chan
 def with_downstream(record: Record, downstream: Downstream) -> Record:
     """The life event; that of a failed node names the nodes downstream of it."""
     fed = downstream.get(record.node)
-    if record.event not in ("node-crashed", "node-oom") or not fed:
+    if record.event not in FAILURES or not fed:
         return record
     return replace(record, details={**record.details, "downstream": " ".join(fed)})
 
@@ -237,7 +239,10 @@ def with_downstream(record: Record, downstream: Downstream) -> Record:
 def _record_of(event: life.NodeExited, is_stopping: bool) -> Record:
     if event.oom is not None:
         return Record("node-oom", event.node, event.oom.node_details())
-    name = "node-crashed" if event.exit.is_failure and not is_stopping else "node-exited"
+    if is_stopping or not event.exit.is_failure:
+        return Record("node-exited", event.node, event.exit.details())
+    # Nothing crashed: the runner or dora's health check has ended it.
+    name = "node-ended" if event.exit.kind in (ExitKind.HUNG, ExitKind.SILENT) else "node-crashed"
     return Record(name, event.node, event.exit.details())
 
 

@@ -44,6 +44,7 @@ EVENTS = {
     "node-ready": EventKind("b365b9011367406fafffd2bbd63d5693", INFO, "Node {node} is ready"),
     "node-exited": EventKind("617721968a69470486dcfe591e37fd3c", INFO, "Node {node} exited"),
     "node-crashed": EventKind("c2afc7aa5aac4b8882b951d397ce9297", ERR, "Node {node} crashed"),
+    "node-ended": EventKind("7d79b85f556347d18561d021d884cc39", ERR, "Node {node} was ended"),
     "node-restarted": EventKind(
         "436622a1703a4db68ed8a1aac4ddc336", WARNING, "Node {node} is being restarted by dora"
     ),
@@ -134,7 +135,7 @@ EVENTS = {
 # Each life of a dataflow ends with one of these, unless the runner was killed.
 END_EVENTS = ("dataflow-finished", "dataflow-stopped", "dataflow-failed")
 # Each life of a node's process ends with one of these.
-NODE_END_EVENTS = ("node-exited", "node-crashed", "node-oom")
+NODE_END_EVENTS = ("node-exited", "node-crashed", "node-ended", "node-oom")
 
 ROLLED_BACK = "release-rolled-back"
 BUILD_FAILED = "build-failed"

@@ -4,7 +4,7 @@ import re
 
 _TIME = re.compile(rb"(?:\d{4}-\d\d-\d\d[T ])?\d\d:\d\d:\d\d(?:[.,]\d+)?")
 _EXIT_OF_A_NODE = b"node_failure: dora_daemon::"
-"""In a line of dora's daemon about an end, of which node-crashed or node-exited tells too."""
+"""In a line of dora's daemon about an end, which node-crashed, -ended or -exited reports."""
 
 
 def is_same(one: bytes, other: bytes) -> bool:

@@ -8,6 +8,7 @@ from dora_systemd.decisions.cell.limits import BY_KEY, NodeLimits, merge_node_li
 from dora_systemd.decisions.cell.line_rates import RateLimits, merge_rates
 from dora_systemd.decisions.cell.needs import split_needs
 from dora_systemd.decisions.cell.options import RunnerOptions
+from dora_systemd.decisions.cell.owed import RESTART, base_of
 from dora_systemd.decisions.cell.restarts import DEFAULT, RestartPolicy, with_values
 from dora_systemd.decisions.reload.watch_rules import relative_patterns
 from dora_systemd.decisions.rights.node_rights import BY_KEY as RIGHTS
@@ -100,11 +101,11 @@ def restart_policy(settings: Settings) -> RestartPolicy:
 
 def node_policies(settings: Settings) -> tuple[tuple[str, RestartPolicy], ...]:
     """The policies of nodes in settings files, based on that of the dataflow."""
-    base = restart_policy(settings)
+    base, owes = restart_policy(settings), owes_of(settings.by_node(OWES), settings[OWES])
     return tuple(
-        (node, with_values(base, {_FIELDS[key]: values[key] for key in values.keys() & _FIELDS}))
+        (node, with_values(base_of(base, owes, node), {_FIELDS[key]: values[key] for key in given}))
         for node, values in settings.nodes.items()
-        if values.keys() & _FIELDS
+        if (given := values.keys() & _FIELDS)
     )
 
 
@@ -131,6 +132,8 @@ def hot_reload(settings: Settings, root: str) -> HotReload:
 def idle_warnings(settings: Settings) -> Iterator[str]:
     """A warning for each setting that has no effect without another one."""
     policies = {settings[RESTART_POLICY], *settings.by_node(RESTART_POLICY).values()}
+    owes = (settings[OWES], *settings.by_node(OWES).values())
+    policies |= {"on-failure" for one in owes for owed in one if owed.then == RESTART}
     idle: list[tuple[Setting[Any], Setting[Any]]]
     idle = [(one, RESTART_POLICY) for one in POLICY_SETTINGS[1:] if policies == {"no"}]
     idle += [(one, HOT_RELOAD) for one in (WATCH, IGNORE) if not settings[HOT_RELOAD]]

@@ -7,8 +7,8 @@ from dora_systemd.decisions.logs.events import EVENTS
 from dora_systemd.decisions.why.lives import Happening
 
 FAULTS = (
-    *("node-crashed", "node-oom", "node-hung", "node-watchdog", "node-silent", "node-waiting"),
-    *("node-restarted", "dataflow-oom"),
+    *("node-crashed", "node-ended", "node-oom", "node-hung", "node-watchdog", "node-silent"),
+    *("node-waiting", "node-restarted", "dataflow-oom"),
     *("daemon-lost", "coordinator-lost", "dataflow-failed"),
 )
 ENDS = ("dataflow-finished", "dataflow-stopped")

@@ -7,6 +7,7 @@ _STATES = {
     "node-ready": "running",
     "node-restarted": "starting",
     "node-crashed": "failed",
+    "node-ended": "failed",
     "node-oom": "failed",
     "node-exited": "finished",
 }

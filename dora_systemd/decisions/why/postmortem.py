@@ -19,7 +19,7 @@ from dora_systemd.decisions.why.nodes import ended_nodes
 from dora_systemd.decisions.why.verdict import Facts, Restart, Verdict
 from dora_systemd.values import SECOND
 
-_CRASHES = ("node-crashed", "node-oom")
+_CRASHES = ("node-crashed", "node-ended", "node-oom")
 _LOSSES = (Cause.DAEMON_LOST, Cause.COORDINATOR_LOST, Cause.MACHINE_LOST)
 """Their events have the same names."""
 _END_WORDS = {"dataflow-finished": FINISHED, "dataflow-stopped": STOPPED, "dataflow-failed": FAILED}

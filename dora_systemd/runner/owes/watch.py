@@ -28,6 +28,8 @@ from dora_systemd.runner.reload.apply import Run
 from dora_systemd.values import SECOND
 
 _ANSWER_SECONDS = 30.0
+_LONGEST_GRACE = SECOND
+"""A node that hangs does not stop by itself, and what it owes is late already."""
 
 
 async def watch_owes(run: Run, plan: LaunchPlan, dora: Engine, dialogue: Tasks) -> None:
@@ -116,7 +118,8 @@ class Watch:
         old = cell.nodes.get(silent.node, NodeStatus())
         if cell.state is not State.RUNNING or old.state != "running":
             return  # it has ended meanwhile, or is being replaced
-        params = protocol.node_params("RestartNode", cell.run, silent.node, cell.grace)
+        grace = min(cell.grace, _LONGEST_GRACE)
+        params = protocol.node_params("RestartNode", cell.run, silent.node, grace)
         with self._run.nodes.exchanging(silent.node):
             if error := await self._ask(params):
                 reason = f"{silent.reason}; dora does not restart it: {error}"
@@ -124,7 +127,7 @@ class Watch:
                 return
             await self._run.pump.wait(
                 lambda cell: cell.nodes.get(silent.node, NodeStatus()).pid != old.pid,
-                stop_timeout(cell.grace) / SECOND,
+                stop_timeout(grace) / SECOND,
             )
 
     async def _ask(self, params: protocol.Params) -> str:

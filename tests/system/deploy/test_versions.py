@@ -16,7 +16,9 @@ def params() -> list[object]:
     return [pytest.param(one, id=name, marks=marks[name]) for name, one in BAD.items()]
 
 
-@pytest.mark.warns("crashed", "failed", "Failed", "exit", "error", "is silent", "restarted")
+@pytest.mark.warns(
+    "crashed", "failed", "Failed", "exit", "error", "is silent", "restarted", "was ended"
+)
 @pytest.mark.warns("out of memory", "is ended by its watchdog", "after failure", "ready")
 @pytest.mark.warns("close to a memory limit")  # told where the leak is slow enough to be seen
 @pytest.mark.parametrize("bad", params())

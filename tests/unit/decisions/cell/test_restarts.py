@@ -44,6 +44,29 @@ def test_from_settings() -> None:
     assert node_policies(given) == (("camera", expected._replace(policy="always")),)
 
 
+OWES = {"output": "image", "within": "2s"}
+
+
+@pytest.mark.parametrize(
+    ("node", "policy"),
+    [
+        ({"max_restarts": 2}, "no"),
+        ({"max_restarts": 2, "owes": OWES}, "on-failure"),
+        ({"max_restarts": 2, "owes": {**OWES, "then": "warn"}}, "no"),
+        ({"max_restarts": 2, "owes": OWES, "restart_policy": "no"}, "no"),
+        ({"max_restarts": 2, "owes": OWES, "restart_policy": "always"}, "always"),
+    ],
+)
+def test_a_budget_without_a_policy(node: dict[str, object], policy: str) -> None:
+    given = settings({}, {"nodes": {"camera": node}})
+    assert node_policies(given) == (("camera", DEFAULT._replace(policy=policy, max_restarts=2)),)
+
+
+def test_a_budget_of_what_a_node_owes_has_an_effect() -> None:
+    document = {"max_restarts": 3, "nodes": {"camera": {"owes": OWES}}}
+    assert not list(idle_warnings(settings({}, document)))
+
+
 def test_default_restarts_nothing() -> None:
     assert restart_policy(settings({})).policy == "no"
     # A bare `no` is false in YAML.

@@ -159,3 +159,10 @@ def test_times_of_a_hostile_file() -> None:
     assert parse_times(struct.pack("=3Q", 2**64 - 1, now * 2, 5), two, now) == (0, (0, 5))
     for data in (b"", b"x", bytes(size_of_times(two) + 8)):
         assert parse_times(data, two, now) == (0, (0, 0))
+
+
+def test_the_budget_of_a_node_that_only_owes_is_its_own() -> None:
+    dataflow = flow(max_restarts=2, restart_window=60.0)
+    (node,) = launch_descriptor(dataflow, plan(owes=(CAMERA,)))["nodes"]
+    assert (node["restart_policy"], node["max_restarts"]) == ("on-failure", 2)
+    assert node["restart_window"] == 60.0

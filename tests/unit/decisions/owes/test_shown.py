@@ -50,7 +50,7 @@ def test_a_warning_and_its_end() -> None:
 def test_a_restart_has_the_silence_as_its_cause() -> None:
     cell, _ = step(CELL, silent("restart"))
     cell, (record,) = step(cell, life.NodeExited(10, "camera", Exit(), will_restart=True))
-    assert record == Record("node-crashed", "camera", {"exit": f"silent, {MISSING}"})
+    assert record == Record("node-ended", "camera", {"exit": f"silent, {MISSING}"})
     camera = cell.nodes["camera"]
     assert (camera.state, camera.silent, camera.is_ended) == ("restarting", "", False)
     assert parse_exit(str(camera.exit)) == Exit(ExitKind.SILENT, words=MISSING)
@@ -167,7 +167,7 @@ def test_why_of_a_node_that_is_silent_now() -> None:
 
 
 def test_why_of_one_that_has_ended_for_it() -> None:
-    crash = Happening("node-crashed", 6 * SECOND, "camera", "", "i", "b",
+    crash = Happening("node-ended", 6 * SECOND, "camera", "", "i", "b",
                       {"exit": f"silent, {MISSING}"})  # fmt: skip
     facts = Facts("Degraded", failed={"camera": f"silent, {MISSING} after 5 restarts"})
     verdict = examine([Life((SAID, crash))], facts)

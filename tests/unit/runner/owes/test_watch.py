@@ -103,6 +103,10 @@ class Bench(ReloadBench):
     def added(self) -> list[Any]:
         return [one["AddNode"]["node"] for one in self.dora.asked if "AddNode" in one]  # type: ignore[index]
 
+    def graces(self) -> list[Any]:
+        asked: list[Any] = [one for one in self.dora.asked if "RestartNode" in one]
+        return [one["RestartNode"]["grace_duration"] for one in asked]
+
 
 def lived(root: Path, work: Callable[[Bench], Coroutine[Any, Any, None]], *owes: Owed) -> Bench:
     benches: list[Bench] = []
@@ -142,7 +146,9 @@ def test_silence_is_a_restart_by_dora_with_its_cause(tmp_path: Path) -> None:
     ]
     # dora says that it exited with success; it did not do so by itself.
     assert str(bench.pump.cell.nodes["a"].exit) == "silent, no image for 2s"
-    assert bench.named("node-crashed") == [("node-crashed", None)]
+    assert bench.named("node-ended", "node-crashed") == [("node-ended", None)]
+    # It does not wait for the grace duration of the dataflow.
+    assert bench.graces() == [{"secs": 1, "nanos": 0}]
 
 
 def test_a_restart_that_dora_refuses(tmp_path: Path) -> None:
