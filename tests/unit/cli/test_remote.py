@@ -114,6 +114,16 @@ def test_merged_logs(capsys: Printed) -> None:
     assert "cannot merge -o export" in capsys.readouterr().err
 
 
+def test_a_pattern_need_not_match_on_all_hosts(capsys: Printed) -> None:
+    """logs --grep has exit status 1 where nothing matches."""
+    found = """case "$HOST" in quiet*) exit 1;; broken) exit 4;; esac"""
+    make_program(Path(os.environ["PATH"].partition(":")[0]) / "doractl", found)
+    for hosts, status in (("h1,quiet", 0), ("quiet,quiet2", 1), ("h1,quiet,broken", 4)):
+        assert main.run(["logs", "robot", "--grep", "x", "-H", hosts]) == status
+    assert main.run(["logs", "robot", "-H", "h1,quiet"]) == 1
+    capsys.readouterr()
+
+
 def test_what_was_read_can_be_printed(capsys: Printed) -> None:
     # Between what json reads and what it writes there is a level; which one depends on the stack.
     for depth in range(800, 1000):

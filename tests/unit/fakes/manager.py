@@ -52,7 +52,7 @@ class FakeManager:
         self.after_job: dict[str, dict[str, Any]] = {}
         self.systemd = "257.13-1"
         self.questions = 0
-        self.etc = Path("/nowhere/etc")
+        self.etc, self.kind = Path("/nowhere/etc"), "system"
 
     def add(self, runner: RunnerOptions, active: str = "active", **facts: Any) -> str:
         """A unit of ours in state `active`."""
@@ -181,11 +181,11 @@ class FakeManager:
     def enable_unit_files(self, names: Sequence[str]) -> bool:
         self.calls.append(("enable", *names))
         for name in names:
-            wants = self.etc / "systemd/system/dora.target.wants"
+            wants = self.etc / "systemd" / self.kind / "dora.target.wants"
             wants.mkdir(parents=True, exist_ok=True)
             link = wants / Path(name).name
             link.unlink(missing_ok=True)
-            link.symlink_to(self.etc / "systemd/system" / link.name)
+            link.symlink_to(self.etc / "systemd" / self.kind / link.name)
         return True
 
     def disable_unit_files(self, units: Sequence[str]) -> None:

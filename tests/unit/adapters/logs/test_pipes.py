@@ -310,6 +310,7 @@ def test_close_counts_what_it_cannot_write(tmp_path: Path) -> None:
         (entry,) = cell.received()
         assert (entry["DORA_EVENT"], entry["DORA_COUNT"]) == ("lines-lost", "2")
         assert cell.pipes.line_counts()[WHOLE_CELL] == LineCount(lost=2)
+        assert entry["DORA_REASON"] == "journald did not take them"
 
     run(tmp_path, scenario)
 

@@ -115,6 +115,15 @@ def test_who_stops_a_member_stops_the_dataflow() -> None:
     assert cell.failure == "it was stopped on machine gpu by SIGTERM"
 
 
+def test_who_stops_a_member_before_the_run_stops_the_dataflow() -> None:
+    """Its link would only start it again."""
+    cell, actions = step(head(State.GATHERING), life.MachineLost(5, "gpu", "bye", by="SIGTERM"))
+    assert (cell.exit, cell.cause) == (RunnerExit.STOPPED_ON_MACHINE, Cause.STOPPED_ON_MACHINE)
+    assert cell.failure == "it was stopped on machine gpu by SIGTERM"
+    assert Record("machine-lost", "", {"machine": "gpu", "reason": "bye"}) in actions
+    assert cell.state is not State.GATHERING
+
+
 def test_a_machine_that_is_lost_while_dora_stops_is_not_waited_for() -> None:
     cell, actions = step(head(State.RUNNING), life.StopAsked(1, "SIGTERM"))
     assert Do.ASK_STOP in actions

@@ -7,7 +7,9 @@ from typing import Any
 import pytest
 
 from dora_systemd.decisions.cell.launch import LaunchPlan, launch_descriptor
+from dora_systemd.decisions.cell.limits import NodeLimits
 from dora_systemd.decisions.cell.machines import Placed
+from dora_systemd.decisions.cell.needs import NodeNeed
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.dataflow import Dataflow, parse_dataflow
 from dora_systemd.decisions.machines.own import own_options
@@ -59,6 +61,16 @@ def test_each_machine_has_its_own_nodes() -> None:
     watchdogs: Watchdogs = {"source": 1, "mid": 2}
     assert own_options(head._replace(watchdogs=watchdogs)).watchdogs == {"source": 1}
     assert own_options(member._replace(watchdogs=watchdogs)).watchdogs == {"mid": 2}
+
+
+def test_a_member_leaves_out_what_its_settings_say_of_other_machines() -> None:
+    """Its project may be a copy of the head's, with the same settings file."""
+    need = NodeNeed("source", "/dev/video0")
+    head, member = plan().options, plan(machine="gpu").options
+    assert own_options(head._replace(needs=(need,))).needs == (need,)
+    assert own_options(member._replace(needs=(need,))).needs == ()
+    limits = NodeLimits("source", ()), NodeLimits("mid", ())
+    assert own_options(member._replace(node_limits=limits)).node_limits == limits[1:]
 
 
 def test_a_launch_file_starts_the_node_whatever_its_words_are(tmp_path: Path) -> None:

@@ -45,8 +45,10 @@ class FakeHead(FakeDora):
 
     daemons: list[str]
     age = 0
+    when_asked: Callable[[], object] = staticmethod(lambda: None)
 
     async def heartbeats(self) -> list[tuple[str, int]]:
+        self.when_asked()
         return [(machine, self.age) for machine in self.daemons]
 
 
@@ -246,6 +248,26 @@ def test_a_daemon_that_is_gone_is_a_lost_machine(tmp_path: Path) -> None:
         reason = "its dora daemon is not connected any more"
         lost = life.MachineLost(0, "gpu", reason, is_failure=True)
         assert lost in bench.heard(life.MachineLost)
+
+    run(tmp_path, work)
+
+
+def test_the_word_of_a_member_explains_more_than_dora(tmp_path: Path) -> None:
+    """The member may say why its daemon is gone a moment after dora has noticed that."""
+
+    async def work(bench: Bench) -> None:
+        bench.actions[Do.GATHER]()
+        other = await bench.link(READY)
+        await asyncio.sleep(0.5)
+        bench.be(State.RUNNING)
+        bench.dora.daemons = [""]
+        word = wire.Ended("the dora daemon is gone (signal SIGKILL)")
+        later = asyncio.get_running_loop().call_later
+        bench.dora.when_asked = lambda: later(0.5, other.say, word)
+        for _ in range(4):
+            await asyncio.sleep(1)
+            other.say(wire.Beat())
+        assert bench.heard(life.MachineLost)[0] == life.MachineLost(0, "gpu", word.reason)
 
     run(tmp_path, work)
 

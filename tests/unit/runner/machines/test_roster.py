@@ -197,6 +197,23 @@ def test_a_machine_that_is_not_reached(tries: int, is_awaited: bool, most: int |
     run(work)
 
 
+def test_attempts_count_in_a_row() -> None:
+    """A machine that has been there is not given up for what failed before."""
+
+    async def work(bench: Bench) -> None:
+        unreached = wire.Unreached("cannot reach b: no route", "", 2)
+        for said in ((unreached,), (READY,), (unreached,)):
+            other = await bench.link()
+            other.say(*said)
+            await settle()
+        assert refusals(bench) == []
+        (await bench.link()).say(unreached)
+        await settle()
+        assert refusals(bench) == [("machine gpu: cannot reach b: no route", Cause.NO_MACHINE)]
+
+    run(work)
+
+
 @pytest.mark.parametrize(
     ("is_awaited", "cause"), [(True, Cause.NO_MACHINE), (False, Cause.MACHINE_LOST)]
 )

@@ -82,6 +82,18 @@ def test_what_is_not_what_was_announced(data: bytes, tmp_path: Path) -> None:
     assert not [*tmp_path.iterdir()]
 
 
+def test_a_file_here_that_changes_after_it_was_compared(tmp_path: Path) -> None:
+    """A copy of it would be released under the digest of what it was."""
+    (tmp_path / "dataflow.yml").write_text("odd")
+    parcel = Parcel("robot", "", "copy", None, "", {"copy": OLD})
+    known = Known(tmp_path, {"dataflow.yml": OLD})
+    with (
+        pytest.raises(DoraSystemdError, match="cannot receive copy: it is not what was announced"),
+        incoming(tmp_path) as draft,
+    ):
+        _fill(stream_of(b""), parcel, [], draft, known, lambda _: None)
+
+
 @pytest.mark.parametrize(
     "read",
     [

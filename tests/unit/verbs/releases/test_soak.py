@@ -1,6 +1,8 @@
 """How long a trial lasts: until all that nodes owe has come, however short the soak is."""
 
 import time
+from collections.abc import Sequence
+from typing import Any
 
 import pytest
 
@@ -14,6 +16,7 @@ from dora_systemd.verbs.releases import soak as module
 from dora_systemd.verbs.releases.soak import Gate
 from tests.unit.fakes.manager import FakeManager, options
 
+HUNG = "the supervisor process hung and was killed by the watchdog"
 IMAGE, DEPTH = Owed("camera", "image", SECOND, 3 * SECOND), Owed("camera", "depth", SECOND, SECOND)
 
 
@@ -74,6 +77,35 @@ def test_what_never_comes_fails_it(
     found, _ = soaked(manager, scope, monkeypatch, clock, (1e6, 0.1))
     words = "node camera: silent, no image within 3s of its start"
     assert (found, clock[0] < 1006) == (Fault(words, "camera"), True)
+
+
+@pytest.mark.parametrize(
+    ("after", "facts", "fault"),
+    [
+        (0.5, {}, None),
+        (0.5, {"InvocationID": b"\2"}, Fault("systemd has restarted it")),
+        (5.0, {"InvocationID": b"\2"}, None),
+        (0.5, {"ActiveState": "inactive"}, Fault("it was stopped", is_stop=True)),
+        (0.5, {"ActiveState": "failed", "Result": "watchdog"}, Fault(HUNG)),
+    ],
+)
+def test_what_becomes_of_the_unit_while_it_is_watched(
+    scope: Scope,
+    clock: list[float],
+    after: float,
+    facts: dict[str, object],
+    fault: Fault | None,
+) -> None:
+    """With Restart=always a unit that fails is active again a moment later."""
+
+    class Changing(FakeManager):
+        def read(self, unit: str, names: Sequence[str]) -> dict[str, Any]:
+            self.units[unit] |= facts if clock[0] > 1000 + after else {}
+            return super().read(unit, names)
+
+    manager = Changing()
+    manager.add(options(), InvocationID=b"\1")
+    assert Gate(manager, scope, options(), lambda _: None)._soak(2 * SECOND) == fault
 
 
 def crash(at: float, boot: str = "b") -> dict[str, str]:
