@@ -41,6 +41,7 @@ from dora_systemd.runner.cell.boot import EarlyDaemon
 from dora_systemd.runner.cell.clock import StopClock
 from dora_systemd.runner.cell.dialogue import Dialogue
 from dora_systemd.runner.cell.failure import Beside, say, words
+from dora_systemd.runner.cell.keepalive import Keepalive
 from dora_systemd.runner.cell.life import Life, begin_life, learn_first
 from dora_systemd.runner.cell.pause import forget_restarts, hold_back
 from dora_systemd.runner.cell.pump import Pump, now_us
@@ -149,6 +150,9 @@ async def live(runs: Runs, losses: LossWatch | None) -> RunnerExit:
     role, answer = runs.role, runs.reloader.answer
     socket = serve(runs.paths.socket, answer, reach, role.sessions, role.door)
     beside.spawn("serve its socket", socket)
+    if "WATCHDOG_USEC" in os.environ:
+        seconds = int(os.environ["WATCHDOG_USEC"]) / SECOND / 3
+        beside.spawn("feed the watchdog", Keepalive(seconds).beat())
     if losses is not None:
         beside.spawn("count what journald throws away", losses.run())
     try:
@@ -256,7 +260,6 @@ def listen(runs: Runs, pump: Pump, dialogue: Dialogue) -> None:
     dialogue.spawn("take samples", dialogue.take_samples(SAMPLE_SECONDS))
     if "WATCHDOG_USEC" in os.environ:
         seconds = int(os.environ["WATCHDOG_USEC"]) / 1_000_000 / 3
-        dialogue.spawn("feed the watchdog", dialogue.feed_watchdog(seconds))
         dialogue.spawn("watch dora", dialogue.watch_dora(seconds))
     timeout = runs.role.start_timeout
     if pump.cell.is_trial:

@@ -17,6 +17,11 @@ NODES = {
     "well": LISTENS,
     "five-at-stop": LISTENS + "sys.exit(5)\n",
     "crashes": "from dora import Node\nNode()\nraise SystemExit(3)\n",
+    "slow": LISTENS.split("for event")[0] + "time.sleep(300)\n",
+    "slow-143": LISTENS.split("for event")[0]
+    + "import os, signal\nsignal.signal(signal.SIGTERM, lambda *_: os._exit(143))\n"
+    + "time.sleep(300)\n",
+    "143-at-stop": LISTENS + "sys.exit(143)\n",
     "ends": "from dora import Node\nNode()\n",
     "deaf": LISTENS.split("for event")[0]
     + "import signal\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\ntime.sleep(300)\n",
@@ -25,6 +30,9 @@ CASES = {
     "well": ("INT", "", 0),
     "five-at-stop": ("INT", "", 1),
     "deaf": ("TERM", "", 1),
+    "slow": ("INT", "", 0),
+    "slow-143": ("TERM", "", 0),
+    "143-at-stop": ("INT", "", 1),
     "crashes": ("INT", "restart_policy: on-failure, restart_delay: 1, max_restarts: 100", 1),
     "ends": ("INT", "", 0),
 }

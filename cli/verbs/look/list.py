@@ -37,7 +37,8 @@ from dora_systemd.decisions.views.selection import SORTS, STATUSES
     metavar="COLUMN",
     help=f"Sort by {', '.join(SORTS)}; highest first.",
 )
-@click.option("-q",
+@click.option(
+    "-q",
     "--quiet",
     "is_quiet",
     is_flag=True,

@@ -37,6 +37,11 @@ class Exit(NamedTuple):
         """Whether the process ended, and not with success."""
         return self != Exit()
 
+    @property
+    def is_terminated(self) -> bool:
+        """Whether SIGTERM ended the process, or it exited as a shell does then."""
+        return self in (exit_of(-signal.SIGTERM), exit_of(128 + signal.SIGTERM))
+
     def details(self) -> dict[str, str]:
         """The detail `exit` of a life event; success has none."""
         return {"exit": str(self)} if self.is_failure else {}

@@ -13,7 +13,7 @@ events came before: dora's events and the ends of its processes arrive in any or
 
 from dataclasses import replace
 
-from dora_systemd.decisions.cell.status import HELD, LATCHED
+from dora_systemd.decisions.cell.status import HELD, LATCHED, NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life import nodes as table
 from dora_systemd.decisions.life.causes import Cause
@@ -128,7 +128,8 @@ def stop_early(cell: Cell, event: life.StopAsked) -> Next:
 
 def stop(cell: Cell, event: life.StopAsked) -> Next:
     """Have dora stop the nodes, if any of them runs."""
-    return wind_down(replace(cell, stop_by=event.by), _stopping(event))
+    stopped = replace(cell, stop_by=event.by, stop_us=event.at_us)
+    return wind_down(stopped, _stopping(event))
 
 
 def _stopping(event: life.StopAsked) -> Record:
@@ -230,6 +231,9 @@ def result(cell: Cell, event: life.ResultKnown) -> Next:
         code = RunnerExit.NODES_FAILED if spent else RunnerExit.FAILED
         cell = because(cell, Cause.NODE_FAILED, {**failed, **spent})
         cell = replace(cell, failure=reason, exit=code)
+    elif not (cell.ready_us or _is_stopping(cell)):
+        # All nodes have ended before dora's start barrier was reported, but it was open.
+        return _leave(replace(cell, ready_us=event.at_us), Record("dataflow-started"))
     return _leave(cell)
 
 
@@ -258,11 +262,18 @@ def raised_leaving(cell: Cell, event: life.Failed) -> Next:
 def _exit_of_stop(cell: Cell) -> RunnerExit:
     """A requested stop of a service counts as clean, whatever exit status the nodes had.
 
-    `doractl run` ends as `dora run` does, which fails if a node failed on the way out. For its unit
-    that status is a success: the stop itself has worked.
+    `doractl run` ends as `dora run` does, which fails if a node failed on the way out, but not if
+    dora's SIGTERM after the grace has ended it. For its unit that status is a success: the stop
+    itself has worked.
     """
-    is_failed = cell.is_attached and any(node.exit.is_failure for node in cell.nodes.values())
-    return RunnerExit.FAILED_AT_STOP if is_failed else RunnerExit.OK
+    ended = cell.stop_us + cell.grace
+    failed = (node for node in cell.nodes.values() if _has_failed_at_stop(node, ended))
+    return RunnerExit.FAILED_AT_STOP if cell.is_attached and any(failed) else RunnerExit.OK
+
+
+def _has_failed_at_stop(node: NodeStatus, grace_ends_us: int) -> bool:
+    is_late = node.state == "stopped" and node.since_us >= grace_ends_us
+    return node.exit.is_failure and not (is_late and node.exit.is_terminated)
 
 
 def daemon_left(cell: Cell, event: life.ChildExited) -> Next:

@@ -82,16 +82,17 @@ class Cell:
     """All that the runner knows of its cell.
 
     grace: µs. run: dora's id of the run, or "". nodes: the live table. started_us, ready_us:
-    CLOCK_REALTIME µs. stop_by: what requested the stop, or "". failure: why the cell fails, or "".
-    exit: the future exit status of the runner. cause, culprits: of the failure, and the nodes that
-    caused it. downstream: the nodes that depend on each node. is_again: whether this process has
-    had a run before. is_trial: whether the version before can come back. reload: whether the run
-    ends for the next one in this process. notice: the result of the last reload. is_attached:
-    whether it belongs to `doractl run`, which tells how the nodes ended after a stop, too. met_us:
-    when a node last got what it needs, CLOCK_REALTIME µs. machine: the name of this machine if it
-    is a member. members: the other machines, if it is the head. awaited: which of them is not
-    there, and why. lost: those that had joined and were lost. waits_for_lost: whether the loss of a
-    machine leads to another run in this process.
+    CLOCK_REALTIME µs. stop_by: what requested the stop, or ""; stop_us: when that was, if nodes
+    were running, CLOCK_REALTIME µs. failure: why the cell fails, or "". exit: the future exit
+    status of the runner. cause, culprits: of the failure, and the nodes that caused it. downstream:
+    the nodes that depend on each node. is_again: whether this process has had a run before.
+    is_trial: whether the version before can come back. reload: whether the run ends for the next
+    one in this process. notice: the result of the last reload. is_attached: whether it belongs to
+    `doractl run`, which tells how the nodes ended after a stop, too. met_us: when a node last got
+    what it needs, CLOCK_REALTIME µs. machine: the name of this machine if it is a member. members:
+    the other machines, if it is the head. awaited: which of them is not there, and why. lost: those
+    that had joined and were lost. waits_for_lost: whether the loss of a machine leads to another
+    run in this process.
     """
 
     grace: int
@@ -101,6 +102,7 @@ class Cell:
     run: str = ""
     ready_us: int = 0
     stop_by: str = ""
+    stop_us: int = 0
     failure: str = ""
     exit: RunnerExit = RunnerExit.OK
     cause: Cause = Cause.NONE

@@ -15,7 +15,7 @@ from dora_systemd.decisions.cell.status import (
     NodeStatus,
 )
 from dora_systemd.decisions.life.nodes import WITH_PROCESS, is_held_up, lacking
-from dora_systemd.decisions.life.states import Cell, State
+from dora_systemd.decisions.life.states import Cell, RunnerExit, State
 from dora_systemd.decisions.life.stop_budget import kill_delay
 from dora_systemd.decisions.needs.words import format_wait
 from dora_systemd.decisions.signs.table import Sign
@@ -136,6 +136,15 @@ def is_waiting_only(cell: Cell) -> bool:
 def has_started(cell: Cell) -> bool:
     """Whether the unit counts as started: a wait for a device must not keep the boot waiting."""
     return cell.state is State.RUNNING or is_waiting_only(cell)
+
+
+def is_up(cell: Cell) -> bool:
+    """Whether READY=1 is due: it has started, or ends well without that.
+
+    systemd calls the end of a service that was never ready a failure, whatever its exit status.
+    """
+    ends_well = cell.exit in (RunnerExit.OK, RunnerExit.FAILED_AT_STOP) and not cell.reload
+    return has_started(cell) or (cell.state is State.ENDED and ends_well)
 
 
 def cell_status(

@@ -3,6 +3,7 @@
 Keys are those of unit files; the values have the types of StartTransientUnit.
 """
 
+import signal
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -168,7 +169,11 @@ def restart_properties(options: RunnerOptions) -> dict[str, Property]:
         *apart,
         *(_ENDS_OF_ATTACHED if options.attached else ()),
     )
-    common = typed(RestartPreventExitStatus=(tuple(sorted(map(int, final))), ()))
+    common = typed(
+        RestartPreventExitStatus=(tuple(sorted(map(int, final))), ()),
+        # The signal of the watchdog: a runner that hangs says nothing about its nodes.
+        RestartForceExitStatus=((), (int(signal.SIGABRT),)),
+    )
     if policy.policy == "no":
         return common | typed(Restart="no")
     is_endless = policy.max_restarts == INFINITY

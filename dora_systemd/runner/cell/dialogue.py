@@ -9,7 +9,6 @@ from collections.abc import Callable, Coroutine, Mapping
 from typing import Any
 
 from dora_systemd.adapters.dora import engine
-from dora_systemd.adapters.host import notify
 from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.decisions.cell.exits import Exit
 from dora_systemd.decisions.cell.options import RunnerOptions
@@ -38,6 +37,8 @@ _AGAIN_SECONDS = 0.02
 _QUIET_SECONDS = 0.1
 _WAITING_SECONDS = 1.0
 """Time for the effect of a stop on other nodes to be seen, if there are any."""
+_LATE_SECONDS = 2.0
+"""How late the loop may be without being held up."""
 _LONG_SECONDS = 3600.0 * 24 * 365
 
 
@@ -249,26 +250,20 @@ class Dialogue(Tasks):
         if not self._engine.dismiss_daemon():
             self._pump.push(life.ChildExited(now_us(), "daemon", Exit(words="earlier")))
 
-    async def feed_watchdog(self, seconds: float) -> None:
-        """Send WATCHDOG=1 every `seconds`, and wait for nothing in between.
-
-        On a machine without time to spare dora takes long to answer, and the watchdog is about this
-        process alone.
-        """
-        while True:
-            await asyncio.sleep(seconds)
-            notify.send_alive()
-
     async def watch_dora(self, seconds: float) -> None:
         """See every `seconds` that neither coordinator nor daemon hangs.
 
-        While the cell stops, TimeoutStopSec= bounds it.
+        While the cell stops, TimeoutStopSec= bounds it. If this process itself had no time, or was
+        frozen, the answer may be there and unread: then dora is asked again in the next round.
         """
+        timeout, clock = 1.5 * seconds, asyncio.get_running_loop().time
         while True:
+            begun = clock()
             await asyncio.sleep(seconds)
             if self._pump.cell.state is State.RUNNING:
-                silent = await self._engine.find_silent(1.5 * seconds)
-                if silent and self._pump.cell.state is State.RUNNING:
+                silent = await self._engine.find_silent(timeout)
+                is_late = clock() - begun > seconds + timeout + _LATE_SECONDS
+                if silent and not is_late and self._pump.cell.state is State.RUNNING:
                     reason = f"the dora {silent} does not answer any more"
                     self._pump.push(life.ConnectionLost(now_us(), silent, reason))
 

@@ -28,7 +28,7 @@ from dora_systemd.decisions.life.causes import Cause
 from dora_systemd.decisions.life.failures import ENGINE_TIMEOUT
 from dora_systemd.decisions.life.states import Action, Cell, Deadline, Do, Record, RunnerExit, State
 from dora_systemd.decisions.life.table import step
-from dora_systemd.decisions.life.view import cell_status, format_status, has_started
+from dora_systemd.decisions.life.view import cell_status, format_status, is_up
 from dora_systemd.decisions.logs.events import END_EVENTS, NODE_END_EVENTS
 from dora_systemd.errors import DoraSystemdError
 from dora_systemd.paths import CellPaths
@@ -188,7 +188,7 @@ class Pump:
         if text != self._text:
             self._text = text
             notify.send_status(text)
-        becomes_ready = not self._is_ready and has_started(self.cell)
+        becomes_ready = not self._is_ready and is_up(self.cell)
         if becomes_ready:
             self._is_ready = True
             self._life.become_up()

@@ -19,6 +19,10 @@ class ImpatientLoop(asyncio.SelectorEventLoop):
     def time(self) -> float:
         return self._ahead
 
+    def jump(self, seconds: float) -> None:
+        """Stand still for so long."""
+        self._ahead += seconds
+
     def _run_once(self) -> None:
         times = [one.when() for one in self._scheduled if not one.cancelled()]
         if not self._ready and times:

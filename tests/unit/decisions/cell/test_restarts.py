@@ -171,7 +171,11 @@ def test_delays_double_up_to_the_longest() -> None:
 
 
 def test_unit_without_restarts() -> None:
-    assert unit(DEFAULT) == {"Restart": "no", "RestartPreventExitStatus": ((70, 72, 77, 78), ())}
+    assert unit(DEFAULT) == {
+        "Restart": "no",
+        "RestartPreventExitStatus": ((70, 72, 77, 78), ()),
+        "RestartForceExitStatus": ((), (6,)),  # of the watchdog, which says nothing of the nodes
+    }
     assert unit(POLICY, attached=True)["RestartPreventExitStatus"] == ((0, 70, 71, 72, 77, 78), ())
     assert unit(POLICY._replace(max_restarts=INFINITY))["StartLimitIntervalSec"] == 0
 

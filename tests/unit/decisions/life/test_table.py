@@ -13,6 +13,7 @@ from dora_systemd.decisions.life.failures import ENGINE_TIMEOUT
 from dora_systemd.decisions.life.states import Cell, Deadline, Do, Record, RunnerExit, State
 from dora_systemd.decisions.life.stop_budget import stop_timeout
 from dora_systemd.decisions.life.table import TABLE, step
+from dora_systemd.decisions.life.view import is_up
 from dora_systemd.decisions.logs.events import END_EVENTS
 from dora_systemd.values import SECOND
 
@@ -230,6 +231,43 @@ def test_history_finish() -> None:
     assert done[-2:] == [Record("dataflow-finished"), Do.EXIT]
 
 
+def test_history_finish_at_once() -> None:
+    """The end of the run is reported before, or without, the opening of the start barrier."""
+    now, done = live(
+        *START,
+        life.NodeExited(9, "a", Exit(), False),
+        life.NodeExited(9, "b", Exit(), False),
+        life.RunFinished(10),
+        life.ResultKnown(11, {"a": Exit(), "b": Exit()}),
+        life.ChildExited(12, "daemon", exit_of(0)),
+    )
+    assert now.exit is RunnerExit.OK
+    assert now.ready_us == 11
+    assert is_up(now)
+    assert [one.event for one in done if isinstance(one, Record)][-2:] == [
+        "dataflow-started",
+        "dataflow-finished",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"exit": RunnerExit.OK}, True),
+        ({"exit": RunnerExit.FAILED_AT_STOP}, True),
+        ({"exit": RunnerExit.OK, "reload": True}, False),
+        ({"exit": RunnerExit.FAILED}, False),
+        ({"exit": RunnerExit.BAD_DATAFLOW}, False),
+    ],
+)
+def test_systemd_hears_of_a_good_end_before_the_start(
+    changes: dict[str, object], expected: bool
+) -> None:
+    """Otherwise it calls that a failure: Result=protocol."""
+    assert is_up(cell(State.ENDED, **changes)) is expected
+    assert not is_up(cell(State.LEAVING, **changes))
+
+
 def test_history_failed_before_ready() -> None:
     now, done = live(
         *START,
@@ -415,6 +453,9 @@ def test_each_handler_takes_the_events_of_its_entries() -> None:
         (False, exit_of(5), RunnerExit.OK),
         (True, exit_of(5), RunnerExit.FAILED_AT_STOP),
         (True, Exit(), RunnerExit.OK),
+        (True, exit_of(-15), RunnerExit.OK),
+        (True, exit_of(143), RunnerExit.OK),
+        (True, exit_of(-9), RunnerExit.FAILED_AT_STOP),
     ],
 )
 def test_a_node_that_fails_on_the_way_out(
@@ -422,6 +463,16 @@ def test_a_node_that_fails_on_the_way_out(
 ) -> None:
     """Only `doractl run` fails then; systemd must not call a stop of a service a failure."""
     before = cell(State.LEAVING, stop_by="SIGTERM", is_attached=is_attached)
-    nodes = {"a": NodeStatus("stopped", exit=exit), "b": NodeStatus("stopped")}
+    late = before.stop_us + before.grace
+    nodes = {"a": NodeStatus("stopped", exit=exit, since_us=late), "b": NodeStatus("stopped")}
     after, actions = step(replace(before, nodes=nodes), life.ChildExited(1, "daemon", exit_of(-2)))
     assert (after.exit, Record("dataflow-stopped") in actions) == (status, True)
+
+
+@pytest.mark.parametrize(("state", "since_us"), [("failed", 20 * SECOND), ("stopped", 7)])
+def test_sigterm_that_was_not_dora_s(state: str, since_us: int) -> None:
+    before = cell(State.LEAVING, stop_by="SIGTERM", stop_us=1, is_attached=True)
+    ended = NodeStatus(state, exit=exit_of(-15), since_us=since_us)
+    nodes = {"a": ended, "b": NodeStatus("stopped")}
+    after, _ = step(replace(before, nodes=nodes), life.ChildExited(1, "daemon", exit_of(-2)))
+    assert after.exit is RunnerExit.FAILED_AT_STOP

@@ -50,6 +50,7 @@ OOMPolicy=continue
 KillMode=mixed
 TimeoutStopSec=25s
 RestartPreventExitStatus=70 72 77 78
+RestartForceExitStatus=SIGABRT
 Restart=no
 Delegate=yes
 DelegateSubgroup=supervisor
