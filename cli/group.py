@@ -1,5 +1,6 @@
 """The verbs of doractl as a click group that imports only the verb that runs."""
 
+from contextlib import suppress
 from importlib import import_module
 from inspect import cleandoc
 from pathlib import Path
@@ -8,7 +9,7 @@ from typing import Any, NamedTuple
 import click
 
 from dora_systemd import __version__
-from dora_systemd.cli.parameters import scope_options
+from dora_systemd.cli.parameters import current_scope, scope_options
 from dora_systemd.errors import DoraSystemdError, ExitCode
 
 TITLES = {
@@ -69,6 +70,26 @@ SHOWN = {name: verb for name, verb in VERBS.items() if name not in HIDDEN}
 """The others: those in --help, completion and hints."""
 ALIASES = {"ps": "list", "status": "list", "reset-failed": "reset"}
 
+WORDS_OF_OTHERS = {
+    "ls": "list",
+    "stat": "status",
+    "inspect": "show",
+    "monit": "top",
+    "htop": "top",
+    "tail": "logs NAME --follow",
+    "log": "logs",
+    "journal": "logs",
+    "kill": "stop",
+    "down": "destroy",
+    "rm": "stop",
+    "delete": "stop",
+    "remove": "stop",
+    "create": "start",
+    "check": "start --dry-run",
+    "validate": "start --dry-run",
+}
+"""Commands of docker, pm2, systemctl and dora, and the command of doractl that does the same."""
+
 _EPILOG = """\b
 Examples:
   doractl start dataflow.yml --name robot
@@ -97,11 +118,7 @@ class VerbGroup(click.Group):
         name = args[0]
         if name.startswith("-") or self.get_command(ctx, name):
             return super().resolve_command(ctx, args)
-        from difflib import get_close_matches
-
-        near = get_close_matches(name, [*SHOWN, *ALIASES], n=1)
-        hint = f"did you mean doractl {near[0]}?" if near else "doractl --help lists all commands"
-        raise DoraSystemdError(f"unknown command {name!r}", hint, ExitCode.USAGE)
+        raise DoraSystemdError(f"unknown command {name!r}", _meant_verb(name), ExitCode.USAGE)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List the verbs and their summaries without importing them."""
@@ -150,6 +167,17 @@ def run_verb(arguments: list[str], group: click.Group = doractl) -> int:
     return result if isinstance(result, int) else ExitCode.OK
 
 
+def _meant_verb(name: str) -> str:
+    """The hint for an unknown command."""
+    from difflib import get_close_matches
+
+    if name == "build":
+        return "dora build FILE builds the nodes, doractl deploy builds a release"
+    known = WORDS_OF_OTHERS.get(name)
+    meant = known or next(iter(get_close_matches(name, [*SHOWN, *ALIASES], n=1)), "")
+    return f"did you mean doractl {meant}?" if meant else "doractl --help lists all commands"
+
+
 def _near(error: click.NoSuchOption) -> list[str]:
     """The options that click suggests, without those that only have the dashes in common."""
     from difflib import get_close_matches
@@ -165,8 +193,23 @@ def _usage_error(error: click.ClickException) -> DoraSystemdError:
     command = context.command_path if context else "doractl"
     possible = _near(error) if isinstance(error, click.NoSuchOption) else []
     hint = f"did you mean {' or '.join(sorted(possible))}?" if possible else f"see {command} --help"
+    if isinstance(error, click.MissingParameter):
+        hint = _known_names(error) or hint
     words = text.split(". Did you mean")[0]
     words = f"{words[:1].lower()}{words[1:]}".replace("no such command", "unknown command", 1)
     if isinstance(error, click.NoSuchOption):
         words = f"unknown option {error.option_name}"
     return DoraSystemdError(words, hint, ExitCode.USAGE)
+
+
+def _known_names(error: click.MissingParameter) -> str:
+    """The hint for a missing SELECTOR: the dataflows that there are."""
+    if not error.ctx or not error.param or error.param.name not in ("selector", "selectors"):
+        return ""
+    from dora_systemd.adapters.bus.systemd import Bus
+    from dora_systemd.verbs.facts.cells import read_cells
+
+    with suppress(DoraSystemdError):
+        names = [cell.name for cell in read_cells(Bus(current_scope(error.ctx), for_reading=True))]
+        return f"known dataflows: {', '.join(names)}" if names else ""
+    return ""

@@ -12,6 +12,7 @@ from dora_systemd.cli.edge import write_own
 from dora_systemd.decisions.views.dataflows import format_dataflows, is_up_word
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.errors import DoraSystemdError, ExitCode
+from dora_systemd.names import SLICE
 from dora_systemd.scope import Scope, scope_of
 from dora_systemd.verbs.facts.cells import read_cells
 
@@ -190,7 +191,6 @@ def _print_nothing(request: ListRequest) -> None:
         return
     # Imported late: most lists have a row.
     from dora_systemd.adapters.cgroup.groups import count_units
-    from dora_systemd.names import SLICE
 
     with suppress(DoraSystemdError):
         if count := count_units(SLICE):

@@ -132,9 +132,9 @@ serial_option = click.option(
 """For what brings a release to hosts."""
 
 
-def current_scope() -> Scope:
-    """The scope of the command line."""
-    return scope_of(click.get_current_context().meta.get(_SCOPE_KEY))
+def current_scope(context: click.Context | None = None) -> Scope:
+    """The scope of the command line. context: of an error that has ended it."""
+    return scope_of((context or click.get_current_context()).meta.get(_SCOPE_KEY))
 
 
 def wants_json() -> bool:

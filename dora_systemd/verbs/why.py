@@ -7,20 +7,21 @@ from dora_systemd.adapters.journal.reader import JournalReader
 from dora_systemd.decisions.cell.status import GATHERING, HELD, CellStatus
 from dora_systemd.decisions.life import nodes as node_table
 from dora_systemd.decisions.logs.query import scope_matches
+from dora_systemd.decisions.views.dataflows import DEGRADED, FAILED
 from dora_systemd.decisions.views.rows import DataflowRow
 from dora_systemd.decisions.why.last_lines import Word, choose_last, shown_last
 from dora_systemd.decisions.why.lives import SHUTDOWN_MESSAGE
 from dora_systemd.decisions.why.postmortem import examine
 from dora_systemd.decisions.why.report import LINES, Report, Subject
 from dora_systemd.decisions.why.verdict import Facts, Verdict
-from dora_systemd.errors import DoraSystemdError
+from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import unit_name
 from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.budget import restart_budget
 from dora_systemd.verbs.facts.cells import Cell, read_cell, read_cells
-from dora_systemd.verbs.facts.ended import not_recorded
+from dora_systemd.verbs.facts.ended import newest_ended, not_recorded
 from dora_systemd.verbs.facts.held import read_held
-from dora_systemd.verbs.facts.list import mark_enabled
+from dora_systemd.verbs.facts.list import mark_enabled, read_rows
 from dora_systemd.verbs.facts.lives import now_boot, read_lives
 from dora_systemd.verbs.facts.locks import read_holders
 from dora_systemd.verbs.facts.reading import look_at_table, read_status
@@ -50,6 +51,22 @@ def explain(manager: Manager, scope: Scope, selector: str, journal: JournalReade
     is_held = cell is not None and _is_held(scope, cell, verdict.node)
     machines = _machines(manager, cell) if cell and cell.options.placed else {}
     return Report(subject, verdict, words, budget, inhibitors, is_held, machines)
+
+
+def newest_failure(manager: Manager, scope: Scope) -> str:
+    """The UUID of the dataflow that failed last: a degraded one that runs, or one that has ended.
+
+    Raises DoraSystemdError: NOT_FOUND if none has failed.
+    """
+    rows = read_rows(manager, scope)
+    ended = newest_ended(manager, scope, rows, None)
+    degraded = sorted((row for row in rows if row.status == DEGRADED), key=lambda row: -row.started)
+    failed = [*degraded, *(row for row in ended if row.status == FAILED)]
+    if not failed:
+        names = ", ".join(row.name for row in rows)
+        hint = f"known dataflows: {names}" if names else "doractl list --all"
+        raise DoraSystemdError("no dataflow has failed", hint, ExitCode.NOT_FOUND)
+    return failed[0].uuid
 
 
 def _machines(manager: Manager, cell: Cell) -> dict[str, str]:

@@ -36,6 +36,9 @@ def test_what_failed_comes_first_with_its_reason(cell: Cell, project: Project) -
     assert "killed" in row["text"]
     assert row["text"] in cell.doractl("list").stdout
     assert cell.doractl("list", "-q").stdout == ""
+    assert cell.doractl("why").stdout.startswith(f"{cell.name}: Failed\n")
+    hint = f"hint: known dataflows: {cell.name}\n"
+    assert cell.doractl("restart", check=False).stderr.endswith(hint)
 
 
 def test_table(cell: Cell, project: Project) -> None:

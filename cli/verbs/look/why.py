@@ -9,19 +9,22 @@ from dora_systemd.cli.parameters import current_scope, output_option, print_json
 from dora_systemd.decisions.why.report import format_report
 from dora_systemd.decisions.why.report_object import report_object
 from dora_systemd.errors import ExitCode
-from dora_systemd.verbs.why import explain, subject_row
+from dora_systemd.verbs.why import explain, newest_failure, subject_row
 
 
 @click.command("why")
-@click.argument("selector")
+@click.argument("selector", required=False)
 @output_option
 @scope_options
-def command(selector: str, output: str) -> int:
+def command(selector: str | None, output: str) -> int:
     """Explain what happened to a dataflow and why: what ended, when, which node, what to do.
 
     The dataflow may be running, failed, stopped, or known only to the journal. Nothing is changed.
 
+    Without a SELECTOR: the dataflow that failed last.
+
     Examples:
+      doractl why                   the newest failure
       doractl why robot             what ended it, which node, when, what to do
       doractl why robot -o json     the same for a program
       doractl why 44f30e60          one that ended long ago, by its UUID
@@ -29,7 +32,7 @@ def command(selector: str, output: str) -> int:
     scope = current_scope()
     check_readable(scope)
     bus = Bus(scope, for_reading=True)
-    report = explain(bus, scope, selector, JournalReader())
+    report = explain(bus, scope, selector or newest_failure(bus, scope), JournalReader())
     if output == "json":
         print_json(report_object(report, subject_row(bus, scope, report.subject)))
         return ExitCode.OK

@@ -26,6 +26,7 @@ LATE = {
             *("verbs.list", "verbs.facts.ended", "verbs.facts.list"),
             *("decisions.views.details", "decisions.views.objects"),
             *("decisions.views.selection", "cli.colors", "verbs.facts.selector"),
+            "adapters.cgroup.groups",
         },
         "names": {"difflib"},
         "cli.edge": {"decisions.views.objects"},
@@ -45,8 +46,8 @@ LATE = {
     "a restart of what runs makes no plan": {
         "cli.verbs.run.restart": {"verbs.restart"},
     },
-    "only an unknown command has a similar one": {
-        "cli.group": {"difflib"},
+    "only a wrong command line needs a similar command, or the names of dataflows": {
+        "cli.group": {"difflib", "adapters.bus.systemd", "verbs.facts.cells"},
     },
     "a Tab after a verb or an option does not ask for a dataflow": {
         "cli.completion": {

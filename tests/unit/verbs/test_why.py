@@ -6,7 +6,9 @@ from typing import Any
 
 import pytest
 
-from dora_systemd.verbs.why import words_of_start
+from dora_systemd.errors import DoraSystemdError
+from dora_systemd.verbs.why import newest_failure, words_of_start
+from tests.unit.fakes.journal import FakeJournal, life_record
 from tests.unit.fakes.manager import FakeManager, ScopeIn, options
 from tests.unit.fakes.programs import make_program
 
@@ -74,3 +76,19 @@ def test_a_failed_start_ends_with_the_words_of_the_guilty_node(
 
 def test_nothing_is_known(scope: ScopeIn, manager: FakeManager) -> None:
     assert words_of_start(manager, scope, UUID) == []
+
+
+def test_the_newest_failure(
+    scope: ScopeIn, manager: FakeManager, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Of those that systemd keeps and those that only the journal knows."""
+    journal = FakeJournal(monkeypatch, tmp_path)
+    manager.add(options("runs"))
+    with pytest.raises(DoraSystemdError, match="no dataflow has failed") as caught:
+        newest_failure(manager, scope)
+    assert caught.value.hint == "known dataflows: runs"
+    manager.add(options("kept"), "failed", InactiveEnterTimestamp=5, ExecMainStatus=1)
+    assert newest_failure(manager, scope) == UUID
+    other = UUID[:-1] + "7"
+    journal.write(life_record("dataflow-failed", 9, "old", other, scope, DORA_REASON="it broke"))
+    assert newest_failure(manager, scope) == other
