@@ -36,6 +36,8 @@ from dora_systemd.decisions.logs.lines import Origin
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import settings_path
 from dora_systemd.paths import CellPaths
+from dora_systemd.runner.asked.hand import end_held
+from dora_systemd.runner.asked.requests import NodeRequests
 from dora_systemd.runner.cell.begin import daemon_variables, enter_supervisor, make_lock
 from dora_systemd.runner.cell.boot import EarlyDaemon
 from dora_systemd.runner.cell.clock import StopClock
@@ -147,7 +149,8 @@ async def live(runs: Runs, losses: LossWatch | None) -> RunnerExit:
     options, is_user = runs.reloader.options, runs.paths.is_of_user
     beside.spawn("forget restarts", forget_restarts(options))
     beside.spawn("count restarts", learn_first(runs.this_life, options.name, is_user))
-    role, answer = runs.role, runs.reloader.answer
+    role = runs.role
+    answer = NodeRequests(runs.reloader, role).answer
     socket = serve(runs.paths.socket, answer, reach, role.sessions, role.door)
     beside.spawn("serve its socket", socket)
     if "WATCHDOG_USEC" in os.environ:
@@ -226,6 +229,7 @@ async def run_once(runs: Runs, is_again: bool) -> Cell:
         run = Run(pump, runs.nodes, runs.pipes, Swapper(pump, dora))
         reloader.begin(run, prepared, started_us * 1000)
         wait_for_needs(run, own, reloader.definition, dialogue.spawn)
+        dialogue.spawn("end with the last node", end_held(run))
         dialogue.spawn("tell that it has started", tell_started(run, reloader.has_started))
         begin_watch(run, prepared.plan, dora, dialogue)
         runs.beside.attach(pump.push)

@@ -9,7 +9,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.parts import refuse_parts
 from dora_systemd.verbs.inhibit.guard import uninhibited
-from dora_systemd.verbs.node import restart_node, stop_node
+from dora_systemd.verbs.node import NodeOrder, order_node
 from dora_systemd.verbs.stop import note_stop, restart_cells, stop_cells
 
 
@@ -31,9 +31,7 @@ def act_on(
     """
     refuse_parts([cell], action)
     if node:
-        do = stop_node if action == "stop" else restart_node
-        do(scope, cell, node)
-        return f"Node {node} of {cell.name}: {action} begun"
+        return order_node(scope, cell, NodeOrder(action, node, by))
     observer = partial(tell_stage, on_stage)
     if action == "stop":
         note_stop([cell], by)

@@ -2,40 +2,34 @@
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.runner_socket import client as runner_socket
+from dora_systemd.adapters.runner_socket.client import done_of, order
 from dora_systemd.decisions.cell.status import CellStatus
-from dora_systemd.decisions.descriptor.expansion import sent_again
 from dora_systemd.decisions.dora.coordinator import Coordinator
-from dora_systemd.decisions.dora.protocol import (
-    Params,
-    Reply,
-    first_line,
-    node_params,
-    replace_params,
-)
+from dora_systemd.decisions.dora.protocol import Params, Reply
 from dora_systemd.decisions.dora.variables import coordinator_variables
-from dora_systemd.decisions.reload.changes import has_readers
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import did_you_mean
 from dora_systemd.paths import CellPaths
 from dora_systemd.scope import Scope
 from dora_systemd.trust.programs import Account, account_of_uid, become, fresh_environment
-from dora_systemd.trust.sockets import plain, require_listener
+from dora_systemd.trust.sockets import require_listener
 from dora_systemd.trust.terminals import run_apart
 from dora_systemd.values import quoted
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.parts import CONTROL, refuse_parts
 from dora_systemd.verbs.facts.reading import read_status
+from dora_systemd.verbs.start.asked import caller
 
 _NO_USER = 2**32 - 1
 """UID of a unit without User=: it runs as the manager's own user."""
 
-Ask = Callable[[Scope, Cell, Params], Reply]
+Ask = Callable[[Path, Mapping[str, Any]], dict[str, Any]]
 
 
 def read_coordinator(scope: Scope, cell: Cell) -> Coordinator:
@@ -89,30 +83,37 @@ def ask_coordinator(scope: Scope, cell: Cell, params: Params) -> Reply:
     return control.request(*runner_socket.relay(socket_of(scope, cell)), params)
 
 
-def restart_node(scope: Scope, cell: Cell, node: str, ask: Ask = ask_coordinator) -> None:
-    """Restart one node; the others keep running.
+@dataclass(frozen=True)
+class NodeOrder:
+    """What is asked of one node. what: RESTART or STOP of decisions/cell/asked.py.
 
-    dora's RestartNode also ends all nodes downstream of a node with restart policy "never". So
-    ReplaceNode replaces such a node by a copy of itself, which the nodes downstream do not notice.
-    dora starts the copy before the old process ends, and tells the old one to stop only after its
-    grace duration.
+    by: the door, such as "doractl node stop". grace: µs that its process has to end; None: that of
+    the dataflow.
     """
-    status = _checked_status(scope, cell, node)
-    info = _answer(cell, ask(scope, cell, {"Info": {"dataflow_uuid": status.run}}))
-    nodes = _nodes(cell, info)
-    definition = next((one for one in nodes if one.get("id") == node), {})
-    is_replaceable = definition.get("restart_policy", "never") == "never"
-    if is_replaceable and has_readers(node, nodes):
-        params = replace_params(status.run, sent_again(definition))
-    else:
-        params = node_params("RestartNode", status.run, node)
-    _answer(cell, ask(scope, cell, params))
+
+    what: str
+    node: str
+    by: str
+    grace: int | None = None
 
 
-def stop_node(scope: Scope, cell: Cell, node: str, ask: Ask = ask_coordinator) -> None:
-    """Stop one node for good; its neighbours see a closed input."""
-    status = _checked_status(scope, cell, node)
-    _answer(cell, ask(scope, cell, node_params("StopNode", status.run, node)))
+def order_node(scope: Scope, cell: Cell, given: NodeOrder, ask: Ask = order) -> str:
+    """Have the runner restart or stop one node; what it does, for people.
+
+    The runner records who has asked, and uses none of the restarts that the node's policy allows.
+    Raises DoraSystemdError.
+    """
+    require_running(cell)
+    refuse_parts([cell], CONTROL)
+    require_node(scope, cell, given.node)
+    by = f"{caller(os.getuid(), os.environ)} ({given.by})"
+    request = {"what": given.what, "node": given.node, "by": by, "grace": given.grace}
+    path = socket_of(scope, cell)
+    try:
+        return "; ".join(done_of(path, ask(path, {"verb": "node", **request})))
+    except DoraSystemdError as error:
+        hint = error.hint.replace("NAME", cell.name)
+        raise DoraSystemdError(error.message, hint, error.code) from error
 
 
 def exec_dora(scope: Scope, manager: Manager, cell: Cell, arguments: Sequence[str]) -> int:
@@ -174,13 +175,6 @@ def dora_environment(coordinator: Coordinator) -> dict[str, str]:
     return coordinator_variables(coordinator.port, coordinator.token, coordinator.local_listen_port)
 
 
-def _checked_status(scope: Scope, cell: Cell, node: str) -> CellStatus:
-    require_running(cell)
-    refuse_parts([cell], CONTROL)
-    runner_socket.require_access(socket_of(scope, cell))
-    return require_node(scope, cell, node)
-
-
 def require_node(scope: Scope, cell: Cell, node: str) -> CellStatus:
     """The live table, which contains `node`. Raises DoraSystemdError (NOT_FOUND) otherwise."""
     status = read_status(scope, cell)
@@ -191,26 +185,3 @@ def require_node(scope: Scope, cell: Cell, node: str) -> CellStatus:
             ExitCode.NOT_FOUND,
         )
     return status
-
-
-def _answer(cell: Cell, reply: Reply) -> dict[str, Any]:
-    if reply.error:
-        raise DoraSystemdError(
-            f"cannot do that in the dataflow {cell.name}: {plain(first_line(reply.error))}",
-            f"doractl restart {cell.name} starts all of it again",
-        )
-    return reply.result if isinstance(reply.result, dict) else {}
-
-
-def _nodes(cell: Cell, info: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The nodes in dora's reply to Info, which the owner of the dataflow could have forged."""
-    try:
-        nodes = info["DataflowInfo"]["descriptor"]["nodes"]
-        if all(isinstance(one, dict) for one in nodes):
-            return list(nodes)
-    except (KeyError, TypeError):
-        pass
-    raise DoraSystemdError(
-        f"cannot understand dora's answer in the dataflow {cell.name}",
-        f"doractl restart {cell.name} starts all of it again",
-    )

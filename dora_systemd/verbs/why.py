@@ -4,6 +4,7 @@ from contextlib import suppress
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.journal.reader import JournalReader
+from dora_systemd.decisions.cell.asked import is_stopped
 from dora_systemd.decisions.cell.status import GATHERING, HELD, CellStatus
 from dora_systemd.decisions.life import nodes as node_table
 from dora_systemd.decisions.logs.query import scope_matches
@@ -122,6 +123,7 @@ def _facts(manager: Manager, scope: Scope, cell: Cell) -> Facts:
         unit["NRestarts"],
         {key: node.silent for key, node in nodes if node.silent},
         is_gathering=status.stage == GATHERING,
+        stopped={key: node.asked_by for key, node in nodes if is_stopped(node)},
     )
 
 

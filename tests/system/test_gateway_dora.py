@@ -219,6 +219,8 @@ def test_single_nodes(dora: Dora, three: list[Cell]) -> None:
     assert three[1].status.nodes["sink"].pid == before[1]["sink"].pid
     dora("node", "stop", "sink", "-d", "two", "--grace", "2s")
     wait_for("it is gone", lambda: not three[1].status.nodes["sink"].is_alive)
+    assert "(dora node stop)" in three[1].status.nodes["sink"].asked_by
+    assert three[1].status.nodes["source"].restarts == 0
     assert [three[n].status.nodes for n in (0, 2)] == [before[0], before[2]]
 
 
@@ -417,7 +419,7 @@ def test_refusals(dora: Dora, three: list[Cell], places: Sequence[Project]) -> N
         (("logs", NO_SUCH_UUID, "--node", "a"), "no dataflow with the UUID"),
         (("logs", "two", "--node", "sonk"), "did you mean sink?"),
         (("node", "restart", "sonk", "-d", "two"), "did you mean sink?"),
-        (("node", "stop", "sonk", "-d", "two"), "not found"),
+        (("node", "stop", "sonk", "-d", "two"), "did you mean sink?"),
         (("param", "get", "-d", "two", "sonk", "x"), "not found"),
         (("topic", "echo", "-d", "two", "sonk/x", "--count", "1"), "sonk"),
         (("clean",), "the journal"),

@@ -1,6 +1,9 @@
 """doractl stop, restart, node, show and dora against real dataflows."""
 
 import json
+import os
+import re
+import signal
 import time
 from pathlib import Path
 
@@ -8,7 +11,7 @@ import pytest
 
 from dora_systemd.errors import ExitCode
 from tests.lab.pace import bound
-from tests.system.cells import Cell, Project, is_alive, run, sync_journal, wait_for
+from tests.system.cells import SINK, Cell, Project, is_alive, run, sync_journal, wait_for
 
 DEAF = """
 import os, signal, time
@@ -93,11 +96,58 @@ def test_restart_of_one_node(cell: Cell, project: Project) -> None:
     cell.wait_exchanging()
 
 
-def test_stop_of_one_node(cell: Cell, project: Project) -> None:
-    cell.start(project.three_nodes())
-    cell.doractl("node", "stop", cell.name, "sink")
+@pytest.mark.warns(
+    *("Node sink crashed: signal SIGKILL", "Node sink is being restarted by dora"),
+    *("error: Signal(9) node_id=sink", "error: ExitCode(3) node_id=sink"),
+)
+def test_restarts_and_stops_that_somebody_asks_for(cell: Cell, project: Project) -> None:
+    """They count nowhere, however the node ends; one that crashes has all of its restarts."""
+    flow = project.three_nodes()
+    policy = "    restart_policy: on-failure\n    max_restarts: 2\n"
+    flow.write_text(flow.read_text() + policy)
+    project.write("sink.py", SINK + "raise SystemExit(3)\n")
+    cell.start(flow)
+    pids = {cell.status.nodes["sink"].pid}
+    for _ in range(4):
+        cell.doractl("node", "restart", cell.name, "sink")
+        wait_for("it runs", lambda: cell.status.nodes["sink"].state == "running")
+        pids.add(cell.status.nodes["sink"].pid)
+    assert len(pids) == 5
+    assert cell.status.nodes["sink"].restarts == 0
+    os.kill(cell.status.nodes["sink"].pid, signal.SIGKILL)
+    wait_for("dora restarts it", lambda: cell.status.nodes["sink"].restarts == 1)
+    wait_for("it runs", lambda: cell.status.nodes["sink"].state == "running")
+    for said in ("stopping: sink", "already stopped: sink (requested by "):
+        assert f"Node {said}" in cell.doractl("node", "stop", cell.name, "sink").stdout
     wait_for("it has gone", lambda: not cell.pids("node-sink"))
     assert cell.show("ActiveState") == "active"
+    sync_journal()
+    shown = cell.doractl("list", cell.name).stdout, cell.doractl("why", cell.name).stdout
+    for text in shown:
+        assert re.search(r"Stopped: +sink, requested by .* [(]doractl node stop[)]", text), text
+    assert re.search(r"^sink +Stopped +-", shown[0], re.M)
+    assert shown[1].startswith(f"{cell.name}: Running\n")
+    cell.doractl("node", "restart", cell.name, "sink")
+    cell.wait_exchanging()
+    sync_journal()
+    events = [name for name, node in cell.events() if node == "sink"]
+    counts = {"node-asked": 6, "node-crashed": 1, "node-restarted": 1, "node-exited": 5}
+    assert {name: events.count(name) for name in counts} == counts
+
+
+@pytest.mark.warns("failed to receive reply from daemon")
+def test_a_stopped_node_that_others_read_comes_back_to_them(cell: Cell, project: Project) -> None:
+    cell.start(project.three_nodes())
+    cell.doractl("node", "stop", cell.name, "doubler")
+    wait_for("its launcher waits", lambda: cell.status.nodes["doubler"].is_held)
+    assert cell.status.nodes["sink"].state == "running"
+    cell.doractl("node", "restart", cell.name, "doubler")
+    cell.wait_exchanging()
+    cell.doractl("node", "stop", cell.name, "doubler")
+    wait_for("its launcher waits", lambda: cell.status.nodes["doubler"].is_held)
+    begin = time.monotonic()
+    cell.doractl("stop", cell.name)
+    assert time.monotonic() - begin < bound(8)
 
 
 def test_unknown_node(cell: Cell, project: Project) -> None:

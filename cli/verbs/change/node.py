@@ -9,10 +9,13 @@ from dora_systemd.cli.parameters import (
     print_outcomes,
     scope_options,
 )
+from dora_systemd.decisions.cell.asked import RESTART, STOP
 from dora_systemd.decisions.views.outcome import Outcome
-from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.selector import Selector
-from dora_systemd.verbs.node import restart_node, stop_node
+from dora_systemd.verbs.node import NodeOrder, order_node
+
+_DOORS = {RESTART: "doractl node restart", STOP: "doractl node stop"}
+"""What the journal has for who asked."""
 
 
 @click.group("node")
@@ -31,10 +34,8 @@ def command() -> None:
 @click.argument("node")
 @acting_options
 def restart(selector: str, node: str) -> int:
-    """Restart NODE of the dataflow SELECTOR; the other nodes keep running."""
-    cell = _cell(selector)
-    restart_node(current_scope(), cell, node)
-    return print_outcomes([Outcome(cell, f"Node restarting: {node}", node=node)])
+    """Restart NODE of the dataflow SELECTOR; it uses up none of its automatic restarts."""
+    return _order(selector, RESTART, node)
 
 
 @command.command("stop")
@@ -42,11 +43,12 @@ def restart(selector: str, node: str) -> int:
 @click.argument("node")
 @acting_options
 def stop(selector: str, node: str) -> int:
-    """Stop NODE of the dataflow SELECTOR for good; its neighbours see their input closed."""
-    cell = _cell(selector)
-    stop_node(current_scope(), cell, node)
-    return print_outcomes([Outcome(cell, f"Node stopping: {node}", node=node)])
+    """Stop NODE of the dataflow SELECTOR until it is restarted; the other nodes keep running."""
+    return _order(selector, STOP, node)
 
 
-def _cell(selector: str) -> Cell:
-    return Selector(selector).find(Bus(current_scope()))
+def _order(selector: str, what: str, node: str) -> int:
+    scope = current_scope()
+    cell = Selector(selector).find(Bus(scope))
+    done = order_node(scope, cell, NodeOrder(what, node, _DOORS[what]))
+    return print_outcomes([Outcome(cell, done, node=node)])

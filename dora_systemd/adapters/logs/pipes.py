@@ -27,6 +27,7 @@ from dora_systemd.decisions.logs.events import event_fields
 from dora_systemd.decisions.logs.fields import Value, encode_entry
 from dora_systemd.decisions.logs.limiter import LineLimiter
 from dora_systemd.decisions.logs.lines import LineEncoder, LineSplitter, Origin, dora_log_fields
+from dora_systemd.decisions.logs.noise import is_end_of
 from dora_systemd.paths import CellPaths
 
 # Bytes: a child process that outlives its node may keep writing, and drain() must still return.
@@ -57,6 +58,7 @@ class LogPipes:
         self._outputs: dict[int, LineSplitter] = {}
         self.left_out: tuple[bytes, ...] = ()  # what their lines say that are no records
         self._muted: frozenset[str] = frozenset()
+        self._asked: set[str] = set()  # nodes whose end somebody has asked for
         self._lost = 0
 
     def make(self, node_id: str, paths: CellPaths) -> None:
@@ -154,6 +156,10 @@ class LogPipes:
         """Write life event `name` of decisions/logs/events.py after the lines queued before it."""
         if name == "lines-lost" and isinstance(lost := details["count"], int):
             self._lost += lost
+        if node and name == "node-asked":
+            self._asked.add(node)
+        elif name in ("node-ready", "node-crashed"):
+            self._asked.discard(node or "")
         fields = event_fields(name, dataflow=self._origin.name, node=node or "", **details)
         if node:
             self._queue.put_record(node, self._entry(fields, node))
@@ -286,7 +292,8 @@ class LogPipes:
             return
         for line in self._outputs[fd].feed(data) if data else self._outputs[fd].flush():
             is_muted = label in self._muted or any(map(line.__contains__, self.left_out))
-            if not is_muted and (fields := dora_log_fields(line)):
+            fields = None if is_muted else dora_log_fields(line)
+            if fields and not is_end_of(str(fields["MESSAGE"]), self._asked):
                 self._queue.put_record(label, self._entry(fields, label))
             if on_line is not None:
                 on_line(line.decode("utf-8", "replace"))

@@ -67,6 +67,8 @@ class NodeStatus(NamedTuple):
     window, 0 without limit. hung: why dora's health check or its watchdog ended the process, or "".
     silent: which output that it owes has not come, or "". is_ended: the runner ends it for that.
     needs: what it waits for, or "". machine: the name of the other machine that it runs on, or "".
+    asked: what was asked for, for decisions/cell/asked.py, or "". asked_by: by whom. is_held:
+    whether dora only has a launcher of it, which waits because a stop was asked for.
     """
 
     state: str = "starting"
@@ -82,6 +84,9 @@ class NodeStatus(NamedTuple):
     is_ended: bool = False
     needs: str = ""
     machine: str = ""
+    asked: str = ""
+    asked_by: str = ""
+    is_held: bool = False
 
     @property
     def is_alive(self) -> bool:
@@ -206,6 +211,9 @@ def _parse_node(raw: Any) -> NodeStatus:
         is_ended=known.get("is_ended") is True,
         needs=_text(known, "needs"),
         machine=_machine(known),
+        asked=_text(known, "asked"),
+        asked_by=_text(known, "asked_by"),
+        is_held=known.get("is_held") is True,
     )
 
 

@@ -208,6 +208,20 @@ class StopAnswered(Event):
 
 
 @dataclass(frozen=True)
+class NodeAsked(Event):
+    """Somebody has asked for a restart or a stop of one node; it follows.
+
+    what: RESTART or STOP of asked.py. by: who, and by which door. status: the initial status of the
+    next process after a restart.
+    """
+
+    node: str
+    what: str
+    by: str
+    status: NodeStatus | None = None
+
+
+@dataclass(frozen=True)
 class NodeReloading(Event):
     """The runner is about to end the node, and to start another process in its place.
 

@@ -13,6 +13,7 @@ events came before: dora's events and the ends of its processes arrive in any or
 
 from dataclasses import replace
 
+from dora_systemd.decisions.cell.asked import is_stopped
 from dora_systemd.decisions.cell.status import HELD, LATCHED, NodeStatus
 from dora_systemd.decisions.life import events as life
 from dora_systemd.decisions.life import nodes as table
@@ -223,7 +224,7 @@ def result(cell: Cell, event: life.ResultKnown) -> Next:
     failed = {
         node: str(cell.nodes[node].exit if node in cell.nodes else how)
         for node, how in event.results.items()
-        if how.is_failure
+        if how.is_failure and not is_stopped(cell.nodes.get(node, NodeStatus()))
     }
     spent = table.spent(cell.nodes)
     if failed or spent:
@@ -272,6 +273,8 @@ def _exit_of_stop(cell: Cell) -> RunnerExit:
 
 
 def _has_failed_at_stop(node: NodeStatus, grace_ends_us: int) -> bool:
+    if is_stopped(node):  # before, by somebody who asked for it
+        return False
     is_late = node.state == "stopped" and node.since_us >= grace_ends_us
     return node.exit.is_failure and not (is_late and node.exit.is_terminated)
 

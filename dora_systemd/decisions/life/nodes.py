@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import replace
 
+from dora_systemd.decisions.cell.asked import STOP, is_stopped, was_asked
 from dora_systemd.decisions.cell.exits import KILLED, Exit, ExitKind
 from dora_systemd.decisions.cell.owed import RESTART
 from dora_systemd.decisions.cell.status import HELD, LATCHED, NodeStatus
@@ -16,7 +17,7 @@ Change = tuple[NodeTable, Record | None]
 """The table after an event, and the life event for the journal."""
 
 WITH_PROCESS = frozenset({"starting", "ready", "running"})
-_MAYBE = ("reloading", "waiting")
+_MAYBE = ("reloading", "waiting", "stopped")
 FAILURES = ("node-crashed", "node-ended", "node-oom")
 """The events of a process that has failed."""
 
@@ -72,10 +73,7 @@ def _changed(nodes: NodeTable, event: life.Event, is_stopping: bool, is_open: bo
         case life.NodeSpawned():
             nodes, record = _spawned(nodes, event)
         case life.NodeReady():
-            state = "running" if is_open else "ready"
-            count = _count(nodes.get(event.node, NodeStatus()))
-            nodes = _set(nodes, event.node, event.at_us, state=state, restarts=count)
-            record = Record("node-ready", event.node)
+            nodes, record = _ready(nodes, event, is_open)
         case life.NodeExited():
             nodes, record = _exited(nodes, event, is_stopping)
         case life.NodeCascaded():
@@ -86,8 +84,8 @@ def _changed(nodes: NodeTable, event: life.Event, is_stopping: bool, is_open: bo
             nodes, record = _heard(nodes, event)
         case life.NodeLacks() | life.NodeMet():
             nodes, record = _needs(nodes, event)
-        case life.NodeReloading():
-            nodes = _reloading(nodes, event)
+        case life.NodeAsked() | life.NodeReloading():
+            nodes, record = _told_to_end(nodes, event)
         case life.NodeAdded() | life.NodeRemoved():
             others = {ident: node for ident, node in nodes.items() if ident != event.node}
             nodes = {**others, **_added(event)}
@@ -101,8 +99,23 @@ def _set(nodes: NodeTable, ident: str, at_us: int, **changes: str | int | Exit) 
     return {**nodes, ident: old._replace(**changes)}  # type: ignore[arg-type]
 
 
+def _ready(nodes: NodeTable, event: life.NodeReady, is_open: bool) -> Change:
+    old, record = nodes.get(event.node, NodeStatus()), Record("node-ready", event.node)
+    if is_stopped(old):  # dora has told it to end meanwhile
+        return nodes, record
+    fresh: dict[str, int | str] = {"restarts": _count(old), "asked": "", "asked_by": ""}
+    state = "running" if is_open else "ready"
+    return _set(nodes, event.node, event.at_us, state=state, **fresh), record
+
+
 def _added(event: life.NodeAdded | life.NodeRemoved) -> NodeTable:
     return {event.node: event.status} if isinstance(event, life.NodeAdded) else {}
+
+
+def _told_to_end(nodes: NodeTable, event: life.NodeAsked | life.NodeReloading) -> Change:
+    if isinstance(event, life.NodeAsked):
+        return _asked(nodes, event)
+    return _reloading(nodes, event), None
 
 
 def _reloading(nodes: NodeTable, event: life.NodeReloading) -> NodeTable:
@@ -114,14 +127,52 @@ def _reloading(nodes: NodeTable, event: life.NodeReloading) -> NodeTable:
     return {**nodes, event.node: status}
 
 
+def _asked(nodes: NodeTable, event: life.NodeAsked) -> Change:
+    """A restart or stop of a node was asked for: its process is about to end."""
+    if event.node not in nodes:
+        return nodes, None
+    old = nodes[event.node]
+    record = Record("node-asked", event.node, {"asked": event.what, "by": event.by})
+    if event.what == STOP:
+        # What was wrong with it is over, and how it ends is no failure.
+        new = NodeStatus("stopped", old.pid, old.restarts, event.at_us)._replace(
+            **{key: getattr(old, key) for key in _KEPT}, is_held=old.state == "waiting"
+        )
+    elif old.state == "waiting":
+        return nodes, record  # it waits on: the next process is there already
+    else:
+        state = "starting" if is_stopped(old) else "reloading"
+        new = (event.status or old)._replace(state=state, pid=old.pid, since_us=event.at_us)
+        new = new._replace(machine=old.machine)
+    return {**nodes, event.node: new._replace(asked=event.what, asked_by=event.by)}, record
+
+
+_KEPT = ("kind", "policy", "max_restarts", "machine")
+
+
 def lacking(nodes: NodeTable) -> dict[str, NodeStatus]:
     """The nodes that wait for what they need."""
     return {ident: node for ident, node in nodes.items() if node.state == "waiting"}
 
 
+def held(nodes: NodeTable) -> dict[str, NodeStatus]:
+    """The stopped nodes of which dora has a launcher, which waits."""
+    return {ident: node for ident, node in nodes.items() if is_stopped(node) and node.pid}
+
+
+def is_over_but_for_held(nodes: NodeTable) -> bool:
+    """Whether all nodes have ended, but for some that somebody has stopped and that may come back.
+
+    If nothing else has ended, somebody has stopped all of them, and the dataflow goes on.
+    """
+    own = [node for node in nodes.values() if not is_stopped(node)]
+    is_over = all(node.state in ("finished", "failed") for node in own)
+    return bool(own) and is_over and bool(held(nodes))
+
+
 def is_held_up(nodes: NodeTable) -> bool:
     """Whether the start waits for nothing but what nodes need."""
-    done = ("waiting", "ready", "dynamic")
+    done = ("waiting", "ready", "dynamic", "stopped")
     return bool(lacking(nodes)) and all(node.state in done for node in nodes.values())
 
 
@@ -184,15 +235,17 @@ def _spawned(nodes: NodeTable, event: life.NodeSpawned) -> Change:
         return {**nodes, event.node: old._replace(policy="never")}, None
     if old.state == "waiting":
         return {**nodes, event.node: old._replace(pid=event.pid)}, None
+    if is_stopped(old):
+        return {**nodes, event.node: old._replace(pid=event.pid, is_held=True)}, None
     at_us, pid = event.at_us, event.pid
     return _set(nodes, event.node, at_us, state="starting", pid=pid, restarts=_count(old)), None
 
 
 def _exited(nodes: NodeTable, event: life.NodeExited, is_stopping: bool) -> Change:
     old = nodes.get(event.node, NodeStatus())
-    if old.state == "reloading" and not is_stopping and not event.is_stale:
-        nodes = {**nodes, event.node: old._replace(pid=0)}
-        return nodes, Record("node-exited", event.node, event.exit.details())
+    is_told = was_asked(old) or old.state == "reloading"
+    if is_told and not event.is_stale and (is_stopped(old) or not is_stopping):
+        return _exited_as_told(nodes, event, old)
     if old.state == "waiting" and not is_stopping:
         # The process before this wait, or a launcher that was replaced: neither is a crash.
         pid = old.pid if event.is_stale else 0
@@ -226,6 +279,18 @@ def _exited(nodes: NodeTable, event: life.NodeExited, is_stopping: bool) -> Chan
         needs="",
     )
     return nodes, record
+
+
+def _exited_as_told(nodes: NodeTable, event: life.NodeExited, old: NodeStatus) -> Change:
+    """Somebody has asked for this end, or a reload needs it: whatever the exit, it is no crash."""
+    asked = {"asked": old.asked} if old.asked else {}
+    record = Record("node-exited", event.node, {**event.exit.details(), **asked})
+    if old.is_held:  # its launcher, which has no end of its own
+        return {**nodes, event.node: old._replace(pid=0, is_held=False)}, None
+    if is_stopped(old):
+        return {**nodes, event.node: old._replace(pid=0, exit=event.exit)}, record
+    state = "starting" if was_asked(old) else old.state
+    return _set(nodes, event.node, event.at_us, state=state, pid=0), record
 
 
 def with_downstream(record: Record, downstream: Downstream) -> Record:
@@ -277,6 +342,8 @@ def _restarts(count: int) -> str:
 def apply_results(nodes: NodeTable, results: Mapping[str, Exit], at_us: int) -> NodeTable:
     """The table with dora's results, which have causes that no event has."""
     for ident, how in results.items():
+        if ident in nodes and is_stopped(nodes[ident]):
+            continue
         if ident in nodes and (how.is_failure or nodes[ident].state not in ("failed", "stopped")):
             state = "failed" if how.is_failure else "finished"
             # For an OOM kill, dora only knows the signal.

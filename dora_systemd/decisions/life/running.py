@@ -37,9 +37,10 @@ def _is_replaced(cell: Cell, node: NodeStatus) -> bool:
     """Whether this is the first process after a reload: the reloader goes back if it fails.
 
     While the dataflow runs, only such a process has never been ready and is no restart of dora's.
-    With a notice the reload is over: the process was too slow for it.
+    With a notice the reload is over: the process was too slow for it. After a restart that somebody
+    asked for nothing goes back.
     """
-    return node.state == "starting" and not node.restarts and not cell.notice
+    return node.state == "starting" and not (node.restarts or cell.notice or node.asked)
 
 
 def _is_lost(cell: Cell, ident: str) -> bool:

@@ -30,7 +30,9 @@ _NODES: dict[str, Handler] = dict.fromkeys(
     ("NodeSpawned", "NodeReady", "NodeExited", "NodeCascaded", "NodeHung"), handle.node_event
 )
 _RELOADS: dict[str, Handler] = {
-    **dict.fromkeys(("NodeReloading", "NodeAdded", "NodeRemoved", "NodeLacks"), handle.node_event),
+    **dict.fromkeys(
+        ("NodeAsked", "NodeReloading", "NodeAdded", "NodeRemoved", "NodeLacks"), handle.node_event
+    ),
     "NodeMet": handle.node_met,
     "ReloadNoted": handle.note_reload,
     "ReloadAsked": handle.reload,

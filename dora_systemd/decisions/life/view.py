@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
+from dora_systemd.decisions.cell.asked import is_stopped
 from dora_systemd.decisions.cell.counters import CpuSample, LineCount
 from dora_systemd.decisions.cell.restarts import HELD_SECONDS, LATCH_SECONDS
 from dora_systemd.decisions.cell.status import (
@@ -86,6 +87,8 @@ def _format_running(cell: Cell) -> str:
         nodes = {ident: node for ident, node in cell.nodes.items() if node.state == state}
         if nodes:
             parts.append(f"{state}: {_names([_with_exit(*one) for one in nodes.items()])}")
+    if stopped := [ident for ident, node in cell.nodes.items() if is_stopped(node)]:
+        parts.append(f"stopped: {_names(stopped)}")
     silent = [f"{ident} ({node.silent})" for ident, node in cell.nodes.items() if node.silent]
     if silent:
         parts.append(f"silent: {_names(silent)}")

@@ -48,6 +48,11 @@ EVENTS = {
     "node-restarted": EventKind(
         "436622a1703a4db68ed8a1aac4ddc336", WARNING, "Node {node} is being restarted by dora"
     ),
+    "node-asked": EventKind(
+        "4a47fed288b84bba8f92865ae43618ed",
+        NOTICE,
+        "Node {node}: {asked} requested by {by}",
+    ),
     "node-oom": EventKind("1e5f89981faf4b0ba7cd69e0b844f9a3", ERR, "Node {node} was killed"),
     "dataflow-oom": _dataflow(
         "074b91207b234b46973343bb14a637a9", ERR, "has used up its memory limit"

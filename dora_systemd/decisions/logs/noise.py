@@ -1,10 +1,12 @@
 """What people need not read twice: lines that repeat, and what an event says already. Pure."""
 
 import re
+from collections.abc import Collection
 
 _TIME = re.compile(rb"(?:\d{4}-\d\d-\d\d[T ])?\d\d:\d\d:\d\d(?:[.,]\d+)?")
 _EXIT_OF_A_NODE = b"node_failure: dora_daemon::"
 """In a line of dora's daemon about an end, which node-crashed, -ended or -exited reports."""
+_END_OF_NODE = re.compile(r"node_failure: .*\bnode_id=(\S+)")
 
 
 def is_same(one: bytes, other: bytes) -> bool:
@@ -21,6 +23,12 @@ def repeated(text: str, times: int) -> str:
     if times < 3:
         return text * (times - 1)
     return f"... {times} times"
+
+
+def is_end_of(text: str, nodes: Collection[str]) -> bool:
+    """Whether a line of dora's daemon, as it is recorded, says that one of `nodes` has failed."""
+    match = _END_OF_NODE.search(text) if nodes else None
+    return match is not None and match[1] in nodes
 
 
 def is_told_by_event(origin: bytes, text: bytes) -> bool:

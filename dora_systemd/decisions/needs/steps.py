@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from enum import Enum
 from typing import NamedTuple
 
+from dora_systemd.decisions.cell.asked import is_stopped
 from dora_systemd.decisions.cell.status import HELD, LATCHED, NodeStatus
 
 _WITH_PROGRAM = ("starting", "ready", "running", "restarting")
@@ -47,7 +48,11 @@ def need_steps(
         return
     # Dora starts all nodes together, so one that went on early would only wait elsewhere, and could
     # lose its device meanwhile, which dora counts as a failed start.
-    lacking = [node for node, what in missing.items() if what]
+    lacking = [
+        node
+        for node, what in missing.items()
+        if what and not is_stopped(nodes.get(node, NodeStatus()))
+    ]
     for node in sorted(missing.keys() & nodes.keys() - passed):
         if nodes[node].state in ("starting", "waiting"):
             yield from _step_before(node, nodes[node], missing[node], lacking)

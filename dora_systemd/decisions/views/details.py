@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+from dora_systemd.decisions.cell.asked import format_stopped
 from dora_systemd.decisions.cell.machines import HEAD
 from dora_systemd.decisions.cell.restarts import budget_words
 from dora_systemd.decisions.signs.table import format_watchdog
@@ -90,6 +91,7 @@ def format_dataflow(row: DataflowRow, width: int | None = None, want_colors: boo
         ("CPU", _cpu_words(row)),
         ("Memory", _memory_words(row)),
         ("Restarts", format_count(row.restarts)),
+        ("Stopped", format_stopped({one.node: one.stopped_by for one in row.nodes})),
         ("Budget", budget_words(row.restart_budget) if row.restart_budget else ""),
         ("Inhibit", format_holders(row.inhibitors) if row.inhibitors else ""),
         ("At boot", "started" if row.enabled else ""),

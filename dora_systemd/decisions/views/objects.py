@@ -81,6 +81,7 @@ def _node_object(whole: DataflowRow, row: NodeRow, shares: Shares | None) -> dic
         "pid": row.pid or None,
         "exit": row.exit or None,
         "waits_for": row.needs or None,
+        "stopped_by": row.stopped_by or None,
         **moment("since", row.since),
         "text": row.text or None,
         "watchdog_us": row.watchdog,

@@ -71,7 +71,7 @@ PRESSURE = Family(
     "pressure_seconds_total", "Time in which some, or all, of its processes waited for a resource."
 )
 STATE = Family("state", "1 for the current state, 0 for all others.")
-RESTARTS = Family("restarts_total", "Automatic restarts.")
+RESTARTS = Family("restarts_total", "Automatic restarts; those that somebody asked for are none.")
 START = Family("start_time_seconds", "When all nodes were ready, in Unix time.")
 NODE_START = Family("start_time_seconds", "When it became ready, in Unix time.")
 WATCHDOG = Family("watchdog_seconds", "Time in which it must send WATCHDOG=1.")

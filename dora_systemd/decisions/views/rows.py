@@ -30,7 +30,8 @@ class NodeRow(NamedTuple):
     must send WATCHDOG=1, and how long ago it did, in µs. essential: whether its final failure ends
     the dataflow. scheduling: as in the settings, or "". cpus: those that it may use, "" if the
     settings name none. silent: what is missing of the outputs that it owes, or "". needs: what it
-    waits for, or "". machine: the other machine that it runs on, or "".
+    waits for, or "". machine: the other machine that it runs on, or "". stopped_by: who has asked
+    for a stop of the node alone, or "".
     """
 
     node: str
@@ -56,6 +57,7 @@ class NodeRow(NamedTuple):
     needs: str = ""
     outputs: tuple[OutputRow, ...] = ()
     machine: str = ""
+    stopped_by: str = ""
 
     @property
     def word(self) -> str:

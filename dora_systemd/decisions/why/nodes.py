@@ -1,5 +1,6 @@
 """The nodes of an ended dataflow, from its life events: the runner's table is gone. Pure."""
 
+from dora_systemd.decisions.cell.asked import STOP
 from dora_systemd.decisions.views.rows import NodeRow
 from dora_systemd.decisions.why.lives import Happening, Life
 
@@ -10,6 +11,7 @@ _STATES = {
     "node-ended": "failed",
     "node-oom": "failed",
     "node-exited": "finished",
+    "node-asked": "stopped",
 }
 _WITH_PROCESS = ("running", "starting")
 
@@ -20,7 +22,8 @@ def ended_nodes(life: Life) -> tuple[NodeRow, ...]:
     is_stopping = False
     for one in life.happenings:
         is_stopping |= one.name == "dataflow-stopping"
-        if one.node and one.name in _STATES:
+        is_news = one.name != "node-asked" or one.detail("asked") == STOP
+        if one.node and one.name in _STATES and is_news:
             row = rows.get(one.node, NodeRow(one.node, "", restarts=0))
             rows[one.node] = _after(row, one, is_stopping)
     end = life.last("dataflow-failed")
@@ -31,9 +34,9 @@ def ended_nodes(life: Life) -> tuple[NodeRow, ...]:
 
 
 def _after(row: NodeRow, event: Happening, is_stopping: bool) -> NodeRow:
-    state = _STATES[event.name]
+    state, is_end = _STATES[event.name], event.name == "node-exited"
     return row._replace(
-        state="stopped" if is_stopping and event.name == "node-exited" else state,
+        state="stopped" if is_end and (is_stopping or event.detail("asked") == STOP) else state,
         restarts=(row.restarts or 0) + (event.name == "node-restarted"),
         exit=row.exit if state in _WITH_PROCESS else event.detail("exit"),
         since=event.at_us,

@@ -77,6 +77,7 @@ def examine(lives: Sequence[Life], facts: Facts, shutdowns: Sequence[int] = ()) 
         before=before.summary,
         before_us=before.at_us,
         nodes=() if status in UP_WORDS else ended_nodes(life),
+        stopped=facts.stopped,
     )
 
 
@@ -279,6 +280,7 @@ def restarts_of(chain: Sequence[Life]) -> list[Restart]:
 
 _FRESH = {
     "node-reloaded": (How.SWAP.value, How.REWIRE.value),
+    "node-asked": ("",),
     "reloaded": ("",),
     "machine-lost": ("",),
 }

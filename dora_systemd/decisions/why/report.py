@@ -4,6 +4,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
+from dora_systemd.decisions.cell.asked import format_stopped
 from dora_systemd.decisions.cell.machines import HEAD
 from dora_systemd.decisions.cell.restarts import budget_words
 from dora_systemd.decisions.logs.events import BUILD_FAILED, ROLLED_BACK
@@ -161,6 +162,7 @@ def _facts(report: Report) -> list[str]:
         "Machines": _machine_words(report.machines),
         "Memory": _memory_words(verdict.details),
         "Starved": ", ".join(verdict.starved),
+        "Stopped": format_stopped(verdict.stopped),
         "Restarts": _restart_words(verdict.restarts),
         "Budget": _budget_words(report),
         "Inhibit": format_holders(report.inhibitors) if report.inhibitors else "",

@@ -11,6 +11,7 @@ from typing import Any
 
 from dora_systemd.adapters.dora.control import Connection
 from dora_systemd.adapters.runner_socket.client import relay
+from dora_systemd.decisions.cell.asked import RESTART, STOP
 from dora_systemd.decisions.cell.launch import PROGRAM_KEYS
 from dora_systemd.decisions.dora.protocol import Params, Reply
 from dora_systemd.decisions.gateway.answers import restored_descriptor
@@ -22,7 +23,7 @@ from dora_systemd.scope import Scope
 from dora_systemd.verbs.facts.cells import Cell
 from dora_systemd.verbs.facts.nodes import written_dataflow
 from dora_systemd.verbs.facts.reading import read_status
-from dora_systemd.verbs.node import require_running, restart_node, socket_of
+from dora_systemd.verbs.node import NodeOrder, order_node, require_running, socket_of
 
 _GOING_AWAY = 1001
 
@@ -35,13 +36,21 @@ async def forward(talk: Talk, request: Request) -> Result:
 
 
 async def restart_one_node(talk: Talk, request: Request) -> Result:
-    """RestartNode, without ending the nodes downstream. Raises DoraSystemdError."""
-    if request.grace is not None:
-        return await forward(talk, request)
+    """RestartNode, by the runner. Raises DoraSystemdError."""
+    return {"NodeRestarted": await _order(talk, request, RESTART)}
+
+
+async def stop_one_node(talk: Talk, request: Request) -> Result:
+    """StopNode, by the runner. Raises DoraSystemdError."""
+    return {"NodeStopped": await _order(talk, request, STOP)}
+
+
+async def _order(talk: Talk, request: Request, what: str) -> dict[str, str]:
     node = request.text("node_id")
     cell, _ = await asyncio.to_thread(_running, talk.scope, request.dataflow)
-    await asyncio.to_thread(restart_node, talk.scope, cell, node)
-    return {"NodeRestarted": {"dataflow_id": cell.uuid, "node_id": node}}
+    given = NodeOrder(what, node, f"dora node {what}", request.grace)
+    await asyncio.to_thread(order_node, talk.scope, cell, given)
+    return {"dataflow_id": cell.uuid, "node_id": node}
 
 
 async def describe(talk: Talk, request: Request) -> Result:

@@ -123,11 +123,12 @@ HANDLERS: dict[str, Handler] = {
     "Logs": logs.send_logs,
     "LogSubscribe": logs.subscribe_logs,
     "RestartNode": cell.restart_one_node,
+    "StopNode": cell.stop_one_node,
     "TopicSubscribe": cell.subscribe_topics,
     "TopicUnsubscribe": cell.unsubscribe_topics,
     **dict.fromkeys(
         (
-            *("StopNode", "Reload", "TopicPublish"),
+            *("Reload", "TopicPublish"),
             *("GetParams", "GetParam", "SetParam", "DeleteParam"),
         ),
         cell.forward,

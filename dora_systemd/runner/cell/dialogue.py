@@ -16,7 +16,7 @@ from dora_systemd.decisions.cell.owed import is_probe
 from dora_systemd.decisions.cell.status import NodeStatus
 from dora_systemd.decisions.dora import life_events, protocol
 from dora_systemd.decisions.life import events as life
-from dora_systemd.decisions.life.nodes import lacking, with_process
+from dora_systemd.decisions.life.nodes import held, lacking, with_process
 from dora_systemd.decisions.life.states import Cell, Do, State
 from dora_systemd.decisions.life.stop_budget import stop_timeout
 from dora_systemd.decisions.rights.node_rights import is_essential
@@ -220,7 +220,7 @@ class Dialogue(Tasks):
     async def _ask_stop(self) -> None:
         self._nodes.let_go()
         cell = self._pump.cell
-        if lacking(cell.nodes):
+        if lacking(cell.nodes) or held(cell.nodes):
             self.spawn("end the nodes that wait", self._end_waiting(cell))
         seconds = stop_timeout(cell.grace) / SECOND
         # A refusal means that dora has ended the run already. Stop sometimes gets no answer at all:

@@ -4,7 +4,7 @@ Alone is the cell of all others. The head and the members are in runner/machines
 """
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from dora_systemd.adapters.dora.engine import Child
 from dora_systemd.adapters.dora.preparation import Prepared
@@ -12,6 +12,7 @@ from dora_systemd.adapters.logs.pipes import LogPipes
 from dora_systemd.adapters.runner_socket.listener import Session
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.dataflow import Dataflow
+from dora_systemd.decisions.life.events import NodeAsked
 from dora_systemd.decisions.life.states import Cell
 from dora_systemd.paths import CellPaths
 from dora_systemd.runner.cell.boot import EarlyDaemon
@@ -70,6 +71,13 @@ class Alone:
     def start_coordinator(self, dora: Engine) -> Child | None:
         """Start the coordinator, if it runs on this machine. Raises OSError."""
         return dora.start_coordinator()
+
+    def definition(self, node: Mapping[str, Any]) -> Mapping[str, Any]:
+        """A node as dora gets it while the run goes on."""
+        return node
+
+    async def tell_asked(self, machine: str, event: NodeAsked) -> None:
+        """Let the machine of a node know what somebody has asked for, before it happens."""
 
     def cell(self, cell: Cell) -> Cell:
         """The cell at the beginning of a run."""

@@ -95,7 +95,9 @@ class Needs:
         if cell.state not in _STATES:
             return
         missing = {node: self._missing(node, seen) for node, seen in found.items()}
-        is_running, passed = cell.state is State.RUNNING, frozenset(self._passed)
+        gates, is_running = self._run.nodes.gates, cell.state is State.RUNNING
+        # A stop that somebody asked for closes a gate, too.
+        passed = frozenset(filter(gates.is_passing, self._passed))
         for step in list(need_steps(cell.nodes, missing, is_running, passed)):
             if step.node not in self._losing and not self._run.lock.locked():
                 self._take(step, found[step.node])

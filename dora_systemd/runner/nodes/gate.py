@@ -1,4 +1,6 @@
-"""The gates of nodes with needs: a launcher waits at one before it executes the node's program.
+"""The gates of nodes: a launcher waits at one before it executes the node's program.
+
+Nodes with needs have one, and nodes that somebody has stopped.
 
 A gate is a FIFO. launcher.pl opens it for reading, which waits until the runner has it open, and
 reads one word. So a gate is open for as long as the runner holds its descriptor and words are in
@@ -19,23 +21,49 @@ _WORDS = 1024
 
 
 class Gates:
-    """The gates of all nodes with needs; none of them is open at first."""
+    """All gates; none of them is open at first."""
 
     def __init__(self, paths: CellPaths) -> None:
         self._paths = paths
         self._open: dict[str, int] = {}
         self._known: set[str] = set()
         self._passing: set[str] = set()
+        self._needing: set[str] = set()
         self._is_over = False
 
     def make(self, nodes: Iterable[str]) -> None:
         """Create closed gates for `nodes`, for a new run of the dataflow. Raises OSError."""
         self._is_over = False
-        self._known = set(nodes)
-        for node in self._known:
+        self._needing = set(nodes)
+        for node in self._known - self._needing:  # of nodes that were stopped in the run before
             self.close(node)
-            with contextlib.suppress(FileExistsError):
-                os.mkfifo(self._paths.node_gate(node), 0o600)
+            self._paths.node_gate(node).unlink(missing_ok=True)
+        self._known = set()
+        for node in self._needing:
+            self.close(node)
+            self.add(node)
+
+    def add(self, node: str) -> None:
+        """Create a gate for one more node, unless it has one. Raises OSError."""
+        self._known.add(node)
+        with contextlib.suppress(FileExistsError):
+            os.mkfifo(self._paths.node_gate(node), 0o600)
+
+    def reset(self, node: str) -> None:
+        """As before the run: the gate of a node with needs is closed, no other one has a gate."""
+        if node in self._known:
+            self.close(node)
+        if not self.is_for_needs(node):
+            self._known.discard(node)
+            self._paths.node_gate(node).unlink(missing_ok=True)
+
+    def is_for_needs(self, node: str) -> bool:
+        """Whether the gate of the node opens when its needs are met."""
+        return node in self._needing
+
+    def is_passing(self, node: str) -> bool:
+        """Whether launchers of the node go on."""
+        return node in self._passing
 
     def open(self, node: str) -> None:
         """Let every launcher of the node go on. Raises OSError."""
@@ -46,6 +74,11 @@ class Gates:
         """Have every launcher of the node end as the node has ended. Raises OSError."""
         self._passing.discard(node)
         self._fill(node, _word_of(exit))
+
+    def leave(self, node: str) -> None:
+        """Have the launcher of a stopped node end with success. Raises OSError."""
+        self._passing.discard(node)
+        self._fill(node, _LEAVE)
 
     def close(self, node: str) -> None:
         """Let the launchers of the node wait."""

@@ -198,6 +198,10 @@ class Nodes:
             if self.noted_pid(node) == pid:  # else the next one runs
                 cgroup.kill_group(self._group(node))
 
+    def has_gate_for(self, node: str) -> bool:
+        """Whether the launcher of the node can wait at a gate."""
+        return node in self._launched
+
     def noted_pid(self, node: str) -> int:
         """The process that the launcher of the node became, 0 if there is none yet."""
         with contextlib.suppress(OSError, ValueError):

@@ -20,6 +20,7 @@ from dora_systemd.decisions.cell.line_rates import RateLimits, parse_rates
 from dora_systemd.decisions.cell.options import RunnerOptions
 from dora_systemd.decisions.descriptor.wiring import downstream_of
 from dora_systemd.decisions.life import events as life
+from dora_systemd.decisions.reload.changes import has_readers
 from dora_systemd.decisions.rights.node_rights import essential_nodes
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.names import settings_path
@@ -92,6 +93,11 @@ class Reloader:
         if self._untold is not None:
             self._refuse(self._untold)
 
+    @property
+    def run(self) -> Run | None:
+        """The current run, if there is one."""
+        return self._run
+
     def end(self) -> None:
         """The run has ended."""
         self._run = None
@@ -128,6 +134,12 @@ class Reloader:
         """A node of the current version, as dora gets it."""
         nodes = self.current.descriptor["nodes"] if self.current else []
         return next(one for one in nodes if one["id"] == node)
+
+    def has_readers(self, node: str) -> bool:
+        """Whether other nodes, or the watch over owed outputs, have an input from this node."""
+        nodes = self.current.descriptor["nodes"] if self.current else []
+        is_owing = any(one.node == node for one in self.options.owes)
+        return is_owing or has_readers(node, nodes)
 
     def _settle(self, outcome: str) -> None:
         if self._outcome is not None and not self._outcome.done():

@@ -63,9 +63,9 @@ class Swapper:
         node = str(definition["id"])
         old = self._pump.cell.nodes[node]
         self._pump.push(life.NodeReloading(now_us(), node, _status(definition, kind)))
-        if old.pid and not starts_first and not old.needs and _is_restartable(old):
+        if old.pid and not starts_first and not old.needs and is_restartable(old):
             await self._end(node, "RestartNode")
-        await self._ask(protocol.replace_params(self._run, definition))
+        await self.ask(protocol.replace_params(self._run, definition))
         await self._wait_ready(node)
 
     async def hold(self, definition: Mapping[str, Any]) -> None:
@@ -75,26 +75,26 @@ class Swapper:
         """
         node = str(definition["id"])
         old = self._pump.cell.nodes[node]
-        if old.pid and _is_restartable(old):
+        if old.pid and is_restartable(old):
             # Dora refuses this for a node that is just being started.
             with contextlib.suppress(DoraSystemdError):
                 await self._end(node, "RestartNode")
         if self._pump.cell.state is State.RUNNING:  # else a stop has come meanwhile
-            await self._ask(protocol.replace_params(self._run, definition))
+            await self.ask(protocol.replace_params(self._run, definition))
 
     async def rewire(self, definition: Mapping[str, Any], kind: str) -> None:
         """Replace a node whose inputs or outputs change. Raises DoraSystemdError and NotReady."""
         node = str(definition["id"])
         self._pump.push(life.NodeReloading(now_us(), node, _status(definition, kind)))
         await self._end(node, "RemoveNode")
-        await self._ask(protocol.add_params(self._run, definition))
+        await self.ask(protocol.add_params(self._run, definition))
         await self._wait_ready(node)
 
     async def add(self, definition: Mapping[str, Any], kind: str) -> None:
         """Add a node, whose pipes must be open. Raises DoraSystemdError and NotReady."""
         node = str(definition["id"])
         self._pump.push(life.NodeAdded(now_us(), node, _status(definition, kind)))
-        await self._ask(protocol.add_params(self._run, definition))
+        await self.ask(protocol.add_params(self._run, definition))
         if kind != "dynamic":
             await self._wait_ready(node)
 
@@ -106,20 +106,21 @@ class Swapper:
 
     async def reload_operator(self, node: str, operator: str) -> None:
         """Have a Python operator load its file again. Raises DoraSystemdError."""
-        await self._ask(protocol.reload_params(self._run, node, operator))
+        await self.ask(protocol.reload_params(self._run, node, operator))
 
     @property
     def _run(self) -> str:
         return self._pump.cell.run
 
-    async def _ask(self, params: protocol.Params) -> None:
+    async def ask(self, params: protocol.Params) -> None:
+        """Send one request to dora. Raises DoraSystemdError if dora refuses it."""
         reply = await self._engine.ask_apart(params, _ANSWER_SECONDS)
         if reply.error:
             raise DoraSystemdError(f"cannot do that in dora: {protocol.first_line(reply.error)}")
 
     async def _end(self, node: str, method: str) -> None:
         grace = self._pump.cell.grace
-        await self._ask(protocol.node_params(method, self._run, node, grace))
+        await self.ask(protocol.node_params(method, self._run, node, grace))
         await self._pump.wait(_of(node, lambda one: not one.pid), stop_timeout(grace) / SECOND)
 
     async def _wait_ready(self, node: str) -> None:
@@ -135,7 +136,7 @@ def _is_settled(node: NodeStatus) -> bool:
     return node.is_alive or node.state in ("failed", "finished", "waiting")
 
 
-def _is_restartable(node: NodeStatus) -> bool:
+def is_restartable(node: NodeStatus) -> bool:
     """Whether dora would start the node again: only then RestartNode is sent, as a restart."""
     used = node.restarts + (node.state == "restarting")
     return node.policy != "never" and not 0 < node.max_restarts <= used

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 from dora_systemd.adapters.bus.manager import Manager
 from dora_systemd.adapters.cgroup import groups as cgroup
+from dora_systemd.decisions.cell.asked import is_stopped
 from dora_systemd.decisions.cell.counters import (
     WHOLE_CELL,
     CpuSample,
@@ -227,7 +228,7 @@ def _node_row(node: str, status: NodeStatus | None, numbers: dict[str, Any]) -> 
     if status is None:
         return NodeRow(node, "unknown", **numbers)
     facts = {
-        "pid": status.pid,
+        "pid": 0 if status.is_held else status.pid,
         "restarts": status.restarts,
         "max_restarts": status.max_restarts or None,
         "exit": str(status.exit),
@@ -235,5 +236,6 @@ def _node_row(node: str, status: NodeStatus | None, numbers: dict[str, Any]) -> 
         "silent": status.silent,
         "needs": status.needs,
         "machine": status.machine,
+        "stopped_by": status.asked_by if is_stopped(status) else "",
     }
     return NodeRow(node, status.state, **facts, **numbers)  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""Fifteen tasks as a person types them, from the first start to the end.
+"""Sixteen tasks as a person types them, from the first start to the end.
 
 Each is a text: tests/system/typed.py says how it is read. Where one differs, the whole of it is
 printed as it was really shown. Two of them need another lab: reboot.txt is replayed by tests/boot,

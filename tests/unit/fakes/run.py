@@ -52,6 +52,7 @@ class FakeNodes(Nodes):
         self.gates = Gates(CellPaths(Path("/nowhere")))
         self.living: set[tuple[str, int]] = set()
         self.ooms: dict[str, Oom] = {}
+        self.bare: set[str] = set()
 
     def expect(self) -> None:
         self.calls.append(("expect",))
@@ -68,6 +69,9 @@ class FakeNodes(Nodes):
 
     def forget(self, node: str) -> None:
         self.calls.append(("forget", node))
+
+    def has_gate_for(self, node: str) -> bool:
+        return node not in self.bare
 
     def has_process(self, node: str, pid: int) -> bool:
         return (node, pid) in self.living

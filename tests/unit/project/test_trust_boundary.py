@@ -81,7 +81,7 @@ _TABLE = {
         adapters.runner_socket.address
         adapters.runner_socket.listener adapters.runner_socket.relay runner.cell.begin
         runner.cell.life runner.machines.member_boot
-        adapters.host.presence runner.needs.needs runner.nodes.gate
+        adapters.host.presence runner.asked.hand runner.needs.needs runner.nodes.gate
         runner.cell.engine runner.cell.pump runner.machines.head runner.machines.reach
         runner.main runner.nodes.nodes
         runner.owes.listen runner.reload.settings_file runner.reload.sources runner.stop_post

@@ -4,7 +4,7 @@ import os
 import socket
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,6 @@ import pytest
 
 from dora_systemd.decisions.cell.status import CellStatus, NodeStatus
 from dora_systemd.decisions.dora.coordinator import Coordinator
-from dora_systemd.decisions.dora.protocol import Params, Reply
 from dora_systemd.errors import DoraSystemdError, ExitCode
 from dora_systemd.scope import Scope
 from dora_systemd.verbs import node
@@ -26,23 +25,22 @@ def scope(tmp_path: Path) -> Scope:
     return ScopeIn(is_user=True, uid=1000, root=tmp_path)
 
 
-class FakeCoordinator:
-    """Answers every request with `reply`, Info with a descriptor of one node."""
+class FakeRunner:
+    """Answers every request with `reply`, or raises it."""
 
-    def __init__(self, restart_policy: str | None) -> None:
+    def __init__(self, reply: dict[str, Any] | DoraSystemdError) -> None:
+        self.reply = reply
         self.requests: list[Mapping[str, Any]] = []
-        self.node: dict[str, Any] = {"id": "camera", "path": "x"}
-        self.others = [{"id": "plot", "inputs": {"image": {"source": "camera/image"}}}]
-        if restart_policy:
-            self.node["restart_policy"] = restart_policy
-        self.error = ""
 
-    def __call__(self, scope: Scope, cell: Cell, params: Params) -> Reply:
-        assert not isinstance(params, str)
-        assert (scope.is_user, cell.name) == (True, "robot")
-        self.requests.append(params)
-        info = {"DataflowInfo": {"descriptor": {"nodes": [self.node, *self.others]}}}
-        return Reply("", info if "Info" in params else {}, self.error)
+    def __call__(self, path: Path, request: Mapping[str, Any]) -> dict[str, Any]:
+        assert path.name == "runner.sock"
+        self.requests.append(request)
+        if isinstance(self.reply, DoraSystemdError):
+            raise self.reply
+        return self.reply
+
+
+STOP = node.NodeOrder("stop", "camera", "doractl node stop", 5)
 
 
 @pytest.fixture
@@ -63,50 +61,28 @@ def make_cell(active: str) -> Cell:
     return read_cells(manager)[0]
 
 
-@pytest.mark.parametrize(
-    ("policy", "method"),
-    [
-        (None, "ReplaceNode"),
-        ("never", "ReplaceNode"),
-        ("on-failure", "RestartNode"),
-        ("always", "RestartNode"),
-    ],
-)
-def test_restart(scope: Scope, cell: Cell, policy: str | None, method: str) -> None:
-    fake = FakeCoordinator(policy)
-    node.restart_node(scope, cell, "camera", fake)
-    ((asked, params),) = fake.requests[-1].items()
-    assert asked == method
-    assert params["dataflow_id"] == "run-1"
-
-
-def test_restart_of_a_node_that_nobody_reads(scope: Scope, cell: Cell) -> None:
-    fake = FakeCoordinator(None)
-    fake.others = [{"id": "plot", "inputs": {"image": "camera2/image"}}]
-    node.restart_node(scope, cell, "camera", fake)
-    assert list(fake.requests[-1]) == ["RestartNode"]
-
-
-def test_stop(scope: Scope, cell: Cell) -> None:
-    fake = FakeCoordinator(None)
-    node.stop_node(scope, cell, "camera", fake)
-    assert fake.requests == [
-        {"StopNode": {"dataflow_id": "run-1", "node_id": "camera", "grace_duration": None}}
-    ]
+def test_who_asks_for_what(scope: Scope, cell: Cell) -> None:
+    runner = FakeRunner({"done": ["Node stopping: camera"]})
+    assert node.order_node(scope, cell, STOP, runner) == "Node stopping: camera"
+    (request,) = runner.requests
+    by = request.pop("by") if isinstance(request, dict) else ""
+    assert by.endswith(" (doractl node stop)")
+    assert request == {"verb": "node", "what": "stop", "node": "camera", "grace": 5}
 
 
 def test_unknown_node(scope: Scope, cell: Cell) -> None:
     with pytest.raises(DoraSystemdError, match="cannot find a node 'camer'") as caught:
-        node.stop_node(scope, cell, "camer")
+        node.order_node(scope, cell, replace(STOP, node="camer"))
     assert caught.value.hint == "did you mean camera?"
     assert caught.value.code is ExitCode.NOT_FOUND
 
 
-def test_what_dora_refuses(scope: Scope, cell: Cell) -> None:
-    fake = FakeCoordinator(None)
-    fake.error = "not found in running dataflow"
-    with pytest.raises(DoraSystemdError, match="not found in running dataflow"):
-        node.stop_node(scope, cell, "camera", fake)
+def test_a_refusal(scope: Scope, cell: Cell) -> None:
+    hint, code = "doractl list NAME says what it does", ExitCode.NOT_RUNNING
+    refusal = DoraSystemdError("cannot restart camera: it has ended", hint, code)
+    with pytest.raises(DoraSystemdError, match="cannot restart camera") as caught:
+        node.order_node(scope, cell, STOP, FakeRunner(refusal))
+    assert (caught.value.hint, caught.value.code) == ("doractl list robot says what it does", code)
 
 
 def test_dataflow_that_does_not_run(scope: Scope) -> None:
@@ -115,36 +91,16 @@ def test_dataflow_that_does_not_run(scope: Scope) -> None:
     assert caught.value.code is ExitCode.NOT_RUNNING
 
 
-def test_nothing_is_asked_of_what_is_no_runner(scope: Scope, cell: Cell) -> None:
+def test_no_runner(scope: Scope, cell: Cell) -> None:
     (scope.cell_directory("robot") / "runner.sock").unlink()
-    fake = FakeCoordinator(None)
     with pytest.raises(DoraSystemdError) as caught:
-        node.stop_node(scope, cell, "camera", fake)
+        node.order_node(scope, cell, STOP)
     assert caught.value.code is ExitCode.NOT_RUNNING
-    assert not fake.requests
 
 
-@pytest.mark.parametrize(
-    "info",
-    [
-        {},
-        {"DataflowInfo": 5},
-        {"DataflowInfo": {"descriptor": {"nodes": 5}}},
-        {"DataflowInfo": {"descriptor": {"nodes": [5]}}},
-    ],
-)
-def test_an_odd_answer(scope: Scope, cell: Cell, info: dict[str, Any]) -> None:
-    with pytest.raises(DoraSystemdError, match="cannot understand dora's answer"):
-        node.restart_node(scope, cell, "camera", lambda *_: Reply("", info, ""))
-
-
-def test_words_of_dora_are_no_orders_for_a_terminal(scope: Scope, cell: Cell) -> None:
-    fake = FakeCoordinator(None)
-    fake.error = "no\x1b]0;title\x07\n\nLocation:\n    binaries/daemon/src/lib.rs:3:5"
-    with pytest.raises(DoraSystemdError) as caught:
-        node.stop_node(scope, cell, "camera", fake)
-    assert caught.value.message.isprintable()
-    assert "Location" not in caught.value.message
+def test_an_odd_answer(scope: Scope, cell: Cell) -> None:
+    with pytest.raises(DoraSystemdError, match="it answers something else than was asked"):
+        node.order_node(scope, cell, STOP, FakeRunner({"done": [5]}))
 
 
 def test_a_port_of_somebody_else(scope: Scope) -> None:

@@ -55,6 +55,10 @@ SAMPLES: dict[type[life.Event], tuple[life.Event, ...]] = {
     life.StopAsked: (life.StopAsked(1, "SIGTERM"),),
     life.StopAnswered: (life.StopAnswered(1),),
     life.NodeReloading: (life.NodeReloading(1, "a"),),
+    life.NodeAsked: (
+        life.NodeAsked(1, "a", "restart", "root"),
+        life.NodeAsked(1, "a", "stop", "root"),
+    ),
     life.NodeAdded: (life.NodeAdded(1, "c", NodeStatus()),),
     life.NodeRemoved: (life.NodeRemoved(1, "a"), life.NodeRemoved(1, "unknown")),
     life.ReloadNoted: (life.ReloadNoted(1, "a.py: line 3: invalid syntax"),),
